@@ -1,0 +1,1 @@
+"""The adjoint, the optimisers, the baselines and the attack file."""

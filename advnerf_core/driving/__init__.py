@@ -1,0 +1,1 @@
+"""Vehicle dynamics, reference path, expert, policy, imitation learning and the one rollout loop."""

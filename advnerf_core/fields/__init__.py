@@ -1,0 +1,1 @@
+"""Learned fields: hash-grid scenes and voxel-grid objects."""

@@ -1,0 +1,1 @@
+"""Ray casting, volume rendering, occupancy and depth-ordered composition."""

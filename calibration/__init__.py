@@ -1,0 +1,1 @@
+"""Tools that measure, and the dated YAML files they write."""

@@ -1,0 +1,1 @@
+"""One device per file, and the simulated lab that speaks their protocols."""

@@ -1,0 +1,1 @@
+"""The simulated lab: a MuJoCo world and protocol-exact device emulators."""

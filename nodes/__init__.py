@@ -1,0 +1,1 @@
+"""ROS-style nodes, one process per file, connected by ZeroMQ."""

@@ -1,0 +1,1 @@
+"""What all nodes share: messages, topics, bus, clock, node loop, bags, launch."""
