@@ -77,7 +77,7 @@ class Pinhole:
 
     def cropped(self, left_px: int, top_px: int, width: int, height: int) -> Pinhole:
         """Intrinsics of a window of the image; the window may not leave the image."""
-        inside = 0 <= left_px and 0 <= top_px and left_px + width <= self.width and top_px + height <= self.height
+        inside = left_px >= 0 and top_px >= 0 and left_px + width <= self.width and top_px + height <= self.height
         if not inside:
             raise ValueError(
                 f"expected a crop inside {self.width} x {self.height}, got {width} x {height} at ({left_px}, {top_px})"
@@ -188,7 +188,9 @@ def look_at(position_m: ArrayLike, target_m: ArrayLike) -> Array:
     position, target = np.asarray(position_m, dtype=np.float64), np.asarray(target_m, dtype=np.float64)
     z = target - position
     if np.hypot(z[0], z[1]) < 1e-9:
-        raise ValueError(f"expected a target that is not straight above or below the camera, got {position} -> {target}")
+        raise ValueError(
+            f"expected a target that is not straight above or below the camera, got {position} -> {target}"
+        )
     z /= np.linalg.norm(z)
     x = np.cross(z, [0.0, 0.0, 1.0])
     x /= np.linalg.norm(x)

@@ -1,0 +1,50 @@
+# The two commands a newcomer needs: `make demo` and `make test`. The rest is for those who change the code.
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+export MUJOCO_GL ?= egl
+
+.PHONY: help setup demo experiment test test-slow check bench fmt clean
+
+help:  ## Show this list
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
+
+# The stamp depends on what is installed, so that a changed dependency is installed by the next command.
+setup: $(VENV)/.installed  ## Install everything into .venv (and the EGL packages when root on Debian or Ubuntu)
+$(VENV)/.installed: pyproject.toml constraints.txt docker/system-packages.sh
+	@sh docker/system-packages.sh
+	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	@echo "installing Python packages into $(VENV) (two to four minutes the first time)"
+	@# torch first and alone: pulled in by another package it would be the CUDA build of several GB.
+	@$(BIN)/pip install -q --disable-pip-version-check -c constraints.txt torch
+	@$(BIN)/pip install -q --disable-pip-version-check -c constraints.txt -e '.[all,dev]'
+	@touch $@
+
+demo: setup  ## The whole experiment, small setting, on the simulated lab (up to 20 minutes on 2 cores)
+	@$(BIN)/advnerf experiment launch/room.experiment.yaml --setting demo --run-folder runs/demo
+
+experiment: setup  ## The full experiment, 3 seeds (up to 2 hours on 2 cores); writes its rows to docs/results.json
+	@$(BIN)/advnerf experiment launch/room.experiment.yaml --setting full --run-folder runs/full
+	@$(BIN)/python -m benchmarks.experiment_rows runs/full
+
+test: setup  ## The default tests (under 6 minutes)
+	@$(BIN)/pytest -q
+
+test-slow: setup  ## The tests that take minutes, the default ones excluded
+	@$(BIN)/pytest -q -m 'slow' --timeout 1200
+
+check: setup  ## Lint, types, import contracts
+	@$(BIN)/ruff check .
+	@$(BIN)/ruff format --check .
+	@$(BIN)/mypy
+	@$(BIN)/lint-imports
+
+bench: setup  ## The benchmarks; each writes its rows to docs/results.json
+	@$(BIN)/python -m benchmarks.run_all
+
+fmt: setup  ## Format and fix what can be fixed
+	@$(BIN)/ruff check --fix .
+	@$(BIN)/ruff format .
+
+clean:  ## Remove the environment and every run
+	rm -rf $(VENV) runs
