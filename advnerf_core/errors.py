@@ -1,0 +1,10 @@
+"""The base of the exceptions that a user of advnerf is meant to see."""
+
+from __future__ import annotations
+
+
+class AdvnerfError(Exception):
+    """Something a person can put right; the message says what was expected, what was found and what to do.
+
+    The command line prints it as one line, without a traceback. Anything else that escapes is a defect of ours.
+    """

@@ -1,0 +1,220 @@
+"""ROS 2 messages without ROS: types, CDR bytes, and the conversions every node needs.
+
+The type definitions are those of ROS 2 Jazzy plus the ``.msg`` files shipped in ``nodes/runtime/msg``. Only these are
+registered: the code generator behind them runs what a definition says, so a stranger's definitions never reach it here.
+
+Decoded arrays are read-only views of the received bytes: copy before drawing on them.
+"""
+
+from __future__ import annotations
+
+import struct
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from rosbags.serde import SerdeError
+from rosbags.typesys import Stores, get_typestore, get_types_from_msg
+
+from advnerf_core.geometry import Pinhole, make_transform, quaternion_from_rotation, rotation_from_quaternion
+from nodes.runtime.clock import NS_PER_S
+from nodes.runtime.errors import MessageError
+
+ROS_DISTRO = "jazzy"
+MSG_FOLDER = Path(__file__).parent / "msg"
+# No message of ours comes near; a corrupt length field must not make a receiver ask for gigabytes.
+MAX_SEQUENCE_LENGTH = 64 * 1024 * 1024
+# Written in the byte order of x86 and ARM, the only machines we run on.
+_RGB8, _MONO8, _BGR8 = "rgb8", "mono8", "bgr8"
+_CHANNELS = {_RGB8: 3, _BGR8: 3, _MONO8: 1}
+
+
+def _build_store() -> Any:
+    store = get_typestore(Stores.ROS2_JAZZY)
+    store.max_sequence_length = MAX_SEQUENCE_LENGTH
+    definitions: dict[str, Any] = {}
+    for path in sorted(MSG_FOLDER.glob("*/msg/*.msg")):
+        package = path.parent.parent.name
+        definitions.update(get_types_from_msg(path.read_text(encoding="utf-8"), f"{package}/msg/{path.stem}"))
+    store.register(definitions)
+    return store
+
+
+_STORE = _build_store()
+_PACKAGES = (
+    "builtin_interfaces",
+    "std_msgs",
+    "geometry_msgs",
+    "sensor_msgs",
+    "diagnostic_msgs",
+    "ackermann_msgs",
+    "advnerf_msgs",
+)
+
+
+class _Types:
+    """Message classes by short name, e.g. ``types.Image``; see ``nodes/runtime/msg`` for ours."""
+
+    def __getattr__(self, name: str) -> Any:
+        for package in _PACKAGES:
+            if found := _STORE.types.get(f"{package}/msg/{name}"):
+                return found
+        raise AttributeError(f"no message type called {name} in {', '.join(_PACKAGES)}")
+
+
+types = _Types()
+
+
+def type_name(message: Any) -> str:
+    """Full ROS 2 type name of a message, e.g. ``sensor_msgs/msg/Image``."""
+    try:
+        return str(message.__msgtype__)
+    except AttributeError:
+        raise MessageError(f"expected a ROS 2 message, got {type(message).__name__}") from None
+
+
+@cache
+def type_hash(typename: str) -> str:
+    """RIHS01 hash of a type, as ``ros2 topic info -v`` prints it."""
+    _require_type(typename)
+    return str(_STORE.hash_rihs01(typename))
+
+
+@cache
+def type_hash_prefix(typename: str) -> bytes:
+    """First 8 bytes of the type hash: what travels with every message."""
+    return bytes.fromhex(type_hash(typename).removeprefix("RIHS01_")[:16])
+
+
+@cache
+def type_definition(typename: str) -> str:
+    """Definition text of a type with everything it contains, in the form bags carry (``ros2msg``)."""
+    _require_type(typename)
+    return str(_STORE.generate_msgdef(typename, ros_version=2)[0])
+
+
+def encode(message: Any) -> bytes:
+    """CDR bytes of a message."""
+    name = type_name(message)
+    try:
+        return bytes(_STORE.serialize_cdr(message, name))
+    except (SerdeError, struct.error, AttributeError, TypeError, ValueError) as error:
+        raise MessageError(f"a field of {name} has a wrong type or is out of range: {error}") from error
+
+
+def decode(typename: str, data: bytes | memoryview) -> Any:
+    """Message of CDR bytes; its arrays are read-only views of ``data``."""
+    _require_type(typename)
+    try:
+        return _STORE.deserialize_cdr(memoryview(data).toreadonly(), typename)
+    except (SerdeError, struct.error, ValueError, IndexError, UnicodeDecodeError, AssertionError) as error:
+        raise MessageError(f"expected CDR bytes of {typename}, got {len(data)} bytes that are not: {error}") from error
+
+
+def stamp_from_ns(stamp_ns: int) -> Any:
+    """``builtin_interfaces/Time`` of a real time [ns]."""
+    return types.Time(sec=int(stamp_ns) // NS_PER_S, nanosec=int(stamp_ns) % NS_PER_S)
+
+
+def ns_from_stamp(stamp: Any) -> int:
+    """Real time [ns] of a ``builtin_interfaces/Time``."""
+    return int(stamp.sec) * NS_PER_S + int(stamp.nanosec)
+
+
+def header(stamp_ns: int, frame_id: str = "") -> Any:
+    """``std_msgs/Header`` with a real time [ns] and a frame."""
+    return types.Header(stamp=stamp_from_ns(stamp_ns), frame_id=frame_id)
+
+
+def stamp_ns(message: Any) -> int:
+    """Real time [ns] in the header of a message."""
+    return ns_from_stamp(message.header.stamp)
+
+
+def image_message(image: NDArray[np.uint8], stamp_ns: int, frame_id: str, encoding: str = _RGB8) -> Any:
+    """``sensor_msgs/Image`` of pixels ``[H, W, 3]`` uint8 (or ``[H, W]`` with encoding mono8)."""
+    channels = _CHANNELS.get(encoding)
+    if channels is None:
+        raise MessageError(f"expected an encoding of {', '.join(_CHANNELS)}, got {encoding!r}")
+    shape_fits = image.ndim == 2 if channels == 1 else image.ndim == 3 and image.shape[2] == channels
+    if image.dtype != np.uint8 or not shape_fits:
+        raise MessageError(f"expected a uint8 image for {encoding}, got {image.dtype} {list(image.shape)}")
+    height, width = image.shape[:2]
+    return types.Image(
+        header=header(stamp_ns, frame_id), height=height, width=width, encoding=encoding, is_bigendian=0,
+        step=width * channels, data=np.ascontiguousarray(image).reshape(-1),
+    )  # fmt: skip
+
+
+def image_array(message: Any) -> NDArray[np.uint8]:
+    """Pixels ``[H, W, 3]`` (RGB or BGR as the message says) or ``[H, W]`` uint8; read-only when it came over the wire."""
+    channels = _CHANNELS.get(message.encoding)
+    if channels is None:
+        raise MessageError(f"expected an encoding of {', '.join(_CHANNELS)}, got {message.encoding!r}")
+    height, width, step = int(message.height), int(message.width), int(message.step)
+    if step < width * channels or len(message.data) != height * step:
+        raise MessageError(
+            f"expected {height} rows of {step} >= {width * channels} bytes for {width} x {height} {message.encoding}, "
+            f"got {len(message.data)} bytes"
+        )
+    rows = np.asarray(message.data, dtype=np.uint8).reshape(height, step)[:, : width * channels]
+    return rows.reshape(height, width) if channels == 1 else rows.reshape(height, width, channels)
+
+
+def pose_message(T_frame_from_body: ArrayLike, stamp_ns: int, frame_id: str = "world") -> Any:
+    """``geometry_msgs/PoseStamped`` of a transform ``[4, 4]`` that takes body coordinates to ``frame_id``."""
+    T = np.asarray(T_frame_from_body, dtype=np.float64)
+    x, y, z, w = (float(q) for q in quaternion_from_rotation(T[:3, :3]))
+    position = types.Point(x=float(T[0, 3]), y=float(T[1, 3]), z=float(T[2, 3]))
+    pose = types.Pose(position=position, orientation=types.Quaternion(x=x, y=y, z=z, w=w))
+    return types.PoseStamped(header=header(stamp_ns, frame_id), pose=pose)
+
+
+def pose_matrix(message: Any) -> NDArray[np.float64]:
+    """Transform ``[4, 4]`` of a ``PoseStamped``; a quaternion of length zero is an error."""
+    position, q = message.pose.position, message.pose.orientation
+    try:
+        rotation = rotation_from_quaternion([q.x, q.y, q.z, q.w])
+    except ValueError as error:
+        raise MessageError(f"pose without an orientation: {error}") from error
+    return make_transform(rotation, np.array([position.x, position.y, position.z]))
+
+
+def drive_message(speed_mps: float, steering_rad: float, stamp_ns: int, frame_id: str = "car") -> Any:
+    """``AckermannDriveStamped``; ``stamp_ns`` is the capture time of the image behind the command."""
+    drive = types.AckermannDrive(
+        steering_angle=float(steering_rad),
+        steering_angle_velocity=0.0,
+        speed=float(speed_mps),
+        acceleration=0.0,
+        jerk=0.0,
+    )
+    return types.AckermannDriveStamped(header=header(stamp_ns, frame_id), drive=drive)
+
+
+def camera_info_message(
+    pinhole: Pinhole, stamp_ns: int, frame_id: str, distortion: ArrayLike = (0.0, 0.0, 0.0, 0.0, 0.0)
+) -> Any:
+    """``sensor_msgs/CameraInfo``; ROS puts pixel centres at integers, so half a pixel is taken off the principal point."""
+    K = pinhole.matrix.copy()
+    K[:2, 2] -= 0.5
+    P = np.hstack([K, np.zeros((3, 1))])
+    window = types.RegionOfInterest(x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
+    return types.CameraInfo(
+        header=header(stamp_ns, frame_id), height=pinhole.height, width=pinhole.width, distortion_model="plumb_bob",
+        d=np.asarray(distortion, dtype=np.float64), k=K.reshape(-1), r=np.eye(3).reshape(-1), p=P.reshape(-1),
+        binning_x=0, binning_y=0, roi=window,
+    )  # fmt: skip
+
+
+def pinhole_from_camera_info(message: Any) -> Pinhole:
+    """Intrinsics of a ``CameraInfo`` in our convention (pixel centres at +0.5)."""
+    K = np.asarray(message.k, dtype=np.float64).reshape(3, 3)
+    return Pinhole(int(message.width), int(message.height), K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5)
+
+
+def _require_type(typename: str) -> None:
+    if typename not in _STORE.fielddefs:
+        raise MessageError(f"unknown message type {typename!r}; ours are in {MSG_FOLDER}")

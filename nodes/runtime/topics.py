@@ -1,0 +1,74 @@
+"""The one table of topics: who sends what, how often, and how receivers treat it. Bus, recorder, CLI and tests read it."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+from nodes.runtime.errors import TopicError
+
+STATUS_PREFIX = "/status/"
+STATUS_RATE_HZ = 5.0
+
+
+@dataclass(frozen=True)
+class Topic:
+    """One row of the table.
+
+    Attributes:
+        name: Name with a leading slash.
+        type: ROS 2 type, e.g. ``sensor_msgs/msg/Image``.
+        rate_hz: Nominal rate [Hz]; None for what comes on occasion.
+        queue: How many messages a receiver keeps; 1 means only the newest (older ones are dropped and counted).
+        max_age_s: Age since publication beyond which a receiver must not act on it [s]; None where age does not matter.
+        publisher: Role that sends it.
+    """
+
+    name: str
+    type: str
+    rate_hz: float | None
+    queue: int
+    max_age_s: float | None
+    publisher: str
+
+    @property
+    def latest(self) -> bool:
+        """Whether receivers take only the newest message."""
+        return self.queue == 1
+
+
+_ACKERMANN = "ackermann_msgs/msg/AckermannDriveStamped"
+_ROWS = (
+    Topic("/camera/image_raw", "sensor_msgs/msg/Image", 10.0, 1, 0.2, "camera"),
+    Topic("/camera/camera_info", "sensor_msgs/msg/CameraInfo", 10.0, 1, None, "camera"),
+    Topic("/vicon/car", "geometry_msgs/msg/PoseStamped", 100.0, 200, 0.1, "vicon"),
+    Topic("/vicon/board", "geometry_msgs/msg/PoseStamped", 100.0, 200, 0.1, "vicon"),
+    Topic("/vicon/monitor", "geometry_msgs/msg/PoseStamped", 100.0, 200, 0.1, "vicon"),
+    Topic("/compositor/image", "sensor_msgs/msg/Image", 10.0, 1, 0.2, "compositor"),
+    Topic("/compositor/attack", "advnerf_msgs/msg/AttackStamp", 10.0, 50, None, "compositor"),
+    Topic("/policy/drive", _ACKERMANN, 10.0, 1, 0.25, "policy"),
+    Topic("/safety/drive", _ACKERMANN, 10.0, 1, 0.25, "safety"),
+    Topic("/safety/state", "advnerf_msgs/msg/SafetyState", 10.0, 20, 0.5, "safety"),
+    Topic("/arm", "advnerf_msgs/msg/Arm", None, 20, None, "operator"),
+    Topic("/motor/sent", "advnerf_msgs/msg/MotorSent", 20.0, 200, None, "motor"),
+    Topic("/motor/state", "advnerf_msgs/msg/VescState", 20.0, 50, 0.5, "motor"),
+)
+TOPICS: dict[str, Topic] = {row.name: row for row in _ROWS}
+_NODE_NAME = re.compile(r"[a-z][a-z0-9_]{0,23}")
+
+
+def status_topic(node: str) -> str:
+    """Topic on which a node reports its status."""
+    if not _NODE_NAME.fullmatch(node):
+        raise TopicError(f"expected a node name of at most 24 letters a-z, digits and _, got {node!r}")
+    return STATUS_PREFIX + node
+
+
+def topic(name: str) -> Topic:
+    """Row of a topic; every node has a status topic besides the table."""
+    if row := TOPICS.get(name):
+        return row
+    if name.startswith(STATUS_PREFIX):
+        node = name.removeprefix(STATUS_PREFIX)
+        return Topic(status_topic(node), "advnerf_msgs/msg/NodeStatus", STATUS_RATE_HZ, 1, 1.0, node)
+    raise TopicError(f"unknown topic {name!r}; known are {', '.join(TOPICS)}, {STATUS_PREFIX}<node>")
