@@ -1,0 +1,163 @@
+"""Stages of a long job: run once, cached by their inputs, resumed where they were stopped.
+
+A run folder holds one sub-folder per stage. A stage is finished when its ``stage.json`` says so *and* the key in it equals the
+key of what would be run now. The key is a hash over the stage's configuration, its code version and the digests of what the
+stages before it wrote, so a changed setting runs exactly what depends on it. An interrupted stage keeps its folder: with an
+unchanged key it finds its own partial work there, otherwise the folder is emptied first. What a stage *does* is not known here.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+from advnerf_core.errors import AdvnerfError
+from advnerf_core.files import write_atomically
+
+_RECORD = "stage.json"
+
+
+class StageError(AdvnerfError):
+    """A stage was asked for that does not exist, or whose inputs are not there."""
+
+
+class Report(Protocol):
+    """Told about the progress of one stage."""
+
+    def __call__(self, fraction: float, text: str = "") -> None:
+        """Called with the finished fraction (0..1) and what is being done."""
+
+
+class Display(Protocol):
+    """Shows a person how far the stages are."""
+
+    def start(self, stage: str) -> Report:
+        """A stage begins; the returned callable takes its progress."""
+
+    def finish(self, stage: str, seconds: float, cached: bool) -> None:
+        """A stage has ended, or its earlier result is used."""
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One step of a job.
+
+    Attributes:
+        name: Name of the stage and of its folder.
+        run: Does the work, writing only below the given folder.
+        settings: The part of the configuration that the result depends on (JSON types).
+        after: Stages whose outputs this one reads.
+        version: Raised when the meaning of the stage's output changes.
+    """
+
+    name: str
+    run: Callable[[Path, Report], None]
+    settings: Mapping[str, Any]
+    after: Sequence[str] = ()
+    version: int = 1
+
+
+@dataclass(frozen=True)
+class StageRecord:
+    """What is remembered of a stage: its key, and once finished the digest of its files and the seconds it took."""
+
+    key: str
+    digest: str | None
+    seconds: float
+
+
+def run_stages(
+    stages: Sequence[Stage], folder: Path, display: Display, until: str | None = None
+) -> dict[str, StageRecord]:
+    """Run the stages in order, skipping those whose result is there and still fits.
+
+    Args:
+        stages: The stages, each after those it names in ``after``.
+        folder: The run folder.
+        display: Told of starts, progress and ends.
+        until: Name of the last stage wanted; None runs all.
+
+    Returns:
+        The record of every stage that was considered, by name.
+
+    Raises:
+        StageError: ``until`` or an ``after`` names no stage before it.
+    """
+    if until is not None and until not in [stage.name for stage in stages]:
+        raise StageError(f"expected one of the stages {', '.join(s.name for s in stages)}; got '{until}'")
+    records: dict[str, StageRecord] = {}
+    for stage in stages:
+        records[stage.name] = _run_or_reuse(stage, folder / stage.name, records, display)
+        if stage.name == until:
+            break
+    return records
+
+
+def read_record(folder: Path) -> StageRecord | None:
+    """The record in a stage's folder; None if there is none that can be read."""
+    try:
+        fields = json.loads((folder / _RECORD).read_text())
+        return StageRecord(str(fields["key"]), fields["digest"], float(fields["seconds"]))
+    except (FileNotFoundError, ValueError, KeyError, TypeError):
+        # An unreadable record means unknown contents: the stage is run again from nothing.
+        return None
+
+
+def hash_of(value: Any) -> str:
+    """SHA-256 of a JSON value, independent of the order of keys."""
+    return hashlib.sha256(json.dumps(value, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+
+
+def digest_of(folder: Path) -> str:
+    """SHA-256 over the names and contents of all files below a folder, the stage's own record excepted."""
+    digest = hashlib.sha256()
+    for path in sorted(p for p in folder.rglob("*") if p.is_file() and p != folder / _RECORD):
+        digest.update(path.relative_to(folder).as_posix().encode() + b"\0")
+        with path.open("rb") as stream:
+            while block := stream.read(1 << 20):
+                digest.update(block)
+    return digest.hexdigest()
+
+
+def _run_or_reuse(stage: Stage, folder: Path, records: Mapping[str, StageRecord], display: Display) -> StageRecord:
+    missing = [name for name in stage.after if name not in records]
+    if missing:
+        raise StageError(f"stage '{stage.name}' needs {', '.join(missing)} to run before it")
+    inputs = {name: records[name].digest for name in stage.after}
+    key = hash_of({"name": stage.name, "version": stage.version, "settings": stage.settings, "inputs": inputs})
+    old = read_record(folder)
+    if old is not None and old.key == key and old.digest is not None:
+        display.finish(stage.name, old.seconds, cached=True)
+        return old
+    resumed = old is not None and old.key == key
+    if not resumed and folder.exists():
+        shutil.rmtree(folder)
+    earlier_s = old.seconds if resumed and old is not None else 0.0
+    return _run(stage, folder, key, earlier_s, display)
+
+
+def _run(stage: Stage, folder: Path, key: str, earlier_s: float, display: Display) -> StageRecord:
+    folder.mkdir(parents=True, exist_ok=True)
+    _write_record(folder, StageRecord(key, None, earlier_s))
+    report = display.start(stage.name)
+    begin = time.monotonic()
+    try:
+        stage.run(folder, report)
+    except BaseException:
+        _write_record(folder, StageRecord(key, None, earlier_s + time.monotonic() - begin))
+        raise
+    record = StageRecord(key, digest_of(folder), earlier_s + time.monotonic() - begin)
+    _write_record(folder, record)
+    display.finish(stage.name, record.seconds, cached=False)
+    return record
+
+
+def _write_record(folder: Path, record: StageRecord) -> None:
+    text = json.dumps({"key": record.key, "digest": record.digest, "seconds": round(record.seconds, 3)}, indent=1)
+    write_atomically(folder / _RECORD, text + "\n")

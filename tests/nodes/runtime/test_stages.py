@@ -1,0 +1,102 @@
+import pytest
+
+from advnerf_core.files import write_atomically
+from nodes.runtime.stages import Stage, StageError, digest_of, read_record, run_stages
+
+
+class Notes:
+    def __init__(self):
+        self.events = []
+
+    def start(self, stage):
+        self.events.append(("start", stage))
+        return lambda fraction, text="": self.events.append((stage, fraction))
+
+    def finish(self, stage, seconds, cached):
+        self.events.append(("cached" if cached else "done", stage))
+
+    @property
+    def ran(self):
+        return [name for kind, name in self.events if kind == "done"]
+
+
+def writing(text):
+    return lambda folder, report: write_atomically(folder / "out.txt", text)
+
+
+def job(first_setting=1, second_setting=1, first_text="a"):
+    return [
+        Stage("first", writing(first_text), {"x": first_setting}),
+        Stage("second", writing("b"), {"y": second_setting}, after=("first",)),
+        Stage("other", writing("c"), {}),
+    ]
+
+
+def test_a_second_run_does_nothing(tmp_path):
+    assert run_and_note(tmp_path, job()) == ["first", "second", "other"]
+    assert run_and_note(tmp_path, job()) == []
+
+
+def run_and_note(folder, stages, until=None):
+    notes = Notes()
+    run_stages(stages, folder, notes, until)
+    return notes.ran
+
+
+def test_a_changed_setting_runs_what_depends_on_it_and_no_more(tmp_path):
+    run_and_note(tmp_path, job())
+    assert run_and_note(tmp_path, job(second_setting=2)) == ["second"]
+    # The first stage runs again but writes the same bytes, so what follows still fits.
+    assert run_and_note(tmp_path, job(first_setting=2, second_setting=2)) == ["first"]
+    assert run_and_note(tmp_path, job(first_setting=3, second_setting=2, first_text="new")) == ["first", "second"]
+
+
+def test_an_interrupted_stage_finds_its_own_partial_work(tmp_path):
+    seen = []
+
+    def work(folder, report):
+        seen.append((folder / "partial").exists())
+        (folder / "partial").write_text("half")
+        if len(seen) == 1:
+            raise KeyboardInterrupt
+
+    stages = [Stage("long", work, {})]
+    with pytest.raises(KeyboardInterrupt):
+        run_and_note(tmp_path, stages)
+    assert read_record(tmp_path / "long").digest is None
+    assert run_and_note(tmp_path, stages) == ["long"]
+    assert seen == [False, True]
+
+
+def test_partial_work_of_other_settings_is_not_used(tmp_path):
+    def fail(folder, report):
+        (folder / "partial").write_text("half")
+        raise RuntimeError("stop")
+
+    with pytest.raises(RuntimeError):
+        run_and_note(tmp_path, [Stage("s", fail, {"x": 1})])
+    run_and_note(tmp_path, [Stage("s", writing("whole"), {"x": 2})])
+    assert not (tmp_path / "s" / "partial").exists()
+
+
+def test_an_unreadable_record_runs_the_stage_again(tmp_path):
+    run_and_note(tmp_path, job())
+    (tmp_path / "first" / "stage.json").write_text("{")
+    assert run_and_note(tmp_path, job()) == ["first"]
+
+
+def test_until_stops_after_the_named_stage_and_unknown_names_are_refused(tmp_path):
+    assert run_and_note(tmp_path, job(), until="second") == ["first", "second"]
+    with pytest.raises(StageError, match="first, second, other; got 'third'"):
+        run_and_note(tmp_path, job(), until="third")
+    with pytest.raises(StageError, match="'b' needs a"):
+        run_and_note(tmp_path, [Stage("b", writing(""), {}, after=("a",))])
+
+
+def test_the_digest_sees_names_and_contents(tmp_path):
+    write_atomically(tmp_path / "a", "1")
+    before = digest_of(tmp_path)
+    (tmp_path / "a").rename(tmp_path / "b")
+    renamed = digest_of(tmp_path)
+    write_atomically(tmp_path / "b", "2")
+    assert len({before, renamed, digest_of(tmp_path)}) == 3
