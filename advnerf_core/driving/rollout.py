@@ -1,0 +1,52 @@
+"""The one closed loop: policy, sensor and dynamics, in the surrogate or a deployment scene, attacked or not."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from advnerf_core.driving.dynamics import Dynamics
+from advnerf_core.driving.policy import Policy
+
+Observe = Callable[[Tensor], Tensor]
+"""Images ``[B, 3, 66, 200]`` RGB 0..1 seen from states ``[B, n]``."""
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """Trajectories of one batch of starts.
+
+    Attributes:
+        states: ``[T + 1, B, n]``; ``states[t]`` is where the image for ``controls[t]`` was taken.
+        controls: ``[T, B]`` steering [rad] (or turn rate [rad/s] for Dubins).
+    """
+
+    states: Tensor
+    controls: Tensor
+
+
+@torch.no_grad()
+def drive(
+    policy: Policy, observe: Observe, dynamics: Dynamics, start_states: Tensor, steps: int, goals: Tensor | None = None
+) -> Rollout:
+    """Drive ``steps`` ticks from ``start_states [B, n]``; nothing is recorded for differentiation.
+
+    Args:
+        policy: Frozen policy in eval mode.
+        observe: Sensor, called once per tick with the states ``[B, n]``.
+        dynamics: Vehicle model, or a deployment scene that steps itself.
+        start_states: ``[B, n]``; its dtype is the dtype of the rollout.
+        steps: Number of ticks, at least one.
+        goals: ``[B, goal_size]`` for goal-conditioned policies, constant over the drive.
+    """
+    if steps < 1:
+        raise ValueError(f"expected at least one step, got {steps}")
+    states, controls = [start_states.detach()], []
+    for _ in range(steps):
+        control = policy(observe(states[-1]), goals).to(start_states.dtype)
+        controls.append(control)
+        states.append(dynamics.step(states[-1], control))
+    return Rollout(torch.stack(states), torch.stack(controls))
