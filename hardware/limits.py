@@ -1,0 +1,133 @@
+"""Limits of the car and the map from speed and steering to what its motor controller takes.
+
+This is the lowest layer above the wire: nothing faster, sharper or more sudden than stated here leaves the computer, whoever
+asks. The driver reports what it really sent, so a clipped command is visible in every recording.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+# A command after a pause may move the setpoints by no more than what the slew limits allow in this time [s].
+MAX_SLEW_STEP_S = 0.1
+
+
+@dataclass(frozen=True)
+class DriveLimits:
+    """What the car may be asked to do.
+
+    Attributes:
+        speed_min_mps: Fastest reverse speed, <= 0 [m/s].
+        speed_max_mps: Fastest forward speed [m/s].
+        steering_min_rad: Rightmost front wheel angle, < 0 [rad].
+        steering_max_rad: Leftmost front wheel angle [rad].
+        acceleration_mps2: Largest increase of the magnitude of the speed setpoint [m/s^2]; slowing down is never delayed.
+        steering_rate_radps: Largest change of the steering setpoint [rad/s].
+    """
+
+    speed_min_mps: float = -0.87
+    speed_max_mps: float = 1.30
+    steering_min_rad: float = -0.2634
+    steering_max_rad: float = 0.3135
+    acceleration_mps2: float = 3.5
+    steering_rate_radps: float = 3.2
+
+    def __post_init__(self) -> None:
+        ordered = self.speed_min_mps <= 0.0 < self.speed_max_mps and self.steering_min_rad < 0.0 < self.steering_max_rad
+        if not (ordered and self.acceleration_mps2 > 0.0 and self.steering_rate_radps > 0.0):
+            raise ValueError(f"expected limits around zero and positive rates, got {self}")
+
+
+@dataclass(frozen=True)
+class VehicleGains:
+    """Affine maps between the car's motion and its motor controller, as the RACECAR family states them.
+
+    Attributes:
+        erpm_per_mps: Electrical rpm per speed [1/(m/s)].
+        erpm_offset: Electrical rpm at standstill.
+        servo_per_rad: Servo units per front wheel angle [1/rad]; negative because a larger value turns right.
+        servo_offset: Servo value that drives straight.
+        servo_min: Smallest servo value the linkage allows.
+        servo_max: Largest servo value the linkage allows.
+    """
+
+    erpm_per_mps: float = 4614.0
+    erpm_offset: float = 0.0
+    servo_per_rad: float = -1.2135
+    servo_offset: float = 0.5304
+    servo_min: float = 0.15
+    servo_max: float = 0.85
+
+    def __post_init__(self) -> None:
+        if self.erpm_per_mps == 0.0 or self.servo_per_rad == 0.0 or not 0.0 <= self.servo_min < self.servo_max <= 1.0:
+            raise ValueError(f"expected gains that are not zero and servo limits in 0..1, got {self}")
+
+    def erpm(self, speed_mps: float) -> float:
+        """Electrical rpm for a speed."""
+        return self.erpm_per_mps * speed_mps + self.erpm_offset
+
+    def servo(self, steering_rad: float) -> float:
+        """Servo value for a front wheel angle, inside the linkage's range."""
+        return min(max(self.servo_per_rad * steering_rad + self.servo_offset, self.servo_min), self.servo_max)
+
+    def speed_mps(self, erpm: float) -> float:
+        """Speed at an electrical rpm [m/s]."""
+        return (erpm - self.erpm_offset) / self.erpm_per_mps
+
+    def steering_rad(self, servo: float) -> float:
+        """Front wheel angle at a servo value [rad]."""
+        return (servo - self.servo_offset) / self.servo_per_rad
+
+
+@dataclass(frozen=True)
+class Setpoint:
+    """Speed [m/s] and steering [rad] inside all limits."""
+
+    speed_mps: float
+    steering_rad: float
+
+
+class DriveLimiter:
+    """Holds commands inside `DriveLimits`; it knows the last setpoint and therefore the next possible one."""
+
+    def __init__(self, limits: DriveLimits) -> None:
+        self.limits = limits
+        self._last = Setpoint(0.0, 0.0)
+        self._last_s: float | None = None
+
+    @property
+    def setpoint(self) -> Setpoint:
+        """The last setpoint given out."""
+        return self._last
+
+    def apply(self, speed_mps: float, steering_rad: float, now_s: float) -> Setpoint | None:
+        """Next setpoint toward a command at monotonic time ``now_s``; None if the command is not finite: stop."""
+        if not (math.isfinite(speed_mps) and math.isfinite(steering_rad)):
+            self.stop()
+            return None
+        limits = self.limits
+        step_s = MAX_SLEW_STEP_S if self._last_s is None else min(max(now_s - self._last_s, 0.0), MAX_SLEW_STEP_S)
+        speed = min(max(speed_mps, limits.speed_min_mps), limits.speed_max_mps)
+        steering = min(max(steering_rad, limits.steering_min_rad), limits.steering_max_rad)
+        self._last = Setpoint(
+            self._slew_speed(speed, limits.acceleration_mps2 * step_s),
+            _toward(self._last.steering_rad, steering, limits.steering_rate_radps * step_s),
+        )
+        self._last_s = now_s
+        return self._last
+
+    def stop(self) -> None:
+        """Note that the car was told to stop, so that the next speed starts from standstill."""
+        self._last = replace(self._last, speed_mps=0.0)
+        self._last_s = None
+
+    def _slew_speed(self, speed_mps: float, step_mps: float) -> float:
+        last = self._last.speed_mps
+        # A reversal passes through zero: slowing down to it is free, speeding up beyond it is not.
+        start = last if last * speed_mps > 0.0 else 0.0
+        return speed_mps if abs(speed_mps) <= abs(start) else _toward(start, speed_mps, step_mps)
+
+
+def _toward(start: float, goal: float, step: float) -> float:
+    return start + min(max(goal - start, -step), step)
