@@ -1,0 +1,178 @@
+"""Object fields: a decoder-less, view-independent voxel grid whose squashed colours are interpolated trilinearly.
+
+The free parameters of an object, ``theta``, are colour-grid values before squashing. The squash (a sigmoid) is applied to
+grid values *before* interpolation, so with frozen geometry every pixel is linear in the squashed grid: rendering is one
+sparse matrix product and its vector-Jacobian product is the transpose of the same matrix (see ``render/cast_object``).
+
+Voxels share parameters through ``slots``: each voxel names the row of the colour vector ``[squash(theta); fixed]`` it shows.
+That is how a face several voxels deep stays one texture, and how parts that are not deployed stay plain.
+
+Object frame of a face object: origin at the centre of the deployed face, x its outward normal, z up, y = z cross x. A viewer
+in front of the face sees texture row 0 at the top and column 0 at the left, which is at the smallest y.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
+
+from advnerf_core.geometry import Array, transform_points
+
+# Inverse squash of exactly 0 or 1 is infinite; half an 8-bit step is as far as a display can show.
+_SATURATION = 0.5 / 255.0
+
+
+@dataclass(frozen=True, eq=False)
+class VoxelGridObject:
+    """A box of voxels with a pose. Voxel values sit at voxel centres and are clamped at the border of the box.
+
+    Attributes:
+        slots: Row of the colour vector that each voxel shows, ``[nx, ny, nz]`` int32.
+        theta_shape: Shape ``[..., 3]`` of the free parameters; its leading sizes multiply to the number of free rows.
+        fixed_colours: Colours of the rows after the free ones, ``[F, 3]`` in 0..1 (F may be 0).
+        box_min: Corner of the box in object units, ``[3]``.
+        box_max: Opposite corner, ``[3]``.
+        T_world_from_object: Rigid pose ``[4, 4]``.
+        scale: World metres per object unit; ``sigma * length`` is taken in object units.
+        density: Extinction at voxel centres per object unit, ``[nx, ny, nz]``; None is an opaque solid box (the limit of
+            infinite density: one sample where the ray enters).
+        one_sided: Only rays that enter through the ``+x`` face hit. This is what a projected or displayed texture does: it has
+            a front and no sides.
+        step_units: Length of a ray-marching step in object units; used with a density only.
+    """
+
+    slots: NDArray[np.int32]
+    theta_shape: tuple[int, ...]
+    fixed_colours: Array
+    box_min: Array
+    box_max: Array
+    T_world_from_object: Array
+    scale: float = 1.0
+    density: Array | None = None
+    one_sided: bool = False
+    step_units: float = 0.01
+
+    def __post_init__(self) -> None:
+        """Check shapes and ranges, so that the casting kernel may index without looking."""
+        if self.slots.ndim != 3 or self.slots.dtype != np.int32:
+            raise ValueError(f"expected slots [nx, ny, nz] of int32, got {self.slots.shape} of {self.slots.dtype}")
+        if self.theta_shape[-1] != 3:
+            raise ValueError(f"expected theta_shape to end in 3 colour channels, got {self.theta_shape}")
+        if self.slots.min() < 0 or self.slots.max() >= self.slot_count:
+            raise ValueError(f"expected slots in 0..{self.slot_count - 1}, got {self.slots.min()}..{self.slots.max()}")
+        if not (np.asarray(self.box_max) > np.asarray(self.box_min)).all():
+            raise ValueError(f"expected box_max above box_min, got {self.box_min} and {self.box_max}")
+        if self.density is not None and (self.density.shape != self.slots.shape or (self.density < 0).any()):
+            raise ValueError(f"expected a density >= 0 of shape {self.slots.shape}, got shape {self.density.shape}")
+        if self.scale <= 0 or self.step_units <= 0:
+            raise ValueError(f"expected a positive scale and step, got {self.scale} and {self.step_units}")
+
+    @property
+    def free_count(self) -> int:
+        """Number of free rows of the colour vector."""
+        return int(np.prod(self.theta_shape[:-1]))
+
+    @property
+    def slot_count(self) -> int:
+        """Number of rows of the colour vector, free and fixed."""
+        return self.free_count + len(self.fixed_colours)
+
+    def colours(self, theta: Tensor) -> Tensor:
+        """The colour vector ``[slot_count, 3]``: squashed free rows, then the fixed ones."""
+        if tuple(theta.shape) != tuple(self.theta_shape):
+            raise ValueError(f"expected theta of shape {tuple(self.theta_shape)}, got {tuple(theta.shape)}")
+        fixed = torch.as_tensor(self.fixed_colours, dtype=theta.dtype, device=theta.device).reshape(-1, 3)
+        return torch.cat([squash(theta).reshape(-1, 3), fixed])
+
+    def corners_in_world(self) -> Array:
+        """The eight corners of the box, ``[8, 3]`` [m]."""
+        unit = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1).reshape(8, 3)
+        corners = self.box_min + unit * (self.box_max - self.box_min)
+        return transform_points(self.T_world_from_object, self.scale * corners)
+
+
+def squash(theta: Tensor) -> Tensor:
+    """Colours in 0..1 of grid values: the logistic function."""
+    return torch.sigmoid(theta)
+
+
+def squash_derivative(theta: Tensor) -> Tensor:
+    """Derivative of :func:`squash` at ``theta``, elementwise."""
+    colour = torch.sigmoid(theta)
+    return colour * (1.0 - colour)
+
+
+def unsquash(colour: ArrayLike) -> Array:
+    """Grid values whose squash is ``colour``; colours are kept half an 8-bit step away from 0 and 1."""
+    c = np.clip(np.asarray(colour, dtype=np.float64), _SATURATION, 1.0 - _SATURATION)
+    return np.log(c) - np.log1p(-c)
+
+
+def initial_theta(
+    theta_shape: tuple[int, ...], plain_rgb: ArrayLike, generator: torch.Generator, dtype: Any = torch.float32
+) -> Tensor:
+    """Start of an attack: the plain colour plus noise of 1e-4, which is what differs between seeds.
+
+    Args:
+        theta_shape: Shape ``[..., 3]``.
+        plain_rgb: Plain colour ``[3]`` or any shape that broadcasts to ``theta_shape``, in 0..1.
+        generator: Source of the noise.
+        dtype: Floating point type of the result.
+    """
+    plain = torch.as_tensor(unsquash(plain_rgb), dtype=torch.float64)
+    noise = torch.randn(theta_shape, generator=generator, dtype=torch.float64)
+    return (plain.expand(theta_shape) + 1e-4 * noise).to(dtype)
+
+
+def cube_face_object(
+    size_m: float = 0.80,
+    resolution: int = 16,
+    plain_rgb: ArrayLike = (0.15, 0.55, 0.25),
+    T_world_from_object: ArrayLike | None = None,
+    depth_m: float = 0.01,
+    one_sided: bool = True,
+) -> VoxelGridObject:
+    """An opaque slab or cube of which one square face is textured and the rest is plain.
+
+    The texture reaches two voxels deep (the whole depth of a thin slab), so where a ray enters through the face the colour is
+    exactly the bilinear interpolation of the squashed ``[resolution, resolution, 3]`` grid at its cell centres.
+
+    Args:
+        size_m: Edge of the face [m].
+        resolution: Texture cells along an edge; low values transfer, high frequencies do not.
+        plain_rgb: Colour of everything that is not the face, in 0..1.
+        T_world_from_object: Pose ``[4, 4]``; origin at the face's centre, x = outward normal. Default: identity.
+        depth_m: Thickness behind the face [m]; ``size_m`` makes a cube.
+        one_sided: See :class:`VoxelGridObject`.
+    """
+    if size_m <= 0 or depth_m <= 0 or resolution < 1:
+        raise ValueError(f"expected positive sizes, got size {size_m} m, depth {depth_m} m, {resolution} cells")
+    layers = max(3, round(resolution * depth_m / size_m))
+    free = resolution * resolution
+    slots = np.full((layers, resolution, resolution), free, dtype=np.int32)
+    column, z_index = np.meshgrid(np.arange(resolution), np.arange(resolution), indexing="ij")
+    texture = ((resolution - 1 - z_index) * resolution + column).astype(np.int32)
+    textured = layers if depth_m < 2.0 * size_m / resolution else 2
+    slots[layers - textured :] = texture
+    half = 0.5 * size_m
+    pose = np.eye(4) if T_world_from_object is None else np.asarray(T_world_from_object, dtype=np.float64)
+    return VoxelGridObject(
+        slots=slots,
+        theta_shape=(resolution, resolution, 3),
+        fixed_colours=np.asarray(plain_rgb, dtype=np.float64).reshape(1, 3),
+        box_min=np.array([-depth_m, -half, -half]),
+        box_max=np.array([0.0, half, half]),
+        T_world_from_object=pose,
+        one_sided=one_sided,
+    )
+
+
+def face_corners_in_object(size_m: float) -> Array:
+    """Corners ``[4, 3]`` of the deployed face: top left, top right, bottom right, bottom left as its viewer sees them [m]."""
+    h = 0.5 * size_m
+    return np.array([[0.0, -h, h], [0.0, h, h], [0.0, h, -h], [0.0, -h, -h]])

@@ -1,0 +1,138 @@
+import dataclasses
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from advnerf_core.fields.voxel_grid import VoxelGridObject, cube_face_object, squash
+from advnerf_core.geometry import Pinhole, look_at, make_transform, rotation_z
+from advnerf_core.render.cast_object import cast_object
+
+PINHOLE = Pinhole(80, 60, 60.0, 61.0, 40.0, 29.0)
+
+
+def face_toward_camera(resolution=6, **options):
+    # The face's normal is its x axis; the camera sits at positive x and looks back.
+    return cube_face_object(
+        0.8, resolution, T_world_from_object=make_transform(rotation_z(0.2), [1, 2, 0.5]), **options
+    )
+
+
+def camera(distance_m=1.5, side_m=0.4):
+    return look_at([1 + distance_m, 2 + side_m, 0.7], [1, 2, 0.5])[None]
+
+
+def dense(cast, colours, pinhole=PINHOLE, batch=1):
+    image = np.zeros((batch * pinhole.height * pinhole.width, 3))
+    image[cast.pixels] = cast.weights @ colours
+    return image.reshape(batch, pinhole.height, pinhole.width, 3)
+
+
+def test_the_face_shows_exactly_the_bilinear_texture():
+    face = face_toward_camera()
+    theta = torch.randn(6, 6, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    T = camera()
+    cast = cast_object(face, T, PINHOLE, supersample=1, dtype=np.float64)
+    rendered = cast.weights @ face.colours(theta).numpy()
+    # Independent: intersect each ray with the face's plane and sample the texture with OpenCV's convention.
+    rays = PINHOLE.directions().reshape(-1, 3)[cast.pixels] @ T[0, :3, :3].T
+    R, t = face.T_world_from_object[:3, :3], face.T_world_from_object[:3, 3]
+    depth = ((t - T[0, :3, 3]) @ R[:, 0]) / (rays @ R[:, 0])
+    local = (T[0, :3, 3] + depth[:, None] * rays - t) @ R
+    columns = (local[:, 1] + 0.4) / 0.8 * 6 - 0.5
+    rows = (0.4 - local[:, 2]) / 0.8 * 6 - 0.5
+    expected = bilinear(squash(theta).numpy(), rows, columns)
+    np.testing.assert_allclose(rendered, expected, atol=1e-12)
+    np.testing.assert_allclose(cast.depth_m, depth, atol=1e-12)
+    np.testing.assert_allclose(cast.alpha, 1.0)
+    assert len(cast.pixels) > 500
+
+
+def bilinear(texture, rows, columns):
+    n = len(texture)
+    rows, columns = np.clip(rows, 0, n - 1), np.clip(columns, 0, n - 1)
+    r, c = np.minimum(rows.astype(int), n - 2), np.minimum(columns.astype(int), n - 2)
+    fr, fc = (rows - r)[:, None], (columns - c)[:, None]
+    top = texture[r, c] * (1 - fc) + texture[r, c + 1] * fc
+    bottom = texture[r + 1, c] * (1 - fc) + texture[r + 1, c + 1] * fc
+    return top * (1 - fr) + bottom * fr
+
+
+def test_viewer_sees_row_0_on_top_and_column_0_on_the_left():
+    face = cube_face_object(0.8, 2, one_sided=True)
+    colours = np.eye(5)[:, :4]  # one channel per texture cell
+    cast = cast_object(face, look_at([2.0, 0.0, 0.01], [0, 0, 0])[None], PINHOLE, dtype=np.float64)
+    image = np.zeros((60 * 80, 4))
+    image[cast.pixels] = cast.weights @ colours
+    image = image.reshape(60, 80, 4)
+    centre = [(np.argwhere(image[..., k] > 0.9)).mean(axis=0) for k in range(4)]
+    assert centre[0][0] < centre[2][0]  # cell (0, 0) above (1, 0)
+    assert centre[0][1] < centre[1][1]  # cell (0, 0) left of (0, 1)
+
+
+def test_supersampling_is_the_area_average_of_a_finer_image():
+    face, T = face_toward_camera(), camera()
+    colours = face.colours(torch.randn(6, 6, 3, dtype=torch.float64)).numpy()
+    fine = PINHOLE.resized(160, 120)
+    coarse = dense(cast_object(face, T, PINHOLE, supersample=2, dtype=np.float64), colours)[0]
+    finer = dense(cast_object(face, T, fine, supersample=1, dtype=np.float64), colours, fine)[0]
+    np.testing.assert_allclose(coarse, cv2.resize(finer, (80, 60), interpolation=cv2.INTER_AREA), atol=1e-12)
+
+
+def test_a_dense_medium_converges_to_the_opaque_solid_and_a_thin_one_obeys_beer_lambert():
+    face, T = face_toward_camera(), camera(side_m=0.0)
+    solid = cast_object(face, T, PINHOLE, 1, np.float64)
+    medium = dataclasses.replace(face, density=np.full(face.slots.shape, 1e5), step_units=2e-5)
+    thick = cast_object(medium, T, PINHOLE, 1, np.float64)
+    colours = face.colours(torch.randn(6, 6, 3, dtype=torch.float64)).numpy()
+    np.testing.assert_allclose(dense(thick, colours), dense(solid, colours), atol=2e-3)
+    # A cube of constant extinction 2 per unit at scale 0.5, looked at along its axis: alpha = 1 - exp(-2 * 1).
+    cube = VoxelGridObject(np.zeros((4, 4, 4), np.int32), (1, 3), np.zeros((0, 3)), -0.5 * np.ones(3), 0.5 * np.ones(3),
+                           np.eye(4), scale=0.5, density=np.full((4, 4, 4), 2.0), step_units=0.001)  # fmt: skip
+    narrow = Pinhole(1, 1, 1e6, 1e6, 0.5, 0.5)
+    cast = cast_object(cube, look_at([3.0, 0, 1e-6], [0, 0, 0])[None], narrow, 1, np.float64)
+    np.testing.assert_allclose(cast.alpha, [1 - np.exp(-2.0)], rtol=1e-6)
+    length_m, sigma = 0.5, 4.0  # the same medium in metres
+    mean = 2.75 + 1 / sigma - length_m / (np.exp(sigma * length_m) - 1)  # mean depth of absorption
+    np.testing.assert_allclose(cast.depth_m, [mean], rtol=1e-5)
+
+
+def test_one_sided_faces_are_invisible_from_behind_and_from_the_side():
+    front, behind = look_at([2.0, 0, 0.1], [0, 0, 0]), look_at([-2.0, 0, 0.1], [0, 0, 0])
+    beside = look_at([-0.005, 2.0, 0.1], [-0.005, 0, 0])
+    poses = np.stack([front, behind, beside])
+    cast = cast_object(cube_face_object(0.8, 4, depth_m=0.2), poses, PINHOLE)
+    assert set(np.unique(cast.pixels // (80 * 60))) == {0}
+    both = cast_object(cube_face_object(0.8, 4, depth_m=0.2, one_sided=False), poses, PINHOLE)
+    assert set(np.unique(both.pixels // (80 * 60))) == {0, 1, 2}
+
+
+def test_windows_lose_nothing_when_the_object_straddles_the_camera_plane():
+    face = cube_face_object(0.8, 4)
+    close = make_transform(look_at([1, 0, 0], [0, 0, 0])[:3, :3] @ rotation_z(0), [0.05, 0.3, 0.0])
+    turned = look_at([0.1, 0.35, 0.0], [0.0, 1.0, 0.0])  # looks along the face, part of it behind the camera
+    poses = np.stack([close, turned])
+    cast = cast_object(face, poses, PINHOLE, 1, np.float64)
+    for b in range(2):
+        rays = PINHOLE.directions().reshape(-1, 3) @ poses[b, :3, :3].T
+        with np.errstate(divide="ignore"):
+            depth = -poses[b, 0, 3] / rays[:, 0]
+        hit = poses[b, :3, 3] + depth[:, None] * rays
+        inside = (depth > 0.02) & (np.abs(hit[:, 1]) < 0.4) & (np.abs(hit[:, 2]) < 0.4)
+        assert set(np.flatnonzero(inside)) == {p - b * 4800 for p in cast.pixels if p // 4800 == b}
+
+
+def test_weights_sum_to_alpha_and_edges_are_antialiased():
+    cast = cast_object(face_toward_camera(), camera(), PINHOLE, 3)
+    np.testing.assert_allclose(np.asarray(cast.weights.sum(axis=1)).ravel(), cast.alpha, atol=1e-6)
+    assert cast.weights.dtype == np.float32
+    assert ((cast.alpha > 0.05) & (cast.alpha < 0.95)).any()
+    assert cast.nbytes > 0
+
+
+def test_an_object_out_of_view_gives_an_empty_cast():
+    cast = cast_object(cube_face_object(0.8, 4), look_at([2.0, 0, 0.1], [4.0, 0, 0])[None], PINHOLE)
+    assert cast.weights.shape == (0, 17)
+    with pytest.raises(ValueError, match="at least 1 ray"):
+        cast_object(cube_face_object(0.8, 4), camera(), PINHOLE, supersample=0)
