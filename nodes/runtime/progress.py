@@ -1,0 +1,75 @@
+"""How far a long job is: progress bars with the time left on a terminal, a line now and then in a log."""
+
+from __future__ import annotations
+
+import time
+from types import TracebackType
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from nodes.runtime.stages import Report
+
+LOG_PERIOD_S = 15.0
+
+
+class ProgressDisplay:
+    """Implements `nodes.runtime.stages.Display`.
+
+    Args:
+        console: Where to write; a log file or pipe gets lines instead of bars.
+    """
+
+    def __init__(self, console: Console | None = None) -> None:
+        self._console = console or Console()
+        columns = (
+            TextColumn("{task.fields[stage]:<8}"), BarColumn(bar_width=24), TextColumn("{task.percentage:>3.0f} %"),
+            TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(), TextColumn("{task.fields[text]}"),
+        )  # fmt: skip
+        self._progress = Progress(*columns, console=self._console) if self._console.is_terminal else None
+
+    def __enter__(self) -> ProgressDisplay:
+        if self._progress is not None:
+            self._progress.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._progress is not None:
+            self._progress.stop()
+
+    def start(self, stage: str) -> Report:
+        """A stage begins."""
+        if self._progress is None:
+            self._console.print(f"{stage}: started", highlight=False)
+            return _LogReport(self._console, stage)
+        return _BarReport(self._progress, self._progress.add_task("", total=1.0, stage=stage, text=""))
+
+    def finish(self, stage: str, seconds: float, cached: bool) -> None:
+        """A stage has ended, or its earlier result is used."""
+        text = "unchanged, used again" if cached else f"done in {seconds:.1f} s"
+        self._console.print(f"{stage}: {text}", highlight=False)
+
+
+class _BarReport:
+    def __init__(self, progress: Progress, task: TaskID) -> None:
+        self._progress, self._task = progress, task
+
+    def __call__(self, fraction: float, text: str = "") -> None:
+        self._progress.update(self._task, completed=min(max(fraction, 0.0), 1.0), text=text)
+
+
+class _LogReport:
+    def __init__(self, console: Console, stage: str) -> None:
+        self._console, self._stage = console, stage
+        self._begin_s = self._printed_s = time.monotonic()
+
+    def __call__(self, fraction: float, text: str = "") -> None:
+        now_s = time.monotonic()
+        if now_s - self._printed_s < LOG_PERIOD_S:
+            return
+        self._printed_s = now_s
+        left = (now_s - self._begin_s) * (1.0 / fraction - 1.0) if fraction > 0.01 else float("nan")
+        remaining = "" if left != left else f", about {left:.0f} s left"
+        self._console.print(f"{self._stage}: {100 * fraction:.0f} % {text}{remaining}", highlight=False)

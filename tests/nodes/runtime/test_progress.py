@@ -1,0 +1,42 @@
+import io
+
+import pytest
+from rich.console import Console
+
+from nodes.runtime import progress
+from nodes.runtime.progress import ProgressDisplay
+
+
+@pytest.fixture
+def moments(monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
+    return now
+
+
+def test_a_log_gets_a_line_now_and_then_with_the_time_left(moments):
+    out = io.StringIO()
+    with ProgressDisplay(Console(file=out, force_terminal=False)) as display:
+        report = display.start("scene")
+        moments[0] = 1.0
+        report(0.05, "step 5")
+        moments[0] = 20.0
+        report(0.25, "step 25")
+        display.finish("scene", 80.0, cached=False)
+        display.finish("policy", 9.0, cached=True)
+    assert out.getvalue().splitlines() == [
+        "scene: started",
+        "scene: 25 % step 25, about 60 s left",
+        "scene: done in 80.0 s",
+        "policy: unchanged, used again",
+    ]
+
+
+def test_a_terminal_gets_a_bar_that_fills():
+    out = io.StringIO()
+    with ProgressDisplay(Console(file=out, force_terminal=True, width=120)) as display:
+        report = display.start("scene")
+        report(0.5, "step 1")
+        report(1.5, "step 2")
+    assert "100 %" in out.getvalue()
+    assert "step 2" in out.getvalue()
