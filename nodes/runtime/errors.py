@@ -36,5 +36,5 @@ class BagError(RuntimeFault):
     """A bag cannot be written or read."""
 
 
-class NodeFinished(Exception):  # noqa: N818 - not an error: the regular end of a node that has one
+class NodeFinished(Exception):
     """Raised by a node whose work is done (a player at the end of its bag); the loop then ends with exit code 0."""

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from rosbags.serde import SerdeError
-from rosbags.typesys import Stores, get_typestore, get_types_from_msg
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from advnerf_core.geometry import Pinhole, make_transform, quaternion_from_rotation, rotation_from_quaternion
 from nodes.runtime.clock import NS_PER_S

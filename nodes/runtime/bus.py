@@ -1,0 +1,308 @@
+"""Publish and subscribe between the processes of one host: one XPUB socket per topic, no broker. ZeroMQ stays in here.
+
+Receivers of a ``latest`` topic drain it to the newest message; a small high-water mark alone leaves frames stale, and
+CONFLATE keeps only the last frame of a multipart message. Other topics keep their queue; gaps in the sequence are counted.
+A bus belongs to the thread that made it, and that thread must call `Bus.wait` or `Bus.receive` now and then: ZeroMQ
+repeats a subscription to a restarted publisher only when its socket is used.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import secrets
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TextIO
+
+import zmq
+
+from nodes.runtime.clock import NS_PER_S, Clock, SystemClock
+from nodes.runtime.errors import BusError, MessageError
+from nodes.runtime.messages import MAX_SEQUENCE_LENGTH, decode, encode, type_hash_prefix, type_name
+from nodes.runtime.paths import socket_path
+from nodes.runtime.topics import Topic
+from nodes.runtime.topics import topic as topic_row
+from nodes.runtime.wire import MessageInfo, Meta, pack_meta, unpack
+
+_SEND_QUEUE = 16
+# Deep enough that a reader that stalls for seconds still drains to the true newest: a full pipe holds back what comes after.
+_LATEST_QUEUE = 64
+# A publisher that outruns its reader must not keep the reader in here for ever.
+_DRAIN_LIMIT = 1000
+_FAREWELL_MS = 100
+
+
+@dataclass(frozen=True)
+class Received:
+    """One message off the wire, not decoded yet."""
+
+    topic: str
+    info: MessageInfo
+
+    def message(self) -> Any:
+        """Decode it."""
+        return decode(topic_row(self.topic).type, self.info.raw)
+
+
+@dataclass
+class Counts:
+    """What happened to the messages of one subscription."""
+
+    received: int = 0
+    dropped: int = 0  # older than the newest, on a topic that wants only the newest
+    lost: int = 0  # published, but never came: a full queue on the way
+    refused: int = 0  # not our format, or another version of the type
+
+
+class Publisher:
+    """Sends one topic; there can be only one per topic and run folder."""
+
+    def __init__(self, context: zmq.Context[Any], run_dir: Path, topic: Topic, instance_id: int, clock: Clock) -> None:
+        self.topic = topic
+        self._clock = clock
+        self._instance_id = instance_id
+        self._prefix = type_hash_prefix(topic.type)
+        self._name = topic.name.encode()
+        self._sequence = 0
+        self._subscribers = 0
+        path = socket_path(run_dir, topic.name)
+        self._lock = _lock_endpoint(path, topic.name, run_dir)
+        self._socket = context.socket(zmq.XPUB)
+        self._socket.linger = 0
+        self._socket.sndhwm = _SEND_QUEUE
+        # Every subscriber is told to us, and every one that leaves: they are counted by the readiness barrier.
+        self._socket.setsockopt(zmq.XPUB_VERBOSER, 1)
+        try:
+            self._socket.bind(f"ipc://{path}")
+        except zmq.ZMQError as error:
+            self._socket.close()
+            self._lock.close()
+            raise BusError(f"cannot publish {topic.name} at {path}: {error.strerror}") from error
+
+    def publish(self, message: Any) -> None:
+        """Send a message, or CDR bytes of the topic's type; never blocks."""
+        if isinstance(message, bytes | memoryview):
+            cdr: bytes | memoryview = message
+        elif type_name(message) != self.topic.type:
+            raise MessageError(f"expected {self.topic.type} on {self.topic.name}, got {type_name(message)}")
+        else:
+            cdr = encode(message)
+        now = self._clock.now()
+        meta = Meta(now.mono_ns, now.real_ns, self._sequence, self._prefix, self._instance_id)
+        self._sequence += 1
+        self._socket.send_multipart([self._name, pack_meta(meta), cdr], zmq.NOBLOCK)
+
+    def subscribers(self) -> int:
+        """How many subscribers are connected."""
+        while self._socket.poll(0, zmq.POLLIN):
+            event = self._socket.recv(zmq.NOBLOCK)
+            if event == b"\x01" + self._name:
+                self._subscribers += 1
+            elif event == b"\x00" + self._name:
+                self._subscribers = max(0, self._subscribers - 1)
+        return self._subscribers
+
+    def close(self, linger_ms: int) -> None:
+        """Stop sending; the endpoint stays locked until `unlock`."""
+        self._socket.close(linger=linger_ms)
+
+    def unlock(self) -> None:
+        """Give the endpoint free; only after the context is gone, because the socket dies in another thread."""
+        self._lock.close()
+
+
+@dataclass
+class _Subscription:
+    topic: Topic
+    socket: zmq.Socket[Any]
+    take_all: bool
+    limit: int
+    counts: Counts = field(default_factory=Counts)
+    instance_id: int | None = None
+    sequence: int = 0
+    last_refusal: str = ""
+
+
+class Bus:
+    """All publishers and subscriptions of one process.
+
+    Args:
+        run_dir: Folder of the run; who shares it shares the bus.
+        clock: Where publish and receive times come from.
+    """
+
+    def __init__(self, run_dir: Path, clock: Clock | None = None) -> None:
+        self._run_dir = Path(run_dir)
+        self._clock = clock or SystemClock()
+        self._context: zmq.Context[Any] = zmq.Context()
+        self._poller = zmq.Poller()
+        self._publishers: dict[str, Publisher] = {}
+        self._subscriptions: dict[str, _Subscription] = {}
+        self.instance_id = secrets.randbits(64)
+
+    def __enter__(self) -> Bus:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    def publisher(self, topic: str) -> Publisher:
+        """The publisher of a topic, opened on first use."""
+        if topic not in self._publishers:
+            row = topic_row(topic)
+            self._publishers[topic] = Publisher(self._context, self._run_dir, row, self.instance_id, self._clock)
+        return self._publishers[topic]
+
+    def publish(self, topic: str, message: Any) -> None:
+        """Send a message, or CDR bytes of the topic's type."""
+        self.publisher(topic).publish(message)
+
+    def subscribe(self, topic: str, queue: int | None = None) -> None:
+        """Listen to a topic, whether its publisher is there yet or not.
+
+        Args:
+            topic: Name from the topic table.
+            queue: Keep every message, up to so many, even of a topic of which others want only the newest (recorder).
+        """
+        if topic in self._subscriptions:
+            return
+        row = topic_row(topic)
+        take_all = queue is not None or not row.latest
+        limit = queue or row.queue
+        socket = self._context.socket(zmq.SUB)
+        socket.linger = 0
+        socket.rcvhwm = limit if take_all else _LATEST_QUEUE
+        socket.setsockopt(zmq.MAXMSGSIZE, 2 * MAX_SEQUENCE_LENGTH)
+        # A publisher that starts later or again must be found within its first period, not after the default growth.
+        socket.setsockopt(zmq.RECONNECT_IVL, 20)
+        socket.setsockopt(zmq.RECONNECT_IVL_MAX, 100)
+        socket.subscribe(row.name.encode())
+        socket.connect(f"ipc://{socket_path(self._run_dir, row.name)}")
+        self._poller.register(socket, zmq.POLLIN)
+        self._subscriptions[topic] = _Subscription(row, socket, take_all, limit)
+
+    def watch(self, file_descriptor: int) -> None:
+        """Let `wait` also return when a file descriptor is readable."""
+        self._poller.register(file_descriptor, zmq.POLLIN)
+
+    def wait(self, timeout_s: float) -> set[int]:
+        """Sleep until something comes or the time is over; returns the watched file descriptors that are readable."""
+        # ZeroMQ counts in milliseconds; rounding down makes the last one a short spin instead of a late tick.
+        ready = self._poller.poll(max(0, int(timeout_s * 1e3)))
+        return {entry for entry, _ in ready if isinstance(entry, int)}
+
+    def receive(self) -> list[Received]:
+        """Everything that has come, in order of publication; the newest only of ``latest`` topics."""
+        batch: list[Received] = []
+        for subscription in self._subscriptions.values():
+            batch += self._receive_one(subscription)
+        if len(batch) > 1:
+            batch.sort(key=lambda received: received.info.publish_mono_ns)
+        return batch
+
+    def _receive_one(self, subscription: _Subscription) -> list[Received]:
+        kept: list[Received] = []
+        for _ in range(subscription.limit if subscription.take_all else _DRAIN_LIMIT):
+            try:
+                frames = subscription.socket.recv_multipart(zmq.NOBLOCK)
+            except zmq.Again:
+                break
+            try:
+                meta, cdr = unpack(subscription.topic.name, frames)
+            except MessageError as error:
+                subscription.counts.refused += 1
+                subscription.last_refusal = str(error)
+                continue
+            received = Received(subscription.topic.name, self._info(subscription, meta, cdr))
+            if kept and not subscription.take_all:
+                subscription.counts.dropped += 1
+                kept[0] = received
+            else:
+                kept.append(received)
+        return kept
+
+    def _info(self, subscription: _Subscription, meta: Meta, cdr: bytes) -> MessageInfo:
+        same_publisher = meta.instance_id == subscription.instance_id
+        lost = max(0, meta.sequence - subscription.sequence - 1) if same_publisher else 0
+        subscription.instance_id, subscription.sequence = meta.instance_id, meta.sequence
+        subscription.counts.received += 1
+        subscription.counts.lost += lost
+        now = self._clock.now()
+        return MessageInfo(
+            publish_mono_ns=meta.publish_mono_ns, receive_mono_ns=now.mono_ns, sequence=meta.sequence, raw=cdr,
+            publish_real_ns=meta.publish_real_ns, receive_real_ns=now.real_ns, instance_id=meta.instance_id, lost=lost,
+        )  # fmt: skip
+
+    def refuse(self, topic: str, reason: str) -> None:
+        """Count a message whose bytes turned out not to decode."""
+        subscription = self._subscriptions[topic]
+        subscription.counts.refused += 1
+        subscription.last_refusal = reason
+
+    def refusals(self) -> dict[str, str]:
+        """Why messages were refused last, by topic."""
+        return {name: s.last_refusal for name, s in self._subscriptions.items() if s.last_refusal}
+
+    def counts(self) -> dict[str, Counts]:
+        """What happened to the messages of every subscription."""
+        return {name: subscription.counts for name, subscription in self._subscriptions.items()}
+
+    def subscribers(self, topic: str) -> int:
+        """How many subscribers are connected to a topic we publish."""
+        return self.publisher(topic).subscribers()
+
+    def wait_for_subscribers(self, topics: Iterable[str], timeout_s: float, count: int = 1) -> None:
+        """Wait until every topic has so many subscribers; ZeroMQ drops what is sent before."""
+        deadline = time.monotonic() + timeout_s
+        waiting = list(topics)
+        while waiting := [name for name in waiting if self.subscribers(name) < count]:
+            if time.monotonic() > deadline:
+                raise BusError(
+                    f"expected {count} subscriber(s) of {', '.join(waiting)} within {timeout_s:g} s; is the receiving node running "
+                    f"with the same --run-dir ({self._run_dir})?"
+                )
+            time.sleep(0.005)
+
+    def close(self, farewell: bool = False) -> None:
+        """Close all sockets and give the endpoints free.
+
+        Args:
+            farewell: Give messages just sent 100 ms to leave.
+        """
+        for subscription in self._subscriptions.values():
+            self._poller.unregister(subscription.socket)
+            subscription.socket.close(linger=0)
+        for publisher in self._publishers.values():
+            publisher.close(_FAREWELL_MS if farewell else 0)
+        self._context.term()
+        for publisher in self._publishers.values():
+            publisher.unlock()
+        self._publishers.clear()
+        self._subscriptions.clear()
+
+
+def age_s(info: MessageInfo, mono_ns: int) -> float:
+    """Time since a message was published [s]."""
+    return (mono_ns - info.publish_mono_ns) / NS_PER_S
+
+
+def _lock_endpoint(path: Path, topic: str, run_dir: Path) -> TextIO:
+    """Hold a lock beside the socket: a second bind to an ipc path succeeds silently and robs the first of its readers."""
+    lock = open(path.with_name(path.name + ".lock"), "a+", encoding="ascii")  # noqa: SIM115 - kept open: it is the lock
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        lock.seek(0)
+        owner = lock.read().strip() or "unknown"
+        lock.close()
+        raise BusError(
+            f"{topic} is already published in {run_dir} by process {owner}: another launch uses the same endpoints; "
+            "stop it, or give this one another --run-dir"
+        ) from None
+    lock.truncate(0)
+    lock.write(f"{os.getpid()}\n")
+    lock.flush()
+    return lock

@@ -1,0 +1,58 @@
+"""Where a run keeps its sockets and logs."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import stat
+import tempfile
+from pathlib import Path
+
+from nodes.runtime.errors import BusError
+
+# sizeof(sockaddr_un.sun_path) is 108 on Linux, one of which is the final zero.
+UNIX_PATH_LIMIT = 107
+_LONGEST_NAME = 40
+
+
+def private_folder(path: Path) -> Path:
+    """Create a folder that only this user may enter; refuse one that belongs to somebody else."""
+    path.mkdir(mode=0o700, parents=True, exist_ok=True)
+    found = path.lstat()
+    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid():
+        raise BusError(
+            f"expected {path} to be a folder of user {os.getuid()}, got one of user {found.st_uid}; remove it"
+        )
+    if stat.S_IMODE(found.st_mode) & 0o077:
+        path.chmod(0o700)
+    return path
+
+
+def user_folder() -> Path:
+    """Short folder of this user for what lives as long as a run: under XDG_RUNTIME_DIR, or else the temporary folder."""
+    base = os.environ.get("XDG_RUNTIME_DIR")
+    if base and os.path.isdir(base) and os.access(base, os.W_OK):
+        return private_folder(Path(base) / "advnerf")
+    return private_folder(Path(tempfile.gettempdir()) / f"advnerf-{os.getuid()}")
+
+
+def bus_folder(run_dir: Path) -> Path:
+    """Folder of a run's sockets: ``<run_dir>/bus``, or a short stand-in where that path is too long for a socket."""
+    run_dir = Path(run_dir).resolve()
+    folder = run_dir / "bus"
+    if len(os.fsencode(folder)) + 1 + _LONGEST_NAME > UNIX_PATH_LIMIT:
+        folder = user_folder() / hashlib.sha256(os.fsencode(run_dir)).hexdigest()[:12]
+        if len(os.fsencode(folder)) + 1 + _LONGEST_NAME > UNIX_PATH_LIMIT:
+            raise BusError(
+                f"expected socket paths of at most {UNIX_PATH_LIMIT} characters, but {folder} is too long; "
+                "use a --run-dir under /tmp or a short XDG_RUNTIME_DIR"
+            )
+    return private_folder(folder)
+
+
+def socket_path(run_dir: Path, topic: str) -> Path:
+    """Path of the Unix socket of a topic."""
+    name = topic.strip("/").replace("/", ".")
+    if len(name) > _LONGEST_NAME:
+        raise BusError(f"expected a topic name of at most {_LONGEST_NAME} characters, got {topic!r}")
+    return bus_folder(run_dir) / name

@@ -1,0 +1,75 @@
+"""What travels between processes: three frames ``[topic, meta, cdr]``. Pure bytes, no sockets."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from nodes.runtime.errors import MessageError
+from nodes.runtime.messages import type_hash_prefix
+from nodes.runtime.topics import topic as topic_row
+
+# publish monotonic ns, publish real ns, sequence, first 8 bytes of the RIHS01 type hash, publisher instance id.
+_META = struct.Struct("<QQQ8sQ")
+META_BYTES = _META.size
+
+
+@dataclass(frozen=True)
+class MessageInfo:
+    """How a message came.
+
+    Attributes:
+        publish_mono_ns: Monotonic time of publication [ns]; comparable on the publisher's host only.
+        receive_mono_ns: Monotonic time at which this process took it off its socket [ns].
+        sequence: Counts the publisher's messages on this topic from 0.
+        raw: The CDR bytes.
+        publish_real_ns: Real time of publication [ns].
+        receive_real_ns: Real time at which this process took it off its socket [ns].
+        instance_id: Drawn when the publisher starts; a change means that it was restarted.
+        lost: Messages of the topic that were published but never came, just before this one.
+    """
+
+    publish_mono_ns: int
+    receive_mono_ns: int
+    sequence: int = 0
+    raw: bytes = b""
+    publish_real_ns: int = 0
+    receive_real_ns: int = 0
+    instance_id: int = 0
+    lost: int = 0
+
+
+@dataclass(frozen=True)
+class Meta:
+    """Content of the second frame."""
+
+    publish_mono_ns: int
+    publish_real_ns: int
+    sequence: int
+    type_prefix: bytes
+    instance_id: int
+
+
+def pack_meta(meta: Meta) -> bytes:
+    """Bytes of the second frame."""
+    return _META.pack(
+        meta.publish_mono_ns, meta.publish_real_ns, meta.sequence, meta.type_prefix, meta.instance_id
+    )  # fmt: skip
+
+
+def unpack(topic: str, frames: Sequence[bytes]) -> tuple[Meta, bytes]:
+    """Meta and CDR bytes of a received message; refuses other topics, formats and types before anything is decoded."""
+    if len(frames) < 3 or frames[0] != topic.encode() or len(frames[1]) != META_BYTES:
+        raise MessageError(
+            f"expected frames [topic, {META_BYTES} bytes, cdr] on {topic}, got {[len(f) for f in frames]} bytes"
+        )
+    meta = Meta(*_META.unpack(frames[1]))
+    typename = topic_row(topic).type
+    expected = type_hash_prefix(typename)
+    if meta.type_prefix != expected:
+        raise MessageError(
+            f"{topic} is {typename} with type hash {expected.hex()} here, but its publisher uses {meta.type_prefix.hex()}; "
+            "run the same version of advnerf on both sides"
+        )
+    return meta, frames[2] if len(frames) == 3 else b"".join(frames[2:])

@@ -1,0 +1,179 @@
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from nodes.runtime.bus import Bus
+from nodes.runtime.errors import BusError, MessageError, TopicError
+from nodes.runtime.messages import drive_message, header, image_array, image_message, pose_message, types
+from nodes.runtime.messages import stamp_ns as stamp_of
+
+
+def receive_for(bus, duration_s):
+    out, end = [], time.monotonic() + duration_s
+    while (left := end - time.monotonic()) > 0:
+        bus.wait(left)
+        out += bus.receive()
+    return out
+
+
+def test_message_arrives_with_its_meta(tmp_path):
+    with Bus(tmp_path) as sender, Bus(tmp_path) as receiver:
+        receiver.subscribe("/policy/drive")
+        sender.publisher("/policy/drive")
+        sender.wait_for_subscribers(["/policy/drive"], 2.0)
+        before = time.monotonic_ns()
+        sender.publish("/policy/drive", drive_message(0.8, 0.1, 123))
+        (got,) = receive_for(receiver, 0.1)
+        assert before <= got.info.publish_mono_ns <= got.info.receive_mono_ns
+        assert abs(got.info.publish_real_ns - time.time_ns()) < 1e9
+        assert got.info.instance_id == sender.instance_id
+        message = got.message()
+        assert stamp_of(message) == 123
+        assert message.drive.speed == pytest.approx(0.8)
+
+
+def test_latest_topic_is_drained_to_the_newest_and_drops_are_counted(tmp_path):
+    with Bus(tmp_path) as sender, Bus(tmp_path) as receiver:
+        receiver.subscribe("/camera/image_raw")
+        sender.publisher("/camera/image_raw")
+        sender.wait_for_subscribers(["/camera/image_raw"], 2.0)
+        for i in range(5):
+            sender.publish("/camera/image_raw", image_message(np.full((4, 5, 3), i, np.uint8), i, "cam"))
+            time.sleep(0.01)
+        (got,) = receiver.receive()
+        assert image_array(got.message())[0, 0, 0] == 4
+        counts = receiver.counts()["/camera/image_raw"]
+        assert counts.dropped + counts.lost == 4
+
+
+def test_slow_consumer_of_images_is_never_more_than_one_period_behind(tmp_path):
+    # The high-water mark alone left frames 138 ms old here (middleware.md 2.5).
+    with Bus(tmp_path) as sender, Bus(tmp_path) as receiver:
+        receiver.subscribe("/camera/image_raw")
+        sender.publisher("/camera/image_raw")
+        sender.wait_for_subscribers(["/camera/image_raw"], 2.0)
+        image = np.zeros((188, 366, 3), np.uint8)
+        ages = []
+        for i in range(60):
+            sender.publish("/camera/image_raw", image_message(image, i, "cam"))
+            time.sleep(1 / 60)
+            if i % 3 == 2:
+                (got,) = receiver.receive()
+                ages.append(i - stamp_of(got.message()))
+        assert max(ages) <= 1
+
+
+def test_queue_topic_keeps_all_in_order_and_counts_what_was_lost_on_the_way(tmp_path):
+    with Bus(tmp_path) as sender, Bus(tmp_path) as receiver:
+        receiver.subscribe("/vicon/car")
+        sender.publisher("/vicon/car")
+        sender.wait_for_subscribers(["/vicon/car"], 2.0)
+        for i in range(100):
+            sender.publish("/vicon/car", pose_message(np.eye(4), i))
+            time.sleep(0.0005)
+        got = receive_for(receiver, 0.1)
+        assert [g.info.sequence for g in got] == list(range(100))
+        big = pose_message(np.eye(4), 0, "f" * 20_000)
+        for _ in range(2000):
+            sender.publish("/vicon/car", big)
+        got = receive_for(receiver, 0.2)
+        sender.publish("/vicon/car", big)
+        receive_for(receiver, 0.2)
+        counts = receiver.counts()["/vicon/car"]
+        assert counts.lost > 0
+        assert counts.received + counts.lost == 2101
+
+
+def test_subscribers_are_counted_up_and_down(tmp_path):
+    with Bus(tmp_path) as sender:
+        sender.publisher("/arm")
+        buses = [Bus(tmp_path) for _ in range(3)]
+        for bus in buses:
+            bus.subscribe("/arm")
+        sender.wait_for_subscribers(["/arm"], 2.0, count=3)
+        buses[0].close()
+        deadline = time.monotonic() + 2.0
+        while sender.subscribers("/arm") != 2:
+            assert time.monotonic() < deadline
+        for bus in buses[1:]:
+            bus.close()
+
+
+def test_second_publisher_is_one_clear_error_and_the_endpoint_is_free_afterwards(tmp_path):
+    with Bus(tmp_path) as first, Bus(tmp_path) as second:
+        first.publisher("/arm")
+        with pytest.raises(BusError, match=r"/arm is already published in .* by process \d+.*--run-dir"):
+            second.publisher("/arm")
+    with Bus(tmp_path) as third:
+        third.publisher("/arm")
+
+
+def test_restarted_publisher_has_a_new_instance_and_is_found_again(tmp_path):
+    with Bus(tmp_path) as receiver:
+        receiver.subscribe("/arm")
+        instances = []
+        for _ in range(2):
+            with Bus(tmp_path) as sender:
+                sender.publisher("/arm")
+                while sender.subscribers("/arm") == 0:
+                    receiver.wait(0.01)
+                sender.publish("/arm", types.Arm(header=header(1), arm=True, source="test", reason=""))
+                (got,) = receive_for(receiver, 0.1)
+                instances.append(got.info.instance_id)
+                assert got.info.lost == 0
+        assert instances[0] != instances[1]
+
+
+def test_subscriber_started_first_loses_nothing_after_the_barrier(tmp_path):
+    script = (
+        "import sys; from pathlib import Path; from nodes.runtime.bus import Bus; import numpy as np\n"
+        "from nodes.runtime.messages import pose_message\n"
+        "b = Bus(Path(sys.argv[1])); b.publisher('/vicon/car'); b.wait_for_subscribers(['/vicon/car'], 5)\n"
+        "[b.publish('/vicon/car', pose_message(np.eye(4), i)) for i in range(15)]; b.close(farewell=True)"
+    )
+    with Bus(tmp_path) as receiver:
+        receiver.subscribe("/vicon/car")
+        process = subprocess.Popen([sys.executable, "-c", script, str(tmp_path)])
+        got = []
+        deadline = time.monotonic() + 10
+        while len(got) < 15 and time.monotonic() < deadline:
+            receiver.wait(0.1)
+            got += receiver.receive()
+        assert process.wait(5) == 0
+    assert [stamp_of(g.message()) for g in got] == list(range(15))
+
+
+def test_other_type_version_is_refused_before_decoding(tmp_path):
+    with Bus(tmp_path) as sender, Bus(tmp_path) as receiver:
+        receiver.subscribe("/policy/drive")
+        publisher = sender.publisher("/policy/drive")
+        sender.wait_for_subscribers(["/policy/drive"], 2.0)
+        publisher._prefix = bytes(8)
+        sender.publish("/policy/drive", drive_message(0.8, 0.1, 1))
+        assert receive_for(receiver, 0.1) == []
+        assert receiver.counts()["/policy/drive"].refused == 1
+        assert "same version" in receiver.refusals()["/policy/drive"]
+
+
+def test_wrong_type_and_unknown_topic_are_errors(tmp_path):
+    with Bus(tmp_path) as bus:
+        with pytest.raises(MessageError, match="expected advnerf_msgs/msg/Arm on /arm"):
+            bus.publish("/arm", drive_message(0, 0, 0))
+        with pytest.raises(TopicError, match="known are /camera/image_raw"):
+            bus.subscribe("/no/such")
+
+
+def test_wait_for_subscribers_says_what_to_do(tmp_path):
+    with Bus(tmp_path) as bus, pytest.raises(BusError, match="is the receiving node running"):
+        bus.wait_for_subscribers(["/arm"], 0.05)
+
+
+def test_long_run_folder_still_has_sockets(tmp_path):
+    deep = tmp_path / ("d" * 60) / ("e" * 60)
+    with Bus(deep) as sender, Bus(deep) as receiver:
+        receiver.subscribe("/arm")
+        sender.publisher("/arm")
+        sender.wait_for_subscribers(["/arm"], 2.0)
