@@ -1,0 +1,217 @@
+"""First-person clips: one or several drives side by side, captioned, small enough to sit inside a page.
+
+H.264 in MP4 where PyAV's FFmpeg has libx264, else VP9 in WebM: browsers play both.
+"""
+
+from __future__ import annotations
+
+import base64
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import av
+import cv2
+import matplotlib
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from PIL import Image, ImageDraw, ImageFont  # comes with matplotlib
+
+from advnerf_core.report.data import Condition
+from advnerf_core.report.palette import DARK
+
+MAX_BYTES = 1_500_000
+_QUALITIES = (24, 28, 32, 36, 40, 44)  # constant rate factors: larger is smaller and worse
+_TITLE_PX, _STATUS_PX, _GAP_PX, _MIN_WIDTH_PX = 22, 22, 6, 320
+_MEDIA_TYPES = {".mp4": "video/mp4", ".webm": "video/webm", ".png": "image/png", ".jpg": "image/jpeg"}
+
+Frames = NDArray[np.uint8]
+
+
+@dataclass(frozen=True, eq=False)
+class ClipTrack:
+    """One drive in a clip.
+
+    Attributes:
+        title: What is seen, such as "deployed, gradient".
+        condition: What the object shows; gives the colour.
+        frames: First-person images, ``[N]`` of uint8 RGB ``[height, width, 3]``, one per control tick.
+        cte_m: Signed cross-track error at the frames, ``[N]`` [m].
+        attack_id: Short hash of the attack file; "" for none.
+        note: Said after the last frame, such as "stopped by the fence".
+    """
+
+    title: str
+    condition: Condition
+    frames: Sequence[Frames] | Frames
+    cte_m: ArrayLike
+    attack_id: str = ""
+    note: str = "ended"
+
+    def __post_init__(self) -> None:
+        if len(self.frames) == 0 or len(self.frames) != len(np.asarray(self.cte_m)):
+            raise ValueError(
+                f"expected one cross-track error per frame of {self.title!r}, "
+                f"got {len(self.frames)} frames and {np.asarray(self.cte_m).shape} errors"
+            )
+
+
+def write_clip(
+    path: Path, tracks: Sequence[ClipTrack], rate_hz: float = 10.0, off_track_m: float = 0.4, max_bytes: int = MAX_BYTES
+) -> Path:
+    """Write drives side by side as one video, atomically, as fine as the size limit allows.
+
+    Args:
+        path: Where to; the suffix is replaced by that of the container used.
+        tracks: The drives, left to right, of one frame size; a shorter one holds its last frame.
+        rate_hz: Frames per second.
+        off_track_m: ``|CTE|`` above this is shown as off-track [m].
+        max_bytes: Size limit [bytes].
+
+    Returns:
+        The file written: ``.mp4``, or ``.webm`` without libx264.
+    """
+    if not tracks:
+        raise ValueError("expected at least one drive for a clip, got none")
+    codec, suffix = ("libx264", ".mp4") if "libx264" in av.codecs_available else ("libvpx-vp9", ".webm")
+    path = path.with_suffix(suffix)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}{suffix}")
+    try:
+        for quality in _QUALITIES:
+            _encode(temporary, codec, quality, rate_hz, compose(tracks, rate_hz, off_track_m))
+            size = temporary.stat().st_size
+            if size <= max_bytes:
+                os.replace(temporary, path)
+                return path
+    finally:
+        temporary.unlink(missing_ok=True)
+    raise ValueError(
+        f"expected clip {path.name} under {max_bytes} bytes, got {size} at the coarsest setting: film fewer frames"
+    )
+
+
+def compose(tracks: Sequence[ClipTrack], rate_hz: float = 10.0, off_track_m: float = 0.4) -> Iterator[Frames]:
+    """Frames of the side-by-side video with their caption strips, ``[height, width, 3]``, both sides even."""
+    steps = max(len(t.frames) for t in tracks)
+    for step in range(steps):
+        panels = [_panel(t, step, rate_hz, off_track_m) for t in tracks]
+        heights = {p.shape[0] for p in panels}
+        if len(heights) > 1:
+            raise ValueError(f"expected drives of one frame size side by side, got heights {sorted(heights)}")
+        gap = np.full((panels[0].shape[0], _GAP_PX, 3), _rgb("paper"), np.uint8)
+        row = np.concatenate([part for p in panels for part in (gap, p)][1:], axis=1)
+        # 4:2:0 video has even sides.
+        yield np.pad(row, ((0, row.shape[0] % 2), (0, row.shape[1] % 2), (0, 0)), mode="edge")
+
+
+def read_clip(path: Path) -> Frames:
+    """Decode a whole clip to RGB, ``[N, height, width, 3]``."""
+    with av.open(str(path)) as container:
+        return np.stack([f.to_ndarray(format="rgb24") for f in container.decode(video=0)])
+
+
+def data_uri(path: Path) -> str:
+    """A media file as a data URI."""
+    kind = _MEDIA_TYPES.get(path.suffix.lower())
+    if kind is None:
+        raise ValueError(f"expected a file of type {', '.join(_MEDIA_TYPES)}, got {path}")
+    return f"data:{kind};base64,{base64.b64encode(path.read_bytes()).decode()}"
+
+
+def image_uri(image: Frames, quality: int | None = None) -> str:
+    """An RGB image as a data URI: PNG, or JPEG of the given quality."""
+    suffix, options = (".png", []) if quality is None else (".jpg", [cv2.IMWRITE_JPEG_QUALITY, quality])
+    _, encoded = cv2.imencode(suffix, cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2BGR), options)
+    return f"data:{_MEDIA_TYPES[suffix]};base64,{base64.b64encode(encoded.tobytes()).decode()}"
+
+
+def film_strip(path: Path, count: int = 4) -> list[Frames]:
+    """Frames ``[height, width, 3]`` of a clip at equal intervals, the last one included, for print and posters."""
+    frames = read_clip(path)
+    chosen = np.linspace(0, len(frames) - 1, min(count, len(frames)) + 1).round().astype(int)[1:]
+    return [frames[i] for i in chosen]
+
+
+def _encode(path: Path, codec: str, quality: int, rate_hz: float, frames: Iterator[Frames]) -> None:
+    options = {"crf": str(quality)}
+    options |= (
+        {"preset": "slow", "tune": "animation"}
+        if codec == "libx264"
+        else {"b": "0", "deadline": "good", "cpu-used": "3"}
+    )
+    # The index in front lets a page play the clip while it is read.
+    container_options = {"movflags": "+faststart"} if path.suffix == ".mp4" else {}
+    with av.open(str(path), "w", options=container_options) as container:
+        stream: Any = None
+        for frame in frames:
+            if stream is None:
+                stream = container.add_stream(codec, rate=round(rate_hz), options=options)
+                stream.height, stream.width = frame.shape[:2]
+                stream.pix_fmt = "yuv420p"
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
+        container.mux(stream.encode(None))
+
+
+def _panel(track: ClipTrack, step: int, rate_hz: float, off_track_m: float) -> Frames:
+    index = min(step, len(track.frames) - 1)
+    image = np.asarray(track.frames[index], dtype=np.uint8)
+    scale = max(1, -(-_MIN_WIDTH_PX // image.shape[1]))  # the policy's 200-pixel views are doubled to hold the caption
+    image = np.repeat(np.repeat(image, scale, axis=0), scale, axis=1)
+    height, width = image.shape[:2]
+    canvas = Image.new("RGB", (width, _TITLE_PX + height + _STATUS_PX), _rgb("paper"))
+    canvas.paste(Image.fromarray(image), (0, _TITLE_PX))
+    cte = float(np.asarray(track.cte_m)[index])
+    _draw_title(canvas, track)
+    _draw_status(canvas, index / rate_hz, cte, off_track_m, track.note if step > index else "")
+    return np.asarray(canvas)
+
+
+def _draw_title(canvas: Image.Image, track: ClipTrack) -> None:
+    draw = ImageDraw.Draw(canvas)
+    draw.rectangle((0, 0, 4, _TITLE_PX - 3), fill=_rgb(track.condition))
+    draw.text((11, _TITLE_PX / 2 - 1), track.title, fill=_rgb("ink"), font=_font(13, bold=True), anchor="lm")
+    if track.attack_id:
+        draw.text(
+            (canvas.width - 2, _TITLE_PX / 2 - 1), track.attack_id, fill=_rgb("muted"), font=_font(11), anchor="rm"
+        )
+
+
+def _draw_status(canvas: Image.Image, time_s: float, cte_m: float, off_track_m: float, note: str) -> None:
+    """Time, cross-track error as a number and as a needle over the track's width, and OFF TRACK in words."""
+    draw = ImageDraw.Draw(canvas)
+    middle = canvas.height - _STATUS_PX / 2
+    draw.text((2, middle), f"{time_s:4.1f} s", fill=_rgb("ink"), font=_font(12), anchor="lm")
+    draw.text((62, middle), f"CTE {cte_m:+.2f} m", fill=_rgb("ink"), font=_font(12), anchor="lm")
+    off = abs(cte_m) > off_track_m
+    # The needle moves as the car does on the screen: left of the path is left.
+    left, right = 160, 236
+    centre, metre = (left + right) / 2, (right - left) / 4 / off_track_m
+    draw.rectangle((left, middle - 4, right, middle + 4), fill=_rgb("grid"))
+    draw.rectangle(
+        (centre - off_track_m * metre, middle - 4, centre + off_track_m * metre, middle + 4), fill=_rgb("tape")
+    )
+    at = float(np.clip(centre - cte_m * metre, left + 1, right - 1))
+    draw.rectangle((at - 1.5, middle - 7, at + 1.5, middle + 7), fill=_rgb("ink"))
+    text = " · ".join([*(["OFF TRACK"] if off else []), *([note] if note else [])])
+    draw.text(
+        (canvas.width - 2, middle),
+        text,
+        fill=_rgb("gradient" if off else "muted"),
+        font=_font(12, bold=off),
+        anchor="rm",
+    )
+
+
+def _rgb(name: str) -> tuple[int, int, int]:
+    colour = DARK[name]
+    return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16)
+
+
+@cache
+def _font(size_px: int, bold: bool = False) -> ImageFont.FreeTypeFont:
+    name = "DejaVuSans-Bold.ttf" if bold else "DejaVuSans.ttf"
+    return ImageFont.truetype(str(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / name), size_px)

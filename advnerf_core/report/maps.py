@@ -1,0 +1,119 @@
+"""The room from above: track, furniture of the experiment, and where the car went."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.patches import PathPatch, Polygon, Rectangle
+from matplotlib.path import Path as Outline
+from numpy.typing import NDArray
+
+from advnerf_core.report.data import Laps, ReportData, Run, Scene, Victim
+from advnerf_core.report.palette import LIGHT
+from advnerf_core.report.plots import add_run_legend, end_style, new_axes, run_style
+
+Floats = NDArray[np.float64]
+
+
+def trajectory_map(data: ReportData, zoom: bool = False, victim: Victim = "hardened") -> Figure:
+    """All drives of one victim from above: the whole room, or only where the car went."""
+    runs = data.select(victim=victim)
+    with new_axes(6.0, 6.2 if zoom else 5.4) as ax:
+        _draw_scene(ax, data.scene)
+        for run in runs:
+            ax.plot(run.states[:, 0], run.states[:, 1], **run_style(run))
+            ax.plot(*run.states[-1, :2], **end_style(run))
+        _draw_starts(ax, runs)
+        if zoom:
+            _frame(ax, _driven_box(data.scene, runs))
+            add_run_legend(ax, runs)
+        else:
+            _frame(ax, np.reshape(data.scene.room_m, (2, 2)))
+    return ax.figure
+
+
+def laps_map(laps: Laps, scene: Scene) -> Figure:
+    """The drive without attack from above."""
+    with new_axes(6.0, 5.4) as ax:
+        _draw_scene(ax, scene)
+        ax.plot(laps.states[:, 0], laps.states[:, 1], color=LIGHT["none"], lw=1.2)
+        _frame(ax, np.reshape(scene.room_m, (2, 2)))
+    return ax.figure
+
+
+def band_outline(scene: Scene) -> Outline:
+    """The on-track band around the path as one outline; a closed path gives a ring."""
+    xy = scene.path_xy_m
+    if scene.closed and np.allclose(xy[0], xy[-1]):
+        xy = xy[:-1]
+    tangent = np.roll(xy, -1, axis=0) - np.roll(xy, 1, axis=0) if scene.closed else np.gradient(xy, axis=0)
+    normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1) / np.linalg.norm(tangent, axis=1, keepdims=True)
+    left, right = xy + scene.off_track_m * normal, (xy - scene.off_track_m * normal)[::-1]
+    if not scene.closed:
+        return Outline(np.concatenate([left, right]), closed=False)
+    # Opposite senses: the fill rule leaves the inside of the ring empty.
+    return Outline.make_compound_path(
+        *(Outline(np.concatenate([ring, ring[:1]]), closed=True) for ring in (left, right))
+    )
+
+
+def _draw_scene(ax: Any, scene: Scene) -> None:
+    x_min, y_min, x_max, y_max = scene.room_m
+    ax.grid(False)
+    ax.add_patch(PathPatch(band_outline(scene), fc=LIGHT["band"], ec="none", zorder=0.5))
+    ax.add_patch(Rectangle((x_min, y_min), x_max - x_min, y_max - y_min, fill=False, ec=LIGHT["ink"], lw=1.6, zorder=1))
+    path = np.concatenate([scene.path_xy_m, scene.path_xy_m[:1]]) if scene.closed else scene.path_xy_m
+    ax.plot(path[:, 0], path[:, 1], color=LIGHT["tape"], lw=2.6, alpha=0.55, zorder=1.1, solid_joinstyle="round")
+    _note(ax, path[len(path) * 5 // 8], "tape, on-track band", (0, 12))
+    if scene.fence_m is not None:
+        ax.add_patch(Polygon(scene.fence_m, fill=False, ec=LIGHT["muted"], lw=1.0, ls=(0, (1, 2)), zorder=1))
+        corner = scene.fence_m[np.argmin(scene.fence_m @ [1.0, -1.0])]
+        _note(ax, corner, "fence", (4, -9), ha="left")
+    for segment, name in ((scene.board_m, "board"), (scene.monitor_m, "monitor")):
+        if segment is not None:
+            _draw_face(ax, segment, name)
+    ax.set(xlabel="x [m]", ylabel="y [m]")
+    ax.set_aspect("equal")
+
+
+def _draw_face(ax: Any, segment: Floats, name: str) -> None:
+    """A face from above, with short strokes on its front side."""
+    along = segment[1] - segment[0]
+    front = np.array([along[1], -along[0]]) / np.linalg.norm(along)
+    ax.plot(*segment.T, color=LIGHT["ink"], lw=4.0, solid_capstyle="butt", zorder=2.5)
+    middle = segment.mean(axis=0)
+    ax.annotate("", middle + 0.34 * front, middle, arrowprops={"arrowstyle": "-|>", "color": LIGHT["ink"], "lw": 1.0})
+    away = -11.0 * front
+    ax.annotate(name, middle, xytext=tuple(away), textcoords="offset points", ha="center", va="center", size=8.5,
+                rotation=float(np.degrees(np.arctan2(along[1], along[0]))), rotation_mode="anchor", annotation_clip=True)  # fmt: skip
+
+
+def _draw_starts(ax: Any, runs: Sequence[Run]) -> None:
+    """An arrow along the first heading of every start."""
+    for start in sorted({r.start for r in runs}):
+        x, y, yaw = next(r.states[0] for r in runs if r.start == start)
+        ax.annotate("", (x, y), (x - 0.3 * np.cos(yaw), y - 0.3 * np.sin(yaw)), zorder=3.5, annotation_clip=True,
+                    arrowprops={"arrowstyle": "-|>", "color": LIGHT["ink"], "lw": 1.2})  # fmt: skip
+    if runs:
+        _note(ax, runs[0].states[0, :2], "start", (-14, 9), ha="center")
+
+
+def _note(ax: Any, at: Floats, text: str, offset_pt: tuple[float, float], ha: str = "center") -> None:
+    ax.annotate(text, tuple(at), xytext=offset_pt, textcoords="offset points", ha=ha, size=8, color=LIGHT["muted"],
+                annotation_clip=True, zorder=4)  # fmt: skip
+
+
+def _driven_box(scene: Scene, runs: Sequence[Run]) -> Floats:
+    """Corners ``[2, 2]`` of the part of the room that holds all drives and the board [m]."""
+    points = [r.states[:, :2] for r in runs] + ([scene.board_m] if scene.board_m is not None else [])
+    xy = np.concatenate(points) if points else np.reshape(scene.room_m, (2, 2))
+    return np.stack([xy.min(axis=0) - 0.45, xy.max(axis=0) + 0.35])
+
+
+def _frame(ax: Any, box: Floats) -> None:
+    margin = 0.15
+    ax.set_xlim(box[0, 0] - margin, box[1, 0] + margin)
+    ax.set_ylim(box[0, 1] - margin, box[1, 1] + margin)

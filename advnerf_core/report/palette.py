@@ -1,0 +1,56 @@
+"""One palette for plots, page and clips. Conditions differ in lightness as well as hue, and plots add line style and marker.
+
+The keys are also the names of the page's CSS variables: a figure drawn in the light palette is re-coloured by `themed_svg`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+
+LIGHT: Mapping[str, str] = MappingProxyType(
+    {
+        "none": "#0072b2",
+        "random": "#dd9300",
+        "gradient": "#b0123c",
+        "empty": "#7d848d",
+        "ink": "#1c2128",
+        "muted": "#59626d",
+        "grid": "#dde2e7",
+        "band": "#eaf1ec",
+        "tape": "#3f9b6b",
+        "paper": "#fffffe",
+    }
+)
+DARK: Mapping[str, str] = MappingProxyType(
+    {
+        "none": "#4fb0f2",
+        "random": "#f7cc5a",
+        "gradient": "#f4577a",
+        "empty": "#8f98a3",
+        "ink": "#e4e8ec",
+        "muted": "#9da7b1",
+        "grid": "#30373f",
+        "band": "#1d2a24",
+        "tape": "#52b788",
+        "paper": "#14181c",
+    }
+)
+
+CONDITION_NAMES: Mapping[str, str] = MappingProxyType(
+    {"none": "no attack", "random": "best random", "gradient": "gradient", "empty": "empty scene"}
+)
+MARKERS: Mapping[str, str] = MappingProxyType({"none": "o", "random": "s", "gradient": "^", "empty": "D"})
+LINE_STYLES: Mapping[str, str] = MappingProxyType({"surrogate": "--", "deployed": "-"})
+
+
+def css_variables(palette: Mapping[str, str]) -> str:
+    """The palette as CSS custom properties."""
+    return " ".join(f"--{name}: {colour};" for name, colour in palette.items())
+
+
+def themed_svg(svg: str) -> str:
+    """Replace the light palette's colours in an SVG by CSS variables, so that it follows the page's theme."""
+    for name, colour in LIGHT.items():
+        svg = svg.replace(colour, f"var(--{name})")
+    return svg

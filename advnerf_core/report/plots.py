@@ -1,0 +1,278 @@
+"""The curves of the report. Each function returns a matplotlib figure drawn without a display; `svg` makes it part of a page.
+
+Conditions keep their colour in every figure; the surrogate is dashed, the deployed drive solid.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import re
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+from markupsafe import escape
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from advnerf_core.report.data import Domain, Fidelity, Laps, Latency, MemoryRow, ReportData, Run, Victim
+from advnerf_core.report.palette import CONDITION_NAMES, LIGHT, LINE_STYLES, MARKERS, themed_svg
+
+_STYLE: dict[str, Any] = {
+    "font.family": "DejaVu Sans",
+    "font.size": 9,
+    "svg.fonttype": "none",
+    "svg.hashsalt": "advnerf",
+    "text.color": LIGHT["ink"],
+    "axes.edgecolor": LIGHT["muted"],
+    "axes.labelcolor": LIGHT["ink"],
+    "axes.linewidth": 0.8,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "axes.titlesize": 9,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "grid.color": LIGHT["grid"],
+    "grid.linewidth": 0.7,
+    "xtick.color": LIGHT["muted"],
+    "ytick.color": LIGHT["muted"],
+    "legend.frameon": False,
+    "legend.fontsize": 8.5,
+    "legend.handlelength": 2.6,
+    "lines.linewidth": 1.6,
+    "lines.solid_capstyle": "round",
+    "figure.facecolor": "none",
+    "axes.facecolor": "none",
+    "savefig.facecolor": "none",
+}
+
+
+@contextmanager
+def new_axes(width_in: float = 6.0, height_in: float = 3.4) -> Iterator[Any]:
+    """Axes of a new figure in the report's style."""
+    with matplotlib.rc_context(_STYLE):
+        yield Figure(figsize=(width_in, height_in), layout="constrained").add_subplot()
+
+
+def cte_over_time(data: ReportData, domain: Domain, victim: Victim = "hardened") -> Figure:
+    """Signed cross-track error of all drives in one domain; the axis is shared by both domains."""
+    period = data.settings.control_period_s
+    everything = [abs(r.cte_m).max() for r in data.select(victim=victim)]
+    limit = max([data.settings.off_track_m * 1.25, *everything]) * 1.08
+    with new_axes() as ax:
+        ax.axhspan(-data.settings.off_track_m, data.settings.off_track_m, color=LIGHT["band"], lw=0, zorder=0)
+        ax.axhline(0.0, color=LIGHT["tape"], lw=1.2, zorder=1)
+        runs = data.select(domain=domain, victim=victim)
+        for run in runs:
+            ax.plot(np.arange(len(run.cte_m)) * period, run.cte_m, **run_style(run))
+            ax.plot((len(run.cte_m) - 1) * period, run.cte_m[-1], **end_style(run))
+        ax.set(xlabel="time [s]", ylabel="cross-track error, left + [m]", ylim=(-limit, limit), title=domain)
+        ax.set_xlim(left=0.0)
+        ax.annotate("on track", (1, data.settings.off_track_m), xycoords=("axes fraction", "data"), xytext=(-4, -4),
+                    textcoords="offset points", ha="right", va="top", color=LIGHT["muted"], size=8)  # fmt: skip
+        add_run_legend(ax, runs)
+    return ax.figure
+
+
+def loss_curves(data: ReportData, victim: Victim = "hardened") -> Figure:
+    """Total CTE per evaluation of the searches; the no-attack level of the surrogate as reference."""
+    curves = [c for c in data.curves if c.victim == victim]
+    clean = [r.total_cte_m for r in data.select(domain="surrogate", condition="none", victim=victim)]
+    handles = []
+    with new_axes() as ax:
+        for curve in curves:
+            x, style = np.arange(1, len(curve.total_cte_m) + 1), {"color": LIGHT[curve.method]}
+            if curve.method == "random":
+                ax.plot(x, curve.total_cte_m, MARKERS["random"], ms=2.4, alpha=0.55, mew=0, **style)
+                ax.plot(x, np.maximum.accumulate(curve.total_cte_m), drawstyle="steps-post", **style)
+            else:
+                ax.plot(x, curve.total_cte_m, **style)
+                ax.plot(x[-1], curve.total_cte_m[-1], MARKERS["gradient"], ms=5, **style)
+        present = {c.method for c in curves}
+        if "gradient" in present:
+            handles.append(Line2D([], [], color=LIGHT["gradient"], label="gradient, one line per seed"))
+        if "random" in present:
+            handles.append(
+                Line2D([], [], color=LIGHT["random"], marker="s", ms=2.4, label="random: each texture, best so far")
+            )
+        if clean:
+            handles.append(
+                ax.axhline(float(np.mean(clean)), color=LIGHT["none"], ls="--", lw=1.2, label="no attack, surrogate")
+            )
+        ax.set(xlabel="evaluation", ylabel="total CTE, surrogate [m]")
+        ax.set_ylim(bottom=0.0)
+        _legend_above(ax, handles)
+    return ax.figure
+
+
+def steering_agreement(fidelity: Fidelity, tolerance_rad: float = 0.03) -> Figure:
+    """The policy's steering on the surrogate's image against that on the real image."""
+    pairs = fidelity.steering_rad
+    low, high = float(pairs.min()), float(pairs.max())
+    margin = max(0.06 * (high - low), tolerance_rad)
+    line = np.array([low - margin, high + margin])
+    with new_axes(4.2, 3.9) as ax:
+        ax.fill_between(line, line - tolerance_rad, line + tolerance_rad, color=LIGHT["band"], lw=0)
+        ax.plot(line, line, color=LIGHT["tape"], lw=1.0)
+        ax.plot(pairs[:, 0], pairs[:, 1], "o", ms=4, mew=0, alpha=0.75, color=LIGHT["ink"])
+        ax.set(
+            xlabel="steering on the real image [rad]",
+            ylabel="steering on the surrogate's image [rad]",
+            xlim=line,
+            ylim=line,
+        )
+        ax.set_aspect("equal")
+        text = f"mean |difference| {fidelity.steering_difference_rad:.4f} rad\nband: ± {tolerance_rad:g} rad, n = {len(pairs)}"
+        ax.text(0.04, 0.96, text, transform=ax.transAxes, va="top", size=8.5)
+    return ax.figure
+
+
+def latency_histogram(latency: Latency) -> Figure:
+    """Distribution of the time from capture to serial write, with the camera period as the limit."""
+    samples, limit, overall = latency.capture_to_serial_ms, latency.camera_period_ms, latency.overall
+    end = max(limit * 1.12, float(samples.max()) * 1.05)
+    with new_axes(6.0, 2.9) as ax:
+        ax.hist(samples, bins=np.linspace(0.0, end, 90).tolist(), color=LIGHT["none"], log=True)
+        ax.axvline(limit, color=LIGHT["ink"], lw=1.4)
+        ax.axvline(overall.p99_ms, color=LIGHT["muted"], lw=1.2, ls=":")
+        top = ax.get_xaxis_transform()
+        ax.text(
+            limit,
+            1.01,
+            f"camera period {limit:g} ms",
+            transform=top,
+            ha="right" if end < limit * 1.3 else "center",
+            size=8.5,
+        )
+        ax.text(
+            overall.p99_ms,
+            1.01,
+            f"p99 {overall.p99_ms:.1f} ms",
+            transform=top,
+            ha="center",
+            size=8.5,
+            color=LIGHT["muted"],
+        )
+        ax.set(xlabel="capture to serial write [ms]", ylabel="frames", xlim=(0.0, end))
+    return ax.figure
+
+
+def memory_against_horizon(rows: Iterable[MemoryRow]) -> Figure:
+    """Peak memory above idle against the horizon."""
+    ordered = sorted(rows, key=lambda m: m.horizon_steps)
+    other = [m for m in ordered if m.backprop_mib is not None]
+    with new_axes(6.0, 3.0) as ax:
+        ax.plot(
+            [m.horizon_steps for m in ordered],
+            [m.adjoint_mib for m in ordered],
+            "-o",
+            ms=5,
+            color=LIGHT["gradient"],
+            label="adjoint, time batches",
+        )
+        if other:
+            ax.plot(
+                [m.horizon_steps for m in other],
+                [m.backprop_mib for m in other],
+                "--s",
+                ms=5,
+                color=LIGHT["muted"],
+                label="back-propagation",
+            )
+        ax.set(xlabel="horizon T [control ticks]", ylabel="peak above idle [MiB]")
+        ax.set_xlim(left=0.0)
+        ax.set_ylim(bottom=0.0)
+        _legend_above(ax, ax.get_legend_handles_labels()[0])
+    return ax.figure
+
+
+def laps_cte(laps: Laps, period_s: float, off_track_m: float) -> Figure:
+    """Signed cross-track error of the drive without attack."""
+    with new_axes(6.0, 2.6) as ax:
+        ax.axhspan(-off_track_m, off_track_m, color=LIGHT["band"], lw=0)
+        ax.axhline(0.0, color=LIGHT["tape"], lw=1.2)
+        ax.plot(np.arange(len(laps.cte_m)) * period_s, laps.cte_m, color=LIGHT["none"], lw=1.2)
+        limit = max(off_track_m * 1.2, float(abs(laps.cte_m).max()) * 1.1)
+        ax.set(xlabel="time [s]", ylabel="cross-track error, left + [m]", ylim=(-limit, limit))
+        ax.set_xlim(left=0.0)
+    return ax.figure
+
+
+def run_style(run: Run) -> dict[str, Any]:
+    """How a drive is drawn: colour by condition, line by domain."""
+    front = {"empty": 2.0, "none": 2.1, "random": 2.2, "gradient": 2.3}[run.condition]
+    return {"color": LIGHT[run.condition], "ls": LINE_STYLES[run.domain], "zorder": front, "alpha": 0.9}
+
+
+def end_style(run: Run) -> dict[str, Any]:
+    """The mark at the end of a drive: shape by condition, filled if deployed."""
+    fill = LIGHT[run.condition] if run.domain == "deployed" else LIGHT["paper"]
+    return {
+        "marker": MARKERS[run.condition],
+        "ms": 5,
+        "color": LIGHT[run.condition],
+        "mfc": fill,
+        "ls": "none",
+        "zorder": 3,
+    }
+
+
+def add_run_legend(ax: Any, runs: Iterable[Run]) -> None:
+    """A legend of the cells that occur, above the axes."""
+    cells: dict[tuple[str, str], Run] = {(r.condition, r.domain): r for r in runs}
+    handles = []
+    for condition, name in CONDITION_NAMES.items():
+        for domain in LINE_STYLES:
+            if run := cells.get((condition, domain)):
+                style = {**run_style(run), **{k: v for k, v in end_style(run).items() if k in ("marker", "ms", "mfc")}}
+                handles.append(Line2D([], [], label=f"{name}, {domain}", **style))
+    _legend_above(ax, handles)
+
+
+def _legend_above(ax: Any, handles: list[Any]) -> None:
+    if handles:
+        columns = 3 if len(handles) > 4 else 2
+        ax.figure.legend(handles=handles, loc="outside upper left", ncols=columns, columnspacing=1.6)
+
+
+def svg(figure: Figure, description: str) -> str:
+    """A figure as inline SVG in the page's colours: no scripts, no external names, text as text.
+
+    Args:
+        figure: The figure.
+        description: What it shows, for those who cannot see it (plain text; it is escaped).
+    """
+    buffer = io.StringIO()
+    nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
+    with matplotlib.rc_context(_STYLE):
+        figure.savefig(buffer, format="svg", metadata=nothing)
+    text = buffer.getvalue()
+    text = text[text.index("<svg") :]
+    text = re.sub(r'\s+xmlns(:xlink)?="[^"]*"', "", text)
+    text = text.replace("xlink:href", "href")
+    text = re.sub(
+        r'<svg[^>]*?viewBox="([^"]+)"[^>]*>',
+        rf'<svg viewBox="\1" role="img" aria-label="{escape(description)}">',
+        text,
+        count=1,
+    )
+    return themed_svg(text)
+
+
+def write_png(figure: Figure, path: Path, dpi: int = 160) -> Path:
+    """Write a figure as a picture on white, atomically."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with matplotlib.rc_context(_STYLE):
+            figure.savefig(temporary, format="png", dpi=dpi, facecolor="white")
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+    return path

@@ -1,0 +1,135 @@
+# ruff: noqa: RUF001 (typography for readers: multiplication signs and dashes)
+"""What happened, in words: the opening paragraph and the key figures of the page."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from advnerf_core.report.data import ReportData
+from advnerf_core.report.tables import TransferRow, find_row, number, transfer_rows
+from advnerf_core.report.targets import Target, evaluate_targets
+
+
+@dataclass(frozen=True)
+class KeyFigure:
+    """One number of the page's head; `met` is None without a target or a measurement."""
+
+    value: str
+    label: str
+    target: str
+    met: bool | None
+    condition: str = ""
+
+
+def key_figures(data: ReportData) -> tuple[KeyFigure, ...]:
+    """The numbers a reader looks for first."""
+    rows = transfer_rows(data)
+    cells = (
+        ("surrogate", "gradient", 3.3, True, "gradient attack, surrogate"),
+        ("deployed", "gradient", 3.0, True, "gradient attack, driven live"),
+        ("deployed", "random", 1.5, False, "best random texture, driven live"),
+    )
+    figures = []
+    for domain, condition, bound, at_least, label in cells:
+        row = find_row(rows, domain, condition)  # type: ignore[arg-type]
+        ratio = row.ratio if row else None
+        met = None if ratio is None else (ratio >= bound if at_least else ratio <= bound)
+        target = f"target {'≥' if at_least else '≤'} {bound:g} ×"
+        figures.append(KeyFigure(number(ratio, 2, " ×"), f"total CTE, {label}", target, met, condition))
+    figures.append(_off_track_figure(find_row(rows, "deployed", "gradient")))
+    psnr = data.fidelity.mean("psnr_policy_db") if data.fidelity else None
+    figures.append(
+        KeyFigure(
+            number(psnr, 1, " dB"),
+            "PSNR of the surrogate at 200x66",
+            "target ≥ 27 dB",
+            None if psnr is None else psnr >= 27,
+        )
+    )
+    latency = data.latency
+    p99 = latency.overall.p99_ms if latency else None
+    period = latency.camera_period_ms if latency else 100.0
+    figures.append(
+        KeyFigure(
+            number(p99, 1, " ms"),
+            "capture to serial write, p99",
+            f"target ≤ {period:g} ms",
+            None if p99 is None else p99 <= period,
+        )
+    )
+    return tuple(figures)
+
+
+def _off_track_figure(row: TransferRow | None) -> KeyFigure:
+    value = f"{row.off_track} of {row.runs}" if row else "–"
+    met = None if row is None else row.off_track / row.runs >= 2 / 3
+    return KeyFigure(value, "attacked live drives left the track", "target ≥ 2 of 3", met, "gradient")
+
+
+def opening(data: ReportData) -> tuple[str, ...]:
+    """The opening paragraphs as plain text: what was done, what it did, what that is worth."""
+    return tuple(
+        p for p in (_what_was_done(data), _what_it_did(data), verdict(evaluate_targets(data)), _caveats(data)) if p
+    )
+
+
+def _what_was_done(data: ReportData) -> str:
+    s = data.settings
+    starts, seeds = len(s.start_poses), len(s.seeds)
+    return (
+        f"A texture for one flat board was searched for in a learned copy of the room: {s.iterations} gradient steps over "
+        f"{s.horizon_steps} control ticks ({s.horizon_steps * s.control_period_s:g} s) from {_count(starts, 'start pose')} with "
+        f"{_count(seeds, 'seed')}, against the best of {s.random_evaluations} random textures. Both were then shown to the "
+        f"driving car, frame by frame, by the live node graph."
+    )
+
+
+def _what_it_did(data: ReportData) -> str:
+    rows = transfer_rows(data)
+    parts = []
+    for domain, place in (("surrogate", "In the learned scene"), ("deployed", "On the live drive")):
+        clean, attacked, random = (find_row(rows, domain, c) for c in ("none", "gradient", "random"))  # type: ignore[arg-type]
+        if clean is None or attacked is None:
+            parts.append(f"{place} the attack was not measured in this run.")
+            continue
+        text = (
+            f"{place} the gradient texture took the total distance from the tape (total CTE) from "
+            f"{clean.total_cte_mean_m:.2f} m to {attacked.total_cte_mean_m:.2f} m, {number(attacked.ratio)} times as much, and the "
+            f"car left the track in {attacked.off_track} of {_count(attacked.runs, 'drive')}"
+        )
+        if random is not None:
+            text += (
+                f"; the best random texture gave {number(random.ratio)} times and {random.off_track} of {random.runs}"
+            )
+        parts.append(text + ".")
+    return " ".join(parts)
+
+
+def verdict(targets: Sequence[Target]) -> str:
+    """Which targets were met, missed, and not measured."""
+    met = [t for t in targets if t.met is True]
+    missed = [t for t in targets if t.met is False]
+    judged = len(met) + len(missed)
+    if not judged:
+        return "No target was measured in this run."
+    text = f"{len(met)} of {_count(judged, 'measured target')} {'was' if judged == 1 else 'were'} met."
+    if missed:
+        listed = "; ".join(f"{t.what}: {t.measured} (target {t.target})" for t in missed)
+        text += f" Missed: {listed}."
+    if len(targets) > judged:
+        text += f" {_count(len(targets) - judged, 'target')} not measured in this run."
+    return text
+
+
+def _caveats(data: ReportData) -> str:
+    if data.settings.name == "full":
+        return ""
+    return (
+        "This is the small setting: it shows that the whole chain works, and its total CTE ratios rest on very few drives. The targets "
+        "are stated for the full setting (make experiment)."
+    )
+
+
+def _count(n: int, noun: str) -> str:
+    return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
