@@ -190,8 +190,10 @@ class Bus:
 
     def wait(self, timeout_s: float) -> set[int]:
         """Sleep until something comes or the time is over; returns the watched file descriptors that are readable."""
-        # ZeroMQ counts in milliseconds; rounding down makes the last one a short spin instead of a late tick.
+        # ZeroMQ counts in milliseconds; the last fraction is slept, so that a tick is neither late nor waited for by spinning.
         ready = self._poller.poll(max(0, int(timeout_s * 1e3)))
+        if not ready and 0.0 < timeout_s < 1e-3:
+            time.sleep(timeout_s)
         return {entry for entry, _ in ready if isinstance(entry, int)}
 
     def receive(self) -> list[Received]:

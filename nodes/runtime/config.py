@@ -1,0 +1,185 @@
+"""Configuration: YAML in, a typed object out, and one error that says which file, which line, and what would be right."""
+
+from __future__ import annotations
+
+import types
+import typing
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar, Union
+
+import yaml
+from pydantic import BaseModel, ValidationError
+
+from nodes.runtime.errors import ConfigError
+
+M = TypeVar("M", bound=BaseModel)
+Key = tuple[str | int, ...]
+
+
+@dataclass
+class Document:
+    """A parsed YAML file that remembers where everything stood.
+
+    Attributes:
+        data: The content.
+        source: File name for messages.
+        places: Where a key came from, as ``file:line`` or as the override that set it, by its path.
+    """
+
+    data: Any
+    source: str
+    places: dict[Key, str] = field(default_factory=dict)
+
+    def place(self, key: Key) -> str:
+        """Where a key, or else what encloses it, stands."""
+        while key and key not in self.places:
+            key = key[:-1]
+        return self.places.get(key, self.source)
+
+    def part(self, key: Key) -> Document:
+        """What stands under a key, with its places; empty if there is nothing."""
+        data = self.data
+        for step in key:
+            data = (data or {}).get(step) if isinstance(data, dict) else data[step]
+        places = {path[len(key) :]: place for path, place in self.places.items() if path[: len(key)] == key}
+        places.setdefault((), self.place(key))
+        return Document({} if data is None else data, self.source, places)
+
+
+def read_yaml(path: Path) -> Document:
+    """Parse a YAML or JSON file; tags that build objects are refused, a key given twice is an error."""
+    path = Path(path)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise ConfigError(f"{path}: no such file") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: cannot be read: {error}") from error
+    return parse_yaml(text, str(path))
+
+
+def parse_yaml(text: str, source: str) -> Document:
+    """Parse YAML text; ``source`` is what messages call it."""
+    try:
+        root = yaml.compose(text, Loader=yaml.SafeLoader)
+        data = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        line = f":{mark.line + 1}" if mark is not None else ""
+        raise ConfigError(f"{source}{line}: not valid YAML: {getattr(error, 'problem', None) or error}") from error
+    document = Document({} if data is None else data, source)
+    if root is not None:
+        _note_places(root, (), document)
+    return document
+
+
+def _note_places(node: yaml.Node, key: Key, document: Document) -> None:
+    document.places.setdefault(key, f"{document.source}:{node.start_mark.line + 1}")
+    if isinstance(node, yaml.MappingNode):
+        seen: set[str] = set()
+        for name, value in node.value:
+            here = f"{document.source}:{name.start_mark.line + 1}"
+            if name.value in seen:
+                raise ConfigError(f"{here}: {'.'.join(map(str, (*key, name.value)))} is given twice")
+            seen.add(name.value)
+            document.places[(*key, name.value)] = here
+            _note_places(value, (*key, name.value), document)
+    elif isinstance(node, yaml.SequenceNode):
+        for index, value in enumerate(node.value):
+            _note_places(value, (*key, index), document)
+
+
+def apply_overrides(document: Document, overrides: Iterable[str], prefix: Key = ()) -> None:
+    """Apply ``key.of.it=value`` texts in place; values are YAML, and keys below ``prefix`` are meant."""
+    for text in overrides:
+        name, separator, value = text.partition("=")
+        if not separator or not name.strip():
+            raise ConfigError(f"--set {text}: expected KEY=VALUE, e.g. --set camera.rate_hz=10")
+        key: Key = (*prefix, *name.strip().split("."))
+        parsed = parse_yaml(value, f"--set {text}").data if value.strip() else None
+        target = document.data
+        for step in key[:-1]:
+            if not isinstance(target, dict):
+                raise ConfigError(f"--set {text}: {step!r} is below something that has no keys")
+            if target.get(step) is None:
+                target[step] = {}
+            target = target[step]
+        if not isinstance(target, dict):
+            raise ConfigError(f"--set {text}: {key[-1]!r} is below something that has no keys")
+        target[key[-1]] = parsed
+        document.places[key] = f"--set {text}"
+
+
+def validate(model: type[M], document: Document) -> M:
+    """Typed object of a document; anything unknown or invalid is one `ConfigError`."""
+    if not isinstance(document.data, dict):
+        raise ConfigError(f"{document.place(())}: expected keys and values, got {type(document.data).__name__}")
+    try:
+        return model.model_validate(document.data)
+    except ValidationError as error:
+        raise ConfigError(_explain(model, document, error)) from None
+
+
+def load_config(model: type[M], path: Path, overrides: Sequence[str] = ()) -> M:
+    """Read, override and validate a configuration file."""
+    document = read_yaml(path)
+    apply_overrides(document, overrides)
+    return validate(model, document)
+
+
+def load_node_config(model: type[M], node: str, path: Path | None, overrides: Sequence[str] = ()) -> M:
+    """Configuration of one node.
+
+    The file is either plain (keys and values) or what the launch supervisor writes: keys and values under ``config``, and
+    under ``places`` where the user wrote them, so that an error names the launch file and not the copy.
+    """
+    document = Document({}, f"defaults of {node}") if path is None else read_yaml(path)
+    if isinstance(document.data, dict) and set(document.data) == {"config", "places"}:
+        places = {tuple(name.split(".")) if name else (): place for name, place in document.data["places"].items()}
+        document = Document(document.data["config"], document.source, typing.cast("dict[Key, str]", places))
+    apply_overrides(document, overrides)
+    return validate(model, document)
+
+
+def node_document(document: Document) -> dict[str, Any]:
+    """What the supervisor writes for a node; the counterpart of `load_node_config`."""
+    return {
+        "config": document.data,
+        "places": {".".join(map(str, key)): place for key, place in document.places.items()},
+    }
+
+
+def _explain(model: type[BaseModel], document: Document, error: ValidationError) -> str:
+    problems = error.errors(include_url=False)
+    first = problems[0]
+    key = tuple(first["loc"])
+    name = ".".join(map(str, key)) or "the whole"
+    if first["type"] == "extra_forbidden":
+        what = f"unknown key {name}; valid keys here: {', '.join(_valid_keys(model, key[:-1])) or 'none'}"
+    elif first["type"] == "missing":
+        what = f"{name} is missing"
+    else:
+        message = str(first["msg"]).removeprefix("Value error, ")
+        what = f"{name}: {message[:1].lower()}{message[1:]}, got {first['input']!r:.80}"
+    more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
+    return f"{document.place(key)}: {what}{more}"
+
+
+def _valid_keys(annotation: Any, key: Key) -> list[str]:
+    """Keys of the model that stands under a path; empty if there is none."""
+    if typing.get_origin(annotation) is typing.Annotated:
+        annotation = typing.get_args(annotation)[0]
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        if not key:
+            return sorted(f.alias or name for name, f in annotation.model_fields.items())
+        by_name = {f.alias or name: f for name, f in annotation.model_fields.items()}
+        return _valid_keys(by_name[str(key[0])].annotation, key[1:]) if key[0] in by_name else []
+    arguments = typing.get_args(annotation)
+    origin = typing.get_origin(annotation)
+    if origin in (Union, types.UnionType):
+        return next((keys for option in arguments if (keys := _valid_keys(option, key))), [])
+    if key and arguments and isinstance(origin, type) and issubclass(origin, typing.Iterable):
+        return _valid_keys(arguments[-1] if issubclass(origin, dict) else arguments[0], key[1:])
+    return []

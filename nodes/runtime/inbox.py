@@ -1,0 +1,108 @@
+"""How a driver's thread hands data to its node: a small queue that wakes the node's loop at once."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import threading
+from collections import deque
+from collections.abc import Callable
+from typing import Generic, TypeVar
+
+T = TypeVar("T")
+
+
+class Inbox(Generic[T]):
+    """Queue from one or more driver threads to the loop of one node; when full, the oldest item goes and is counted.
+
+    Args:
+        capacity: How many items wait at most.
+
+    Attributes:
+        dropped: Items that went unseen.
+    """
+
+    def __init__(self, capacity: int = 2) -> None:
+        if capacity < 1:
+            raise ValueError(f"expected a capacity >= 1, got {capacity}")
+        self._items: deque[T] = deque(maxlen=capacity)
+        self._lock = threading.Lock()
+        self._failure: BaseException | None = None
+        self._event = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        self._closed = False
+        self.dropped = 0
+
+    def put(self, item: T) -> None:
+        """Add an item and wake the loop (any thread)."""
+        with self._lock:
+            if self._closed:
+                return
+            self.dropped += len(self._items) == self._items.maxlen
+            self._items.append(item)
+            os.eventfd_write(self._event, 1)
+
+    def fail(self, failure: BaseException) -> None:
+        """Make the next `take` raise: a driver that dies must take its node with it (any thread)."""
+        with self._lock:
+            if self._closed:
+                return
+            self._failure = failure
+            os.eventfd_write(self._event, 1)
+
+    def take(self) -> list[T]:
+        """All items that wait, oldest first (the loop's thread)."""
+        with self._lock:
+            with contextlib.suppress(BlockingIOError):
+                os.eventfd_read(self._event)
+            if self._failure is not None:
+                raise self._failure
+            items = list(self._items)
+            self._items.clear()
+        return items
+
+    def fileno(self) -> int:
+        """File descriptor that is readable while items wait."""
+        return self._event
+
+    def close(self) -> None:
+        """Give the file descriptor back; later items are ignored."""
+        with self._lock:
+            if not self._closed:
+                self._closed = True
+                os.close(self._event)
+
+
+class ReaderThread(Generic[T]):
+    """The one read thread of all drivers: calls a blocking read again and again and puts what it returns into an inbox.
+
+    Args:
+        read: Blocks for a bounded time; returns None when nothing came.
+        inbox: Where results go, and the exception when ``read`` raises.
+        name: Thread name.
+    """
+
+    def __init__(self, read: Callable[[], T | None], inbox: Inbox[T], name: str) -> None:
+        self._read = read
+        self._inbox = inbox
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+
+    def start(self) -> None:
+        """Begin to read."""
+        self._thread.start()
+
+    def stop(self, timeout_s: float = 2.0) -> None:
+        """End after the current read."""
+        self._stop.set()
+        if self._thread.is_alive():
+            self._thread.join(timeout_s)
+
+    def _run(self) -> None:
+        try:
+            while not self._stop.is_set():
+                item = self._read()
+                if item is not None:
+                    self._inbox.put(item)
+        except Exception as failure:  # every failure of a driver is its node's failure, raised there
+            if not self._stop.is_set():
+                self._inbox.fail(failure)

@@ -1,0 +1,187 @@
+"""A node as a process: build it, run its loop, and end in an orderly way whatever happens."""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import signal
+import sys
+import threading
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from types import FrameType
+from typing import TypeVar
+
+from pydantic import BaseModel
+
+from nodes.runtime.bus import Bus
+from nodes.runtime.clock import Clock, SystemClock
+from nodes.runtime.config import load_node_config
+from nodes.runtime.errors import NodeFinished
+from nodes.runtime.loop import NodeLoop
+from nodes.runtime.node import FAULT, STARTING, Node, NodeContext
+from nodes.runtime.topics import status_topic
+
+C = TypeVar("C", bound=BaseModel)
+
+
+class _Signals:
+    """SIGINT and SIGTERM end the loop; before there is a loop they end the process."""
+
+    def __init__(self) -> None:
+        self._loop: NodeLoop | None = None
+        self._previous = {number: signal.signal(number, self._handle) for number in (signal.SIGINT, signal.SIGTERM)}
+
+    def attach(self, loop: NodeLoop) -> None:
+        self._loop = loop
+        signal.set_wakeup_fd(loop.wakeup_fd, warn_on_full_buffer=False)
+
+    def restore(self) -> None:
+        signal.set_wakeup_fd(-1)
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        del number, frame  # both signals mean the same
+        if self._loop is None:
+            raise SystemExit(0)
+        self._loop.stop()
+
+
+def run_node(
+    build: Callable[[NodeContext], Node],
+    name: str,
+    run_dir: Path,
+    clock: Clock | None = None,
+    on_loop: Callable[[NodeLoop], None] | None = None,
+) -> int:
+    """Run a node until SIGINT, SIGTERM, `NodeFinished` or an exception.
+
+    Args:
+        build: Makes the node; devices are opened here.
+        name: Name of the node; its status goes to ``/status/<name>``.
+        run_dir: Folder of the run.
+        clock: Where time comes from.
+        on_loop: Called with the loop before it runs; lets a test stop it.
+
+    Returns:
+        Exit code: 0 after an orderly end, 1 after a fault (one line on stderr, traceback in ``<run_dir>/logs``).
+    """
+    clock = clock or SystemClock()
+    in_main_thread = threading.current_thread() is threading.main_thread()
+    signals = _Signals() if in_main_thread else None
+    runner = _Runner(name, Path(run_dir), clock)
+    try:
+        runner.start(build)
+        if signals is not None and runner.loop is not None:
+            signals.attach(runner.loop)
+        if on_loop is not None and runner.loop is not None:
+            on_loop(runner.loop)
+        runner.run()
+    except NodeFinished:
+        pass
+    except Exception as error:  # whatever it is: make the device safe, say it in one line, end with an error code
+        runner.fail(error)
+    finally:
+        if signals is not None:
+            signals.restore()
+        runner.close()
+    return runner.exit_code
+
+
+class _Runner:
+    """Builds, runs and takes down one node in the right order."""
+
+    def __init__(self, name: str, run_dir: Path, clock: Clock) -> None:
+        self._name, self._run_dir, self._clock = name, run_dir, clock
+        self._bus: Bus | None = None
+        self._node: Node | None = None
+        self.loop: NodeLoop | None = None
+        self.exit_code = 0
+
+    def start(self, build: Callable[[NodeContext], Node]) -> None:
+        self._bus = Bus(self._run_dir, self._clock)
+        # Before any device is opened: a second node of this name in this run folder ends here.
+        self._bus.publisher(status_topic(self._name))
+        self._node = build(NodeContext(self._name, self._run_dir, self._clock))
+        self.loop = NodeLoop(self._name, self._node, self._bus, self._clock)
+        self.loop.publish_status(self._clock.now(), STARTING, "")
+        # What is alive now stays alive: the collector need not walk it again and again while the car drives.
+        gc.collect()
+        gc.freeze()
+
+    def run(self) -> None:
+        assert self.loop is not None
+        self.loop.run()
+
+    def fail(self, error: Exception) -> None:
+        self.exit_code = 1
+        log = self._run_dir / "logs" / f"{self._name}.traceback.txt"
+        line = f"{self._name}: {_one_line(error)}"
+        try:
+            log.parent.mkdir(parents=True, exist_ok=True)
+            log.write_text("".join(traceback.format_exception(error)), encoding="utf-8")
+            line += f" (traceback in {log})"
+        except OSError as second:
+            line += f" (no traceback written: {second.strerror})"
+        print(line, file=sys.stderr, flush=True)
+        if self.loop is not None:
+            try:
+                self.loop.publish_status(self._clock.now(), FAULT, _one_line(error))
+            except Exception as second:  # the node must still be closed
+                print(f"{self._name}: could not report the fault: {second}", file=sys.stderr, flush=True)
+
+    def close(self) -> None:
+        try:
+            if self._node is not None:
+                self._node.close()
+        except Exception as error:  # the sockets must still be closed
+            self.fail(error)
+        finally:
+            if self._bus is not None:
+                self._bus.close(farewell=self.loop is not None)
+            if self._node is not None and self._node.inbox is not None:
+                self._node.inbox.close()
+            if self.loop is not None:
+                self.loop.close()
+
+
+def run_node_main(config_type: type[C], build: Callable[[C, NodeContext], Node]) -> int:
+    """Command line of a node process, as the launch supervisor starts it.
+
+    Args:
+        config_type: Schema of the node's configuration.
+        build: Makes the node of a configuration and a context.
+
+    Returns:
+        Exit code: 0 after an orderly end, 1 after a fault, 2 when the configuration is wrong.
+    """
+    module = sys.modules["__main__"].__spec__
+    role = module.name.rsplit(".", 1)[-1] if module is not None else Path(sys.argv[0]).stem
+    parser = argparse.ArgumentParser(prog=f"python -m nodes.{role}", description=f"The {role} node.")
+    parser.add_argument(
+        "--config", type=Path, help="YAML or JSON file with the node's configuration (default: all defaults)"
+    )
+    parser.add_argument("--run-dir", type=Path, required=True, help="folder of the run: sockets, logs")
+    parser.add_argument("--name", default=role, help="name of the node (default: %(default)s)")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", dest="overrides", help="override a key"
+    )
+    options = parser.parse_args()
+    try:
+        config = load_node_config(config_type, options.name, options.config, options.overrides)
+    except (ValueError, OSError) as error:
+        print(f"{options.name}: {_one_line(error)}", file=sys.stderr, flush=True)
+        return 2
+    return run_node(lambda context: build(config, context), options.name, options.run_dir)
+
+
+def _one_line(error: BaseException) -> str:
+    text = " ".join(str(error).split()) or "no message"
+    # Our own exceptions and those of the system say what happened; of others the type is half of the message.
+    return (
+        text
+        if type(error).__module__.startswith(("nodes.", "hardware.", "advnerf_core."))
+        else f"{type(error).__name__}: {text}"
+    )
