@@ -166,9 +166,13 @@ class Surrogate:
         """Images at camera poses ``[B, 4, 4]`` and their vjp; see :class:`Rendered`. ``theta`` is None without objects."""
         return self.prepare(T_world_from_camera).render(None if theta is None else theta.detach())
 
+    def sense(self, states: Tensor, theta: Tensor | None) -> Rendered:
+        """What the car's camera sees from states ``[B, n]``; poses are detached."""
+        return self.render(self.camera_poses(states), theta)
+
     def observe(self, theta: Tensor | None) -> Callable[[Tensor], Tensor]:
         """The sensor of a rollout: car states ``[B, n]`` to images ``[B, 3, H, W]``."""
-        return lambda states: self.render(self.camera_poses(states), theta).images
+        return lambda states: self.sense(states, theta).images
 
     def _render_background(self, poses: Array) -> tuple[Any, Any]:
         rgb, depth_m = self._background(poses, self.camera)[:2]

@@ -1,0 +1,328 @@
+"""The discrete adjoint of a closed loop whose camera poses are detached.
+
+The loop is ``o_t = h(stop_gradient(x_t), theta)``, ``u_t = pi(o_t)``, ``x_{t+1} = f(x_t, u_t)`` with loss
+``J = sum_{t=1..T} C(x_t)``, averaged over start poses. Its adjoint (Lagrange multipliers of the dynamics) is::
+
+    lambda_T = dC/dx(x_T),   lambda_t = dC/dx(x_t) + (df/dx)^T lambda_{t+1}
+    dJ/dtheta = sum_{t=0..T-1} (do_t/dtheta)^T (dpi/do)^T (df/du)^T lambda_{t+1}
+
+This is the exact derivative of the rollout with every camera pose frozen at its nominal value while the states still move. It
+is *not* the derivative of the true closed loop, in which a changed state also changes the image.
+
+For a stateless policy all lambdas follow from states and controls without rendering, and the terms of the sum are independent:
+they are evaluated in time batches of fixed size. What the forward pass rendered is kept up to a byte budget, the rest is
+rendered again, so memory does not grow with the horizon. A policy with memory falls back to one step at a time, backwards.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from advnerf_core.driving.cross_track import cross_track
+from advnerf_core.driving.dynamics import Dynamics
+from advnerf_core.driving.metrics import Horizon, drive_metrics
+from advnerf_core.driving.path import Path
+from advnerf_core.driving.rollout import Rollout, drive
+from advnerf_core.scene.surrogate import Rendered
+
+
+class Sensor(Protocol):
+    """A differentiable sensor; the attack does not know which renderer is behind it."""
+
+    @property
+    def theta_shape(self) -> tuple[int, ...]:
+        """Shape of the attacked parameters."""
+
+    def initial_theta(self, generator: torch.Generator) -> Tensor:
+        """Where an attack starts."""
+
+    def sense(self, states: Tensor, theta: Tensor) -> Rendered:
+        """Images at detached states ``[B, n]`` with their vjp."""
+
+
+class RecurrentPolicy(Protocol):
+    """A policy with memory: hidden units, or a stack of past frames. ``stateless`` is False."""
+
+    stateless: bool
+
+    def initial_memory(self, batch: int) -> Tensor:
+        """Memory ``[B, ...]`` before the first image."""
+
+    def __call__(self, images: Tensor, goals: Tensor | None, memory: Tensor) -> tuple[Tensor, Tensor]:
+        """Steering ``[B]`` and the next memory."""
+
+
+@dataclass(frozen=True, eq=False)
+class AttackProblem:
+    """Everything an attack needs except ``theta``.
+
+    Attributes:
+        policy: Frozen policy in eval mode; ``stateless`` says which adjoint is used.
+        sensor: Differentiable sensor, usually a ``Surrogate``.
+        dynamics: Vehicle model with Jacobians.
+        path: Reference path; the cost of a state is minus its absolute cross-track error.
+        start_states: ``[B, n]``; their dtype is that of states and lambdas.
+        steps: Horizon T in control ticks.
+        goals: ``[B, goal_size]`` or None.
+        time_batch: Steps whose policy gradients are evaluated at once.
+        cache_bytes: Budget for renders kept from the forward to the backward pass; 0 keeps none.
+        fence_m: Half side of the square |x|, |y| beyond which the car is stopped in deployment [m]; None if there is no fence.
+            It shapes the reported total only: the loss goes on driving, as its gradient would else be zero.
+        held_cap_m: Cap of the |CTE| that a stopped car is charged per tick in the reported total [m].
+    """
+
+    policy: Any
+    sensor: Sensor
+    dynamics: Dynamics
+    path: Path
+    start_states: Tensor
+    steps: int
+    goals: Tensor | None = None
+    time_batch: int = 8
+    cache_bytes: int = 256 * 2**20
+    fence_m: float | None = None
+    held_cap_m: float = 1.5
+
+    def __post_init__(self) -> None:
+        """Refuse what would give a wrong gradient silently."""
+        if getattr(self.policy, "training", False):
+            raise ValueError("expected the policy in eval mode, got one in training mode; call policy.eval()")
+        size = self.dynamics.state_size
+        if self.start_states.ndim != 2 or self.start_states.shape[1] != size:
+            raise ValueError(f"expected start states [B, {size}], got {list(self.start_states.shape)}")
+        if self.steps < 1 or self.time_batch < 1 or self.cache_bytes < 0:
+            raise ValueError(
+                "expected steps >= 1, time_batch >= 1 and cache_bytes >= 0, "
+                f"got {self.steps}, {self.time_batch} and {self.cache_bytes}"
+            )
+
+    def cost(self, states: Tensor) -> Tensor:
+        """Cost ``[...]`` of states ``[..., n]``: minus the absolute cross-track error [m]."""
+        return -cross_track(self.path, states[..., :2]).abs()
+
+
+@dataclass(frozen=True, eq=False)
+class Totals:
+    """Total cross-track error of each start of a rollout.
+
+    Attributes:
+        total_cte_m: What the loss sums: |CTE| over t = 1..T, ``[B]`` [m].
+        protocol_cte_m: What is compared between domains (``driving/metrics``): the car stops at the fence, ``[B]`` [m].
+    """
+
+    total_cte_m: Tensor
+    protocol_cte_m: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class AdjointResult:
+    """A loss with its gradient.
+
+    Attributes:
+        loss: ``mean_b sum_t C(x_t)`` [m]; negative, and lower is a stronger attack.
+        gradient: dJ/dtheta with camera poses frozen, of the shape of ``theta``.
+        lambdas: Adjoint states ``[T + 1, B, n]``; ``lambdas[0]`` is the derivative with respect to the start.
+        rollout: The nominal trajectory.
+        totals: Total CTE per start.
+        rerendered: Steps that the cache could not keep and that were rendered twice.
+    """
+
+    loss: float
+    gradient: Tensor
+    lambdas: Tensor
+    rollout: Rollout
+    totals: Totals
+    rerendered: int
+
+
+@dataclass
+class RenderCache:
+    """Renders of a rollout by step, up to a byte budget; what does not fit is not kept."""
+
+    budget_bytes: int
+    used_bytes: int = 0
+    _kept: dict[int, Rendered] = field(default_factory=dict)
+
+    def offer(self, step: int, rendered: Rendered) -> None:
+        """Keep a render if it fits."""
+        if self.used_bytes + rendered.nbytes <= self.budget_bytes:
+            self._kept[step] = rendered
+            self.used_bytes += rendered.nbytes
+
+    def take(self, step: int) -> Rendered | None:
+        """Give a render away and forget it, or None if it was not kept."""
+        rendered = self._kept.pop(step, None)
+        if rendered is not None:
+            self.used_bytes -= rendered.nbytes
+        return rendered
+
+
+def roll_out(problem: AttackProblem, theta: Tensor, cache: RenderCache | None = None) -> tuple[Rollout, list[Tensor]]:
+    """Drive the closed loop for ``theta``; also the memories ``[T + 1]`` of a policy that has one (else empty)."""
+    step = 0
+
+    def observe(states: Tensor) -> Tensor:
+        nonlocal step
+        rendered = problem.sensor.sense(states, theta)
+        if cache is not None:
+            cache.offer(step, rendered)
+        step += 1
+        return rendered.images
+
+    policy = problem.policy if problem.policy.stateless else _Remembering(problem.policy, len(problem.start_states))
+    rollout = drive(policy, observe, problem.dynamics, problem.start_states, problem.steps, problem.goals)
+    return rollout, policy.memories if isinstance(policy, _Remembering) else []
+
+
+class _Remembering:
+    """A recurrent policy as a rollout sees it: it keeps every memory it had."""
+
+    stateless = True
+
+    def __init__(self, policy: RecurrentPolicy, batch: int) -> None:
+        self._policy = policy
+        self.memories = [policy.initial_memory(batch)]
+
+    def __call__(self, images: Tensor, goals: Tensor | None = None) -> Tensor:
+        steering, memory = self._policy(images, goals, self.memories[-1])
+        self.memories.append(memory)
+        return steering
+
+
+def evaluate(problem: AttackProblem, theta: Tensor) -> tuple[Rollout, Totals]:
+    """One closed-loop evaluation without a gradient."""
+    rollout, _ = roll_out(problem, theta)
+    return rollout, _totals(problem, rollout.states)
+
+
+def _totals(problem: AttackProblem, states: Tensor) -> Totals:
+    total = -problem.cost(states[1:]).detach().sum(0)
+    horizon = Horizon(problem.steps, problem.dynamics.dt_s, held_cap_m=problem.held_cap_m)
+    protocol = []
+    for drive_states in states.detach().cpu().numpy().swapaxes(0, 1):
+        stopped = None
+        if problem.fence_m is not None:
+            outside = np.flatnonzero((np.abs(drive_states[:, :2]) > problem.fence_m).any(axis=1))
+            stopped = int(outside[0]) if outside.size else None
+        protocol.append(drive_metrics(problem.path, drive_states, horizon, stopped).total_cte_m)
+    return Totals(total, torch.tensor(protocol, dtype=total.dtype))
+
+
+def adjoint_gradient(problem: AttackProblem, theta: Tensor) -> AdjointResult:
+    """Loss and gradient of one rollout; see the module's docstring for what the gradient is and is not."""
+    theta = theta.detach()
+    cache = RenderCache(problem.cache_bytes)
+    rollout, memories = roll_out(problem, theta, cache)
+    loss, cost_slopes = _cost_slopes(problem, rollout.states)
+    lambdas, control_slopes = adjoint_states(problem.dynamics, rollout, cost_slopes)
+    rerendered = 0
+    gradient = torch.zeros_like(theta)
+    batches = _batched_terms if problem.policy.stateless else _sequential_terms
+    for term, again in batches(problem, theta, rollout, control_slopes, cache, memories):
+        gradient += term
+        rerendered += again
+    return AdjointResult(loss, gradient, lambdas, rollout, _totals(problem, rollout.states), rerendered)
+
+
+def _cost_slopes(problem: AttackProblem, states: Tensor) -> tuple[float, Tensor]:
+    """The loss, and dJ/dx_t holding all other states, ``[T + 1, B, n]`` (zero at t = 0: the start is given)."""
+    with torch.enable_grad():
+        later = states[1:].detach().requires_grad_()
+        loss = problem.cost(later).sum(0).mean()
+        (slopes,) = torch.autograd.grad(loss, later)
+    return float(loss.detach()), torch.cat([torch.zeros_like(states[:1]), slopes])
+
+
+def adjoint_states(dynamics: Dynamics, rollout: Rollout, cost_slopes: Tensor) -> tuple[Tensor, Tensor]:
+    """Lambdas from states and controls alone, without a render.
+
+    Args:
+        dynamics: Vehicle model.
+        rollout: Nominal trajectory.
+        cost_slopes: ``[T + 1, B, n]``.
+
+    Returns:
+        Lambdas ``[T + 1, B, n]`` and ``(df/du)^T lambda_{t+1}``, the gradient with respect to each control, ``[T, B]``.
+    """
+    lambdas = cost_slopes.clone()
+    control_slopes = torch.empty_like(rollout.controls)
+    for t in range(len(rollout.controls) - 1, -1, -1):
+        df_dx, df_du = dynamics.jacobians(rollout.states[t], rollout.controls[t])
+        control_slopes[t] = (df_du * lambdas[t + 1]).sum(-1)
+        lambdas[t] += torch.einsum("bij,bi->bj", df_dx, lambdas[t + 1])
+    return lambdas, control_slopes
+
+
+_Terms = Iterator[tuple[Tensor, int]]
+
+
+def _batched_terms(problem: AttackProblem, theta: Tensor, rollout: Rollout, control_slopes: Tensor,
+                   cache: RenderCache, memories: Sequence[Tensor]) -> _Terms:  # fmt: skip
+    """Gradient terms of a stateless policy, one time batch after the other, each with its count of repeated renders."""
+    del memories  # there are none
+    steps, starts = control_slopes.shape
+    for first in range(0, steps, problem.time_batch):
+        last = min(first + problem.time_batch, steps)
+        pieces, again = _renders(problem, theta, rollout, range(first, last), cache)
+        goals = None if problem.goals is None else problem.goals.repeat(last - first, 1)
+        with torch.enable_grad():
+            images = torch.cat([piece.images for piece in pieces]).requires_grad_()
+            controls = problem.policy(images, goals)
+            seed = control_slopes[first:last].reshape(-1).to(controls.dtype)
+            (grad_images,) = torch.autograd.grad(controls, images, seed)
+        del controls, images
+        sizes = [len(piece.images) for piece in pieces]
+        parts = [piece.vjp(grad) for piece, grad in zip(pieces, grad_images.split(sizes), strict=True)]
+        assert sum(sizes) == (last - first) * starts
+        yield torch.stack(parts).sum(0), again
+
+
+def _renders(problem: AttackProblem, theta: Tensor, rollout: Rollout, steps: range,
+             cache: RenderCache) -> tuple[list[Rendered], int]:  # fmt: skip
+    """Renders of consecutive steps in order: kept ones singly, runs of missing ones rendered together."""
+    pieces: list[Rendered] = []
+    missing: list[int] = []
+    again = 0
+
+    def fill() -> None:
+        if missing:
+            states = rollout.states[missing].flatten(0, 1)
+            pieces.append(problem.sensor.sense(states, theta))
+            missing.clear()
+
+    for step in steps:
+        kept = cache.take(step)
+        if kept is None:
+            missing.append(step)
+            again += 1
+        else:
+            fill()
+            pieces.append(kept)
+    fill()
+    return pieces, again
+
+
+def _sequential_terms(problem: AttackProblem, theta: Tensor, rollout: Rollout, control_slopes: Tensor,
+                      cache: RenderCache, memories: Sequence[Tensor]) -> _Terms:  # fmt: skip
+    """Gradient terms of a policy with memory, last step first, carrying the adjoint of the memory.
+
+    With ``(u_t, m_{t+1}) = pi(o_t, m_t)`` the memory has its own multiplier ``mu_t = (du/dm)^T (df/du)^T lambda_{t+1} +
+    (dm_{t+1}/dm_t)^T mu_{t+1}``, and an image is also charged for what it leaves in the memory.
+    """
+    memory_slope = torch.zeros_like(memories[-1])
+    for t in range(len(control_slopes) - 1, -1, -1):
+        (rendered,), again = _renders(problem, theta, rollout, range(t, t + 1), cache)
+        with torch.enable_grad():
+            images = rendered.images.detach().requires_grad_()
+            memory = memories[t].detach().requires_grad_()
+            outputs = problem.policy(images, problem.goals, memory)
+            seeds = (control_slopes[t].to(outputs[0].dtype), memory_slope)
+            grad_images, slope = torch.autograd.grad(outputs, (images, memory), seeds, allow_unused=True)
+        memory_slope = torch.zeros_like(memory) if slope is None else slope
+        yield rendered.vjp(grad_images), again
