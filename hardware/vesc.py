@@ -134,7 +134,7 @@ class Vesc:
         """Ask for the firmware version and wait for the answer."""
         self._write(encode_command(CommandId.FW_VERSION))
         self._wait_for(FirmwareVersion, timeout_s)
-        assert self.firmware is not None  # noqa: S101 - set by the reply just received
+        assert self.firmware is not None
         return self.firmware
 
     def drive(self, speed_mps: float, steering_rad: float) -> Sent:
@@ -182,7 +182,7 @@ class Vesc:
         """Ask for telemetry and wait for it."""
         self.request_values()
         reply = self._wait_for(Values, timeout_s)
-        assert isinstance(reply, Values)  # noqa: S101 - that is what was waited for
+        assert isinstance(reply, Values)
         return reply
 
     def _decode(self, payload: bytes) -> Values | FirmwareVersion | None:
@@ -243,5 +243,5 @@ class Vesc:
 def _as_sent(command: CommandId, value: float) -> float:
     """The value that the other end reads after the protocol's truncation."""
     decoded = decode_command(encode_command(command, value)[2:-3])
-    assert isinstance(decoded, Command)  # noqa: S101 - our own frame
+    assert isinstance(decoded, Command)
     return 0.0 if decoded.value is None else decoded.value

@@ -1,0 +1,67 @@
+"""Camera that plays recorded pictures: numbered image files, at a steady rate."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from hardware.cameras.interface import Frame
+from hardware.errors import DeviceNotFound, LinkLost
+
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp")
+
+
+class FileCamera:
+    """Delivers the images of a folder in the order of their names.
+
+    Args:
+        folder: Where the images are.
+        rate_hz: Frames per second.
+        loop: Begin again after the last one; otherwise the device goes away, like a camera that is unplugged.
+    """
+
+    def __init__(self, folder: Path | str, rate_hz: float = 10.0, loop: bool = True) -> None:
+        if not rate_hz > 0.0:
+            raise ValueError(f"expected a rate > 0 Hz, got {rate_hz}")
+        self.folder = Path(folder)
+        self._period_s = 1.0 / rate_hz
+        self._loop = loop
+        self._files: list[Path] = []
+        self._sequence = 0
+        self._next_s = 0.0
+
+    def open(self) -> None:
+        """List the images."""
+        self._files = sorted(p for p in self.folder.glob("*") if p.suffix.lower() in IMAGE_SUFFIXES)
+        if not self._files:
+            raise DeviceNotFound(f"expected images ({', '.join(IMAGE_SUFFIXES)}) in {self.folder}, found none")
+        self._sequence, self._next_s = 0, time.monotonic()
+
+    def read(self, timeout_s: float) -> Frame | None:
+        """Next image when its time has come, or None after ``timeout_s``."""
+        if not self._files:
+            raise LinkLost(f"expected an open camera, {self.folder} is not open: call open() first")
+        wait_s = self._next_s - time.monotonic()
+        if wait_s > timeout_s:
+            time.sleep(timeout_s)
+            return None
+        time.sleep(max(wait_s, 0.0))
+        if self._sequence >= len(self._files) and not self._loop:
+            raise LinkLost(f"all {len(self._files)} images of {self.folder} were played")
+        path = self._files[self._sequence % len(self._files)]
+        bgr = cv2.imread(str(path), cv2.IMREAD_COLOR)
+        if bgr is None:
+            raise LinkLost(f"expected an image, cannot decode {path}: remove or replace it")
+        rgb = np.ascontiguousarray(bgr[:, :, ::-1])
+        frame = Frame(rgb, time.time_ns(), time.monotonic_ns(), self._sequence)
+        self._sequence += 1
+        # From now on, not from the plan: pictures are never delivered in a burst.
+        self._next_s = max(self._next_s + self._period_s, time.monotonic())
+        return frame
+
+    def close(self) -> None:
+        """Forget the images."""
+        self._files = []

@@ -1,0 +1,93 @@
+"""Camera whose frames come over a Unix socket: the client of `hardware.twin.frame_server`, or of any other frame server."""
+
+from __future__ import annotations
+
+import socket
+import time
+from pathlib import Path
+
+from hardware.cameras.frame_wire import HEAD_BYTES, decode_frame, pixel_bytes
+from hardware.cameras.interface import Frame
+from hardware.errors import DeviceNotFound, LinkLost, LinkTimeout
+
+
+class SocketCamera:
+    """Reads frames that carry their capture stamps; nothing is stamped again here.
+
+    Args:
+        path: Path of the socket.
+        stall_s: A frame that has begun must be complete within this time [s].
+    """
+
+    def __init__(self, path: Path | str, stall_s: float = 1.0) -> None:
+        self.path = Path(path)
+        self._stall_s = stall_s
+        self._socket: socket.socket | None = None
+
+    def open(self) -> None:
+        """Connect to the server."""
+        self.close()
+        client = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        try:
+            client.connect(str(self.path))
+        except OSError as error:
+            client.close()
+            raise DeviceNotFound(
+                f"expected a frame server at {self.path}, got: {error.strerror or error}; is the twin (or the camera's server) running?"
+            ) from error
+        self._socket = client
+
+    def read(self, timeout_s: float) -> Frame | None:
+        """Newest frame not read yet, or None after ``timeout_s``."""
+        frame = self._read_one(timeout_s)
+        while frame is not None and (newer := self._read_one(0.0)) is not None:
+            frame = newer
+        return frame
+
+    def close(self) -> None:
+        """Disconnect."""
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+
+    def __enter__(self) -> SocketCamera:
+        self.open()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    def _read_one(self, timeout_s: float) -> Frame | None:
+        if self._socket is None:
+            raise LinkLost(f"expected an open camera, {self.path} is not connected: call open() first")
+        self._socket.settimeout(timeout_s)
+        try:
+            first = self._socket.recv(1)
+        except (TimeoutError, BlockingIOError):
+            return None
+        except OSError as error:
+            raise LinkLost(f"lost the frame server at {self.path}: {error}") from error
+        if not first:
+            raise LinkLost(f"the frame server at {self.path} hung up")
+        deadline = time.monotonic() + self._stall_s
+        head = first + self._receive(HEAD_BYTES - 1, deadline)
+        return decode_frame(head, self._receive(pixel_bytes(head), deadline))
+
+    def _receive(self, count: int, deadline: float) -> bytes:
+        assert self._socket is not None
+        buffer, filled = bytearray(count), 0
+        view = memoryview(buffer)
+        while filled < count:
+            self._socket.settimeout(max(deadline - time.monotonic(), 1e-3))
+            try:
+                received = self._socket.recv_into(view[filled:])
+            except TimeoutError as error:
+                raise LinkTimeout(
+                    f"expected a whole frame from {self.path} within {self._stall_s} s, got {filled} of {count} bytes"
+                ) from error
+            except OSError as error:
+                raise LinkLost(f"lost the frame server at {self.path}: {error}") from error
+            if received == 0:
+                raise LinkLost(f"the frame server at {self.path} hung up in the middle of a frame")
+            filled += received
+        return bytes(buffer)

@@ -1,0 +1,121 @@
+"""Serves the twin's frames on a Unix socket. A slow reader loses frames, never delays them for others or for the lab."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import socket
+import threading
+from pathlib import Path
+
+from hardware.cameras.frame_wire import encode_head
+from hardware.cameras.interface import Frame
+from hardware.errors import DeviceBusy, HardwareError
+
+
+class FrameServer:
+    """Every client gets the newest frame whenever it has taken the last one.
+
+    Args:
+        path: Path of the socket; a dead one from an earlier run is replaced, a living one is an error.
+    """
+
+    def __init__(self, path: Path | str) -> None:
+        self.path = Path(path)
+        self._newest: Frame | None = None
+        self._condition = threading.Condition()
+        self._stopping = False
+        self._clients: set[socket.socket] = set()
+        self._listener = _listen(self.path)
+        self._thread = threading.Thread(target=self._accept, name="frame server", daemon=True)
+        self._thread.start()
+
+    def publish(self, frame: Frame) -> None:
+        """Offer a frame to all clients."""
+        with self._condition:
+            self._newest = frame
+            self._condition.notify_all()
+
+    @property
+    def clients(self) -> int:
+        """How many are connected."""
+        with self._condition:
+            return len(self._clients)
+
+    def close(self) -> None:
+        """Hang up on everybody and remove the socket."""
+        with self._condition:
+            if self._stopping:
+                return
+            self._stopping = True
+            clients = list(self._clients)
+            self._condition.notify_all()
+        for client in (self._listener, *clients):
+            with contextlib.suppress(OSError):
+                client.shutdown(socket.SHUT_RDWR)
+        self._listener.close()
+        self._thread.join(timeout=2.0)
+        self.path.unlink(missing_ok=True)
+
+    def __enter__(self) -> FrameServer:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    def _accept(self) -> None:
+        while True:
+            try:
+                client, _ = self._listener.accept()
+            except OSError:
+                return  # closed
+            with self._condition:
+                self._clients.add(client)
+            threading.Thread(target=self._serve, args=(client,), name="frame client", daemon=True).start()
+
+    def _serve(self, client: socket.socket) -> None:
+        # A frame is larger than what the socket holds, so a reader that stops is never more than one frame behind.
+        client.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 64 * 1024)
+        sent: Frame | None = None
+        try:
+            while (frame := self._wait_for_newer(sent)) is not None:
+                client.sendall(encode_head(frame) + frame.rgb.tobytes())
+                sent = frame
+        except OSError:
+            pass  # the client left
+        finally:
+            with self._condition:
+                self._clients.discard(client)
+            client.close()
+
+    def _wait_for_newer(self, sent: Frame | None) -> Frame | None:
+        with self._condition:
+            # A client that has just come waits for the next frame: the last one may be old.
+            known = self._newest if sent is None else sent
+            while self._newest is known and not self._stopping:
+                self._condition.wait()
+            return None if self._stopping else self._newest
+
+
+def _listen(path: Path) -> socket.socket:
+    listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    if path.exists():
+        try:
+            listener.connect(str(path))
+        except OSError:
+            path.unlink()
+        else:
+            listener.close()
+            raise DeviceBusy(f"expected {path} to be free, a frame server answers there: stop the other twin first")
+        listener.close()
+        listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    try:
+        listener.bind(str(path))
+        os.chmod(path, 0o600)
+        listener.listen()
+    except OSError as error:
+        listener.close()
+        raise HardwareError(
+            f"cannot serve frames at {path}: {error.strerror or error}; use a shorter --run-dir?"
+        ) from error
+    return listener

@@ -1,0 +1,142 @@
+"""Cameras on real sockets and files."""
+
+import socket
+import threading
+import time
+
+import cv2
+import numpy as np
+import pytest
+
+from hardware.cameras.file import FileCamera
+from hardware.cameras.frame_wire import HEAD_BYTES, decode_frame, encode_head
+from hardware.cameras.interface import Frame
+from hardware.cameras.socket import SocketCamera
+from hardware.errors import DeviceBusy, DeviceNotFound, LinkLost, LinkTimeout, ProtocolError
+from hardware.twin.frame_server import FrameServer
+
+
+def frame(sequence, shape=(188, 336, 3)):
+    rng = np.random.default_rng(sequence)
+    return Frame(rng.integers(0, 255, shape, dtype=np.uint8), 10**18 + sequence, 5 * 10**9 + sequence, sequence)
+
+
+def wait_for(condition):
+    deadline = time.monotonic() + 2.0
+    while not condition():
+        assert time.monotonic() < deadline, "timed out"
+        time.sleep(0.002)
+
+
+def test_head_round_trip():
+    sent = frame(3, (4, 5, 3))
+    got = decode_frame(encode_head(sent), sent.rgb.tobytes())
+    assert (got.stamp_realtime_ns, got.stamp_mono_ns, got.sequence) == (10**18 + 3, 5 * 10**9 + 3, 3)
+    np.testing.assert_array_equal(got.rgb, sent.rgb)
+    with pytest.raises(ProtocolError, match="60 pixel bytes"):
+        decode_frame(encode_head(sent), b"abc")
+
+
+def test_frames_come_through_with_their_stamps(tmp_path):
+    with FrameServer(tmp_path / "frames") as server, SocketCamera(tmp_path / "frames") as camera:
+        wait_for(lambda: server.clients == 1)
+        assert camera.read(timeout_s=0.02) is None
+        for sequence in range(5):
+            server.publish(frame(sequence))
+            got = camera.read(timeout_s=1.0)
+            assert (got.sequence, got.stamp_realtime_ns) == (sequence, 10**18 + sequence)
+            np.testing.assert_array_equal(got.rgb, frame(sequence).rgb)
+            assert not got.rgb.flags.writeable
+
+
+def test_a_reader_that_slept_gets_the_newest_soon_and_never_a_backlog(tmp_path):
+    with FrameServer(tmp_path / "frames") as server, SocketCamera(tmp_path / "frames") as camera:
+        wait_for(lambda: server.clients == 1)
+        for sequence in range(30):
+            server.publish(frame(sequence))
+            time.sleep(0.002)
+        got = [camera.read(timeout_s=0.3) for _ in range(3)]
+        delivered = [g.sequence for g in got if g is not None]
+        assert delivered[-1] == 29
+        assert len(delivered) <= 2
+
+
+def test_server_that_ends_is_a_lost_link_and_can_be_reopened(tmp_path):
+    path = tmp_path / "frames"
+    camera = SocketCamera(path)
+    with pytest.raises(DeviceNotFound, match="is the twin"):
+        camera.open()
+    with FrameServer(path) as server:
+        camera.open()
+        wait_for(lambda: server.clients == 1)
+    with pytest.raises(LinkLost, match="hung up"):
+        camera.read(timeout_s=1.0)
+    assert not path.exists()
+    with FrameServer(path) as server:
+        camera.open()
+        wait_for(lambda: server.clients == 1)
+        server.publish(frame(1))
+        assert camera.read(timeout_s=1.0).sequence == 1
+    camera.close()
+    with pytest.raises(LinkLost, match="open"):
+        camera.read(timeout_s=0.1)
+
+
+def test_two_servers_on_one_path(tmp_path):
+    with FrameServer(tmp_path / "frames"), pytest.raises(DeviceBusy, match="answers there"):
+        FrameServer(tmp_path / "frames")
+
+
+def test_a_dead_socket_file_is_replaced(tmp_path):
+    dead = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    dead.bind(str(tmp_path / "frames"))
+    dead.close()
+    with FrameServer(tmp_path / "frames"), SocketCamera(tmp_path / "frames"):
+        pass
+
+
+@pytest.mark.parametrize(
+    ("sent", "error"), [(b"HTTP/1.1 200 OK" + bytes(40), ProtocolError), (encode_head(frame(0)) + b"abc", LinkTimeout)]
+)
+def test_a_server_that_talks_nonsense_or_stalls(tmp_path, sent, error):
+    path = str(tmp_path / "frames")
+    listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    listener.bind(path)
+    listener.listen()
+    camera = SocketCamera(path, stall_s=0.05)
+    camera.open()
+    client, _ = listener.accept()
+    threading.Thread(target=client.sendall, args=(sent,)).start()
+    with pytest.raises(error):
+        camera.read(timeout_s=1.0)
+    for end in (client, listener, camera):
+        end.close()
+    assert HEAD_BYTES < 40
+
+
+def test_file_camera_plays_in_order_at_its_rate(tmp_path):
+    for k in range(3):
+        cv2.imwrite(str(tmp_path / f"{k:03d}.png"), np.full((4, 6, 3), (10 * k, 0, 200), dtype=np.uint8))
+    camera = FileCamera(tmp_path, rate_hz=50.0, loop=False)
+    camera.open()
+    start = time.monotonic()
+    frames = [camera.read(timeout_s=1.0) for _ in range(3)]
+    assert 0.03 < time.monotonic() - start < 0.5
+    assert [f.sequence for f in frames] == [0, 1, 2]
+    assert frames[2].rgb[0, 0].tolist() == [200, 0, 20]
+    with pytest.raises(LinkLost, match="all 3 images"):
+        camera.read(timeout_s=1.0)
+    camera.close()
+
+
+def test_file_camera_without_images(tmp_path):
+    with pytest.raises(DeviceNotFound, match="found none"):
+        FileCamera(tmp_path).open()
+
+
+def test_file_camera_with_a_broken_image(tmp_path):
+    (tmp_path / "a.png").write_bytes(b"not a picture")
+    camera = FileCamera(tmp_path)
+    camera.open()
+    with pytest.raises(LinkLost, match="cannot decode"):
+        camera.read(timeout_s=1.0)

@@ -1,0 +1,180 @@
+"""VICON packets against a hand-packed one, the forms of occlusion, and a real UDP socket."""
+
+import math
+import socket
+import struct
+import time
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from advnerf_core.geometry import make_transform, planar_pose
+from hardware.errors import DeviceBusy, ProtocolError
+from hardware.vicon import SubjectTracker, ViconConfig, ViconReceiver
+from hardware.vicon_codec import ObjectPose, decode_block, encode_blocks, object_pose
+
+CONFIG = ViconConfig(subjects=("car", "board"), frozen_frames=4)
+
+
+def by_hand(frame, items, block=1024):
+    data = struct.pack("<I", frame) + bytes([len(items)])
+    for name, numbers in items:
+        data += b"\0" + struct.pack("<H", 72) + name.encode().ljust(24, b"\0")
+        data += b"".join(struct.pack("<d", n) for n in numbers)
+    return data.ljust(block, b"\0")
+
+
+def at(frame, x=1.0, name="car"):
+    return by_hand(frame, [(name, (x, 2.0, 3.0, 0.0, 0.0, 0.1))])
+
+
+class Feed:
+    def __init__(self, config=CONFIG):
+        self.tracker = SubjectTracker(config)
+        self.mono_ns = 10**9
+
+    def __call__(self, datagram, after_s=0.01):
+        self.mono_ns += round(after_s * 1e9)
+        return self.tracker.update(datagram, self.mono_ns + 10**18, self.mono_ns)
+
+
+@pytest.mark.parametrize("block", [256, 512, 1024])
+def test_layout(block):
+    items = [("car", (1.5, -2.5, 3.5, 0.1, -0.2, 0.3)), ("a_name_of_24_characters_", (0.0, 1.0, 2.0, 0.0, 0.0, 0.0))]
+    datagram = by_hand(7, items, block)
+    objects = [ObjectPose(name, tuple(n[:3]), tuple(n[3:])) for name, n in items]
+    assert decode_block(datagram).objects == tuple(objects)
+    assert encode_blocks(7, objects, block) == [datagram]
+    # Offsets as published: count at 4, name of the first item at 8, translation at 32, rotation at 56, second item at 80.
+    assert struct.unpack_from("<d", datagram, 32)[0] == 1.5
+    assert struct.unpack_from("<d", datagram, 56)[0] == 0.1
+    assert datagram[83:107] == b"a_name_of_24_characters_"
+
+
+@pytest.mark.parametrize(("block", "per_block"), [(256, 3), (512, 6), (1024, 13)])
+def test_more_objects_than_a_block_holds(block, per_block):
+    objects = [ObjectPose(f"s{i}", (i, 0.0, 0.0), (0.0, 0.0, 0.0)) for i in range(per_block + 1)]
+    blocks = encode_blocks(9, objects, block)
+    assert [len(b) for b in blocks] == [block, block]
+    assert [len(decode_block(b).objects) for b in blocks] == [per_block, 1]
+
+
+def test_rotation_convention_is_intrinsic_xyz():
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        R = Rotation.random(random_state=rng)
+        T = make_transform(R.as_matrix(), rng.normal(size=3))
+        wire = object_pose("car", T)
+        assert wire.rotation_rad == pytest.approx(tuple(R.as_euler("XYZ")), abs=1e-9)
+        np.testing.assert_allclose(wire.T_world_from_subject, T, atol=1e-9)
+
+
+@pytest.mark.parametrize("pitch", [math.pi / 2, -math.pi / 2])
+def test_gimbal_lock_keeps_the_rotation(pitch):
+    R = Rotation.from_euler("XYZ", [0.4, pitch, 0.3]).as_matrix()
+    np.testing.assert_allclose(
+        object_pose("car", make_transform(R, [0, 0, 0])).T_world_from_subject[:3, :3], R, atol=1e-7
+    )
+
+
+@pytest.mark.parametrize(
+    "datagram", [b"", b"\0\0\0", by_hand(1, [("car", (0.0,) * 6)])[:60], struct.pack("<IB", 1, 3).ljust(256, b"\0")]
+)
+def test_cut_or_foreign_datagrams(datagram):
+    with pytest.raises(ProtocolError):
+        decode_block(datagram)
+    feed = Feed()
+    assert feed(datagram) == []
+    assert feed.tracker.counts.refused == 1
+
+
+def test_pose_in_metres_with_both_stamps():
+    (pose,) = Feed(ViconConfig(subjects=("car",), latency_s=0.004))(at(5, x=1500.0))
+    assert pose.T_world_from_subject[0, 3] == 1.5
+    assert (pose.frame_number, pose.receive_mono_ns) == (5, 1_010_000_000)
+    assert pose.stamp_real_ns == 10**18 + 1_006_000_000
+
+
+@pytest.mark.parametrize(
+    "lost",
+    [
+        by_hand(2, []),
+        by_hand(2, [("car", (0.0, 0.0, 0.0, 0.0, 0.0, 0.0))]),
+        by_hand(2, [("car", (0.0, 0.0, 0.0, 0.0, 0.0, 0.5))]),
+        by_hand(2, [("car", (math.nan, 1.0, 1.0, 0.0, 0.0, 0.0))]),
+        by_hand(2, [("car", (1.0, 1.0, 1.0, 0.0, 0.0, math.inf))]),
+        by_hand(2, [("somebody", (1.0, 1.0, 1.0, 0.0, 0.0, 0.0))]),
+    ],
+)
+def test_forms_of_occlusion(lost):
+    feed = Feed()
+    assert len(feed(at(1))) == 1
+    assert feed(lost) == []
+    assert len(feed(at(3, x=1.1))) == 1
+
+
+def test_frozen_pose_is_lost_after_some_frames_and_comes_back_when_it_moves():
+    feed = Feed()
+    got = [len(feed(at(frame))) for frame in range(1, 9)]
+    assert got == [1, 1, 1, 1, 0, 0, 0, 0]
+    assert feed.tracker.counts.lost["car"] == 4
+    assert len(feed(at(9, x=1.0001))) == 1
+
+
+def test_duplicates_and_reordering_are_dropped():
+    feed = Feed()
+    assert len(feed(at(10))) == 1
+    assert feed(at(10)) == []
+    assert feed(at(9, x=2.0), after_s=0.001) == []
+    assert feed.tracker.counts.late == 1
+    assert len(feed(at(12, x=3.0))) == 1
+    assert feed.tracker.counts.missed_frames == 1
+
+
+def test_one_frame_in_two_datagrams():
+    feed = Feed()
+    assert [p.name for p in feed(at(3)) + feed(at(3, name="board"))] == ["car", "board"]
+
+
+def test_wrap_of_the_frame_number():
+    feed = Feed()
+    assert len(feed(at(2**32 - 1))) == 1
+    assert len(feed(at(0, x=2.0))) == 1
+    assert (feed.tracker.counts.restarts, feed.tracker.counts.missed_frames) == (0, 0)
+
+
+@pytest.mark.parametrize(("before", "after_s"), [(100_000, 0.01), (20, 2.0)])
+def test_restart_of_tracker(before, after_s):
+    feed = Feed()
+    feed(at(before))
+    assert len(feed(at(1, x=2.0), after_s=after_s)) == 1
+    assert feed.tracker.counts.restarts == 1
+
+
+def test_receiver_on_a_real_socket():
+    config = ViconConfig(subjects=("car",), port=0)
+    with ViconReceiver(config) as receiver, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        assert receiver.read(timeout_s=0.01) == []
+        before = time.time_ns()
+        for frame in range(20):
+            pose = object_pose("car", planar_pose(0.1 * frame, 1.0, 0.3))
+            for datagram in encode_blocks(frame, [pose], 256):
+                sender.sendto(datagram, ("127.0.0.1", receiver.port))
+        time.sleep(0.05)
+        read_ns = time.time_ns()
+        poses = receiver.read(timeout_s=1.0)
+        assert [p.frame_number for p in poses] == list(range(20))
+        assert poses[-1].T_world_from_subject == pytest.approx(planar_pose(1.9, 1.0, 0.3), abs=1e-9)
+        # The stamp is the arrival, not the reading 50 ms later.
+        assert all(before <= p.stamp_real_ns <= read_ns - 40_000_000 for p in poses)
+        age_ns = time.time_ns() - poses[0].stamp_real_ns
+        assert time.monotonic_ns() - poses[0].receive_mono_ns == pytest.approx(age_ns, abs=5e6)
+
+
+def test_port_in_use_is_one_clear_error():
+    with (
+        ViconReceiver(ViconConfig(subjects=("car",), port=0)) as first,
+        pytest.raises(DeviceBusy, match="set another port"),
+    ):
+        ViconReceiver(ViconConfig(subjects=("car",), port=first.port))
