@@ -23,6 +23,7 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from advnerf_core.driving.policy_view import PolicyView
+from advnerf_core.errors import AdvnerfError
 
 IMAGE_HEIGHT, IMAGE_WIDTH = 66, 200
 FILE_FORMAT = "advnerf-policy-1"
@@ -41,7 +42,7 @@ class Policy(Protocol):
         """Steering ``[B]`` [rad], left positive, for images ``[B, 3, 66, 200]`` RGB 0..1 and goals ``[B, goal_size]``."""
 
 
-class PolicyFileError(ValueError):
+class PolicyFileError(AdvnerfError, ValueError):
     """A policy file cannot be read or is not what was asked for."""
 
 

@@ -1,0 +1,149 @@
+"""How far a drive left its path: total cross-track error over a fixed horizon, the same in every domain.
+
+Total CTE is the sum of |CTE| [m] at the control ticks 1..T after the start. If the car stops before the horizon ends, its
+last |CTE| holds for the remaining ticks, capped, so that hitting a wall or the fence is not rewarded.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from advnerf_core.driving.path import Array, Path
+
+
+@dataclass(frozen=True)
+class Horizon:
+    """What is summed, and the limits.
+
+    Attributes:
+        ticks: Number of control ticks.
+        dt_s: Length of a tick [s].
+        off_track_m: A larger |CTE| is off the track [m]; half a lane elsewhere.
+        held_cap_m: Greatest |CTE| that a stopped car is charged per tick [m].
+    """
+
+    ticks: int = 60
+    dt_s: float = 0.1
+    off_track_m: float = 0.4
+    held_cap_m: float = 1.5
+
+    def __post_init__(self) -> None:
+        if self.ticks < 1 or not min(self.dt_s, self.off_track_m, self.held_cap_m) > 0.0:
+            raise ValueError(f"expected at least one tick and positive limits, got {self}")
+
+
+@dataclass(frozen=True)
+class DriveMetrics:
+    """Result of one drive.
+
+    Attributes:
+        total_cte_m: Sum of |CTE| over the horizon [m].
+        mean_cte_m: Mean |CTE| over the horizon [m].
+        max_cte_m: Greatest |CTE| over the horizon [m].
+        off_track: Whether |CTE| ever exceeded the limit.
+        time_to_leaving_s: Time of the first tick off the track [s]; None if it never left.
+        held_ticks: Number of ticks that were filled in because the car had stopped.
+        ctes_m: Signed CTE at the ticks 1..T [m]; held ticks carry the sign of the last one.
+    """
+
+    total_cte_m: float
+    mean_cte_m: float
+    max_cte_m: float
+    off_track: bool
+    time_to_leaving_s: float | None
+    held_ticks: int
+    ctes_m: tuple[float, ...]
+
+
+def drive_metrics(
+    path: Path, states: ArrayLike, horizon: Horizon | None = None, stopped_tick: int | None = None
+) -> DriveMetrics:
+    """Metrics of one trajectory sampled at the control ticks.
+
+    Args:
+        path: Reference path.
+        states: ``[K, >= 2]`` rear-axle positions, ``states[0]`` at the start (not counted). Fewer than ``ticks + 1`` mean
+            that the car stopped after the last one; more are ignored.
+        horizon: What is summed.
+        stopped_tick: The car stands from this tick on, if known (see :func:`first_still_tick`).
+    """
+    limits = horizon or Horizon()
+    xy = np.asarray(states, dtype=np.float64)
+    if xy.ndim != 2 or xy.shape[0] < 2 or xy.shape[1] < 2 or not np.isfinite(xy).all():
+        raise ValueError(f"expected finite states [K >= 2, >= 2] of one drive, got shape {list(xy.shape)}")
+    seen = min(xy.shape[0] - 1, limits.ticks)
+    if stopped_tick is not None:
+        seen = min(seen, max(stopped_tick, 1))
+    ctes = path.project(xy[1 : seen + 1, :2]).cte_m
+    held = limits.ticks - seen
+    filled = np.concatenate([ctes, np.full(held, np.clip(ctes[-1], -limits.held_cap_m, limits.held_cap_m))])
+    magnitude = np.abs(filled)
+    off = np.flatnonzero(magnitude > limits.off_track_m)
+    return DriveMetrics(
+        total_cte_m=float(magnitude.sum()),
+        mean_cte_m=float(magnitude.mean()),
+        max_cte_m=float(magnitude.max()),
+        off_track=off.size > 0,
+        time_to_leaving_s=float((off[0] + 1) * limits.dt_s) if off.size else None,
+        held_ticks=held,
+        ctes_m=tuple(float(value) for value in filled),
+    )
+
+
+def first_still_tick(states: ArrayLike, tolerance_m: float = 0.005, at_least_ticks: int = 3) -> int | None:
+    """First tick from which the car stands still until the end of ``states [K, >= 2]``; None if it is still moving.
+
+    Args:
+        states: Positions at the control ticks.
+        tolerance_m: Greatest distance from the last position that counts as standing [m].
+        at_least_ticks: Fewer still ticks than this at the end do not count as a stop.
+    """
+    xy = np.asarray(states, dtype=np.float64)[:, :2]
+    moving = np.flatnonzero(np.linalg.norm(xy - xy[-1], axis=1) > tolerance_m)
+    first = int(moving[-1]) + 1 if moving.size else 0
+    return first if len(xy) - first >= at_least_ticks else None
+
+
+def states_at_ticks(
+    stamps_ns: ArrayLike, poses: ArrayLike, start_ns: int, horizon: Horizon | None = None, max_gap_s: float = 0.5
+) -> Array:
+    """Resample a pose stream (motion capture) at the control ticks.
+
+    Args:
+        stamps_ns: ``[N]`` strictly increasing stamps [ns].
+        poses: ``[N, 3]`` x [m], y [m], yaw [rad]; yaw may be wrapped.
+        start_ns: Stamp of tick 0, on the same clock, not before the first pose.
+        horizon: Ticks wanted.
+        max_gap_s: A tick inside a longer gap of the stream is an error [s].
+
+    Returns:
+        ``[K, 3]`` states at the ticks 0..K-1, linear in time between poses, continuous yaw; shorter than the horizon if
+        the stream ends early.
+    """
+    limits = horizon or Horizon()
+    stamps, values = np.asarray(stamps_ns, dtype=np.int64), np.array(poses, dtype=np.float64)
+    if stamps.ndim != 1 or values.shape != (len(stamps), 3) or len(stamps) < 2 or (np.diff(stamps) <= 0).any():
+        raise ValueError(
+            f"expected >= 2 strictly increasing stamps [N] and poses [N, 3], got {list(stamps.shape)} and {list(values.shape)}"
+        )
+    ticks_ns = start_ns + np.round(np.arange(limits.ticks + 1) * limits.dt_s * 1e9).astype(np.int64)
+    ticks_ns = ticks_ns[ticks_ns <= stamps[-1]]
+    if start_ns < stamps[0] or len(ticks_ns) < 2:
+        raise ValueError(f"expected a stream that covers the start {start_ns}, got {stamps[0]}..{stamps[-1]} ns")
+    _require_no_gap(stamps, ticks_ns, max_gap_s)
+    values[:, 2] = np.unwrap(values[:, 2])
+    seconds, wanted = (stamps - start_ns) * 1e-9, (ticks_ns - start_ns) * 1e-9
+    return np.stack([np.interp(wanted, seconds, values[:, k]) for k in range(3)], axis=1)
+
+
+def _require_no_gap(stamps: NDArray[np.int64], ticks_ns: NDArray[np.int64], max_gap_s: float) -> None:
+    after = np.searchsorted(stamps, ticks_ns, side="left")
+    before = np.maximum(after - 1, 0)
+    gaps_s = np.where(stamps[after] == ticks_ns, 0, stamps[after] - stamps[before]) * 1e-9
+    if gaps_s.max() > max_gap_s:
+        raise ValueError(
+            f"expected no gap over {max_gap_s} s in the pose stream, got {gaps_s.max():.2f} s: the car was not tracked; repeat"
+        )
