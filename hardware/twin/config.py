@@ -214,8 +214,8 @@ class LabConfig(_Frozen):
         board: Green board at the bottom right corner of the track, motion-capture subject "board".
         monitor: 27-inch screen at the top right corner, motion-capture subject "monitor".
         car: Vehicle.
-        shadows: Whether lights cast shadows.
-        multisamples: Samples per pixel of the rasteriser's anti-aliasing; 0 switches it off.
+        shadows: Whether the furniture casts shadows.
+        supersampling: Images are drawn this many times larger per axis and averaged.
     """
 
     room: RoomConfig = RoomConfig()
@@ -234,7 +234,12 @@ class LabConfig(_Frozen):
     )  # fmt: skip
     car: CarConfig = CarConfig()
     shadows: bool = True
-    multisamples: int = Field(default=4, ge=0, le=16)
+    supersampling: int = Field(default=2, ge=1, le=4)
+
+    @property
+    def start_pose(self) -> tuple[float, float, float]:
+        """Nominal start of the experiments, 2 m before the bottom right corner: x [m], y [m], yaw [rad]."""
+        return 0.5 * self.track.side_m - self.track.corner_radius_m - 2.0, -0.5 * self.track.side_m, 0.0
 
 
 def _centred_pinhole(width: int, height: int, horizontal_fov_deg: float) -> Pinhole:

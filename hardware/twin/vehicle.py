@@ -70,19 +70,26 @@ class TwinVehicle:
         params: Gains, lags and sizes.
         obstacles: Footprints the body cannot enter.
         room_half_m: The walls are at plus and minus this [m]; infinite without a room.
+        start: Where it stands at first: x [m], y [m], yaw [rad].
     """
 
-    def __init__(self, params: CarConfig, obstacles: Sequence[Footprint] = (), room_half_m: float = math.inf) -> None:
+    def __init__(
+        self,
+        params: CarConfig,
+        obstacles: Sequence[Footprint] = (),
+        room_half_m: float = math.inf,
+        start: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    ) -> None:
         self.params = params
         self._obstacles = tuple(obstacles)
         self._room_half_m = room_half_m
-        self.reset(0.0, 0.0, 0.0)
+        self.reset(*start)
 
     def reset(self, x_m: float, y_m: float, yaw_rad: float, speed_mps: float = 0.0) -> None:
         """Put the car down with its wheels straight and its motor released (coasting if it moves)."""
         if not all(map(math.isfinite, (x_m, y_m, yaw_rad, speed_mps))):
             raise ValueError(f"expected a finite pose and speed, got {(x_m, y_m, yaw_rad, speed_mps)}")
-        if self._blocked(x_m, y_m, yaw_rad):
+        if not self.fits(x_m, y_m, yaw_rad):
             raise ValueError(
                 f"expected a free place for the car, got ({x_m:.2f}, {y_m:.2f}, {yaw_rad:.2f} rad), which is inside a wall "
                 "or an obstacle; choose a start pose on the track"
@@ -155,6 +162,10 @@ class TwinVehicle:
     def body(self) -> Footprint:
         """Where the body stands."""
         return self._body(self._x, self._y, self._yaw)
+
+    def fits(self, x_m: float, y_m: float, yaw_rad: float) -> bool:
+        """Whether the body is clear of walls and obstacles with the rear axle at this pose."""
+        return not self._blocked(x_m, y_m, yaw_rad)
 
     def _substep(self, dt_s: float) -> None:
         p = self.params
