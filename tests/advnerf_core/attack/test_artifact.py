@@ -1,0 +1,97 @@
+import dataclasses
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+from safetensors import safe_open
+from safetensors.numpy import save_file
+
+from advnerf_core.attack.artifact import AttackFile, AttackFileError, face_texture, load_attack, save_attack
+from advnerf_core.fields.voxel_grid import face_corners_in_object, squash
+from advnerf_core.geometry import Pinhole
+
+
+def attack(**changes):
+    theta = np.random.default_rng(0).normal(size=(16, 16, 3)).astype(np.float32)
+    base = AttackFile(
+        method="gradient", theta=theta, texture=face_texture(theta), size_m=(0.8, 0.8), T_world_from_object=np.eye(4),
+        subject="board", corners_in_subject=face_corners_in_object(0.8), camera=Pinhole(200, 66, 103.6, 103.4, 100, 32),
+        scene_sha256="a" * 64, policy_sha256="b" * 64, config_sha256="c" * 64, seed=3, predicted_total_cte_m=9.25,
+        software_version="0.1.0", extra={"iterations": 50},
+    )  # fmt: skip
+    return dataclasses.replace(base, **changes)
+
+
+def test_round_trip_keeps_everything_and_the_id(tmp_path):
+    path = tmp_path / "attack.safetensors"
+    saved = attack()
+    assert save_attack(path, saved) == saved.attack_id
+    loaded = load_attack(path)
+    assert loaded.attack_id == saved.attack_id
+    assert len(loaded.attack_id) == 12
+    for field in dataclasses.fields(AttackFile):
+        a, b = getattr(saved, field.name), getattr(loaded, field.name)
+        assert np.array_equal(a, b) if isinstance(a, np.ndarray) else a == b
+    assert [p.name for p in tmp_path.iterdir()] == ["attack.safetensors"]
+
+
+def test_the_id_depends_on_every_part():
+    ids = {attack().attack_id, attack(seed=4).attack_id, attack(policy_sha256="d" * 64).attack_id}
+    ids.add(attack(theta=attack().theta + np.float32(1e-3)).attack_id)
+    ids.add(attack(texture=255 - attack().texture).attack_id)
+    assert len(ids) == 5
+
+
+def test_a_changed_file_is_noticed(tmp_path):
+    path = tmp_path / "attack.safetensors"
+    save_attack(path, attack())
+    with safe_open(path, framework="numpy") as handle:
+        header, tensors = handle.metadata(), {k: handle.get_tensor(k).copy() for k in ("theta", "texture")}
+    tensors["texture"][0, 0, 0] ^= 1
+    save_file(tensors, path, metadata=header)
+    with pytest.raises(AttackFileError, match="changed after it was saved"):
+        load_attack(path)
+
+
+@pytest.mark.parametrize("content", [b"", b"not a safetensors file", b"\x10\x00\x00\x00\x00\x00\x00\x00{}"])
+def test_garbage_gives_one_clear_error(tmp_path, content):
+    path = tmp_path / "attack.safetensors"
+    path.write_bytes(content)
+    with pytest.raises(AttackFileError, match=r"cannot read .* as an attack file"):
+        load_attack(path)
+
+
+def test_missing_truncated_and_foreign_files(tmp_path):
+    with pytest.raises(AttackFileError, match="found none"):
+        load_attack(tmp_path / "none.safetensors")
+    path = tmp_path / "attack.safetensors"
+    save_attack(path, attack())
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(AttackFileError, match="cannot read"):
+        load_attack(path)
+    save_file({"weights": np.zeros(3)}, path)
+    with pytest.raises(AttackFileError, match=r"expected .* to be of format"):
+        load_attack(path)
+
+
+def test_impossible_attacks_are_refused():
+    with pytest.raises(AttackFileError, match="method"):
+        attack(method="guess")
+    with pytest.raises(AttackFileError, match="finite"):
+        attack(theta=np.full((4, 4, 3), np.nan, np.float32))
+
+
+def test_texture_is_the_squashed_grid_interpolated_at_cell_centres():
+    theta = torch.randn(4, 4, 3, dtype=torch.float64)
+    texture = face_texture(theta.numpy(), 512)
+    # The pixel centres of a 512 texture do not meet cell centres; an odd multiple does.
+    odd = face_texture(theta.numpy(), 4 * 27)
+    np.testing.assert_allclose(odd[13::27, 13::27], 255 * squash(theta).numpy(), atol=0.51)
+    assert texture.shape == (512, 512, 3)
+
+
+def test_loading_needs_no_torch():
+    code = "import sys, advnerf_core.attack.artifact, advnerf_core.attack.projection; assert 'torch' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True)
