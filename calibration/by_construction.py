@@ -1,0 +1,104 @@
+"""Calibration files of the simulated lab: nothing to measure there, its configuration is the truth.
+
+``python -m calibration.by_construction calibration/twin`` writes the files of the default lab; an experiment with another
+`LabConfig` writes its own.
+"""
+
+from __future__ import annotations
+
+import datetime
+import math
+import sys
+from pathlib import Path
+
+from advnerf_core.driving.path import Path as DrivingPath
+from calibration.schema import (
+    Calibration,
+    CameraCalibration,
+    GainsSection,
+    LimitsSection,
+    RoomCalibration,
+    TargetCalibration,
+    VehicleCalibration,
+    save_calibration,
+)
+from hardware.limits import DriveLimits, VehicleGains
+from hardware.twin.config import CarConfig, LabConfig, PanelConfig
+
+METHOD = "by construction"
+# The day the default lab got its numbers; the files do not change when they are written again.
+LAB_DATE = datetime.date(2026, 11, 21)
+FENCE_MARGIN_M = 0.5
+OFF_TRACK_M = 0.4
+# Two metres of path before the corner at which the board stands, for the default track.
+START_BEFORE_CORNER_M = 2.0
+
+
+def twin_calibrations(lab: LabConfig) -> dict[str, Calibration]:
+    """Calibration of a simulated lab by file name without suffix: camera, vehicle, board, monitor, room."""
+    return {
+        "camera": _camera(lab),
+        "vehicle": _vehicle(lab.car),
+        "board": _target("board", lab.board),
+        "monitor": _target("monitor", lab.monitor),
+        "room": _room(lab),
+    }
+
+
+def write_twin_calibrations(lab: LabConfig, folder: Path) -> dict[str, Path]:
+    """Write the files of a simulated lab into a folder; their paths by name."""
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = {}
+    for name, calibration in twin_calibrations(lab).items():
+        paths[name] = folder / f"{name}.yaml"
+        save_calibration(calibration, paths[name])
+    return paths
+
+
+def _camera(lab: LabConfig) -> CameraCalibration:
+    pinhole = lab.camera.pinhole
+    return CameraCalibration(
+        date=LAB_DATE, method=METHOD, width=pinhole.width, height=pinhole.height, fx=pinhole.fx, fy=pinhole.fy,
+        cx=pinhole.cx, cy=pinhole.cy, T_car_from_camera=lab.camera.T_car_from_camera.tolist(),
+    )  # fmt: skip
+
+
+def _vehicle(car: CarConfig) -> VehicleCalibration:
+    gains = VehicleGains(
+        erpm_per_mps=car.nominal_erpm_gain, servo_per_rad=car.nominal_servo_gain, servo_offset=car.nominal_servo_offset,
+        servo_min=car.servo_min, servo_max=car.servo_max,
+    )  # fmt: skip
+    # The servo's range is what limits the wheels.
+    right, left = sorted(gains.steering_rad(servo) for servo in (car.servo_min, car.servo_max))
+    limits = DriveLimits(steering_min_rad=right, steering_max_rad=left)
+    return VehicleCalibration(
+        date=LAB_DATE, method=METHOD, wheelbase_m=car.wheelbase_m,
+        notes="nominal gains, as a careful person would measure them; the simulated car deviates by 2 to 3 %",
+        gains=GainsSection(**vars(gains)), limits=LimitsSection(**vars(limits)),
+    )  # fmt: skip
+
+
+def _target(subject: str, panel: PanelConfig) -> TargetCalibration:
+    y, z = 0.5 * panel.width_m, 0.5 * panel.height_m
+    # Facing the panel one looks along its -x with z up, so left is its -y.
+    corners = ((0.0, -y, z), (0.0, y, z), (0.0, y, -z), (0.0, -y, -z))
+    return TargetCalibration(date=LAB_DATE, method=METHOD, subject=subject, corners_in_subject_m=corners)
+
+
+def _room(lab: LabConfig) -> RoomCalibration:
+    track = lab.track
+    path = DrivingPath.rounded_square(track.side_m, track.corner_radius_m)
+    corner_s_m = track.side_m - 2.0 * track.corner_radius_m
+    x, y, yaw = (float(v) for v in path.pose_at(corner_s_m))
+    # Straight back from the corner: with a long lead the start lies on the extension of the straight, not on the arc before it.
+    start = (x - START_BEFORE_CORNER_M * math.cos(yaw), y - START_BEFORE_CORNER_M * math.sin(yaw), yaw)
+    reach = 0.5 * lab.room.side_m - FENCE_MARGIN_M
+    return RoomCalibration(
+        date=LAB_DATE, method=METHOD, path=path.to_dict(), off_track_m=OFF_TRACK_M, start_pose=start,
+        fence_m=((-reach, -reach), (reach, -reach), (reach, reach), (-reach, reach)),
+    )  # fmt: skip
+
+
+if __name__ == "__main__":
+    for written in write_twin_calibrations(LabConfig(), Path(sys.argv[1])).values():
+        print(written)

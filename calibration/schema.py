@@ -1,0 +1,255 @@
+"""What is measured about the lab: one small dated YAML file per thing, strict in what it accepts.
+
+Every file says what it is (``kind``), when and how it was measured. The twin's files have the method "by construction". Distances
+are in metres, angles in radians, transforms ``T_a_from_b`` as four rows.
+"""
+
+from __future__ import annotations
+
+import datetime
+import os
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+import numpy as np
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+
+from advnerf_core.driving.path import Path as DrivingPath
+from advnerf_core.geometry import Array, Pinhole
+from hardware.limits import DriveLimits, VehicleGains
+
+Row4 = tuple[float, float, float, float]
+Point3 = tuple[float, float, float]
+Point2 = tuple[float, float]
+_RIGID_TOLERANCE = 1e-6
+_PLANAR_TOLERANCE_M = 0.005
+
+
+class CalibrationError(ValueError):
+    """A calibration file is missing or wrong."""
+
+
+class Calibration(BaseModel):
+    """What all files have.
+
+    Attributes:
+        kind: What is calibrated.
+        date: Day of the measurement.
+        method: How it was measured.
+        notes: Anything a person should know.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    kind: str
+    date: datetime.date
+    method: str = Field(min_length=1)
+    notes: str = ""
+
+
+class CameraCalibration(Calibration):
+    """A camera on the car.
+
+    Attributes:
+        width: Image width [px].
+        height: Image height [px].
+        fx: Focal length [px].
+        fy: Focal length [px].
+        cx: Principal point, pixel centres at +0.5 [px].
+        cy: Principal point, pixel centres at +0.5 [px].
+        distortion: OpenCV's k1, k2, p1, p2, k3.
+        rms_px: Reprojection error of the fit [px]; None where nothing was fitted.
+        T_car_from_camera: Mounting pose, OpenCV camera axes.
+        latency_s: From exposure to the stamp, measured; subtracted by the camera node [s].
+    """
+
+    kind: Literal["camera"] = "camera"
+    width: int = Field(gt=0)
+    height: int = Field(gt=0)
+    fx: float = Field(gt=0.0)
+    fy: float = Field(gt=0.0)
+    cx: float
+    cy: float
+    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    rms_px: float | None = Field(default=None, ge=0.0)
+    T_car_from_camera: tuple[Row4, Row4, Row4, Row4]
+    latency_s: float = 0.0
+
+    @field_validator("T_car_from_camera")
+    @classmethod
+    def _rigid(cls, rows: tuple[Row4, ...]) -> tuple[Row4, ...]:
+        T = np.array(rows)
+        R = T[:3, :3]
+        error = max(np.abs(R @ R.T - np.eye(3)).max(), np.abs(T[3] - [0.0, 0.0, 0.0, 1.0]).max())
+        if error > _RIGID_TOLERANCE or np.linalg.det(R) < 0.0:
+            raise ValueError(f"expected a rotation and a translation with last row 0 0 0 1, is off by {error:.1e}")
+        return rows
+
+    @property
+    def pinhole(self) -> Pinhole:
+        """Intrinsics."""
+        return Pinhole(self.width, self.height, self.fx, self.fy, self.cx, self.cy)
+
+    @property
+    def mount(self) -> Array:
+        """``T_car_from_camera`` as an array ``[4, 4]``."""
+        return np.array(self.T_car_from_camera)
+
+
+class GainsSection(BaseModel):
+    """See `hardware.limits.VehicleGains`."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    erpm_per_mps: float
+    erpm_offset: float
+    servo_per_rad: float
+    servo_offset: float
+    servo_min: float
+    servo_max: float
+
+
+class LimitsSection(BaseModel):
+    """See `hardware.limits.DriveLimits`."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    speed_min_mps: float
+    speed_max_mps: float
+    steering_min_rad: float
+    steering_max_rad: float
+    acceleration_mps2: float
+    steering_rate_radps: float
+
+
+class VehicleCalibration(Calibration):
+    """The car.
+
+    Attributes:
+        wheelbase_m: Distance between the axles [m].
+        gains: From speed and steering to the motor controller.
+        limits: What may be sent.
+    """
+
+    kind: Literal["vehicle"] = "vehicle"
+    wheelbase_m: float = Field(gt=0.0)
+    gains: GainsSection
+    limits: LimitsSection
+
+    @model_validator(mode="after")
+    def _possible(self) -> VehicleCalibration:
+        # The driver's own classes check what makes sense.
+        _ = self.vehicle_gains, self.drive_limits
+        return self
+
+    @property
+    def vehicle_gains(self) -> VehicleGains:
+        """For the driver."""
+        return VehicleGains(**self.gains.model_dump())
+
+    @property
+    def drive_limits(self) -> DriveLimits:
+        """For the driver."""
+        return DriveLimits(**self.limits.model_dump())
+
+
+class TargetCalibration(Calibration):
+    """A flat face on which an attack is shown.
+
+    Attributes:
+        subject: Name of the motion-capture subject it is fixed to.
+        corners_in_subject_m: The face's corners in the subject's frame, where the texture's top left, top right, bottom right and
+            bottom left go, as seen by somebody who faces it [m].
+    """
+
+    kind: Literal["target"] = "target"
+    subject: str = Field(min_length=1, max_length=24)
+    corners_in_subject_m: tuple[Point3, Point3, Point3, Point3]
+
+    @field_validator("corners_in_subject_m")
+    @classmethod
+    def _a_face(cls, corners: tuple[Point3, ...]) -> tuple[Point3, ...]:
+        points = np.array(corners)
+        normal = np.cross(points[1] - points[0], points[3] - points[0])
+        area = float(np.linalg.norm(normal))
+        if area < 1e-4:
+            raise ValueError("expected four corners that span a face, got a line or a point")
+        off = float(abs((points[2] - points[0]) @ normal) / area)
+        if off > _PLANAR_TOLERANCE_M:
+            raise ValueError(f"expected four corners in one plane, the third is {off * 1000:.1f} mm off: measure again")
+        return corners
+
+    @property
+    def corners(self) -> Array:
+        """Corners ``[4, 3]`` [m]."""
+        return np.array(self.corners_in_subject_m)
+
+    @property
+    def outward_normal(self) -> Array:
+        """Unit vector ``[3]`` out of the face, toward somebody who faces it, in the subject's frame."""
+        points = self.corners
+        normal = np.cross(points[3] - points[0], points[1] - points[0])
+        return np.asarray(normal / np.linalg.norm(normal), dtype=np.float64)
+
+
+class RoomCalibration(Calibration):
+    """Where the car drives.
+
+    Attributes:
+        path: Reference path as `advnerf_core.driving.path.Path.to_dict` writes it.
+        off_track_m: Magnitude of the cross-track error beyond which the car is off the track [m].
+        fence_m: Corners of the polygon that the rear axle may not leave [m].
+        start_pose: Where the experiments start: x [m], y [m], yaw [rad].
+    """
+
+    kind: Literal["room"] = "room"
+    path: dict[str, Any]
+    off_track_m: float = Field(gt=0.0)
+    fence_m: tuple[Point2, ...] = Field(min_length=3)
+    start_pose: tuple[float, float, float]
+
+    @field_validator("path")
+    @classmethod
+    def _a_path(cls, path: dict[str, Any]) -> dict[str, Any]:
+        DrivingPath.from_dict(path)
+        return path
+
+    @property
+    def reference_path(self) -> DrivingPath:
+        """The reference path."""
+        return DrivingPath.from_dict(self.path)
+
+
+C = TypeVar("C", bound=Calibration)
+
+
+def load_calibration(model: type[C], path: Path | str) -> C:
+    """Read one file; everything wrong with it is one `CalibrationError` that names the file and the key."""
+    path = Path(path)
+    try:
+        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise CalibrationError(f"{path}: no such calibration file") from None
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise CalibrationError(f"{path}: cannot be read as YAML: {' '.join(str(error).split())}") from error
+    try:
+        return model.model_validate(data)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        key = ".".join(map(str, first["loc"])) or "the whole file"
+        known = f"; known keys: {', '.join(model.model_fields)}" if first["type"] == "extra_forbidden" else ""
+        raise CalibrationError(f"{path}: {key}: {first['msg'].removeprefix('Value error, ')}{known}") from None
+
+
+def save_calibration(calibration: Calibration, path: Path | str) -> None:
+    """Write one file, whole or not at all."""
+    path = Path(path)
+    text = yaml.safe_dump(calibration.model_dump(mode="python"), sort_keys=False, default_flow_style=None, width=120)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        temporary.write_text(text, encoding="utf-8")
+        os.replace(temporary, path)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise CalibrationError(f"cannot write {path}: {error.strerror or error}") from error

@@ -1,0 +1,133 @@
+"""Calibration files: what is accepted, what is refused with which words, and that the shipped ones are the twin's truth."""
+
+import datetime
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from advnerf_core.geometry import transform_points
+from calibration.by_construction import twin_calibrations, write_twin_calibrations
+from calibration.schema import (
+    CalibrationError,
+    CameraCalibration,
+    RoomCalibration,
+    TargetCalibration,
+    VehicleCalibration,
+    load_calibration,
+    save_calibration,
+)
+from hardware.limits import VehicleGains
+from hardware.twin.config import CameraConfig, LabConfig
+
+SHIPPED = Path(__file__).parents[2] / "calibration" / "twin"
+MODELS = {
+    "camera": CameraCalibration,
+    "vehicle": VehicleCalibration,
+    "board": TargetCalibration,
+    "monitor": TargetCalibration,
+    "room": RoomCalibration,
+}
+
+
+@pytest.mark.parametrize("name", sorted(MODELS))
+def test_shipped_files_are_those_of_the_default_lab(name):
+    assert load_calibration(MODELS[name], SHIPPED / f"{name}.yaml") == twin_calibrations(LabConfig())[name]
+
+
+def test_numbers_of_the_default_lab():
+    camera = load_calibration(CameraCalibration, SHIPPED / "camera.yaml")
+    assert camera.pinhole.fx == pytest.approx(173.97, abs=0.01)
+    # A point straight ahead on the floor: where the optical axis, 10 degrees down from 0.2 m up, hits it.
+    hit_x = 0.30 + 0.20 / np.tan(np.radians(10.0))
+    in_camera = transform_points(np.linalg.inv(camera.mount), [[hit_x, 0.0, 0.0]])
+    assert camera.pinhole.project(in_camera)[0] == pytest.approx([168.0, 94.0], abs=1e-6)
+    room = load_calibration(RoomCalibration, SHIPPED / "room.yaml")
+    assert room.start_pose == pytest.approx((-1.1, -2.0, 0.0))
+    assert room.reference_path.length_m == pytest.approx(4 * 1.8 + 2 * np.pi * 1.1)
+    assert np.abs(room.fence_m).max() == 3.5
+    vehicle = load_calibration(VehicleCalibration, SHIPPED / "vehicle.yaml")
+    assert vehicle.vehicle_gains == VehicleGains()
+    assert vehicle.drive_limits.steering_max_rad == pytest.approx(0.3135, abs=1e-4)
+    assert vehicle.drive_limits.steering_min_rad == pytest.approx(-0.2634, abs=1e-4)
+
+
+@pytest.mark.parametrize("name", ["board", "monitor"])
+def test_faces_look_where_their_subject_looks(name):
+    lab = LabConfig()
+    panel = getattr(lab, name)
+    target = load_calibration(TargetCalibration, SHIPPED / f"{name}.yaml")
+    assert target.outward_normal == pytest.approx([1.0, 0.0, 0.0])
+    corners = transform_points(panel.T_world_from_face, target.corners)
+    assert corners.mean(axis=0) == pytest.approx([panel.x_m, panel.y_m, panel.z_m])
+    # The board faces a driver on the bottom straight, who sees +y of the world on the left.
+    if name == "board":
+        assert corners[0, 1] > corners[1, 1]
+    assert corners[0, 2] > corners[3, 2]
+
+
+def test_another_lab_gets_its_own_files(tmp_path):
+    paths = write_twin_calibrations(LabConfig(camera=CameraConfig(width=366)), tmp_path)
+    assert load_calibration(CameraCalibration, paths["camera"]).width == 366
+
+
+def edited(tmp_path, name, **changes):
+    data = yaml.safe_load((SHIPPED / f"{name}.yaml").read_text())
+    data.update(changes)
+    path = tmp_path / f"{name}.yaml"
+    path.write_text(yaml.safe_dump({k: v for k, v in data.items() if v is not ...}))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("name", "changes", "words"),
+    [
+        ("camera", {"zoom": 2}, "zoom.*known keys: .*width"),
+        ("camera", {"fx": -1.0}, "fx"),
+        ("camera", {"fx": float("nan")}, "fx"),
+        ("camera", {"date": ...}, "date"),
+        ("camera", {"kind": "vehicle"}, "kind"),
+        ("camera", {"T_car_from_camera": np.diag([1.0, 1.0, -1.0, 1.0]).tolist()}, "T_car_from_camera.*rotation"),
+        ("camera", {"T_car_from_camera": np.diag([2.0, 1.0, 1.0, 1.0]).tolist()}, "off by"),
+        ("board", {"corners_in_subject_m": [[0, 0, 0]] * 4}, "span a face"),
+        ("board", {"corners_in_subject_m": [[0, -1, 1], [0, 1, 1], [0.1, 1, -1], [0, -1, -1]]}, "100.0 mm off"),
+        ("room", {"fence_m": [[0, 0], [1, 1]]}, "fence_m"),
+        ("room", {"path": {"segments": []}}, "path"),
+    ],
+)
+def test_wrong_files_are_one_clear_error(tmp_path, name, changes, words):
+    path = edited(tmp_path, name, **changes)
+    with pytest.raises(CalibrationError, match=words) as error:
+        load_calibration(MODELS[name], path)
+    assert str(error.value).startswith(f"{path}: ")
+    assert "\n" not in str(error.value)
+
+
+def test_impossible_limits_are_found_when_the_file_is_read(tmp_path):
+    limits = yaml.safe_load((SHIPPED / "vehicle.yaml").read_text())["limits"] | {"speed_max_mps": -1.0}
+    with pytest.raises(CalibrationError, match="around zero"):
+        load_calibration(VehicleCalibration, edited(tmp_path, "vehicle", limits=limits))
+
+
+def test_missing_and_unreadable_files(tmp_path):
+    with pytest.raises(CalibrationError, match="no such calibration file"):
+        load_calibration(CameraCalibration, tmp_path / "none.yaml")
+    (tmp_path / "bad.yaml").write_text("a: [1, 2")
+    with pytest.raises(CalibrationError, match="cannot be read as YAML"):
+        load_calibration(CameraCalibration, tmp_path / "bad.yaml")
+    (tmp_path / "tag.yaml").write_text("!!python/object/apply:os.system ['true']")
+    with pytest.raises(CalibrationError, match="cannot be read as YAML"):
+        load_calibration(CameraCalibration, tmp_path / "tag.yaml")
+
+
+def test_nothing_is_left_half_written(tmp_path):
+    target = TargetCalibration(
+        date=datetime.date(2026, 1, 2), method="ruler", subject="sign",
+        corners_in_subject_m=((0, 0, 1), (0, 1, 1), (0, 1, 0), (0, 0, 0)),
+    )  # fmt: skip
+    save_calibration(target, tmp_path / "sign.yaml")
+    assert load_calibration(TargetCalibration, tmp_path / "sign.yaml") == target
+    with pytest.raises(CalibrationError, match="cannot write"):
+        save_calibration(target, tmp_path / "nowhere" / "sign.yaml")
+    assert [p.name for p in tmp_path.iterdir()] == ["sign.yaml"]
