@@ -1,0 +1,123 @@
+"""The live twin end to end: bytes on the pty move the car that VICON packets and pictures show."""
+
+import time
+
+import cv2
+import numpy as np
+import pytest
+
+from advnerf_core.geometry import VehicleState, yaw_of
+from hardware.cameras.socket import SocketCamera
+from hardware.errors import HardwareError
+from hardware.limits import DriveLimits, VehicleGains
+from hardware.twin.lab import Lab
+from hardware.twin.live import LiveLab, LiveLabConfig, PoseHistory
+from hardware.twin.vicon_emulator import OCCLUSION_FORMS, ViconEmulatorConfig, ViconFrames
+from hardware.vesc import Vesc
+from hardware.vicon import SubjectTracker, ViconConfig, ViconReceiver
+
+
+@pytest.fixture(scope="module")
+def receiver():
+    with ViconReceiver(ViconConfig(subjects=("car", "board"), port=0)) as receiver:
+        yield receiver
+
+
+@pytest.fixture(scope="module")
+def lab(receiver, tmp_path_factory):
+    config = LiveLabConfig(vicon=ViconEmulatorConfig(port=receiver.port))
+    with LiveLab(config, tmp_path_factory.mktemp("run")) as lab:
+        yield lab
+
+
+def poses_of(receiver, name, duration_s):
+    receiver.read(0.0)
+    poses, deadline = [], time.monotonic() + duration_s
+    while time.monotonic() < deadline:
+        poses += [p for p in receiver.read(0.05) if p.name == name]
+    return poses
+
+
+def test_history_interpolates_over_the_cut_of_the_circle():
+    history = PoseHistory(200.0)
+    history.add(1_000, VehicleState(0.0, 0.0, 3.1))
+    history.add(2_000, VehicleState(1.0, 2.0, -3.1))
+    middle = history.at(1_500)
+    assert (middle.x_m, middle.y_m) == (0.5, 1.0)
+    assert abs(middle.yaw_rad) == pytest.approx(np.pi)
+    assert history.at(5_000).x_m == 1.0
+    assert history.at(500).x_m == 0.0
+    history.clear()
+    assert history.at(1_500) is None
+
+
+@pytest.mark.parametrize("form", [None, *OCCLUSION_FORMS])
+def test_every_form_of_occlusion_is_recognised(form):
+    frames = ViconFrames(ViconEmulatorConfig())
+    tracker = SubjectTracker(ViconConfig(subjects=("car",)))
+    seen = []
+    for k in range(60):
+        if k == 20:
+            frames.occlude("car", form)
+        for datagram in frames.next({"car": np.eye(4) + 0.0}):
+            seen.append(len(tracker.update(datagram, 0, k * 10_000_000)))
+    # Noise makes a standing car look alive; "frozen" needs ten equal frames to be noticed.
+    assert sum(seen[:20]) == 20
+    assert sum(seen[30:]) == (30 if form is None else 0)
+
+
+def test_vicon_rate_noise_and_truth(lab, receiver):
+    poses = poses_of(receiver, "car", 0.5)
+    assert 40 <= len(poses) <= 55
+    xyz = np.array([p.T_world_from_subject[:3, 3] for p in poses])
+    assert np.abs(xyz.mean(axis=0) - [-1.1, -2.0, 0.0]).max() < 1e-3
+    assert 2e-5 < xyz.std() < 1.0
+    board = poses_of(receiver, "board", 0.1)[0]
+    np.testing.assert_allclose(board.T_world_from_subject, lab.config.lab.board.T_world_from_face, atol=2e-3)
+
+
+def test_frames_come_at_their_rate_with_true_stamps(lab):
+    with SocketCamera(lab.frames_path) as camera:
+        frames = [camera.read(timeout_s=1.0) for _ in range(6)]
+        arrived_ns = time.time_ns()
+    stamps = np.array([f.stamp_realtime_ns for f in frames])
+    assert np.diff(stamps) / 1e6 == pytest.approx([100.0] * 5, abs=2.0)
+    assert 0 < arrived_ns - stamps[-1] < 100e6
+    assert frames[0].rgb.shape == (188, 336, 3)
+    with Lab(lab.config.lab) as still:
+        expected, _ = still.observe_at(-1.1, -2.0, 0.0, depth=False)
+    assert cv2.PSNR(frames[-1].rgb, expected) > 40.0
+
+
+def test_driving_moves_what_is_measured_and_seen(lab, receiver):
+    lab.place(-1.1, -2.0, 0.0)
+    with Vesc(str(lab.vesc_port), VehicleGains(), DriveLimits()) as vesc, SocketCamera(lab.frames_path) as camera:
+        assert vesc.identify().hardware_name == "TWIN"
+        before = camera.read(timeout_s=1.0)
+        for _ in range(20):
+            vesc.drive(0.8, 0.15)
+            time.sleep(0.05)
+        pose = poses_of(receiver, "car", 0.05)[-1].T_world_from_subject
+        with pytest.raises(HardwareError, match="disarm first"):
+            lab.place(0.0, 0.0, 0.0)
+        vesc.brake(20.0)
+        after = camera.read(timeout_s=1.0)
+    lab.check()
+    assert pose[0, 3] > -0.8
+    assert yaw_of(pose) > 0.05
+    assert cv2.PSNR(before.rgb, after.rgb) < 30.0
+    assert lab.state.speed_mps == 0.0
+    time.sleep(0.05)  # the last bytes are on their way
+    names = [event.name for event in lab.vesc.events() if event.name != "GET_VALUES"]
+    assert names[-1] == "SET_CURRENT"
+    assert "SET_CURRENT_BRAKE" in names
+    assert "TIMEOUT" not in names
+    lab.place(-1.1, -2.0, 0.0)
+    assert poses_of(receiver, "car", 0.1)[-1].T_world_from_subject[0, 3] == pytest.approx(-1.1, abs=2e-3)
+
+
+def test_an_impossible_start_pose_leaves_nothing_behind(tmp_path):
+    with pytest.raises(ValueError, match="free place"):
+        LiveLab(LiveLabConfig(start_pose=(3.9, 0.0, 0.0)), tmp_path)
+    assert not (tmp_path / "frames").exists()
+    assert not (tmp_path / "vesc").is_symlink()
