@@ -163,7 +163,8 @@ def _panel(track: ClipTrack, step: int, rate_hz: float, off_track_m: float) -> F
     image = np.repeat(np.repeat(image, scale, axis=0), scale, axis=1)
     height, width = image.shape[:2]
     canvas = Image.new("RGB", (width, _TITLE_PX + height + _STATUS_PX), _rgb("paper"))
-    canvas.paste(Image.fromarray(image), (0, _TITLE_PX))
+    # Captions go on top: a player puts its controls over the bottom.
+    canvas.paste(Image.fromarray(image), (0, _TITLE_PX + _STATUS_PX))
     cte = float(np.asarray(track.cte_m)[index])
     _draw_title(canvas, track)
     _draw_status(canvas, index / rate_hz, cte, off_track_m, track.note if step > index else "")
@@ -183,7 +184,7 @@ def _draw_title(canvas: Image.Image, track: ClipTrack) -> None:
 def _draw_status(canvas: Image.Image, time_s: float, cte_m: float, off_track_m: float, note: str) -> None:
     """Time, cross-track error as a number and as a needle over the track's width, and OFF TRACK in words."""
     draw = ImageDraw.Draw(canvas)
-    middle = canvas.height - _STATUS_PX / 2
+    middle = _TITLE_PX + _STATUS_PX / 2 - 2
     draw.text((2, middle), f"{time_s:4.1f} s", fill=_rgb("ink"), font=_font(12), anchor="lm")
     draw.text((62, middle), f"CTE {cte_m:+.2f} m", fill=_rgb("ink"), font=_font(12), anchor="lm")
     off = abs(cte_m) > off_track_m

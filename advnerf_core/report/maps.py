@@ -17,30 +17,32 @@ from advnerf_core.report.plots import add_run_legend, end_style, new_axes, run_s
 
 Floats = NDArray[np.float64]
 
+_MARGIN_M = 0.15  # white around what a map shows
+
 
 def trajectory_map(data: ReportData, zoom: bool = False, victim: Victim = "hardened") -> Figure:
     """All drives of one victim from above: the whole room, or only where the car went."""
     runs = data.select(victim=victim)
-    with new_axes(6.0, 6.2 if zoom else 5.4) as ax:
+    box = _driven_box(data.scene, runs) if zoom else np.reshape(data.scene.room_m, (2, 2))
+    with new_axes(6.0, _height_in(box, legend=zoom)) as ax:
         _draw_scene(ax, data.scene)
         for run in runs:
             ax.plot(run.states[:, 0], run.states[:, 1], **run_style(run))
             ax.plot(*run.states[-1, :2], **end_style(run))
         _draw_starts(ax, runs)
+        _frame(ax, box)
         if zoom:
-            _frame(ax, _driven_box(data.scene, runs))
             add_run_legend(ax, runs)
-        else:
-            _frame(ax, np.reshape(data.scene.room_m, (2, 2)))
     return ax.figure
 
 
 def laps_map(laps: Laps, scene: Scene) -> Figure:
     """The drive without attack from above."""
-    with new_axes(6.0, 5.4) as ax:
+    box = np.reshape(scene.room_m, (2, 2))
+    with new_axes(6.0, _height_in(box)) as ax:
         _draw_scene(ax, scene)
         ax.plot(laps.states[:, 0], laps.states[:, 1], color=LIGHT["none"], lw=1.2)
-        _frame(ax, np.reshape(scene.room_m, (2, 2)))
+        _frame(ax, box)
     return ax.figure
 
 
@@ -113,7 +115,13 @@ def _driven_box(scene: Scene, runs: Sequence[Run]) -> Floats:
     return np.stack([xy.min(axis=0) - 0.45, xy.max(axis=0) + 0.35])
 
 
+def _height_in(box: Floats, legend: bool = False) -> float:
+    """Height of a 6 inch wide figure that shows ``box`` to scale without empty stripes [inch]."""
+    width_m, height_m = box[1] - box[0] + 2 * _MARGIN_M
+    return float(np.clip(5.4 * height_m / width_m, 2.0, 5.4)) + (1.25 if legend else 0.45)
+
+
 def _frame(ax: Any, box: Floats) -> None:
-    margin = 0.15
+    margin = _MARGIN_M
     ax.set_xlim(box[0, 0] - margin, box[1, 0] + margin)
     ax.set_ylim(box[0, 1] - margin, box[1, 1] + margin)

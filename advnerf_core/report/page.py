@@ -156,7 +156,7 @@ def _video(title: str, caption: str, path: Path) -> dict[str, Any]:
         "uri": data_uri(path),
         "width": width,
         "height": height,
-        "poster": image_uri(stills[len(stills) // 2], quality=80),
+        "poster": image_uri(stills[-1], quality=80),
         "stills": [image_uri(s, quality=80) for s in stills],
     }
 

@@ -138,9 +138,9 @@ def latency_histogram(latency: Latency) -> Figure:
     samples, limit, overall = latency.capture_to_serial_ms, latency.camera_period_ms, latency.overall
     end = max(limit * 1.12, float(samples.max()) * 1.05)
     with new_axes(6.0, 2.9) as ax:
-        ax.hist(samples, bins=np.linspace(0.0, end, 90).tolist(), color=LIGHT["none"], log=True)
+        ax.hist(samples, bins=np.linspace(0.0, end, 90).tolist(), color=LIGHT["muted"], log=True)
         ax.axvline(limit, color=LIGHT["ink"], lw=1.4)
-        ax.axvline(overall.p99_ms, color=LIGHT["muted"], lw=1.2, ls=":")
+        ax.axvline(overall.p99_ms, color=LIGHT["ink"], lw=1.2, ls=":")
         top = ax.get_xaxis_transform()
         ax.text(
             limit,
@@ -237,7 +237,7 @@ def add_run_legend(ax: Any, runs: Iterable[Run]) -> None:
 
 def _legend_above(ax: Any, handles: list[Any]) -> None:
     if handles:
-        columns = 3 if len(handles) > 4 else 2
+        columns = 3 if len(handles) in (3, 5, 6) else 2
         ax.figure.legend(handles=handles, loc="outside upper left", ncols=columns, columnspacing=1.6)
 
 
@@ -256,12 +256,11 @@ def svg(figure: Figure, description: str) -> str:
     text = text[text.index("<svg") :]
     text = re.sub(r'\s+xmlns(:xlink)?="[^"]*"', "", text)
     text = text.replace("xlink:href", "href")
-    text = re.sub(
-        r'<svg[^>]*?viewBox="([^"]+)"[^>]*>',
-        rf'<svg viewBox="\1" role="img" aria-label="{escape(description)}">',
-        text,
-        count=1,
-    )
+    width_px = figure.get_figwidth() * 90  # one text size in all figures where there is room
+    view_box = re.search(r'viewBox="([^"]+)"', text)
+    shown = f'viewBox="{view_box[1]}"' if view_box else ""
+    label = f'role="img" aria-label="{escape(description)}" style="max-width: {width_px:.0f}px"'
+    text = f"<svg {shown} {label}>" + text[text.index(">") + 1 :]
     return themed_svg(text)
 
 

@@ -6,9 +6,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from advnerf_core.report.data import ReportData
+from advnerf_core.report.data import Condition, Domain, ReportData
 from advnerf_core.report.tables import TransferRow, find_row, number, transfer_rows
 from advnerf_core.report.targets import Target, evaluate_targets
+
+_COMPARED: tuple[Condition, ...] = ("none", "gradient", "random")
 
 
 @dataclass(frozen=True)
@@ -25,14 +27,14 @@ class KeyFigure:
 def key_figures(data: ReportData) -> tuple[KeyFigure, ...]:
     """The numbers a reader looks for first."""
     rows = transfer_rows(data)
-    cells = (
+    cells: tuple[tuple[Domain, Condition, float, bool, str], ...] = (
         ("surrogate", "gradient", 3.3, True, "gradient attack, surrogate"),
         ("deployed", "gradient", 3.0, True, "gradient attack, driven live"),
         ("deployed", "random", 1.5, False, "best random texture, driven live"),
     )
     figures = []
     for domain, condition, bound, at_least, label in cells:
-        row = find_row(rows, domain, condition)  # type: ignore[arg-type]
+        row = find_row(rows, domain, condition)
         ratio = row.ratio if row else None
         met = None if ratio is None else (ratio >= bound if at_least else ratio <= bound)
         target = f"target {'≥' if at_least else '≤'} {bound:g} ×"
@@ -69,41 +71,42 @@ def _off_track_figure(row: TransferRow | None) -> KeyFigure:
 
 def opening(data: ReportData) -> tuple[str, ...]:
     """The opening paragraphs as plain text: what was done, what it did, what that is worth."""
-    return tuple(
-        p for p in (_what_was_done(data), _what_it_did(data), verdict(evaluate_targets(data)), _caveats(data)) if p
-    )
+    story = f"{_what_was_done(data)} {_what_it_did(data)}"
+    return tuple(p for p in (story, verdict(evaluate_targets(data)), _caveats(data)) if p)
 
 
 def _what_was_done(data: ReportData) -> str:
     s = data.settings
     starts, seeds = len(s.start_poses), len(s.seeds)
+    live = any(r.domain == "deployed" and r.condition == "gradient" for r in data.runs)
+    shown = " Both were then shown to the driving car, frame by frame, by the live node graph." if live else ""
     return (
         f"A texture for one flat board was searched for in a learned copy of the room: {s.iterations} gradient steps over "
         f"{s.horizon_steps} control ticks ({s.horizon_steps * s.control_period_s:g} s) from {_count(starts, 'start pose')} with "
-        f"{_count(seeds, 'seed')}, against the best of {s.random_evaluations} random textures. Both were then shown to the "
-        f"driving car, frame by frame, by the live node graph."
+        f"{_count(seeds, 'seed')}, against the best of {s.random_evaluations} random textures.{shown}"
     )
 
 
 def _what_it_did(data: ReportData) -> str:
     rows = transfer_rows(data)
-    parts = []
-    for domain, place in (("surrogate", "In the learned scene"), ("deployed", "On the live drive")):
-        clean, attacked, random = (find_row(rows, domain, c) for c in ("none", "gradient", "random"))  # type: ignore[arg-type]
-        if clean is None or attacked is None:
-            parts.append(f"{place} the attack was not measured in this run.")
-            continue
-        text = (
-            f"{place} the gradient texture took the total distance from the tape (total CTE) from "
-            f"{clean.total_cte_mean_m:.2f} m to {attacked.total_cte_mean_m:.2f} m, {number(attacked.ratio)} times as much, and the "
-            f"car left the track in {attacked.off_track} of {_count(attacked.runs, 'drive')}"
-        )
-        if random is not None:
-            text += (
-                f"; the best random texture gave {number(random.ratio)} times and {random.off_track} of {random.runs}"
-            )
-        parts.append(text + ".")
-    return " ".join(parts)
+    surrogate, deployed = _effect(rows, "surrogate"), _effect(rows, "deployed")
+    return (
+        f"In the surrogate the total cross-track error (total CTE, the summed distance from the tape) {surrogate}. "
+        f"On the live drive it {deployed}."
+    )
+
+
+def _effect(rows: Sequence[TransferRow], domain: Domain) -> str:
+    clean, attacked, random = (find_row(rows, domain, c) for c in _COMPARED)
+    if clean is None or attacked is None:
+        return "was not measured in this run"
+    text = (
+        f"went from {clean.total_cte_mean_m:.2f} m without attack to {attacked.total_cte_mean_m:.2f} m with the gradient texture "
+        f"({number(attacked.ratio)} ×), and the car left the track in {attacked.off_track} of {_count(attacked.runs, 'drive')}"
+    )
+    if random is not None:
+        text += f"; with the best random texture it was {number(random.ratio)} ×, and the car left in {random.off_track} of {random.runs}"
+    return text
 
 
 def verdict(targets: Sequence[Target]) -> str:

@@ -12,6 +12,7 @@ from typing import Any
 import rich.box
 import rich.table
 from markupsafe import Markup
+from rich.text import Text
 
 from advnerf_core.report.data import DOMAINS, VICTIMS, Condition, Domain, ReportData, Run, Victim
 from advnerf_core.report.palette import CONDITION_NAMES
@@ -23,7 +24,7 @@ PAPER_RATIOS: dict[tuple[str, str], float] = {
     ("deployed", "random"): 46 / 48,
     ("deployed", "gradient"): 248 / 48,
 }
-_TABLE_CONDITIONS: tuple[Condition, ...] = ("empty", "none", "random", "gradient")
+_TABLE_CONDITIONS: tuple[Condition, ...] = ("none", "random", "gradient", "empty")
 
 
 @dataclass(frozen=True)
@@ -174,20 +175,15 @@ class Table:
         return Markup(' class="number"') if self.right[column] else Markup("")
 
     def rich(self) -> rich.table.Table:
-        """The table for the terminal."""
+        """The table for the terminal; `Text` keeps rich from reading units in brackets as markup."""
         table = rich.table.Table(title=self.title or None, box=rich.box.SIMPLE_HEAD, title_justify="left")
         for heading, right in zip(self.columns, self.right, strict=True):
-            table.add_column(heading, justify="right" if right else "left")
+            table.add_column(Text(heading), justify="right" if right else "left")
         for i, row in enumerate(self.rows):
             if i in self.groups and i > 0:
                 table.add_section()
-            table.add_row(*(str(escape_markup(cell)) for cell in row))
+            table.add_row(*(Text(cell) for cell in row))
         return table
-
-
-def escape_markup(text: str) -> str:
-    """Text that rich prints as it is."""
-    return text.replace("[", r"\[")
 
 
 def transfer_table(rows: Sequence[TransferRow]) -> Table:
@@ -206,12 +202,12 @@ def transfer_table(rows: Sequence[TransferRow]) -> Table:
     )
     cells, groups = [], []
     for i, r in enumerate(rows):
-        if i == 0 or (r.victim, r.domain) != (rows[i - 1].victim, rows[i - 1].domain):
-            groups.append(i)
+        first = i == 0 or (r.victim, r.domain) != (rows[i - 1].victim, rows[i - 1].domain)
+        groups += [i] if first else []
         cells.append(
             (
-                *((r.victim,) if several else ()),
-                r.domain,
+                *((r.victim if first else "",) if several else ()),
+                r.domain if first else "",
                 CONDITION_NAMES[r.condition],
                 str(r.runs),
                 spread(r.total_cte_mean_m, r.total_cte_std_m),

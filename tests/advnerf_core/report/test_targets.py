@@ -1,0 +1,84 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from advnerf_core.report.data import Check, Fidelity, FidelityView, Laps, Latency, MemoryRow
+from advnerf_core.report.summary import key_figures, opening, verdict
+from advnerf_core.report.targets import evaluate_targets
+
+
+def verdicts(report):
+    return {t.what: t.met for t in evaluate_targets(report)}
+
+
+def test_nothing_measured_is_neither_met_nor_missed(bare_report):
+    report = replace(bare_report, manifest=replace(bare_report.manifest, wall_s=None))
+    assert set(verdicts(report).values()) == {None}
+    assert verdict(evaluate_targets(report)) == "No target was measured in this run."
+    assert all(k.met is None for k in key_figures(report))
+
+
+@pytest.mark.parametrize(("ratio", "met"), [(3.29, False), (3.3, True)])
+def test_surrogate_ratio(bare_report, make, ratio, met):
+    clean = replace(make.drive("surrogate", "none", 0.0), total_cte_m=1.0)
+    attacked = replace(make.drive("surrogate", "gradient", 0.0), total_cte_m=ratio)
+    assert verdicts(replace(bare_report, runs=(clean, attacked)))["gradient attack, surrogate: total CTE"] is met
+
+
+@pytest.mark.parametrize(("off_track", "met"), [((True, True, False), True), ((True, False, False), False)])
+def test_leaving_the_track_in_two_of_three(bare_report, make, off_track, met):
+    runs = tuple(replace(make.drive("deployed", "gradient", 0.0, s), off_track=o) for s, o in enumerate(off_track))
+    name = "gradient attack, live: left the track (|CTE| > 0.4 m)"
+    assert verdicts(replace(bare_report, runs=runs))[name] is met
+
+
+@pytest.mark.parametrize(("ratio", "left", "met"), [(1.4, False, True), (1.6, False, False), (1.4, True, False)])
+def test_random_may_neither_be_strong_nor_leave(bare_report, make, ratio, left, met):
+    clean = replace(make.drive("deployed", "none", 0.0), total_cte_m=1.0)
+    random = replace(make.drive("deployed", "random", 0.0), total_cte_m=ratio, off_track=left)
+    found = verdicts(replace(bare_report, runs=(clean, random)))
+    assert found["best random texture, live: total CTE and drives that left"] is met
+
+
+@pytest.mark.parametrize(
+    ("samples", "missed", "met"), [((20.0, 30.0), 0, True), ((20.0, 130.0), 0, False), ((20.0,), 1, False), ((20.0,), None, None)]
+)  # fmt: skip
+def test_latency(bare_report, samples, missed, met):
+    latency = Latency(np.array(samples), 100.0, missed)
+    assert verdicts(replace(bare_report, latency=latency))["capture to serial write, live"] is met
+
+
+def test_memory_needs_both_horizons(bare_report):
+    name = "adjoint, peak memory above idle"
+    assert verdicts(replace(bare_report, memory=(MemoryRow(50, 100.0), MemoryRow(200, 90.0))))[name] is None
+    assert verdicts(replace(bare_report, memory=(MemoryRow(50, 100.0), MemoryRow(400, 110.0))))[name] is True
+    assert verdicts(replace(bare_report, memory=(MemoryRow(50, 100.0), MemoryRow(400, 111.0))))[name] is False
+
+
+def test_fidelity_and_laps(bare_report):
+    views = (
+        FidelityView("a", 26.0, 30.0, None, None, 0.1, 0.139),
+        FidelityView("b", 27.0, 24.5, None, None, 0.1, 0.08),
+    )
+    laps = Laps(3, np.zeros((4, 3)), np.zeros(4), 0.079, False)
+    found = verdicts(replace(bare_report, fidelity=Fidelity(views), laps=laps))
+    assert found["surrogate on held-out views, full size"] is False  # 26.5 dB
+    assert found["surrogate on held-out views, 200x66"] is True  # 27.25 dB
+    assert found["steering on surrogate against real views"] is True  # 0.0295 rad
+    assert found["policy without attack, 3 laps live"] is True
+
+
+def test_cached_stages_do_not_count_as_a_fresh_run(report):
+    name = "full setting, 2 cores"
+    assert verdicts(report)[name] is True
+    stages = (replace(report.timings[0], cached=True), *report.timings[1:])
+    assert verdicts(replace(report, timings=stages))[name] is None
+
+
+def test_the_opening_names_every_miss(bare_report):
+    report = replace(bare_report, checks=(Check("fox photographs", "PSNR ≥ 26 dB", "24.1 dB", False),))
+    text = " ".join(opening(report))
+    assert "Missed:" in text
+    assert "fox photographs: 24.1 dB (target PSNR ≥ 26 dB)" in text
+    assert "small setting" in text
