@@ -131,9 +131,12 @@ def image_uri(image: Frames, quality: int | None = None) -> str:
 
 def film_strip(path: Path, count: int = 4) -> list[Frames]:
     """Frames ``[height, width, 3]`` of a clip at equal intervals, the last one included, for print and posters."""
-    frames = read_clip(path)
-    chosen = np.linspace(0, len(frames) - 1, min(count, len(frames)) + 1).round().astype(int)[1:]
-    return [frames[i] for i in chosen]
+    # Two passes: a long clip does not fit into memory, and WebM does not say how long it is.
+    with av.open(str(path)) as container:
+        length = sum(1 for _ in container.decode(video=0))
+    chosen = set(np.linspace(0, length - 1, min(count, length) + 1).round().astype(int)[1:].tolist())
+    with av.open(str(path)) as container:
+        return [f.to_ndarray(format="rgb24") for i, f in enumerate(container.decode(video=0)) if i in chosen]
 
 
 def _encode(path: Path, codec: str, quality: int, rate_hz: float, frames: Iterator[Frames]) -> None:
