@@ -111,7 +111,7 @@ def compose(tracks: Sequence[ClipTrack], rate_hz: float = 10.0, off_track_m: flo
 def read_clip(path: Path) -> Frames:
     """Decode a whole clip to RGB, ``[N, height, width, 3]``."""
     with av.open(str(path)) as container:
-        return np.stack([f.to_ndarray(format="rgb24") for f in container.decode(video=0)])
+        return np.stack([np.asarray(f.to_ndarray(format="rgb24"), dtype=np.uint8) for f in container.decode(video=0)])
 
 
 def data_uri(path: Path) -> str:
@@ -136,7 +136,8 @@ def film_strip(path: Path, count: int = 4) -> list[Frames]:
         length = sum(1 for _ in container.decode(video=0))
     chosen = set(np.linspace(0, length - 1, min(count, length) + 1).round().astype(int)[1:].tolist())
     with av.open(str(path)) as container:
-        return [f.to_ndarray(format="rgb24") for i, f in enumerate(container.decode(video=0)) if i in chosen]
+        frames = enumerate(container.decode(video=0))
+        return [np.asarray(f.to_ndarray(format="rgb24"), dtype=np.uint8) for i, f in frames if i in chosen]
 
 
 def _encode(path: Path, codec: str, quality: int, rate_hz: float, frames: Iterator[Frames]) -> None:
