@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from advnerf_core.geometry import Array, Pinhole, transform_points
 
 NEAR_M = 0.02  # as in the surrogate: nearer to the camera nothing is drawn
+_CORNER_TOLERANCE_M = 0.02  # measured corners may be this far from a parallelogram; the nearest one is drawn
 _EDGE_ON = 1e-4  # sine of the angle between ray and face below which the face is a line
 
 Image = NDArray[np.uint8]
@@ -43,13 +44,16 @@ class FaceOverlay:
         supersample: int = 2,
     ) -> None:
         corners = np.asarray(corners_in_subject, dtype=np.float64)
-        if corners.shape != (4, 3) or np.abs(corners[0] + corners[2] - corners[1] - corners[3]).max() > 1e-6:
+        if (
+            corners.shape != (4, 3)
+            or np.abs(corners[0] + corners[2] - corners[1] - corners[3]).max() > _CORNER_TOLERANCE_M
+        ):
             raise ValueError(f"expected the 4 corners of a rectangle in order, got {corners.tolist()}")
         if texture.ndim != 3 or texture.shape[2] != 3 or texture.dtype != np.uint8:
             raise ValueError(f"expected a texture [h, w, 3] uint8, got {list(texture.shape)} {texture.dtype}")
         if supersample < 1:
             raise ValueError(f"expected at least 1 sample along a pixel's side, got {supersample}")
-        self._corners = corners
+        self._corners = _nearest_parallelogram(corners)
         self._camera = camera
         self._samples = supersample
         self._distorted = any(distortion)
@@ -157,6 +161,14 @@ def clip_near(polygon_in_camera: ArrayLike, near_m: float = NEAR_M) -> Array:
             fraction = (near_m - start[2]) / (end[2] - start[2])
             kept.append(start + fraction * (end - start))
     return np.array(kept).reshape(-1, 3)
+
+
+def _nearest_parallelogram(corners: Array) -> Array:
+    """Least squares fit; corners of a parallelogram are kept as they are."""
+    right = 0.5 * (corners[1] - corners[0] + corners[2] - corners[3])
+    down = 0.5 * (corners[3] - corners[0] + corners[2] - corners[1])
+    first = corners.mean(axis=0) - 0.5 * (right + down)
+    return np.stack([first, first + right, first + right + down, first + down])
 
 
 def _sample_rays(

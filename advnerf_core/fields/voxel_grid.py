@@ -14,7 +14,6 @@ in front of the face sees texture row 0 at the top and column 0 at the left, whi
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -25,6 +24,8 @@ from advnerf_core.geometry import Array, transform_points
 
 # Inverse squash of exactly 0 or 1 is infinite; half an 8-bit step is as far as a display can show.
 _SATURATION = 0.5 / 255.0
+# An attack starts at the plain colours plus this much noise on theta; it is all that differs between seeds.
+INITIAL_NOISE = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,26 +108,10 @@ def squash_derivative(theta: Tensor) -> Tensor:
     return colour * (1.0 - colour)
 
 
-def unsquash(colour: ArrayLike) -> Array:
+def inverse_squash(colour: ArrayLike) -> Array:
     """Grid values whose squash is ``colour``; colours are kept half an 8-bit step away from 0 and 1."""
     c = np.clip(np.asarray(colour, dtype=np.float64), _SATURATION, 1.0 - _SATURATION)
     return np.log(c) - np.log1p(-c)
-
-
-def initial_theta(
-    theta_shape: tuple[int, ...], plain_rgb: ArrayLike, generator: torch.Generator, dtype: Any = torch.float32
-) -> Tensor:
-    """Start of an attack: the plain colour plus noise of 1e-4, which is what differs between seeds.
-
-    Args:
-        theta_shape: Shape ``[..., 3]``.
-        plain_rgb: Plain colour ``[3]`` or any shape that broadcasts to ``theta_shape``, in 0..1.
-        generator: Source of the noise.
-        dtype: Floating point type of the result.
-    """
-    plain = torch.as_tensor(unsquash(plain_rgb), dtype=torch.float64)
-    noise = torch.randn(theta_shape, generator=generator, dtype=torch.float64)
-    return (plain.expand(theta_shape) + 1e-4 * noise).to(dtype)
 
 
 def cube_face_object(

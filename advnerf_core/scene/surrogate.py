@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from scipy import sparse
 from torch import Tensor
 
-from advnerf_core.fields.voxel_grid import VoxelGridObject, initial_theta, squash_derivative
+from advnerf_core.fields.voxel_grid import INITIAL_NOISE, VoxelGridObject, inverse_squash, squash_derivative
 from advnerf_core.geometry import Array, Pinhole, planar_poses
 from advnerf_core.render.cast_object import ObjectCast, cast_object
 from advnerf_core.render.composite import visible_shares
@@ -132,14 +132,19 @@ class Surrogate:
             return self.objects[0].theta_shape
         return (sum(field.free_count for field in self.objects), 3)
 
+    def plain_theta(self, dtype: torch.dtype | None = None) -> Tensor:
+        """The colours without an attack: the mean of each object's fixed ones, else grey; ``theta_shape``."""
+        rows = [torch.zeros(0, 3, dtype=torch.float64)]
+        for field in self.objects:
+            plain = field.fixed_colours.mean(axis=0) if len(field.fixed_colours) else np.full(3, 0.5)
+            rows.append(torch.as_tensor(inverse_squash(plain)).expand(field.free_count, 3))
+        return torch.cat(rows).reshape(self.theta_shape).to(dtype or self.dtype)
+
     def initial_theta(self, generator: torch.Generator, dtype: torch.dtype | None = None) -> Tensor:
-        """Plain colours (the mean of each object's fixed ones, else grey) with noise of 1e-4; ``theta_shape``."""
-        plains = [f.fixed_colours.mean(axis=0) if len(f.fixed_colours) else np.full(3, 0.5) for f in self.objects]
-        parts = [
-            initial_theta((field.free_count, 3), plain, generator, dtype or self.dtype)
-            for field, plain in zip(self.objects, plains, strict=True)
-        ]
-        return torch.cat([torch.zeros(0, 3, dtype=dtype or self.dtype), *parts]).reshape(self.theta_shape)
+        """Where an attack starts: plain colours with noise of 1e-4, which is what differs between seeds; ``theta_shape``."""
+        plain = self.plain_theta(torch.float64)
+        noise = torch.randn(plain.shape, generator=generator, dtype=torch.float64)
+        return (plain + INITIAL_NOISE * noise).to(dtype or self.dtype)
 
     def camera_poses(self, states: Tensor) -> Array:
         """``T_world_from_camera [B, 4, 4]`` at car states ``[B, n]``, detached."""
@@ -154,13 +159,13 @@ class Surrogate:
             rgb = self._background_colour(rgb)
         numpy_dtype = np.float64 if self.dtype == torch.float64 else np.float32
         casts = [cast_object(f, poses, self.camera, self._supersample, numpy_dtype) for f in self.objects]
-        shares = self._visible(casts, depth_m)
+        background_share, shares = self._visible(casts, depth_m)
         weights = []
-        for cast, share in zip(casts, shares[:-1], strict=True):
-            scale = share.reshape(-1)[torch.from_numpy(cast.pixels)].numpy().astype(numpy_dtype)
-            weights.append(sparse.csr_matrix(sparse.diags(scale, dtype=numpy_dtype) @ cast.weights))
+        for cast, share in zip(casts, shares, strict=True):
+            scale = sparse.diags(share.astype(numpy_dtype), dtype=numpy_dtype)
+            weights.append(sparse.csr_matrix(scale @ cast.weights))
         pixels = tuple(torch.from_numpy(cast.pixels) for cast in casts)
-        return Frames(rgb * shares[-1][..., None], tuple(weights), pixels, self.objects)
+        return Frames(rgb * background_share[..., None], tuple(weights), pixels, self.objects)
 
     def render(self, T_world_from_camera: ArrayLike, theta: Tensor | None) -> Rendered:
         """Images at camera poses ``[B, 4, 4]`` and their vjp; see :class:`Rendered`. ``theta`` is None without objects."""
@@ -182,17 +187,22 @@ class Surrogate:
             raise ValueError(f"expected a background of shapes {(*size, 3)} and {size}, got {got}")
         return rgb, depth_m
 
-    def _visible(self, casts: Sequence[ObjectCast], depth_m: Tensor) -> Tensor:
-        """Shares ``[objects + 1, B, H, W]`` of light that reaches the camera from each object and from the background."""
-        alphas = torch.zeros(len(casts) + 1, depth_m.numel(), dtype=torch.float64)
+    def _visible(self, casts: Sequence[ObjectCast], depth_m: Tensor) -> tuple[Tensor, list[Array]]:
+        """Shares of light that reach the camera: of the background ``[B, H, W]``, and of each object at its pixels ``[P]``."""
+        covered = np.unique(np.concatenate([np.zeros(0, np.int64), *(cast.pixels for cast in casts)]))
+        alphas = torch.zeros(len(casts) + 1, len(covered), dtype=torch.float64)
         depths = torch.full_like(alphas, torch.inf)
-        for k, cast in enumerate(casts):
-            index = torch.from_numpy(cast.pixels)
-            alphas[k, index] = torch.from_numpy(cast.alpha)
-            depths[k, index] = torch.from_numpy(cast.depth_m) - self._tolerance_m
+        places = [torch.from_numpy(np.searchsorted(covered, cast.pixels)) for cast in casts]
+        for k, (cast, place) in enumerate(zip(casts, places, strict=True)):
+            alphas[k, place] = torch.from_numpy(cast.alpha)
+            depths[k, place] = torch.from_numpy(cast.depth_m) - self._tolerance_m
+        index = torch.from_numpy(covered)
         alphas[-1] = 1.0
-        depths[-1] = torch.nan_to_num(depth_m.reshape(-1).double(), nan=torch.inf)
-        return visible_shares(alphas, depths).reshape(-1, *depth_m.shape).to(depth_m.dtype)
+        depths[-1] = torch.nan_to_num(depth_m.reshape(-1)[index].double(), nan=torch.inf)
+        shares = visible_shares(alphas, depths)
+        background = torch.ones(depth_m.numel(), dtype=depth_m.dtype)
+        background[index] = shares[-1].to(depth_m.dtype)
+        return background.reshape(depth_m.shape), [shares[k, place].numpy() for k, place in enumerate(places)]
 
 
 def split_theta(objects: Sequence[VoxelGridObject], theta: Tensor | None) -> list[Tensor]:

@@ -130,15 +130,23 @@ def test_background_colour_map_touches_the_background_only():
     torch.testing.assert_close(a - b, 0.5 * black, atol=1e-12, rtol=0)
 
 
-def test_float32_agrees_and_initial_theta_is_plain():
-    scene64 = surrogate(face(2.0))
-    scene32 = Surrogate(wall, PINHOLE, MOUNT, face(2.0))
-    theta = scene64.initial_theta(torch.Generator().manual_seed(3))
-    torch.testing.assert_close(squash(theta), torch.tensor([0.2, 0.5, 0.3]).double().expand(4, 4, 3), atol=2e-4, rtol=0)
+def test_float32_agrees_with_float64():
+    scene64, scene32 = surrogate(face(2.0)), Surrogate(wall, PINHOLE, MOUNT, face(2.0))
+    theta = torch.randn(scene64.theta_shape, dtype=torch.float64)
     a = scene64.observe(theta)(STATES)
     b = scene32.observe(theta.float())(STATES.float())
     assert b.dtype == torch.float32
     torch.testing.assert_close(a.float(), b, atol=2e-6, rtol=0)
+
+
+def test_initial_theta_is_plain_with_little_noise_that_differs_by_seed():
+    scene = surrogate(face(2.0))
+    torch.testing.assert_close(squash(scene.plain_theta()), torch.tensor([0.2, 0.5, 0.3]).double().expand(4, 4, 3))
+    a, b, again = (scene.initial_theta(torch.Generator().manual_seed(s)) for s in (0, 1, 0))
+    assert torch.equal(a, again)
+    assert not torch.equal(a, b)
+    assert 5e-5 < (a - scene.plain_theta()).std() < 2e-4
+    assert surrogate(None).initial_theta(torch.Generator()).shape == (0, 3)
 
 
 def test_wrong_backgrounds_and_missing_theta_are_refused():

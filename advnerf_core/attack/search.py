@@ -1,0 +1,172 @@
+"""What every search for a texture shares: its record of evaluations, the best so far, and a state file to resume from.
+
+The closed loop is chaotic, so the last evaluation is rarely the best: every search keeps the best by predicted total CTE. A
+state file is written after every evaluation, whole or not at all; a search resumed from it gives the same bits (on one machine
+and one number of threads) as one that was never stopped.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor
+
+from advnerf_core.attack.adjoint import AttackProblem, Totals
+from advnerf_core.errors import AdvnerfError
+from advnerf_core.files import write_atomically
+
+_FORMAT = "advnerf-search-1"
+
+
+class SearchStateError(AdvnerfError, ValueError):
+    """A search cannot be resumed from its state file."""
+
+
+class SearchDivergedError(AdvnerfError, ArithmeticError):
+    """A loss or gradient is not finite."""
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """One closed-loop evaluation of a search.
+
+    Attributes:
+        iteration: Its number, from 0.
+        loss_m: The loss: minus the mean over starts of the sum of |CTE| [m].
+        total_cte_m: What each start contributes to the loss [m].
+        protocol_cte_m: Total CTE of each start by the protocol, which stops the car at the fence [m].
+        seconds: Time it took, with its gradient if it had one [s].
+    """
+
+    iteration: int
+    loss_m: float
+    total_cte_m: tuple[float, ...]
+    protocol_cte_m: tuple[float, ...]
+    seconds: float
+
+    @property
+    def predicted_total_cte_m(self) -> float:
+        """Mean over starts of the total CTE by the protocol [m]: what a search maximises and reports."""
+        return sum(self.protocol_cte_m) / len(self.protocol_cte_m)
+
+
+@dataclass(frozen=True, eq=False)
+class SearchResult:
+    """What a search found.
+
+    Attributes:
+        theta: The best parameters.
+        best: The evaluation that found them.
+        history: All evaluations, in order.
+    """
+
+    theta: Tensor
+    best: Evaluation
+    history: tuple[Evaluation, ...]
+
+
+OnEvaluation = Callable[[Evaluation], None]
+
+
+@dataclass
+class SearchState:
+    """Everything a search needs to go on; ``tensors`` is what is special to the kind of search.
+
+    Attributes:
+        tensors: Search-specific tensors: current theta, optimiser moments, random generator.
+        best_theta: Best parameters so far; None before the first evaluation.
+        history: Evaluations so far.
+    """
+
+    tensors: dict[str, Tensor]
+    best_theta: Tensor | None = None
+    history: list[Evaluation] = field(default_factory=list)
+
+    @property
+    def best(self) -> Evaluation:
+        """The best evaluation so far; the first of equals."""
+        return max(self.history, key=lambda e: (e.predicted_total_cte_m, -e.iteration))
+
+    def record(self, theta: Tensor, loss_m: float, totals: Totals, seconds: float) -> Evaluation:
+        """Add an evaluation of ``theta``."""
+        evaluation = Evaluation(
+            len(self.history),
+            loss_m,
+            tuple(totals.total_cte_m.tolist()),
+            tuple(totals.protocol_cte_m.tolist()),
+            seconds,
+        )
+        self.history.append(evaluation)
+        if self.best is evaluation:
+            self.best_theta = theta.detach().clone()
+        return evaluation
+
+    def result(self) -> SearchResult:
+        """What was found so far; needs at least one evaluation."""
+        assert self.best_theta is not None
+        return SearchResult(self.best_theta, self.best, tuple(self.history))
+
+    def save(self, path: Path, fingerprint: str) -> None:
+        """Write the state file."""
+        assert self.best_theta is not None
+        header = {"format": _FORMAT, "fingerprint": fingerprint}
+        header["history"] = json.dumps([asdict(evaluation) for evaluation in self.history])
+        write_atomically(path, save({**self.tensors, "best_theta": self.best_theta}, metadata=header))
+
+
+def load_state(path: Path, fingerprint: str) -> SearchState:
+    """Read a state file that a search with the same settings wrote."""
+    try:
+        with safe_open(path, framework="pt") as handle:
+            header = handle.metadata() or {}
+            tensors = {name: handle.get_tensor(name) for name in handle.keys()}  # noqa: SIM118 - not a mapping
+        if header.get("format") != _FORMAT:
+            raise SearchStateError(
+                f"expected {path} to be a search state of format {_FORMAT}; delete it to start afresh"
+            )
+        history = [_evaluation(entry) for entry in json.loads(header["history"])]
+        best_theta = tensors.pop("best_theta")
+    except (SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
+        if isinstance(error, SearchStateError):
+            raise
+        raise SearchStateError(f"cannot resume from {path} ({error}); delete it to start afresh") from error
+    if header.get("fingerprint") != fingerprint:
+        raise SearchStateError(f"{path} belongs to a search with other settings; delete it, or use another folder")
+    return SearchState(tensors, best_theta, history)
+
+
+def _evaluation(entry: dict[str, Any]) -> Evaluation:
+    values: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in entry.items()}
+    return Evaluation(**values)
+
+
+def search_fingerprint(problem: AttackProblem, theta_shape: tuple[int, ...], **settings: Any) -> str:
+    """Hash of what must not change between a search and its resumption (its length may)."""
+    text = json.dumps({"steps": problem.steps, "theta_shape": list(theta_shape), **settings}, sort_keys=True)
+    digest = hashlib.sha256(text.encode())
+    digest.update(problem.start_states.detach().cpu().numpy().tobytes())
+    return digest.hexdigest()
+
+
+def draw_start_states(nominal: tuple[float, float, float], count: int, sigma: float = 0.1, seed: int = 0) -> Tensor:
+    """Start poses ``[count, 3]`` float64 optimised together: the nominal one, then normal around it.
+
+    Args:
+        nominal: x [m], y [m], yaw [rad].
+        count: Number of starts.
+        sigma: Spread, metres and radians alike.
+        seed: Drawn once per attack.
+    """
+    if count < 1:
+        raise ValueError(f"expected at least one start, got {count}")
+    noise = torch.randn(count, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+    noise[0] = 0.0
+    return torch.tensor(nominal, dtype=torch.float64) + sigma * noise
