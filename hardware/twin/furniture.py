@@ -117,11 +117,11 @@ def vehicle_in_room(config: LabConfig) -> TwinVehicle:
 def _bookshelf(x: float, y: float, yaw: float) -> _Place:
     p = _Place(x, y, yaw)
     depth, width, height = 0.32, 1.5, 1.8
-    p.box(0.0, -0.02, 0.0, width, 0.04, height, DARK_WOOD)
+    p.box(0.0, -0.025, 0.0, width, 0.04, height, DARK_WOOD)
     for side in (-1, 1):
-        p.box(side * (0.5 * width - 0.02), -0.5 * depth, 0.0, 0.04, depth, height, DARK_WOOD)
+        p.box(side * (0.5 * width - 0.02), -0.5 * depth - 0.005, 0.0, 0.04, depth, height, DARK_WOOD)
     for level in range(5):
-        p.box(0.0, -0.5 * depth, level * 0.44, width, depth, 0.04, DARK_WOOD)
+        p.box(0.0, -0.5 * depth - 0.005, level * 0.44, width, depth, 0.04, DARK_WOOD)
     # Wide blocks of books in distinct colours instead of single spines: texture, not noise.
     rows: list[list[tuple[float, float, float, Colour]]] = [
         [(-0.45, 0.50, 0.30, (0.66, 0.20, 0.18)), (0.20, 0.55, 0.26, (0.20, 0.32, 0.52))],

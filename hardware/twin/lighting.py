@@ -15,6 +15,7 @@ from advnerf_core.geometry import Array
 from hardware.twin.furniture import Solid
 
 AMBIENT = 0.56  # share of the light that has bounced so often that it comes from everywhere
+LAMP_POWER = 11.0  # of all lamps together [m2]: a floor point under a lamp gets about 1 in all
 
 
 def lamp_samples(room_half_m: float, room_height_m: float) -> Array:
@@ -48,7 +49,7 @@ def irradiance(points_m: Array, normal: Array, lamps_m: Array, occluders: Sequen
     visible = np.ones(light.shape, dtype=bool)
     for solid in occluders:
         visible &= ~_blocked(start, ray, solid)
-    scale = 11.0 / len(lamps_m)
+    scale = LAMP_POWER / len(lamps_m)
     return (AMBIENT + scale * (light * visible).sum(axis=1)).astype(np.float64)
 
 

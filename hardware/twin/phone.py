@@ -103,10 +103,10 @@ def car_mounted_poses(config: LabConfig, count: int, rng: np.random.Generator) -
 
 
 def _held_position(bearing: float, half_m: float, inwards: bool, phone: PhoneConfig, rng: np.random.Generator) -> Array:
-    # A ray from the middle meets the square wall at this distance; stay 0.5 m off it.
-    to_wall = half_m / max(abs(math.cos(bearing)), abs(math.sin(bearing)))
+    # A ray from the middle comes within 0.5 m of the square's wall at this distance.
+    reach = (half_m - 0.5) / max(abs(math.cos(bearing)), abs(math.sin(bearing)))
     # Who looks in steps back to the wall, who looks at the wall steps back to the middle.
-    radius = rng.uniform(0.5 * to_wall, to_wall - 0.5) if inwards else rng.uniform(0.8, 0.5 * to_wall)
+    radius = rng.uniform(0.6 * reach, reach) if inwards else rng.uniform(0.8, 0.6 * reach)
     return np.array([radius * math.cos(bearing), radius * math.sin(bearing), rng.uniform(*phone.walk_height_m)])
 
 

@@ -8,17 +8,18 @@ from typing import Any
 import numpy as np
 
 from advnerf_core.geometry import Array, quaternion_from_rotation, rotation_z
-from hardware.twin import lighting, textures
+from hardware.twin import textures
 from hardware.twin.config import LabConfig, PanelConfig
 from hardware.twin.furniture import Solid, furnish
 from hardware.twin.gl import load_mujoco
+from hardware.twin.surfaces import UP, Surface, paint_room
 from hardware.twin.textures import Image
 
 BOARD_PIXELS = (512, 512)  # width, height of the board face's texture
 MONITOR_PIXELS = (1024, 576)
 CAR_GROUP, CEILING_GROUP = 3, 2  # geom groups that views switch on or off
 TAPE_HEIGHT_M = 0.001
-# The lights that shade the furniture; the surfaces with baked light are corrected for them (see _surface).
+# The lights that shade the furniture; the surfaces with baked light are corrected for them (see _add_surface).
 AMBIENT = 0.62
 LIGHTS = (((0.30, 0.18, -0.94), 0.44), ((-0.82, 0.45, -0.35), 0.16), ((0.55, -0.80, -0.25), 0.12))
 
@@ -36,10 +37,13 @@ def build_model(config: LabConfig) -> Any:
     spec = mujoco.MjSpec()
     spec.visual.headlight.active = 0
     spec.visual.quality.offsamples = 0  # the renderer averages a larger image instead, which also filters textures
-    solids = furnish(config)
     _add_lights(mujoco, spec)
-    _add_surfaces(mujoco, spec, config, solids)
-    for solid in solids:
+    surfaces, tape = paint_room(config)
+    for name, surface in surfaces.items():
+        geom = _add_surface(mujoco, spec, surface)
+        geom.group = CEILING_GROUP if name == "ceiling" else 0
+    _add_tape(mujoco, spec, config, tape)
+    for solid in furnish(config):
         _add_solid(mujoco, spec.worldbody, solid)
     _add_panel(mujoco, spec, "board", config.board, BOARD_PIXELS, np.full((8, 8, 3), config.board.rgb, np.float32))
     _add_panel(mujoco, spec, "monitor", config.monitor, MONITOR_PIXELS, textures.screen_image(*MONITOR_PIXELS))
@@ -66,50 +70,16 @@ def shading(normal: Array) -> float:
     return total
 
 
-def _add_surfaces(mujoco: Any, spec: Any, config: LabConfig, solids: list[Solid]) -> None:
-    room, half = config.room, 0.5 * config.room.side_m
-    rng = np.random.default_rng(room.seed)
-    lamps = lighting.lamp_samples(half, room.height_m)
-    occluders = solids if config.shadows else []
-    floor = textures.floor_image(room.side_m, rng)
-    walls = textures.wall_images(room.side_m, room.height_m, rng)
-    ceiling = textures.ceiling_image(room.side_m, rng)
-
-    up = np.array([0.0, 0.0, 1.0])
-    grid = (np.arange(80) + 0.5) / 80 * 2.0 - 1.0
-    x, y = np.meshgrid(grid * half, -grid * half)
-    points = np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3)
-    floor_light = lighting.irradiance(points, up, lamps, occluders).reshape(x.shape)
-    right, far = np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0])
-    _surface(mujoco, spec, "floor", np.zeros(3), right, far, (half, half), textures.with_light(floor, floor_light))
-    _add_tape(mujoco, spec, config, floor_light)
-    top = np.array([0.0, 0.0, room.height_m])
-    ceiling_geom = _surface(mujoco, spec, "ceiling", top, right, -far, (half, half), ceiling)
-    ceiling_geom.group = CEILING_GROUP
-
-    for name, normal in (("south", far), ("east", -right), ("north", -far), ("west", right)):
-        across = np.cross(up, normal)  # a viewer who faces the wall has this on the right
-        u, v = np.meshgrid(grid * half, -grid[1::4] * 0.5 * room.height_m)
-        centre = -half * normal + 0.5 * room.height_m * up
-        points = centre + u.reshape(-1, 1) * across + v.reshape(-1, 1) * up
-        light = lighting.irradiance(points, normal, lamps, occluders).reshape(u.shape)
-        image = textures.with_light(walls[name], light)
-        _surface(mujoco, spec, name, centre, across, up, (half, 0.5 * room.height_m), image)
-
-
-def _surface(
-    mujoco: Any, spec: Any, name: str, centre: Array, right: Array, up: Array, half: tuple[float, float], image: Image
-) -> Any:
+def _add_surface(mujoco: Any, spec: Any, surface: Surface) -> Any:
     """Add a one-sided rectangle whose picture is seen as it is, whatever the rasteriser's lights do to its normal."""
-    normal = np.asarray(np.cross(right, up), dtype=np.float64)
-    factor = shading(normal)
-    _texture(mujoco, spec, name, textures.to_uint8(image / np.float32(max(factor, 1.0))))
-    material = _material(mujoco, spec, name)
+    factor = shading(surface.normal)
+    _texture(mujoco, spec, surface.name, textures.to_uint8(surface.image / np.float32(max(factor, 1.0))))
+    material = _material(mujoco, spec, surface.name)
     material.emission = max(1.0 - factor, 0.0)
-    geom = _geom(spec.worldbody, mujoco.mjtGeom.mjGEOM_PLANE, (*half, 0.1))
-    geom.pos = centre
-    geom.quat = _quaternion(np.stack([right, up, normal], axis=1))
-    geom.material = name
+    geom = _geom(spec.worldbody, mujoco.mjtGeom.mjGEOM_PLANE, (*surface.half_m, 0.1))
+    geom.pos = surface.centre_m
+    geom.quat = _quaternion(np.stack([surface.right, surface.up, surface.normal], axis=1))
+    geom.material = surface.name
     return geom
 
 
@@ -167,12 +137,11 @@ def _add_panel(mujoco: Any, spec: Any, name: str, panel: PanelConfig, pixels: tu
     geom.material = name
 
 
-def _add_tape(mujoco: Any, spec: Any, config: LabConfig, floor_light: Array) -> None:
+def _add_tape(mujoco: Any, spec: Any, config: LabConfig, picture: Image) -> None:
     """The tape as a flat ring of triangles: a texture would blur it at the grazing angle of the driving camera."""
-    light = textures.with_light(np.full((256, 256, 3), config.track.tape_rgb, np.float32), floor_light)
-    _texture(mujoco, spec, "tape", textures.to_uint8(light))
+    _texture(mujoco, spec, "tape", textures.to_uint8(picture))
     material = _material(mujoco, spec, "tape")
-    material.emission = max(1.0 - shading(np.array([0.0, 0.0, 1.0])), 0.0)
+    material.emission = max(1.0 - shading(UP), 0.0)
     inner, outer = tape_edges(config)
     count = len(inner)
     flat = np.concatenate([inner, outer])
