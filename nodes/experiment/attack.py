@@ -1,0 +1,168 @@
+"""Stage attack: for every victim and seed the gradient attack and random search, in the learned scene only."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+
+from advnerf_core.attack.adjoint import AttackProblem, evaluate
+from advnerf_core.attack.artifact import AttackFile, face_texture, save_attack
+from advnerf_core.attack.baselines import random_search
+from advnerf_core.attack.optimise import gradient_attack
+from advnerf_core.attack.search import Evaluation, SearchResult, draw_start_states
+from advnerf_core.driving.policy import LoadedPolicy, load_policy
+from advnerf_core.files import write_atomically
+from advnerf_core.scene.surrogate import Surrogate
+from nodes.experiment.context import Experiment
+from nodes.experiment.objects import attacked_object, surrogate_of
+from nodes.experiment.policy import HARDENED, NAIVE, victim_file
+from nodes.experiment.scene import load_background, scene_sha256
+from nodes.runtime.stages import Report, hash_of
+
+Method = Literal["random", "gradient"]
+METHODS: tuple[Method, ...] = ("random", "gradient")
+
+
+@dataclass(frozen=True)
+class Search:
+    """One search: which victim, which method, which seed."""
+
+    victim: str
+    method: Method
+    seed: int
+
+    @property
+    def name(self) -> str:
+        """Name of its files."""
+        return f"{self.victim}_{self.method}_{self.seed}"
+
+
+def victims(experiment: Experiment) -> list[str]:
+    """The policies that are attacked."""
+    return [HARDENED, NAIVE] if experiment.config.policy.naive_steps else [HARDENED]
+
+
+def searches(experiment: Experiment) -> list[Search]:
+    """All searches: every seed against the hardened victim, the first also against the naive one."""
+    seeds = experiment.config.attack.seeds
+    plan = [Search(HARDENED, method, seed) for seed in seeds for method in METHODS]
+    if NAIVE in victims(experiment):
+        plan += [Search(NAIVE, method, seeds[0]) for method in METHODS]
+    return plan
+
+
+def start_states(experiment: Experiment, seed: int) -> torch.Tensor:
+    """Start poses ``[B, 3]`` of one attack; the first is the nominal one."""
+    attack = experiment.config.attack
+    return draw_start_states(experiment.room.start_pose, attack.starts, attack.start_sigma, seed)
+
+
+def frozen_hashes(experiment: Experiment) -> dict[str, str]:
+    """What is fixed before the first attack: scene, victims, placement, starts and seeds."""
+    policies = {f"policy_{name}": load_policy(victim_file(experiment, name)).sha256 for name in victims(experiment)}
+    placement = np.asarray(attacked_object(experiment).T_world_from_object).tolist()
+    starts = {str(seed): start_states(experiment, seed).tolist() for seed in experiment.config.attack.seeds}
+    return {
+        "scene": scene_sha256(experiment),
+        **policies,
+        "placement": hash_of(placement),
+        "starts_and_seeds": hash_of(starts),
+        "config": hash_of(experiment.config.model_dump(mode="json")),
+    }
+
+
+def run(experiment: Experiment, folder: Path, report: Report) -> None:
+    """Freeze, drive without attack, search; one attack file and one JSON of surrogate drives per search."""
+    write_atomically(folder / "frozen.json", json.dumps(frozen_hashes(experiment), indent=1) + "\n")
+    background = load_background(experiment)
+    bare = surrogate_of(experiment, [], background)
+    attacked = surrogate_of(experiment, [attacked_object(experiment)], background)
+    plan = searches(experiment)
+    for victim in victims(experiment):
+        for seed in experiment.config.attack.seeds:
+            _drive_without_attack(experiment, bare, victim, seed, folder)
+    for index, search in enumerate(plan):
+        if (folder / f"{search.name}.json").exists():
+            continue
+
+        def progress(fraction: float, text: str = "", index: int = index, search: Search = search) -> None:
+            report((index + fraction) / len(plan), f"{search.victim} {search.method} seed {search.seed}: {text}")
+
+        _search(experiment, attacked, search, folder, progress)
+
+
+def _problem(experiment: Experiment, surrogate: Surrogate, policy: LoadedPolicy, seed: int) -> AttackProblem:
+    attack = experiment.config.attack
+    fence = np.abs(np.array(experiment.room.fence_m)).min()
+    return AttackProblem(
+        policy.policy, surrogate, experiment.dynamics, experiment.path, start_states(experiment, seed), attack.horizon,
+        time_batch=attack.time_batch, cache_bytes=int(attack.cache_mib * 2**20), fence_m=float(fence),
+    )  # fmt: skip
+
+
+def _drive_without_attack(experiment: Experiment, bare: Surrogate, victim: str, seed: int, folder: Path) -> None:
+    policy = load_policy(victim_file(experiment, victim))
+    problem = _problem(experiment, bare, policy, seed)
+    rollout, totals = evaluate(problem, torch.zeros(bare.theta_shape))
+    drives = {"states": rollout.states.transpose(0, 1).tolist(), "total_cte_m": totals.protocol_cte_m.tolist()}
+    write_atomically(folder / f"{victim}_none_{seed}.json", json.dumps(drives) + "\n")
+
+
+def _search(
+    experiment: Experiment, surrogate: Surrogate, search: Search, folder: Path, progress: Callable[..., None]
+) -> None:
+    attack = experiment.config.attack
+    policy = load_policy(victim_file(experiment, search.victim))
+    problem = _problem(experiment, surrogate, policy, search.seed)
+    wanted = attack.iterations if search.method == "gradient" else attack.random_evaluations
+    best = [0.0]
+
+    def told(evaluation: Evaluation) -> None:
+        best[0] = max(best[0], evaluation.predicted_total_cte_m)
+        done = evaluation.iteration + 1
+        progress(done / wanted, f"{done}/{wanted}, total CTE {evaluation.predicted_total_cte_m:.1f} m, best {best[0]:.1f} m")
+
+    common: dict[str, Any] = {
+        "seed": search.seed, "state_path": folder / f"{search.name}.state.safetensors", "on_evaluation": told,
+        "settings_hash": hash_of(frozen_hashes(experiment)),
+    }  # fmt: skip
+    if search.method == "gradient":
+        result = gradient_attack(problem, attack.iterations, attack.learning_rate, **common)
+    else:
+        result = random_search(problem, attack.random_evaluations, attack.random_sigma, **common)
+    attack_id = save_attack(attack_path(folder, search), _attack_file(experiment, policy, search, result))
+    rollout, totals = evaluate(problem, result.theta)
+    drives = {
+        "attack_id": attack_id,
+        "states": rollout.states.transpose(0, 1).tolist(),
+        "total_cte_m": totals.protocol_cte_m.tolist(),
+        "curve_total_cte_m": [evaluation.predicted_total_cte_m for evaluation in result.history],
+        "seconds": sum(evaluation.seconds for evaluation in result.history),
+    }
+    write_atomically(folder / f"{search.name}.json", json.dumps(drives) + "\n")
+    common["state_path"].unlink(missing_ok=True)
+
+
+def attack_path(folder: Path, search: Search) -> Path:
+    """The attack file of a search."""
+    return folder / f"{search.name}.attack.safetensors"
+
+
+def _attack_file(experiment: Experiment, policy: LoadedPolicy, search: Search, result: SearchResult) -> AttackFile:
+    board, theta = experiment.lab_config.board, result.theta.numpy().astype(np.float32)
+    return AttackFile(
+        method=search.method, theta=theta, texture=face_texture(theta), size_m=(board.width_m, board.height_m),
+        T_world_from_object=np.asarray(attacked_object(experiment).T_world_from_object),
+        subject=experiment.target.subject, corners_in_subject=experiment.target.corners,
+        camera=experiment.view.pinhole, scene_sha256=scene_sha256(experiment), policy_sha256=policy.sha256,
+        config_sha256=hash_of(experiment.config.model_dump(mode="json")), seed=search.seed,
+        predicted_total_cte_m=result.best.predicted_total_cte_m, software_version=version("advnerf"),
+        extra={"victim": search.victim, "horizon": experiment.config.attack.horizon},
+    )  # fmt: skip

@@ -1,0 +1,84 @@
+"""Stage capture: photograph the lab with the phone, and with the driving camera for comparison."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from advnerf_core.files import write_atomically
+from advnerf_core.geometry import Array, planar_pose
+from advnerf_core.scene.dataset import write_transforms
+from calibration.by_construction import write_twin_calibrations
+from hardware.twin.lab import Lab
+from hardware.twin.phone import car_mounted_poses, walk_around_poses
+from nodes.experiment.config import CaptureConfig
+from nodes.experiment.context import CALIBRATION, Experiment
+from nodes.runtime.stages import Report
+
+PHONE, COLOUR_PAIRS, HELD_OUT = "phone", "colour_pairs", "held_out"
+
+
+def run(experiment: Experiment, folder: Path, report: Report) -> None:
+    """Write three posed image sets: ``phone`` (learned from), ``colour_pairs`` and ``held_out`` (driving camera)."""
+    capture, lab_config = experiment.config.capture, experiment.lab_config
+    write_twin_calibrations(lab_config, folder / CALIBRATION)
+    rng = np.random.default_rng(capture.seed)
+    phone_poses = [
+        *walk_around_poses(lab_config, capture.walk_around, rng),
+        *car_mounted_poses(lab_config, capture.car_mounted, rng),
+    ]
+    car_states = driving_states(experiment, capture.colour_pairs + capture.held_out, rng)
+    driving_poses = [planar_pose(*state) @ experiment.camera.mount for state in car_states]
+    total = len(phone_poses) + len(driving_poses)
+    with Lab(lab_config) as lab:
+
+        def photograph(name: str, poses: list[Array], take: Callable[[int], NDArray[np.uint8]], done: int) -> None:
+            names = []
+            for index in range(len(poses)):
+                names.append(f"images/{index:04d}.{'jpg' if name == PHONE else 'png'}")
+                _write_image(folder / name / names[-1], take(index))
+                report((done + index + 1) / total, f"{name} {index + 1}/{len(poses)}")
+            pinhole = lab_config.phone.pinhole if name == PHONE else lab_config.camera.pinhole
+            write_transforms(folder / name / "transforms.json", names, poses, pinhole)
+
+        photograph(PHONE, phone_poses, lambda i: lab.photograph(phone_poses[i]), 0)
+        # Interleaved, so that both sets cover the whole track.
+        held_out = _held_out_indices(capture)
+        pairs = [i for i in range(len(driving_poses)) if i not in held_out]
+        for name, chosen, done in ((COLOUR_PAIRS, pairs, 0), (HELD_OUT, sorted(held_out), len(pairs))):
+            poses = [driving_poses[i] for i in chosen]
+            states = [car_states[i] for i in chosen]
+            photograph(name, poses, lambda i, s=states: lab.observe_at(*s[i])[0], len(phone_poses) + done)  # type: ignore[misc]
+
+
+def driving_states(experiment: Experiment, count: int, rng: np.random.Generator) -> Array:
+    """Car states ``[count, 3]`` spread evenly over the path, with the offsets that driving shows."""
+    path = experiment.path
+    s_m = (np.arange(count) + rng.uniform(0.0, 1.0, count)) / count * path.length_m
+    poses = path.pose_at(s_m)
+    lateral_m = rng.uniform(-0.15, 0.15, count)
+    states = poses.copy()
+    states[:, 0] -= np.sin(poses[:, 2]) * lateral_m
+    states[:, 1] += np.cos(poses[:, 2]) * lateral_m
+    states[:, 2] += rng.uniform(-0.15, 0.15, count)
+    return states
+
+
+def _held_out_indices(capture: CaptureConfig) -> set[int]:
+    total = capture.colour_pairs + capture.held_out
+    return {int(i) for i in np.linspace(0, total - 1, capture.held_out).round()}
+
+
+def _write_image(path: Path, rgb: NDArray[np.uint8]) -> None:
+    # A phone stores JPEG; the comparison frames stay lossless.
+    options = [cv2.IMWRITE_JPEG_QUALITY, 95] if path.suffix == ".jpg" else []
+    encoded, data = cv2.imencode(path.suffix, cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), options)
+    if not encoded:
+        raise ValueError(f"expected an image that can be written as {path.suffix}, got shape {rgb.shape}")
+    write_atomically(path, data.tobytes())
+
+

@@ -1,0 +1,90 @@
+"""What all stages of one experiment share: the resolved configuration, the lab, the calibration, the path."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path as FilePath
+
+from advnerf_core.driving.dynamics import Ackermann
+from advnerf_core.driving.path import Path
+from advnerf_core.driving.policy_view import PolicyView
+from calibration.schema import (
+    CameraCalibration,
+    RoomCalibration,
+    TargetCalibration,
+    VehicleCalibration,
+    load_calibration,
+)
+from hardware.twin.config import LabConfig
+from nodes.experiment.config import ExperimentConfig
+
+CONTROL_PERIOD_S = 0.1
+CALIBRATION = "calibration"
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """One resolved experiment.
+
+    Attributes:
+        config: The resolved configuration.
+        file: The experiment file.
+        folder: The run folder.
+        setting: Name of the setting, e.g. ``demo``.
+    """
+
+    config: ExperimentConfig
+    file: FilePath
+    folder: FilePath
+    setting: str
+
+    @cached_property
+    def lab_config(self) -> LabConfig:
+        """The simulated lab with the experiment's changes."""
+        return LabConfig.model_validate(self.config.lab)
+
+    def stage_folder(self, stage: str) -> FilePath:
+        """Where a stage writes."""
+        return self.folder / stage
+
+    def calibration_file(self, name: str) -> FilePath:
+        """A calibration file that the capture stage left: camera, vehicle, board, monitor or room."""
+        return self.stage_folder("capture") / CALIBRATION / f"{name}.yaml"
+
+    @cached_property
+    def camera(self) -> CameraCalibration:
+        """The driving camera."""
+        return load_calibration(CameraCalibration, self.calibration_file("camera"))
+
+    @cached_property
+    def room(self) -> RoomCalibration:
+        """Path, fence and start pose."""
+        return load_calibration(RoomCalibration, self.calibration_file("room"))
+
+    @cached_property
+    def target(self) -> TargetCalibration:
+        """The face on which an attack is shown."""
+        return load_calibration(TargetCalibration, self.calibration_file("board"))
+
+    @cached_property
+    def path(self) -> Path:
+        """The reference path."""
+        return self.room.reference_path
+
+    @cached_property
+    def view(self) -> PolicyView:
+        """What the policy sees of the driving camera."""
+        return PolicyView(self.camera.pinhole, distortion=self.camera.distortion)
+
+    @cached_property
+    def dynamics(self) -> Ackermann:
+        """The surrogate's car: as calibrated, without the lags and errors of the real one."""
+        vehicle = load_calibration(VehicleCalibration, self.calibration_file("vehicle"))
+        limits = (vehicle.limits.steering_min_rad, vehicle.limits.steering_max_rad)
+        return Ackermann(vehicle.wheelbase_m, self.speed_mps, CONTROL_PERIOD_S, limits)
+
+    @property
+    def speed_mps(self) -> float:
+        """Driving speed."""
+        return self.lab_config.car.speed_mps

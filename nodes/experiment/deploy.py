@@ -1,0 +1,138 @@
+"""Stage deploy: drive every attack live through the node graph against the simulated lab, and measure from the bag."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from advnerf_core.attack.artifact import load_attack
+from advnerf_core.driving.metrics import Horizon
+from advnerf_core.driving.policy import load_policy
+from advnerf_core.files import write_atomically
+from nodes.evaluation import attack_ids, score, timing, trajectory
+from nodes.experiment.attack import METHODS, Search, attack_path, frozen_hashes, victims
+from nodes.experiment.context import CONTROL_PERIOD_S, Experiment
+from nodes.experiment.policy import HARDENED, NAIVE, victim_file
+from nodes.runtime.clock import NS_PER_S
+from nodes.runtime.errors import RuntimeFault
+from nodes.runtime.stages import Report
+from nodes.trial import TrialPlan
+from nodes.trial_runner import run_trial
+
+Condition = Literal["none", "random", "gradient", "empty", "laps"]
+# The absent board of the empty scene stands outside the room, out of every camera's sight.
+_OUT_OF_SIGHT_M = 60.0
+
+
+class FrozenChangedError(RuntimeFault):
+    """Something that was fixed before the first attack is no longer what it was."""
+
+
+@dataclass(frozen=True)
+class LiveRun:
+    """One live run: which victim meets what."""
+
+    victim: str
+    condition: Condition
+    seed: int
+
+    @property
+    def name(self) -> str:
+        """Name of its folder and result."""
+        return f"{self.victim}_{self.condition}_{self.seed}"
+
+
+def live_runs(experiment: Experiment) -> list[LiveRun]:
+    """All runs of the stage, in order: laps, then for each seed none, random, gradient; the naive victim last."""
+    seeds, deploy = experiment.config.attack.seeds, experiment.config.deploy
+    plan = [LiveRun(HARDENED, "laps", seeds[0])] if deploy.laps else []
+    plan += [LiveRun(HARDENED, condition, seed) for seed in seeds for condition in ("none", *METHODS)]
+    if deploy.empty_scene:
+        plan.append(LiveRun(HARDENED, "empty", seeds[0]))
+    if NAIVE in victims(experiment):
+        plan += [LiveRun(NAIVE, condition, seeds[0]) for condition in ("none", *METHODS)]
+    return plan
+
+
+def run(experiment: Experiment, folder: Path, report: Report) -> None:
+    """Drive what is not driven yet; one folder with a bag and one JSON per run."""
+    _check_frozen(experiment)
+    plan = live_runs(experiment)
+    for index, live in enumerate(plan):
+        report(index / len(plan), f"{live.victim} {live.condition} seed {live.seed}")
+        if not (folder / f"{live.name}.json").exists():
+            shutil.rmtree(folder / live.name, ignore_errors=True)
+            _drive(experiment, live, folder)
+
+
+def _check_frozen(experiment: Experiment) -> None:
+    then = json.loads((experiment.stage_folder("attack") / "frozen.json").read_text())
+    changed = [name for name, value in frozen_hashes(experiment).items() if name != "config" and then[name] != value]
+    if changed:
+        raise FrozenChangedError(
+            f"expected {', '.join(changed)} as frozen before the first attack, got another; run the attack stage again"
+        )
+
+
+def _drive(experiment: Experiment, live: LiveRun, folder: Path) -> None:
+    deploy = experiment.config.deploy
+    horizon = live_horizon(experiment, live)
+    launch_file = experiment.file.parent / deploy.launch_file
+    plan = TrialPlan(experiment.room.start_pose, horizon.ticks * horizon.dt_s + 0.2, deploy.nodes)
+    run_dir = folder / live.name
+    outcome = run_trial(launch_file, _overrides(experiment, live), run_dir, plan, deploy.ready_timeout_s)
+    bag = run_dir / "bag"
+    states = trajectory(bag, outcome.start_real_ns, horizon)
+    stopped_s = (outcome.end_real_ns - outcome.start_real_ns) / NS_PER_S if outcome.stopped_early else None
+    metrics, held = score(states, experiment.path, horizon, stopped_s)
+    times = timing(bag, outcome.start_real_ns, outcome.end_real_ns)
+    drawn = sorted(attack_ids(bag))
+    _check_drawn(experiment, live, drawn)
+    result: dict[str, Any] = {
+        "victim": live.victim, "condition": live.condition, "seed": live.seed, "attack_ids": drawn,
+        "outcome": outcome.to_dict(), "states": held.tolist(),
+        "cte_m": experiment.path.project(held[:, :2]).cte_m.tolist(), "total_cte_m": metrics.total_cte_m,
+        "mean_abs_cte_m": metrics.mean_cte_m, "max_abs_cte_m": metrics.max_cte_m, "off_track": metrics.off_track,
+        "time_to_leave_s": metrics.time_to_leaving_s, "frames": times.frames, "missed": times.missed,
+        "capture_to_serial_ms": times.capture_to_serial_ms.tolist(),
+        "hops_ms": {name: values.tolist() for name, values in times.hops_ms.items()},
+    }  # fmt: skip
+    write_atomically(folder / f"{live.name}.json", json.dumps(result) + "\n")
+
+
+def live_horizon(experiment: Experiment, live: LiveRun) -> Horizon:
+    """Control ticks over which a run is measured."""
+    ticks = experiment.config.attack.horizon
+    if live.condition == "laps":
+        ticks = round(experiment.config.deploy.laps * experiment.path.length_m / experiment.speed_mps / CONTROL_PERIOD_S)
+    return Horizon(ticks, CONTROL_PERIOD_S, experiment.room.off_track_m)
+
+
+def _overrides(experiment: Experiment, live: LiveRun) -> list[str]:
+    policy = victim_file(experiment, live.victim)
+    calibration = experiment.calibration_file("camera").parent
+    overrides = [
+        f"params.calibration={calibration}",
+        f"params.policy={policy}",
+        f"policy.policy_sha256={load_policy(policy).sha256}",
+        f"twin.lab={json.dumps(experiment.lab_config.model_dump(mode='json'))}",
+    ]
+    if live.condition in METHODS:
+        overrides.append(f"params.attack={_attack_file(experiment, live)}")
+    if live.condition == "empty":
+        overrides.append(f"twin.lab.board.x_m={_OUT_OF_SIGHT_M}")
+    return overrides
+
+
+def _attack_file(experiment: Experiment, live: LiveRun) -> Path:
+    assert live.condition in ("random", "gradient")
+    return attack_path(experiment.stage_folder("attack"), Search(live.victim, live.condition, live.seed))
+
+
+def _check_drawn(experiment: Experiment, live: LiveRun, drawn: list[str]) -> None:
+    expected = [load_attack(_attack_file(experiment, live)).attack_id] if live.condition in METHODS else []
+    if drawn != expected:
+        raise RuntimeFault(f"expected the attacks {expected} in the frames of run {live.name}, got {drawn}")

@@ -1,0 +1,120 @@
+"""Stage policy: learn to drive from lab and surrogate frames, with the object plain and with random textures."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from advnerf_core.attack.artifact import face_texture
+from advnerf_core.attack.projection import FaceOverlay
+from advnerf_core.driving.expert import Expert, ExpertConfig
+from advnerf_core.driving.imitation import ImitationConfig, SourcePlan, train_policy
+from advnerf_core.driving.path import Array
+from advnerf_core.driving.policy import images_to_tensor, load_policy
+from advnerf_core.driving.sources import Overlay, RenderedSource, SceneSource, Show, Texture
+from advnerf_core.fields.voxel_grid import unsquash
+from advnerf_core.files import write_atomically
+from advnerf_core.geometry import invert_transform, planar_pose
+from advnerf_core.scene.dataset import load_transforms
+from hardware.twin.lab import Lab
+from nodes.experiment import capture
+from nodes.experiment.context import CONTROL_PERIOD_S, Experiment
+from nodes.experiment.objects import attacked_object, last_result_kept, surrogate_of
+from nodes.experiment.scene import load_background
+from nodes.runtime.stages import Report
+
+HARDENED, NAIVE = "hardened", "naive"
+FILES = {HARDENED: "policy.safetensors", NAIVE: "naive.safetensors"}
+_TRAINING_TEXTURE_PX = 128
+
+
+def run(experiment: Experiment, folder: Path, report: Report) -> None:
+    """Train the victims, then compare their steering on held-out lab views and the surrogate's image of them."""
+    config = experiment.config.policy
+    settings = ImitationConfig(
+        seed=config.seed, dagger_rounds=config.dagger_rounds, first_steps=config.first_steps,
+        round_steps=config.round_steps, naive_steps=config.naive_steps,
+    )  # fmt: skip
+    expert = Expert(experiment.path, replace(ExpertConfig(), speed_mps=experiment.speed_mps))
+    with Lab(experiment.lab_config) as lab:
+        plans = [
+            SourcePlan(_lab_source(experiment, lab), config.lab_stills, config.lab_drives, config.drive_steps),
+            SourcePlan(
+                _surrogate_source(experiment), config.surrogate_stills, config.surrogate_drives, config.drive_steps
+            ),
+        ]
+        trained = train_policy(
+            settings, plans, expert, experiment.view, folder, lambda part, text: report(0.98 * part, text)
+        )
+    report(0.98, "comparing steering on real and learned views")
+    summary = {
+        "sha256": trained.sha256, "naive_sha256": trained.naive_sha256, "frames": trained.frames,
+        "validation_mae_rad": trained.validation_mae_rad, "naive_validation_mae_rad": trained.naive_validation_mae_rad,
+        "seconds": trained.seconds, "steering_on_held_out_views": steering_on_held_out_views(experiment),
+    }  # fmt: skip
+    write_atomically(folder / "policy.json", json.dumps(summary, indent=1) + "\n")
+
+
+def victim_file(experiment: Experiment, victim: str) -> Path:
+    """Policy file of a victim."""
+    return experiment.stage_folder("policy") / FILES[victim]
+
+
+def steering_on_held_out_views(experiment: Experiment) -> list[dict[str, float]]:
+    """Steering [rad] of the hardened victim on each held-out view of the driving camera and on the surrogate's image of it."""
+    views = load_transforms(experiment.stage_folder("capture") / capture.HELD_OUT / "transforms.json")
+    policy = load_policy(victim_file(experiment, HARDENED)).policy
+    surrogate = surrogate_of(experiment, [])
+    rows = []
+    for path, T_world_from_camera in zip(views.paths, views.T_world_from_camera, strict=True):
+        real = experiment.view.image(cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB).astype(np.uint8))
+        with torch.no_grad():
+            on_real = float(policy(images_to_tensor(real))[0])
+            on_surrogate = float(policy(surrogate.render(T_world_from_camera[None], None).images)[0])
+        rows.append({"real_rad": on_real, "surrogate_rad": on_surrogate})
+    return rows
+
+
+def _lab_source(experiment: Experiment, lab: Lab) -> SceneSource:
+    return SceneSource(
+        "lab", lab, experiment.view, experiment.speed_mps, CONTROL_PERIOD_S, _lab_overlay(experiment),
+        experiment.config.object.resolution,
+    )  # fmt: skip
+
+
+def _lab_overlay(experiment: Experiment) -> Overlay:
+    """Paints textures on the board's face with the compositor's own projection."""
+    T_camera_from_car = invert_transform(experiment.camera.mount)
+    T_world_from_face = experiment.lab_config.board.T_world_from_face
+
+    def overlay(rgb: NDArray[np.uint8], depth_m: NDArray[np.float32], state: Array, texture: Texture) -> NDArray[np.uint8]:
+        del depth_m  # nothing in the lab hides the face
+        displayed = face_texture(unsquash(texture), _TRAINING_TEXTURE_PX)
+        face = FaceOverlay(displayed, experiment.target.corners, experiment.camera.pinhole, experiment.camera.distortion)
+        T_camera_from_world = T_camera_from_car @ invert_transform(planar_pose(*state[:3]))
+        return face.draw(rgb, T_camera_from_world @ T_world_from_face)[0]
+
+    return overlay
+
+
+def _surrogate_source(experiment: Experiment) -> RenderedSource:
+    background = last_result_kept(load_background(experiment))
+    bare = surrogate_of(experiment, [], background)
+    with_object = surrogate_of(experiment, [attacked_object(experiment)], background)
+    sigma = experiment.config.attack.random_sigma
+
+    def prepare(states: Array) -> Show:
+        poses = with_object.camera_poses(torch.from_numpy(np.asarray(states)))
+        plain, attacked = bare.prepare(poses), with_object.prepare(poses)
+        return lambda theta: plain.render(None).images if theta is None else attacked.render(theta).images
+
+    def sample(rng: np.random.Generator) -> torch.Tensor:
+        return torch.from_numpy(sigma * rng.standard_normal(with_object.theta_shape)).float()
+
+    return RenderedSource("surrogate", prepare, experiment.dynamics, sample)

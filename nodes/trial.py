@@ -1,0 +1,249 @@
+"""One measured drive: put the car on its start, arm, let it drive for the horizon, disarm, wait until it stands.
+
+The operator of a trial is a node like the others, so that it runs in tests and in replay without sockets. It arms by itself
+only when the motor's peer says that it is the twin; on a real car arming is a person's act.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from enum import Enum
+from typing import Any
+
+import numpy as np
+
+from advnerf_core.geometry import planar_pose, wrap_angle, yaw_of
+from nodes.runtime.clock import NS_PER_S, Now
+from nodes.runtime.errors import NodeFinished, RuntimeFault
+from nodes.runtime.messages import header, ns_from_stamp, pose_matrix, pose_message, types
+from nodes.runtime.node import MessageInfo, Node, Out
+from nodes.runtime.topics import status_topic
+
+TWIN_PEER = "TWIN"
+_REPEAT_S = 0.5
+_SETTLE_S = 0.5
+_MOVED_M = 0.01
+_AT_START_M, _AT_START_RAD = 0.03, 0.05
+_SPOT_M = 0.005
+_STANDING_S = 0.5
+
+
+class TrialError(RuntimeFault):
+    """A trial could not be carried out."""
+
+
+class Phase(Enum):
+    """Where a trial is."""
+
+    GATHERING = "waiting for the nodes"
+    PLACING = "putting the car on its start"
+    ARMING = "arming"
+    DRIVING = "driving"
+    STOPPING = "stopping"
+    DONE = "done"
+
+
+@dataclass(frozen=True)
+class TrialPlan:
+    """What is driven.
+
+    Attributes:
+        start_pose: Pose of the rear axle: x [m], y [m], yaw [rad].
+        duration_s: Time from the first motion to the disarming [s].
+        nodes: Nodes that must be ready before anything moves.
+        patience_s: Time that each phase but driving may take [s].
+    """
+
+    start_pose: tuple[float, float, float]
+    duration_s: float
+    nodes: tuple[str, ...]
+    patience_s: float = 20.0
+
+
+@dataclass
+class TrialOutcome:
+    """What happened.
+
+    Attributes:
+        start_real_ns: Capture time of the first pose that had moved, CLOCK_REALTIME [ns]; 0 if it never moved.
+        end_real_ns: When the trial disarmed, or the stack stopped by itself [ns].
+        stopped_early: Why the stack stopped before the horizon's end; empty if it did not.
+        peer: What the motor controller says it is.
+    """
+
+    start_real_ns: int = 0
+    end_real_ns: int = 0
+    stopped_early: str = ""
+    peer: str = ""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data."""
+        return asdict(self)
+
+
+@dataclass
+class _Seen:
+    """The newest of everything the operator watches."""
+
+    ready: set[str] = field(default_factory=set)
+    T_world_from_car: Any = None
+    spot_m: Any = None
+    standing_since_ns: int | None = None
+    armed: bool = False
+    safety_reason: str = ""
+    peer: str = ""
+
+
+class TrialNode(Node):
+    """The operator of one trial.
+
+    Args:
+        plan: What is driven.
+        trouble: Asked at every tick whether the graph has failed; a text ends the trial.
+    """
+
+    tick_rate_hz = 20.0
+    publications = ("/arm", "/twin/reset")
+
+    def __init__(self, plan: TrialPlan, trouble: Callable[[], str] = str) -> None:
+        self.plan = plan
+        self._trouble = trouble
+        self.outcome = TrialOutcome()
+        self.phase = Phase.GATHERING
+        self.subscriptions = ("/vicon/car", "/safety/state", "/motor/sent", *map(status_topic, plan.nodes))
+        self._seen = _Seen()
+        self._phase_began_ns: int | None = None
+        self._said_ns = 0
+
+    def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
+        """Remember what is going on; act on the car's pose at once."""
+        del info
+        if topic == "/vicon/car":
+            self._see_car(message, now)
+        elif topic == "/safety/state":
+            self._seen.armed, self._seen.safety_reason = bool(message.armed), str(message.reason)
+        elif topic == "/motor/sent":
+            self._seen.peer = str(message.peer)
+        else:
+            self._see_status(message)
+        return []
+
+    def tick(self, now: Now) -> list[Out]:
+        """Go on to the next phase when this one has reached its end, and say again what was not heard."""
+        if self._phase_began_ns is None:
+            self._phase_began_ns = now.mono_ns
+        step = {
+            Phase.GATHERING: self._gather, Phase.PLACING: self._place, Phase.ARMING: self._arm,
+            Phase.DRIVING: self._drive, Phase.STOPPING: self._stop,
+        }  # fmt: skip
+        if self.phase is Phase.DONE:
+            raise NodeFinished
+        if trouble := self._trouble():
+            raise TrialError(f"the graph failed while {self.phase.value}: {trouble}")
+        waited_s = (now.mono_ns - self._phase_began_ns) / NS_PER_S
+        if self.phase is not Phase.DRIVING and waited_s > self.plan.patience_s:
+            raise TrialError(f"gave up after {waited_s:.0f} s {self.phase.value}: {self._what_is_missing()}")
+        return step[self.phase](now)
+
+    def status(self) -> tuple[str, str]:
+        """The phase, for a person."""
+        return "active", self.phase.value
+
+    def _see_car(self, message: Any, now: Now) -> None:
+        T, stamp_ns = pose_matrix(message), ns_from_stamp(message.header.stamp)
+        seen = self._seen
+        # Speed from neighbouring poses would be noise; standing means not having left a spot for a while.
+        if seen.spot_m is None or float(np.linalg.norm(T[:3, 3] - seen.spot_m)) > _SPOT_M:
+            seen.spot_m, seen.standing_since_ns = T[:3, 3].copy(), now.mono_ns
+        seen.T_world_from_car = T
+        if self.phase in (Phase.ARMING, Phase.DRIVING) and not self.outcome.start_real_ns:
+            offset_m = float(np.linalg.norm(T[:2, 3] - self._start_xy))
+            if offset_m > _MOVED_M:
+                self.outcome.start_real_ns = stamp_ns
+
+    def _see_status(self, message: Any) -> None:
+        if message.state in ("ready", "active"):
+            self._seen.ready.add(str(message.node))
+        else:
+            self._seen.ready.discard(str(message.node))
+
+    def _gather(self, now: Now) -> list[Out]:
+        seen = self._seen
+        if set(self.plan.nodes) <= seen.ready and seen.T_world_from_car is not None and seen.peer:
+            if TWIN_PEER not in seen.peer.upper():
+                raise TrialError(
+                    f"expected the motor's peer to say that it is the twin, got {seen.peer!r}: a real car is armed by a person"
+                )
+            self.outcome.peer = seen.peer
+            self._enter(Phase.PLACING, now)
+        return []
+
+    def _place(self, now: Now) -> list[Out]:
+        if self._at_start() and self._stood_s(now) > _SETTLE_S:
+            self._start_xy = self._seen.T_world_from_car[:2, 3].copy()
+            self._enter(Phase.ARMING, now)
+            return []
+        return self._say(Out("/twin/reset", pose_message(planar_pose(*self.plan.start_pose), now.real_ns)), now)
+
+    def _arm(self, now: Now) -> list[Out]:
+        if self._seen.armed:
+            self._enter(Phase.DRIVING, now)
+            return []
+        return self._say(self._arm_message(True, now), now)
+
+    def _drive(self, now: Now) -> list[Out]:
+        began_ns = self.outcome.start_real_ns
+        if not self._seen.armed:
+            self.outcome.stopped_early = self._seen.safety_reason or "disarmed"
+        driven = began_ns and now.real_ns - began_ns > self.plan.duration_s * NS_PER_S
+        if self.outcome.stopped_early or driven:
+            self.outcome.end_real_ns = now.real_ns
+            self._enter(Phase.STOPPING, now)
+            return [self._arm_message(False, now)]
+        if not began_ns and self._phase_s(now) > self.plan.patience_s:
+            raise TrialError(f"armed, but the car did not move within {self.plan.patience_s:g} s; is the policy running?")
+        return []
+
+    def _stop(self, now: Now) -> list[Out]:
+        if not self._seen.armed and self._stood_s(now) > _STANDING_S:
+            self._enter(Phase.DONE, now)
+            return []
+        return self._say(self._arm_message(False, now), now)
+
+    def _enter(self, phase: Phase, now: Now) -> None:
+        self.phase, self._phase_began_ns, self._said_ns = phase, now.mono_ns, 0
+
+    def _phase_s(self, now: Now) -> float:
+        return (now.mono_ns - (self._phase_began_ns or now.mono_ns)) / NS_PER_S
+
+    def _stood_s(self, now: Now) -> float:
+        since = self._seen.standing_since_ns
+        return 0.0 if since is None else (now.mono_ns - since) / NS_PER_S
+
+    def _at_start(self) -> bool:
+        T, (x_m, y_m, yaw_rad) = self._seen.T_world_from_car, self.plan.start_pose
+        near = np.hypot(T[0, 3] - x_m, T[1, 3] - y_m) < _AT_START_M
+        return bool(near and abs(float(wrap_angle(yaw_of(T) - yaw_rad))) < _AT_START_RAD)
+
+    def _say(self, out: Out, now: Now) -> list[Out]:
+        """Repeat a request until it has had its effect: the first may come before its receiver listens."""
+        if self._said_ns and now.mono_ns - self._said_ns < _REPEAT_S * NS_PER_S:
+            return []
+        self._said_ns = now.mono_ns
+        return [out]
+
+    def _arm_message(self, arm: bool, now: Now) -> Out:
+        reason = "trial starts" if arm else "trial is over"
+        return Out("/arm", types.Arm(header=header(now.real_ns), arm=arm, source="trial", reason=reason))
+
+    def _what_is_missing(self) -> str:
+        seen = self._seen
+        missing = sorted(set(self.plan.nodes) - seen.ready)
+        if missing:
+            return f"not ready: {', '.join(missing)}"
+        if seen.T_world_from_car is None:
+            return "no pose of the car on /vicon/car"
+        if not seen.peer:
+            return "the motor node has not said what it is connected to"
+        return f"safety says: {seen.safety_reason or 'nothing'}"

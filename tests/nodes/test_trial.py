@@ -1,0 +1,128 @@
+import numpy as np
+import pytest
+
+from advnerf_core.geometry import planar_pose
+from nodes.runtime.clock import Now
+from nodes.runtime.errors import NodeFinished
+from nodes.runtime.messages import header, pose_message, types
+from nodes.trial import Phase, TrialError, TrialNode, TrialPlan
+
+REAL_NS = 1_700_000_000_000_000_000
+START = (-1.1, -2.0, 0.0)
+
+
+class Stage:
+    """A trial node, its clock, and a car that does what the operator asks for."""
+
+    def __init__(self, peer="TWIN v1", moves=True, **plan):
+        self.node = TrialNode(TrialPlan(START, 1.0, ("camera", "motor"), **plan))
+        self.t_s, self.pose, self.armed, self.reason, self.sent = 0.0, np.array([0.0, 0.0, 1.0]), False, "", []
+        self.peer, self.moves, self.requests = peer, moves, 0
+
+    @property
+    def now(self):
+        return Now(int(self.t_s * 1e9), REAL_NS + int(self.t_s * 1e9))
+
+    def hear(self, topic, message):
+        self.node.handle(topic, message, None, self.now)
+
+    def step(self):
+        self.t_s += 0.05
+        if self.armed and self.moves:
+            self.pose = self.pose + [0.04, 0.0, 0.0]
+        jitter = 1e-4 * np.sin(self.t_s * 1e3)
+        T = planar_pose(self.pose[0] + jitter, self.pose[1], self.pose[2])
+        self.hear("/vicon/car", pose_message(T, self.now.real_ns))
+        state = types.SafetyState(
+            header=header(self.now.real_ns), armed=self.armed, stopping=not self.armed, reason=self.reason, source="",
+            command_age_s=0.0, pose_age_s=0.0,
+        )  # fmt: skip
+        self.hear("/safety/state", state)
+        for topic, message in self.node.tick(self.now):
+            self.sent.append(topic)
+            if topic == "/twin/reset":
+                self.pose = np.array(START)
+            else:
+                self.armed = bool(message.arm)
+
+    def nodes_are_ready(self):
+        for name in ("camera", "motor"):
+            self.hear(f"/status/{name}", status(name, "active"))
+        sent = types.MotorSent(
+            header=header(0), serial_write_mono_ns=0, serial_write_real_ns=0, speed_mps=0.0, steering_rad=0.0, erpm=0.0,
+            servo=0.5, brake_current_a=0.0, braking=True, reason="", peer=self.peer,
+        )  # fmt: skip
+        self.hear("/motor/sent", sent)
+
+    def run_until(self, phase, limit_s=30.0):
+        while self.node.phase is not phase:
+            assert self.t_s < limit_s, f"stuck while {self.node.phase}"
+            self.step()
+
+
+def status(node, state):
+    none = np.zeros(0)
+    return types.NodeStatus(
+        header=header(0), node=node, pid=1, state=state, text="", subscriptions=[], publications=[],
+        subscribers=none.astype(np.uint32), counter_names=[], counter_values=none,
+    )  # fmt: skip
+
+
+def test_a_trial_places_arms_drives_for_its_time_and_disarms():
+    stage = Stage()
+    stage.nodes_are_ready()
+    stage.run_until(Phase.DONE)
+    outcome = stage.node.outcome
+    assert outcome.peer == "TWIN v1"
+    assert outcome.stopped_early == ""
+    assert (outcome.end_real_ns - outcome.start_real_ns) / 1e9 == pytest.approx(1.0, abs=0.11)
+    assert not stage.armed
+    assert stage.sent.index("/twin/reset") < stage.sent.index("/arm")
+    with pytest.raises(NodeFinished):
+        stage.step()
+
+
+def test_nothing_is_placed_or_armed_before_every_node_is_ready():
+    stage = Stage()
+    stage.hear("/status/camera", status("camera", "active"))
+    for _ in range(100):
+        stage.step()
+    assert stage.sent == []
+    assert stage.node.phase is Phase.GATHERING
+
+
+def test_a_real_car_is_never_armed():
+    stage = Stage(peer="60_MK5 5.2")
+    stage.nodes_are_ready()
+    with pytest.raises(TrialError, match=r"armed by a person"):
+        stage.run_until(Phase.ARMING)
+    assert "/arm" not in stage.sent
+
+
+def test_a_fence_stop_ends_the_drive_with_its_reason():
+    stage = Stage()
+    stage.nodes_are_ready()
+    stage.run_until(Phase.DRIVING)
+    for _ in range(4):
+        stage.step()
+    stage.armed, stage.reason = False, "outside the fence"
+    stage.run_until(Phase.DONE)
+    assert stage.node.outcome.stopped_early == "outside the fence"
+
+
+def test_a_car_that_does_not_move_and_a_missing_node_are_named():
+    stage = Stage(moves=False, patience_s=3.0)
+    stage.nodes_are_ready()
+    with pytest.raises(TrialError, match="did not move"):
+        stage.run_until(Phase.DONE)
+    stage = Stage(patience_s=2.0)
+    stage.hear("/status/camera", status("camera", "active"))
+    with pytest.raises(TrialError, match="not ready: motor"):
+        stage.run_until(Phase.DONE)
+
+
+def test_a_failed_graph_ends_the_trial():
+    stage = Stage()
+    stage.node = TrialNode(stage.node.plan, lambda: "required node camera died")
+    with pytest.raises(TrialError, match="camera died"):
+        stage.step()
