@@ -1,0 +1,217 @@
+"""The compositor node: shows the attacked face in the live image, where the motion capture says that it is.
+
+Images and poses are joined by capture stamp. An image waits a bounded time for the poses after it; then the poses are continued
+at constant velocity, which is flagged, up to a limit; beyond that the image is dropped and counted, and the layers nearer to the
+motor stop the car. Without an attack file the images pass through unchanged.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+
+from advnerf_core.attack.artifact import AttackFile, load_attack
+from advnerf_core.attack.projection import FaceOverlay
+from advnerf_core.geometry import Array, invert_transform
+from calibration.schema import CameraCalibration, TargetCalibration, load_calibration
+from nodes.pose_buffer import PoseBuffer
+from nodes.runtime.clock import NS_PER_S
+from nodes.runtime.errors import ConfigError
+from nodes.runtime.messages import header, image_array, image_message, pose_matrix, stamp_ns, types
+from nodes.runtime.node import ACTIVE, READY, MessageInfo, Node, NodeContext, Now, Out, run_node_main
+
+_IMAGE, _CAR = "/camera/image_raw", "/vicon/car"
+_ACTIVE_S = 1.0
+_SIZE_TOLERANCE = 0.05
+
+
+class CompositorConfig(BaseModel):
+    """Configuration of the compositor node.
+
+    Attributes:
+        attack: Attack file to show; empty for none.
+        camera: Camera calibration file.
+        target: Calibration file of the face that carries the attack.
+        wait_s: How long an image waits for poses [s].
+        extrapolation_limit_s: How far poses are continued at constant velocity after that [s].
+        max_gap_s: Longest gap in a pose stream across which is interpolated [s].
+        supersample: Samples along each side of a pixel.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    attack: Path | None = None
+    camera: Path
+    target: Path
+    wait_s: float = Field(default=0.025, ge=0.0, le=0.1)
+    extrapolation_limit_s: float = Field(default=0.05, ge=0.0, le=0.2)
+    max_gap_s: float = Field(default=0.1, gt=0.0, le=0.5)
+    supersample: int = Field(default=2, ge=1, le=4)
+
+    @field_validator("attack", mode="before")
+    @classmethod
+    def _empty_is_none(cls, value: Any) -> Any:
+        return None if value == "" else value
+
+
+@dataclass(frozen=True, eq=False)
+class Showing:
+    """What is shown, and through which camera.
+
+    Attributes:
+        attack_id: Short hash of the attack file.
+        overlay: Draws its face.
+        T_car_from_camera: Mount of the camera.
+        subject: Motion-capture subject that carries the face.
+    """
+
+    attack_id: str
+    overlay: FaceOverlay
+    T_car_from_camera: Array
+    subject: str
+
+
+@dataclass(frozen=True, eq=False)
+class _Waiting:
+    message: Any
+    stamp_ns: int
+    deadline_mono_ns: int
+
+
+class CompositorNode(Node):
+    """Joins images with poses and draws the face; see the module's docstring.
+
+    Args:
+        showing: What is shown; None passes images through.
+        wait_s: How long an image waits for poses [s].
+        extrapolation_limit_s: How far poses are continued after that [s].
+        max_gap_s: Longest gap in a pose stream across which is interpolated [s].
+    """
+
+    publications = ("/compositor/image", "/compositor/attack")
+    tick_rate_hz = 100.0
+
+    def __init__(
+        self,
+        showing: Showing | None,
+        wait_s: float = 0.025,
+        extrapolation_limit_s: float = 0.05,
+        max_gap_s: float = 0.1,
+    ) -> None:
+        self._showing = showing
+        self._wait_ns = round(wait_s * NS_PER_S)
+        self._limit_s = extrapolation_limit_s
+        self._face_topic = f"/vicon/{showing.subject}" if showing else "/vicon/board"
+        self.subscriptions = (_IMAGE, _CAR, self._face_topic)
+        self._poses = {topic: PoseBuffer(max_gap_s=max_gap_s) for topic in (_CAR, self._face_topic)}
+        self._waiting: _Waiting | None = None
+        self._counts = {"images": 0, "drawn": 0, "extrapolated": 0, "dropped_no_pose": 0}
+        self._last_image_ns: int | None = None
+        self._now_ns = 0
+        self._trouble = ""
+
+    @classmethod
+    def build(cls, config: CompositorConfig, context: NodeContext) -> CompositorNode:
+        """Make the node of a process."""
+        del context  # it needs no clock of its own
+        camera = load_calibration(CameraCalibration, config.camera)
+        target = load_calibration(TargetCalibration, config.target)
+        showing = None
+        if config.attack is not None:
+            showing = show(load_attack(config.attack), camera, target, config.supersample)
+        return cls(showing, config.wait_s, config.extrapolation_limit_s, config.max_gap_s)
+
+    def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
+        """Take an image or a pose."""
+        self._now_ns = now.mono_ns
+        if topic != _IMAGE:
+            self._poses[topic].add(stamp_ns(message), pose_matrix(message))
+            return self._release(now)
+        self._last_image_ns = now.mono_ns
+        self._counts["images"] += 1
+        if self._showing is None:
+            return [Out("/compositor/image", info.raw or message), self._label(message, False, "no attack file")]
+        # An older image that still waits gets what there is now: two never wait.
+        before = self._finish(now) if self._waiting else []
+        self._waiting = _Waiting(message, stamp_ns(message), now.mono_ns + self._wait_ns)
+        return before + self._release(now)
+
+    def tick(self, now: Now) -> list[Out]:
+        """Let a waiting image go when its time is over."""
+        self._now_ns = now.mono_ns
+        return self._release(now)
+
+    def status(self) -> tuple[str, str]:
+        """Active while images come."""
+        shown = f"attack {self._showing.attack_id}" if self._showing else "no attack file, images pass through"
+        if self._last_image_ns is None or self._now_ns - self._last_image_ns > _ACTIVE_S * NS_PER_S:
+            return READY, f"waiting for images; {shown}"
+        return ACTIVE, f"{shown}; {self._trouble}" if self._trouble else shown
+
+    def counters(self) -> dict[str, float]:
+        """Images seen, drawn on, drawn with extrapolated poses, dropped."""
+        return {key: float(value) for key, value in self._counts.items()}
+
+    def _release(self, now: Now) -> list[Out]:
+        waiting = self._waiting
+        if waiting is None:
+            return []
+        complete = all(poses.reaches(waiting.stamp_ns) for poses in self._poses.values())
+        return self._finish(now) if complete or now.mono_ns >= waiting.deadline_mono_ns else []
+
+    def _finish(self, now: Now) -> list[Out]:
+        del now  # the decision is made; only stamps count from here on
+        waiting, self._waiting = self._waiting, None
+        assert waiting is not None
+        assert self._showing is not None
+        car = self._poses[_CAR].at(waiting.stamp_ns, self._limit_s)
+        face = self._poses[self._face_topic].at(waiting.stamp_ns, self._limit_s)
+        if car is None or face is None:
+            missing = _CAR if car is None else self._face_topic
+            self._counts["dropped_no_pose"] += 1
+            self._trouble = f"image dropped: no pose on {missing} at its stamp"
+            return []
+        T_camera_from_face = invert_transform(car.T @ self._showing.T_car_from_camera) @ face.T
+        # The received array is read-only; the overlay draws on a copy.
+        image, drawn = self._showing.overlay.draw(image_array(waiting.message), T_camera_from_face)
+        ahead_s = max(car.extrapolated_s, face.extrapolated_s)
+        self._counts["drawn"] += drawn
+        self._counts["extrapolated"] += ahead_s > 0.0
+        self._trouble = f"pose extrapolated by {1e3 * ahead_s:.0f} ms" if ahead_s > 0.0 else ""
+        frame, encoding = waiting.message.header.frame_id, waiting.message.encoding
+        out = waiting.message if not drawn else image_message(image, waiting.stamp_ns, frame, encoding)
+        reason = self._trouble if drawn else "out of view"
+        return [Out("/compositor/image", out), self._label(waiting.message, drawn, reason)]
+
+    def _label(self, image: Any, drawn: bool, reason: str) -> Out:
+        attack_id = self._showing.attack_id if self._showing else ""
+        head = header(stamp_ns(image), image.header.frame_id)
+        label = types.AttackStamp(header=head, attack_id=attack_id, drawn=bool(drawn), reason=reason)
+        return Out("/compositor/attack", label)
+
+
+def show(attack: AttackFile, camera: CameraCalibration, target: TargetCalibration, supersample: int = 2) -> Showing:
+    """Prepare an attack for a camera and a face; a face of another size or subject is refused."""
+    corners = target.corners
+    size_m = (np.linalg.norm(corners[1] - corners[0]), np.linalg.norm(corners[3] - corners[0]))
+    wrong_size = any(abs(got / want - 1.0) > _SIZE_TOLERANCE for got, want in zip(size_m, attack.size_m, strict=True))
+    if wrong_size or attack.subject != target.subject:
+        raise ConfigError(
+            f"attack {attack.attack_id} was made for {attack.subject}, {attack.size_m[0]:.2f} x {attack.size_m[1]:.2f} m, but the "
+            f"target is {target.subject}, {size_m[0]:.2f} x {size_m[1]:.2f} m; name the target it was made for"
+        )
+    overlay = FaceOverlay(attack.texture, corners, camera.pinhole, camera.distortion, supersample)
+    return Showing(attack.attack_id, overlay, camera.mount, target.subject)
+
+
+def main() -> None:
+    """Run the node as a process."""
+    raise SystemExit(run_node_main(CompositorConfig, CompositorNode.build))
+
+
+if __name__ == "__main__":
+    main()

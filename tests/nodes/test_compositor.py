@@ -1,0 +1,205 @@
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from advnerf_core.attack.artifact import AttackFile, AttackFileError, face_texture, save_attack
+from advnerf_core.attack.projection import FaceOverlay
+from advnerf_core.geometry import Pinhole, invert_transform, make_transform, planar_pose, rotation_z
+from calibration.schema import CameraCalibration, TargetCalibration, load_calibration
+from nodes.compositor import CompositorConfig, CompositorNode, show
+from nodes.runtime.clock import ManualClock
+from nodes.runtime.errors import ConfigError
+from nodes.runtime.messages import decode, encode, image_array, image_message, pose_message, stamp_ns, type_name
+from nodes.runtime.node import MessageInfo, NodeContext
+
+CALIBRATION = Path(__file__).parents[2] / "calibration" / "twin"
+CAMERA = load_calibration(CameraCalibration, CALIBRATION / "camera.yaml")
+TARGET = load_calibration(TargetCalibration, CALIBRATION / "board.yaml")
+T_WORLD_FROM_BOARD = make_transform(rotation_z(np.deg2rad(172)), [3.15, -1.75, 0.42])
+T0 = 1_700_000_000_000_000_000
+MS = 1_000_000
+
+
+def attack(**changes):
+    theta = np.random.default_rng(0).normal(size=(8, 8, 3)).astype(np.float32)
+    values = {
+        "method": "gradient", "theta": theta, "texture": face_texture(theta, 128), "size_m": (0.8, 0.8),
+        "T_world_from_object": T_WORLD_FROM_BOARD, "subject": "board", "corners_in_subject": TARGET.corners,
+        "camera": Pinhole(200, 66, 103.6, 103.4, 100, 32), "scene_sha256": "", "policy_sha256": "", "config_sha256": "",
+        "seed": 0, "predicted_total_cte_m": 1.0, "software_version": "0",
+    }  # fmt: skip
+    return AttackFile(**{**values, **changes})
+
+
+def car_at(t_s):
+    """Driving toward the board at 0.8 m/s while turning a little."""
+    return planar_pose(0.5 + 0.8 * t_s, -2.0, 0.1 * t_s)
+
+
+class Bench:
+    """Feeds a node as its loop would: every message through CDR, on a clock that only the test moves."""
+
+    def __init__(self, node):
+        self.node, self.clock, self.out = node, ManualClock(mono_ns=5 * 10**9, real_ns=T0), []
+
+    def send(self, topic, message):
+        raw = encode(message)
+        info = MessageInfo(0, 0, raw=raw)
+        self._take(self.node.handle(topic, decode(type_name(message), raw), info, self.clock.now()))
+
+    def poses(self, t_s):
+        stamp = T0 + round(t_s * 1e9)
+        self.send("/vicon/board", pose_message(T_WORLD_FROM_BOARD, stamp))
+        self.send("/vicon/car", pose_message(car_at(t_s), stamp))
+
+    def image(self, t_s, value=90):
+        rgb = np.full((188, 336, 3), value, np.uint8)
+        self.send("/camera/image_raw", image_message(rgb, T0 + round(t_s * 1e9), "camera"))
+
+    def pass_time(self, seconds):
+        for _ in range(round(seconds / 0.01)):
+            self.clock.advance(0.01)
+            self._take(self.node.tick(self.clock.now()))
+
+    def _take(self, outs):
+        for topic, message in outs:
+            data = message if isinstance(message, bytes) else encode(message)
+            self.out.append((topic, data))
+
+    def images(self):
+        return [decode("sensor_msgs/msg/Image", data) for topic, data in self.out if topic == "/compositor/image"]
+
+    def labels(self):
+        return [
+            decode("advnerf_msgs/msg/AttackStamp", data) for topic, data in self.out if topic == "/compositor/attack"
+        ]
+
+
+@pytest.fixture
+def bench():
+    return Bench(CompositorNode(show(attack(), CAMERA, TARGET)))
+
+
+def expected_image(t_s, value=90):
+    overlay = FaceOverlay(attack().texture, TARGET.corners, CAMERA.pinhole)
+    T = invert_transform(car_at(t_s) @ CAMERA.mount) @ T_WORLD_FROM_BOARD
+    return overlay.draw(np.full((188, 336, 3), value, np.uint8), T)[0]
+
+
+def test_an_image_waits_for_the_pose_after_it_and_shows_the_face_at_its_own_stamp(bench):
+    for t in (0.0, 0.01, 0.02):
+        bench.poses(t)
+    bench.image(0.025)
+    assert bench.out == []
+    bench.poses(0.03)
+    (image,), (label,) = bench.images(), bench.labels()
+    assert stamp_ns(image) == stamp_ns(label) == T0 + 25 * MS
+    assert image.header.frame_id == "camera"
+    assert label.attack_id == attack().attack_id
+    assert label.drawn
+    assert label.reason == ""
+    # Interpolation between poses 10 ms apart is exact to micrometres here: at most a rounding step somewhere.
+    difference = np.abs(image_array(image).astype(int) - expected_image(0.025))
+    assert difference.max() <= 1
+    assert (image_array(image) != 90).any()
+
+
+def test_after_the_bounded_wait_the_pose_is_extrapolated_and_flagged(bench):
+    for t in (0.0, 0.01, 0.02):
+        bench.poses(t)
+    bench.image(0.035)
+    bench.pass_time(0.02)
+    assert bench.out == []
+    bench.pass_time(0.01)
+    (image,), (label,) = bench.images(), bench.labels()
+    assert label.drawn
+    assert "extrapolated by 15 ms" in label.reason
+    assert "extrapolated" in bench.node.status()[1]
+    assert bench.node.counters()["extrapolated"] == 1
+    assert np.abs(image_array(image).astype(int) - expected_image(0.035)).mean() < 0.3
+
+
+def test_without_poses_in_reach_the_image_is_dropped_and_counted(bench):
+    bench.image(0.0)
+    bench.pass_time(0.05)
+    for t in (0.05, 0.06):
+        bench.poses(t)
+    bench.image(0.2)  # 140 ms after the last pose
+    bench.pass_time(0.05)
+    assert bench.out == []
+    assert bench.node.counters()["dropped_no_pose"] == 2
+    assert "dropped" in bench.node.status()[1]
+
+
+def test_two_images_never_wait(bench):
+    for t in (0.0, 0.01):
+        bench.poses(t)
+    bench.image(0.02, value=10)
+    bench.image(0.03, value=20)
+    assert [image_array(i)[0, 0, 0] for i in bench.images()] == [10]
+    bench.poses(0.03)
+    assert [image_array(i)[0, 0, 0] for i in bench.images()] == [10, 20]
+
+
+def test_out_of_view_passes_the_image_unchanged_and_says_so(bench):
+    for t in (0.0, 0.01):
+        bench.send("/vicon/board", pose_message(T_WORLD_FROM_BOARD, T0 + round(t * 1e9)))
+        bench.send("/vicon/car", pose_message(planar_pose(0.0, 2.0, np.pi), T0 + round(t * 1e9)))
+    bench.image(0.005)
+    (image,), (label,) = bench.images(), bench.labels()
+    assert (image_array(image) == 90).all()
+    assert not label.drawn
+    assert label.reason == "out of view"
+
+
+def test_without_an_attack_file_images_pass_at_once():
+    bench = Bench(CompositorNode(None))
+    bench.image(0.0)
+    (image,), (label,) = bench.images(), bench.labels()
+    assert (image_array(image) == 90).all()
+    assert (label.attack_id, label.drawn) == ("", False)
+    assert bench.node.status()[0] == "active"
+    bench.pass_time(1.5)
+    assert bench.node.status()[0] == "ready"
+
+
+def test_any_order_of_arrival_before_the_deadline_gives_the_same_bytes():
+    def run(order):
+        bench = Bench(CompositorNode(show(attack(), CAMERA, TARGET)))
+        events = [lambda t=t: bench.poses(t) for t in (0.0, 0.01, 0.02, 0.03)] + [lambda: bench.image(0.024)]
+        for k in order:
+            events[k]()
+        return bench.out
+
+    first = run([0, 1, 2, 3, 4])
+    assert len(first) == 2
+    for order in ([4, 0, 1, 2, 3], [0, 4, 2, 1, 3], [0, 2, 1, 4, 3]):
+        assert run(order) == first
+
+
+def test_build_reads_the_files_and_refuses_wrong_ones(tmp_path):
+    path = tmp_path / "attack.safetensors"
+    save_attack(path, attack())
+    files = {"camera": CALIBRATION / "camera.yaml", "target": CALIBRATION / "board.yaml"}
+    context = NodeContext("compositor", tmp_path, ManualClock())
+    node = CompositorNode.build(CompositorConfig(attack=path, **files), context)
+    assert node.subscriptions == ("/camera/image_raw", "/vicon/car", "/vicon/board")
+    assert "passes through" not in node.status()[1]
+    assert CompositorNode.build(CompositorConfig(attack="", **files), context).status()[1].endswith("pass through")
+    path.write_bytes(b"garbage")
+    with pytest.raises(AttackFileError, match="cannot read"):
+        CompositorNode.build(CompositorConfig(attack=path, **files), context)
+    save_attack(path, attack(size_m=(0.3, 0.3)))
+    with pytest.raises(ConfigError, match="name the target it was made for"):
+        CompositorNode.build(CompositorConfig(attack=path, **files), context)
+    with pytest.raises(ValidationError, match="Extra inputs"):
+        CompositorConfig(atack=path, **files)
+
+
+def test_the_node_needs_no_torch():
+    code = "import sys, nodes.compositor; assert not {'torch', 'numba', 'scipy'} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).parents[2])
