@@ -50,6 +50,7 @@ _ROWS = (
     Topic("/safety/drive", _ACKERMANN, 10.0, 1, 0.25, "safety"),
     Topic("/safety/state", "advnerf_msgs/msg/SafetyState", 10.0, 20, 0.5, "safety"),
     Topic("/arm", "advnerf_msgs/msg/Arm", None, 20, None, "operator"),
+    Topic("/twin/reset", "geometry_msgs/msg/PoseStamped", None, 5, None, "operator"),
     Topic("/motor/sent", "advnerf_msgs/msg/MotorSent", 20.0, 200, None, "motor"),
     Topic("/motor/state", "advnerf_msgs/msg/VescState", 20.0, 50, 0.5, "motor"),
 )

@@ -1,0 +1,141 @@
+"""What stands between drive commands and the motor controller: freshness, and a latch that only an explicit stop opens.
+
+Pure: time and messages come as arguments.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import Enum
+
+from nodes.runtime.clock import NS_PER_S
+from nodes.runtime.wire import MessageInfo
+
+_IDLE_RESEND_S = 0.1
+
+
+@dataclass(frozen=True)
+class GateSettings:
+    """Numbers of the gate.
+
+    Attributes:
+        command_age_limit_s: A command older than this, since it was published, is no command [s].
+        brake_current_a: Brake current for every stop [A].
+        brake_ramp_s: Time over which the brake current rises from a third to the whole [s].
+        brake_hold_s: Time of braking, after which the motor is let go [s].
+    """
+
+    command_age_limit_s: float
+    brake_current_a: float
+    brake_ramp_s: float
+    brake_hold_s: float
+
+
+class GateState(Enum):
+    """What the gate lets through."""
+
+    LATCHED = "latched"  # nothing, until an explicit stop comes
+    STOPPED = "stopped"  # told to stop; the next command to move is obeyed
+    DRIVING = "driving"
+
+
+@dataclass(frozen=True)
+class Drive:
+    """Send this speed [m/s] and steering [rad]."""
+
+    speed_mps: float
+    steering_rad: float
+
+
+@dataclass(frozen=True)
+class Brake:
+    """Send this brake current [A]; 0 lets the motor go."""
+
+    current_a: float
+
+
+class CommandGate:
+    """Decides what goes to the controller.
+
+    Attributes:
+        state: What it lets through.
+        reason: Why it does not drive.
+        refused: Commands that were too old, or to move while latched.
+    """
+
+    def __init__(self, settings: GateSettings, mono_ns: int) -> None:
+        self._settings = settings
+        self._limit_ns = round(settings.command_age_limit_s * NS_PER_S)
+        self._fresh_ns = mono_ns  # publication of the newest command that was obeyed
+        self._stop_began_ns = mono_ns  # a car that rolls when this node starts is stopped first
+        self._instance_id: int | None = None
+        self._command = Drive(0.0, 0.0)
+        self._idle_sent_ns = 0
+        self.state = GateState.LATCHED
+        self.reason = "waiting for the safety node"
+        self.refused = 0
+
+    def command(self, speed_mps: float, steering_rad: float, info: MessageInfo, mono_ns: int) -> Drive | Brake | None:
+        """A drive command came; what to send now."""
+        self._notice_silence(mono_ns)
+        known, self._instance_id = self._instance_id, info.instance_id
+        if known is not None and info.instance_id != known:
+            self.latch("the safety node was restarted", mono_ns)
+        if mono_ns - info.publish_mono_ns > self._limit_ns:
+            self.refused += 1
+            return None
+        if not (math.isfinite(speed_mps) and math.isfinite(steering_rad)):
+            self.latch("a command that is not finite", mono_ns)
+            return self._braking(mono_ns)
+        if speed_mps == 0.0:
+            return self._stop(info.publish_mono_ns, mono_ns)
+        if self.state is GateState.LATCHED:
+            self.refused += 1
+            return None
+        self.state, self.reason = GateState.DRIVING, ""
+        self._fresh_ns = info.publish_mono_ns
+        self._command = Drive(speed_mps, steering_rad)
+        return self._command
+
+    def tick(self, mono_ns: int) -> Drive | Brake | None:
+        """Time has passed; what to send now."""
+        self._notice_silence(mono_ns)
+        if self.state is GateState.DRIVING:
+            return self._command
+        if mono_ns - self._stop_began_ns <= self._settings.brake_hold_s * NS_PER_S:
+            return self._braking(mono_ns)
+        if mono_ns - self._idle_sent_ns < _IDLE_RESEND_S * NS_PER_S:
+            return None
+        self._idle_sent_ns = mono_ns
+        return Brake(0.0)
+
+    def latch(self, reason: str, mono_ns: int) -> None:
+        """Stop, and obey nothing until an explicit stop comes."""
+        if self.state is GateState.DRIVING:
+            self._stop_began_ns = mono_ns
+        if self.state is not GateState.LATCHED:
+            self.reason = reason
+        self.state = GateState.LATCHED
+
+    def brake_again(self, mono_ns: int) -> None:
+        """Begin the stop anew, after the controller was out of reach."""
+        self._stop_began_ns = mono_ns
+
+    def _notice_silence(self, mono_ns: int) -> None:
+        silence_ns = mono_ns - self._fresh_ns
+        if self.state is not GateState.LATCHED and silence_ns > self._limit_ns:
+            self.latch(f"no fresh command for {silence_ns / NS_PER_S:.2f} s", mono_ns)
+
+    def _stop(self, publish_ns: int, mono_ns: int) -> Brake | None:
+        self._fresh_ns = publish_ns
+        was_driving = self.state is GateState.DRIVING
+        if was_driving:
+            self._stop_began_ns = mono_ns
+        self.state, self.reason = GateState.STOPPED, "told to stop"
+        return self._braking(mono_ns) if was_driving else None
+
+    def _braking(self, mono_ns: int) -> Brake:
+        ramp_ns = self._settings.brake_ramp_s * NS_PER_S
+        rise = 1.0 if ramp_ns == 0.0 else min((mono_ns - self._stop_began_ns) / ramp_ns, 1.0)
+        return Brake(self._settings.brake_current_a * (1.0 + 2.0 * rise) / 3.0)

@@ -1,0 +1,224 @@
+"""The motor node: drive commands in, VESC bytes out. Stopping is what it does unless it is told otherwise, freshly and again.
+
+It obeys only commands younger than a limit. When they stop coming, are not finite, or come from another safety process than
+before, it brakes and latches: from then on it ignores every command to move until it has seen an explicit stop, which the safety
+node sends only while disarmed. So nothing that dies, hangs or wakes up again makes the car move without somebody arming it anew.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from calibration.schema import VehicleCalibration, load_calibration
+from hardware.errors import HardwareError, ProtocolError
+from hardware.vesc import Sent, Vesc
+from hardware.vesc_replies import Values
+from nodes.command_gate import Brake, CommandGate, Drive, GateSettings, GateState
+from nodes.runtime.clock import NS_PER_S
+from nodes.runtime.messages import header, ns_from_stamp, types
+from nodes.runtime.node import ACTIVE, FAULT, READY, STARTING, MessageInfo, Node, NodeContext, Now, Out, run_node_main
+
+_TICK_RATE_HZ = 50.0
+_RETRY_S = 0.5
+_POLL_S = 0.04
+
+
+class MotorConfig(BaseModel):
+    """Configuration of the motor node.
+
+    Attributes:
+        port: Serial device; ``<run_dir>/vesc`` for the twin.
+        calibration: Vehicle calibration file: gains and limits.
+        command_age_limit_s: A command older than this, since it was published, is no command [s].
+        brake_current_a: Brake current for every stop [A].
+        brake_ramp_s: Time over which the brake current rises from a third to the whole [s].
+        brake_hold_s: Time of braking, after which the motor is let go [s].
+        link_timeout_s: A controller that answers nothing for this long is a fault [s].
+        controller_timeout_ms: The controller's own command time-out, as set in its configuration; reported, not checked [ms].
+        controller_brake_current_a: Its brake current on time-out, as set in its configuration; reported, not checked [A].
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    port: str
+    calibration: Path
+    command_age_limit_s: float = Field(default=0.22, gt=0.0, le=0.25)
+    brake_current_a: float = Field(default=20.0, gt=0.0, le=60.0)
+    brake_ramp_s: float = Field(default=0.1, ge=0.0, le=0.5)
+    brake_hold_s: float = Field(default=1.0, gt=0.0)
+    link_timeout_s: float = Field(default=0.3, gt=0.0)
+    controller_timeout_ms: float = Field(default=1000.0, ge=0.0)
+    controller_brake_current_a: float = Field(default=0.0, ge=0.0)
+
+
+class MotorNode(Node):
+    """Connects the gate with the controller, and reports what was sent.
+
+    Args:
+        config: Its configuration.
+        make_vesc: Makes a driver that is not open yet.
+        mono_ns: Monotonic time at the start [ns].
+    """
+
+    subscriptions = ("/safety/drive",)
+    publications = ("/motor/sent", "/motor/state")
+    tick_rate_hz = _TICK_RATE_HZ
+
+    def __init__(self, config: MotorConfig, make_vesc: Callable[[], Vesc], mono_ns: int) -> None:
+        self._config = config
+        self._vesc = make_vesc()
+        settings = GateSettings(
+            config.command_age_limit_s, config.brake_current_a, config.brake_ramp_s, config.brake_hold_s
+        )
+        self._gate = CommandGate(settings, mono_ns)
+        self._link_error = "not connected yet"
+        self._linked_once = False
+        self._retry_ns = 0
+        self._polled_ns = 0
+        self._origin_stamp_ns = 0
+
+    @classmethod
+    def build(cls, config: MotorConfig, context: NodeContext) -> MotorNode:
+        """Make the node of a process; the port is opened by the first tick, and again whenever it went away."""
+        car = load_calibration(VehicleCalibration, config.calibration)
+
+        def make() -> Vesc:
+            return Vesc(config.port, car.vehicle_gains, car.drive_limits, config.brake_current_a)
+
+        return cls(config, make, context.clock.now().mono_ns)
+
+    def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
+        """Obey or refuse a command."""
+        drive = message.drive
+        action = self._gate.command(float(drive.speed), float(drive.steering_angle), info, now.mono_ns)
+        if isinstance(action, Drive):
+            self._origin_stamp_ns = ns_from_stamp(message.header.stamp)
+        return self._act(action, now, first=True)
+
+    def tick(self, now: Now) -> list[Out]:
+        """Keep what was commanded going, stop when it is stale, read telemetry, mend the link."""
+        if self._link_error:
+            self._connect(now)
+        # The last command again only while the limiter has not reached it: repeating it for ever is what keeps dead cars driving.
+        action = self._gate.tick(now.mono_ns)
+        outs = [] if isinstance(action, Drive) and self._reached(action) else self._act(action, now, first=False)
+        return outs + self._telemetry(now)
+
+    def status(self) -> tuple[str, str]:
+        """Fault when the link is broken or commands ceased; active while driving."""
+        if self._link_error:
+            return (FAULT if self._linked_once else STARTING), self._link_error
+        peer = f"{self._vesc.firmware}, {self._controller_text()}"
+        if self._gate.state is GateState.DRIVING:
+            return ACTIVE, peer
+        if self._gate.state is GateState.STOPPED:
+            return READY, peer
+        waiting = self._gate.reason.startswith("waiting")
+        return (STARTING if waiting else FAULT), f"latched: {self._gate.reason}"
+
+    def counters(self) -> dict[str, float]:
+        """Commands that were not obeyed."""
+        return {"commands_refused": self._gate.refused}
+
+    def close(self) -> None:
+        """Brake until the car stands, let the motor go."""
+        self._vesc.close()
+
+    def _controller_text(self) -> str:
+        return (
+            f"own time-out set to {self._config.controller_timeout_ms:g} ms with {self._config.controller_brake_current_a:g} A"
+            " (as configured, not read back)"
+        )
+
+    def _connect(self, now: Now) -> None:
+        if now.mono_ns < self._retry_ns:
+            return
+        self._retry_ns = now.mono_ns + round(_RETRY_S * NS_PER_S)
+        try:
+            self._vesc.abandon()
+            self._vesc.open()
+            self._vesc.identify(timeout_s=0.2)
+        except (HardwareError, ProtocolError) as error:
+            self._vesc.abandon()
+            self._link_error = str(error)
+            return
+        self._link_error, self._linked_once = "", True
+        # Whatever the car did while nobody was connected, it is stopped first.
+        self._gate.brake_again(now.mono_ns)
+
+    def _lose(self, error: Exception, now: Now) -> None:
+        self._vesc.abandon()
+        self._link_error = str(error)
+        self._gate.latch(f"link fault: {error}", now.mono_ns)
+
+    def _reached(self, action: Drive) -> bool:
+        setpoint, limits = self._vesc.limiter.setpoint, self._vesc.limiter.limits
+        speed = min(max(action.speed_mps, limits.speed_min_mps), limits.speed_max_mps)
+        steering = min(max(action.steering_rad, limits.steering_min_rad), limits.steering_max_rad)
+        return setpoint.speed_mps == speed and setpoint.steering_rad == steering
+
+    def _act(self, action: Drive | Brake | None, now: Now, first: bool) -> list[Out]:
+        if action is None or self._link_error:
+            return []
+        try:
+            if isinstance(action, Drive):
+                sent = self._vesc.drive(action.speed_mps, action.steering_rad)
+            elif action.current_a > 0.0:
+                sent = self._vesc.brake(action.current_a)
+            else:
+                sent = self._vesc.release()
+        except HardwareError as error:
+            self._lose(error, now)
+            return []
+        # One report for each command, with the write that latency counts; the slewing that follows is not reported.
+        return [self._report(sent)] if first or not isinstance(action, Drive) else []
+
+    def _report(self, sent: Sent) -> Out:
+        driving = self._gate.state is GateState.DRIVING
+        stamp_ns = self._origin_stamp_ns if driving else sent.write_real_ns
+        message = types.MotorSent(
+            header=header(stamp_ns, "car"), serial_write_mono_ns=sent.write_mono_ns, serial_write_real_ns=sent.write_real_ns,
+            speed_mps=sent.speed_mps, steering_rad=sent.steering_rad, erpm=sent.erpm, servo=sent.servo,
+            brake_current_a=sent.brake_current_a or 0.0, braking=not driving, reason=self._gate.reason,
+            peer=str(self._vesc.firmware),
+        )  # fmt: skip
+        return Out("/motor/sent", message)
+
+    def _telemetry(self, now: Now) -> list[Out]:
+        if self._link_error:
+            return []
+        try:
+            replies = self._vesc.receive()
+            if now.mono_ns - self._polled_ns >= _POLL_S * NS_PER_S:
+                self._polled_ns = now.mono_ns
+                self._vesc.request_values()
+        except (HardwareError, ProtocolError) as error:
+            self._lose(error, now)
+            return []
+        silence_s = (now.mono_ns - self._vesc.last_reply_mono_ns) / NS_PER_S
+        if silence_s > self._config.link_timeout_s:
+            self._lose(HardwareError(f"the VESC at {self._config.port} has not answered for {silence_s:.2f} s"), now)
+        return [Out("/motor/state", self._state(reply, now)) for reply in replies if isinstance(reply, Values)]
+
+    def _state(self, values: Values, now: Now) -> Any:
+        if values.fault:
+            self._gate.latch(f"the VESC reports a fault: {values.fault_name}", now.mono_ns)
+        return types.VescState(
+            header=header(now.real_ns, "car"), speed_mps=self._vesc.gains.speed_mps(values.erpm), erpm=values.erpm,
+            duty=values.duty, input_voltage_v=values.v_in, motor_current_a=values.motor_current_a,
+            input_current_a=values.input_current_a, mosfet_temperature_c=values.temp_fet_c or 0.0, fault=values.fault,
+            fault_text=values.fault_name if values.fault else "",
+        )  # fmt: skip
+
+
+def main() -> int:
+    """Run the node as a process."""
+    return run_node_main(MotorConfig, MotorNode.build)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

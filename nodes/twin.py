@@ -1,0 +1,78 @@
+"""The twin node: the simulated lab as a process, with its VESC, its VICON and its camera behind the real protocols.
+
+The other nodes do not know it: they open a serial port, a UDP port and a frame socket. Only who runs experiments uses the one
+topic it has, ``/twin/reset``, to lift the car to a start pose; that is refused while the car moves or is commanded to.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from advnerf_core.geometry import yaw_of
+from hardware.errors import HardwareError
+from hardware.twin.live import LiveLab, LiveLabConfig
+from nodes.runtime.errors import MessageError
+from nodes.runtime.messages import pose_matrix
+from nodes.runtime.node import ACTIVE, MessageInfo, Node, NodeContext, Now, Out, run_node_main
+
+RESET_TOPIC = "/twin/reset"
+
+
+class TwinConfig(LiveLabConfig):
+    """Configuration of the twin node: see `hardware.twin.live.LiveLabConfig`."""
+
+
+class TwinNode(Node):
+    """Owns the live lab."""
+
+    subscriptions = (RESET_TOPIC,)
+    tick_rate_hz = 10.0
+
+    def __init__(self, lab: LiveLab) -> None:
+        self._lab = lab
+        self._text = ""
+        self._resets = self._refused = 0
+
+    @classmethod
+    def build(cls, config: TwinConfig, context: NodeContext) -> TwinNode:
+        """Build the lab; returns when it can be seen."""
+        return cls(LiveLab(config, context.run_dir))
+
+    def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
+        """Lift the car to where a ``PoseStamped`` says."""
+        try:
+            T = pose_matrix(message)
+            self._lab.place(float(T[0, 3]), float(T[1, 3]), yaw_of(T))
+            self._resets += 1
+            self._text = ""
+        except (HardwareError, MessageError, ValueError) as error:
+            self._refused += 1
+            self._text = f"reset refused: {error}"
+        return []
+
+    def tick(self, now: Now) -> list[Out]:
+        """Notice when a part of the lab has died."""
+        self._lab.check()
+        return []
+
+    def status(self) -> tuple[str, str]:
+        """The last refusal, if any."""
+        return ACTIVE, self._text
+
+    def counters(self) -> dict[str, float]:
+        """Ticks that the lab's threads left out, and resets."""
+        missed = {f"missed {name}": float(count) for name, count in self._lab.missed.items()}
+        return {**missed, "resets": self._resets, "resets_refused": self._refused}
+
+    def close(self) -> None:
+        """End the lab."""
+        self._lab.close()
+
+
+def main() -> int:
+    """Run the node as a process."""
+    return run_node_main(TwinConfig, TwinNode.build)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

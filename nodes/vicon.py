@@ -1,0 +1,150 @@
+"""The VICON node: one topic of poses for each tracked subject; a pose that cannot be trusted is not published."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+
+from hardware.vicon import DEFAULT_PORT, SubjectPose, ViconConfig, ViconReceiver
+from nodes.runtime.clock import NS_PER_S
+from nodes.runtime.messages import pose_message
+from nodes.runtime.node import (
+    ACTIVE,
+    FAULT,
+    STARTING,
+    Inbox,
+    MessageInfo,
+    Node,
+    NodeContext,
+    Now,
+    Out,
+    ReaderThread,
+    run_node_main,
+)
+from nodes.runtime.topics import topic
+
+_READ_TIMEOUT_S = 0.2
+_TOPIC_PREFIX = "/vicon/"
+
+
+class ViconNodeConfig(BaseModel):
+    """Configuration of the VICON node.
+
+    Attributes:
+        host: Local address to listen on; empty for all.
+        port: UDP port of Tracker's object stream.
+        source: Accept datagrams of this address only.
+        subjects: Subjects to publish, each on ``/vicon/<subject>``.
+        latency_s: From exposure to receipt, as measured [s].
+        frozen_frames: So many frames with the same bits make a subject lost.
+        max_age_s: A pose older than this when it is published is dropped [s].
+        silence_s: Time without any pose of the first subject after which the node reports a fault [s].
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    host: str = "127.0.0.1"
+    port: int = Field(default=DEFAULT_PORT, ge=0, le=65535)
+    source: str | None = None
+    subjects: tuple[str, ...] = Field(default=("car", "board", "monitor"), min_length=1)
+    latency_s: float = 0.0
+    frozen_frames: int = Field(default=10, ge=2)
+    max_age_s: float = Field(default=0.1, gt=0.0)
+    silence_s: float = Field(default=0.5, gt=0.0)
+
+    @field_validator("subjects")
+    @classmethod
+    def _have_topics(cls, subjects: tuple[str, ...]) -> tuple[str, ...]:
+        for subject in subjects:
+            topic(_TOPIC_PREFIX + subject)
+        return subjects
+
+
+class ViconNode(Node):
+    """Turns poses into messages."""
+
+    def __init__(self, config: ViconNodeConfig) -> None:
+        self._config = config
+        self._receiver = ViconReceiver(
+            ViconConfig(
+                config.subjects, config.host, config.port, config.latency_s, config.frozen_frames, config.source
+            )
+        )
+        self.publications = tuple(_TOPIC_PREFIX + subject for subject in config.subjects)
+        self.inbox: Inbox[list[SubjectPose]] = Inbox(capacity=50)
+        self._reader = ReaderThread(self._read, self.inbox, "vicon")
+        self._seen_ns: dict[str, int] = {}
+        self._now_ns = time.monotonic_ns
+        self._stale = 0
+
+    @classmethod
+    def build(cls, config: ViconNodeConfig, context: NodeContext) -> ViconNode:
+        """Make the node of a process and begin to listen."""
+        node = cls(config)
+        node._now_ns = lambda: context.clock.now().mono_ns
+        node._reader.start()
+        return node
+
+    @property
+    def port(self) -> int:
+        """UDP port it listens on."""
+        return self._receiver.port
+
+    def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
+        """It listens to nobody on the bus."""
+        return []
+
+    def receive(self, item: list[SubjectPose], now: Now) -> list[Out]:
+        """Publish poses."""
+        outs = []
+        for pose in item:
+            if (now.mono_ns - pose.receive_mono_ns) / NS_PER_S > self._config.max_age_s:
+                self._stale += 1  # left over from a time when this process was held up
+                continue
+            self._seen_ns[pose.name] = now.mono_ns
+            message = pose_message(pose.T_world_from_subject, pose.stamp_real_ns)
+            outs.append(Out(_TOPIC_PREFIX + pose.name, message))
+        return outs
+
+    def status(self) -> tuple[str, str]:
+        """Fault while the first subject is not seen."""
+        now_ns, first = self._now_ns(), self._config.subjects[0]
+        lost = [name for name in self._config.subjects if self._silence_s(name, now_ns) > self._config.silence_s]
+        text = f"not seen: {', '.join(lost)}" if lost else ""
+        if first not in self._seen_ns:
+            return (
+                STARTING,
+                text if self._receiver.counts.datagrams else f"no datagrams on UDP port {self._receiver.port}",
+            )
+        return (FAULT if first in lost else ACTIVE), text
+
+    def counters(self) -> dict[str, float]:
+        """What happened to datagrams and poses."""
+        counts = self._receiver.counts
+        totals: dict[str, float] = {
+            "datagrams": counts.datagrams, "refused": counts.refused, "late": counts.late, "stale": self._stale,
+            "frames_missed": counts.missed_frames, "restarts": counts.restarts,
+        }  # fmt: skip
+        return totals | {f"lost {name}": float(count) for name, count in counts.lost.items()}
+
+    def close(self) -> None:
+        """Stop listening."""
+        self._reader.stop()
+        self._receiver.close()
+
+    def _read(self) -> list[SubjectPose] | None:
+        return self._receiver.read(_READ_TIMEOUT_S) or None
+
+    def _silence_s(self, name: str, now_ns: int) -> float:
+        return (now_ns - self._seen_ns.get(name, 0)) / NS_PER_S
+
+
+def main() -> int:
+    """Run the node as a process."""
+    return run_node_main(ViconNodeConfig, ViconNode.build)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
