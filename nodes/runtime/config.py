@@ -152,7 +152,8 @@ def node_document(document: Document) -> dict[str, Any]:
 
 
 def _explain(model: type[BaseModel], document: Document, error: ValidationError) -> str:
-    problems = error.errors(include_url=False)
+    # A misspelt key is often the reason why another one is missing, so it is told first.
+    problems = sorted(error.errors(include_url=False), key=lambda problem: problem["type"] != "extra_forbidden")
     first = problems[0]
     key = tuple(first["loc"])
     name = ".".join(map(str, key)) or "the whole"

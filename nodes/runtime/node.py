@@ -7,8 +7,8 @@ handed to it: messages, time, and what its constructor got.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -36,11 +36,13 @@ class NodeContext:
         name: Name of the node in the launch file.
         run_dir: Folder of the run.
         clock: The clock to read wherever time is needed outside `Node.handle` and `Node.tick`.
+        subscribers: How many subscribers a topic of this node has.
     """
 
     name: str
     run_dir: Path
     clock: Clock
+    subscribers: Callable[[str], int] = field(default=lambda topic: 0)
 
 
 class Node(ABC):

@@ -1,0 +1,131 @@
+"""The recorder node: everything that goes over the bus into a bag."""
+
+from __future__ import annotations
+
+import platform
+import subprocess
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from nodes.runtime.bag import BagWriter
+from nodes.runtime.errors import BagError
+from nodes.runtime.node import MessageInfo, Node, NodeContext, Now, Out, run_node_main
+from nodes.runtime.paths import RESOLVED_NAME
+from nodes.runtime.topics import TOPICS, status_topic
+from nodes.runtime.topics import topic as topic_row
+
+# The last chunk is handed to the system so often; what a killed recorder loses is shorter than this.
+_FLUSH_HZ = 20.0
+
+
+class RecorderConfig(BaseModel):
+    """Configuration of the recorder.
+
+    Attributes:
+        output: Folder of the bag, relative to the run folder; it must not exist.
+        topics: What to record; none means the whole topic table.
+        statuses_of: Nodes whose status is recorded too.
+        attachments: Files that ride along: calibration, attack file.
+        queue: Messages that may wait per topic while the disk is busy.
+    """
+
+    model_config = ConfigDict(extra="forbid")
+
+    output: Path = Path("bag")
+    topics: list[str] | None = None
+    statuses_of: list[str] = Field(default_factory=list)
+    attachments: list[Path] = Field(default_factory=list)
+    queue: int = Field(200, ge=1)
+
+
+class RecorderNode(Node):
+    """Writes wire bytes to a bag, undecoded.
+
+    Args:
+        writer: The bag.
+        topics: What to subscribe to.
+        queue: Messages that may wait per topic.
+    """
+
+    raw = True
+    tick_rate_hz = _FLUSH_HZ
+
+    def __init__(self, writer: BagWriter, topics: list[str], queue: int) -> None:
+        self._writer = writer
+        self._lost = dict.fromkeys(topics, 0)
+        self.subscriptions = tuple(topics)
+        self.queues = dict.fromkeys(topics, queue)
+
+    @classmethod
+    def build(cls, config: RecorderConfig, context: NodeContext) -> RecorderNode:
+        """Open the bag and read what rides along."""
+        topics = list(TOPICS) if config.topics is None else [topic_row(name).name for name in config.topics]
+        topics += [topic for name in config.statuses_of if (topic := status_topic(name)) not in topics]
+        attachments = _read_attachments([context.run_dir / RESOLVED_NAME], must_exist=False)
+        attachments |= _read_attachments(config.attachments, must_exist=True)
+        return cls(BagWriter(context.run_dir / config.output, attachments, provenance()), topics, config.queue)
+
+    def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
+        """Write one message."""
+        self._writer.write(topic, info.raw, info.receive_real_ns, info.publish_real_ns, info.sequence)
+        self._lost[topic] += info.lost
+        return []
+
+    def tick(self, now: Now) -> list[Out]:
+        """Hand what has come to the system."""
+        self._writer.flush()
+        return []
+
+    def status(self) -> tuple[str, str]:
+        """Active, with the number of messages."""
+        return "active", f"{sum(self._writer.contents.counts.values())} messages in {self._writer.folder}"
+
+    def counters(self) -> dict[str, float]:
+        """Messages that were lost on the way."""
+        return {"lost_total": float(sum(self._lost.values()))}
+
+    def close(self) -> None:
+        """Finish the bag."""
+        self._writer.close({f"lost {topic}": str(count) for topic, count in self._lost.items()})
+
+
+def provenance() -> dict[str, str]:
+    """Where a recording comes from: versions, git hash, machine."""
+    facts = {"python": platform.python_version(), "host": platform.node(), "machine": platform.machine()}
+    try:
+        facts["version"] = version("advnerf")
+    except PackageNotFoundError:
+        facts["version"] = "not installed"
+    command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
+    try:
+        result = subprocess.run(command, capture_output=True, text=True, timeout=5, check=False)
+        facts["git"] = result.stdout.strip() if result.returncode == 0 else "not a checkout"
+    except (OSError, subprocess.TimeoutExpired):
+        facts["git"] = "git did not answer"
+    return facts
+
+
+def _read_attachments(paths: list[Path], must_exist: bool) -> dict[str, bytes]:
+    contents: dict[str, bytes] = {}
+    for path in paths:
+        if not must_exist and not path.exists():
+            continue
+        if path.name in contents:
+            raise BagError(f"two attachments are called {path.name}; rename one")
+        try:
+            contents[path.name] = path.read_bytes()
+        except OSError as error:
+            raise BagError(f"cannot attach {path}: {error.strerror}") from error
+    return contents
+
+
+def main() -> int:
+    """Run the node as a process."""
+    return run_node_main(RecorderConfig, RecorderNode.build)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,151 @@
+"""Look into bags and take messages out of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from mcap.reader import McapReader, make_reader
+from mcap.records import Statistics
+from mcap.summary import Summary
+
+from nodes.runtime.bag_repair import mcap_file, read_summary
+from nodes.runtime.clock import NS_PER_S
+from nodes.runtime.errors import BagError, TopicError
+from nodes.runtime.messages import type_hash
+from nodes.runtime.topics import topic as topic_row
+
+
+@dataclass(frozen=True)
+class TopicInfo:
+    """One topic of a bag.
+
+    Attributes:
+        name: Topic.
+        type: ROS 2 type.
+        count: Messages.
+        lost: Messages that were published but did not reach the recorder; None when the recorder did not say.
+    """
+
+    name: str
+    type: str
+    count: int
+    lost: int | None
+
+
+@dataclass(frozen=True)
+class BagInfo:
+    """What a bag holds; times are log times [ns since 1970]."""
+
+    path: Path
+    size_bytes: int
+    start_ns: int
+    end_ns: int
+    topics: tuple[TopicInfo, ...]
+    attachments: tuple[str, ...]
+    metadata: dict[str, str]
+
+    @property
+    def duration_s(self) -> float:
+        """Time from the first to the last message [s]."""
+        return (self.end_ns - self.start_ns) / NS_PER_S
+
+    @property
+    def messages(self) -> int:
+        """Number of messages."""
+        return sum(topic.count for topic in self.topics)
+
+
+@dataclass(frozen=True)
+class BagMessage:
+    """One message of a bag."""
+
+    topic: str
+    cdr: bytes
+    log_ns: int
+    publish_ns: int
+    sequence: int
+
+
+def read_info(bag: Path) -> BagInfo:
+    """Summary of a bag."""
+    path, summary, statistics = _whole_file(bag)
+    with open(path, "rb") as file:
+        records = {record.name: dict(record.metadata) for record in make_reader(file).iter_metadata()}
+    ends = records.get("advnerf_end")
+    topics = tuple(
+        TopicInfo(
+            channel.topic, summary.schemas[channel.schema_id].name, statistics.channel_message_counts.get(channel.id, 0),
+            None if ends is None else int(ends.get(f"lost {channel.topic}", 0)),
+        )
+        for channel in sorted(summary.channels.values(), key=lambda channel: channel.topic)
+    )  # fmt: skip
+    return BagInfo(
+        path, path.stat().st_size, statistics.message_start_time, statistics.message_end_time, topics,
+        tuple(index.name for index in summary.attachment_indexes), records.get("advnerf", {}),
+    )  # fmt: skip
+
+
+def read_attachment(bag: Path, name: str) -> bytes:
+    """Content of an attached file."""
+    with open(_whole_file(bag)[0], "rb") as file:
+        names = []
+        for attachment in make_reader(file).iter_attachments():
+            if attachment.name == name:
+                return bytes(attachment.data)
+            names.append(attachment.name)
+    raise BagError(f"{bag} has no attachment {name!r}; it has {', '.join(names) or 'none'}")
+
+
+def read_messages(bag: Path, topics: Sequence[str] | None = None, start_offset_s: float = 0.0) -> Iterator[BagMessage]:
+    """Messages in order of their log time.
+
+    Args:
+        bag: Bag folder or file.
+        topics: Only these; every one must be in the bag.
+        start_offset_s: Leave out so much of the beginning [s].
+    """
+    info = read_info(bag)
+    path = info.path
+    known = [topic.name for topic in info.topics]
+    for name in topics or ():
+        if name not in known:
+            raise BagError(f"{path} has no topic {name}; it has {', '.join(known)}")
+    start_ns = info.start_ns + round(start_offset_s * NS_PER_S)
+    if start_offset_s < 0 or start_ns > info.end_ns:
+        raise BagError(
+            f"expected a start offset between 0 and {info.duration_s:.1f} s, the length of {path}, got {start_offset_s}"
+        )
+    with open(path, "rb") as file:
+        reader: McapReader = make_reader(file)
+        for _, channel, message in reader.iter_messages(topics, starting_at=start_ns, log_time_order=True):
+            yield BagMessage(channel.topic, message.data, message.log_time, message.publish_time, message.sequence)
+
+
+def require_our_types(bag: Path, topics: Sequence[str]) -> None:
+    """Refuse a bag whose topics have other types than ours: receivers would refuse every message."""
+    path, summary, _ = _whole_file(bag)
+    for channel in summary.channels.values():
+        if channel.topic not in topics:
+            continue
+        typename = summary.schemas[channel.schema_id].name
+        try:
+            ours = topic_row(channel.topic).type
+        except TopicError as error:
+            raise BagError(f"{path}: cannot play {channel.topic}: {error}") from None
+        found = channel.metadata.get("topic_type_hash", "")
+        if typename != ours or found not in ("", type_hash(ours)):
+            raise BagError(
+                f"{path}: {channel.topic} is {typename} {found}, but here it is {ours} {type_hash(ours)}; leave it out with --topics"
+            )
+
+
+def _whole_file(bag: Path) -> tuple[Path, Summary, Statistics]:
+    path = mcap_file(bag)
+    found = read_summary(path)
+    if found is None:
+        raise BagError(
+            f"{path} is unfinished: its recorder was killed or is still at work; make it whole with: advnerf bag repair {bag}"
+        )
+    return path, *found

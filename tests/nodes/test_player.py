@@ -1,0 +1,111 @@
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from nodes.player import PlayerConfig, PlayerNode
+from nodes.runtime.bag import BagWriter
+from nodes.runtime.bus import Bus
+from nodes.runtime.clock import ManualClock
+from nodes.runtime.errors import BagError, NodeFinished
+from nodes.runtime.messages import decode, encode, header, pose_message, stamp_ns, types
+
+START_NS = 1_800_000_000_000_000_000
+
+
+@pytest.fixture
+def bag(tmp_path):
+    """Two seconds: poses of the car at 50 Hz, of the board at 10 Hz, one request to arm, one status."""
+    arm = encode(types.Arm(header=header(START_NS), arm=True, source="person", reason=""))
+    with BagWriter(tmp_path / "bag") as writer:
+        writer.write("/arm", arm, START_NS, START_NS, 0)
+        for i in range(100):
+            t = START_NS + i * 20_000_000
+            writer.write("/vicon/car", encode(pose_message(np.eye(4), t)), t, t, i)
+            if i % 5 == 0:
+                writer.write("/vicon/board", encode(pose_message(np.eye(4), t)), t + 1, t + 1, i // 5)
+    return tmp_path / "bag"
+
+
+def play(node, clock, step_s=0.01, steps=10_000):
+    """All messages with the time at which they came [s], until the node is done."""
+    out, start = [], clock.now().mono_ns
+    try:
+        for _ in range(steps):
+            out += [((clock.now().mono_ns - start) / 1e9, o.topic, o.message) for o in node.tick(clock.now())]
+            clock.advance(step_s)
+    except NodeFinished:
+        return out, True
+    return out, False
+
+
+def test_messages_come_when_they_are_due_and_then_it_is_done(bag):
+    node = PlayerNode(PlayerConfig(bag=bag), lambda topic: 0)
+    assert set(node.publications) == {"/vicon/car", "/vicon/board"}
+    out, done = play(node, ManualClock(123, 456))
+    assert done
+    assert len(out) == 120
+    for t, _, cdr in out:
+        due_s = (stamp_ns(decode("geometry_msgs/msg/PoseStamped", cdr)) - START_NS) / 1e9
+        assert 0 <= t - due_s <= 0.011
+
+
+@pytest.mark.parametrize(("rate", "duration_s"), [(0.5, 3.96), (2.0, 0.99)])
+def test_rate(bag, rate, duration_s):
+    out, _ = play(PlayerNode(PlayerConfig(bag=bag, rate=rate), lambda topic: 0), ManualClock())
+    assert out[-1][0] == pytest.approx(duration_s, abs=0.02)
+
+
+def test_start_offset_and_topics(bag):
+    config = PlayerConfig(bag=bag, start_offset_s=1.5, topics=["/vicon/board"])
+    out, _ = play(PlayerNode(config, lambda topic: 0), ManualClock())
+    assert [topic for _, topic, _ in out] == ["/vicon/board"] * 5
+    assert out[0][0] == pytest.approx(0.01)
+
+
+def test_loop_begins_again(bag):
+    out, done = play(PlayerNode(PlayerConfig(bag=bag, loop=True), lambda topic: 0), ManualClock(), steps=600)
+    assert not done
+    assert 355 <= len(out) <= 366  # three rounds of 120, and the beginning of a fourth
+
+
+def test_waits_for_subscribers(bag):
+    there = {"/vicon/car": 0}
+    node = PlayerNode(PlayerConfig(bag=bag, wait_for=["/vicon/car"]), lambda topic: there[topic])
+    clock = ManualClock()
+    assert play(node, clock, steps=50) == ([], False)
+    assert node.status() == ("ready", "waits for subscribers of /vicon/car")
+    there["/vicon/car"] = 1
+    assert len(play(node, clock)[0]) == 120
+
+
+def test_requests_to_arm_are_played_only_when_asked_for(bag):
+    assert PlayerNode(PlayerConfig(bag=bag, topics=["/arm"]), lambda topic: 0).publications == ("/arm",)
+
+
+def test_wrong_choices_are_errors(bag, tmp_path):
+    with pytest.raises(BagError, match="has no topic /camera/image_raw; it has /arm, /vicon/board, /vicon/car"):
+        PlayerNode(PlayerConfig(bag=bag, topics=["/camera/image_raw"]), lambda topic: 0)
+    with pytest.raises(BagError, match="it is not played; played are /vicon/car"):
+        PlayerNode(PlayerConfig(bag=bag, topics=["/vicon/car"], wait_for=["/arm"]), lambda topic: 0)
+    with pytest.raises(BagError, match="expected a bag folder"):
+        PlayerNode(PlayerConfig(bag=tmp_path / "nothing"), lambda topic: 0)
+
+
+def test_process_plays_a_bag_to_a_subscriber_and_ends(bag, tmp_path):
+    command = [sys.executable, "-m", "nodes.player", "--run-dir", str(tmp_path), "--set", f"bag={bag}"]
+    command += ["--set", "rate=4", "--set", "wait_for=[/vicon/car]"]
+    with Bus(tmp_path) as bus:
+        bus.subscribe("/vicon/car")
+        process = subprocess.Popen(command)
+        got, deadline = [], time.monotonic() + 20
+        while process.poll() is None and time.monotonic() < deadline:
+            bus.wait(0.05)
+            got += bus.receive()
+        got += bus.receive()
+    assert process.returncode == 0
+    assert [g.info.sequence for g in got] == list(range(100))
+    duration_s = (got[-1].info.publish_mono_ns - got[0].info.publish_mono_ns) / 1e9
+    assert duration_s == pytest.approx(1.98 / 4, abs=0.1)

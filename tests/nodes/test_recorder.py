@@ -1,0 +1,113 @@
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from nodes.recorder import RecorderConfig, RecorderNode, provenance
+from nodes.runtime.bag_read import read_attachment, read_info, read_messages
+from nodes.runtime.bag_repair import repair
+from nodes.runtime.bus import Bus
+from nodes.runtime.clock import Now, SystemClock
+from nodes.runtime.errors import BagError
+from nodes.runtime.messages import encode, image_message, pose_message
+from nodes.runtime.node import MessageInfo, NodeContext
+
+
+def context(tmp_path):
+    return NodeContext("recorder", tmp_path, SystemClock())
+
+
+def test_wire_bytes_and_all_times_go_into_the_bag_with_what_rides_along(tmp_path):
+    (tmp_path / "launch.resolved.yaml").write_text("name: x\n")
+    (tmp_path / "camera.yaml").write_text("fx: 1\n")
+    config = RecorderConfig(topics=["/vicon/car"], statuses_of=["camera"], attachments=[tmp_path / "camera.yaml"])
+    node = RecorderNode.build(config, context(tmp_path))
+    assert node.subscriptions == ("/vicon/car", "/status/camera")
+    cdr = encode(pose_message(np.eye(4), 5))
+    info = MessageInfo(1, 2, sequence=7, raw=cdr, publish_real_ns=1000, receive_real_ns=2000, lost=4)
+    assert node.handle("/vicon/car", None, info, Now(0, 0)) == []
+    node.close()
+    (message,) = read_messages(tmp_path / "bag")
+    assert (message.cdr, message.log_ns, message.publish_ns, message.sequence) == (cdr, 2000, 1000, 7)
+    assert read_attachment(tmp_path / "bag", "camera.yaml") == b"fx: 1\n"
+    assert read_attachment(tmp_path / "bag", "launch.resolved.yaml") == b"name: x\n"
+    assert read_info(tmp_path / "bag").topics[0].lost == 4
+    assert read_info(tmp_path / "bag").metadata.keys() >= {"git", "version", "host", "python"}
+
+
+def test_missing_attachment_is_an_error_before_anything_is_written(tmp_path):
+    with pytest.raises(BagError, match=r"cannot attach .*nothing\.yaml: No such file"):
+        RecorderNode.build(RecorderConfig(attachments=[tmp_path / "nothing.yaml"]), context(tmp_path))
+    assert not (tmp_path / "bag").exists()
+
+
+def test_unknown_key_is_refused():
+    with pytest.raises(ValidationError):
+        RecorderConfig(outputs="x")
+
+
+def test_provenance_names_the_version():
+    assert provenance()["version"]
+
+
+def start_recorder(tmp_path, bus):
+    command = [sys.executable, "-m", "nodes.recorder", "--run-dir", str(tmp_path)]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    for topic in ("/camera/image_raw", "/vicon/car"):
+        bus.publisher(topic)
+    bus.wait_for_subscribers(["/camera/image_raw", "/vicon/car"], 20)
+    return process
+
+
+def drive(bus, duration_s):
+    """30 Hz images and 50 Hz poses; returns how many of each were sent."""
+    sent = {"/camera/image_raw": 0, "/vicon/car": 0}
+    image, start = np.zeros((188, 366, 3), np.uint8), time.monotonic()
+    while (t := time.monotonic() - start) < duration_s:
+        if t * 30 >= sent["/camera/image_raw"]:
+            bus.publish("/camera/image_raw", image_message(image, time.time_ns(), "camera"))
+            sent["/camera/image_raw"] += 1
+        if t * 50 >= sent["/vicon/car"]:
+            bus.publish("/vicon/car", pose_message(np.eye(4), time.time_ns()))
+            sent["/vicon/car"] += 1
+        time.sleep(0.001)
+    return sent
+
+
+def test_process_records_everything_even_of_latest_topics(tmp_path):
+    with Bus(tmp_path) as bus:
+        process = start_recorder(tmp_path, bus)
+        sent = drive(bus, 1.0)
+        time.sleep(0.2)
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=10)
+    assert (process.returncode, errors) == (0, "")
+    assert {t.name: t.count for t in read_info(tmp_path / "bag").topics} == sent
+
+
+def test_killed_process_loses_at_most_what_came_in_its_last_moment(tmp_path):
+    with Bus(tmp_path) as bus:
+        process = start_recorder(tmp_path, bus)
+        sent = drive(bus, 1.0)
+        os.kill(process.pid, signal.SIGKILL)
+        process.communicate(timeout=10)
+    repaired = repair(tmp_path / "bag")
+    # A chunk is closed every 50 ms: 1.5 images (each a chunk of its own) and 2.5 poses come in that time.
+    assert sum(sent.values()) - repaired.messages <= 8
+    counts = {t.name: t.count for t in read_info(tmp_path / "bag").topics}
+    assert set(counts) == set(sent)
+
+
+def test_bag_that_exists_is_one_clear_line_and_exit_code_1(tmp_path):
+    (tmp_path / "bag").mkdir()
+    (tmp_path / "bag" / "x").write_text("")
+    command = [sys.executable, "-m", "nodes.recorder", "--run-dir", str(tmp_path)]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=20)
+    assert result.returncode == 1
+    assert result.stderr.count("\n") == 1
+    assert "exists and is not empty; record to another folder" in result.stderr
