@@ -108,8 +108,7 @@ def _train_step(
     rng = np.random.default_rng([config.seed, step])
     rows = frames.training[rng.integers(0, len(frames.training), config.batch_size)]
     images, labels, goals = frames.batch(rows)
-    generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
-    inputs = augment(images_to_tensor(images), config.augment, generator)
+    inputs = torch.from_numpy(augment(images, config.augment, rng)).permute(0, 3, 1, 2)  # stays channels-last
     target = torch.from_numpy(labels)
     output: Tensor = policy(inputs, torch.from_numpy(goals) if policy.goal_size else None)
     loss = F.huber_loss(output, target, delta=config.huber_rad) / config.huber_rad**2
