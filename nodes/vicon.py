@@ -9,6 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from hardware.vicon import DEFAULT_PORT, SubjectPose, ViconConfig, ViconReceiver
 from nodes.runtime.clock import NS_PER_S
+from nodes.runtime.errors import TopicError
 from nodes.runtime.messages import pose_message
 from nodes.runtime.node import (
     ACTIVE,
@@ -58,7 +59,10 @@ class ViconNodeConfig(BaseModel):
     @classmethod
     def _have_topics(cls, subjects: tuple[str, ...]) -> tuple[str, ...]:
         for subject in subjects:
-            topic(_TOPIC_PREFIX + subject)
+            try:
+                topic(_TOPIC_PREFIX + subject)
+            except TopicError as error:
+                raise ValueError(f"{error}; a new subject needs a row in nodes/runtime/topics.py") from None
         return subjects
 
 

@@ -71,16 +71,17 @@ class FrameServer:
                 return  # closed
             with self._condition:
                 self._clients.add(client)
-            threading.Thread(target=self._serve, args=(client,), name="frame client", daemon=True).start()
+                # A client that has just come waits for the next frame: the last one may be old.
+                last = self._newest
+            threading.Thread(target=self._serve, args=(client, last), name="frame client", daemon=True).start()
 
-    def _serve(self, client: socket.socket) -> None:
+    def _serve(self, client: socket.socket, last: Frame | None) -> None:
         # A frame is larger than what the socket holds, so a reader that stops is never more than one frame behind.
         client.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 64 * 1024)
-        sent: Frame | None = None
         try:
-            while (frame := self._wait_for_newer(sent)) is not None:
+            while (frame := self._wait_for_newer(last)) is not None:
                 client.sendall(encode_head(frame) + frame.rgb.tobytes())
-                sent = frame
+                last = frame
         except OSError:
             pass  # the client left
         finally:
@@ -88,11 +89,9 @@ class FrameServer:
                 self._clients.discard(client)
             client.close()
 
-    def _wait_for_newer(self, sent: Frame | None) -> Frame | None:
+    def _wait_for_newer(self, last: Frame | None) -> Frame | None:
         with self._condition:
-            # A client that has just come waits for the next frame: the last one may be old.
-            known = self._newest if sent is None else sent
-            while self._newest is known and not self._stopping:
+            while self._newest is last and not self._stopping:
                 self._condition.wait()
             return None if self._stopping else self._newest
 
