@@ -32,18 +32,18 @@ class PlayerConfig(BaseModel):
         loop: Begin again at the end.
         start_offset_s: Leave out so much of the beginning [s].
         topics: What to play; none means all but statuses and requests to arm.
-        wait_for: Topics that must have a subscriber before the first message; none means do not wait, and lose what is
-            sent before a subscriber is there.
+        wait_for: Topics that must have a subscriber before the first message; none means that one of any topic will do,
+            an empty list means do not wait, and lose what is sent before a subscriber is there.
     """
 
     model_config = ConfigDict(extra="forbid")
 
     bag: Path
-    rate: float = Field(1.0, gt=0)
+    rate: float = Field(default=1.0, gt=0)
     loop: bool = False
-    start_offset_s: float = Field(0.0, ge=0)
+    start_offset_s: float = Field(default=0.0, ge=0)
     topics: list[str] | None = None
-    wait_for: list[str] = Field(default_factory=list)
+    wait_for: list[str] | None = None
 
 
 class PlayerNode(Node):
@@ -62,7 +62,7 @@ class PlayerNode(Node):
         self._info = read_info(config.bag)
         self.publications = tuple(_choose_topics(config, [topic.name for topic in self._info.topics]))
         require_our_types(config.bag, self.publications)
-        for topic in config.wait_for:
+        for topic in config.wait_for or ():
             if topic not in self.publications:
                 raise BagError(
                     f"cannot wait for subscribers of {topic}, it is not played; played are {', '.join(self.publications)}"
@@ -106,7 +106,11 @@ class PlayerNode(Node):
         return ACTIVE, f"{self._played} messages played"
 
     def _missing(self) -> list[str]:
-        return [topic for topic in self._config.wait_for if self._subscribers(topic) == 0]
+        wanted = self._config.wait_for
+        missing = [
+            topic for topic in (self.publications if wanted is None else wanted) if self._subscribers(topic) == 0
+        ]
+        return [] if wanted is None and len(missing) < len(self.publications) else missing
 
     def _rewind(self, now: Now) -> None:
         self._messages = read_messages(self._config.bag, self.publications, self._config.start_offset_s)

@@ -38,7 +38,7 @@ class RecorderConfig(BaseModel):
     topics: list[str] | None = None
     statuses_of: list[str] = Field(default_factory=list)
     attachments: list[Path] = Field(default_factory=list)
-    queue: int = Field(200, ge=1)
+    queue: int = Field(default=200, ge=1)
 
 
 class RecorderNode(Node):

@@ -18,8 +18,8 @@ from pathlib import Path
 import yaml
 from mcap.writer import CompressionType, Writer
 
+from advnerf_core.files import write_atomically
 from nodes.runtime.errors import BagError
-from nodes.runtime.files import write_atomically
 from nodes.runtime.messages import ROS_DISTRO, type_definition, type_hash
 from nodes.runtime.topics import topic as topic_row
 

@@ -39,9 +39,9 @@ from mcap.stream_reader import breakup_chunk
 from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC
 
+from advnerf_core.files import write_atomically
 from nodes.runtime.bag import METADATA_FILE, Contents, rosbag2_metadata
 from nodes.runtime.errors import BagError
-from nodes.runtime.files import write_atomically
 
 _RECORD_HEAD = struct.Struct("<BQ")
 _MESSAGE_HEAD_BYTES = 9

@@ -18,11 +18,11 @@ from typing import Any, TextIO
 
 import yaml
 
+from advnerf_core.files import write_atomically
 from nodes.runtime.bus import Bus
 from nodes.runtime.child import Child
 from nodes.runtime.config import node_document
 from nodes.runtime.errors import LaunchError
-from nodes.runtime.files import write_atomically
 from nodes.runtime.launch_file import Plan, load_launch
 from nodes.runtime.paths import RESOLVED_NAME, private_folder, user_folder
 from nodes.runtime.topics import status_topic

@@ -13,6 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from nodes.runtime.config import Document, apply_overrides, read_yaml, validate
 from nodes.runtime.errors import ConfigError, TopicError
+from nodes.runtime.paths import bus_folder
 from nodes.runtime.topics import status_topic
 
 RECORDER = "recorder"
@@ -33,10 +34,10 @@ class Respawn(_Strict):
         max_delay_s: Longest wait [s].
     """
 
-    max_restarts: int = Field(5, ge=1)
-    window_s: float = Field(60.0, gt=0)
-    delay_s: float = Field(0.2, ge=0)
-    max_delay_s: float = Field(5.0, ge=0)
+    max_restarts: int = Field(default=5, ge=1)
+    window_s: float = Field(default=60.0, gt=0)
+    delay_s: float = Field(default=0.2, ge=0)
+    max_delay_s: float = Field(default=5.0, ge=0)
 
 
 class NodeEntry(_Strict):
@@ -57,14 +58,14 @@ class NodeEntry(_Strict):
 
     module: str
     config: dict[str, Any] = Field(default_factory=dict)
-    enabled: bool = Field(True, alias="if")
+    enabled: bool = Field(default=True, alias="if")
     required: bool = True
     respawn: Respawn | None = None
     ends_launch: bool = False
     stop_last: bool = False
     env: dict[str, str] = Field(default_factory=dict)
-    start_timeout_s: float = Field(60.0, gt=0)
-    hang_timeout_s: float = Field(5.0, gt=0)
+    start_timeout_s: float = Field(default=60.0, gt=0)
+    hang_timeout_s: float = Field(default=5.0, gt=0)
 
     @field_validator("config", mode="before")
     @classmethod
@@ -78,12 +79,13 @@ class RecordEntry(_Strict):
     Attributes:
         output: Bag folder, relative to the run folder.
         topics: Topics to record; none means all of the topic table.
-        attachments: Files that ride along in the bag, besides the resolved launch file: calibration, attack file.
+        attachments: Files that ride along in the bag, besides the resolved launch file: calibration, attack file; an empty
+            entry (a parameter without a value) is left out.
     """
 
     output: str = "bag"
     topics: list[str] | None = None
-    attachments: list[str] = Field(default_factory=list)
+    attachments: list[str | None] = Field(default_factory=list)
 
 
 class LaunchFile(_Strict):
@@ -91,7 +93,8 @@ class LaunchFile(_Strict):
 
     Attributes:
         name: Name of the launch.
-        params: Values to use elsewhere as ``${name}``; ``${run_dir}`` always exists.
+        params: Values to use elsewhere as ``${name}``. Two always exist: ``${run_dir}``, and ``${socket_dir}``, a folder
+            whose path is short enough for Unix sockets however long that of the run folder is.
         nodes: The nodes, in the order in which they are started.
         record: Add a recorder of everything; true for the defaults.
         include: Launch files, relative to this one, on which this one builds.
@@ -140,7 +143,8 @@ def load_launch(file: Path, overrides: Sequence[str] = (), run_dir: Path | str =
         raise ConfigError(f"{document.place(())}: expected a launch file with keys name and nodes")
     for override in overrides:
         _apply_override(document, override)
-    params = {**(document.data.get("params") or {}), "run_dir": str(run_dir)}
+    socket_dir = str(bus_folder(run_dir)) if isinstance(run_dir, Path) else "<socket_dir>"
+    params = {**(document.data.get("params") or {}), "run_dir": str(run_dir), "socket_dir": socket_dir}
     document.data = _substitute(document.data, params, document, ())
     launch = validate(LaunchFile, document)
     if launch.record is not False:
@@ -226,7 +230,8 @@ def _add_recorder(document: Document, launch: LaunchFile) -> None:
     if RECORDER in launch.nodes:
         raise ConfigError(f"{document.place(('nodes', RECORDER))}: this node and the key record exclude each other")
     others = [name for name, entry in launch.nodes.items() if entry.enabled]
-    config = {**record.model_dump(), "statuses_of": others}
+    attachments = [file for file in record.attachments if file]
+    config = {**record.model_dump(), "attachments": attachments, "statuses_of": others}
     document.data["nodes"][RECORDER] = {"module": "nodes.recorder", "stop_last": True, "config": config}
     document.data["record"] = False
     document.places[("nodes", RECORDER)] = document.place(("record",))

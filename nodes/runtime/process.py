@@ -182,6 +182,6 @@ def _one_line(error: BaseException) -> str:
     # Our own exceptions and those of the system say what happened; of others the type is half of the message.
     return (
         text
-        if type(error).__module__.startswith(("nodes.", "hardware.", "advnerf_core."))
+        if type(error).__module__.startswith(("nodes.", "hardware.", "advnerf_core.", "calibration."))
         else f"{type(error).__name__}: {text}"
     )

@@ -42,7 +42,7 @@ def play(node, clock, step_s=0.01, steps=10_000):
 
 
 def test_messages_come_when_they_are_due_and_then_it_is_done(bag):
-    node = PlayerNode(PlayerConfig(bag=bag), lambda topic: 0)
+    node = PlayerNode(PlayerConfig(bag=bag, wait_for=[]), lambda topic: 0)
     assert set(node.publications) == {"/vicon/car", "/vicon/board"}
     out, done = play(node, ManualClock(123, 456))
     assert done
@@ -54,19 +54,21 @@ def test_messages_come_when_they_are_due_and_then_it_is_done(bag):
 
 @pytest.mark.parametrize(("rate", "duration_s"), [(0.5, 3.96), (2.0, 0.99)])
 def test_rate(bag, rate, duration_s):
-    out, _ = play(PlayerNode(PlayerConfig(bag=bag, rate=rate), lambda topic: 0), ManualClock())
+    out, _ = play(PlayerNode(PlayerConfig(bag=bag, rate=rate, wait_for=[]), lambda topic: 0), ManualClock())
     assert out[-1][0] == pytest.approx(duration_s, abs=0.02)
 
 
 def test_start_offset_and_topics(bag):
-    config = PlayerConfig(bag=bag, start_offset_s=1.5, topics=["/vicon/board"])
+    config = PlayerConfig(bag=bag, start_offset_s=1.5, wait_for=[], topics=["/vicon/board"])
     out, _ = play(PlayerNode(config, lambda topic: 0), ManualClock())
     assert [topic for _, topic, _ in out] == ["/vicon/board"] * 5
     assert out[0][0] == pytest.approx(0.01)
 
 
 def test_loop_begins_again(bag):
-    out, done = play(PlayerNode(PlayerConfig(bag=bag, loop=True), lambda topic: 0), ManualClock(), steps=600)
+    out, done = play(
+        PlayerNode(PlayerConfig(bag=bag, loop=True, wait_for=[]), lambda topic: 0), ManualClock(), steps=600
+    )
     assert not done
     assert 355 <= len(out) <= 366  # three rounds of 120, and the beginning of a fourth
 
@@ -79,6 +81,14 @@ def test_waits_for_subscribers(bag):
     assert node.status() == ("ready", "waits for subscribers of /vicon/car")
     there["/vicon/car"] = 1
     assert len(play(node, clock)[0]) == 120
+
+
+def test_any_subscriber_will_do_when_none_is_named(bag):
+    there = {"/vicon/car": 0, "/vicon/board": 0}
+    node = PlayerNode(PlayerConfig(bag=bag), lambda topic: there[topic])
+    assert play(node, ManualClock(), steps=5) == ([], False)
+    there["/vicon/board"] = 1
+    assert len(play(node, ManualClock())[0]) == 120
 
 
 def test_requests_to_arm_are_played_only_when_asked_for(bag):

@@ -1,0 +1,220 @@
+"""The command ``advnerf``. Each command imports what it needs when it is called, so that ``--help`` is quick."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from nodes import cli_bag, cli_topic
+from nodes.runtime.terminal import Overrides, RunDir, print_table, say_error, table
+
+if TYPE_CHECKING:
+    from nodes.runtime.launch import Launch
+
+OUR_PACKAGES = ("advnerf_core", "hardware", "calibration", "nodes")
+ERROR_EXIT, FAILURE_EXIT = 2, 1
+
+app = typer.Typer(
+    name="advnerf", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
+    help="Find objects that drive a self-driving policy off its path, and prove it on the car or on its simulated lab.",
+)  # fmt: skip
+app.add_typer(cli_topic.app, name="topic")
+app.add_typer(cli_bag.app, name="bag")
+
+_debug = False
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+
+        print(f"advnerf {version('advnerf')}")
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    show_version: Annotated[
+        bool, typer.Option("--version", help="Show the version.", callback=_print_version, is_eager=True)
+    ] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")] = False,
+) -> None:
+    """Options of all commands."""
+    global _debug
+    _debug = debug
+
+
+@app.command()
+def launch(
+    file: Annotated[Path, typer.Argument(help="A *.launch.yaml file.", exists=True, dir_okay=False)],
+    overrides: Overrides = None,
+    run_dir: Annotated[
+        Path | None,
+        typer.Option("--run-dir", help="Folder for logs, sockets and bag.", show_default="runs/<name>-<time>"),
+    ] = None,
+    duration_s: Annotated[
+        float | None, typer.Option("--duration", min=0.0, help="Stop by itself after so many seconds.")
+    ] = None,
+    check: Annotated[bool, typer.Option("--check", help="Only say what would be started.")] = False,
+) -> None:
+    """Start the nodes of a launch file and watch them; Ctrl-C stops them, twice stops them at once."""
+    from nodes.runtime.launch import Launch
+    from nodes.runtime.launch_file import load_launch
+
+    plan = load_launch(file, overrides or [])
+    if check:
+        _print_plan(plan)
+        return
+    run_dir = run_dir or Path("runs") / f"{plan.launch.name}-{time.strftime('%Y%m%d-%H%M%S')}"
+    started = Launch(file, overrides or [], run_dir, report=lambda line: print(f"[launch] {line}", flush=True))
+    _watch_launch(started, duration_s)
+
+
+def _watch_launch(started: Launch, duration_s: float | None) -> None:
+    asked = 0
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        nonlocal asked
+        asked += 1
+        started.request_stop(kill=asked > 1)
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, stop)
+    print(f"[launch] {started.plan.launch.name} in {started.run_dir}", flush=True)
+    started.start()
+    try:
+        if started.wait(duration_s) is None:
+            started.request_stop()
+    finally:
+        code = started.stop()
+    if code:
+        say_error(started.failure)
+        raise typer.Exit(code)
+
+
+def _print_plan(plan: Any) -> None:
+    rows = table("node", "module", "required", "config")
+    for name, entry in plan.nodes.items():
+        rows.add_row(name, entry.module, "yes" if entry.required else "no", str(plan.documents[name].data))
+    print_table(rows)
+
+
+@app.command()
+def experiment(
+    file: Annotated[Path, typer.Argument(help="A *.experiment.yaml file.", exists=True, dir_okay=False)],
+    setting: Annotated[str, typer.Option("--setting", help="Which of the file's settings.")] = "demo",
+    run_folder: Annotated[
+        Path | None, typer.Option("--run-folder", help="Folder of all results.", show_default="runs/<setting>")
+    ] = None,
+    until: Annotated[str | None, typer.Option("--until", metavar="STAGE", help="Stop after this stage.")] = None,
+    overrides: Overrides = None,
+) -> None:
+    """Run an experiment: every stage that is not there yet, from the photographs to the report."""
+    _run_experiment(file, setting, run_folder, until, overrides)
+
+
+def _run_experiment(
+    file: Path, setting: str, folder: Path | None, until: str | None, overrides: list[str] | None
+) -> None:
+    # Rendering without a display is the only way the stages know; an import of MuJoCo decides on it.
+    os.environ.setdefault("MUJOCO_GL", "egl")
+    from nodes.experiment.run import load_experiment, run_experiment
+
+    run_experiment(load_experiment(file, setting, overrides or [], folder or Path("runs") / setting), until)
+
+
+def _add_stage(name: str, what: str) -> None:
+    def command(
+        file: Annotated[Path, typer.Argument(help="A *.experiment.yaml file.", exists=True, dir_okay=False)],
+        setting: Annotated[str, typer.Option("--setting", help="Which of the file's settings.")] = "demo",
+        run_folder: Annotated[Path | None, typer.Option("--run-folder", show_default="runs/<setting>")] = None,
+        overrides: Overrides = None,
+    ) -> None:
+        _run_experiment(file, setting, run_folder, name, overrides)
+
+    app.command(name, help=f"Stage of an experiment: {what} (and what it needs first).", rich_help_panel="Stages")(
+        command
+    )
+
+
+for _name, _what in {
+    "capture": "photograph the room and record the drive of an expert",
+    "scene": "learn the room from its photographs",
+    "policy": "train the policy that will be attacked",
+    "object": "make the object that carries the attack",
+    "attack": "search for the texture",
+    "deploy": "drive through the real nodes, with and without the attack",
+    "report": "put everything on one page",
+}.items():
+    _add_stage(_name, _what)
+
+
+@app.command()
+def arm(
+    run_dir: RunDir = None, reason: Annotated[str, typer.Option("--reason", help="Why, for the record.")] = ""
+) -> None:
+    """Ask the safety node of a running launch to let the car move."""
+    _send_arm(True, run_dir, reason)
+
+
+@app.command()
+def disarm(
+    run_dir: RunDir = None, reason: Annotated[str, typer.Option("--reason", help="Why, for the record.")] = ""
+) -> None:
+    """Stop the car of a running launch and keep it stopped."""
+    _send_arm(False, run_dir, reason)
+
+
+def _send_arm(wanted: bool, run_dir: Path | None, reason: str) -> None:
+    from nodes.runtime.watching import ask_to_arm, find_run_dir
+
+    armed, why = ask_to_arm(find_run_dir(run_dir), wanted, reason)
+    print(f"armed by {why}" if armed else f"not armed: {why}")
+    if armed != wanted:
+        raise typer.Exit(FAILURE_EXIT)
+
+
+@app.command()
+def doctor(
+    folder: Annotated[Path, typer.Option("--folder", help="Where results will be written.")] = Path("runs"),
+    vicon_port: Annotated[int, typer.Option("--vicon-port", min=1, max=65535)] = 51001,
+) -> None:
+    """Say what this machine has, what it lacks, and what to do about it."""
+    from nodes.runtime.doctor import FAILURE, OK, examine
+
+    rows = table("check", "state", "found")
+    checks = examine(folder, vicon_port)
+    for check in checks:
+        colour = "green" if check.state == OK else "red" if check.state == FAILURE else "yellow"
+        rows.add_row(check.name, f"[{colour}]{check.state}[/]", check.text)
+    print_table(rows)
+    if any(check.state == FAILURE for check in checks):
+        raise typer.Exit(FAILURE_EXIT)
+
+
+def _is_for_people(error: Exception) -> bool:
+    """Whether the message of an exception was written for whoever typed the command."""
+    return isinstance(error, OSError) or type(error).__module__.partition(".")[0] in OUR_PACKAGES
+
+
+def main() -> None:
+    """Run the command line; what a person can put right is one line and exit code 2, never a traceback."""
+    try:
+        app()
+    except KeyboardInterrupt:
+        raise SystemExit(130) from None
+    except Exception as error:  # everything else is a defect of ours and keeps its traceback
+        if _debug or not _is_for_people(error):
+            raise
+        say_error(str(error) or type(error).__name__)
+        raise SystemExit(ERROR_EXIT) from None
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,58 @@
+"""The commands ``advnerf topic ...``."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from nodes.runtime.terminal import RunDir, print_table, table
+
+app = typer.Typer(no_args_is_help=True, help="Look at what the nodes of a running launch say.")
+
+
+@app.command("list")
+def topic_list(run_dir: RunDir = None) -> None:
+    """List all topics, who publishes them and to how many."""
+    from nodes.runtime.topics import topic
+    from nodes.runtime.watching import find_run_dir, list_topics
+
+    rows = table("topic", "type", "rate", "publisher", "subscribers")
+    for row in list_topics(find_run_dir(run_dir)):
+        rate_hz = topic(row.name).rate_hz
+        rows.add_row(
+            row.name, row.type, f"{rate_hz:g} Hz" if rate_hz else "", row.publisher or "-", str(row.subscribers)
+        )
+    print_table(rows)
+
+
+@app.command("hz")
+def topic_hz(
+    topic: str,
+    duration_s: Annotated[float, typer.Option("--duration", min=0.1, help="Listen for so many seconds.")] = 5.0,
+    run_dir: RunDir = None,
+) -> None:
+    """Measure the rate of a topic, its gaps, its losses, and how old its capture stamps are."""
+    from nodes.runtime.watching import find_run_dir, measure_rate
+
+    report = measure_rate(find_run_dir(run_dir), topic, duration_s)
+    print(f"{topic}: {report.rate_hz:.2f} Hz, {report.messages} messages, {report.lost} lost")
+    print(f"gaps: {report.shortest_s * 1e3:.1f} to {report.longest_s * 1e3:.1f} ms")
+    if report.age_median_s is not None and report.age_worst_s is not None:
+        print(f"age of the stamp: median {report.age_median_s * 1e3:.1f} ms, worst {report.age_worst_s * 1e3:.1f} ms")
+
+
+@app.command("echo")
+def topic_echo(
+    topic: str,
+    count: Annotated[int | None, typer.Option("--count", min=1, help="Stop after so many messages.")] = None,
+    duration_s: Annotated[float | None, typer.Option("--duration", min=0.1, help="Stop after so many seconds.")] = None,
+    run_dir: RunDir = None,
+) -> None:
+    """Print the messages of a topic."""
+    from nodes.runtime.watching import describe, find_run_dir, listen
+
+    for shown, received in enumerate(listen(find_run_dir(run_dir), topic, duration_s), start=1):
+        print(f"{describe(received.message())}\n---", flush=True)
+        if count is not None and shown >= count:
+            return

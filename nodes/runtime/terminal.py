@@ -1,0 +1,44 @@
+"""What the commands share: options, tables, errors in one line."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+Overrides = Annotated[
+    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Change a value; may be repeated.")
+]
+RunDir = Annotated[
+    Path | None, typer.Option("--run-dir", help="Folder of the run.", show_default="that of the only running launch")
+]
+Topics = Annotated[
+    list[str] | None, typer.Option("--topics", metavar="TOPIC", help="Only this topic; may be repeated.")
+]
+
+
+def table(*columns: str) -> Table:
+    """An empty table without lines."""
+    from rich.table import Table
+
+    empty = Table(box=None, pad_edge=False)
+    for column in columns:
+        empty.add_column(column, overflow="fold")
+    return empty
+
+
+def print_table(full: Table) -> None:
+    """Print a table; into a pipe without breaking its lines."""
+    from rich.console import Console
+
+    Console(width=None if sys.stdout.isatty() else 240).print(full)
+
+
+def say_error(text: str) -> None:
+    """Print an error as one line."""
+    print(f"error: {' '.join(text.split())}", file=sys.stderr, flush=True)

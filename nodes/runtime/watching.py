@@ -1,0 +1,173 @@
+"""What a person asks a running launch: which topics there are, how often they come, what they say."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nodes.runtime.bus import Bus, Received
+from nodes.runtime.clock import NS_PER_S
+from nodes.runtime.errors import LaunchError, MessageError
+from nodes.runtime.launch import active_launches
+from nodes.runtime.messages import header, stamp_ns, types
+from nodes.runtime.paths import bus_folder
+from nodes.runtime.topics import STATUS_PREFIX, TOPICS, status_topic
+from nodes.runtime.topics import topic as topic_row
+
+_STATUS_WAIT_S = 1.0
+_ECHO_ITEMS = 12
+_ANSWER_WAIT_S = 2.0
+_READING_NS = 20_000_000
+
+
+@dataclass(frozen=True)
+class TopicRow:
+    """One topic of a running launch."""
+
+    name: str
+    type: str
+    publisher: str
+    subscribers: int
+
+
+@dataclass(frozen=True)
+class RateReport:
+    """How a topic came during a while; ages are those of the capture stamps at reception."""
+
+    messages: int
+    lost: int
+    rate_hz: float
+    shortest_s: float
+    longest_s: float
+    age_median_s: float | None
+    age_worst_s: float | None
+
+
+def find_run_dir(given: Path | None) -> Path:
+    """The run folder to look at: the one that was given, or that of the only launch that is running."""
+    if given is not None:
+        if not given.is_dir():
+            raise LaunchError(f"no run folder {given}")
+        return given
+    launches = active_launches()
+    if len(launches) != 1:
+        found = ", ".join(str(launch["run_dir"]) for launch in launches) or "none"
+        raise LaunchError(f"expected one running launch, found {len(launches)} ({found}); say which with --run-dir")
+    return Path(launches[0]["run_dir"])
+
+
+def node_names(run_dir: Path) -> list[str]:
+    """Names of the nodes that have, or had, a socket in a run folder."""
+    prefix = status_topic("x")[:-1].strip("/").replace("/", ".")
+    names = (path.name for path in bus_folder(run_dir).iterdir() if path.suffix != ".lock")
+    return sorted(name.removeprefix(prefix + ".") for name in names if name.startswith(prefix + "."))
+
+
+def node_statuses(run_dir: Path, wait_s: float = _STATUS_WAIT_S) -> dict[str, Any]:
+    """Last status of every node that reports within a moment."""
+    names = node_names(run_dir)
+    statuses: dict[str, Any] = {}
+    with Bus(run_dir) as bus:
+        for name in names:
+            bus.subscribe(status_topic(name))
+        deadline = time.monotonic() + wait_s
+        while len(statuses) < len(names) and (left := deadline - time.monotonic()) > 0:
+            bus.wait(left)
+            for received in bus.receive():
+                statuses[received.topic.removeprefix(STATUS_PREFIX)] = received.message()
+    return statuses
+
+
+def list_topics(run_dir: Path) -> list[TopicRow]:
+    """All topics of the table and all statuses, with who publishes them now and to how many."""
+    publishers: dict[str, tuple[str, int]] = {}
+    statuses = node_statuses(run_dir)
+    for name, status in statuses.items():
+        for topic, subscribers in zip(status.publications, status.subscribers, strict=True):
+            publishers[topic] = (name, int(subscribers))
+    rows = [TopicRow(name, row.type, *publishers.get(name, ("", 0))) for name, row in TOPICS.items()]
+    return rows + [
+        TopicRow(status_topic(name), topic_row(status_topic(name)).type, name, 0) for name in sorted(statuses)
+    ]
+
+
+def listen(run_dir: Path, topic: str, duration_s: float | None) -> Iterator[Received]:
+    """Every message of a topic as it comes, until the time is over (None: for ever)."""
+    deadline = None if duration_s is None else time.monotonic() + duration_s
+    with Bus(run_dir) as bus:
+        bus.subscribe(topic, queue=1000)
+        while deadline is None or time.monotonic() < deadline:
+            bus.wait(0.1 if deadline is None else min(0.1, max(0.0, deadline - time.monotonic())))
+            yield from bus.receive()
+
+
+def measure_rate(run_dir: Path, topic: str, duration_s: float) -> RateReport:
+    """Listen for a while and say how the topic came."""
+    times, ages, lost = [], [], 0
+    for received in listen(run_dir, topic, duration_s):
+        times.append(received.info.publish_mono_ns)
+        lost += received.info.lost
+        message = received.message()
+        if hasattr(message, "header"):
+            ages.append((received.info.receive_real_ns - stamp_ns(message)) / NS_PER_S)
+    if len(times) < 2:
+        raise MessageError(
+            f"expected {topic} to come at least twice in {duration_s:g} s, got {len(times)}; is its node running?"
+        )
+    gaps = [(b - a) / NS_PER_S for a, b in pairwise(times)]
+    return RateReport(
+        len(times), lost, len(gaps) / sum(gaps), min(gaps), max(gaps),
+        statistics.median(ages) if ages else None, max(ages) if ages else None,
+    )  # fmt: skip
+
+
+def ask_to_arm(run_dir: Path, wanted: bool, reason: str) -> tuple[bool, str]:
+    """Send a request to arm or to disarm as a person, and wait for the safety node's answer.
+
+    Returns:
+        Whether the car is armed now, and by whom, or else why not.
+    """
+    with Bus(run_dir) as bus:
+        bus.publisher("/arm")
+        bus.subscribe("/safety/state")
+        bus.wait_for_subscribers(["/arm"], _ANSWER_WAIT_S)
+        request = types.Arm(header=header(time.time_ns()), arm=wanted, source="operator", reason=reason)
+        sent_ns = time.monotonic_ns()
+        bus.publish("/arm", request)
+        deadline, state = time.monotonic() + _ANSWER_WAIT_S, None
+        while (left := deadline - time.monotonic()) > 0:
+            bus.wait(left)
+            for received in bus.receive():
+                # What was said before the request was read is no answer to it.
+                if received.info.publish_mono_ns > sent_ns + _READING_NS:
+                    state = received.message()
+            if state is not None and bool(state.armed) == wanted:
+                break
+    if state is None:
+        raise LaunchError(f"the safety node did not answer within {_ANSWER_WAIT_S:g} s; is it running?")
+    return bool(state.armed), str(state.source if state.armed else state.reason)
+
+
+def describe(message: Any, indent: str = "") -> str:
+    """A message as indented text; long arrays are cut."""
+    lines = []
+    for name, value in vars(message).items():
+        if name.startswith("__"):
+            continue
+        if hasattr(value, "__msgtype__"):
+            lines.append(f"{indent}{name}:\n{describe(value, indent + '  ')}")
+        elif isinstance(value, np.ndarray | list) and len(value) > _ECHO_ITEMS:
+            shown = ", ".join(str(item) for item in value[:_ECHO_ITEMS])
+            lines.append(f"{indent}{name}: [{shown}, ... {len(value)} in all]")
+        elif isinstance(value, np.ndarray):
+            lines.append(f"{indent}{name}: {value.tolist()}")
+        else:
+            lines.append(f"{indent}{name}: {value!r}")
+    return "\n".join(lines)

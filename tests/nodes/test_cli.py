@@ -1,0 +1,261 @@
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+
+import numpy as np
+import pytest
+
+from nodes import cli
+from nodes.runtime import doctor
+from nodes.runtime.bag import BagWriter
+from nodes.runtime.bag_read import read_info
+from nodes.runtime.messages import encode, pose_message
+from nodes.runtime.watching import describe
+
+SENDER = """
+    import numpy as np
+    from pydantic import BaseModel, ConfigDict
+    from nodes.runtime.messages import pose_message
+    from nodes.runtime.node import Node, Out, run_node_main
+
+    class Config(BaseModel):
+        model_config = ConfigDict(extra="forbid")
+        rate_hz: float = 50.0
+
+    class Sender(Node):
+        publications = ("/vicon/car",)
+        def __init__(self, config):
+            self.tick_rate_hz = config.rate_hz
+        def handle(self, topic, message, info, now):
+            return []
+        def tick(self, now):
+            return [Out("/vicon/car", pose_message(np.eye(4), now.real_ns))]
+
+    raise SystemExit(run_node_main(Config, lambda config, context: Sender(config)))
+"""
+LAUNCH = """\
+name: little
+nodes:
+  sender:
+    module: sender_node
+    config: {rate_hz: 50}
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    path = tmp_path_factory.mktemp("cli")
+    (path / "sender_node.py").write_text(textwrap.dedent(SENDER))
+    (path / "little.launch.yaml").write_text(LAUNCH)
+    return path
+
+
+def environment(folder):
+    return {**os.environ, "PYTHONPATH": str(folder)}
+
+
+def start(folder, *arguments):
+    command = [sys.executable, "-m", "nodes.cli", "launch", str(folder / "little.launch.yaml"), *arguments]
+    return subprocess.Popen(
+        command, env=environment(folder), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=os.getcwd()
+    )
+
+
+@pytest.fixture(scope="module")
+def running(folder):
+    """A launch at work; its run folder."""
+    process = start(folder, "--run-dir", str(folder / "run"))
+    for line in process.stdout:
+        if "all nodes are ready" in line:
+            break
+    yield folder / "run"
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=10)
+    assert (process.returncode, errors) == (0, "")
+
+
+@pytest.fixture
+def command(monkeypatch, capsys):
+    """Call the command line as `advnerf` does: exit code, stdout, stderr."""
+
+    def call(*arguments):
+        monkeypatch.setattr(sys, "argv", ["advnerf", *map(str, arguments)])
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+        captured = capsys.readouterr()
+        return int(ended.value.code or 0), captured.out, captured.err
+
+    return call
+
+
+def test_topic_list_names_publishers(running, command):
+    code, output, _ = command("topic", "list", "--run-dir", running)
+    assert code == 0
+    rows = {line.split()[0]: line.split() for line in output.splitlines()}
+    assert rows["/vicon/car"][1:] == ["geometry_msgs/msg/PoseStamped", "100", "Hz", "sender", "0"]
+    assert rows["/arm"][-2:] == ["-", "0"]
+    assert "/status/sender" in rows
+
+
+def test_topic_hz_measures_the_rate(running, command):
+    code, output, _ = command("topic", "hz", "/vicon/car", "--duration", 1, "--run-dir", running)
+    assert code == 0
+    assert float(output.split()[1]) == pytest.approx(50, rel=0.1)
+    assert ", 0 lost" in output
+    assert "age of the stamp: median" in output
+
+
+def test_topic_echo_prints_messages(running, command):
+    code, output, _ = command("topic", "echo", "/vicon/car", "--count", 2, "--run-dir", running)
+    assert code == 0
+    assert output.count("---") == 2
+    assert "frame_id: 'world'" in output
+    assert "\n    w: 1.0\n" in output
+
+
+def test_long_arrays_are_cut():
+    from nodes.runtime.messages import image_message
+
+    text = describe(image_message(np.zeros((20, 30, 3), np.uint8), 0, "camera"))
+    assert "data: [0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, ... 1800 in all]" in text
+
+
+def test_bag_is_recorded_described_played_and_repaired(running, folder, command):
+    bag = folder / "recorded"
+    program = [sys.executable, "-m", "nodes.cli", "bag", "record", "-o", str(bag), "--run-dir", str(running)]
+    recorder = subprocess.Popen(program, stdout=subprocess.DEVNULL)
+    deadline = time.monotonic() + 20
+    while not bag.exists() or next(bag.glob("*.mcap")).stat().st_size < 20_000:
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    recorder.send_signal(signal.SIGINT)
+    assert recorder.wait(10) == 0
+    code, output, _ = command("bag", "info", bag)
+    assert code == 0
+    assert "attachments: launch.resolved.yaml" in output
+    rows = {line.split()[0]: line.split() for line in output.splitlines()}
+    assert rows["/vicon/car"][-1] == "0"
+    assert "/status/sender" in rows
+    played = ("bag", "play", bag, "--rate", 20, "--no-wait", "--run-dir", folder / "other")
+    assert command(*played)[0] == 0
+    whole = (bag / "recorded.mcap").read_bytes()
+    (bag / "recorded.mcap").write_bytes(whole[:-100])
+    assert command("bag", "info", bag)[0] == 2
+    code, output, _ = command("bag", "repair", bag)
+    assert (code, "kept" in output) == (0, True)
+    assert read_info(bag).messages > 50
+    assert "is whole" in command("bag", "repair", bag)[1]
+
+
+def test_second_launch_in_the_same_folder_is_one_clear_line(running, folder):
+    process = start(folder, "--run-dir", str(running))
+    _, errors = process.communicate(timeout=20)
+    assert process.returncode == 2
+    assert errors.startswith("error: ")
+    assert errors.count("\n") == 1
+    assert "in use by the launch of process" in errors
+
+
+def test_dead_node_is_one_line_and_exit_code_1(folder):
+    process = start(folder, "--run-dir", str(folder / "bad"), "--set", "sender.speed=3")
+    _, errors = process.communicate(timeout=20)
+    assert process.returncode == 1
+    assert errors.count("\n") == 1
+    expected = (
+        "required node sender ended with exit code 2: --set sender.speed=3: unknown key speed; valid keys here: rate_hz"
+    )
+    assert expected in errors
+
+
+def test_launch_can_end_by_itself(folder):
+    process = start(folder, "--run-dir", str(folder / "short"), "--duration", "0.3")
+    _, errors = process.communicate(timeout=20)
+    assert (process.returncode, errors) == (0, "")
+
+
+def test_launch_check_starts_nothing(folder, command, monkeypatch):
+    monkeypatch.syspath_prepend(folder)
+    code, output, _ = command("launch", folder / "little.launch.yaml", "--check", "--set", "sender.rate_hz=3")
+    assert code == 0
+    assert "sender_node" in output
+    assert "{'rate_hz': 3}" in output
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["bag", "info", "{folder}"], "expected a bag folder with one .mcap file, got 0"),
+        (
+            ["topic", "echo", "/nothing", "--run-dir", "{folder}"],
+            "unknown topic '/nothing'; known are /camera/image_raw",
+        ),
+        (["topic", "list", "--run-dir", "{folder}/none"], "no run folder"),
+        (["launch", "{folder}/little.launch.yaml", "--set", "x"], "no node called 'x'; known are sender"),
+        (["topic", "hz", "/arm", "--duration", "0.1", "--run-dir", "{folder}"], "expected /arm to come at least twice"),
+    ],
+)
+def test_mistake_is_one_line_without_a_traceback(folder, command, arguments, message, monkeypatch):
+    monkeypatch.syspath_prepend(folder)
+    code, _, errors = command(*(argument.format(folder=folder) for argument in arguments))
+    assert code == 2
+    assert errors.startswith("error: ")
+    assert errors.count("\n") == 1
+    assert message in errors
+
+
+def test_mistake_in_an_option_is_told_by_the_option(command, tmp_path):
+    code, _, errors = command("bag", "play", tmp_path, "--rate", "-1")
+    assert code == 2
+    assert "--rate" in errors
+    assert command("launch", tmp_path / "nothing.yaml")[0] == 2
+
+
+def test_debug_shows_the_traceback(monkeypatch, tmp_path):
+    from nodes.runtime.errors import BagError
+
+    monkeypatch.setattr(sys, "argv", ["advnerf", "--debug", "bag", "info", str(tmp_path)])
+    with pytest.raises(BagError):
+        cli.main()
+
+
+def test_defect_of_ours_keeps_its_traceback(monkeypatch):
+    def broken():
+        raise IndexError("list index out of range")
+
+    monkeypatch.setattr(cli, "app", broken)
+    with pytest.raises(IndexError):
+        cli.main()
+
+
+def test_doctor_says_what_is_there(command, tmp_path):
+    code, output, _ = command("doctor", "--folder", tmp_path)
+    assert code == 0
+    for name in ("python", "machine", "EGL", "torch", "disk", "sockets", "VICON port", "serial", "launches"):
+        assert name in output
+
+
+def test_doctor_finds_a_full_disk_and_a_port_in_use(command, tmp_path, monkeypatch):
+    import socket
+    from collections import namedtuple
+
+    usage = namedtuple("usage", "total used free")
+    monkeypatch.setattr(doctor.shutil, "disk_usage", lambda path: usage(10**9, 10**9, 1000))
+    monkeypatch.setattr(doctor, "_try", lambda program: (False, "ImportError: libEGL.so.1"))
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as occupied:
+        occupied.bind(("0.0.0.0", 0))
+        code, output, _ = command("doctor", "--folder", tmp_path / "new", "--vicon-port", occupied.getsockname()[1])
+    assert code == 1
+    assert "Address already in use; stop what uses it" in output
+    assert "free some" in output
+    assert "apt-get install libegl1" in output
+
+
+def test_play_refuses_what_is_not_there(command, tmp_path):
+    with BagWriter(tmp_path / "bag") as writer:
+        writer.write("/vicon/car", encode(pose_message(np.eye(4), 1)), 1, 1, 0)
+    code, _, errors = command("bag", "play", tmp_path / "bag", "--topics", "/arm", "--run-dir", tmp_path / "run")
+    assert code == 1
+    assert "has no topic /arm; it has /vicon/car" in errors
