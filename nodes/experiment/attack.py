@@ -98,7 +98,8 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
         _search(experiment, attacked, search, folder, progress)
 
 
-def _problem(experiment: Experiment, surrogate: Surrogate, policy: LoadedPolicy, seed: int) -> AttackProblem:
+def attack_problem(experiment: Experiment, surrogate: Surrogate, policy: LoadedPolicy, seed: int) -> AttackProblem:
+    """The attack on one victim with the starts of one seed."""
     attack = experiment.config.attack
     fence = np.abs(np.array(experiment.room.fence_m)).min()
     return AttackProblem(
@@ -109,7 +110,7 @@ def _problem(experiment: Experiment, surrogate: Surrogate, policy: LoadedPolicy,
 
 def _drive_without_attack(experiment: Experiment, bare: Surrogate, victim: str, seed: int, folder: Path) -> None:
     policy = load_policy(victim_file(experiment, victim))
-    problem = _problem(experiment, bare, policy, seed)
+    problem = attack_problem(experiment, bare, policy, seed)
     rollout, totals = evaluate(problem, torch.zeros(bare.theta_shape))
     drives = {"states": rollout.states.transpose(0, 1).tolist(), "total_cte_m": totals.protocol_cte_m.tolist()}
     write_atomically(folder / f"{victim}_none_{seed}.json", json.dumps(drives) + "\n")
@@ -120,7 +121,7 @@ def _search(
 ) -> None:
     attack = experiment.config.attack
     policy = load_policy(victim_file(experiment, search.victim))
-    problem = _problem(experiment, surrogate, policy, search.seed)
+    problem = attack_problem(experiment, surrogate, policy, search.seed)
     wanted = attack.iterations if search.method == "gradient" else attack.random_evaluations
     best = [0.0]
 

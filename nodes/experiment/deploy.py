@@ -31,6 +31,10 @@ class FrozenChangedError(RuntimeFault):
     """Something that was fixed before the first attack is no longer what it was."""
 
 
+# What every victim meets, in this order.
+_CONDITIONS: tuple[Condition, ...] = ("none", *METHODS)
+
+
 @dataclass(frozen=True)
 class LiveRun:
     """One live run: which victim meets what."""
@@ -49,11 +53,11 @@ def live_runs(experiment: Experiment) -> list[LiveRun]:
     """All runs of the stage, in order: laps, then for each seed none, random, gradient; the naive victim last."""
     seeds, deploy = experiment.config.attack.seeds, experiment.config.deploy
     plan = [LiveRun(HARDENED, "laps", seeds[0])] if deploy.laps else []
-    plan += [LiveRun(HARDENED, condition, seed) for seed in seeds for condition in ("none", *METHODS)]
+    plan += [LiveRun(HARDENED, condition, seed) for seed in seeds for condition in _CONDITIONS]
     if deploy.empty_scene:
         plan.append(LiveRun(HARDENED, "empty", seeds[0]))
     if NAIVE in victims(experiment):
-        plan += [LiveRun(NAIVE, condition, seeds[0]) for condition in ("none", *METHODS)]
+        plan += [LiveRun(NAIVE, condition, seeds[0]) for condition in _CONDITIONS]
     return plan
 
 

@@ -6,7 +6,6 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -18,10 +17,10 @@ from advnerf_core.driving.imitation import ImitationConfig, SourcePlan, train_po
 from advnerf_core.driving.path import Array
 from advnerf_core.driving.policy import images_to_tensor, load_policy
 from advnerf_core.driving.sources import Overlay, RenderedSource, SceneSource, Show, Texture
-from advnerf_core.fields.voxel_grid import unsquash
+from advnerf_core.fields.voxel_grid import inverse_squash
 from advnerf_core.files import write_atomically
 from advnerf_core.geometry import invert_transform, planar_pose
-from advnerf_core.scene.dataset import load_transforms
+from advnerf_core.scene.dataset import load_image, load_transforms
 from hardware.twin.lab import Lab
 from nodes.experiment import capture
 from nodes.experiment.context import CONTROL_PERIOD_S, Experiment
@@ -72,11 +71,11 @@ def steering_on_held_out_views(experiment: Experiment) -> list[dict[str, float]]
     policy = load_policy(victim_file(experiment, HARDENED)).policy
     surrogate = surrogate_of(experiment, [])
     rows = []
-    for path, T_world_from_camera in zip(views.paths, views.T_world_from_camera, strict=True):
-        real = experiment.view.image(cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB).astype(np.uint8))
+    for frame in views.frames:
+        real = experiment.view.image(load_image(frame)[0])
         with torch.no_grad():
             on_real = float(policy(images_to_tensor(real))[0])
-            on_surrogate = float(policy(surrogate.render(T_world_from_camera[None], None).images)[0])
+            on_surrogate = float(policy(surrogate.render(frame.T_world_from_camera[None], None).images)[0])
         rows.append({"real_rad": on_real, "surrogate_rad": on_surrogate})
     return rows
 
@@ -93,9 +92,8 @@ def _lab_overlay(experiment: Experiment) -> Overlay:
     T_camera_from_car = invert_transform(experiment.camera.mount)
     T_world_from_face = experiment.lab_config.board.T_world_from_face
 
-    def overlay(rgb: NDArray[np.uint8], depth_m: NDArray[np.float32], state: Array, texture: Texture) -> NDArray[np.uint8]:
-        del depth_m  # nothing in the lab hides the face
-        displayed = face_texture(unsquash(texture), _TRAINING_TEXTURE_PX)
+    def overlay(rgb: NDArray[np.uint8], state: Array, texture: Texture) -> NDArray[np.uint8]:
+        displayed = face_texture(inverse_squash(texture), _TRAINING_TEXTURE_PX)
         face = FaceOverlay(displayed, experiment.target.corners, experiment.camera.pinhole, experiment.camera.distortion)
         T_camera_from_world = T_camera_from_car @ invert_transform(planar_pose(*state[:3]))
         return face.draw(rgb, T_camera_from_world @ T_world_from_face)[0]

@@ -1,0 +1,69 @@
+"""Peak memory of one adjoint gradient against the horizon, in this experiment's own scene, with nothing cached.
+
+Each horizon is measured in a fresh process: ``python -m nodes.experiment.memory RUN_FOLDER TICKS`` prints the peak above idle.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import torch
+
+from advnerf_core.attack.adjoint import adjoint_gradient, evaluate
+from advnerf_core.driving.policy import load_policy
+from advnerf_core.files import write_atomically
+from advnerf_core.memory import peak_mib, restart_peak
+from advnerf_core.report.data import MemoryRow
+from nodes.experiment.attack import attack_problem
+from nodes.experiment.config import ExperimentConfig
+from nodes.experiment.context import Experiment
+from nodes.experiment.objects import attacked_object, surrogate_of
+from nodes.experiment.policy import HARDENED, victim_file
+from nodes.runtime.stages import Report
+
+HORIZONS = (50, 100, 200, 400)
+
+
+def measure(experiment: Experiment, folder: Path, report: Report) -> tuple[MemoryRow, ...]:
+    """Measure the horizons that are not measured yet; kept in ``memory.json`` so that a stopped report goes on."""
+    kept = folder / "memory.json"
+    rows: dict[str, float] = json.loads(kept.read_text()) if kept.exists() else {}
+    for index, ticks in enumerate(HORIZONS):
+        report(index / len(HORIZONS), f"memory of the adjoint at T = {ticks}")
+        if str(ticks) not in rows:
+            command = [sys.executable, "-m", "nodes.experiment.memory", str(experiment.folder), str(ticks)]
+            done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
+            rows[str(ticks)] = float(done.stdout.split()[-1])
+            write_atomically(kept, json.dumps(rows) + "\n")
+    return tuple(MemoryRow(int(ticks), mib) for ticks, mib in rows.items())
+
+
+def peak_above_idle_mib(experiment: Experiment, ticks: int) -> float:
+    """Peak above idle of one gradient over so many ticks [MiB]; the process must be fresh."""
+    surrogate = surrogate_of(experiment, [attacked_object(experiment)])
+    policy = load_policy(victim_file(experiment, HARDENED))
+    problem = attack_problem(experiment, surrogate, policy, experiment.config.attack.seeds[0])
+    problem = dataclasses.replace(problem, start_states=problem.start_states[:1], steps=ticks, cache_bytes=0)
+    theta = surrogate.initial_theta(torch.Generator().manual_seed(0))
+    # Libraries, compiled kernels and thread pools are idle memory.
+    adjoint_gradient(dataclasses.replace(problem, steps=problem.time_batch), theta)
+    evaluate(dataclasses.replace(problem, steps=1), theta)
+    idle_mib = restart_peak()
+    adjoint_gradient(problem, theta)
+    return peak_mib() - idle_mib
+
+
+def main() -> None:
+    """Measure one horizon of a run folder."""
+    folder, ticks = Path(sys.argv[1]), int(sys.argv[2])
+    manifest = json.loads((folder / "manifest.json").read_text())
+    config = ExperimentConfig.model_validate(manifest["config"])
+    print(peak_above_idle_mib(Experiment(config, Path(manifest["file"]), folder, manifest["setting"]), ticks))
+
+
+if __name__ == "__main__":
+    main()
