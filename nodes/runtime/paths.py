@@ -12,7 +12,8 @@ from nodes.runtime.errors import BusError
 
 # sizeof(sockaddr_un.sun_path) is 108 on Linux, one of which is the final zero.
 UNIX_PATH_LIMIT = 107
-_LONGEST_NAME = 40
+# "status." and a node name of 24 characters.
+_LONGEST_NAME = 31
 # The launch file as it was run, in the run folder; recorders attach it to their bag.
 RESOLVED_NAME = "launch.resolved.yaml"
 

@@ -230,6 +230,7 @@ def test_defect_of_ours_keeps_its_traceback(monkeypatch):
         cli.main()
 
 
+@pytest.mark.slow  # imports torch and starts EGL
 def test_doctor_says_what_is_there(command, tmp_path):
     code, output, _ = command("doctor", "--folder", tmp_path)
     assert code == 0
