@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from typing import Annotated
 
 import typer
@@ -52,7 +53,8 @@ def topic_echo(
     """Print the messages of a topic."""
     from nodes.runtime.watching import describe, find_run_dir, listen
 
-    for shown, received in enumerate(listen(find_run_dir(run_dir), topic, duration_s), start=1):
-        print(f"{describe(received.message())}\n---", flush=True)
-        if count is not None and shown >= count:
-            return
+    with contextlib.suppress(KeyboardInterrupt):  # Ctrl-C is how this usually ends
+        for shown, received in enumerate(listen(find_run_dir(run_dir), topic, duration_s), start=1):
+            print(f"{describe(received.message())}\n---", flush=True)
+            if count is not None and shown >= count:
+                return
