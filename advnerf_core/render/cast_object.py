@@ -71,19 +71,44 @@ def cast_object(
     if supersample < 1:
         raise ValueError(f"expected at least 1 ray along a pixel's side, got {supersample}")
     T_object_from_camera = invert_transform(field.T_world_from_object) @ poses
-    windows = _windows(field, poses, pinhole)
+    parts = [
+        _cast_one(field, T, window, pinhole, supersample)
+        for T, window in zip(T_object_from_camera, _windows(field, poses, pinhole), strict=True)
+    ]
+    image_size = pinhole.width * pinhole.height
+    pixels = np.concatenate([part.pixels + b * image_size for b, part in enumerate(parts)])
+    weights = sparse.vstack([part.weights for part in parts], format="csr", dtype=dtype)
+    alpha, depth_m = (np.concatenate([getattr(part, name) for part in parts]) for name in ("alpha", "depth_m"))
+    return ObjectCast(pixels, alpha, depth_m, weights)
+
+
+def _cast_one(
+    field: VoxelGridObject, T_object_from_camera: Array, window: NDArray[np.int64], pinhole: Pinhole, supersample: int
+) -> ObjectCast:
+    """Cast into one image; pixels are flat indices into ``[H, W]``, weights float64."""
     solid = field.density is None
     density = np.zeros((1, 1, 1)) if field.density is None else np.ascontiguousarray(field.density, dtype=np.float64)
-    intrinsics = np.array([pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy])
-    pixels, alpha, depth_m, starts, indices, values = _cast(
-        np.ascontiguousarray(T_object_from_camera[:, :3, :3]) / field.scale,
-        np.ascontiguousarray(T_object_from_camera[:, :3, 3]) / field.scale,
-        windows, intrinsics, pinhole.width, pinhole.height, supersample,
-        np.ascontiguousarray(field.slots), field.slot_count, density, solid, field.one_sided,
-        np.asarray(field.box_min, dtype=np.float64), np.asarray(field.box_max, dtype=np.float64), field.step_units,
-    )  # fmt: skip
-    weights = sparse.csr_matrix((values.astype(dtype), indices, starts), shape=(len(pixels), field.slot_count))
-    return ObjectCast(pixels, alpha, depth_m, weights)
+    area = int(max(0, window[1] - window[0]) * max(0, window[3] - window[2]))
+    pixels, alpha, depth_m = np.empty(area, np.int64), np.empty(area), np.empty(area)
+    starts = np.zeros(area + 1, np.int64)
+    room = area * 4 * supersample + 64
+    while True:
+        indices, values = np.empty(room, np.int64), np.empty(room)
+        found = _cast_window(
+            np.ascontiguousarray(T_object_from_camera[:3, :3]) / field.scale, T_object_from_camera[:3, 3] / field.scale,
+            window, np.array([pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy]), pinhole.width, supersample,
+            np.ascontiguousarray(field.slots), density, solid, field.one_sided,
+            np.asarray(field.box_min, dtype=np.float64), np.asarray(field.box_max, dtype=np.float64), field.step_units,
+            np.zeros(field.slot_count), np.empty(field.slot_count, np.int64), np.empty((8, 3), np.int64), np.empty(8),
+            np.empty(6), pixels, alpha, depth_m, starts, indices, values,
+        )  # fmt: skip
+        if found >= 0:
+            break
+        room *= 4
+    filled = int(starts[found])
+    shape = (found, field.slot_count)
+    weights = sparse.csr_matrix((values[:filled].copy(), indices[:filled].astype(np.int32), starts[: found + 1]), shape)
+    return ObjectCast(pixels[:found].copy(), alpha[:found].copy(), depth_m[:found].copy(), weights)
 
 
 def _windows(field: VoxelGridObject, poses: Array, pinhole: Pinhole) -> NDArray[np.int64]:
@@ -135,11 +160,11 @@ def _corner(position: float, low: float, high: float, count: int) -> tuple[int, 
 
 
 @njit(cache=True, error_model="numpy")
-def _gather(p: Any, low: Any, high: Any, shape: Any, cells: Any, shares: Any) -> None:
+def _gather(p: Any, low: Any, high: Any, slots: Any, cells: Any, shares: Any) -> None:
     """The eight voxels around ``p`` and their trilinear shares, written to ``cells [8, 3]`` and ``shares [8]``."""
-    x0, x1, fx = _corner(p[0], low[0], high[0], shape[0])
-    y0, y1, fy = _corner(p[1], low[1], high[1], shape[1])
-    z0, z1, fz = _corner(p[2], low[2], high[2], shape[2])
+    x0, x1, fx = _corner(p[0], low[0], high[0], slots.shape[0])
+    y0, y1, fy = _corner(p[1], low[1], high[1], slots.shape[1])
+    z0, z1, fz = _corner(p[2], low[2], high[2], slots.shape[2])
     for k in range(8):
         a, b, c = k & 1, (k >> 1) & 1, k >> 2
         cells[k, 0] = x1 if a else x0
@@ -149,26 +174,26 @@ def _gather(p: Any, low: Any, high: Any, shape: Any, cells: Any, shares: Any) ->
 
 
 @njit(cache=True, error_model="numpy")
-def _march(o: Any, d: Any, t_in: float, t_out: float, slots: Any, density: Any, solid: bool, low: Any, high: Any,
-           step: float, share_of_pixel: float, row: Any, touched: Any, touched_count: int, cells: Any, shares: Any,
-           p: Any, shape: Any) -> tuple[int, float, float]:  # fmt: skip
+def _march(o: Any, d: Any, p: Any, t_in: float, t_out: float, slots: Any, density: Any, solid: bool, low: Any, high: Any,
+           step: float, share: float, row: Any, touched: Any, count: int, cells: Any,
+           shares: Any) -> tuple[int, float, float]:  # fmt: skip
     """Add one ray to the dense scratch ``row [slots]``; returns the touched count, the ray's alpha and alpha-weighted depth."""
     speed = np.sqrt(d[0] ** 2 + d[1] ** 2 + d[2] ** 2)  # object units a metre of planar depth
-    count = 1 if solid else max(1, int(np.ceil((t_out - t_in) * speed / step)))
-    dt = (t_out - t_in) / count
+    samples = 1 if solid else max(1, int(np.ceil((t_out - t_in) * speed / step)))
+    dt = (t_out - t_in) / samples
     transmittance, alpha, alpha_depth = 1.0, 0.0, 0.0
-    for i in range(count):
+    for i in range(samples):
         t = t_in if solid else t_in + (i + 0.5) * dt
         for axis in range(3):
             p[axis] = o[axis] + t * d[axis]
-        _gather(p, low, high, shape, cells, shares)
+        _gather(p, low, high, slots, cells, shares)
         opacity = 1.0
         if not solid:
             sigma = 0.0
             for k in range(8):
                 sigma += shares[k] * density[cells[k, 0], cells[k, 1], cells[k, 2]]
             opacity = 1.0 - np.exp(-sigma * dt * speed)
-        weight = transmittance * opacity
+        weight = transmittance * opacity * share
         if weight > 0.0:
             alpha += weight
             alpha_depth += weight * t
@@ -176,65 +201,70 @@ def _march(o: Any, d: Any, t_in: float, t_out: float, slots: Any, density: Any, 
                 if shares[k] > 0.0:
                     slot = slots[cells[k, 0], cells[k, 1], cells[k, 2]]
                     if row[slot] == 0.0:
-                        touched[touched_count] = slot
-                        touched_count += 1
-                    row[slot] += weight * shares[k] * share_of_pixel
+                        touched[count] = slot
+                        count += 1
+                    row[slot] += weight * shares[k]
         transmittance *= 1.0 - opacity
         if transmittance < _STOP_TRANSMITTANCE:
             break
-    return touched_count, alpha * share_of_pixel, alpha_depth * share_of_pixel
+    return count, alpha, alpha_depth
 
 
 @njit(cache=True, error_model="numpy")
-def _cast(rotations: Any, origins: Any, windows: Any, intrinsics: Any, width: int, height: int, supersample: int,
-          slots: Any, slot_count: int, density: Any, solid: bool, one_sided: bool, low: Any, high: Any,
-          step: float) -> Any:  # fmt: skip
-    """All rays of all windows. Returns pixels, alpha, depth and the CSR arrays of the weights."""
-    area = 0
-    for b in range(windows.shape[0]):
-        area += max(0, windows[b, 1] - windows[b, 0]) * max(0, windows[b, 3] - windows[b, 2])
-    pixels, alphas, depths = np.empty(area, np.int64), np.empty(area), np.empty(area)
-    starts = np.zeros(area + 1, np.int64)
-    indices, values = np.empty(max(64, 8 * area), np.int64), np.empty(max(64, 8 * area))
-    row, touched = np.zeros(slot_count), np.empty(slot_count, np.int64)
-    cells, shares, p, d = np.empty((8, 3), np.int64), np.empty(8), np.empty(3), np.empty(3)
-    shape = np.array([slots.shape[0], slots.shape[1], slots.shape[2]])
+def _cast_window(R: Any, o: Any, window: Any, intrinsics: Any, width: int, supersample: int, slots: Any, density: Any,
+                 solid: bool, one_sided: bool, low: Any, high: Any, step: float, row: Any, touched: Any, cells: Any,
+                 shares: Any, scratch: Any, pixels: Any, alphas: Any, depths: Any, starts: Any, indices: Any,
+                 values: Any) -> int:  # fmt: skip
+    """All rays of one window; arrays are the caller's, as compiling array making costs seconds.
+
+    Returns the number of covered pixels, or -1 if ``indices`` and ``values`` are too short.
+    """
+    d, p = scratch[:3], scratch[3:]
     share, found, filled = 1.0 / (supersample * supersample), 0, 0
-    for b in range(windows.shape[0]):
-        R, o = rotations[b], origins[b]
-        for v in range(windows[b, 0], windows[b, 1]):
-            for u in range(windows[b, 2], windows[b, 3]):
-                alpha, alpha_depth, touched_count = 0.0, 0.0, 0
-                for s in range(supersample * supersample):
-                    x = (u + (s % supersample + 0.5) / supersample - intrinsics[2]) / intrinsics[0]
-                    y = (v + (s // supersample + 0.5) / supersample - intrinsics[3]) / intrinsics[1]
-                    for axis in range(3):
-                        d[axis] = R[axis, 0] * x + R[axis, 1] * y + R[axis, 2]
-                    t_in, t_out, by_face = _enter_box(o, d, low, high, NEAR_M)
-                    if t_out <= t_in or (one_sided and not by_face):
-                        continue
-                    touched_count, a, ad = _march(
-                        o, d, t_in, t_out, slots, density, solid, low, high, step, share, row, touched, touched_count,
-                        cells, shares, p, shape,
-                    )  # fmt: skip
-                    alpha += a
-                    alpha_depth += ad
-                if alpha <= 0.0:
+    for v in range(window[0], window[1]):
+        for u in range(window[2], window[3]):
+            alpha, alpha_depth, count = 0.0, 0.0, 0
+            for s in range(supersample * supersample):
+                x = (u + (s % supersample + 0.5) / supersample - intrinsics[2]) / intrinsics[0]
+                y = (v + (s // supersample + 0.5) / supersample - intrinsics[3]) / intrinsics[1]
+                for axis in range(3):
+                    d[axis] = R[axis, 0] * x + R[axis, 1] * y + R[axis, 2]
+                t_in, t_out, by_face = _enter_box(o, d, low, high, NEAR_M)
+                if t_out <= t_in or (one_sided and not by_face):
                     continue
-                if filled + touched_count > len(indices):
-                    capacity = 2 * len(indices) + touched_count
-                    more_indices, more_values = np.empty(capacity, np.int64), np.empty(capacity)
-                    more_indices[:filled], more_values[:filled] = indices[:filled], values[:filled]
-                    indices, values = more_indices, more_values
-                for k in range(touched_count):
-                    indices[filled + k], values[filled + k] = touched[k], row[touched[k]]
-                    row[touched[k]] = 0.0
-                filled += touched_count
-                pixels[found] = (b * height + v) * width + u
-                alphas[found], depths[found] = alpha, alpha_depth / alpha
-                found += 1
-                starts[found] = filled
-    return (
-        pixels[:found].copy(), alphas[:found].copy(), depths[:found].copy(), starts[: found + 1].copy(),
-        indices[:filled].astype(np.int32), values[:filled].copy(),
-    )  # fmt: skip
+                count, a, ad = _march(
+                    o,
+                    d,
+                    p,
+                    t_in,
+                    t_out,
+                    slots,
+                    density,
+                    solid,
+                    low,
+                    high,
+                    step,
+                    share,
+                    row,
+                    touched,
+                    count,
+                    cells,
+                    shares,
+                )
+                alpha += a
+                alpha_depth += ad
+            if alpha <= 0.0:
+                continue
+            if filled + count > len(indices):
+                return -1
+            for k in range(count):
+                indices[filled + k] = touched[k]
+                values[filled + k] = row[touched[k]]
+                row[touched[k]] = 0.0
+            filled += count
+            pixels[found] = v * width + u
+            alphas[found] = alpha
+            depths[found] = alpha_depth / alpha
+            found += 1
+            starts[found] = filled
+    return found

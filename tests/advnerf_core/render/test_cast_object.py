@@ -136,3 +136,44 @@ def test_an_object_out_of_view_gives_an_empty_cast():
     assert cast.weights.shape == (0, 17)
     with pytest.raises(ValueError, match="at least 1 ray"):
         cast_object(cube_face_object(0.8, 4), camera(), PINHOLE, supersample=0)
+
+
+def test_a_thin_cloud_equals_a_ray_march_written_out():
+    generator = np.random.default_rng(0)
+    shape, step = (5, 6, 7), 0.01
+    density = generator.uniform(0.0, 3.0, shape)
+    cloud = VoxelGridObject(
+        np.arange(210, dtype=np.int32).reshape(shape), (210, 3), np.zeros((0, 3)), -0.5 * np.ones(3), 0.5 * np.ones(3),
+        make_transform(rotation_z(0.3), [0.1, 0, 0]), scale=0.8, density=density, step_units=step,
+    )  # fmt: skip
+    pinhole, T = Pinhole(3, 2, 8.0, 8.0, 1.5, 1.0), look_at([2.0, 0.2, 0.3], [0, 0, 0])
+    colours = generator.uniform(size=(210, 3))
+    cast = cast_object(cloud, T[None], pinhole, 1, np.float64)
+    assert cast.weights.nnz > 6 * 4 + 64  # more than the caster makes room for at first
+    rendered = cast.weights @ colours
+    origin, rotation = (T[:3, 3] - [0.1, 0, 0]) @ rotation_z(0.3) / 0.8, rotation_z(-0.3) @ T[:3, :3] / 0.8
+    for pixel, got, alpha in zip(cast.pixels, rendered, cast.alpha, strict=True):
+        d = rotation @ pinhole.directions().reshape(-1, 3)[pixel]
+        near, far = np.sort([(-0.5 - origin) / d, (0.5 - origin) / d], axis=0)
+        t_in, t_out = near.max(), far.min()
+        count = int(np.ceil((t_out - t_in) * np.linalg.norm(d) / step))
+        dt = (t_out - t_in) / count
+        light, total = 1.0, np.zeros(3)
+        for t in t_in + (np.arange(count) + 0.5) * dt:
+            g = np.clip((origin + t * d + 0.5) * shape - 0.5, 0, np.array(shape) - 1)
+            sigma, colour = (trilinear(grid, g) for grid in (density, colours.reshape(*shape, 3)))
+            opacity = 1 - np.exp(-sigma * dt * np.linalg.norm(d))
+            total += light * opacity * colour
+            light *= 1 - opacity
+        np.testing.assert_allclose(got, total, atol=1e-10)
+        np.testing.assert_allclose(alpha, 1 - light, atol=1e-10)
+
+
+def trilinear(grid, g):
+    first = np.minimum(g.astype(int), np.array(grid.shape[:3]) - 2)
+    f = g - first
+    total = 0.0
+    for corner in np.ndindex(2, 2, 2):
+        share = np.prod(np.where(corner, f, 1 - f))
+        total = total + share * grid[tuple(first + corner)]
+    return total
