@@ -105,11 +105,12 @@ class _Runner:
         # Before any device is opened: a second node of this name in this run folder ends here.
         self._bus.publisher(status_topic(self._name))
         self._node = build(NodeContext(self._name, self._run_dir, self._clock, self._bus.subscribers))
-        self.loop = NodeLoop(self._name, self._node, self._bus, self._clock)
-        self.loop.publish_status(self._clock.now(), STARTING, "")
-        # What is alive now stays alive: the collector need not walk it again and again while the car drives.
+        # What is alive now stays alive: the collector need not walk it again and again while the car drives. Before the
+        # subscriptions are open, so that nothing waits for it.
         gc.collect()
         gc.freeze()
+        self.loop = NodeLoop(self._name, self._node, self._bus, self._clock)
+        self.loop.publish_status(self._clock.now(), STARTING, "")
 
     def run(self) -> None:
         assert self.loop is not None
