@@ -76,7 +76,7 @@ class Frames:
         weights, pixels, free = self.weights, self.pixels, [field.free_count for field in self.objects]
 
         def vjp(grad_images: Tensor) -> Tensor:
-            if theta is None:
+            if theta is None or not weights:
                 return torch.zeros(0, 3)
             flat = grad_images.detach().permute(0, 2, 3, 1).reshape(-1, 3)
             rows = [

@@ -146,7 +146,11 @@ def test_initial_theta_is_plain_with_little_noise_that_differs_by_seed():
     assert torch.equal(a, again)
     assert not torch.equal(a, b)
     assert 5e-5 < (a - scene.plain_theta()).std() < 2e-4
-    assert surrogate(None).initial_theta(torch.Generator()).shape == (0, 3)
+    empty = surrogate(None)
+    assert empty.initial_theta(torch.Generator()).shape == (0, 3)
+    for theta in (None, torch.zeros(0, 3)):
+        rendered = empty.render(empty.camera_poses(STATES), theta)
+        assert rendered.vjp(rendered.images).shape == (0, 3)
 
 
 def test_wrong_backgrounds_and_missing_theta_are_refused():
