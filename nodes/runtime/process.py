@@ -82,8 +82,10 @@ def run_node(
     except NodeFinished:
         pass
     except Exception as error:  # whatever it is: make the device safe, say it in one line, end with an error code
+        runner.close_node()
         runner.fail(error)
     finally:
+        runner.close_node()  # still deaf to a second Ctrl-C: making a device safe must not be interrupted
         if signals is not None:
             signals.restore()
         runner.close()
@@ -133,19 +135,24 @@ class _Runner:
             except Exception as second:  # the node must still be closed
                 print(f"{self._name}: could not report the fault: {second}", file=sys.stderr, flush=True)
 
-    def close(self) -> None:
+    def close_node(self) -> None:
+        """Close the node, once. Before anything is logged: a slow disk must not keep the car moving."""
+        node, self._node = self._node, None
+        if node is None:
+            return
         try:
-            if self._node is not None:
-                self._node.close()
+            node.close()
         except Exception as error:  # the sockets must still be closed
             self.fail(error)
-        finally:
-            if self._bus is not None:
-                self._bus.close(farewell=self.loop is not None)
-            if self._node is not None and self._node.inbox is not None:
-                self._node.inbox.close()
-            if self.loop is not None:
-                self.loop.close()
+        if node.inbox is not None:
+            node.inbox.close()
+
+    def close(self) -> None:
+        self.close_node()
+        if self._bus is not None:
+            self._bus.close(farewell=self.loop is not None)
+        if self.loop is not None:
+            self.loop.close()
 
 
 def run_node_main(config_type: type[C], build: Callable[[C, NodeContext], Node]) -> int:
