@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 import torch
@@ -30,8 +30,8 @@ KeepDriving = Callable[[Array], NDArray[np.bool_]]
 Texture = NDArray[np.float32]
 """Colours ``[n, n, 3]`` in 0..1 of the object's face, row 0 on top, column 0 left for a viewer who faces it."""
 
-Overlay = Callable[[Image, NDArray[np.float32], Array, Texture], Image]
-"""``(rgb [H, W, 3], planar depth [H, W] in metres, state [3], texture) -> rgb`` with the texture on the object's face."""
+Overlay = Callable[[Image, Array, Texture], Image]
+"""``(rgb [H, W, 3], state [3], texture) -> rgb`` with the texture on the object's face; the same image if out of view."""
 
 
 @dataclass(frozen=True)
@@ -87,10 +87,10 @@ class SteppedScene(Protocol):
     def step(self, steering_rad: float, speed_mps: float, duration_s: float) -> VehicleState:
         """Drive on and return the true state."""
 
-    def observe(self) -> tuple[Image, NDArray[np.float32]]:
-        """RGB ``[H, W, 3]`` uint8 and planar depth ``[H, W]`` [m] of the driving camera."""
+    def observe(self, depth: Literal[False]) -> tuple[Image, None]:
+        """RGB ``[H, W, 3]`` uint8 of the driving camera, without depth."""
 
-    def observe_at(self, x_m: float, y_m: float, yaw_rad: float) -> tuple[Image, NDArray[np.float32]]:
+    def observe_at(self, x_m: float, y_m: float, yaw_rad: float, depth: Literal[False]) -> tuple[Image, None]:
         """The same, as if the car stood there."""
 
 
@@ -128,7 +128,11 @@ class SceneSource:
 
     def look(self, states: Array, rng: np.random.Generator) -> Seen:
         """What is seen from the states ``[B, 3]``."""
-        return Seen.join([self._seen(*self._scene.observe_at(*map(float, state)), state, rng) for state in states])
+        parts = []
+        for state in states:
+            x, y, yaw = map(float, state)
+            parts.append(self._seen(self._scene.observe_at(x, y, yaw, depth=False)[0], state, rng))
+        return Seen.join(parts)
 
     def drive(
         self, steer: Steer, starts: Array, steps: int, keep_driving: KeepDriving, rng: np.random.Generator
@@ -140,8 +144,7 @@ class SceneSource:
             self._scene.reset(*map(float, start))
             state = np.asarray(start, dtype=np.float64)
             for _ in range(steps):
-                rgb, depth = self._scene.observe()
-                parts.append(self._seen(rgb, depth, state, rng, held))
+                parts.append(self._seen(self._scene.observe(depth=False)[0], state, rng, held))
                 steering = float(steer(parts[-1].images[-1:] if held is not None else parts[-1].images[:1])[0])
                 moved = self._scene.step(steering, self._speed_mps, self._dt_s)
                 state = np.array([moved.x_m, moved.y_m, moved.yaw_rad])
@@ -152,7 +155,6 @@ class SceneSource:
     def _seen(
         self,
         rgb: Image,
-        depth: NDArray[np.float32],
         state: Array,
         rng: np.random.Generator,
         held: Texture | None = None,
@@ -162,7 +164,7 @@ class SceneSource:
         if self._overlay is not None:
             textures = [random_texture(rng, self._cells) for _ in range(self._variants)]
             for texture in textures if held is None else [*textures[:-1], held]:
-                painted = self._overlay(rgb, depth, state, texture)
+                painted = self._overlay(rgb, state, texture)
                 if np.array_equal(painted, rgb):  # the object is out of view
                     break
                 images.append(self._view.image(painted))

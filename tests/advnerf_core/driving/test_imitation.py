@@ -1,6 +1,7 @@
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -72,15 +73,15 @@ class FloorScene:
         self.state = car.step(torch.from_numpy(self.state)[None], torch.tensor([steering_rad])).numpy()[0]
         return VehicleState(*map(float, self.state))
 
-    def observe(self) -> tuple[np.ndarray, np.ndarray]:
-        return self.observe_at(*map(float, self.state))
+    def observe(self, depth: Literal[False]) -> tuple[np.ndarray, None]:
+        return self.observe_at(*map(float, self.state), depth=depth)
 
-    def observe_at(self, x_m: float, y_m: float, yaw_rad: float) -> tuple[np.ndarray, np.ndarray]:
+    def observe_at(self, x_m: float, y_m: float, yaw_rad: float, depth: Literal[False]) -> tuple[np.ndarray, None]:
         image = paint_floor(np.array([[x_m, y_m, yaw_rad]]), VIEW.camera)[0]
-        return (image * 255).astype(np.uint8), np.ones((188, 336), np.float32)
+        return (image * 255).astype(np.uint8), None
 
 
-def overlay(rgb: np.ndarray, depth: np.ndarray, state: np.ndarray, texture: np.ndarray) -> np.ndarray:
+def overlay(rgb: np.ndarray, state: np.ndarray, texture: np.ndarray) -> np.ndarray:
     painted = rgb.copy()
     if state[0] > 0.0:
         painted[60:64, 100:104] = (texture * 255).astype(np.uint8)
