@@ -1,0 +1,173 @@
+"""The policy node: steers by the newest image, and stamps its command with that image's capture time.
+
+It never acts on an old image: one that was captured or published too long ago is dropped and counted, so that the layers nearer
+to the motor notice that commands have stopped. The first inferences of a process are slow; they are done on a blank image before
+the node reports that it is ready.
+"""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from pydantic import BaseModel, ConfigDict, Field
+
+from advnerf_core.driving.policy import LoadedPolicy, images_to_tensor, load_policy
+from nodes.runtime.clock import NS_PER_S
+from nodes.runtime.errors import ConfigError
+from nodes.runtime.messages import drive_message, image_array, stamp_ns
+from nodes.runtime.node import ACTIVE, FAULT, READY, MessageInfo, Node, NodeContext, Now, Out, run_node_main
+
+_DRIVE = "/policy/drive"
+_WARM_UP_RUNS = 5
+_ACTIVE_S = 1.0
+# A camera whose clock runs ahead of ours by more than this has the wrong clock.
+_CLOCK_TOLERANCE_S = 0.02
+
+
+class PolicyConfig(BaseModel):
+    """Configuration of the policy node.
+
+    Attributes:
+        policy: Policy file.
+        sha256: Its hash, if it must be that very policy; empty accepts any.
+        image_topic: Where images come from.
+        speed_mps: Speed of the commands [m/s].
+        max_age_s: Oldest image, since capture and since publication, that is acted upon [s].
+        goal: Goal vector of a goal-conditioned policy.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    policy: Path
+    sha256: str = ""
+    image_topic: str = "/compositor/image"
+    speed_mps: float = Field(default=0.8, ge=0.0, le=2.0)
+    max_age_s: float = Field(default=0.15, gt=0.0, le=0.5)
+    goal: tuple[float, ...] = ()
+
+
+class PolicyNode(Node):
+    """Image in, drive command out.
+
+    Args:
+        loaded: The policy with its view.
+        image_topic: Where images come from.
+        speed_mps: Speed of the commands [m/s].
+        max_age_s: Oldest image that is acted upon [s].
+        goal: Goal vector, of the length that the policy wants.
+    """
+
+    publications = (_DRIVE,)
+    tick_rate_hz = 10.0
+
+    def __init__(
+        self,
+        loaded: LoadedPolicy,
+        image_topic: str = "/compositor/image",
+        speed_mps: float = 0.8,
+        max_age_s: float = 0.15,
+        goal: tuple[float, ...] = (),
+    ) -> None:
+        if len(goal) != loaded.policy.goal_size:
+            raise ConfigError(
+                f"expected a goal of {loaded.policy.goal_size} numbers for this policy, got {len(goal)}; set 'goal'"
+            )
+        self.subscriptions = (image_topic,)
+        self._loaded = loaded
+        self._speed_mps = speed_mps
+        self._max_age_ns = round(max_age_s * NS_PER_S)
+        self._goals = torch.tensor([goal], dtype=torch.float32) if goal else None
+        self._counts = {"images": 0, "dropped_stale": 0, "dropped_bad": 0}
+        self._inference_ms = 0.0
+        self._last_drive_ns: int | None = None
+        self._now_ns = 0
+        self._trouble = ""
+        self._fault = False
+        self._warm_up()
+
+    @classmethod
+    def build(cls, config: PolicyConfig, context: NodeContext) -> PolicyNode:
+        """Make the node of a process: load, check and warm up the policy."""
+        del context  # it needs no clock of its own
+        # One image at a time: more threads would only take cores from the other nodes and wake up late.
+        torch.set_num_threads(1)
+        cv2.setNumThreads(1)
+        loaded = load_policy(config.policy, config.sha256 or None)
+        return cls(loaded, config.image_topic, config.speed_mps, config.max_age_s, config.goal)
+
+    def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
+        """Steer by an image, unless it is too old or not what the policy was trained on."""
+        self._now_ns = now.mono_ns
+        self._counts["images"] += 1
+        capture_ns = stamp_ns(message)
+        captured_age_ns, published_age_ns = now.real_ns - capture_ns, now.mono_ns - info.publish_mono_ns
+        if max(captured_age_ns, published_age_ns) > self._max_age_ns:
+            self._drop("dropped_stale", f"image is {max(captured_age_ns, published_age_ns) / 1e6:.0f} ms old")
+            return []
+        if captured_age_ns < -_CLOCK_TOLERANCE_S * NS_PER_S:
+            self._drop(
+                "dropped_bad", "image comes from the future; synchronise the clocks of camera and policy computer"
+            )
+            return []
+        camera = self._loaded.view.camera
+        if (message.encoding, int(message.width), int(message.height)) != ("rgb8", camera.width, camera.height):
+            got = f"{message.encoding} {message.width} x {message.height}"
+            self._drop(
+                "dropped_bad", f"expected rgb8 {camera.width} x {camera.height}, got {got}; train for this camera"
+            )
+            return []
+        steering_rad = self._steer(image_array(message))
+        if not np.isfinite(steering_rad):
+            self._drop("dropped_bad", "the policy's output is not finite")
+            return []
+        self._trouble, self._fault = "", False
+        self._last_drive_ns = now.mono_ns
+        return [Out(_DRIVE, drive_message(self._speed_mps, steering_rad, capture_ns))]
+
+    def tick(self, now: Now) -> list[Out]:
+        """Only notes the time, so that the status shows when images stop."""
+        self._now_ns = now.mono_ns
+        return []
+
+    def status(self) -> tuple[str, str]:
+        """Active while commands go out; fault when images come that it cannot use."""
+        name = f"policy {self._loaded.sha256[:12]}"
+        if self._trouble:
+            return (FAULT if self._fault else READY), self._trouble
+        recent = self._last_drive_ns is not None and self._now_ns - self._last_drive_ns < _ACTIVE_S * NS_PER_S
+        return (ACTIVE, name) if recent else (READY, f"{name}, waiting for images")
+
+    def counters(self) -> dict[str, float]:
+        """Images taken and dropped, and the time of the last inference [ms]."""
+        return {**self._counts, "inference_ms": self._inference_ms}
+
+    def _steer(self, rgb: np.ndarray[Any, np.dtype[np.uint8]]) -> float:
+        # The duration is reported only; no decision depends on this clock, so replays stay deterministic.
+        start = time.perf_counter()
+        with torch.inference_mode():
+            steering = self._loaded.policy(images_to_tensor(self._loaded.view.image(rgb)), self._goals)
+        self._inference_ms = 1e3 * (time.perf_counter() - start)
+        return float(steering[0])
+
+    def _warm_up(self) -> None:
+        camera = self._loaded.view.camera
+        for _ in range(_WARM_UP_RUNS):
+            self._steer(np.zeros((camera.height, camera.width, 3), np.uint8))
+
+    def _drop(self, counter: str, trouble: str) -> None:
+        self._counts[counter] += 1
+        self._trouble, self._fault = trouble, counter == "dropped_bad"
+
+
+def main() -> int:
+    """Run the node as a process."""
+    return run_node_main(PolicyConfig, PolicyNode.build)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

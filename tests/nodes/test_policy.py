@@ -1,0 +1,117 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from advnerf_core.driving.policy import (
+    LoadedPolicy,
+    PilotNet,
+    PolicyFileError,
+    images_to_tensor,
+    load_policy,
+    save_policy,
+)
+from advnerf_core.driving.policy_view import PolicyView
+from advnerf_core.geometry import Pinhole
+from nodes.policy import PolicyConfig, PolicyNode
+from nodes.runtime.clock import ManualClock
+from nodes.runtime.errors import ConfigError
+from nodes.runtime.messages import decode, encode, image_message, stamp_ns, type_name
+from nodes.runtime.node import MessageInfo, NodeContext
+
+VIEW = PolicyView(Pinhole(336, 188, 173.97, 173.97, 168.0, 94.0))
+T0 = 1_700_000_000_000_000_000
+MS = 1_000_000
+
+
+def _loaded(goal_size: int = 0) -> LoadedPolicy:
+    torch.manual_seed(0)
+    return LoadedPolicy(PilotNet(goal_size).eval().requires_grad_(False), VIEW, {}, "ab" * 32)
+
+
+def _rgb(value: int = 90, shape: tuple[int, int, int] = (188, 336, 3)) -> np.ndarray:
+    return (np.random.default_rng(value).random(shape) * 255).astype(np.uint8)
+
+
+def _send(node: PolicyNode, message, captured_ms: int = 30, published_ms: int = 2):
+    """Hand over a message through CDR, ``captured_ms`` after its stamp and ``published_ms`` after publication."""
+    raw = encode(message)
+    clock = ManualClock(mono_ns=10**10, real_ns=stamp_ns(message) + captured_ms * MS)
+    info = MessageInfo(10**10 - published_ms * MS, 10**10, raw=raw)
+    return node.handle("/compositor/image", decode(type_name(message), raw), info, clock.now())
+
+
+def test_steers_like_the_policy_and_keeps_the_capture_stamp() -> None:
+    node, rgb = PolicyNode(_loaded(), speed_mps=0.7), _rgb()
+    (out,) = _send(node, image_message(rgb, T0, "camera"))
+    assert out.topic == "/policy/drive"
+    assert stamp_ns(out.message) == T0
+    expected = float(_loaded().policy(images_to_tensor(VIEW.image(rgb)))[0])
+    assert out.message.drive.steering_angle == pytest.approx(expected, abs=1e-6)
+    assert out.message.drive.speed == pytest.approx(0.7)
+    assert node.status()[0] == "active"
+    assert node.counters()["images"] == 1
+    encode(out.message)
+
+
+@pytest.mark.parametrize(("captured_ms", "published_ms"), [(151, 2), (30, 151)])
+def test_stale_images_are_refused(captured_ms: int, published_ms: int) -> None:
+    node = PolicyNode(_loaded())
+    assert _send(node, image_message(_rgb(), T0, "camera"), captured_ms, published_ms) == []
+    assert node.counters()["dropped_stale"] == 1
+    assert node.status() == ("ready", "image is 151 ms old")
+    assert len(_send(node, image_message(_rgb(), T0, "camera"), 149, 149)) == 1
+    assert node.status()[0] == "active"
+
+
+def test_images_that_the_policy_does_not_know_are_a_fault() -> None:
+    node = PolicyNode(_loaded())
+    assert _send(node, image_message(_rgb(shape=(94, 168, 3)), T0, "camera")) == []
+    assert node.status() == ("fault", "expected rgb8 336 x 188, got rgb8 168 x 94; train for this camera")
+    assert _send(node, image_message(_rgb(), T0, "camera", "bgr8")) == []
+    assert _send(node, image_message(_rgb(), T0, "camera"), captured_ms=-50) == []
+    assert "clocks" in node.status()[1]
+    assert node.counters()["dropped_bad"] == 3
+    assert len(_send(node, image_message(_rgb(), T0, "camera"))) == 1
+
+
+def test_a_policy_that_is_not_finite_sends_nothing() -> None:
+    loaded = _loaded()
+    node = PolicyNode(loaded)
+    with torch.no_grad():
+        loaded.policy.head[-1].bias.fill_(float("nan"))
+    assert _send(node, image_message(_rgb(), T0, "camera")) == []
+    assert node.status() == ("fault", "the policy's output is not finite")
+
+
+def test_status_shows_that_images_have_stopped() -> None:
+    node = PolicyNode(_loaded())
+    assert node.status() == ("ready", "policy abababababab, waiting for images")
+    _send(node, image_message(_rgb(), T0, "camera"))
+    clock = ManualClock(mono_ns=10**10 + 1100 * MS)
+    assert node.tick(clock.now()) == []
+    assert node.status()[0] == "ready"
+
+
+def test_built_from_a_file_with_its_hash(tmp_path: Path) -> None:
+    digest = save_policy(tmp_path / "policy.safetensors", _loaded().policy, VIEW, {})
+    context = NodeContext("policy", tmp_path, ManualClock())
+    threads = torch.get_num_threads()
+    try:
+        config = PolicyConfig(policy=tmp_path / "policy.safetensors", sha256=digest, image_topic="/camera/image_raw")
+        node = PolicyNode.build(config, context)
+        assert node.subscriptions == ("/camera/image_raw",)
+        assert torch.get_num_threads() == 1
+        with pytest.raises(PolicyFileError, match="expected the policy 00"):
+            PolicyNode.build(config.model_copy(update={"sha256": "00"}), context)
+    finally:
+        torch.set_num_threads(threads)
+    assert load_policy(tmp_path / "policy.safetensors").sha256 == digest
+
+
+def test_goal_must_fit_the_policy() -> None:
+    with pytest.raises(ConfigError, match="goal of 3 numbers for this policy, got 0"):
+        PolicyNode(_loaded(goal_size=3))
+    node = PolicyNode(_loaded(goal_size=3), goal=(0.0, 1.0, 0.0))
+    assert len(_send(node, image_message(_rgb(), T0, "camera"))) == 1
