@@ -7,7 +7,6 @@ are in metres, angles in radians, transforms ``T_a_from_b`` as four rows.
 from __future__ import annotations
 
 import datetime
-import os
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -16,6 +15,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from advnerf_core.driving.path import Path as DrivingPath
+from advnerf_core.files import write_atomically
 from advnerf_core.geometry import Array, Pinhole
 from hardware.limits import DriveLimits, VehicleGains
 
@@ -246,10 +246,7 @@ def save_calibration(calibration: Calibration, path: Path | str) -> None:
     """Write one file, whole or not at all."""
     path = Path(path)
     text = yaml.safe_dump(calibration.model_dump(mode="python"), sort_keys=False, default_flow_style=None, width=120)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        temporary.write_text(text, encoding="utf-8")
-        os.replace(temporary, path)
+        write_atomically(path, text)
     except OSError as error:
-        temporary.unlink(missing_ok=True)
         raise CalibrationError(f"cannot write {path}: {error.strerror or error}") from error

@@ -55,7 +55,7 @@ class FileCamera:
         bgr = cv2.imread(str(path), cv2.IMREAD_COLOR)
         if bgr is None:
             raise LinkLost(f"expected an image, cannot decode {path}: remove or replace it")
-        rgb = np.ascontiguousarray(bgr[:, :, ::-1])
+        rgb = np.ascontiguousarray(bgr[:, :, ::-1], dtype=np.uint8)
         frame = Frame(rgb, time.time_ns(), time.monotonic_ns(), self._sequence)
         self._sequence += 1
         # From now on, not from the plan: pictures are never delivered in a burst.

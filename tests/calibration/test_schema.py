@@ -129,5 +129,5 @@ def test_nothing_is_left_half_written(tmp_path):
     save_calibration(target, tmp_path / "sign.yaml")
     assert load_calibration(TargetCalibration, tmp_path / "sign.yaml") == target
     with pytest.raises(CalibrationError, match="cannot write"):
-        save_calibration(target, tmp_path / "nowhere" / "sign.yaml")
+        save_calibration(target, tmp_path / "sign.yaml" / "sign.yaml")
     assert [p.name for p in tmp_path.iterdir()] == ["sign.yaml"]

@@ -33,14 +33,9 @@ def stack(tmp_path_factory):
         stack.close()
 
 
-def commands_after(stack, mono_ns):
-    kept = MOVES | BRAKES | {"SET_CURRENT", "TIMEOUT"}
-    return [event for event, *_ in stack.wire() if event.mono_ns >= mono_ns and event.name in kept]
-
-
 def assert_stopped(stack, since_ns, limit_ms=350.0):
     """Brake within the limit, no motion afterwards, and zero current in the end."""
-    events = commands_after(stack, since_ns)
+    events = stack.commands_after(since_ns)
     first = next(e for e in events if e.name in BRAKES)
     assert (first.mono_ns - since_ns) / 1e6 <= limit_ms
     after = [e for e in events if e.mono_ns >= first.mono_ns]
@@ -54,9 +49,9 @@ def assert_stopped(stack, since_ns, limit_ms=350.0):
 def test_drive_reports_and_latency(stack):
     stack.wait_ready()
     stack.put_back()
-    stack.all_sent.clear()
+    stack.sent.clear()
     stack.drive(1.5)
-    driving = [m for m in stack.all_sent if not m.braking]
+    driving = [m for m in stack.sent if not m.braking]
     assert len(driving) >= 12
     latencies = [m.serial_write_real_ns - (m.header.stamp.sec * 10**9 + m.header.stamp.nanosec) for m in driving]
     assert min(latencies) > 0
@@ -66,10 +61,10 @@ def test_drive_reports_and_latency(stack):
     assert stack.seen["/motor/state"].speed_mps == pytest.approx(0.8, abs=0.1)
     assert stack.seen["/vicon/car"].pose.position.x > -0.5
     stack.say_arm(False)
-    stack.wait_until(lambda: not stack.armed)
+    stack.wait_until(lambda: not stack.armed, 5.0, "to be disarmed")
     stack.watch(1.5)
     assert stack.seen["/safety/state"].reason == "disarmed by trial: test"
-    assert commands_after(stack, 0)[-1].name == "SET_CURRENT"
+    assert stack.commands_after(0)[-1].name == "SET_CURRENT"
 
 
 @pytest.mark.parametrize("victim", victims(quick="safety"))
@@ -101,7 +96,7 @@ def test_a_process_that_is_killed_stops_the_car_and_its_successor_does_not_move_
     assert not stack.armed
     stack.drive(0.8)
     stack.say_arm(False)
-    stack.wait_until(lambda: not stack.armed)
+    stack.wait_until(lambda: not stack.armed, 5.0, "to be disarmed")
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, pytest.param(signal.SIGSTOP, marks=pytest.mark.slow)])
@@ -111,7 +106,7 @@ def test_the_controller_itself_brakes_when_the_motor_node_is_gone(stack, number)
     stack.drive()
     since_ns = stack.signal("motor", number)
     stack.watch(1.5)
-    events = commands_after(stack, since_ns)
+    events = stack.commands_after(since_ns)
     timeout = next(e for e in events if e.name == "TIMEOUT")
     assert timeout.value == 20.0
     assert (timeout.mono_ns - since_ns) / 1e6 <= 300.0
@@ -124,7 +119,7 @@ def test_the_controller_itself_brakes_when_the_motor_node_is_gone(stack, number)
         stack.signal("motor", signal.SIGCONT)
     stack.wait_ready()
     stack.watch(1.0)
-    assert not [e for e in commands_after(stack, timeout.mono_ns) if e.name in MOVES]
+    assert not [e for e in stack.commands_after(timeout.mono_ns) if e.name in MOVES]
     stack.drive(0.5)
     stack.say_arm(False)
-    stack.wait_until(lambda: not stack.armed)
+    stack.wait_until(lambda: not stack.armed, 5.0, "to be disarmed")
