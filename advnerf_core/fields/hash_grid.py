@@ -1,0 +1,152 @@
+"""Multiresolution hash encoding (Müller et al. 2022, "Instant Neural Graphics Primitives", section 3) as a torch module.
+
+On a CPU in float32 it runs numba kernels; on any other device or dtype plain torch indexing, which is also the reference that the
+kernels are tested against (to 1e-6).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from advnerf_core.fields.hash_grid_kernels import PRIME_Y, PRIME_Z, Array32, encode_level, scatter_level
+from advnerf_core.parallel import run_slots
+
+
+@dataclass(frozen=True)
+class HashGridConfig:
+    """Sizes of a multiresolution hash grid.
+
+    Attributes:
+        levels: Number of levels L.
+        features: Features per entry F.
+        log2_entries: Largest number of entries of a level, as a power of two.
+        coarsest: Cells per axis of the coarsest level.
+        finest: Cells per axis of the finest level; levels between grow geometrically.
+    """
+
+    levels: int = 16
+    features: int = 2
+    log2_entries: int = 17
+    coarsest: int = 16
+    finest: int = 2048
+
+    def __post_init__(self) -> None:
+        if not (1 <= self.levels <= 64 and self.features in (2, 4, 8, 16) and 4 <= self.log2_entries <= 24):
+            raise ValueError(f"expected 1..64 levels, 2, 4, 8 or 16 features and 2^4..2^24 entries, got {self}")
+        if not 1 <= self.coarsest <= self.finest:
+            raise ValueError(f"expected 1 <= coarsest <= finest cells, got {self.coarsest} and {self.finest}")
+
+    @property
+    def width(self) -> int:
+        """Number of encoded features, L * F."""
+        return self.levels * self.features
+
+    def level_table(self) -> NDArray[np.int64]:
+        """Level descriptions ``[L, 4]``: first row, cells per axis, index mask, densely indexed or not."""
+        growth = (self.finest / self.coarsest) ** (1.0 / max(self.levels - 1, 1))
+        rows, first = [], 0
+        for level in range(self.levels):
+            cells = int(np.floor(self.coarsest * growth**level + 1e-6))
+            limit = 1 << self.log2_entries
+            dense = (cells + 1) ** 3 <= limit
+            rows.append((first, cells, limit - 1, int(dense)))
+            first += (cells + 1) ** 3 if dense else limit
+        return np.array(rows, dtype=np.int64)
+
+    @property
+    def entries(self) -> int:
+        """Number of table rows over all levels."""
+        first, cells, mask, dense = self.level_table()[-1]
+        return int(first + ((cells + 1) ** 3 if dense else mask + 1))
+
+
+class HashGrid(nn.Module):
+    """Encodes points of the unit cube by trilinear interpolation in L hashed grids.
+
+    Not differentiable to the points on the CPU float32 path (scene poses are never optimised); the plain torch path is, almost
+    everywhere.
+    """
+
+    def __init__(self, config: HashGridConfig | None = None, generator: torch.Generator | None = None) -> None:
+        super().__init__()
+        self.config = config or HashGridConfig()
+        self.levels = self.config.level_table()
+        table = torch.empty(self.config.entries, self.config.features)
+        # Müller et al., section 4: uniform and tiny, so that the first steps see a nearly constant field.
+        self.table = nn.Parameter(table.uniform_(-1e-4, 1e-4, generator=generator))
+
+    def forward(self, points: Tensor) -> Tensor:
+        """Encode points.
+
+        Args:
+            points: ``[N, 3]`` in [0, 1]; outside, coordinates are clamped.
+
+        Returns:
+            Features ``[N, L * F]``, level by level. On the CPU path this is a transposed view of feature-major memory.
+        """
+        if points.ndim != 2 or points.shape[1] != 3:
+            raise ValueError(f"expected points [N, 3], got {tuple(points.shape)}")
+        if self.table.device.type == "cpu" and self.table.dtype == points.dtype == torch.float32:
+            return _NumbaEncode.apply(points, self.table, self.levels).T
+        return encode_reference(points, self.table, self.levels)
+
+
+def encode_reference(points: Tensor, table: Tensor, levels: NDArray[np.int64]) -> Tensor:
+    """Plain torch indexing, any device and dtype, differentiable: points ``[N, 3]`` to features ``[N, L * F]``."""
+    encoded = []
+    for first, cells, mask, dense in levels.tolist():
+        position = points.clamp(0.0, 1.0) * cells
+        low = position.detach().floor().clamp(max=cells - 1).to(torch.int64)
+        fraction = position - low
+        total: Tensor | float = 0.0
+        for corner in range(8):
+            bits = torch.tensor([corner & 1, corner >> 1 & 1, corner >> 2 & 1], device=points.device)
+            x, y, z = (low + bits).unbind(-1)
+            if dense:
+                row = x + (cells + 1) * (y + (cells + 1) * z)
+            else:
+                row = (x ^ (y * PRIME_Y) ^ (z * PRIME_Z)) & mask
+            weight = torch.where(bits.bool(), fraction, 1.0 - fraction).prod(-1, keepdim=True)
+            total = total + weight * table[first + row]
+        encoded.append(total)
+    return torch.cat([e for e in encoded if isinstance(e, Tensor)], dim=-1)
+
+
+class _NumbaEncode(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, points: Tensor, table: Tensor, levels: NDArray[np.int64]) -> Tensor:
+        ctx.save_for_backward(points)
+        ctx.levels, ctx.shape = levels, table.shape
+        out = torch.empty(1, levels.shape[0] * table.shape[1], len(points))
+        encode(points.detach().contiguous().numpy(), len(points), table.detach().numpy(), levels, out.numpy())
+        return out[0]
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[None, Tensor, None]:
+        (points,) = ctx.saved_tensors
+        grad_table = torch.zeros(ctx.shape)
+        grad_out = grads[0].contiguous().numpy()[None]
+        scatter(points.detach().contiguous().numpy(), len(points), grad_out, ctx.levels, grad_table.numpy())
+        return None, grad_table, None
+
+
+def encode(points: Array32, count: int, table: Array32, levels: NDArray[np.int64], out: Array32) -> None:
+    """``encode_level`` at all levels, in parallel over levels.
+
+    One level at a time, so that its table (1 MB at 2^17 x 2) stays in the cache while all points pass.
+    """
+    last = levels.shape[0] - 1
+    # Finest first: those miss the cache most, and a slow level handed out last would leave the other threads waiting.
+    run_slots(lambda slot: encode_level(points, count, table, last - slot, levels, out), levels.shape[0])
+
+
+def scatter(points: Array32, count: int, grad_out: Array32, levels: NDArray[np.int64], grad_table: Array32) -> None:
+    """``scatter_level`` at all levels, in parallel over levels (no two write the same rows)."""
+    last = levels.shape[0] - 1
+    run_slots(lambda slot: scatter_level(points, count, grad_out, last - slot, levels, grad_table), levels.shape[0])

@@ -1,0 +1,82 @@
+"""Threads for CPU kernels: numba functions that release the GIL, run over fixed slots of the work.
+
+Why not numba's own ``parallel=True``: it compiles several times slower (the demo counts compilation), its work queue may not be
+entered from two Python threads, and its pool does not survive a fork. Slots are fixed by the caller, not by the number of
+threads, so sums taken per slot and added in slot order give the same bits on every machine.
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+
+# Kernels may reorder and contract float sums, but must honour NaN and infinity: trainers test for them.
+KERNEL_OPTIONS = {
+    "nogil": True,
+    "cache": True,
+    "fastmath": {"reassoc", "contract", "nsz", "arcp", "afn"},
+    "error_model": "numpy",
+    "boundscheck": False,
+}
+
+_pools: dict[
+    tuple[int, int], ThreadPoolExecutor
+] = {}  # by process and size: a forked child must not reuse its parent's
+_threads = 0
+
+
+def thread_count() -> int:
+    """Number of threads that kernels use: the processors this process may run on, unless set."""
+    return _threads or len(os.sched_getaffinity(0))
+
+
+def set_thread_count(threads: int) -> None:
+    """Use so many threads for kernels; 0 goes back to all available processors."""
+    if threads < 0:
+        raise ValueError(f"expected a number of threads >= 0, got {threads}")
+    global _threads
+    _threads = threads
+
+
+def run_slots(function: Callable[[int], object], slots: int) -> None:
+    """Call ``function(slot)`` for each of ``slots`` slots, on all threads; slots are handed out as threads get free.
+
+    Args:
+        function: Does the work of one slot; must write only what belongs to that slot, and release the GIL to gain anything.
+        slots: Number of slots. A few per thread balance the load.
+    """
+    threads = min(thread_count(), slots)
+    if threads <= 1:
+        for slot in range(slots):
+            function(slot)
+        return
+    counter = itertools.count()
+
+    def worker() -> None:
+        for slot in counter:
+            if slot >= slots:
+                return
+            function(slot)
+
+    pool = _pool(threads - 1)
+    futures = [pool.submit(worker) for _ in range(threads - 1)]
+    worker()
+    for future in futures:
+        future.result()
+
+
+def slot_bounds(count: int, slots: int, multiple: int = 1) -> list[tuple[int, int]]:
+    """Split ``range(count)`` into ``slots`` contiguous parts ``(start, stop)`` whose starts are multiples of ``multiple``."""
+    blocks = -(-count // multiple)
+    edges = [min(count, (blocks * slot // slots) * multiple) for slot in range(slots + 1)]
+    edges[-1] = count
+    return list(zip(edges[:-1], edges[1:], strict=True))
+
+
+def _pool(size: int) -> ThreadPoolExecutor:
+    key = (os.getpid(), size)
+    if key not in _pools:
+        _pools[key] = ThreadPoolExecutor(size, thread_name_prefix="advnerf-kernel")
+    return _pools[key]

@@ -1,0 +1,116 @@
+"""Where in the box something may be: a grid of density bounds, kept up while the field learns, and leap distances over it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from advnerf_core.parallel import KERNEL_OPTIONS
+
+Array32 = NDArray[np.float32]
+LogDensity = Callable[[Array32], Array32]
+"""Points ``[N, 3]`` in box coordinates to the logarithm of density ``[N]``."""
+
+MAX_REACH = 32  # cells; leaps longer than that are rare and gain nothing
+
+
+@dataclass(frozen=True, eq=False)
+class Leaps:
+    """Leap distances, as the marching kernels read them.
+
+    Attributes:
+        distance: ``[X, Y, Z]`` uint8: 0 occupied, d > 0: all cells at Chebyshev distance below d are empty.
+        cells: Cells per unit of box coordinates along each axis ``[3]`` float32.
+    """
+
+    distance: NDArray[np.uint8]
+    cells: Array32
+
+
+class OccupancyGrid:
+    """Running upper estimate of density per cell (Müller et al. 2022, appendix C).
+
+    Args:
+        box_high: High corner of the box in box coordinates ``[3]``.
+        resolution: Cells along the longest side.
+        seed: Seed of the places inside cells where density is probed.
+    """
+
+    def __init__(self, box_high: Array32, resolution: int = 128, seed: int = 0) -> None:
+        self.box_high = np.asarray(box_high, np.float32)
+        shape = np.maximum(1, np.ceil(self.box_high * resolution - 1e-4)).astype(int)
+        self.shape: tuple[int, int, int] = (int(shape[0]), int(shape[1]), int(shape[2]))
+        self.density = np.full(self.shape, np.inf, np.float32)
+        self.seed = seed
+
+    @property
+    def cells(self) -> Array32:
+        """Cells per unit of box coordinates along each axis ``[3]``."""
+        return (np.array(self.shape) / self.box_high).astype(np.float32)
+
+    def update(self, log_density: LogDensity, step: int, share: float, decay: float = 0.95) -> None:
+        """Probe cells at random places inside them and keep ``max(decay * old, probed)``.
+
+        Args:
+            log_density: The field.
+            step: Training step; with the seed it fixes the random numbers, so that a resumed run goes on alike.
+            share: Share of the cells to probe, 1 for all; chosen at random.
+            decay: Factor on the old estimates, of all cells: one that is not probed for long is given up.
+        """
+        rng = np.random.Generator(np.random.Philox(key=[self.seed, 2 * step + 1]))
+        total = self.density.size
+        chosen = np.arange(total) if share >= 1.0 else rng.integers(0, total, int(total * share))
+        flat = self.density.reshape(-1)
+        self.density *= np.float32(decay)
+        for part in np.array_split(chosen, max(1, len(chosen) // 262144)):
+            index = np.stack(np.unravel_index(part, self.shape), axis=-1)
+            places = ((index + rng.random((len(part), 3), dtype=np.float32)) / self.cells).astype(np.float32)
+            probed = np.exp(np.minimum(log_density(places), 15.0))
+            flat[part] = np.fmax(np.where(np.isfinite(flat[part]), flat[part], 0.0), probed)
+
+    def occupied(self, threshold: float) -> NDArray[np.bool_]:
+        """Cells ``[X, Y, Z]`` whose density may exceed ``threshold`` or, early on, the mean."""
+        finite = self.density[np.isfinite(self.density)]
+        mean = float(finite.mean()) if finite.size else 0.0
+        return np.asarray(self.density > min(threshold, mean))
+
+
+def leap_distances(occupied: NDArray[np.bool_], cells: Array32) -> Leaps:
+    """Chebyshev distance to the nearest occupied cell, for occupied ``[X, Y, Z]``."""
+    distance = np.where(occupied, np.uint8(0), np.uint8(MAX_REACH))
+    _chamfer(distance)
+    return Leaps(distance, np.asarray(cells, np.float32))
+
+
+@njit(**KERNEL_OPTIONS)
+def _chamfer(distance: NDArray[np.uint8]) -> None:
+    """Two raster sweeps (Borgefors 1986) that turn 0 / MAX_REACH into chessboard distances."""
+    nx, ny, nz = distance.shape
+    for sweep in range(2):
+        sign = 1 - 2 * sweep
+        for a in range(nx):
+            i = a if sweep == 0 else nx - 1 - a
+            for b in range(ny):
+                j = b if sweep == 0 else ny - 1 - b
+                for c in range(nz):
+                    k = c if sweep == 0 else nz - 1 - c
+                    best = distance[i, j, k]
+                    if best == 0:
+                        continue
+                    # The thirteen neighbours that this sweep has already passed.
+                    ip, kp = i - sign, k - sign
+                    if 0 <= ip < nx:
+                        for jj in range(max(j - 1, 0), min(j + 2, ny)):
+                            for kk in range(max(k - 1, 0), min(k + 2, nz)):
+                                best = min(best, distance[ip, jj, kk] + 1)
+                    jp = j - sign
+                    if 0 <= jp < ny:
+                        for kk in range(max(k - 1, 0), min(k + 2, nz)):
+                            best = min(best, distance[i, jp, kk] + 1)
+                    if 0 <= kp < nz:
+                        best = min(best, distance[i, j, kp] + 1)
+                    distance[i, j, k] = best

@@ -1,0 +1,95 @@
+"""Colour maps between cameras: the camera that learned a scene is not the one that drives through it.
+
+The map goes from learned colours ``a`` to driving colours ``b`` in two steps: each channel is straightened by a power, because phones
+store tone-mapped values, then mixed by an affine map: ``b = M a^g + offset``. Powers are found by search, the rest by least
+squares in closed form, so a fit is deterministic.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import minimize_scalar
+
+_POWERS = (0.3, 3.0)
+
+
+@dataclass(frozen=True)
+class ColourMap:
+    """Colours of one camera to those of another.
+
+    Attributes:
+        matrix: ``M``, row by row ``[3][3]``.
+        offset: ``[3]``.
+        power: ``g``.
+    """
+
+    matrix: tuple[tuple[float, float, float], ...]
+    offset: tuple[float, float, float]
+    power: float = 1.0
+
+    def apply(self, rgb: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Map colours ``[..., 3]`` in 0..1; results are clipped to 0..1."""
+        matrix, offset = np.array(self.matrix, np.float32), np.array(self.offset, np.float32)
+        straight = np.maximum(rgb, np.float32(0.0)) ** np.float32(self.power)
+        # Contiguous 2-d product: the sum of products then has one order whatever the image size.
+        mapped = straight.reshape(-1, 3) @ matrix.T + offset
+        return np.clip(mapped, np.float32(0.0), np.float32(1.0)).reshape(rgb.shape)
+
+    def to_dict(self) -> dict[str, Any]:
+        """As JSON can hold it."""
+        return {"matrix": [list(row) for row in self.matrix], "offset": list(self.offset), "power": self.power}
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> ColourMap:
+        """Inverse of ``to_dict``."""
+        a, b, c = (tuple(float(v) for v in row) for row in values["matrix"])
+        offset = tuple(float(v) for v in values["offset"])
+        return cls((a, b, c), (offset[0], offset[1], offset[2]), float(values["power"]))  # type: ignore[arg-type]
+
+
+IDENTITY = ColourMap(((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), (0.0, 0.0, 0.0))
+
+
+def fit_colour_map(learned: ArrayLike, driving: ArrayLike, trim: float = 0.1) -> ColourMap:
+    """Fit a map from paired colours.
+
+    Args:
+        learned: Rendered colours ``[..., 3]`` in 0..1.
+        driving: Colours of the driving camera at the same pixels, same shape (uint8 is divided by 255).
+        trim: Share of the pairs with the largest errors to leave out in a second fit: at edges a render is displaced, not
+            differently coloured.
+    """
+    a, b = _pairs(learned), _pairs(driving)
+    if a.shape != b.shape or len(a) < 16:
+        raise ValueError(f"expected at least 16 paired colours, got {a.shape} and {b.shape}")
+    keep = np.ones(len(a), bool)
+    for _ in range(2):
+        x, y = a[keep], b[keep]
+        found = minimize_scalar(lambda g, x=x, y=y: _solve(x, y, g)[1], bounds=_POWERS, method="bounded")
+        power = float(found.x)
+        solution = _solve(x, y, power)[0]
+        error = np.abs(_design(a, power) @ solution - b).max(axis=1)
+        keep = error <= np.quantile(error, 1.0 - trim)
+    rows = tuple((float(r[0]), float(r[1]), float(r[2])) for r in solution[:3].T)
+    offset = solution[3]
+    return ColourMap(rows, (float(offset[0]), float(offset[1]), float(offset[2])), power)
+
+
+def _pairs(colours: ArrayLike) -> NDArray[np.float64]:
+    values = np.asarray(colours)
+    scale = 255.0 if values.dtype == np.uint8 else 1.0
+    return values.reshape(-1, 3).astype(np.float64) / scale
+
+
+def _design(colours: NDArray[np.float64], power: float) -> NDArray[np.float64]:
+    return np.concatenate([np.maximum(colours, 0.0) ** power, np.ones((len(colours), 1))], axis=1)
+
+
+def _solve(a: NDArray[np.float64], b: NDArray[np.float64], power: float) -> tuple[NDArray[np.float64], float]:
+    design = _design(a, power)
+    solution = np.linalg.lstsq(design, b, rcond=None)[0]
+    return solution, float(np.mean((design @ solution - b) ** 2))

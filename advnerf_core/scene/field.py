@@ -1,0 +1,200 @@
+"""The scene field: hash grid, density network, and a colour network that decodes features accumulated along a ray.
+
+Colours are decoded once per ray, from accumulated features and the viewing direction (deferred shading as in Hedman et al. 2021,
+"Baking neural radiance fields", and Reiser et al. 2023, "MERF"), not once per sample: on a CPU the networks are the cost, and a
+ray has about ten samples.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save as save_tensors
+from torch import Tensor, nn
+
+from advnerf_core.errors import AdvnerfError
+from advnerf_core.fields.hash_grid import HashGrid, HashGridConfig
+from advnerf_core.fields.spherical_harmonics import spherical_harmonics
+from advnerf_core.files import write_atomically
+from advnerf_core.render.volume_kernels import MAX_LOG_DENSITY
+
+FORMAT = "advnerf-scene-1"
+
+
+class SceneFileError(AdvnerfError):
+    """A scene file cannot be used; the message says why."""
+
+
+@dataclass(frozen=True)
+class SceneFieldConfig:
+    """Sizes of a scene field.
+
+    Attributes:
+        box_low_m: Low corner of the box that holds the scene, in the world [m].
+        box_high_m: High corner [m].
+        grid: Hash grid over a cube with the box's longest side.
+        hidden: Width of the hidden layer of both networks.
+        features: Features per sample that are accumulated and decoded to a colour.
+        direction_bands: Bands of spherical harmonics of the viewing direction; 1 means colours do not depend on it.
+    """
+
+    box_low_m: tuple[float, float, float]
+    box_high_m: tuple[float, float, float]
+    grid: HashGridConfig = field(default_factory=lambda: HashGridConfig(levels=8, features=4, finest=2048))
+    hidden: int = 64
+    features: int = 15
+    direction_bands: int = 3
+
+    def __post_init__(self) -> None:
+        if not all(low < high for low, high in zip(self.box_low_m, self.box_high_m, strict=True)):
+            raise ValueError(f"expected a box with low < high [m], got {self.box_low_m} .. {self.box_high_m}")
+        if self.hidden % 4 or self.grid.width % 4 or (self.features + 1) % 4:
+            raise ValueError(
+                "expected a hidden width, levels * features of the grid, and 1 + features that are multiples of 4, got "
+                f"{self.hidden}, {self.grid.width} and 1 + {self.features}"
+            )
+        if not 1 <= self.direction_bands <= 4:
+            raise ValueError(f"expected 1..4 direction bands, got {self.direction_bands}")
+
+    @property
+    def extent_m(self) -> float:
+        """Longest side of the box, the unit of box coordinates [m]."""
+        return max(high - low for low, high in zip(self.box_low_m, self.box_high_m, strict=True))
+
+    @property
+    def box_high(self) -> NDArray[np.float32]:
+        """High corner of the box in box coordinates ``[3]``."""
+        return ((np.array(self.box_high_m) - np.array(self.box_low_m)) / self.extent_m).astype(np.float32)
+
+    @property
+    def colour_inputs(self) -> int:
+        """Inputs of the colour network: features and directions, filled up to a multiple of 4."""
+        return -(-(self.features + self.direction_bands**2) // 4) * 4
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> SceneFieldConfig:
+        """Inverse of ``dataclasses.asdict``, from JSON."""
+        low, high = tuple(values["box_low_m"]), tuple(values["box_high_m"])
+        return cls(**{**values, "box_low_m": low, "box_high_m": high, "grid": HashGridConfig(**values["grid"])})
+
+
+class SceneField(nn.Module):
+    """Density and colour everywhere in a box; all points are in box coordinates (see ``to_box``)."""
+
+    def __init__(self, config: SceneFieldConfig, seed: int = 0) -> None:
+        super().__init__()
+        self.config = config
+        generator = torch.Generator().manual_seed(seed)
+        self.grid = HashGrid(config.grid, generator)
+        self.density_1 = _linear(config.grid.width, config.hidden, generator)
+        self.density_2 = _linear(config.hidden, 1 + config.features, generator)
+        self.colour_1 = _linear(config.colour_inputs, config.hidden, generator)
+        self.colour_2 = _linear(config.hidden, 4, generator)  # red, green, blue, unused: kernels take outputs in fours
+        self.background = nn.Parameter(torch.zeros(config.features))
+
+    def to_box(self, points_in_world: Tensor) -> Tensor:
+        """World points ``[..., 3]`` [m] in box coordinates: from the low corner, in units of the longest side."""
+        low = torch.tensor(self.config.box_low_m, dtype=points_in_world.dtype, device=points_in_world.device)
+        return (points_in_world - low) / self.config.extent_m
+
+    def density_and_features(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Density per box side ``[N]`` and features ``[N, C]`` in (-1, 1) at points ``[N, 3]`` in box coordinates."""
+        hidden = torch.relu(self.density_1(self.grid(points)))
+        out = self.density_2(hidden)
+        return torch.exp(out[:, 0].clamp(max=MAX_LOG_DENSITY)), nn.functional.softsign(out[:, 1:])
+
+    def decode(self, features: Tensor, directions: Tensor) -> Tensor:
+        """Colours ``[N, 3]`` in 0..1 of accumulated features ``[N, C]`` seen along unit ``directions [N, 3]``."""
+        inputs = torch.cat([features, spherical_harmonics(directions, self.config.direction_bands)], dim=-1)
+        inputs = nn.functional.pad(inputs, (0, self.config.colour_inputs - inputs.shape[-1]))
+        return torch.sigmoid(self.colour_2(torch.relu(self.colour_1(inputs)))[:, :3])
+
+    def density_and_colour(self, points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+        """Density per box side ``[N]`` and the colour ``[N, 3]`` that an opaque surface at each point would have."""
+        density, features = self.density_and_features(points)
+        return density, self.decode(features, directions)
+
+    def arrays(self) -> dict[str, NDArray[np.float32]]:
+        """Parameters by name as numpy arrays that share their memory (CPU only)."""
+        return {name: value.detach().numpy() for name, value in self.named_parameters()}
+
+
+def _linear(inputs: int, outputs: int, generator: torch.Generator) -> nn.Linear:
+    layer = nn.Linear(inputs, outputs)
+    bound = (6.0 / inputs) ** 0.5  # He et al. 2015 for rectifiers
+    nn.init.uniform_(layer.weight, -bound, bound, generator=generator)
+    nn.init.zeros_(layer.bias)
+    return layer
+
+
+def scene_hash(scene: SceneField, occupancy: NDArray[np.bool_]) -> str:
+    """Content hash of a trained scene: its configuration, weights and occupancy; 16 hexadecimal digits."""
+    digest = hashlib.sha256(json.dumps(asdict(scene.config), sort_keys=True).encode())
+    for name, value in sorted(scene.named_parameters()):
+        digest.update(name.encode() + value.detach().cpu().numpy().tobytes())
+    digest.update(np.packbits(occupancy).tobytes())
+    return digest.hexdigest()[:16]
+
+
+def save_scene(
+    path: Path, scene: SceneField, occupancy: NDArray[np.bool_], metadata: dict[str, Any] | None = None
+) -> str:
+    """Write a trained scene to one ``.safetensors`` file, atomically.
+
+    Args:
+        path: The file.
+        scene: The field.
+        occupancy: Cells where something is ``[X, Y, Z]``.
+        metadata: Anything JSON can hold: how it was trained, figures.
+
+    Returns:
+        The scene's hash.
+    """
+    tensors = {name: value.detach().cpu().contiguous() for name, value in scene.named_parameters()}
+    tensors["occupancy_bits"] = torch.from_numpy(np.packbits(occupancy))
+    content = scene_hash(scene, occupancy)
+    header = {
+        "format": FORMAT,
+        "config": json.dumps(asdict(scene.config)),
+        "occupancy_shape": json.dumps(list(occupancy.shape)),
+        "scene_hash": content,
+        "metadata": json.dumps(metadata or {}),
+    }
+    write_atomically(Path(path), save_tensors(tensors, header))
+    return content
+
+
+def load_scene(path: Path) -> tuple[SceneField, NDArray[np.bool_], dict[str, Any]]:
+    """Read a scene file: field, occupancy ``[X, Y, Z]``, metadata (with ``scene_hash``).
+
+    Raises:
+        SceneFileError: The file is missing, damaged, or something else.
+    """
+    path = Path(path)
+    try:
+        with safe_open(str(path), framework="pt") as file:
+            header = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a dict
+    except (OSError, SafetensorError) as error:
+        raise SceneFileError(f"expected a scene file at {path}, got: {error}; train the scene again") from error
+    if header.get("format") != FORMAT:
+        raise SceneFileError(f"expected format {FORMAT} in {path}, got {header.get('format')}; train the scene again")
+    scene = SceneField(SceneFieldConfig.from_dict(json.loads(header["config"])))
+    shape = tuple(json.loads(header["occupancy_shape"]))
+    occupancy = (
+        np.unpackbits(tensors.pop("occupancy_bits").numpy(), count=int(np.prod(shape))).reshape(shape).astype(bool)
+    )
+    try:
+        scene.load_state_dict(tensors)
+    except RuntimeError as error:
+        raise SceneFileError(f"expected weights that fit the configuration in {path}, got: {error}") from error
+    metadata = {**json.loads(header["metadata"]), "scene_hash": header["scene_hash"]}
+    return scene, occupancy, metadata

@@ -1,0 +1,111 @@
+"""Rendering a trained scene field without gradients, fast: what the attack and the data for policies are made from."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
+
+from advnerf_core.geometry import Pinhole
+from advnerf_core.parallel import run_slots, slot_bounds
+from advnerf_core.render.occupancy import leap_distances
+from advnerf_core.render.rays import intrinsics_row, poses_in_box
+from advnerf_core.scene.colour import ColourMap
+from advnerf_core.scene.field import SceneField, load_scene
+from advnerf_core.scene.render_kernels import SIDE, render_tiles
+from advnerf_core.scene.train_step import MarchConfig
+
+_SLOTS = 16
+
+
+class FieldRenderer:
+    """Renders images, planar depth and opacity of a trained field on the CPU; same inputs, same bits.
+
+    Args:
+        scene: The field; a copy of its weights is taken.
+        occupied: Cells where something is ``[X, Y, Z]``.
+        march: How samples were placed in training; intervals here are the same.
+        colour_map: Applied to all colours: from the camera that learned the scene to the one that is rendered.
+        least_transmittance: A ray stops when so little light would still come through.
+    """
+
+    def __init__(
+        self,
+        scene: SceneField,
+        occupied: NDArray[np.bool_],
+        march: MarchConfig | None = None,
+        colour_map: ColourMap | None = None,
+        least_transmittance: float = 5e-3,
+    ) -> None:
+        self.config, self.march, self.colour_map = scene.config, march or MarchConfig(), colour_map
+        self.least_transmittance = least_transmittance
+        self.samples = 0  # evaluated by the last call, for benchmarks
+        self._weights = {name: value.copy() for name, value in scene.arrays().items()}
+        self._levels = scene.grid.levels
+        cells = np.array(occupied.shape) / self.config.box_high
+        self._leaps = leap_distances(occupied, cells)
+
+    @classmethod
+    def from_file(cls, path: str | Path, colour_map: ColourMap | None = None) -> FieldRenderer:
+        """Renderer of a scene file; the colour map in the file, if any, applies unless another is given."""
+        scene, occupied, metadata = load_scene(Path(path))
+        march = MarchConfig(**metadata["march"]) if "march" in metadata else None
+        if colour_map is None and "colour_map" in metadata:
+            colour_map = ColourMap.from_dict(metadata["colour_map"])
+        return cls(scene, occupied, march, colour_map)
+
+    def render(self, T_world_from_camera: ArrayLike | Tensor, pinhole: Pinhole) -> tuple[Tensor, Tensor, Tensor]:
+        """Render a batch of views.
+
+        Args:
+            T_world_from_camera: Poses ``[B, 4, 4]``.
+            pinhole: Intrinsics of all views.
+
+        Returns:
+            Colours ``[B, H, W, 3]`` in 0..1, planar depth ``[B, H, W]`` [m] (infinite where nothing is) and opacity
+            ``[B, H, W]``, all float32 without history.
+        """
+        if isinstance(T_world_from_camera, Tensor):
+            T_world_from_camera = T_world_from_camera.detach().cpu().numpy()
+        poses = np.asarray(T_world_from_camera, np.float64)
+        if poses.ndim != 3 or poses.shape[1:] != (4, 4):
+            raise ValueError(f"expected poses [B, 4, 4], got {poses.shape}")
+        shape = (len(poses), pinhole.height, pinhole.width)
+        rgb, depth_m, alpha = (
+            np.empty((*shape, 3), np.float32),
+            np.empty(shape, np.float32),
+            np.empty(shape, np.float32),
+        )
+        tiles = len(poses) * -(-pinhole.height // SIDE) * -(-pinhole.width // SIDE)
+        bounds, samples = slot_bounds(tiles, _SLOTS), np.zeros(_SLOTS, np.int64)
+        in_box = poses_in_box(poses, self.config.box_low_m, self.config.extent_m)
+
+        def work(slot: int) -> None:
+            samples[slot] = self._render_tiles(in_box, intrinsics_row(pinhole), bounds[slot], rgb, depth_m, alpha)
+
+        run_slots(work, _SLOTS)
+        self.samples = int(samples.sum())
+        if self.colour_map is not None:
+            rgb = self.colour_map.apply(rgb)
+        return torch.from_numpy(rgb), torch.from_numpy(depth_m), torch.from_numpy(alpha)
+
+    __call__ = render
+
+    def _render_tiles(
+        self, poses: NDArray[np.float32], intrinsics: NDArray[np.float32], bounds: tuple[int, int],
+        rgb: NDArray[np.float32], depth_m: NDArray[np.float32], alpha: NDArray[np.float32],
+    ) -> int:  # fmt: skip
+        w = self._weights
+        return int(
+            render_tiles(
+                poses, intrinsics, *bounds, self.config.box_high, np.float32(self.march.near_m), self.march.steps(),
+                self._leaps.distance, self._leaps.cells, w["grid.table"], self._levels,
+                w["density_1.weight"], w["density_1.bias"], w["density_2.weight"], w["density_2.bias"],
+                w["colour_1.weight"], w["colour_1.bias"], w["colour_2.weight"], w["colour_2.bias"], w["background"],
+                self.config.direction_bands, np.float32(self.least_transmittance), self.march.max_samples,
+                rgb, depth_m, alpha,
+            )
+        )  # fmt: skip

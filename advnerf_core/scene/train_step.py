@@ -1,0 +1,329 @@
+"""One training step on the CPU: march, encode, networks, composite, compare, and all of it backwards, in numba kernels.
+
+The backward pass is written out by hand; tests compare it with torch's automatic differentiation of ``reference_colours``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from advnerf_core.fields.hash_grid import encode, scatter
+from advnerf_core.fields.mlp_kernels import TILE
+from advnerf_core.parallel import run_slots, slot_bounds
+from advnerf_core.render.march_kernels import march
+from advnerf_core.render.occupancy import Leaps
+from advnerf_core.render.volume_kernels import (
+    MIN_TRANSMITTANCE, accumulate, accumulate_backward, gather_columns, mark_visible,
+)  # fmt: skip
+from advnerf_core.scene.field import SceneField
+from advnerf_core.scene.field_kernels import (
+    adam, background_backward, colour_loss, complete_colour_inputs, density_network, two_layers, two_layers_backward,
+)  # fmt: skip
+
+Array32 = NDArray[np.float32]
+
+SLOTS = 8  # parts of the work; fixed, so that sums over slots do not depend on the number of threads
+
+
+@dataclass(frozen=True)
+class MarchConfig:
+    """How samples are placed on rays.
+
+    Attributes:
+        near_m: Nothing is sampled closer to the camera [m].
+        smallest_step_m: Shortest sample interval [m].
+        largest_step_m: Longest sample interval [m].
+        step_growth: Interval per metre of distance, between the two: pixels get wider with distance, so may samples.
+        max_samples: Most samples on one ray.
+    """
+
+    near_m: float = 0.05
+    smallest_step_m: float = 0.004
+    largest_step_m: float = 0.05
+    step_growth: float = 0.008
+    max_samples: int = 384
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.smallest_step_m <= self.largest_step_m or self.max_samples < 1 or self.near_m < 0.0:
+            raise ValueError(f"expected 0 < smallest_step_m <= largest_step_m and max_samples >= 1, got {self}")
+
+    def steps(self, scale: float = 1.0) -> Array32:
+        """Smallest and largest interval [m] and growth ``[3]``, as the kernels read them."""
+        return np.array([self.smallest_step_m, self.largest_step_m, self.step_growth], np.float32) * np.float32(scale)
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """Samples packed by ray.
+
+    Attributes:
+        points: ``[N, 3]`` in box coordinates.
+        t_mid_m: Ray parameters ``[N]`` [m].
+        widths: Intervals ``[N]`` in box coordinates.
+        begins: First sample of each ray ``[R + 1]``.
+    """
+
+    points: Array32
+    t_mid_m: Array32
+    widths: Array32
+    begins: NDArray[np.int64]
+
+    @property
+    def rays(self) -> int:
+        """Number of rays."""
+        return len(self.begins) - 1
+
+
+class Marcher:
+    """Packs the samples of a batch of rays; keeps its memory between batches.
+
+    Args:
+        capacity: Most samples in a batch. Rays that do not fit are left out.
+        config: How samples are placed.
+        box_high: High corner of the box in box coordinates ``[3]``.
+    """
+
+    def __init__(self, capacity: int, config: MarchConfig, box_high: Array32) -> None:
+        self.config, self.box_high = config, box_high
+        room = max(capacity // SLOTS, config.max_samples)
+        self._points, self._t = np.empty((SLOTS, room, 3), np.float32), np.empty((SLOTS, room), np.float32)
+        self._widths = np.empty((SLOTS, room), np.float32)
+
+    def __call__(
+        self, rays: Array32, jitter: Array32, leaps: Leaps, step_scale: float = 1.0
+    ) -> tuple[Samples, NDArray[np.int64]]:
+        """Samples of the rays that fit, and which rays those are ``[R']``."""
+        bounds = slot_bounds(len(rays), SLOTS)
+        begins = [np.zeros(stop - start + 1, np.int64) for start, stop in bounds]
+        fitted = [0] * SLOTS
+        near, steps = np.float32(self.config.near_m), self.config.steps(step_scale)
+
+        def work(slot: int) -> None:
+            start, stop = bounds[slot]
+            fitted[slot] = march(
+                rays, jitter, start, stop, self.box_high, near, steps, leaps.distance, leaps.cells, self._points[slot],
+                self._t[slot], self._widths[slot], begins[slot], self.config.max_samples,
+            )  # fmt: skip
+
+        run_slots(work, SLOTS)
+        counts = [int(begins[slot][fitted[slot]]) for slot in range(SLOTS)]
+        offsets = np.concatenate([[0], np.cumsum(counts)])
+        packed = [begins[slot][: fitted[slot]] + offsets[slot] for slot in range(SLOTS)]
+        samples = Samples(
+            np.concatenate([self._points[slot, : counts[slot]] for slot in range(SLOTS)]),
+            np.concatenate([self._t[slot, : counts[slot]] for slot in range(SLOTS)]),
+            np.concatenate([self._widths[slot, : counts[slot]] for slot in range(SLOTS)]),
+            np.concatenate([*packed, offsets[-1:]]),
+        )
+        kept = np.concatenate([np.arange(bounds[slot][0], bounds[slot][0] + fitted[slot]) for slot in range(SLOTS)])
+        return samples, kept
+
+
+@dataclass(frozen=True)
+class StepResult:
+    """What a training step reports.
+
+    Attributes:
+        loss: Mean Huber loss.
+        mse: Mean squared error.
+        rays: Rays used.
+        samples: Samples used.
+    """
+
+    loss: float
+    mse: float
+    rays: int
+    samples: int
+
+
+class CpuStep:
+    """Gradients and Adam for a scene field on the CPU.
+
+    Args:
+        scene: The field; its parameters are changed in place.
+        huber: Where the loss turns from square to linear.
+    """
+
+    def __init__(self, scene: SceneField, huber: float = 0.1) -> None:
+        self.scene, self.huber = scene, np.float32(huber)
+        self.values = scene.arrays()
+        self.grads = {name: np.zeros_like(value) for name, value in self.values.items()}
+        self.means = {name: np.zeros_like(value) for name, value in self.values.items()}
+        self.squares = {name: np.zeros_like(value) for name, value in self.values.items()}
+        self._buffers: dict[str, Array32] = {}
+
+    def visible(self, samples: Samples, least_weight: float = 5e-4) -> tuple[Samples, Array32]:
+        """Samples that show in the image, and their encodings in tiles ``[tiles, K, TILE]``.
+
+        Behind a surface, and in air that the occupancy grid is too coarse to leave out, weights and therefore gradients vanish;
+        everything after the density is spared there.
+        """
+        v, n = self.values, len(samples.points)
+        tiles, rows = -(-n // TILE), self.scene.config.grid.width
+        encoded, logs = self._buffer("encoded_all", tiles, rows), self._buffer("log_density", tiles, 2)
+        _clear_tail(encoded, n)
+        encode(samples.points, n, v["grid.table"], self.scene.grid.levels, encoded)
+        w2, b2 = np.ascontiguousarray(v["density_2.weight"][:2]), np.ascontiguousarray(v["density_2.bias"][:2])
+        bounds, ray_bounds = slot_bounds(tiles, SLOTS), slot_bounds(samples.rays, SLOTS)
+        w1, b1 = v["density_1.weight"], v["density_1.bias"]
+        run_slots(lambda s: two_layers(w1, b1, w2, b2, encoded, logs, *bounds[s]), SLOTS)
+        keep, least = np.empty(n, np.bool_), np.float32(least_weight)
+        run_slots(lambda s: mark_visible(logs, samples.widths, samples.begins, *ray_bounds[s], least, keep), SLOTS)
+        kept = np.flatnonzero(keep)
+        compact = self._buffer("encoded", -(-len(kept) // TILE), rows)
+        columns = slot_bounds(len(kept), SLOTS, TILE)
+        run_slots(lambda s: gather_columns(encoded, kept, *columns[s], compact), SLOTS)
+        before = np.concatenate([[0], np.cumsum(keep)])
+        return (
+            Samples(samples.points[kept], samples.t_mid_m[kept], samples.widths[kept], before[samples.begins]),
+            compact,
+        )
+
+    def gradients(
+        self, rays: Array32, targets: NDArray[np.uint8], noise: Array32, samples: Samples, encoded: Array32
+    ) -> StepResult:
+        """Add the gradient of the mean Huber loss of a batch to ``grads``.
+
+        Args:
+            rays: ``[R, 6]`` in box coordinates.
+            targets: Pixels ``[R, 3]``.
+            noise: Added to the features of the background ``[R, C]``.
+            samples: Samples of those rays.
+            encoded: Their encodings ``[tiles, K, TILE]``, overwritten.
+        """
+        v, n_rays, n = self.values, len(rays), len(samples.points)
+        tiles, ray_tiles = -(-n // TILE), -(-n_rays // TILE)
+        field = self._buffer("field", tiles, 1 + self.scene.config.features)
+        inputs = self._buffer("inputs", ray_tiles, self.scene.config.colour_inputs)
+        colours = self._buffer("colours", ray_tiles, 4)
+        weights, grad_weights = np.empty(n, np.float32), np.zeros(n, np.float32)
+        alpha, grad_alpha = np.empty(n_rays, np.float32), np.empty(n_rays, np.float32)
+        _clear_tail(encoded, n)
+        sample_slots, ray_slots = slot_bounds(tiles, SLOTS), slot_bounds(n_rays, SLOTS, TILE)
+        density = (v["density_1.weight"], v["density_1.bias"], v["density_2.weight"], v["density_2.bias"])
+        run_slots(lambda s: density_network(*density, encoded, field, *sample_slots[s]), SLOTS)
+        slot_grads = [self._small_grads() for _ in range(SLOTS)]
+        sums = np.zeros((SLOTS, 2))
+        if n_rays % TILE:
+            inputs[-1], colours[-1] = 0.0, 0.0
+
+        def shade(slot: int) -> None:
+            accumulate(field, samples.widths, samples.begins, *ray_slots[slot], weights, inputs, alpha)
+            sums[slot] = self._shade(
+                slot_grads[slot], rays, targets, noise, inputs, colours, alpha, grad_alpha, ray_slots[slot]
+            )
+            accumulate_backward(
+                field, samples.widths, samples.begins, *ray_slots[slot], weights, inputs, grad_alpha, grad_weights
+            )
+
+        run_slots(shade, SLOTS)
+        _clear_tail(field, n)
+
+        def density_backward(slot: int) -> None:
+            g = slot_grads[slot]
+            two_layers_backward(
+                *density[:3], encoded, field, *sample_slots[slot],
+                g["density_1.weight"], g["density_1.bias"], g["density_2.weight"], g["density_2.bias"],
+            )  # fmt: skip
+
+        run_slots(density_backward, SLOTS)
+        scatter(samples.points, n, encoded, self.scene.grid.levels, self.grads["grid.table"])
+        for name in slot_grads[0]:
+            for g in slot_grads:
+                self.grads[name] += g[name]
+        loss, square = sums.sum(axis=0) / (3.0 * max(n_rays, 1))
+        return StepResult(float(loss), float(square), n_rays, n)
+
+    def _shade(
+        self, grads: dict[str, Array32], rays: Array32, targets: NDArray[np.uint8], noise: Array32, inputs: Array32,
+        colours: Array32, alpha: Array32, grad_alpha: Array32, bounds: tuple[int, int],
+    ) -> tuple[float, float]:  # fmt: skip
+        """Decode, compare and differentiate the rays of a slot; ``inputs`` become their gradient."""
+        v, (start, stop) = self.values, bounds
+        tiles = (start // TILE, -(-stop // TILE))
+        complete_colour_inputs(
+            inputs, rays, alpha, v["background"], noise, self.scene.config.direction_bands, start, stop
+        )
+        w1, b1, w2, b2 = v["colour_1.weight"], v["colour_1.bias"], v["colour_2.weight"], v["colour_2.bias"]
+        two_layers(w1, b1, w2, b2, inputs, colours, *tiles)
+        scale = np.float32(1.0 / (3.0 * len(rays)))
+        if stop % TILE:
+            colours[tiles[1] - 1, :, stop % TILE :] = 0.0  # columns without a ray have no gradient
+        sums = colour_loss(colours, targets, start, stop, self.huber, scale)
+        two_layers_backward(
+            w1, b1, w2, inputs, colours, *tiles,
+            grads["colour_1.weight"], grads["colour_1.bias"], grads["colour_2.weight"], grads["colour_2.bias"],
+        )  # fmt: skip
+        background_backward(inputs, alpha, v["background"], noise, start, stop, grad_alpha, grads["background"])
+        return sums
+
+    def update(self, step: int, rate: float) -> None:
+        """Adam with the gradients gathered since the last update; ``step`` counts from 0."""
+        mean_scale, square_scale = np.float32(1 / (1 - 0.9 ** (step + 1))), np.float32(1 / (1 - 0.99 ** (step + 1)))
+        for name, value in self.values.items():
+            flat = [a.reshape(-1) for a in (value, self.grads[name], self.means[name], self.squares[name])]
+            bounds = slot_bounds(len(flat[0]), SLOTS if name == "grid.table" else 1, 16)
+
+            def work(slot: int, flat: Any = flat, bounds: Any = bounds, table: bool = name == "grid.table") -> None:
+                part = slice(*bounds[slot])
+                adam(*(a[part] for a in flat), np.float32(rate), mean_scale, square_scale, table)
+
+            run_slots(work, len(bounds))
+
+    def log_density(self, points: Array32) -> Array32:
+        """Logarithm of density per box side ``[N]`` at points ``[N, 3]`` in box coordinates."""
+        return log_density(self.scene, points)
+
+    def _small_grads(self) -> dict[str, Array32]:
+        return {name: np.zeros_like(value) for name, value in self.values.items() if name != "grid.table"}
+
+    def _buffer(self, name: str, tiles: int, rows: int) -> Array32:
+        held = self._buffers.get(name)
+        if held is None or len(held) < tiles:
+            held = self._buffers[name] = np.zeros((tiles + tiles // 8, rows, TILE), np.float32)
+        return held[:tiles]
+
+
+def log_density(scene: SceneField, points: Array32) -> Array32:
+    """Logarithm of density per box side ``[N]`` at points ``[N, 3]`` in box coordinates (CPU kernels)."""
+    v, n = scene.arrays(), len(points)
+    tiles = -(-n // TILE)
+    encoded = np.zeros((tiles, scene.config.grid.width, TILE), np.float32)
+    out = np.empty((tiles, 2, TILE), np.float32)
+    encode(np.ascontiguousarray(points, np.float32), n, v["grid.table"], scene.grid.levels, encoded)
+    w2, b2 = np.ascontiguousarray(v["density_2.weight"][:2]), np.ascontiguousarray(v["density_2.bias"][:2])
+    bounds = slot_bounds(tiles, SLOTS)
+    run_slots(lambda s: two_layers(v["density_1.weight"], v["density_1.bias"], w2, b2, encoded, out, *bounds[s]), SLOTS)
+    return np.ascontiguousarray(out[:, 0]).reshape(-1)[:n]
+
+
+def reference_colours(scene: SceneField, rays: Tensor, noise: Tensor, samples: Samples) -> Tensor:
+    """Colours ``[R, 3]`` of rays ``[R, 6]`` in plain torch, on the scene's device, differentiable to its parameters."""
+    device, dtype = scene.background.device, scene.background.dtype
+    counts = torch.from_numpy(np.diff(samples.begins)).to(device)
+    ray_of = torch.repeat_interleave(torch.arange(samples.rays, device=device), counts)
+    density, features = scene.density_and_features(torch.from_numpy(samples.points).to(device, dtype))
+    depth = density * torch.from_numpy(samples.widths).to(device, dtype)
+    before = torch.cumsum(depth, 0) - depth
+    begins = torch.from_numpy(samples.begins[:-1]).to(device).clamp(max=max(len(depth) - 1, 0))
+    through = torch.exp(-(before - before[begins][ray_of]))
+    through = torch.where(through < MIN_TRANSMITTANCE, torch.zeros_like(through), through)
+    weights = through * (1.0 - torch.exp(-depth))
+    total = torch.zeros(samples.rays, features.shape[1], device=device, dtype=dtype).index_add(
+        0, ray_of, weights[:, None] * features
+    )
+    alpha = torch.zeros(samples.rays, device=device, dtype=dtype).index_add(0, ray_of, weights)
+    directions = torch.nn.functional.normalize(rays[:, 3:].to(device, dtype), dim=-1)
+    return scene.decode(total + (1.0 - alpha)[:, None] * (scene.background + noise.to(device, dtype)), directions)
+
+
+def _clear_tail(tiles: Array32, count: int) -> None:
+    """Zero the columns after ``count`` in the last tile, which the networks read but nobody wrote."""
+    if count % TILE:
+        tiles[-1, :, count % TILE :] = 0.0
