@@ -72,7 +72,7 @@ def slot_bounds(count: int, slots: int, multiple: int = 1) -> list[tuple[int, in
     blocks = -(-count // multiple)
     edges = [min(count, (blocks * slot // slots) * multiple) for slot in range(slots + 1)]
     edges[-1] = count
-    return list(zip(edges[:-1], edges[1:], strict=True))
+    return list(itertools.pairwise(edges))
 
 
 def _pool(size: int) -> ThreadPoolExecutor:

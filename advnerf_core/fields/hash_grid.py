@@ -108,10 +108,8 @@ def encode_reference(points: Tensor, table: Tensor, levels: NDArray[np.int64]) -
         for corner in range(8):
             bits = torch.tensor([corner & 1, corner >> 1 & 1, corner >> 2 & 1], device=points.device)
             x, y, z = (low + bits).unbind(-1)
-            if dense:
-                row = x + (cells + 1) * (y + (cells + 1) * z)
-            else:
-                row = (x ^ (y * PRIME_Y) ^ (z * PRIME_Z)) & mask
+            plain, hashed = x + (cells + 1) * (y + (cells + 1) * z), x ^ (y * PRIME_Y) ^ (z * PRIME_Z)
+            row = plain if dense else hashed & mask
             weight = torch.where(bits.bool(), fraction, 1.0 - fraction).prod(-1, keepdim=True)
             total = total + weight * table[first + row]
         encoded.append(total)

@@ -161,3 +161,44 @@ def accumulate_backward(
             # Dropped samples, and those past the clamp, do not move the image.
             moves = weight > _f(0.0) and raw < _TOP
             field[tile, 0, lane] = depth * (through * grad_weights[n] - total) if moves else _f(0.0)
+
+
+@njit(**KERNEL_OPTIONS)
+def add_distortion_gradient(
+    weights: Array32,
+    middles: Array32,
+    widths: Array32,
+    begins: Array64i,
+    first: int,
+    stop: int,
+    scale: np.float32,
+    grad_weights: Array32,
+) -> None:
+    """Gradient of the distortion loss, which pulls the weights of a ray together into one surface.
+
+    ``L = sum_ij w_i w_j |m_i - m_j| + 1/3 sum_i w_i^2 d_i`` per ray (Barron et al. 2022, "Mip-NeRF 360", equation 15), in linear
+    time since samples are sorted. Differentiated to weights only: samples are where they are.
+
+    Args:
+        weights: ``[N]``.
+        middles: Where samples lie along their rays, any unit ``[N]``.
+        widths: Their intervals in the same unit ``[N]``.
+        begins: First sample of each ray ``[R + 1]``.
+        first: First ray.
+        stop: One past the last ray.
+        scale: Factor on the gradient.
+        grad_weights: ``[N]``, added to.
+    """
+    for r in range(first, stop):
+        total, moment = _f(0.0), _f(0.0)
+        for n in range(begins[r], begins[r + 1]):
+            total += weights[n]
+            moment += weights[n] * middles[n]
+        before, moment_before = _f(0.0), _f(0.0)
+        for n in range(begins[r], begins[r + 1]):
+            w, m = weights[n], middles[n]
+            after, moment_after = total - before - w, moment - moment_before - w * m
+            apart = m * (before - after) - (moment_before - moment_after)
+            grad_weights[n] += scale * (_f(2.0) * apart + _f(2.0 / 3.0) * w * widths[n])
+            before += w
+            moment_before += w * m

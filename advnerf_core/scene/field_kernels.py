@@ -66,7 +66,6 @@ def complete_colour_inputs(
     rays: Array32,
     alpha: Array32,
     background: Array32,
-    noise: Array32,
     bands: int,
     first: int,
     stop: int,
@@ -78,7 +77,6 @@ def complete_colour_inputs(
         rays: ``[R, 6]``.
         alpha: ``[R]``.
         background: Features of the far background ``[C]``.
-        noise: Added to them, ``[R, C]``.
         bands: Bands of spherical harmonics.
         first: First ray.
         stop: One past the last ray.
@@ -87,7 +85,7 @@ def complete_colour_inputs(
     for r in range(first, stop):
         block, column = r // TILE, r % TILE
         for c in range(channels):
-            inputs[block, c, column] += (_ONE - alpha[r]) * (background[c] + noise[r, c])
+            inputs[block, c, column] += (_ONE - alpha[r]) * background[c]
         x, y, z = rays[r, 3], rays[r, 4], rays[r, 5]
         scale = _ONE / np.sqrt(x * x + y * y + z * z)
         write_spherical_harmonics(x * scale, y * scale, z * scale, bands, inputs[block], channels, column)
@@ -129,19 +127,19 @@ def colour_loss(
 
 @njit(**KERNEL_OPTIONS)
 def background_backward(
-    grad_inputs: Array32, alpha: Array32, background: Array32, noise: Array32, first: int, stop: int, grad_alpha: Array32,
-    grad: Array32,
+    grad_inputs: Array32, alpha: Array32, background: Array32, first: int, stop: int, grad_alpha: Array32,
+    grad: Array32, pull: np.float32,
 ) -> None:  # fmt: skip
-    """Gradients of ``complete_colour_inputs``: ``grad_alpha [R]`` written, ``grad [C]`` of the background added to."""
+    """Gradients of ``complete_colour_inputs``: ``grad_alpha [R]`` written, less ``pull``; ``grad [C]`` of the background added to."""
     channels = background.shape[0]
     for r in range(first, stop):
         block, column = r // TILE, r % TILE
         total = _f(0.0)
         for c in range(channels):
             g = grad_inputs[block, c, column]
-            total += g * (background[c] + noise[r, c])
+            total += g * background[c]
             grad[c] += g * (_ONE - alpha[r])
-        grad_alpha[r] = -total
+        grad_alpha[r] = -total - pull
 
 
 @njit(**KERNEL_OPTIONS)

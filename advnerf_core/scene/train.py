@@ -45,12 +45,13 @@ class TrainConfig:
         learning_rate: Adam's rate at the start.
         final_rate: Factor on the rate at the end; between, it falls exponentially.
         huber: Where the loss turns from square to linear, in colour units 0..1.
+        distortion: Weight of the distortion loss, which turns fog into surfaces.
         occupancy_resolution: Cells along the longest side of the box.
         occupancy_every: Steps between updates of the occupancy grid.
         warmup_steps: Steps during which sample intervals shrink to their final size and all cells are probed.
         march: How samples are placed.
-        closed: Whether no ray leaves the box unobstructed, as in a room: what lies behind is then noise in training, so that
-            surfaces must be opaque to be seen. Otherwise a constant background is learned.
+        opacity: Weight of the rays' mean transmittance in the loss, for scenes that no ray leaves, such as rooms; 0 for open
+            ones. A constant background is learned for what is left.
         seed: Seed of everything random.
         checkpoint_every_s: Time between checkpoints [s].
     """
@@ -62,11 +63,12 @@ class TrainConfig:
     learning_rate: float = 1e-2
     final_rate: float = 0.03
     huber: float = 0.1
+    distortion: float = 2e-3
     occupancy_resolution: int = 128
     occupancy_every: int = 16
-    warmup_steps: int = 200
+    warmup_steps: int = 256
     march: MarchConfig = field(default_factory=MarchConfig)
-    closed: bool = True
+    opacity: float = 1e-3
     seed: int = 0
     checkpoint_every_s: float = 60.0
 
@@ -129,7 +131,7 @@ class Trainer:
     def __init__(self, images: ImageSet, field_config: SceneFieldConfig, config: TrainConfig | None = None) -> None:
         self.images, self.config = images, config or TrainConfig()
         self.scene = SceneField(field_config, seed=self.config.seed)
-        self.stepper = CpuStep(self.scene, self.config.huber)
+        self.stepper = CpuStep(self.scene, self.config.huber, self.config.distortion, self.config.opacity)
         self.occupancy = OccupancyGrid(field_config.box_high, self.config.occupancy_resolution, self.config.seed)
         self.step, self.elapsed_s = 0, 0.0
         self.rays_per_step = min(self.config.max_rays, 2048)
@@ -192,10 +194,7 @@ class Trainer:
         colours = np.empty((self.rays_per_step, 3), np.uint8)
         pixel_rays(pixels, self.images.rgb, self._poses, self._intrinsics, rays, colours)
         samples, kept = self._marcher(rays, rng.random(len(rays), dtype=np.float32), self._leaps, self._step_scale())
-        noise = np.zeros((len(kept), self.scene.config.features), np.float32)
-        if config.closed:
-            noise = rng.uniform(-1.0, 1.0, noise.shape).astype(np.float32)
-        result = self._optimise(rays[kept], colours[kept], noise, samples)
+        result = self._optimise(rays[kept], colours[kept], samples)
         per_ray = max(len(samples.points) / max(len(kept), 1), 1.0)
         wanted = config.samples_per_step / per_ray
         # Follow slowly: the next batch may hold more samples per ray than this one.
@@ -254,8 +253,8 @@ class Trainer:
         # The grid in use is the one of the last update, which the saved densities are.
         self._leaps = leap_distances(self.occupied(), self.occupancy.cells) if self.step else None
 
-    def _optimise(self, rays: Array32, colours: NDArray[np.uint8], noise: Array32, samples: Samples) -> StepResult:
-        result = self.stepper.gradients(rays, colours, noise, *self.stepper.visible(samples))
+    def _optimise(self, rays: Array32, colours: NDArray[np.uint8], samples: Samples) -> StepResult:
+        result = self.stepper.gradients(rays, colours, *self.stepper.visible(samples))
         if not math.isfinite(result.loss):
             raise AdvnerfError(
                 f"expected a finite loss, got {result.loss} at step {self.step}; lower the learning rate "
@@ -274,7 +273,7 @@ class Trainer:
 
     def _step_scale(self) -> float:
         """Factor on sample intervals: long while everything counts as occupied, 1 from the end of the warm-up."""
-        return 1.0 + 3.0 * max(0.0, 1.0 - self.step / max(self.config.warmup_steps, 1))
+        return 1.0 + 5.0 * max(0.0, 1.0 - self.step / max(self.config.warmup_steps, 1))
 
     def _report(self, progress: Callable[[Progress], None] | None) -> None:
         recent, self._recent = self._recent, []

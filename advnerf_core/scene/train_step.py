@@ -19,11 +19,22 @@ from advnerf_core.parallel import run_slots, slot_bounds
 from advnerf_core.render.march_kernels import march
 from advnerf_core.render.occupancy import Leaps
 from advnerf_core.render.volume_kernels import (
-    MIN_TRANSMITTANCE, accumulate, accumulate_backward, gather_columns, mark_visible,
+    MIN_TRANSMITTANCE,
+    accumulate,
+    accumulate_backward,
+    add_distortion_gradient,
+    gather_columns,
+    mark_visible,
 )  # fmt: skip
 from advnerf_core.scene.field import SceneField
 from advnerf_core.scene.field_kernels import (
-    adam, background_backward, colour_loss, complete_colour_inputs, density_network, two_layers, two_layers_backward,
+    adam,
+    background_backward,
+    colour_loss,
+    complete_colour_inputs,
+    density_network,
+    two_layers,
+    two_layers_backward,
 )  # fmt: skip
 
 Array32 = NDArray[np.float32]
@@ -148,10 +159,13 @@ class CpuStep:
     Args:
         scene: The field; its parameters are changed in place.
         huber: Where the loss turns from square to linear.
+        distortion: Weight of the distortion loss, with distances in box sides.
+        opacity: Weight of the mean transmittance of rays in the loss.
     """
 
-    def __init__(self, scene: SceneField, huber: float = 0.1) -> None:
+    def __init__(self, scene: SceneField, huber: float = 0.1, distortion: float = 0.0, opacity: float = 0.0) -> None:
         self.scene, self.huber = scene, np.float32(huber)
+        self.distortion, self.opacity = distortion, opacity
         self.values = scene.arrays()
         self.grads = {name: np.zeros_like(value) for name, value in self.values.items()}
         self.means = {name: np.zeros_like(value) for name, value in self.values.items()}
@@ -185,15 +199,12 @@ class CpuStep:
             compact,
         )
 
-    def gradients(
-        self, rays: Array32, targets: NDArray[np.uint8], noise: Array32, samples: Samples, encoded: Array32
-    ) -> StepResult:
+    def gradients(self, rays: Array32, targets: NDArray[np.uint8], samples: Samples, encoded: Array32) -> StepResult:
         """Add the gradient of the mean Huber loss of a batch to ``grads``.
 
         Args:
             rays: ``[R, 6]`` in box coordinates.
             targets: Pixels ``[R, 3]``.
-            noise: Added to the features of the background ``[R, C]``.
             samples: Samples of those rays.
             encoded: Their encodings ``[tiles, K, TILE]``, overwritten.
         """
@@ -213,11 +224,18 @@ class CpuStep:
         if n_rays % TILE:
             inputs[-1], colours[-1] = 0.0, 0.0
 
+        middles = samples.t_mid_m / np.float32(self.scene.config.extent_m)
+        pull = np.float32(self.distortion / max(n_rays, 1))
+
         def shade(slot: int) -> None:
             accumulate(field, samples.widths, samples.begins, *ray_slots[slot], weights, inputs, alpha)
             sums[slot] = self._shade(
-                slot_grads[slot], rays, targets, noise, inputs, colours, alpha, grad_alpha, ray_slots[slot]
+                slot_grads[slot], rays, targets, inputs, colours, alpha, grad_alpha, ray_slots[slot]
             )
+            if self.distortion > 0.0:
+                add_distortion_gradient(
+                    weights, middles, samples.widths, samples.begins, *ray_slots[slot], pull, grad_weights
+                )
             accumulate_backward(
                 field, samples.widths, samples.begins, *ray_slots[slot], weights, inputs, grad_alpha, grad_weights
             )
@@ -241,15 +259,13 @@ class CpuStep:
         return StepResult(float(loss), float(square), n_rays, n)
 
     def _shade(
-        self, grads: dict[str, Array32], rays: Array32, targets: NDArray[np.uint8], noise: Array32, inputs: Array32,
+        self, grads: dict[str, Array32], rays: Array32, targets: NDArray[np.uint8], inputs: Array32,
         colours: Array32, alpha: Array32, grad_alpha: Array32, bounds: tuple[int, int],
     ) -> tuple[float, float]:  # fmt: skip
         """Decode, compare and differentiate the rays of a slot; ``inputs`` become their gradient."""
         v, (start, stop) = self.values, bounds
         tiles = (start // TILE, -(-stop // TILE))
-        complete_colour_inputs(
-            inputs, rays, alpha, v["background"], noise, self.scene.config.direction_bands, start, stop
-        )
+        complete_colour_inputs(inputs, rays, alpha, v["background"], self.scene.config.direction_bands, start, stop)
         w1, b1, w2, b2 = v["colour_1.weight"], v["colour_1.bias"], v["colour_2.weight"], v["colour_2.bias"]
         two_layers(w1, b1, w2, b2, inputs, colours, *tiles)
         scale = np.float32(1.0 / (3.0 * len(rays)))
@@ -260,7 +276,8 @@ class CpuStep:
             w1, b1, w2, inputs, colours, *tiles,
             grads["colour_1.weight"], grads["colour_1.bias"], grads["colour_2.weight"], grads["colour_2.bias"],
         )  # fmt: skip
-        background_backward(inputs, alpha, v["background"], noise, start, stop, grad_alpha, grads["background"])
+        pull = np.float32(self.opacity / max(len(rays), 1))
+        background_backward(inputs, alpha, v["background"], start, stop, grad_alpha, grads["background"], pull)
         return sums
 
     def update(self, step: int, rate: float) -> None:
@@ -303,7 +320,7 @@ def log_density(scene: SceneField, points: Array32) -> Array32:
     return np.ascontiguousarray(out[:, 0]).reshape(-1)[:n]
 
 
-def reference_colours(scene: SceneField, rays: Tensor, noise: Tensor, samples: Samples) -> Tensor:
+def reference_colours(scene: SceneField, rays: Tensor, samples: Samples) -> Tensor:
     """Colours ``[R, 3]`` of rays ``[R, 6]`` in plain torch, on the scene's device, differentiable to its parameters."""
     device, dtype = scene.background.device, scene.background.dtype
     counts = torch.from_numpy(np.diff(samples.begins)).to(device)
@@ -320,7 +337,7 @@ def reference_colours(scene: SceneField, rays: Tensor, noise: Tensor, samples: S
     )
     alpha = torch.zeros(samples.rays, device=device, dtype=dtype).index_add(0, ray_of, weights)
     directions = torch.nn.functional.normalize(rays[:, 3:].to(device, dtype), dim=-1)
-    return scene.decode(total + (1.0 - alpha)[:, None] * (scene.background + noise.to(device, dtype)), directions)
+    return scene.decode(total + (1.0 - alpha)[:, None] * scene.background, directions)
 
 
 def _clear_tail(tiles: Array32, count: int) -> None:
