@@ -20,9 +20,12 @@ class ExpertConfig:
         wheelbase_m: Distance between the axles [m].
         speed_mps: Speed at which it drives [m/s].
         delay_s: From seeing to wheels that have turned: half a control tick, computing, command delay and servo lag [s].
-        stiffness_1pm: Natural frequency of the return to the path, per metre driven [1/m].
+        stiffness_1pm: Natural frequency of the return to the path, per metre driven [1/m]. A steering error that is worth a
+            curvature ``k`` costs ``k / stiffness^2`` of offset, so this decides how much a fooled policy can be led astray.
         damping: Damping ratio of that return.
         max_approach_rad: The path is never approached more steeply than this [rad].
+        feed_forward: Share of the path's curvature that is steered ahead, 0..1. At 0 it is the plain PD law on the tracked pose,
+            which runs wide in corners by ``curvature / stiffness^2``; at 1 it holds them.
         smoothing_m: Path curvature is averaged over this length, so that the steering is continuous in the state [m].
         steering_limits_rad: Rightmost and leftmost steering [rad], inside what the policy can express.
     """
@@ -30,9 +33,10 @@ class ExpertConfig:
     wheelbase_m: float = 0.25
     speed_mps: float = 0.8
     delay_s: float = 0.16
-    stiffness_1pm: float = 2.0
+    stiffness_1pm: float = 1.0
     damping: float = 1.0
     max_approach_rad: float = 0.6
+    feed_forward: float = 1.0
     smoothing_m: float = 0.24
     steering_limits_rad: tuple[float, float] = (-0.26, 0.29)
 
@@ -40,8 +44,8 @@ class ExpertConfig:
         positive = (
             self.wheelbase_m, self.speed_mps, self.stiffness_1pm, self.damping, self.max_approach_rad, self.smoothing_m
         )  # fmt: skip
-        if not (min(positive) > 0.0 and self.delay_s >= 0.0):
-            raise ValueError(f"expected positive expert settings and a delay >= 0, got {self}")
+        if not (min(positive) > 0.0 and self.delay_s >= 0.0 and 0.0 <= self.feed_forward <= 1.0):
+            raise ValueError(f"expected positive expert settings, a delay >= 0 and a feed-forward of 0..1, got {self}")
 
 
 class Expert:
@@ -71,7 +75,7 @@ class Expert:
         heading_error = wrap_angle(yaw - at.heading_rad)
         error = at.cte_m + ahead * np.sin(heading_error)
         wanted = -c.max_approach_rad * np.tanh(c.stiffness_1pm / (2.0 * c.damping) * error / c.max_approach_rad)
-        feed_forward = self._parallel_curvature(at.s_m + ahead * np.cos(heading_error), at.cte_m)
+        feed_forward = c.feed_forward * self._parallel_curvature(at.s_m + ahead * np.cos(heading_error), at.cte_m)
         curvature = feed_forward - 2.0 * c.damping * c.stiffness_1pm * (heading_error - wanted)
         return np.clip(np.arctan(c.wheelbase_m * curvature), *c.steering_limits_rad)
 

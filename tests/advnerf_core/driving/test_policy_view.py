@@ -24,14 +24,14 @@ def test_linear_ramp_lands_where_the_intrinsics_say() -> None:
 
 def test_rows_outside_the_crop_are_not_seen() -> None:
     image = np.full((188, 336, 3), 255, np.uint8)
-    image[40:151] = 7
+    image[24:135] = 7
     assert (VIEW.image(image) == 7).all()
 
 
 def test_pinhole_projects_like_the_camera() -> None:
     points = np.array([[0.3, 0.1, 1.0], [-0.5, 0.2, 2.0]])
     scale = np.array([200 / 336, 66 / 111])
-    np.testing.assert_allclose(VIEW.pinhole.project(points), (CAMERA.project(points) - [0, 40]) * scale)
+    np.testing.assert_allclose(VIEW.pinhole.project(points), (CAMERA.project(points) - [0, 24]) * scale)
 
 
 def test_distortion_is_removed() -> None:
