@@ -14,6 +14,7 @@ from hardware.twin.live import LiveLab, LiveLabConfig
 from nodes.runtime.errors import MessageError
 from nodes.runtime.messages import pose_matrix
 from nodes.runtime.node import ACTIVE, MessageInfo, Node, NodeContext, Now, Out, run_node_main
+from nodes.runtime.paths import bus_folder
 
 RESET_TOPIC = "/twin/reset"
 
@@ -36,7 +37,7 @@ class TwinNode(Node):
     @classmethod
     def build(cls, config: TwinConfig, context: NodeContext) -> TwinNode:
         """Build the lab; returns when it can be seen."""
-        return cls(LiveLab(config, context.run_dir))
+        return cls(LiveLab(config, context.run_dir, bus_folder(context.run_dir)))
 
     def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
         """Lift the car to where a ``PoseStamped`` says."""

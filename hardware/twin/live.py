@@ -98,18 +98,21 @@ def _between(a: tuple[int, VehicleState], b: tuple[int, VehicleState], mono_ns: 
 class LiveLab:
     """The whole lab; it lives from construction to `close`.
 
-    In the run folder: ``vesc`` (link to the pty), ``frames`` (socket), ``vesc_wire.csv`` (what the controller read).
+    In the run folder: ``vesc`` (link to the pty), ``vesc_wire.csv`` (what the controller read); in the socket folder: ``frames``.
 
     Args:
         config: All numbers.
-        run_dir: Folder for the link, the socket and the log.
+        run_dir: Folder for the link and the log.
+        socket_dir: Folder for the socket, whose path may have 107 characters at most; None is the run folder.
         ready_timeout_s: How long building the world may take [s].
     """
 
-    def __init__(self, config: LiveLabConfig, run_dir: Path, ready_timeout_s: float = 60.0) -> None:
+    def __init__(
+        self, config: LiveLabConfig, run_dir: Path, socket_dir: Path | None = None, ready_timeout_s: float = 60.0
+    ) -> None:
         self.config = config
         self.vesc_port = run_dir / "vesc"
-        self.frames_path = run_dir / "frames"
+        self.frames_path = (socket_dir or run_dir) / "frames"
         self._stop = threading.Event()
         self._ready = threading.Event()
         self._failure: BaseException | None = None

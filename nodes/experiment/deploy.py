@@ -121,7 +121,7 @@ def _overrides(experiment: Experiment, live: LiveRun) -> list[str]:
     overrides = [
         f"params.calibration={calibration}",
         f"params.policy={policy}",
-        f"policy.policy_sha256={load_policy(policy).sha256}",
+        f"policy.sha256={load_policy(policy).sha256}",
         f"twin.lab={json.dumps(experiment.lab_config.model_dump(mode='json'))}",
     ]
     if live.condition in METHODS:

@@ -16,6 +16,7 @@ import yaml
 from advnerf_core.geometry import planar_pose
 from benchmarks.operator import LiveOperator
 from nodes.runtime.messages import encode, pose_message
+from nodes.runtime.paths import bus_folder
 
 REPOSITORY = Path(__file__).parents[2]
 CALIBRATION = REPOSITORY / "calibration" / "twin"
@@ -40,7 +41,7 @@ class Stack(LiveOperator):
         self.configs = {
             "twin": {"vicon": {"port": port}, "vesc": vesc or TIMEOUT, "start_pose": list(START)},
             "camera": {
-                "source": {"kind": "socket", "path": str(run_dir / "frames")},
+                "source": {"kind": "socket", "path": str(bus_folder(run_dir) / "frames")},
                 "calibration": str(CALIBRATION / "camera.yaml"),
             },
             "vicon": {"port": port, "subjects": ["car", "board"]},

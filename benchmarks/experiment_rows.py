@@ -1,0 +1,133 @@
+"""Rows of the ledger that the full experiment answers: ``python -m benchmarks.experiment_rows runs/full``."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from rosbags.highlevel import AnyReader
+
+from advnerf_core.report.data import ReportData
+from advnerf_core.report.results import read_results
+from advnerf_core.report.tables import TransferRow, find_row, transfer_rows
+from benchmarks.results import record_row
+
+COMMAND = "make experiment"
+Record = Callable[[str, float | str, str, str, bool | None, str], None]
+
+
+def record_fidelity(data: ReportData, record: Record) -> None:
+    assert data.fidelity is not None
+    views = f"{len(data.fidelity.views)} held-out views of the driving camera"
+    for name, key in (("336x188", "psnr_full_db"), ("200x66", "psnr_policy_db")):
+        value = data.fidelity.mean(key)
+        assert value is not None
+        record(f"#2 surrogate on held-out lab views, {name}", value, "dB PSNR", ">= 27 dB", value >= 27.0, views)
+    difference = data.fidelity.steering_difference_rad
+    assert difference is not None
+    record(
+        "#2 surrogate on held-out lab views, steering", difference, "rad mean abs", "<= 0.03 rad", difference <= 0.03, views
+    )
+
+
+def record_transfer(data: ReportData, record: Record) -> None:
+    rows = transfer_rows(data)
+    live = data.select(domain="deployed", condition="gradient", victim="hardened")
+    off = sum(run.off_track for run in live)
+    mean_abs = float(np.mean([run.mean_abs_cte_m for run in live]))
+    gradient = _row(rows, "surrogate", "gradient")
+    record(
+        "#2 total CTE, gradient, surrogate", gradient.ratio or 0.0, "x no attack", ">= 3.3 x",
+        (gradient.ratio or 0.0) >= 3.3, _spread(gradient),
+    )  # fmt: skip
+    gradient = _row(rows, "deployed", "gradient")
+    met = (gradient.ratio or 0.0) >= 3.0 and mean_abs >= 0.25 and off >= 2
+    record(
+        "#2 total CTE, gradient, live green screen", gradient.ratio or 0.0, "x no attack",
+        ">= 3.0 x, mean |CTE| >= 0.25 m, off-track in >= 2 of 3", met,
+        f"mean |CTE| {mean_abs:.3f} m, off-track in {off} of {len(live)}; {_spread(gradient)}",
+    )  # fmt: skip
+    for domain in ("surrogate", "deployed"):
+        random = _row(rows, domain, "random")
+        met = (random.ratio or 0.0) <= 1.5 and (domain == "surrogate" or random.off_track == 0)
+        target = "<= 1.5 x" + ("" if domain == "surrogate" else ", never off-track")
+        note = f"best of {data.settings.random_evaluations}; off-track in {random.off_track} of {random.runs}; {_spread(random)}"
+        record(f"#2 total CTE, best random, {domain}", random.ratio or 0.0, "x no attack", target, met, note)
+
+
+def record_live(data: ReportData, record: Record) -> None:
+    if data.laps is not None:
+        met = not data.laps.off_track and data.laps.mean_abs_cte_m <= 0.08
+        record(
+            "#2 policy, no attack, laps live", data.laps.mean_abs_cte_m, "m mean |CTE|", "<= 0.08 m, never off-track", met,
+            f"{data.laps.laps} laps, off-track: {data.laps.off_track}, worst {np.abs(data.laps.cte_m).max():.3f} m",
+        )  # fmt: skip
+    assert data.latency is not None
+    overall = data.latency.overall
+    met = overall.p99_ms <= data.latency.camera_period_ms and data.latency.missed_ticks == 0
+    record(
+        "#2 capture to serial write, live", overall.p99_ms, "ms p99", "<= 100 ms, no tick missed", met,
+        f"{overall.count} frames, p50 {overall.p50_ms:.1f} ms, worst {overall.max_ms:.1f} ms, {data.latency.missed_ticks} ticks missed",
+    )  # fmt: skip
+
+
+def record_bags(folder: Path, record: Record) -> None:
+    """Open every bag of the run with two independent readers and decode every message."""
+    bags = sorted((folder / "deploy").glob("*/bag"))
+    topics: set[str] = set()
+    messages = 0
+    for bag in bags:
+        with (next(bag.glob("*.mcap"))).open("rb") as stream:
+            reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+            counted = [channel.topic for _, channel, _, decoded in reader.iter_decoded_messages() if decoded is not None]
+        with AnyReader([bag]) as other:
+            decoded_again = [
+                connection.topic
+                for connection, _, raw in other.messages()
+                if other.deserialize(raw, connection.msgtype) is not None
+            ]
+        if len(counted) != len(decoded_again):
+            record("#2 the bag", len(counted), "messages", "every topic decodes in both", False, f"{bag}: {len(decoded_again)}")
+            return
+        topics |= set(counted)
+        messages += len(counted)
+    note = f"{len(bags)} bags, {len(topics)} topics; mcap with mcap-ros2-support and rosbags decode the same messages"
+    record("#2 the bag", messages, "messages", "every topic decodes in both", bool(bags), note)
+
+
+def _row(rows: tuple[TransferRow, ...], domain: str, condition: str) -> TransferRow:
+    row = find_row(rows, domain, condition)  # type: ignore[arg-type]
+    if row is None:
+        raise SystemExit(f"expected {domain} {condition} runs in the report, got none: run make experiment to its end")
+    return row
+
+
+def _spread(row: TransferRow) -> str:
+    return f"{row.runs} runs, total CTE {row.total_cte_mean_m:.1f} +- {row.total_cte_std_m or 0.0:.1f} m"
+
+
+def main() -> None:
+    """Read a finished full run and record its rows."""
+    parser = argparse.ArgumentParser(description=main.__doc__)
+    parser.add_argument("run_folder", type=Path)
+    folder = parser.parse_args().run_folder
+    data = read_results(folder / "report" / "results.json")
+    if data.settings.name != "full":
+        raise SystemExit(f"expected a run of the full setting in {folder}, got {data.settings.name}: use make experiment")
+
+    def record(line: str, value: float | str, unit: str, target: str, met: bool | None, note: str) -> None:
+        record_row(line, value, unit, target, met, COMMAND, note)
+        print(f"{line}: {value if isinstance(value, str) else f'{value:.4g}'} {unit} (target {target}): {met}")
+
+    record_fidelity(data, record)
+    record_transfer(data, record)
+    record_live(data, record)
+    record_bags(folder, record)
+
+
+if __name__ == "__main__":
+    main()
