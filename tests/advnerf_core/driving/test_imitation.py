@@ -224,7 +224,7 @@ def test_fit_learns() -> None:
     torch.manual_seed(0)
     policy = PilotNet()
     before = mean_absolute_error(policy, frames)
-    fit(policy, frames, FitConfig(steps=40, batch_size=8))
+    fit(policy, frames, FitConfig(steps=60, batch_size=16))
     assert mean_absolute_error(policy, frames) < 0.5 * before
 
 
