@@ -11,9 +11,10 @@ import itertools
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 # Kernels may reorder and contract float sums, but must honour NaN and infinity: trainers test for them.
-KERNEL_OPTIONS = {
+KERNEL_OPTIONS: dict[str, Any] = {
     "nogil": True,
     "cache": True,
     "fastmath": {"reassoc", "contract", "nsz", "arcp", "afn"},

@@ -30,7 +30,12 @@ def record_fidelity(data: ReportData, record: Record) -> None:
     difference = data.fidelity.steering_difference_rad
     assert difference is not None
     record(
-        "#2 surrogate on held-out lab views, steering", difference, "rad mean abs", "<= 0.03 rad", difference <= 0.03, views
+        "#2 surrogate on held-out lab views, steering",
+        difference,
+        "rad mean abs",
+        "<= 0.03 rad",
+        difference <= 0.03,
+        views,
     )
 
 
@@ -83,7 +88,9 @@ def record_bags(folder: Path, record: Record) -> None:
     for bag in bags:
         with (next(bag.glob("*.mcap"))).open("rb") as stream:
             reader = make_reader(stream, decoder_factories=[DecoderFactory()])
-            counted = [channel.topic for _, channel, _, decoded in reader.iter_decoded_messages() if decoded is not None]
+            counted = [
+                channel.topic for _, channel, _, decoded in reader.iter_decoded_messages() if decoded is not None
+            ]
         with AnyReader([bag]) as other:
             decoded_again = [
                 connection.topic
@@ -91,7 +98,14 @@ def record_bags(folder: Path, record: Record) -> None:
                 if other.deserialize(raw, connection.msgtype) is not None
             ]
         if len(counted) != len(decoded_again):
-            record("#2 the bag", len(counted), "messages", "every topic decodes in both", False, f"{bag}: {len(decoded_again)}")
+            record(
+                "#2 the bag",
+                len(counted),
+                "messages",
+                "every topic decodes in both",
+                False,
+                f"{bag}: {len(decoded_again)}",
+            )
             return
         topics |= set(counted)
         messages += len(counted)
@@ -117,7 +131,9 @@ def main() -> None:
     folder = parser.parse_args().run_folder
     data = read_results(folder / "report" / "results.json")
     if data.settings.name != "full":
-        raise SystemExit(f"expected a run of the full setting in {folder}, got {data.settings.name}: use make experiment")
+        raise SystemExit(
+            f"expected a run of the full setting in {folder}, got {data.settings.name}: use make experiment"
+        )
 
     def record(line: str, value: float | str, unit: str, target: str, met: bool | None, note: str) -> None:
         record_row(line, value, unit, target, met, COMMAND, note)

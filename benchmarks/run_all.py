@@ -23,7 +23,10 @@ def main() -> int:
     for module in MODULES:
         began = time.monotonic()
         code = subprocess.run([sys.executable, "-m", module], cwd=REPOSITORY).returncode
-        print(f"{module}: {'done' if code == 0 else f'failed with {code}'} in {time.monotonic() - began:.0f} s", flush=True)
+        print(
+            f"{module}: {'done' if code == 0 else f'failed with {code}'} in {time.monotonic() - began:.0f} s",
+            flush=True,
+        )
         if code != 0:
             failed.append(module)
     return 1 if failed else 0

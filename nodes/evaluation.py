@@ -83,7 +83,9 @@ def timing(bag: Path, start_real_ns: int, end_real_ns: int) -> Timing:
         if stamp_ns in inside and not message.braking:
             written.setdefault(stamp_ns, (int(message.serial_write_real_ns) - stamp_ns) / _NS_PER_MS)
     hops = {
-        name: np.array([(published - stamp) / _NS_PER_MS for stamp, published in _stamps(bag, topic) if stamp in inside])
+        name: np.array(
+            [(published - stamp) / _NS_PER_MS for stamp, published in _stamps(bag, topic) if stamp in inside]
+        )
         for name, topic in HOPS.items()
     }
     return Timing(np.array(list(written.values())), hops, len(captured), len(inside - written.keys()))

@@ -202,7 +202,9 @@ class TrialNode(Node):
             self._enter(Phase.STOPPING, now)
             return [self._arm_message(False, now)]
         if not began_ns and self._phase_s(now) > self.plan.patience_s:
-            raise TrialError(f"armed, but the car did not move within {self.plan.patience_s:g} s; is the policy running?")
+            raise TrialError(
+                f"armed, but the car did not move within {self.plan.patience_s:g} s; is the policy running?"
+            )
         return []
 
     def _stop(self, now: Now) -> list[Out]:

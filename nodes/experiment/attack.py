@@ -128,7 +128,9 @@ def _search(
     def told(evaluation: Evaluation) -> None:
         best[0] = max(best[0], evaluation.predicted_total_cte_m)
         done = evaluation.iteration + 1
-        progress(done / wanted, f"{done}/{wanted}, total CTE {evaluation.predicted_total_cte_m:.1f} m, best {best[0]:.1f} m")
+        progress(
+            done / wanted, f"{done}/{wanted}, total CTE {evaluation.predicted_total_cte_m:.1f} m, best {best[0]:.1f} m"
+        )
 
     common: dict[str, Any] = {
         "seed": search.seed, "state_path": folder / f"{search.name}.state.safetensors", "on_evaluation": told,

@@ -80,5 +80,3 @@ def _write_image(path: Path, rgb: NDArray[np.uint8]) -> None:
     if not encoded:
         raise ValueError(f"expected an image that can be written as {path.suffix}, got shape {rgb.shape}")
     write_atomically(path, data.tobytes())
-
-

@@ -28,42 +28,56 @@ class SceneConfig(_Section):
     """How the radiance field is trained; the length is in steps, so that the result does not depend on the machine."""
 
     steps: Positive = Field(default=2500, description="Training iterations.")
-    margin_m: Annotated[float, Field(ge=0)] = Field(default=0.1, description="How far the field's box reaches beyond the walls [m].")
+    margin_m: Annotated[float, Field(ge=0)] = Field(
+        default=0.1, description="How far the field's box reaches beyond the walls [m]."
+    )
     seed: int = 0
 
 
 class PolicyConfig(_Section):
     """How the driving policy is trained: frames per domain, rounds, optimiser steps."""
 
-    lab_stills: Positive = Field(default=1100, description="Lab poses around the path, each seen plain and with random textures.")
-    surrogate_stills: Positive = Field(default=700, description="The same in the surrogate.")
-    lab_drives: Positive = Field(default=10, description="Lab drives of each DAgger round.")
+    lab_stills: Positive = Field(
+        default=900, description="Lab poses around the path, each seen plain and with random textures."
+    )
+    surrogate_stills: Positive = Field(default=600, description="The same in the surrogate.")
+    lab_drives: Positive = Field(default=6, description="Lab drives of each DAgger round.")
     surrogate_drives: Positive = Field(default=8, description="Surrogate drives of each DAgger round.")
     drive_steps: Positive = Field(default=40, description="Control ticks of a drive.")
-    dagger_rounds: Count = Field(default=2, description="Rounds of DAgger.")
-    first_steps: Positive = Field(default=500, description="Optimiser steps of behaviour cloning.")
-    round_steps: Positive = Field(default=250, description="Optimiser steps after each round.")
-    naive_steps: Count = Field(default=500, description="Optimiser steps of the victim that never sees a random texture; 0: none.")
+    dagger_rounds: Count = Field(default=1, description="Rounds of DAgger.")
+    first_steps: Positive = Field(default=350, description="Optimiser steps of behaviour cloning.")
+    round_steps: Positive = Field(default=150, description="Optimiser steps after each round.")
+    naive_steps: Count = Field(
+        default=250, description="Optimiser steps of the victim that never sees a random texture; 0: none."
+    )
     seed: int = 0
 
 
 class ObjectConfig(_Section):
     """The attacked object: one face of a cube where the lab's green board stands."""
 
-    resolution: Annotated[int, Field(ge=2, le=128)] = Field(default=16, description="Grid cells along each side of the face.")
-    plain_rgb: tuple[float, float, float] = Field(default=(0.25, 0.62, 0.3), description="Colour of the plain object, 0..1.")
+    resolution: Annotated[int, Field(ge=2, le=128)] = Field(
+        default=64, description="Grid cells along each side of the face."
+    )
+    plain_rgb: tuple[float, float, float] = Field(
+        default=(0.25, 0.62, 0.3), description="Colour of the plain object, 0..1."
+    )
 
 
 class AttackConfig(_Section):
     """The adversary, and what it may spend."""
 
     starts: Positive = Field(default=1, description="Start poses optimised together; the first is the nominal one.")
-    start_sigma: Annotated[float, Field(ge=0)] = Field(default=0.1, description="Spread of the other starts [m and rad].")
+    start_sigma: Annotated[float, Field(ge=0)] = Field(
+        default=0.1, description="Spread of the other starts [m and rad]."
+    )
     horizon: Positive = Field(default=40, description="Control ticks of the rollout (T).")
     iterations: Positive = Field(default=30, description="Gradient iterations.")
     random_evaluations: Positive = Field(default=10, description="Random textures tried.")
     learning_rate: Annotated[float, Field(gt=0)] = 0.1
-    random_sigma: Annotated[float, Field(gt=0)] = Field(default=5.0, description="Spread of the random textures' theta.")
+    random_sigma: Annotated[float, Field(gt=0)] = Field(
+        default=5.0, description="Spread of the random textures' theta."
+    )
     seeds: tuple[int, ...] = Field(default=(0,), min_length=1, description="One attack per seed.")
     time_batch: Positive = Field(default=16, description="Frames per gradient batch.")
     cache_mib: Annotated[float, Field(ge=0)] = Field(default=512.0, description="Budget of the frame cache [MiB].")
@@ -79,7 +93,9 @@ class DeployConfig(_Section):
     )
     laps: Count = Field(default=0, description="Laps driven live without attack before the runs.")
     empty_scene: bool = Field(default=False, description="Also drive with the board taken away.")
-    ready_timeout_s: Annotated[float, Field(gt=0)] = Field(default=60.0, description="Time for the graph to become ready [s].")
+    ready_timeout_s: Annotated[float, Field(gt=0)] = Field(
+        default=60.0, description="Time for the graph to become ready [s]."
+    )
 
 
 class ExperimentConfig(_Section):

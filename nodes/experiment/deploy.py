@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import socket
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -111,7 +112,9 @@ def live_horizon(experiment: Experiment, live: LiveRun) -> Horizon:
     """Control ticks over which a run is measured."""
     ticks = experiment.config.attack.horizon
     if live.condition == "laps":
-        ticks = round(experiment.config.deploy.laps * experiment.path.length_m / experiment.speed_mps / CONTROL_PERIOD_S)
+        ticks = round(
+            experiment.config.deploy.laps * experiment.path.length_m / experiment.speed_mps / CONTROL_PERIOD_S
+        )
     return Horizon(ticks, CONTROL_PERIOD_S, experiment.room.off_track_m)
 
 
@@ -121,6 +124,7 @@ def _overrides(experiment: Experiment, live: LiveRun) -> list[str]:
     overrides = [
         f"params.calibration={calibration}",
         f"params.policy={policy}",
+        f"params.vicon_port={_free_udp_port()}",
         f"policy.sha256={load_policy(policy).sha256}",
         f"twin.lab={json.dumps(experiment.lab_config.model_dump(mode='json'))}",
     ]
@@ -129,6 +133,13 @@ def _overrides(experiment: Experiment, live: LiveRun) -> list[str]:
     if live.condition == "empty":
         overrides.append(f"twin.lab.board.x_m={_OUT_OF_SIGHT_M}")
     return overrides
+
+
+def _free_udp_port() -> int:
+    """A port for this run's motion capture, so that a lab or another run on this host does not answer."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
 
 
 def _attack_file(experiment: Experiment, live: LiveRun) -> Path:

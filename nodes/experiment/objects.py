@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+import torch
+from numpy.typing import NDArray
 
 from advnerf_core.fields.voxel_grid import VoxelGridObject, cube_face_object
 from advnerf_core.files import write_atomically
@@ -70,15 +72,15 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
         write_atomically(folder / f"{name}.png", data.tobytes())
 
 
-def _previews(experiment: Experiment, field: VoxelGridObject) -> dict[str, Any]:
-    import torch
+def as_uint8(image: torch.Tensor) -> NDArray[np.uint8]:
+    """Image ``[3, H, W]`` in 0..1 as uint8 ``[H, W, 3]``."""
+    return np.ascontiguousarray((image.clamp(0, 1) * 255).round().byte().permute(1, 2, 0).numpy())
 
+
+def _previews(experiment: Experiment, field: VoxelGridObject) -> dict[str, Any]:
     pose = planar_pose(*experiment.room.start_pose) @ experiment.camera.mount
     surrogate = surrogate_of(experiment, [field])
     theta = surrogate.initial_theta(torch.Generator().manual_seed(0))
     plain = surrogate.render(pose[None], theta).images[0]
     bare = surrogate_of(experiment, []).render(pose[None], None).images[0]
-    as_uint8: Callable[[Any], Any] = lambda image: (
-        (image.clamp(0, 1) * 255).round().byte().permute(1, 2, 0).numpy().copy()
-    )
     return {"start_view": as_uint8(bare), "start_view_with_plain_face": as_uint8(plain)}

@@ -94,7 +94,9 @@ def _lab_overlay(experiment: Experiment) -> Overlay:
 
     def overlay(rgb: NDArray[np.uint8], state: Array, texture: Texture) -> NDArray[np.uint8]:
         displayed = face_texture(inverse_squash(texture), _TRAINING_TEXTURE_PX)
-        face = FaceOverlay(displayed, experiment.target.corners, experiment.camera.pinhole, experiment.camera.distortion)
+        face = FaceOverlay(
+            displayed, experiment.target.corners, experiment.camera.pinhole, experiment.camera.distortion
+        )
         T_camera_from_world = T_camera_from_car @ invert_transform(planar_pose(*state[:3]))
         return face.draw(rgb, T_camera_from_world @ T_world_from_face)[0]
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import platform
-import time
 from collections.abc import Iterator
 from datetime import datetime, timezone
 from pathlib import Path
@@ -13,11 +12,11 @@ from typing import Any, Literal
 
 import cv2
 import numpy as np
+import torch
 from rich.console import Console
 
 from advnerf_core.attack.artifact import load_attack
 from advnerf_core.driving.metrics import Horizon
-from advnerf_core.driving.policy import images_to_tensor
 from advnerf_core.geometry import planar_poses
 from advnerf_core.report import data as rd
 from advnerf_core.report import tables, targets
@@ -29,13 +28,12 @@ from nodes.experiment import memory
 from nodes.experiment.attack import METHODS, attack_path, searches, start_states
 from nodes.experiment.context import CONTROL_PERIOD_S, Experiment
 from nodes.experiment.deploy import LiveRun, live_runs
-from nodes.experiment.objects import attacked_object, surrogate_of
+from nodes.experiment.objects import as_uint8, attacked_object, surrogate_of
 from nodes.experiment.policy import HARDENED
 from nodes.runtime.stages import Report, read_record
 
 SHOWN_VIEWS = 6
 _PATH_POINTS = 400
-_CLIP_HEIGHT = 188
 
 
 def run(experiment: Experiment, folder: Path, report: Report) -> None:
@@ -56,7 +54,9 @@ def print_summary(experiment: Experiment, console: Console) -> None:
     console.print(f"report: {folder / 'report.html'}", highlight=False, soft_wrap=True)
 
 
-def _report_data(experiment: Experiment, clips: tuple[rd.Clip, ...], memory_rows: tuple[rd.MemoryRow, ...]) -> rd.ReportData:
+def _report_data(
+    experiment: Experiment, clips: tuple[rd.Clip, ...], memory_rows: tuple[rd.MemoryRow, ...]
+) -> rd.ReportData:
     live = {run.name: _live_result(experiment, run) for run in live_runs(experiment)}
     laps = next((live[run.name] for run in live_runs(experiment) if run.condition == "laps"), None)
     return rd.ReportData(
@@ -145,7 +145,9 @@ def _curves(experiment: Experiment) -> Iterator[rd.LossCurve]:
 def _textures(experiment: Experiment) -> Iterator[rd.Texture]:
     for search in searches(experiment):
         attack = load_attack(attack_path(experiment.stage_folder("attack"), search))
-        label = f"{search.method}, seed {search.seed}" + ("" if search.victim == HARDENED else f", {search.victim} victim")
+        label = f"{search.method}, seed {search.seed}" + (
+            "" if search.victim == HARDENED else f", {search.victim} victim"
+        )
         yield rd.Texture(label, search.method, attack.texture, attack.attack_id, search.seed, search.victim)  # type: ignore[arg-type]
 
 
@@ -161,9 +163,15 @@ def _fidelity(experiment: Experiment) -> rd.Fidelity:
         }
         views.append(
             rd.FidelityView(
-                view["label"], view["psnr_full_db"], view["psnr_policy_db"], view["ssim_full"], view["ssim_policy"],
-                angles["real_rad"], angles["surrogate_rad"], **images,
-            )  # fmt: skip
+                view["label"],
+                view["psnr_full_db"],
+                view["psnr_policy_db"],
+                view["ssim_full"],
+                view["ssim_policy"],
+                angles["real_rad"],
+                angles["surrogate_rad"],
+                **images,
+            )
         )
     return rd.Fidelity(tuple(views))
 
@@ -194,7 +202,11 @@ def _manifest(experiment: Experiment) -> rd.Manifest:
         "system": platform.platform(),
     }  # fmt: skip
     return rd.Manifest(
-        manifest["command"], datetime.now(timezone.utc).isoformat(timespec="seconds"), frozen, manifest["versions"], machine,
+        manifest["command"],
+        datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        frozen,
+        manifest["versions"],
+        machine,
         wall_s=sum(t.wall_s for t in _timings(experiment)),
     )
 
@@ -221,8 +233,6 @@ def _clips(experiment: Experiment, folder: Path) -> tuple[rd.Clip, ...]:
 
 
 def _surrogate_track(experiment: Experiment, seed: int) -> ClipTrack:
-    import torch
-
     search = next(s for s in searches(experiment) if (s.victim, s.method, s.seed) == (HARDENED, METHODS[1], seed))
     folder = experiment.stage_folder("attack")
     states = np.array(json.loads((folder / f"{search.name}.json").read_text())["states"][0])
@@ -231,7 +241,7 @@ def _surrogate_track(experiment: Experiment, seed: int) -> ClipTrack:
     surrogate.camera = experiment.camera.pinhole
     poses = planar_poses(states) @ experiment.camera.mount
     images = [surrogate.render(pose[None], torch.from_numpy(attack.theta)).images[0] for pose in poses]
-    frames = [(image.clamp(0, 1) * 255).round().byte().permute(1, 2, 0).numpy().copy() for image in images]
+    frames = [as_uint8(image) for image in images]
     cte_m = experiment.path.project(states[:, :2]).cte_m
     return ClipTrack("learned scene, attacked", "gradient", frames, cte_m, attack.attack_id)
 

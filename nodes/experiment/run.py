@@ -6,7 +6,7 @@ import json
 import platform
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ from nodes.experiment.context import Experiment
 from nodes.runtime.config import Document, apply_overrides, read_yaml, validate
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import ProgressDisplay
-from nodes.runtime.stages import Stage, StageRecord, run_stages
+from nodes.runtime.stages import Report, Stage, StageRecord, run_stages
 
 STAGES = ("capture", "scene", "policy", "object", "attack", "deploy", "report")
 
@@ -52,7 +52,9 @@ def load_experiment(file: Path, setting: str, overrides: Sequence[str], folder: 
     return Experiment(config, file.resolve(), folder.resolve(), setting)
 
 
-def run_experiment(experiment: Experiment, until: str | None = None, console: Console | None = None) -> dict[str, StageRecord]:
+def run_experiment(
+    experiment: Experiment, until: str | None = None, console: Console | None = None
+) -> dict[str, StageRecord]:
     """Run the stages that are not there yet, and print the result of a finished experiment."""
     console = console or Console()
     began = time.monotonic()
@@ -73,7 +75,10 @@ def stages_of(experiment: Experiment) -> list[Stage]:
 
     def stage(name: str, module: Any, sections: Sequence[BaseModel], after: Sequence[str]) -> Stage:
         settings = {"lab": lab, **{type(s).__name__: s.model_dump(mode="json") for s in sections}}
-        work: Callable[..., None] = lambda folder, told: module.run(experiment, folder, told)
+
+        def work(folder: Path, told: Report) -> None:
+            module.run(experiment, folder, told)
+
         return Stage(name, work, settings, after)
 
     return [
@@ -81,7 +86,9 @@ def stages_of(experiment: Experiment) -> list[Stage]:
         stage("scene", scene, [config.scene], ("capture",)),
         stage("policy", policy, [config.policy, config.object], ("capture", "scene")),
         stage("object", objects, [config.object], ("capture", "scene")),
-        stage("attack", attack, [config.policy, config.object, config.attack], ("capture", "scene", "policy", "object")),
+        stage(
+            "attack", attack, [config.policy, config.object, config.attack], ("capture", "scene", "policy", "object")
+        ),
         stage("deploy", deploy, [config.policy, config.deploy, config.attack], ("capture", "policy", "attack")),
         stage("report", report, [config], ("capture", "scene", "policy", "object", "attack", "deploy")),
     ]

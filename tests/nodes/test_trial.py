@@ -29,7 +29,7 @@ class Stage:
     def step(self):
         self.t_s += 0.05
         if self.armed and self.moves:
-            self.pose = self.pose + [0.04, 0.0, 0.0]
+            self.pose = np.add(self.pose, [0.04, 0.0, 0.0])
         jitter = 1e-4 * np.sin(self.t_s * 1e3)
         T = planar_pose(self.pose[0] + jitter, self.pose[1], self.pose[2])
         self.hear("/vicon/car", pose_message(T, self.now.real_ns))
