@@ -43,7 +43,8 @@ class SceneFieldConfig:
         grid: Hash grid over a cube with the box's longest side.
         hidden: Width of the hidden layer of both networks.
         features: Features per sample that are accumulated and decoded to a colour.
-        direction_bands: Bands of spherical harmonics of the viewing direction; 1 means colours do not depend on it.
+        direction_bands: Bands of spherical harmonics of the viewing direction; 1 means colours do not depend on it, as
+            in a matte room: fog that looks different from every side then explains nothing, and geometry is found sooner.
     """
 
     box_low_m: tuple[float, float, float]
@@ -51,7 +52,7 @@ class SceneFieldConfig:
     grid: HashGridConfig = field(default_factory=lambda: HashGridConfig(levels=8, features=4, finest=2048))
     hidden: int = 64
     features: int = 15
-    direction_bands: int = 3
+    direction_bands: int = 1
 
     def __post_init__(self) -> None:
         if not all(low < high for low, high in zip(self.box_low_m, self.box_high_m, strict=True)):

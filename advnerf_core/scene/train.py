@@ -56,19 +56,19 @@ class TrainConfig:
         checkpoint_every_s: Time between checkpoints [s].
     """
 
-    steps: int = 2500
+    steps: int = 1000
     max_seconds: float | None = None
     samples_per_step: int = 1 << 17
     max_rays: int = 1 << 14
     learning_rate: float = 1e-2
     final_rate: float = 0.03
     huber: float = 0.1
-    distortion: float = 2e-3
+    distortion: float = 1e-2
     occupancy_resolution: int = 128
     occupancy_every: int = 16
     warmup_steps: int = 256
     march: MarchConfig = field(default_factory=MarchConfig)
-    opacity: float = 1e-3
+    opacity: float = 1.5e-3
     seed: int = 0
     checkpoint_every_s: float = 60.0
 
@@ -131,7 +131,7 @@ class Trainer:
     def __init__(self, images: ImageSet, field_config: SceneFieldConfig, config: TrainConfig | None = None) -> None:
         self.images, self.config = images, config or TrainConfig()
         self.scene = SceneField(field_config, seed=self.config.seed)
-        self.stepper = CpuStep(self.scene, self.config.huber, self.config.distortion, self.config.opacity)
+        self.stepper = CpuStep(self.scene, self.config.huber, opacity=self.config.opacity)
         self.occupancy = OccupancyGrid(field_config.box_high, self.config.occupancy_resolution, self.config.seed)
         self.step, self.elapsed_s = 0, 0.0
         self.rays_per_step = min(self.config.max_rays, 2048)
@@ -254,6 +254,8 @@ class Trainer:
         self._leaps = leap_distances(self.occupied(), self.occupancy.cells) if self.step else None
 
     def _optimise(self, rays: Array32, colours: NDArray[np.uint8], samples: Samples) -> StepResult:
+        # Only once geometry is found: earlier, pulling weights together freezes surfaces at wrong depths.
+        self.stepper.distortion = self.config.distortion * min(1.0, max(0.0, 4.0 * self.fraction - 2.0))
         result = self.stepper.gradients(rays, colours, *self.stepper.visible(samples))
         if not math.isfinite(result.loss):
             raise AdvnerfError(

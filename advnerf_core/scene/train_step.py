@@ -54,7 +54,7 @@ class MarchConfig:
         max_samples: Most samples on one ray.
     """
 
-    near_m: float = 0.05
+    near_m: float = 0.1
     smallest_step_m: float = 0.004
     largest_step_m: float = 0.05
     step_growth: float = 0.008
