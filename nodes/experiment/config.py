@@ -27,7 +27,7 @@ class CaptureConfig(_Section):
 class SceneConfig(_Section):
     """How the radiance field is trained; the length is in steps, so that the result does not depend on the machine."""
 
-    steps: Positive = Field(default=2500, description="Training iterations.")
+    steps: Positive = Field(default=700, description="Training iterations.")
     margin_m: Annotated[float, Field(ge=0)] = Field(
         default=0.1, description="How far the field's box reaches beyond the walls [m]."
     )
