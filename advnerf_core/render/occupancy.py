@@ -79,6 +79,43 @@ class OccupancyGrid:
         return np.asarray(self.density > min(threshold, mean))
 
 
+def refine_occupied(
+    occupied: NDArray[np.bool_],
+    box_high: Array32,
+    log_density: LogDensity,
+    least_depth: float = 0.2,
+    factor: int = 2,
+    probes: int = 6,
+    seed: int = 0,
+) -> NDArray[np.bool_]:
+    """Split occupied cells and keep the parts that a ray would notice.
+
+    Args:
+        occupied: ``[X, Y, Z]``.
+        box_high: High corner of the box in box coordinates ``[3]``.
+        log_density: The field.
+        least_depth: Optical depth of crossing a part, at the largest density found in it, from which it is kept.
+        factor: Parts along each side of a cell.
+        probes: Random places in each part where density is looked at.
+        seed: Seed of those places.
+
+    Returns:
+        ``[factor * X, factor * Y, factor * Z]``.
+    """
+    fine = occupied.repeat(factor, 0).repeat(factor, 1).repeat(factor, 2)
+    rng = np.random.Generator(np.random.Philox(key=[seed, 1]))
+    cells = np.array(fine.shape) / np.asarray(box_high)
+    kept = np.zeros(fine.size, np.bool_)
+    for part in np.array_split(np.flatnonzero(fine), max(1, int(fine.sum()) // 262144)):
+        index = np.stack(np.unravel_index(part, fine.shape), axis=-1)
+        largest = np.full(len(part), -np.inf, np.float32)
+        for _ in range(probes):
+            places = (index + rng.random((len(part), 3), dtype=np.float32)) / cells
+            largest = np.maximum(largest, log_density(places.astype(np.float32)))
+        kept[part] = np.exp(np.minimum(largest, 15.0)) >= least_depth * cells.max()
+    return kept.reshape(fine.shape)
+
+
 def leap_distances(occupied: NDArray[np.bool_], cells: Array32) -> Leaps:
     """Chebyshev distance to the nearest occupied cell, for occupied ``[X, Y, Z]``."""
     distance = np.where(occupied, np.uint8(0), np.uint8(MAX_REACH))

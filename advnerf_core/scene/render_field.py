@@ -27,7 +27,7 @@ class FieldRenderer:
     Args:
         scene: The field; a copy of its weights is taken.
         occupied: Cells where something is ``[X, Y, Z]``.
-        march: How samples were placed in training; intervals here are the same.
+        march: How samples are placed, from training.
         colour_map: Applied to all colours: from the camera that learned the scene to the one that is rendered.
         least_transmittance: A ray stops when so little light would still come through.
     """

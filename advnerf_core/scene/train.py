@@ -19,7 +19,7 @@ from safetensors.numpy import save as save_arrays
 
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.files import write_atomically
-from advnerf_core.render.occupancy import Leaps, OccupancyGrid, leap_distances
+from advnerf_core.render.occupancy import Leaps, OccupancyGrid, leap_distances, refine_occupied
 from advnerf_core.render.rays import intrinsics_row, pixel_rays, poses_in_box
 from advnerf_core.scene.dataset import ImageSet
 from advnerf_core.scene.field import SceneField, SceneFieldConfig
@@ -52,6 +52,7 @@ class TrainConfig:
         march: How samples are placed.
         opacity: Weight of the rays' mean transmittance in the loss, for scenes that no ray leaves, such as rooms; 0 for open
             ones. A constant background is learned for what is left.
+        render_step_scale: Sample intervals for rendering, in those of the training: a finished field is smooth along rays.
         seed: Seed of everything random.
         checkpoint_every_s: Time between checkpoints [s].
     """
@@ -69,6 +70,7 @@ class TrainConfig:
     warmup_steps: int = 256
     march: MarchConfig = field(default_factory=MarchConfig)
     opacity: float = 1.5e-3
+    render_step_scale: float = 2.0
     seed: int = 0
     checkpoint_every_s: float = 60.0
 
@@ -108,8 +110,8 @@ class TrainedScene:
 
     Attributes:
         scene: The field.
-        occupied: Cells where something is ``[X, Y, Z]``.
-        march: How samples were placed in training.
+        occupied: Cells where something is ``[X, Y, Z]``, finer than in training.
+        march: How to place samples for rendering.
         history: One row per report: step, elapsed [s], PSNR [dB].
     """
 
@@ -180,7 +182,9 @@ class Trainer:
                 saved_s = self.elapsed_s
         if checkpoint is not None:
             self.save(checkpoint)
-        return TrainedScene(self.scene, self.occupied(), self.config.march, self.history)
+        occupied = refine_occupied(self.occupied(), self.occupancy.box_high, self.stepper.log_density)
+        march = self.config.march.coarser(self.config.render_step_scale)
+        return TrainedScene(self.scene, occupied, march, self.history)
 
     def train_step(self) -> StepResult:
         """One batch of random pixels; all randomness follows from the seed and the step number."""

@@ -5,7 +5,7 @@ The backward pass is written out by hand; tests compare it with torch's automati
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -55,14 +55,23 @@ class MarchConfig:
     """
 
     near_m: float = 0.1
-    smallest_step_m: float = 0.004
-    largest_step_m: float = 0.05
-    step_growth: float = 0.008
+    smallest_step_m: float = 0.008
+    largest_step_m: float = 0.08
+    step_growth: float = 0.016
     max_samples: int = 384
 
     def __post_init__(self) -> None:
         if not 0.0 < self.smallest_step_m <= self.largest_step_m or self.max_samples < 1 or self.near_m < 0.0:
             raise ValueError(f"expected 0 < smallest_step_m <= largest_step_m and max_samples >= 1, got {self}")
+
+    def coarser(self, scale: float) -> MarchConfig:
+        """The same with intervals ``scale`` times as long."""
+        return replace(
+            self,
+            smallest_step_m=scale * self.smallest_step_m,
+            largest_step_m=scale * self.largest_step_m,
+            step_growth=scale * self.step_growth,
+        )
 
     def steps(self, scale: float = 1.0) -> Array32:
         """Smallest and largest interval [m] and growth ``[3]``, as the kernels read them."""
