@@ -12,8 +12,7 @@ MODULES = (
     "benchmarks.hash_encoding",
     "benchmarks.adjoint_gradient",
     "benchmarks.adjoint_memory",
-    "benchmarks.faults",
-    "benchmarks.stop_distance",
+    "benchmarks.fault_stops",
 )
 
 

@@ -3,9 +3,10 @@
 # Without root, or on another system, it says what is missing and goes on: only the twin needs them.
 set -eu
 
-packages="libegl1 libgl1-mesa-dri libegl-mesa0"
+packages="libegl1 libgl1-mesa-dri libegl-mesa0 libopengl0"
 
-if ldconfig -p 2>/dev/null | grep -q 'libEGL.so.1'; then
+# mujoco's offscreen context needs EGL, Mesa's software driver behind it, and the OpenGL entry points.
+if ldconfig -p 2>/dev/null | grep -q 'libEGL_mesa.so.0' && ldconfig -p | grep -qE 'libOpenGL.so.0|libGL.so.1'; then
   exit 0
 fi
 if ! command -v apt-get >/dev/null 2>&1; then

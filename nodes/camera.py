@@ -40,7 +40,7 @@ class SocketSource(BaseModel):
 
     Attributes:
         kind: ``socket``.
-        path: Path of the socket; ``<run_dir>/frames`` for the twin.
+        path: Path of the socket; ``${socket_dir}/frames`` for the twin.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)

@@ -144,7 +144,7 @@ def _add_stage(name: str, what: str) -> None:
 
 
 for _name, _what in {
-    "capture": "photograph the room and record the drive of an expert",
+    "capture": "photograph the room",
     "scene": "learn the room from its photographs",
     "policy": "train the policy that will be attacked",
     "object": "make the object that carries the attack",

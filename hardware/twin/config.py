@@ -224,8 +224,8 @@ class LabConfig(_Frozen):
     phone: PhoneConfig = PhoneConfig()
     # Facing back down the bottom straight, turned 8 degrees towards its start.
     board: PanelConfig = PanelConfig(
-        x_m=3.15, y_m=-1.75, z_m=0.42, yaw_rad=math.pi + math.radians(8.0),
-        width_m=0.80, height_m=0.80, thickness_m=0.05, rgb=(0.20, 0.62, 0.28),
+        x_m=3.05, y_m=-1.80, z_m=0.52, yaw_rad=math.pi + math.radians(8.0),
+        width_m=1.0, height_m=1.0, thickness_m=0.05, rgb=(0.20, 0.62, 0.28),
     )  # fmt: skip
     # The same place relative to the next corner, so that it faces back down the right-hand straight.
     monitor: PanelConfig = PanelConfig(

@@ -8,7 +8,7 @@ from typing import Any
 
 EGL_HELP = (
     "the simulated lab renders off-screen with EGL and could not start it. On Debian or Ubuntu: "
-    "`sudo apt-get install libegl1 libgl1-mesa-dri libegl-mesa0`; leave MUJOCO_GL unset or set MUJOCO_GL=egl"
+    "`sudo apt-get install libegl1 libgl1-mesa-dri libegl-mesa0 libopengl0`; leave MUJOCO_GL unset or set MUJOCO_GL=egl"
 )
 
 

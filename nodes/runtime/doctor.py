@@ -79,7 +79,7 @@ def _render() -> Check:
     return Check(
         "EGL", WARNING,
         f"the simulated lab cannot render: {text}. pip install 'advnerf[twin]'; on Debian or Ubuntu: "
-        "apt-get install libegl1 libgl1-mesa-dri libegl-mesa0",
+        "apt-get install libegl1 libgl1-mesa-dri libegl-mesa0 libopengl0",
     )  # fmt: skip
 
 

@@ -32,7 +32,7 @@ def test_board_faces_the_start_of_the_bottom_straight():
     T = LabConfig().board.T_world_from_face
     normal = T[:3, 0]
     assert math.degrees(math.acos(-normal[0])) == pytest.approx(8.0)
-    assert normal[1] < 0.0  # the start of the straight is at y = -2, the board's centre at -1.75
+    assert normal[1] < 0.0  # the start of the straight is at y = -2, the board's centre at -1.80
     np.testing.assert_allclose(T[:3, 2], [0.0, 0.0, 1.0], atol=1e-12)
 
 

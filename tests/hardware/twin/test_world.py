@@ -216,7 +216,7 @@ def test_missing_egl_names_the_packages(monkeypatch):
             raise AttributeError("'NoneType' object has no attribute 'eglQueryString'")
 
     monkeypatch.setattr(gl.importlib, "import_module", lambda name: Broken)
-    with pytest.raises(gl.TwinUnavailable, match=r"libegl1 libgl1-mesa-dri libegl-mesa0.*MUJOCO_GL=egl"):
+    with pytest.raises(gl.TwinUnavailable, match=r"libegl1 libgl1-mesa-dri libegl-mesa0 libopengl0.*MUJOCO_GL=egl"):
         gl.create_context(8, 8)
 
 

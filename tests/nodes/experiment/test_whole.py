@@ -1,0 +1,38 @@
+"""The whole experiment in its smallest size: real lab, real field, real node graph. What it finds is not judged, only that it runs."""
+
+import json
+import os
+from pathlib import Path
+
+import pytest
+
+from advnerf_core.report.results import read_results
+from nodes.experiment.run import load_experiment, run_experiment
+
+ROOM = Path(__file__).parents[3] / "launch" / "room.experiment.yaml"
+SMALL = [
+    "capture.walk_around=12", "capture.car_mounted=12", "capture.colour_pairs=2", "capture.held_out=2", "scene.steps=60",
+    "policy.lab_stills=12", "policy.surrogate_stills=8", "policy.lab_drives=2", "policy.surrogate_drives=2",
+    "policy.drive_steps=4", "policy.first_steps=8", "policy.round_steps=4", "policy.naive_steps=0",
+    "attack.horizon=8", "attack.iterations=2", "attack.random_evaluations=2", "object.resolution=8",
+]  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_from_photographs_to_report_and_nothing_twice(tmp_path):
+    os.environ.setdefault("MUJOCO_GL", "egl")
+    first = run_experiment(load_experiment(ROOM, "demo", SMALL, tmp_path))
+    page = (tmp_path / "report" / "report.html").read_text()
+    assert "<html" in page
+    data = read_results(tmp_path / "report" / "results.json")
+    assert {(run.domain, run.condition) for run in data.runs} == {
+        (domain, condition) for domain in ("surrogate", "deployed") for condition in ("none", "random", "gradient")
+    }
+    assert data.latency is not None
+    drawn = json.loads((tmp_path / "deploy" / "hardened_gradient_0.json").read_text())["attack_ids"]
+    assert len(drawn) == 1
+    kept = (tmp_path / "report" / "report.html").stat().st_mtime_ns
+    again = run_experiment(load_experiment(ROOM, "demo", SMALL, tmp_path))
+    assert {name: record.digest for name, record in again.items()} == {n: r.digest for n, r in first.items()}
+    assert (tmp_path / "report" / "report.html").stat().st_mtime_ns == kept
