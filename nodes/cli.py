@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 OUR_PACKAGES = ("advnerf_core", "hardware", "calibration", "nodes")
 ERROR_EXIT, FAILURE_EXIT = 2, 1
+# Which extra brings what a base installation, such as the car's, does not have.
+_EXTRA_OF = dict.fromkeys(("torch", "numba", "scipy", "matplotlib", "jinja2", "av"), "core") | {"mujoco": "twin"}
 
 app = typer.Typer(
     name="advnerf", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
@@ -209,6 +211,12 @@ def main() -> None:
         app()
     except KeyboardInterrupt:
         raise SystemExit(130) from None
+    except ModuleNotFoundError as error:
+        missing = (error.name or "").split(".")[0]
+        if _debug or missing in OUR_PACKAGES or missing not in _EXTRA_OF:
+            raise
+        say_error(f"this command needs {missing}, which is not installed: pip install 'advnerf[{_EXTRA_OF[missing]}]'")
+        raise SystemExit(ERROR_EXIT) from None
     except Exception as error:  # everything else is a defect of ours and keeps its traceback
         if _debug or not _is_for_people(error):
             raise

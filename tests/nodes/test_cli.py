@@ -260,3 +260,13 @@ def test_play_refuses_what_is_not_there(command, tmp_path):
     code, _, errors = command("bag", "play", tmp_path / "bag", "--topics", "/arm", "--run-dir", tmp_path / "run")
     assert code == 1
     assert "has no topic /arm; it has /vicon/car" in errors
+
+
+def test_a_missing_extra_is_named_with_its_installation(monkeypatch, capsys):
+    def without_torch():
+        raise ModuleNotFoundError("No module named 'torch'", name="torch")
+
+    monkeypatch.setattr(cli, "app", without_torch)
+    with pytest.raises(SystemExit, match="2"):
+        cli.main()
+    assert "pip install 'advnerf[core]'" in capsys.readouterr().err
