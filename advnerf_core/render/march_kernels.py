@@ -7,6 +7,8 @@ direction: 0 is occupied, d > 0 means that all cells at Chebyshev distance below
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -62,9 +64,9 @@ def next_sample(ray: Array32, t: np.float32, end: np.float32, distance: Array8, 
     last_x, last_y, last_z = distance.shape[0] - 1, distance.shape[1] - 1, distance.shape[2] - 1
     while t < end:
         x, y, z = ray[0] + t * ray[3], ray[1] + t * ray[4], ray[2] + t * ray[5]
-        i = min(max(np.int32(x * cells[0]), 0), last_x)
-        j = min(max(np.int32(y * cells[1]), 0), last_y)
-        k = min(max(np.int32(z * cells[2]), 0), last_z)
+        i: Any = min(max(np.int32(x * cells[0]), 0), last_x)
+        j: Any = min(max(np.int32(y * cells[1]), 0), last_y)
+        k: Any = min(max(np.int32(z * cells[2]), 0), last_z)
         reach = np.int64(distance[i, j, k])
         if reach == 0:
             return t

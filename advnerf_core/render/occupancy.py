@@ -108,7 +108,7 @@ def refine_occupied(
     kept = np.zeros(fine.size, np.bool_)
     for part in np.array_split(np.flatnonzero(fine), max(1, int(fine.sum()) // 262144)):
         index = np.stack(np.unravel_index(part, fine.shape), axis=-1)
-        largest = np.full(len(part), -np.inf, np.float32)
+        largest: NDArray[np.float32] = np.full(len(part), -np.inf, np.float32)
         for _ in range(probes):
             places = (index + rng.random((len(part), 3), dtype=np.float32)) / cells
             largest = np.maximum(largest, log_density(places.astype(np.float32)))

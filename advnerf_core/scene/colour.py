@@ -91,5 +91,5 @@ def _design(colours: NDArray[np.float64], power: float) -> NDArray[np.float64]:
 
 def _solve(a: NDArray[np.float64], b: NDArray[np.float64], power: float) -> tuple[NDArray[np.float64], float]:
     design = _design(a, power)
-    solution = np.linalg.lstsq(design, b, rcond=None)[0]
+    solution = np.asarray(np.linalg.lstsq(design, b, rcond=None)[0], np.float64)
     return solution, float(np.mean((design @ solution - b) ** 2))

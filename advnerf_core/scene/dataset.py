@@ -28,6 +28,7 @@ Rgb = NDArray[np.uint8]
 _DISTORTION_KEYS = ("k1", "k2", "p1", "p2", "k3")
 _NGP_SCALE = 0.33  # Instant-NGP maps the file's coordinates into its unit cube by 0.33 x + 0.5
 
+_LENSES = {"OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"}
 
 class DatasetError(AdvnerfError):
     """A set of posed images cannot be used; the message names the file and what is wrong with it."""
@@ -131,6 +132,7 @@ def load_transforms(path: str | Path, require_all: bool = False) -> PosedImages:
     path = Path(path)
     path = path / "transforms.json" if path.is_dir() else path
     content = _read_json(path)
+    _require_known_lens(content, path)
     listed = content.get("frames")
     if not isinstance(listed, list) or not listed:
         raise DatasetError(f"expected a list 'frames' in {path}, got {type(listed).__name__} without entries")
@@ -191,16 +193,17 @@ def load_image(frame: PosedImage, size: tuple[int, int] | None = None) -> tuple[
 
     Undistortion keeps the largest window without missing pixels, so intrinsics change a little with it.
     """
-    bgr = cv2.imread(str(frame.path), cv2.IMREAD_COLOR)
-    if bgr is None:
+    read = cv2.imread(str(frame.path), cv2.IMREAD_COLOR)
+    if read is None:
         raise DatasetError(f"expected a readable image, got {frame.path}; it may be damaged, so copy it again")
+    bgr: Rgb = np.asarray(read, np.uint8)
     height, width = bgr.shape[:2]
     pinhole = frame.pinhole.resized(width, height)
     if any(frame.distortion):
         bgr, pinhole = _undistort(bgr, pinhole, np.array(frame.distortion))
     if size is not None and size != (width, height):
         shrinks = size[0] <= width and size[1] <= height
-        bgr = cv2.resize(bgr, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+        bgr = np.asarray(cv2.resize(bgr, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR), np.uint8)
         pinhole = pinhole.resized(*size)
     return np.ascontiguousarray(bgr[..., ::-1], dtype=np.uint8), pinhole
 
@@ -214,6 +217,21 @@ def _undistort(bgr: Rgb, pinhole: Pinhole, coefficients: Array) -> tuple[Rgb, Pi
     straight = cv2.remap(bgr, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     fx, fy, cx, cy = (float(v) for v in (ideal[0, 0], ideal[1, 1], ideal[0, 2] + 0.5, ideal[1, 2] + 0.5))
     return np.asarray(straight, np.uint8), Pinhole(*size, fx, fy, cx, cy)
+
+
+def _require_known_lens(content: dict[str, Any], path: Path) -> None:
+    """Refuse a lens whose coefficients mean something else: read as OpenCV's they would bend the scene silently."""
+    models = {str(entry.get("camera_model", "OPENCV")) for entry in (content, *_frames_of(content))}
+    if content.get("is_fisheye") or not models <= _LENSES:
+        raise DatasetError(
+            f"expected camera_model {' or '.join(sorted(_LENSES))} in {path}, got {', '.join(sorted(models - _LENSES)) or 'a fisheye'}; "
+            "undistort the images first"
+        )
+
+
+def _frames_of(content: dict[str, Any]) -> list[dict[str, Any]]:
+    frames = content.get("frames")
+    return [frame for frame in frames if isinstance(frame, dict)] if isinstance(frames, list) else []
 
 
 def _read_json(path: Path) -> dict[str, Any]:

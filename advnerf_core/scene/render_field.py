@@ -45,7 +45,7 @@ class FieldRenderer:
         self.samples = 0  # evaluated by the last call, for benchmarks
         self._weights = {name: value.copy() for name, value in scene.arrays().items()}
         self._levels = scene.grid.levels
-        cells = np.array(occupied.shape) / self.config.box_high
+        cells = (np.array(occupied.shape) / self.config.box_high).astype(np.float32)
         self._leaps = leap_distances(occupied, cells)
 
     @classmethod
@@ -89,7 +89,7 @@ class FieldRenderer:
         run_slots(work, _SLOTS)
         self.samples = int(samples.sum())
         if self.colour_map is not None:
-            rgb = self.colour_map.apply(rgb)
+            return torch.from_numpy(self.colour_map.apply(rgb)), torch.from_numpy(depth_m), torch.from_numpy(alpha)
         return torch.from_numpy(rgb), torch.from_numpy(depth_m), torch.from_numpy(alpha)
 
     __call__ = render
