@@ -37,6 +37,9 @@ class SceneConfig(_Section):
 class PolicyConfig(_Section):
     """How the driving policy is trained: frames per domain, rounds, optimiser steps."""
 
+    feed_forward: Annotated[float, Field(ge=0, le=1)] = Field(
+        default=0.93, description="Share of the path's curvature that the expert steers ahead; see ExpertConfig."
+    )
     lab_stills: Positive = Field(
         default=900, description="Lab poses around the path, each seen plain and with random textures."
     )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -40,7 +39,7 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
         seed=config.seed, dagger_rounds=config.dagger_rounds, first_steps=config.first_steps,
         round_steps=config.round_steps, naive_steps=config.naive_steps,
     )  # fmt: skip
-    expert = Expert(experiment.path, replace(ExpertConfig(), speed_mps=experiment.speed_mps))
+    expert = Expert(experiment.path, ExpertConfig(speed_mps=experiment.speed_mps, feed_forward=config.feed_forward))
     with Lab(experiment.lab_config) as lab:
         plans = [
             SourcePlan(_lab_source(experiment, lab), config.lab_stills, config.lab_drives, config.drive_steps),
