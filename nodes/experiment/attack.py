@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
@@ -108,9 +108,14 @@ def attack_problem(experiment: Experiment, surrogate: Surrogate, policy: LoadedP
     )  # fmt: skip
 
 
+def measured(experiment: Experiment, problem: AttackProblem) -> AttackProblem:
+    """The same drive over the ticks that the protocol measures, whatever was optimised."""
+    return replace(problem, steps=experiment.config.horizon)
+
+
 def _drive_without_attack(experiment: Experiment, bare: Surrogate, victim: str, seed: int, folder: Path) -> None:
     policy = load_policy(victim_file(experiment, victim))
-    problem = attack_problem(experiment, bare, policy, seed)
+    problem = measured(experiment, attack_problem(experiment, bare, policy, seed))
     rollout, totals = evaluate(problem, torch.zeros(bare.theta_shape))
     drives = {"states": rollout.states.transpose(0, 1).tolist(), "total_cte_m": totals.protocol_cte_m.tolist()}
     write_atomically(folder / f"{victim}_none_{seed}.json", json.dumps(drives) + "\n")
@@ -141,7 +146,7 @@ def _search(
     else:
         result = random_search(problem, attack.random_evaluations, attack.random_sigma, **common)
     attack_id = save_attack(attack_path(folder, search), _attack_file(experiment, policy, search, result))
-    rollout, totals = evaluate(problem, result.theta)
+    rollout, totals = evaluate(measured(experiment, problem), result.theta)
     drives = {
         "attack_id": attack_id,
         "states": rollout.states.transpose(0, 1).tolist(),

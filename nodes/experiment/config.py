@@ -74,7 +74,7 @@ class AttackConfig(_Section):
     start_sigma: Annotated[float, Field(ge=0)] = Field(
         default=0.1, description="Spread of the other starts [m and rad]."
     )
-    horizon: Positive = Field(default=40, description="Control ticks of the rollout (T).")
+    horizon: Positive = Field(default=40, description="Control ticks of the rollouts that are optimised (T).")
     iterations: Positive = Field(default=30, description="Gradient iterations.")
     random_evaluations: Positive = Field(default=10, description="Random textures tried.")
     learning_rate: Annotated[float, Field(gt=0)] = 0.1
@@ -87,7 +87,7 @@ class AttackConfig(_Section):
 
 
 class DeployConfig(_Section):
-    """The live runs through the node graph, each as long as the attack's horizon."""
+    """The live runs through the node graph."""
 
     launch_file: str = Field(default="green_screen.launch.yaml", description="Node graph, beside the experiment file.")
     nodes: tuple[str, ...] = Field(
@@ -105,6 +105,10 @@ class ExperimentConfig(_Section):
     """One experiment, resolved: the file's values, one of its settings over them, then the command line."""
 
     name: str = Field(min_length=1)
+    horizon: Positive = Field(
+        default=60,
+        description="Control ticks over which every drive is measured, learned or live (the protocol's 6 s).",
+    )
     lab: dict[str, Any] = Field(default_factory=dict, description="Changes to the simulated lab.")
     capture: CaptureConfig = CaptureConfig()
     scene: SceneConfig = SceneConfig()

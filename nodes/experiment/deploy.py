@@ -93,7 +93,9 @@ def _drive(experiment: Experiment, live: LiveRun, folder: Path) -> None:
     states = trajectory(bag, outcome.start_real_ns, horizon)
     stopped_s = (outcome.end_real_ns - outcome.start_real_ns) / NS_PER_S if outcome.stopped_early else None
     metrics, held = score(states, experiment.path, horizon, stopped_s)
-    times = timing(bag, outcome.start_real_ns, outcome.end_real_ns)
+    # A frame that was captured less than a tick before the end may rightly find the car disarmed.
+    last_frame_ns = outcome.end_real_ns - round(CONTROL_PERIOD_S * NS_PER_S)
+    times = timing(bag, outcome.start_real_ns, last_frame_ns)
     drawn = sorted(attack_ids(bag))
     _check_drawn(experiment, live, drawn)
     result: dict[str, Any] = {
@@ -110,7 +112,7 @@ def _drive(experiment: Experiment, live: LiveRun, folder: Path) -> None:
 
 def live_horizon(experiment: Experiment, live: LiveRun) -> Horizon:
     """Control ticks over which a run is measured."""
-    ticks = experiment.config.attack.horizon
+    ticks = experiment.config.horizon
     if live.condition == "laps":
         ticks = round(
             experiment.config.deploy.laps * experiment.path.length_m / experiment.speed_mps / CONTROL_PERIOD_S

@@ -25,7 +25,7 @@ from nodes.experiment.objects import attacked_object, surrogate_of
 from nodes.experiment.policy import HARDENED, victim_file
 from nodes.runtime.stages import Report
 
-HORIZONS = (50, 100, 200, 400)
+HORIZONS = (50, 200, 400)
 
 
 def measure(experiment: Experiment, folder: Path, report: Report) -> tuple[MemoryRow, ...]:
@@ -50,7 +50,6 @@ def peak_above_idle_mib(experiment: Experiment, ticks: int) -> float:
     problem = dataclasses.replace(problem, start_states=problem.start_states[:1], steps=ticks, cache_bytes=0)
     theta = surrogate.initial_theta(torch.Generator().manual_seed(0))
     # Libraries, compiled kernels and thread pools are idle memory.
-    adjoint_gradient(dataclasses.replace(problem, steps=problem.time_batch), theta)
     evaluate(dataclasses.replace(problem, steps=1), theta)
     idle_mib = restart_peak()
     adjoint_gradient(problem, theta)

@@ -76,11 +76,11 @@ def _report_data(
 def _settings(experiment: Experiment) -> rd.Settings:
     attack = experiment.config.attack
     return rd.Settings(
-        name="full" if experiment.setting == "full" else "small", horizon_steps=attack.horizon, control_period_s=CONTROL_PERIOD_S, iterations=attack.iterations,
+        name="full" if experiment.setting == "full" else "small", horizon_steps=experiment.config.horizon, control_period_s=CONTROL_PERIOD_S, iterations=attack.iterations,
         random_evaluations=attack.random_evaluations, start_poses=start_states(experiment, attack.seeds[0]).numpy(),
         seeds=attack.seeds, speed_mps=experiment.speed_mps, learning_rate=attack.learning_rate,
         off_track_m=experiment.room.off_track_m,
-        extra={"face cells": experiment.config.object.resolution, "time batch": attack.time_batch},
+        extra={"optimised ticks (T)": attack.horizon, "face cells": experiment.config.object.resolution, "time batch": attack.time_batch},
     )  # fmt: skip
 
 
@@ -99,7 +99,7 @@ def _scene(experiment: Experiment) -> rd.Scene:
 
 def _surrogate_runs(experiment: Experiment) -> Iterator[rd.Run]:
     folder, path = experiment.stage_folder("attack"), experiment.path
-    horizon = Horizon(experiment.config.attack.horizon, CONTROL_PERIOD_S, experiment.room.off_track_m)
+    horizon = Horizon(experiment.config.horizon, CONTROL_PERIOD_S, experiment.room.off_track_m)
     fence_m = float(np.abs(np.array(experiment.room.fence_m)).min())
     attacked = [(s.victim, str(s.method), s.seed) for s in searches(experiment)]
     clean = sorted({(victim, "none", seed) for victim, _, seed in attacked})

@@ -74,7 +74,11 @@ def stages_of(experiment: Experiment) -> list[Stage]:
     lab = experiment.lab_config.model_dump(mode="json")
 
     def stage(name: str, module: Any, sections: Sequence[BaseModel], after: Sequence[str]) -> Stage:
-        settings = {"lab": lab, **{type(s).__name__: s.model_dump(mode="json") for s in sections}}
+        settings = {
+            "lab": lab,
+            "horizon": config.horizon if name in ("attack", "deploy", "report") else None,
+            **{type(s).__name__: s.model_dump(mode="json") for s in sections},
+        }
 
         def work(folder: Path, told: Report) -> None:
             module.run(experiment, folder, told)
