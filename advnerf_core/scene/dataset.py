@@ -30,6 +30,7 @@ _NGP_SCALE = 0.33  # Instant-NGP maps the file's coordinates into its unit cube 
 
 _LENSES = {"OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"}
 
+
 class DatasetError(AdvnerfError):
     """A set of posed images cannot be used; the message names the file and what is wrong with it."""
 
