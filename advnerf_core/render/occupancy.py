@@ -83,7 +83,7 @@ def refine_occupied(
     occupied: NDArray[np.bool_],
     box_high: Array32,
     log_density: LogDensity,
-    least_depth: float = 0.2,
+    least_depth: float = 0.05,
     factor: int = 2,
     probes: int = 6,
     seed: int = 0,
