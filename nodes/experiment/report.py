@@ -201,13 +201,13 @@ def _manifest(experiment: Experiment) -> rd.Manifest:
         "processor": _processor(), "cores": str(len(os.sched_getaffinity(0))), "memory": f"{memory_gib:.0f} GiB",
         "system": platform.platform(),
     }  # fmt: skip
+    # The wall time from a clean clone is not known here: benchmarks/newcomer measures it.
     return rd.Manifest(
         manifest["command"],
         datetime.now(timezone.utc).isoformat(timespec="seconds"),
         frozen,
         manifest["versions"],
         machine,
-        wall_s=sum(t.wall_s for t in _timings(experiment)),
     )
 
 
