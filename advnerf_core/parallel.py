@@ -22,6 +22,8 @@ KERNEL_OPTIONS: dict[str, Any] = {
     "boundscheck": False,
 }
 
+SLOTS = 8  # parts of the work; fixed, so that sums over slots do not depend on the number of threads
+
 _pools: dict[
     tuple[int, int], ThreadPoolExecutor
 ] = {}  # by process and size: a forked child must not reuse its parent's

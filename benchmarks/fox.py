@@ -15,12 +15,12 @@ import numpy as np
 
 from advnerf_core.fields.hash_grid import HashGridConfig
 from advnerf_core.parallel import thread_count
+from advnerf_core.render.march import MarchConfig
 from advnerf_core.scene.dataset import ImageSet, load_transforms
 from advnerf_core.scene.field import SceneFieldConfig
 from advnerf_core.scene.metrics import psnr
 from advnerf_core.scene.render_field import FieldRenderer
 from advnerf_core.scene.train import Progress, TrainConfig, TrainedScene, train_scene
-from advnerf_core.scene.train_step import MarchConfig
 from benchmarks.results import record_row
 
 SIZE = (270, 480)

@@ -11,12 +11,12 @@ from torch import Tensor
 
 from advnerf_core.geometry import Pinhole
 from advnerf_core.parallel import run_slots, slot_bounds
+from advnerf_core.render.march import MarchConfig
 from advnerf_core.render.occupancy import leap_distances
 from advnerf_core.render.rays import intrinsics_row, poses_in_box
 from advnerf_core.scene.colour import ColourMap
 from advnerf_core.scene.field import SceneField, load_scene
 from advnerf_core.scene.render_kernels import SIDE, render_tiles
-from advnerf_core.scene.train_step import MarchConfig
 
 _SLOTS = 16
 

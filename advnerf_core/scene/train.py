@@ -19,11 +19,12 @@ from safetensors.numpy import save as save_arrays
 
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.files import write_atomically
+from advnerf_core.render.march import MarchConfig, Marcher, Samples
 from advnerf_core.render.occupancy import Leaps, OccupancyGrid, leap_distances, refine_occupied
 from advnerf_core.render.rays import intrinsics_row, pixel_rays, poses_in_box
 from advnerf_core.scene.dataset import ImageSet
 from advnerf_core.scene.field import SceneField, SceneFieldConfig
-from advnerf_core.scene.train_step import CpuStep, MarchConfig, Marcher, Samples, StepResult
+from advnerf_core.scene.train_step import CpuStep, StepResult
 
 Array32 = NDArray[np.float32]
 

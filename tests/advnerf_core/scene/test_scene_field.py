@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from advnerf_core.fields.hash_grid import HashGridConfig
 from advnerf_core.geometry import Array, Pinhole, look_at
+from advnerf_core.render.march import MarchConfig, Marcher
 from advnerf_core.render.march_kernels import span_in_box
 from advnerf_core.render.occupancy import leap_distances
 from advnerf_core.scene.dataset import ImageSet
@@ -17,7 +18,7 @@ from advnerf_core.scene.field import SceneField, SceneFieldConfig, SceneFileErro
 from advnerf_core.scene.metrics import psnr
 from advnerf_core.scene.render_field import FieldRenderer
 from advnerf_core.scene.train import CheckpointError, TrainConfig, TrainedScene, Trainer
-from advnerf_core.scene.train_step import CpuStep, MarchConfig, Marcher, reference_colours
+from advnerf_core.scene.train_step import CpuStep, reference_colours
 
 HALF = np.array([1.0, 1.0, 0.5])
 BOX = ((-1.05, -1.05, -0.55), (1.05, 1.05, 0.55))
