@@ -39,7 +39,12 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
         seed=config.seed, dagger_rounds=config.dagger_rounds, first_steps=config.first_steps,
         round_steps=config.round_steps, naive_steps=config.naive_steps,
     )  # fmt: skip
-    expert = Expert(experiment.path, ExpertConfig(speed_mps=experiment.speed_mps, feed_forward=config.feed_forward))
+    expert = Expert(
+        experiment.path,
+        ExpertConfig(
+            speed_mps=experiment.speed_mps, stiffness_1pm=config.stiffness_1pm, feed_forward=config.feed_forward
+        ),
+    )
     with Lab(experiment.lab_config) as lab:
         plans = [
             SourcePlan(_lab_source(experiment, lab), config.lab_stills, config.lab_drives, config.drive_steps),
