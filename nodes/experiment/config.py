@@ -38,10 +38,10 @@ class PolicyConfig(_Section):
     """How the driving policy is trained: frames per domain, rounds, optimiser steps."""
 
     stiffness_1pm: Annotated[float, Field(gt=0)] = Field(
-        default=1.0, description="How firmly the expert returns to the path [1/m]; see ExpertConfig."
+        default=0.75, description="How firmly the expert returns to the path [1/m]; see ExpertConfig."
     )
     feed_forward: Annotated[float, Field(ge=0, le=1)] = Field(
-        default=0.93, description="Share of the path's curvature that the expert steers ahead; see ExpertConfig."
+        default=0.97, description="Share of the path's curvature that the expert steers ahead; see ExpertConfig."
     )
     lab_stills: Positive = Field(
         default=900, description="Lab poses around the path, each seen plain and with random textures."
