@@ -128,7 +128,10 @@ def main() -> None:
     """Read a finished full run and record its rows."""
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("run_folder", type=Path)
-    folder = parser.parse_args().run_folder
+    parser.add_argument("--command", default=COMMAND, help="the command that made the run")
+    parser.add_argument("--note", default="", help="what readers must know, such as a smaller number of seeds")
+    arguments = parser.parse_args()
+    folder = arguments.run_folder
     data = read_results(folder / "report" / "results.json")
     if data.settings.name != "full":
         raise SystemExit(
@@ -136,7 +139,7 @@ def main() -> None:
         )
 
     def record(line: str, value: float | str, unit: str, target: str, met: bool | None, note: str) -> None:
-        record_row(line, value, unit, target, met, COMMAND, note)
+        record_row(line, value, unit, target, met, arguments.command, "; ".join(filter(None, (note, arguments.note))))
         print(f"{line}: {value if isinstance(value, str) else f'{value:.4g}'} {unit} (target {target}): {met}")
 
     record_fidelity(data, record)

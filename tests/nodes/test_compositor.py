@@ -27,7 +27,7 @@ MS = 1_000_000
 def attack(**changes):
     theta = np.random.default_rng(0).normal(size=(8, 8, 3)).astype(np.float32)
     values = {
-        "method": "gradient", "theta": theta, "texture": face_texture(theta, 128), "size_m": (0.8, 0.8),
+        "method": "gradient", "theta": theta, "texture": face_texture(theta, 128), "size_m": (1.0, 1.0),
         "T_world_from_object": T_WORLD_FROM_BOARD, "subject": "board", "corners_in_subject": TARGET.corners,
         "camera": Pinhole(200, 66, 103.6, 103.4, 100, 32), "scene_sha256": "", "policy_sha256": "", "config_sha256": "",
         "seed": 0, "predicted_total_cte_m": 1.0, "software_version": "0",
