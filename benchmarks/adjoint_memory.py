@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import resource
 import subprocess
 import sys
 from pathlib import Path
@@ -21,12 +20,12 @@ from torch import Tensor
 
 from advnerf_core.attack.adjoint import AttackProblem, adjoint_gradient, evaluate
 from advnerf_core.files import write_atomically
+from advnerf_core.memory import peak_mib, restart_peak
 from benchmarks.attack_toy import toy_problem
 from benchmarks.results import REPOSITORY, record_row
 
 COMMAND = "python -m benchmarks.adjoint_memory"
 METHODS = ("adjoint", "backprop")
-_KIB_PER_MIB = 1024.0
 
 
 class _Render(torch.autograd.Function):
@@ -61,27 +60,9 @@ def peak_above_idle_mib(method: str, steps: int) -> float:
     problem = AttackProblem(**{**vars(problem), "start_states": problem.start_states[:1]})
     theta = problem.sensor.initial_theta(torch.Generator().manual_seed(0))
     evaluate(AttackProblem(**{**vars(problem), "steps": 1}), theta)
-    idle = _restart_peak()
+    idle = restart_peak()
     _ = adjoint_gradient(problem, theta) if method == "adjoint" else unrolled_gradient(problem, theta)
-    return _peak_mib() - idle
-
-
-def _restart_peak() -> float:
-    """Set the kernel's peak to the present resident size, where it lets us, and return it [MiB]."""
-    try:
-        Path("/proc/self/clear_refs").write_text("5")
-    except OSError:
-        print("cannot reset the peak: idle includes start-up", file=sys.stderr)
-    return _peak_mib()
-
-
-def _peak_mib() -> float:
-    status = Path("/proc/self/status")
-    if status.exists():
-        for line in status.read_text().splitlines():
-            if line.startswith("VmHWM:"):
-                return float(line.split()[1]) / _KIB_PER_MIB
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / _KIB_PER_MIB
+    return peak_mib() - idle
 
 
 def measure(horizons: list[int], repeats: int = 3) -> list[dict[str, Any]]:

@@ -8,8 +8,6 @@ repeats a subscription to a restarted publisher only when its socket is used.
 
 from __future__ import annotations
 
-import fcntl
-import os
 import secrets
 import time
 from collections.abc import Iterable
@@ -21,6 +19,7 @@ import zmq
 
 from nodes.runtime.clock import NS_PER_S, Clock, SystemClock
 from nodes.runtime.errors import BusError, MessageError
+from nodes.runtime.locks import HeldError, hold
 from nodes.runtime.messages import MAX_SEQUENCE_LENGTH, decode, encode, type_hash_prefix, type_name
 from nodes.runtime.paths import socket_path
 from nodes.runtime.topics import Topic
@@ -293,18 +292,10 @@ def age_s(info: MessageInfo, mono_ns: int) -> float:
 
 def _lock_endpoint(path: Path, topic: str, run_dir: Path) -> TextIO:
     """Hold a lock beside the socket: a second bind to an ipc path succeeds silently and robs the first of its readers."""
-    lock = open(path.with_name(path.name + ".lock"), "a+", encoding="ascii")  # noqa: SIM115 - kept open: it is the lock
     try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        lock.seek(0)
-        owner = lock.read().strip() or "unknown"
-        lock.close()
+        return hold(path.with_name(path.name + ".lock"))
+    except HeldError as error:
         raise BusError(
-            f"{topic} is already published in {run_dir} by process {owner}: another launch uses the same endpoints; "
+            f"{topic} is already published in {run_dir} by process {error.owner}: another launch uses the same endpoints; "
             "stop it, or give this one another --run-dir"
         ) from None
-    lock.truncate(0)
-    lock.write(f"{os.getpid()}\n")
-    lock.flush()
-    return lock

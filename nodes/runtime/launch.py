@@ -24,6 +24,7 @@ from nodes.runtime.child import Child
 from nodes.runtime.config import node_document
 from nodes.runtime.errors import LaunchError
 from nodes.runtime.launch_file import Plan, load_launch
+from nodes.runtime.locks import HeldError, hold
 from nodes.runtime.paths import RESOLVED_NAME, private_folder, user_folder
 from nodes.runtime.topics import status_topic
 
@@ -280,21 +281,13 @@ def _silence(child: Child, now: float) -> str:
 
 def _lock_run(run_dir: Path) -> TextIO:
     run_dir.mkdir(parents=True, exist_ok=True)
-    lock = open(run_dir / "launch.lock", "a+", encoding="ascii")  # noqa: SIM115 - kept open: it is the lock
     try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        lock.seek(0)
-        owner = lock.read().strip() or "unknown"
-        lock.close()
+        return hold(run_dir / "launch.lock")
+    except HeldError as error:
         raise LaunchError(
-            f"{run_dir} is in use by the launch of process {owner}: two launches cannot share endpoints; stop it, or use "
+            f"{run_dir} is in use by the launch of process {error.owner}: two launches cannot share endpoints; stop it, or use "
             "another --run-dir"
         ) from None
-    lock.truncate(0)
-    lock.write(f"{os.getpid()}\n")
-    lock.flush()
-    return lock
 
 
 def _is_locked(run_dir: Path) -> bool:
