@@ -1,4 +1,8 @@
-"""Frames on a Unix socket: a fixed head with both capture stamps, then raw RGB. Used by the twin's frame server and its client."""
+"""Frames on a Unix socket. Used by the twin's frame server and its client.
+
+The client asks with one byte; the server answers with its newest frame, or the next one if the client has that already:
+a fixed head with both capture stamps, then raw RGB.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +15,7 @@ from hardware.errors import ProtocolError
 
 MAGIC = b"ADVF"
 VERSION = 1
+REQUEST = b"?"
 # magic, version, height, width, sequence, capture real time [ns], capture monotonic time [ns].
 _HEAD = struct.Struct("<4sHHHQqq")
 HEAD_BYTES = _HEAD.size

@@ -6,13 +6,18 @@ import socket
 import time
 from pathlib import Path
 
-from hardware.cameras.frame_wire import HEAD_BYTES, decode_frame, pixel_bytes
+from hardware.cameras.frame_wire import HEAD_BYTES, REQUEST, decode_frame, pixel_bytes
 from hardware.cameras.interface import Frame
 from hardware.errors import DeviceNotFound, LinkLost, LinkTimeout
+
+# What a server on the same machine needs to answer when it has something to answer with.
+_ANSWER_S = 0.01
 
 
 class SocketCamera:
     """Reads frames that carry their capture stamps; nothing is stamped again here.
+
+    Each frame is asked for, so that none grows old in the socket while the reader does something else.
 
     Args:
         path: Path of the socket.
@@ -23,6 +28,7 @@ class SocketCamera:
         self.path = Path(path)
         self._stall_s = stall_s
         self._socket: socket.socket | None = None
+        self._asked = False
 
     def open(self) -> None:
         """Connect to the server."""
@@ -35,14 +41,17 @@ class SocketCamera:
             raise DeviceNotFound(
                 f"expected a frame server at {self.path}, got: {error.strerror or error}; is the twin (or the camera's server) running?"
             ) from error
-        self._socket = client
+        self._socket, self._asked = client, False
 
     def read(self, timeout_s: float) -> Frame | None:
         """Newest frame not read yet, or None after ``timeout_s``."""
-        frame = self._read_one(timeout_s)
-        while frame is not None and (newer := self._read_one(0.0)) is not None:
-            frame = newer
-        return frame
+        if not self._asked:
+            self._ask()
+        elif (frame := self._read_one(0.0)) is not None:
+            # It answers a call that gave up some time ago, so there may be a newer one by now.
+            self._ask()
+            return self._read_one(_ANSWER_S) or frame
+        return self._read_one(timeout_s)
 
     def close(self) -> None:
         """Disconnect."""
@@ -57,9 +66,17 @@ class SocketCamera:
     def __exit__(self, *exception: object) -> None:
         self.close()
 
-    def _read_one(self, timeout_s: float) -> Frame | None:
+    def _ask(self) -> None:
         if self._socket is None:
             raise LinkLost(f"expected an open camera, {self.path} is not connected: call open() first")
+        try:
+            self._socket.sendall(REQUEST)
+        except OSError as error:
+            raise LinkLost(f"the frame server at {self.path} hung up: {error.strerror or error}") from error
+        self._asked = True
+
+    def _read_one(self, timeout_s: float) -> Frame | None:
+        assert self._socket is not None
         self._socket.settimeout(timeout_s)
         try:
             first = self._socket.recv(1)
@@ -71,7 +88,9 @@ class SocketCamera:
             raise LinkLost(f"the frame server at {self.path} hung up")
         deadline = time.monotonic() + self._stall_s
         head = first + self._receive(HEAD_BYTES - 1, deadline)
-        return decode_frame(head, self._receive(pixel_bytes(head), deadline))
+        frame = decode_frame(head, self._receive(pixel_bytes(head), deadline))
+        self._asked = False
+        return frame
 
     def _receive(self, count: int, deadline: float) -> bytes:
         assert self._socket is not None

@@ -1,4 +1,4 @@
-"""Serves the twin's frames on a Unix socket. A slow reader loses frames, never delays them for others or for the lab."""
+"""Serves the twin's frames on a Unix socket. A slow reader misses frames, never gets old ones, never delays them for others."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ import socket
 import threading
 from pathlib import Path
 
-from hardware.cameras.frame_wire import encode_head
+from hardware.cameras.frame_wire import REQUEST, encode_head
 from hardware.cameras.interface import Frame
 from hardware.errors import DeviceBusy, HardwareError
 
 
 class FrameServer:
-    """Every client gets the newest frame whenever it has taken the last one.
+    """Every client gets the newest frame when it asks, or the next one if it has had that.
 
     Args:
         path: Path of the socket; a dead one from an earlier run is replaced, a living one is an error.
@@ -76,10 +76,8 @@ class FrameServer:
             threading.Thread(target=self._serve, args=(client, last), name="frame client", daemon=True).start()
 
     def _serve(self, client: socket.socket, last: Frame | None) -> None:
-        # A frame is larger than what the socket holds, so a reader that stops is never more than one frame behind.
-        client.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 64 * 1024)
         try:
-            while (frame := self._wait_for_newer(last)) is not None:
+            while client.recv(len(REQUEST)) and (frame := self._wait_for_newer(last)) is not None:
                 client.sendall(encode_head(frame) + frame.rgb.tobytes())
                 last = frame
         except OSError:

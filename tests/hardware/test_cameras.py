@@ -49,16 +49,19 @@ def test_frames_come_through_with_their_stamps(tmp_path):
             assert not got.rgb.flags.writeable
 
 
-def test_a_reader_that_slept_gets_the_newest_soon_and_never_a_backlog(tmp_path):
+@pytest.mark.parametrize("gave_up_before", [False, True])
+def test_a_reader_that_slept_gets_the_newest_and_no_backlog(tmp_path, gave_up_before):
     with FrameServer(tmp_path / "frames") as server, SocketCamera(tmp_path / "frames") as camera:
         wait_for(lambda: server.clients == 1)
+        if gave_up_before:
+            assert camera.read(timeout_s=0.01) is None
         for sequence in range(30):
             server.publish(frame(sequence))
             time.sleep(0.002)
-        got = [camera.read(timeout_s=0.3) for _ in range(3)]
-        delivered = [g.sequence for g in got if g is not None]
-        assert delivered[-1] == 29
-        assert len(delivered) <= 2
+        assert camera.read(timeout_s=1.0).sequence == 29
+        assert camera.read(timeout_s=0.05) is None
+        server.publish(frame(30))
+        assert camera.read(timeout_s=1.0).sequence == 30
 
 
 def test_server_that_ends_is_a_lost_link_and_can_be_reopened(tmp_path):

@@ -102,11 +102,15 @@ def test_driving_moves_what_is_measured_and_seen(lab, receiver):
             lab.place(0.0, 0.0, 0.0)
         vesc.brake(20.0)
         after = camera.read(timeout_s=1.0)
+        deadline = time.monotonic() + 1.0
+        while lab.state.speed_mps > 0.0 and time.monotonic() < deadline:
+            time.sleep(0.005)
+        assert lab.state.speed_mps == 0.0
     lab.check()
     assert pose[0, 3] > -0.8
     assert yaw_of(pose) > 0.05
+    assert after.stamp_mono_ns - before.stamp_mono_ns > 0.9e9  # a reader away for a second gets what is seen now
     assert cv2.PSNR(before.rgb, after.rgb) < 30.0
-    assert lab.state.speed_mps == 0.0
     time.sleep(0.05)  # the last bytes are on their way
     names = [event.name for event in lab.vesc.events() if event.name != "GET_VALUES"]
     assert names[-1] == "SET_CURRENT"
