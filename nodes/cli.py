@@ -20,7 +20,9 @@ if TYPE_CHECKING:
 OUR_PACKAGES = ("advnerf_core", "hardware", "calibration", "nodes")
 ERROR_EXIT, FAILURE_EXIT = 2, 1
 # Which extra brings what a base installation, such as the car's, does not have.
-_EXTRA_OF = dict.fromkeys(("torch", "numba", "scipy", "matplotlib", "jinja2", "av"), "core") | {"mujoco": "twin"}
+_EXTRA_OF = dict.fromkeys(("torch", "numba", "scipy", "matplotlib", "jinja2", "av"), "core") | {
+    "mujoco": "twin", "pycolmap": "sfm", "trimesh": "mesh", "viser": "view", "onnxruntime": "onnx", "onnx": "onnx",
+}  # fmt: skip
 
 app = typer.Typer(
     name="advnerf", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
@@ -28,6 +30,11 @@ app = typer.Typer(
 )  # fmt: skip
 app.add_typer(cli_topic.app, name="topic")
 app.add_typer(cli_bag.app, name="bag")
+stage_app = typer.Typer(
+    no_args_is_help=True,
+    help="One stage of an experiment, and what it needs first: capture, scene, policy, object, attack, deploy, report.",
+)
+app.add_typer(stage_app, name="stage")
 
 _debug = False
 
@@ -140,9 +147,7 @@ def _add_stage(name: str, what: str) -> None:
     ) -> None:
         _run_experiment(file, setting, run_folder, name, overrides)
 
-    app.command(name, help=f"Stage of an experiment: {what} (and what it needs first).", rich_help_panel="Stages")(
-        command
-    )
+    stage_app.command(name, help=f"{what[0].upper()}{what[1:]} (and what it needs first).")(command)
 
 
 for _name, _what in {
