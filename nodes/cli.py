@@ -70,7 +70,9 @@ def launch(
     duration_s: Annotated[
         float | None, typer.Option("--duration", min=0.0, help="Stop by itself after so many seconds.")
     ] = None,
-    check: Annotated[bool, typer.Option("--check", help="Only say what would be started.")] = False,
+    check: Annotated[
+        bool, typer.Option("--check", help="Only say what would be started, and what is wrong with it.")
+    ] = False,
 ) -> None:
     """Start the nodes of a launch file and watch them; Ctrl-C stops them, twice stops them at once."""
     from nodes.runtime.launch import Launch
@@ -79,6 +81,7 @@ def launch(
     plan = load_launch(file, overrides or [])
     if check:
         _print_plan(plan)
+        _say_problems(plan)
         return
     run_dir = run_dir or Path("runs") / f"{plan.launch.name}-{time.strftime('%Y%m%d-%H%M%S')}"
     started = Launch(file, overrides or [], run_dir, report=lambda line: print(f"[launch] {line}", flush=True))
@@ -112,6 +115,16 @@ def _print_plan(plan: Any) -> None:
     for name, entry in plan.nodes.items():
         rows.add_row(name, entry.module, "yes" if entry.required else "no", str(plan.documents[name].data))
     print_table(rows)
+
+
+def _say_problems(plan: Any) -> None:
+    from nodes.runtime.launch_check import check_nodes
+
+    problems = check_nodes(plan)
+    for problem in problems.values():
+        say_error(problem)
+    if problems:
+        raise typer.Exit(ERROR_EXIT)
 
 
 @app.command()

@@ -48,6 +48,11 @@ class Experiment:
         """Where a stage writes."""
         return self.folder / stage
 
+    @property
+    def launch_file(self) -> FilePath:
+        """The node graph of the live runs."""
+        return self.file.parent / self.config.deploy.launch_file
+
     def calibration_file(self, name: str) -> FilePath:
         """A calibration file that the capture stage left: camera, vehicle, board, monitor or room."""
         return self.stage_folder("capture") / CALIBRATION / f"{name}.yaml"

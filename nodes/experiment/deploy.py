@@ -85,10 +85,9 @@ def _check_frozen(experiment: Experiment) -> None:
 def _drive(experiment: Experiment, live: LiveRun, folder: Path) -> None:
     deploy = experiment.config.deploy
     horizon = live_horizon(experiment, live)
-    launch_file = experiment.file.parent / deploy.launch_file
     plan = TrialPlan(experiment.room.start_pose, horizon.ticks * horizon.dt_s + 0.2, deploy.nodes)
     run_dir = folder / live.name
-    outcome = run_trial(launch_file, _overrides(experiment, live), run_dir, plan, deploy.ready_timeout_s)
+    outcome = run_trial(experiment.launch_file, _overrides(experiment, live), run_dir, plan, deploy.ready_timeout_s)
     bag = run_dir / "bag"
     states = trajectory(bag, outcome.start_real_ns, horizon)
     stopped_s = (outcome.end_real_ns - outcome.start_real_ns) / NS_PER_S if outcome.stopped_early else None

@@ -21,8 +21,9 @@ from nodes.experiment.config import ExperimentConfig
 from nodes.experiment.context import Experiment
 from nodes.runtime.config import Document, apply_overrides, read_yaml, validate
 from nodes.runtime.errors import ConfigError
+from nodes.runtime.launch_file import load_launch
 from nodes.runtime.progress import ProgressDisplay
-from nodes.runtime.stages import Report, Stage, StageRecord, run_stages
+from nodes.runtime.stages import Report, Stage, StageRecord, check_until, run_stages
 
 STAGES = ("capture", "scene", "policy", "object", "attack", "deploy", "report")
 
@@ -58,10 +59,12 @@ def run_experiment(
     """Run the stages that are not there yet, and print the result of a finished experiment."""
     console = console or Console()
     began = time.monotonic()
+    stages = stages_of(experiment)
+    check_until(stages, until)
     experiment.folder.mkdir(parents=True, exist_ok=True)
     _write_manifest(experiment)
     with ProgressDisplay(console) as display:
-        records = run_stages(stages_of(experiment), experiment.folder, display, until)
+        records = run_stages(stages, experiment.folder, display, until)
     if "report" in records:
         report.print_summary(experiment, console)
     console.print(f"{experiment.config.name} ({experiment.setting}): {time.monotonic() - began:.0f} s", highlight=False)
@@ -79,6 +82,8 @@ def stages_of(experiment: Experiment) -> list[Stage]:
             "horizon": config.horizon if name in ("attack", "deploy", "report") else None,
             **{type(s).__name__: s.model_dump(mode="json") for s in sections},
         }
+        if name == "deploy":
+            settings["graph"] = load_launch(experiment.launch_file).resolved
 
         def work(folder: Path, told: Report) -> None:
             module.run(experiment, folder, told)

@@ -176,12 +176,15 @@ def run_node_main(config_type: type[C], build: Callable[[C, NodeContext], Node])
     parser.add_argument(
         "--set", action="append", default=[], metavar="KEY=VALUE", dest="overrides", help="override a key"
     )
+    parser.add_argument("--check", action="store_true", help="only say what is wrong with the configuration")
     options = parser.parse_args()
     try:
         config = load_node_config(config_type, options.name, options.config, options.overrides)
     except (ValueError, OSError) as error:
         print(f"{options.name}: {_one_line(error)}", file=sys.stderr, flush=True)
         return 2
+    if options.check:
+        return 0
     return run_node(lambda context: build(config, context), options.name, options.run_dir)
 
 

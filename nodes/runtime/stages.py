@@ -89,14 +89,19 @@ def run_stages(
     Raises:
         StageError: ``until`` or an ``after`` names no stage before it.
     """
-    if until is not None and until not in [stage.name for stage in stages]:
-        raise StageError(f"expected one of the stages {', '.join(s.name for s in stages)}; got '{until}'")
+    check_until(stages, until)
     records: dict[str, StageRecord] = {}
     for stage in stages:
         records[stage.name] = _run_or_reuse(stage, folder / stage.name, records, display)
         if stage.name == until:
             break
     return records
+
+
+def check_until(stages: Sequence[Stage], until: str | None) -> None:
+    """Refuse a last stage that does not exist, before anything is written."""
+    if until is not None and until not in [stage.name for stage in stages]:
+        raise StageError(f"expected one of the stages {', '.join(s.name for s in stages)}; got '{until}'")
 
 
 def read_record(folder: Path) -> StageRecord | None:

@@ -1,11 +1,13 @@
+import shutil
 from pathlib import Path
 
 import pytest
 
 from nodes.experiment.attack import Search, searches
 from nodes.experiment.deploy import live_runs
-from nodes.experiment.run import STAGES, load_experiment, stages_of
+from nodes.experiment.run import STAGES, load_experiment, run_experiment, stages_of
 from nodes.runtime.errors import ConfigError
+from nodes.runtime.stages import StageError
 
 ROOM = Path(__file__).parents[3] / "launch" / "room.experiment.yaml"
 
@@ -65,3 +67,21 @@ def test_every_seed_meets_every_condition_and_the_naive_victim_the_first(tmp_pat
     assert "hardened_empty_0" in runs
     assert len(runs) == len(set(runs))
     assert not any("laps" in run.name or "empty" in run.name for run in live_runs(room(tmp_path)))
+
+
+def test_a_changed_node_graph_is_driven_again(tmp_path):
+    for name in (ROOM.name, "green_screen.launch.yaml"):
+        shutil.copy(ROOM.parent / name, tmp_path / name)
+    experiment = load_experiment(tmp_path / ROOM.name, "demo", [], tmp_path / "run")
+    before = {stage.name: stage.settings for stage in stages_of(experiment)}
+    graph = tmp_path / "green_screen.launch.yaml"
+    graph.write_text(graph.read_text().replace("timeout_ms: 250", "timeout_ms: 300"))
+    after = {stage.name: stage.settings for stage in stages_of(experiment)}
+    assert {name for name in before if before[name] != after[name]} == {"deploy"}
+
+
+def test_an_unknown_last_stage_leaves_nothing_behind(tmp_path):
+    experiment = load_experiment(ROOM, "demo", [], tmp_path / "run")
+    with pytest.raises(StageError, match="got 'flight'"):
+        run_experiment(experiment, "flight")
+    assert not (tmp_path / "run").exists()
