@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import time
@@ -238,8 +239,15 @@ def main() -> None:
     except Exception as error:  # everything else is a defect of ours and keeps its traceback
         if _debug or not _is_for_people(error):
             raise
-        say_error(str(error) or type(error).__name__)
+        say_error(_words(error))
         raise SystemExit(ERROR_EXIT) from None
+
+
+def _words(error: Exception) -> str:
+    if isinstance(error, OSError) and error.errno == errno.ENOSPC:
+        where = f" of {error.filename}" if error.filename else ""
+        return f"the disk{where} is full: free some space or choose another folder; what was finished is kept"
+    return str(error) or type(error).__name__
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@ import subprocess
 import sys
 import textwrap
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -211,6 +212,14 @@ def test_mistake_is_one_line_without_a_traceback(folder, command, arguments, mes
     assert errors.startswith("error: ")
     assert errors.count("\n") == 1
     assert message in errors
+
+
+def test_a_full_disk_is_told_with_the_way_out(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["advnerf"])
+    monkeypatch.setattr(cli, "app", lambda: Path("/dev/full").write_bytes(bytes(10)))
+    with pytest.raises(SystemExit, match="2"):
+        cli.main()
+    assert capsys.readouterr().err.startswith("error: the disk is full: free some space or choose another folder")
 
 
 def test_mistake_in_an_option_is_told_by_the_option(command, tmp_path):
