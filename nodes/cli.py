@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from nodes import cli_bag, cli_topic
+from nodes import cli_bag, cli_scene, cli_topic
 from nodes.runtime.terminal import Overrides, RunDir, print_table, say_error, table
 
 if TYPE_CHECKING:
@@ -31,6 +31,7 @@ app = typer.Typer(
 )  # fmt: skip
 app.add_typer(cli_topic.app, name="topic")
 app.add_typer(cli_bag.app, name="bag")
+app.add_typer(cli_scene.app, name="scene")
 stage_app = typer.Typer(
     no_args_is_help=True,
     help="One stage of an experiment, and what it needs first: capture, scene, policy, object, attack, deploy, report.",
