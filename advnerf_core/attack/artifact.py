@@ -27,11 +27,36 @@ from advnerf_core.geometry import Array, Pinhole
 FILE_FORMAT = "advnerf-attack-1"
 TEXTURE_PX = 512
 
-Method = Literal["none", "random", "gradient"]
+Method = Literal["none", "random", "gradient", "cem", "evolution"]
 
 
 class AttackFileError(AdvnerfError, ValueError):
     """An attack file cannot be read, or is not what was saved."""
+
+
+@dataclass(frozen=True, eq=False)
+class AttackedObject:
+    """One of several objects of an attack, or one without a face that could be displayed.
+
+    Attributes:
+        name: What it is, e.g. ``hydrant.object`` or ``face``.
+        theta: Its free colours before squashing, ``[..., 3]`` float32.
+        T_world_from_object: Its pose, ``[4, 4]``.
+        scale: World metres per object unit.
+        sha256: Hash of its geometry and fixed colours.
+    """
+
+    name: str
+    theta: NDArray[np.float32]
+    T_world_from_object: Array
+    scale: float
+    sha256: str
+
+    def __post_init__(self) -> None:
+        if self.theta.ndim < 2 or self.theta.shape[-1] != 3 or self.theta.dtype != np.float32:
+            raise AttackFileError(f"expected theta [..., 3] float32, got {self.theta.shape} {self.theta.dtype}")
+        if not (np.isfinite(self.theta).all() and np.isfinite(self.T_world_from_object).all()):
+            raise AttackFileError(f"expected finite colours and a finite pose of {self.name}, got some that are not")
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,8 +65,9 @@ class AttackFile:
 
     Attributes:
         method: How the texture was found; ``none`` is the plain object.
-        theta: Colour grid before squashing, ``[N, N, 3]`` float32; row 0 on top, column 0 left for the viewer.
-        texture: The face as it is displayed, ``[H, W, 3]`` uint8 sRGB.
+        theta: Colour grid before squashing, ``[N, N, 3]`` float32; row 0 on top, column 0 left for the viewer. Empty if no object
+            has a face that can be displayed.
+        texture: The face as it is displayed, ``[H, W, 3]`` uint8 sRGB; empty like ``theta``.
         size_m: Width and height of the face [m].
         T_world_from_object: Pose of the object when it was attacked, ``[4, 4]``.
         subject: Motion-capture subject that carries the face.
@@ -55,6 +81,7 @@ class AttackFile:
         predicted_total_cte_m: Total CTE the surrogate predicts, averaged over starts [m]; None if it was not computed.
         software_version: Version of advnerf that wrote the file.
         extra: Anything else worth keeping, as plain data.
+        objects: All objects with their colours, where there is more to them than the one face.
     """
 
     method: Method
@@ -72,6 +99,7 @@ class AttackFile:
     predicted_total_cte_m: float | None
     software_version: str
     extra: dict[str, Any] = field(default_factory=dict)
+    objects: tuple[AttackedObject, ...] = ()
 
     def __post_init__(self) -> None:
         if self.method not in get_args(Method):
@@ -96,14 +124,22 @@ class AttackFile:
         return digest.hexdigest()
 
     @property
+    def has_face(self) -> bool:
+        """Whether there is a face that a projection or a display can show."""
+        return self.texture.size > 0
+
+    @property
     def attack_id(self) -> str:
         """Short hash that names this attack everywhere."""
         return self.sha256[:12]
 
     def _tensors(self) -> dict[str, NDArray[Any]]:
-        return {"theta": np.ascontiguousarray(self.theta), "texture": np.ascontiguousarray(self.texture)}
+        others = {f"objects.{k}.theta": np.ascontiguousarray(each.theta) for k, each in enumerate(self.objects)}
+        return {"theta": np.ascontiguousarray(self.theta), "texture": np.ascontiguousarray(self.texture), **others}
 
     def _metadata(self) -> dict[str, Any]:
+        # Left out when there are none: a file with one face keeps the hash that it always had.
+        objects = {"objects": [_object_metadata(each) for each in self.objects]} if self.objects else {}
         return {
             "method": self.method,
             "size_m": [float(v) for v in self.size_m],
@@ -118,7 +154,13 @@ class AttackFile:
             "predicted_total_cte_m": self.predicted_total_cte_m,
             "software_version": self.software_version,
             "extra": self.extra,
+            **objects,
         }
+
+
+def _object_metadata(each: AttackedObject) -> dict[str, Any]:
+    pose = np.asarray(each.T_world_from_object, dtype=np.float64).tolist()
+    return {"name": each.name, "T_world_from_object": pose, "scale": float(each.scale), "sha256": each.sha256}
 
 
 def face_texture(theta: ArrayLike, size_px: int = TEXTURE_PX) -> NDArray[np.uint8]:
@@ -171,6 +213,16 @@ def _from_parts(metadata: dict[str, Any], tensors: dict[str, NDArray[Any]]) -> A
     values["size_m"] = tuple(values["size_m"])
     values["T_world_from_object"] = np.array(values["T_world_from_object"])
     values["corners_in_subject"] = np.array(values["corners_in_subject"])
+    values["objects"] = tuple(
+        AttackedObject(
+            each["name"],
+            tensors[f"objects.{k}.theta"],
+            np.array(each["T_world_from_object"]),
+            each["scale"],
+            each["sha256"],
+        )
+        for k, each in enumerate(values.get("objects", ()))
+    )
     return AttackFile(theta=tensors["theta"], texture=tensors["texture"], **values)
 
 

@@ -1,0 +1,1 @@
+"""Attacks on request: from a file or a message to a problem, a search and an attack file."""

@@ -1,0 +1,88 @@
+"""The objects of a request: their geometry, what is free, and the face that a projection or display can show."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from advnerf_core.fields.voxel_grid import VoxelGridObject, cube_face_object, face_corners_in_object
+from advnerf_core.geometry import Array
+from calibration.schema import TargetCalibration, load_calibration
+from nodes.attacking.request import ObjectRequest
+from nodes.runtime.errors import ConfigError
+
+
+@dataclass(frozen=True, eq=False)
+class Face:
+    """The deployable face of an object.
+
+    Attributes:
+        size_m: Width and height [m].
+        subject: Motion-capture subject that carries it.
+        corners_in_subject: Top left, top right, bottom right, bottom left for the viewer, ``[4, 3]`` [m].
+    """
+
+    size_m: tuple[float, float]
+    subject: str
+    corners_in_subject: Array
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedObject:
+    """An object of a request in the scene.
+
+    Attributes:
+        name: What it is, for people.
+        field: Geometry, colours, pose.
+        face: Its deployable face, whose colours are all of its theta ``[N, N, 3]``; None if it has none.
+        sha256: Hash of geometry, fixed colours and pose.
+    """
+
+    name: str
+    field: VoxelGridObject
+    face: Face | None
+    sha256: str
+
+
+def place(wanted: ObjectRequest) -> PlacedObject:
+    """Make the object of a request.
+
+    Raises:
+        ConfigError: An object file where there is no reader for it, or a face that cannot be shown.
+    """
+    if wanted.kind == "file":
+        raise ConfigError(f"{wanted.file}: object files cannot be read")
+    field = cube_face_object(
+        wanted.size_m, wanted.resolution, wanted.plain_rgb, wanted.pose, one_sided=wanted.kind == "face",
+        depth_m=wanted.size_m if wanted.kind == "cube" else 0.01,
+    )  # fmt: skip
+    field = _scaled(field, wanted.scale)
+    return PlacedObject(wanted.kind, field, _face(wanted), object_sha256(field))
+
+
+def _scaled(field: VoxelGridObject, scale: float) -> VoxelGridObject:
+    return replace(field, scale=field.scale * scale)
+
+
+def _face(wanted: ObjectRequest) -> Face:
+    size_m = wanted.scale * wanted.size_m
+    if wanted.target is None:
+        return Face((size_m, size_m), wanted.subject, face_corners_in_object(size_m))
+    target = load_calibration(TargetCalibration, wanted.target)
+    corners = target.corners
+    shown = (float(np.linalg.norm(corners[1] - corners[0])), float(np.linalg.norm(corners[3] - corners[0])))
+    return Face(shown, target.subject, corners)
+
+
+def object_sha256(field: VoxelGridObject) -> str:
+    """Hash of everything about an object except the colours that are searched for."""
+    digest = hashlib.sha256(repr((field.theta_shape, field.scale, field.one_sided, field.step_units)).encode())
+    parts = (field.slots, field.fixed_colours, field.box_min, field.box_max, field.T_world_from_object, field.density)
+    for part in parts:
+        array: NDArray[np.generic] = np.zeros(0) if part is None else np.ascontiguousarray(part)
+        digest.update(f"{array.dtype} {array.shape}".encode())
+        digest.update(array.tobytes())
+    return digest.hexdigest()
