@@ -14,6 +14,7 @@ from torch import Tensor
 from advnerf_core.attack.adjoint import AttackProblem, Sensor
 from advnerf_core.attack.artifact import AttackedObject, AttackFile, face_texture
 from advnerf_core.attack.search import SearchResult, draw_start_states
+from advnerf_core.driving.actuated import ActuatedAckermann
 from advnerf_core.driving.dynamics import Ackermann, Dynamics
 from advnerf_core.driving.policy import LoadedPolicy, load_policy
 from advnerf_core.scene.field import load_scene
@@ -139,10 +140,15 @@ def request_hash(request: AttackRequest) -> str:
 
 
 def make_dynamics(request: AttackRequest) -> Dynamics:
-    """The surrogate's car."""
+    """The surrogate's car: as calibrated, behind the delay, lag and slew limit that were asked for."""
     vehicle = load_calibration(VehicleCalibration, request.calibration_file("vehicle"))
     limits = (vehicle.limits.steering_min_rad, vehicle.limits.steering_max_rad)
-    return Ackermann(vehicle.wheelbase_m, request.dynamics.speed_mps, request.dynamics.dt_s, limits)
+    wanted = request.dynamics
+    if wanted.delay_s == wanted.lag_s == 0.0 and wanted.slew_radps is None:
+        return Ackermann(vehicle.wheelbase_m, wanted.speed_mps, wanted.dt_s, limits)
+    return ActuatedAckermann(
+        vehicle.wheelbase_m, wanted.speed_mps, wanted.dt_s, wanted.delay_s, wanted.lag_s, wanted.slew_radps, limits
+    )
 
 
 def start_states(request: AttackRequest, room: RoomCalibration, dynamics: Dynamics, seed: int) -> Tensor:
