@@ -1,0 +1,187 @@
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from advnerf_core.geometry import OPENGL_FROM_OPENCV, Pinhole, look_at
+from advnerf_core.scene.dataset import DatasetError, Lens, load_transforms, write_transforms
+
+FOX = Path("../shared/data/fox")
+WIDTH, HEIGHT = 32, 24
+
+
+def paint(path, width=WIDTH, height=HEIGHT, channels=3, value=90):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    assert cv2.imwrite(str(path), np.full((height, width, channels), value, np.uint8))
+
+
+def pose(k=0):
+    return (look_at([3.0, k, 1.0], [0.0, 0.0, 0.5]) @ OPENGL_FROM_OPENCV).tolist()
+
+
+def write(folder, frames=None, name="transforms.json", **content):
+    """A file whose frames are images 0.png, 1.png, ... unless given."""
+    if frames is None:
+        frames = [{"file_path": f"{k}.png", "transform_matrix": pose(k)} for k in range(2)]
+    for frame in frames:
+        if isinstance(frame, dict) and str(frame.get("file_path", "")).endswith("png"):
+            paint(folder / frame["file_path"])
+    (folder / name).write_text(json.dumps({"fl_x": 30.0, "frames": frames, **content}))
+    return folder / name
+
+
+def test_blender_folder_with_its_splits(tmp_path):
+    for split, count in (("train", 3), ("val", 1), ("test", 2)):
+        frames = [{"file_path": f"./{split}/r_{k}", "transform_matrix": pose(k)} for k in range(count)]
+        for k in range(count):
+            paint(tmp_path / split / f"r_{k}.png", channels=4)
+        (tmp_path / f"transforms_{split}.json").write_text(json.dumps({"camera_angle_x": 0.69, "frames": frames}))
+    listed = load_transforms(tmp_path)
+    assert listed.splits == ("train", "val", "test")
+    training, held_out = listed.training_and_held_out()
+    assert (len(training.frames), len(held_out.frames)) == (3, 3)
+    assert listed.frames[0].pinhole.fx == pytest.approx(0.5 * WIDTH / np.tan(0.345))
+    assert len(load_transforms(tmp_path / "transforms_test.json").frames) == 2
+    assert listed.load().alpha.shape == (6, HEIGHT, WIDTH)
+
+
+def test_nerfstudio_lists_of_splits(tmp_path):
+    frames = [{"file_path": f"{k}.png", "transform_matrix": pose(k)} for k in range(4)]
+    listed = load_transforms(write(tmp_path, frames, train_filenames=["0.png", "./2.png"], test_filenames=["3.png"]))
+    assert [f.split for f in listed.frames] == ["train", None, "train", "test"]
+    training, held_out = listed.training_and_held_out()
+    assert [f.path.name for f in (*training.frames, *held_out.frames)] == ["0.png", "2.png", "3.png"]
+
+
+def test_without_splits_every_nth_by_name_is_held_out(tmp_path):
+    frames = [{"file_path": f"{k}.png", "transform_matrix": pose(k)} for k in (3, 1, 2, 0)]
+    training, held_out = load_transforms(write(tmp_path, frames)).training_and_held_out(every=2)
+    assert [f.path.name for f in held_out.frames] == ["0.png", "2.png"]
+    assert [f.path.name for f in training.frames] == ["1.png", "3.png"]
+
+
+def test_one_image_can_be_loaded_but_not_held_out(tmp_path):
+    listed = load_transforms(write(tmp_path, [{"file_path": "0.png", "transform_matrix": pose()}]))
+    assert listed.load().rgb.shape == (1, HEIGHT, WIDTH, 3)
+    with pytest.raises(DatasetError, match=r"expected at least 2 images in .*transforms\.json.* got 1"):
+        listed.training_and_held_out()
+
+
+def test_instant_ngp_scale_and_offset_place_the_box(tmp_path):
+    listed = load_transforms(write(tmp_path, aabb_scale=2, scale=0.5, offset=[0.5, 0.25, 1.0]))
+    low, high = listed.box()
+    # u = 0.5 x + offset; the box is [-0.5, 1.5] in u.
+    np.testing.assert_allclose(low, [-2.0, -1.5, -3.0])
+    np.testing.assert_allclose(high, [2.0, 2.5, 1.0])
+
+
+def test_fields_of_view_in_degrees_and_of_both_axes(tmp_path):
+    frames = [{"file_path": "0.png", "transform_matrix": pose()}]
+    write(tmp_path, frames, x_fov=90.0, camera_angle_y=np.pi / 2)
+    content = json.loads((tmp_path / "transforms.json").read_text())
+    del content["fl_x"]
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    pinhole = load_transforms(tmp_path).frames[0].pinhole
+    assert (pinhole.fx, pinhole.fy) == (pytest.approx(WIDTH / 2), pytest.approx(HEIGHT / 2))
+
+
+def test_cameras_of_one_set_keep_their_own_intrinsics_and_names(tmp_path):
+    for name in ("phone.png", "car.png"):
+        paint(tmp_path / name)
+    pinholes = [Pinhole(WIDTH, HEIGHT, 30.0, 31.0, 16.0, 12.0), Pinhole(WIDTH, HEIGHT, 20.0, 20.0, 15.0, 11.0)]
+    lenses = [Lens((0.1, -0.05, 0.001, 0.0, 0.0)), Lens((0.01, 0.0, 0.0, 0.0), fisheye=True)]
+    poses = np.stack([look_at([3.0, k, 1.0], [0.0, 0.0, 0.5]) for k in range(2)])
+    path = tmp_path / "transforms.json"
+    write_transforms(
+        path, ["phone.png", tmp_path / "car.png"], poses, pinholes, lens=lenses, camera_ids=["phone", "car"]
+    )
+    listed = load_transforms(path)
+    assert [f.pinhole for f in listed.frames] == pinholes
+    assert [f.lens for f in listed.frames] == lenses
+    assert listed.camera_ids == ("phone", "car")
+    assert listed.of_camera("car").load().camera_ids == ("car",)
+    with pytest.raises(DatasetError, match=r"cameras phone, car of .*transforms\.json, got 'drone'"):
+        listed.of_camera("drone")
+
+
+def test_windows_separators_and_frames_without_a_suffix(tmp_path):
+    paint(tmp_path / "images" / "0.jpg")
+    write(tmp_path, [{"file_path": "images\\0", "transform_matrix": pose()}])
+    assert load_transforms(tmp_path).frames[0].path == tmp_path / "images" / "0.jpg"
+
+
+def test_rounded_rotations_become_rotations(tmp_path):
+    rounded = np.round(pose(1), 3).tolist()
+    listed = load_transforms(write(tmp_path, [{"file_path": "0.png", "transform_matrix": rounded}]))
+    R = listed.frames[0].T_world_from_camera[:3, :3]
+    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
+
+
+def scaled(factor):
+    matrix = np.array(pose())
+    matrix[:3, :3] = matrix[:3, :3] * factor
+    return matrix.tolist()
+
+
+def moved(value):
+    matrix = np.array(pose())
+    matrix[0, 3] = value
+    return matrix.tolist()
+
+
+FRAME = r"transforms\.json: frame 1 \(1\.png\): "
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"transform_matrix": moved(float("nan"))}, FRAME + "transform_matrix: expected finite numbers"),
+        ({"transform_matrix": scaled(1.7)}, FRAME + r"transform_matrix: .*a stretch by 1\.7, 1\.7, 1\.7"),
+        ({"transform_matrix": scaled([1.0, 1.0, -1.0])}, FRAME + "transform_matrix: .*a mirror image"),
+        ({"transform_matrix": np.array(moved(2.0)).T.tolist()}, FRAME + "transform_matrix: .*is it transposed"),
+        (
+            {"transform_matrix": [[1, 2], [3, 4]]},
+            FRAME + r"transform_matrix: expected 4 x 4 numbers, got shape \[2, 2\]",
+        ),
+        ({"transform_matrix": "eye"}, FRAME + "transform_matrix: expected 4 x 4 numbers"),
+        (
+            {"transform_matrix": moved(6e5)},
+            r"frame 1\.png: transform_matrix: expected a camera within 100000 m.*6e\+05",
+        ),
+        ({"fl_x": -3}, FRAME + "fl_x: expected a positive number, got -3"),
+        ({"fl_x": None}, FRAME + "fl_x: expected fl_x, camera_angle_x or x_fov"),
+        ({"fl_x": None, "camera_angle_x": 4.0}, FRAME + "camera_angle_x: expected a field of view below a half turn"),
+        ({"cx": "middle"}, FRAME + "cx: expected a number, got 'middle'"),
+        ({"mask_path": "no.png"}, FRAME + r"mask_path: expected a mask at .*no\.png"),
+        ({"file_path": 7}, r"transforms\.json: frame 1 \(7\): file_path: expected the name"),
+    ],
+)
+def test_a_wrong_field_is_one_error_with_file_frame_and_field(tmp_path, change, message):
+    frames = [{"file_path": f"{k}.png", "transform_matrix": pose(k)} for k in range(2)]
+    frames[1].update(change)
+    with pytest.raises(DatasetError, match=message):
+        load_transforms(write(tmp_path, frames))
+
+
+def test_a_missing_pose_and_a_frame_that_is_no_object(tmp_path):
+    with pytest.raises(DatasetError, match=r"frame 0 \(0\.png\): transform_matrix: .*missing"):
+        load_transforms(write(tmp_path, [{"file_path": "0.png"}]))
+    with pytest.raises(DatasetError, match=r"frame 0: expected an object with file_path"):
+        load_transforms(write(tmp_path, ["0.png"]))
+    with pytest.raises(DatasetError, match=r"scale: expected a positive number"):
+        load_transforms(write(tmp_path, scale=0))
+
+
+@pytest.mark.data
+def test_fox_as_it_is_distributed():
+    listed = load_transforms(FOX)
+    assert (len(listed.frames), len(listed.missing)) == (50, 17)
+    assert all(not path.exists() for path in listed.missing)
+    assert listed.aabb_scale == 4
+    training, held_out = listed.training_and_held_out(8)
+    assert (len(training.frames), len(held_out.frames)) == (43, 7)
+    view = held_out.with_frames(held_out.frames[:1]).load((270, 480))
+    assert view.rgb.shape == (1, 480, 270, 3)
+    assert view.pinholes[0].fx == pytest.approx(1375.52 / 4, rel=0.1)
