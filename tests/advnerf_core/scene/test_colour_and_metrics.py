@@ -19,6 +19,17 @@ def test_fit_recovers_a_map_despite_displaced_edges() -> None:
     assert found.power == pytest.approx(1.3, abs=0.02)
 
 
+def test_a_fit_to_many_pixels_takes_a_fixed_sample_of_them() -> None:
+    true = ColourMap(((0.9, 0.1, 0.0), (0.05, 0.8, 0.1), (0.0, 0.1, 0.85)), (0.01, 0.0, 0.02), 0.8)
+    learned = RNG.random((400, 500, 3)).astype(np.float32)
+    driving = np.rint(255.0 * true.apply(learned)).astype(np.uint8)
+    learned[:5] = np.nan  # rays that met nothing
+    found = fit_colour_map(learned, driving)
+    assert found == fit_colour_map(learned, driving)
+    test = RNG.random((1000, 3)).astype(np.float32)
+    np.testing.assert_allclose(found.apply(test), true.apply(test), atol=2e-3)
+
+
 def test_identity_changes_nothing_and_maps_survive_json() -> None:
     image = RNG.random((2, 4, 5, 3)).astype(np.float32)
     np.testing.assert_allclose(IDENTITY.apply(image), image, atol=1e-6)
