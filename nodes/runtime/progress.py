@@ -42,14 +42,14 @@ class ProgressDisplay:
     def start(self, stage: str) -> Report:
         """A stage begins."""
         if self._progress is None:
-            self._console.print(f"{stage}: started", highlight=False)
+            self._console.print(f"{stage}: started", highlight=False, soft_wrap=True)
             return _LogReport(self._console, stage)
         return _BarReport(self._progress, self._progress.add_task("", total=1.0, stage=stage, text=""))
 
     def finish(self, stage: str, seconds: float, cached: bool) -> None:
         """A stage has ended, or its earlier result is used."""
         text = "unchanged, used again" if cached else f"done in {seconds:.1f} s"
-        self._console.print(f"{stage}: {text}", highlight=False)
+        self._console.print(f"{stage}: {text}", highlight=False, soft_wrap=True)
 
 
 class _BarReport:
@@ -72,4 +72,4 @@ class _LogReport:
         self._printed_s = now_s
         left = (now_s - self._begin_s) * (1.0 / fraction - 1.0) if fraction > 0.01 else float("nan")
         remaining = "" if left != left else f", about {left:.0f} s left"
-        self._console.print(f"{self._stage}: {100 * fraction:.0f} % {text}{remaining}", highlight=False)
+        self._console.print(f"{self._stage}: {100 * fraction:.0f} % {text}{remaining}", highlight=False, soft_wrap=True)
