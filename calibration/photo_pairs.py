@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 Descriptors = NDArray[np.uint8]
 
+_FEATURE_SIZE = 128  # of SIFT
 _WORDS = 32
 _VOCABULARY_SAMPLE = 20_000
 _ITERATIONS = 12
@@ -29,7 +30,7 @@ def chosen_pairs(
     """Neighbours in time, at growing distances too, and for every image those that look most like it.
 
     Args:
-        descriptors: Local features of each image ``[n_i, d]`` uint8.
+        descriptors: Local features of each image ``[n_i, 128]`` uint8.
         sequences: Images in the order of each video.
         overlap: How many followers of an image in its video.
         look_alikes: How many images that look like it, out of all.
@@ -89,5 +90,5 @@ def _nearest(features: NDArray[np.float32], words: NDArray[np.float32]) -> NDArr
 
 def _rooted(descriptors: Descriptors) -> NDArray[np.float32]:
     """Features of unit length."""
-    values = np.asarray(descriptors, np.float32).reshape(len(descriptors), -1)
+    values = np.asarray(descriptors, np.float32).reshape(-1, _FEATURE_SIZE)
     return np.asarray(values / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-9), np.float32)
