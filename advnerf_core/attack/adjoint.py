@@ -18,106 +18,26 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from advnerf_core.driving.cross_track import cross_track
+from advnerf_core.attack.problem import AttackProblem, RecurrentPolicy, SearchDivergedError, Sensor, Totals
 from advnerf_core.driving.dynamics import Dynamics
 from advnerf_core.driving.metrics import Horizon, drive_metrics
-from advnerf_core.driving.path import Path
 from advnerf_core.driving.rollout import Rollout, drive
+from advnerf_core.errors import AdvnerfError
 from advnerf_core.scene.surrogate import Rendered
 
-
-class Sensor(Protocol):
-    """A differentiable sensor; the attack does not know which renderer is behind it."""
-
-    @property
-    def theta_shape(self) -> tuple[int, ...]:
-        """Shape of the attacked parameters."""
-
-    def initial_theta(self, generator: torch.Generator) -> Tensor:
-        """Where an attack starts."""
-
-    def sense(self, states: Tensor, theta: Tensor) -> Rendered:
-        """Images at detached states ``[B, n]`` with their vjp."""
+__all__ = [
+    "AdjointResult", "AttackProblem", "BlackBoxError", "RecurrentPolicy", "RenderCache", "Sensor", "Totals", "adjoint_gradient", "adjoint_states",
+    "evaluate", "gradient_pass", "roll_out",
+]  # fmt: skip
 
 
-class RecurrentPolicy(Protocol):
-    """A policy with memory: hidden units, or a stack of past frames. ``stateless`` is False."""
-
-    stateless: bool
-
-    def initial_memory(self, batch: int) -> Tensor:
-        """Memory ``[B, ...]`` before the first image."""
-
-    def __call__(self, images: Tensor, goals: Tensor | None, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Steering ``[B]`` and the next memory."""
-
-
-@dataclass(frozen=True, eq=False)
-class AttackProblem:
-    """Everything an attack needs except ``theta``.
-
-    Attributes:
-        policy: Frozen policy in eval mode; ``stateless`` says which adjoint is used.
-        sensor: Differentiable sensor, usually a ``Surrogate``.
-        dynamics: Vehicle model with Jacobians.
-        path: Reference path; the cost of a state is minus its absolute cross-track error.
-        start_states: ``[B, n]``; their dtype is that of states and lambdas.
-        steps: Horizon T in control ticks.
-        goals: ``[B, goal_size]`` or None.
-        time_batch: Steps whose policy gradients are evaluated at once.
-        cache_bytes: Budget for renders kept from the forward to the backward pass; 0 keeps none.
-        fence_m: Half side of the square |x|, |y| beyond which the car is stopped in deployment [m]; None if there is no fence.
-            It shapes the reported total only: the loss goes on driving, as its gradient would else be zero.
-        held_cap_m: Cap of the |CTE| that a stopped car is charged per tick in the reported total [m].
-    """
-
-    policy: Any
-    sensor: Sensor
-    dynamics: Dynamics
-    path: Path
-    start_states: Tensor
-    steps: int
-    goals: Tensor | None = None
-    time_batch: int = 8
-    cache_bytes: int = 256 * 2**20
-    fence_m: float | None = None
-    held_cap_m: float = 1.5
-
-    def __post_init__(self) -> None:
-        """Refuse what would give a wrong gradient silently."""
-        if getattr(self.policy, "training", False):
-            raise ValueError("expected the policy in eval mode, got one in training mode; call policy.eval()")
-        size = self.dynamics.state_size
-        if self.start_states.ndim != 2 or self.start_states.shape[1] != size:
-            raise ValueError(f"expected start states [B, {size}], got {list(self.start_states.shape)}")
-        if self.steps < 1 or self.time_batch < 1 or self.cache_bytes < 0:
-            raise ValueError(
-                "expected steps >= 1, time_batch >= 1 and cache_bytes >= 0, "
-                f"got {self.steps}, {self.time_batch} and {self.cache_bytes}"
-            )
-
-    def cost(self, states: Tensor) -> Tensor:
-        """Cost ``[...]`` of states ``[..., n]``: minus the absolute cross-track error [m]."""
-        return -cross_track(self.path, states[..., :2]).abs()
-
-
-@dataclass(frozen=True, eq=False)
-class Totals:
-    """Total cross-track error of each start of a rollout.
-
-    Attributes:
-        total_cte_m: What the loss sums: |CTE| over t = 1..T, ``[B]`` [m].
-        protocol_cte_m: What is compared between domains (``driving/metrics``): the car stops at the fence, ``[B]`` [m].
-    """
-
-    total_cte_m: Tensor
-    protocol_cte_m: Tensor
+class BlackBoxError(AdvnerfError, TypeError):
+    """A gradient was asked for of a policy that has none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,7 +45,7 @@ class AdjointResult:
     """A loss with its gradient.
 
     Attributes:
-        loss: ``mean_b sum_t C(x_t)`` [m]; negative, and lower is a stronger attack.
+        loss: ``mean_b sum_t C(x_t)`` [m], and the regulariser's part; lower is a stronger attack.
         gradient: dJ/dtheta with camera poses frozen, of the shape of ``theta``.
         lambdas: Adjoint states ``[T + 1, B, n]``; ``lambdas[0]`` is the derivative with respect to the start.
         rollout: The nominal trajectory.
@@ -169,7 +89,7 @@ def roll_out(problem: AttackProblem, theta: Tensor, cache: RenderCache | None = 
 
     def observe(states: Tensor) -> Tensor:
         nonlocal step
-        rendered = problem.sensor.sense(states, theta)
+        rendered = problem.sense((step,), states, theta)
         if cache is not None:
             cache.offer(step, rendered)
         step += 1
@@ -177,6 +97,11 @@ def roll_out(problem: AttackProblem, theta: Tensor, cache: RenderCache | None = 
 
     policy = problem.policy if problem.policy.stateless else _Remembering(problem.policy, len(problem.start_states))
     rollout = drive(policy, observe, problem.dynamics, problem.start_states, problem.steps, problem.goals)
+    if not bool(torch.isfinite(rollout.states).all()):
+        tick = int((~torch.isfinite(rollout.states)).flatten(1).any(1).nonzero()[0])
+        raise SearchDivergedError(
+            f"expected finite states, got some that are not after {tick} ticks; check policy and scene for NaN"
+        )
     return rollout, policy.memories if isinstance(policy, _Remembering) else []
 
 
@@ -215,10 +140,34 @@ def _totals(problem: AttackProblem, states: Tensor) -> Totals:
 
 
 def adjoint_gradient(problem: AttackProblem, theta: Tensor) -> AdjointResult:
-    """Loss and gradient of one rollout; see the module's docstring for what the gradient is and is not."""
+    """Loss and gradient of one rollout; see the module's docstring for what the gradient is and is not.
+
+    Raises:
+        BlackBoxError: The policy says that it has no gradient.
+    """
+    if not problem.differentiable:
+        raise BlackBoxError(
+            "expected a policy with a gradient, got one that declares differentiable = False; search with the methods random, "
+            "cem or evolution instead"
+        )
     theta = theta.detach()
     cache = RenderCache(problem.cache_bytes)
     rollout, memories = roll_out(problem, theta, cache)
+    return gradient_pass(problem, theta, rollout, cache, memories)
+
+
+def gradient_pass(
+    problem: AttackProblem, theta: Tensor, rollout: Rollout, cache: RenderCache, memories: Sequence[Tensor] = ()
+) -> AdjointResult:
+    """The gradient of a rollout that was driven with ``theta``.
+
+    Args:
+        problem: What is attacked.
+        theta: Parameters of the rollout, without history.
+        rollout: Nominal trajectory.
+        cache: Renders that were kept of it; it is emptied.
+        memories: Memories ``[T + 1]`` of a policy that has one.
+    """
     loss, cost_slopes = _cost_slopes(problem, rollout.states)
     lambdas, control_slopes = adjoint_states(problem.dynamics, rollout, cost_slopes)
     rerendered = 0
@@ -227,6 +176,9 @@ def adjoint_gradient(problem: AttackProblem, theta: Tensor) -> AdjointResult:
     for term, again in batches(problem, theta, rollout, control_slopes, cache, memories):
         gradient += term
         rerendered += again
+    if problem.regulariser is not None:
+        extra, slope = problem.regulariser(theta)
+        loss, gradient = loss + extra, gradient + slope
     return AdjointResult(loss, gradient, lambdas, rollout, _totals(problem, rollout.states), rerendered)
 
 
@@ -292,8 +244,7 @@ def _renders(problem: AttackProblem, theta: Tensor, rollout: Rollout, steps: ran
 
     def fill() -> None:
         if missing:
-            states = rollout.states[missing].flatten(0, 1)
-            pieces.append(problem.sensor.sense(states, theta))
+            pieces.append(problem.sense(missing, rollout.states[missing].flatten(0, 1), theta))
             missing.clear()
 
     for step in steps:

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import torch
 
-from advnerf_core.attack.adjoint import AttackProblem, evaluate
-from advnerf_core.attack.search import OnEvaluation, SearchResult, SearchState, load_state, search_fingerprint
+from advnerf_core.attack.adjoint import AttackProblem
+from advnerf_core.attack.search import OnEvaluation, SearchResult, begin, search_fingerprint, without_gradient
 
 
 def random_search(
@@ -36,16 +36,12 @@ def random_search(
     shape = problem.sensor.theta_shape
     fingerprint = search_fingerprint(problem, shape, method="random", seed=seed, sigma=sigma, hash=settings_hash)
     generator = torch.Generator().manual_seed(seed)
-    if state_path is not None and state_path.exists():
-        state = load_state(state_path, fingerprint)
-        generator.set_state(state.tensors["generator"])
-    else:
-        state = SearchState({"generator": generator.get_state()})
+    state = begin(state_path, fingerprint, lambda: {"generator": generator.get_state()})
+    generator.set_state(state.tensors["generator"])
     while len(state.history) < evaluations:
         began = time.perf_counter()
         theta = sigma * torch.randn(shape, generator=generator)
-        _, totals = evaluate(problem, theta)
-        loss_m = -float(totals.total_cte_m.mean())
+        loss_m, totals = without_gradient(problem, theta, len(state.history))
         evaluation = state.record(theta, loss_m, totals, time.perf_counter() - began)
         state.tensors["generator"] = generator.get_state()
         if state_path is not None:

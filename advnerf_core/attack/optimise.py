@@ -15,7 +15,7 @@ from advnerf_core.attack.search import (
     SearchDivergedError,
     SearchResult,
     SearchState,
-    load_state,
+    begin,
     search_fingerprint,
 )
 
@@ -48,14 +48,12 @@ def gradient_attack(
     fingerprint = search_fingerprint(
         problem, shape, method="gradient", seed=seed, learning_rate=learning_rate, hash=settings_hash
     )
-    if state_path is not None and state_path.exists():
-        state = load_state(state_path, fingerprint)
-    else:
-        state = SearchState({"theta": problem.sensor.initial_theta(torch.Generator().manual_seed(seed))})
+    start = torch.Generator().manual_seed(seed)
+    state = begin(state_path, fingerprint, lambda: {"theta": problem.sensor.initial_theta(start)})
     theta, adam = _adam(state, learning_rate)
     while len(state.history) < iterations:
         began = time.perf_counter()
-        result = adjoint_gradient(problem, theta)
+        result = adjoint_gradient(problem.at_draw(len(state.history)), theta)
         if not (math.isfinite(result.loss) and bool(torch.isfinite(result.gradient).all())):
             raise SearchDivergedError(
                 f"expected a finite loss and gradient at iteration {len(state.history)}, got loss {result.loss}; "

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -19,19 +20,21 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from advnerf_core.attack.adjoint import AttackProblem, Totals
+from advnerf_core.attack.adjoint import AttackProblem, Totals, evaluate
+from advnerf_core.attack.problem import SearchDivergedError
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.files import write_atomically
+
+__all__ = [
+    "Evaluation", "OnEvaluation", "SearchDivergedError", "SearchResult", "SearchState", "SearchStateError", "begin",
+    "draw_start_states", "load_state", "search_fingerprint", "without_gradient",
+]  # fmt: skip
 
 _FORMAT = "advnerf-search-1"
 
 
 class SearchStateError(AdvnerfError, ValueError):
     """A search cannot be resumed from its state file."""
-
-
-class SearchDivergedError(AdvnerfError, ArithmeticError):
-    """A loss or gradient is not finite."""
 
 
 @dataclass(frozen=True)
@@ -143,6 +146,30 @@ def load_state(path: Path, fingerprint: str) -> SearchState:
     return SearchState(tensors, best_theta, history)
 
 
+def begin(path: Path | None, fingerprint: str, fresh: Callable[[], dict[str, Tensor]]) -> SearchState:
+    """The state to go on from if there is one at ``path``, else a fresh one with these tensors."""
+    if path is not None and path.exists():
+        return load_state(path, fingerprint)
+    return SearchState(fresh())
+
+
+def without_gradient(problem: AttackProblem, theta: Tensor, number: int) -> tuple[float, Totals]:
+    """Loss and totals of evaluation ``number`` of a search that asks for no gradient.
+
+    Raises:
+        SearchDivergedError: The loss is not finite.
+    """
+    _, totals = evaluate(problem.at_draw(number), theta)
+    loss_m = -float(totals.total_cte_m.mean())
+    if problem.regulariser is not None:
+        loss_m += problem.regulariser(theta)[0]
+    if not math.isfinite(loss_m):
+        raise SearchDivergedError(
+            f"expected a finite loss at evaluation {number}, got {loss_m}; check the policy and the scene for NaN"
+        )
+    return loss_m, totals
+
+
 def _evaluation(entry: dict[str, Any]) -> Evaluation:
     values: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in entry.items()}
     return Evaluation(**values)
@@ -152,6 +179,8 @@ def search_fingerprint(problem: AttackProblem, theta_shape: tuple[int, ...], **s
     """Hash of what must not change between a search and its resumption (its length may)."""
     text = json.dumps({"steps": problem.steps, "theta_shape": list(theta_shape), **settings}, sort_keys=True)
     digest = hashlib.sha256(text.encode())
+    if problem.disturbances is not None:
+        digest.update(repr(problem.disturbances).encode())
     digest.update(problem.start_states.detach().cpu().numpy().tobytes())
     return digest.hexdigest()
 

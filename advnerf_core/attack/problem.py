@@ -1,0 +1,155 @@
+"""What an attack is given: a frozen policy, a differentiable sensor, dynamics, a path and start poses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from advnerf_core.attack.robustness import Disturbances, PosedSensor
+from advnerf_core.driving.cross_track import cross_track
+from advnerf_core.driving.dynamics import Dynamics
+from advnerf_core.driving.path import Path
+from advnerf_core.errors import AdvnerfError
+from advnerf_core.scene.surrogate import Rendered
+
+Regulariser = Callable[[Tensor], tuple[float, Tensor]]
+"""``theta -> (part of the loss, its gradient)``, for example `Smoothness`."""
+
+
+class SearchDivergedError(AdvnerfError, ArithmeticError):
+    """A drive, loss or gradient is not finite."""
+
+
+class Sensor(Protocol):
+    """A differentiable sensor; the attack does not know which renderer is behind it."""
+
+    @property
+    def theta_shape(self) -> tuple[int, ...]:
+        """Shape of the attacked parameters."""
+
+    def initial_theta(self, generator: torch.Generator) -> Tensor:
+        """Where an attack starts."""
+
+    def sense(self, states: Tensor, theta: Tensor) -> Rendered:
+        """Images at detached states ``[B, n]`` with their vjp."""
+
+
+class RecurrentPolicy(Protocol):
+    """A policy with memory: hidden units, or a stack of past frames. ``stateless`` is False."""
+
+    stateless: bool
+
+    def initial_memory(self, batch: int) -> Tensor:
+        """Memory ``[B, ...]`` before the first image."""
+
+    def __call__(self, images: Tensor, goals: Tensor | None, memory: Tensor) -> tuple[Tensor, Tensor]:
+        """Steering ``[B]`` and the next memory."""
+
+
+@dataclass(frozen=True, eq=False)
+class AttackProblem:
+    """Everything an attack needs except ``theta``.
+
+    Attributes:
+        policy: Frozen policy in eval mode; ``stateless`` says which adjoint is used.
+        sensor: Differentiable sensor, usually a ``Surrogate``.
+        dynamics: Vehicle model with Jacobians.
+        path: Reference path; the cost of a state is minus its absolute cross-track error.
+        start_states: ``[B, n]``; their dtype is that of states and lambdas.
+        steps: Horizon T in control ticks.
+        goals: ``[B, goal_size]`` or None.
+        time_batch: Steps whose policy gradients are evaluated at once.
+        cache_bytes: Budget for renders kept from the forward to the backward pass; 0 keeps none.
+        fence_m: Half side of the square |x|, |y| beyond which the car is stopped in deployment [m]; None if there is no fence.
+            It shapes the reported total only: the loss goes on driving, as its gradient would else be zero.
+        held_cap_m: Cap of the |CTE| that a stopped car is charged per tick in the reported total [m].
+        disturbances: Random disturbances of what is seen; None changes nothing.
+        draw: Which draw of the disturbances; searches count their evaluations here.
+        regulariser: Added to the loss, for example `Smoothness`; None adds nothing.
+    """
+
+    policy: Any
+    sensor: Sensor
+    dynamics: Dynamics
+    path: Path
+    start_states: Tensor
+    steps: int
+    goals: Tensor | None = None
+    time_batch: int = 8
+    cache_bytes: int = 256 * 2**20
+    fence_m: float | None = None
+    held_cap_m: float = 1.5
+    disturbances: Disturbances | None = None
+    draw: int = 0
+    regulariser: Regulariser | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse what would give a wrong gradient silently."""
+        if getattr(self.policy, "training", False):
+            raise ValueError("expected the policy in eval mode, got one in training mode; call policy.eval()")
+        size = self.dynamics.state_size
+        if self.start_states.ndim != 2 or self.start_states.shape[1] != size:
+            raise ValueError(f"expected start states [B, {size}], got {list(self.start_states.shape)}")
+        if self.steps < 1 or self.time_batch < 1 or self.cache_bytes < 0:
+            raise ValueError(
+                "expected steps >= 1, time_batch >= 1 and cache_bytes >= 0, "
+                f"got {self.steps}, {self.time_batch} and {self.cache_bytes}"
+            )
+
+        moved = self.disturbances is not None and self.disturbances.moves_the_camera
+        if moved and not isinstance(self.sensor, PosedSensor):
+            raise ValueError("expected a sensor with camera_poses and render for camera jitter, got one without")
+
+    @property
+    def differentiable(self) -> bool:
+        """Whether the policy has a gradient; one without declares ``differentiable = False``."""
+        return bool(getattr(self.policy, "differentiable", True))
+
+    def sense(self, ticks: Sequence[int], states: Tensor, theta: Tensor) -> Rendered:
+        """What the policy sees at some ticks of a drive.
+
+        Args:
+            ticks: Their numbers.
+            states: ``[ticks * B, n]``, ordered by tick.
+            theta: Parameters of the objects.
+        """
+        if self.disturbances is None:
+            return self.sensor.sense(states, theta)
+        if self.disturbances.moves_the_camera:
+            assert isinstance(self.sensor, PosedSensor)
+            poses = self.disturbances.camera_poses(self.sensor.camera_poses(states), ticks, self.draw)
+            rendered = self.sensor.render(poses, theta)
+        else:
+            rendered = self.sensor.sense(states, theta)
+        return self.disturbances.disturb(rendered, ticks, self.draw)
+
+    def at_draw(self, draw: int) -> AttackProblem:
+        """The problem of one evaluation of a search; itself where nothing is drawn."""
+        return self if self.disturbances is None else replace(self, draw=draw)
+
+    def undisturbed(self) -> AttackProblem:
+        """The same problem without disturbances and regulariser: what an attack is judged by."""
+        if self.disturbances is None and self.regulariser is None:
+            return self
+        return replace(self, disturbances=None, draw=0, regulariser=None)
+
+    def cost(self, states: Tensor) -> Tensor:
+        """Cost ``[...]`` of states ``[..., n]``: minus the absolute cross-track error [m]."""
+        return -cross_track(self.path, states[..., :2]).abs()
+
+
+@dataclass(frozen=True, eq=False)
+class Totals:
+    """Total cross-track error of each start of a rollout.
+
+    Attributes:
+        total_cte_m: What the loss sums: |CTE| over t = 1..T, ``[B]`` [m].
+        protocol_cte_m: What is compared between domains (``driving/metrics``): the car stops at the fence, ``[B]`` [m].
+    """
+
+    total_cte_m: Tensor
+    protocol_cte_m: Tensor
