@@ -45,6 +45,8 @@ class VoxelGridObject:
         one_sided: Only rays that enter through the ``+x`` face hit. This is what a projected or displayed texture does: it has
             a front and no sides.
         step_units: Length of a ray-marching step in object units; used with a density only.
+        plain_colours: Colours of the free rows without an attack, ``[free_count, 3]`` in 0..1; None is the mean of the fixed
+            ones.
     """
 
     slots: NDArray[np.int32]
@@ -57,6 +59,7 @@ class VoxelGridObject:
     density: Array | None = None
     one_sided: bool = False
     step_units: float = 0.01
+    plain_colours: Array | None = None
 
     def __post_init__(self) -> None:
         """Check shapes and ranges, so that the casting kernel may index without looking."""
@@ -70,6 +73,8 @@ class VoxelGridObject:
             raise ValueError(f"expected box_max above box_min, got {self.box_min} and {self.box_max}")
         if self.density is not None and (self.density.shape != self.slots.shape or (self.density < 0).any()):
             raise ValueError(f"expected a density >= 0 of shape {self.slots.shape}, got shape {self.density.shape}")
+        if self.plain_colours is not None and self.plain_colours.shape != (self.free_count, 3):
+            raise ValueError(f"expected plain_colours {(self.free_count, 3)}, got {self.plain_colours.shape}")
         if self.scale <= 0 or self.step_units <= 0:
             raise ValueError(f"expected a positive scale and step, got {self.scale} and {self.step_units}")
 
@@ -82,6 +87,14 @@ class VoxelGridObject:
     def slot_count(self) -> int:
         """Number of rows of the colour vector, free and fixed."""
         return self.free_count + len(self.fixed_colours)
+
+    @property
+    def plain_theta(self) -> Array:
+        """Free parameters without an attack, ``[free_count, 3]``; grey if nothing says otherwise."""
+        if self.plain_colours is not None:
+            return inverse_squash(self.plain_colours)
+        plain = self.fixed_colours.mean(axis=0) if len(self.fixed_colours) else np.full(3, 0.5)
+        return np.broadcast_to(inverse_squash(plain), (self.free_count, 3))
 
     def colours(self, theta: Tensor) -> Tensor:
         """The colour vector ``[slot_count, 3]``: squashed free rows, then the fixed ones."""

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from scipy import sparse
 from torch import Tensor
 
-from advnerf_core.fields.voxel_grid import INITIAL_NOISE, VoxelGridObject, inverse_squash, squash_derivative
+from advnerf_core.fields.voxel_grid import INITIAL_NOISE, VoxelGridObject, squash_derivative
 from advnerf_core.geometry import Array, Pinhole, planar_poses
 from advnerf_core.render.cast_object import ObjectCast, cast_object
 from advnerf_core.render.composite import visible_shares
@@ -133,11 +133,9 @@ class Surrogate:
         return (sum(field.free_count for field in self.objects), 3)
 
     def plain_theta(self, dtype: torch.dtype | None = None) -> Tensor:
-        """The colours without an attack: the mean of each object's fixed ones, else grey; ``theta_shape``."""
+        """The colours without an attack (``VoxelGridObject.plain_theta``); ``theta_shape``."""
         rows = [torch.zeros(0, 3, dtype=torch.float64)]
-        for field in self.objects:
-            plain = field.fixed_colours.mean(axis=0) if len(field.fixed_colours) else np.full(3, 0.5)
-            rows.append(torch.as_tensor(inverse_squash(plain)).expand(field.free_count, 3))
+        rows += [torch.tensor(field.plain_theta) for field in self.objects]
         return torch.cat(rows).reshape(self.theta_shape).to(dtype or self.dtype)
 
     def initial_theta(self, generator: torch.Generator, dtype: torch.dtype | None = None) -> Tensor:
