@@ -63,7 +63,9 @@ class Coarse:
 class Strategy(Protocol):
     """How candidates are drawn, and what is learned from them; everything it knows is in tensors."""
 
-    name: str
+    @property
+    def name(self) -> str:
+        """Name of the method."""
 
     def fresh(self, shape: tuple[int, ...]) -> dict[str, Tensor]:
         """What is known before the first generation."""

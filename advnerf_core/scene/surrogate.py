@@ -7,6 +7,7 @@ never needs a gradient: what the forward pass computed is all that the backward 
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -124,6 +125,12 @@ class Surrogate:
         self._supersample = supersample
         self._background_colour = background_colour
         self.dtype = dtype
+
+    def in_type(self, dtype: torch.dtype) -> Surrogate:
+        """The same surrogate with images and weights of another type; geometry is float64 in any case."""
+        other = copy.copy(self)
+        other.dtype = dtype
+        return other
 
     @property
     def theta_shape(self) -> tuple[int, ...]:

@@ -11,12 +11,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from advnerf_core.attack.adjoint import AttackProblem, Sensor
+from advnerf_core.attack.adjoint import AttackProblem
 from advnerf_core.attack.artifact import AttackedObject, AttackFile, face_texture
+from advnerf_core.attack.robustness import Disturbances, Smoothness
 from advnerf_core.attack.search import SearchResult, draw_start_states
 from advnerf_core.driving.actuated import ActuatedAckermann
 from advnerf_core.driving.dynamics import Ackermann, Dynamics
-from advnerf_core.driving.policy import LoadedPolicy, load_policy
+from advnerf_core.driving.policy import LoadedPolicy
+from advnerf_core.policies.load import load_any_policy
 from advnerf_core.scene.field import load_scene
 from advnerf_core.scene.render_field import FieldRenderer
 from advnerf_core.scene.surrogate import Surrogate, split_theta
@@ -60,7 +62,8 @@ class Prepared:
         """The same with another seed: other starts, other draws."""
         room = load_calibration(RoomCalibration, self.request.calibration_file("room"))
         starts = start_states(self.request, room, self.problem.dynamics, seed)
-        return replace(self, problem=replace(self.problem, start_states=starts), seed=seed)
+        problem = replace(self.problem, start_states=starts, disturbances=disturbances(self.request, seed))
+        return replace(self, problem=problem, seed=seed)
 
     def make_attack_file(self, result: SearchResult, predicted_total_cte_m: float | None = None) -> AttackFile:
         """The attack file of a search's result; the prediction is the best evaluation's own unless another is given."""
@@ -104,7 +107,7 @@ def prepare(request: AttackRequest, seed: int | None = None) -> Prepared:
         AdvnerfError: A file is missing, damaged, or does not fit the others.
     """
     seed = request.search.seeds[0] if seed is None else seed
-    loaded = load_policy(request.policy)
+    loaded = load_any_policy(str(request.policy))
     camera = load_calibration(CameraCalibration, request.calibration_file("camera"))
     room = load_calibration(RoomCalibration, request.calibration_file("room"))
     _check_view(request, loaded, camera)
@@ -158,18 +161,36 @@ def start_states(request: AttackRequest, room: RoomCalibration, dynamics: Dynami
         poses = torch.tensor(starts.poses, dtype=torch.float64)
     else:
         poses = draw_start_states(starts.nominal or room.start_pose, starts.count, starts.sigma, seed)
+    # Drives of one start pose differ by what is drawn in them.
+    poses = poses.repeat_interleave(request.robustness.draws if request.robustness.disturbed else 1, dim=0)
     return torch.nn.functional.pad(poses, (0, dynamics.state_size - 3))
 
 
 def _problem(
-    request: AttackRequest, loaded: LoadedPolicy, sensor: Sensor, dynamics: Dynamics, room: RoomCalibration, seed: int
+    request: AttackRequest,
+    loaded: LoadedPolicy,
+    surrogate: Surrogate,
+    dynamics: Dynamics,
+    room: RoomCalibration,
+    seed: int,
 ) -> AttackProblem:
     starts, search = start_states(request, room, dynamics, seed), request.search
+    smoothness = request.robustness.smoothness
     return AttackProblem(
-        loaded.policy, sensor, dynamics, room.reference_path, starts, request.horizon,
+        loaded.policy, surrogate, dynamics, room.reference_path, starts, request.horizon,
         goals=_goals(request, loaded, len(starts)), time_batch=search.time_batch,
         cache_bytes=int(search.cache_mib * 2**20), fence_m=float(np.abs(np.array(room.fence_m)).min()),
+        disturbances=disturbances(request, seed),
+        regulariser=Smoothness(surrogate.objects, smoothness) if smoothness else None,
     )  # fmt: skip
+
+
+def disturbances(request: AttackRequest, seed: int) -> Disturbances | None:
+    """What is drawn in every evaluation; None if nothing is."""
+    wanted = request.robustness
+    if not wanted.disturbed:
+        return None
+    return Disturbances(wanted.noise, wanted.gain, wanted.brightness, wanted.jitter_m, wanted.jitter_rad, seed)
 
 
 def _goals(request: AttackRequest, loaded: LoadedPolicy, starts: int) -> Tensor | None:
@@ -182,7 +203,7 @@ def _goals(request: AttackRequest, loaded: LoadedPolicy, starts: int) -> Tensor 
     if not request.goals:
         return None
     goals = torch.tensor(request.goals, dtype=torch.float32)
-    return goals.expand(starts, -1) if len(goals) == 1 else goals
+    return goals.repeat_interleave(starts // len(goals), dim=0)
 
 
 def _check_view(request: AttackRequest, loaded: LoadedPolicy, camera: CameraCalibration) -> None:

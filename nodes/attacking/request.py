@@ -14,6 +14,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from advnerf_core.geometry import Array, make_transform, rotation_z
+from advnerf_core.policies.load import is_factory
 from nodes.runtime.config import Document, apply_overrides, parse_yaml, read_yaml, validate
 
 Method = Literal["gradient", "random", "cem", "evolution"]
@@ -132,7 +133,9 @@ class SearchRequest(_Section):
 
     method: Method = "gradient"
     evaluations: Count = Field(default=50, description="Closed-loop evaluations; an iteration of the gradient is one.")
-    learning_rate: AboveZero = Field(default=0.1, description="Of Adam; for the gradient and the evolution strategy.")
+    learning_rate: AboveZero | None = Field(
+        default=None, description="Of Adam: 0.1 for the gradient, 0.5 for evolution, if not given."
+    )
     sigma: AboveZero | None = Field(
         default=None,
         description="Spread of theta: 5 for random, 3 to begin with for cem, 1 for evolution, if not given.",
@@ -151,7 +154,7 @@ class AttackRequest(_Section):
 
     name: str = Field(default="attack", min_length=1)
     scene: Path = Field(description="Checkpoint of a trained scene.")
-    policy: Path = Field(description="Policy file.")
+    policy: Path = Field(description="Policy file, or package.module:factory.")
     calibration: Path | None = Field(default=None, description="Folder with camera.yaml, vehicle.yaml and room.yaml.")
     camera: Path | None = Field(default=None, description="Camera calibration, instead of the folder's.")
     vehicle: Path | None = Field(default=None, description="Vehicle calibration, instead of the folder's.")
@@ -212,7 +215,9 @@ def _resolve(document: Document, folder: Path, overrides: Sequence[str]) -> Atta
     request = validate(AttackRequest, document)
 
     def absolute(path: Path | None) -> Path | None:
-        return None if path is None else (folder / path.expanduser()).resolve()
+        if path is None or is_factory(str(path)):
+            return path
+        return (folder / path.expanduser()).resolve()
 
     changes: dict[str, Any] = {name: absolute(getattr(request, name)) for name in _PATHS}
     changes["objects"] = tuple(

@@ -1,0 +1,144 @@
+"""Running a prepared attack: the method that was asked for, resumable, ending in an attack file."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from advnerf_core.attack.adjoint import BlackBoxError, evaluate
+from advnerf_core.attack.artifact import AttackFile, save_attack
+from advnerf_core.attack.baselines import random_search
+from advnerf_core.attack.optimise import gradient_attack
+from advnerf_core.attack.population import CrossEntropy, Evolution, population_search
+from advnerf_core.attack.search import Evaluation, OnEvaluation, SearchResult
+from advnerf_core.files import write_atomically
+from nodes.attacking.prepare import Prepared, prepare
+from nodes.attacking.request import AttackRequest, load_request, request_text
+from nodes.runtime.errors import ConfigError
+from nodes.runtime.stages import Display
+
+REQUEST = "request.attack.yaml"
+
+
+def search(
+    prepared: Prepared, state_path: Path | None = None, on_evaluation: OnEvaluation | None = None
+) -> SearchResult:
+    """Search as the request asks; what ``on_evaluation`` raises ends it, and a state file then goes on from there."""
+    wanted, problem = prepared.request.search, prepared.problem
+    if wanted.method == "gradient" and not problem.differentiable:
+        raise BlackBoxError(f"{prepared.request.policy} has no gradient: use the method random, cem or evolution")
+    common: dict[str, Any] = {
+        "seed": prepared.seed, "state_path": state_path, "on_evaluation": on_evaluation,
+        "settings_hash": prepared.settings_hash,
+    }  # fmt: skip
+    if wanted.method == "gradient":
+        return gradient_attack(problem, wanted.evaluations, wanted.learning_rate or 0.1, **common)
+    if wanted.method == "random":
+        return random_search(problem, wanted.evaluations, wanted.sigma or 5.0, **common)
+    if wanted.method == "cem":
+        strategy: CrossEntropy | Evolution = CrossEntropy(wanted.sigma or 3.0)
+    else:
+        strategy = Evolution(wanted.sigma or 1.0, wanted.learning_rate or 0.5)
+    return population_search(problem, strategy, wanted.evaluations, wanted.population, wanted.cells, **common)
+
+
+def finish(prepared: Prepared, result: SearchResult) -> AttackFile:
+    """The attack file; its prediction is made without disturbances."""
+    if prepared.problem.disturbances is None:
+        return prepared.make_attack_file(result)
+    _, totals = evaluate(prepared.problem.undisturbed(), result.theta)
+    return prepared.make_attack_file(result, float(totals.protocol_cte_m.mean()))
+
+
+def run_attack(
+    request: AttackRequest, folder: Path, display: Display, on_evaluation: OnEvaluation | None = None
+) -> list[Path]:
+    """Run every seed of a request in a folder, going on where it was stopped.
+
+    Args:
+        request: What is asked for; kept in the folder.
+        folder: Where states and attack files go.
+        display: Told of the progress of each seed.
+        on_evaluation: Also called after every evaluation.
+
+    Returns:
+        The attack files, ``seed_<seed>.attack.safetensors``, each with its curve in a JSON file beside it.
+
+    Raises:
+        ConfigError: The folder holds another request.
+    """
+    keep_request(request, folder)
+    prepared, files = None, []
+    for seed in request.search.seeds:
+        name = f"seed_{seed}"
+        file = attack_file(folder, seed)
+        files.append(file)
+        if file.exists():
+            display.finish(name, 0.0, cached=True)
+            continue
+        prepared = prepare(request, seed) if prepared is None else prepared.with_seed(seed)
+        _run_seed(prepared, folder, display, on_evaluation)
+    return files
+
+
+def attack_file(folder: Path, seed: int) -> Path:
+    """Where the attack file of a seed is."""
+    return folder / f"seed_{seed}.attack.safetensors"
+
+
+def keep_request(request: AttackRequest, folder: Path) -> None:
+    """Write the request into a fresh folder; another one in it is refused."""
+    kept = folder / REQUEST
+    if not kept.exists():
+        write_atomically(kept, request_text(request))
+    elif load_request(kept) != request:
+        raise ConfigError(f"{kept}: this folder belongs to another attack; resume it, or choose another folder")
+
+
+def kept_request(folder: Path) -> AttackRequest:
+    """The request of a folder."""
+    if not (folder / REQUEST).exists():
+        raise ConfigError(f"expected a folder of 'advnerf attack run' with a {REQUEST}, found none in {folder}")
+    return load_request(folder / REQUEST)
+
+
+def _run_seed(prepared: Prepared, folder: Path, display: Display, on_evaluation: OnEvaluation | None) -> None:
+    name, state_path = f"seed_{prepared.seed}", folder / f"seed_{prepared.seed}.state.safetensors"
+    report = display.start(name)
+    result = search(prepared, state_path, _both(telling(prepared.request.search.evaluations, report), on_evaluation))
+    attack_id = save_attack(attack_file(folder, prepared.seed), finish(prepared, result))
+    curve = {
+        "attack_id": attack_id, "method": prepared.request.search.method, "seed": prepared.seed,
+        "best_evaluation": result.best.iteration, "loss_m": [e.loss_m for e in result.history],
+        "predicted_total_cte_m": [e.predicted_total_cte_m for e in result.history],
+        "seconds": [e.seconds for e in result.history],
+    }  # fmt: skip
+    write_atomically(folder / f"{name}.json", json.dumps(curve, indent=1) + "\n")
+    state_path.unlink(missing_ok=True)
+    display.finish(name, sum(e.seconds for e in result.history), cached=False)
+
+
+def telling(evaluations: int, report: Callable[[float, str], None]) -> OnEvaluation:
+    """Evaluations as progress: the fraction done, and in words the last and the best total."""
+    best = [0.0]
+
+    def told(evaluation: Evaluation) -> None:
+        total_m = evaluation.predicted_total_cte_m
+        best[0] = max(best[0], total_m)
+        done = evaluation.iteration + 1
+        report(done / evaluations, f"{done}/{evaluations}, total CTE {total_m:.1f} m, best {best[0]:.1f} m")
+
+    return told
+
+
+def _both(first: OnEvaluation, second: OnEvaluation | None) -> OnEvaluation:
+    if second is None:
+        return first
+
+    def told(evaluation: Evaluation) -> None:
+        first(evaluation)
+        second(evaluation)
+
+    return told
