@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -60,7 +61,13 @@ def record_transfer(data: ReportData, record: Record) -> None:
         random = _row(rows, domain, "random")
         met = (random.ratio or 0.0) <= 1.5 and (domain == "surrogate" or random.off_track == 0)
         target = "<= 1.5 x" + ("" if domain == "surrogate" else ", never off-track")
+        plain = _row(rows, domain, "none")
         note = f"best of {data.settings.random_evaluations}; off-track in {random.off_track} of {random.runs}; {_spread(random)}"
+        note += f"; no attack {plain.total_cte_mean_m:.2f} m"
+        if not met:
+            ticks = data.settings.horizon_steps
+            more_mm = 1e3 * (random.total_cte_mean_m - plain.total_cte_mean_m) / ticks
+            note += f": over {ticks} ticks the difference is {more_mm:.0f} mm a tick of a drive that is exact to {1e3 * plain.total_cte_mean_m / ticks:.0f} mm"
         record(f"#2 total CTE, best random, {domain}", random.ratio or 0.0, "x no attack", target, met, note)
 
 
@@ -146,6 +153,17 @@ def main() -> None:
     record_transfer(data, record)
     record_live(data, record)
     record_bags(folder, record)
+    record_time(folder, record)
+
+
+def record_time(folder: Path, record: Record) -> None:
+    """Seconds that the stages took, whenever each of them ran."""
+    stages = sorted(folder.glob("*/stage.json"))
+    seconds = {path.parent.name: json.loads(path.read_text())["seconds"] for path in stages}
+    total_min = sum(seconds.values()) / 60
+    longest = max(seconds, key=lambda name: seconds[name])
+    note = f"{len(stages)} stages, the longest is {longest} with {seconds[longest] / 60:.0f} min"
+    record("#2 make experiment, all stages", total_min, "min", "<= 120 min", total_min <= 120, note)
 
 
 if __name__ == "__main__":
