@@ -2,21 +2,20 @@
 
 It never acts on an old image: one that was captured or published too long ago is dropped and counted, so that the layers nearer
 to the motor notice that commands have stopped. The first inferences of a process are slow; they are done on a blank image before
-the node reports that it is ready.
+the node reports that it is ready. Any policy of the contract (docs/policies.md) drives; one in an ONNX file needs no torch.
 """
 
 from __future__ import annotations
 
 import time
-from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
-import torch
+from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from advnerf_core.driving.policy import LoadedPolicy, images_to_tensor, load_policy
+from advnerf_core.policies.load import Driver, load_driver
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.messages import drive_message, image_array, stamp_ns
@@ -33,7 +32,7 @@ class PolicyConfig(BaseModel):
     """Configuration of the policy node.
 
     Attributes:
-        policy: Policy file.
+        policy: Policy file (.safetensors, .onnx, .pt2), or ``package.module:factory``.
         sha256: Its hash, if it must be that very policy; empty accepts any.
         image_topic: Where images come from.
         speed_mps: Speed of the commands [m/s].
@@ -43,7 +42,7 @@ class PolicyConfig(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    policy: Path
+    policy: str = Field(min_length=1)
     sha256: str = ""
     image_topic: str = "/compositor/image"
     speed_mps: float = Field(default=0.8, ge=0.0, le=2.0)
@@ -55,7 +54,7 @@ class PolicyNode(Node):
     """Image in, drive command out.
 
     Args:
-        loaded: The policy with its view.
+        driver: The policy with its view.
         image_topic: Where images come from.
         speed_mps: Speed of the commands [m/s].
         max_age_s: Oldest image that is acted upon [s].
@@ -67,21 +66,21 @@ class PolicyNode(Node):
 
     def __init__(
         self,
-        loaded: LoadedPolicy,
+        driver: Driver,
         image_topic: str = "/compositor/image",
         speed_mps: float = 0.8,
         max_age_s: float = 0.15,
         goal: tuple[float, ...] = (),
     ) -> None:
-        if len(goal) != loaded.policy.goal_size:
+        if len(goal) != driver.goal_size:
             raise ConfigError(
-                f"expected a goal of {loaded.policy.goal_size} numbers for this policy, got {len(goal)}; set 'goal'"
+                f"expected a goal of {driver.goal_size} numbers for this policy, got {len(goal)}; set 'goal'"
             )
         self.subscriptions = (image_topic,)
-        self._loaded = loaded
+        self._driver = driver
+        self._goal = goal
         self._speed_mps = speed_mps
         self._max_age_ns = round(max_age_s * NS_PER_S)
-        self._goals = torch.tensor([goal], dtype=torch.float32) if goal else None
         self._counts = {"images": 0, "dropped_stale": 0, "dropped_bad": 0}
         self._inference_ms = 0.0
         self._last_drive_ns: int | None = None
@@ -95,10 +94,9 @@ class PolicyNode(Node):
         """Make the node of a process: load, check and warm up the policy."""
         del context  # it needs no clock of its own
         # One image at a time: more threads would only take cores from the other nodes and wake up late.
-        torch.set_num_threads(1)
         cv2.setNumThreads(1)
-        loaded = load_policy(config.policy, config.sha256 or None)
-        return cls(loaded, config.image_topic, config.speed_mps, config.max_age_s, config.goal)
+        driver = load_driver(config.policy, config.sha256 or None)
+        return cls(driver, config.image_topic, config.speed_mps, config.max_age_s, config.goal)
 
     def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
         """Steer by an image, unless it is too old or not what the policy was trained on."""
@@ -114,7 +112,7 @@ class PolicyNode(Node):
                 "dropped_bad", "image comes from the future; synchronise the clocks of camera and policy computer"
             )
             return []
-        camera = self._loaded.view.camera
+        camera = self._driver.view.camera
         if (message.encoding, int(message.width), int(message.height)) != ("rgb8", camera.width, camera.height):
             got = f"{message.encoding} {message.width} x {message.height}"
             self._drop(
@@ -136,7 +134,7 @@ class PolicyNode(Node):
 
     def status(self) -> tuple[str, str]:
         """Active while commands go out; fault when images come that it cannot use."""
-        name = f"policy {self._loaded.sha256[:12]}"
+        name = f"policy {self._driver.sha256[:12]}"
         if self._trouble:
             return (FAULT if self._fault else READY), self._trouble
         recent = self._last_drive_ns is not None and self._now_ns - self._last_drive_ns < _ACTIVE_S * NS_PER_S
@@ -146,18 +144,18 @@ class PolicyNode(Node):
         """Images taken and dropped, and the time of the last inference [ms]."""
         return {**self._counts, "inference_ms": self._inference_ms}
 
-    def _steer(self, rgb: np.ndarray[Any, np.dtype[np.uint8]]) -> float:
+    def _steer(self, rgb: NDArray[np.uint8]) -> float:
         # The duration is reported only; no decision depends on this clock, so replays stay deterministic.
         start = time.perf_counter()
-        with torch.inference_mode():
-            steering = self._loaded.policy(images_to_tensor(self._loaded.view.image(rgb)), self._goals)
+        steering_rad = self._driver.steer(self._driver.view.image(rgb), self._goal)
         self._inference_ms = 1e3 * (time.perf_counter() - start)
-        return float(steering[0])
+        return steering_rad
 
     def _warm_up(self) -> None:
-        camera = self._loaded.view.camera
+        camera = self._driver.view.camera
         for _ in range(_WARM_UP_RUNS):
             self._steer(np.zeros((camera.height, camera.width, 3), np.uint8))
+        self._driver.reset()
 
     def _drop(self, counter: str, trouble: str) -> None:
         self._counts[counter] += 1

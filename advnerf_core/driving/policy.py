@@ -39,7 +39,7 @@ class Policy(Protocol):
     stateless: bool
 
     def __call__(self, images: Tensor, goals: Tensor | None = None) -> Tensor:
-        """Steering ``[B]`` [rad], left positive, for images ``[B, 3, 66, 200]`` RGB 0..1 and goals ``[B, goal_size]``."""
+        """Steering ``[B]`` [rad], left positive, for images ``[B, 3, H, W]`` RGB 0..1 and goals ``[B, goal_size]``."""
 
 
 class PolicyFileError(AdvnerfError, ValueError):
@@ -107,16 +107,17 @@ class PilotNet(nn.Module):
 
 @dataclass(frozen=True)
 class LoadedPolicy:
-    """A policy read from a file.
+    """A policy read from a file, or made by a factory.
 
     Attributes:
-        policy: The network, in eval mode, without gradients to its weights.
+        policy: A `PilotNet` or an ``AdaptedPolicy`` with ``stateless`` and ``goal_size``, in eval mode, without gradients to its
+            weights.
         view: How camera images become policy images.
         metadata: What the trainer wrote about it.
         sha256: Hash over weights and metadata; identifies the policy in manifests and attack files.
     """
 
-    policy: PilotNet
+    policy: Any
     view: PolicyView
     metadata: dict[str, Any]
     sha256: str

@@ -1,3 +1,5 @@
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +16,9 @@ from advnerf_core.driving.policy import (
 )
 from advnerf_core.driving.policy_view import PolicyView
 from advnerf_core.geometry import Pinhole
+from advnerf_core.policies.contract import PolicyContract
+from advnerf_core.policies.onnx_policy import export_onnx
+from advnerf_core.policies.torch_driver import TorchDriver
 from nodes.policy import PolicyConfig, PolicyNode
 from nodes.runtime.clock import ManualClock
 from nodes.runtime.errors import ConfigError
@@ -43,7 +48,7 @@ def _send(node: PolicyNode, message, captured_ms: int = 30, published_ms: int = 
 
 
 def test_steers_like_the_policy_and_keeps_the_capture_stamp() -> None:
-    node, rgb = PolicyNode(_loaded(), speed_mps=0.7), _rgb()
+    node, rgb = PolicyNode(TorchDriver(_loaded()), speed_mps=0.7), _rgb()
     (out,) = _send(node, image_message(rgb, T0, "camera"))
     assert out.topic == "/policy/drive"
     assert stamp_ns(out.message) == T0
@@ -57,7 +62,7 @@ def test_steers_like_the_policy_and_keeps_the_capture_stamp() -> None:
 
 @pytest.mark.parametrize(("captured_ms", "published_ms"), [(151, 2), (30, 151)])
 def test_stale_images_are_refused(captured_ms: int, published_ms: int) -> None:
-    node = PolicyNode(_loaded())
+    node = PolicyNode(TorchDriver(_loaded()))
     assert _send(node, image_message(_rgb(), T0, "camera"), captured_ms, published_ms) == []
     assert node.counters()["dropped_stale"] == 1
     assert node.status() == ("ready", "image is 151 ms old")
@@ -66,7 +71,7 @@ def test_stale_images_are_refused(captured_ms: int, published_ms: int) -> None:
 
 
 def test_images_that_the_policy_does_not_know_are_a_fault() -> None:
-    node = PolicyNode(_loaded())
+    node = PolicyNode(TorchDriver(_loaded()))
     assert _send(node, image_message(_rgb(shape=(94, 168, 3)), T0, "camera")) == []
     assert node.status() == ("fault", "expected rgb8 336 x 188, got rgb8 168 x 94; train for this camera")
     assert _send(node, image_message(_rgb(), T0, "camera", "bgr8")) == []
@@ -78,7 +83,7 @@ def test_images_that_the_policy_does_not_know_are_a_fault() -> None:
 
 def test_a_policy_that_is_not_finite_sends_nothing() -> None:
     loaded = _loaded()
-    node = PolicyNode(loaded)
+    node = PolicyNode(TorchDriver(loaded))
     with torch.no_grad():
         loaded.policy.head[-1].bias.fill_(float("nan"))
     assert _send(node, image_message(_rgb(), T0, "camera")) == []
@@ -86,7 +91,7 @@ def test_a_policy_that_is_not_finite_sends_nothing() -> None:
 
 
 def test_status_shows_that_images_have_stopped() -> None:
-    node = PolicyNode(_loaded())
+    node = PolicyNode(TorchDriver(_loaded()))
     assert node.status() == ("ready", "policy abababababab, waiting for images")
     _send(node, image_message(_rgb(), T0, "camera"))
     clock = ManualClock(mono_ns=10**10 + 1100 * MS)
@@ -99,7 +104,9 @@ def test_built_from_a_file_with_its_hash(tmp_path: Path) -> None:
     context = NodeContext("policy", tmp_path, ManualClock())
     threads = torch.get_num_threads()
     try:
-        config = PolicyConfig(policy=tmp_path / "policy.safetensors", sha256=digest, image_topic="/camera/image_raw")
+        config = PolicyConfig(
+            policy=str(tmp_path / "policy.safetensors"), sha256=digest, image_topic="/camera/image_raw"
+        )
         node = PolicyNode.build(config, context)
         assert node.subscriptions == ("/camera/image_raw",)
         assert torch.get_num_threads() == 1
@@ -112,6 +119,32 @@ def test_built_from_a_file_with_its_hash(tmp_path: Path) -> None:
 
 def test_goal_must_fit_the_policy() -> None:
     with pytest.raises(ConfigError, match="goal of 3 numbers for this policy, got 0"):
-        PolicyNode(_loaded(goal_size=3))
-    node = PolicyNode(_loaded(goal_size=3), goal=(0.0, 1.0, 0.0))
+        PolicyNode(TorchDriver(_loaded(goal_size=3)))
+    node = PolicyNode(TorchDriver(_loaded(goal_size=3)), goal=(0.0, 1.0, 0.0))
     assert len(_send(node, image_message(_rgb(), T0, "camera"))) == 1
+
+
+def test_an_onnx_policy_steers_alike_in_a_process_without_torch(tmp_path: Path) -> None:
+    pytest.importorskip("onnxruntime")
+    file = tmp_path / "policy.onnx"
+    export_onnx(_loaded(goal_size=2).policy, PolicyContract(VIEW, goal_size=2), file)
+    np.save(tmp_path / "rgb.npy", _rgb())
+    code = f"""
+import sys
+sys.modules["torch"] = None
+import numpy as np
+from pathlib import Path
+from nodes.policy import PolicyConfig, PolicyNode
+from nodes.runtime.clock import ManualClock
+from nodes.runtime.messages import image_message
+from nodes.runtime.node import MessageInfo, NodeContext
+node = PolicyNode.build(PolicyConfig(policy={str(file)!r}, goal=(0.5, -1.0)), NodeContext("policy", Path("."), ManualClock()))
+clock = ManualClock(mono_ns=10**10, real_ns={T0} + 10**7)
+(out,) = node.handle("/compositor/image", image_message(np.load({str(tmp_path / "rgb.npy")!r}), {T0}, "c"), MessageInfo(10**10, 10**10), clock.now())
+print(out.message.drive.steering_angle)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=Path(__file__).parents[2])
+    assert done.returncode == 0, done.stderr
+    goal = torch.tensor([[0.5, -1.0]])
+    expected = float(_loaded(goal_size=2).policy(images_to_tensor(VIEW.image(_rgb())), goal)[0])
+    assert float(done.stdout) == pytest.approx(expected, abs=1e-5)

@@ -1,0 +1,71 @@
+"""A network of any origin as the policy that rollouts, attacks and the live node know."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from torch import Tensor, nn
+
+from advnerf_core.policies.contract import PolicyContract, PolicyContractError
+
+
+class AdaptedPolicy(nn.Module):
+    """A network behind its declaration.
+
+    Its mode is that of the network when it was wrapped: nothing is put into eval mode silently.
+
+    Args:
+        network: Called as ``network(images)``, with goals as ``network(images, goals)``, and if it is not stateless as
+            ``network(images, goals, memory) -> (output, memory)``; then it also has ``initial_memory(batch)``.
+        contract: Its declaration.
+
+    Attributes:
+        stateless: As declared.
+        differentiable: As declared.
+        goal_size: As declared.
+    """
+
+    def __init__(self, network: Callable[..., Any], contract: PolicyContract) -> None:
+        super().__init__()
+        if not contract.stateless and not hasattr(network, "initial_memory"):
+            raise PolicyContractError(
+                "expected a network that is not stateless to have initial_memory(batch), got one without; add it, or declare "
+                "stateless = True if the output depends on the present image only"
+            )
+        self.network = network
+        self.contract = contract
+        self.stateless = contract.stateless
+        self.differentiable = contract.differentiable
+        self.goal_size = contract.goal_size
+        self.training = bool(getattr(network, "training", False))
+
+    def initial_memory(self, batch: int) -> Tensor:
+        """Memory ``[B, ...]`` before the first image, of a policy that is not stateless."""
+        memory: Tensor = self.network.initial_memory(batch)  # type: ignore[attr-defined]
+        return memory
+
+    def forward(self, images: Tensor, goals: Tensor | None = None, memory: Tensor | None = None) -> Any:
+        """Steering ``[B]`` [rad], left positive, of images ``[B, 3, H, W]`` RGB 0..1; with memory also the next memory."""
+        given = self.contract.to_network(images)
+        self._check_goals(goals, len(images))
+        if not self.stateless:
+            raw, memory = self.network(given, goals, memory)
+            return self.contract.to_steering_rad(raw, len(images)), memory
+        raw = self.network(given) if self.goal_size == 0 else self.network(given, goals)
+        return self.contract.to_steering_rad(raw, len(images))
+
+    def _check_goals(self, goals: Tensor | None, batch: int) -> None:
+        shape = None if goals is None else tuple(goals.shape)
+        if shape != (None if self.goal_size == 0 else (batch, self.goal_size)):
+            raise PolicyContractError(f"expected goals [{batch}, {self.goal_size}] (0: none), got {shape}")
+
+
+def adapt(network: Callable[..., Any], contract: PolicyContract) -> AdaptedPolicy:
+    """What a ``package.module:factory`` returns: the network, in eval mode with its weights, and its declaration."""
+    return AdaptedPolicy(network, contract)
+
+
+def adapted(policy: Any, contract: PolicyContract) -> AdaptedPolicy:
+    """The policy itself if it is adapted, else a policy that already speaks the contract, wrapped."""
+    return policy if isinstance(policy, AdaptedPolicy) else AdaptedPolicy(policy, contract)

@@ -1,0 +1,289 @@
+"""What is wrong with a policy's adapter, each finding in a sentence that says what to change."""
+
+from __future__ import annotations
+
+import traceback
+from dataclasses import dataclass
+from typing import Any, Final, Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from advnerf_core.driving.policy import images_to_tensor
+from advnerf_core.policies.adapter import AdaptedPolicy
+from advnerf_core.policies.contract import PolicyContractError
+from advnerf_core.policies.hypotheses import USEFUL_ERROR, Array, judge, steering_of
+
+Verdict = Literal["ok", "warning", "failure"]
+OK: Final = "ok"
+WARNING: Final = "warning"
+FAILURE: Final = "failure"
+
+# No car turns its wheels further [rad].
+LARGEST_STEERING_RAD = 1.2
+# Outputs that should be equal may differ by this share of their spread: batched kernels round differently.
+_EQUAL_SHARE = 1e-3
+_CONSTANT_RAD = 1e-6
+_PROBES = 4
+_MODES = (nn.modules.dropout._DropoutNd, nn.modules.batchnorm._BatchNorm)
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the report.
+
+    Attributes:
+        name: What was looked at.
+        verdict: ``ok``, ``warning`` or ``failure``.
+        text: What was found, and what to change.
+    """
+
+    name: str
+    verdict: Verdict
+    text: str
+
+
+def check_policy(
+    policy: AdaptedPolicy,
+    images: NDArray[np.uint8],
+    steering_rad: Array | None = None,
+    goal: tuple[float, ...] | None = None,
+) -> list[Finding]:
+    """Everything that can be told of a policy from the outside; what an earlier failure hides is left out.
+
+    Args:
+        policy: As its author left it.
+        images: Policy images ``[N, H, W, 3]`` uint8 RGB of the policy's own view, at least 4 and not all alike.
+        steering_rad: What an expert would steer on them ``[N]`` [rad], left positive; None leaves the comparison out.
+        goal: Goal vector for a policy that has goals; zeros if not given.
+    """
+    if len(images) < _PROBES:
+        raise ValueError(f"expected at least {_PROBES} images, got {len(images)}")
+    examined = _Examined(policy, goal)
+    findings = [_mode(policy)]
+    runs = _runs(examined, images)
+    findings.append(runs)
+    if runs.verdict == FAILURE:
+        return findings
+    for look in (_finite, _repeatable, _independent, _gradient):
+        finding = look(examined, images)
+        findings.append(finding)
+        if finding.verdict == FAILURE and look in (_finite, _repeatable):
+            return findings
+    findings.append(_range(examined, images))
+    if findings[-1].verdict != FAILURE and steering_rad is not None:
+        findings.append(_expert(examined, images, steering_rad))
+    elif steering_rad is not None and np.ptp(examined.steering(images)) > _CONSTANT_RAD:
+        findings[-1] = _expert(examined, images, steering_rad)
+    return findings
+
+
+class _Examined:
+    """A policy and its goal, called on plain images."""
+
+    def __init__(self, policy: AdaptedPolicy, goal: tuple[float, ...] | None) -> None:
+        self.policy = policy
+        size = policy.contract.goal_size
+        self.goal = None if size == 0 else np.array(goal if goal is not None else (0.0,) * size)
+
+    def steering(self, images: NDArray[np.uint8]) -> Array:
+        return steering_of(self.policy, self.policy.contract, images, self.goal)
+
+    def __call__(self, images: Tensor) -> Tensor:
+        goals = None if self.goal is None else torch.tensor(self.goal, dtype=images.dtype).expand(len(images), -1)
+        if self.policy.stateless:
+            steering: Tensor = self.policy(images, goals)
+        else:
+            steering, _ = self.policy(images, goals, self.policy.initial_memory(len(images)))
+        return steering
+
+
+def _mode(policy: AdaptedPolicy) -> Finding:
+    network = policy.network
+    if not isinstance(network, nn.Module):
+        return Finding("mode", OK, "no torch module, so no training mode")
+    left_on = [name or "the network" for name, part in network.named_modules() if part.training]
+    if not left_on:
+        return Finding("mode", OK, "eval mode")
+    acting = [type(part).__name__ for part in network.modules() if part.training and isinstance(part, _MODES)]
+    what = f", with {', '.join(sorted(set(acting)))} at work" if acting else ""
+    return Finding("mode", FAILURE, f"{left_on[0]} is in training mode{what}; call .eval() before adapt()")
+
+
+def _runs(examined: _Examined, images: NDArray[np.uint8]) -> Finding:
+    height, width = examined.policy.contract.size
+    batch = images_to_tensor(images[:2])
+    try:
+        with torch.no_grad():
+            examined(batch)
+    except PolicyContractError as error:
+        return Finding("input", FAILURE, str(error))
+    except Exception as error:  # whatever a stranger's network raises
+        reason = " ".join(traceback.format_exception_only(error)[-1].split())
+        return Finding(
+            "input", FAILURE, f"fails on images [B, 3, {height}, {width}]: {reason:.160}; {_remedy(examined, batch)}"
+        )
+    return Finding("input", OK, f"takes images [B, 3, {height}, {width}], returns steering [B]")
+
+
+def _remedy(examined: _Examined, batch: Tensor) -> str:
+    """Which other shape the network would take."""
+    contract = examined.policy.contract
+    given = contract.to_network(batch)
+    # As NCHW it would be given the other layout's axes; then height and width swapped; then the commonest other sizes.
+    other = given.permute(0, 2, 3, 1) if contract.layout == "NCHW" else given.permute(0, 3, 1, 2)
+    attempts: list[tuple[str, Tensor]] = [
+        (f"set layout = {'NHWC' if contract.layout == 'NCHW' else 'NCHW'!r}", other),
+        ("exchange width and height of the view", given.transpose(-1, -2)),
+    ]
+    for height, width in ((66, 200), (160, 320), (120, 160), (224, 224), (128, 128), (64, 64), (480, 640)):
+        if contract.layout == "NCHW" and (height, width) != contract.size:
+            attempts.append((f"set width = {width} and height = {height} in the view", _resized(given, height, width)))
+    for advice, images in attempts:
+        if _accepts(examined, images):
+            return advice
+    return "set the view's width and height to the size it was trained with, and the output to [B] or [B, 1]"
+
+
+def _resized(images: Tensor, height: int, width: int) -> Tensor:
+    return nn.functional.interpolate(images, (height, width), mode="area")
+
+
+def _accepts(examined: _Examined, given: Tensor) -> bool:
+    policy, goal = examined.policy, examined.goal
+    extra: list[Any] = [] if goal is None else [torch.tensor(goal, dtype=torch.float32).expand(len(given), -1)]
+    try:
+        with torch.no_grad():
+            raw = policy.network(given.contiguous(), *extra)
+            policy.contract.to_steering_rad(raw, len(given))
+    except Exception:  # it does not take this shape either
+        return False
+    return True
+
+
+def _finite(examined: _Examined, images: NDArray[np.uint8]) -> Finding:
+    extremes = np.stack([np.zeros_like(images[0]), np.full_like(images[0], 255)])
+    for name, batch in (("the reference frames", images), ("a black and a white image", extremes)):
+        if not np.isfinite(examined.steering(batch)).all():
+            advice = "look for a division by a spread or a logarithm of zero, and for damaged weights"
+            return Finding("finite", FAILURE, f"the output on {name} is NaN or infinite; {advice}")
+    return Finding("finite", OK, "finite on every image, also on black and white")
+
+
+def _repeatable(examined: _Examined, images: NDArray[np.uint8]) -> Finding:
+    """Tells randomness from memory: with the same seed, only memory still makes a difference."""
+    first, other = images[:_PROBES], images[-_PROBES:][::-1]
+
+    def seeded(batch: NDArray[np.uint8], seed: int) -> Array:
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            return examined.steering(batch)
+
+    before = seeded(first, 0)
+    seeded(255 - other, 0)
+    after, reseeded = seeded(first, 0), seeded(first, 1)
+    seed_again = seeded(first, 1)
+    tolerance = _tolerance(before)
+    if np.abs(after - before).max() > tolerance or np.abs(seed_again - reseeded).max() > tolerance:
+        text = (
+            "declared stateless, but the output depends on the images before; declare stateless = False and hand the memory "
+            "through forward(images, goals, memory), or clear it on every call"
+        )
+        if not examined.policy.stateless:
+            text = "keeps a memory of its own besides the one it is handed; put everything into the memory that forward returns"
+        return Finding("repeatable", FAILURE, text)
+    if np.abs(reseeded - before).max() > tolerance:
+        text = "the output is random: dropout or noise is left on; call .eval(), and give functional dropout training=self.training"
+        return Finding("repeatable", FAILURE, text)
+    return Finding("repeatable", OK, "the same image gives the same steering")
+
+
+def _independent(examined: _Examined, images: NDArray[np.uint8]) -> Finding:
+    batch = np.concatenate([images[:_PROBES], 255 - images[:_PROBES]])
+    together = examined.steering(batch)
+    alone = np.concatenate([examined.steering(image[None]) for image in batch])
+    worst = float(np.abs(together - alone).max())
+    if worst > _tolerance(together):
+        text = (
+            f"an image steers differently in a batch than alone (by up to {worst:.3g} rad); put batch normalisation into eval mode "
+            "and take no mean or maximum over the batch"
+        )
+        return Finding("batch", FAILURE, text)
+    return Finding("batch", OK, "an image steers the same alone and in a batch")
+
+
+def _gradient(examined: _Examined, images: NDArray[np.uint8]) -> Finding:
+    declared = examined.policy.differentiable
+    if not declared:
+        return Finding("gradient", OK, "declared a black box: searched without a gradient (random, cem, evolution)")
+    batch = images_to_tensor(images[:_PROBES]).contiguous().requires_grad_()
+    with torch.enable_grad():
+        steering = examined(batch)
+    if not steering.requires_grad:
+        text = (
+            "no gradient reaches the image: look for .detach(), .data, .item(), numpy, torch.no_grad() or argmax in forward; or "
+            "declare differentiable = False"
+        )
+        return Finding("gradient", FAILURE, text)
+    (slopes,) = torch.autograd.grad(steering.sum(), batch, allow_unused=True)
+    if slopes is None or not bool(slopes.abs().sum() > 0.0):
+        text = (
+            "the gradient is zero everywhere: look for argmax, rounding, clamping or a saturated output, and check the range of "
+            "values; or declare differentiable = False"
+        )
+        return Finding("gradient", FAILURE, text)
+    if not bool(torch.isfinite(slopes).all()):
+        return Finding("gradient", FAILURE, "the gradient is NaN or infinite; look for sqrt, norm or division at zero")
+    return _slope(examined, batch.detach(), slopes)
+
+
+def _slope(examined: _Examined, batch: Tensor, slopes: Tensor, step: float = 2e-3) -> Finding:
+    """The gradient against the difference of two evaluations along it."""
+    direction = slopes.sign()
+    with torch.no_grad():
+        difference = (examined(batch + step * direction) - examined(batch - step * direction)).double() / (2 * step)
+    expected = (slopes * direction).double().sum(dim=(1, 2, 3))
+    error = float((difference - expected).abs().sum() / expected.abs().sum())
+    if error > 0.3:
+        text = (
+            f"the gradient differs from finite differences by {100 * error:.0f} %: look for a detached branch, rounding, or a "
+            "straight-through estimator; an attack would follow a wrong direction"
+        )
+        return Finding("gradient", WARNING, text)
+    return Finding("gradient", OK, f"reaches the image, within {100 * error:.1f} % of finite differences")
+
+
+def _range(examined: _Examined, images: NDArray[np.uint8]) -> Finding:
+    steering = examined.steering(images)
+    largest = float(np.abs(steering).max())
+    if float(np.ptp(steering)) < _CONSTANT_RAD:
+        text = f"steers {steering[0]:.4f} rad whatever it sees; check the range of values (value_max) and that the weights are loaded"
+        return Finding("range", FAILURE, text)
+    if largest > LARGEST_STEERING_RAD:
+        text = f"steers up to {largest:.3g} rad, more than any car can; set output_unit = 'deg' if the network was trained on degrees"
+        return Finding("range", FAILURE, text)
+    return Finding("range", OK, f"steers {steering.min():+.3f} to {steering.max():+.3f} rad, left positive")
+
+
+def _expert(examined: _Examined, images: NDArray[np.uint8], steering_rad: Array) -> Finding:
+    judgement = judge(examined.policy, images, steering_rad, examined.goal)
+    share = f"error {judgement.declared_error:.2f} of that of steering straight through"
+    if judgement.believed:
+        text = (
+            f"{' and '.join(judgement.best.found)}: {' and '.join(judgement.best.advice)} ({share} as declared, "
+            f"{judgement.best_error:.2f} so)"
+        )
+        return Finding("expert", FAILURE, text)
+    if judgement.declared_error > USEFUL_ERROR:
+        text = (
+            f"does not steer as the expert does ({share}), and no other declaration explains why; check the crop of the view and "
+            "that the policy was trained for this place"
+        )
+        return Finding("expert", WARNING, text)
+    return Finding("expert", OK, f"steers as the expert does ({share})")
+
+
+def _tolerance(steering: Array) -> float:
+    return _EQUAL_SHARE * max(float(np.abs(steering).max()), 1e-4)

@@ -1,0 +1,177 @@
+"""Which wrong declaration would explain what a policy does on images of which the right steering is known.
+
+Every hypothesis is a declaration other than the given one: colours the other way round, another range, another unit, the other
+sign. The network is run as each would run it, and the hypothesis whose steering lies nearest to the expert's is believed if it
+explains much more than the declaration does. One error of input and one of output may come together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from advnerf_core.driving.policy import images_to_tensor
+from advnerf_core.policies.adapter import AdaptedPolicy
+from advnerf_core.policies.contract import PolicyContract
+
+Array = NDArray[np.float64]
+
+# A hypothesis is believed if it leaves less than this share of the declaration's error, and explains something by itself ...
+BELIEVED_SHARE = 0.9
+USEFUL_ERROR = 0.8
+# ... and if that is no accident of the frames: the mean of the paired differences, in its standard errors.
+BELIEVED_DEVIATIONS = 3.0
+_BATCH = 32
+_IMAGENET = ((0.485, 0.456, 0.406), (0.229, 0.224, 0.225))
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """Another declaration, in words.
+
+    Attributes:
+        found: What it says is wrong; empty for the declaration itself.
+        advice: What to change; empty for the declaration itself.
+        contract: The declaration that it proposes.
+    """
+
+    found: tuple[str, ...]
+    advice: tuple[str, ...]
+    contract: PolicyContract
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """How well the declaration and the best other one explain the expert.
+
+    Attributes:
+        declared_error: Mean error over that of always steering the expert's median; below 1 is better than no policy.
+        best: The most likely hypothesis.
+        best_error: Its error, likewise.
+        deviations: Mean of the frames' differences in error between the two, over its standard error.
+    """
+
+    declared_error: float
+    best: Hypothesis
+    best_error: float
+    deviations: float
+
+    @property
+    def believed(self) -> bool:
+        """Whether the declaration is taken to be wrong in the way the hypothesis says."""
+        better = self.best_error < BELIEVED_SHARE * self.declared_error and self.deviations > BELIEVED_DEVIATIONS
+        return bool(self.best.found) and better and self.best_error < USEFUL_ERROR
+
+
+def judge(
+    policy: AdaptedPolicy, images: NDArray[np.uint8], steering_rad: Array, goal: Array | None = None
+) -> Judgement:
+    """Try every hypothesis.
+
+    Args:
+        policy: A policy of stateless steering.
+        images: Its images ``[N, H, W, 3]`` uint8 RGB.
+        steering_rad: What the expert would steer ``[N]`` [rad], left positive; it must vary.
+        goal: Goal vector, for a policy that has goals.
+    """
+    wanted = np.asarray(steering_rad, dtype=np.float64)
+    scale = float(np.abs(wanted - np.median(wanted)).mean())
+    if not scale > 0.0:
+        raise ValueError("expected reference frames whose steering varies, got one angle for all")
+    declared = np.abs(steering_of(policy, policy.contract, images, goal) - wanted)
+    best, best_errors = Hypothesis((), (), policy.contract), declared
+    for hypothesis in _hypotheses(policy.contract):
+        errors = np.abs(steering_of(policy, hypothesis.contract, images, goal) - wanted)
+        # A second change must earn its place: between nearly equals, the one with fewer changes is meant.
+        penalty = 1.1 ** (len(hypothesis.found) - len(best.found))
+        if np.isfinite(errors).all() and errors.mean() * max(penalty, 1.0) < best_errors.mean():
+            best, best_errors = hypothesis, errors
+    gains = declared - best_errors
+    spread = float(gains.std()) / np.sqrt(len(gains))
+    deviations = float(gains.mean()) / spread if spread > 0.0 else 0.0
+    return Judgement(float(declared.mean()) / scale, best, float(best_errors.mean()) / scale, deviations)
+
+
+@torch.no_grad()
+def steering_of(
+    policy: AdaptedPolicy, contract: PolicyContract, images: NDArray[np.uint8], goal: Array | None = None
+) -> Array:
+    """Steering ``[N]`` [rad] of a policy's network under some declaration of the same view."""
+    assumed = AdaptedPolicy(policy.network, contract)
+    steering: list[Any] = []
+    for first in range(0, len(images), _BATCH):
+        batch = images_to_tensor(images[first : first + _BATCH])
+        goals = None if goal is None else torch.tensor(goal, dtype=torch.float32).expand(len(batch), -1)
+        if contract.stateless:
+            steering.append(assumed(batch, goals))
+        else:
+            steering.append(assumed(batch, goals, assumed.initial_memory(len(batch)))[0])
+    return np.asarray(torch.cat(steering).double().numpy())
+
+
+def _hypotheses(contract: PolicyContract) -> Iterator[Hypothesis]:
+    inputs = [Hypothesis((), (), contract), *_input_changes(contract)]
+    for first in inputs:
+        for second in [Hypothesis((), (), first.contract), *_output_changes(first.contract)]:
+            if first.found or second.found:
+                yield Hypothesis(first.found + second.found, first.advice + second.advice, second.contract)
+
+
+def _input_changes(contract: PolicyContract) -> Iterator[Hypothesis]:
+    ranges = list(_range_changes(contract))
+    yield from ranges
+    for base in [Hypothesis((), (), contract), *ranges]:
+        other = "BGR" if contract.colour_order == "RGB" else "RGB"
+        swapped = replace(base.contract, colour_order=other)  # type: ignore[arg-type]
+        yield Hypothesis(
+            (*base.found, f"takes {other} for {contract.colour_order}"),
+            (*base.advice, f"set colour_order = {other!r}"),
+            swapped,
+        )
+
+
+def _range_changes(contract: PolicyContract) -> Iterator[Hypothesis]:
+    plain = not any(contract.mean) and contract.std == (1.0, 1.0, 1.0)
+    other = 255.0 if contract.value_max == 1.0 else 1.0
+    if plain:
+        yield Hypothesis(
+            (f"expects values of 0..{other:g}, but is given 0..{contract.value_max:g}",),
+            (f"set value_max = {other:g}",),
+            replace(contract, value_max=other),
+        )
+        yield Hypothesis(
+            ("expects ImageNet's normalisation, but is given plain values",),
+            (f"set value_max = 1, mean = {_IMAGENET[0]} and std = {_IMAGENET[1]}",),
+            replace(contract, value_max=1.0, mean=_IMAGENET[0], std=_IMAGENET[1]),
+        )
+        yield Hypothesis(
+            ("expects values of -1..1, but is given others",),
+            ("set value_max = 1, mean = (0.5, 0.5, 0.5) and std = (0.5, 0.5, 0.5)",),
+            replace(contract, value_max=1.0, mean=(0.5, 0.5, 0.5), std=(0.5, 0.5, 0.5)),
+        )
+        return
+    for value_max in (1.0, 255.0):
+        yield Hypothesis(
+            (f"expects plain values of 0..{value_max:g}, but is given normalised ones",),
+            (f"leave mean and std out and set value_max = {value_max:g}",),
+            replace(contract, value_max=value_max, mean=(0.0, 0.0, 0.0), std=(1.0, 1.0, 1.0)),
+        )
+
+
+def _output_changes(contract: PolicyContract) -> Iterator[Hypothesis]:
+    unit = "deg" if contract.output_unit == "rad" else "rad"
+    side = "right" if contract.positive == "left" else "left"
+    words = {"deg": "degrees", "rad": "radians"}
+    of_unit = (f"steers in {words[unit]} for {words[contract.output_unit]}", f"set output_unit = {unit!r}")
+    of_side = (f"steers positive to the {side}, not to the {contract.positive}", f"set positive = {side!r}")
+    in_unit = replace(contract, output_unit=unit)  # type: ignore[arg-type]
+    yield Hypothesis((of_unit[0],), (of_unit[1],), in_unit)
+    for found, base in (((), contract), ((of_unit,), in_unit)):
+        turned = replace(base, positive=side)  # type: ignore[arg-type]
+        both = (*found, of_side)
+        yield Hypothesis(tuple(each[0] for each in both), tuple(each[1] for each in both), turned)

@@ -1,0 +1,170 @@
+"""One door for policies of any origin. Imports torch only for what needs it.
+
+A policy is named by a file (``.safetensors``: a PilotNet as we train it; ``.onnx``; ``.pt2``) or by ``package.module:factory``, a
+function without arguments that returns ``adapt(network, contract)``.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import os
+import re
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from advnerf_core.driving.policy_view import PolicyView
+from advnerf_core.policies.contract import PolicyContract, PolicyContractError
+
+if TYPE_CHECKING:
+    from advnerf_core.driving.policy import LoadedPolicy
+    from advnerf_core.policies.adapter import AdaptedPolicy
+
+_FACTORY = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*")
+_SUFFIXES = (".safetensors", ".onnx", ".pt2")
+
+
+def is_factory(spec: str | os.PathLike[str]) -> bool:
+    """Whether a policy is named as ``package.module:factory`` and not as a file."""
+    return isinstance(spec, str) and _FACTORY.fullmatch(spec) is not None
+
+
+def load_any_policy(spec: str | os.PathLike[str], expected_sha256: str | None = None) -> LoadedPolicy:
+    """A policy ready for a rollout or an attack: frozen, in eval mode, with its view and hash.
+
+    Raises:
+        AdvnerfError: It cannot be loaded, is left in training mode, or is not the one that was expected.
+    """
+    from advnerf_core.driving.policy import LoadedPolicy, load_policy
+
+    suffix = "" if is_factory(spec) else Path(spec).suffix
+    if suffix == ".safetensors":
+        return load_policy(spec, expected_sha256)
+    policy, sha256 = load_adapted(spec)
+    if policy.training:
+        raise PolicyContractError(f"{spec} is in training mode; call .eval() on the network before it is adapted")
+    if expected_sha256 is not None and sha256 != expected_sha256:
+        raise PolicyContractError(f"expected the policy {expected_sha256}, got {sha256} from {spec}; correct the hash")
+    policy.requires_grad_(False)
+    return LoadedPolicy(policy, policy.contract.view, {"origin": str(spec)}, sha256)
+
+
+def load_adapted(spec: str | os.PathLike[str]) -> tuple[AdaptedPolicy, str]:
+    """The network with its declaration, as its author left it, and its hash: what the conformance test looks at."""
+    from advnerf_core.policies.adapter import AdaptedPolicy
+
+    if is_factory(spec):
+        return _from_factory(str(spec))
+    path = Path(spec)
+    if path.suffix == ".onnx":
+        from advnerf_core.policies.onnx_policy import OnnxNetwork, TensorNetwork
+
+        network = OnnxNetwork(path)
+        return AdaptedPolicy(TensorNetwork(network), network.contract), network.sha256
+    if path.suffix == ".pt2":
+        from advnerf_core.policies.exported_policy import load_program
+
+        program, contract, sha256 = load_program(path)
+        return AdaptedPolicy(program, contract), sha256
+    if path.suffix == ".safetensors":
+        from advnerf_core.driving.policy import load_policy
+
+        loaded = load_policy(path)
+        return AdaptedPolicy(
+            loaded.policy, PolicyContract(loaded.view, goal_size=loaded.policy.goal_size)
+        ), loaded.sha256
+    raise PolicyContractError(f"expected a file of {', '.join(_SUFFIXES)} or package.module:factory, got {spec}")
+
+
+def _from_factory(spec: str) -> tuple[AdaptedPolicy, str]:
+    from advnerf_core.policies.adapter import AdaptedPolicy
+
+    module_name, _, name = spec.partition(":")
+    if str(Path.cwd()) not in sys.path:
+        sys.path.insert(0, str(Path.cwd()))  # as `python -m` does; the command line's own folder is elsewhere
+    try:
+        module = importlib.import_module(module_name)
+        factory = getattr(module, name)
+    except (ImportError, AttributeError) as error:
+        raise PolicyContractError(f"cannot find {spec}: {error}; start in the folder that holds it") from error
+    try:
+        policy = factory()
+    except Exception as error:
+        if isinstance(error, PolicyContractError):
+            raise
+        raise PolicyContractError(f"{spec}() failed: {type(error).__name__}: {error}") from error
+    if not isinstance(policy, AdaptedPolicy):
+        raise PolicyContractError(
+            f"expected {spec}() to return adapt(network, PolicyContract(...)), got {type(policy).__name__}"
+        )
+    return policy, _factory_sha256(spec, policy, module)
+
+
+def _factory_sha256(spec: str, policy: AdaptedPolicy, module: Any) -> str:
+    """Names weights, declaration and the module's source; what that module imports is not looked at."""
+    digest = hashlib.sha256(f"{spec}\0{policy.contract.to_json()}".encode())
+    if source := getattr(module, "__file__", None):
+        digest.update(Path(source).read_bytes())
+    for name, tensor in sorted(policy.state_dict().items()):
+        array = tensor.detach().cpu().contiguous().numpy()
+        digest.update(f"{name}\0{array.dtype.str}\0{array.shape}\0".encode())
+        digest.update(array.tobytes())
+    return digest.hexdigest()
+
+
+class Driver(Protocol):
+    """A policy as the live node uses it: one image after the other."""
+
+    view: PolicyView
+    goal_size: int
+    sha256: str
+
+    def steer(self, image: NDArray[np.uint8], goal: tuple[float, ...]) -> float:
+        """Steering [rad], left positive, of one policy image ``[H, W, 3]`` uint8 RGB."""
+
+    def reset(self) -> None:
+        """Forget the images so far."""
+
+
+def load_driver(spec: str | os.PathLike[str], expected_sha256: str | None = None) -> Driver:
+    """A policy for the live node, on one thread; an ONNX file needs no torch."""
+    if not is_factory(spec) and Path(spec).suffix == ".onnx":
+        from advnerf_core.policies.onnx_policy import OnnxNetwork
+
+        driver = OnnxDriver(OnnxNetwork(Path(spec)))
+        if expected_sha256 not in (None, driver.sha256):
+            raise PolicyContractError(f"expected the policy {expected_sha256}, got {driver.sha256} from {spec}")
+        return driver
+    import torch
+
+    from advnerf_core.policies.torch_driver import TorchDriver
+
+    torch.set_num_threads(1)
+    return TorchDriver(load_any_policy(spec, expected_sha256))
+
+
+class OnnxDriver:
+    """Drives by an ONNX file.
+
+    Args:
+        network: The file.
+    """
+
+    def __init__(self, network: Any) -> None:
+        self._network = network
+        self.view: PolicyView = network.contract.view
+        self.goal_size: int = network.contract.goal_size
+        self.sha256: str = network.sha256
+
+    def steer(self, image: NDArray[np.uint8], goal: tuple[float, ...]) -> float:
+        """Steering [rad] of one image."""
+        images = np.moveaxis(image, -1, 0)[None].astype(np.float32) / np.float32(255.0)
+        goals = np.array([goal], dtype=np.float32) if goal else None
+        return float(self._network.steering_rad(images, goals)[0])
+
+    def reset(self) -> None:
+        """There is no memory."""

@@ -1,0 +1,110 @@
+"""The commands ``advnerf policy ...``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from nodes.runtime.terminal import print_table, table
+
+if TYPE_CHECKING:
+    from advnerf_core.driving.policy_view import PolicyView
+    from nodes.policy_reference import Reference
+
+app = typer.Typer(
+    no_args_is_help=True, help="Bring a policy of any origin: check its adapter, export it, look into it."
+)
+Spec = Annotated[
+    str, typer.Argument(metavar="POLICY", help="A .safetensors, .onnx or .pt2 file, or package.module:factory.")
+]
+_COLOURS = {"ok": "green", "warning": "yellow", "failure": "red"}
+_FAILURE_EXIT = 1
+
+
+@app.command("check")
+def policy_check(
+    policy: Spec,
+    run_folder: Annotated[
+        Path | None, typer.Option("--run-folder", help="Frames and labels of an experiment's policy stage.")
+    ] = None,
+    bag: Annotated[Path | None, typer.Option("--bag", help="Frames and poses of a driven bag.")] = None,
+    room: Annotated[
+        Path, typer.Option("--room", help="Room calibration with the path that the bag's expert follows.")
+    ] = Path("calibration/twin/room.yaml"),
+    goal: Annotated[list[float] | None, typer.Option("--goal", help="One number of the goal vector; repeat.")] = None,
+) -> None:
+    """Say what is wrong with a policy's adapter; the expert's frames come from the simulated lab if none are given."""
+    from advnerf_core.policies.conformance import FAILURE, check_policy
+    from advnerf_core.policies.load import load_adapted
+
+    adapted, sha256 = load_adapted(policy)
+    reference = _reference(adapted.contract.view, run_folder, bag, room)
+    print(f"{policy} ({sha256[:12]}) on {reference.source}")
+    findings = check_policy(adapted, reference.images, reference.steering_rad, tuple(goal) if goal else None)
+    rows = table("check", "state", "found")
+    for finding in findings:
+        rows.add_row(
+            finding.name, f"[{_COLOURS[finding.verdict]}]{finding.verdict}[/]", finding.text.replace("[", r"\[")
+        )
+    print_table(rows)
+    if any(finding.verdict == FAILURE for finding in findings):
+        raise typer.Exit(_FAILURE_EXIT)
+
+
+def _reference(view: PolicyView, run_folder: Path | None, bag: Path | None, room: Path) -> Reference:
+    from nodes.policy_reference import from_bag, from_run, from_twin
+    from nodes.runtime.errors import ConfigError
+
+    if run_folder is not None and bag is not None:
+        raise ConfigError("expected --run-folder or --bag, got both")
+    if run_folder is not None:
+        return from_run(run_folder, view)
+    return from_bag(bag, room, view) if bag is not None else from_twin(view)
+
+
+@app.command("export")
+def policy_export(
+    policy: Spec,
+    onnx: Annotated[Path | None, typer.Option("--onnx", help="Write an ONNX file: runs without torch.")] = None,
+    pt2: Annotated[Path | None, typer.Option("--pt2", help="Write an exported program: keeps its gradient.")] = None,
+) -> None:
+    """Write a policy with its declaration as a file that needs none of its source."""
+    from advnerf_core.policies.load import load_adapted, load_any_policy
+    from nodes.runtime.errors import ConfigError
+
+    if onnx is None and pt2 is None:
+        raise ConfigError("expected --onnx FILE or --pt2 FILE, got neither")
+    load_any_policy(policy)  # refuses what could not be used either
+    adapted, _ = load_adapted(policy)
+    adapted.requires_grad_(False)
+    if onnx is not None:
+        from advnerf_core.policies.onnx_policy import OnnxNetwork, export_onnx
+
+        export_onnx(adapted.network, adapted.contract, onnx)
+        print(f"{onnx} {OnnxNetwork(onnx).sha256[:12]}")
+    if pt2 is not None:
+        from advnerf_core.policies.exported_policy import export_program, load_program
+
+        export_program(adapted.network, adapted.contract, pt2)
+        print(f"{pt2} {load_program(pt2)[2][:12]}")
+
+
+@app.command("info")
+def policy_info(policy: Spec) -> None:
+    """Say what a policy declares, and its hash."""
+    from advnerf_core.policies.load import load_adapted
+
+    adapted, sha256 = load_adapted(policy)
+    contract = adapted.contract
+    rows = table("what", "value")
+    for name, value in contract.to_dict().items():
+        if name != "view":
+            rows.add_row(name, str(value).replace("[", r"\["))
+    view = contract.view
+    rows.add_row("image", f"{view.width} x {view.height}")
+    crop = f"rows {view.crop_top_px} to {view.crop_top_px + view.crop_height_px - 1}"
+    rows.add_row("view", f"{crop} of {view.camera.width} x {view.camera.height}")
+    rows.add_row("sha256", sha256)
+    print_table(rows)

@@ -1,0 +1,203 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from advnerf_core.driving.policy_view import PolicyView
+from advnerf_core.geometry import Pinhole
+from advnerf_core.policies.adapter import adapt
+from advnerf_core.policies.conformance import FAILURE, OK, check_policy
+from advnerf_core.policies.contract import PolicyContract
+
+VIEW = PolicyView(Pinhole(336, 188, 173.97, 173.97, 168.0, 94.0), width=40, height=22)
+DECLARED = PolicyContract(VIEW)
+
+
+def reference(count=64):
+    """Scenes of a coloured blob left or right of the middle; an expert steers to where it is, harder the redder it is."""
+    rng = np.random.default_rng(0)
+    images = rng.integers(60, 90, (count, 22, 40, 3)).astype(np.uint8)
+    columns, reds = rng.integers(2, 34, count), rng.integers(120, 255, count)
+    for image, column, red in zip(images, columns, reds, strict=True):
+        image[6:14, column : column + 5] = (red, 40, 40)
+    redness = (reds / 255.0 - 0.36) / 0.64
+    steering = 0.25 * (19.5 - (columns + 2)) / 20.0 * redness + rng.normal(0.0, 0.01, count)
+    return images, steering
+
+
+class Seer(nn.Module):
+    """What the expert does, from the image; smooth, and bounded as PilotNet is."""
+
+    def __init__(self):
+        super().__init__()
+        self.gain = nn.Parameter(torch.tensor(1.0))
+
+    def forward(self, images):
+        red = nn.functional.softplus(20.0 * (images[:, 0] - images[:, 2] - 0.2)) / 20.0
+        weight = torch.linspace(1.0, -1.0, images.shape[-1])
+        return 0.3 * torch.tanh(self.gain * 0.036 * (red * weight).sum(dim=(1, 2)))
+
+
+class Around(nn.Module):
+    """The seer with something done before and after it."""
+
+    def __init__(self, before=lambda x: x, after=lambda y: y):
+        super().__init__()
+        self.seer, self.before, self.after = Seer(), before, after
+
+    def forward(self, images):
+        return self.after(self.seer(self.before(images)))
+
+
+def findings(network, contract=DECLARED):
+    return {f.name: f for f in check_policy(adapt(network, contract), *reference())}
+
+
+def around(before=lambda x: x, after=lambda y: y):
+    return Around(before, after).eval()
+
+
+def test_an_honest_policy_passes_every_check():
+    found = findings(around())
+    assert list(found) == ["mode", "input", "finite", "repeatable", "batch", "gradient", "range", "expert"]
+    assert {f.verdict for f in found.values()} == {OK}, found
+    with pytest.raises(ValueError, match="at least 4 images"):
+        check_policy(adapt(around(), DECLARED), reference()[0][:2])
+
+
+def swapped(x):
+    return x[:, [2, 1, 0]]
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "advice", "contract"),
+    [
+        (swapped, lambda y: y, "takes BGR for RGB: set colour_order = 'BGR'", {}),
+        (lambda x: x / 255, lambda y: y, "expects values of 0..255, but is given 0..1: set value_max = 255", {}),
+        (lambda x: x, lambda y: y, "expects values of 0..1, but is given 0..255: set value_max = 1", {"value_max": 255.0}),
+        (lambda x: x, lambda y: y * 180 / np.pi, "steers in degrees for radians: set output_unit = 'deg'", {}),
+        (lambda x: x, lambda y: y, "steers in radians for degrees: set output_unit = 'rad'", {"output_unit": "deg"}),
+        (lambda x: x, lambda y: -y, "steers positive to the right, not to the left: set positive = 'right'", {}),
+        (lambda x: swapped(x) / 255, lambda y: y, "0..255, but is given 0..1 and takes BGR for RGB", {}),
+        (swapped, lambda y: -y, "takes BGR for RGB and steers positive to the right", {}),
+    ],
+)  # fmt: skip
+def test_a_lie_is_recognised_and_named(before, after, advice, contract):
+    found = findings(around(before, after), replace(DECLARED, **contract))
+    assert found["expert"].verdict == FAILURE, found
+    assert advice in found["expert"].text
+
+
+def test_the_declaration_that_is_advised_makes_it_right():
+    network = around(lambda x: swapped(x) / 255, lambda y: -y * 180 / np.pi)
+    truth = replace(DECLARED, colour_order="BGR", value_max=255.0, output_unit="deg", positive="right")
+    assert findings(network, truth)["expert"].verdict == OK
+    assert findings(network)["expert"].verdict == FAILURE
+
+
+def test_a_policy_for_another_place_is_no_liar_but_a_warning():
+    found = findings(around(lambda x: x.flip(2).roll(13, 3)[:, [1, 0, 2]] * 0.3 + 0.1))
+    assert found["expert"].verdict == "warning"
+    assert "check the crop" in found["expert"].text
+
+
+def test_without_an_expert_degrees_are_still_too_much():
+    found = check_policy(adapt(around(after=lambda y: 60 * y), DECLARED), reference()[0])
+    assert found[-1].name == "range"
+    assert "output_unit = 'deg'" in found[-1].text
+
+
+class Dropping(nn.Module):
+    def __init__(self, always):
+        super().__init__()
+        self.seer, self.drop, self.always = Seer(), nn.Dropout(0.5), always
+
+    def forward(self, images):
+        images = nn.functional.dropout(images, 0.5, training=True) if self.always else self.drop(images)
+        return self.seer(images)
+
+
+def test_training_mode_and_dropout():
+    found = findings(Dropping(always=False))
+    assert "in training mode, with Dropout at work; call .eval()" in found["mode"].text
+    assert "dropout or noise is left on" in found["repeatable"].text
+    found = findings(Dropping(always=True).eval())
+    assert found["mode"].verdict == OK
+    assert found["repeatable"].verdict == FAILURE
+    assert "random" in found["repeatable"].text
+
+
+class Remembering(nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.seer, self.last = Seer(), 0.0
+
+    def forward(self, images):
+        steering = self.seer(images) + 0.5 * self.last
+        self.last = float(steering.mean().detach())
+        return steering
+
+
+def test_a_hidden_memory():
+    found = findings(Remembering().eval())
+    assert "declared stateless, but the output depends on the images before" in found["repeatable"].text
+
+
+def test_an_image_that_depends_on_its_batch():
+    found = findings(around(lambda x: x - x.mean(0, keepdim=True)))
+    assert found["batch"].verdict == FAILURE
+    assert "differently in a batch than alone" in found["batch"].text
+
+
+class Flat(nn.Module):
+    def __init__(self, height, width):
+        super().__init__()
+        self.linear, self.size = nn.Linear(3 * height * width, 1), (height, width)
+
+    def forward(self, images):
+        return self.linear(images.flatten(1))
+
+
+@pytest.mark.parametrize(
+    ("network", "advice"),
+    [
+        (Flat(66, 200), "set width = 200 and height = 66 in the view"),
+        (Around(lambda x: x.permute(0, 3, 1, 2) if x.shape[-1] == 3 else 1 / 0), "set layout = 'NHWC'"),
+        (nn.Sequential(nn.Flatten(), nn.Linear(2640, 2)), "return the column that steers"),
+        (nn.Sequential(nn.Flatten(), nn.Linear(7, 1)), "the size it was trained with"),
+    ],
+)
+def test_a_wrong_size_layout_or_output(network, advice):
+    found = findings(network.eval())
+    assert list(found) == ["mode", "input"]
+    assert found["input"].verdict == FAILURE
+    assert advice in found["input"].text
+
+
+def test_nan():
+    found = findings(around(lambda x: x / x.std(dim=(1, 2, 3), keepdim=True)))
+    assert list(found)[-1] == "finite"
+    assert "black and a white image is NaN" in found["finite"].text
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "sentence"),
+    [
+        (lambda x: x.detach(), lambda y: y.detach(), "no gradient reaches the image"),
+        (lambda x: torch.round(x * 255) / 255, lambda y: y, "the gradient is zero everywhere"),
+        (lambda x: x, lambda y: torch.round(y * 50) / 50 + 0 * y, "the gradient is zero everywhere"),
+        (lambda x: 0.5 * x + 0.5 * x.detach(), lambda y: y, "differs from finite differences by"),
+    ],
+)
+def test_no_gradient(before, after, sentence):
+    found = findings(around(before, after))
+    assert found["gradient"].verdict != OK
+    assert sentence in found["gradient"].text
+    assert findings(around(before, after), replace(DECLARED, differentiable=False))["gradient"].verdict == OK
+
+
+def test_a_constant_output():
+    found = findings(around(after=lambda y: 0 * y + 0.1))
+    assert "steers 0.1000 rad whatever it sees" in found["range"].text
