@@ -3,19 +3,26 @@
 Images and poses are joined by capture stamp. An image waits a bounded time for the poses after it; then the poses are continued
 at constant velocity, which is flagged, up to a limit; beyond that the image is dropped and counted, and the layers nearer to the
 motor stop the car. Without an attack file the images pass through unchanged.
+
+A new attack comes in pieces over the bus. What is shown stays until the new one is whole, verified, and fits camera and face;
+then it changes between two images. Whatever is wrong with it is said in the status and changes nothing.
 """
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
-from advnerf_core.attack.artifact import AttackFile, load_attack
+from advnerf_core.attack.artifact import AttackFile, attack_from_bytes, load_attack
 from advnerf_core.attack.projection import FaceOverlay
+from advnerf_core.errors import AdvnerfError
 from advnerf_core.geometry import Array, invert_transform
 from calibration.schema import CameraCalibration, TargetCalibration, load_calibration
 from nodes.pose_buffer import PoseBuffer
@@ -23,8 +30,9 @@ from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.messages import header, image_array, image_message, pose_matrix, stamp_ns, types
 from nodes.runtime.node import ACTIVE, READY, MessageInfo, Node, NodeContext, Now, Out, run_node_main
+from nodes.runtime.transfer import Assembler, ReceivedFile
 
-_IMAGE, _CAR = "/camera/image_raw", "/vicon/car"
+_IMAGE, _CAR, _FILE = "/camera/image_raw", "/vicon/car", "/attack/file"
 _ACTIVE_S = 1.0
 _SIZE_TOLERANCE = 0.05
 
@@ -90,6 +98,8 @@ class CompositorNode(Node):
         wait_s: How long an image waits for poses [s].
         extrapolation_limit_s: How far poses are continued after that [s].
         max_gap_s: Longest gap in a pose stream across which is interpolated [s].
+        subject: Motion-capture subject that carries the face; that of ``showing``, if there is one.
+        prepare: Makes a new attack ready to be shown, or refuses it; None listens to no new ones.
     """
 
     publications = ("/compositor/image", "/compositor/attack")
@@ -101,12 +111,18 @@ class CompositorNode(Node):
         wait_s: float = 0.025,
         extrapolation_limit_s: float = 0.05,
         max_gap_s: float = 0.1,
+        subject: str = "board",
+        prepare: Callable[[AttackFile], Showing] | None = None,
     ) -> None:
         self._showing = showing
+        self._prepare = prepare
+        self._assembler = Assembler()
+        self._shown_sha256 = self._transfer_trouble = ""
+        self._taken, self._refused, self._takeover_ms = 0, 0, 0.0
         self._wait_ns = round(wait_s * NS_PER_S)
         self._limit_s = extrapolation_limit_s
-        self._face_topic = f"/vicon/{showing.subject}" if showing else "/vicon/board"
-        self.subscriptions = (_IMAGE, _CAR, self._face_topic)
+        self._face_topic = f"/vicon/{showing.subject if showing else subject}"
+        self.subscriptions = (_IMAGE, _CAR, self._face_topic, *((_FILE,) if prepare else ()))
         self._poses = {topic: PoseBuffer(max_gap_s=max_gap_s) for topic in (_CAR, self._face_topic)}
         self._waiting: _Waiting | None = None
         self._counts = {"images": 0, "drawn": 0, "extrapolated": 0, "dropped_no_pose": 0}
@@ -120,14 +136,15 @@ class CompositorNode(Node):
         del context  # it needs no clock of its own
         camera = load_calibration(CameraCalibration, config.camera)
         target = load_calibration(TargetCalibration, config.target)
-        showing = None
-        if config.attack is not None:
-            showing = show(load_attack(config.attack), camera, target, config.supersample)
-        return cls(showing, config.wait_s, config.extrapolation_limit_s, config.max_gap_s)
+        prepare = partial(show, camera=camera, target=target, supersample=config.supersample)
+        showing = None if config.attack is None else prepare(load_attack(config.attack))
+        return cls(showing, config.wait_s, config.extrapolation_limit_s, config.max_gap_s, target.subject, prepare)
 
     def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
         """Take an image or a pose."""
         self._now_ns = now.mono_ns
+        if topic == _FILE:
+            return self._take_piece(message, info, now)
         if topic != _IMAGE:
             self._poses[topic].add(stamp_ns(message), pose_matrix(message))
             return self._release(now)
@@ -149,12 +166,45 @@ class CompositorNode(Node):
         """Active while images come."""
         shown = f"attack {self._showing.attack_id}" if self._showing else "no attack file, images pass through"
         if self._last_image_ns is None or self._now_ns - self._last_image_ns > _ACTIVE_S * NS_PER_S:
-            return READY, f"waiting for images; {shown}"
-        return ACTIVE, f"{shown}; {self._trouble}" if self._trouble else shown
+            return READY, "; ".join(filter(None, (f"waiting for images; {shown}", self._transfer_trouble)))
+        return ACTIVE, "; ".join(filter(None, (shown, self._trouble, self._transfer_trouble)))
 
     def counters(self) -> dict[str, float]:
-        """Images seen, drawn on, drawn with extrapolated poses, dropped."""
-        return {key: float(value) for key, value in self._counts.items()}
+        """Images seen, drawn on, drawn with extrapolated poses, dropped; attacks taken over and refused."""
+        counts = {key: float(value) for key, value in self._counts.items()}
+        transfers = {"attacks_taken": self._taken, "attacks_refused": self._refused, "takeover_ms": self._takeover_ms}
+        return counts | transfers
+
+    def _take_piece(self, chunk: Any, info: MessageInfo, now: Now) -> list[Out]:
+        """Take a piece of a new attack; the last one changes what is shown, if all is well with it."""
+        if self._showing is not None and chunk.sha256 == self._shown_sha256 and not self._assembler.receiving:
+            return []  # sent again for others
+        received, trouble = self._assembler.add(chunk, info.instance_id)
+        if trouble:
+            self._refuse(trouble)
+        return self._take_over(received, now) if received is not None else []
+
+    def _take_over(self, received: ReceivedFile, now: Now) -> list[Out]:
+        assert self._prepare is not None
+        # The duration is reported only; no decision depends on this clock, so replays stay deterministic.
+        start = time.perf_counter()
+        try:
+            showing = self._prepare(attack_from_bytes(received.content, f"the attack {received.name}"))
+            if showing.subject != self._face_topic.removeprefix("/vicon/"):
+                raise ConfigError(f"attack {received.name} is for {showing.subject}, which is not followed here")
+        except (AdvnerfError, ValueError) as error:
+            self._refuse(str(error))
+            return []
+        # An image that waits was seen under the old attack and gets it.
+        before = self._finish(now) if self._waiting else []
+        self._showing, self._shown_sha256, self._transfer_trouble = showing, received.sha256, ""
+        self._taken += 1
+        self._takeover_ms = 1e3 * (time.perf_counter() - start)
+        return before
+
+    def _refuse(self, why: str) -> None:
+        self._refused += 1
+        self._transfer_trouble = f"new attack refused: {why}"
 
     def _release(self, now: Now) -> list[Out]:
         waiting = self._waiting

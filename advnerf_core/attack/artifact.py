@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save
+from safetensors.numpy import load, save
 
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.files import write_atomically
@@ -193,12 +193,31 @@ def load_attack(path: str | os.PathLike[str]) -> AttackFile:
         with safe_open(source, framework="numpy") as handle:
             header = handle.metadata() or {}
             tensors = {name: handle.get_tensor(name) for name in handle.keys()}  # noqa: SIM118 - not a mapping
-        if header.get("format") != FILE_FORMAT:
-            raise AttackFileError(f"expected {source} to be of format {FILE_FORMAT}, got {header.get('format')!r}")
+    except (SafetensorError, OSError, ValueError) as error:
+        raise AttackFileError(f"cannot read {source} as an attack file ({error}); make it again") from error
+    return _checked(header, tensors, str(source))
+
+
+def attack_from_bytes(content: bytes, source: str) -> AttackFile:
+    """An attack file's content, checked as `load_attack` does; ``source`` is what messages call it."""
+    # The container begins with the length of its header and the header itself, which is all that its reader of bytes leaves out.
+    try:
+        length = int.from_bytes(content[:8], "little")
+        header = json.loads(content[8 : 8 + length])["__metadata__"]
+        tensors = load(content)
+    except (SafetensorError, KeyError, TypeError, ValueError) as error:
+        raise AttackFileError(f"cannot read {source} as an attack file ({error}); make it again") from error
+    return _checked(header, tensors, source)
+
+
+def _checked(header: dict[str, Any], tensors: dict[str, NDArray[Any]], source: str) -> AttackFile:
+    if header.get("format") != FILE_FORMAT:
+        raise AttackFileError(f"expected {source} to be of format {FILE_FORMAT}, got {header.get('format')!r}")
+    try:
         attack = _from_parts(json.loads(header["metadata"]), tensors)
     except AttackFileError:
         raise
-    except (SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError) as error:
         raise AttackFileError(f"cannot read {source} as an attack file ({error}); make it again") from error
     if attack.sha256 != header.get("sha256"):
         raise AttackFileError(

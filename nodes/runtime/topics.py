@@ -51,6 +51,12 @@ _ROWS = (
     Topic("/safety/state", "advnerf_msgs/msg/SafetyState", 10.0, 20, 0.5, "safety"),
     Topic("/arm", "advnerf_msgs/msg/Arm", None, 20, None, "operator"),
     Topic("/twin/reset", "geometry_msgs/msg/PoseStamped", None, 5, None, "operator"),
+    Topic("/attack/request", "advnerf_msgs/msg/AttackRequest", None, 5, None, "operator"),
+    Topic("/attack/cancel", "advnerf_msgs/msg/AttackCancel", None, 5, None, "operator"),
+    Topic("/attack/progress", "advnerf_msgs/msg/AttackProgress", 1.0, 50, None, "attack"),
+    Topic("/attack/texture", "sensor_msgs/msg/Image", None, 1, None, "attack"),
+    Topic("/attack/preview", "sensor_msgs/msg/Image", None, 1, None, "attack"),
+    Topic("/attack/file", "advnerf_msgs/msg/FileChunk", None, 300, None, "attack"),
     Topic("/motor/sent", "advnerf_msgs/msg/MotorSent", 20.0, 200, None, "motor"),
     Topic("/motor/state", "advnerf_msgs/msg/VescState", 20.0, 50, 0.5, "motor"),
 )

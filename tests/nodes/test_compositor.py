@@ -1,5 +1,7 @@
 import subprocess
 import sys
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +17,7 @@ from nodes.runtime.clock import ManualClock
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.messages import decode, encode, image_array, image_message, pose_message, stamp_ns, type_name
 from nodes.runtime.node import MessageInfo, NodeContext
+from nodes.runtime.transfer import chunk_messages
 
 CALIBRATION = Path(__file__).parents[2] / "calibration" / "twin"
 CAMERA = load_calibration(CameraCalibration, CALIBRATION / "camera.yaml")
@@ -187,7 +190,7 @@ def test_build_reads_the_files_and_refuses_wrong_ones(tmp_path):
     files = {"camera": CALIBRATION / "camera.yaml", "target": CALIBRATION / "board.yaml"}
     context = NodeContext("compositor", tmp_path, ManualClock())
     node = CompositorNode.build(CompositorConfig(attack=path, **files), context)
-    assert node.subscriptions == ("/camera/image_raw", "/vicon/car", "/vicon/board")
+    assert node.subscriptions == ("/camera/image_raw", "/vicon/car", "/vicon/board", "/attack/file")
     assert "passes through" not in node.status()[1]
     assert CompositorNode.build(CompositorConfig(attack="", **files), context).status()[1].endswith("pass through")
     path.write_bytes(b"garbage")
@@ -198,6 +201,92 @@ def test_build_reads_the_files_and_refuses_wrong_ones(tmp_path):
         CompositorNode.build(CompositorConfig(attack=path, **files), context)
     with pytest.raises(ValidationError, match="Extra inputs"):
         CompositorConfig(atack=path, **files)
+
+
+def listening(showing=None):
+    return Bench(CompositorNode(showing, prepare=partial(show, camera=CAMERA, target=TARGET)))
+
+
+def file_of(tmp_path, **changes):
+    save_attack(tmp_path / "new.safetensors", attack(**changes))
+    return (tmp_path / "new.safetensors").read_bytes()
+
+
+def drive_by(bench, t_s):
+    for t in (t_s - 0.005, t_s + 0.005):
+        bench.poses(t)
+    bench.image(t_s)
+
+
+def test_a_new_attack_is_taken_over_between_two_images_and_every_label_names_what_was_drawn(tmp_path):
+    bench = listening(show(attack(), CAMERA, TARGET))
+    drive_by(bench, 0.1)
+    chunks = chunk_messages(file_of(tmp_path, seed=7), "new", T0)
+    assert len(chunks) > 0
+    bench.poses(0.195)
+    bench.image(0.2)  # waits for the pose after it, and was seen under the old attack
+    for chunk in chunks:
+        bench.send("/attack/file", chunk)
+    for t_s in (0.3, 0.4):
+        drive_by(bench, t_s)
+    old, new = attack().attack_id, attack(seed=7).attack_id
+    assert [label.attack_id for label in bench.labels()] == [old, old, new, new]
+    assert all(label.drawn for label in bench.labels())
+    assert bench.node.status()[1] == f"attack {new}"
+    counters = bench.node.counters()
+    assert (counters["attacks_taken"], counters["attacks_refused"]) == (1, 0)
+    for chunk in chunks:  # it is sent again for others
+        bench.send("/attack/file", chunk)
+    assert bench.node.counters()["attacks_taken"] == 1
+
+
+def test_without_an_attack_the_first_one_is_shown_when_it_comes(tmp_path):
+    bench = listening()
+    drive_by(bench, 0.1)
+    for chunk in chunk_messages(file_of(tmp_path), "new", T0):
+        bench.send("/attack/file", chunk)
+    drive_by(bench, 0.2)
+    assert [(label.attack_id, label.drawn) for label in bench.labels()] == [("", False), (attack().attack_id, True)]
+    assert (image_array(bench.images()[1]) != 90).any()
+
+
+def broken(case, tmp_path):
+    chunks = [decode("advnerf_msgs/msg/FileChunk", encode(c)) for c in chunk_messages(file_of(tmp_path), "new", T0)]
+    if case == "garbage":
+        return chunk_messages(b"garbage", "new", T0)
+    if case == "changed":
+        return chunk_messages(file_of(tmp_path).replace(b'"seed\\":0', b'"seed\\":1'), "new", T0)
+    if case == "corrupt":
+        return [replace(chunks[0], data=chunks[0].data ^ 1), *chunks[1:]]
+    sizes = {"size": {"size_m": (0.3, 0.3)}, "subject": {"subject": "monitor"}}
+    return chunk_messages(file_of(tmp_path, **sizes[case]), "new", T0)
+
+
+@pytest.mark.parametrize(
+    ("case", "reason"),
+    [
+        ("garbage", "cannot read the attack new as an attack file"),
+        ("changed", "was changed after it was saved"),
+        ("corrupt", "damaged on the way"),
+        ("size", "name the target it was made for"),
+        ("subject", "was made for monitor"),
+    ],
+)
+def test_what_is_wrong_with_a_new_attack_is_said_and_the_old_one_stays(case, reason, tmp_path):
+    bench = listening(show(attack(seed=3), CAMERA, TARGET))
+    for chunk in broken(case, tmp_path):
+        bench.send("/attack/file", chunk)
+    drive_by(bench, 0.1)
+    (label,) = bench.labels()
+    assert (label.attack_id, label.drawn) == (attack(seed=3).attack_id, True)
+    state, text = bench.node.status()
+    assert state == "active"
+    assert "new attack refused" in text
+    assert reason in text
+    assert bench.node.counters()["attacks_refused"] == 1
+    for chunk in chunk_messages(file_of(tmp_path, seed=9), "good", T0):
+        bench.send("/attack/file", chunk)
+    assert bench.node.status()[1] == f"attack {attack(seed=9).attack_id}"
 
 
 def test_the_node_needs_no_torch():

@@ -58,6 +58,17 @@ def sample(typename, stamp_ns):
             header=h, speed_mps=0.8, erpm=3691.0, duty=0.1, input_voltage_v=12.0, motor_current_a=1.0,
             input_current_a=0.5, mosfet_temperature_c=30.0, fault=0, fault_text="",
         ),
+        "advnerf_msgs/msg/AttackRequest": lambda: types.AttackRequest(
+            header=h, request_id="a", request="horizon: 1", source=""
+        ),
+        "advnerf_msgs/msg/AttackCancel": lambda: types.AttackCancel(header=h, request_id="", reason="enough"),
+        "advnerf_msgs/msg/AttackProgress": lambda: types.AttackProgress(
+            header=h, request_id="a", state="searching", text="", seed=0, evaluation=1, evaluations=2, loss_m=-1.0,
+            total_cte_m=1.0, best_total_cte_m=1.0, seconds=0.1, attack_id="",
+        ),
+        "advnerf_msgs/msg/FileChunk": lambda: types.FileChunk(
+            header=h, name="a", sha256="ab", size_bytes=3, index=0, count=1, data=np.arange(3, dtype=np.uint8)
+        ),
         "advnerf_msgs/msg/NodeStatus": lambda: types.NodeStatus(
             header=h, node="x", pid=1, state="active", text="", subscriptions=["/arm"], publications=[],
             subscribers=np.zeros(0, np.uint32), counter_names=["n"], counter_values=np.array([1.0]),

@@ -1,0 +1,118 @@
+"""Files over the bus: cut into pieces by the sender, put together and verified by the receiver.
+
+A receiver has either the whole file, with the hash that was announced, or nothing. Pieces come in order from one publisher;
+whatever else comes ends the transfer, and the next one begins at piece 0. The sender repeats a file, so a lost piece costs time.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from nodes.runtime.messages import header, types
+
+# Well below what a full queue of 16 messages may hold in memory on the car's computer.
+CHUNK_BYTES = 256 * 1024
+LARGEST_BYTES = 64 * 1024 * 1024
+
+
+def chunk_messages(content: bytes, name: str, stamp_ns: int) -> list[Any]:
+    """``FileChunk`` messages of a file of 1 byte to 64 MiB."""
+    if not 0 < len(content) <= LARGEST_BYTES:
+        raise ValueError(f"expected a file of 1 to {LARGEST_BYTES} bytes, got {len(content)}")
+    sha256 = hashlib.sha256(content).hexdigest()
+    starts = range(0, len(content), CHUNK_BYTES)
+    return [
+        types.FileChunk(
+            header=header(stamp_ns), name=name, sha256=sha256, size_bytes=len(content), index=index, count=len(starts),
+            data=np.frombuffer(content[start : start + CHUNK_BYTES], dtype=np.uint8),
+        )
+        for index, start in enumerate(starts)
+    ]  # fmt: skip
+
+
+@dataclass(frozen=True)
+class ReceivedFile:
+    """A whole file, verified.
+
+    Attributes:
+        name: What its sender calls it.
+        sha256: Its hash.
+        content: Its bytes.
+    """
+
+    name: str
+    sha256: str
+    content: bytes
+
+
+class Assembler:
+    """Puts one file at a time together."""
+
+    def __init__(self) -> None:
+        self._key: tuple[int, str, str, int, int] | None = None
+        self._parts: list[bytes] = []
+
+    @property
+    def receiving(self) -> bool:
+        """Whether a file has begun and not ended."""
+        return self._key is not None
+
+    def add(self, chunk: Any, instance_id: int) -> tuple[ReceivedFile | None, str]:
+        """Take a piece.
+
+        Args:
+            chunk: A ``FileChunk``.
+            instance_id: Which publisher sent it.
+
+        Returns:
+            The file when this was its last piece, and what went wrong with a transfer, or an empty text.
+        """
+        key = (instance_id, str(chunk.name), str(chunk.sha256), int(chunk.size_bytes), int(chunk.count))
+        index, trouble = int(chunk.index), ""
+        if self._key is None and index > 0:
+            return None, ""  # the rest of a file that was given up, or that began before we listened; it is sent again
+        if self._key is not None and (key != self._key or index != len(self._parts)):
+            came = f"piece {index + 1} of {key[4]} of {key[1]}"
+            trouble = f"expected piece {len(self._parts) + 1} of {self._key[4]} of {self._key[1]}, got {came}; waiting for it to be sent again"
+            self._forget()
+            if index > 0:
+                return None, trouble
+        if self._key is None:
+            if problem := _announcement_problem(key):
+                return None, problem
+            self._key = key
+        return self._append(chunk, trouble)
+
+    def _append(self, chunk: Any, trouble: str) -> tuple[ReceivedFile | None, str]:
+        assert self._key is not None
+        _, name, sha256, size, count = self._key
+        expected = CHUNK_BYTES if len(self._parts) < count - 1 else size - CHUNK_BYTES * (count - 1)
+        data = bytes(chunk.data)
+        if len(data) != expected:
+            self._forget()
+            return None, f"expected {expected} bytes in piece {int(chunk.index) + 1} of {name}, got {len(data)}"
+        self._parts.append(data)
+        if len(self._parts) < count:
+            return None, trouble
+        content = b"".join(self._parts)
+        self._forget()
+        if hashlib.sha256(content).hexdigest() != sha256:
+            return (
+                None,
+                f"{name} was damaged on the way: its bytes do not have the hash {sha256[:12]} that was announced",
+            )
+        return ReceivedFile(name, sha256, content), trouble
+
+    def _forget(self) -> None:
+        self._key, self._parts = None, []
+
+
+def _announcement_problem(key: tuple[int, str, str, int, int]) -> str:
+    _, name, _, size, count = key
+    if not 0 < size <= LARGEST_BYTES or count != -(-size // CHUNK_BYTES):
+        return f"expected {name} in pieces of {CHUNK_BYTES} bytes, at most {LARGEST_BYTES}, got {size} bytes in {count} pieces"
+    return ""
