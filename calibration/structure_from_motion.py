@@ -6,6 +6,7 @@ in a folder and goes on where it was stopped. Everything runs on the CPU.
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
@@ -16,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from advnerf_core.errors import AdvnerfError
+from advnerf_core.files import write_atomically
 from advnerf_core.geometry import Array, Pinhole
 from advnerf_core.scene.lens import Lens
 from calibration import colmap_database as database
@@ -187,9 +189,13 @@ def _map(
 ) -> tuple[Any, int]:
     import pycolmap
 
+    sparse, finished = work / "sparse", work / "finished.json"
+    if finished.exists():
+        record = json.loads(finished.read_text())
+        return pycolmap.Reconstruction(sparse / record["model"]), int(record["parts"])
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed, options.extract_colors = config.seed, False
-    options.num_threads = database.threads()
+    options.num_threads = 1  # sums over threads in another order end in another model
     options.constant_cameras = database.held_cameras(file, sources)
     # Indoors walls are smooth: COLMAP's own limits, made for buildings outdoors, would leave many a photograph out.
     options.mapper.init_min_num_inliers, options.mapper.abs_pose_min_num_inliers = 60, 15
@@ -200,9 +206,9 @@ def _map(
         placed = min(placed + 1, total)  # images of a part that is given up are counted again
         report(_MATCHES_UNTIL + (0.99 - _MATCHES_UNTIL) * placed / total, f"{placed} of {total} images placed")
 
-    sparse = work / "sparse"
     shutil.rmtree(sparse, ignore_errors=True)
     sparse.mkdir()
+    pycolmap.set_random_seed(config.seed)
     with database.quiet():
         found = pycolmap.incremental_mapping(file, root, sparse, options, next_image_callback=one_more)
     if not found:
@@ -210,7 +216,12 @@ def _map(
             f"expected {total} photographs of one scene, could not put any two together; they need overlap (every spot in three "
             "photographs), texture, and movement of the camera between them, not only turning"
         )
-    return max(found.values(), key=lambda each: (each.num_reg_images(), each.num_points3D())), len(found)
+    best = max(found, key=lambda number: (found[number].num_reg_images(), found[number].num_points3D()))
+    folder = sparse / str(best)
+    folder.mkdir(exist_ok=True)
+    found[best].write(folder)
+    write_atomically(finished, json.dumps({"model": folder.name, "parts": len(found)}))
+    return found[best], len(found)
 
 
 def _model(reconstruction: Any, sources: Sequence[Source], parts: int) -> Model:
@@ -225,7 +236,9 @@ def _model(reconstruction: Any, sources: Sequence[Source], parts: int) -> Model:
         T[:3] = image.cam_from_world().inverse().matrix()
         pinhole, lens = database.intrinsics(image.camera)
         registered.append(Registered(name, camera_id, T, pinhole, lens, image.num_points3D))
-    points = [p.xyz for p in reconstruction.points3D.values() if p.track.length() >= 3]
+    points = [
+        p.xyz for _, p in sorted(reconstruction.points3D.items(), key=lambda item: item[0]) if p.track.length() >= 3
+    ]
     unregistered = tuple(name for name in camera_of if name not in by_name)
     return Model(
         tuple(registered), unregistered, _array(points), float(reconstruction.compute_mean_reprojection_error()), parts

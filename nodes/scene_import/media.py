@@ -64,11 +64,7 @@ def gather(media: Sequence[Path], output: Path, config: MediaConfig, report: Rep
     for index, (label, files, is_video) in enumerate(entries):
         name = _unique(label, names)
         folder = output / IMAGES / name
-        done = index / len(entries)
-
-        def progress(share: float, text: str = "", done: float = done) -> None:
-            report(done + share / len(entries), text)
-
+        progress = _part_of(report, index, len(entries))
         if is_video:
             kept = video.keep_keyframes(files[0], folder, config.keyframes, config.most, progress)
         else:
@@ -76,6 +72,13 @@ def gather(media: Sequence[Path], output: Path, config: MediaConfig, report: Rep
         images = tuple(path.relative_to(output).as_posix() for path in kept)
         sources.append(Source("camera" if config.one_camera else name, images, ordered=is_video))
     return sources
+
+
+def _part_of(report: Report, index: int, parts: int) -> Report:
+    def progress(fraction: float, text: str = "") -> None:
+        report((index + fraction) / parts, text)
+
+    return progress
 
 
 def photographs_in(folder: Path) -> list[Path]:

@@ -1,0 +1,162 @@
+"""Structure from motion on photographs whose poses and lens are known: a box's inner corner with painted walls."""
+
+import cv2
+import numpy as np
+import pytest
+
+from advnerf_core.geometry import Pinhole, look_at
+from advnerf_core.scene.image_files import image_size
+from advnerf_core.scene.lens import Lens
+from advnerf_core.scene.similarity import align_poses
+from calibration.structure_from_motion import ReconstructionError, SfmConfig, Source, reconstruct
+
+PHONE = Pinhole(400, 300, 330.0, 330.0, 200.0, 150.0)
+CAR = Pinhole(320, 200, 210.0, 210.0, 160.0, 100.0)
+PHONE_LENS, CAR_LENS = Lens((-0.12, 0.03, 0.0, 0.0, 0.0)), Lens()
+WALL_M = 3.0
+
+
+def painting(seed):
+    """Random blocks of several sizes: corners at every scale."""
+    rng = np.random.default_rng(seed)
+    image = np.zeros((900, 900, 3), np.float32)
+    for cells, weight in ((9, 0.4), (30, 0.35), (90, 0.25)):
+        blocks = rng.uniform(0.0, 255.0, (cells, cells, 3)).astype(np.float32)
+        image += weight * cv2.resize(blocks, (900, 900), interpolation=cv2.INTER_NEAREST)
+    return cv2.GaussianBlur(image, (0, 0), 1.0)
+
+
+WALLS = [painting(seed) for seed in range(3)]
+
+
+def photograph(T_world_from_camera, pinhole, lens):
+    """Cast a ray through every pixel of the distorted image onto the planes x = 0, y = 0, z = 0."""
+    columns, rows = np.meshgrid(np.arange(pinhole.width, dtype=float), np.arange(pinhole.height, dtype=float))
+    matrix = pinhole.matrix.copy()
+    matrix[:2, 2] -= 0.5
+    pixels = np.stack([columns, rows], axis=-1).reshape(-1, 1, 2)
+    straight = cv2.undistortPoints(pixels, matrix, np.array(lens.coefficients)).reshape(-1, 2)
+    directions = np.column_stack([straight, np.ones(len(straight))]) @ T_world_from_camera[:3, :3].T
+    origin, image, nearest = T_world_from_camera[:3, 3], np.zeros((len(straight), 3)), np.full(len(straight), np.inf)
+    for axis in range(3):
+        with np.errstate(divide="ignore"):
+            distance = -origin[axis] / directions[:, axis]
+        u, v = ((origin + distance[:, None] * directions)[:, other] for other in range(3) if other != axis)
+        hit = (distance > 0) & (distance < nearest) & (u >= 0) & (u < WALL_M) & (v >= 0) & (v < WALL_M)
+        nearest[hit] = distance[hit]
+        maps = ((900 / WALL_M * each[hit]).astype(np.float32).reshape(-1, 1) for each in (u, v))
+        # In rows of one pixel; OpenCV's maps may not be longer than 32767.
+        x, y = maps
+        parts = [
+            cv2.remap(WALLS[axis], a, b, cv2.INTER_LINEAR)
+            for a, b in zip(np.array_split(x, 8), np.array_split(y, 8), strict=True)
+        ]
+        image[hit] = np.concatenate(parts).reshape(-1, 3)
+    return np.rint(image).clip(0, 255).astype(np.uint8).reshape(pinhole.height, pinhole.width, 3)
+
+
+def poses_of(count, radius, height, first, last):
+    angles = np.linspace(first, last, count)
+    return [look_at([radius * np.cos(a), radius * np.sin(a), height], [0.7, 0.7, 0.6]) for a in angles]
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """Folder of images, sources, true poses by name."""
+    root, truth, names = tmp_path_factory.mktemp("sfm"), {}, {"phone": [], "car": []}
+    plan = {
+        "phone": (poses_of(8, 2.6, 1.5, 0.3, 1.27), PHONE, PHONE_LENS),
+        "car": (poses_of(6, 2.3, 0.8, 0.4, 1.17), CAR, CAR_LENS),
+    }
+    for camera, (poses, pinhole, lens) in plan.items():
+        for index, pose in enumerate(poses):
+            name = f"{camera}_{index}.png"
+            assert cv2.imwrite(str(root / name), photograph(pose, pinhole, lens)[..., ::-1])
+            truth[name] = pose
+            names[camera].append(name)
+    sources = [
+        Source("phone", tuple(names["phone"]), ordered=True),
+        Source("car", tuple(names["car"]), True, CAR, CAR_LENS),
+    ]
+    return root, sources, truth
+
+
+@pytest.mark.slow
+def test_poses_and_lens_of_two_cameras_are_found(scene):
+    root, sources, truth = scene
+    model = reconstruct(root, sources, root / "work")
+    assert model.unregistered == ()
+    assert [image.name for image in model.images] == list(truth)
+    aligned = align_poses(model.poses, np.stack([truth[i.name] for i in model.images]), 0.1, 0.1, 1.0)
+    assert aligned.position_error_m.max() < 0.01 * aligned.extent_m
+    assert np.rad2deg(aligned.rotation_error_rad.max()) < 0.4
+    phone, car = model.images[0], model.images[-1]
+    assert phone.pinhole.fx == pytest.approx(PHONE.fx, rel=0.01)
+    assert phone.lens.coefficients[0] == pytest.approx(-0.12, abs=0.03)
+    assert car.pinhole == CAR, "known intrinsics are held"
+    assert model.reprojection_error_px < 1.0
+    points = aligned.similarity.points(model.points)
+    off_wall = np.abs(points).min(axis=1)
+    assert np.median(off_wall) < 0.01, "points lie on the walls"
+
+
+@pytest.mark.slow
+def test_a_stopped_run_goes_on_and_other_inputs_begin_anew(scene, tmp_path):
+    root, sources, _ = scene
+
+    class StoppedError(Exception):
+        pass
+
+    def stop(share, text):
+        if "matched" in text:
+            raise StoppedError
+
+    work = tmp_path / "work"
+    with pytest.raises(StoppedError):
+        reconstruct(root, sources, work, report=stop)
+    said = []
+    first = reconstruct(root, sources, work, report=lambda share, text: said.append(text))
+    assert not any(text.startswith("features") for text in said), "features were there already"
+    said.clear()
+    again = reconstruct(root, sources, work, report=lambda share, text: said.append(text))
+    assert not any("placed" in text for text in said), "a finished model is read, not made again"
+    np.testing.assert_array_equal(again.points, first.points)
+    (work / "finished.json").unlink()
+    again = reconstruct(root, sources, work)
+    np.testing.assert_allclose(again.poses, first.poses, atol=1e-9)
+    said.clear()
+    reconstruct(root, sources, work, SfmConfig(max_features=1500), lambda share, text: said.append(text))
+    assert any(text.startswith("features") for text in said)
+
+
+@pytest.mark.slow
+def test_photographs_without_overlap_are_refused_with_what_to_do(tmp_path):
+    rng = np.random.default_rng(0)
+    for k in range(4):
+        blocks = rng.integers(0, 255, (30, 40, 3), np.uint8)
+        cv2.imwrite(str(tmp_path / f"{k}.png"), cv2.resize(blocks, (400, 300), interpolation=cv2.INTER_NEAREST))
+    with pytest.raises(ReconstructionError, match=r"could not put any two together; they need overlap"):
+        reconstruct(tmp_path, [Source("phone", tuple(f"{k}.png" for k in range(4)))], tmp_path / "work")
+
+
+def test_what_cannot_begin_is_refused_at_once(tmp_path):
+    with pytest.raises(ReconstructionError, match="at least 3 different images, got 2"):
+        reconstruct(tmp_path, [Source("phone", ("a.png", "b.png"))], tmp_path / "work")
+    with pytest.raises(ReconstructionError, match="got a fisheye"):
+        Source("phone", ("a.png",), lens=Lens((0.1, 0.0, 0.0, 0.0), fisheye=True))
+    with pytest.raises(ReconstructionError, match="images of camera 'phone', got none"):
+        Source("phone", ())
+
+
+def test_the_painted_corner_is_seen_where_it_is(tmp_path):
+    """The test's own renderer against the pinhole: the corner of the box is at the pixel that projection says."""
+    pose = look_at([2.0, 1.8, 1.2], [0.0, 0.0, 0.0])
+    image = photograph(pose, PHONE, Lens())
+    cv2.imwrite(str(tmp_path / "a.png"), image)
+    assert image_size(tmp_path / "a.png") == (400, 300)
+    T = np.linalg.inv(pose)
+    point = np.array([1.0, 0.0, 0.7])
+    u, v = PHONE.project(T[:3, :3] @ point + T[:3, 3])
+    painted = WALLS[1][round(900 / WALL_M * 0.7), round(900 / WALL_M * 1.0)]
+    seen = image[int(v) - 1 : int(v) + 2, int(u) - 1 : int(u) + 2].reshape(-1, 3).astype(float)
+    assert np.abs(seen - painted).sum(axis=1).min() < 60.0
