@@ -25,6 +25,8 @@ from nodes.scene_import.media import IMAGES, MediaConfig, gather
 TRANSFORMS, REPORT_FILE, COLMAP = "transforms.json", "import.json", "colmap"
 _MEDIA_SHARE = 0.3
 _BOX_PERCENT, _BOX_MARGIN = 0.5, 0.05
+# Against the spread of the x axes: small, so that they decide as soon as the cameras have turned a little.
+_LEVEL_WEIGHT = 0.005
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,9 +121,14 @@ def from_phone_and_car(
 
 
 def upright(model: Model, extent_m: float) -> Similarity:
-    """The similarity that makes z point up, by the mean of the cameras' own up, and puts the middle of the points at the origin."""
+    """The similarity that makes z point up and puts the middle of the points at the origin.
+
+    Up is where the cameras' own up points in the mean, drawn to what is square to all their x axes: people hold a camera level more
+    exactly than they look straight ahead.
+    """
     poses = model.poses
-    up = -poses[:, :3, 1].mean(axis=0)
+    sideways, up = poses[:, :3, 0], -poses[:, :3, 1].mean(axis=0)
+    up = np.linalg.solve(sideways.T @ sideways / len(poses) + _LEVEL_WEIGHT * np.eye(3), up)
     up = up / np.linalg.norm(up) if np.linalg.norm(up) > 1e-6 else np.array([0.0, 0.0, 1.0])
     aside = np.cross([0.0, 1.0, 0.0] if abs(up[1]) < 0.9 else [1.0, 0.0, 0.0], up)
     x = aside / np.linalg.norm(aside)

@@ -1,0 +1,80 @@
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from advnerf_core.geometry import Pinhole, look_at, make_transform, rotation_x, rotation_z
+from advnerf_core.scene.dataset import load_transforms
+from advnerf_core.scene.lens import Lens
+from advnerf_core.scene.similarity import Similarity, align_poses, extent
+from benchmarks.lab_recordings import lab_with_phone, photograph
+from calibration.structure_from_motion import Model, Registered
+from hardware.twin.lab import Lab
+from hardware.twin.phone import video_poses
+from nodes.scene_import.data_set import upright
+
+
+def walk(count=40):
+    angles = np.linspace(0.0, 6.0, count)
+    return np.stack([look_at([3.0 * np.cos(a), 3.0 * np.sin(a), 1.5], [0.0, 0.0, 1.0]) for a in angles])
+
+
+def model_of(poses):
+    images = [
+        Registered(f"{k}", "phone", pose, Pinhole(4, 3, 3.0, 3.0, 2.0, 1.5), Lens(), 9) for k, pose in enumerate(poses)
+    ]
+    return Model(tuple(images), (), np.array([[1.0, 2.0, 3.0], [2.0, 2.0, 3.0], [9.0, 2.0, 3.0]]), 0.5, 1)
+
+
+def test_a_walk_is_put_upright_centred_and_to_scale():
+    tilted = Similarity(0.2, make_transform(rotation_x(1.0) @ rotation_z(0.4), [5.0, -3.0, 2.0]))
+    model = model_of(tilted.poses(walk()))
+    found = upright(model, extent_m=5.0)
+    poses = found.poses(model.poses)
+    assert extent(poses[:, :3, 3]) == pytest.approx(5.0)
+    assert np.ptp(poses[:, 2, 3]) < 2e-3, "all at one height again"
+    assert (poses[:, 2, 1] < -0.5).all(), "the cameras' y axes point down"
+    np.testing.assert_allclose(found.points([2.0, 2.0, 3.0]), 0.0, atol=1e-9)
+
+
+def run(*arguments):
+    command = [sys.executable, "-m", "nodes.cli", "scene", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+
+
+def test_an_error_is_one_line_and_exit_code_2(tmp_path):
+    (tmp_path / "empty").mkdir()
+    result = run("from-images", tmp_path / "empty", "-o", tmp_path / "out")
+    assert result.returncode == 2
+    assert result.stderr.count("\n") == 1
+    assert result.stderr.startswith("error: expected photographs")
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(400)
+def test_photographs_of_the_lab_become_a_data_set(tmp_path):
+    config = lab_with_phone(800)
+    poses = video_poses(config, 120)[:18]
+    with Lab(config) as lab:
+        files = photograph(lab, poses, tmp_path / "phone")
+    result = run("from-images", tmp_path / "phone", "-o", tmp_path / "set", "--extent", "3")
+    assert (result.returncode, result.stderr) == (0, "")
+    assert "18 of 18 images placed" in result.stdout
+    listed = load_transforms(tmp_path / "set", require_all=True)
+    assert [frame.path.name for frame in listed.frames] == [file.name for file in files]
+    found = np.stack([frame.T_world_from_camera for frame in listed.frames])
+    aligned = align_poses(found, np.stack(poses), 0.3, 0.1, 1.0)
+    assert aligned.rms_position_m < 0.01 * aligned.extent_m
+    assert np.rad2deg(aligned.rms_rotation_rad) < 0.6
+    assert listed.frames[0].pinhole.fx == pytest.approx(config.phone.pinhole.fx, rel=0.02)
+    low, high = listed.box()
+    assert ((found[:, :3, 3] > low) & (found[:, :3, 3] < high)).all()
+    report = json.loads((tmp_path / "set" / "import.json").read_text())
+    assert report["structure_from_motion"]["registered"] == 18
+    # The same again reads what is there.
+    assert run("from-images", tmp_path / "phone", "-o", tmp_path / "set", "--extent", "3").returncode == 0
+    np.testing.assert_allclose(
+        np.stack([f.T_world_from_camera for f in load_transforms(tmp_path / "set").frames]), found
+    )
