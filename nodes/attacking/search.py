@@ -53,7 +53,11 @@ def finish(prepared: Prepared, result: SearchResult) -> AttackFile:
 
 
 def run_attack(
-    request: AttackRequest, folder: Path, display: Display, on_evaluation: OnEvaluation | None = None
+    request: AttackRequest,
+    folder: Path,
+    display: Display,
+    on_evaluation: OnEvaluation | None = None,
+    on_prepared: Callable[[Prepared], None] | None = None,
 ) -> list[Path]:
     """Run every seed of a request in a folder, going on where it was stopped.
 
@@ -62,6 +66,7 @@ def run_attack(
         folder: Where states and attack files go.
         display: Told of the progress of each seed.
         on_evaluation: Also called after every evaluation.
+        on_prepared: Called before the search of each seed.
 
     Returns:
         The attack files, ``seed_<seed>.attack.safetensors``, each with its curve in a JSON file beside it.
@@ -79,6 +84,8 @@ def run_attack(
             display.finish(name, 0.0, cached=True)
             continue
         prepared = prepare(request, seed) if prepared is None else prepared.with_seed(seed)
+        if on_prepared is not None:
+            on_prepared(prepared)
         _run_seed(prepared, folder, display, on_evaluation)
     return files
 

@@ -1,0 +1,255 @@
+"""The attack node: takes a request, searches in a process of its own, and ends with the attack file on the bus.
+
+The search may take hours; this loop stays free: it answers a cancel at once and tells its health. What it is doing is on disk
+before it begins, so a node that was killed goes on with the same request when it is started in the same run folder.
+The file is sent in pieces several times, and once more whenever somebody new listens.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from advnerf_core.attack.artifact import load_attack
+from advnerf_core.errors import AdvnerfError
+from advnerf_core.files import write_atomically
+from nodes.attacking.job import REQUEST, Job, Said
+from nodes.attacking.request import parse_request, request_text
+from nodes.runtime.clock import NS_PER_S
+from nodes.runtime.messages import header, image_message, types
+from nodes.runtime.node import ACTIVE, READY, Inbox, MessageInfo, Node, NodeContext, Now, Out, run_node_main
+from nodes.runtime.transfer import chunk_messages
+
+_REQUEST, _CANCEL = "/attack/request", "/attack/cancel"
+_PROGRESS, _FILE = "/attack/progress", "/attack/file"
+_IMAGES = {"texture": "/attack/texture", "preview": "/attack/preview"}
+_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,39}")
+_CURRENT = "current.json"
+_TELL_NS = NS_PER_S
+_INBOX = 1000
+RUNNING = ("preparing", "searching")
+
+
+class AttackConfig(BaseModel):
+    """Configuration of the attack node.
+
+    Attributes:
+        folder: Where requests, states and attack files are kept, one folder each; relative to the run folder.
+        sends: How often a finished attack file is sent.
+        repeat_s: Pause between [s].
+        threads: Threads of the search; 0 leaves it to the libraries.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    folder: Path = Path("attack")
+    sends: int = Field(default=3, ge=1)
+    repeat_s: float = Field(default=2.0, ge=0.0)
+    threads: int = Field(default=0, ge=0)
+
+
+class AttackNode(Node):
+    """Request in; progress, pictures and the attack file out.
+
+    Args:
+        config: Its configuration.
+        folder: Where requests are kept.
+        subscribers: How many listen to a topic.
+    """
+
+    subscriptions = (_REQUEST, _CANCEL)
+    publications = (_PROGRESS, *_IMAGES.values(), _FILE)
+    tick_rate_hz = 20.0
+
+    def __init__(self, config: AttackConfig, folder: Path, subscribers: Callable[[str], int] = lambda topic: 0) -> None:
+        self.inbox: Inbox[Said] = Inbox(_INBOX)
+        self._config, self._folder, self._subscribers = config, folder, subscribers
+        self._job: Job | None = None
+        self._request_id = ""
+        self._progress: dict[str, Any] = {}
+        self._told_ns = 0
+        self._sender: Sender | None = None
+        self._resume()
+
+    @classmethod
+    def build(cls, config: AttackConfig, context: NodeContext) -> AttackNode:
+        """Make the node of a process; it goes on with what it was doing when it was killed."""
+        folder = context.run_dir.resolve() / config.folder
+        folder.mkdir(parents=True, exist_ok=True)
+        return cls(config, folder, context.subscribers)
+
+    def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
+        """Take a request or a cancel."""
+        if topic == _CANCEL:
+            return self._cancel(message, now)
+        try:
+            self._accept(message)
+        except (AdvnerfError, OSError) as error:
+            refusal = _fresh("refused", " ".join(str(error).split()))
+            return [self._message(now, str(message.request_id), refusal)]
+        return [self._tell(now)]
+
+    def receive(self, item: Said, now: Now) -> list[Out]:
+        """Take what the search says; what an earlier one said is too late."""
+        if item.job is not self._job:
+            return []
+        if item.kind == "progress":
+            best = max(self._progress["best_total_cte_m"], item.data.get("total_cte_m", 0.0))
+            self._progress |= {**item.data, "best_total_cte_m": best}
+            self._progress.pop("bytes", None)
+        elif item.kind == "image":
+            pixels = np.frombuffer(item.pixels, np.uint8).reshape(item.data["height"], item.data["width"], 3)
+            return [Out(_IMAGES[item.data["name"]], image_message(pixels, now.real_ns, self._request_id[:40]))]
+        elif item.kind == "done":
+            self._keep("done", file=item.data["file"])
+            self._finish("done", f"{item.data['file']}", attack_id=item.data["attack_id"])
+            self._begin_sending(Path(item.data["file"]), now)
+        elif item.kind == "ended" and self._progress["state"] in RUNNING:
+            why = item.job.why_it_failed()
+            self._keep("failed")
+            self._finish("failed", why)
+        return [self._tell(now)]
+
+    def tick(self, now: Now) -> list[Out]:
+        """Say now and then how far it is, and send a piece of the file."""
+        outs = [self._tell(now)] if now.mono_ns - self._told_ns >= _TELL_NS else []
+        if self._sender is not None and (piece := self._sender.next(now, self._subscribers(_FILE))) is not None:
+            outs.append(Out(_FILE, piece))
+        return outs
+
+    def status(self) -> tuple[str, str]:
+        """Active while it searches."""
+        if not self._request_id:
+            return READY, "waiting for a request"
+        state, p = self._progress["state"], self._progress
+        text = f"{self._request_id}: {state}"
+        if self._job is None:
+            return READY, f"{text} {p['text']}".strip()
+        return ACTIVE, f"{text} {p['evaluation']}/{p['evaluations']}, best {p['best_total_cte_m']:.2f} m"
+
+    def counters(self) -> dict[str, float]:
+        """Evaluations of the present search, and its process."""
+        job = {"worker_pid": float(self._job.pid)} if self._job is not None else {}
+        return {"evaluation": float(self._progress.get("evaluation", 0)), **job}
+
+    def close(self) -> None:
+        """End the search; its request stays the current one, so that the next node goes on with it."""
+        if self._job is not None:
+            self._job.stop()
+            self._job = None
+
+    def _accept(self, message: Any) -> None:
+        request_id, text = str(message.request_id), str(message.request)
+        if not _ID.fullmatch(request_id):
+            raise AdvnerfError(f"expected a request id of 1 to 40 letters, digits, - and _, got {request_id!r}")
+        kept_text = request_text(parse_request(text, f"request {request_id}"))
+        if self._job is not None and request_id != self._request_id:
+            raise AdvnerfError(f"busy with {self._request_id}; wait for it, or cancel it")
+        folder = self._folder / request_id
+        kept = folder / REQUEST
+        if kept.exists() and kept.read_text(encoding="utf-8") != kept_text:
+            raise AdvnerfError(f"{request_id} is another request already; give this one another id")
+        if self._job is not None:
+            return  # the very same request again
+        write_atomically(kept, kept_text)
+        self._start(request_id)
+
+    def _start(self, request_id: str) -> None:
+        self._request_id, self._progress, self._sender = request_id, _fresh("preparing", ""), None
+        self._keep("running")
+        self._job = Job(self._folder / request_id, self.inbox, self._config.threads)
+
+    def _cancel(self, message: Any, now: Now) -> list[Out]:
+        wanted = str(message.request_id)
+        if self._job is None or wanted not in ("", self._request_id):
+            return [self._tell(now)]
+        self._keep("cancelled")
+        self._finish("cancelled", str(message.reason))
+        return [self._tell(now)]
+
+    def _finish(self, state: str, text: str, attack_id: str = "") -> None:
+        self._progress |= {"state": state, "text": text, "attack_id": attack_id}
+        self.close()
+
+    def _begin_sending(self, file: Path, now: Now) -> None:
+        attack = load_attack(file)
+        chunks = chunk_messages(file.read_bytes(), attack.attack_id, now.real_ns)
+        self._sender = Sender(chunks, self._config.sends, round(self._config.repeat_s * NS_PER_S))
+
+    def _keep(self, state: str, **more: str) -> None:
+        content = {"request_id": self._request_id, "state": state, **more}
+        write_atomically(self._folder / _CURRENT, json.dumps(content) + "\n")
+
+    def _resume(self) -> None:
+        """Go on with a search that was cut off, and send again what was finished."""
+        try:
+            current = json.loads((self._folder / _CURRENT).read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            return
+        if current["state"] == "running":
+            self._start(current["request_id"])
+            return
+        self._request_id, self._progress = current["request_id"], _fresh(current["state"], "before this start")
+        if current["state"] == "done" and Path(current["file"]).is_file():
+            attack = load_attack(current["file"])
+            best = attack.predicted_total_cte_m or 0.0
+            self._progress |= {"attack_id": attack.attack_id, "best_total_cte_m": best}
+            self._begin_sending(Path(current["file"]), Now(0, 0))
+
+    def _tell(self, now: Now) -> Out:
+        self._told_ns = now.mono_ns
+        return self._message(now, self._request_id, self._progress or _fresh("idle", ""))
+
+    def _message(self, now: Now, request_id: str, progress: dict[str, Any]) -> Out:
+        return Out(_PROGRESS, types.AttackProgress(header=header(now.real_ns), request_id=request_id, **progress))
+
+
+class Sender:
+    """Sends the pieces of a file, one a tick, again and again: some rounds, and one more for whoever begins to listen.
+
+    Args:
+        chunks: The pieces.
+        rounds: How often.
+        pause_ns: Time between two rounds [ns].
+    """
+
+    def __init__(self, chunks: list[Any], rounds: int, pause_ns: int) -> None:
+        self._chunks, self._rounds, self._pause_ns = chunks, rounds, pause_ns
+        self._index, self._due_ns, self._listeners = 0, 0, 0
+
+    def next(self, now: Now, listeners: int) -> Any | None:
+        """The piece that is due, or None."""
+        if listeners > self._listeners:
+            self._rounds = max(self._rounds, 1 + (self._index > 0))
+        self._listeners = listeners
+        if self._rounds == 0 or now.mono_ns < self._due_ns:
+            return None
+        piece = self._chunks[self._index]
+        self._index = (self._index + 1) % len(self._chunks)
+        if self._index == 0:
+            self._rounds -= 1
+            self._due_ns = now.mono_ns + self._pause_ns
+        return piece
+
+
+def _fresh(state: str, text: str) -> dict[str, Any]:
+    return {
+        "state": state, "text": text, "seed": 0, "evaluation": 0, "evaluations": 0, "loss_m": math.nan, "total_cte_m": 0.0,
+        "best_total_cte_m": 0.0, "seconds": 0.0, "attack_id": "",
+    }  # fmt: skip
+
+
+def main() -> int:
+    """Run the node as a process."""
+    return run_node_main(AttackConfig, AttackNode.build)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
