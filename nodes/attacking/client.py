@@ -19,7 +19,7 @@ ENDED = ("done", "failed", "cancelled", "refused")
 
 def new_request_id(name: str) -> str:
     """A name for a request that is not taken: its own, shortened, and the time."""
-    safe = "".join(letter if letter.isalnum() and letter.isascii() or letter in "-_" else "-" for letter in name)
+    safe = "".join(letter if (letter.isalnum() and letter.isascii()) or letter in "-_" else "-" for letter in name)
     return f"{safe.strip('-_')[:24] or 'attack'}-{time.strftime('%Y%m%d-%H%M%S')}"
 
 

@@ -52,10 +52,12 @@ class Speaker:
 
     def prepared(self, prepared: Prepared) -> None:
         """A seed can be searched."""
-        self._prepared, self._best_m = prepared, None
+        done, self._best_m = _so_far(self._state(prepared))
+        self._prepared = prepared
         self.say(
-            "progress", state="searching", seed=prepared.seed, evaluation=0, evaluations=self._evaluations, text=""
-        )
+            "progress", state="searching", seed=prepared.seed, evaluation=done, evaluations=self._evaluations, text="",
+            total_cte_m=self._best_m or 0.0,
+        )  # fmt: skip
 
     def told(self, evaluation: Evaluation) -> None:
         """An evaluation is done and its state is on disk."""

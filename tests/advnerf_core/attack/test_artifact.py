@@ -37,6 +37,13 @@ def test_round_trip_keeps_everything_and_the_id(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["attack.safetensors"]
 
 
+def test_the_same_attack_is_the_same_bytes(tmp_path):
+    files = [tmp_path / f"{k}.safetensors" for k in range(8)]
+    for file in files:
+        save_attack(file, attack())
+    assert len({file.read_bytes() for file in files}) == 1
+
+
 def test_the_id_depends_on_every_part():
     ids = {attack().attack_id, attack(seed=4).attack_id, attack(policy_sha256="d" * 64).attack_id}
     ids.add(attack(theta=attack().theta + np.float32(1e-3)).attack_id)
