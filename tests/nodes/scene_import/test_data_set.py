@@ -9,7 +9,7 @@ from advnerf_core.geometry import Pinhole, look_at, make_transform, rotation_x, 
 from advnerf_core.scene.dataset import load_transforms
 from advnerf_core.scene.lens import Lens
 from advnerf_core.scene.similarity import Similarity, align_poses, extent
-from benchmarks.lab_recordings import lab_with_phone, photograph
+from benchmarks.lab_recordings import lab_with_phone, photograph, record_drive
 from calibration.structure_from_motion import Model, Registered
 from hardware.twin.lab import Lab
 from hardware.twin.phone import video_poses
@@ -78,3 +78,30 @@ def test_photographs_of_the_lab_become_a_data_set(tmp_path):
     np.testing.assert_allclose(
         np.stack([f.T_world_from_camera for f in load_transforms(tmp_path / "set").frames]), found
     )
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_phone_and_car_come_out_metric_in_the_motion_capture_world(tmp_path):
+    config = lab_with_phone(800)
+    # A third of a lap, round the first corner: high and inwards, high and outwards, low and ahead.
+    frames = [lap * 50 + k for lap in range(3) for k in range(16)]
+    poses = [video_poses(config, 150)[k] for k in frames]
+    with Lab(config) as lab:
+        files = photograph(lab, poses, tmp_path / "phone")
+        record_drive(lab, tmp_path / "drive", laps=0.3)
+    result = run("from-phone-and-car", tmp_path / "phone", "--bag", tmp_path / "drive", "-o", tmp_path / "set")
+    assert (result.returncode, result.stderr) == (0, "")
+    truth = {file.name: pose for file, pose in zip(files, poses, strict=True)}
+    phone = load_transforms(tmp_path / "set" / "transforms_phone.json", require_all=True)
+    assert phone.camera_ids == ("phone",)
+    assert len(phone.frames) >= 40
+    # No alignment here: the poses themselves must be in the world of motion capture.
+    off_m = [np.linalg.norm((f.T_world_from_camera - truth[f.path.name])[:3, 3]) for f in phone.frames]
+    assert np.median(off_m) < 0.04
+    assert load_transforms(tmp_path / "set").camera_ids == ("phone", "car")
+    car = load_transforms(tmp_path / "set" / "transforms_car.json")
+    assert car.frames[0].pinhole == config.camera.pinhole
+    placing = json.loads((tmp_path / "set" / "import.json").read_text())["placing"]
+    assert placing["inliers"] >= 0.8 * placing["cameras"]
+    assert placing["rms_position_m"] < 0.05
