@@ -104,7 +104,7 @@ def align_poses(
     Args:
         T_source_from_camera: ``[N, 4, 4]``.
         T_target_from_camera: ``[N, 4, 4]`` of the same cameras.
-        position_tolerance_m: How far an inlier may be from its target [target units].
+        position_tolerance_m: How far an inlier may be from its target [target units]; with both tolerances infinite all count.
         rotation_tolerance_rad: How far an inlier may be turned from its target [rad].
         min_inlier_share: With fewer inliers than this share the result is refused.
         seed: Of the choice of candidate pairs, where there are too many to try all.
@@ -125,7 +125,8 @@ def align_poses(
         )
     _refuse_degenerate(target[:, :3, 3], "all")
     tolerances = (position_tolerance_m, rotation_tolerance_rad)
-    inliers = _consensus(source, target, tolerances, seed)
+    everything = np.isinf(tolerances).all()
+    inliers = np.ones(len(source), np.bool_) if everything else _consensus(source, target, tolerances, seed)
     _require_share(inliers, min_inlier_share, tolerances)
     for _ in range(20):  # to a fixed point; the set settles after two or three rounds
         similarity = _fit(source[inliers], target[inliers])
@@ -199,6 +200,7 @@ def _consensus(source: Array, target: Array, tolerances: tuple[float, float], se
     best_rank = (-1, -np.inf)
     for i, j in pairs:
         apart = source[j, :3, 3] - source[i, :3, 3]
+        # A pair no farther apart than its own errors fixes no scale.
         if apart @ apart < 1e-24 or np.linalg.norm(target[j, :3, 3] - target[i, :3, 3]) <= tolerances[0]:
             continue
         similarity = _fit(source[[i, j]], target[[i, j]])

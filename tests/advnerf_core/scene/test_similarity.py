@@ -81,6 +81,14 @@ def test_no_small_change_of_the_similarity_fits_better():
         assert cost(s + step[0], base + step[1:4], T[:3, 3] + step[4:]) > least
 
 
+def test_without_tolerances_every_camera_is_fitted():
+    source = cameras()
+    target = disturbed(TRUE.poses(source), 0.2, 0.1)
+    found = align_poses(source, target, np.inf, np.inf, min_inlier_share=1.0)
+    assert found.inliers.all()
+    assert found.rms_position_m == pytest.approx(0.2 * np.sqrt(3), rel=0.15)
+
+
 @pytest.mark.parametrize(
     ("spread", "message"),
     [((4.0, 0.0, 0.0), "on one line"), ((4.0, 0.01, 0.01), "on one line"), ((0.0, 0.0, 0.0), "at one place")],
