@@ -56,7 +56,13 @@ def export_program(network: Any, contract: PolicyContract, path: Path) -> None:
         raise PolicyContractError("expected a stateless policy, got one with memory: write a factory for it instead")
     examples, _ = example_inputs(contract)
     batch = torch.export.Dim("batch", min=1, max=_LARGEST_BATCH)
-    program = torch.export.export(network, examples, dynamic_shapes=tuple({0: batch} for _ in examples))
+    try:
+        program = torch.export.export(network, examples, dynamic_shapes=tuple({0: batch} for _ in examples))
+    except Exception as error:  # the exporter and the network raise what they like
+        reason = " ".join(str(error).split())
+        raise PolicyContractError(
+            f"the network cannot be exported ({type(error).__name__}: {reason:.160}); name its factory instead of a file"
+        ) from error
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.stem}.{os.getpid()}.tmp.pt2")
     try:

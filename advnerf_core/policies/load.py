@@ -30,7 +30,7 @@ _SUFFIXES = (".safetensors", ".onnx", ".pt2")
 
 def is_factory(spec: str | os.PathLike[str]) -> bool:
     """Whether a policy is named as ``package.module:factory`` and not as a file."""
-    return isinstance(spec, str) and _FACTORY.fullmatch(spec) is not None
+    return _FACTORY.fullmatch(str(spec)) is not None
 
 
 def load_any_policy(spec: str | os.PathLike[str], expected_sha256: str | None = None) -> LoadedPolicy:

@@ -121,10 +121,17 @@ def export_onnx(network: Any, contract: PolicyContract, path: Path) -> None:
     with warnings.catch_warnings(), torch.no_grad():
         # It announces its successor, which needs another package, and remarks on every check of a shape.
         warnings.simplefilter("ignore")
-        torch.onnx.export(
-            network, examples, buffer, dynamo=False, opset_version=_OPSET, input_names=names, output_names=["steering"],
-            dynamic_axes={name: {0: "B"} for name in [*names, "steering"]},
-        )  # fmt: skip
+        try:
+            torch.onnx.export(
+                network, examples, buffer, dynamo=False, opset_version=_OPSET, input_names=names, output_names=["steering"],
+                dynamic_axes={name: {0: "B"} for name in [*names, "steering"]},
+            )  # fmt: skip
+        except Exception as error:  # the exporter and the network raise what they like
+            reason = " ".join(str(error).split())
+            raise PolicyContractError(
+                f"the network cannot be written as ONNX ({type(error).__name__}: {reason:.160}); keep its gradient in a .pt2 file, "
+                "or replace the layer"
+            ) from error
     model = onnx.load_from_string(buffer.getvalue())
     model.metadata_props.add(key=METADATA_KEY, value=_black_box(contract, path).to_json())
     onnx.checker.check_model(model)

@@ -165,6 +165,20 @@ def test_an_exported_program_keeps_its_gradient(tmp_path):
     assert all(not parameter.requires_grad for parameter in loaded.parameters())
 
 
+def test_what_cannot_be_exported_is_one_error(tmp_path):
+    pooled = nn.Sequential(nn.AdaptiveAvgPool2d((7, 7)), nn.Flatten(), nn.Linear(147, 1)).eval()
+    with pytest.raises(PolicyContractError, match="cannot be written as ONNX"):
+        export_onnx(pooled, PolicyContract(VIEW), tmp_path / "a.onnx")
+
+    class Branching(nn.Module):
+        def forward(self, given):
+            return given.mean((1, 2, 3)) if float(given.mean()) > 0.5 else given.sum((1, 2, 3))
+
+    with pytest.raises(PolicyContractError, match="cannot be exported"):
+        export_program(Branching().eval(), PolicyContract(VIEW), tmp_path / "a.pt2")
+    assert list(tmp_path.iterdir()) == []
+
+
 class Bomb:
     def __reduce__(self):
         return (sys.exit, ("a stranger's code ran",))
