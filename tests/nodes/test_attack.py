@@ -255,6 +255,7 @@ class Car:
         self.labels += [received.message() for received in self.bus.receive() if received.topic == "/compositor/attack"]
 
 
+@pytest.mark.slow
 def test_a_killed_node_goes_on_and_a_running_compositor_takes_the_attack_over(tmp_path):
     run_dir = tmp_path / "run"
     request = load_request(tiny_request(tmp_path / "data", evaluations=20))
