@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from pathlib import Path
+from typing import BinaryIO
 
 import cv2
 import numpy as np
@@ -64,7 +65,8 @@ def image_size(path: Path) -> tuple[int, int]:
 def is_cut_off(data: bytes) -> bool:
     """Whether a JPEG or PNG lacks its end: decoders would fill up the rest of the picture with grey."""
     if data.startswith(_JPEG):
-        return _first_scan(data) is None or data.find(b"\xff\xd9", _first_scan(data)) < 0
+        scan = _first_scan(data)
+        return scan is None or data.find(b"\xff\xd9", scan) < 0
     if data.startswith(_PNG):
         return b"IEND" not in data
     return False
@@ -73,7 +75,7 @@ def is_cut_off(data: bytes) -> bool:
 def read_bytes(path: Path) -> bytes:
     """The file's content; what stands in the way is one error."""
     with _open(path) as stream:
-        return bytes(stream.read())
+        return stream.read()
 
 
 def _first_scan(data: bytes) -> int | None:
@@ -90,7 +92,7 @@ def _first_scan(data: bytes) -> int | None:
     return None
 
 
-def _open(path: Path):  # type: ignore[no-untyped-def]
+def _open(path: Path) -> BinaryIO:
     try:
         return path.open("rb")
     except OSError as error:

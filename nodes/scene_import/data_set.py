@@ -24,6 +24,7 @@ from nodes.scene_import.media import IMAGES, MediaConfig, gather
 
 TRANSFORMS, REPORT_FILE, COLMAP = "transforms.json", "import.json", "colmap"
 _MEDIA_SHARE = 0.3
+_CLAIM = ".made_by_advnerf"
 _BOX_PERCENT, _BOX_MARGIN = 0.5, 0.05
 # Against the spread of the x axes: small, so that they decide as soon as the cameras have turned a little.
 _LEVEL_WEIGHT = 0.005
@@ -55,6 +56,7 @@ def from_media(
         extent_m: Largest distance between two places the photographs were taken from [m].
         report: Told of the progress.
     """
+    _claim(output, media)
     sources = gather(media, output, media_config, lambda share, text="": report(_MEDIA_SHARE * share, text))
     model = _reconstruct(output, sources, sfm, report)
     similarity = upright(model, extent_m)
@@ -80,6 +82,7 @@ def from_bag(
         report: Told of the progress.
         calibration: The camera's file; None takes the bag's.
     """
+    _claim(output)
     frames = take_frames(bag, output / IMAGES / CAR_CAMERA, config, report, calibration)
     positions = frames.T_world_from_camera[:, :3, 3]
     facts = {"bag": str(bag), **_bag_facts(frames), "scale": "metric: motion capture"}
@@ -98,6 +101,7 @@ def from_phone_and_car(
     ``transforms.json`` holds all registered images with the model's poses, ``transforms_phone.json`` only the phone's (to learn a
     scene from), ``transforms_car.json`` all frames of the car with their motion-capture poses (to fit colours and to compare).
     """
+    _claim(output, media)
     frames = take_frames(
         bag, output / IMAGES / CAR_CAMERA, bag_config, lambda share, text="": report(0.1 * share, text), calibration
     )
@@ -139,6 +143,21 @@ def upright(model: Model, extent_m: float) -> Similarity:
     scale = extent_m / spread
     middle = np.median(model.points, axis=0) if len(model.points) else poses[:, :3, 3].mean(axis=0)
     return Similarity(scale, make_transform(R, -scale * R @ middle))
+
+
+def _claim(output: Path, media: Sequence[Path] = ()) -> None:
+    """Images there are replaced and removed, so they must be ours: no photograph of a person is ever touched."""
+    images = output / IMAGES
+    inside = [path for path in media if path.resolve().is_relative_to(images.resolve())]
+    if inside:
+        raise ImportRecordingError(
+            f"expected media outside {images}, where the data set keeps its own copies, got {inside[0]}; give another --output"
+        )
+    if images.exists() and any(images.iterdir()) and not (images / _CLAIM).exists():
+        raise ImportRecordingError(
+            f"expected a new folder or one of an earlier import, but {images} holds other files; give another --output"
+        )
+    write_atomically(images / _CLAIM, "Images in this folder are copies; an import replaces and removes them.\n")
 
 
 def _reconstruct(output: Path, sources: Sequence[Source], sfm: SfmConfig, report: Report) -> Model:

@@ -90,6 +90,16 @@ def test_a_file_that_was_cut_off_is_refused(tmp_path, suffix):
         read_image(path)
 
 
+def test_the_end_of_a_thumbnail_is_not_the_end_of_the_photograph(tmp_path):
+    path = tmp_path / "0.jpg"
+    save(path, np.random.default_rng(0).integers(0, 255, (40, 60, 3), np.uint8))
+    data, thumbnail = path.read_bytes(), b"Exif\0\0" + b"\xff\xd8 small picture \xff\xd9"
+    with_thumbnail = data[:2] + b"\xff\xe1" + (len(thumbnail) + 2).to_bytes(2, "big") + thumbnail + data[2:]
+    assert not is_cut_off(with_thumbnail)
+    assert is_cut_off(with_thumbnail[:-200])
+    assert not is_cut_off(with_thumbnail + b"a film that the phone hangs on")
+
+
 def test_grey_and_16_bit_images_are_read_as_colours(tmp_path):
     save(tmp_path / "grey.png", np.full((5, 6), 70, np.uint8))
     save(tmp_path / "deep.png", np.full((5, 6, 3), 257 * 70, np.uint16))

@@ -10,10 +10,12 @@ from advnerf_core.scene.dataset import load_transforms
 from advnerf_core.scene.lens import Lens
 from advnerf_core.scene.similarity import Similarity, align_poses, extent
 from benchmarks.lab_recordings import lab_with_phone, photograph, record_drive
-from calibration.structure_from_motion import Model, Registered
+from calibration.structure_from_motion import Model, Registered, SfmConfig
 from hardware.twin.lab import Lab
 from hardware.twin.phone import video_poses
-from nodes.scene_import.data_set import upright
+from nodes.scene_import.data_set import from_media, upright
+from nodes.scene_import.errors import ImportRecordingError
+from nodes.scene_import.media import MediaConfig
 
 
 def walk(count=40):
@@ -50,6 +52,17 @@ def test_an_error_is_one_line_and_exit_code_2(tmp_path):
     assert result.returncode == 2
     assert result.stderr.count("\n") == 1
     assert result.stderr.startswith("error: expected photographs")
+
+
+def test_pictures_of_a_person_are_never_touched(tmp_path):
+    mine = tmp_path / "holiday" / "images" / "phone" / "000001.jpg"
+    mine.parent.mkdir(parents=True)
+    mine.write_bytes(b"precious")
+    for media, message in ((mine.parent, "outside"), (tmp_path / "other", "holds other files")):
+        media.mkdir(exist_ok=True)
+        with pytest.raises(ImportRecordingError, match=message):
+            from_media([media], tmp_path / "holiday", MediaConfig(), SfmConfig(), 4.0, lambda share, text="": None)
+    assert mine.read_bytes() == b"precious"
 
 
 @pytest.mark.slow
