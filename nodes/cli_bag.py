@@ -70,7 +70,7 @@ def bag_play(
     no_wait: Annotated[bool, typer.Option("--no-wait", help="Begin at once, whether anybody listens or not.")] = False,
     run_dir: RunDir = None,
 ) -> None:
-    """Play a bag to the nodes of a run folder; statuses and requests to arm only when named by --topics."""
+    """Play a bag to the nodes of a run folder; statuses and requests only when named by --topics."""
     from nodes.player import PlayerConfig, PlayerNode
     from nodes.runtime.node import run_node
     from nodes.runtime.watching import find_run_dir

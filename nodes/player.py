@@ -1,7 +1,7 @@
 """The player node: a bag back onto the bus, at its own pace or another.
 
 The bytes and the capture stamps are those of the recording; publish times are new, so that receivers see fresh messages.
-Statuses and requests to arm stay in the bag unless they are asked for: a recording must not arm a car.
+Statuses and requests (to arm, for an attack) stay in the bag unless they are asked for: a recording must not arm a car.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from nodes.runtime.errors import BagError, NodeFinished
 from nodes.runtime.node import ACTIVE, READY, MessageInfo, Node, NodeContext, Now, Out, run_node_main
 from nodes.runtime.topics import STATUS_PREFIX
 
-_ARM_TOPIC = "/arm"
+_REQUESTS = ("/arm", "/attack/request", "/attack/cancel")
 # Messages leave at the first tick after they are due, so they are up to 2.5 ms late on average.
 _TICK_HZ = 200.0
 
@@ -31,7 +31,7 @@ class PlayerConfig(BaseModel):
         rate: Speed relative to the recording.
         loop: Begin again at the end.
         start_offset_s: Leave out so much of the beginning [s].
-        topics: What to play; none means all but statuses and requests to arm.
+        topics: What to play; none means all but statuses and requests.
         wait_for: Topics that must have a subscriber before the first message; none means that one of any topic will do,
             an empty list means do not wait, and lose what is sent before a subscriber is there.
     """
@@ -129,7 +129,7 @@ class PlayerNode(Node):
 
 def _choose_topics(config: PlayerConfig, recorded: list[str]) -> list[str]:
     if config.topics is None:
-        chosen = [name for name in recorded if name != _ARM_TOPIC and not name.startswith(STATUS_PREFIX)]
+        chosen = [name for name in recorded if name not in _REQUESTS and not name.startswith(STATUS_PREFIX)]
     else:
         chosen = list(dict.fromkeys(config.topics))
         if unknown := [name for name in chosen if name not in recorded]:

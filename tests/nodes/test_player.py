@@ -91,6 +91,18 @@ def test_any_subscriber_will_do_when_none_is_named(bag):
     assert len(play(node, ManualClock())[0]) == 120
 
 
+def test_a_recording_does_not_ask_for_an_attack(tmp_path):
+    with BagWriter(tmp_path / "bag") as writer:
+        request = encode(types.AttackRequest(header=header(START_NS), request_id="a", request="", source=""))
+        cancel = encode(types.AttackCancel(header=header(START_NS), request_id="a", reason=""))
+        for topic, data in (("/attack/request", request), ("/attack/cancel", cancel)):
+            writer.write(topic, data, START_NS, START_NS, 0)
+        for k in range(2):
+            pose = encode(pose_message(np.eye(4), START_NS))
+            writer.write("/vicon/car", pose, START_NS + k, START_NS, k)
+    assert PlayerNode(PlayerConfig(bag=tmp_path / "bag"), lambda topic: 0).publications == ("/vicon/car",)
+
+
 def test_requests_to_arm_are_played_only_when_asked_for(bag):
     assert PlayerNode(PlayerConfig(bag=bag, topics=["/arm"]), lambda topic: 0).publications == ("/arm",)
 
