@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from nodes import cli_attack, cli_attack_node, cli_bag, cli_policy, cli_scene, cli_topic
+from nodes import cli_attack, cli_attack_node, cli_bag, cli_object, cli_policy, cli_scene, cli_topic
 from nodes.runtime.terminal import Overrides, RunDir, print_table, say_error, table
 
 if TYPE_CHECKING:
@@ -33,6 +33,7 @@ app.add_typer(cli_topic.app, name="topic")
 app.add_typer(cli_bag.app, name="bag")
 cli_attack_node.add_to(cli_attack.app)
 app.add_typer(cli_attack.app, name="attack")
+app.add_typer(cli_object.app, name="object")
 app.add_typer(cli_policy.app, name="policy")
 app.add_typer(cli_scene.app, name="scene")
 stage_app = typer.Typer(

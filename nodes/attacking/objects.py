@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from advnerf_core.fields.voxel_grid import VoxelGridObject, cube_face_object, face_corners_in_object
 from advnerf_core.geometry import Array
+from advnerf_core.objects.model import load_object
 from calibration.schema import TargetCalibration, load_calibration
 from nodes.attacking.request import ObjectRequest
 from nodes.runtime.errors import ConfigError
@@ -51,16 +52,27 @@ def place(wanted: ObjectRequest) -> PlacedObject:
     """Make the object of a request.
 
     Raises:
-        ConfigError: An object file where there is no reader for it, or a face that cannot be shown.
+        ObjectFileError: An object file that cannot be read.
+        ConfigError: A face of an object file: it has none that could be displayed.
     """
     if wanted.kind == "file":
-        raise ConfigError(f"{wanted.file}: object files cannot be read")
+        return _from_file(wanted)
     field = cube_face_object(
         wanted.size_m, wanted.resolution, wanted.plain_rgb, wanted.pose, one_sided=wanted.kind == "face",
         depth_m=wanted.size_m if wanted.kind == "cube" else 0.01,
     )  # fmt: skip
     field = _scaled(field, wanted.scale)
     return PlacedObject(wanted.kind, field, _face(wanted), object_sha256(field))
+
+
+def _from_file(wanted: ObjectRequest) -> PlacedObject:
+    assert wanted.file is not None
+    if wanted.free == "face" or wanted.target is not None:
+        raise ConfigError(
+            f"{wanted.file}: expected all colours of an object file to be free; only a face or cube has a face"
+        )
+    field = load_object(wanted.file).placed(wanted.pose, wanted.scale)
+    return PlacedObject(wanted.file.name.partition(".")[0], field, None, object_sha256(field))
 
 
 def _scaled(field: VoxelGridObject, scale: float) -> VoxelGridObject:

@@ -1,0 +1,55 @@
+"""Cameras around an object: for fitting it, judging it, and showing it."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from advnerf_core.geometry import Array, Pinhole
+
+FIELD_OF_VIEW_RAD = np.deg2rad(35.0)
+
+
+def look_at(eye: Array, target: Array) -> Array:
+    """``T_world_from_camera [4, 4]`` of a camera at ``eye`` that looks at ``target``, upright, OpenCV axes."""
+    forward = (target - eye) / np.linalg.norm(target - eye)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    if np.linalg.norm(right) < 1e-9:
+        raise ValueError(f"expected a camera that does not look straight up or down, from {eye} to {target}")
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :4] = np.stack([right, np.cross(forward, right), forward, eye], axis=1)
+    return pose
+
+
+def viewing_lens(pixels: int) -> Pinhole:
+    """A square picture of 35 degrees."""
+    f = 0.5 * pixels / np.tan(FIELD_OF_VIEW_RAD / 2)
+    return Pinhole(pixels, pixels, f, f, pixels / 2, pixels / 2)
+
+
+def ring(box: tuple[Array, Array], count: int, elevation_rad: float = 0.25, phase: float = 0.0) -> Array:
+    """Poses ``[count, 4, 4]`` on a circle around a box that they hold in view; ``phase`` in 0..1 turns by a part of a step."""
+    azimuth = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False) + 2.0 * np.pi * phase / count
+    return _poses(box, azimuth, np.full(count, elevation_rad, dtype=np.float64))
+
+
+def dome(
+    box: tuple[Array, Array], count: int, lowest_rad: float = -0.1, highest_rad: float = 1.1, phase: float = 0.0
+) -> Array:
+    """Poses ``[count, 4, 4]`` spread evenly over the part of a sphere that a car's camera and a person's see (a golden spiral)."""
+    k = (np.arange(count) + 0.5) / count
+    sine = np.sin(lowest_rad) + k * (np.sin(highest_rad) - np.sin(lowest_rad))
+    azimuth = 2.0 * np.pi * ((np.arange(count) + phase) * 0.6180339887498949 % 1.0)
+    return _poses(box, azimuth, np.asarray(np.arcsin(sine), dtype=np.float64))
+
+
+def _poses(box: tuple[Array, Array], azimuth: ArrayLike, elevation: ArrayLike) -> Array:
+    low, high = box
+    azimuth, elevation = np.asarray(azimuth), np.asarray(elevation)
+    centre, radius = (low + high) / 2, np.linalg.norm(high - low) / 2
+    distance = 1.05 * radius / np.sin(FIELD_OF_VIEW_RAD / 2)
+    ray = np.stack(
+        [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)], axis=-1
+    )
+    return np.stack([look_at(centre + distance * direction, centre) for direction in ray])
