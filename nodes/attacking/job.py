@@ -91,14 +91,19 @@ class Job:
         """End it at once; its state file is whole, whenever that is."""
         with contextlib.suppress(ProcessLookupError):
             os.killpg(self._process.pid, signal.SIGKILL)
-        self._process.wait(_END_S)
+        # A process that hangs in the system dies when it comes back; the node must not wait for that.
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(_END_S)
         self._reader.stop()
         if self._process.stdout is not None:
             self._process.stdout.close()
 
     def why_it_failed(self) -> str:
         """Last words of a search that ended by itself."""
-        code = self._process.wait(_END_S)
+        try:
+            code = self._process.wait(_END_S)
+        except subprocess.TimeoutExpired:
+            return f"fell silent without ending (log: {self.log})"
         if code < 0:
             return f"was killed by {signal.Signals(-code).name}; send the request again to go on"
         lines = self.log.read_bytes()[-4000:].decode("utf-8", "replace").strip().splitlines()
