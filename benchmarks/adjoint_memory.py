@@ -11,12 +11,14 @@ import argparse
 import json
 import subprocess
 import sys
+import time
 from pathlib import Path
 from statistics import median
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch.utils.checkpoint import checkpoint
 
 from advnerf_core.attack.adjoint import AttackProblem, adjoint_gradient, evaluate
 from advnerf_core.files import write_atomically
@@ -26,6 +28,8 @@ from benchmarks.results import REPOSITORY, record_row
 
 COMMAND = "python -m benchmarks.adjoint_memory"
 METHODS = ("adjoint", "backprop")
+WAYS = ("adjoint", "cached", "backprop", "checkpointed")
+CACHE_MIB = 32
 
 
 class _Render(torch.autograd.Function):
@@ -54,15 +58,43 @@ def unrolled_gradient(problem: AttackProblem, theta: Tensor) -> tuple[float, Ten
     return float(loss.detach()), gradient
 
 
-def peak_above_idle_mib(method: str, steps: int) -> float:
-    """Measure in this process, which must be fresh."""
-    problem = toy_problem(steps, resolution=16, dtype=torch.float32, cache_bytes=0)
+def checkpointed_gradient(problem: AttackProblem, theta: Tensor) -> tuple[float, Tensor]:
+    """The same with one checkpoint per step: only states are kept, each step is run again on the way back."""
+    theta = theta.clone().requires_grad_()
+
+    def step(theta: Tensor, states: Tensor) -> Tensor:
+        images = _Render.apply(theta, problem, states.detach())
+        return problem.dynamics.step(states, problem.policy(images, problem.goals).to(states.dtype))
+
+    states, loss = problem.start_states, torch.zeros((), dtype=problem.start_states.dtype)
+    for _ in range(problem.steps):
+        states = checkpoint(step, theta, states, use_reentrant=False)
+        loss = loss + problem.cost(states).mean()
+    (gradient,) = torch.autograd.grad(loss, theta)
+    return float(loss.detach()), gradient
+
+
+def gradient_by(way: str, problem: AttackProblem, theta: Tensor) -> tuple[float, Tensor]:
+    """Loss and gradient by one of `WAYS`; ``cached`` is the adjoint with a budget."""
+    if way in ("adjoint", "cached"):
+        result = adjoint_gradient(problem, theta)
+        return result.loss, result.gradient
+    return unrolled_gradient(problem, theta) if way == "backprop" else checkpointed_gradient(problem, theta)
+
+
+def peak_above_idle_mib(method: str, steps: int) -> tuple[float, float]:
+    """Peak [MiB] and time [s] of one gradient in this process, which must be fresh."""
+    cache_bytes = CACHE_MIB * 2**20 if method == "cached" else 0
+    problem = toy_problem(steps, resolution=16, dtype=torch.float32, cache_bytes=cache_bytes)
     problem = AttackProblem(**{**vars(problem), "start_states": problem.start_states[:1]})
     theta = problem.sensor.initial_theta(torch.Generator().manual_seed(0))
     evaluate(AttackProblem(**{**vars(problem), "steps": 1}), theta)
     idle = restart_peak()
-    _ = adjoint_gradient(problem, theta) if method == "adjoint" else unrolled_gradient(problem, theta)
-    return peak_mib() - idle
+    gradient_by(method, problem, theta)
+    peak = peak_mib() - idle
+    began = time.perf_counter()
+    gradient_by(method, problem, theta)
+    return peak, time.perf_counter() - began
 
 
 def measure(horizons: list[int], repeats: int = 3) -> list[dict[str, Any]]:
@@ -71,16 +103,50 @@ def measure(horizons: list[int], repeats: int = 3) -> list[dict[str, Any]]:
     for steps in horizons:
         row: dict[str, Any] = {"horizon_steps": steps}
         for method in METHODS:
-            row[f"{method}_mib"] = median(_in_fresh_process(method, steps) for _ in range(repeats))
+            row[f"{method}_mib"] = median(_in_fresh_process(method, steps)["mib"] for _ in range(repeats))
             print(f"T = {steps}: {method} {row[f'{method}_mib']:.1f} MiB above idle", flush=True)
         rows.append(row)
     return rows
 
 
-def _in_fresh_process(method: str, steps: int) -> float:
+def _in_fresh_process(method: str, steps: int) -> dict[str, float]:
     command = [sys.executable, "-m", "benchmarks.adjoint_memory", "--child", method, "--horizons", str(steps)]
     done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True, cwd=REPOSITORY)
-    return float(json.loads(done.stdout.splitlines()[-1])["mib"])
+    measured: dict[str, float] = json.loads(done.stdout.splitlines()[-1])
+    return measured
+
+
+def compare(repeats: int, trial: bool, horizons: tuple[int, int, int] = (60, 200, 600)) -> None:
+    """The lines of issue 3: memory and time at T = 200 against other ways, memory at T = 600 against T = 60."""
+    short, middle, long = horizons
+    wanted = [("adjoint", short), ("adjoint", long), ("cached", short), ("cached", long)]
+    wanted += [(way, middle) for way in WAYS]
+    found = {}
+    for way, steps in wanted:
+        runs = [_in_fresh_process(way, steps) for _ in range(repeats)]
+        found[way, steps] = {key: median(run[key] for run in runs) for key in ("mib", "seconds")}
+        print(
+            f"{way}, T = {steps}: {found[way, steps]['mib']:.1f} MiB, {found[way, steps]['seconds']:.2f} s", flush=True
+        )
+    ours, cached, plain, steps = (found[way, middle] for way in WAYS)
+    grown = found["adjoint", long]["mib"] / found["adjoint", short]["mib"]
+    share, more = ours["mib"] / plain["mib"], cached["mib"] / steps["mib"]
+    faster = steps["seconds"] / cached["seconds"]
+    above = found["cached", long]["mib"] - found["adjoint", long]["mib"]
+    rows = [
+        ("memory at T = 200 against plain back-propagation", share, "x", "<= 0.1 x", share <= 0.1, "cache off"),
+        ("against one checkpoint per step, T = 200, time", faster, "x", "> 1 x", faster > 1.0,
+         f"{CACHE_MIB} MiB cache: {cached['seconds']:.2f} against {steps['seconds']:.2f} s at {more:.2f} x memory"),
+        ("against one checkpoint per step, T = 200, memory", more, "x", "<= 2 x", more <= 2.0, f"{CACHE_MIB} MiB cache"),
+        ("memory, T = 600 against T = 60, cache off", grown, "x", "<= 1.05 x", grown <= 1.05,
+         f"{found['adjoint', short]['mib']:.1f} and {found['adjoint', long]['mib']:.1f} MiB above idle"),
+        ("memory, T = 600, what the cache adds", above, "MiB", f"<= {CACHE_MIB} MiB, its budget", above <= CACHE_MIB,
+         "peak above idle with the cache less the one without"),
+    ]  # fmt: skip
+    for line, value, unit, target, met, note in rows:
+        print(f"{line}: {value:.3f} {unit} (target {target})")
+        if not trial:
+            record_row(f"#3 adjoint {line}", value, unit, target, met, f"{COMMAND} --compare", note)
 
 
 def main() -> None:
@@ -92,10 +158,16 @@ def main() -> None:
     )
     parser.add_argument("--repeats", type=int, default=3, help="fresh processes per number, of which the median counts")
     parser.add_argument("--no-record", action="store_true", help="leave the ledger alone")
-    parser.add_argument("--child", choices=METHODS, help=argparse.SUPPRESS)
+    parser.add_argument("--compare", action="store_true", help="T = 60, 200, 600: also with a cache and checkpoints")
+    parser.add_argument("--trial", action="store_true", help="with --compare: short horizons, and nothing is recorded")
+    parser.add_argument("--child", choices=WAYS, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.child:
-        print(json.dumps({"mib": peak_above_idle_mib(arguments.child, arguments.horizons[0])}))
+        mib, seconds = peak_above_idle_mib(arguments.child, arguments.horizons[0])
+        print(json.dumps({"mib": mib, "seconds": seconds}))
+        return
+    if arguments.compare:
+        compare(arguments.repeats, arguments.trial, (16, 24, 48) if arguments.trial else (60, 200, 600))
         return
     rows = measure(arguments.horizons, arguments.repeats)
     write_atomically(arguments.output, json.dumps(rows, indent=1) + "\n")
