@@ -24,9 +24,11 @@ from advnerf_core.render.occupancy import Leaps, OccupancyGrid, leap_distances, 
 from advnerf_core.render.rays import intrinsics_row, pixel_rays, poses_in_box
 from advnerf_core.scene.dataset import ImageSet
 from advnerf_core.scene.field import SceneField, SceneFieldConfig
+from advnerf_core.scene.torch_step import TorchStep
 from advnerf_core.scene.train_step import CpuStep, StepResult
 
 Array32 = NDArray[np.float32]
+BACKENDS = ("auto", "numba", "torch")
 
 
 class CheckpointError(AdvnerfError):
@@ -56,6 +58,7 @@ class TrainConfig:
         render_step_scale: Sample intervals for rendering, in those of the training: a finished field is smooth along rays.
         seed: Seed of everything random.
         checkpoint_every_s: Time between checkpoints [s].
+        backend: ``numba`` (CPU kernels), ``torch`` (any device), or ``auto``: torch where it sees an accelerator, else numba.
     """
 
     steps: int = 1000
@@ -74,12 +77,15 @@ class TrainConfig:
     render_step_scale: float = 2.0
     seed: int = 0
     checkpoint_every_s: float = 60.0
+    backend: str = "auto"
 
     def __post_init__(self) -> None:
         if self.steps < 1 or self.samples_per_step < 1 or self.max_rays < 1:
             raise ValueError(f"expected at least one step, sample and ray, got {self}")
         if self.max_seconds is not None and not self.max_seconds > 0.0:
             raise ValueError(f"expected max_seconds > 0 or none, got {self.max_seconds}")
+        if self.backend not in BACKENDS:
+            raise ValueError(f"expected a backend of {', '.join(BACKENDS)}, got {self.backend!r}")
 
 
 @dataclass(frozen=True)
@@ -134,7 +140,7 @@ class Trainer:
     def __init__(self, images: ImageSet, field_config: SceneFieldConfig, config: TrainConfig | None = None) -> None:
         self.images, self.config = images, config or TrainConfig()
         self.scene = SceneField(field_config, seed=self.config.seed)
-        self.stepper = CpuStep(self.scene, self.config.huber, opacity=self.config.opacity)
+        self.stepper = _stepper(self.scene, self.config)
         self.occupancy = OccupancyGrid(field_config.box_high, self.config.occupancy_resolution, self.config.seed)
         self.step, self.elapsed_s = 0, 0.0
         self.rays_per_step = min(self.config.max_rays, 2048)
@@ -143,6 +149,10 @@ class Trainer:
         self._intrinsics = np.stack([intrinsics_row(p) for p in images.pinholes])
         capacity = int(1.25 * self.config.samples_per_step)
         self._marcher = Marcher(capacity, self.config.march, field_config.box_high)
+        # Pixels to learn from, where a mask or an undistortion leaves some out.
+        self._usable = None if images.valid is None else np.flatnonzero(images.valid)
+        if self._usable is not None and not len(self._usable):
+            raise AdvnerfError("expected pixels to learn from, the masks leave none: are they the right way round?")
         self._leaps: Leaps | None = None
         self._recent: list[StepResult] = []
 
@@ -185,7 +195,7 @@ class Trainer:
             self.save(checkpoint)
         occupied = refine_occupied(self.occupied(), self.occupancy.box_high, self.stepper.log_density)
         march = self.config.march.coarser(self.config.render_step_scale)
-        return TrainedScene(self.scene, occupied, march, self.history)
+        return TrainedScene(self.scene.cpu(), occupied, march, self.history)
 
     def train_step(self) -> StepResult:
         """One batch of random pixels; all randomness follows from the seed and the step number."""
@@ -193,8 +203,10 @@ class Trainer:
         self._refresh_occupancy()
         assert self._leaps is not None
         rng = np.random.Generator(np.random.Philox(key=[config.seed, 2 * self.step]))
-        shape = self.images.rgb.shape
-        pixels = rng.integers(0, shape[0] * shape[1] * shape[2], self.rays_per_step)
+        if self._usable is None:
+            pixels = rng.integers(0, self.images.rgb[..., 0].size, self.rays_per_step)
+        else:
+            pixels = self._usable[rng.integers(0, len(self._usable), self.rays_per_step)]
         rays = np.empty((self.rays_per_step, 6), np.float32)
         colours = np.empty((self.rays_per_step, 3), np.uint8)
         pixel_rays(pixels, self.images.rgb, self._poses, self._intrinsics, rays, colours)
@@ -215,10 +227,7 @@ class Trainer:
 
     def save(self, path: Path) -> None:
         """Write a checkpoint, atomically."""
-        tensors = {f"value.{name}": value for name, value in self.stepper.values.items()}
-        tensors |= {f"mean.{name}": value for name, value in self.stepper.means.items()}
-        tensors |= {f"square.{name}": value for name, value in self.stepper.squares.items()}
-        tensors["occupancy"] = self.occupancy.density
+        tensors = {**self.stepper.state(), "occupancy": self.occupancy.density}
         state = {
             "step": self.step,
             "elapsed_s": self.elapsed_s,
@@ -246,11 +255,7 @@ class Trainer:
             raise CheckpointError(
                 f"expected a checkpoint of these images and settings at {path}, got one of others; delete it to train anew"
             )
-        for kind, arrays in (
-            ("value", self.stepper.values), ("mean", self.stepper.means), ("square", self.stepper.squares),
-        ):  # fmt: skip
-            for name, array in arrays.items():
-                array[...] = tensors[f"{kind}.{name}"]
+        self.stepper.load_state(tensors)
         self.occupancy.density[...] = tensors["occupancy"]
         self.step, self.elapsed_s = int(state["step"]), float(state["elapsed_s"])
         self.rays_per_step = int(state["rays_per_step"])
@@ -261,7 +266,7 @@ class Trainer:
     def _optimise(self, rays: Array32, colours: NDArray[np.uint8], samples: Samples) -> StepResult:
         # Only once geometry is found: earlier, pulling weights together freezes surfaces at wrong depths.
         self.stepper.distortion = self.config.distortion * min(1.0, max(0.0, 4.0 * self.fraction - 2.0))
-        result = self.stepper.gradients(rays, colours, *self.stepper.visible(samples))
+        result = self.stepper.step(rays, colours, samples)
         if not math.isfinite(result.loss):
             raise AdvnerfError(
                 f"expected a finite loss, got {result.loss} at step {self.step}; lower the learning rate "
@@ -298,7 +303,16 @@ class Trainer:
         digest = hashlib.sha256(json.dumps([asdict(self.scene.config), asdict(self.config)], sort_keys=True).encode())
         digest.update(str(self.images.rgb.shape).encode() + self.images.T_world_from_camera.tobytes())
         digest.update(self.images.rgb[:, ::16, ::16].tobytes())
+        if self._usable is not None:
+            digest.update(self._usable.tobytes())
         return digest.hexdigest()[:16]
+
+
+def _stepper(scene: SceneField, config: TrainConfig) -> CpuStep | TorchStep:
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    if config.backend == "torch" or (config.backend == "auto" and device != "cpu"):
+        return TorchStep(scene.to(device), config.huber, opacity=config.opacity)
+    return CpuStep(scene, config.huber, opacity=config.opacity)
 
 
 def train_scene(

@@ -1,6 +1,6 @@
 """One training step on the CPU: march, encode, networks, composite, compare, and all of it backwards, in numba kernels.
 
-The backward pass is written out by hand; tests compare it with torch's automatic differentiation of ``reference_colours``.
+The backward pass is written out by hand; tests compare it with torch's automatic differentiation in ``torch_step``.
 """
 
 from __future__ import annotations
@@ -9,16 +9,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from advnerf_core.fields.hash_grid import encode, scatter
 from advnerf_core.fields.mlp_kernels import TILE
 from advnerf_core.parallel import SLOTS, run_slots, slot_bounds
 from advnerf_core.render.march import Samples
 from advnerf_core.render.volume_kernels import (
-    MIN_TRANSMITTANCE,
     accumulate,
     accumulate_backward,
     add_distortion_gradient,
@@ -74,6 +71,10 @@ class CpuStep:
         self.means = {name: np.zeros_like(value) for name, value in self.values.items()}
         self.squares = {name: np.zeros_like(value) for name, value in self.values.items()}
         self._buffers: dict[str, Array32] = {}
+
+    def step(self, rays: Array32, targets: NDArray[np.uint8], samples: Samples) -> StepResult:
+        """Add the gradient of a batch, of the samples that show; arguments as in ``gradients``."""
+        return self.gradients(rays, targets, *self.visible(samples))
 
     def visible(self, samples: Samples, least_weight: float = 5e-4) -> tuple[Samples, Array32]:
         """Samples that show in the image, and their encodings in tiles ``[tiles, K, TILE]``.
@@ -204,6 +205,16 @@ class CpuStep:
 
             run_slots(work, len(bounds))
 
+    def state(self) -> dict[str, Array32]:
+        """Parameters and moments by kind and name, not copied."""
+        kinds = {"value": self.values, "mean": self.means, "square": self.squares}
+        return {f"{kind}.{name}": array for kind, arrays in kinds.items() for name, array in arrays.items()}
+
+    def load_state(self, state: dict[str, Array32]) -> None:
+        """Take over what ``state`` gave."""
+        for name, array in self.state().items():
+            array[...] = state[name]
+
     def log_density(self, points: Array32) -> Array32:
         """Logarithm of density per box side ``[N]`` at points ``[N, 3]`` in box coordinates."""
         return log_density(self.scene, points)
@@ -229,26 +240,6 @@ def log_density(scene: SceneField, points: Array32) -> Array32:
     bounds = slot_bounds(tiles, SLOTS)
     run_slots(lambda s: two_layers(v["density_1.weight"], v["density_1.bias"], w2, b2, encoded, out, *bounds[s]), SLOTS)
     return np.ascontiguousarray(out[:, 0]).reshape(-1)[:n]
-
-
-def reference_colours(scene: SceneField, rays: Tensor, samples: Samples) -> Tensor:
-    """Colours ``[R, 3]`` of rays ``[R, 6]`` in plain torch, on the scene's device, differentiable to its parameters."""
-    device, dtype = scene.background.device, scene.background.dtype
-    counts = torch.from_numpy(np.diff(samples.begins)).to(device)
-    ray_of = torch.repeat_interleave(torch.arange(samples.rays, device=device), counts)
-    density, features = scene.density_and_features(torch.from_numpy(samples.points).to(device, dtype))
-    depth = density * torch.from_numpy(samples.widths).to(device, dtype)
-    before = torch.cumsum(depth, 0) - depth
-    begins = torch.from_numpy(samples.begins[:-1]).to(device).clamp(max=max(len(depth) - 1, 0))
-    through = torch.exp(-(before - before[begins][ray_of]))
-    through = torch.where(through < MIN_TRANSMITTANCE, torch.zeros_like(through), through)
-    weights = through * (1.0 - torch.exp(-depth))
-    total = torch.zeros(samples.rays, features.shape[1], device=device, dtype=dtype).index_add(
-        0, ray_of, weights[:, None] * features
-    )
-    alpha = torch.zeros(samples.rays, device=device, dtype=dtype).index_add(0, ray_of, weights)
-    directions = torch.nn.functional.normalize(rays[:, 3:].to(device, dtype), dim=-1)
-    return scene.decode(total + (1.0 - alpha)[:, None] * scene.background, directions)
 
 
 def _clear_tail(tiles: Array32, count: int) -> None:

@@ -17,8 +17,9 @@ from advnerf_core.scene.dataset import ImageSet
 from advnerf_core.scene.field import SceneField, SceneFieldConfig, SceneFileError, load_scene, save_scene
 from advnerf_core.scene.metrics import psnr
 from advnerf_core.scene.render_field import FieldRenderer
+from advnerf_core.scene.torch_step import render_rays
 from advnerf_core.scene.train import CheckpointError, TrainConfig, TrainedScene, Trainer
-from advnerf_core.scene.train_step import CpuStep, reference_colours
+from advnerf_core.scene.train_step import CpuStep
 
 HALF = np.array([1.0, 1.0, 0.5])
 BOX = ((-1.05, -1.05, -0.55), (1.05, 1.05, 0.55))
@@ -87,7 +88,7 @@ def test_rendering_agrees_with_plain_torch_and_is_the_same_each_time(trained: Tr
     samples, kept = Marcher(1 << 20, trained.march, FIELD.box_high)(rays, np.full(len(rays), 0.5, np.float32), leaps)
     assert len(kept) == len(rays)
     with torch.no_grad():
-        plain = reference_colours(trained.scene, torch.from_numpy(rays), samples)
+        plain = render_rays(trained.scene, torch.from_numpy(rays), samples)[0]
     difference = (plain.reshape(first[0].shape) - first[0]).abs()
     assert difference.mean() < 1e-4
     assert difference.max() < 2e-2  # a ray that grazes a cell's edge may gain or lose a sample to rounding
@@ -109,7 +110,7 @@ def test_hand_written_gradients_agree_with_automatic_differentiation() -> None:
     step = CpuStep(scene, huber=0.1)
     packed, encoded = step.visible(samples, least_weight=0.0)
     result = step.gradients(rays, targets, packed, encoded)
-    colours = reference_colours(scene, torch.from_numpy(rays), packed)
+    colours = render_rays(scene, torch.from_numpy(rays), packed)[0]
     loss = torch.nn.functional.huber_loss(colours, torch.from_numpy(targets) / 255.0, delta=0.1)
     loss.backward()
     assert result.loss == pytest.approx(loss.item(), rel=1e-5)
