@@ -1,0 +1,79 @@
+"""A request run in a folder: killed and gone on with, shown, checked."""
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from advnerf_core.attack.artifact import load_attack
+from nodes import cli
+from nodes.attacking.check import check
+from nodes.attacking.request import load_request
+from nodes.attacking.search import attack_file, run_attack
+from nodes.runtime.errors import ConfigError
+from nodes.runtime.progress import ProgressDisplay
+
+sys.path.insert(0, str(Path(__file__).parent))
+from tiny import tiny_request
+
+
+class StoppedError(Exception):
+    pass
+
+
+def stop_at_one(evaluation):
+    if evaluation.iteration == 1:
+        raise StoppedError
+
+
+@pytest.mark.parametrize("method", ["gradient", "random", "cem", "evolution"])
+def test_a_stopped_run_goes_on_to_the_same_bytes(tmp_path, method):
+    file = tiny_request(tmp_path)
+    changes = [f"search.method={method}", "search.population=4", "robustness.noise=0.01", "dynamics.delay_s=0.05"]
+    request = load_request(file, changes)
+    (whole,) = run_attack(request, tmp_path / "whole", ProgressDisplay())
+    with pytest.raises(StoppedError):
+        run_attack(request, tmp_path / "stopped", ProgressDisplay(), stop_at_one)
+    assert not attack_file(tmp_path / "stopped", 0).exists()
+    (resumed,) = run_attack(request, tmp_path / "stopped", ProgressDisplay())
+    assert resumed.read_bytes() == whole.read_bytes()
+    attack = load_attack(whole)
+    assert attack.method == method
+    assert attack.subject == "board"
+    assert len(json.loads((tmp_path / "whole" / "seed_0.json").read_text())["loss_m"]) == 3
+    with pytest.raises(ConfigError, match="belongs to another attack"):
+        run_attack(load_request(file), tmp_path / "whole", ProgressDisplay())
+
+
+def test_show_writes_the_texture_and_resume_needs_a_folder_of_a_run(tmp_path, monkeypatch, capsys):
+    file = tiny_request(tmp_path)
+    for command in (["run", str(file), "-o", str(tmp_path / "out")], ["resume", str(tmp_path / "out")],
+                    ["show", str(tmp_path / "out" / "seed_0.attack.safetensors")]):  # fmt: skip
+        monkeypatch.setattr(sys, "argv", ["advnerf", "attack", *command])
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+        assert ended.value.code == 0
+    assert (tmp_path / "out" / "seed_0.texture.png").exists()
+    assert load_attack(tmp_path / "out" / "seed_0.attack.safetensors").attack_id in capsys.readouterr().out
+    monkeypatch.setattr(sys, "argv", ["advnerf", "attack", "resume", str(tmp_path)])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    assert ended.value.code == 2
+    assert "expected a folder of 'advnerf attack run'" in capsys.readouterr().err
+
+
+def test_the_check_confirms_the_gradient_and_says_so(tmp_path):
+    found = check(load_request(tiny_request(tmp_path)), 3, False, lambda fraction, text="": None)
+    assert found.frozen_error <= 1e-4
+    assert found.sound
+    assert found.verdict[0].startswith("gradient right")
+    np.testing.assert_allclose(found.ticks.visible, 1.0)
+
+
+def test_an_object_out_of_sight_has_no_gradient_and_the_check_says_so(tmp_path):
+    away = ["objects=[{x_m: -3.5, y_m: 3.0, z_m: 0.4, yaw_rad: 0.0, resolution: 4}]"]
+    found = check(load_request(tiny_request(tmp_path), away), 2, False, lambda fraction, text="": None)
+    assert not found.sound
+    assert found.verdict[0].startswith("NO GRADIENT")
