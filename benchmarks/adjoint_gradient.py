@@ -14,7 +14,6 @@ from torch import Tensor
 
 from advnerf_core.attack.adjoint import AttackProblem, adjoint_gradient, evaluate
 from advnerf_core.driving.rollout import Rollout
-from advnerf_core.fields.voxel_grid import squash
 from advnerf_core.scene.surrogate import Frames, Surrogate
 from benchmarks.attack_toy import toy_problem
 from benchmarks.results import record_row
@@ -47,9 +46,8 @@ def backpropagated_gradient(problem: AttackProblem, theta: Tensor, rollout: Roll
 
 
 def _differentiable_images(frames: Frames, theta: Tensor) -> Tensor:
-    (field,), (W,), (pixels,) = frames.objects, frames.weights, frames.pixels
-    fixed = torch.as_tensor(field.fixed_colours, dtype=theta.dtype)
-    colours = torch.cat([squash(theta).reshape(-1, 3), fixed])
+    (seen,), (W,), (pixels,) = frames.seen, frames.weights, frames.pixels
+    colours = seen.field.colours(theta)[torch.from_numpy(seen.rows)]
     flat = frames.background.reshape(-1, 3)
     flat = flat.index_add(0, pixels, torch.as_tensor(W.toarray(), dtype=theta.dtype) @ colours)
     return flat.reshape(frames.background.shape).permute(0, 3, 1, 2)

@@ -13,11 +13,14 @@ in front of the face sees texture row 0 at the top and column 0 at the left, whi
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
+from scipy import sparse
+from scipy.sparse.linalg import lsqr
 from torch import Tensor
 
 from advnerf_core.geometry import Array, transform_points
@@ -47,6 +50,9 @@ class VoxelGridObject:
         step_units: Length of a ray-marching step in object units; used with a density only.
         plain_colours: Colours of the free rows without an attack, ``[free_count, 3]`` in 0..1; None is the mean of the fixed
             ones.
+        mixing: Free rows as sums of parameters before the squash, ``[free_count, parameter_count]``; None is the identity. It
+            is how summed levels (``fields/summed_levels``) keep a picture linear in the squashed colours.
+        derived: What renderers have worked out from slots and density; shared by moved copies.
     """
 
     slots: NDArray[np.int32]
@@ -60,6 +66,8 @@ class VoxelGridObject:
     one_sided: bool = False
     step_units: float = 0.01
     plain_colours: Array | None = None
+    mixing: sparse.csr_matrix | None = None
+    derived: dict[Any, Any] = field(init=False, repr=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         """Check shapes and ranges, so that the casting kernel may index without looking."""
@@ -73,15 +81,23 @@ class VoxelGridObject:
             raise ValueError(f"expected box_max above box_min, got {self.box_min} and {self.box_max}")
         if self.density is not None and (self.density.shape != self.slots.shape or (self.density < 0).any()):
             raise ValueError(f"expected a density >= 0 of shape {self.slots.shape}, got shape {self.density.shape}")
+        if self.mixing is not None and self.mixing.shape[1] != self.parameter_count:
+            raise ValueError(f"expected mixing of {self.parameter_count} parameters, got {self.mixing.shape}")
         if self.plain_colours is not None and self.plain_colours.shape != (self.free_count, 3):
             raise ValueError(f"expected plain_colours {(self.free_count, 3)}, got {self.plain_colours.shape}")
         if self.scale <= 0 or self.step_units <= 0:
             raise ValueError(f"expected a positive scale and step, got {self.scale} and {self.step_units}")
+        _check_pose(self.T_world_from_object, self.scale)
+
+    @property
+    def parameter_count(self) -> int:
+        """Number of rows of ``theta``."""
+        return int(np.prod(self.theta_shape[:-1]))
 
     @property
     def free_count(self) -> int:
-        """Number of free rows of the colour vector."""
-        return int(np.prod(self.theta_shape[:-1]))
+        """Number of free rows of the colour vector: the rows of ``theta``, unless these are mixed."""
+        return self.parameter_count if self.mixing is None else int(self.mixing.shape[0])
 
     @property
     def slot_count(self) -> int:
@@ -90,24 +106,58 @@ class VoxelGridObject:
 
     @property
     def plain_theta(self) -> Array:
-        """Free parameters without an attack, ``[free_count, 3]``; grey if nothing says otherwise."""
+        """Free parameters without an attack, ``[parameter_count, 3]``; grey if nothing says otherwise."""
         if self.plain_colours is not None:
-            return inverse_squash(self.plain_colours)
-        plain = self.fixed_colours.mean(axis=0) if len(self.fixed_colours) else np.full(3, 0.5)
-        return np.broadcast_to(inverse_squash(plain), (self.free_count, 3))
+            values = inverse_squash(self.plain_colours)
+        else:
+            plain = self.fixed_colours.mean(axis=0) if len(self.fixed_colours) else np.full(3, 0.5)
+            values = np.broadcast_to(inverse_squash(plain), (self.free_count, 3))
+        if self.mixing is None:
+            return values
+        return np.stack(
+            [lsqr(self.mixing, values[:, k], atol=1e-6, btol=1e-6, iter_lim=200)[0] for k in range(3)], axis=-1
+        )
 
-    def colours(self, theta: Tensor) -> Tensor:
-        """The colour vector ``[slot_count, 3]``: squashed free rows, then the fixed ones."""
+    def check_theta(self, theta: Tensor) -> None:
+        """Raise ``ValueError`` unless ``theta`` has the object's ``theta_shape``."""
         if tuple(theta.shape) != tuple(self.theta_shape):
             raise ValueError(f"expected theta of shape {tuple(self.theta_shape)}, got {tuple(theta.shape)}")
-        fixed = torch.as_tensor(self.fixed_colours, dtype=theta.dtype, device=theta.device).reshape(-1, 3)
-        return torch.cat([squash(theta).reshape(-1, 3), fixed])
 
-    def corners_in_world(self) -> Array:
-        """The eight corners of the box, ``[8, 3]`` [m]."""
+    def colours(self, theta: Tensor) -> Tensor:
+        """The colour vector ``[slot_count, 3]``: squashed free rows, then the fixed ones; with autograd history."""
+        self.check_theta(theta)
+        fixed = torch.as_tensor(self.fixed_colours, dtype=theta.dtype, device=theta.device).reshape(-1, 3)
+        rows = theta.reshape(-1, 3)
+        if self.mixing is not None:
+            entries = self.mixing.tocoo()
+            places = torch.from_numpy(np.stack([entries.row, entries.col]).astype(np.int64))
+            data = torch.from_numpy(entries.data).to(theta.dtype)
+            matrix = torch.sparse_coo_tensor(places, data, entries.shape, check_invariants=True)
+            rows = matrix @ rows
+        return torch.cat([squash(rows), fixed])
+
+    def moved(self, T_world_from_object: ArrayLike, scale: float | None = None) -> VoxelGridObject:
+        """The same object elsewhere, and with another scale if one is given; what renderers derived from it is shared."""
+        pose = np.asarray(T_world_from_object, dtype=np.float64)
+        other = replace(self, T_world_from_object=pose, scale=self.scale if scale is None else scale)
+        object.__setattr__(other, "derived", self.derived)
+        return other
+
+    def corners_in_world(self, low: Array | None = None, high: Array | None = None) -> Array:
+        """The eight corners of the box, or of the part of it from ``low`` to ``high`` in object units; ``[8, 3]`` [m]."""
+        low, high = self.box_min if low is None else low, self.box_max if high is None else high
         unit = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1).reshape(8, 3)
-        corners = self.box_min + unit * (self.box_max - self.box_min)
-        return transform_points(self.T_world_from_object, self.scale * corners)
+        return transform_points(self.T_world_from_object, self.scale * (low + unit * (high - low)))
+
+
+def _check_pose(T_world_from_object: Array, scale: float) -> None:
+    """Raise ``ValueError`` unless the pose is rigid and finite: lengths are taken from the scale alone."""
+    T = np.asarray(T_world_from_object)
+    if T.shape != (4, 4) or not (np.isfinite(T).all() and np.isfinite(scale)):
+        raise ValueError(f"expected a finite pose [4, 4] and scale of an object, got {T.tolist()} and {scale}")
+    R = T[:3, :3]
+    if not np.allclose(R @ R.T, np.eye(3), atol=1e-4) or np.linalg.det(R) < 0 or not np.allclose(T[3], [0, 0, 0, 1]):
+        raise ValueError(f"expected a rigid pose of an object (its size goes into the scale), got {T.tolist()}")
 
 
 def squash(theta: Tensor) -> Tensor:

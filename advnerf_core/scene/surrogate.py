@@ -18,10 +18,11 @@ from numpy.typing import ArrayLike
 from scipy import sparse
 from torch import Tensor
 
-from advnerf_core.fields.voxel_grid import INITIAL_NOISE, VoxelGridObject, squash_derivative
+from advnerf_core.fields.seen_rows import SeenRows, compact
+from advnerf_core.fields.voxel_grid import INITIAL_NOISE, VoxelGridObject
 from advnerf_core.geometry import Array, Pinhole, planar_poses
-from advnerf_core.render.cast_object import ObjectCast, cast_object
-from advnerf_core.render.composite import visible_shares
+from advnerf_core.render.cast_object import ObjectCast, cast_objects, made_opaque
+from advnerf_core.render.composite import sparse_shares
 
 BackgroundRenderer = Callable[[Array, Pinhole], Sequence[Any]]
 """``(T_world_from_camera [B, 4, 4], pinhole) -> (rgb [B, H, W, 3] in 0..1, planar depth [B, H, W] in metres, ...)``."""
@@ -48,44 +49,45 @@ class Frames:
 
     Attributes:
         background: What is seen where no object is, already dimmed by the objects in front, ``[B, H, W, 3]``.
-        weights: Per object, rendering weights ``[P, slots]`` after occlusion.
+        weights: Per object, rendering weights ``[P, V]`` after occlusion, of the pixels and colours that are seen.
         pixels: Per object, flat indices ``[P]`` into ``[B, H, W]``.
-        objects: The objects, in the order of ``weights``.
+        seen: Per object, which colours these are; the objects are in the order of ``weights``.
     """
 
     background: Tensor
     weights: tuple[sparse.csr_matrix, ...]
     pixels: tuple[Tensor, ...]
-    objects: tuple[VoxelGridObject, ...]
+    seen: tuple[SeenRows, ...]
 
     def render(self, theta: Tensor | None) -> Rendered:
         """Images for ``theta`` (of ``Surrogate.theta_shape``; ignored, and may be None, without objects)."""
         flat = self.background.reshape(-1, 3).clone()
-        parts = split_theta(self.objects, theta)
-        for field, W, pixels, part in zip(self.objects, self.weights, self.pixels, parts, strict=True):
-            colours = field.colours(part.to(flat.dtype)).numpy()
-            flat.index_add_(0, pixels, torch.from_numpy(W @ colours))
+        parts = split_theta([rows.field for rows in self.seen], theta)
+        values = [rows.values(part.to(flat.dtype)) for rows, part in zip(self.seen, parts, strict=True)]
+        for rows, W, pixels, value in zip(self.seen, self.weights, self.pixels, values, strict=True):
+            flat.index_add_(0, pixels, torch.from_numpy(W @ rows.colours(value).numpy()))
         images = flat.reshape(self.background.shape).permute(0, 3, 1, 2).contiguous()
-        return Rendered(images, self._vjp(theta, parts), images.nbytes + self._weight_bytes())
+        own = sum(rows.nbytes for rows in self.seen) + sum(value.nbytes for value in values)
+        return Rendered(images, self._vjp(theta, values), images.nbytes + self._weight_bytes() + own)
 
     def _weight_bytes(self) -> int:
         matrices = sum(W.data.nbytes + W.indices.nbytes + W.indptr.nbytes for W in self.weights)
         return int(matrices + sum(pixels.nbytes for pixels in self.pixels))
 
-    def _vjp(self, theta: Tensor | None, parts: Sequence[Tensor]) -> Callable[[Tensor], Tensor]:
-        # Only these names are kept alive: the background is not.
-        weights, pixels, free = self.weights, self.pixels, [field.free_count for field in self.objects]
+    def _vjp(self, theta: Tensor | None, values: Sequence[Tensor]) -> Callable[[Tensor], Tensor]:
+        # Only these names are kept alive: the background is not, nor is theta.
+        weights, pixels, seen = self.weights, self.pixels, self.seen
+        dtype, shape = (torch.float32, None) if theta is None else (theta.dtype, theta.shape)
 
         def vjp(grad_images: Tensor) -> Tensor:
-            if theta is None or not weights:
+            if shape is None or not weights:
                 return torch.zeros(0, 3)
             flat = grad_images.detach().permute(0, 2, 3, 1).reshape(-1, 3)
             rows = [
-                torch.from_numpy(W.T @ flat[index].numpy())[:count].to(theta.dtype)
-                for W, index, count in zip(weights, pixels, free, strict=True)
+                here.gradient(value, torch.from_numpy(W.T @ flat[index].numpy()))
+                for here, value, W, index in zip(seen, values, weights, pixels, strict=True)
             ]
-            slopes = [squash_derivative(part).reshape(-1, 3) for part in parts]
-            return torch.cat([r * s for r, s in zip(rows, slopes, strict=True)]).reshape(theta.shape)
+            return (rows[0] if len(rows) == 1 else torch.cat(rows)).to(dtype).reshape(shape)
 
         return vjp
 
@@ -104,6 +106,8 @@ class Surrogate:
         background_colour: Optional map of background colours ``[B, H, W, 3]``, for a scene learned by another camera than the
             one that drives.
         dtype: Type of images and weights.
+        opaque: Compose as a deployment does that cannot blend: each pixel is wholly the object's or wholly the scene's, whichever
+            is nearer; an object that covers less than half of a pixel is not there.
     """
 
     def __init__(
@@ -116,6 +120,7 @@ class Surrogate:
         supersample: int = 2,
         background_colour: Callable[[Tensor], Tensor] | None = None,
         dtype: torch.dtype = torch.float32,
+        opaque: bool = False,
     ) -> None:
         self._background = background
         self.camera = camera
@@ -125,6 +130,7 @@ class Surrogate:
         self._supersample = supersample
         self._background_colour = background_colour
         self.dtype = dtype
+        self.opaque = opaque
 
     def in_type(self, dtype: torch.dtype) -> Surrogate:
         """The same surrogate with images and weights of another type; geometry is float64 in any case."""
@@ -137,7 +143,7 @@ class Surrogate:
         """Shape of ``theta``: the object's own if there is one, the stacked rows ``[sum, 3]`` of several, ``(0, 3)`` of none."""
         if len(self.objects) == 1:
             return self.objects[0].theta_shape
-        return (sum(field.free_count for field in self.objects), 3)
+        return (sum(field.parameter_count for field in self.objects), 3)
 
     def plain_theta(self, dtype: torch.dtype | None = None) -> Tensor:
         """The colours without an attack (``VoxelGridObject.plain_theta``); ``theta_shape``."""
@@ -162,15 +168,43 @@ class Surrogate:
         rgb, depth_m = (torch.as_tensor(part, device="cpu").to(self.dtype) for part in self._render_background(poses))
         if self._background_colour is not None:
             rgb = self._background_colour(rgb)
-        numpy_dtype = np.float64 if self.dtype == torch.float64 else np.float32
-        casts = [cast_object(f, poses, self.camera, self._supersample, numpy_dtype) for f in self.objects]
-        background_share, shares = self._visible(casts, depth_m)
-        weights = []
-        for cast, share in zip(casts, shares, strict=True):
-            scale = sparse.diags(share.astype(numpy_dtype), dtype=numpy_dtype)
-            weights.append(sparse.csr_matrix(scale @ cast.weights))
-        pixels = tuple(torch.from_numpy(cast.pixels) for cast in casts)
-        return Frames(rgb * background_share[..., None], tuple(weights), pixels, self.objects)
+        return self._composed(poses, rgb, depth_m)
+
+    @torch.no_grad()
+    def overlay(
+        self, rgb: ArrayLike, depth_m: ArrayLike, T_world_from_camera: ArrayLike, theta: Tensor | None
+    ) -> Tensor:
+        """Put the objects into given images, by the same composition.
+
+        Args:
+            rgb: Images ``[B, H, W, 3]`` in 0..1.
+            depth_m: Their planar depth ``[B, H, W]`` [m]; infinite or NaN where nothing is known.
+            T_world_from_camera: Poses they were taken from ``[B, 4, 4]``.
+            theta: See :meth:`render`.
+
+        Returns:
+            Images ``[B, 3, H, W]``.
+        """
+        poses = np.asarray(T_world_from_camera, dtype=np.float64).reshape(-1, 4, 4)
+        images, depths = (torch.as_tensor(part, device="cpu").to(self.dtype) for part in (rgb, depth_m))
+        self._check_background(images, depths, len(poses))
+        return self._composed(poses, images, depths).render(None if theta is None else theta.detach()).images
+
+    def _composed(self, poses: Array, rgb: Tensor, depth_m: Tensor) -> Frames:
+        casts = cast_objects(self.objects, poses, self.camera, self._supersample, rgb.numpy().dtype)
+        if self.opaque:
+            casts = [made_opaque(cast) for cast in casts]
+        background, shares = sparse_shares(
+            [cast.pixels for cast in casts],
+            [cast.alpha for cast in casts],
+            [cast.depth_m - self._tolerance_m for cast in casts],
+            depth_m.reshape(-1).double().numpy(),
+        )
+        seen = [_seen(cast, share, field) for cast, share, field in zip(casts, shares, self.objects, strict=True)]
+        dimmed = rgb * torch.from_numpy(background).to(rgb.dtype).reshape(depth_m.shape)[..., None]
+        return Frames(
+            dimmed, tuple(part[1] for part in seen), tuple(part[0] for part in seen), tuple(part[2] for part in seen)
+        )
 
     def render(self, T_world_from_camera: ArrayLike, theta: Tensor | None) -> Rendered:
         """Images at camera poses ``[B, 4, 4]`` and their vjp; see :class:`Rendered`. ``theta`` is None without objects."""
@@ -186,28 +220,23 @@ class Surrogate:
 
     def _render_background(self, poses: Array) -> tuple[Any, Any]:
         rgb, depth_m = self._background(poses, self.camera)[:2]
-        size = (len(poses), self.camera.height, self.camera.width)
+        self._check_background(rgb, depth_m, len(poses))
+        return rgb, depth_m
+
+    def _check_background(self, rgb: Any, depth_m: Any, count: int) -> None:
+        size = (count, self.camera.height, self.camera.width)
         if tuple(rgb.shape) != (*size, 3) or tuple(depth_m.shape) != size:
             got = f"{tuple(rgb.shape)} and {tuple(depth_m.shape)}"
             raise ValueError(f"expected a background of shapes {(*size, 3)} and {size}, got {got}")
-        return rgb, depth_m
 
-    def _visible(self, casts: Sequence[ObjectCast], depth_m: Tensor) -> tuple[Tensor, list[Array]]:
-        """Shares of light that reach the camera: of the background ``[B, H, W]``, and of each object at its pixels ``[P]``."""
-        covered = np.unique(np.concatenate([np.zeros(0, np.int64), *(cast.pixels for cast in casts)]))
-        alphas = torch.zeros(len(casts) + 1, len(covered), dtype=torch.float64)
-        depths = torch.full_like(alphas, torch.inf)
-        places = [torch.from_numpy(np.searchsorted(covered, cast.pixels)) for cast in casts]
-        for k, (cast, place) in enumerate(zip(casts, places, strict=True)):
-            alphas[k, place] = torch.from_numpy(cast.alpha)
-            depths[k, place] = torch.from_numpy(cast.depth_m) - self._tolerance_m
-        index = torch.from_numpy(covered)
-        alphas[-1] = 1.0
-        depths[-1] = torch.nan_to_num(depth_m.reshape(-1)[index].double(), nan=torch.inf)
-        shares = visible_shares(alphas, depths)
-        background = torch.ones(depth_m.numel(), dtype=depth_m.dtype)
-        background[index] = shares[-1].to(depth_m.dtype)
-        return background.reshape(depth_m.shape), [shares[k, place].numpy() for k, place in enumerate(places)]
+
+def _seen(cast: ObjectCast, share: Array, field: VoxelGridObject) -> tuple[Tensor, sparse.csr_matrix, SeenRows]:
+    """Pixels, weights and colours of what is seen of a cast whose pixels keep ``share [P]`` of their light."""
+    W, kept = cast.weights, share > 0.0
+    if not kept.all():
+        W, share = W[np.flatnonzero(kept)], share[kept]
+    data = W.data * np.repeat(share.astype(W.dtype), np.diff(W.indptr))
+    return torch.from_numpy(cast.pixels[kept]), *compact(sparse.csr_matrix((data, W.indices, W.indptr), W.shape), field)
 
 
 def split_theta(objects: Sequence[VoxelGridObject], theta: Tensor | None) -> list[Tensor]:
@@ -218,5 +247,5 @@ def split_theta(objects: Sequence[VoxelGridObject], theta: Tensor | None) -> lis
         raise ValueError(f"expected theta for {len(objects)} object(s), got None")
     if len(objects) == 1:
         return [theta]
-    parts = theta.reshape(-1, 3).split([field.free_count for field in objects])
+    parts = theta.reshape(-1, 3).split([field.parameter_count for field in objects])
     return [part.reshape(field.theta_shape) for part, field in zip(parts, objects, strict=True)]

@@ -7,7 +7,7 @@ import torch
 
 from advnerf_core.fields.voxel_grid import VoxelGridObject, cube_face_object, squash
 from advnerf_core.geometry import Pinhole, look_at, make_transform, rotation_z
-from advnerf_core.render.cast_object import cast_object
+from advnerf_core.render.cast_object import cast_object, cast_objects, made_opaque
 
 PINHOLE = Pinhole(80, 60, 60.0, 61.0, 40.0, 29.0)
 
@@ -177,3 +177,103 @@ def trilinear(grid, g):
         share = np.prod(np.where(corner, f, 1 - f))
         total = total + share * grid[tuple(first + corner)]
     return total
+
+
+def sparse_blob(T_world_from_object=None, scale=1.0):
+    """A ball of fog, a thick plate and a lonely voxel in a box that is mostly empty."""
+    generator = np.random.default_rng(5)
+    shape = (24, 20, 16)
+    i, j, k = np.indices(shape)
+    density = np.where((i - 6) ** 2 + (j - 6) ** 2 + (k - 8) ** 2 < 9, 4.0, 0.0) * generator.uniform(0.5, 1.0, shape)
+    density[18:20, 3:17, 2:14] = 60.0
+    density[12, 18, 12] = 9.0
+    pose = make_transform(rotation_z(0.4), [0.2, -0.1, 0.3]) if T_world_from_object is None else T_world_from_object
+    return VoxelGridObject(
+        np.arange(density.size, dtype=np.int32).reshape(shape), (density.size, 3), np.zeros((0, 3)),
+        np.array([-0.6, -0.5, -0.4]), np.array([0.6, 0.5, 0.4]), pose, scale=scale, density=density, step_units=0.02,
+    )  # fmt: skip
+
+
+def test_leaping_over_empty_space_changes_nothing():
+    field, poses = sparse_blob(), np.stack([camera_toward(azimuth) for azimuth in (0.3, 1.7, 3.1, 4.5)])
+    leaping = cast_object(field, poses, PINHOLE, 2, np.float64)
+    plodding = dataclasses.replace(field, density=field.density + 1e-300)  # no cell is empty
+    everywhere = cast_object(plodding, poses, PINHOLE, 2, np.float64)
+    colours = np.random.default_rng(0).uniform(size=(field.slot_count, 3))
+    np.testing.assert_allclose(dense(leaping, colours, batch=4), dense(everywhere, colours, batch=4), atol=1e-10)
+    assert len(leaping.pixels) > 1000
+
+
+def camera_toward(azimuth_rad):
+    return look_at([0.2 + 2.0 * np.cos(azimuth_rad), -0.1 + 2.0 * np.sin(azimuth_rad), 0.9], [0.2, -0.1, 0.3])
+
+
+def test_a_turned_object_looks_like_a_turned_camera():
+    turn = make_transform(rotation_z(0.7), [0.4, 0.2, 0.1])
+    field, T = sparse_blob(), camera_toward(0.4)
+    colours = np.random.default_rng(0).uniform(size=(field.slot_count, 3))
+    moved = dense(
+        cast_object(field.moved(turn @ field.T_world_from_object), (turn @ T)[None], PINHOLE, 2, np.float64), colours
+    )
+    np.testing.assert_allclose(moved, dense(cast_object(field, T[None], PINHOLE, 2, np.float64), colours), atol=1e-9)
+    # Twice as large and twice as far is the same picture.
+    large = make_transform(rotation_z(0.4), 2 * field.T_world_from_object[:3, 3])
+    far = T.copy()
+    far[:3, 3] *= 2
+    cast = cast_object(field.moved(large, 2.0), far[None], PINHOLE, 2, np.float64)
+    np.testing.assert_allclose(dense(cast, colours), moved, atol=1e-9)
+
+
+def test_a_ball_of_fog_has_the_transmittance_and_depth_of_its_chords():
+    count, radius_m, sigma = 64, 0.4, 3.0
+    axis = (np.arange(count) + 0.5) / count - 0.5
+    away = np.sqrt(axis[:, None, None] ** 2 + axis[None, :, None] ** 2 + axis[None, None, :] ** 2)
+    # The share of a voxel inside the ball, nearly: a ramp of one voxel across the surface.
+    density = sigma * np.clip((radius_m - away) * count + 0.5, 0.0, 1.0)
+    ball = VoxelGridObject(np.zeros((count,) * 3, np.int32), (1, 3), np.zeros((0, 3)), -0.5 * np.ones(3), 0.5 * np.ones(3),
+                           np.eye(4), density=density, step_units=0.004)  # fmt: skip
+    T = look_at([2.0, 0.0, 0.001], [0, 0, 0])
+    cast = cast_object(ball, T[None], PINHOLE, 1, np.float64)
+    rays = PINHOLE.directions().reshape(-1, 3)[cast.pixels]
+    unit = rays / np.linalg.norm(rays, axis=1, keepdims=True) @ T[:3, :3].T
+    along = -(T[:3, 3] @ unit.T)
+    impact2 = T[:3, 3] @ T[:3, 3] - along**2
+    half = np.sqrt(np.maximum(radius_m**2 - impact2, 0.0))
+    middle = impact2 < (radius_m - 0.05) ** 2
+    assert middle.sum() > 200
+    length = 2 * half[middle]
+    np.testing.assert_allclose(cast.alpha[middle], 1 - np.exp(-sigma * length), atol=6e-3)  # of voxels
+    mean = along[middle] - half[middle] + 1 / sigma - length / np.expm1(sigma * length)
+    np.testing.assert_allclose(cast.depth_m[middle], mean / np.linalg.norm(rays[middle], axis=1), atol=3e-3)
+
+
+def test_several_objects_and_threads_give_what_each_gives_alone():
+    fields = [sparse_blob(), face_toward_camera(), sparse_blob(make_transform(rotation_z(2.0), [-0.4, 0.5, 0.1]), 0.5)]
+    poses = np.stack([camera_toward(azimuth) for azimuth in (0.3, 1.7)])
+    for dtype in (np.float32, np.float64):
+        together = cast_objects(fields, poses, PINHOLE, 2, dtype)
+        for field, cast in zip(fields, together, strict=True):
+            for b in range(2):
+                single = cast_object(field, poses[b : b + 1], PINHOLE, 2, dtype)
+                mine = cast.pixels // (80 * 60) == b
+                np.testing.assert_array_equal(cast.pixels[mine] - b * 80 * 60, single.pixels)
+                np.testing.assert_array_equal(cast.depth_m[mine], single.depth_m)
+                assert (cast.weights[np.flatnonzero(mine)] != single.weights).nnz == 0
+
+
+def test_an_opaque_cast_is_there_or_not():
+    cast = cast_object(sparse_blob(), camera_toward(0.3)[None], PINHOLE, 2, np.float64)
+    solid = made_opaque(cast)
+    assert 0 < len(solid.pixels) == (cast.alpha >= 0.5).sum() < len(cast.pixels)
+    np.testing.assert_allclose(np.asarray(solid.weights.sum(axis=1)).ravel(), 1.0)
+
+
+def test_a_camera_without_a_pose_sees_nothing_and_an_object_without_one_is_refused():
+    poses = np.stack([camera_toward(0.3), np.full((4, 4), np.nan)])
+    assert set(cast_object(sparse_blob(), poses, PINHOLE).pixels // (80 * 60)) == {0}
+    with pytest.raises(ValueError, match="expected a finite pose"):
+        sparse_blob(np.full((4, 4), np.nan))
+    with pytest.raises(ValueError, match="expected a rigid pose"):
+        sparse_blob(np.diag([2.0, 2.0, 2.0, 1.0]))
+    with pytest.raises(ValueError, match="expected a finite pose"):
+        sparse_blob(scale=np.inf)

@@ -1,6 +1,8 @@
+import numpy as np
+import pytest
 import torch
 
-from advnerf_core.render.composite import composite, visible_shares
+from advnerf_core.render.composite import composite, sparse_shares, visible_shares
 
 
 def test_three_layers_follow_the_formula_nearest_first():
@@ -45,3 +47,40 @@ def test_an_opaque_layer_hides_what_is_behind_and_infinite_depth_of_nothing_is_h
 def test_equal_depths_keep_the_order_of_the_layers():
     alpha = torch.tensor([[1.0], [1.0]])
     assert visible_shares(alpha, torch.zeros(2, 1)).squeeze().tolist() == [1.0, 0.0]
+
+
+def test_sparse_layers_follow_the_dense_formula_in_any_order():
+    generator = np.random.default_rng(3)
+    count, layers = 40, 5
+    pixels = [np.sort(generator.permutation(count)[: 5 + 7 * k]) for k in range(layers)]
+    alphas = [generator.uniform(size=len(part)) for part in pixels]
+    depths = [generator.uniform(1.0, 3.0, len(part)) for part in pixels]
+    behind = generator.uniform(1.5, 4.0, count)
+    behind[::9] = np.nan
+    dense_alpha, dense_depth = (
+        torch.zeros(layers + 1, count).double(),
+        torch.full((layers + 1, count), torch.inf).double(),
+    )
+    for k, (part, alpha, depth) in enumerate(zip(pixels, alphas, depths, strict=True)):
+        dense_alpha[k, part], dense_depth[k, part] = torch.from_numpy(alpha), torch.from_numpy(depth)
+    dense_alpha[-1], dense_depth[-1] = 1.0, torch.from_numpy(np.nan_to_num(behind, nan=np.inf))
+    expected = visible_shares(dense_alpha, dense_depth).numpy()
+    for order in (range(layers), [3, 0, 4, 1, 2]):
+        background, shares = sparse_shares(*([part[k] for k in order] for part in (pixels, alphas, depths)), behind)
+        np.testing.assert_allclose(background, expected[-1], atol=1e-12)
+        for k, share in zip(order, shares, strict=True):
+            np.testing.assert_allclose(share, expected[k, pixels[k]], atol=1e-12)
+
+
+def test_sparse_layers_of_equal_depth_keep_their_order_and_win_over_the_background():
+    one = np.zeros(1, np.int64)
+    background, shares = sparse_shares(
+        [one, one], [np.array([0.25]), np.array([1.0])], [np.ones(1), np.ones(1)], np.ones(2)
+    )
+    assert [part.tolist() for part in shares] == [[1.0], [0.75]]
+    assert background.tolist() == [0.0, 1.0]
+    background, shares = sparse_shares([], [], [], np.ones(3))
+    assert shares == []
+    assert background.tolist() == [1.0, 1.0, 1.0]
+    with pytest.raises(ValueError, match="expected pixels within"):
+        sparse_shares([one + 2], [np.ones(1)], [np.ones(1)], np.ones(2))

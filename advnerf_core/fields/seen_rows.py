@@ -1,0 +1,70 @@
+"""The rows of an object's colour vector that a batch of images shows: all that a render and its gradient have to touch.
+
+A 64^3 object has a quarter of a million voxels, of which a frame shows a few thousand. Squashing, mixing and their derivatives
+are taken for these only.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy import sparse
+from torch import Tensor
+
+from advnerf_core.fields.voxel_grid import VoxelGridObject, squash, squash_derivative
+
+
+class SeenRows:
+    """Rows of an object's colour vector.
+
+    Args:
+        field: The object.
+        rows: Which rows, ascending, ``[V]`` int64.
+    """
+
+    def __init__(self, field: VoxelGridObject, rows: NDArray[np.int64]) -> None:
+        self.field, self.rows = field, rows
+        free = rows[: int(np.searchsorted(rows, field.free_count))]
+        self._free = torch.from_numpy(free)
+        self._mixing = None if field.mixing is None else field.mixing[free]
+
+    @property
+    def nbytes(self) -> int:
+        """Memory held [bytes]."""
+        mixing = self._mixing
+        extra = 0 if mixing is None else mixing.data.nbytes + mixing.indices.nbytes + mixing.indptr.nbytes
+        return int(self.rows.nbytes + self._free.nbytes + extra)
+
+    def values(self, theta: Tensor) -> Tensor:
+        """Free rows before the squash ``[V_free, 3]``, without history."""
+        self.field.check_theta(theta)
+        flat = theta.detach().reshape(-1, 3)
+        if self._mixing is None:
+            return flat[self._free]
+        return torch.from_numpy(self._mixing.astype(flat.numpy().dtype, copy=False) @ flat.numpy())
+
+    def colours(self, values: Tensor) -> Tensor:
+        """Colours ``[V, 3]`` of the rows, of the free rows' ``values``."""
+        fixed = self.field.fixed_colours[self.rows[len(self._free) :] - self.field.free_count]
+        return torch.cat([squash(values), torch.as_tensor(fixed, dtype=values.dtype).reshape(-1, 3)])
+
+    def gradient(self, values: Tensor, grad_colours: Tensor) -> Tensor:
+        """Gradient with respect to ``theta`` ``[parameter_count, 3]`` of one with respect to the rows' colours ``[V, 3]``."""
+        slopes = grad_colours[: len(self._free)] * squash_derivative(values)
+        if self._mixing is not None:
+            return torch.from_numpy(self._mixing.T.astype(slopes.numpy().dtype, copy=False) @ slopes.numpy())
+        out = torch.zeros(self.field.parameter_count, 3, dtype=values.dtype)
+        out[self._free] = slopes
+        return out
+
+
+def compact(weights: sparse.csr_matrix, field: VoxelGridObject) -> tuple[sparse.csr_matrix, SeenRows]:
+    """Weights ``[P, slots]`` with only the columns that are used ``[P, V]``, and what these are."""
+    used = np.zeros(weights.shape[1], dtype=np.bool_)
+    used[weights.indices] = True
+    rows = np.flatnonzero(used)
+    place = np.empty(len(used), np.int32)
+    place[rows] = np.arange(len(rows), dtype=np.int32)
+    packed = sparse.csr_matrix((weights.data, place[weights.indices], weights.indptr), (weights.shape[0], len(rows)))
+    return packed, SeenRows(field, rows)

@@ -1,0 +1,187 @@
+"""The CPU kernel that casts a voxel-grid object into a window of pixels.
+
+Rays run in voxel coordinates: voxel ``i`` of an axis has its value at ``i``, the box reaches from ``-0.5`` to ``n - 0.5``. Samples lie
+evenly between where a ray enters and leaves the box. Those in empty cells are leapt over, several at a time: a table says for
+each cell how far around it all cells are empty, so what is skipped is exactly what would have added nothing.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from advnerf_core.parallel import KERNEL_OPTIONS
+
+NEAR_M = 0.02  # closer than this to the camera nothing is drawn
+# A ray ends where less than a quarter of an 8-bit step of light is left; its last sample takes the rest.
+LEAST_TRANSMITTANCE = 1e-3
+# Progress of a cast: next pixel of the window, covered pixels, weights written.
+NEXT, FOUND, FILLED = 0, 1, 2
+_ROUNDING = 1e-9  # samples; a leap may not end beyond an occupied cell for the last bit of a float
+
+
+@njit(**KERNEL_OPTIONS)
+def _span_in_box(o: Any, d: Any, sizes: Any, near: float) -> tuple[float, float, bool]:
+    """Ray parameters of entry and exit, and whether the entry is through the ``+x`` face; exit <= entry is a miss."""
+    t_in, t_out, by_face = near, np.inf, False
+    for axis in range(3):
+        low, high = -0.5, sizes[axis] - 0.5
+        if abs(d[axis]) < 1e-15:
+            if o[axis] < low or o[axis] > high:
+                return 1.0, 0.0, False
+            continue
+        t_low, t_high = (low - o[axis]) / d[axis], (high - o[axis]) / d[axis]
+        first, last = min(t_low, t_high), max(t_low, t_high)
+        if first > t_in:
+            t_in = first
+            by_face = axis == 0 and d[0] < 0.0
+        t_out = min(t_out, last)
+    return t_in, t_out, by_face
+
+
+@njit(**KERNEL_OPTIONS)
+def _cell(position: float, count: int) -> int:
+    """First of the two voxels that ``position`` lies between; clamped at both ends."""
+    return max(min(int(np.floor(position)), count - 2), 0)
+
+
+@njit(**KERNEL_OPTIONS)
+def _steps_to_leap(position: float, stride: float, cell: int, clear: int) -> int:
+    """Samples from ``position`` on, itself included, that surely stay within ``clear`` cells of ``cell``."""
+    if stride > 0.0:
+        return int(min((cell + clear - position) / stride - _ROUNDING, 1e9)) + 1
+    if stride < 0.0:
+        return int(min((position - (cell - clear + 1)) / -stride - _ROUNDING, 1e9)) + 1
+    return 1_000_000_000
+
+
+@njit(**KERNEL_OPTIONS)
+def _share(position: float, first: int, count: int) -> float:
+    """Weight of the second of the two voxels around ``position``."""
+    return min(max(position, 0.0), count - 1.0) - first
+
+
+@njit(**KERNEL_OPTIONS)
+def _march(o: Any, d: Any, edges: Any, t_in: float, t_out: float, slots: Any, density: Any, clear: Any, solid: bool,
+           step: float, share: float, row: Any, touched: Any, count: int) -> tuple[int, float, float]:  # fmt: skip
+    """Add one ray to the scratch ``row [slots]``; returns the touched count, the ray's alpha and alpha-weighted depth."""
+    nx, ny, nz = slots.shape
+    # Object units a metre of planar depth.
+    speed = np.sqrt((d[0] * edges[0]) ** 2 + (d[1] * edges[1]) ** 2 + (d[2] * edges[2]) ** 2)
+    samples = 1 if solid else max(1, int(np.ceil((t_out - t_in) * speed / step)))
+    dt = (t_out - t_in) / samples
+    begin = t_in if solid else t_in + 0.5 * dt
+    gx, gy, gz = o[0] + begin * d[0], o[1] + begin * d[1], o[2] + begin * d[2]
+    sx, sy, sz = dt * d[0], dt * d[1], dt * d[2]
+    transmittance, alpha, alpha_depth, i = 1.0, 0.0, 0.0, 0
+    while i < samples:
+        x, y, z = gx + i * sx, gy + i * sy, gz + i * sz
+        cx, cy, cz = _cell(x, nx), _cell(y, ny), _cell(z, nz)
+        if not solid and clear[cx, cy, cz] > 0:
+            reach = int(clear[cx, cy, cz])
+            leap = min(
+                _steps_to_leap(x, sx, cx, reach), _steps_to_leap(y, sy, cy, reach), _steps_to_leap(z, sz, cz, reach)
+            )
+            i += max(leap, 1)
+            continue
+        fx, fy, fz = _share(x, cx, nx), _share(y, cy, ny), _share(z, cz, nz)
+        ax, ay, az = min(cx + 1, nx - 1), min(cy + 1, ny - 1), min(cz + 1, nz - 1)
+        opacity = 1.0
+        if not solid:
+            near = ((density[cx, cy, cz] * (1.0 - fz) + density[cx, cy, az] * fz) * (1.0 - fy)
+                    + (density[cx, ay, cz] * (1.0 - fz) + density[cx, ay, az] * fz) * fy)  # fmt: skip
+            far = ((density[ax, cy, cz] * (1.0 - fz) + density[ax, cy, az] * fz) * (1.0 - fy)
+                   + (density[ax, ay, cz] * (1.0 - fz) + density[ax, ay, az] * fz) * fy)  # fmt: skip
+            opacity = 1.0 - np.exp(-(near * (1.0 - fx) + far * fx) * dt * speed)
+            if transmittance * (1.0 - opacity) < LEAST_TRANSMITTANCE:
+                opacity = 1.0
+        weight = transmittance * opacity * share
+        if weight > 0.0:
+            alpha += weight
+            alpha_depth += weight * (t_in if solid else begin + i * dt)
+            for k in range(8):
+                part = (fx if k & 1 else 1.0 - fx) * (fy if k & 2 else 1.0 - fy) * (fz if k & 4 else 1.0 - fz) * weight
+                if part > 0.0:
+                    slot = slots[ax if k & 1 else cx, ay if k & 2 else cy, az if k & 4 else cz]
+                    if row[slot] == 0.0:
+                        touched[count] = slot
+                        count += 1
+                    row[slot] += part
+        transmittance *= 1.0 - opacity
+        if transmittance <= 0.0:
+            break
+        i += 1
+    return count, alpha, alpha_depth
+
+
+@njit(**KERNEL_OPTIONS)
+def cast_window(R: Any, o: Any, edges: Any, window: Any, intrinsics: Any, width: int, supersample: int, slots: Any,
+                density: Any, clear: Any, solid: bool, one_sided: bool, step: float, row: Any, touched: Any, ray: Any,
+                progress: Any, pixels: Any, alphas: Any, depths: Any, ends: Any, indices: Any, values: Any) -> bool:  # fmt: skip
+    """Cast the rays of one window, from where ``progress`` says.
+
+    Args:
+        R: Directions of unit planar depth in the camera to voxel coordinates ``[3, 3]``.
+        o: Camera centre in voxel coordinates ``[3]``.
+        edges: Object units per voxel along each axis ``[3]``.
+        window: First row, end row, first column, end column ``[4]``.
+        intrinsics: ``fx, fy, cx, cy`` ``[4]``.
+        width: Pixels in a row of the image.
+        supersample: Rays along each side of a pixel.
+        slots: ``[nx, ny, nz]`` int32.
+        density: ``[nx, ny, nz]``; not read if ``solid``.
+        clear: Cells around each cell between voxels that are empty, ``[nx - 1, ny - 1, nz - 1]``; not read if ``solid``.
+        solid: One sample where the ray enters.
+        one_sided: Only rays through the ``+x`` face count.
+        step: Object units between samples.
+        row: Scratch ``[slots]``, zero before and after.
+        touched: Scratch ``[slots]``.
+        ray: Scratch ``[3]``.
+        progress: ``[NEXT, FOUND, FILLED]``, kept up.
+        pixels: Flat indices ``[P]``, written.
+        alphas: ``[P]``, written.
+        depths: ``[P]``, written.
+        ends: Where each pixel's weights end ``[P]``, written.
+        indices: Slots of the weights, written.
+        values: The weights, written.
+
+    Returns:
+        Whether the window is done; if not, there was no room left in ``indices`` and ``values``: give more and call again.
+    """
+    share, across = 1.0 / (supersample * supersample), window[3] - window[2]
+    sizes = slots.shape
+    while progress[NEXT] < (window[1] - window[0]) * across:
+        v, u = window[0] + progress[NEXT] // across, window[2] + progress[NEXT] % across
+        alpha, alpha_depth, count = 0.0, 0.0, 0
+        for s in range(supersample * supersample):
+            x = (u + (s % supersample + 0.5) / supersample - intrinsics[2]) / intrinsics[0]
+            y = (v + (s // supersample + 0.5) / supersample - intrinsics[3]) / intrinsics[1]
+            for axis in range(3):
+                ray[axis] = R[axis, 0] * x + R[axis, 1] * y + R[axis, 2]
+            t_in, t_out, by_face = _span_in_box(o, ray, sizes, NEAR_M)
+            if t_out <= t_in or (one_sided and not by_face):
+                continue
+            count, a, ad = _march(
+                o, ray, edges, t_in, t_out, slots, density, clear, solid, step, share, row, touched, count
+            )
+            alpha += a
+            alpha_depth += ad
+        filled, found = progress[FILLED], progress[FOUND]
+        room = filled + count <= len(indices)
+        for k in range(count):
+            if room:
+                indices[filled + k] = touched[k]
+                values[filled + k] = row[touched[k]]
+            row[touched[k]] = 0.0
+        if not room:
+            return False
+        progress[NEXT] += 1
+        if alpha > 0.0:
+            pixels[found] = v * width + u
+            alphas[found] = min(alpha, 1.0)
+            depths[found] = alpha_depth / alpha
+            ends[found] = filled + count
+            progress[FOUND], progress[FILLED] = found + 1, filled + count
+    return True
