@@ -1,0 +1,203 @@
+"""What ``advnerf scene train|eval|render`` do: a data set in, a scene file, its figures and its pictures out."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import av
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from advnerf_core.files import write_atomically
+from advnerf_core.geometry import Array
+from advnerf_core.render.march import MarchConfig
+from advnerf_core.scene.dataset import ImageSet, PosedImages, load_transforms
+from advnerf_core.scene.field import SceneFieldConfig, save_scene
+from advnerf_core.scene.metrics import psnr, ssim
+from advnerf_core.scene.render_field import FieldRenderer
+from advnerf_core.scene.train import Progress, TrainConfig, train_scene
+from nodes.runtime.errors import ConfigError
+from nodes.runtime.stages import Report
+
+SCENE, CHECKPOINT, FIGURES = "scene.safetensors", "checkpoint.safetensors", "held_out.json"
+MM_PER_M = 1000.0
+# Sample intervals as shares of the box: a fine cell of the hash grid, and a coarse one.
+_SMALLEST_STEP, _LARGEST_STEP = 1 / 2048, 1 / 160
+_NO_TIME_LIMIT_STEPS = 1_000_000
+_VIDEO_FPS = 10
+
+
+@dataclass(frozen=True)
+class TrainingRequest:
+    """How a scene is to be trained.
+
+    Attributes:
+        transforms: The data set: a ``transforms.json`` or its folder.
+        output: Folder of the results; a stopped training goes on there.
+        steps: Optimisation steps; None with ``minutes``.
+        minutes: Time limit instead.
+        box_m: Low and high corner of what is learned, in the data set's unit; None is Instant-NGP's box of the file.
+        size: ``(width, height)`` to bring the images to; None keeps theirs.
+        open_scene: Rays may leave the box and colours may depend on the direction, as out of doors.
+        every: Every so-manieth image is held out, unless the data set splits itself.
+        near: Nothing nearer to a camera than this is learned, in the data set's unit.
+        seed: Of everything random.
+        checkpoint_every_s: A kill loses at most so much training [s].
+    """
+
+    transforms: Path
+    output: Path
+    steps: int | None = 1000
+    minutes: float | None = None
+    box_m: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
+    size: tuple[int, int] | None = None
+    open_scene: bool = False
+    every: int = 8
+    near: float = 0.05
+    seed: int = 0
+    checkpoint_every_s: float = 30.0
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be trained."""
+        if (self.steps is None) == (self.minutes is None):
+            raise ConfigError("expected either a number of steps or a time limit")
+        if self.box_m is not None and not all(low < high for low, high in zip(*self.box_m, strict=True)):
+            raise ConfigError(f"expected a box with low < high, got {self.box_m}")
+
+
+def train(request: TrainingRequest, report: Report) -> dict[str, Any]:
+    """Train, write the scene file and the figures on held-out images; returns the figures."""
+    training, held_out = load_transforms(request.transforms).training_and_held_out(request.every)
+    for path in training.missing:
+        print(f"missing, left out: {path}")
+    box = _field(request, training)
+    config = TrainConfig(
+        steps=request.steps or _NO_TIME_LIMIT_STEPS, seed=request.seed, checkpoint_every_s=request.checkpoint_every_s,
+        max_seconds=None if request.minutes is None else 60.0 * request.minutes,
+        march=MarchConfig(
+            near_m=request.near, smallest_step_m=_SMALLEST_STEP * box.extent_m, largest_step_m=_LARGEST_STEP * box.extent_m
+        ),
+        opacity=0.0 if request.open_scene else TrainConfig.opacity,
+        distortion=2e-3 if request.open_scene else TrainConfig.distortion,
+    )  # fmt: skip
+
+    def progress(at: Progress) -> None:
+        report(0.95 * at.fraction, f"step {at.step}, {at.psnr_db:.1f} dB on training rays")
+
+    images = training.load(request.size)
+    _make_opaque(images)
+    trained = train_scene(images, box, config, request.output / CHECKPOINT, progress)
+    metadata = {
+        "march": vars(trained.march), "steps": trained.history[-1][0], "seed": request.seed, "photographs": len(images.rgb),
+        "dataset": str(request.transforms),
+    }  # fmt: skip
+    save_scene(request.output / SCENE, trained.scene, trained.occupied, metadata)
+    figures = evaluate(FieldRenderer.from_file(request.output / SCENE), held_out, request.size)
+    write_atomically(request.output / FIGURES, json.dumps(figures, indent=1) + "\n")
+    return figures
+
+
+def evaluate(renderer: FieldRenderer, listed: PosedImages, size: tuple[int, int] | None) -> dict[str, Any]:
+    """PSNR [dB] and SSIM on images that nothing was learned from, each and on average; masked pixels do not count for PSNR."""
+    views = listed.load(size)
+    _make_opaque(views)
+    rows = []
+    for index, real in enumerate(views.rgb):
+        rendered = renderer.render(views.T_world_from_camera[index][None], views.pinholes[index])[0][0].numpy()
+        usable = np.ones(real.shape[:2], dtype=bool) if views.valid is None else views.valid[index]
+        rows.append(
+            {
+                "image": listed.frames[index].path.name,
+                "psnr_db": psnr(rendered[usable], real[usable] / 255.0),
+                "ssim": ssim(rendered, real / 255.0),
+            }
+        )
+    means = {key: float(np.mean([row[key] for row in rows])) for key in ("psnr_db", "ssim")}
+    return {"mean": means, "images": rows}
+
+
+def render(
+    renderer: FieldRenderer,
+    listed: PosedImages,
+    size: tuple[int, int] | None,
+    output: Path,
+    video: Path | None,
+    report: Report,
+) -> int:
+    """Write what the field shows from every camera of a data set: colour, depth in millimetres (16 bit), and a video.
+
+    Returns:
+        The number of views.
+    """
+    loaded = listed.load(size)
+    frames: list[NDArray[np.uint8]] = []
+    for index, (pose, pinhole) in enumerate(zip(loaded.T_world_from_camera, loaded.pinholes, strict=True)):
+        rgb, depth_m, _ = renderer.render(pose[None], pinhole)
+        picture = np.rint(255 * rgb[0].numpy()).astype(np.uint8)
+        name = listed.frames[index].path.stem
+        _write_png(output / f"{index:04d}_{name}.png", picture[..., ::-1])
+        depth_mm = np.nan_to_num(MM_PER_M * depth_m[0].numpy(), posinf=0.0)
+        _write_png(output / f"{index:04d}_{name}_depth_mm.png", np.clip(depth_mm, 0, 65535).astype(np.uint16))
+        frames.append(picture)
+        report((index + 1) / len(loaded.rgb), name)
+    if video is not None:
+        write_video(video, frames)
+    return len(frames)
+
+
+def write_video(path: Path, frames: Sequence[NDArray[np.uint8]]) -> None:
+    """Write pictures ``[H, W, 3]`` as an H.264 video; the file appears when it is whole."""
+    partial = path.with_name(path.name + ".part")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        with av.open(str(partial), "w", format="mp4") as container:
+            stream = container.add_stream("libx264", rate=_VIDEO_FPS)
+            # The format wants even sides.
+            stream.height, stream.width = (side - side % 2 for side in frames[0].shape[:2])
+            stream.pix_fmt = "yuv420p"
+            for picture in frames:
+                even = np.ascontiguousarray(picture[: stream.height, : stream.width])
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(even, format="rgb24")))
+            container.mux(stream.encode())
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def _field(request: TrainingRequest, listed: PosedImages) -> SceneFieldConfig:
+    low, high = listed.box() if request.box_m is None else (np.array(corner) for corner in request.box_m)
+    inside = [
+        np.all((low <= f.T_world_from_camera[:3, 3]) & (f.T_world_from_camera[:3, 3] <= high)) for f in listed.frames
+    ]
+    if request.box_m is None and listed.aabb_scale is None and not all(inside):
+        raise ConfigError(
+            f"expected a box: {request.transforms} has no aabb_scale, and {len(inside) - sum(inside)} of {len(inside)} cameras "
+            f"stand outside its unit cube; give --box, cameras are at {_span(listed)}"
+        )
+    bands = 3 if request.open_scene else 1
+    return SceneFieldConfig(_corner(low), _corner(high), direction_bands=bands)
+
+
+def _span(listed: PosedImages) -> str:
+    places = np.stack([frame.T_world_from_camera[:3, 3] for frame in listed.frames])
+    return f"{np.round(places.min(axis=0), 2).tolist()} .. {np.round(places.max(axis=0), 2).tolist()}"
+
+
+def _corner(corner: Array) -> tuple[float, float, float]:
+    x, y, z = (float(value) for value in corner)
+    return x, y, z
+
+
+def _make_opaque(images: ImageSet) -> None:
+    """Pictures with transparency stand before white; the field learns that as its background."""
+    if images.alpha is not None:
+        images.rgb[...] = images.on_background((1.0, 1.0, 1.0))
+
+
+def _write_png(path: Path, pixels: NDArray[Any]) -> None:
+    write_atomically(path, cv2.imencode(".png", pixels)[1].tobytes())
