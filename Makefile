@@ -39,7 +39,7 @@ check: setup  ## Lint, types, import contracts
 	@$(BIN)/mypy
 	@$(BIN)/lint-imports
 
-bench: setup  ## The benchmarks; each writes its rows to docs/results.json
+bench: setup  ## The benchmarks (about an hour); each writes its rows to docs/results.json
 	@$(BIN)/python -m benchmarks.run_all
 
 fmt: setup  ## Format and fix what can be fixed

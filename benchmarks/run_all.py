@@ -1,33 +1,49 @@
-"""``make bench``: every benchmark that needs no other data and less than a few minutes, one after the other."""
+"""``make bench``: every benchmark that needs no other data, one after the other.
+
+Those that look at a learned scene use the run folder of ``make experiment`` and are left out without one; ``--quick`` leaves out
+those that take more than a few minutes.
+"""
 
 from __future__ import annotations
 
+import argparse
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 from benchmarks.results import REPOSITORY
 
-MODULES = (
-    "benchmarks.hash_encoding",
-    "benchmarks.adjoint_gradient",
-    "benchmarks.adjoint_memory",
-    "benchmarks.fault_stops",
-)
+QUICK = ("hash_encoding", "adjoint_gradient", "adjoint_memory", "fault_stops", "hydrant", "structure_from_motion")
+LONG = ("attack_kill", "adjoint_memory --compare", "newcomer")
+OF_A_RUN = ("gradient_pass", "phone_to_car")
+
+
+def commands(run_folder: Path, quick: bool) -> list[str]:
+    """What to run, as arguments after ``python -m benchmarks.``."""
+    chosen = [*QUICK, *(() if quick else LONG)]
+    if (run_folder / "policy" / "policy.safetensors").exists():
+        chosen += [f"{name} {run_folder}" for name in OF_A_RUN]
+    else:
+        print(f"left out without {run_folder}: {', '.join(OF_A_RUN)}; make experiment leaves it", flush=True)
+    return chosen
 
 
 def main() -> int:
     """Run them all; the exit code is 1 if one failed."""
+    parser = argparse.ArgumentParser(description=main.__doc__)
+    parser.add_argument("--run-folder", type=Path, default=Path("runs/full"))
+    parser.add_argument("--quick", action="store_true", help="leave out what takes more than a few minutes")
+    options = parser.parse_args()
     failed = []
-    for module in MODULES:
+    for command in commands(options.run_folder, options.quick):
         began = time.monotonic()
-        code = subprocess.run([sys.executable, "-m", module], cwd=REPOSITORY).returncode
-        print(
-            f"{module}: {'done' if code == 0 else f'failed with {code}'} in {time.monotonic() - began:.0f} s",
-            flush=True,
-        )
+        module, *arguments = command.split()
+        code = subprocess.run([sys.executable, "-m", f"benchmarks.{module}", *arguments], cwd=REPOSITORY).returncode
+        outcome = "done" if code == 0 else f"failed with {code}"
+        print(f"{command}: {outcome} in {time.monotonic() - began:.0f} s", flush=True)
         if code != 0:
-            failed.append(module)
+            failed.append(command)
     return 1 if failed else 0
 
 

@@ -53,7 +53,7 @@ def object_build(
             )
         else:
             mesh, source = _mesh(file, generate, up, height_m)
-            model = build_from_mesh(mesh, name, resolution, 300 if steps is None else steps, source, report)
+            model = build_from_mesh(mesh, name, resolution, 400 if steps is None else steps, source, report)
     path = output or Path(f"{name}.object.safetensors")
     save_object(path, model)
     size = " x ".join(f"{side:.2f}" for side in model.size_m)

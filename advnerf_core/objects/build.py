@@ -29,7 +29,7 @@ def build_from_mesh(
     mesh: SurfaceMesh,
     name: str,
     resolution: int = 64,
-    steps: int = 300,
+    steps: int = 400,
     source: dict[str, Any] | None = None,
     progress: Progress | None = None,
 ) -> ObjectModel:
