@@ -25,7 +25,7 @@ from benchmarks.results import record_row
 
 SIZE = (270, 480)
 HELD_OUT_EVERY = 8
-TARGET_DB = 26.0
+TARGETS_DB = {"#2 real photos: fox, held-out PSNR": 26.0, "#3 fox, 10 min on 2 cores, held-out PSNR": 28.0}
 
 
 def main() -> None:
@@ -51,8 +51,8 @@ def main() -> None:
     config = TrainConfig(
         steps=1_000_000,
         max_seconds=arguments.seconds - (time.perf_counter() - began),
-        opacity=0.0,
         distortion=2e-3,
+        refine_depth=0.005,
         march=march,
     )
     trained = train_scene(training.load(SIZE), box, config, progress=report)
@@ -62,7 +62,8 @@ def main() -> None:
     print(f"{mean_db:.2f} dB: {note}")
     if arguments.seconds == 600.0:
         command = "python -m benchmarks.fox --data ../shared/data/fox"
-        record_row("#2 real photos: fox, held-out PSNR", mean_db, "dB", ">= 26 dB", mean_db >= TARGET_DB, command, note)
+        for line, target_db in TARGETS_DB.items():
+            record_row(line, mean_db, "dB", f">= {target_db:.0f} dB", mean_db >= target_db, command, note)
 
 
 def report(at: Progress) -> None:

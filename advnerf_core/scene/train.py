@@ -53,9 +53,11 @@ class TrainConfig:
         occupancy_every: Steps between updates of the occupancy grid.
         warmup_steps: Steps during which sample intervals shrink to their final size and all cells are probed.
         march: How samples are placed.
-        opacity: Weight of the rays' mean transmittance in the loss, for scenes that no ray leaves, such as rooms; 0 for open
-            ones. A constant background is learned for what is left.
+        opacity: Weight of the rays' mean transmittance in the loss. A constant background is learned for what is left; without
+            this pull it explains walls that all cameras see from one side, and is wrong from any other.
         render_step_scale: Sample intervals for rendering, in those of the training: a finished field is smooth along rays.
+        refine_depth: Optical depth of crossing a fine cell from which rendering looks into it. Surfaces of a finished room are
+            dense; where they may still be haze, as in large boxes or after short trainings, 0.005 keeps them whole.
         seed: Seed of everything random.
         checkpoint_every_s: Time between checkpoints [s].
         backend: ``numba`` (CPU kernels), ``torch`` (any device), or ``auto``: torch where it sees an accelerator, else numba.
@@ -75,6 +77,7 @@ class TrainConfig:
     march: MarchConfig = field(default_factory=MarchConfig)
     opacity: float = 1.5e-3
     render_step_scale: float = 2.0
+    refine_depth: float = 0.05
     seed: int = 0
     checkpoint_every_s: float = 60.0
     backend: str = "auto"
@@ -193,7 +196,9 @@ class Trainer:
                 saved_s = self.elapsed_s
         if checkpoint is not None:
             self.save(checkpoint)
-        occupied = refine_occupied(self.occupied(), self.occupancy.box_high, self.stepper.log_density)
+        occupied = refine_occupied(
+            self.occupied(), self.occupancy.box_high, self.stepper.log_density, self.config.refine_depth
+        )
         march = self.config.march.coarser(self.config.render_step_scale)
         return TrainedScene(self.scene.cpu(), occupied, march, self.history)
 

@@ -12,6 +12,7 @@ from torch import Tensor
 from advnerf_core.fields.hash_grid import HashGridConfig
 from advnerf_core.geometry import Array, Pinhole, look_at
 from advnerf_core.render.march import MarchConfig, Samples
+from advnerf_core.render.occupancy import refine_occupied
 from advnerf_core.scene.dataset import ImageSet
 from advnerf_core.scene.field import SceneField, SceneFieldConfig
 from advnerf_core.scene.torch_step import TorchStep, distortion_loss, render_rays
@@ -164,6 +165,14 @@ def test_a_training_in_torch_learns_as_the_kernels_do_and_resumes_in_them(tmp_pa
     for name, value in plain.stepper.state().items():
         np.testing.assert_array_equal(resumed.stepper.state()[name], value, err_msg=name)
     assert not trained.scene.background.is_cuda
+
+
+def test_haze_stays_visible_where_it_is_asked_for() -> None:
+    everywhere, box = np.ones((4, 4, 4), np.bool_), np.ones(3, np.float32)
+    # Crossing one of the 8 fine cells along a side takes 0.02 of optical depth.
+    log_density = TorchStep(constant_scene(float(np.log(8 * 0.02)))).log_density
+    assert refine_occupied(everywhere, box, log_density, least_depth=0.015).all()
+    assert not refine_occupied(everywhere, box, log_density, least_depth=0.025).any()
 
 
 def test_an_unknown_backend_is_refused() -> None:
