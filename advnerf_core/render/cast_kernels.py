@@ -23,7 +23,7 @@ _ROUNDING = 1e-9  # samples; a leap may not end beyond an occupied cell for the 
 
 
 @njit(**KERNEL_OPTIONS)
-def _span_in_box(o: Any, d: Any, sizes: Any, near: float) -> tuple[float, float, bool]:
+def span_in_box(o: Any, d: Any, sizes: Any, near: float) -> tuple[float, float, bool]:
     """Ray parameters of entry and exit, and whether the entry is through the ``+x`` face; exit <= entry is a miss."""
     t_in, t_out, by_face = near, np.inf, False
     for axis in range(3):
@@ -42,13 +42,13 @@ def _span_in_box(o: Any, d: Any, sizes: Any, near: float) -> tuple[float, float,
 
 
 @njit(**KERNEL_OPTIONS)
-def _cell(position: float, count: int) -> int:
+def cell_of(position: float, count: int) -> int:
     """First of the two voxels that ``position`` lies between; clamped at both ends."""
     return max(min(int(np.floor(position)), count - 2), 0)
 
 
 @njit(**KERNEL_OPTIONS)
-def _steps_to_leap(position: float, stride: float, cell: int, clear: int) -> int:
+def steps_to_leap(position: float, stride: float, cell: int, clear: int) -> int:
     """Samples from ``position`` on, itself included, that surely stay within ``clear`` cells of ``cell``."""
     if stride > 0.0:
         return int(min((cell + clear - position) / stride - _ROUNDING, 1e9)) + 1
@@ -58,7 +58,7 @@ def _steps_to_leap(position: float, stride: float, cell: int, clear: int) -> int
 
 
 @njit(**KERNEL_OPTIONS)
-def _share(position: float, first: int, count: int) -> float:
+def share_of(position: float, first: int, count: int) -> float:
     """Weight of the second of the two voxels around ``position``."""
     return min(max(position, 0.0), count - 1.0) - first
 
@@ -78,15 +78,15 @@ def _march(o: Any, d: Any, edges: Any, t_in: float, t_out: float, slots: Any, de
     transmittance, alpha, alpha_depth, i = 1.0, 0.0, 0.0, 0
     while i < samples:
         x, y, z = gx + i * sx, gy + i * sy, gz + i * sz
-        cx, cy, cz = _cell(x, nx), _cell(y, ny), _cell(z, nz)
+        cx, cy, cz = cell_of(x, nx), cell_of(y, ny), cell_of(z, nz)
         if not solid and clear[cx, cy, cz] > 0:
             reach = int(clear[cx, cy, cz])
             leap = min(
-                _steps_to_leap(x, sx, cx, reach), _steps_to_leap(y, sy, cy, reach), _steps_to_leap(z, sz, cz, reach)
+                steps_to_leap(x, sx, cx, reach), steps_to_leap(y, sy, cy, reach), steps_to_leap(z, sz, cz, reach)
             )
             i += max(leap, 1)
             continue
-        fx, fy, fz = _share(x, cx, nx), _share(y, cy, ny), _share(z, cz, nz)
+        fx, fy, fz = share_of(x, cx, nx), share_of(y, cy, ny), share_of(z, cz, nz)
         ax, ay, az = min(cx + 1, nx - 1), min(cy + 1, ny - 1), min(cz + 1, nz - 1)
         opacity = 1.0
         if not solid:
@@ -160,7 +160,7 @@ def cast_window(R: Any, o: Any, edges: Any, window: Any, intrinsics: Any, width:
             y = (v + (s // supersample + 0.5) / supersample - intrinsics[3]) / intrinsics[1]
             for axis in range(3):
                 ray[axis] = R[axis, 0] * x + R[axis, 1] * y + R[axis, 2]
-            t_in, t_out, by_face = _span_in_box(o, ray, sizes, NEAR_M)
+            t_in, t_out, by_face = span_in_box(o, ray, sizes, NEAR_M)
             if t_out <= t_in or (one_sided and not by_face):
                 continue
             count, a, ad = _march(

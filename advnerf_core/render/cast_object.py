@@ -92,9 +92,9 @@ def cast_objects(
         raise ValueError(f"expected at least 1 ray along a pixel's side, got {supersample}")
     bands = max(1, -(-_LEAST_PARTS // max(1, len(poses))))
     jobs = [
-        (k, _Part(_prepared(field, dtype), field, T, pinhole, supersample, window, b * pinhole.width * pinhole.height))
+        (k, _Part(prepared(field, dtype), field, T, pinhole, supersample, window, b * pinhole.width * pinhole.height))
         for k, field in enumerate(fields)
-        for b, T, whole in zip(range(len(poses)), poses, _windows(field, poses, pinhole), strict=True)
+        for b, T, whole in zip(range(len(poses)), poses, windows(field, poses, pinhole), strict=True)
         for window in _bands(whole, bands)
     ]
     run_slots(lambda slot: jobs[slot][1].cast(), len(jobs))
@@ -110,7 +110,7 @@ def made_opaque(cast: ObjectCast) -> ObjectCast:
 
 
 @dataclass(frozen=True, eq=False)
-class _Grids:
+class KernelGrids:
     """An object as the kernel reads it; ``low`` and ``high`` bound what is not empty, in object units."""
 
     slots: NDArray[np.int32]
@@ -120,14 +120,16 @@ class _Grids:
     high: Array
 
 
-def _prepared(field: VoxelGridObject, dtype: Any) -> _Grids:
+def prepared(field: VoxelGridObject, dtype: Any) -> KernelGrids:
     """Grids in the kernel's types; made once per object and type, and shared by its moved copies."""
     key = ("cast", np.dtype(dtype).char)
     if key not in field.derived:
         slots = np.require(field.slots, np.int32, ["C", "W"])
         low, high = np.asarray(field.box_min, np.float64), np.asarray(field.box_max, np.float64)
         if field.density is None:
-            field.derived[key] = _Grids(slots, np.zeros((1, 1, 1), dtype), np.zeros((1, 1, 1), np.uint8), low, high)
+            field.derived[key] = KernelGrids(
+                slots, np.zeros((1, 1, 1), dtype), np.zeros((1, 1, 1), np.uint8), low, high
+            )
         else:
             density = np.require(field.density, dtype, ["C", "W"])
             filled = cells_with_density(density)
@@ -140,10 +142,10 @@ def _prepared(field: VoxelGridObject, dtype: Any) -> _Grids:
                     np.where(first == 0, low, low + edge * (first + 0.5)),
                     np.where(last >= np.array(slots.shape) - 1, high, low + edge * (last + 0.5)),
                 )
-            field.derived[key] = _Grids(
+            field.derived[key] = KernelGrids(
                 slots, density, leap_distances(filled, np.ones(3, np.float32)).distance, low, high
             )
-    grids: _Grids = field.derived[key]
+    grids: KernelGrids = field.derived[key]
     return grids
 
 
@@ -158,7 +160,7 @@ def cells_with_density(density: NDArray[Any]) -> NDArray[np.bool_]:
 class _Part:
     """The cast of one object into rows of one image."""
 
-    def __init__(self, grids: _Grids, field: VoxelGridObject, T_world_from_camera: Array, pinhole: Pinhole,
+    def __init__(self, grids: KernelGrids, field: VoxelGridObject, T_world_from_camera: Array, pinhole: Pinhole,
                  supersample: int, window: NDArray[np.int64], offset: int) -> None:  # fmt: skip
         self._grids, self._field, self._T, self._pinhole = grids, field, T_world_from_camera, pinhole
         self._supersample, self._window, self._offset = supersample, window, offset
@@ -223,21 +225,21 @@ def _bands(window: NDArray[np.int64], count: int) -> list[NDArray[np.int64]]:
     return [np.array([first, last, window[2], window[3]]) for first, last in itertools.pairwise(edges)]
 
 
-def _windows(field: VoxelGridObject, poses: Array, pinhole: Pinhole) -> NDArray[np.int64]:
-    """Pixel windows ``[B, 4]`` (first row, end row, first column, end column) that surely hold the object."""
-    grids = _prepared(field, np.float32)
+def windows(field: VoxelGridObject, poses: Array, pinhole: Pinhole) -> NDArray[np.int64]:
+    """Pixel out ``[B, 4]`` (first row, end row, first column, end column) that surely hold the object."""
+    grids = prepared(field, np.float32)
     corners = transform_corners(poses, field.corners_in_world(grids.low, grids.high))
-    windows = np.zeros((len(poses), 4), dtype=np.int64)
-    windows[:, 1], windows[:, 3] = pinhole.height, pinhole.width
+    out = np.zeros((len(poses), 4), dtype=np.int64)
+    out[:, 1], out[:, 3] = pinhole.height, pinhole.width
     ahead = (corners[..., 2] > NEAR_M).all(axis=1)
     uv = pinhole.project(corners[ahead])
     low, high = np.floor(uv.min(axis=1)).astype(np.int64) - 1, np.ceil(uv.max(axis=1)).astype(np.int64) + 1
-    windows[ahead, 0] = np.clip(low[:, 1], 0, pinhole.height)
-    windows[ahead, 1] = np.clip(high[:, 1], 0, pinhole.height)
-    windows[ahead, 2] = np.clip(low[:, 0], 0, pinhole.width)
-    windows[ahead, 3] = np.clip(high[:, 0], 0, pinhole.width)
-    windows[~(corners[..., 2] > NEAR_M).any(axis=1)] = 0  # behind the camera, or not finite
-    return windows
+    out[ahead, 0] = np.clip(low[:, 1], 0, pinhole.height)
+    out[ahead, 1] = np.clip(high[:, 1], 0, pinhole.height)
+    out[ahead, 2] = np.clip(low[:, 0], 0, pinhole.width)
+    out[ahead, 3] = np.clip(high[:, 0], 0, pinhole.width)
+    out[~(corners[..., 2] > NEAR_M).any(axis=1)] = 0  # behind the camera, or not finite
+    return out
 
 
 def transform_corners(T_world_from_camera: Array, points_in_world: Array) -> Array:

@@ -36,14 +36,15 @@ def visible_shares(alphas: Tensor, depths_m: Tensor) -> Tensor:
             f"expected alphas and depths of one shape, got {list(alphas.shape)} and {list(depths_m.shape)}"
         )
     # Pairs instead of a sort: a scene has few layers, and a sort along the short axis is ten times slower.
-    shares = torch.ones_like(alphas)
+    shares = []
     for behind in range(len(alphas)):
+        share = torch.ones_like(alphas[behind])
         for front in range(len(alphas)):
-            if front == behind:
-                continue
-            nearer = depths_m[front] < depths_m[behind] if front > behind else depths_m[front] <= depths_m[behind]
-            shares[behind] *= torch.where(nearer, 1.0 - alphas[front], 1.0)
-    return shares
+            if front != behind:
+                nearer = depths_m[front] < depths_m[behind] if front > behind else depths_m[front] <= depths_m[behind]
+                share = share * torch.where(nearer, 1.0 - alphas[front], 1.0)
+        shares.append(share)
+    return torch.stack(shares) if shares else torch.ones_like(alphas)
 
 
 def composite(premultiplied: Tensor, alphas: Tensor, depths_m: Tensor) -> tuple[Tensor, Tensor, Tensor]:

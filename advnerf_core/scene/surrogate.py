@@ -22,7 +22,8 @@ from advnerf_core.fields.seen_rows import SeenRows, compact
 from advnerf_core.fields.voxel_grid import INITIAL_NOISE, VoxelGridObject
 from advnerf_core.geometry import Array, Pinhole, planar_poses
 from advnerf_core.render.cast_object import ObjectCast, cast_objects, made_opaque
-from advnerf_core.render.composite import sparse_shares
+from advnerf_core.render.composite import composite, sparse_shares
+from advnerf_core.render.soft_pose import render_soft
 
 BackgroundRenderer = Callable[[Array, Pinhole], Sequence[Any]]
 """``(T_world_from_camera [B, 4, 4], pinhole) -> (rgb [B, H, W, 3] in 0..1, planar depth [B, H, W] in metres, ...)``."""
@@ -165,10 +166,7 @@ class Surrogate:
     def prepare(self, T_world_from_camera: ArrayLike) -> Frames:
         """Render the background and cast the objects for camera poses ``[B, 4, 4]``."""
         poses = np.asarray(T_world_from_camera, dtype=np.float64).reshape(-1, 4, 4)
-        rgb, depth_m = (torch.as_tensor(part, device="cpu").to(self.dtype) for part in self._render_background(poses))
-        if self._background_colour is not None:
-            rgb = self._background_colour(rgb)
-        return self._composed(poses, rgb, depth_m)
+        return self._composed(poses, *self._coloured_background(poses))
 
     @torch.no_grad()
     def overlay(
@@ -210,6 +208,31 @@ class Surrogate:
         """Images at camera poses ``[B, 4, 4]`` and their vjp; see :class:`Rendered`. ``theta`` is None without objects."""
         return self.prepare(T_world_from_camera).render(None if theta is None else theta.detach())
 
+    def render_placed(self, T_world_from_camera: ArrayLike, theta: Tensor, placements: Tensor) -> Tensor:
+        """Images of the objects standing elsewhere, differentiable by autograd with respect to where, and to ``theta``.
+
+        Args:
+            T_world_from_camera: Camera poses ``[B, 4, 4]``.
+            theta: Of ``theta_shape``.
+            placements: ``(x_m, y_m, yaw_rad, scale)`` of each object, ``[K, 4]``; see ``render/soft_pose``.
+
+        Returns:
+            Images ``[B, 3, H, W]`` in float64, with history.
+        """
+        if placements.shape != (len(self.objects), 4):
+            raise ValueError(f"expected placements [{len(self.objects)}, 4], got {list(placements.shape)}")
+        poses = np.asarray(T_world_from_camera, dtype=np.float64).reshape(-1, 4, 4)
+        rgb, depth_m = self._coloured_background(poses)
+        layers = [
+            render_soft(field, placement, part, poses, self.camera, self._supersample)
+            for field, placement, part in zip(self.objects, placements, split_theta(self.objects, theta), strict=True)
+        ]
+        colours = torch.stack([*(layer[0] for layer in layers), rgb.double()])
+        alphas = torch.stack([*(layer[1] for layer in layers), torch.ones_like(depth_m).double()])
+        behind = torch.nan_to_num(depth_m.double(), nan=torch.inf)
+        depths = torch.stack([*(layer[2] - self._tolerance_m for layer in layers), behind])
+        return composite(colours, alphas, depths)[0].permute(0, 3, 1, 2)
+
     def sense(self, states: Tensor, theta: Tensor | None) -> Rendered:
         """What the car's camera sees from states ``[B, n]``; poses are detached."""
         return self.render(self.camera_poses(states), theta)
@@ -218,10 +241,13 @@ class Surrogate:
         """The sensor of a rollout: car states ``[B, n]`` to images ``[B, 3, H, W]``."""
         return lambda states: self.sense(states, theta).images
 
-    def _render_background(self, poses: Array) -> tuple[Any, Any]:
+    @torch.no_grad()
+    def _coloured_background(self, poses: Array) -> tuple[Tensor, Tensor]:
+        """Colours ``[B, H, W, 3]`` and depth ``[B, H, W]`` of the scene without objects."""
         rgb, depth_m = self._background(poses, self.camera)[:2]
         self._check_background(rgb, depth_m, len(poses))
-        return rgb, depth_m
+        rgb, depth_m = (torch.as_tensor(part, device="cpu").to(self.dtype) for part in (rgb, depth_m))
+        return rgb if self._background_colour is None else self._background_colour(rgb), depth_m
 
     def _check_background(self, rgb: Any, depth_m: Any, count: int) -> None:
         size = (count, self.camera.height, self.camera.width)
