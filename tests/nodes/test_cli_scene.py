@@ -87,6 +87,7 @@ def test_training_learns_what_it_did_not_see(pictures, tmp_path):
     assert 0.9 < figures["mean"]["ssim"] <= 1.0
 
 
+@pytest.mark.slow
 def test_a_finished_training_is_not_repeated_and_other_settings_are_refused(command, trained, pictures):
     before = (trained / "scene.safetensors").read_bytes()
     arguments = ("train", pictures, "-o", trained, *BOX, "--open", "--near", "1")
