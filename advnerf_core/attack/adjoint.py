@@ -230,9 +230,12 @@ def _batched_terms(problem: AttackProblem, theta: Tensor, rollout: Rollout, cont
             (grad_images,) = torch.autograd.grad(controls, images, seed)
         del controls, images
         sizes = [len(piece.images) for piece in pieces]
-        parts = [piece.vjp(grad) for piece, grad in zip(pieces, grad_images.split(sizes), strict=True)]
         assert sum(sizes) == (last - first) * starts
-        yield torch.stack(parts).sum(0), again
+        # One sum, not a stack: a dense object's gradient is as large as its grid.
+        total = torch.zeros_like(theta)
+        for piece, grad in zip(pieces, grad_images.split(sizes), strict=True):
+            total += piece.vjp(grad)
+        yield total, again
 
 
 def _renders(problem: AttackProblem, theta: Tensor, rollout: Rollout, steps: range,
