@@ -27,7 +27,7 @@ from advnerf_core.files import write_atomically
 
 __all__ = [
     "Evaluation", "OnEvaluation", "SearchDivergedError", "SearchResult", "SearchState", "SearchStateError", "begin",
-    "draw_start_states", "load_state", "search_fingerprint", "without_gradient",
+    "draw_start_states", "evaluation_from_json", "load_state", "search_fingerprint", "without_gradient",
 ]  # fmt: skip
 
 _FORMAT = "advnerf-search-1"
@@ -135,7 +135,7 @@ def load_state(path: Path, fingerprint: str) -> SearchState:
             raise SearchStateError(
                 f"expected {path} to be a search state of format {_FORMAT}; delete it to start afresh"
             )
-        history = [_evaluation(entry) for entry in json.loads(header["history"])]
+        history = [evaluation_from_json(entry) for entry in json.loads(header["history"])]
         best_theta = tensors.pop("best_theta")
     except (SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
         if isinstance(error, SearchStateError):
@@ -170,7 +170,8 @@ def without_gradient(problem: AttackProblem, theta: Tensor, number: int) -> tupl
     return loss_m, totals
 
 
-def _evaluation(entry: dict[str, Any]) -> Evaluation:
+def evaluation_from_json(entry: dict[str, Any]) -> Evaluation:
+    """The evaluation that ``dataclasses.asdict`` and JSON made this of."""
     values: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in entry.items()}
     return Evaluation(**values)
 

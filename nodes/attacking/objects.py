@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from advnerf_core.fields.summed_levels import with_summed_levels
 from advnerf_core.fields.voxel_grid import VoxelGridObject, cube_face_object, face_corners_in_object
 from advnerf_core.geometry import Array
 from advnerf_core.objects.model import load_object
@@ -72,6 +73,8 @@ def _from_file(wanted: ObjectRequest) -> PlacedObject:
             f"{wanted.file}: expected all colours of an object file to be free; only a face or cube has a face"
         )
     field = load_object(wanted.file).placed(wanted.pose, wanted.scale)
+    if wanted.levels:
+        field = with_summed_levels(field, wanted.levels, finest=max(field.slots.shape))
     return PlacedObject(wanted.file.name.partition(".")[0], field, None, object_sha256(field))
 
 
@@ -93,6 +96,8 @@ def object_sha256(field: VoxelGridObject) -> str:
     """Hash of everything about an object except the colours that are searched for."""
     digest = hashlib.sha256(repr((field.theta_shape, field.scale, field.one_sided, field.step_units)).encode())
     parts = (field.slots, field.fixed_colours, field.box_min, field.box_max, field.T_world_from_object, field.density)
+    if field.mixing is not None:
+        parts = (*parts, field.mixing.data, field.mixing.indices, field.mixing.indptr)
     for part in parts:
         array: NDArray[np.generic] = np.zeros(0) if part is None else np.ascontiguousarray(part)
         digest.update(f"{array.dtype} {array.shape}".encode())

@@ -132,10 +132,12 @@ def request_hash(request: AttackRequest) -> str:
     asked = request.model_dump(
         mode="json", exclude={"name", "scene", "policy", "calibration", "camera", "vehicle", "room"}
     )
-    for key in ("evaluations", "cache_mib", "time_batch", "seeds"):
+    for key in ("evaluations", "cache_mib", "time_batch", "seeds", "together"):
         asked["search"].pop(key)
     for wanted in asked["objects"]:
         del wanted["file"], wanted["target"]
+        if not wanted["levels"]:
+            del wanted["levels"]
     digest = hashlib.sha256(hash_of(asked).encode())
     for name in ("camera", "vehicle", "room"):
         digest.update(request.calibration_file(name).read_bytes())

@@ -52,6 +52,10 @@ class ObjectRequest(_Section):
     free: Literal["all", "face"] = Field(
         default="all", description="Which colours of an object file may change: all, or those on its deployed face."
     )
+    levels: Annotated[int, Field(ge=0, le=32)] = Field(
+        default=0,
+        description="Summed grids, coarse to fine, that give an object file's colours; 0: one value per voxel.",
+    )
     target: Path | None = Field(
         default=None, description="Calibration file of the face that shows the attack: its subject and its corners."
     )
@@ -59,6 +63,8 @@ class ObjectRequest(_Section):
 
     @model_validator(mode="after")
     def _consistent(self) -> ObjectRequest:
+        if self.levels and self.kind != "file":
+            raise ValueError("expected levels with kind 'file' only: a face has one flat grid of colours")
         if (self.kind == "file") != (self.file is not None):
             raise ValueError("expected a file exactly with kind 'file'")
         place = (self.x_m, self.y_m, self.z_m)
@@ -145,6 +151,9 @@ class SearchRequest(_Section):
         default=8, description="Cells along an edge that cem and evolution search over; 0 for the face's own."
     )
     seeds: tuple[int, ...] = Field(default=(0,), min_length=1, description="One attack for each.")
+    together: bool = Field(
+        default=False, description="Gradient: search all seeds in one batch, not one after the other."
+    )
     cache_mib: NotNegative = Field(default=512.0, description="Budget of the frames kept for the gradient [MiB].")
     time_batch: Count = Field(default=16, description="Frames per gradient batch.")
 
@@ -175,6 +184,8 @@ class AttackRequest(_Section):
     @model_validator(mode="after")
     def _complete(self) -> AttackRequest:
         missing = [name for name in ("camera", "vehicle", "room") if getattr(self, name) is None]
+        if self.search.together and self.search.method != "gradient":
+            raise ValueError(f"search.together is for the gradient method only, got method {self.search.method}")
         if self.calibration is None and missing:
             raise ValueError(f"expected a calibration folder, or files for {', '.join(missing)}")
         count = len(self.starts.poses) or self.starts.count

@@ -13,6 +13,7 @@ from advnerf_core.attack.baselines import random_search
 from advnerf_core.attack.optimise import gradient_attack
 from advnerf_core.attack.population import CrossEntropy, Evolution, population_search
 from advnerf_core.attack.search import Evaluation, OnEvaluation, SearchResult
+from advnerf_core.attack.together import gradient_attacks
 from advnerf_core.files import write_atomically
 from nodes.attacking.prepare import Prepared, prepare
 from nodes.attacking.request import AttackRequest, load_request, request_text
@@ -75,6 +76,8 @@ def run_attack(
         ConfigError: The folder holds another request.
     """
     keep_request(request, folder)
+    if request.search.together:
+        return _run_together(request, folder, display, on_evaluation, on_prepared)
     prepared, files = None, []
     for seed in request.search.seeds:
         name = f"seed_{seed}"
@@ -115,6 +118,40 @@ def _run_seed(prepared: Prepared, folder: Path, display: Display, on_evaluation:
     name, state_path = f"seed_{prepared.seed}", folder / f"seed_{prepared.seed}.state.safetensors"
     report = display.start(name)
     result = search(prepared, state_path, _both(telling(prepared.request.search.evaluations, report), on_evaluation))
+    _keep(prepared, result, folder)
+    state_path.unlink(missing_ok=True)
+    display.finish(name, sum(e.seconds for e in result.history), cached=False)
+
+
+def _run_together(
+    request: AttackRequest, folder: Path, display: Display, on_evaluation: OnEvaluation | None,
+    on_prepared: Callable[[Prepared], None] | None,
+) -> list[Path]:  # fmt: skip
+    """All seeds of a gradient attack in one batch; their files are written when all are done."""
+    seeds, state_path = request.search.seeds, folder / "together.state.safetensors"
+    files = [attack_file(folder, seed) for seed in seeds]
+    if all(file.exists() for file in files):
+        for seed in seeds:
+            display.finish(f"seed_{seed}", 0.0, cached=True)
+        return files
+    prepared = prepare(request, seeds[0])
+    each = [prepared, *(prepared.with_seed(seed) for seed in seeds[1:])]
+    if on_prepared is not None:
+        on_prepared(prepared)
+    told = [_both(telling(request.search.evaluations, display.start(f"seed_{seed}")), on_evaluation) for seed in seeds]
+    results = gradient_attacks(
+        [one.problem for one in each], seeds, request.search.evaluations, request.search.learning_rate or 0.1,
+        state_path, lambda k, evaluation: told[k](evaluation), prepared.settings_hash,
+    )  # fmt: skip
+    for one, result in zip(each, results, strict=True):
+        _keep(one, result, folder)
+        display.finish(f"seed_{one.seed}", sum(e.seconds for e in result.history), cached=False)
+    state_path.unlink(missing_ok=True)
+    return files
+
+
+def _keep(prepared: Prepared, result: SearchResult, folder: Path) -> None:
+    """Write the attack file of a finished search, and its curve beside it."""
     attack_id = save_attack(attack_file(folder, prepared.seed), finish(prepared, result))
     curve = {
         "attack_id": attack_id, "method": prepared.request.search.method, "seed": prepared.seed,
@@ -122,9 +159,7 @@ def _run_seed(prepared: Prepared, folder: Path, display: Display, on_evaluation:
         "predicted_total_cte_m": [e.predicted_total_cte_m for e in result.history],
         "seconds": [e.seconds for e in result.history],
     }  # fmt: skip
-    write_atomically(folder / f"{name}.json", json.dumps(curve, indent=1) + "\n")
-    state_path.unlink(missing_ok=True)
-    display.finish(name, sum(e.seconds for e in result.history), cached=False)
+    write_atomically(folder / f"seed_{prepared.seed}.json", json.dumps(curve, indent=1) + "\n")
 
 
 def telling(evaluations: int, report: Callable[[float, str], None]) -> OnEvaluation:

@@ -47,6 +47,24 @@ def test_a_stopped_run_goes_on_to_the_same_bytes(tmp_path, method):
         run_attack(load_request(file), tmp_path / "whole", ProgressDisplay())
 
 
+def test_seeds_searched_together_resume_to_the_same_bytes_and_end_as_they_do_alone(tmp_path):
+    file = tiny_request(tmp_path)
+    request = load_request(file, ["search.seeds=[0, 1]", "search.together=true"])
+    whole = run_attack(request, tmp_path / "whole", ProgressDisplay())
+    with pytest.raises(StoppedError):
+        run_attack(request, tmp_path / "stopped", ProgressDisplay(), stop_at_one)
+    resumed = run_attack(request, tmp_path / "stopped", ProgressDisplay())
+    assert [one.read_bytes() for one in resumed] == [one.read_bytes() for one in whole]
+    alone = run_attack(load_request(file, ["search.seeds=[0, 1]"]), tmp_path / "alone", ProgressDisplay())
+    for one, other in zip(whole, alone, strict=True):
+        assert load_attack(one).predicted_total_cte_m == pytest.approx(
+            load_attack(other).predicted_total_cte_m, rel=1e-4
+        )
+        np.testing.assert_allclose(load_attack(one).theta, load_attack(other).theta, atol=1e-3)
+    with pytest.raises(ConfigError, match="gradient method only"):
+        load_request(file, ["search.method=random", "search.together=true"])
+
+
 def test_show_writes_the_texture_and_resume_needs_a_folder_of_a_run(tmp_path, monkeypatch, capsys):
     file = tiny_request(tmp_path)
     for command in (["run", str(file), "-o", str(tmp_path / "out")], ["resume", str(tmp_path / "out")],
