@@ -91,6 +91,9 @@ def _note_places(node: yaml.Node, key: Key, document: Document) -> None:
             _note_places(value, (*key, index), document)
 
 
+_NONE = ("", "null", "Null", "NULL", "~")
+
+
 def apply_overrides(document: Document, overrides: Iterable[str], prefix: Key = ()) -> None:
     """Apply ``key.of.it=value`` texts in place; values are YAML, and keys below ``prefix`` are meant."""
     for text in overrides:
@@ -98,7 +101,8 @@ def apply_overrides(document: Document, overrides: Iterable[str], prefix: Key = 
         if not separator or not name.strip():
             raise ConfigError(f"--set {text}: expected KEY=VALUE, e.g. --set camera.rate_hz=10")
         key: Key = (*prefix, *name.strip().split("."))
-        parsed = parse_yaml(value, f"--set {text}").data if value.strip() else None
+        # A file that says nothing has no keys; a value that says nothing, or null, is none.
+        parsed = parse_yaml(value, f"--set {text}").data if value.strip() not in _NONE else None
         target = document.data
         for step in key[:-1]:
             if not isinstance(target, dict):

@@ -71,6 +71,13 @@ def test_mistake_names_file_line_and_valid_keys(tmp_path, text, message):
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("nothing", ["", "null", "~", " null "])
+def test_an_override_can_say_none(nothing):
+    document = parse_yaml("{name: front, maybe: {fov_deg: 60}}", "camera.yaml")
+    apply_overrides(document, [f"maybe={nothing}"])
+    assert document.data["maybe"] is None
+
+
 def test_missing_file_is_a_config_error(tmp_path):
     with pytest.raises(ConfigError, match="no such file"):
         load_config(Camera, tmp_path / "nothing.yaml")
