@@ -15,6 +15,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from advnerf_core.driving.path import Path as DrivingPath
+from advnerf_core.errors import AdvnerfError
 from advnerf_core.files import write_atomically
 from advnerf_core.geometry import Array, Pinhole
 from hardware.limits import DriveLimits, VehicleGains
@@ -24,9 +25,10 @@ Point3 = tuple[float, float, float]
 Point2 = tuple[float, float]
 _RIGID_TOLERANCE = 1e-6
 _PLANAR_TOLERANCE_M = 0.005
+_OPTIONAL = ("views", "residuals", "response")
 
 
-class CalibrationError(ValueError):
+class CalibrationError(AdvnerfError, ValueError):
     """A calibration file is missing or wrong."""
 
 
@@ -38,6 +40,8 @@ class Calibration(BaseModel):
         date: Day of the measurement.
         method: How it was measured.
         notes: Anything a person should know.
+        views: Pictures, segments or samples that the result rests on; None where nothing was fitted.
+        residuals: What the fit left, by name with its unit; empty where nothing was fitted.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
@@ -46,6 +50,18 @@ class Calibration(BaseModel):
     date: datetime.date
     method: str = Field(min_length=1)
     notes: str = ""
+    views: int | None = Field(default=None, ge=0)
+    residuals: dict[str, float] = {}
+
+
+def require_rigid(rows: tuple[Row4, ...]) -> tuple[Row4, ...]:
+    """The rows of a transform ``[4, 4]``, or a `ValueError` that says what is wrong with them."""
+    T = np.array(rows)
+    R = T[:3, :3]
+    error = max(np.abs(R @ R.T - np.eye(3)).max(), np.abs(T[3] - [0.0, 0.0, 0.0, 1.0]).max())
+    if error > _RIGID_TOLERANCE or np.linalg.det(R) < 0.0:
+        raise ValueError(f"expected a rotation and a translation with last row 0 0 0 1, is off by {error:.1e}")
+    return rows
 
 
 class CameraCalibration(Calibration):
@@ -79,12 +95,7 @@ class CameraCalibration(Calibration):
     @field_validator("T_car_from_camera")
     @classmethod
     def _rigid(cls, rows: tuple[Row4, ...]) -> tuple[Row4, ...]:
-        T = np.array(rows)
-        R = T[:3, :3]
-        error = max(np.abs(R @ R.T - np.eye(3)).max(), np.abs(T[3] - [0.0, 0.0, 0.0, 1.0]).max())
-        if error > _RIGID_TOLERANCE or np.linalg.det(R) < 0.0:
-            raise ValueError(f"expected a rotation and a translation with last row 0 0 0 1, is off by {error:.1e}")
-        return rows
+        return require_rigid(rows)
 
     @property
     def pinhole(self) -> Pinhole:
@@ -123,6 +134,38 @@ class LimitsSection(BaseModel):
     steering_rate_radps: float
 
 
+class ResponseSection(BaseModel):
+    """How late and how slowly the car obeys.
+
+    Attributes:
+        pipeline_delay_s: From the capture of an image to the command written for it, in the mean [s].
+        steering_delay_s: From the written command until the wheels begin to move [s].
+        steering_lag_s: Time constant of the wheel angle [s].
+        steering_slew_radps: Greatest rate of the wheel angle [rad/s]; None if the commands never reached it.
+        speed_delay_s: From the written command until the speed begins to change [s].
+        speed_lag_s: Time constant of the speed [s].
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    pipeline_delay_s: float = Field(ge=0.0)
+    steering_delay_s: float = Field(ge=0.0)
+    steering_lag_s: float = Field(ge=0.0)
+    steering_slew_radps: float | None = Field(default=None, gt=0.0)
+    speed_delay_s: float = Field(ge=0.0)
+    speed_lag_s: float = Field(ge=0.0)
+
+    def attack_dynamics(self) -> dict[str, float]:
+        """What an attack request puts under ``dynamics``: delay from image to wheels, lag and, where known, slew."""
+        found = {
+            "delay_s": round(self.pipeline_delay_s + self.steering_delay_s, 4),
+            "lag_s": round(self.steering_lag_s, 4),
+        }
+        return (
+            found if self.steering_slew_radps is None else {**found, "slew_radps": round(self.steering_slew_radps, 3)}
+        )
+
+
 class VehicleCalibration(Calibration):
     """The car.
 
@@ -130,12 +173,14 @@ class VehicleCalibration(Calibration):
         wheelbase_m: Distance between the axles [m].
         gains: From speed and steering to the motor controller.
         limits: What may be sent.
+        response: Delay and lag; None where they were not measured.
     """
 
     kind: Literal["vehicle"] = "vehicle"
     wheelbase_m: float = Field(gt=0.0)
     gains: GainsSection
     limits: LimitsSection
+    response: ResponseSection | None = None
 
     @model_validator(mode="after")
     def _possible(self) -> VehicleCalibration:
@@ -245,7 +290,10 @@ def load_calibration(model: type[C], path: Path | str) -> C:
 def save_calibration(calibration: Calibration, path: Path | str) -> None:
     """Write one file, whole or not at all."""
     path = Path(path)
-    text = yaml.safe_dump(calibration.model_dump(mode="python"), sort_keys=False, default_flow_style=None, width=120)
+    values = calibration.model_dump(mode="python")
+    # Files that measured nothing stay as short as they were.
+    kept = {key: value for key, value in values.items() if key not in _OPTIONAL or value not in (None, {})}
+    text = yaml.safe_dump(kept, sort_keys=False, default_flow_style=None, width=120)
     try:
         write_atomically(path, text)
     except OSError as error:

@@ -1,0 +1,219 @@
+"""Where the camera sits on the car, from pictures of a ChArUco board and motion-capture poses.
+
+With ``X = T_car_from_camera``, ``Y = T_base_from_pattern`` and, for view i, ``A_i = T_car_from_base`` by motion capture and
+``B_i = T_camera_from_pattern`` in the picture, ``A_i Y = X B_i``. The base is the tracked board (best: where the print sits on it is
+then fixed, and may be known), or the world itself when the board just stands there (hand-eye).
+
+If Y is known every view gives X by itself. If not, both follow when the car's rotations relative to the base span more than one
+axis; for a car on a floor before an upright board they do not, and shifting X and Y together along that axis changes nothing that is seen. Such
+sets are refused. The start is closed form (Park and Martin 1994, by OpenCV). The end is the maximum of the likelihood of all corners, in
+which the errors of motion capture are marginalised: they move all corners of a view together, so a view's corners are weighted by
+``(s^2 I + J S J^T)^-1`` with the derivatives ``J`` of the corners with respect to the poses and their covariance ``S``.
+"""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from advnerf_core.geometry import Array, invert_transform, make_transform
+from advnerf_core.scene.similarity import rotation_angles
+from calibration.charuco import Detection, board_pose
+from calibration.degeneracy import DegenerateDataError, PoorFitError, mean_rotation, require_count, rotation_spread
+from calibration.measured import LensCalibration, rows_of
+from calibration.mount_problem import MountConfig, MountProblem
+from calibration.schema import CameraCalibration
+
+_CONTRADICTION = "did car and board stand still at the stamps, and is the subject the one the camera is on?"
+
+
+@dataclass(frozen=True, eq=False)
+class MountView:
+    """One moment at which board and car stood still.
+
+    Attributes:
+        T_world_from_car: By motion capture ``[4, 4]``.
+        T_world_from_board: By motion capture ``[4, 4]``; None if the board is not tracked.
+        found: The pattern in the picture.
+    """
+
+    T_world_from_car: Array
+    T_world_from_board: Array | None
+    found: Detection
+
+
+@dataclass(frozen=True, eq=False)
+class MountFit:
+    """A fitted mounting pose.
+
+    Attributes:
+        T_car_from_camera: ``[4, 4]``.
+        T_base_from_pattern: ``[4, 4]``: the pattern on the tracked board, or in the world.
+        used: ``[N]`` bool: views that were fitted.
+        view_rms_px: ``[N]`` reprojection error of each view through the whole chain; NaN without a board pose.
+        rotation_stddev_rad: Standard deviation of the rotation, its largest axis [rad].
+        translation_stddev_m: Standard deviation of the translation, its largest axis [m].
+        method: In words.
+    """
+
+    T_car_from_camera: Array
+    T_base_from_pattern: Array
+    used: NDArray[np.bool_]
+    view_rms_px: Array
+    rotation_stddev_rad: float
+    translation_stddev_m: float
+    method: str
+
+    @property
+    def rms_px(self) -> float:
+        """Reprojection error of the views that were fitted [px]."""
+        return float(np.sqrt(np.mean(self.view_rms_px[self.used] ** 2)))
+
+    def calibration(self, camera: LensCalibration) -> CameraCalibration:
+        """The camera's file."""
+        residuals = {
+            "rms_px": self.rms_px, "views_left_out": float((~self.used).sum()),
+            "rotation_stddev_deg": float(np.degrees(self.rotation_stddev_rad)), "translation_stddev_m": self.translation_stddev_m,
+        }  # fmt: skip
+        return CameraCalibration(
+            date=datetime.date.today(), method=self.method, views=int(self.used.sum()),
+            residuals={key: round(value, 6) for key, value in residuals.items()}, rms_px=camera.rms_px,
+            T_car_from_camera=rows_of(self.T_car_from_camera),
+            **{key: getattr(camera, key) for key in ("width", "height", "fx", "fy", "cx", "cy", "distortion")},
+        )  # fmt: skip
+
+
+def calibrate_mount(
+    views: Sequence[MountView], camera: LensCalibration, T_board_from_pattern: ArrayLike | None = None,
+    config: MountConfig | None = None,
+) -> MountFit:  # fmt: skip
+    """Find the mounting pose of the camera.
+
+    Args:
+        views: Moments at which everything stood still; all with a tracked board, or none.
+        camera: Its lens.
+        T_board_from_pattern: Where the print is on the tracked board ``[4, 4]``, probed with a wand; None solves for it.
+        config: Gates.
+
+    Raises:
+        DegenerateDataError: Too few views, or rotations about one axis only with an unknown pattern pose.
+        PoorFitError: The views contradict each other.
+    """
+    config = config or MountConfig()
+    tracked = all(view.T_world_from_board is not None for view in views)
+    if T_board_from_pattern is not None and not tracked:
+        raise DegenerateDataError(
+            "expected a tracked board with a pattern of known pose, got views without the board's pose"
+        )
+    matrix, distortion = camera.pinhole.matrix, np.array(camera.distortion)
+    seen = [board_pose(view.found, matrix, distortion) for view in views]
+    good = np.array([pose is not None for pose in seen], np.bool_)
+    cure = "stop at more places, with the board near and slanted"
+    require_count(int(good.sum()), config.min_views, "views with an unambiguous board", cure)
+    chosen = [view for view, keep in zip(views, good, strict=True) if keep]
+    T_camera_from_pattern = np.stack([pose for pose in seen if pose is not None])
+    T_base_from_car = np.stack([_base_from_car(view, tracked) for view in chosen])
+    known = None if T_board_from_pattern is None else np.asarray(T_board_from_pattern, np.float64)
+    if known is None:
+        _require_axes(T_base_from_car, tracked, config)
+    X, Y, inside = _start(T_base_from_car, T_camera_from_pattern, known, config)
+    problem = MountProblem(T_base_from_car, [view.found for view in chosen], matrix, distortion, known, config)
+    X, Y, turn_stddev, move_stddev = problem.solve(X, Y, inside)
+    rms = problem.view_rms(X, Y)
+    used, all_rms = np.zeros(len(views), np.bool_), np.full(len(views), np.nan)
+    used[np.flatnonzero(good)[inside]], all_rms[good] = True, rms
+    fit = MountFit(X, Y, used, all_rms, turn_stddev, move_stddev, _method(tracked, known is not None))
+    if fit.rms_px > config.most_rms_px:
+        raise PoorFitError(
+            f"expected the chain from motion capture to the picture to close within {config.most_rms_px} px, got {fit.rms_px:.1f} px; did "
+            "car and board stand still, is the lens this camera's, the square size right, the subject's axes those of the car?"
+        )
+    return fit
+
+
+def _method(tracked: bool, known: bool) -> str:
+    if not tracked:
+        return "hand-eye on a standing ChArUco board, then reprojection error"
+    where = "pattern pose given" if known else "pattern pose solved jointly"
+    return f"ChArUco board tracked by motion capture, {where}, then reprojection error"
+
+
+def _base_from_car(view: MountView, tracked: bool) -> Array:
+    if not tracked or view.T_world_from_board is None:
+        return view.T_world_from_car
+    return invert_transform(view.T_world_from_board) @ view.T_world_from_car
+
+
+def _require_axes(T_base_from_car: Array, tracked: bool, config: MountConfig) -> None:
+    spread = rotation_spread(T_base_from_car[:, :3, :3])
+    if spread[1] < config.least_second_axis_rad:
+        first, second = np.degrees(spread[:2])
+        cure = (
+            "tilt the board into several directions, or give the pattern's pose on it" if tracked else "track the board"
+        )
+        raise DegenerateDataError(
+            f"expected rotations about more than one axis, got planar ones: {first:.1f} degrees about the first and {second:.2f} about the "
+            f"second (at least {np.degrees(config.least_second_axis_rad):.1f}); height and the pattern's pose stay open: {cure}, or tilt the car by hand"
+        )
+
+
+def _start(
+    T_base_from_car: Array, T_camera_from_pattern: Array, known: Array | None, config: MountConfig
+) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Closed form, chordal means, and the views that agree with them."""
+    inside: NDArray[np.bool_] = np.ones(len(T_base_from_car), np.bool_)
+    Y = known if known is not None else _closed_form(T_base_from_car, T_camera_from_pattern)
+    for _ in range(10):
+        each = invert_transform(T_base_from_car) @ Y @ invert_transform(T_camera_from_pattern)
+        X = _mean_pose(each[inside])
+        if known is None:
+            Y = _mean_pose((T_base_from_car @ X @ T_camera_from_pattern)[inside])
+            each = invert_transform(T_base_from_car) @ Y @ invert_transform(T_camera_from_pattern)
+        again = _agreeing(*_distances(each, X), config)
+        if (again == inside).all():
+            break
+        inside = again
+    turn, move = (float(np.median(error)) for error in _distances(each, X))
+    if turn > config.most_median_rad or move > config.most_median_m:
+        raise PoorFitError(
+            f"expected views that agree on one mounting pose, got half of them more than {np.degrees(turn):.1f} degrees and "
+            f"{1000.0 * move:.0f} mm from the mean; {_CONTRADICTION}"
+        )
+    needed = max(config.min_views, int(np.ceil((1.0 - config.most_share_left_out) * len(inside))))
+    if inside.sum() < needed:
+        raise PoorFitError(
+            f"expected at least {needed} of {len(inside)} views to agree on one mounting pose, got {int(inside.sum())}; {_CONTRADICTION}"
+        )
+    return X, Y, inside
+
+
+def _closed_form(T_base_from_car: Array, T_camera_from_pattern: Array) -> Array:
+    # The method goes by keyword: as the fifth positional argument it would be taken for an output and ignored.
+    turn, move = cv2.calibrateHandEye(
+        list(T_base_from_car[:, :3, :3]), list(T_base_from_car[:, :3, 3]),
+        list(T_camera_from_pattern[:, :3, :3]), list(T_camera_from_pattern[:, :3, 3]), method=cv2.CALIB_HAND_EYE_PARK,
+    )  # fmt: skip
+    return _mean_pose(T_base_from_car @ make_transform(turn, move.ravel()) @ T_camera_from_pattern)
+
+
+def _mean_pose(poses: Array) -> Array:
+    # The median of the translations starts the rejection without its outliers.
+    return make_transform(mean_rotation(poses[:, :3, :3]), np.median(poses[:, :3, 3], axis=0))
+
+
+def _distances(each: Array, X: Array) -> tuple[Array, Array]:
+    turn = rotation_angles(X[:3, :3].T @ each[:, :3, :3])
+    return turn, np.asarray(np.linalg.norm(each[:, :3, 3] - X[:3, 3], axis=1))
+
+
+def _agreeing(turn: Array, move: Array, config: MountConfig) -> NDArray[np.bool_]:
+    inside = np.ones(len(turn), np.bool_)
+    for error, floor in ((turn, np.radians(0.3)), (move, 0.004)):
+        # Of a norm of three normal errors the median is 1.54 standard deviations.
+        inside &= error <= max(config.outlier_factor * float(np.median(error)) / 1.54, floor)
+    return inside

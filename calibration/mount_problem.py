@@ -1,0 +1,110 @@
+"""The likelihood of all corners of all views as a function of a camera's mounting pose; see `calibration.camera_to_car`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from advnerf_core.geometry import Array, invert_transform, make_transform
+from calibration.charuco import Detection
+
+
+@dataclass(frozen=True)
+class MountConfig:
+    """What is refused.
+
+    Attributes:
+        min_views: Fewer agreeing views are refused.
+        least_second_axis_rad: With an unknown pattern pose, the root mean square turn about the second axis must reach this [rad].
+        outlier_factor: Views farther from the mean than so many robust standard deviations are left out.
+        most_share_left_out: With a larger share left out the set is refused.
+        most_rms_px: A larger reprojection error through the whole chain is refused [px].
+        most_median_rad: With a larger median angle between the views' mounting poses and their mean the set is refused [rad].
+        most_median_m: Or a larger median distance [m].
+        corner_stddev_px: How well a corner is found, per axis [px].
+        mocap_stddev_m: How well motion capture places a body, per axis [m].
+        mocap_stddev_rad: How well it turns it, per axis [rad].
+    """
+
+    min_views: int = 10
+    least_second_axis_rad: float = 0.08
+    outlier_factor: float = 4.0
+    most_share_left_out: float = 0.4
+    most_rms_px: float = 2.0
+    most_median_rad: float = 0.05
+    most_median_m: float = 0.05
+    corner_stddev_px: float = 0.15
+    mocap_stddev_m: float = 0.0005
+    mocap_stddev_rad: float = 0.001
+
+
+class MountProblem:
+    """The whitened reprojection error of all corners as a function of X, and of Y where it is not known."""
+
+    def __init__(
+        self, T_base_from_car: Array, found: Sequence[Detection], matrix: Array, distortion: Array, known: Array | None,
+        config: MountConfig,
+    ) -> None:  # fmt: skip
+        self._T_base_from_car, self._found = T_base_from_car, found
+        self._matrix, self._distortion, self._known, self._config = matrix, distortion, known, config
+
+    def solve(self, X: Array, Y: Array, inside: NDArray[np.bool_]) -> tuple[Array, Array, float, float]:
+        """Refined X and Y, and the standard deviations of X's rotation [rad] and translation [m]."""
+        rows = np.flatnonzero(inside)
+        factors = [self._factor(X, Y, row) for row in rows]
+
+        def residuals(p: Array) -> Array:
+            A, B = self._moved(X, Y, p)
+            each = (self._errors(A, B, row).ravel() for row in rows)
+            return np.concatenate([solve_triangular(f, e, lower=True) for f, e in zip(factors, each, strict=True)])
+
+        size = 6 if self._known is not None else 12
+        found = least_squares(residuals, np.zeros(size), x_scale="jac")
+        # Scaled by what is left over, so that a larger noise than stated is not hidden.
+        scale = 2.0 * found.cost / (len(found.fun) - size)
+        covariance = np.linalg.pinv(found.jac.T @ found.jac) * max(scale, 1.0)
+        turn, move = (np.sqrt(np.linalg.eigvalsh(covariance[a : a + 3, a : a + 3])[-1]) for a in (0, 3))
+        return *self._moved(X, Y, found.x), float(turn), float(move)
+
+    def view_rms(self, X: Array, Y: Array) -> Array:
+        """Reprojection error of each view ``[N]`` [px]."""
+        count = len(self._found)
+        return np.array([np.sqrt(np.mean(np.sum(self._errors(X, Y, row) ** 2, axis=1))) for row in range(count)])
+
+    def _factor(self, X: Array, Y: Array, row: int) -> Array:
+        """Lower Cholesky factor of the covariance of a view's corners ``[2n, 2n]``: their own noise and that of both bodies' poses."""
+        config, A = self._config, self._T_base_from_car[row]
+        here = self._errors(X, Y, row).ravel()
+        covariance = config.corner_stddev_px**2 * np.eye(len(here))
+        step = 1e-6
+        for axis in range(6):
+            p = np.zeros(6)
+            p[axis] = step
+            stddev = config.mocap_stddev_rad if axis < 3 else config.mocap_stddev_m
+            # The car's frame moves, then the board's.
+            for moved in (A @ small_motion(p), small_motion(p) @ A):
+                slope = (self._errors(X, Y, row, moved).ravel() - here) / step * stddev
+                covariance += np.outer(slope, slope)
+        return np.asarray(np.linalg.cholesky(covariance))
+
+    def _moved(self, X: Array, Y: Array, p: Array) -> tuple[Array, Array]:
+        return X @ small_motion(p[:6]), Y if self._known is not None else Y @ small_motion(p[6:])
+
+    def _errors(self, X: Array, Y: Array, row: int, T_base_from_car: Array | None = None) -> Array:
+        A = self._T_base_from_car[row] if T_base_from_car is None else T_base_from_car
+        T = invert_transform(A @ X) @ Y
+        points = self._found[row].board_m @ T[:3, :3].T + T[:3, 3]
+        predicted = cv2.projectPoints(points, np.zeros(3), np.zeros(3), self._matrix, self._distortion)[0]
+        return np.asarray(predicted.reshape(-1, 2) - self._found[row].pixels)
+
+
+def small_motion(p: Array) -> Array:
+    """A transform ``[4, 4]`` of a rotation vector [rad] and a translation [m] ``[6]``."""
+    return make_transform(Rotation.from_rotvec(p[:3]).as_matrix(), p[3:])

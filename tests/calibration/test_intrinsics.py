@@ -1,0 +1,90 @@
+"""A camera of known numbers is found again within what its noise allows; sets that fix none are refused with the reason."""
+
+import numpy as np
+import pytest
+from boards import BOARD, board_views
+
+from calibration.charuco import Board, BoardDetector
+from calibration.degeneracy import DegenerateDataError, PoorFitError
+from calibration.intrinsics import IntrinsicsConfig, calibrate_intrinsics
+from calibration.measured import LensCalibration
+from calibration.schema import CalibrationError, load_calibration, save_calibration
+
+SIZE = (672, 376)
+MATRIX = np.array([[350.0, 0.0, 338.2], [0.0, 351.5, 187.1], [0.0, 0.0, 1.0]])
+DISTORTION = (-0.17, 0.03, 0.0006, -0.0004, 0.0)
+
+
+@pytest.fixture(scope="module")
+def views():
+    return board_views(np.random.default_rng(1), 30, MATRIX, DISTORTION, SIZE)
+
+
+def test_known_camera_is_found_within_its_own_standard_deviations(views):
+    fit = calibrate_intrinsics(views, SIZE)
+    found, stated = fit.calibration, fit.calibration.residuals
+    truth = {"fx": 350.0, "fy": 351.5, "cx": 338.2, "cy": 187.1}
+    for name, value in truth.items():
+        assert abs(getattr(found, name) - value) < 4.0 * stated[f"{name}_stddev_px"], name
+        assert stated[f"{name}_stddev_px"] < 0.5
+    assert found.distortion[:2] == pytest.approx(DISTORTION[:2], abs=0.02)
+    # Two-dimensional noise of 0.1 px each.
+    assert found.rms_px == pytest.approx(0.1 * np.sqrt(2.0), rel=0.1)
+    assert found.views == 30
+    assert fit.used.all()
+
+
+def test_a_blurred_view_is_left_out(views):
+    rng = np.random.default_rng(2)
+    spoiled = list(views)
+    spoiled[4] = type(views[4])(views[4].board_m, views[4].pixels + rng.normal(0.0, 3.0, views[4].pixels.shape))
+    fit = calibrate_intrinsics(spoiled, SIZE)
+    assert np.flatnonzero(~fit.used).tolist() == [4]
+    assert fit.calibration.fx == pytest.approx(350.0, abs=1.0)
+
+
+def test_too_few_views_are_refused(views):
+    with pytest.raises(DegenerateDataError, match="at least 20 pictures with the board, got 19: take more"):
+        calibrate_intrinsics(views[:19], SIZE)
+
+
+def test_a_board_always_in_one_corner_is_refused(views):
+    half = [type(v)(v.board_m[v.pixels[:, 0] < 330], v.pixels[v.pixels[:, 0] < 330]) for v in views]
+    with pytest.raises(DegenerateDataError, match="at the right edge"):
+        calibrate_intrinsics([v for v in half if len(v.pixels) >= 6][:25], SIZE, IntrinsicsConfig(min_views=8))
+
+
+def test_a_board_seen_face_on_only_is_refused():
+    flat = board_views(np.random.default_rng(3), 25, MATRIX, DISTORTION, SIZE, tilt_rad=0.02)
+    with pytest.raises(DegenerateDataError, match="face on, focal length and distance cannot be told apart"):
+        calibrate_intrinsics(flat, SIZE)
+
+
+def test_a_blurred_set_is_refused():
+    rough = board_views(np.random.default_rng(4), 25, MATRIX, DISTORTION, SIZE, noise_px=1.0)
+    with pytest.raises(PoorFitError, match=r"below 0\.5 px, got 1\.\d+ px"):
+        calibrate_intrinsics(rough, SIZE)
+
+
+def test_a_drawn_board_is_detected_at_our_pixel_centres():
+    picture = np.pad(BOARD.picture(40), 40, constant_values=255)
+    found = BoardDetector(BOARD).find(np.repeat(picture[..., None], 3, axis=-1))
+    # Corner k of a picture of 40 px squares lies on the border between two pixels: a whole number where centres are at +0.5.
+    np.testing.assert_allclose(found.pixels, 40.0 + found.board_m[:, :2] / BOARD.square_m * 40.0, atol=0.06)
+    assert len(found.pixels) == 35
+    assert BoardDetector(BOARD).find(np.full((200, 200), 255, np.uint8)) is None
+
+
+def test_impossible_boards_are_refused():
+    with pytest.raises(CalibrationError, match="markers smaller than squares"):
+        Board(marker_m=0.2)
+    with pytest.raises(CalibrationError, match="DICT_4X4_50 has 50"):
+        Board(columns=20, rows=20)
+    with pytest.raises(CalibrationError, match="marker dictionary such as"):
+        Board(dictionary="DICT_NONE")
+
+
+def test_the_file_survives_a_round_trip(views, tmp_path):
+    calibration = calibrate_intrinsics(views, SIZE).calibration
+    save_calibration(calibration, tmp_path / "lens.yaml")
+    assert load_calibration(LensCalibration, tmp_path / "lens.yaml") == calibration
