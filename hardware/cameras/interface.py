@@ -8,6 +8,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from advnerf_core.geometry import Pinhole
+
 
 @dataclass(frozen=True)
 class Frame:
@@ -27,7 +29,10 @@ class Frame:
 
 
 class Camera(Protocol):
-    """A source of frames. `open` may be called again after an error; one thread at a time."""
+    """A source of frames. `open` may be called again after an error; one thread at a time.
+
+    Drivers derive from it and write `open`, `read` and `close`; the others have answers for a device that knows nothing more.
+    """
 
     def open(self) -> None:
         """Start the device; raises `hardware.errors.DeviceNotFound` if it is not there."""
@@ -40,3 +45,12 @@ class Camera(Protocol):
     def close(self) -> None:
         """Stop the device; harmless when it is not open."""
         ...
+
+    @property
+    def pinhole(self) -> Pinhole | None:
+        """Intrinsics of the delivered pictures as the device itself knows them (factory calibration), once it is open."""
+        return None
+
+    def counters(self) -> dict[str, float]:
+        """What went wrong with frames since the beginning, by name; it survives `open` and `close`."""
+        return {}

@@ -1,0 +1,113 @@
+"""Turns the time stamps that devices give into real and monotonic time, and notices when they cannot be believed."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+NS_PER_S = 1_000_000_000
+# A frame waits in the kernel for one frame period at most before the read thread takes it; 1 fps is the slowest we support.
+_OLDEST_NS = 1_000_000_000
+# Rounding to microseconds, and drivers that convert from the device's own clock, may put a stamp slightly ahead.
+_AHEAD_NS = 5_000_000
+_PATIENCE = 10
+
+
+class Stamper:
+    """Converts stamps of one device; its results never go back.
+
+    A stamp is believed if it lies within the last second on the monotonic clock (what V4L2 promises, and depthai's host clock is)
+    or on the real-time clock (what ``uvcvideo`` with ``clock=CLOCK_REALTIME`` gives). A device that never gave such a stamp has
+    its frames stamped on receipt. From one that did, a frame with another stamp is old until proven otherwise and is not
+    delivered; after ten of them in a row its clock has jumped, and frames are stamped on receipt until it is back.
+
+    Args:
+        monotonic_ns: Monotonic time [ns].
+        realtime_ns: Real time [ns].
+
+    Attributes:
+        replaced: Frames stamped on receipt.
+        refused: Frames that were not delivered because of their stamp.
+    """
+
+    def __init__(
+        self, monotonic_ns: Callable[[], int] = time.monotonic_ns, realtime_ns: Callable[[], int] = time.time_ns
+    ) -> None:
+        self._monotonic_ns = monotonic_ns
+        self._realtime_ns = realtime_ns
+        self._last_ns: int | None = None
+        self._believed = False
+        self._in_a_row = 0
+        self.replaced = self.refused = 0
+
+    def restart(self) -> None:
+        """The device was opened anew: forget how far it could be believed; results still never go back."""
+        self._believed, self._in_a_row = False, 0
+
+    def convert(self, stamp_ns: int | None) -> tuple[int, int] | None:
+        """Real time and monotonic time [ns] of a frame with this stamp, or None if it must not be delivered.
+
+        Args:
+            stamp_ns: What the device says [ns]; None if it says nothing.
+        """
+        real_ns, mono_ns = self._now()
+        captured_ns = None if stamp_ns is None else _captured(stamp_ns, real_ns, mono_ns)
+        if captured_ns is not None and (self._last_ns is None or captured_ns > self._last_ns):
+            self._believed, self._in_a_row = True, 0
+        elif self._believed and self._in_a_row < _PATIENCE:
+            self._in_a_row += 1
+            self.refused += 1
+            return None
+        else:
+            captured_ns = mono_ns if self._last_ns is None else max(mono_ns, self._last_ns + 1)
+            self.replaced += 1
+        self._last_ns = captured_ns
+        return captured_ns + (real_ns - mono_ns), captured_ns
+
+    def _now(self) -> tuple[int, int]:
+        # Monotonic time on both sides of the real time: an interruption in between would become an error of the stamp.
+        before_ns = self._monotonic_ns()
+        real_ns = self._realtime_ns()
+        return real_ns, (before_ns + self._monotonic_ns()) // 2
+
+
+def _captured(stamp_ns: int, real_ns: int, mono_ns: int) -> int | None:
+    """Monotonic time of a stamp of either clock [ns], at most now; None if it is of neither."""
+    for now_ns in (mono_ns, real_ns):
+        if -_AHEAD_NS <= now_ns - stamp_ns <= _OLDEST_NS:
+            return min(stamp_ns + (mono_ns - now_ns), mono_ns)
+    return None
+
+
+class Decimator:
+    """Chooses frames for a lower rate by their stamps: one for each slot of a regular grid.
+
+    Args:
+        rate_hz: Frames per second to keep.
+        source_hz: Frames per second that come.
+    """
+
+    def __init__(self, rate_hz: float, source_hz: float) -> None:
+        if not 0.0 < rate_hz <= source_hz:
+            raise ValueError(
+                f"expected a rate > 0 Hz and at most that of the device, {source_hz:g} Hz; got {rate_hz:g} Hz"
+            )
+        self._period_ns = NS_PER_S / rate_hz
+        self._half_source_ns = NS_PER_S / source_hz / 2.0
+        self._start_ns: int | None = None
+        self._slot = -1
+
+    def restart(self) -> None:
+        """Begin a new grid at the next frame."""
+        self._start_ns, self._slot = None, -1
+
+    def slot(self, stamp_ns: int) -> int | None:
+        """Number of the slot that this frame fills, or None if it is not wanted; a missing number is a missing frame."""
+        if self._start_ns is None:
+            self._start_ns = stamp_ns
+        # The frame nearest to the beginning of its slot: half a frame early is nearer than the next one.
+        slot = int((stamp_ns - self._start_ns + self._half_source_ns) // self._period_ns)
+        if slot <= self._slot:
+            return None
+        self._slot = slot
+        return slot
