@@ -24,6 +24,7 @@ class DriveLimits:
         steering_max_rad: Leftmost front wheel angle [rad].
         acceleration_mps2: Largest increase of the magnitude of the speed setpoint [m/s^2]; slowing down is never delayed.
         steering_rate_radps: Largest change of the steering setpoint [rad/s].
+        current_max_a: Largest magnitude of any current that is commanded [A].
     """
 
     speed_min_mps: float = -0.87
@@ -32,11 +33,13 @@ class DriveLimits:
     steering_max_rad: float = 0.3135
     acceleration_mps2: float = 3.5
     steering_rate_radps: float = 3.2
+    current_max_a: float = 60.0
 
     def __post_init__(self) -> None:
         ordered = self.speed_min_mps <= 0.0 < self.speed_max_mps and self.steering_min_rad < 0.0 < self.steering_max_rad
-        if not (ordered and self.acceleration_mps2 > 0.0 and self.steering_rate_radps > 0.0):
-            raise ValueError(f"expected limits around zero and positive rates, got {self}")
+        positive = self.acceleration_mps2 > 0.0 and self.steering_rate_radps > 0.0 and self.current_max_a > 0.0
+        if not (ordered and positive):
+            raise ValueError(f"expected limits around zero, positive rates and a positive current, got {self}")
 
 
 @dataclass(frozen=True)
@@ -88,6 +91,34 @@ class Setpoint:
     steering_rad: float
 
 
+@dataclass(frozen=True)
+class Sent:
+    """What really went down the wire, after limits and the rounding of the protocol.
+
+    Attributes:
+        speed_mps: Speed that the sent rpm means [m/s]; 0 when braking or coasting.
+        steering_rad: Front wheel angle that the sent servo value means [rad]; the last one when no servo was sent.
+        erpm: Electrical rpm sent; 0 when braking or coasting.
+        servo: Servo value sent, or the last one sent.
+        brake_current_a: Brake current sent [A]; None if this was no brake command.
+        write_mono_ns: Monotonic time just after the bytes were handed to the kernel [ns].
+        write_real_ns: The same instant in real time [ns].
+    """
+
+    speed_mps: float
+    steering_rad: float
+    erpm: float
+    servo: float
+    brake_current_a: float | None
+    write_mono_ns: int
+    write_real_ns: int
+
+    @property
+    def braking(self) -> bool:
+        """Whether this was a brake command."""
+        return self.brake_current_a is not None
+
+
 class DriveLimiter:
     """Holds commands inside `DriveLimits`; it knows the last setpoint and therefore the next possible one."""
 
@@ -116,6 +147,17 @@ class DriveLimiter:
         )
         self._last_s = now_s
         return self._last
+
+    def steer(self, steering_rad: float) -> float:
+        """A steering angle for a standing car inside its limits, at once: nothing slips at standstill [rad]."""
+        steering_rad = steering_rad if math.isfinite(steering_rad) else 0.0
+        steering_rad = min(max(steering_rad, self.limits.steering_min_rad), self.limits.steering_max_rad)
+        self._last = Setpoint(0.0, steering_rad)
+        return steering_rad
+
+    def current(self, current_a: float) -> float:
+        """A current inside the limits [A]."""
+        return min(max(current_a, -self.limits.current_max_a), self.limits.current_max_a)
 
     def stop(self) -> None:
         """Note that the car was told to stop, so that the next speed starts from standstill."""

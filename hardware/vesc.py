@@ -9,46 +9,27 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass
 from types import TracebackType
+from typing import TypeVar
 
 import serial
 
 from hardware.errors import DeviceBusy, DeviceNotFound, LinkLost, LinkTimeout, ProtocolError
-from hardware.limits import DriveLimiter, DriveLimits, VehicleGains
-from hardware.vesc_codec import Command, CommandId, FrameDecoder, decode_command, encode_command
+from hardware.limits import DriveLimiter, DriveLimits, Sent, VehicleGains
+from hardware.vesc_codec import CommandId, FrameDecoder, as_sent, encode_command
 from hardware.vesc_replies import FirmwareVersion, Values, decode_firmware_version, decode_values
+from hardware.vesc_settings import AppConfiguration, Stored, TimeoutSettings, decode_app_configuration
 
 # Below this the car counts as standing; the firmware's slowest closed-loop speed is 900 (about 0.2 m/s).
 STANDSTILL_ERPM = 100.0
+# Storing a configuration takes the firmware 0.2 s of deliberate waiting, and the flash memory some more.
+_STORE_S = 2.0
+# The bytes of one frame follow one another at once; a pause of so long within it means that it has no end [ns].
+_SILENCE_NS = 20_000_000
 
 
-@dataclass(frozen=True)
-class Sent:
-    """What really went down the wire, after limits and the rounding of the protocol.
-
-    Attributes:
-        speed_mps: Speed that the sent rpm means [m/s]; 0 when braking or coasting.
-        steering_rad: Front wheel angle that the sent servo value means [rad]; the last one when no servo was sent.
-        erpm: Electrical rpm sent; 0 when braking or coasting.
-        servo: Servo value sent, or the last one sent.
-        brake_current_a: Brake current sent [A]; None if this was no brake command.
-        write_mono_ns: Monotonic time just after the bytes were handed to the kernel [ns].
-        write_real_ns: The same instant in real time [ns].
-    """
-
-    speed_mps: float
-    steering_rad: float
-    erpm: float
-    servo: float
-    brake_current_a: float | None
-    write_mono_ns: int
-    write_real_ns: int
-
-    @property
-    def braking(self) -> bool:
-        """Whether this was a brake command."""
-        return self.brake_current_a is not None
+Reply = Values | FirmwareVersion | AppConfiguration | Stored
+R = TypeVar("R", Values, FirmwareVersion, AppConfiguration, Stored)
 
 
 class Vesc:
@@ -79,7 +60,8 @@ class Vesc:
         self._write_timeout_s = write_timeout_s
         self._serial: serial.Serial | None = None
         self._decoder = FrameDecoder()
-        self._servo = _as_sent(CommandId.SET_SERVO_POS, gains.servo(0.0))
+        self._heard_ns = 0
+        self._servo = as_sent(CommandId.SET_SERVO_POS, gains.servo(0.0))
 
     def open(self) -> None:
         """Open the port for this process alone."""
@@ -133,9 +115,47 @@ class Vesc:
     def identify(self, timeout_s: float = 0.5) -> FirmwareVersion:
         """Ask for the firmware version and wait for the answer."""
         self._write(encode_command(CommandId.FW_VERSION))
-        self._wait_for(FirmwareVersion, timeout_s)
-        assert self.firmware is not None
-        return self.firmware
+        return self._wait_for(FirmwareVersion, timeout_s)
+
+    def request_app_configuration(self) -> None:
+        """Ask for the application configuration; the answer comes with a later `receive`. Identify the controller first."""
+        self._write(encode_command(CommandId.GET_APPCONF))
+
+    def read_timeout(self, timeout_s: float = 0.5) -> TimeoutSettings:
+        """The controller's own time-out and the current it then brakes with. Identify the controller first."""
+        return self._read_app_configuration(timeout_s).timeout
+
+    def set_timeout(self, settings: TimeoutSettings) -> TimeoutSettings:
+        """Store another time-out and brake current in a controller whose motor stands; what it then reads back.
+
+        Raises:
+            ProtocolError: The motor turns, or what is read back is not what was sent.
+            LinkTimeout: The controller does not answer.
+        """
+        before = self._read_app_configuration(0.5)
+        if abs(erpm := self.read_values().erpm) >= STANDSTILL_ERPM:
+            raise ProtocolError(
+                f"expected a motor at rest before its settings change, got {erpm:.0f} erpm: stop the car"
+            )
+        wanted = before.with_timeout(settings)
+        self._write(wanted.encode_set())
+        self._wait_for(Stored, _STORE_S)
+        if (after := self._read_app_configuration(0.5)).data != wanted.data:
+            raise ProtocolError(
+                f"expected the controller to keep a time-out of {settings}, it reads back {after.timeout}: set it in VESC Tool"
+            )
+        return after.timeout
+
+    def _read_app_configuration(self, timeout_s: float) -> AppConfiguration:
+        self.request_app_configuration()
+        return self._wait_for(AppConfiguration, timeout_s)
+
+    def steer(self, steering_rad: float) -> Sent:
+        """Send steering alone, for a car that stands; the motor stays as it is."""
+        servo = self.gains.servo(self.limiter.steer(steering_rad))
+        self._write(encode_command(CommandId.SET_SERVO_POS, servo))
+        self._servo = as_sent(CommandId.SET_SERVO_POS, servo)
+        return self._sent()
 
     def drive(self, speed_mps: float, steering_rad: float) -> Sent:
         """Send steering and speed, limited; a command that is not finite brakes instead."""
@@ -145,15 +165,15 @@ class Vesc:
         servo = self.gains.servo(setpoint.steering_rad)
         erpm = self.gains.erpm(setpoint.speed_mps)
         self._write(encode_command(CommandId.SET_SERVO_POS, servo) + encode_command(CommandId.SET_RPM, erpm))
-        self._servo = _as_sent(CommandId.SET_SERVO_POS, servo)
-        return self._sent(erpm=_as_sent(CommandId.SET_RPM, erpm))
+        self._servo = as_sent(CommandId.SET_SERVO_POS, servo)
+        return self._sent(erpm=as_sent(CommandId.SET_RPM, erpm))
 
     def brake(self, current_a: float) -> Sent:
         """Brake with a motor current [A]; steering stays where it is."""
-        current_a = abs(current_a) if math.isfinite(current_a) else self._stop_brake_current_a
+        current_a = self.limiter.current(abs(current_a) if math.isfinite(current_a) else self._stop_brake_current_a)
         self.limiter.stop()
         self._write(encode_command(CommandId.SET_CURRENT_BRAKE, current_a))
-        return self._sent(brake_current_a=_as_sent(CommandId.SET_CURRENT_BRAKE, current_a))
+        return self._sent(brake_current_a=as_sent(CommandId.SET_CURRENT_BRAKE, current_a))
 
     def release(self) -> Sent:
         """Zero current: the motor turns freely."""
@@ -165,7 +185,7 @@ class Vesc:
         """Ask for telemetry; the answer comes with a later `receive`."""
         self._write(encode_command(CommandId.GET_VALUES))
 
-    def receive(self) -> list[Values | FirmwareVersion]:
+    def receive(self) -> list[Reply]:
         """Replies that have arrived, without waiting."""
         if self._serial is None:
             raise LinkLost(f"expected an open port, {self.port} is closed")
@@ -173,27 +193,47 @@ class Vesc:
             data = self._serial.read(self._serial.in_waiting)
         except OSError as error:  # pyserial's errors are OSErrors; a hang-up also raises the bare one
             raise LinkLost(f"lost the VESC at {self.port} ({error}): check the USB cable") from error
-        replies = [reply for payload in self._decoder.feed(data) if (reply := self._decode(payload)) is not None]
+        replies = [reply for payload in self._frames(data) if (reply := self._decode(payload)) is not None]
         if replies:
             self.last_reply_mono_ns = time.monotonic_ns()
         return replies
 
+    def _frames(self, data: bytes) -> list[bytes]:
+        now_ns = time.monotonic_ns()
+        if data or not self._decoder.pending:
+            self._heard_ns = now_ns
+            return self._decoder.feed(data)
+        # A false start byte in noise would otherwise hold back the reply behind it until 500 more bytes have come.
+        return self._decoder.give_up() if now_ns - self._heard_ns > _SILENCE_NS else []
+
     def read_values(self, timeout_s: float = 0.1) -> Values:
         """Ask for telemetry and wait for it."""
         self.request_values()
-        reply = self._wait_for(Values, timeout_s)
-        assert isinstance(reply, Values)
-        return reply
+        return self._wait_for(Values, timeout_s)
 
-    def _decode(self, payload: bytes) -> Values | FirmwareVersion | None:
+    @property
+    def skipped_bytes(self) -> int:
+        """Received bytes that belonged to no frame since the port was opened."""
+        return self._decoder.skipped_bytes
+
+    @property
+    def servo(self) -> float:
+        """Last servo value sent; before the first one, that of straight wheels."""
+        return self._servo
+
+    def _decode(self, payload: bytes) -> Reply | None:
         if payload[0] == CommandId.GET_VALUES:
             return decode_values(payload)
         if payload[0] == CommandId.FW_VERSION:
             self.firmware = decode_firmware_version(payload)
             return self.firmware
+        if payload[0] == CommandId.GET_APPCONF and self.firmware is not None:
+            return decode_app_configuration(payload, self.firmware)
+        if payload == bytes([CommandId.SET_APPCONF]):
+            return Stored()
         return None  # some other program's question, or a message of the controller's script
 
-    def _wait_for(self, kind: type[Values] | type[FirmwareVersion], timeout_s: float) -> Values | FirmwareVersion:
+    def _wait_for(self, kind: type[R], timeout_s: float) -> R:
         deadline = time.monotonic() + timeout_s
         while time.monotonic() < deadline:
             for reply in self.receive():
@@ -238,10 +278,3 @@ class Vesc:
             write_mono_ns=time.monotonic_ns(),
             write_real_ns=time.time_ns(),
         )
-
-
-def _as_sent(command: CommandId, value: float) -> float:
-    """The value that the other end reads after the protocol's truncation."""
-    decoded = decode_command(encode_command(command, value)[2:-3])
-    assert isinstance(decoded, Command)
-    return 0.0 if decoded.value is None else decoded.value

@@ -32,6 +32,8 @@ class CommandId(IntEnum):
     SET_CURRENT_BRAKE = 7
     SET_RPM = 8
     SET_SERVO_POS = 12
+    SET_APPCONF = 16
+    GET_APPCONF = 17
     REBOOT = 29
     ALIVE = 30
 
@@ -96,6 +98,18 @@ class FrameDecoder:
     def feed(self, data: bytes) -> list[bytes]:
         """Add received bytes; return the payloads of the frames that are now complete."""
         self._buffer += data
+        return self._search(patient=True)
+
+    def give_up(self) -> list[bytes]:
+        """After silence on the line: what waits for its rest waits in vain; return the frames behind it."""
+        return self._search(patient=False)
+
+    @property
+    def pending(self) -> bool:
+        """Whether bytes wait for the rest of their frame."""
+        return bool(self._buffer)
+
+    def _search(self, patient: bool) -> list[bytes]:
         payloads = []
         while self._buffer:
             head = self._head()
@@ -105,7 +119,10 @@ class FrameDecoder:
             head_bytes, payload_bytes = head
             frame_bytes = head_bytes + payload_bytes + _TAIL_BYTES
             if payload_bytes == 0 or len(self._buffer) < frame_bytes:
-                break  # more bytes are needed to tell
+                if patient:
+                    break  # more bytes are needed to tell
+                self._skip()
+                continue
             payload = bytes(self._buffer[head_bytes : head_bytes + payload_bytes])
             crc, end = struct.unpack_from(">HB", self._buffer, head_bytes + payload_bytes)
             if end != END or crc != crc16(payload):
@@ -114,11 +131,6 @@ class FrameDecoder:
             del self._buffer[:frame_bytes]
             payloads.append(payload)
         return payloads
-
-    def reset(self) -> None:
-        """Forget a partly received frame, after silence on the line."""
-        self.skipped_bytes += len(self._buffer)
-        self._buffer.clear()
 
     def _skip(self) -> None:
         del self._buffer[0]
@@ -171,3 +183,10 @@ def decode_command(payload: bytes) -> Command | None:
     if len(payload) < 1 + struct.calcsize(">" + code):
         return None
     return Command(identity, struct.unpack_from(">" + code, payload, 1)[0] / scale)
+
+
+def as_sent(command: CommandId, value: float) -> float:
+    """The value that the other end reads after the protocol's truncation."""
+    decoded = decode_command(encode_command(command, value)[2:-3])
+    assert decoded is not None
+    return 0.0 if decoded.value is None else decoded.value

@@ -6,7 +6,9 @@ car did at that moment.
 
 from __future__ import annotations
 
+import contextlib
 import os
+import random
 import select
 import threading
 import time
@@ -19,6 +21,8 @@ from advnerf_core.geometry import VehicleState
 from hardware.errors import HardwareError
 from hardware.twin.vehicle import TwinVehicle
 from hardware.twin.vesc_firmware import VescEmulatorConfig, VescFirmware, WireEvent
+from hardware.twin.vesc_wire import require_wire_fault, wire_chunks
+from hardware.vesc_settings import TimeoutSettings
 
 # Slower than this the car stands.
 STANDSTILL_MPS = 0.005
@@ -47,19 +51,14 @@ class VescEmulator:
         if log is not None:
             self._log = open(log, "w", buffering=1, encoding="ascii")  # noqa: SIM115 - closed in close()
             self._log.write(LOG_HEADER)
-        # The slave end stays open here: without it every client that closes would hang up the master.
-        self._master, self._slave = os.openpty()
-        tty.setraw(self._slave)
-        os.set_blocking(self._master, False)
-        self.port = os.ttyname(self._slave)
         self._link = link
-        if link is not None:
-            link.unlink(missing_ok=True)
-            link.symlink_to(self.port)
+        self._fault: str | None = None
+        self._rng = random.Random(0)  # noise on a wire must come again in a repeated test
         self._stop_read, self._stop_write = os.pipe()
         self._open = True
-        self._thread = threading.Thread(target=self._serve, name="vesc emulator", daemon=True)
-        self._thread.start()
+        self._master = self._slave = -1
+        self.port = ""
+        self.plug_in()
 
     @property
     def config(self) -> VescEmulatorConfig:
@@ -71,6 +70,18 @@ class VescEmulator:
         """Where the car is."""
         with self._lock:
             return self.vehicle.state
+
+    @property
+    def timeout(self) -> TimeoutSettings:
+        """The controller's own time-out and brake current, as stored in it now."""
+        return self._firmware.timeout
+
+    def report_fault(self, code: int) -> None:
+        """Let the controller report a fault, and obey no command to move meanwhile; 0 ends it."""
+        with self._lock:
+            self._firmware.fault = code
+            if code:
+                self.vehicle.command(current_a=0.0)
 
     @property
     def timed_out(self) -> bool:
@@ -105,6 +116,27 @@ class VescEmulator:
             self.vehicle.reset(x_m, y_m, yaw_rad)
             self._note([WireEvent(time.monotonic_ns(), "PLACED")])
 
+    def disturb(self, fault: str | None) -> None:
+        """Let replies reach the computer with a fault of `WIRE_FAULTS`; None heals the wire."""
+        require_wire_fault(fault)
+        with self._lock:
+            self._fault = fault
+
+    def plug_in(self) -> None:
+        """Connect the USB plug (again): another terminal, under the same link."""
+        if self._master >= 0:
+            return
+        # The slave end stays open here: without it every client that closes would hang up the master.
+        self._master, self._slave = os.openpty()
+        tty.setraw(self._slave)
+        os.set_blocking(self._master, False)
+        self.port = os.ttyname(self._slave)
+        if self._link is not None:
+            self._link.unlink(missing_ok=True)
+            self._link.symlink_to(self.port)
+        self._thread = threading.Thread(target=self._serve, name="vesc emulator", daemon=True)
+        self._thread.start()
+
     def hang_up(self) -> None:
         """Pull the USB plug: every open client gets an error."""
         self._stop_thread()
@@ -136,6 +168,7 @@ class VescEmulator:
         if self._thread.is_alive():
             os.write(self._stop_write, b"x")
             self._thread.join(timeout=2.0)
+            os.read(self._stop_read, 1)
 
     def _serve(self) -> None:
         while True:
@@ -149,14 +182,14 @@ class VescEmulator:
             with self._lock:
                 replies, events = self._firmware.receive(data, time.monotonic_ns())
                 self._note(events)
-            self._reply(replies)
+                chunks = wire_chunks(replies, self._fault, self._rng)
+            for chunk in chunks:
+                self._reply(chunk)
 
     def _reply(self, data: bytes) -> None:
-        try:
-            if data:
-                os.write(self._master, data)
-        except BlockingIOError:
-            pass  # nobody reads: like a USB endpoint without a host, the bytes are gone
+        # When nobody reads, the bytes are gone, as on a USB endpoint without a host.
+        with contextlib.suppress(BlockingIOError):
+            os.write(self._master, data)
 
     def _note(self, events: list[WireEvent]) -> None:
         self._events.extend(events)

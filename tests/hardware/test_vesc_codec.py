@@ -107,12 +107,16 @@ def test_start_bytes_inside_a_damaged_frame_are_tried():
     assert FrameDecoder().feed(bytes(outer)) == [b"\x04"]
 
 
-def test_reset_forgets_a_partial_frame():
+def test_giving_up_finds_what_a_false_start_held_back():
     decoder = FrameDecoder()
+    assert decoder.feed(b"\x02\xff" + encode_command(CommandId.ALIVE)) == []
+    assert decoder.pending
+    assert decoder.give_up() == [b"\x1e"]
+    assert decoder.skipped_bytes == 2
     assert decoder.feed(b"\x02\xff\x01") == []
-    decoder.reset()
+    assert decoder.give_up() == []
+    assert (decoder.pending, decoder.skipped_bytes) == (False, 5)
     assert decoder.feed(encode_command(CommandId.ALIVE)) == [b"\x1e"]
-    assert decoder.skipped_bytes == 3
 
 
 @given(st.lists(st.binary(min_size=1, max_size=300), max_size=6), st.integers(1, 50), st.binary(max_size=8))
