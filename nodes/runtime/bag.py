@@ -128,10 +128,15 @@ class BagWriter:
         folder: New folder of the bag; its name is also that of the file in it.
         attachments: Content of the files that ride along, by name.
         metadata: Facts that ride along: versions, git hash.
+        attached_ns: Time at which the files were attached [ns since 1970]; none means now.
     """
 
     def __init__(
-        self, folder: Path, attachments: Mapping[str, bytes] | None = None, metadata: Mapping[str, str] | None = None
+        self,
+        folder: Path,
+        attachments: Mapping[str, bytes] | None = None,
+        metadata: Mapping[str, str] | None = None,
+        attached_ns: int | None = None,
     ) -> None:
         self.folder = Path(folder)
         self.path = self.folder / f"{self.folder.name}.mcap"
@@ -150,8 +155,9 @@ class BagWriter:
             self._writer.start(profile=PROFILE, library=LIBRARY)
             if metadata:
                 self._writer.add_metadata("advnerf", dict(metadata))
+            stamp_ns = time.time_ns() if attached_ns is None else attached_ns
             for name, content in (attachments or {}).items():
-                self._writer.add_attachment(time.time_ns(), time.time_ns(), name, "application/octet-stream", content)
+                self._writer.add_attachment(stamp_ns, stamp_ns, name, "application/octet-stream", content)
         except OSError as error:
             shutil.rmtree(self.folder, ignore_errors=True)
             raise BagError(

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 from mcap.reader import McapReader, make_reader
 from mcap.records import Statistics
 from mcap.summary import Summary
 
+from advnerf_core.files import write_atomically
 from nodes.runtime.bag_repair import mcap_file, read_summary
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import BagError, TopicError
@@ -98,6 +100,39 @@ def read_attachment(bag: Path, name: str) -> bytes:
     raise BagError(f"{bag} has no attachment {name!r}; it has {', '.join(names) or 'none'}")
 
 
+def read_attachments(bag: Path) -> dict[str, bytes]:
+    """Content of all attached files by name; of two with one name the later."""
+    with open(_whole_file(bag)[0], "rb") as file:
+        return {attachment.name: bytes(attachment.data) for attachment in make_reader(file).iter_attachments()}
+
+
+def extract_attachments(bag: Path, folder: Path, names: Sequence[str] = ()) -> list[Path]:
+    """Write attached files into a folder.
+
+    Args:
+        bag: Bag folder or file.
+        folder: Where they go; made if it is missing. A file that is there already is an error, never overwritten.
+        names: Only these; none means all.
+    """
+    contents = read_attachments(bag)
+    if unknown := [name for name in names if name not in contents]:
+        raise BagError(f"{bag} has no attachment {', '.join(unknown)}; it has {', '.join(contents) or 'none'}")
+    targets = {name: Path(folder) / plain_name(bag, name) for name in names or contents}
+    for target in targets.values():
+        if target.exists():
+            raise BagError(f"{target} exists; remove it or choose another folder with --output")
+    for name, target in targets.items():
+        write_atomically(target, contents[name])
+    return list(targets.values())
+
+
+def plain_name(bag: Path, name: str) -> str:
+    """The name of an attachment, if it is that of a file and nothing else: a stranger's bag must not write where it likes."""
+    if name in ("", ".", "..") or Path(name).name != name or "\0" in name:
+        raise BagError(f"{bag}: the attachment {name!r} has no plain file name; it is not written anywhere")
+    return name
+
+
 def read_messages(bag: Path, topics: Sequence[str] | None = None, start_offset_s: float = 0.0) -> Iterator[BagMessage]:
     """Messages in order of their log time.
 
@@ -143,9 +178,17 @@ def require_our_types(bag: Path, topics: Sequence[str]) -> None:
 
 def _whole_file(bag: Path) -> tuple[Path, Summary, Statistics]:
     path = mcap_file(bag)
-    found = read_summary(path)
+    state = path.stat()
+    found = _summary_of(path, state.st_mtime_ns, state.st_size)
     if found is None:
         raise BagError(
             f"{path} is unfinished: its recorder was killed or is still at work; make it whole with: advnerf bag repair {bag}"
         )
     return path, *found
+
+
+@lru_cache(maxsize=4)
+def _summary_of(path: Path, mtime_ns: int, size_bytes: int) -> tuple[Summary, Statistics] | None:
+    """Summary of a file in a certain state; one with an hour of chunks takes a second to read."""
+    del mtime_ns, size_bytes  # they are the state
+    return read_summary(path)
