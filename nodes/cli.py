@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from nodes import cli_attack, cli_attack_node, cli_bag, cli_object, cli_policy, cli_scene, cli_topic
+from nodes import cli_attack, cli_attack_node, cli_bag, cli_object, cli_policy, cli_replay, cli_scene, cli_topic
 from nodes.runtime.terminal import Overrides, RunDir, print_table, say_error, table
 
 if TYPE_CHECKING:
@@ -36,6 +36,7 @@ app.add_typer(cli_attack.app, name="attack")
 app.add_typer(cli_object.app, name="object")
 app.add_typer(cli_policy.app, name="policy")
 app.add_typer(cli_scene.app, name="scene")
+cli_replay.add_to(app)
 stage_app = typer.Typer(
     no_args_is_help=True,
     help="One stage of an experiment, and what it needs first: capture, scene, policy, object, attack, deploy, report.",
