@@ -44,9 +44,12 @@ def drive(
     """
     if steps < 1:
         raise ValueError(f"expected at least one step, got {steps}")
-    states, controls = [start_states.detach()], []
-    for _ in range(steps):
-        control = policy(observe(states[-1]), goals).to(start_states.dtype)
-        controls.append(control)
-        states.append(dynamics.step(states[-1], control))
-    return Rollout(torch.stack(states), torch.stack(controls))
+    # Room for all of it at once: small tensors kept from every tick, between the large ones that come and go, would
+    # scatter the heap, and resident memory would grow with the horizon.
+    states = start_states.new_empty(steps + 1, *start_states.shape)
+    controls = start_states.new_empty(steps, len(start_states))
+    states[0] = start_states
+    for t in range(steps):
+        controls[t] = policy(observe(states[t]), goals)
+        states[t + 1] = dynamics.step(states[t], controls[t])
+    return Rollout(states, controls)
