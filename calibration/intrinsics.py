@@ -133,7 +133,11 @@ def _fit(views: Sequence[Detection], size: tuple[int, int], model: Model) -> _Fi
     predicted = [cv2.projectPoints(o, r, t, matrix, distortion)[0].reshape(-1, 2) for o, r, t in zip(objects, turns, moves, strict=True)]  # fmt: skip
     errors = np.concatenate([p - q for p, q in zip(pixels, predicted, strict=True)])
     rotations = np.stack([cv2.Rodrigues(turn)[0] for turn in turns])
-    return _Fit(matrix, five, float(rms), view_rms.ravel(), stddev.ravel()[:4], rotations, errors)
+    f = np.float64
+    return _Fit(
+        np.asarray(matrix, f), five, float(rms), np.asarray(view_rms, f).ravel(), np.asarray(stddev, f).ravel()[:4],
+        rotations.astype(f), errors.astype(f),
+    )  # fmt: skip
 
 
 def _coverage(views: Sequence[Detection], size: tuple[int, int]) -> NDArray[np.int64]:

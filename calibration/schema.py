@@ -132,6 +132,7 @@ class LimitsSection(BaseModel):
     steering_max_rad: float
     acceleration_mps2: float
     steering_rate_radps: float
+    current_max_a: float = Field(default=60.0, gt=0.0)
 
 
 class ResponseSection(BaseModel):

@@ -1,0 +1,76 @@
+"""An attack on what a monitor shows, seen by the camera as the monitor and the room let it: `advnerf_core.display` with gradients.
+
+``DisplayedSensor`` stands before any sensor whose ``theta`` is the squash-inverse of colours. The attack then searches the colours that are
+*shown*; the renderer gets those that are *seen*. Nothing else changes, and the result goes to the monitor as it is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from advnerf_core.attack.problem import Sensor
+from advnerf_core.display import DARKEST, DisplayModel
+from advnerf_core.scene.surrogate import Rendered
+
+# The squash has no inverse at 0 and 1.
+_MARGIN = 1e-4
+
+
+def displayed(model: DisplayModel, shown: Tensor, cos_angle: float | Tensor = 1.0) -> Tensor:
+    """What the camera sees ``[..., 3]`` of shown colours ``[..., 3]`` in 0..1; differentiable. See `DisplayModel.forward`."""
+    like = {"dtype": shown.dtype, "device": shown.device}
+    curves, mixing = torch.tensor(model.curves, **like), torch.tensor(model.mixing, **like)
+    last = curves.shape[1] - 1
+    position = shown.clamp(0.0, 1.0) * last
+    below = position.detach().floor().clamp(0, last - 1)
+    index = below.long()
+    channel = torch.arange(3, device=shown.device).expand(shown.shape)
+    low, high = curves[channel, index], curves[channel, index + 1]
+    light = low + (position - below) * (high - low)
+    gain = torch.as_tensor(cos_angle, **like)[..., None] ** model.falloff
+    seen = torch.tensor(model.ambient, **like) + gain * (light @ mixing.T)
+    return (seen.clamp_min(DARKEST) ** (1.0 / model.response)).clamp(0.0, 1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class DisplayedSensor:
+    """A sensor whose colours are shown on a monitor.
+
+    Attributes:
+        sensor: Renders ``theta`` with the last axis red, green, blue before squashing.
+        model: The monitor before the camera.
+        cos_angle: Cosine of the angle at which the camera looks at the panel, in the mean of a drive.
+    """
+
+    sensor: Sensor
+    model: DisplayModel
+    cos_angle: float = field(default=1.0)
+
+    @property
+    def theta_shape(self) -> tuple[int, ...]:
+        """Of the sensor behind it."""
+        return self.sensor.theta_shape
+
+    def initial_theta(self, generator: torch.Generator) -> Tensor:
+        """Where an attack starts: showing what the sensor behind it starts with."""
+        return self.sensor.initial_theta(generator)
+
+    def seen_theta(self, theta: Tensor) -> Tensor:
+        """Squash-inverse of the seen colours; differentiable."""
+        return torch.logit(displayed(self.model, torch.sigmoid(theta), self.cos_angle), eps=_MARGIN)
+
+    def sense(self, states: Tensor, theta: Tensor) -> Rendered:
+        """Images at detached states with their vjp with respect to what is shown."""
+        leaf = theta.detach().requires_grad_(True)
+        with torch.enable_grad():
+            seen = self.seen_theta(leaf)
+        rendered = self.sensor.sense(states, seen.detach())
+
+        def vjp(gradient: Tensor) -> Tensor:
+            (shown,) = torch.autograd.grad(seen, leaf, rendered.vjp(gradient), retain_graph=True)
+            return shown
+
+        return Rendered(rendered.images, vjp, rendered.nbytes)

@@ -1,0 +1,130 @@
+"""What a camera sees of a colour that is shown on a monitor, and what to show so that it sees a given colour. Numpy only.
+
+``seen = (ambient + cos(angle)^falloff  M curve(shown)) ^ (1 / response)``: each channel of the monitor has its own monotone curve (its gamma), the
+camera mixes the channels' light by ``M``, the room reflects in the glass, the panel dims to the side, and the camera answers with its own
+power. All colours are in 0..1. `advnerf_core.attack.displayed` is the same in torch, with gradients.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from advnerf_core.errors import AdvnerfError
+from advnerf_core.geometry import Array
+
+# Below this the camera's power has no finite slope.
+DARKEST = 1e-6
+_LEAST_DETERMINANT = 1e-3
+
+
+class DisplayModelError(AdvnerfError, ValueError):
+    """Numbers that are no display."""
+
+
+@dataclass(frozen=True, eq=False)
+class DisplayModel:
+    """A monitor before a camera.
+
+    Attributes:
+        curves: Light of each channel at evenly spread levels ``[3, K]``, from 0 to 1, increasing.
+        mixing: ``M`` ``[3, 3]``: rows are the camera's channels, columns the monitor's; light at full drive, seen straight on.
+        ambient: Reflected light by camera channel ``[3]``.
+        response: Power of the camera.
+        falloff: Power of the cosine of the angle to the panel's normal.
+    """
+
+    curves: Array
+    mixing: Array
+    ambient: Array
+    response: float = 1.0
+    falloff: float = 0.0
+
+    def __post_init__(self) -> None:
+        curves, mixing, ambient = (np.array(v, np.float64) for v in (self.curves, self.mixing, self.ambient))
+        if (
+            curves.ndim != 2
+            or curves.shape[0] != 3
+            or curves.shape[1] < 2
+            or mixing.shape != (3, 3)
+            or ambient.shape != (3,)
+        ):
+            raise DisplayModelError(
+                f"expected curves [3, K >= 2], mixing [3, 3] and ambient [3], got {curves.shape}, {mixing.shape} and {ambient.shape}"
+            )
+        everything = np.concatenate([curves.ravel(), mixing.ravel(), ambient, [self.response, self.falloff]])
+        if not np.isfinite(everything).all() or ambient.min() < 0.0 or self.response <= 0.0 or self.falloff < 0.0:
+            raise DisplayModelError("expected finite numbers, ambient light and falloff >= 0 and a response > 0")
+        ends = np.abs(curves[:, [0, -1]] - [0.0, 1.0]).max()
+        if (np.diff(curves, axis=1) <= 0.0).any() or ends > 1e-9:
+            raise DisplayModelError("expected curves that rise from 0 to 1")
+        if abs(np.linalg.det(mixing)) < _LEAST_DETERMINANT * max(float(np.abs(mixing).max()), 1e-12) ** 3:
+            raise DisplayModelError(
+                "expected a mixing matrix that can be inverted, got channels that look alike to the camera"
+            )
+        for name, value in (("curves", curves), ("mixing", mixing), ("ambient", ambient)):
+            value.setflags(write=False)
+            object.__setattr__(self, name, value)
+
+    @classmethod
+    def ideal(cls, levels: int = 2) -> DisplayModel:
+        """A monitor whose colours the camera sees as they are."""
+        return cls(np.tile(np.linspace(0.0, 1.0, levels), (3, 1)), np.eye(3), np.zeros(3))
+
+    def light(self, shown: ArrayLike) -> Array:
+        """Light of the monitor's channels ``[..., 3]`` at shown colours ``[..., 3]``."""
+        colours = np.asarray(shown, np.float64)
+        levels = np.linspace(0.0, 1.0, self.curves.shape[1])
+        return np.stack([np.interp(colours[..., c], levels, self.curves[c]) for c in range(3)], axis=-1)
+
+    def forward(self, shown: ArrayLike, cos_angle: ArrayLike = 1.0) -> Array:
+        """What the camera sees ``[..., 3]`` of shown colours ``[..., 3]``.
+
+        Args:
+            shown: Colours in 0..1; beyond, they are clipped.
+            cos_angle: Cosine of the angle between the panel's normal and the way to the camera ``[...]``.
+        """
+        gain = np.asarray(cos_angle, np.float64)[..., None] ** self.falloff
+        light = self.ambient + gain * (self.light(shown) @ self.mixing.T)
+        return np.clip(np.maximum(light, DARKEST) ** (1.0 / self.response), 0.0, 1.0)
+
+    def inverse(self, wanted: ArrayLike, cos_angle: ArrayLike = 1.0) -> tuple[Array, float]:
+        """What to show so that the camera sees wanted colours.
+
+        Args:
+            wanted: Colours ``[..., 3]`` in 0..1.
+            cos_angle: As in :meth:`forward`.
+
+        Returns:
+            Colours ``[..., 3]`` in 0..1, and the share of them that the monitor cannot make and that were clipped, channel by channel.
+        """
+        target = np.clip(np.asarray(wanted, np.float64), 0.0, 1.0) ** self.response - self.ambient
+        gain = np.asarray(cos_angle, np.float64)[..., None] ** self.falloff
+        light = (target / gain) @ np.linalg.inv(self.mixing).T
+        outside = ((light < -1e-6) | (light > 1.0 + 1e-6)).any(axis=-1)
+        levels = np.linspace(0.0, 1.0, self.curves.shape[1])
+        shown = np.stack([np.interp(light[..., c], self.curves[c], levels) for c in range(3)], axis=-1)
+        return shown, float(np.mean(outside)) if outside.size else 0.0
+
+    def to_dict(self) -> dict[str, Any]:
+        """As JSON or YAML can hold it."""
+        return {
+            "curves": self.curves.tolist(), "mixing": self.mixing.tolist(), "ambient": self.ambient.tolist(),
+            "response": float(self.response), "falloff": float(self.falloff),
+        }  # fmt: skip
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> DisplayModel:
+        """Inverse of :meth:`to_dict`."""
+        try:
+            return cls(
+                np.array(values["curves"], np.float64), np.array(values["mixing"], np.float64),
+                np.array(values["ambient"], np.float64), float(values["response"]), float(values["falloff"]),
+            )  # fmt: skip
+        except (KeyError, TypeError, ValueError) as error:
+            if isinstance(error, DisplayModelError):
+                raise
+            raise DisplayModelError(f"expected curves, mixing, ambient, response and falloff, got {error}") from error

@@ -1,0 +1,129 @@
+"""Where a learned scene lies in the motion-capture world, from cameras whose poses are known in both.
+
+Structure from motion leaves scale and frame open. Frames taken on the tracked car (or with a tracked phone) have poses in both worlds; the
+similarity is `advnerf_core.scene.similarity.align_poses` (Umeyama 1991 with consensus). It is judged on cameras it was not fitted to.
+"""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from advnerf_core.geometry import Array
+from advnerf_core.scene.similarity import Alignment, SimilarityError, align_poses, rotation_angles
+from calibration.degeneracy import DegenerateDataError, PoorFitError, require_count
+from calibration.measured import SceneCalibration, rows_of
+
+
+@dataclass(frozen=True)
+class SceneConfig:
+    """What is refused.
+
+    Attributes:
+        min_cameras: Fewer cameras with a pose in both worlds are refused.
+        position_tolerance_m: Cameras farther from their motion-capture place are outliers [m].
+        rotation_tolerance_rad: Cameras turned farther are outliers [rad].
+        min_share: With a smaller share of inliers the set is refused.
+        folds: The cameras are left out in so many turns, to see how well the others place them.
+        most_held_out_m: A larger median error of left-out inliers is refused [m].
+    """
+
+    min_cameras: int = 12
+    position_tolerance_m: float = 0.08
+    rotation_tolerance_rad: float = float(np.radians(3.0))
+    min_share: float = 0.5
+    folds: int = 4
+    most_held_out_m: float = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class SceneFit:
+    """A placed scene.
+
+    Attributes:
+        alignment: Similarity, inliers and residuals of all cameras.
+        names: Of the cameras, in the order of the residuals.
+        held_out_m: Distance of each inlier from where the similarity of the others puts it ``[I]`` [m].
+        held_out_rad: Angle of the same ``[I]`` [rad].
+        T_world_from_camera: Motion-capture poses ``[N, 4, 4]``.
+        placed: The scene's poses in the world ``[N, 4, 4]``.
+    """
+
+    alignment: Alignment
+    names: tuple[str, ...]
+    held_out_m: Array
+    held_out_rad: Array
+    T_world_from_camera: Array
+    placed: Array
+
+    @property
+    def calibration(self) -> SceneCalibration:
+        """The file."""
+        a = self.alignment
+        residuals = {
+            "rms_position_m": a.rms_position_m, "rms_rotation_rad": a.rms_rotation_rad, "outliers": float((~a.inliers).sum()),
+            "held_out_median_m": float(np.median(self.held_out_m)), "held_out_worst_m": float(self.held_out_m.max()),
+            "held_out_median_rad": float(np.median(self.held_out_rad)), "extent_m": a.extent_m,
+        }  # fmt: skip
+        return SceneCalibration(
+            date=datetime.date.today(), method="similarity of camera poses (Umeyama with consensus), judged on cameras left out in turn",
+            views=int(a.inliers.sum()), residuals={key: round(value, 6) for key, value in residuals.items()},
+            scale=float(a.similarity.scale), T_world_from_scene=rows_of(a.similarity.T_target_from_source),
+        )  # fmt: skip
+
+
+def place_scene(
+    T_scene_from_camera: Mapping[str, Array], T_world_from_camera: Mapping[str, Array], config: SceneConfig | None = None
+) -> SceneFit:  # fmt: skip
+    """Find the similarity from a scene to the motion-capture world.
+
+    Args:
+        T_scene_from_camera: Poses ``[4, 4]`` in the scene, by image name.
+        T_world_from_camera: Poses ``[4, 4]`` in the world, by image name; only names in both count.
+        config: Gates.
+
+    Raises:
+        DegenerateDataError: Too few cameras in both, or all of them on one line.
+        PoorFitError: Too few agree, or left-out cameras are misplaced.
+    """
+    config = config or SceneConfig()
+    names = tuple(name for name in T_scene_from_camera if name in T_world_from_camera)
+    cure = (
+        "the images of both must have the same file names; take more frames of the car into the scene's reconstruction"
+    )
+    require_count(len(names), config.min_cameras, "cameras with a pose in both worlds", cure)
+    source = np.stack([np.asarray(T_scene_from_camera[name], np.float64) for name in names])
+    target = np.stack([np.asarray(T_world_from_camera[name], np.float64) for name in names])
+    alignment = _align(source, target, config, config.min_share)
+    inside = np.flatnonzero(alignment.inliers)
+    require_count(len(inside), config.min_cameras, "cameras that agree", "take more frames on curves of the drive")
+    far, angle = _held_out(source[inside], target[inside], config)
+    if float(np.median(far)) > config.most_held_out_m:
+        raise PoorFitError(
+            f"expected cameras that were left out to be placed within {100 * config.most_held_out_m:.0f} cm, got {100 * np.median(far):.1f} cm in the "
+            "median: does the reconstruction bend, are the stamps right, is the mounting pose that of this camera?"
+        )
+    return SceneFit(alignment, names, far, angle, target, alignment.similarity.poses(source))
+
+
+def _align(source: Array, target: Array, config: SceneConfig, share: float) -> Alignment:
+    try:
+        return align_poses(source, target, config.position_tolerance_m, config.rotation_tolerance_rad, share)
+    except SimilarityError as error:
+        kind = DegenerateDataError if "line" in str(error) or "place" in str(error) else PoorFitError
+        raise kind(str(error)) from error
+
+
+def _held_out(source: Array, target: Array, config: SceneConfig) -> tuple[Array, Array]:
+    """Errors of each camera under the similarity of the others, in blocks of neighbours: next-door frames know too much."""
+    fold = np.arange(len(source)) * config.folds // len(source)
+    far, angle = np.empty(len(source)), np.empty(len(source))
+    for k in range(config.folds):
+        out = fold == k
+        moved = _align(source[~out], target[~out], config, 0.5).similarity.poses(source[out])
+        far[out] = np.linalg.norm(moved[:, :3, 3] - target[out, :3, 3], axis=1)
+        angle[out] = rotation_angles(np.swapaxes(moved[:, :3, :3], 1, 2) @ target[out, :3, :3])
+    return far, angle

@@ -1,0 +1,278 @@
+"""How much later the camera stamps an instant than motion capture: the camera's own turning against that of the car.
+
+Between two frames the camera turns by a rotation that follows from corners tracked from one to the other (as directions, by a
+robust Procrustes fit); about the car's vertical axis this is the image's yaw. Motion capture knows the car's yaw at any stamp. The shift
+between both that makes them agree best is the offset: the peak of their correlation over a grid of shifts, refined by least squares.
+What the camera moves sideways while it turns looks like more turning, in proportion; the free scale takes it.
+"""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from advnerf_core.geometry import Array
+from calibration.degeneracy import DegenerateDataError, PoorFitError, mean_rotation, require_count
+from calibration.measured import TimeOffsetCalibration
+from calibration.schema import CameraCalibration
+
+_MOST_CORNERS, _LEAST_TRACKED = 300, 25
+_INLIER_RAD, _ROUNDS = 0.01, 8
+# Poses are smoothed over this long before they are differentiated; it is symmetric and moves nothing.
+_SMOOTH_S = 0.05
+
+
+@dataclass(frozen=True)
+class OffsetConfig:
+    """What is searched and refused.
+
+    Attributes:
+        largest_s: The offset is searched between minus and plus this [s].
+        step_s: Step of the search [s].
+        min_turns: Fewer pairs of frames with a known turn are refused.
+        least_turn_rad: The root mean square turn between frames must reach this [rad].
+        least_correlation: A lower correlation at the peak is refused.
+        most_second_peak: A second peak of more than this share of the first is ambiguous.
+        most_stddev_s: A larger standard deviation of the result is refused [s].
+    """
+
+    largest_s: float = 0.4
+    step_s: float = 0.005
+    min_turns: int = 40
+    least_turn_rad: float = 0.015
+    least_correlation: float = 0.9
+    most_second_peak: float = 0.97
+    most_stddev_s: float = 0.003
+
+
+@dataclass(frozen=True, eq=False)
+class Turns:
+    """How far the camera turned between neighbouring frames.
+
+    Attributes:
+        start_s: Stamps of the first frames ``[N]`` [s].
+        end_s: Stamps of the second frames ``[N]`` [s].
+        yaw_rad: Turn about the car's vertical axis, left positive ``[N]`` [rad].
+    """
+
+    start_s: Array
+    end_s: Array
+    yaw_rad: Array
+
+
+@dataclass(frozen=True, eq=False)
+class OffsetFit:
+    """The offset and the curve it was found on.
+
+    Attributes:
+        camera_minus_mocap_s: Camera stamp less mocap stamp of one instant [s].
+        stddev_s: Its standard deviation by the residuals [s].
+        scale: Image turn per car turn; above 1 where the camera also moves sideways.
+        rms_rad: Residual of the turns [rad].
+        shifts_s: Shifts of the search ``[K]`` [s].
+        correlation: Correlation at each ``[K]``.
+        turns: What the image said.
+        car_yaw_rad: What motion capture says at the offset ``[N]``, times the scale.
+    """
+
+    camera_minus_mocap_s: float
+    stddev_s: float
+    scale: float
+    rms_rad: float
+    shifts_s: Array
+    correlation: Array
+    turns: Turns
+    car_yaw_rad: Array
+
+    @property
+    def calibration(self) -> TimeOffsetCalibration:
+        """The file."""
+        residuals = {"rms_rad": self.rms_rad, "correlation": float(self.correlation.max()), "scale": self.scale}
+        return TimeOffsetCalibration(
+            date=datetime.date.today(), method="image yaw by tracked corners against motion-capture yaw, correlation peak refined by least squares",
+            views=len(self.turns.yaw_rad), residuals={key: round(value, 6) for key, value in residuals.items()},
+            camera_minus_mocap_s=round(self.camera_minus_mocap_s, 6), stddev_s=round(self.stddev_s, 6),
+        )  # fmt: skip
+
+
+def image_turns(frames: Iterable[tuple[float, NDArray[np.uint8]]], camera: CameraCalibration) -> Turns:
+    """Track the camera's turning through frames.
+
+    Args:
+        frames: Stamp [s] and picture ``[H, W]`` or ``[H, W, 3]`` RGB, in order.
+        camera: Lens and mounting pose; only its rotation matters.
+    """
+    before: tuple[float, NDArray[np.uint8]] | None = None
+    rows = []
+    for stamp, image in frames:
+        grey = np.asarray(
+            image if image.ndim == 2 else cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY), np.uint8
+        )
+        if grey.shape != (camera.height, camera.width):
+            raise DegenerateDataError(
+                f"expected frames of {camera.width} x {camera.height}, as calibrated, got {grey.shape[1]} x {grey.shape[0]}"
+            )
+        now = np.ascontiguousarray(grey)
+        if before is not None and (turn := _turn(before[1], now, camera)) is not None:
+            rows.append((before[0], stamp, turn))
+        before = (stamp, now)
+    table = np.array(rows, np.float64).reshape(-1, 3)
+    return Turns(table[:, 0], table[:, 1], table[:, 2])
+
+
+def fit_offset(turns: Turns, pose_s: Array, yaw_rad: Array, config: OffsetConfig | None = None) -> OffsetFit:
+    """Find the offset between both clocks.
+
+    Args:
+        turns: From the images.
+        pose_s: Stamps of the poses, increasing ``[M]`` [s].
+        yaw_rad: The car's yaw, unwrapped ``[M]`` [rad].
+        config: Search and gates.
+
+    Raises:
+        DegenerateDataError: Too few frames, too little turning, turning at one rate only, or a rhythm that fits at several shifts.
+        PoorFitError: Image and motion capture do not agree at any shift.
+    """
+    config = config or OffsetConfig()
+    require_count(
+        len(pose_s), 100, "poses of the car", "record motion capture with the camera, for ten seconds or more"
+    )
+    reach = config.largest_s + _SMOOTH_S
+    inside = (turns.start_s > pose_s[0] + reach) & (turns.end_s < pose_s[-1] - reach)
+    turns = Turns(turns.start_s[inside], turns.end_s[inside], turns.yaw_rad[inside])
+    require_count(
+        len(turns.yaw_rad),
+        config.min_turns,
+        "pairs of frames with a tracked turn",
+        "turn the car before a wall with something on it",
+    )
+    _require_turning(turns, config)
+    yaw = CubicSpline(pose_s, _smoothed(pose_s, yaw_rad))
+    count = round(config.largest_s / config.step_s)
+    shifts: Array = config.step_s * np.arange(-count, count + 1, dtype=np.float64)
+    correlation = np.array([_correlation(turns.yaw_rad, _car_turns(yaw, turns, float(shift))) for shift in shifts])
+    peak = _peak(shifts, correlation, config)
+
+    def residuals(p: Array) -> Array:
+        return p[1] * _car_turns(yaw, turns, float(p[0])) + p[2] - turns.yaw_rad
+
+    found = least_squares(residuals, [peak, 1.0, 0.0], loss="soft_l1", f_scale=0.003, x_scale=[0.01, 1.0, 0.01])
+    left = residuals(found.x)
+    covariance = np.linalg.pinv(found.jac.T @ found.jac) * 2.0 * found.cost / max(len(left) - 3, 1)
+    stddev = float(np.sqrt(covariance[0, 0]))
+    if stddev > config.most_stddev_s:
+        raise DegenerateDataError(
+            f"expected an offset known to {1000 * config.most_stddev_s:.0f} ms, got {1000 * found.x[0]:.0f} ms give or take {1000 * stddev:.1f} ms: turn "
+            "the car to and fro faster, and longer"
+        )
+    rms = float(np.sqrt(np.mean(left**2)))
+    return OffsetFit(
+        float(found.x[0]), stddev, float(found.x[1]), rms, shifts, correlation, turns, turns.yaw_rad + left
+    )
+
+
+def _turn(first: NDArray[np.uint8], second: NDArray[np.uint8], camera: CameraCalibration) -> float | None:
+    """Turn of the car between two pictures, left positive [rad]; None with too few corners that agree."""
+    corners = cv2.goodFeaturesToTrack(first, _MOST_CORNERS, 0.005, 5)
+    if corners is None or len(corners) < _LEAST_TRACKED:
+        return None
+    moved, ok, _ = cv2.calcOpticalFlowPyrLK(
+        first, second, corners, np.zeros_like(corners), winSize=(15, 15), maxLevel=4
+    )
+    back, ok_back, _ = cv2.calcOpticalFlowPyrLK(
+        second, first, moved, np.zeros_like(corners), winSize=(15, 15), maxLevel=4
+    )
+    kept = (ok.ravel() > 0) & (ok_back.ravel() > 0) & (np.linalg.norm((back - corners).reshape(-1, 2), axis=1) < 0.5)
+    if kept.sum() < _LEAST_TRACKED:
+        return None
+    a, b = (_directions(points.reshape(-1, 2)[kept] + 0.5, camera) for points in (corners, moved))
+    R = _rotation(a, b)
+    if R is None:
+        return None
+    # R takes directions of the first camera to the second; the camera itself turned the other way.
+    about_car = camera.mount[:3, :3] @ Rotation.from_matrix(R.T).as_rotvec()
+    return float(about_car[2])
+
+
+def _directions(pixels: Array, camera: CameraCalibration) -> Array:
+    points = cv2.undistortPoints(
+        pixels.reshape(-1, 1, 2).astype(np.float64), camera.pinhole.matrix, np.array(camera.distortion)
+    ).reshape(-1, 2)
+    rays = np.concatenate([points, np.ones((len(points), 1))], axis=1)
+    return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
+
+
+def _rotation(a: Array, b: Array) -> Array | None:
+    """Rotation with ``b = R a`` for most directions: least squares, again and again without those that are farther off than most."""
+    inside: NDArray[np.bool_] = np.ones(len(a), np.bool_)
+    R = np.eye(3)
+    for _ in range(_ROUNDS):
+        R = mean_rotation(b[inside, :, None] * a[inside, None, :])
+        error = np.linalg.norm(b - a @ R.T, axis=1)
+        again = error < max(_INLIER_RAD, 2.0 * float(np.median(error)))
+        if again.sum() < _LEAST_TRACKED:
+            return None
+        if (again == inside).all():
+            break
+        inside = again
+    return R
+
+
+def _smoothed(pose_s: Array, yaw_rad: Array) -> Array:
+    period = float(np.median(np.diff(pose_s)))
+    count = max(3, 2 * round(0.5 * _SMOOTH_S / period) + 1)
+    window = np.hanning(count + 2)[1:-1]
+    padded = np.pad(yaw_rad, count // 2, mode="reflect", reflect_type="odd")
+    return np.convolve(padded, window / window.sum(), mode="valid")
+
+
+def _car_turns(yaw: CubicSpline, turns: Turns, shift_s: float) -> Array:
+    return np.asarray(yaw(turns.end_s - shift_s) - yaw(turns.start_s - shift_s))
+
+
+def _correlation(a: Array, b: Array) -> float:
+    a, b = a - a.mean(), b - b.mean()
+    return float(a @ b / max(np.linalg.norm(a) * np.linalg.norm(b), 1e-12))
+
+
+def _require_turning(turns: Turns, config: OffsetConfig) -> None:
+    rms, spread = float(np.sqrt(np.mean(turns.yaw_rad**2))), float(np.std(turns.yaw_rad))
+    if rms < config.least_turn_rad:
+        raise DegenerateDataError(
+            f"expected turns of at least {config.least_turn_rad} rad from frame to frame, got {rms:.4f} rad in the mean: too little "
+            "excitation, turn the car to and fro by hand"
+        )
+    if spread < 0.5 * config.least_turn_rad:
+        raise DegenerateDataError(
+            f"expected turns to and fro, got a steady rate ({rms:.4f} rad per frame, varying by {spread:.4f}): it looks the same at any offset"
+        )
+
+
+def _peak(shifts: Array, correlation: Array, config: OffsetConfig) -> float:
+    best = int(np.argmax(correlation))
+    if correlation[best] < config.least_correlation:
+        raise PoorFitError(
+            f"expected image and motion capture to turn alike, got a correlation of {correlation[best]:.2f} at best (needed "
+            f"{config.least_correlation}); is the subject the car the camera is on, is the scene static and lit?"
+        )
+    if best in (0, len(shifts) - 1):
+        raise PoorFitError(
+            f"expected an offset within {config.largest_s} s, got the best agreement at the end of the search; set the clocks first"
+        )
+    inner = correlation[1:-1]
+    tops = np.flatnonzero((inner >= correlation[:-2]) & (inner > correlation[2:])) + 1
+    second = max((float(correlation[top]) for top in tops if abs(top - best) * config.step_s > 0.05), default=-1.0)
+    if second > config.most_second_peak * correlation[best]:
+        raise DegenerateDataError(
+            f"expected one offset that fits, got two peaks of the correlation ({correlation[best]:.3f} and {second:.3f}): turn the car "
+            "irregularly, not in a rhythm"
+        )
+    return float(shifts[best])

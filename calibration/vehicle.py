@@ -1,0 +1,321 @@
+"""The car's gains from a drive with constant commands, by motion capture: speed, servo gain and offset, and where the rear axle is.
+
+While servo and motor command are constant the car moves with a constant twist: a circle or a straight line. Each such segment gives,
+by least squares over its poses, the yaw rate ``w`` and the velocity of the tracked point in the body's frame ``(vx, vy)``. Then:
+
+- the rear axle is the point without sideways velocity. A point ``a`` ahead of it and ``b`` to its left, on a body whose marked x axis is
+  turned by ``e``, moves with ``vx = v - b w`` and ``vy = a w - e v``, so all segments together give ``a`` and ``e``;
+- the curvature ``k = w / v`` gives the wheel angle ``d = atan(L k)``, and a line through the segments' ``(d, servo)`` gives gain and offset.
+  The wheelbase ``L`` is measured with a ruler: fitted together with the gain it could be anything;
+- a line through the segments' ``(v, erpm)`` gives the speed gain.
+
+Delay and lag come from how the same drive changes between the segments: `calibration.vehicle_response`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from advnerf_core.geometry import Array
+from calibration.degeneracy import DegenerateDataError, PoorFitError, require_count
+
+
+@dataclass(frozen=True, eq=False)
+class Drive:
+    """A recorded drive.
+
+    Attributes:
+        pose_s: Stamps of the motion-capture poses, increasing ``[N]`` [s].
+        poses: x [m], y [m], yaw [rad] of the car's subject, yaw unwrapped ``[N, 3]``.
+        command_s: When commands were written to the motor controller, increasing ``[M]`` [s], on the same clock.
+        servo: Servo value of each ``[M]``.
+        erpm: Speed command of each ``[M]`` [electrical rpm]; NaN while braking or letting go.
+        pipeline_s: From the capture of the image behind each command to its writing ``[M]`` [s]; NaN where unknown.
+    """
+
+    pose_s: Array
+    poses: Array
+    command_s: Array
+    servo: Array
+    erpm: Array
+    pipeline_s: Array
+
+
+@dataclass(frozen=True)
+class GainsConfig:
+    """What counts as a segment, and what is refused.
+
+    Attributes:
+        settle_s: After a change of command so much is left out [s].
+        least_s: Shorter segments are left out [s].
+        longest_s: Longer ones are cut, so that one long circle does not count as one measurement [s].
+        servo_tolerance: Servo values this near are one.
+        erpm_tolerance: Speed commands this near are one.
+        least_speed_mps: Slower segments are left out [m/s].
+        least_curvature_1pm: Both left and right circles must be at least this tight [1/m].
+        straight_1pm: Circles wider than this count as straight [1/m].
+        most_steering_rms_rad: A larger scatter of the wheel angles about the line is refused [rad].
+        most_speed_rms: A larger relative scatter of the speeds about the line is refused.
+    """
+
+    settle_s: float = 0.8
+    least_s: float = 0.5
+    longest_s: float = 3.0
+    servo_tolerance: float = 0.004
+    erpm_tolerance: float = 20.0
+    least_speed_mps: float = 0.15
+    least_curvature_1pm: float = 0.3
+    straight_1pm: float = 0.12
+    most_steering_rms_rad: float = 0.02
+    most_speed_rms: float = 0.05
+
+
+@dataclass(frozen=True)
+class Segment:
+    """A stretch with constant commands.
+
+    Attributes:
+        start_s: Where its poses begin [s].
+        end_s: Where they end [s].
+        servo: Mean servo value.
+        erpm: Mean speed command.
+        vx_mps: Velocity of the tracked point along the body's x [m/s].
+        vy_mps: Velocity of the tracked point along the body's y [m/s].
+        yaw_rate_radps: Yaw rate [rad/s].
+    """
+
+    start_s: float
+    end_s: float
+    servo: float
+    erpm: float
+    vx_mps: float
+    vy_mps: float
+    yaw_rate_radps: float
+
+
+@dataclass(frozen=True, eq=False)
+class GainsFit:
+    """What the segments say.
+
+    Attributes:
+        segments: The segments.
+        wheelbase_m: As given [m].
+        servo_per_rad: Servo per wheel angle [1/rad].
+        servo_offset: Servo that drives straight.
+        erpm_per_mps: Electrical rpm per speed.
+        erpm_offset: Electrical rpm at standstill; 0 where the speeds do not tell it from the gain.
+        origin_ahead_m: How far ahead of the rear axle the subject's origin is [m].
+        axis_turned_rad: How far the subject's x axis is turned to the left of the direction of travel [rad].
+        speed_mps: Speed of the rear axle in each segment ``[S]``.
+        steering_rad: Wheel angle in each segment ``[S]``.
+        stddev: Standard deviations by name.
+    """
+
+    segments: tuple[Segment, ...]
+    wheelbase_m: float
+    servo_per_rad: float
+    servo_offset: float
+    erpm_per_mps: float
+    erpm_offset: float
+    origin_ahead_m: float
+    axis_turned_rad: float
+    speed_mps: Array
+    steering_rad: Array
+    stddev: dict[str, float]
+
+    def steering_of(self, servo: Array) -> Array:
+        """Wheel angles of servo values [rad]."""
+        return (servo - self.servo_offset) / self.servo_per_rad
+
+    def speed_of(self, erpm: Array) -> Array:
+        """Speeds of electrical rpm [m/s]."""
+        return (erpm - self.erpm_offset) / self.erpm_per_mps
+
+    @property
+    def steering_rms_rad(self) -> float:
+        """Scatter of the wheel angles about the line [rad]."""
+        servo = np.array([segment.servo for segment in self.segments])
+        return float(np.sqrt(np.mean((self.steering_of(servo) - self.steering_rad) ** 2)))
+
+    @property
+    def speed_rms_mps(self) -> float:
+        """Scatter of the speeds about the line [m/s]."""
+        erpm = np.array([segment.erpm for segment in self.segments])
+        return float(np.sqrt(np.mean((self.speed_of(erpm) - self.speed_mps) ** 2)))
+
+
+def fit_gains(drive: Drive, wheelbase_m: float, config: GainsConfig | None = None) -> GainsFit:
+    """Fit the car's gains to a drive.
+
+    Args:
+        drive: Circles to both sides, straight runs, two speeds or more.
+        wheelbase_m: Distance between the axles, by ruler [m].
+        config: Segments and gates.
+
+    Raises:
+        DegenerateDataError: Too few segments, one side only, no straight run, one speed only.
+        PoorFitError: The segments lie on no line.
+    """
+    config = config or GainsConfig()
+    segments = find_segments(drive, config)
+    _require_variety(segments, config)
+    w = np.array([s.yaw_rate_radps for s in segments])
+    vx, vy = (np.array([getattr(s, name) for s in segments]) for name in ("vx_mps", "vy_mps"))
+    (ahead, turned), _ = _least_squares(np.stack([w, -vx], axis=1), vy)
+    # The tracked point's speed along the way of the rear axle; b is not told from the gain's asymmetry and is taken as 0.
+    speed = vx * np.cos(turned) - (vy - ahead * w) * np.sin(turned)
+    steering = np.arctan(wheelbase_m * w / speed)
+    servo, erpm = (np.array([getattr(s, name) for s in segments]) for name in ("servo", "erpm"))
+    # The servo value is exact, the angle is measured: angle over servo, then inverted.
+    (slope, at_zero), (slope_sd, _) = _least_squares(np.stack([servo, np.ones_like(servo)], axis=1), steering)
+    if abs(slope) < 1e-3:
+        raise PoorFitError(
+            "expected the curvature to follow the servo, got none; is the servo output on, the stamp right?"
+        )
+    gain, offset = 1.0 / slope, -at_zero / slope
+    # Near the middle of the data the line is known best; the offset's error is that of the line at angle zero.
+    offset_sd = _line_stddev(servo, steering, slope, at_zero, offset) * abs(gain)
+    speed_gain, speed_offset, speed_sd = _speed_line(speed, erpm)
+    stddev = {
+        "servo_per_rad": slope_sd * gain**2, "servo_offset": offset_sd, "erpm_per_mps": speed_sd,
+    }  # fmt: skip
+    fit = GainsFit(
+        tuple(segments), wheelbase_m, gain, offset, speed_gain, speed_offset, ahead, turned, speed, steering, stddev
+    )
+    _require_lines(fit, config)
+    return fit
+
+
+def find_segments(drive: Drive, config: GainsConfig) -> list[Segment]:
+    """Stretches with constant commands, settled, with their twists."""
+    if len(drive.command_s) < 2 or len(drive.pose_s) < 10:
+        raise DegenerateDataError(
+            f"expected commands and poses of a drive, got {len(drive.command_s)} commands and {len(drive.pose_s)} poses"
+        )
+    segments = []
+    for start, end, servo, erpm in _constant_stretches(drive, config):
+        begin = start + config.settle_s
+        pieces = max(1, int(np.ceil((end - begin) / config.longest_s)))
+        edges = np.linspace(begin, end, pieces + 1)
+        for a, b in pairwise(edges):
+            inside = (drive.pose_s >= a) & (drive.pose_s <= b)
+            if b - a < config.least_s or inside.sum() < 10:
+                continue
+            vx, vy, w = twist(drive.pose_s[inside], drive.poses[inside])
+            if np.hypot(vx, vy) >= config.least_speed_mps:
+                segments.append(Segment(float(a), float(b), servo, erpm, vx, vy, w))
+    return segments
+
+
+def twist(time_s: Array, poses: Array) -> tuple[float, float, float]:
+    """The constant twist that explains poses ``[N, 3]`` best: body velocities vx, vy [m/s] and yaw rate [rad/s].
+
+    Under a constant twist the position is an affine function of ``(S, C)`` with ``S = sin(w t) / w``, ``C = (1 - cos(w t)) / w`` and the
+    yaw at the middle, so for a yaw rate from the yaw alone everything else is linear.
+    """
+    t = time_s - time_s.mean()
+    (w, yaw), _ = _least_squares(np.stack([t, np.ones_like(t)], axis=1), poses[:, 2])
+    sine = t * np.sinc(w * t / np.pi)
+    cosine = 0.5 * w * t**2 * np.sinc(0.5 * w * t / np.pi) ** 2
+    one, zero = np.ones_like(t), np.zeros_like(t)
+    # x' = vx cos - vy sin, y' = vx sin + vy cos in the frame of the yaw at the middle.
+    c, s = np.cos(yaw), np.sin(yaw)
+    along, across = c * poses[:, 0] + s * poses[:, 1], c * poses[:, 1] - s * poses[:, 0]
+    rows = np.concatenate([np.stack([sine, -cosine, one, zero], axis=1), np.stack([cosine, sine, zero, one], axis=1)])
+    (vx, vy, _, _), _ = _least_squares(rows, np.concatenate([along, across]))
+    return vx, vy, w
+
+
+def _constant_stretches(drive: Drive, config: GainsConfig) -> list[tuple[float, float, float, float]]:
+    """Start, end, mean servo and mean erpm of runs in which each command is near the run's first."""
+    stretches, first = [], 0
+    servo, erpm, when = drive.servo, drive.erpm, drive.command_s
+    for row in range(1, len(when) + 1):
+        same = (
+            row < len(when)
+            and abs(servo[row] - servo[first]) <= config.servo_tolerance
+            and abs(erpm[row] - erpm[first]) <= config.erpm_tolerance
+        )  # NaN is like nothing, itself included
+        if same:
+            continue
+        if np.isfinite(erpm[first]) and row - first > 1:
+            run = slice(first, row)
+            end = when[min(row, len(when) - 1)]
+            stretches.append((float(when[first]), float(end), float(servo[run].mean()), float(erpm[run].mean())))
+        first = row
+    return stretches
+
+
+def _require_variety(segments: list[Segment], config: GainsConfig) -> None:
+    cure = f"hold each command for {config.settle_s + config.least_s:.1f} s or more: circles to both sides, straight runs, two speeds"
+    require_count(len(segments), 6, "stretches with constant commands", cure)
+    curvature = np.array([s.yaw_rate_radps / np.hypot(s.vx_mps, s.vy_mps) * np.sign(s.vx_mps) for s in segments])
+    tight = config.least_curvature_1pm
+    missing = [
+        name
+        for name, there in (
+            ("left circle", (curvature > tight).any()), ("right circle", (curvature < -tight).any()),
+            ("straight run", (np.abs(curvature) < config.straight_1pm).any()),
+        )
+        if not there
+    ]  # fmt: skip
+    if missing:
+        raise DegenerateDataError(
+            f"expected left circles, right circles and straight runs, got no {', no '.join(missing)} among {len(segments)} stretches "
+            f"(curvatures {curvature.min():.2f} to {curvature.max():.2f} 1/m): gain and offset would rest on one side"
+        )
+    erpm = np.array([s.erpm for s in segments])
+    if np.ptp(erpm) < 0.2 * np.abs(erpm).max():
+        raise DegenerateDataError(
+            f"expected at least two speeds that differ by a fifth, got {erpm.min():.0f} to {erpm.max():.0f} erpm only: an offset would hide in the gain"
+        )
+
+
+def _speed_line(speed: Array, erpm: Array) -> tuple[float, float, float]:
+    """Gain, offset and the gain's standard deviation; no offset unless the data show one beyond doubt."""
+    (slope, at_zero), (slope_sd, zero_sd) = _least_squares(np.stack([erpm, np.ones_like(erpm)], axis=1), speed)
+    if abs(at_zero) < 3.0 * zero_sd or abs(at_zero) < 0.005:
+        (slope,), (slope_sd,) = _least_squares(erpm[:, None], speed)
+        at_zero = 0.0
+    if abs(slope) < 1e-6:
+        raise PoorFitError("expected the speed to follow the command, got none; is the motor on, the car on the floor?")
+    return 1.0 / slope, -at_zero / slope, slope_sd / slope**2
+
+
+def _require_lines(fit: GainsFit, config: GainsConfig) -> None:
+    if fit.steering_rms_rad > config.most_steering_rms_rad:
+        raise PoorFitError(
+            f"expected wheel angles on a line within {config.most_steering_rms_rad:.3f} rad, got {fit.steering_rms_rad:.3f} rad; does the car "
+            "slip, is the servo at its end, are commands and poses on one clock?"
+        )
+    fast = float(np.abs(fit.speed_mps).max())
+    if fit.speed_rms_mps > config.most_speed_rms * fast:
+        raise PoorFitError(
+            f"expected speeds on a line within {100 * config.most_speed_rms:.0f} %, got {fit.speed_rms_mps:.3f} m/s at up to {fast:.2f} m/s; was the "
+            "floor level, the battery full, the car lifted?"
+        )
+
+
+def _least_squares(rows: Array, values: Array) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Coefficients and their standard deviations."""
+    found, _, rank, _ = np.linalg.lstsq(rows, values, rcond=None)
+    left = values - rows @ found
+    freedom = max(len(values) - rows.shape[1], 1)
+    covariance = np.linalg.pinv(rows.T @ rows) * float(left @ left) / freedom
+    if rank < rows.shape[1]:
+        raise DegenerateDataError(
+            "expected commands that differ, got the same everywhere: gain and offset cannot be told apart"
+        )
+    return tuple(float(v) for v in found), tuple(float(v) for v in np.sqrt(np.diag(covariance)))
+
+
+def _line_stddev(x: Array, y: Array, slope: float, at_zero: float, where: float) -> float:
+    """Standard deviation of a fitted line at one place."""
+    left: NDArray[np.float64] = y - slope * x - at_zero
+    variance = float(left @ left) / max(len(x) - 2, 1)
+    spread = float(np.sum((x - x.mean()) ** 2))
+    return float(np.sqrt(variance * (1.0 / len(x) + (where - x.mean()) ** 2 / spread)))

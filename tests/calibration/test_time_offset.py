@@ -1,0 +1,106 @@
+"""An offset put between camera and motion capture is measured; steady, rhythmic and missing turns are refused with the reason."""
+
+import cv2
+import numpy as np
+import pytest
+
+from advnerf_core.geometry import camera_mount
+from calibration.degeneracy import DegenerateDataError, PoorFitError
+from calibration.measured import TimeOffsetCalibration
+from calibration.schema import CameraCalibration, load_calibration, save_calibration
+from calibration.time_offset import Turns, fit_offset, image_turns
+
+CAMERA = CameraCalibration(
+    date="2026-11-21", method="test", width=336, height=188, fx=174.0, fy=174.0, cx=168.0, cy=94.0,
+    T_car_from_camera=camera_mount(0.3, 0.0, 0.2, 0.17).tolist(),
+)  # fmt: skip
+POSE_S = np.arange(0.0, 24.0, 0.01)
+FRAME_S = np.arange(1.0, 23.0, 0.1)
+
+
+def yaw_at(t):
+    """Turned to and fro by hand: no rhythm."""
+    return 0.5 * np.sin(1.1 * t) + 0.25 * np.sin(2.63 * t + 1.0) + 0.1 * np.sin(5.1 * t)
+
+
+def turns(offset_s, rng, noise_rad=0.002, yaw=yaw_at):
+    a, b = FRAME_S[:-1], FRAME_S[1:]
+    return Turns(a, b, yaw(b - offset_s) - yaw(a - offset_s) + rng.normal(0.0, noise_rad, len(a)))
+
+
+@pytest.mark.parametrize("offset_s", [0.0, 0.0437, -0.112, 0.25])
+def test_known_offset(offset_s):
+    rng = np.random.default_rng(0)
+    fit = fit_offset(turns(offset_s, rng), POSE_S, yaw_at(POSE_S) + rng.normal(0.0, 0.001, len(POSE_S)))
+    assert fit.camera_minus_mocap_s == pytest.approx(offset_s, abs=0.003)
+    assert abs(fit.camera_minus_mocap_s - offset_s) < 4.0 * fit.stddev_s
+    assert fit.scale == pytest.approx(1.0, abs=0.02)
+
+
+def test_pictures_of_a_far_wall_turn_as_the_camera_did():
+    """A texture at infinity, warped by the known rotation: image turns against the closed form."""
+    rng = np.random.default_rng(1)
+    grey = cv2.GaussianBlur(rng.uniform(0, 255, (600, 1400)).astype(np.float32), (0, 0), 3.0)
+    grey = cv2.normalize(grey, None, 0, 255, cv2.NORM_MINMAX)
+    matrix, R_mount = CAMERA.pinhole.matrix, CAMERA.mount[:3, :3]
+    times = np.arange(0.0, 2.0, 0.1)
+    frames = []
+    for t in times:
+        yaw = 0.5 * yaw_at(t)
+        c, s = np.cos(yaw), np.sin(yaw)
+        rays = CAMERA.pinhole.directions() @ (np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ R_mount).T
+        u = 700.0 - 400.0 * np.arctan2(rays[..., 1], rays[..., 0])
+        v = 300.0 - 400.0 * rays[..., 2] / np.hypot(rays[..., 0], rays[..., 1])
+        frames.append(
+            (t, cv2.remap(grey, u.astype(np.float32), v.astype(np.float32), cv2.INTER_LINEAR).astype(np.uint8))
+        )
+    found = image_turns(frames, CAMERA)
+    truth = 0.5 * (yaw_at(found.end_s) - yaw_at(found.start_s))
+    assert len(found.yaw_rad) >= 18
+    np.testing.assert_allclose(found.yaw_rad, truth, atol=0.002)
+    assert matrix[0, 0] == 174.0
+
+
+def test_a_car_at_rest_is_refused():
+    rng = np.random.default_rng(2)
+    with pytest.raises(DegenerateDataError, match="too little excitation"):
+        fit_offset(turns(0.0, rng, yaw=lambda t: 0.0 * t), POSE_S, 0.0 * POSE_S)
+
+
+def test_a_steady_circle_is_refused():
+    rng = np.random.default_rng(3)
+    with pytest.raises(DegenerateDataError, match=r"steady rate .* same at any offset"):
+        fit_offset(turns(0.0, rng, yaw=lambda t: 0.5 * t), POSE_S, 0.5 * POSE_S)
+
+
+def test_a_rhythm_is_refused():
+    rng = np.random.default_rng(4)
+
+    def swing(t):
+        return 0.3 * np.sin(2.0 * np.pi * t / 0.35)
+
+    with pytest.raises(DegenerateDataError, match=r"two peaks .* irregularly"):
+        fit_offset(turns(0.0, rng, yaw=swing), POSE_S, swing(POSE_S))
+
+
+def test_another_car_is_refused():
+    rng = np.random.default_rng(5)
+    with pytest.raises(PoorFitError, match="is the subject the car the camera is on"):
+        fit_offset(turns(0.0, rng), POSE_S, 0.6 * np.sin(0.77 * POSE_S) + 0.2 * np.sin(3.3 * POSE_S))
+
+
+def test_a_short_recording_and_a_black_one_are_refused():
+    rng = np.random.default_rng(6)
+    few = turns(0.0, rng)
+    with pytest.raises(DegenerateDataError, match="at least 40 pairs of frames"):
+        fit_offset(Turns(few.start_s[:30], few.end_s[:30], few.yaw_rad[:30]), POSE_S, yaw_at(POSE_S))
+    black = image_turns([(0.1 * k, np.zeros((188, 336), np.uint8)) for k in range(3)], CAMERA)
+    assert len(black.yaw_rad) == 0
+    with pytest.raises(DegenerateDataError, match="frames of 336 x 188, as calibrated, got 10 x 10"):
+        image_turns([(0.0, np.zeros((10, 10), np.uint8))], CAMERA)
+
+
+def test_the_file_survives_a_round_trip(tmp_path):
+    found = fit_offset(turns(0.05, np.random.default_rng(7)), POSE_S, yaw_at(POSE_S)).calibration
+    save_calibration(found, tmp_path / "offset.yaml")
+    assert load_calibration(TimeOffsetCalibration, tmp_path / "offset.yaml") == found
