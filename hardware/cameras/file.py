@@ -8,13 +8,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from hardware.cameras.interface import Frame
+from hardware.cameras.interface import Camera, Frame
 from hardware.errors import DeviceNotFound, LinkLost
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp")
 
 
-class FileCamera:
+class FileCamera(Camera):
     """Delivers the images of a folder in the order of their names.
 
     Args:
@@ -56,6 +56,7 @@ class FileCamera:
         if bgr is None:
             raise LinkLost(f"expected an image, cannot decode {path}: remove or replace it")
         rgb = np.ascontiguousarray(bgr[:, :, ::-1], dtype=np.uint8)
+        rgb.flags.writeable = False
         frame = Frame(rgb, time.time_ns(), time.monotonic_ns(), self._sequence)
         self._sequence += 1
         # From now on, not from the plan: pictures are never delivered in a burst.

@@ -7,14 +7,14 @@ import time
 from pathlib import Path
 
 from hardware.cameras.frame_wire import HEAD_BYTES, REQUEST, decode_frame, pixel_bytes
-from hardware.cameras.interface import Frame
+from hardware.cameras.interface import Camera, Frame
 from hardware.errors import DeviceNotFound, LinkLost, LinkTimeout
 
 # What a server on the same machine needs to answer when it has something to answer with.
 _ANSWER_S = 0.01
 
 
-class SocketCamera:
+class SocketCamera(Camera):
     """Reads frames that carry their capture stamps; nothing is stamped again here.
 
     Each frame is asked for, so that none grows old in the socket while the reader does something else.
