@@ -14,9 +14,11 @@ from pathlib import Path
 
 from benchmarks.results import REPOSITORY
 
-QUICK = ("hash_encoding", "adjoint_gradient", "adjoint_memory", "fault_stops", "hydrant", "structure_from_motion")
-LONG = ("attack_kill", "adjoint_memory --compare", "newcomer")
-OF_A_RUN = ("gradient_pass", "phone_to_car")
+QUICK = (
+    "hash_encoding", "adjoint_gradient", "adjoint_memory", "fault_stops", "hydrant", "structure_from_motion", "training_step",
+)  # fmt: skip
+LONG = ("attack_kill", "scene_kill", "adjoint_memory --compare", "newcomer")
+OF_A_RUN = ("gradient_pass", "objects", "phone_to_car")
 
 
 def commands(run_folder: Path, quick: bool) -> list[str]:
