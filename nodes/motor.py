@@ -3,21 +3,29 @@
 It obeys only commands younger than a limit. When they stop coming, are not finite, or come from another safety process than
 before, it brakes and latches: from then on it ignores every command to move until it has seen an explicit stop, which the safety
 node sends only while disarmed. So nothing that dies, hangs or wakes up again makes the car move without somebody arming it anew.
+
+It is not ready, and the car cannot be armed, before the controller sent telemetry, showed a time-out of its own that is short
+enough (where its firmware tells), and somebody or something saw the front wheels turn.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
 from calibration.schema import VehicleCalibration, load_calibration
 from hardware.errors import HardwareError, ProtocolError
-from hardware.vesc import Sent, Vesc
+from hardware.limits import Sent
+from hardware.vesc import Vesc
 from hardware.vesc_replies import Values
+from hardware.vesc_settings import TimeoutSettings
 from nodes.command_gate import Brake, CommandGate, Drive, GateSettings, GateState
+from nodes.motor_reports import diagnostics_message
+from nodes.motor_watch import ControllerWatch
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.messages import header, ns_from_stamp, types
 from nodes.runtime.node import ACTIVE, FAULT, READY, STARTING, MessageInfo, Node, NodeContext, Now, Out, run_node_main
@@ -25,6 +33,7 @@ from nodes.runtime.node import ACTIVE, FAULT, READY, STARTING, MessageInfo, Node
 _TICK_RATE_HZ = 50.0
 _RETRY_S = 0.5
 _POLL_S = 0.04
+_DIAGNOSTICS_S = 1.0
 
 
 class MotorConfig(BaseModel):
@@ -37,9 +46,13 @@ class MotorConfig(BaseModel):
         brake_current_a: Brake current for every stop [A].
         brake_ramp_s: Time over which the brake current rises from a third to the whole [s].
         brake_hold_s: Time of braking, after which the motor is let go [s].
+        current_max_a: No current that is commanded is larger [A].
         link_timeout_s: A controller that answers nothing for this long is a fault [s].
-        controller_timeout_ms: The controller's own command time-out, as set in its configuration; reported, not checked [ms].
-        controller_brake_current_a: Its brake current on time-out, as set in its configuration; reported, not checked [A].
+        controller_timeout_ms: The longest command time-out of its own that the controller may have; not ready with more [ms].
+        controller_brake_current_a: The smallest brake current it may then use; not ready with less [A].
+        steering_check: Whether somebody must have seen the wheels turn before arming; the twin's controller always steers.
+        steering_angle_rad: Front wheel angle shown in that check [rad].
+        battery_warning_v: Supply voltage below which the diagnostics warn [V].
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -50,9 +63,13 @@ class MotorConfig(BaseModel):
     brake_current_a: float = Field(default=20.0, gt=0.0, le=60.0)
     brake_ramp_s: float = Field(default=0.1, ge=0.0, le=0.5)
     brake_hold_s: float = Field(default=1.0, gt=0.0)
-    link_timeout_s: float = Field(default=0.3, gt=0.0)
-    controller_timeout_ms: float = Field(default=1000.0, ge=0.0)
+    current_max_a: float = Field(default=60.0, gt=0.0)
+    link_timeout_s: float = Field(default=0.2, gt=0.0)
+    controller_timeout_ms: int = Field(default=1000, gt=0)
     controller_brake_current_a: float = Field(default=0.0, ge=0.0)
+    steering_check: Literal["required", "unless_twin", "never"] = "unless_twin"
+    steering_angle_rad: float = Field(default=0.2, gt=0.0, le=0.4)
+    battery_warning_v: float = Field(default=13.2, ge=0.0)
 
 
 class MotorNode(Node):
@@ -61,16 +78,20 @@ class MotorNode(Node):
     Args:
         config: Its configuration.
         make_vesc: Makes a driver that is not open yet.
+        wheelbase_m: Distance between the axles, for odometry [m].
         mono_ns: Monotonic time at the start [ns].
     """
 
-    subscriptions = ("/safety/drive",)
-    publications = ("/motor/sent", "/motor/state")
+    subscriptions = ("/safety/drive", "/motor/check", "/vicon/car")
+    publications = ("/motor/sent", "/motor/state", "/odom", "/diagnostics")
     tick_rate_hz = _TICK_RATE_HZ
 
-    def __init__(self, config: MotorConfig, make_vesc: Callable[[], Vesc], mono_ns: int) -> None:
+    def __init__(self, config: MotorConfig, make_vesc: Callable[[], Vesc], wheelbase_m: float, mono_ns: int) -> None:
         self._config = config
         self._vesc = make_vesc()
+        wanted = TimeoutSettings(config.controller_timeout_ms, config.controller_brake_current_a)
+        self._watch = ControllerWatch(wanted, config.steering_check, config.steering_angle_rad, wheelbase_m)
+        self._diagnosed_ns = 0
         settings = GateSettings(
             config.command_age_limit_s, config.brake_current_a, config.brake_ramp_s, config.brake_hold_s
         )
@@ -86,13 +107,21 @@ class MotorNode(Node):
         """Make the node of a process; the port is opened by the first tick, and again whenever it went away."""
         car = load_calibration(VehicleCalibration, config.calibration)
 
-        def make() -> Vesc:
-            return Vesc(config.port, car.vehicle_gains, car.drive_limits, config.brake_current_a)
+        limits = replace(car.drive_limits, current_max_a=config.current_max_a)
 
-        return cls(config, make, context.clock.now().mono_ns)
+        def make() -> Vesc:
+            return Vesc(config.port, car.vehicle_gains, limits, config.brake_current_a)
+
+        return cls(config, make, car.wheelbase_m, context.clock.now().mono_ns)
 
     def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
-        """Obey or refuse a command."""
+        """Obey or refuse a command; watch the car while its steering is checked."""
+        if topic == "/vicon/car":
+            self._watch.see(message, now.mono_ns)
+            return []
+        if topic == "/motor/check":
+            self._obey_check(str(message.action), str(message.source), now)
+            return []
         drive = message.drive
         action = self._gate.command(float(drive.speed), float(drive.steering_angle), info, now.mono_ns)
         if isinstance(action, Drive):
@@ -101,18 +130,22 @@ class MotorNode(Node):
 
     def tick(self, now: Now) -> list[Out]:
         """Keep what was commanded going, stop when it is stale, read telemetry, mend the link."""
-        if self._link_error:
+        if not self._vesc.is_open:
             self._connect(now)
+        self._watch.check.tick(now.mono_ns)
+        self._show_wheels(now)
         # The last command again only while the limiter has not reached it: repeating it for ever is what keeps dead cars driving.
         action = self._gate.tick(now.mono_ns)
         outs = [] if isinstance(action, Drive) and self._reached(action) else self._act(action, now, first=False)
-        return outs + self._telemetry(now)
+        return outs + self._telemetry(now) + self._diagnostics(now)
 
     def status(self) -> tuple[str, str]:
         """Fault when the link is broken or commands ceased; active while driving."""
         if self._link_error:
             return (FAULT if self._linked_once else STARTING), self._link_error
-        peer = f"{self._vesc.firmware}, {self._controller_text()}"
+        if missing := self._watch.missing():
+            return STARTING, missing
+        peer = self._watch.text()
         if self._gate.state is GateState.DRIVING:
             return ACTIVE, peer
         if self._gate.state is GateState.STOPPED:
@@ -128,25 +161,36 @@ class MotorNode(Node):
         """Brake until the car stands, let the motor go."""
         self._vesc.close()
 
-    def _controller_text(self) -> str:
-        return (
-            f"own time-out set to {self._config.controller_timeout_ms:g} ms with {self._config.controller_brake_current_a:g} A"
-            " (as configured, not read back)"
-        )
+    def _obey_check(self, action: str, source: str, now: Now) -> None:
+        if self._gate.state is GateState.DRIVING or not self._vesc.is_open:
+            return
+        if action == "start":
+            self._watch.start_check(now.mono_ns)
+        elif action in ("confirm", "deny"):
+            self._watch.check.answer(action == "confirm", source, now.mono_ns)
+
+    def _show_wheels(self, now: Now) -> None:
+        steering_rad = self._watch.check.steering_rad(now.mono_ns)
+        if steering_rad is None or self._link_error or self._gate.state is GateState.DRIVING:
+            return
+        try:
+            self._vesc.steer(steering_rad)
+        except HardwareError as error:
+            self._lose(error, now)
 
     def _connect(self, now: Now) -> None:
         if now.mono_ns < self._retry_ns:
             return
         self._retry_ns = now.mono_ns + round(_RETRY_S * NS_PER_S)
         try:
-            self._vesc.abandon()
             self._vesc.open()
-            self._vesc.identify(timeout_s=0.2)
+            firmware = self._vesc.identify(timeout_s=0.2)
         except (HardwareError, ProtocolError) as error:
             self._vesc.abandon()
             self._link_error = str(error)
             return
         self._link_error, self._linked_once = "", True
+        self._watch.connected(firmware)
         # Whatever the car did while nobody was connected, it is stopped first.
         self._gate.brake_again(now.mono_ns)
 
@@ -162,7 +206,7 @@ class MotorNode(Node):
         return setpoint.speed_mps == speed and setpoint.steering_rad == steering
 
     def _act(self, action: Drive | Brake | None, now: Now, first: bool) -> list[Out]:
-        if action is None or self._link_error:
+        if action is None or not self._vesc.is_open:
             return []
         try:
             if isinstance(action, Drive):
@@ -189,20 +233,38 @@ class MotorNode(Node):
         return Out("/motor/sent", message)
 
     def _telemetry(self, now: Now) -> list[Out]:
-        if self._link_error:
+        if not self._vesc.is_open:
             return []
         try:
             replies = self._vesc.receive()
             if now.mono_ns - self._polled_ns >= _POLL_S * NS_PER_S:
                 self._polled_ns = now.mono_ns
-                self._vesc.request_values()
-        except (HardwareError, ProtocolError) as error:
+                self._watch.poll(self._vesc)
+        except ProtocolError as error:
+            self._watch.settings_unreadable()
+            self._link_error = str(error)
+            self._gate.latch(f"link fault: {error}", now.mono_ns)
+            return []
+        except HardwareError as error:
             self._lose(error, now)
             return []
         silence_s = (now.mono_ns - self._vesc.last_reply_mono_ns) / NS_PER_S
         if silence_s > self._config.link_timeout_s:
-            self._lose(HardwareError(f"the VESC at {self._config.port} has not answered for {silence_s:.2f} s"), now)
-        return [Out("/motor/state", self._state(reply, now)) for reply in replies if isinstance(reply, Values)]
+            # The line is still open: what it may yet carry is the brake.
+            self._link_error = f"the VESC at {self._config.port} has not answered for {silence_s:.2f} s"
+            self._gate.latch(f"link fault: {self._link_error}", now.mono_ns)
+        elif self._link_error:
+            self._link_error = ""
+            self._gate.brake_again(now.mono_ns)
+        states = [Out("/motor/state", self._state(reply, now)) for reply in replies if isinstance(reply, Values)]
+        return states + [out for reply in replies for out in self._watch.hear(reply, self._vesc, now)]
+
+    def _diagnostics(self, now: Now) -> list[Out]:
+        if now.mono_ns - self._diagnosed_ns < _DIAGNOSTICS_S * NS_PER_S:
+            return []
+        self._diagnosed_ns = now.mono_ns
+        report = self._watch.report(self._vesc, self._link_error, self._config.battery_warning_v, now)
+        return [Out("/diagnostics", diagnostics_message(report, now.real_ns))]
 
     def _state(self, values: Values, now: Now) -> Any:
         if values.fault:

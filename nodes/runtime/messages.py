@@ -49,6 +49,8 @@ _PACKAGES = (
     "geometry_msgs",
     "sensor_msgs",
     "diagnostic_msgs",
+    "rosgraph_msgs",
+    "nav_msgs",
     "ackermann_msgs",
     "advnerf_msgs",
 )

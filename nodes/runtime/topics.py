@@ -49,6 +49,7 @@ _ROWS = (
     Topic("/policy/drive", _ACKERMANN, 10.0, 1, 0.25, "policy"),
     Topic("/safety/drive", _ACKERMANN, 10.0, 1, 0.25, "safety"),
     Topic("/safety/state", "advnerf_msgs/msg/SafetyState", 10.0, 20, 0.5, "safety"),
+    Topic("/clock/offset", "advnerf_msgs/msg/ClockOffset", 5.0, 20, 1.0, "gateway"),
     Topic("/arm", "advnerf_msgs/msg/Arm", None, 20, None, "operator"),
     Topic("/twin/reset", "geometry_msgs/msg/PoseStamped", None, 5, None, "operator"),
     Topic("/attack/request", "advnerf_msgs/msg/AttackRequest", None, 5, None, "operator"),
@@ -58,7 +59,12 @@ _ROWS = (
     Topic("/attack/preview", "sensor_msgs/msg/Image", None, 1, None, "attack"),
     Topic("/attack/file", "advnerf_msgs/msg/FileChunk", None, 300, None, "attack"),
     Topic("/motor/sent", "advnerf_msgs/msg/MotorSent", 20.0, 200, None, "motor"),
+    Topic("/motor/check", "advnerf_msgs/msg/SteeringCheck", None, 5, None, "operator"),
+    Topic("/odom", "nav_msgs/msg/Odometry", 20.0, 50, 0.5, "motor"),
+    Topic("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray", 1.0, 20, None, "motor"),
     Topic("/motor/state", "advnerf_msgs/msg/VescState", 20.0, 50, 0.5, "motor"),
+    Topic("/clock", "rosgraph_msgs/msg/Clock", 40.0, 1, None, "player"),
+    Topic("/player/control", "std_msgs/msg/String", None, 20, None, "operator"),
 )
 TOPICS: dict[str, Topic] = {row.name: row for row in _ROWS}
 _NODE_NAME = re.compile(r"[a-z][a-z0-9_]{0,23}")

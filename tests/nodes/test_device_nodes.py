@@ -213,7 +213,7 @@ class Drives:
         return outs
 
     def names(self):
-        return [e.name for e in self.emulator.events() if e.name not in ("GET_VALUES", "FW_VERSION")]
+        return [e.name for e in self.emulator.events() if e.name not in ("GET_VALUES", "FW_VERSION", "GET_APPCONF")]
 
 
 @pytest.fixture
@@ -237,7 +237,7 @@ def test_motor_connects_stops_and_waits_for_the_safety_node(drives):
     drives.send(0.0, 0.0)
     state, text = drives.node.status()
     assert state == "ready"
-    assert "not read back" in text
+    assert text == "TWIN firmware 5.02, own time-out 1000 ms with 0 A"
 
 
 def test_motor_obeys_and_reports_the_origin(drives):
@@ -304,7 +304,8 @@ def test_motor_on_a_controller_that_is_silent(tmp_path):
     tty.setraw(slave)
     config = MotorConfig(port=os.ttyname(slave), calibration=TWIN / "vehicle.yaml")
     node = MotorNode.build(config, context(tmp_path))
-    assert node.tick(CLOCK.now()) == []
+    (out,) = node.tick(CLOCK.now())
+    assert (out.topic, out.message.status[0].level) == ("/diagnostics", 2)
     assert node.status()[0] == "starting"
     assert "is this a VESC" in node.status()[1]
     node.close()

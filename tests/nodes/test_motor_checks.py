@@ -1,0 +1,236 @@
+"""What keeps a car from being armed before it can be trusted: telemetry, the controller's time-out, steering that was seen."""
+
+import math
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from advnerf_core.geometry import planar_pose
+from hardware.twin.config import CarConfig
+from hardware.twin.vehicle import TwinVehicle
+from hardware.twin.vesc_emulator import VescEmulator
+from hardware.twin.vesc_firmware import VescEmulatorConfig
+from nodes.cli import app
+from nodes.motor import MotorConfig, MotorNode
+from nodes.runtime.clock import Now, SystemClock
+from nodes.runtime.messages import decode, encode, header, pose_message, types
+from nodes.runtime.node import MessageInfo, NodeContext
+from nodes.steering_check import CheckSettings, SteeringCheck
+
+CLOCK = SystemClock()
+VEHICLE = Path(__file__).parents[2] / "calibration" / "twin" / "vehicle.yaml"
+
+
+class Car:
+    """A motor node on an emulator over a real pty, in time that the test gives out."""
+
+    def __init__(self, tmp_path, config=None, **vesc):
+        self.emulator = VescEmulator(
+            VescEmulatorConfig(**{"hardware_name": "60", **vesc}), TwinVehicle(CarConfig()), tmp_path / "vesc"
+        )
+        config = MotorConfig(port=str(tmp_path / "vesc"), calibration=VEHICLE, **(config or {}))
+        self.node = MotorNode.build(config, NodeContext("motor", tmp_path, CLOCK))
+        self.start = CLOCK.now()
+        self.pose = (0.0, 0.0, 0.0)
+        self.outs = []
+
+    def now(self):
+        return CLOCK.now()
+
+    def settle(self, until, timeout_s=2.0):
+        import time
+
+        deadline = time.monotonic() + timeout_s
+        while not until():
+            assert time.monotonic() < deadline, self.node.status()
+            self.outs += self.node.tick(CLOCK.now())
+            time.sleep(0.005)
+
+    def say(self, action):
+        message = types.SteeringCheck(header=header(0), action=action, source="operator")
+        self.node.handle("/motor/check", message, MessageInfo(0, 0, instance_id=1), CLOCK.now())
+
+    def rows(self):
+        messages = [o.message for o in self.outs if o.topic == "/diagnostics"]
+        decoded = decode("diagnostic_msgs/msg/DiagnosticArray", encode(messages[-1]))
+        return {row.name: row for row in decoded.status}
+
+    def close(self):
+        self.node.close()
+        self.emulator.close()
+
+
+@pytest.fixture
+def make(tmp_path):
+    cars = []
+
+    def build(config=None, **vesc):
+        cars.append(Car(tmp_path, config, **vesc))
+        return cars[-1]
+
+    yield build
+    for car in cars:
+        car.close()
+
+
+def known(car):
+    return lambda: "settings" not in car.node.status()[1] and "telemetry" not in car.node.status()[1]
+
+
+def test_a_car_nobody_has_seen_steering_is_not_ready(make):
+    car = make()
+    car.settle(lambda: "steering was not checked" in car.node.status()[1])
+    assert car.node.status()[0] == "starting"
+
+
+@pytest.mark.parametrize(("config", "vesc"), [({"steering_check": "never"}, {}), ({}, {"hardware_name": "TWIN"})])
+def test_who_is_exempt(make, config, vesc):
+    car = make(config, **vesc)
+    car.settle(lambda: car.node.status()[1] == "latched: waiting for the safety node")
+    strict = SteeringCheck(CheckSettings(0.25))
+    assert not strict.passed
+
+
+def test_a_time_out_that_is_too_long_keeps_it_from_arming(make):
+    car = make({"steering_check": "never", "controller_timeout_ms": 250, "controller_brake_current_a": 20.0})
+    car.settle(lambda: "set-timeout" in car.node.status()[1])
+    assert car.node.status()[0] == "starting"
+    assert "at most 250 ms with at least 20 A, it is 1000 ms with 0 A" in car.node.status()[1]
+
+
+def test_a_time_out_switched_off_is_never_good_enough(make):
+    car = make({"steering_check": "never"}, timeout_ms=0.0)
+    car.settle(lambda: "switched off" in car.node.status()[1])
+
+
+def test_a_controller_that_does_not_tell_is_used_but_said_so(make):
+    car = make({"steering_check": "never"}, readable_settings=False)
+    car.settle(lambda: car.node.status()[1] == "latched: waiting for the safety node")
+    car.settle(lambda: any(o.topic == "/diagnostics" and o.message.status[1].level == 0 for o in car.outs))
+    assert car.rows()["motor: time-out"].level == 1
+    assert "VESC Tool" in car.rows()["motor: time-out"].message
+
+
+def test_a_silent_controller_is_braked_over_the_line_that_is_still_open(make):
+    car = make({"steering_check": "never"})
+    car.settle(lambda: car.node.status()[1] == "latched: waiting for the safety node")
+    drive(car, 0.0)
+    drive(car, 0.5)
+    car.emulator.disturb("silent")
+    since = CLOCK.now().mono_ns
+    car.settle(lambda: any(e.name == "SET_CURRENT_BRAKE" for e in car.emulator.events(since)))
+    assert car.node.status()[0] == "fault"
+    car.emulator.disturb(None)
+    car.settle(lambda: "link fault" in car.node.status()[1] and car.node.status()[1].startswith("latched"))
+
+
+def drive(car, speed):
+    now = CLOCK.now()
+    message = types.AckermannDriveStamped(
+        header=header(now.real_ns),
+        drive=types.AckermannDrive(
+            steering_angle=0.0, steering_angle_velocity=0.0, speed=speed, acceleration=0.0, jerk=0.0
+        ),
+    )
+    return car.node.handle("/safety/drive", message, MessageInfo(now.mono_ns, now.mono_ns, instance_id=1), now)
+
+
+def test_diagnostics_and_odometry_are_standard_messages(make):
+    car = make({"battery_warning_v": 16.0})
+    car.emulator.report_fault(3)
+    car.settle(lambda: any(o.topic == "/odom" for o in car.outs))
+    car.settle(lambda: any(o.topic == "/diagnostics" and o.message.status[1].message for o in car.outs[-3:]), 3.0)
+    rows = car.rows()
+    assert set(rows) == {"motor: controller", "motor: battery", "motor: time-out", "motor: steering"}
+    odometry = decode("nav_msgs/msg/Odometry", encode([o.message for o in car.outs if o.topic == "/odom"][-1]))
+    assert (odometry.header.frame_id, odometry.child_frame_id) == ("odom", "car")
+    assert list(odometry.pose.covariance[[0, 7, 35]]) == [0.2, 0.2, 0.4]
+
+
+# The check itself, with a car pushed by hand: its wheels are those of the simulated car.
+
+
+def push(check, turns, speed=0.2, wheelbase=0.25):
+    """Push a car in both positions; ``turns``: how much of the angle its wheels really take."""
+    x = y = yaw = 0.0
+    check.start(0)
+    angle = 0.0
+    for ms in range(0, 9000, 10):
+        mono_ns = ms * 1_000_000
+        told = check.steering_rad(mono_ns)
+        if told is None:
+            break
+        angle += (turns * told - angle) * 0.1  # the servo needs its time
+        step = speed * 0.01
+        yaw += step * math.tan(angle) / wheelbase
+        x, y = x + step * math.cos(yaw), y + step * math.sin(yaw)
+        check.pose(x, y, yaw, mono_ns)
+        check.tick(mono_ns)
+    return check
+
+
+@pytest.mark.parametrize("speed", [0.2, -0.2])
+def test_motion_capture_sees_wheels_that_turn(speed):
+    check = push(SteeringCheck(CheckSettings(0.25)), 1.0, speed)
+    assert (check.passed, check.text) == (True, "steering seen by motion capture")
+
+
+@pytest.mark.parametrize("turns", [0.0, -1.0, 0.3])
+def test_motion_capture_sees_wheels_that_do_not(turns):
+    check = push(SteeringCheck(CheckSettings(0.25)), turns)
+    assert not check.passed
+    assert "told to turn left" in check.text
+    assert "servo output off" in check.text
+
+
+def test_a_car_that_was_not_pushed_waits_for_a_person():
+    check = push(SteeringCheck(CheckSettings(0.25)), 1.0, speed=0.0)
+    assert not check.passed
+    assert check.text.endswith("confirm or deny")
+    check.answer(True, "Ada", 9 * 10**9)
+    assert (check.passed, check.text) == (True, "steering confirmed by Ada")
+    check.start(10**10)
+    check.answer(True, "Ada", 10**10 + 10**9)
+    assert not check.passed  # too early: nothing was shown yet
+    check.answer(False, "Ada", 10**10 + 9 * 10**9)
+    assert (check.passed, check.showing) == (False, False)
+    check.start(0)
+    check.tick(69 * 10**9)
+    assert "nobody answered" in check.text
+
+
+def test_the_node_turns_the_wheels_and_listens_to_the_person(make):
+    car = make({"steering_angle_rad": 0.15})
+    car.settle(lambda: "steering was not checked" in car.node.status()[1])
+    car.say("start")
+    car.settle(lambda: any(e.name == "SET_SERVO_POS" for e in car.emulator.events()))
+    servo = [e.value for e in car.emulator.events() if e.name == "SET_SERVO_POS"][-1]
+    assert (servo - 0.5304) / -1.2135 == pytest.approx(0.15, abs=2e-3)
+    assert not [e for e in car.emulator.events() if e.name == "SET_RPM"]
+    later = CLOCK.now()
+    for second in range(1, 10):  # the node knows no clock but the one it is given
+        now = Now(later.mono_ns + second * 10**9, later.real_ns)
+        car.node._watch.check.tick(now.mono_ns)
+        car.node.handle(
+            "/vicon/car", pose_message(planar_pose(0.0, 0.0, 0.0), 0), MessageInfo(0, 0, instance_id=1), now
+        )
+    message = types.SteeringCheck(header=header(0), action="confirm", source="operator")
+    car.node.handle("/motor/check", message, MessageInfo(0, 0, instance_id=1), now)
+    assert "steering" not in car.node._watch.missing()
+
+
+def test_command_line(tmp_path):
+    with VescEmulator(VescEmulatorConfig(), TwinVehicle(CarConfig()), tmp_path / "vesc") as emulator:
+        port = ["--port", str(tmp_path / "vesc")]
+        shown = CliRunner().invoke(app, ["motor", "info", *port])
+        assert shown.exit_code == 0, shown.output
+        assert "TWIN firmware 5.02" in shown.output
+        assert "1000 ms with 0 A" in shown.output
+        stored = CliRunner().invoke(
+            app, ["motor", "set-timeout", "--timeout-ms", "250", "--brake-current", "20", *port]
+        )
+        assert stored.exit_code == 0, stored.output
+        assert "was 1000 ms with 0 A, is 250 ms with 20 A" in stored.output
+        assert str(emulator.timeout) == "250 ms with 20 A"
+    assert CliRunner().invoke(app, ["motor", "set-timeout", "--timeout-ms", "0"]).exit_code == 2
