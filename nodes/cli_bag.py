@@ -14,8 +14,13 @@ app = typer.Typer(no_args_is_help=True, help="Record, look into, play and repair
 
 
 @app.command("info")
-def bag_info(bag: Annotated[Path, typer.Argument(help="Bag folder or .mcap file.", exists=True)]) -> None:
-    """Say what is in a bag."""
+def bag_info(
+    bag: Annotated[Path, typer.Argument(help="Bag folder or .mcap file.", exists=True)],
+    stamps: Annotated[
+        bool, typer.Option("--stamps", help="Also read every message and say how late they came.")
+    ] = False,
+) -> None:
+    """Say what is in a bag, and what was lost on the way into it."""
     from datetime import datetime
 
     from nodes.runtime.bag_read import read_info
@@ -33,6 +38,36 @@ def bag_info(bag: Annotated[Path, typer.Argument(help="Bag folder or .mcap file.
         rate = f"{(topic.count - 1) / info.duration_s:.1f} Hz" if topic.count > 1 and info.duration_s > 0 else ""
         rows.add_row(topic.name, topic.type, str(topic.count), rate, "?" if topic.lost is None else str(topic.lost))
     print_table(rows)
+    if stamps:
+        _print_delays(bag)
+
+
+def _print_delays(bag: Path) -> None:
+    from nodes.runtime.bag_stamps import read_delays
+
+    rows = table(
+        "topic", "capture to publish [ms]", "worst", "to reception [ms]", "worst", "stamps that go back", "in future"
+    )
+    for topic, delays in sorted(read_delays(bag).items()):
+        published, worst = (
+            "-" if value is None else f"{value:.1f}" for value in (delays.publish_ms, delays.publish_worst_ms)
+        )
+        received = f"{delays.receive_ms:.1f}", f"{delays.receive_worst_ms:.1f}"
+        rows.add_row(topic, published, worst, *received, str(delays.backwards), str(delays.future))
+    print_table(rows)
+
+
+@app.command("extract")
+def bag_extract(
+    bag: Annotated[Path, typer.Argument(help="Bag folder or .mcap file.", exists=True)],
+    names: Annotated[list[str] | None, typer.Argument(help="Attachments to take out.", show_default="all")] = None,
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder to put them in.")] = Path(),
+) -> None:
+    """Take out the files that ride along in a bag: the launch file as it was run, calibration, the attack."""
+    from nodes.runtime.bag_read import extract_attachments
+
+    for path in extract_attachments(bag, output, names or ()):
+        print(path)
 
 
 @app.command("record")
@@ -61,8 +96,21 @@ def bag_play(
     bag: Annotated[Path, typer.Argument(help="Bag folder or .mcap file.", exists=True)],
     rate: Annotated[float, typer.Option("--rate", min=0.001, help="Speed relative to the recording.")] = 1.0,
     loop: Annotated[bool, typer.Option("--loop", help="Begin again at the end.")] = False,
-    start_offset_s: Annotated[float, typer.Option("--start-offset", min=0.0, help="Leave out so many seconds.")] = 0.0,
+    offset_s: Annotated[
+        float, typer.Option("--offset", "--start-offset", min=0.0, help="Leave out so many seconds.")
+    ] = 0.0,
+    duration_s: Annotated[
+        float | None, typer.Option("--duration", min=0.001, help="Play so many seconds of the recording.")
+    ] = None,
     topics: Topics = None,
+    remap: Annotated[
+        list[str] | None,
+        typer.Option("--remap", metavar="OLD:=NEW", help="Play a topic under another name; may be repeated."),
+    ] = None,
+    paused: Annotated[bool, typer.Option("--paused", help="Begin standing still.")] = False,
+    clock_hz: Annotated[
+        float | None, typer.Option("--clock", metavar="HZ", min=0.1, max=200.0, help="Say the recorded time on /clock.")
+    ] = None,
     wait_for: Annotated[
         list[str] | None,
         typer.Option("--wait-for", metavar="TOPIC", help="Wait for a subscriber of it.", show_default="any topic"),
@@ -70,19 +118,64 @@ def bag_play(
     no_wait: Annotated[bool, typer.Option("--no-wait", help="Begin at once, whether anybody listens or not.")] = False,
     run_dir: RunDir = None,
 ) -> None:
-    """Play a bag to the nodes of a run folder; statuses and requests only when named by --topics."""
+    """Play a bag to the nodes of a run folder; statuses and requests only when named by --topics.
+
+    In a terminal: space pauses and goes on, right arrow or s steps, + and - change the speed, q ends.
+    From elsewhere: advnerf bag control pause|resume|toggle|step [N]|rate X|stop.
+    """
+    import sys
+
     from nodes.player import PlayerConfig, PlayerNode
+    from nodes.runtime.bag_keys import HELP
     from nodes.runtime.node import run_node
     from nodes.runtime.watching import find_run_dir
 
     waiting = [] if no_wait else wait_for or None
     config = PlayerConfig(
-        bag=bag, rate=rate, loop=loop, start_offset_s=start_offset_s, topics=topics or None, wait_for=waiting
+        bag=bag, rate=rate, loop=loop, start_offset_s=offset_s, duration_s=duration_s, topics=topics or None,
+        remap=_pairs(remap or []), paused=paused, clock_hz=clock_hz, wait_for=waiting,
     )  # fmt: skip
     if run_dir is not None:
         run_dir.mkdir(parents=True, exist_ok=True)
     run = find_run_dir(run_dir)
-    raise typer.Exit(run_node(lambda context: PlayerNode.build(config, context), "bag_play", run))
+    terminal = sys.stdin.fileno() if sys.stdin.isatty() else None
+    if terminal is not None:
+        print(HELP, flush=True)
+    raise typer.Exit(run_node(lambda context: PlayerNode(config, context.subscribers, terminal), "bag_play", run))
+
+
+def _pairs(texts: list[str]) -> dict[str, str]:
+    from nodes.runtime.errors import BagError
+
+    pairs: dict[str, str] = {}
+    for text in texts:
+        old, separator, new = text.partition(":=")
+        if not separator or not old or not new:
+            raise BagError(f"--remap {text}: expected OLD:=NEW, e.g. /camera/image_raw:=/compositor/image")
+        if old in pairs:
+            raise BagError(f"--remap {text}: {old} has another name already, {pairs[old]}")
+        pairs[old] = new
+    return pairs
+
+
+@app.command("control")
+def bag_control(
+    words: Annotated[list[str], typer.Argument(help="pause, resume, toggle, step [N], rate X, or stop.")],
+    run_dir: RunDir = None,
+) -> None:
+    """Tell a player that is at work to pause, go on, step, change its speed, or end."""
+    from nodes.runtime.bag_play import Command
+    from nodes.runtime.bus import Bus
+    from nodes.runtime.messages import types
+    from nodes.runtime.watching import find_run_dir
+
+    text = " ".join(words)
+    Command.parse(text)
+    with Bus(find_run_dir(run_dir)) as bus:
+        bus.publisher("/player/control")
+        bus.wait_for_subscribers(["/player/control"], 2.0)
+        bus.publish("/player/control", types.String(data=text))
+        bus.close(farewell=True)
 
 
 @app.command("repair")

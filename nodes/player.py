@@ -2,6 +2,9 @@
 
 The bytes and the capture stamps are those of the recording; publish times are new, so that receivers see fresh messages.
 Statuses and requests (to arm, for an attack) stay in the bag unless they are asked for: a recording must not arm a car.
+
+It can be told to pause, to go on, to step message by message, to change its speed and to end: by keys where it has a terminal,
+and by texts on ``/player/control``. ``/clock`` says where in the recording it is.
 """
 
 from __future__ import annotations
@@ -12,15 +15,32 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from nodes.runtime.bag_keys import Keys
+from nodes.runtime.bag_play import PAUSE, RATE, RESUME, STEP, STOP, TOGGLE, Command, Playhead
 from nodes.runtime.bag_read import BagMessage, read_info, read_messages, require_our_types
 from nodes.runtime.clock import NS_PER_S
-from nodes.runtime.errors import BagError, NodeFinished
-from nodes.runtime.node import ACTIVE, READY, MessageInfo, Node, NodeContext, Now, Out, run_node_main
+from nodes.runtime.errors import BagError, MessageError, NodeFinished
+from nodes.runtime.messages import stamp_from_ns, types
+from nodes.runtime.node import (
+    ACTIVE,
+    READY,
+    Inbox,
+    MessageInfo,
+    Node,
+    NodeContext,
+    Now,
+    Out,
+    ReaderThread,
+    run_node_main,
+)
 from nodes.runtime.topics import STATUS_PREFIX
+from nodes.runtime.topics import topic as topic_row
 
-_REQUESTS = ("/arm", "/attack/request", "/attack/cancel")
+_CONTROL, _CLOCK = "/player/control", "/clock"
+_STAYS = ("/arm", "/attack/request", "/attack/cancel", _CONTROL, _CLOCK)
 # Messages leave at the first tick after they are due, so they are up to 2.5 ms late on average.
 _TICK_HZ = 200.0
+_FASTER = 1.25
 
 
 class PlayerConfig(BaseModel):
@@ -31,9 +51,13 @@ class PlayerConfig(BaseModel):
         rate: Speed relative to the recording.
         loop: Begin again at the end.
         start_offset_s: Leave out so much of the beginning [s].
+        duration_s: Play only so much of the recording from there [s].
         topics: What to play; none means all but statuses and requests.
-        wait_for: Topics that must have a subscriber before the first message; none means that one of any topic will do,
-            an empty list means do not wait, and lose what is sent before a subscriber is there.
+        remap: Other names for topics, by their recorded name.
+        paused: Stand still until told to go on or to step.
+        clock_hz: How often ``/clock`` says where in the recording it is [Hz]; none for never.
+        wait_for: Topics that must have a subscriber before the first message, by the names under which they are played; none
+            means that one of any topic will do, an empty list means do not wait, and lose what is sent before one is there.
     """
 
     model_config = ConfigDict(extra="forbid")
@@ -42,7 +66,11 @@ class PlayerConfig(BaseModel):
     rate: float = Field(default=1.0, gt=0)
     loop: bool = False
     start_offset_s: float = Field(default=0.0, ge=0)
+    duration_s: float | None = Field(default=None, gt=0)
     topics: list[str] | None = None
+    remap: dict[str, str] = Field(default_factory=dict)
+    paused: bool = False
+    clock_hz: float | None = Field(default=None, gt=0, le=_TICK_HZ)
     wait_for: list[str] | None = None
 
 
@@ -52,26 +80,41 @@ class PlayerNode(Node):
     Args:
         config: Configuration.
         subscribers: Number of subscribers of a topic.
+        terminal: File descriptor of a terminal whose keys control it; none for no keys.
     """
 
+    subscriptions = (_CONTROL,)
     tick_rate_hz = _TICK_HZ
 
-    def __init__(self, config: PlayerConfig, subscribers: Callable[[str], int]) -> None:
+    def __init__(self, config: PlayerConfig, subscribers: Callable[[str], int], terminal: int | None = None) -> None:
         self._config = config
         self._subscribers = subscribers
         self._info = read_info(config.bag)
-        self.publications = tuple(_choose_topics(config, [topic.name for topic in self._info.topics]))
-        require_our_types(config.bag, self.publications)
+        self._topics = _choose_topics(config, [topic.name for topic in self._info.topics])
+        require_our_types(config.bag, self._topics)
+        self._names = _renamed(config, self._topics)
+        self._played_names = tuple(self._names[topic] for topic in self._topics)
+        self.publications = (*self._played_names, _CLOCK) if config.clock_hz else self._played_names
         for topic in config.wait_for or ():
             if topic not in self.publications:
                 raise BagError(
                     f"cannot wait for subscribers of {topic}, it is not played; played are {', '.join(self.publications)}"
                 )
+        self._begin_ns = self._info.start_ns + round(config.start_offset_s * NS_PER_S)
+        self._end_ns = self._info.end_ns
+        if config.duration_s is not None:
+            self._end_ns = min(self._end_ns, self._begin_ns + round(config.duration_s * NS_PER_S))
         self._messages: Iterator[BagMessage] = iter(())
         self._next: BagMessage | None = None
-        self._begin_bag_ns = 0
-        self._begin_mono_ns: int | None = None
-        self._played = 0
+        self._head: Playhead | None = None
+        self._clock_due_ns = 0
+        self._played, self._trouble, self._ending = 0, "", False
+        self._keys, self._reader = None, None
+        if terminal is not None:
+            self.inbox = Inbox[str](capacity=16)
+            self._keys = Keys(terminal)
+            self._reader = ReaderThread(self._keys.read, self.inbox, "keys")
+            self._reader.start()
 
     @classmethod
     def build(cls, config: PlayerConfig, context: NodeContext) -> PlayerNode:
@@ -79,57 +122,135 @@ class PlayerNode(Node):
         return cls(config, context.subscribers)
 
     def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
-        """A player hears nothing."""
-        return []
+        """Do what a text on the bus says."""
+        try:
+            return self._obey(Command.parse(str(message.data)), now)
+        except MessageError as error:
+            self._trouble = str(error)
+            return []
+
+    def receive(self, item: str, now: Now) -> list[Out]:
+        """Do what a key says."""
+        if item in ("faster", "slower"):
+            rate = self._head.rate if self._head else self._config.rate
+            return self._obey(Command(RATE, rate * _FASTER if item == "faster" else rate / _FASTER), now)
+        return self._obey(Command(item), now)
 
     def tick(self, now: Now) -> list[Out]:
         """Publish what is due."""
-        if self._begin_mono_ns is None:
+        if self._ending:
+            raise NodeFinished
+        if self._head is None:
             if self._missing():
                 return []
-            self._rewind(now)
+            self._head = Playhead(self._begin_ns, now.mono_ns, self._config.rate, self._config.paused)
+            self._rewind()
         due: list[Out] = []
-        while self._next is not None and self._next.log_ns <= self._bag_time_ns(now):
-            due.append(Out(self._next.topic, self._next.cdr))
-            self._next = next(self._messages, None)
-        self._played += len(due)
+        while not self._head.paused and self._next is not None and self._next.log_ns <= self._head.time_ns(now.mono_ns):
+            due.append(self._take())
         if self._next is None and not due:
             if not self._config.loop:
                 raise NodeFinished
-            self._rewind(now)
-        return due
+            self._head.jump(self._begin_ns, now.mono_ns)
+            self._rewind()
+        return self._clock(now) + due
 
     def status(self) -> tuple[str, str]:
         """Ready while it waits for subscribers."""
-        if self._begin_mono_ns is None and (missing := self._missing()):
+        if self._head is None and (missing := self._missing()):
             return READY, f"waits for subscribers of {', '.join(missing)}"
-        return ACTIVE, f"{self._played} messages played"
+        words = [f"{self._played} messages played"]
+        if self._head is not None and self._head.paused:
+            words.append("paused")
+        return ACTIVE, "; ".join([*words, *filter(None, [self._trouble])])
+
+    def close(self) -> None:
+        """Give the terminal back."""
+        if self._reader is not None and self._keys is not None:
+            self._reader.stop()
+            self._keys.close()
+
+    def _obey(self, command: Command, now: Now) -> list[Out]:
+        self._trouble = ""
+        if command.word == STOP:
+            self._ending = True
+        if self._head is None:
+            return []
+        if command.word in (PAUSE, RESUME, TOGGLE):
+            paused = not self._head.paused if command.word == TOGGLE else command.word == PAUSE
+            self._head.pause(paused, now.mono_ns)
+        elif command.word == RATE:
+            self._head.set_rate(command.number, now.mono_ns)
+        elif command.word == STEP:
+            return self._step(int(command.number), now)
+        return []
+
+    def _step(self, count: int, now: Now) -> list[Out]:
+        """The next messages at once; it stands still behind them."""
+        assert self._head is not None
+        self._head.pause(True, now.mono_ns)
+        outs = []
+        for _ in range(count):
+            if self._next is None:
+                break
+            self._head.jump(self._next.log_ns, now.mono_ns)
+            outs.append(self._take())
+        self._clock_due_ns = now.mono_ns
+        return self._clock(now) + outs
+
+    def _take(self) -> Out:
+        message = self._next
+        assert message is not None
+        self._played += 1
+        self._advance()
+        return Out(self._names[message.topic], message.cdr)
+
+    def _advance(self) -> None:
+        self._next = next(self._messages, None)
+        if self._next is not None and self._next.log_ns > self._end_ns:
+            self._next = None
+
+    def _clock(self, now: Now) -> list[Out]:
+        if self._config.clock_hz is None or self._head is None or now.mono_ns < self._clock_due_ns:
+            return []
+        period_ns = round(NS_PER_S / self._config.clock_hz)
+        late_ns = now.mono_ns - self._clock_due_ns
+        self._clock_due_ns = self._clock_due_ns + period_ns if late_ns < period_ns else now.mono_ns + period_ns
+        return [Out(_CLOCK, types.Clock(clock=stamp_from_ns(self._head.time_ns(now.mono_ns))))]
 
     def _missing(self) -> list[str]:
         wanted = self._config.wait_for
         missing = [
-            topic for topic in (self.publications if wanted is None else wanted) if self._subscribers(topic) == 0
+            topic for topic in (self._played_names if wanted is None else wanted) if self._subscribers(topic) == 0
         ]
-        return [] if wanted is None and len(missing) < len(self.publications) else missing
+        return [] if wanted is None and len(missing) < len(self._played_names) else missing
 
-    def _rewind(self, now: Now) -> None:
-        self._messages = read_messages(self._config.bag, self.publications, self._config.start_offset_s)
-        self._next = next(self._messages, None)
+    def _rewind(self) -> None:
+        self._messages = read_messages(self._config.bag, self._topics, self._config.start_offset_s)
+        self._advance()
         if self._next is None:
-            raise BagError(
-                f"{self._info.path} has no message of {', '.join(self.publications)} after {self._config.start_offset_s} s"
-            )
-        self._begin_bag_ns = self._info.start_ns + round(self._config.start_offset_s * NS_PER_S)
-        self._begin_mono_ns = now.mono_ns
+            span = f"{self._config.start_offset_s} s"
+            span += "" if self._config.duration_s is None else f" within {self._config.duration_s} s"
+            raise BagError(f"{self._info.path} has no message of {', '.join(self._topics)} after {span}")
 
-    def _bag_time_ns(self, now: Now) -> int:
-        assert self._begin_mono_ns is not None
-        return self._begin_bag_ns + round((now.mono_ns - self._begin_mono_ns) * self._config.rate)
+
+def _renamed(config: PlayerConfig, topics: list[str]) -> dict[str, str]:
+    """Name under which each topic is played, by its recorded name."""
+    for old, new in config.remap.items():
+        if old not in topics:
+            raise BagError(f"cannot play {old} as {new}: it is not played; played are {', '.join(topics)}")
+        if topic_row(new).type != topic_row(old).type:
+            raise BagError(f"cannot play {old} as {new}: it is {topic_row(old).type}, {new} is {topic_row(new).type}")
+    names = {topic: config.remap.get(topic, topic) for topic in topics}
+    for name in names.values():
+        if len(sources := [topic for topic, played in names.items() if played == name]) > 1:
+            raise BagError(f"{' and '.join(sources)} would both be played as {name}; leave one out with --topics")
+    return names
 
 
 def _choose_topics(config: PlayerConfig, recorded: list[str]) -> list[str]:
     if config.topics is None:
-        chosen = [name for name in recorded if name not in _REQUESTS and not name.startswith(STATUS_PREFIX)]
+        chosen = [name for name in recorded if name not in _STAYS and not name.startswith(STATUS_PREFIX)]
     else:
         chosen = list(dict.fromkeys(config.topics))
         if unknown := [name for name in chosen if name not in recorded]:

@@ -17,8 +17,8 @@ from nodes.runtime.paths import RESOLVED_NAME
 from nodes.runtime.topics import TOPICS, status_topic
 from nodes.runtime.topics import topic as topic_row
 
-# The last chunk is handed to the system so often; what a killed recorder loses is shorter than this.
-_FLUSH_HZ = 20.0
+# The chunk in progress is ended so often, also of topics that come slowly; what a power cut takes is not much longer than this.
+_FLUSH_HZ = 1.0
 
 
 class RecorderConfig(BaseModel):

@@ -1,7 +1,8 @@
 """Bags: what rosbag2, Foxglove, ``mcap`` and ``rosbags`` open. The bytes of the wire go in as they are.
 
 A bag is a folder with ``<name>.mcap`` and ``metadata.yaml``. Chunks of 64 KiB are written through to the file at once and
-reach the disk once a second, so a recorder that dies loses at most the chunk it was filling (`nodes.runtime.bag_repair`).
+reach the disk once a second; the chunk that is being filled is kept in a journal beside it, so that a recorder that is killed
+loses none of the messages it had received (`nodes.runtime.bag_repair` puts them together).
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import yaml
 from mcap.writer import CompressionType, Writer
 
 from advnerf_core.files import write_atomically
+from nodes.runtime.bag_journal import Entry, Journal
 from nodes.runtime.errors import BagError
 from nodes.runtime.messages import ROS_DISTRO, type_definition, type_hash
 from nodes.runtime.topics import topic as topic_row
@@ -158,6 +160,7 @@ class BagWriter:
             stamp_ns = time.time_ns() if attached_ns is None else attached_ns
             for name, content in (attachments or {}).items():
                 self._writer.add_attachment(stamp_ns, stamp_ns, name, "application/octet-stream", content)
+            self._journal = Journal(self.path, self._stream.tell())
         except OSError as error:
             shutil.rmtree(self.folder, ignore_errors=True)
             raise BagError(
@@ -185,15 +188,21 @@ class BagWriter:
         """
         try:
             channel = self._channels.get(topic) or self._register(topic)
+            self._journal.restart(self._stream.tell())  # a definition may have filled a chunk
+            # A message that fills a chunk by itself ends it at once and needs no journal.
+            if len(cdr) <= CHUNK_BYTES:
+                self._journal.add(Entry(topic, cdr, log_ns, publish_ns, sequence))
             self._writer.add_message(channel, log_ns, cdr, publish_ns, sequence & 0xFFFFFFFF)
+            self._journal.restart(self._stream.tell())
         except OSError as error:
             self._rescue(error)
         self.contents.add_message(topic, log_ns)
 
     def flush(self) -> None:
-        """End the present chunk and hand it to the system, so that the death of this process cannot take it away."""
+        """End the present chunk, so that it reaches the disk with the next sync."""
         try:
             self._writer.flush()
+            self._journal.restart(self._stream.tell())
         except OSError as error:
             self._rescue(error)
 
@@ -214,6 +223,7 @@ class BagWriter:
             self._writer.finish()
             os.fsync(self._stream.descriptor)
             self._let_go()
+            self._journal.path.unlink()
             write_atomically(self.folder / METADATA_FILE, text)
         except OSError as error:
             self._rescue(error)
@@ -251,6 +261,7 @@ class BagWriter:
         self._stop_sync.set()
         self._sync_thread.join()
         self._stream.close()
+        self._journal.close()
         (self.folder / _RESERVE_NAME).unlink(missing_ok=True)
 
     def _sync(self) -> None:

@@ -5,46 +5,40 @@ It works in place, because a bag may be larger than what is left on the disk, an
 
 from __future__ import annotations
 
-import io
 import os
 import struct
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from mcap.data_stream import ReadDataStream, RecordBuilder
+from mcap.data_stream import RecordBuilder
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.records import (
-    Attachment,
-    AttachmentIndex,
     Channel,
     Chunk,
-    ChunkIndex,
     DataEnd,
     Footer,
-    Header,
     Message,
-    MessageIndex,
     Metadata,
     MetadataIndex,
     Schema,
     Statistics,
     SummaryOffset,
 )
-from mcap.stream_reader import breakup_chunk
 from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC
 
 from advnerf_core.files import write_atomically
 from nodes.runtime.bag import METADATA_FILE, Contents, rosbag2_metadata
+from nodes.runtime.bag_journal import journal_of, read_journal
+from nodes.runtime.bag_scan import RECORD_HEAD, Scan, note_chunk, redo_last_index, scan_file
 from nodes.runtime.errors import BagError
-
-_RECORD_HEAD = struct.Struct("<BQ")
-_MESSAGE_HEAD_BYTES = 9
+from nodes.runtime.messages import type_definition, type_hash
+from nodes.runtime.topics import topic as topic_row
 
 
 @dataclass(frozen=True)
@@ -62,22 +56,6 @@ class Repaired:
     messages: int
     cut_bytes: int = 0
     was_whole: bool = False
-
-
-@dataclass
-class _Scan:
-    """Everything the summary needs, gathered from the data section."""
-
-    end: int = len(MCAP0_MAGIC)
-    schemas: dict[int, Schema] = field(default_factory=dict)
-    channels: dict[int, Channel] = field(default_factory=dict)
-    chunks: list[ChunkIndex] = field(default_factory=list)
-    attachments: list[AttachmentIndex] = field(default_factory=list)
-    metadata: list[MetadataIndex] = field(default_factory=list)
-    contents: Contents = field(default_factory=Contents)
-    counts: dict[int, int] = field(default_factory=dict)
-    last_index: list[MessageIndex] = field(default_factory=list)
-    has_rosbag2: bool = False
 
 
 def mcap_file(bag: Path) -> Path:
@@ -109,9 +87,11 @@ def repair(bag: Path) -> Repaired:
         return Repaired(path, found[1].message_count, was_whole=True)
     try:
         with open(path, "r+b") as file:
-            scan = _scan(file, path)
+            scan = scan_file(file, path)
             size = os.fstat(file.fileno()).st_size
             file.truncate(scan.end)
+            kept_end = scan.end
+            _add_journal(file, scan, path)
             file.seek(scan.end)
             _finish(file, scan, path.name)
             file.flush()
@@ -119,7 +99,7 @@ def repair(bag: Path) -> Repaired:
     except OSError as error:
         raise BagError(f"cannot repair {path}: {error.strerror}") from error
     _complete_folder(path, scan.contents)
-    return Repaired(path, sum(scan.counts.values()), max(0, size - scan.end))
+    return Repaired(path, sum(scan.counts.values()), max(0, size - kept_end))
 
 
 def _contents_of(summary: Summary, statistics: Statistics) -> Contents:
@@ -132,139 +112,82 @@ def _contents_of(summary: Summary, statistics: Statistics) -> Contents:
 
 
 def _complete_folder(path: Path, contents: Contents) -> None:
-    """Write ``metadata.yaml`` where it is missing, and drop the space a recorder held back."""
+    """Write ``metadata.yaml`` where it is missing, and drop what the recorder left beside it."""
     (path.parent / ".reserve").unlink(missing_ok=True)
+    journal_of(path).unlink(missing_ok=True)
     if not (path.parent / METADATA_FILE).exists():
         write_atomically(path.parent / METADATA_FILE, rosbag2_metadata(path.name, contents))
 
 
-def _scan(file: BinaryIO, path: Path) -> _Scan:
-    if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
-        raise BagError(f"{path}: expected an MCAP file, but it does not begin like one")
-    scan = _Scan()
-    while (record := _next_record(file)) is not None:
-        opcode, body = record
-        if opcode in (Opcode.DATA_END, Opcode.FOOTER):
-            break
-        if not _note(scan, opcode, body):
-            break
-        scan.end += _RECORD_HEAD.size + len(body)
-    if scan.chunks:
-        _redo_last_index(file, scan)
-    return scan
-
-
-def _next_record(file: BinaryIO) -> tuple[int, bytes] | None:
-    """Opcode and body of the next whole record; None at the end or where it was cut off."""
-    head = file.read(_RECORD_HEAD.size)
-    if len(head) < _RECORD_HEAD.size:
-        return None
-    opcode, length = _RECORD_HEAD.unpack(head)
-    remaining = os.fstat(file.fileno()).st_size - file.tell()
-    if opcode == 0 or length > remaining:
-        return None
-    return opcode, file.read(length)
-
-
-def _note(scan: _Scan, opcode: int, body: bytes) -> bool:
-    """Take a record into the scan; False where the file stops making sense."""
-    stream = ReadDataStream(io.BytesIO(body))
-    length = _RECORD_HEAD.size + len(body)
-    try:
-        if opcode == Opcode.CHUNK:
-            _note_chunk(scan, Chunk.read(stream), length)
-        elif opcode == Opcode.MESSAGE_INDEX and scan.chunks:
-            scan.chunks[-1].message_index_offsets[MessageIndex.read(stream).channel_id] = scan.end
-            scan.chunks[-1].message_index_length += length
-        elif opcode == Opcode.ATTACHMENT:
-            a = Attachment.read(stream)
-            index = AttachmentIndex(scan.end, length, a.log_time, a.create_time, len(a.data), a.name, a.media_type)
-            scan.attachments.append(index)
-        elif opcode == Opcode.METADATA:
-            name = Metadata.read(stream).name
-            scan.has_rosbag2 |= name == "rosbag2"
-            scan.metadata.append(MetadataIndex(offset=scan.end, length=length, name=name))
-        elif opcode == Opcode.HEADER:
-            Header.read(stream)
-        else:
-            return False
-    except (McapError, ValueError, struct.error, KeyError):
-        return False
-    return True
-
-
-def _note_chunk(scan: _Scan, chunk: Chunk, length: int) -> None:
-    if chunk.uncompressed_crc and not chunk.compression and zlib.crc32(chunk.data) != chunk.uncompressed_crc:
-        raise ValueError("chunk is damaged")
-    indexes: dict[int, MessageIndex] = {}
-    position = 0
-    for record in breakup_chunk(chunk, validate_crc=True):
-        if isinstance(record, Schema):
-            scan.schemas[record.id] = record
-        elif isinstance(record, Channel):
-            scan.channels[record.id] = record
-            typename = scan.schemas[record.schema_id].name
-            scan.contents.add_topic(record.topic, typename, record.metadata.get("topic_type_hash", ""))
-        elif isinstance(record, Message):
-            index = indexes.setdefault(record.channel_id, MessageIndex(record.channel_id, []))
-            index.records.append((record.log_time, position))
-            scan.contents.add_message(scan.channels[record.channel_id].topic, record.log_time)
-            scan.counts[record.channel_id] = scan.counts.get(record.channel_id, 0) + 1
-        position += _length_of(record)
-    scan.last_index = list(indexes.values())
-    scan.chunks.append(
-        ChunkIndex(
-            chunk_length=length, chunk_start_offset=scan.end, compression=chunk.compression,
-            compressed_size=len(chunk.data), message_end_time=chunk.message_end_time, message_index_length=0,
-            message_index_offsets={}, message_start_time=chunk.message_start_time, uncompressed_size=chunk.uncompressed_size,
-        )
-    )  # fmt: skip
-
-
-def _length_of(record: Any) -> int:
-    """Bytes of a record inside a chunk."""
-    if isinstance(record, Message):
-        return _MESSAGE_HEAD_BYTES + 22 + len(record.data)
-    builder = RecordBuilder()
-    record.write(builder)
-    return int(builder.count)
-
-
-def _redo_last_index(file: BinaryIO, scan: _Scan) -> None:
-    """Write the message index of the last chunk again: it may have been cut off in the middle."""
-    chunk = scan.chunks[-1]
-    chunk_end = chunk.chunk_start_offset + chunk.chunk_length
-    if scan.end != chunk_end + chunk.message_index_length or len(chunk.message_index_offsets) == len(scan.last_index):
+def _add_journal(file: BinaryIO, scan: Scan, path: Path) -> None:
+    """Append, as one more chunk, the messages of the chunk that the recorder was filling."""
+    position, entries = read_journal(path)
+    # A chunk behind that position is the one: the recorder died, or an earlier repair, before the journal was emptied.
+    if not entries or any(chunk.chunk_start_offset >= position for chunk in scan.chunks):
         return
-    file.truncate(chunk_end)
-    file.seek(chunk_end)
     builder = RecordBuilder()
-    chunk.message_index_offsets.clear()
-    for index in scan.last_index:
-        chunk.message_index_offsets[index.channel_id] = chunk_end + builder.count
-        index.write(builder)
-    chunk.message_index_length = builder.count
+    ids = {channel.topic: channel.id for channel in scan.channels.values()}
+    for entry in entries:
+        if entry.topic not in ids:
+            ids[entry.topic] = _introduce(builder, scan, entry.topic, max(ids.values(), default=0) + 1)
+        times = {"log_time": entry.log_ns, "publish_time": entry.publish_ns}
+        Message(channel_id=ids[entry.topic], data=entry.cdr, sequence=entry.sequence, **times).write(builder)
+    data = bytes(builder.end())
+    chunk = Chunk(
+        compression="", data=data, message_start_time=min(entry.log_ns for entry in entries),
+        message_end_time=max(entry.log_ns for entry in entries), uncompressed_crc=zlib.crc32(data), uncompressed_size=len(data),
+    )  # fmt: skip
+    chunk.write(builder)
+    length = builder.count
+    file.seek(scan.end)
     file.write(builder.end())
-    scan.end = chunk_end + chunk.message_index_length
+    note_chunk(scan, chunk, length)
+    scan.end += length
+    redo_last_index(file, scan)
 
 
-def _finish(file: BinaryIO, scan: _Scan, file_name: str) -> None:
+def _introduce(builder: RecordBuilder, scan: Scan, topic: str, channel_id: int) -> int:
+    """Write schema and channel of a topic whose first message is in the journal."""
+    typename = topic_row(topic).type
+    known = {schema.name: schema.id for schema in scan.schemas.values()}
+    if typename not in known:
+        schema = Schema(
+            id=max(scan.schemas, default=0) + 1,
+            name=typename,
+            encoding="ros2msg",
+            data=type_definition(typename).encode(),
+        )
+        scan.schemas[schema.id] = schema
+        schema.write(builder)
+        known[typename] = schema.id
+    metadata = {"topic_type_hash": type_hash(typename)}
+    Channel(id=channel_id, topic=topic, message_encoding="cdr", metadata=metadata, schema_id=known[typename]).write(
+        builder
+    )
+    return channel_id
+
+
+def _finish(file: BinaryIO, scan: Scan, file_name: str) -> None:
     """Append what ends an MCAP file: bag metadata, end of data, summary, footer."""
     builder = RecordBuilder()
-    if not scan.has_rosbag2:
-        text = rosbag2_metadata(file_name, scan.contents)
-        Metadata(name="rosbag2", metadata={"serialized_metadata": text}).write(builder)
-        scan.metadata.append(MetadataIndex(offset=scan.end, length=builder.count, name="rosbag2"))
+    text = rosbag2_metadata(file_name, scan.contents)
+    # Of what was lost on the way, the recorder took its count with it; the gaps in the sequence numbers are still there.
+    lost = {f"lost {topic}": str(count) for topic, count in scan.lost.items()}
+    for name, metadata in (("advnerf_end", {**lost, "repaired": "yes"}), ("rosbag2", {"serialized_metadata": text})):
+        if name not in scan.metadata_names:
+            before = builder.count
+            Metadata(name=name, metadata=metadata).write(builder)
+            scan.metadata.append(MetadataIndex(offset=scan.end + before, length=builder.count - before, name=name))
     DataEnd(0).write(builder)
     summary_start = scan.end + builder.count
     file.write(builder.end())
     summary, offsets_start = _summary(scan, summary_start)
-    head = _RECORD_HEAD.pack(Opcode.FOOTER, 20) + struct.pack("<QQ", summary_start, offsets_start)
+    head = RECORD_HEAD.pack(Opcode.FOOTER, 20) + struct.pack("<QQ", summary_start, offsets_start)
     Footer(summary_start, offsets_start, zlib.crc32(head, zlib.crc32(summary))).write(builder)
     file.write(summary + builder.end() + MCAP0_MAGIC)
 
 
-def _summary(scan: _Scan, start: int) -> tuple[bytes, int]:
+def _summary(scan: Scan, start: int) -> tuple[bytes, int]:
     """Bytes of the summary section that begins at ``start``, and where its table of offsets begins."""
     statistics = Statistics(
         attachment_count=len(scan.attachments), channel_count=len(scan.channels), channel_message_counts=dict(scan.counts),

@@ -158,10 +158,14 @@ def _build(name: str, entry: NodeEntry, document: Document, choice: Choice, cont
 
 
 def _known_keys(document: Document, config_type: type[BaseModel]) -> Document:
-    """The configuration of a node as far as its stand-in understands it."""
+    """The recorded configuration of a node as far as its stand-in understands it; what a person set must be understood."""
     if config_type.model_config.get("extra") != "forbid" or not isinstance(document.data, dict):
         return document
-    data = {key: value for key, value in document.data.items() if key in config_type.model_fields}
+    data = {
+        key: value
+        for key, value in document.data.items()
+        if key in config_type.model_fields or document.place((key,)).startswith("--set")
+    }
     return Document(data, document.source, document.places)
 
 

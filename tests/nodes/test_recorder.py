@@ -97,8 +97,8 @@ def test_killed_process_loses_at_most_what_came_in_its_last_moment(tmp_path):
         os.kill(process.pid, signal.SIGKILL)
         process.communicate(timeout=10)
     repaired = repair(tmp_path / "bag")
-    # A chunk is closed every 50 ms: 1.5 images (each a chunk of its own) and 2.5 poses come in that time.
-    assert sum(sent.values()) - repaired.messages <= 8
+    # Whatever it had received is in the bag or in its journal; only what was on the way to it is gone.
+    assert sum(sent.values()) - repaired.messages <= 2
     counts = {t.name: t.count for t in read_info(tmp_path / "bag").topics}
     assert set(counts) == set(sent)
 

@@ -16,10 +16,13 @@ from rosbags.typesys import Stores, get_typestore
 
 from nodes.runtime import bag as bag_module
 from nodes.runtime.bag import BagWriter
-from nodes.runtime.bag_read import read_attachment, read_info, read_messages, require_our_types
+from nodes.runtime.bag_journal import journal_of
+from nodes.runtime.bag_read import extract_attachments, read_attachment, read_info, read_messages, require_our_types
 from nodes.runtime.bag_repair import repair
+from nodes.runtime.bag_stamps import read_delays
 from nodes.runtime.errors import BagError
 from nodes.runtime.messages import (
+    _STORE,
     camera_info_message,
     drive_message,
     encode,
@@ -74,7 +77,22 @@ def sample(typename, stamp_ns):
             subscribers=np.zeros(0, np.uint32), counter_names=["n"], counter_values=np.array([1.0]),
         ),
     }  # fmt: skip
-    return encode(made[typename]())
+    return encode(made[typename]() if typename in made else nothing(typename))
+
+
+def nothing(typename):
+    """A message of any type with zeros, empty texts and empty sequences."""
+    values = {}
+    for name, (kind, what) in _STORE.fielddefs[typename][1]:
+        if kind.name == "BASE":
+            values[name] = {"string": "", "bool": False}.get(what[0], 0.0 if "float" in what[0] else 0)
+        elif kind.name == "NAME":
+            values[name] = nothing(what)
+        else:
+            (element, of), length = what
+            plain = element.name == "BASE" and of[0] != "string"
+            values[name] = np.zeros(length if kind.name == "ARRAY" else 0, of[0]) if plain else []
+    return getattr(types, typename.rsplit("/", 1)[-1])(**values)
 
 
 def write_all_topics(folder, rounds=5, **options):
@@ -160,6 +178,95 @@ def test_info_attachments_and_selection(tmp_path):
     with pytest.raises(BagError, match=r"between 0 and 0\.\d s"):
         list(read_messages(tmp_path / "bag", start_offset_s=9))
     require_our_types(tmp_path / "bag", list(TOPICS))
+
+
+def test_attachments_are_taken_out_and_nothing_is_overwritten(tmp_path):
+    attachments = {"a.yaml": b"1", "b.yaml": b"2"}
+    write_all_topics(tmp_path / "bag", rounds=1, attachments=attachments).close()
+    written = extract_attachments(tmp_path / "bag", tmp_path / "new" / "folder")
+    assert {path.name: path.read_bytes() for path in written} == attachments
+    with pytest.raises(BagError, match=r"a\.yaml exists; remove it or choose another folder with --output"):
+        extract_attachments(tmp_path / "bag", tmp_path / "new" / "folder", ["a.yaml"])
+    with pytest.raises(BagError, match=r"has no attachment c\.yaml; it has a\.yaml, b\.yaml"):
+        extract_attachments(tmp_path / "bag", tmp_path / "other", ["c.yaml"])
+    assert not (tmp_path / "other").exists()
+
+
+@pytest.mark.parametrize("name", ["../evil.yaml", "/tmp/evil.yaml", "..", "", "a/b", "x\0y"])
+def test_a_strangers_bag_does_not_write_where_it_likes(tmp_path, name):
+    write_all_topics(tmp_path / "bag", rounds=1, attachments={"ok.yaml": b"", name: b"evil"}).close()
+    with pytest.raises(BagError, match="has no plain file name"):
+        extract_attachments(tmp_path / "bag", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_delays_are_those_that_were_written(tmp_path):
+    with BagWriter(tmp_path / "bag") as writer:
+        for i, (stamp_ms, publish_ms, log_ms) in enumerate([(0, 4, 5), (20, 22, 27), (10, 13, 28), (99, 31, 32)]):
+            pose = encode(pose_message(np.eye(4), START_NS + stamp_ms * 1_000_000))
+            writer.write("/vicon/car", pose, START_NS + log_ms * 1_000_000, START_NS + publish_ms * 1_000_000, i)
+        clock = encode(types.Clock(clock=header(START_NS).stamp))
+        writer.write("/clock", clock, START_NS + 3_000_000, START_NS, 0)
+    delays = read_delays(tmp_path / "bag")
+    car = delays["/vicon/car"]
+    assert (car.publish_ms, car.publish_worst_ms) == (2.5, 4.0)  # of 4, 2, 3 and -68
+    assert (car.receive_ms, car.receive_worst_ms) == (3.0, 15.0)  # of 1, 5, 15 and 1
+    assert (car.backwards, car.future) == (1, 1)
+    assert (delays["/clock"].publish_ms, delays["/clock"].receive_ms) == (None, 3.0)
+
+
+def journal_bag(tmp_path, count=10):
+    """A bag whose writer vanished with its last messages in no chunk."""
+    writer = BagWriter(tmp_path / "bag")
+    writer.write("/camera/image_raw", bytes(100_000), START_NS, START_NS, 0)
+    for i in range(count):
+        writer.write("/vicon/car", bytes([i] * 50), START_NS + 1 + i, START_NS + i, i + (i > 4) * 3)
+    writer._let_go()
+    return writer.path
+
+
+def test_repair_takes_the_unfinished_chunk_from_the_journal(tmp_path):
+    path = journal_bag(tmp_path)
+    assert b"vicon/car" not in path.read_bytes()
+    assert repair(path.parent).messages == 11
+    kept = list(read_messages(path, ["/vicon/car"]))
+    assert [(m.cdr[0], m.log_ns - START_NS, m.publish_ns - START_NS) for m in kept] == [
+        (i, 1 + i, i) for i in range(10)
+    ]
+    # The recorder could not say what it lost; the sequence numbers do.
+    assert {t.name: t.lost for t in read_info(path).topics} == {"/camera/image_raw": 0, "/vicon/car": 3}
+    with open(path, "rb") as file:
+        assert len(list(make_reader(file, validate_crcs=True).iter_messages(["/vicon/car"]))) == 10
+    assert not journal_of(path).exists()
+
+
+@pytest.mark.parametrize("cut", [1, 30, 60, 200])
+def test_journal_cut_anywhere_gives_the_messages_before_the_cut(tmp_path, cut):
+    path = journal_bag(tmp_path)
+    journal = journal_of(path)
+    content = journal.read_bytes()
+    entry = (len(content) - 16) // 10
+    journal.write_bytes(content[:-cut])
+    assert repair(path).messages == 11 - (cut + entry - 1) // entry
+
+
+def test_journal_of_a_chunk_that_is_in_the_bag_is_not_taken_twice(tmp_path):
+    """The recorder died, or a repair was stopped, between writing the chunk and emptying the journal."""
+    path = journal_bag(tmp_path)
+    journal = journal_of(path).read_bytes()
+    repair(path)
+    content = path.read_bytes()
+    journal_of(path).write_bytes(journal)
+    path.write_bytes(content[: content.rindex(b"rosbag2") - 40])
+    assert repair(path).messages == 11
+
+
+def test_damaged_journal_is_cut_where_the_damage_is(tmp_path):
+    path = journal_bag(tmp_path)
+    content = bytearray(journal_of(path).read_bytes())
+    content[len(content) // 2] ^= 1
+    journal_of(path).write_bytes(content)
+    assert 1 < repair(path).messages < 11
 
 
 def test_existing_folder_is_not_overwritten(tmp_path):

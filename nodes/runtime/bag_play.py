@@ -1,0 +1,76 @@
+"""What a player of bags does, without the bus: where in the recording it is, and what a person can tell it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from nodes.runtime.errors import MessageError
+
+PAUSE, RESUME, TOGGLE, STEP, RATE, STOP = "pause", "resume", "toggle", "step", "rate", "stop"
+_PLAIN = (PAUSE, RESUME, TOGGLE, STOP)
+_MOST_STEPS = 10_000
+_SLOWEST, _FASTEST = 1e-3, 1e3
+
+
+@dataclass(frozen=True)
+class Command:
+    """Something a person told the player.
+
+    Attributes:
+        word: ``pause``, ``resume``, ``toggle``, ``step``, ``rate`` or ``stop``.
+        number: Messages of a step; speed relative to the recording of a rate.
+    """
+
+    word: str
+    number: float = 1.0
+
+    @classmethod
+    def parse(cls, text: str) -> Command:
+        """A command of a text such as ``pause``, ``step``, ``step 10`` or ``rate 0.5``."""
+        words = text.split()
+        if len(words) == 1 and words[0] in (*_PLAIN, STEP):
+            return cls(words[0])
+        try:
+            number = float(words[1]) if len(words) == 2 else -1.0
+        except ValueError:
+            number = -1.0
+        if words[:1] == [RATE] and _SLOWEST <= number <= _FASTEST:
+            return cls(RATE, number)
+        if words[:1] == [STEP] and 1 <= number <= _MOST_STEPS and number == int(number):
+            return cls(STEP, number)
+        raise MessageError(
+            f"expected pause, resume, toggle, step [N], rate X (0.001 to 1000) or stop, got {text[:80]!r}"
+        )
+
+
+class Playhead:
+    """Where in the recording the player is.
+
+    Args:
+        bag_ns: Time in the recording to begin at [ns since 1970].
+        mono_ns: Monotonic time now [ns].
+        rate: Speed relative to the recording.
+        paused: Stand still at first.
+    """
+
+    def __init__(self, bag_ns: int, mono_ns: int, rate: float = 1.0, paused: bool = False) -> None:
+        self._bag_ns, self._mono_ns = bag_ns, mono_ns
+        self.rate, self.paused = rate, paused
+
+    def time_ns(self, mono_ns: int) -> int:
+        """Time in the recording [ns since 1970]."""
+        return self._bag_ns if self.paused else self._bag_ns + round((mono_ns - self._mono_ns) * self.rate)
+
+    def jump(self, bag_ns: int, mono_ns: int) -> None:
+        """Go to a time in the recording [ns since 1970]."""
+        self._bag_ns, self._mono_ns = bag_ns, mono_ns
+
+    def pause(self, paused: bool, mono_ns: int) -> None:
+        """Stand still, or go on from there."""
+        self.jump(self.time_ns(mono_ns), mono_ns)
+        self.paused = paused
+
+    def set_rate(self, rate: float, mono_ns: int) -> None:
+        """Go on at another speed."""
+        self.jump(self.time_ns(mono_ns), mono_ns)
+        self.rate = rate

@@ -1,0 +1,68 @@
+"""The little bag of this folder against its golden bag, through the command line and in this process."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import make_golden
+import pytest
+from mcap.reader import make_reader
+
+HERE = Path(__file__).parent
+BAG, GOLDEN = HERE / make_golden.BAG_NAME, HERE / make_golden.GOLDEN_NAME
+NODES = ["--nodes", "compositor,policy", "--replace", "policy=green_policy:GreenPolicy"]
+# Other versions of OpenCV round the pixels of the face elsewhere.
+PIXELS = ["--tolerance", "/compositor/image:data=2", "--tolerance", "/policy/drive:drive.steering_angle=2e-3"]
+
+
+def replay(*arguments):
+    command = [sys.executable, "-m", "nodes.cli", "replay", *map(str, arguments)]
+    root = str(Path(__file__).parents[2])
+    environment = {"PYTHONPATH": f"{root}:{HERE}", "PATH": "/usr/bin:/bin", "HOME": "/tmp"}
+    return subprocess.run(command, capture_output=True, text=True, timeout=60, cwd=HERE, env=environment)
+
+
+def test_command_makes_both_files_again_byte_for_byte(tmp_path):
+    bag = make_golden.make_bag(tmp_path)
+    assert bag.read_bytes() == BAG.read_bytes()
+    first = make_golden.make_golden(bag, tmp_path).read_bytes()
+    assert make_golden.make_golden(bag, tmp_path).read_bytes() == first
+    assert len(first) == GOLDEN.stat().st_size < 200_000
+
+
+def test_replay_is_as_golden():
+    result = replay(BAG, *NODES, "--golden", GOLDEN, *PIXELS)
+    assert (result.returncode, result.stderr) == (0, "")
+    assert "36 messages compared" in result.stdout
+
+
+def test_the_first_difference_is_named():
+    result = replay(BAG, *NODES, "--set", "policy.gain_rad=0.011", "--golden", GOLDEN, *PIXELS)
+    assert result.returncode == 1
+    line = result.stderr.strip()
+    assert line.startswith(
+        f"error: not as in {GOLDEN}: /policy/drive message 0, 0.043 s into the recording, captured at"
+    )
+    # One tenth more gain is one tenth more steering.
+    old, new = (float(line.split(word)[1].split(",")[0].split(":")[0]) for word in ("was ", "is "))
+    assert new / old == pytest.approx(1.1, abs=0.01)
+    assert f"drive.steering_angle was {old:.9g}" in line
+    assert float(line.split("differs by ")[1].split(",")[0]) == pytest.approx(abs(new - old), rel=1e-5)
+
+
+def test_another_face_is_seen_in_the_pixels():
+    result = replay(BAG, *NODES, "--set", "compositor.attack=null", "--golden", GOLDEN)
+    assert result.returncode == 1
+    assert "/compositor/" in result.stderr
+    allowed = replay(BAG, *NODES, "--set", "compositor.attack=null", "--golden", GOLDEN, "--topics", "/nothing")
+    assert (allowed.returncode, "has no topic /nothing; it has /compositor/attack" in allowed.stderr) == (2, True)
+
+
+def test_update_writes_a_bag_that_other_readers_open(tmp_path):
+    golden = tmp_path / "new.mcap"
+    assert replay(BAG, *NODES, "--golden", golden, "--update-golden", "--topics", "/policy/drive").returncode == 0
+    with open(golden, "rb") as file:
+        topics = [channel.topic for _, channel, _ in make_reader(file, validate_crcs=True).iter_messages()]
+    assert topics == ["/policy/drive"] * make_golden.IMAGES
+    assert replay(BAG, *NODES, "--golden", golden, "--topics", "/policy/drive").returncode == 0
+    assert [path.name for path in tmp_path.iterdir()] == ["new.mcap"]
