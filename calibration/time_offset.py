@@ -240,7 +240,7 @@ def _car_turns(yaw: CubicSpline, turns: Turns, shift_s: float) -> Array:
 
 def _correlation(a: Array, b: Array) -> float:
     a, b = a - a.mean(), b - b.mean()
-    return float(a @ b / max(np.linalg.norm(a) * np.linalg.norm(b), 1e-12))
+    return float(a @ b) / max(float(np.linalg.norm(a) * np.linalg.norm(b)), 1e-12)
 
 
 def _require_turning(turns: Turns, config: OffsetConfig) -> None:

@@ -21,8 +21,7 @@ _MARGIN = 1e-4
 
 def displayed(model: DisplayModel, shown: Tensor, cos_angle: float | Tensor = 1.0) -> Tensor:
     """What the camera sees ``[..., 3]`` of shown colours ``[..., 3]`` in 0..1; differentiable. See `DisplayModel.forward`."""
-    like = {"dtype": shown.dtype, "device": shown.device}
-    curves, mixing = torch.tensor(model.curves, **like), torch.tensor(model.mixing, **like)
+    curves, mixing, ambient = (torch.tensor(v).to(shown) for v in (model.curves, model.mixing, model.ambient))
     last = curves.shape[1] - 1
     position = shown.clamp(0.0, 1.0) * last
     below = position.detach().floor().clamp(0, last - 1)
@@ -30,8 +29,8 @@ def displayed(model: DisplayModel, shown: Tensor, cos_angle: float | Tensor = 1.
     channel = torch.arange(3, device=shown.device).expand(shown.shape)
     low, high = curves[channel, index], curves[channel, index + 1]
     light = low + (position - below) * (high - low)
-    gain = torch.as_tensor(cos_angle, **like)[..., None] ** model.falloff
-    seen = torch.tensor(model.ambient, **like) + gain * (light @ mixing.T)
+    gain = torch.as_tensor(cos_angle, dtype=shown.dtype, device=shown.device)[..., None] ** model.falloff
+    seen = ambient + gain * (light @ mixing.T)
     return (seen.clamp_min(DARKEST) ** (1.0 / model.response)).clamp(0.0, 1.0)
 
 

@@ -142,6 +142,38 @@ class PanelConfig(_Frozen):
         return make_transform(rotation_z(self.yaw_rad), [self.x_m, self.y_m, self.z_m])
 
 
+class MonitorOpticsConfig(_Frozen):
+    """What the camera sees of a colour on the monitor; see `hardware.twin.monitor`. The default is seen as it is.
+
+    Attributes:
+        gamma: Exponent from shown value to light, by channel.
+        mixing: Light of the screen's channels (columns) in the camera's (rows), at full drive and straight on.
+        glare: Light of the room reflected by the glass, in the camera's channels.
+        falloff: Power of the cosine of the viewing angle with which the panel dims.
+        response: The camera's answer to light is its power of one over this.
+    """
+
+    gamma: Colour = (1.0, 1.0, 1.0)
+    mixing: Matrix3 = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    glare: Colour = (0.0, 0.0, 0.0)
+    falloff: float = Field(default=0.0, ge=0.0)
+    response: float = Field(default=1.0, gt=0.0)
+
+    @model_validator(mode="after")
+    def _possible(self) -> MonitorOpticsConfig:
+        if min(self.gamma) <= 0.0 or min(self.glare) < 0.0:
+            raise ValueError(f"expected gamma > 0 and glare >= 0, got {self.gamma} and {self.glare}")
+        return self
+
+    @classmethod
+    def office(cls) -> MonitorOpticsConfig:
+        """An ordinary IPS monitor under ceiling lamps before a camera with sRGB-like response."""
+        return cls(
+            gamma=(2.30, 2.16, 2.42), mixing=((0.66, 0.10, 0.02), (0.06, 0.72, 0.07), (0.01, 0.09, 0.68)),
+            glare=(0.015, 0.016, 0.019), falloff=1.4, response=2.2,
+        )  # fmt: skip
+
+
 class CarConfig(_Frozen):
     """A RACECAR/J-sized car: what the driver believes (nominal) and how it really behaves (true).
 
@@ -213,6 +245,7 @@ class LabConfig(_Frozen):
         phone: Camera that photographs the room.
         board: Green board at the bottom right corner of the track, motion-capture subject "board".
         monitor: 27-inch screen at the top right corner, motion-capture subject "monitor".
+        monitor_optics: What the cameras see of the monitor's colours.
         car: Vehicle.
         shadows: Whether the furniture casts shadows.
         supersampling: Images are drawn this many times larger per axis and averaged.
@@ -232,6 +265,7 @@ class LabConfig(_Frozen):
         x_m=1.75, y_m=3.15, z_m=0.38, yaw_rad=1.5 * math.pi + math.radians(8.0),
         width_m=0.5977, height_m=0.3362, thickness_m=0.04, rgb=(0.09, 0.10, 0.12),
     )  # fmt: skip
+    monitor_optics: MonitorOpticsConfig = MonitorOpticsConfig()
     car: CarConfig = CarConfig()
     shadows: bool = True
     supersampling: int = Field(default=2, ge=1, le=4)

@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 
 from advnerf_core.geometry import Array, Pinhole, VehicleState, look_at, planar_pose
 from hardware.twin import textures
-from hardware.twin.config import LabConfig
+from hardware.twin.config import LabConfig, MonitorOpticsConfig
 from hardware.twin.furniture import vehicle_in_room
+from hardware.twin.monitor import ScreenOptics
 from hardware.twin.phone import apply_colours
 from hardware.twin.renderer import Renderer
-from hardware.twin.world import CAR_GROUP, CEILING_GROUP, build_model
+from hardware.twin.world import CAR_GROUP, CEILING_GROUP, MONITOR_PIXELS, build_model
 
 Rgb = NDArray[np.uint8]
 Depth = NDArray[np.float32]
@@ -42,6 +43,13 @@ class Lab:
         self._pending: list[tuple[float, float, float]] = []  # due time [s], servo, erpm
         self._time_s = 0.0
         self._renderer = Renderer(build_model(self.config), self.config.supersampling, hidden_groups=(CAR_GROUP,))
+        # None where colours are seen as they are shown: nothing to compute from frame to frame.
+        self._optics: ScreenOptics | None = None
+        if self.config.monitor_optics != MonitorOpticsConfig():
+            self._optics = ScreenOptics(self.config.monitor_optics, self.config.monitor, MONITOR_PIXELS)
+        self._screen_seen_from: Array | None = None
+        if self._optics is not None:
+            self.set_monitor_image(None)
 
     def reset(self, x_m: float, y_m: float, yaw_rad: float, speed_mps: float = 0.0) -> VehicleState:
         """Put the car down, forget commands under way and start lab time at 0; a speed, if given, is held."""
@@ -124,8 +132,13 @@ class Lab:
         """What the driving camera would see from another pose of the car; the car stays where it is."""
         return self._see(planar_pose(x_m, y_m, yaw_rad), depth)
 
+    def observe_held(self, T_world_from_car: Array) -> Rgb:
+        """What the driving camera sees ``[H, W, 3]`` while a person holds the car at any pose ``[4, 4]``, tilted too."""
+        return self._see(T_world_from_car, depth=False)[0]
+
     def photograph(self, T_world_from_camera: Array) -> Rgb:
         """Take a phone photo ``[H, W, 3]`` uint8 with ``phone_pinhole`` and the phone's own colours."""
+        self._light_screen(T_world_from_camera)
         rgb = self._renderer.render_rgb(T_world_from_camera, self.phone_pinhole)
         return apply_colours(rgb, self.config.phone)
 
@@ -155,8 +168,12 @@ class Lab:
 
     def set_monitor_image(self, rgb: Rgb | None) -> None:
         """Show a picture ``[h, w, 3]`` on the whole monitor (row 0 on top); None shows the idle screen again."""
-        idle = textures.to_uint8(textures.screen_image(256, 144))
-        self._renderer.set_texture("monitor", idle if rgb is None else rgb)
+        shown = textures.to_uint8(textures.screen_image(256, 144)) if rgb is None else rgb
+        if self._optics is None:
+            self._renderer.set_texture("monitor", shown)
+            return
+        self._optics.show(shown)
+        self._screen_seen_from = None
 
     def close(self) -> None:
         """Free the OpenGL context; safe to call twice."""
@@ -176,5 +193,17 @@ class Lab:
 
     def _see(self, T_world_from_car: Array, depth: bool) -> tuple[Rgb, Depth | None]:
         T = T_world_from_car @ self._T_car_from_camera
+        self._light_screen(T)
         rgb = self._renderer.render_rgb(T, self.camera_pinhole)
         return rgb, self._renderer.render_depth(T, self.camera_pinhole) if depth else None
+
+    def _light_screen(self, T_world_from_camera: Array) -> None:
+        """Give the monitor the colours that are seen from where the camera is."""
+        if self._optics is None:
+            return
+        place = T_world_from_camera[:3, 3]
+        before = self._screen_seen_from
+        if before is not None and (not self._optics.depends_on_place or np.array_equal(before, place)):
+            return
+        self._renderer.set_texture("monitor", self._optics.seen_from(place))
+        self._screen_seen_from = np.array(place)

@@ -1,0 +1,156 @@
+"""A picture beside every calibration file: what was seen against what the fit says. Drawn without a display."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from advnerf_core.files import write_atomically
+from calibration.camera_to_car import MountFit
+from calibration.display_colour import DisplayFit
+from calibration.intrinsics import IntrinsicsFit
+from calibration.mocap_to_scene import SceneFit
+from calibration.schema import Calibration, CalibrationError, save_calibration
+from calibration.time_offset import OffsetFit
+from calibration.vehicle import GainsFit
+from calibration.vehicle_response import ResponseFit
+
+_CHANNELS = ("tab:red", "tab:green", "tab:blue")
+
+
+def save_with_plot(calibration: Calibration, path: Path, draw: Callable[[Figure], None]) -> Path:
+    """Write a calibration file and its picture beside it, each whole or not at all; the picture's path."""
+    figure = Figure(figsize=(9.0, 4.0), layout="constrained")
+    draw(figure)
+    buffer = BytesIO()
+    figure.savefig(buffer, format="png", dpi=110)
+    picture = path.with_suffix(".png")
+    try:
+        write_atomically(picture, buffer.getvalue())
+    except OSError as error:
+        raise CalibrationError(f"cannot write {picture}: {error.strerror or error}") from error
+    save_calibration(calibration, path)
+    return picture
+
+
+def intrinsics_plot(fit: IntrinsicsFit) -> Callable[[Figure], None]:
+    """Coverage map and reprojection errors."""
+
+    def draw(figure: Figure) -> None:
+        left, right = figure.subplots(1, 2)
+        size = (fit.calibration.width, fit.calibration.height)
+        shown = left.imshow(fit.coverage, extent=(0, size[0], size[1], 0), cmap="viridis", aspect="equal")
+        figure.colorbar(shown, ax=left, label="corners per cell")
+        left.set(title="coverage", xlabel="column [px]", ylabel="row [px]")
+        right.plot(fit.errors_px[:, 0], fit.errors_px[:, 1], ".", markersize=2, alpha=0.5)
+        _square(right, "reprojection error", "column [px]", "row [px]", f"rms {fit.calibration.rms_px:.3f} px")
+
+    return draw
+
+
+def mount_plot(fit: MountFit) -> Callable[[Figure], None]:
+    """Reprojection error of each view, left-out views marked."""
+
+    def draw(figure: Figure) -> None:
+        axes = figure.subplots()
+        index, rms = np.arange(len(fit.view_rms_px)), fit.view_rms_px
+        axes.bar(index[fit.used], rms[fit.used], label="fitted")
+        axes.bar(index[~fit.used], np.nan_to_num(rms[~fit.used]), color="tab:red", label="left out")
+        degrees, mm = np.degrees(fit.rotation_stddev_rad), 1000.0 * fit.translation_stddev_m
+        axes.set(
+            title=f"{fit.method}\nstandard deviation {degrees:.3f} degrees, {mm:.2f} mm", xlabel="view", ylabel="reprojection error [px]"
+        )  # fmt: skip
+        axes.legend()
+
+    return draw
+
+
+def scene_plot(fit: SceneFit) -> Callable[[Figure], None]:
+    """Cameras in both worlds from above, and the errors of left-out ones."""
+
+    def draw(figure: Figure) -> None:
+        left, right = figure.subplots(1, 2)
+        inside = fit.alignment.inliers
+        left.plot(fit.T_world_from_camera[:, 0, 3], fit.T_world_from_camera[:, 1, 3], "k+", label="motion capture")
+        left.plot(fit.placed[inside, 0, 3], fit.placed[inside, 1, 3], ".", label="scene, placed")
+        left.plot(fit.placed[~inside, 0, 3], fit.placed[~inside, 1, 3], "r.", label="outliers")
+        left.set(title="cameras from above", xlabel="x [m]", ylabel="y [m]", aspect="equal")
+        left.legend()
+        right.hist(1000.0 * fit.held_out_m, bins=20)
+        right.set(title="cameras that were left out", xlabel="distance from motion capture [mm]", ylabel="cameras")
+
+    return draw
+
+
+def vehicle_plot(gains: GainsFit, response: ResponseFit) -> Callable[[Figure], None]:
+    """Both lines, and ten seconds of the yaw."""
+
+    def draw(figure: Figure) -> None:
+        one, two, three = figure.subplots(1, 3)
+        servo, erpm = (np.array([getattr(s, name) for s in gains.segments]) for name in ("servo", "erpm"))
+        _line(one, servo, gains.steering_rad, gains.steering_of, "servo", "wheel angle [rad]")
+        _line(two, erpm, gains.speed_mps, gains.speed_of, "erpm", "speed [m/s]")
+        last = response.steering.time_s > response.steering.time_s[-1] - 10.0
+        three.plot(response.steering.time_s[last], response.steering.seen[last], "k", linewidth=0.8, label="seen")
+        three.plot(response.steering.time_s[last], response.steering.modelled[last], "tab:orange", label="model")
+        s = response.steering
+        three.set(
+            title=f"delay {1000 * s.delay_s:.0f} ms, lag {1000 * s.lag_s:.0f} ms", xlabel="time [s]", ylabel="turn in 60 ms [rad]"
+        )  # fmt: skip
+        three.legend()
+
+    return draw
+
+
+def display_plot(fit: DisplayFit) -> Callable[[Figure], None]:
+    """Curves, and predicted against seen colours."""
+
+    def draw(figure: Figure) -> None:
+        left, right = figure.subplots(1, 2)
+        levels = np.linspace(0.0, 1.0, fit.model.curves.shape[1])
+        predicted = fit.model.forward(fit.shown, fit.cos_angle)
+        for channel, colour in enumerate(_CHANNELS):
+            left.plot(levels, fit.model.curves[channel], color=colour)
+            for rows, marker in ((~fit.held_out, "."), (fit.held_out, "x")):
+                right.plot(fit.seen[rows, channel], predicted[rows, channel], marker, color=colour, markersize=4)
+        left.set(title="light of the monitor's channels", xlabel="shown", ylabel="light")
+        right.plot([0, 1], [0, 1], "k", linewidth=0.6)
+        _square(right, f"held out (x): rmse {100 * fit.rmse(True):.2f} %", "seen", "predicted")
+
+    return draw
+
+
+def offset_plot(fit: OffsetFit) -> Callable[[Figure], None]:
+    """Correlation over the shift, and both turns at the offset."""
+
+    def draw(figure: Figure) -> None:
+        left, right = figure.subplots(1, 2)
+        left.plot(1000.0 * fit.shifts_s, fit.correlation)
+        left.axvline(1000.0 * fit.camera_minus_mocap_s, color="tab:orange")
+        ms, sd = 1000.0 * fit.camera_minus_mocap_s, 1000.0 * fit.stddev_s
+        left.set(title=f"camera {ms:.1f} +- {sd:.1f} ms behind", xlabel="shift [ms]", ylabel="correlation")
+        right.plot(fit.turns.end_s, fit.turns.yaw_rad, "k.", markersize=3, label="image")
+        right.plot(
+            fit.turns.end_s, fit.car_yaw_rad, color="tab:orange", linewidth=0.8, label="motion capture at the offset"
+        )
+        right.set(xlabel="time [s]", ylabel="turn between frames [rad]")
+        right.legend()
+
+    return draw
+
+
+def _line(axes: Any, x: Any, y: Any, of: Callable[[Any], Any], x_name: str, y_name: str) -> None:
+    ends = np.array([x.min(), x.max()])
+    axes.plot(x, y, ".")
+    axes.plot(ends, of(ends), color="tab:orange", linewidth=0.8)
+    axes.set(xlabel=x_name, ylabel=y_name)
+
+
+def _square(axes: Any, title: str, x_name: str, y_name: str, label: str = "") -> None:
+    axes.set(title=f"{title} {label}".strip(), xlabel=x_name, ylabel=y_name, aspect="equal")
+    axes.grid(alpha=0.3)

@@ -1,0 +1,1 @@
+"""What the calibrations of `calibration` need, taken out of bags, folders and running launches."""

@@ -1,0 +1,297 @@
+"""The commands on real bags and folders: a file with its picture, or one line that says what is wrong with the recording."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from advnerf_core.geometry import camera_mount, make_transform, planar_pose
+from advnerf_core.scene.dataset import write_transforms
+from calibration.by_construction import twin_calibrations
+from calibration.charuco import Board, BoardDetector
+from calibration.display_colour import DisplayCalibration, colours_to_show
+from calibration.measured import LensCalibration, SceneCalibration
+from calibration.schema import CameraCalibration, VehicleCalibration, load_calibration, save_calibration
+from hardware.twin.config import LabConfig
+from nodes import cli
+from nodes.calibrating.bags import StillConfig, still_views
+from nodes.calibrating.live import record_live
+from nodes.runtime.bag import BagWriter
+from nodes.runtime.bag_read import read_info
+from nodes.runtime.bus import Bus
+from nodes.runtime.errors import BagError
+from nodes.runtime.messages import encode, header, image_message, pose_message, types
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "calibration"))
+from boards import BOARD
+from drives import CAR, drive
+
+START_NS = 1_800_000_000_000_000_000
+PINHOLE = LabConfig().camera.pinhole
+
+
+def run(*arguments):
+    """The command in this process, as `main` runs it; exit code."""
+    before = sys.argv
+    sys.argv = ["advnerf", *map(str, arguments)]
+    try:
+        cli.main()
+    except SystemExit as end:
+        return end.code or 0
+    finally:
+        sys.argv = before
+    return 0
+
+
+def ns(seconds):
+    return START_NS + round(1e9 * seconds)
+
+
+def write_poses(writer, topic, when, poses):
+    for k, (t, T) in enumerate(zip(when, poses, strict=True)):
+        writer.write(topic, encode(pose_message(T, ns(t))), ns(t), ns(t), k)
+
+
+def drive_bag(folder, recorded):
+    with BagWriter(folder) as writer:
+        write_poses(writer, "/vicon/car", recorded.pose_s, [planar_pose(*row) for row in recorded.poses])
+        for k, t in enumerate(recorded.command_s):
+            sent = types.MotorSent(
+                header=header(ns(t - recorded.pipeline_s[k]), "car"), serial_write_mono_ns=1, serial_write_real_ns=ns(t), speed_mps=0.0,
+                steering_rad=0.0, erpm=float(recorded.erpm[k]), servo=float(recorded.servo[k]), brake_current_a=0.0, braking=False,
+                reason="", peer="twin",
+            )  # fmt: skip
+            writer.write("/motor/sent", encode(sent), ns(t), ns(t), k)
+    return folder
+
+
+def test_vehicle_from_a_bag(tmp_path, capsys):
+    save_calibration(twin_calibrations(LabConfig())["vehicle"], tmp_path / "before.yaml")
+    bag = drive_bag(tmp_path / "bag", drive(np.random.default_rng(0)))
+    assert (
+        run("calibrate", "vehicle", bag, "--before", tmp_path / "before.yaml", "-o", tmp_path / "new" / "vehicle.yaml")
+        == 0
+    )
+    found = load_calibration(VehicleCalibration, tmp_path / "new" / "vehicle.yaml")
+    assert found.gains.servo_per_rad == pytest.approx(CAR.true_servo_gain, rel=0.01)
+    assert found.response.pipeline_delay_s == pytest.approx(0.04, abs=1e-3)
+    assert found.limits == load_calibration(VehicleCalibration, tmp_path / "before.yaml").limits
+    assert cv2.imread(str(tmp_path / "new" / "vehicle.png")).shape[1] > 500
+    assert "dynamics: {delay_s:" in capsys.readouterr().out
+    # The drive holds no camera: said in one line, and nothing is written.
+    camera = tmp_path / "camera.yaml"
+    save_calibration(twin_calibrations(LabConfig())["camera"], camera)
+    assert run("calibrate", "time-offset", bag, "--camera", camera, "-o", tmp_path / "no.yaml") == 2
+    assert "expected /camera/image_raw in" in capsys.readouterr().err
+    assert not (tmp_path / "no.yaml").exists()
+
+
+def test_a_source_is_needed_and_only_one(tmp_path, capsys):
+    save_calibration(twin_calibrations(LabConfig())["vehicle"], tmp_path / "before.yaml")
+    assert run("calibrate", "vehicle", "--before", tmp_path / "before.yaml", "-o", tmp_path / "v.yaml") == 2
+    assert "either a recording or --live SECONDS" in capsys.readouterr().err
+
+
+def view_of(board_picture, T_camera_from_board, board):
+    """A picture of a flat board, warped by the pinhole's homography."""
+    per_square = board_picture.shape[1] / board.columns
+    scale = np.diag([board.square_m / per_square, board.square_m / per_square, 1.0])
+    H = PINHOLE.matrix @ T_camera_from_board[:3, [0, 1, 3]] @ scale
+    # warpPerspective counts from pixel centres, we from corners.
+    shift = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
+    big = 4
+    up = np.diag([big, big, 1.0])
+    M = np.linalg.inv(shift) @ up @ H @ shift
+    size = (PINHOLE.width * big, PINHOLE.height * big)
+    grey = cv2.warpPerspective(board_picture, M, size, flags=cv2.INTER_LINEAR, borderValue=110)
+    grey = cv2.resize(grey, (PINHOLE.width, PINHOLE.height), interpolation=cv2.INTER_AREA)
+    return np.repeat(grey[..., None], 3, axis=-1)
+
+
+def tilt(rng, most=0.4):
+    a, b, c = rng.uniform(-most, most, 3)
+    return (
+        cv2.Rodrigues(np.array([a, 0.0, 0.0]))[0]
+        @ cv2.Rodrigues(np.array([0.0, b, 0.0]))[0]
+        @ cv2.Rodrigues(np.array([0.0, 0.0, c]))[0]
+    )
+
+
+def test_intrinsics_from_a_folder_then_refused_with_half_of_it(tmp_path, capsys):
+    rng, folder = np.random.default_rng(1), tmp_path / "pictures"
+    folder.mkdir()
+    picture = np.pad(BOARD.picture(60), 60, constant_values=255)
+    edge = np.array([-1.0, -1.0, 0.0]) * BOARD.square_m
+    for k in range(36):
+        R = tilt(rng, 0.5)
+        depth = rng.uniform(0.45, 0.8)
+        pixel = rng.uniform([0.15, 0.2], [0.85, 0.8]) * [336, 188]
+        ray = np.array([(pixel[0] - 168.0) / PINHOLE.fx, (pixel[1] - 94.0) / PINHOLE.fy, 1.0])
+        T = make_transform(R, ray * depth - R @ (np.array([0.4, 0.3, 0.0])) + R @ edge)
+        wide = Board(10, 8, BOARD.square_m, BOARD.marker_m, "DICT_4X4_100")
+        cv2.imwrite(str(folder / f"{k:02d}.png"), view_of(picture, T, wide))
+    board = ("--columns", 8, "--rows", 6, "--square", 0.1, "--marker", 0.075)
+    assert run("calibrate", "intrinsics", folder, *board, "--model", "none", "-o", tmp_path / "lens.yaml") == 0
+    found = load_calibration(LensCalibration, tmp_path / "lens.yaml")
+    assert found.fx == pytest.approx(PINHOLE.fx, rel=0.01)
+    assert found.cx == pytest.approx(168.0, abs=1.5)
+    assert found.rms_px < 0.3
+    for file in sorted(folder.glob("*.png"))[15:]:
+        file.unlink()
+    capsys.readouterr()
+    assert run("calibrate", "intrinsics", folder, *board, "-o", tmp_path / "no.yaml") == 2
+    error = capsys.readouterr().err
+    assert "expected at least 20 pictures with the board" in error
+    assert error.count("\n") == 1
+    assert run("calibrate", "intrinsics", tmp_path / "pictures", "--model", "seven", "-o", tmp_path / "no.yaml") == 2
+
+
+def test_camera_to_car_from_a_bag_of_stops(tmp_path, capsys):
+    """Stops with a tilted, tracked board; between them the car moves, and those frames must not count."""
+    rng = np.random.default_rng(2)
+    board = Board(6, 5, 0.12, 0.09)
+    picture = np.pad(board.picture(60), 60, constant_values=255)
+    wide = Board(8, 7, 0.12, 0.09)
+    edge = make_transform(np.eye(3), np.array([-0.12, -0.12, 0.0]))
+    mount = camera_mount(0.3, 0.0, 0.2, np.radians(10.0))
+    pattern = make_transform(np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), [0.0, -0.36, 0.3])
+    save_calibration(
+        LensCalibration(date="2026-11-21", method="test", width=336, height=188, fx=PINHOLE.fx, fy=PINHOLE.fy, cx=168.0, cy=94.0, rms_px=0.1),
+        tmp_path / "lens.yaml",
+    )  # fmt: skip
+    stops, move_s, stop_s = 24, 0.4, 0.6
+    places = [(1.0 + 0.5 * rng.random(), rng.uniform(-0.35, 0.35), tilt(rng, 0.3)) for _ in range(stops + 1)]
+
+    def poses(t):
+        k, inside = divmod(t, move_s + stop_s)
+        share = min(inside / move_s, 1.0)
+        a, b = places[int(k)], places[min(int(k) + 1, stops)]
+        away, angle = (a[i] + share * (b[i] - a[i]) for i in (0, 1))
+        car = planar_pose(away * np.cos(angle), away * np.sin(angle), angle + np.pi)
+        return car, make_transform(b[2], [0.0, 0.0, 0.25])
+
+    with BagWriter(tmp_path / "bag") as writer:
+        times = np.arange(0.0, stops * (move_s + stop_s), 0.01)
+        for topic, which in (("/vicon/car", 0), ("/vicon/board", 1)):
+            moved = [poses(t)[which] @ make_transform(np.eye(3), rng.normal(0.0, 0.0003, 3)) for t in times]
+            write_poses(writer, topic, times, moved)
+        for k, t in enumerate(np.arange(0.2, times[-1], 0.2)):
+            car, held = poses(t)
+            T = np.linalg.inv(car @ mount) @ held @ pattern @ edge
+            stamp = ns(t)
+            writer.write(
+                "/camera/image_raw", encode(image_message(view_of(picture, T, wide), stamp, "camera")), stamp, stamp, k
+            )
+    views, frames = still_views(tmp_path / "bag", BoardDetector(board), "/vicon/board", StillConfig())
+    assert frames > 100
+    assert 18 <= len(views) <= stops
+    options = ("--columns", 6, "--rows", 5, "--square", 0.12, "--marker", 0.09, "--lens", tmp_path / "lens.yaml")
+    assert run("calibrate", "camera-to-car", tmp_path / "bag", *options, "-o", tmp_path / "camera.yaml") == 0
+    found = load_calibration(CameraCalibration, tmp_path / "camera.yaml")
+    np.testing.assert_allclose(found.mount[:3, 3], mount[:3, 3], atol=0.004)
+    assert (tmp_path / "camera.png").exists()
+    capsys.readouterr()
+    # The car itself only drove on the floor: without the board's poses the same bag fixes nothing.
+    assert run("calibrate", "camera-to-car", tmp_path / "bag", *options, "--untracked", "-o", tmp_path / "no.yaml") == 2
+    assert "planar" in capsys.readouterr().err
+    assert not (tmp_path / "no.yaml").exists()
+
+
+def test_mocap_to_scene_from_two_transforms_files(tmp_path):
+    rng = np.random.default_rng(3)
+    shift = make_transform(cv2.Rodrigues(np.array([0.2, -0.4, 1.0]))[0], [1.0, 2.0, 0.3])
+    paths, images = [], {"scene": [], "world": []}
+    for k in range(20):
+        path = tmp_path / f"{k:02d}.png"
+        cv2.imwrite(str(path), np.zeros((188, 336, 3), np.uint8))
+        angle = 0.3 * k
+        world = planar_pose(2.0 * np.cos(angle), 1.5 * np.sin(angle), angle) @ camera_mount(0.3, 0.0, 0.2, 0.17)
+        inside = np.linalg.inv(shift) @ world
+        inside[:3, 3] = inside[:3, 3] / 0.5 + rng.normal(0.0, 0.002, 3)
+        paths.append(path)
+        images["scene"].append(inside)
+        images["world"].append(world)
+    for name, listed in images.items():
+        write_transforms(tmp_path / f"{name}.json", paths, np.stack(listed), PINHOLE)
+    assert (
+        run(
+            "calibrate",
+            "mocap-to-scene",
+            tmp_path / "scene.json",
+            tmp_path / "world.json",
+            "-o",
+            tmp_path / "placed.yaml",
+        )
+        == 0
+    )
+    found = load_calibration(SceneCalibration, tmp_path / "placed.yaml")
+    assert found.scale == pytest.approx(0.5, rel=0.01)
+    np.testing.assert_allclose(found.similarity.T_target_from_source, shift, atol=0.01)
+
+
+def test_display_from_a_folder(tmp_path, capsys):
+    assert run("calibrate", "display-colours", "-o", tmp_path, "--width", 32, "--height", 18) == 0
+    colours = colours_to_show()
+    (tmp_path / "seen").mkdir()
+    rng = np.random.default_rng(4)
+    for k, colour in enumerate(colours):
+        shown = cv2.imread(str(tmp_path / "show" / f"{k:03d}.png"))[0, 0, ::-1]
+        np.testing.assert_array_equal(shown, colour)
+        light = np.array([[0.6, 0.1, 0.0], [0.05, 0.7, 0.05], [0.0, 0.1, 0.6]]) @ (colour / 255.0) ** 2.2
+        image = np.full((60, 90, 3), 40.0)
+        image[10:50, 20:80] = 255.0 * (0.02 + light) ** (1.0 / 2.2)
+        noisy = np.clip(image + rng.normal(0.0, 2.0, image.shape), 0, 255).round().astype(np.uint8)
+        cv2.imwrite(str(tmp_path / "seen" / f"{k:03d}.png"), noisy[..., ::-1])
+    assert run("calibrate", "display", tmp_path, "--conditions", "lamps on", "-o", tmp_path / "display.yaml") == 0
+    found = load_calibration(DisplayCalibration, tmp_path / "display.yaml")
+    assert found.residuals["held_out_rmse"] < 0.01
+    assert yaml.safe_load((tmp_path / "display.yaml").read_text())["conditions"] == "lamps on"
+    (tmp_path / "shown.csv").write_text("file,red\nseen/000.png,0\n")
+    capsys.readouterr()
+    assert run("calibrate", "display", tmp_path, "-o", tmp_path / "no.yaml") == 2
+    assert "columns file, red, green, blue" in capsys.readouterr().err
+
+
+def test_live_topics_become_a_bag_and_silence_is_told(tmp_path):
+    """A publisher in another process, as a node would be."""
+    code = (
+        "import sys, time; from pathlib import Path\n"
+        "import numpy as np\n"
+        "from nodes.runtime.bus import Bus\n"
+        "from nodes.runtime.messages import pose_message\n"
+        "with Bus(Path(sys.argv[1])) as bus:\n"
+        "    bus.publisher('/vicon/car')\n"
+        "    print('up', flush=True)\n"
+        "    end = time.monotonic() + 20\n"
+        "    while time.monotonic() < end:\n"
+        "        bus.publish('/vicon/car', pose_message(np.eye(4), time.time_ns()))\n"
+        "        time.sleep(0.005)\n"
+    )
+    run_dir = tmp_path / "r"
+    run_dir.mkdir()
+    process = subprocess.Popen([sys.executable, "-c", code, str(run_dir)], stdout=subprocess.PIPE)
+    try:
+        assert process.stdout.readline() == b"up\n"
+        bag = record_live(run_dir, ("/vicon/car",), 0.8, tmp_path / "bag")
+        assert next(t.count for t in read_info(bag).topics if t.name == "/vicon/car") > 20
+        with pytest.raises(BagError, match="expected /vicon/board to come within"):
+            record_live(run_dir, ("/vicon/car", "/vicon/board"), 0.3, tmp_path / "silent")
+    finally:
+        process.kill()
+        process.wait()
+        process.stdout.close()
+    with Bus(run_dir):
+        pass
+
+
+def test_a_board_to_print(tmp_path, capsys):
+    assert run("calibrate", "board", "-o", tmp_path / "board.png", "--columns", 7, "--rows", 5, "--square", 0.04) == 0
+    printed = cv2.imread(str(tmp_path / "board.png"), cv2.IMREAD_GRAYSCALE)
+    assert printed.shape == (1000, 1400)
+    found = BoardDetector(Board(7, 5, 0.04, 0.03)).find(np.pad(printed, 100, constant_values=255))
+    assert len(found.pixels) == 24
+    assert "280 x 200 mm" in capsys.readouterr().out
