@@ -12,7 +12,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from nodes import cli_attack, cli_attack_node, cli_bag, cli_object, cli_policy, cli_replay, cli_scene, cli_topic
+from nodes import (
+    cli_attack,
+    cli_attack_node,
+    cli_bag,
+    cli_calibrate,
+    cli_motor,
+    cli_object,
+    cli_policy,
+    cli_replay,
+    cli_scene,
+    cli_topic,
+)
 from nodes.runtime.terminal import Overrides, RunDir, print_table, say_error, table
 
 if TYPE_CHECKING:
@@ -31,6 +42,8 @@ app = typer.Typer(
 )  # fmt: skip
 app.add_typer(cli_topic.app, name="topic")
 app.add_typer(cli_bag.app, name="bag")
+app.add_typer(cli_motor.app, name="motor")
+app.add_typer(cli_calibrate.app, name="calibrate")
 cli_attack_node.add_to(cli_attack.app)
 app.add_typer(cli_attack.app, name="attack")
 app.add_typer(cli_object.app, name="object")
