@@ -17,6 +17,7 @@ from nodes import (
     cli_attack_node,
     cli_bag,
     cli_calibrate,
+    cli_keys,
     cli_motor,
     cli_object,
     cli_policy,
@@ -42,6 +43,7 @@ app = typer.Typer(
 )  # fmt: skip
 app.add_typer(cli_topic.app, name="topic")
 app.add_typer(cli_bag.app, name="bag")
+app.add_typer(cli_keys.app, name="keys")
 app.add_typer(cli_motor.app, name="motor")
 app.add_typer(cli_calibrate.app, name="calibrate")
 cli_attack_node.add_to(cli_attack.app)

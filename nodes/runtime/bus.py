@@ -24,7 +24,7 @@ from nodes.runtime.messages import MAX_SEQUENCE_LENGTH, decode, encode, type_has
 from nodes.runtime.paths import socket_path
 from nodes.runtime.topics import Topic
 from nodes.runtime.topics import topic as topic_row
-from nodes.runtime.wire import MessageInfo, Meta, pack_meta, unpack
+from nodes.runtime.wire import MessageInfo, Meta, Relayed, pack_meta, unpack
 
 _SEND_QUEUE = 16
 # Deep enough that a reader that stalls for seconds still drains to the true newest: a full pipe holds back what comes after.
@@ -83,6 +83,9 @@ class Publisher:
 
     def publish(self, message: Any) -> None:
         """Send a message, or CDR bytes of the topic's type; never blocks."""
+        if isinstance(message, Relayed):
+            self._socket.send_multipart([self._name, pack_meta(message.meta), message.cdr], zmq.NOBLOCK)
+            return
         if isinstance(message, bytes | memoryview):
             cdr: bytes | memoryview = message
         elif type_name(message) != self.topic.type:

@@ -28,6 +28,10 @@ class BusError(RuntimeFault, OSError):
     """An endpoint cannot be used."""
 
 
+class SecurityError(RuntimeFault):
+    """A key is missing, unsafe or unknown, or an address may not be used without one."""
+
+
 class LaunchError(RuntimeFault):
     """A launch could not start, or one of its required nodes died."""
 

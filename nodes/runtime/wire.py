@@ -51,6 +51,14 @@ class Meta:
     instance_id: int
 
 
+@dataclass(frozen=True)
+class Relayed:
+    """A message of another host's publisher, to be sent on under that publisher's own count and times."""
+
+    meta: Meta
+    cdr: bytes
+
+
 def pack_meta(meta: Meta) -> bytes:
     """Bytes of the second frame."""
     return _META.pack(

@@ -1,0 +1,156 @@
+"""The gateway node: the only process of a host that talks to the other one.
+
+It hears the topics that this host exports, and publishes here what comes from there, so that no other node knows about hosts.
+On the end that listens (the car) it also measures how far the other host's clock is off.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from nodes.runtime.clock import NS_PER_S
+from nodes.runtime.messages import header, type_hash_prefix, types
+from nodes.runtime.node import ACTIVE, READY, Inbox, MessageInfo, Node, NodeContext, Now, Out, run_node_main
+from nodes.runtime.security import KeyFolder
+from nodes.runtime.security_link import Inbound, Link, LinkConfig, Offset
+from nodes.runtime.topics import topic as topic_row
+from nodes.runtime.wire import Meta
+
+OFFSET_TOPIC = "/clock/offset"
+_TICK_HZ = 10.0
+_INBOX = 400
+# Three of the listener's clock questions.
+_SILENCE_S = 0.8
+
+
+class GatewayConfig(BaseModel):
+    """Configuration of the gateway.
+
+    Attributes:
+        listen: Address to listen on; the car's end.
+        connect: Address of the host that listens; the other end.
+        watch_port: TCP port by which the listener speaks.
+        drive_port: TCP port by which it hears.
+        keys: Key folder; none only on a loopback address.
+        key: Name of this host's own key.
+        peer_key: Name of the listener's key; only at the end that connects.
+        exports: Topics of this host that the other may hear.
+        imports: Topics of the other host that are published here.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    listen: str | None = None
+    connect: str | None = None
+    watch_port: int = Field(default=5570, ge=1024, le=65535)
+    drive_port: int = Field(default=5571, ge=1024, le=65535)
+    keys: Path | None = None
+    key: str = "robot"
+    peer_key: str = "robot"
+    exports: tuple[str, ...] = ()
+    imports: tuple[str, ...] = ()
+
+    @model_validator(mode="after")
+    def _one_end(self) -> GatewayConfig:
+        if (self.listen is None) == (self.connect is None):
+            raise ValueError("expected either listen or connect")
+        for name in (*self.exports, *self.imports):
+            topic_row(name)
+        if both := set(self.exports) & set(self.imports):
+            raise ValueError(f"{', '.join(sorted(both))} cannot be both exported and imported: it would go in circles")
+        return self
+
+    def link(self) -> LinkConfig:
+        """Both doors of the link."""
+        return LinkConfig(
+            self.listen or self.connect or "", self.listen is not None, self.watch_port, self.drive_port,
+            None if self.keys is None else KeyFolder(self.keys), self.key, self.peer_key, self.imports, bool(self.exports),
+        )  # fmt: skip
+
+
+class GatewayNode(Node):
+    """Carries messages between the bus of this host and the link.
+
+    Args:
+        config: Configuration.
+        subscribers: How many subscribers a topic has on this host.
+    """
+
+    raw = True
+    tick_rate_hz = _TICK_HZ
+
+    def __init__(self, config: GatewayConfig, subscribers: Callable[[str], int]) -> None:
+        self.subscriptions = config.exports
+        self.publications = (*config.imports, *((OFFSET_TOPIC,) if config.listen is not None else ()))
+        self.inbox: Inbox[Inbound | Offset] = Inbox(_INBOX)
+        self._imports, self._subscribers = config.imports, subscribers
+        self._prefixes = {name: type_hash_prefix(topic_row(name).type) for name in config.exports}
+        self._sent = self._taken = 0
+        self._offset: Offset | None = None
+        self._link = Link(config.link(), self.inbox)
+
+    @classmethod
+    def build(cls, config: GatewayConfig, context: NodeContext) -> GatewayNode:
+        """Open the doors."""
+        return cls(config, context.subscribers)
+
+    def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
+        """Send a message of this host on."""
+        meta = Meta(info.publish_mono_ns, info.publish_real_ns, info.sequence, self._prefixes[topic], info.instance_id)
+        self._link.send(topic, meta, info.raw)
+        self._sent += 1
+        return []
+
+    def receive(self, item: Inbound | Offset, now: Now) -> list[Out]:
+        """Publish here what came from there."""
+        if isinstance(item, Inbound):
+            self._taken += 1
+            return [Out(item.topic, item.message)]
+        self._offset = item
+        message = types.ClockOffset(
+            header=header(now.real_ns), peer=item.peer, offset_s=item.best.offset_s,
+            error_s=item.best.round_trip_s / 2, round_trip_s=item.newest.round_trip_s,
+        )  # fmt: skip
+        return [Out(OFFSET_TOPIC, message)]
+
+    def tick(self, now: Now) -> list[Out]:
+        """Ask the other host only for what somebody here reads."""
+        self._link.want(frozenset(name for name in self._imports if self._subscribers(name) > 0))
+        return []
+
+    def status(self) -> tuple[str, str]:
+        """Ready while the other host is not heard; the nodes that need it say so themselves."""
+        heard_ns = self._link.heard_mono_ns
+        if heard_ns is None:
+            return READY, "the other host has not been heard yet"
+        silence_s = (time.monotonic_ns() - heard_ns) / NS_PER_S
+        if silence_s > _SILENCE_S:
+            return READY, f"the other host is silent for {silence_s:.1f} s"
+        clock = "" if self._offset is None else f", its clock is {self._offset.best.offset_s * 1e3:+.1f} ms off"
+        return ACTIVE, f"{self._sent} messages sent, {self._taken} taken{clock}"
+
+    def counters(self) -> dict[str, float]:
+        """What passed and what was refused."""
+        counters = {"sent": float(self._sent), "taken": float(self._taken), "refused": float(self._link.refused)}
+        if self._offset is not None:
+            counters["clock_offset_s"] = self._offset.best.offset_s
+            counters["round_trip_s"] = self._offset.newest.round_trip_s
+        return counters
+
+    def close(self) -> None:
+        """Close the doors."""
+        self._link.close()
+
+
+def main() -> int:
+    """Run the node as a process."""
+    return run_node_main(GatewayConfig, GatewayNode.build)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,334 @@
+import socket
+import stat
+import time
+
+import numpy as np
+import pytest
+import zmq
+
+from nodes.gateway import GatewayConfig, GatewayNode
+from nodes.runtime.bus import Bus
+from nodes.runtime.clock import NS_PER_S
+from nodes.runtime.clock_offset import Exchange, OffsetFilter
+from nodes.runtime.errors import SecurityError, TopicError
+from nodes.runtime.messages import drive_message, encode, header, type_hash_prefix, types
+from nodes.runtime.security import DRIVE, WATCH, KeyFolder
+from nodes.runtime.security_link import on_our_clock
+from nodes.runtime.wire import Meta, pack_meta
+
+ACKERMANN = "ackermann_msgs/msg/AckermannDriveStamped"
+
+
+def free_ports(count):
+    probes = [socket.socket() for _ in range(count)]
+    for probe in probes:
+        probe.bind(("127.0.0.1", 0))
+    ports = [probe.getsockname()[1] for probe in probes]
+    for probe in probes:
+        probe.close()
+    return ports
+
+
+class Host:
+    """A bus and its gateway, stepped by hand."""
+
+    def __init__(self, run_dir, config):
+        self.bus = Bus(run_dir)
+        self.eyes = Bus(run_dir)
+        self.node = GatewayNode(config, self.bus.subscribers)
+        for topic in self.node.publications:
+            self.bus.publisher(topic)
+        for topic in self.node.subscriptions:
+            self.bus.subscribe(topic)
+
+    def step(self):
+        from nodes.runtime.clock import SystemClock
+
+        now = SystemClock().now()
+        outs = self.node.tick(now)
+        for received in self.bus.receive():
+            outs += self.node.handle(received.topic, None, received.info, now)
+        for item in self.node.inbox.take():
+            outs += self.node.receive(item, now)
+        for topic, message in outs:
+            self.bus.publish(topic, message)
+        return self.eyes.receive()
+
+    def close(self):
+        self.node.close()
+        self.node.inbox.close()
+        self.bus.close()
+        self.eyes.close()
+
+
+@pytest.fixture
+def lab(tmp_path):
+    """Keys of a car, a workstation that may drive and a visitor who may watch; ports; and a factory of hosts."""
+    keys = {name: KeyFolder(tmp_path / f"keys_{name}") for name in ("robot", "workstation", "visitor")}
+    public = {name: folder.new(name) for name, folder in keys.items()}
+    for name in ("workstation", "visitor"):
+        keys[name].add("robot", public["robot"])
+        keys["robot"].add(name, public[name])
+    keys["robot"].allow("workstation", DRIVE)
+    keys["robot"].allow("visitor", WATCH)
+    watch_port, drive_port = free_ports(2)
+    hosts = []
+
+    class Lab:
+        def host(self, name, **options):
+            config = GatewayConfig(
+                watch_port=watch_port, drive_port=drive_port, **{"keys": keys[name].path, "key": name, **options}
+            )
+            run_dir = tmp_path / f"run_{name}_{len(hosts)}"
+            run_dir.mkdir()
+            hosts.append(Host(run_dir, config))
+            return hosts[-1]
+
+        def robot(self):
+            host = self.host("robot", listen="127.0.0.1", exports=("/vicon/car",), imports=("/policy/drive", "/arm"))
+            for topic in ("/policy/drive", "/arm", "/clock/offset"):
+                host.eyes.subscribe(topic)
+            return host
+
+        def workstation(self, name="workstation", **options):
+            options = {"connect": "127.0.0.1", "exports": ("/policy/drive",), "imports": ("/vicon/car",), **options}
+            host = self.host(name, **options)
+            host.eyes.subscribe("/vicon/car")
+            return host
+
+        def run(self, duration_s, until=lambda got: False, act=lambda: None):
+            got, end = [], time.monotonic() + duration_s
+            while time.monotonic() < end and not until(got):
+                act()
+                for host in hosts:
+                    got += [(host, received) for received in host.step()]
+                time.sleep(0.005)
+            return got
+
+    lab = Lab()
+    lab.keys = keys
+    lab.ports = {WATCH: watch_port, DRIVE: drive_port}
+    yield lab
+    for host in hosts:
+        host.close()
+
+
+def drives(got):
+    return [received for _, received in got if received.topic == "/policy/drive"]
+
+
+def hello(host, topic="/policy/drive"):
+    return lambda: host.eyes.publish(topic, drive_message(0.5, 0.1, time.time_ns()))
+
+
+def test_secret_keys_are_private_and_names_are_unique(tmp_path):
+    keys = KeyFolder(tmp_path / "keys")
+    public = keys.new("robot")
+    file = tmp_path / "keys" / "secret" / "robot.key"
+    assert stat.S_IMODE(file.stat().st_mode) == 0o600
+    assert stat.S_IMODE(file.parent.stat().st_mode) == 0o700
+    # The pair belongs together, by ZeroMQ's own arithmetic.
+    assert zmq.curve_public(keys.secret("robot").encode()).decode() == public
+    with pytest.raises(SecurityError, match="has a key robot already"):
+        keys.new("robot")
+    with pytest.raises(SecurityError, match="expected a name"):
+        keys.new("../robot")
+    file.chmod(0o644)
+    with pytest.raises(SecurityError, match="got 0644: others may have read it"):
+        keys.secret("robot")
+
+
+def test_rights_are_separate_and_can_be_taken_back(tmp_path):
+    keys = KeyFolder(tmp_path)
+    public = keys.new("alice")
+    keys.allow("alice", WATCH)
+    assert keys.allowed(WATCH) == {public: "alice"}
+    assert keys.allowed(DRIVE) == {}
+    keys.allow("alice", DRIVE)
+    assert keys.rows()[0].rights == (WATCH, DRIVE)
+    assert keys.revoke("alice", DRIVE) == (DRIVE,)
+    assert keys.allowed(WATCH)
+    assert not keys.allowed(DRIVE)
+    keys.revoke("alice")
+    assert keys.rows()[0].rights == ()
+    with pytest.raises(SecurityError, match="on no such list"):
+        keys.revoke("alice")
+    with pytest.raises(SecurityError, match="no public key"):
+        keys.allow("bob", WATCH)
+    with pytest.raises(SecurityError, match="40 Z85 characters"):
+        keys.add("bob", "short")
+
+
+def test_an_address_for_all_without_keys_is_refused(tmp_path):
+    for address in ("0.0.0.0", "192.168.1.20", "::", "robot.local"):
+        config = GatewayConfig(listen=address, watch_port=5590, drive_port=5591)
+        with pytest.raises(SecurityError, match="anybody could drive the car"):
+            GatewayNode(config, lambda topic: 0)
+    with pytest.raises(ValueError, match="either listen or connect"):
+        GatewayConfig(listen="127.0.0.1", connect="127.0.0.1")
+    with pytest.raises(ValueError, match="in circles"):
+        GatewayConfig(listen="127.0.0.1", exports=("/arm",), imports=("/arm",))
+
+
+def test_messages_cross_with_their_count_stamp_and_publisher_and_clocks_are_compared(lab):
+    robot, workstation = lab.robot(), lab.workstation()
+    got = lab.run(8.0, lambda got: len(drives(got)) > 3, hello(workstation))
+    host, last = [(h, r) for h, r in got if r.topic == "/policy/drive"][-1]
+    assert host is robot
+    assert last.message().drive.speed == pytest.approx(0.5)
+    assert last.info.instance_id == workstation.eyes.instance_id
+    assert 0 <= time.monotonic_ns() - last.info.publish_mono_ns < NS_PER_S
+    offsets = [r.message() for _, r in got + lab.run(0.6) if r.topic == "/clock/offset"]
+    assert offsets
+    assert offsets[-1].peer == "workstation"
+    assert abs(offsets[-1].offset_s) <= offsets[-1].error_s < 0.05  # one computer: the truth is zero
+    assert robot.node.status()[0] == workstation.node.status()[0] == "active"
+
+
+def test_watch_only_key_sees_but_cannot_drive_or_arm(lab, capfd):
+    robot = lab.robot()
+    visitor = lab.workstation("visitor", exports=("/policy/drive", "/arm"))
+    robot.eyes.publisher("/vicon/car")
+    arm = types.Arm(header=header(0), arm=True, source="operator", reason="")
+
+    def act():
+        robot.eyes.publish("/vicon/car", encode(types.PoseStamped(header=header(0), pose=IDENTITY)))
+        hello(visitor)()
+        visitor.eyes.publish("/arm", arm)
+
+    got = lab.run(2.0, act=act)
+    assert any(r.topic == "/vicon/car" and h is visitor for h, r in got)
+    assert not [r for _, r in got if r.topic in ("/policy/drive", "/arm")]
+    assert robot.node.counters()["refused"] > 0
+    assert "at the drive door: its key" in capfd.readouterr().err
+
+
+IDENTITY = types.Pose(
+    position=types.Point(x=0.0, y=0.0, z=0.0), orientation=types.Quaternion(x=0.0, y=0.0, z=0.0, w=1.0)
+)
+
+
+def test_revocation_ends_a_running_connection(lab):
+    lab.robot()
+    workstation = lab.workstation()
+    assert lab.run(8.0, drives, hello(workstation))
+    lab.keys["robot"].revoke("workstation", DRIVE)
+    lab.run(1.0, act=hello(workstation))
+    assert not drives(lab.run(1.5, act=hello(workstation)))
+    lab.keys["robot"].allow("workstation", DRIVE)
+    assert drives(lab.run(8.0, drives, hello(workstation)))
+
+
+class Stranger:
+    """A client of our own making at the drive door."""
+
+    def __init__(self, lab, secret=None, public=None, server=None):
+        self.context = zmq.Context()
+        self.socket = self.context.socket(zmq.PUB)
+        self.socket.linger = 0
+        if secret:
+            self.socket.curve_secretkey, self.socket.curve_publickey = secret.encode(), public.encode()
+            self.socket.curve_serverkey = (server or lab.keys["robot"].public("robot")).encode()
+        self.socket.connect(f"tcp://127.0.0.1:{lab.ports[DRIVE]}")
+
+    def say(self, *frames):
+        self.socket.send_multipart(frames)
+
+    def close(self):
+        self.socket.close()
+        self.context.term()
+
+
+def good_frames(topic=b"/policy/drive", cdr=None):
+    meta = Meta(time.monotonic_ns(), time.time_ns(), 0, type_hash_prefix(ACKERMANN), 1)
+    return [topic, pack_meta(meta), encode(drive_message(0.5, 0.1, time.time_ns())) if cdr is None else cdr]
+
+
+@pytest.mark.parametrize("kind", ["no key", "unknown key", "wrong server key"])
+def test_strangers_do_not_get_in(lab, kind, capfd):
+    robot = lab.robot()
+    public, secret = (half.decode() for half in zmq.curve_keypair())
+    server = zmq.curve_keypair()[0].decode() if kind == "wrong server key" else None
+    stranger = Stranger(lab, *(() if kind == "no key" else (secret, public, server)))
+    try:
+        got = lab.run(1.5, act=lambda: stranger.say(*good_frames()))
+    finally:
+        stranger.close()
+    assert not drives(got)
+    assert robot.node.counters()["refused"] > 0
+    assert "link: refused" in capfd.readouterr().err
+
+
+def test_malformed_and_oversized_messages_of_an_allowed_key_are_refused(lab, capfd):
+    robot = lab.robot()
+    keys = lab.keys["workstation"]
+    friend = Stranger(lab, keys.secret("workstation"), keys.public("workstation"))
+    good = good_frames()
+    bad = [
+        [b"/policy/drive"],
+        [b"/policy/drive", b"", b""],
+        [b"/policy/drive", good[1][:-1], good[2]],
+        [b"/policy/drive", good[1], good[2][:-3]],
+        [b"/policy/drive", good[1], b"\xff" * 200],
+        [b"/policy/drive", good[1], bytes(1 << 20)],
+        [b"/policy/drive", pack_meta(Meta(0, 0, 0, b"wrong!!!", 1)), good[2]],
+        [b"/policy/drive/more", good[1], good[2]],
+        [b"/policy/drive", *[b""] * 500],
+    ]
+    try:
+        assert drives(lab.run(8.0, drives, lambda: friend.say(*good_frames())))
+        before = robot.node.counters()["refused"]
+        for frames in bad:
+            friend.say(*frames)
+        got = lab.run(3.0, lambda got: robot.node.counters()["refused"] >= before + len(bad))
+        assert robot.node.counters()["refused"] == before + len(bad)
+        assert not [r for r in drives(got) if r.info.receive_mono_ns > 0 and len(r.info.raw) != len(good[2])]
+        friend.say(b"/policy/drive", good[1], bytes(20 << 20))  # beyond the socket's own limit: ends the connection
+        assert drives(lab.run(8.0, drives, lambda: friend.say(*good_frames())))  # and the honest go on
+    finally:
+        friend.close()
+    assert "expected three frames" in capfd.readouterr().err
+
+
+def test_a_topic_that_nobody_reads_does_not_travel(lab):
+    robot = lab.robot()
+    workstation = lab.workstation(imports=("/camera/image_raw", "/vicon/car"))
+    robot.eyes.publisher("/vicon/car")
+    got = lab.run(
+        5.0, lambda got: any(r.topic == "/vicon/car" for _, r in got),
+        lambda: robot.eyes.publish("/vicon/car", encode(types.PoseStamped(header=header(0), pose=IDENTITY))),
+    )  # fmt: skip
+    assert any(r.topic == "/vicon/car" for _, r in got)
+    assert workstation.node._link._subscribed == {"/vicon/car"}
+
+
+def test_publish_time_moves_to_our_clock_by_its_age():
+    meta = Meta(10**18, 5 * NS_PER_S, 7, b"12345678", 9)
+    moved = on_our_clock(meta, 5 * NS_PER_S + 200_000_000, 40 * NS_PER_S)
+    assert moved.publish_mono_ns == 40 * NS_PER_S - 200_000_000
+    assert (moved.publish_real_ns, moved.sequence, moved.instance_id) == (5 * NS_PER_S, 7, 9)
+    # A clock that is ahead must not make a message younger than new.
+    assert on_our_clock(meta, 4 * NS_PER_S, 40 * NS_PER_S).publish_mono_ns == 40 * NS_PER_S
+
+
+def exchange(asked_s, there_s, back_s, offset_s, work_s=0.001):
+    received = asked_s + there_s + offset_s
+    times = (asked_s, received, received + work_s, asked_s + there_s + work_s + back_s)
+    return Exchange(*(round(t * NS_PER_S) for t in times))
+
+
+def test_clock_offset_of_asymmetric_ways_is_within_its_bound_and_follows_a_step():
+    rng = np.random.default_rng(3)
+    offsets = OffsetFilter()
+    for i in range(50):
+        there, back = rng.exponential(0.02, 2) + 0.001
+        best = offsets.add(exchange(i * 0.2, there, back, 0.05))
+        assert abs(best.offset_s - 0.05) <= best.round_trip_s / 2 + 1e-9
+    assert best.offset_s == pytest.approx(0.05, abs=0.01)
+    stepped = offsets.add(exchange(20.0, 0.002, 0.002, -0.3))
+    assert stepped.offset_s == pytest.approx(-0.3, abs=1e-6)
+
+
+def test_unknown_topic_is_an_error_of_the_configuration():
+    with pytest.raises(TopicError, match="unknown topic '/nothing'"):
+        GatewayConfig(listen="127.0.0.1", exports=("/nothing",))
