@@ -40,12 +40,16 @@ class Topic:
 _ACKERMANN = "ackermann_msgs/msg/AckermannDriveStamped"
 _ROWS = (
     Topic("/camera/image_raw", "sensor_msgs/msg/Image", 10.0, 1, 0.2, "camera"),
+    Topic("/camera/image_raw/compressed", "sensor_msgs/msg/CompressedImage", 10.0, 1, 0.2, "camera"),
     Topic("/camera/camera_info", "sensor_msgs/msg/CameraInfo", 10.0, 1, None, "camera"),
     Topic("/vicon/car", "geometry_msgs/msg/PoseStamped", 100.0, 200, 0.1, "vicon"),
     Topic("/vicon/board", "geometry_msgs/msg/PoseStamped", 100.0, 200, 0.1, "vicon"),
     Topic("/vicon/monitor", "geometry_msgs/msg/PoseStamped", 100.0, 200, 0.1, "vicon"),
+    Topic("/vicon/wand", "geometry_msgs/msg/PoseStamped", 100.0, 200, 0.1, "vicon"),
     Topic("/compositor/image", "sensor_msgs/msg/Image", 10.0, 1, 0.2, "compositor"),
     Topic("/compositor/attack", "advnerf_msgs/msg/AttackStamp", 10.0, 50, None, "compositor"),
+    Topic("/monitor/attack", "advnerf_msgs/msg/AttackStamp", 5.0, 50, None, "monitor"),
+    Topic("/monitor/shown", "advnerf_msgs/msg/DisplayShown", 5.0, 50, None, "monitor"),
     Topic("/policy/drive", _ACKERMANN, 10.0, 1, 0.25, "policy"),
     Topic("/safety/drive", _ACKERMANN, 10.0, 1, 0.25, "safety"),
     Topic("/safety/state", "advnerf_msgs/msg/SafetyState", 10.0, 20, 0.5, "safety"),
