@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from advnerf_core.geometry import Pinhole
 from calibration.schema import CameraCalibration, load_calibration
-from hardware.cameras.file import FileCamera
-from hardware.cameras.interface import Camera, Frame
-from hardware.cameras.socket import SocketCamera
-from hardware.errors import HardwareError
+from hardware.cameras.interface import Frame
+from hardware.cameras.stamping import Decimator
+from hardware.cameras.steady import SteadyCamera
+from nodes.camera_sources import CameraSource
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import RuntimeFault
 from nodes.runtime.messages import camera_info_message, image_message
@@ -29,106 +32,73 @@ from nodes.runtime.node import (
     ReaderThread,
     run_node_main,
 )
+from nodes.runtime.pictures import COMPRESSED_TOPIC, RAW_TOPIC, compressed_image_message
 
 _READ_TIMEOUT_S = 0.2
-_RETRY_S = 0.3
+# Of the focal length and, as a share of the picture, of its centre: no calibration moves a factory's numbers so far.
+_FACTORY_TOLERANCE = 0.05
 FRAME_ID = "camera"
 
 
-class SocketSource(BaseModel):
-    """Frames from a Unix socket.
+class CompressedConfig(BaseModel):
+    """JPEG pictures for the air.
 
     Attributes:
-        kind: ``socket``.
-        path: Path of the socket; ``${socket_dir}/frames`` for the twin.
+        rate_hz: Pictures per second at most [Hz].
+        quality: Of the JPEG, 1 to 100.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    kind: Literal["socket"] = "socket"
-    path: Path
-
-    def camera(self) -> Camera:
-        """The device."""
-        return SocketCamera(self.path)
-
-
-class FileSource(BaseModel):
-    """Recorded pictures.
-
-    Attributes:
-        kind: ``file``.
-        folder: Folder of numbered images.
-        rate_hz: Frames per second.
-        loop: Begin again after the last one.
-    """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    kind: Literal["file"] = "file"
-    folder: Path
     rate_hz: float = Field(default=10.0, gt=0.0)
-    loop: bool = True
-
-    def camera(self) -> Camera:
-        """The device."""
-        return FileCamera(self.folder, self.rate_hz, self.loop)
+    quality: int = Field(default=80, ge=1, le=100)
 
 
 class CameraConfig(BaseModel):
     """Configuration of the camera node.
 
     Attributes:
-        source: Device: ``kind: socket`` or ``kind: file``.
+        source: Device: ``kind`` v4l2, zed, oak, socket, file or folder; see `nodes.camera_sources`.
         calibration: Camera calibration file; frames of another size are refused.
         max_age_s: A frame older than this when it arrives is not published [s].
         silence_s: Time without a frame after which the node reports a fault [s].
+        compressed: Also publish JPEG pictures on ``/camera/image_raw/compressed``; only while somebody listens.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    source: Annotated[SocketSource | FileSource, Field(discriminator="kind")]
+    source: CameraSource
     calibration: Path
     max_age_s: float = Field(default=0.2, gt=0.0)
     silence_s: float = Field(default=0.5, gt=0.0)
+    compressed: CompressedConfig | None = None
 
 
-class _Reconnecting:
-    """Reads a camera that may not be there yet, or may go away and come back; lives in the reader's thread."""
-
-    def __init__(self, camera: Camera) -> None:
-        self._camera = camera
-        self._is_open = False
-        self.error = "not connected yet"
-
-    def read(self) -> Frame | None:
-        try:
-            if not self._is_open:
-                self._camera.open()
-                self._is_open, self.error = True, ""
-            return self._camera.read(_READ_TIMEOUT_S)
-        except HardwareError as error:
-            self._camera.close()
-            self._is_open, self.error = False, str(error)
-            time.sleep(_RETRY_S)
-            return None
-
-    def close(self) -> None:
-        self._camera.close()
+def _grid(compressed: CompressedConfig | None) -> Decimator | None:
+    # A frame may come a quarter of a period early and still be its slot's.
+    return None if compressed is None else Decimator(compressed.rate_hz, 2.0 * compressed.rate_hz)
 
 
 class CameraNode(Node):
     """Turns frames into images and camera infos."""
 
-    publications = ("/camera/image_raw", "/camera/camera_info")
-
-    def __init__(self, config: CameraConfig, calibration: CameraCalibration) -> None:
+    def __init__(
+        self,
+        config: CameraConfig,
+        calibration: CameraCalibration,
+        subscribers: Callable[[str], int] = lambda topic: 0,
+        device: SteadyCamera | None = None,
+    ) -> None:
         self._config = config
         self._calibration = calibration
-        self._device = _Reconnecting(config.source.camera())
+        self.publications = (RAW_TOPIC, "/camera/camera_info", *((COMPRESSED_TOPIC,) if config.compressed else ()))
+        self._subscribers = subscribers
+        self._grid = _grid(config.compressed)
+        self._device = device or config.source.steady()
+        self._factory: Pinhole | None = None
         # Two: the newest, and the one that may just be taken.
         self.inbox: Inbox[Frame] = Inbox(capacity=2)
-        self._reader = ReaderThread(self._device.read, self.inbox, "camera")
+        self._reader = ReaderThread(partial(self._device.read, _READ_TIMEOUT_S), self.inbox, "camera")
         self._sequence: int | None = None
         self._arrived_ns: int | None = None
         self._now_ns = time.monotonic_ns
@@ -137,7 +107,7 @@ class CameraNode(Node):
     @classmethod
     def build(cls, config: CameraConfig, context: NodeContext) -> CameraNode:
         """Make the node of a process and begin to read."""
-        node = cls(config, load_calibration(CameraCalibration, config.calibration))
+        node = cls(config, load_calibration(CameraCalibration, config.calibration), context.subscribers)
         node._now_ns = lambda: context.clock.now().mono_ns
         node._reader.start()
         return node
@@ -157,14 +127,13 @@ class CameraNode(Node):
         if (now.mono_ns - item.stamp_mono_ns) / NS_PER_S > self._config.max_age_s:
             self._stale += 1  # left over from a time when this process was held up
             return []
+        self._require_this_camera()
         self._count_missed(item)
         self._arrived_ns = now.mono_ns
         stamp_ns = item.stamp_realtime_ns - round(self._calibration.latency_s * NS_PER_S)
         info = camera_info_message(self._calibration.pinhole, stamp_ns, FRAME_ID, self._calibration.distortion)
-        return [
-            Out("/camera/image_raw", image_message(item.rgb, stamp_ns, FRAME_ID)),
-            Out("/camera/camera_info", info),
-        ]
+        outs = [Out(RAW_TOPIC, image_message(item.rgb, stamp_ns, FRAME_ID)), Out("/camera/camera_info", info)]
+        return outs + self._compressed(item, stamp_ns)
 
     def status(self) -> tuple[str, str]:
         """Fault when frames have ceased."""
@@ -176,13 +145,38 @@ class CameraNode(Node):
         return ACTIVE, ""
 
     def counters(self) -> dict[str, float]:
-        """Frames that were not published."""
-        return {"frames_stale": self._stale, "frames_missed": self._missed}
+        """Frames that were not published, and what the device counts."""
+        return {"frames_stale": self._stale, "frames_missed": self._missed, **self._device.counters()}
 
     def close(self) -> None:
         """Stop reading."""
         self._reader.stop()
         self._device.close()
+
+    def _compressed(self, frame: Frame, stamp_ns: int) -> list[Out]:
+        """The same picture as JPEG, under the same stamp; nothing while nobody listens or it is not its turn."""
+        wanted = self._config.compressed
+        if wanted is None or self._grid is None or self._subscribers(COMPRESSED_TOPIC) == 0:
+            return []
+        if self._grid.slot(stamp_ns) is None:
+            return []
+        return [Out(COMPRESSED_TOPIC, compressed_image_message(frame.rgb, stamp_ns, FRAME_ID, wanted.quality))]
+
+    def _require_this_camera(self) -> None:
+        """A device that knows its own intrinsics must be the calibrated one: the calibration may only refine them."""
+        factory = self._device.camera.pinhole
+        if factory is None or factory == self._factory:
+            return
+        ours = self._calibration.pinhole
+        focal = max(abs(ours.fx / factory.fx - 1.0), abs(ours.fy / factory.fy - 1.0))
+        centre = max(abs(ours.cx - factory.cx) / factory.width, abs(ours.cy - factory.cy) / factory.height)
+        if max(focal, centre) > _FACTORY_TOLERANCE:
+            raise RuntimeFault(
+                f"{self._config.calibration} says fx {ours.fx:.1f}, cx {ours.cx:.1f}, cy {ours.cy:.1f}, but the device's own"
+                f" calibration fx {factory.fx:.1f}, cx {factory.cx:.1f}, cy {factory.cy:.1f}: it is the file of another camera or"
+                " mode; calibrate this one"
+            )
+        self._factory = factory
 
     def _count_missed(self, frame: Frame) -> None:
         if self._sequence is not None and frame.sequence > self._sequence:

@@ -14,7 +14,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from hardware.cameras import v4l2_abi as abi
 from hardware.cameras import v4l2_controls
@@ -38,9 +40,11 @@ class V4l2Camera(Camera):
         controls: What to fix.
         rate_hz: Deliver so many frames per second, chosen by their stamps; None for all.
         columns: First and one past the last column to deliver; None for all.
+        size: Width and height to which the pictures are scaled [px]; None keeps them.
         skip_frames: First frames after the start, which many devices deliver damaged or badly exposed.
         port: The system calls.
         started: Called with the file descriptor when the stream runs, for what a device needs beyond the standard.
+        stamper: Believes or refuses the kernel's stamps.
 
     Attributes:
         identity: What it says about itself, once it is open.
@@ -53,6 +57,7 @@ class V4l2Camera(Camera):
         controls: Controls | None = None,
         rate_hz: float | None = None,
         columns: tuple[int, int] | None = None,
+        size: tuple[int, int] | None = None,
         skip_frames: int = 1,
         port: VideoPort | None = None,
         started: Callable[[int], None] | None = None,
@@ -64,6 +69,7 @@ class V4l2Camera(Camera):
         self._controls = controls or Controls()
         self._decimator = None if rate_hz is None else Decimator(rate_hz, mode.fps)
         self._columns = columns
+        self._size = size
         self._skip_frames = skip_frames
         self._port: VideoPort = port or KernelPort()
         self._started = started
@@ -221,7 +227,14 @@ class V4l2Camera(Camera):
         except ValueError:
             self._counts["frames_damaged"] += 1
             return None
-        return Frame(rgb, *stamps, sequence)
+        return Frame(self._scaled(rgb), *stamps, sequence)
+
+    def _scaled(self, rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        if self._size is None or rgb.shape[1::-1] == self._size:
+            return rgb
+        small = cv2.resize(rgb, self._size, interpolation=cv2.INTER_AREA)
+        small.flags.writeable = False
+        return np.asarray(small, dtype=np.uint8)
 
 
 def _stamp_ns(buffer: abi.Buffer) -> int | None:
