@@ -92,6 +92,9 @@ def launch(
     duration_s: Annotated[
         float | None, typer.Option("--duration", min=0.0, help="Stop by itself after so many seconds.")
     ] = None,
+    host: Annotated[
+        str | None, typer.Option("--host", help="Which of the file's hosts this computer is, or all.")
+    ] = None,
     check: Annotated[
         bool, typer.Option("--check", help="Only say what would be started, and what is wrong with it.")
     ] = False,
@@ -100,13 +103,13 @@ def launch(
     from nodes.runtime.launch import Launch
     from nodes.runtime.launch_file import load_launch
 
-    plan = load_launch(file, overrides or [])
+    plan = load_launch(file, overrides or [], host=host)
     if check:
         _print_plan(plan)
         _say_problems(plan)
         return
     run_dir = run_dir or Path("runs") / f"{plan.launch.name}-{time.strftime('%Y%m%d-%H%M%S')}"
-    started = Launch(file, overrides or [], run_dir, report=lambda line: print(f"[launch] {line}", flush=True))
+    started = Launch(file, overrides or [], run_dir, lambda line: print(f"[launch] {line}", flush=True), host)
     _watch_launch(started, duration_s)
 
 

@@ -41,6 +41,7 @@ class Launch:
         overrides: ``node.key=value`` and ``params.name=value``.
         run_dir: Folder of the run: sockets, logs, resolved configuration.
         report: Called with one line per event (from the supervisor's thread).
+        host: Which of the file's hosts this computer is; None where the file has none.
 
     Use it as a context manager: leaving it stops everything.
     """
@@ -51,9 +52,10 @@ class Launch:
         overrides: Sequence[str] = (),
         run_dir: Path = Path("runs/launch"),
         report: Callable[[str], None] | None = None,
+        host: str | None = None,
     ) -> None:
         self.run_dir = Path(run_dir).resolve()
-        self.plan: Plan = load_launch(Path(file), overrides, self.run_dir)
+        self.plan: Plan = load_launch(Path(file), overrides, self.run_dir, host)
         self.failure = ""
         self._report = report or (lambda line: None)
         self._children = {name: Child(name, entry, self.run_dir) for name, entry in self.plan.nodes.items()}

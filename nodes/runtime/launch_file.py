@@ -13,6 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from nodes.runtime.config import Document, apply_overrides, read_yaml, validate
 from nodes.runtime.errors import ConfigError, TopicError
+from nodes.runtime.launch_hosts import HostEntry, choose_host
 from nodes.runtime.paths import bus_folder
 from nodes.runtime.topics import status_topic
 
@@ -51,6 +52,7 @@ class NodeEntry(_Strict):
         respawn: Restart rule of a node that is not required; none means that it stays down.
         ends_launch: Its regular end (a player at the end of its bag) ends the launch with exit code 0.
         stop_last: Stopped only when the others are down (a recorder, a simulated lab).
+        host: Which of the file's hosts it runs on; only where the file has hosts.
         env: Environment variables to add.
         start_timeout_s: Time until its first status [s].
         hang_timeout_s: Silence of its status after which it counts as hung and is killed [s].
@@ -63,6 +65,7 @@ class NodeEntry(_Strict):
     respawn: Respawn | None = None
     ends_launch: bool = False
     stop_last: bool = False
+    host: str | None = None
     env: dict[str, str] = Field(default_factory=dict)
     start_timeout_s: float = Field(default=60.0, gt=0)
     hang_timeout_s: float = Field(default=5.0, gt=0)
@@ -81,11 +84,13 @@ class RecordEntry(_Strict):
         topics: Topics to record; none means all of the topic table.
         attachments: Files that ride along in the bag, besides the resolved launch file: calibration, attack file; an empty
             entry (a parameter without a value) is left out.
+        host: Host that records; none means the one without an address, whose disk is larger.
     """
 
     output: str = "bag"
     topics: list[str] | None = None
     attachments: list[str | None] = Field(default_factory=list)
+    host: str | None = None
 
 
 class LaunchFile(_Strict):
@@ -98,6 +103,9 @@ class LaunchFile(_Strict):
         nodes: The nodes, in the order in which they are started.
         record: Add a recorder of everything; true for the defaults.
         include: Launch files, relative to this one, on which this one builds.
+        hosts: The two computers of the launch; none means that all runs on one.
+        operator: Host from which people arm and ask; none means the one without an address.
+        keys: Key folder of each host; may be left out only on a loopback address.
     """
 
     name: str
@@ -105,6 +113,9 @@ class LaunchFile(_Strict):
     nodes: dict[str, NodeEntry]
     record: bool | RecordEntry = False
     include: list[str] = Field(default_factory=list)
+    hosts: dict[str, HostEntry] = Field(default_factory=dict)
+    operator: str | None = None
+    keys: str | None = None
 
 
 @dataclass(frozen=True)
@@ -129,13 +140,17 @@ class Plan:
         return {name: entry for name, entry in self.launch.nodes.items() if name in self.documents}
 
 
-def load_launch(file: Path, overrides: Sequence[str] = (), run_dir: Path | str = "<run_dir>") -> Plan:
+def load_launch(
+    file: Path, overrides: Sequence[str] = (), run_dir: Path | str = "<run_dir>", host: str | None = None
+) -> Plan:
     """Read a launch file and resolve it.
 
     Args:
         file: A ``*.launch.yaml`` file.
-        overrides: ``node.key=value`` for a node's configuration, ``params.name=value``, or ``record=true``.
+        overrides: ``node.key=value`` for a node's configuration, ``params.name=value``, ``record=true``,
+            ``hosts.name.key=value``, or ``keys=folder``.
         run_dir: What ``${run_dir}`` stands for.
+        host: Which of the file's hosts this computer is, or ``all``; None where the file has none.
     """
     file = Path(file)
     document = _read_with_includes(file, ())
@@ -150,6 +165,8 @@ def load_launch(file: Path, overrides: Sequence[str] = (), run_dir: Path | str =
     if launch.record is not False:
         _add_recorder(document, launch)
         launch = validate(LaunchFile, document)
+    choose_host(document, launch, host)
+    launch = validate(LaunchFile, document)
     enabled = [name for name, entry in launch.nodes.items() if entry.enabled]
     for name in enabled:
         _check(name, launch.nodes[name], document)
@@ -186,7 +203,7 @@ def _merge(below: Any, above: Any) -> Any:
 def _apply_override(document: Document, override: str) -> None:
     head = override.partition("=")[0].split(".")[0].strip()
     nodes = document.data["nodes"]
-    if head in ("params", "record"):
+    if head in ("params", "record", "hosts", "keys", "operator"):
         known = document.data.get("params") or {}
         name = override.partition("=")[0].split(".", 1)[-1].strip()
         if head == "params" and name not in known:
@@ -231,8 +248,11 @@ def _add_recorder(document: Document, launch: LaunchFile) -> None:
         raise ConfigError(f"{document.place(('nodes', RECORDER))}: this node and the key record exclude each other")
     others = [name for name, entry in launch.nodes.items() if entry.enabled]
     attachments = [file for file in record.attachments if file]
-    config = {**record.model_dump(), "attachments": attachments, "statuses_of": others}
-    document.data["nodes"][RECORDER] = {"module": "nodes.recorder", "stop_last": True, "config": config}
+    config = {**record.model_dump(exclude={"host"}), "attachments": attachments, "statuses_of": others}
+    home = record.host or next((name for name, entry in launch.hosts.items() if entry.address is None), None)
+    document.data["nodes"][RECORDER] = {
+        "module": "nodes.recorder", "stop_last": True, "config": config, "host": home,
+    }  # fmt: skip
     document.data["record"] = False
     document.places[("nodes", RECORDER)] = document.place(("record",))
 
@@ -243,7 +263,7 @@ def _check(name: str, entry: NodeEntry, document: Document) -> None:
         status_topic(name)
     except TopicError as error:
         raise ConfigError(f"{place}: {error}") from None
-    if name in ("params", "record"):
+    if name in ("params", "record", "hosts", "keys", "operator"):
         raise ConfigError(f"{place}: a node cannot be called {name}, because --set uses that word")
     if entry.required and entry.respawn is not None:
         raise ConfigError(f"{place}: node {name} has respawn, so it must also say required: false")

@@ -1,0 +1,83 @@
+import pytest
+
+from nodes.runtime.errors import ConfigError
+from nodes.runtime.launch_file import load_launch
+
+FILE = """
+name: pair
+hosts:
+  robot: {address: 192.168.7.2}
+  workstation: {}
+keys: ~/keys
+record: true
+nodes:
+  camera: {module: nodes.camera, host: robot}
+  vicon: {module: nodes.vicon, host: robot}
+  safety: {module: nodes.safety, host: robot}
+  motor: {module: nodes.motor, host: robot}
+  compositor: {module: nodes.compositor, host: workstation}
+  policy: {module: nodes.policy, host: workstation}
+"""
+
+
+@pytest.fixture
+def launch_file(tmp_path):
+    def write(text=FILE):
+        (tmp_path / "pair.launch.yaml").write_text(text)
+        return tmp_path / "pair.launch.yaml"
+
+    return write
+
+
+def gateway(file, host):
+    plan = load_launch(file, host=host)
+    return set(plan.nodes), plan.documents["gateway"].data
+
+
+def test_each_host_runs_its_nodes_and_a_gateway_whose_lists_mirror_the_other(launch_file):
+    file = launch_file()
+    on_robot, robot = gateway(file, "robot")
+    on_workstation, workstation = gateway(file, "workstation")
+    assert on_robot == {"camera", "vicon", "safety", "motor", "gateway"}
+    assert on_workstation == {"compositor", "policy", "recorder", "gateway"}
+    assert set(robot["exports"]) == set(workstation["imports"])
+    assert set(robot["imports"]) == set(workstation["exports"])
+    assert not set(robot["exports"]) & set(robot["imports"])
+    assert {"/camera/image_raw", "/safety/state", "/status/motor", "/clock/offset"} <= set(robot["exports"])
+    assert {"/policy/drive", "/arm", "/status/policy"} <= set(robot["imports"])
+    assert robot["listen"] == workstation["connect"] == "192.168.7.2"
+    assert (robot["key"], workstation["key"], workstation["peer_key"]) == ("robot", "workstation", "robot")
+
+
+def test_all_runs_everything_here_without_a_gateway(launch_file):
+    assert set(load_launch(launch_file(), host="all").nodes) == {
+        "camera", "vicon", "safety", "motor", "compositor", "policy", "recorder",
+    }  # fmt: skip
+
+
+def test_people_may_be_at_the_car(launch_file):
+    _, robot = gateway(launch_file(FILE + "operator: robot\n"), "robot")
+    assert "/arm" in robot["exports"]
+
+
+@pytest.mark.parametrize(
+    ("change", "host", "words"),
+    [
+        (("", ""), None, "say which host this is"),
+        (("", ""), "laptop", "with one of robot, workstation, or all; got laptop"),
+        (("workstation: {}", "workstation: {address: 10.0.0.3}"), "robot", "one of them with an address"),
+        (("{module: nodes.policy, host: workstation}", "{module: nodes.policy}"), "robot", "node policy needs a host"),
+        (("{module: nodes.motor, host: robot}", "{module: nodes.motor, host: workstation}"), "robot", "no network between"),
+        (("workstation: {}", "workstation: {port: 1}"), "robot", "unknown key hosts.workstation.port"),
+    ],
+)  # fmt: skip
+def test_wrong_hosts_are_one_error(launch_file, change, host, words):
+    with pytest.raises(ConfigError, match=words):
+        load_launch(launch_file(FILE.replace(*change)), host=host)
+
+
+def test_host_of_a_file_without_hosts(launch_file):
+    plain = "name: plain\nnodes: {vicon: {module: nodes.vicon}}\n"
+    assert "gateway" not in load_launch(launch_file(plain)).nodes
+    with pytest.raises(ConfigError, match="knows no hosts"):
+        load_launch(launch_file(plain), host="robot")
