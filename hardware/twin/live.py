@@ -10,6 +10,7 @@ import math
 import threading
 import time
 from collections import deque
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,7 @@ from hardware.twin.config import LabConfig
 from hardware.twin.frame_server import FrameServer
 from hardware.twin.furniture import vehicle_in_room
 from hardware.twin.lab import Lab
+from hardware.twin.monitor_port import MonitorPort
 from hardware.twin.pacing import NS_PER_S, Pacer
 from hardware.twin.vesc_emulator import VescEmulator
 from hardware.twin.vesc_firmware import VescEmulatorConfig
@@ -30,6 +32,7 @@ from hardware.twin.vicon_emulator import ViconEmulator, ViconEmulatorConfig
 # A stall longer than this (a suspended laptop) is not driven through blindly.
 _LONGEST_STEP_S = 0.5
 _HISTORY_S = 2.0
+CAMERA_FAULTS = ("silent", "repeated")
 
 
 class LiveLabConfig(BaseModel):
@@ -98,7 +101,7 @@ def _between(a: tuple[int, VehicleState], b: tuple[int, VehicleState], mono_ns: 
 class LiveLab:
     """The whole lab; it lives from construction to `close`.
 
-    In the run folder: ``vesc`` (link to the pty), ``vesc_wire.csv`` (what the controller read); in the socket folder: ``frames``.
+    In the run folder: ``vesc`` (link to the pty), ``vesc_wire.csv`` (what the controller read); in the socket folder: ``frames``, and ``monitor``, the plug of the monitor.
 
     Args:
         config: All numbers.
@@ -113,17 +116,22 @@ class LiveLab:
         self.config = config
         self.vesc_port = run_dir / "vesc"
         self.frames_path = (socket_dir or run_dir) / "frames"
+        self.monitor_path = (socket_dir or run_dir) / "monitor"
         self._stop = threading.Event()
         self._ready = threading.Event()
         self._failure: BaseException | None = None
+        self._camera_fault: str | None = None
         self._history = PoseHistory(config.physics_rate_hz)
         self._physics_pacer = Pacer(config.physics_rate_hz)
         self._camera_pacer = Pacer(config.lab.camera.rate_hz)
         self._threads: list[threading.Thread] = []
         self._frames = FrameServer(self.frames_path)
+        self._monitor: MonitorPort | None = None
         self._vesc: VescEmulator | None = None
         self._vicon: ViconEmulator | None = None
         try:
+            panel = config.lab.monitor
+            self._monitor = MonitorPort(self.monitor_path, (panel.width_m, panel.height_m))
             car = vehicle_in_room(config.lab)
             car.reset(*config.start_pose)
             self._vesc = VescEmulator(config.vesc, car, self.vesc_port, run_dir / "vesc_wire.csv")
@@ -147,6 +155,12 @@ class LiveLab:
         """The motion capture system, with its faults to inject."""
         assert self._vicon is not None
         return self._vicon
+
+    def freeze_camera(self, fault: str | None) -> None:
+        """Let the camera fall ``silent``, or hand out its last frame ``repeated`` with its old stamp; None heals it."""
+        if fault not in (None, *CAMERA_FAULTS):
+            raise ValueError(f"expected a fault of {', '.join(CAMERA_FAULTS)}, got {fault!r}")
+        self._camera_fault = fault
 
     @property
     def state(self) -> VehicleState:
@@ -177,6 +191,8 @@ class LiveLab:
         for thread in self._threads:
             thread.join(timeout=5.0)
         self._frames.close()
+        if self._monitor is not None:
+            self._monitor.close()
         if self._vesc is not None:
             self._vesc.close()
 
@@ -219,12 +235,24 @@ class LiveLab:
             lab.observe(depth=False)  # the first picture pays for compiling shaders
             self._ready.set()
             sequence = 0
+            last: Frame | None = None
             while (tick_ns := self._camera_pacer.wait(self._stop)) is not None:
                 real_ns = tick_ns + time.time_ns() - time.monotonic_ns()
                 state = self._history.at(tick_ns, wait_s=0.02) or self.state
+                self._light_monitor(lab)
                 rgb, _ = lab.observe_at(state.x_m, state.y_m, state.yaw_rad, depth=False)
-                self._frames.publish(Frame(rgb, real_ns, tick_ns, sequence))
-                sequence += 1
+                frame = Frame(rgb, real_ns, tick_ns, sequence)
+                if self._camera_fault is None:
+                    self._frames.publish(last := frame)
+                    sequence += 1
+                elif self._camera_fault == "repeated" and last is not None:
+                    self._frames.publish(replace(last))  # another object: the server tells frames apart by that
+
+    def _light_monitor(self, lab: Lab) -> None:
+        assert self._monitor is not None
+        changed, shown = self._monitor.take()
+        if changed:
+            lab.set_monitor_image(shown)
 
     def _subject_poses(self, mono_ns: int) -> dict[str, Array]:
         state = self._history.at(mono_ns, wait_s=0.01) or self.state

@@ -1,0 +1,299 @@
+"""The monitor node: shows the attack on a real screen, in true size, while and only while the safety node lets it.
+
+The face is a square in the middle of the panel, the rest is black. Unless the car is armed and its safety node's word is fresh,
+the face is plain. After every change the screen is read back: pixels that differ from what was meant end the node. A new attack
+comes over the bus as to the compositor, and whatever is wrong with it changes nothing.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+
+from advnerf_core.attack.artifact import AttackFile, attack_from_bytes, load_attack
+from advnerf_core.errors import AdvnerfError
+from calibration.panel import Panel, make_panel, require_fits
+from calibration.schema import TargetCalibration, load_calibration
+from hardware.display import Display, PygameDisplay, TwinDisplay
+from hardware.edid import edid_of
+from hardware.errors import HardwareError
+from nodes.runtime.clock import NS_PER_S
+from nodes.runtime.messages import header, types
+from nodes.runtime.node import ACTIVE, READY, MessageInfo, Node, NodeContext, Now, Out, run_node_main
+from nodes.runtime.transfer import Assembler, ReceivedFile
+
+_SAFETY, _FILE = "/safety/state", "/attack/file"
+_SAY_S = 0.2
+_PLAIN_PX = 8
+Colour = tuple[float, float, float]
+
+
+class _Config(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class ScreenConfig(_Config):
+    """A real screen.
+
+    Attributes:
+        index: Which screen, as the window system counts them.
+        connector: Where it is plugged in (``HDMI-A-1``), for its EDID; None trusts the measured corners.
+    """
+
+    kind: Literal["screen"] = "screen"
+    index: int = Field(default=0, ge=0)
+    connector: str | None = None
+
+
+class TwinScreenConfig(_Config):
+    """The monitor of the simulated lab.
+
+    Attributes:
+        path: Its socket.
+        wait_s: How long the twin may take to build its world [s].
+    """
+
+    kind: Literal["twin"] = "twin"
+    path: Path
+    wait_s: float = Field(default=30.0, ge=0.0)
+
+
+class MonitorConfig(_Config):
+    """Configuration of the monitor node.
+
+    Attributes:
+        attack: Attack file to show; empty for none.
+        target: Calibration file with the corners of the whole panel.
+        display: The screen.
+        size_mm: Measured width and height of the picture, instead of what the monitor says [mm].
+        plain_rgb: Colour of the face without an attack, 0..1.
+        face_m: Side of the plain face when there is no attack; None is the centre square [m].
+        interlock: Show the attack only while the safety node says that the car is armed.
+        state_age_s: Oldest word of the safety node that counts [s].
+    """
+
+    attack: Path | None = None
+    target: Path
+    display: Annotated[ScreenConfig | TwinScreenConfig, Field(discriminator="kind")] = ScreenConfig()
+    size_mm: tuple[float, float] | None = None
+    plain_rgb: Colour = (0.20, 0.62, 0.28)
+    face_m: float | None = Field(default=None, gt=0.0)
+    interlock: bool = True
+    state_age_s: float = Field(default=0.5, gt=0.0, le=2.0)
+
+    @field_validator("attack", mode="before")
+    @classmethod
+    def _empty_is_none(cls, value: Any) -> Any:
+        return None if value == "" else value
+
+    @field_validator("size_mm")
+    @classmethod
+    def _a_size(cls, size: tuple[float, float] | None) -> tuple[float, float] | None:
+        if size is not None and min(size) <= 0.0:
+            raise ValueError(f"expected a width and a height > 0 mm, got {size}")
+        return size
+
+    @field_validator("plain_rgb")
+    @classmethod
+    def _a_colour(cls, rgb: Colour) -> Colour:
+        if not all(0.0 <= value <= 1.0 for value in rgb):
+            raise ValueError(f"expected three values from 0 to 1, got {rgb}")
+        return rgb
+
+
+class MonitorNode(Node):
+    """Shows the attack or the plain face; see the module's docstring.
+
+    Args:
+        display: The screen, open; the node closes it.
+        panel: Its size.
+        attack: What to show; None for none.
+        check: Refuses an attack that does not fit.
+        plain_rgb: Colour of the plain face, 0..1.
+        face_m: Side of the plain face without an attack [m]; None is the centre square.
+        interlock: Whether the safety node decides.
+        state_age_s: Oldest word of the safety node that counts [s].
+    """
+
+    publications = ("/monitor/attack", "/monitor/shown")
+    tick_rate_hz = 20.0
+
+    def __init__(
+        self,
+        display: Display,
+        panel: Panel,
+        attack: AttackFile | None,
+        check: Callable[[AttackFile], None],
+        plain_rgb: Colour = (0.20, 0.62, 0.28),
+        face_m: float | None = None,
+        interlock: bool = True,
+        state_age_s: float = 0.5,
+    ) -> None:
+        self._display, self._panel, self._check = display, panel, check
+        self._interlock, self._state_age_ns = interlock, round(state_age_s * NS_PER_S)
+        self.subscriptions = (_FILE, *((_SAFETY,) if interlock else ()))
+        self._plain = np.full((_PLAIN_PX, _PLAIN_PX, 3), np.round(255.0 * np.array(plain_rgb)), np.uint8)
+        self._face_m = min(face_m or panel.square_m, panel.square_m)
+        self._assembler = Assembler()
+        self._armed, self._safety_reason, self._state_ns = False, "nobody has armed", -1
+        self._trouble = ""
+        self._taken = self._refused = self._changes = 0
+        self._attack: AttackFile | None = None
+        self._pictures: dict[bool, NDArray[np.uint8]] = {}
+        self._showing: bool | None = None
+        self._sha256, self._show_ms, self._said_ns = "", 0.0, 0
+        self._load(attack)
+
+    @classmethod
+    def build(cls, config: MonitorConfig, context: NodeContext) -> MonitorNode:
+        """Open the screen and read the files."""
+        del context  # it needs no clock of its own
+        target = load_calibration(TargetCalibration, config.target)
+        attack = None if config.attack is None else load_attack(config.attack)
+        display = _open(config.display)
+        try:
+            said = config.size_mm or (display.edid.size_mm if display.edid else None)
+            if config.size_mm:
+                panel = Panel(display.size_px, (config.size_mm[0] / 1000.0, config.size_mm[1] / 1000.0))
+            else:
+                panel = make_panel(display.size_px, target, said)
+            check = partial(require_fits, panel=panel, target=target)
+            if attack is not None:
+                check(attack)
+            return cls(
+                display, panel, attack, check, config.plain_rgb, config.face_m, config.interlock, config.state_age_s
+            )
+        except BaseException:
+            display.close()
+            raise
+
+    def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
+        """Obey the safety node at once; take a piece of a new attack."""
+        if topic == _SAFETY:
+            self._armed, self._safety_reason = bool(message.armed), str(message.reason)
+            self._state_ns = info.publish_mono_ns
+        elif self._attack is None or message.sha256 != self._attack_sha256 or self._assembler.receiving:
+            received, trouble = self._assembler.add(message, info.instance_id)
+            if trouble:
+                self._refuse(trouble)
+            if received is not None:
+                self._take_over(received)
+        return self._update(now)
+
+    def tick(self, now: Now) -> list[Out]:
+        """Notice silence of the safety node and trouble of the screen; say what is shown."""
+        self._display.keep_alive()
+        outs = self._update(now)
+        if not outs and now.mono_ns - self._said_ns >= _SAY_S * NS_PER_S:
+            outs = self._say(now)
+        return outs
+
+    def status(self) -> tuple[str, str]:
+        """Active while the attack is on the screen."""
+        name = f"attack {self._attack.attack_id}" if self._attack else "no attack file"
+        text = name if self._showing else f"plain face ({self._reason}); {name}"
+        return (ACTIVE if self._showing else READY), "; ".join(filter(None, (text, self._trouble)))
+
+    def counters(self) -> dict[str, float]:
+        """Pictures shown; attacks taken over and refused; time of the last change."""
+        return {
+            "shown": self._changes, "attacks_taken": self._taken, "attacks_refused": self._refused, "show_ms": self._show_ms,
+        }  # fmt: skip
+
+    def close(self) -> None:
+        """Take the picture off the screen."""
+        self._display.close()
+
+    def _granted(self, now: Now) -> str:
+        """Why the attack may not be shown now; empty when it may."""
+        if self._attack is None:
+            return "no attack file"
+        if not self._interlock:
+            return ""
+        if self._state_ns < 0 or now.mono_ns - self._state_ns > self._state_age_ns:
+            return "no word from the safety node"
+        return "" if self._armed else f"not armed: {self._safety_reason}"
+
+    def _update(self, now: Now) -> list[Out]:
+        self._reason = self._granted(now)
+        if self._showing is (not self._reason):
+            return []
+        self._put(not self._reason)
+        return self._say(now)
+
+    def _put(self, attacking: bool) -> None:
+        picture = self._pictures[attacking]
+        self._show_ms = 1e3 * self._display.show(picture)
+        seen = self._display.read_back()
+        if not np.array_equal(seen, picture):
+            wrong = int((seen != picture).any(axis=-1).sum()) if seen.shape == picture.shape else picture.size
+            raise HardwareError(
+                f"the screen holds other pixels than were shown ({wrong} differ): switch off its colour management, scaling and "
+                "night light"
+            )
+        self._sha256 = hashlib.sha256(np.ascontiguousarray(seen).tobytes()).hexdigest()
+        self._showing = attacking
+        self._changes += 1
+
+    def _say(self, now: Now) -> list[Out]:
+        self._said_ns = now.mono_ns
+        attack_id, attacking = self._attack.attack_id if self._attack else "", bool(self._showing)
+        head = header(now.real_ns, "monitor")
+        shown = types.DisplayShown(
+            header=head, attack_id=attack_id, attacking=attacking, reason=self._reason, sha256=self._sha256,
+            width=self._panel.size_px[0], height=self._panel.size_px[1], show_ms=self._show_ms,
+        )  # fmt: skip
+        label = types.AttackStamp(header=head, attack_id=attack_id, drawn=attacking, reason=self._reason)
+        return [Out("/monitor/attack", label), Out("/monitor/shown", shown)]
+
+    def _load(self, attack: AttackFile | None, sha256: str = "") -> None:
+        size = (self._face_m, self._face_m) if attack is None else attack.size_m
+        self._pictures = {False: self._panel.picture(self._plain, size)}
+        if attack is not None:
+            self._pictures[True] = self._panel.picture(attack.texture, size)
+        self._attack, self._attack_sha256 = attack, sha256
+        self._reason = "" if attack else "no attack file"
+        self._put(False)
+
+    def _take_over(self, received: ReceivedFile) -> None:
+        try:
+            attack = attack_from_bytes(received.content, f"the attack {received.name}")
+            self._check(attack)
+        except (AdvnerfError, ValueError) as error:
+            self._refuse(str(error))
+            return
+        # Plain for a moment: `_update` shows the new one, if it may.
+        self._load(attack, received.sha256)
+        self._taken += 1
+        self._trouble = ""
+
+    def _refuse(self, why: str) -> None:
+        self._refused += 1
+        self._trouble = f"new attack refused: {why}"
+
+
+def _open(config: ScreenConfig | TwinScreenConfig) -> Display:
+    if isinstance(config, TwinScreenConfig):
+        deadline = time.monotonic() + config.wait_s
+        while not config.path.exists() and time.monotonic() < deadline:
+            time.sleep(0.05)
+        return TwinDisplay(config.path)
+    edid = None if config.connector is None else edid_of(config.connector)
+    return PygameDisplay(config.index, edid.size_px if edid else None, edid)
+
+
+def main() -> int:
+    """Run the node as a process."""
+    return run_node_main(MonitorConfig, MonitorNode.build)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
