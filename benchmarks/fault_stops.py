@@ -68,6 +68,8 @@ def live_graph(controller: dict[str, float]) -> Iterator[tuple[LiveOperator, sub
             "twin.if=false",
             f"params.vicon_port={VICON_PORT}",
             "policy.module=benchmarks.straight_policy",
+            f"motor.controller_timeout_ms={controller['timeout_ms']:.0f}",
+            f"motor.controller_brake_current_a={controller['timeout_brake_current_a']}",
         )
         overrides = [part for setting in settings for part in ("--set", setting)]
         supervisor = _start("nodes.cli", "launch", str(LAUNCH_FILE), "--run-dir", folder, *overrides)

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 
 from advnerf_core.geometry import Array
 from hardware.errors import DeviceBusy, ProtocolError
-from hardware.vicon_codec import ObjectPose, decode_block
+from hardware.vicon_codec import decode_block
 
 DEFAULT_PORT = 51001
 _SO_TIMESTAMPNS = 35  # Linux: real time of arrival as ancillary data; Python has no name for it
@@ -66,7 +66,7 @@ class ViconConfig:
     host: str = "127.0.0.1"
     port: int = DEFAULT_PORT
     latency_s: float = 0.0
-    frozen_frames: int = 10
+    frozen_frames: int = 5
     source: str | None = None
 
 
@@ -112,7 +112,9 @@ class SubjectTracker:
             return []
         stamp = stamp_real_ns - round(self.config.latency_s * 1e9)
         seen = [
-            item for item in block.objects if item.name in self._subjects and self._is_real(block.frame_number, item)
+            item
+            for item in block.objects
+            if self.is_real(block.frame_number, item.name, (*item.translation_mm, *item.rotation_rad))
         ]
         return [SubjectPose(item.name, item.T_world_from_subject, block.frame_number, stamp, mono_ns) for item in seen]
 
@@ -129,17 +131,17 @@ class SubjectTracker:
         self._frame_number, self._frame_mono_ns = frame_number, mono_ns
         return True
 
-    def _is_real(self, frame_number: int, item: ObjectPose) -> bool:
-        subject = self._subjects[item.name]
-        if subject.frame_number == frame_number:
-            return False  # the same frame twice
+    def is_real(self, frame_number: int, name: str, numbers: tuple[float, ...]) -> bool:
+        """Whether a measurement of a subject is new and no sign of occlusion; ``numbers``: translation, then rotation."""
+        subject = self._subjects.get(name)
+        if subject is None or subject.frame_number == frame_number:
+            return False  # not asked for, or the same frame twice
         subject.frame_number = frame_number
-        bits = (*item.translation_mm, *item.rotation_rad)
-        subject.repeats = subject.repeats + 1 if bits == subject.bits else 0
-        subject.bits = bits
-        finite = all(map(math.isfinite, bits))
-        real = finite and any(item.translation_mm) and subject.repeats < self.config.frozen_frames
-        self.counts.lost[item.name] += not real
+        subject.repeats = subject.repeats + 1 if numbers == subject.bits else 0
+        subject.bits = numbers
+        finite = all(map(math.isfinite, numbers))
+        real = finite and any(numbers[:3]) and subject.repeats < self.config.frozen_frames
+        self.counts.lost[name] += not real
         return real
 
 
@@ -160,6 +162,11 @@ class ViconReceiver:
     def counts(self) -> ViconCounts:
         """What happened so far."""
         return self._tracker.counts
+
+    @property
+    def source(self) -> str:
+        """Where poses come from, for a person."""
+        return f"UDP port {self.port}"
 
     def read(self, timeout_s: float) -> list[SubjectPose]:
         """Trusted poses of all datagrams that have come, oldest first; empty if none came within ``timeout_s``."""

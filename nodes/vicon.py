@@ -7,6 +7,7 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
+from hardware.mocap_library import LibraryConfig, LibraryReceiver
 from hardware.vicon import DEFAULT_PORT, SubjectPose, ViconConfig, ViconReceiver
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import TopicError
@@ -37,6 +38,9 @@ class ViconNodeConfig(BaseModel):
         host: Local address to listen on; empty for all.
         port: UDP port of Tracker's object stream.
         source: Accept datagrams of this address only.
+        library: Use this system of the library ``motioncapture`` (vicon, optitrack, qualisys, ...) at ``hostname`` instead of
+            Tracker's object stream.
+        hostname: Computer of that system.
         subjects: Subjects to publish, each on ``/vicon/<subject>``.
         latency_s: From exposure to receipt, as measured [s].
         frozen_frames: So many frames with the same bits make a subject lost.
@@ -49,9 +53,11 @@ class ViconNodeConfig(BaseModel):
     host: str = "127.0.0.1"
     port: int = Field(default=DEFAULT_PORT, ge=0, le=65535)
     source: str | None = None
+    library: str | None = None
+    hostname: str = "localhost"
     subjects: tuple[str, ...] = Field(default=("car", "board", "monitor"), min_length=1)
     latency_s: float = 0.0
-    frozen_frames: int = Field(default=10, ge=2)
+    frozen_frames: int = Field(default=5, ge=2)
     max_age_s: float = Field(default=0.1, gt=0.0)
     silence_s: float = Field(default=0.5, gt=0.0)
 
@@ -71,11 +77,7 @@ class ViconNode(Node):
 
     def __init__(self, config: ViconNodeConfig) -> None:
         self._config = config
-        self._receiver = ViconReceiver(
-            ViconConfig(
-                config.subjects, config.host, config.port, config.latency_s, config.frozen_frames, config.source
-            )
-        )
+        self._receiver = _receiver(config)
         self.publications = tuple(_TOPIC_PREFIX + subject for subject in config.subjects)
         self.inbox: Inbox[list[SubjectPose]] = Inbox(capacity=50)
         self._reader = ReaderThread(self._read, self.inbox, "vicon")
@@ -93,8 +95,8 @@ class ViconNode(Node):
 
     @property
     def port(self) -> int:
-        """UDP port it listens on."""
-        return self._receiver.port
+        """UDP port it listens on; 0 with the library."""
+        return self._receiver.port if isinstance(self._receiver, ViconReceiver) else 0
 
     def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
         """It listens to nobody on the bus."""
@@ -120,7 +122,7 @@ class ViconNode(Node):
         if first not in self._seen_ns:
             return (
                 STARTING,
-                text if self._receiver.counts.datagrams else f"no datagrams on UDP port {self._receiver.port}",
+                text if self._receiver.counts.datagrams else f"no datagrams on {self._receiver.source}",
             )
         return (FAULT if first in lost else ACTIVE), text
 
@@ -143,6 +145,18 @@ class ViconNode(Node):
 
     def _silence_s(self, name: str, now_ns: int) -> float:
         return (now_ns - self._seen_ns.get(name, 0)) / NS_PER_S
+
+
+def _receiver(config: ViconNodeConfig) -> ViconReceiver | LibraryReceiver:
+    if config.library is None:
+        return ViconReceiver(
+            ViconConfig(
+                config.subjects, config.host, config.port, config.latency_s, config.frozen_frames, config.source
+            )
+        )
+    return LibraryReceiver(
+        LibraryConfig(config.library, config.hostname, config.subjects, config.latency_s, config.frozen_frames)
+    )
 
 
 def main() -> int:

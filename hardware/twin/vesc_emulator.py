@@ -200,12 +200,20 @@ class VescEmulator:
                 self._log.write(f"{event.mono_ns},{event.name},{value},{speed:.4f},{driven:.4f}\n")
 
 
-def read_wire_log(path: Path) -> list[tuple[WireEvent, float, float]]:
-    """Events of a log file, each with the car's speed [m/s] and odometer [m] at that moment; a last line cut short is left out."""
+def read_wire_log(path: Path, offset: int = 0) -> list[tuple[WireEvent, float, float]]:
+    """Events of a log file, each with the car's speed [m/s] and odometer [m] at that moment.
+
+    Args:
+        path: The file.
+        offset: Where to begin [bytes]; what a size of the file was earlier gives what came since. Lines cut short are left out.
+    """
+    with path.open("rb") as log:
+        log.seek(offset)
+        text = log.read().decode("ascii")
     rows = []
-    for line in path.read_text(encoding="ascii").splitlines(keepends=True)[1:]:
+    for line in text.splitlines(keepends=True):
         fields = line.rstrip("\n").split(",")
-        if not line.endswith("\n") or len(fields) != 5:
+        if not line.endswith("\n") or len(fields) != 5 or not fields[0].isdigit():
             continue
         event = WireEvent(int(fields[0]), fields[1], float(fields[2]) if fields[2] else None)
         rows.append((event, float(fields[3]), float(fields[4])))
