@@ -15,7 +15,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator
@@ -27,12 +27,13 @@ from advnerf_core.geometry import Array, invert_transform
 from calibration.schema import CameraCalibration, TargetCalibration, load_calibration
 from nodes.pose_buffer import PoseBuffer
 from nodes.runtime.clock import NS_PER_S
-from nodes.runtime.errors import ConfigError
+from nodes.runtime.errors import ConfigError, MessageError
 from nodes.runtime.messages import header, image_array, image_message, pose_matrix, stamp_ns, types
 from nodes.runtime.node import ACTIVE, READY, MessageInfo, Node, NodeContext, Now, Out, run_node_main
+from nodes.runtime.pictures import RAW_TOPIC, raw_image
 from nodes.runtime.transfer import Assembler, ReceivedFile
 
-_IMAGE, _CAR, _FILE = "/camera/image_raw", "/vicon/car", "/attack/file"
+_CAR, _FILE = "/vicon/car", "/attack/file"
 _ACTIVE_S = 1.0
 _SIZE_TOLERANCE = 0.05
 
@@ -44,6 +45,7 @@ class CompositorConfig(BaseModel):
         attack: Attack file to show; empty for none.
         camera: Camera calibration file.
         target: Calibration file of the face that carries the attack.
+        image_topic: Where images come from; ``/camera/image_raw/compressed`` over a wireless link.
         wait_s: How long an image waits for poses [s].
         extrapolation_limit_s: How far poses are continued at constant velocity after that [s].
         max_gap_s: Longest gap in a pose stream across which is interpolated [s].
@@ -55,6 +57,7 @@ class CompositorConfig(BaseModel):
     attack: Path | None = None
     camera: Path
     target: Path
+    image_topic: Literal["/camera/image_raw", "/camera/image_raw/compressed"] = "/camera/image_raw"
     wait_s: float = Field(default=0.025, ge=0.0, le=0.1)
     extrapolation_limit_s: float = Field(default=0.05, ge=0.0, le=0.2)
     max_gap_s: float = Field(default=0.1, gt=0.0, le=0.5)
@@ -100,6 +103,7 @@ class CompositorNode(Node):
         max_gap_s: Longest gap in a pose stream across which is interpolated [s].
         subject: Motion-capture subject that carries the face; that of ``showing``, if there is one.
         prepare: Makes a new attack ready to be shown, or refuses it; None listens to no new ones.
+        image_topic: Where images come from, raw or compressed.
     """
 
     publications = ("/compositor/image", "/compositor/attack")
@@ -113,7 +117,9 @@ class CompositorNode(Node):
         max_gap_s: float = 0.1,
         subject: str = "board",
         prepare: Callable[[AttackFile], Showing] | None = None,
+        image_topic: str = RAW_TOPIC,
     ) -> None:
+        self._image_topic = image_topic
         self._showing = showing
         self._prepare = prepare
         self._assembler = Assembler()
@@ -122,10 +128,10 @@ class CompositorNode(Node):
         self._wait_ns = round(wait_s * NS_PER_S)
         self._limit_s = extrapolation_limit_s
         self._face_topic = f"/vicon/{showing.subject if showing else subject}"
-        self.subscriptions = (_IMAGE, _CAR, self._face_topic, *((_FILE,) if prepare else ()))
+        self.subscriptions = (image_topic, _CAR, self._face_topic, *((_FILE,) if prepare else ()))
         self._poses = {topic: PoseBuffer(max_gap_s=max_gap_s) for topic in (_CAR, self._face_topic)}
         self._waiting: _Waiting | None = None
-        self._counts = {"images": 0, "drawn": 0, "extrapolated": 0, "dropped_no_pose": 0}
+        self._counts = {"images": 0, "drawn": 0, "extrapolated": 0, "dropped_no_pose": 0, "dropped_bad": 0}
         self._last_image_ns: int | None = None
         self._now_ns = 0
         self._trouble = ""
@@ -138,23 +144,40 @@ class CompositorNode(Node):
         target = load_calibration(TargetCalibration, config.target)
         prepare = partial(show, camera=camera, target=target, supersample=config.supersample)
         showing = None if config.attack is None else prepare(load_attack(config.attack))
-        return cls(showing, config.wait_s, config.extrapolation_limit_s, config.max_gap_s, target.subject, prepare)
+        return cls(
+            showing,
+            config.wait_s,
+            config.extrapolation_limit_s,
+            config.max_gap_s,
+            target.subject,
+            prepare,
+            config.image_topic,
+        )
 
     def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
         """Take an image or a pose."""
         self._now_ns = now.mono_ns
         if topic == _FILE:
             return self._take_piece(message, info, now)
-        if topic != _IMAGE:
+        if topic != self._image_topic:
             self._poses[topic].add(stamp_ns(message), pose_matrix(message))
             return self._release(now)
         self._last_image_ns = now.mono_ns
         self._counts["images"] += 1
+        try:
+            image = raw_image(message)
+        except MessageError as error:
+            self._counts["dropped_bad"] += 1
+            self._trouble = f"image dropped: {error}"
+            return []
         if self._showing is None:
-            return [Out("/compositor/image", info.raw or message), self._label(message, False, "no attack file")]
+            self._trouble = ""
+            # A raw image passes on in the very bytes in which it came.
+            out = (info.raw or message) if image is message else image
+            return [Out("/compositor/image", out), self._label(image, False, "no attack file")]
         # An older image that still waits gets what there is now: two never wait.
         before = self._finish(now) if self._waiting else []
-        self._waiting = _Waiting(message, stamp_ns(message), now.mono_ns + self._wait_ns)
+        self._waiting = _Waiting(image, stamp_ns(image), now.mono_ns + self._wait_ns)
         return before + self._release(now)
 
     def tick(self, now: Now) -> list[Out]:

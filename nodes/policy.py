@@ -17,9 +17,10 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from advnerf_core.policies.load import Driver, load_driver
 from nodes.runtime.clock import NS_PER_S
-from nodes.runtime.errors import ConfigError
+from nodes.runtime.errors import ConfigError, MessageError
 from nodes.runtime.messages import drive_message, image_array, stamp_ns
 from nodes.runtime.node import ACTIVE, FAULT, READY, MessageInfo, Node, NodeContext, Now, Out, run_node_main
+from nodes.runtime.pictures import raw_image
 
 _DRIVE = "/policy/drive"
 _WARM_UP_RUNS = 5
@@ -34,7 +35,7 @@ class PolicyConfig(BaseModel):
     Attributes:
         policy: Policy file (.safetensors, .onnx, .pt2), or ``package.module:factory``.
         sha256: Its hash, if it must be that very policy; empty accepts any.
-        image_topic: Where images come from.
+        image_topic: Where images come from, raw or compressed.
         speed_mps: Speed of the commands [m/s].
         max_age_s: Oldest image, since capture and since publication, that is acted upon [s].
         goal: Goal vector of a goal-conditioned policy.
@@ -111,6 +112,11 @@ class PolicyNode(Node):
             self._drop(
                 "dropped_bad", "image comes from the future; synchronise the clocks of camera and policy computer"
             )
+            return []
+        try:
+            message = raw_image(message)
+        except MessageError as error:
+            self._drop("dropped_bad", str(error))
             return []
         camera = self._driver.view.camera
         if (message.encoding, int(message.width), int(message.height)) != ("rgb8", camera.width, camera.height):
