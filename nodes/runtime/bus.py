@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import secrets
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TextIO
@@ -19,12 +19,13 @@ import zmq
 
 from nodes.runtime.clock import NS_PER_S, Clock, SystemClock
 from nodes.runtime.errors import BusError, MessageError
+from nodes.runtime.image_parts import IMAGE_TYPE, PartedInfo, join_image, split_image, with_parts
 from nodes.runtime.locks import HeldError, hold
 from nodes.runtime.messages import MAX_SEQUENCE_LENGTH, decode, encode, type_hash_prefix, type_name
 from nodes.runtime.paths import socket_path
 from nodes.runtime.topics import Topic
 from nodes.runtime.topics import topic as topic_row
-from nodes.runtime.wire import MessageInfo, Meta, Relayed, pack_meta, unpack
+from nodes.runtime.wire import MessageInfo, Meta, Relayed, pack_meta, unpack_parts
 
 _SEND_QUEUE = 16
 # Deep enough that a reader that stalls for seconds still drains to the true newest: a full pipe holds back what comes after.
@@ -43,6 +44,8 @@ class Received:
 
     def message(self) -> Any:
         """Decode it."""
+        if isinstance(self.info, PartedInfo):
+            return join_image(*self.info.parts)
         return decode(topic_row(self.topic).type, self.info.raw)
 
 
@@ -90,12 +93,18 @@ class Publisher:
             cdr: bytes | memoryview = message
         elif type_name(message) != self.topic.type:
             raise MessageError(f"expected {self.topic.type} on {self.topic.name}, got {type_name(message)}")
+        elif self.topic.type == IMAGE_TYPE and (parts := split_image(message)):
+            self._send(*parts)
+            return
         else:
             cdr = encode(message)
+        self._send(cdr)
+
+    def _send(self, *cdr: bytes | memoryview) -> None:
         now = self._clock.now()
         meta = Meta(now.mono_ns, now.real_ns, self._sequence, self._prefix, self._instance_id)
         self._sequence += 1
-        self._socket.send_multipart([self._name, pack_meta(meta), cdr], zmq.NOBLOCK)
+        self._socket.send_multipart([self._name, pack_meta(meta), *cdr], zmq.NOBLOCK)
 
     def subscribers(self) -> int:
         """How many subscribers are connected."""
@@ -215,12 +224,12 @@ class Bus:
             except zmq.Again:
                 break
             try:
-                meta, cdr = unpack(subscription.topic.name, frames)
+                meta, parts = unpack_parts(subscription.topic.name, frames)
             except MessageError as error:
                 subscription.counts.refused += 1
                 subscription.last_refusal = str(error)
                 continue
-            received = Received(subscription.topic.name, self._info(subscription, meta, cdr))
+            received = Received(subscription.topic.name, self._info(subscription, meta, parts))
             if kept and not subscription.take_all:
                 subscription.counts.dropped += 1
                 kept[0] = received
@@ -228,17 +237,20 @@ class Bus:
                 kept.append(received)
         return kept
 
-    def _info(self, subscription: _Subscription, meta: Meta, cdr: bytes) -> MessageInfo:
+    def _info(self, subscription: _Subscription, meta: Meta, parts: Sequence[bytes]) -> MessageInfo:
         same_publisher = meta.instance_id == subscription.instance_id
         lost = max(0, meta.sequence - subscription.sequence - 1) if same_publisher else 0
         subscription.instance_id, subscription.sequence = meta.instance_id, meta.sequence
         subscription.counts.received += 1
         subscription.counts.lost += lost
         now = self._clock.now()
-        return MessageInfo(
-            publish_mono_ns=meta.publish_mono_ns, receive_mono_ns=now.mono_ns, sequence=meta.sequence, raw=cdr,
+        in_two = len(parts) == 2 and subscription.topic.type == IMAGE_TYPE
+        raw = b"" if in_two else parts[0] if len(parts) == 1 else b"".join(parts)
+        info = MessageInfo(
+            publish_mono_ns=meta.publish_mono_ns, receive_mono_ns=now.mono_ns, sequence=meta.sequence, raw=raw,
             publish_real_ns=meta.publish_real_ns, receive_real_ns=now.real_ns, instance_id=meta.instance_id, lost=lost,
         )  # fmt: skip
+        return with_parts(info, (parts[0], parts[1])) if in_two else info
 
     def refuse(self, topic: str, reason: str) -> None:
         """Count a message whose bytes turned out not to decode."""

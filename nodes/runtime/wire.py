@@ -68,6 +68,12 @@ def pack_meta(meta: Meta) -> bytes:
 
 def unpack(topic: str, frames: Sequence[bytes]) -> tuple[Meta, bytes]:
     """Meta and CDR bytes of a received message; refuses other topics, formats and types before anything is decoded."""
+    meta, parts = unpack_parts(topic, frames)
+    return meta, parts[0] if len(parts) == 1 else b"".join(parts)
+
+
+def unpack_parts(topic: str, frames: Sequence[bytes]) -> tuple[Meta, Sequence[bytes]]:
+    """The same with the CDR bytes in the pieces in which they came."""
     if len(frames) < 3 or frames[0] != topic.encode() or len(frames[1]) != META_BYTES:
         raise MessageError(
             f"expected frames [topic, {META_BYTES} bytes, cdr] on {topic}, got {[len(f) for f in frames]} bytes"
@@ -80,4 +86,4 @@ def unpack(topic: str, frames: Sequence[bytes]) -> tuple[Meta, bytes]:
             f"{topic} is {typename} with type hash {expected.hex()} here, but its publisher uses {meta.type_prefix.hex()}; "
             "run the same version of advnerf on both sides"
         )
-    return meta, frames[2] if len(frames) == 3 else b"".join(frames[2:])
+    return meta, frames[2:]
