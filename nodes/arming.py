@@ -6,9 +6,9 @@ Pure: time and messages come as arguments.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+from nodes.arming_gates import ClockGate, HandGate, edge_distance_m, inside
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.wire import MessageInfo
 
@@ -24,7 +24,9 @@ class ArmingLimits:
     Attributes:
         nodes: Nodes whose status must be fresh and good.
         fence_m: Corners of the polygon that the rear axle may not leave [m].
-        drive_age_s: Oldest command of the policy, since publication [s].
+        drivers: Who may command, first the one that goes before the others.
+        fence_margin_m: The rear axle stays at least this far inside the fence [m].
+        drive_age_s: Oldest command of who drives, since publication [s].
         image_age_s: Oldest camera image, since publication, and oldest capture behind a command [s].
         pose_age_s: Oldest pose of the car, since publication [s].
         status_age_s: Oldest status of a node [s].
@@ -36,6 +38,8 @@ class ArmingLimits:
 
     nodes: tuple[str, ...]
     fence_m: tuple[tuple[float, float], ...]
+    drivers: tuple[str, ...] = ("policy",)
+    fence_margin_m: float = 0.0
     drive_age_s: float = 0.22
     image_age_s: float = 0.25
     pose_age_s: float = 0.2
@@ -63,6 +67,11 @@ class _Source:
 
 
 @dataclass
+class _Driver(_Source):
+    capture_ns: int = 0
+
+
+@dataclass
 class _NodeStatus(_Source):
     state: str = ""
     text: str = ""
@@ -78,24 +87,32 @@ class Arming:
         reason: Why it is not armed.
         source: Who armed it.
         peer: What the motor controller says it is.
+        hand: Who holds the button.
+        clocks: Clocks of other hosts.
+        driver: Whose commands pass; the next one in line may not stand in for it when it falls silent.
     """
 
     limits: ArmingLimits
+    hand: HandGate = field(default_factory=HandGate)
+    clocks: ClockGate = field(default_factory=ClockGate)
     armed: bool = False
     reason: str = "nobody has armed"
     source: str = ""
     peer: str = ""
+    driver: str = ""
+    _estop: str = ""
     _position_m: tuple[float, float] | None = None
     _disarmed_ns: int = 0
     _last_ns: int | None = None
     _camera: _Source = field(default_factory=_Source)
     _car: _Source = field(default_factory=_Source)
-    _drive: _Source = field(default_factory=_Source)
-    _capture_ns: int = 0
+    _drivers: dict[str, _Driver] = field(default_factory=dict)
     _nodes: dict[str, _NodeStatus] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self._nodes = {name: _NodeStatus() for name in self.limits.nodes}
+        self._drivers = {name: _Driver() for name in self.limits.drivers}
+        self.driver = self.limits.drivers[0]
 
     def heard_camera(self, info: MessageInfo) -> None:
         """An image was taken."""
@@ -114,20 +131,46 @@ class Arming:
             node.state, node.text = state, text
 
     def heard_drive(
-        self, speed_mps: float, steering_rad: float, capture_real_ns: int, info: MessageInfo, mono_ns: int, real_ns: int
-    ) -> bool:
-        """The policy commands; whether the command may pass on."""
+        self, speed_mps: float, steering_rad: float, capture_real_ns: int, info: MessageInfo, mono_ns: int, real_ns: int,
+        driver: str = "policy",
+    ) -> bool:  # fmt: skip
+        """A driver commands; whether the command may pass on."""
         self._check_held_up(mono_ns)
-        fault = self._command_fault(speed_mps, steering_rad, capture_real_ns, real_ns)
-        if capture_real_ns > self._capture_ns:
+        fault = self._command_fault(speed_mps, steering_rad) or self._capture_fault(capture_real_ns, real_ns)
+        source = self._drivers[driver]
+        if capture_real_ns > source.capture_ns:
             # A command from an image already used is no sign of life: a frozen camera makes the policy repeat itself.
-            self._drive.heard(info)
-            self._capture_ns = capture_real_ns
+            source.heard(info)
+            source.capture_ns = capture_real_ns
         elif not fault:
+            return False
+        order = self.limits.drivers
+        if not fault and (not self.armed or order.index(driver) < order.index(self.driver)):
+            self._give_way(driver, mono_ns)
+        if driver != self.driver or self.hand.drives:
             return False
         if fault and self.armed:
             self.disarm(fault, mono_ns)
         return not fault and self.check(mono_ns)
+
+    def heard_hand(
+        self, mode: str, pressed_stop: bool, speed_mps: float, steering_rad: float, info: MessageInfo, mono_ns: int
+    ) -> bool:
+        """The teleop node reports; whether its own command may pass on.
+
+        Beginning to hold arms; letting go, and everything else that disarms, must be followed by a new press. An e-stop is
+        cleared only by an explicit request of a person.
+        """
+        self._check_held_up(mono_ns)
+        began = self.hand.heard(mode, pressed_stop, info)
+        if pressed_stop:
+            self._estop = "e-stop pressed; let it go and re-arm"
+            self.disarm(self._estop, mono_ns)
+        elif began and self.hand.required:
+            self.arm(OPERATOR, info, mono_ns, explicit=False)
+        if self.hand.drives and self.armed and (fault := self._command_fault(speed_mps, steering_rad)):
+            self.disarm(fault, mono_ns)
+        return self.check(mono_ns) and self.hand.drives
 
     def check(self, mono_ns: int) -> bool:
         """Disarm if anything is wrong; whether commands to move may pass."""
@@ -136,8 +179,15 @@ class Arming:
             self.disarm(problem, mono_ns)
         return self.armed
 
-    def arm(self, source: str, info: MessageInfo, mono_ns: int) -> None:
-        """Somebody wants to arm. A person may; a program only if no real car can move."""
+    def arm(self, source: str, info: MessageInfo, mono_ns: int, explicit: bool = True) -> None:
+        """Somebody wants to arm. A person may; a program only if no real car can move.
+
+        Args:
+            source: Who.
+            info: Of the request.
+            mono_ns: Now [ns].
+            explicit: Whether it was asked for in so many words, which clears an e-stop; a held button does not.
+        """
         self._check_held_up(mono_ns)
         if self.armed:
             return
@@ -149,6 +199,9 @@ class Arming:
             return
         for watched in self._watched():
             watched.restarted = False  # whatever happened before, this is who is armed with
+        if explicit and source == OPERATOR and not self.hand.pressed_stop:
+            self._estop = ""
+        self.driver = self._first_fresh(mono_ns)
         if source != OPERATOR and TWIN_PEER not in self.peer.upper():
             self.reason = (
                 f"not armed: {source!r} is not a person, and the motor's peer is {self.peer or 'unknown'}, not the twin;"
@@ -166,34 +219,52 @@ class Arming:
     def problem(self, mono_ns: int) -> str:
         """The first thing that is wrong, causes before effects; empty if all is well."""
         limits = self.limits
+        if problem := self._estop or self.hand.problem(mono_ns) or self.clocks.problem(mono_ns):
+            return problem
         for name, node in self._nodes.items():
             if problem := self._node_problem(name, node, mono_ns):
                 return problem
-        sources = (
-            ("no camera image", self._camera, limits.image_age_s),
-            ("no pose of the car", self._car, limits.pose_age_s),
-            ("no command of the policy", self._drive, limits.drive_age_s),
-        )
+        sources = [("no pose of the car", self._car, limits.pose_age_s)]
+        if "camera" in limits.nodes:
+            sources.insert(0, ("no camera image", self._camera, limits.image_age_s))
+        if not self.hand.drives:
+            sources.append((f"no command of the {self.driver}", self._drivers[self.driver], limits.drive_age_s))
         for what, source, limit_s in sources:
             if source.restarted:
                 return f"{what} from the process that was armed with: it was restarted"
             if (age_s := source.age_s(mono_ns)) > limit_s:
                 return f"{what} yet" if math.isinf(age_s) else f"{what} for {age_s:.2f} s"
-        assert self._position_m is not None
-        if not inside(self._position_m, limits.fence_m):
-            return f"the car is outside the fence, at ({self._position_m[0]:.2f}, {self._position_m[1]:.2f}) m"
-        return ""
+        return self._fence_problem()
 
     def drive_age_s(self, mono_ns: int) -> float:
         """Age of the newest command [s]."""
-        return self._drive.age_s(mono_ns)
+        return self._drivers[self.driver].age_s(mono_ns)
 
     def pose_age_s(self, mono_ns: int) -> float:
         """Age of the newest pose of the car [s]."""
         return self._car.age_s(mono_ns)
 
     def _watched(self) -> list[_Source]:
-        return [self._camera, self._car, self._drive, *self._nodes.values()]
+        return [self._camera, self._car, *self._drivers.values(), *self._nodes.values()]
+
+    def _first_fresh(self, mono_ns: int) -> str:
+        fresh = [name for name, d in self._drivers.items() if d.age_s(mono_ns) <= self.limits.drive_age_s]
+        return fresh[0] if fresh else self.limits.drivers[0]
+
+    def _give_way(self, driver: str, mono_ns: int) -> None:
+        """A driver of higher rank takes over at once; while nobody is armed the first fresh one is next."""
+        self.driver = driver if self.armed else self._first_fresh(mono_ns)
+        self._drivers[self.driver].restarted &= self.armed
+
+    def _fence_problem(self) -> str:
+        assert self._position_m is not None
+        x_m, y_m = self._position_m
+        if not inside(self._position_m, self.limits.fence_m):
+            return f"the car is outside the fence, at ({x_m:.2f}, {y_m:.2f}) m"
+        margin_m = self.limits.fence_margin_m
+        if margin_m and (distance_m := edge_distance_m(self._position_m, self.limits.fence_m)) < margin_m:
+            return f"the car is {distance_m:.2f} m from the fence, at ({x_m:.2f}, {y_m:.2f}) m; the margin is {margin_m:.2f} m"
+        return ""
 
     def _node_problem(self, name: str, node: _NodeStatus, mono_ns: int) -> str:
         if node.restarted:
@@ -206,17 +277,18 @@ class Arming:
             return f"node {name} is in state {node.state}: {node.text}"
         return ""
 
-    def _command_fault(self, speed_mps: float, steering_rad: float, capture_real_ns: int, real_ns: int) -> str:
+    def _command_fault(self, speed_mps: float, steering_rad: float) -> str:
         if not (math.isfinite(speed_mps) and math.isfinite(steering_rad)):
             return f"a command that is not finite: {speed_mps} m/s, {steering_rad} rad"
         if abs(speed_mps) > self.limits.speed_mps:
             return f"a command of {speed_mps:.2f} m/s, the limit is {self.limits.speed_mps:.2f} m/s"
         if abs(steering_rad) > self.limits.steering_rad:
             return f"a command of {steering_rad:.2f} rad, the limit is {self.limits.steering_rad:.2f} rad"
-        age_s = (real_ns - capture_real_ns) / NS_PER_S
-        if not -0.05 <= age_s <= self.limits.image_age_s:
-            return f"a command from an image {age_s:.2f} s old"
         return ""
+
+    def _capture_fault(self, capture_real_ns: int, real_ns: int) -> str:
+        age_s = (real_ns - capture_real_ns) / NS_PER_S
+        return "" if -0.05 <= age_s <= self.limits.image_age_s else f"a command from an image {age_s:.2f} s old"
 
     def _check_held_up(self, mono_ns: int) -> None:
         pause_s = 0.0 if self._last_ns is None else (mono_ns - self._last_ns) / NS_PER_S
@@ -224,15 +296,3 @@ class Arming:
         if self.armed and pause_s > self.limits.held_up_s:
             # Stopped by a signal, or the computer was: what was checked before says nothing about now.
             self.disarm(f"the safety node was held up for {pause_s:.2f} s", mono_ns)
-
-
-def inside(point_m: tuple[float, float], polygon_m: Sequence[tuple[float, float]]) -> bool:
-    """Whether a point lies inside a simple polygon (even-odd rule); false for points that are not finite."""
-    x, y = point_m
-    if not (math.isfinite(x) and math.isfinite(y)):
-        return False
-    result = False
-    for (ax, ay), (bx, by) in zip(polygon_m, [*polygon_m[1:], polygon_m[0]], strict=True):
-        if (ay > y) != (by > y) and x < ax + (y - ay) * (bx - ax) / (by - ay):
-            result = not result
-    return result

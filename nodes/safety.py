@@ -1,15 +1,20 @@
-"""The safety node: lets the policy's commands through while the car is armed and everything is well, and says stop otherwise."""
+"""The safety node: lets commands through while the car is armed and everything is well, and says stop otherwise.
+
+A hand on the gamepad or keyboard goes before the drivers, and of these the first in ``drivers`` before the next.
+"""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
 from calibration.schema import RoomCalibration, load_calibration
 from nodes.arming import Arming, ArmingLimits
+from nodes.arming_gates import ClockGate, HandGate, inside, require_simple
 from nodes.runtime.clock import NS_PER_S
+from nodes.runtime.errors import ConfigError
 from nodes.runtime.messages import drive_message, header, ns_from_stamp, types
 from nodes.runtime.node import ACTIVE, READY, MessageInfo, Node, NodeContext, Now, Out, run_node_main
 from nodes.runtime.topics import STATUS_PREFIX, status_topic
@@ -25,6 +30,13 @@ class SafetyConfig(BaseModel):
     Attributes:
         room: Room calibration file: the fence.
         nodes: Nodes whose status must be fresh and good.
+        drivers: Who may command, first the one that goes before the others: expert, policy.
+        teleop: ``hold``: the car moves only while somebody holds a button (see the teleop node); ``none``: once armed.
+        teleop_age_limit_s: Silence of the teleop node after which the button counts as released [s].
+        fence_margin_m: The rear axle stays at least this far inside the room's fence [m].
+        clock_offset_limit_s: Largest offset between the clocks of two hosts [s].
+        clock_error_limit_s: An offset known no better than this is not known [s].
+        clock_peers: Hosts whose clock offset must be known; others count too once they were heard.
         max_speed_mps: A faster command disarms [m/s].
         max_steering_rad: A sharper command than this disarms; the car's own limits are the motor node's [rad].
         drive_age_limit_s: Oldest command of the policy [s].
@@ -38,6 +50,13 @@ class SafetyConfig(BaseModel):
 
     room: Path
     nodes: tuple[str, ...] = ("camera", "vicon", "compositor", "policy", "motor")
+    drivers: tuple[Literal["expert", "policy"], ...] = Field(default=("policy",), min_length=1)
+    teleop: Literal["none", "hold"] = "none"
+    teleop_age_limit_s: float = Field(default=0.2, gt=0.05, le=0.25)
+    fence_margin_m: float = Field(default=0.0, ge=0.0)
+    clock_offset_limit_s: float = Field(default=0.03, gt=0.0, le=0.1)
+    clock_error_limit_s: float = Field(default=0.1, gt=0.0)
+    clock_peers: tuple[str, ...] = ()
     max_speed_mps: float = Field(default=1.0, gt=0.0)
     max_steering_rad: float = Field(default=0.6, gt=0.0)
     drive_age_limit_s: float = Field(default=0.22, gt=0.0, le=0.25)
@@ -47,9 +66,14 @@ class SafetyConfig(BaseModel):
     held_up_limit_s: float = Field(default=0.2, gt=0.04, le=0.25)
 
     def limits(self, room: RoomCalibration) -> ArmingLimits:
-        """Numbers for the state machine."""
+        """Numbers for the state machine; a fence that would never let the car drive is refused."""
+        require_simple(room.fence_m)
+        if not inside(room.start_pose[:2], room.fence_m):
+            raise ConfigError(
+                f"expected a fence about the start, got start_pose {room.start_pose} outside of fence_m in {self.room}"
+            )
         return ArmingLimits(
-            nodes=self.nodes, fence_m=room.fence_m, drive_age_s=self.drive_age_limit_s, image_age_s=self.image_age_limit_s,
+            nodes=self.nodes, fence_m=room.fence_m, drivers=self.drivers, fence_margin_m=self.fence_margin_m, drive_age_s=self.drive_age_limit_s, image_age_s=self.image_age_limit_s,
             pose_age_s=self.pose_age_limit_s, status_age_s=self.status_age_limit_s, held_up_s=self.held_up_limit_s,
             speed_mps=self.max_speed_mps, steering_rad=self.max_steering_rad,
         )  # fmt: skip
@@ -61,28 +85,36 @@ class SafetyNode(Node):
     publications = ("/safety/drive", "/safety/state")
     tick_rate_hz = _TICK_RATE_HZ
 
-    def __init__(self, limits: ArmingLimits) -> None:
-        self._arming = Arming(limits)
+    def __init__(self, limits: ArmingLimits, hand: HandGate | None = None, clocks: ClockGate | None = None) -> None:
+        self._arming = Arming(limits, hand or HandGate(), clocks or ClockGate())
+        self._topic_of = {f"/{driver}/drive": driver for driver in limits.drivers}
         self._stopped_ns = 0
         self._stated_ns = 0
         self._stated_armed: bool | None = None
         self._stops = 0
         self.subscriptions = (
-            "/arm", "/camera/camera_info", "/vicon/car", "/policy/drive", "/motor/sent", *map(status_topic, limits.nodes),
+            "/arm", "/teleop/state", "/clock/offset", "/camera/camera_info", "/vicon/car", "/motor/sent", *self._topic_of,
+            *map(status_topic, limits.nodes),
         )  # fmt: skip
 
     @classmethod
     def build(cls, config: SafetyConfig, context: NodeContext) -> SafetyNode:
         """Make the node of a process."""
         del context  # it needs no clock of its own
-        return cls(config.limits(load_calibration(RoomCalibration, config.room)))
+        hand = HandGate(config.teleop == "hold", config.teleop_age_limit_s)
+        clocks = ClockGate(config.clock_offset_limit_s, config.clock_error_limit_s, config.clock_peers)
+        return cls(config.limits(load_calibration(RoomCalibration, config.room)), hand, clocks)
 
     def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
         """Note what came; pass a command on if it may pass."""
         arming = self._arming
-        if topic == "/policy/drive":
-            return self._pass_on(message, info, now)
-        if topic == "/arm":
+        if topic in self._topic_of:
+            return self._pass_on(self._topic_of[topic], message, info, now)
+        if topic == "/teleop/state":
+            return self._hand(message, info, now)
+        if topic == "/clock/offset":
+            arming.clocks.heard(str(message.peer), float(message.offset_s), float(message.error_s), info)
+        elif topic == "/arm":
             self._obey(message, info, now)
         elif topic == "/camera/camera_info":
             arming.heard_camera(info)
@@ -114,10 +146,18 @@ class SafetyNode(Node):
         """How often it had to stop the car."""
         return {"disarmed": self._stops}
 
-    def _pass_on(self, message: Any, info: MessageInfo, now: Now) -> list[Out]:
+    def _hand(self, message: Any, info: MessageInfo, now: Now) -> list[Out]:
+        speed, steering = float(message.speed_mps), float(message.steering_rad)
+        passes = self._arming.heard_hand(
+            str(message.mode), bool(message.estop), speed, steering, info, now.mono_ns
+        )  # fmt: skip
+        drive = [Out("/safety/drive", drive_message(speed, steering, now.real_ns))] if passes else []
+        return self._news(now) + drive
+
+    def _pass_on(self, driver: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
         drive, capture_ns = message.drive, ns_from_stamp(message.header.stamp)
         speed, steering = float(drive.speed), float(drive.steering_angle)
-        if self._arming.heard_drive(speed, steering, capture_ns, info, now.mono_ns, now.real_ns):
+        if self._arming.heard_drive(speed, steering, capture_ns, info, now.mono_ns, now.real_ns, driver):
             return [Out("/safety/drive", drive_message(speed, steering, capture_ns))]
         return self._news(now)
 

@@ -1,0 +1,160 @@
+"""Gates of the arming that stand on their own: the hand that holds a button, the clocks of two hosts, the fence.
+
+Pure: time and messages come as arguments.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from nodes.runtime.clock import NS_PER_S
+from nodes.runtime.errors import ConfigError
+from nodes.runtime.wire import MessageInfo
+
+IDLE, HUMAN, AUTONOMY = "idle", "human", "autonomy"
+Point = tuple[float, float]
+
+
+@dataclass
+class HandGate:
+    """Hold to run: somebody holds a button, and says so again and again.
+
+    Attributes:
+        required: Whether nothing may move without it.
+        age_limit_s: Silence of the teleop node after which the button counts as released [s].
+        mode: What is held: ``human`` (the hand itself drives), ``autonomy`` (it lets drive) or ``idle``.
+        pressed_stop: Whether the e-stop is pressed, or was and nobody has re-armed.
+    """
+
+    required: bool = False
+    age_limit_s: float = 0.2
+    mode: str = IDLE
+    pressed_stop: bool = False
+    _publish_ns: int | None = None
+    _instance_id: int | None = None
+
+    def heard(self, mode: str, pressed_stop: bool, info: MessageInfo) -> bool:
+        """Note a message; whether the hand has just begun to hold.
+
+        A message of a teleop node that was restarted never begins anything: the button must be seen released first.
+        """
+        known = info.instance_id == self._instance_id
+        began = known and self.mode == IDLE and mode in (HUMAN, AUTONOMY)
+        if not known and mode != IDLE:
+            mode = f"{mode} since before the teleop node was heard"
+        elif known and self.mode not in (IDLE, HUMAN, AUTONOMY) and mode != IDLE:
+            mode = self.mode  # still the press from before
+        self.mode, self.pressed_stop = mode, pressed_stop
+        self._publish_ns, self._instance_id = info.publish_mono_ns, info.instance_id
+        return began
+
+    def problem(self, mono_ns: int) -> str:
+        """Why the car may not move; empty if it may."""
+        if self.pressed_stop:
+            return "the e-stop is pressed"
+        if not self.required:
+            return ""
+        if self._publish_ns is None:
+            return "no sign of the teleop node yet; start one: advnerf teleop"
+        if (age_s := (mono_ns - self._publish_ns) / NS_PER_S) > self.age_limit_s:
+            return f"no sign of the teleop node for {age_s:.2f} s"
+        if self.mode == IDLE:
+            return "nobody holds the button"
+        return "" if self.mode in (HUMAN, AUTONOMY) else f"the button is held as {self.mode}; let it go first"
+
+    @property
+    def drives(self) -> bool:
+        """Whether the hand itself drives, before everything else that commands."""
+        return self.required and self.mode == HUMAN
+
+
+@dataclass
+class ClockGate:
+    """Clocks of other hosts: with a wrong one, every age that is computed from a capture stamp is wrong.
+
+    Attributes:
+        offset_limit_s: Largest offset between this host's clock and another's [s].
+        error_limit_s: An offset known no better than this is not known [s].
+        peers: Hosts whose offset must be known; others count too once they were heard.
+        age_limit_s: A measurement older than this is none [s].
+    """
+
+    offset_limit_s: float = 0.03
+    error_limit_s: float = 0.1
+    peers: tuple[str, ...] = ()
+    age_limit_s: float = 3.0
+    _heard: dict[str, tuple[float, float, int]] = field(default_factory=dict)
+
+    def heard(self, peer: str, offset_s: float, error_s: float, info: MessageInfo) -> None:
+        """Note a measurement."""
+        self._heard[peer] = (offset_s, error_s, info.publish_mono_ns)
+
+    def problem(self, mono_ns: int) -> str:
+        """Why the car may not move; empty if it may."""
+        for peer in self.peers:
+            if peer not in self._heard:
+                return f"the clock offset to {peer} is not known yet"
+        for peer, (offset_s, error_s, publish_ns) in self._heard.items():
+            age_s = (mono_ns - publish_ns) / NS_PER_S
+            if age_s > self.age_limit_s:
+                if peer in self.peers:
+                    return f"the clock offset to {peer} was last measured {age_s:.1f} s ago"
+                continue  # a host that left, and that nobody asked for
+            if not abs(offset_s) <= self.offset_limit_s:
+                return (
+                    f"the clock of {peer} is off by {1e3 * offset_s:.0f} ms, the limit is {1e3 * self.offset_limit_s:.0f} ms;"
+                    " synchronise both hosts (chrony)"
+                )
+            if not error_s <= self.error_limit_s:
+                return f"the clock offset to {peer} is known to {1e3 * error_s:.0f} ms only; the link is too slow"
+        return ""
+
+
+def inside(point_m: Point, polygon_m: Sequence[Point]) -> bool:
+    """Whether a point lies inside a simple polygon, convex or not (even-odd rule); false for points that are not finite."""
+    x, y = point_m
+    if not (math.isfinite(x) and math.isfinite(y)):
+        return False
+    result = False
+    for (ax, ay), (bx, by) in _edges(polygon_m):
+        if (ay > y) != (by > y) and x < ax + (y - ay) * (bx - ax) / (by - ay):
+            result = not result
+    return result
+
+
+def edge_distance_m(point_m: Point, polygon_m: Sequence[Point]) -> float:
+    """Distance from a point to the nearest edge of a polygon [m]."""
+    return min(_segment_distance_m(point_m, a, b) for a, b in _edges(polygon_m))
+
+
+def require_simple(polygon_m: Sequence[Point]) -> None:
+    """Refuse a fence whose edges cross: inside and outside would not mean what was drawn."""
+    edges = _edges(polygon_m)
+    for i, (a, b) in enumerate(edges):
+        for j in range(i + 1, len(edges)):
+            neighbours = j == i + 1 or (i == 0 and j == len(edges) - 1)
+            if not neighbours and _cross(a, b, *edges[j]):
+                raise ConfigError(
+                    f"expected a fence whose edges do not cross, but edge {i + 1} ({a} to {b}) crosses edge {j + 1}"
+                    f" ({edges[j][0]} to {edges[j][1]}); put the corners of fence_m in order"
+                )
+
+
+def _edges(polygon_m: Sequence[Point]) -> list[tuple[Point, Point]]:
+    return list(zip(polygon_m, [*polygon_m[1:], polygon_m[0]], strict=True))
+
+
+def _segment_distance_m(p: Point, a: Point, b: Point) -> float:
+    dx, dy = b[0] - a[0], b[1] - a[1]
+    length2 = dx * dx + dy * dy
+    along = 0.0 if length2 == 0.0 else min(1.0, max(0.0, ((p[0] - a[0]) * dx + (p[1] - a[1]) * dy) / length2))
+    return math.hypot(p[0] - a[0] - along * dx, p[1] - a[1] - along * dy)
+
+
+def _cross(a: Point, b: Point, c: Point, d: Point) -> bool:
+    def side(p: Point, q: Point, r: Point) -> float:
+        return (q[0] - p[0]) * (r[1] - p[1]) - (q[1] - p[1]) * (r[0] - p[0])
+
+    return side(a, b, c) * side(a, b, d) < 0.0 and side(c, d, a) * side(c, d, b) < 0.0
