@@ -17,6 +17,7 @@ from nodes import (
     cli_attack_node,
     cli_bag,
     cli_calibrate,
+    cli_camera,
     cli_keys,
     cli_motor,
     cli_object,
@@ -46,6 +47,7 @@ app.add_typer(cli_bag.app, name="bag")
 app.add_typer(cli_keys.app, name="keys")
 app.add_typer(cli_motor.app, name="motor")
 app.add_typer(cli_calibrate.app, name="calibrate")
+app.add_typer(cli_camera.app, name="camera")
 cli_attack_node.add_to(cli_attack.app)
 app.add_typer(cli_attack.app, name="attack")
 app.add_typer(cli_object.app, name="object")

@@ -87,6 +87,7 @@ class VideoDevice:
         stamp_flags: Clock and event of its stamps, as in ``v4l2_buffer.flags``.
         after_start: What it does to itself when the stream starts.
         extension: Answers requests to the extension units of a UVC device: unit, selector, query, data.
+        card: Its name.
     """
 
     formats: dict[str, list[tuple[int, int]]] = field(default_factory=lambda: {"YUYV": [(640, 480), (320, 240)]})
@@ -97,6 +98,7 @@ class VideoDevice:
     stamp_flags: int = 0x12000  # monotonic, start of exposure
     after_start: Callable[[VideoDevice], None] | None = None
     extension: Callable[[int, int, int, bytearray], None] | None = None
+    card: str = "Emulated Camera"
 
     def __post_init__(self) -> None:
         self.condition = threading.Condition()
@@ -250,7 +252,7 @@ def _text(view: memoryview, offset: int, text: str) -> None:
 
 def _querycap(device: VideoDevice, fd: int, view: memoryview) -> None:
     _text(view, 0, "uvcvideo")
-    _text(view, 16, "Emulated Camera")
+    _text(view, 16, device.card)
     _text(view, 48, "usb-0000:00:14.0-1")
     caps = _METADATA if device.metadata_only else _CAPTURE_AND_STREAMING
     # The first number is about the whole device, the second about this node.
