@@ -47,8 +47,28 @@ def scene_train(
     checkpoint_every_s: Annotated[
         float, typer.Option("--checkpoint-every", min=0.0, help="A kill loses at most so much training [s].")
     ] = 30.0,
+    unbounded: Annotated[
+        bool | None,
+        typer.Option(
+            "--unbounded/--bounded",
+            help="The scene goes on outside the box, to the horizon, with detail that fades with distance.",
+            show_default="unbounded where aabb_scale in the file is more than 1",
+        ),
+    ] = None,
+    preset: Annotated[
+        str,
+        typer.Option(
+            "--preset",
+            help="room: ours, for rooms and for a CPU (8 levels of 4 features, 2^17 entries, matte colours unless --open or "
+            "--unbounded). instant-ngp: its default sizes (16 levels of 2 features, 2^19 entries, finest 2048 x aabb_scale, "
+            "directions to degree 4), for detail and for comparisons; slower.",
+        ),
+    ] = "room",
 ) -> None:
-    """Learn a scene from posed images; ends with PSNR and SSIM on held-out ones."""
+    """Learn a scene from posed images; ends with PSNR and SSIM on held-out ones.
+
+    Images with alpha are learned with it: what they show as transparent stays so.
+    """
     from nodes.runtime.errors import ConfigError
     from nodes.runtime.locks import HeldError, hold
     from nodes.runtime.progress import ProgressDisplay
@@ -69,6 +89,8 @@ def scene_train(
         near,
         seed,
         checkpoint_every_s,
+        unbounded,
+        preset,
     )
     output.mkdir(parents=True, exist_ok=True)
     try:

@@ -13,11 +13,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from advnerf_core.fields.hash_grid import HashGridConfig
 from advnerf_core.files import write_atomically
 from advnerf_core.geometry import Array
 from advnerf_core.render.march import MarchConfig
 from advnerf_core.scene.dataset import ImageSet, PosedImages, load_transforms
 from advnerf_core.scene.field import SceneFieldConfig, save_scene
+from advnerf_core.scene.image_files import OPAQUE
 from advnerf_core.scene.metrics import psnr, ssim
 from advnerf_core.scene.render_field import FieldRenderer
 from advnerf_core.scene.train import Progress, TrainConfig, train_scene
@@ -28,7 +30,11 @@ SCENE, CHECKPOINT, FIGURES = "scene.safetensors", "checkpoint.safetensors", "hel
 MM_PER_M = 1000.0
 # Sample intervals as shares of the box: a fine cell of the hash grid, and a coarse one.
 _SMALLEST_STEP, _LARGEST_STEP = 1 / 2048, 1 / 160
+# Rays that go on to the horizon need more of them; Instant-NGP's 1024 is the most it takes, too.
+_UNBOUNDED_SAMPLES = 1024
 _NO_TIME_LIMIT_STEPS = 1_000_000
+PRESETS = ("room", "instant-ngp")
+_WHITE = (1.0, 1.0, 1.0)
 _VIDEO_FPS = 10
 
 
@@ -48,6 +54,8 @@ class TrainingRequest:
         near: Nothing nearer to a camera than this is learned, in the data set's unit.
         seed: Of everything random.
         checkpoint_every_s: A kill loses at most so much training [s].
+        unbounded: Whether the scene goes on outside the box, contracted; None: if the file's ``aabb_scale`` is more than 1.
+        preset: Sizes of the field: ``room``, ours, or ``instant-ngp``.
     """
 
     transforms: Path
@@ -61,6 +69,8 @@ class TrainingRequest:
     near: float = 0.05
     seed: int = 0
     checkpoint_every_s: float = 30.0
+    unbounded: bool | None = None
+    preset: str = "room"
 
     def __post_init__(self) -> None:
         """Refuse what cannot be trained."""
@@ -68,6 +78,8 @@ class TrainingRequest:
             raise ConfigError("expected either a number of steps or a time limit")
         if self.box_m is not None and not all(low < high for low, high in zip(*self.box_m, strict=True)):
             raise ConfigError(f"expected a box with low < high, got {self.box_m}")
+        if self.preset not in PRESETS:
+            raise ConfigError(f"expected a preset of {', '.join(PRESETS)}, got {self.preset!r}")
 
 
 def train(request: TrainingRequest, report: Report) -> dict[str, Any]:
@@ -75,23 +87,14 @@ def train(request: TrainingRequest, report: Report) -> dict[str, Any]:
     training, held_out = load_transforms(request.transforms).training_and_held_out(request.every)
     for path in training.missing:
         print(f"missing, left out: {path}")
-    box = _field(request, training)
-    config = TrainConfig(
-        steps=request.steps or _NO_TIME_LIMIT_STEPS, seed=request.seed, checkpoint_every_s=request.checkpoint_every_s,
-        max_seconds=None if request.minutes is None else 60.0 * request.minutes,
-        march=MarchConfig(
-            near_m=request.near, smallest_step_m=_SMALLEST_STEP * box.extent_m, largest_step_m=_LARGEST_STEP * box.extent_m
-        ),
-        opacity=0.0 if request.open_scene else TrainConfig.opacity,
-        distortion=2e-3 if request.open_scene else TrainConfig.distortion,
-    )  # fmt: skip
+    images = training.load(request.size)
+    field = scene_field(request, training, transparent=_transparent(images))
+    print(_described(request, field))
 
     def progress(at: Progress) -> None:
         report(0.95 * at.fraction, f"step {at.step}, {at.psnr_db:.1f} dB on training rays")
 
-    images = training.load(request.size)
-    _make_opaque(images)
-    trained = train_scene(images, box, config, request.output / CHECKPOINT, progress)
+    trained = train_scene(images, field, _train_config(request, field), request.output / CHECKPOINT, progress)
     metadata = {
         "march": vars(trained.march), "steps": trained.history[-1][0], "seed": request.seed, "photographs": len(images.rgb),
         "dataset": str(request.transforms),
@@ -105,9 +108,9 @@ def train(request: TrainingRequest, report: Report) -> dict[str, Any]:
 def evaluate(renderer: FieldRenderer, listed: PosedImages, size: tuple[int, int] | None) -> dict[str, Any]:
     """PSNR [dB] and SSIM on images that nothing was learned from, each and on average; masked pixels do not count for PSNR."""
     views = listed.load(size)
-    _make_opaque(views)
     rows = []
-    for index, real in enumerate(views.rgb):
+    # Pictures with alpha are compared before white, which the renderer takes, too.
+    for index, real in enumerate(views.on_background(_WHITE)):
         rendered = renderer.render(views.T_world_from_camera[index][None], views.pinholes[index])[0][0].numpy()
         usable = np.ones(real.shape[:2], dtype=bool) if views.valid is None else views.valid[index]
         rows.append(
@@ -131,16 +134,21 @@ def render(
 ) -> int:
     """Write what the field shows from every camera of a data set: colour, depth in millimetres (16 bit), and a video.
 
+    Pictures of a scene that was learned with alpha have alpha; the video shows it before white.
+
     Returns:
         The number of views.
     """
     loaded = listed.load(size)
     frames: list[NDArray[np.uint8]] = []
     for index, (pose, pinhole) in enumerate(zip(loaded.T_world_from_camera, loaded.pinholes, strict=True)):
-        rgb, depth_m, _ = renderer.render(pose[None], pinhole)
+        rgb, depth_m, alpha = renderer.render(pose[None], pinhole)
         picture = np.rint(255 * rgb[0].numpy()).astype(np.uint8)
         name = listed.frames[index].path.stem
-        _write_png(output / f"{index:04d}_{name}.png", picture[..., ::-1])
+        if renderer.config.learned_background:
+            _write_png(output / f"{index:04d}_{name}.png", picture[..., ::-1])
+        else:
+            _write_png(output / f"{index:04d}_{name}.png", _with_alpha(rgb[0].numpy(), alpha[0].numpy()))
         depth_mm = np.nan_to_num(MM_PER_M * depth_m[0].numpy(), posinf=0.0)
         _write_png(output / f"{index:04d}_{name}_depth_mm.png", np.clip(depth_mm, 0, 65535).astype(np.uint16))
         frames.append(picture)
@@ -169,18 +177,66 @@ def write_video(path: Path, frames: Sequence[NDArray[np.uint8]]) -> None:
         partial.unlink(missing_ok=True)
 
 
-def _field(request: TrainingRequest, listed: PosedImages) -> SceneFieldConfig:
-    low, high = listed.box() if request.box_m is None else (np.array(corner) for corner in request.box_m)
+def scene_field(request: TrainingRequest, listed: PosedImages, transparent: bool = False) -> SceneFieldConfig:
+    """Sizes of the field that a request asks for.
+
+    Args:
+        request: What was asked for.
+        listed: The training images.
+        transparent: Whether they have alpha.
+
+    Raises:
+        ConfigError: No box was given, and the file has none that holds its cameras.
+    """
+    aabb_scale = listed.aabb_scale or 1.0
+    unbounded = aabb_scale > 1.0 if request.unbounded is None else request.unbounded
+    if request.box_m is not None:
+        low, high = (np.array(corner) for corner in request.box_m)
+    else:
+        low, high = listed.inner_box() if unbounded else listed.box()
     inside = [
         np.all((low <= f.T_world_from_camera[:3, 3]) & (f.T_world_from_camera[:3, 3] <= high)) for f in listed.frames
     ]
     if request.box_m is None and listed.aabb_scale is None and not all(inside):
         raise ConfigError(
             f"expected a box: {request.transforms} has no aabb_scale, and {len(inside) - sum(inside)} of {len(inside)} cameras "
-            f"stand outside its unit cube; give --box, cameras are at {_span(listed)}"
+            f"stand outside its unit cube; give --box-low and --box-high (cameras are at {_span(listed)}) or --unbounded"
         )
-    bands = 3 if request.open_scene else 1
-    return SceneFieldConfig(_corner(low), _corner(high), direction_bands=bands)
+    common = {"contraction": unbounded, "learned_background": not transparent}
+    if request.preset == "instant-ngp":
+        # Müller et al. 2022, table 1 and section 5.4, and the sizes of its configs/nerf/base.json.
+        grid = HashGridConfig(levels=16, features=2, log2_entries=19, coarsest=16, finest=round(2048 * aabb_scale))
+        return SceneFieldConfig(_corner(low), _corner(high), grid, direction_bands=4, **common)
+    # The contracted cube is two inner regions wide: twice the cells keep its detail.
+    grid = HashGridConfig(levels=8, features=4, finest=4096 if unbounded else 2048)
+    bands = 3 if request.open_scene or unbounded else 1
+    return SceneFieldConfig(_corner(low), _corner(high), grid, direction_bands=bands, **common)
+
+
+def _train_config(request: TrainingRequest, field: SceneFieldConfig) -> TrainConfig:
+    is_open = request.open_scene or field.contraction
+    march = MarchConfig(
+        near_m=request.near, smallest_step_m=_SMALLEST_STEP * field.extent_m, largest_step_m=_LARGEST_STEP * field.extent_m,
+        max_samples=_UNBOUNDED_SAMPLES if field.contraction else MarchConfig.max_samples,
+    )  # fmt: skip
+    return TrainConfig(
+        steps=request.steps or _NO_TIME_LIMIT_STEPS, seed=request.seed, checkpoint_every_s=request.checkpoint_every_s,
+        max_seconds=None if request.minutes is None else 60.0 * request.minutes, march=march,
+        opacity=0.0 if is_open else TrainConfig.opacity, distortion=2e-3 if is_open else TrainConfig.distortion,
+    )  # fmt: skip
+
+
+def _described(request: TrainingRequest, field: SceneFieldConfig) -> str:
+    """What was decided for the user, and how to decide otherwise."""
+    inside = "inner region" if field.contraction else "box"
+    low, high = (np.round(corner, 2).tolist() for corner in (field.box_low_m, field.box_high_m))
+    text = f"{inside} {low} .. {high}"
+    if field.contraction:
+        why = "" if request.unbounded is not None else " since the file's aabb_scale is more than 1 (--bounded: not so)"
+        text += f", unbounded{why}"
+    if not field.learned_background:
+        text += "; images have alpha: learned before random colours, transparent where they are"
+    return f"{text}; preset {request.preset}"
 
 
 def _span(listed: PosedImages) -> str:
@@ -193,10 +249,15 @@ def _corner(corner: Array) -> tuple[float, float, float]:
     return x, y, z
 
 
-def _make_opaque(images: ImageSet) -> None:
-    """Pictures with transparency stand before white; the field learns that as its background."""
-    if images.alpha is not None:
-        images.rgb[...] = images.on_background((1.0, 1.0, 1.0))
+def _transparent(images: ImageSet) -> bool:
+    return images.alpha is not None and bool((images.alpha < OPAQUE).any())
+
+
+def _with_alpha(over_white: NDArray[np.float32], alpha: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Pixels ``[H, W, 4]``, blue first, not premultiplied, of colours over white."""
+    opacity = alpha[..., None]
+    own = np.clip((over_white - (1.0 - opacity)) / np.maximum(opacity, 1e-3), 0.0, 1.0)
+    return np.rint(255 * np.concatenate([own[..., ::-1], opacity], axis=-1)).astype(np.uint8)
 
 
 def _write_png(path: Path, pixels: NDArray[Any]) -> None:

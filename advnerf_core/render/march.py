@@ -21,7 +21,7 @@ class MarchConfig:
     Attributes:
         near_m: Nothing is sampled closer to the camera [m].
         smallest_step_m: Shortest sample interval [m].
-        largest_step_m: Longest sample interval [m].
+        largest_step_m: Longest sample interval [m]; in a contracted field that is the one of the inner region.
         step_growth: Interval per metre of distance, between the two: pixels get wider with distance, so may samples.
         max_samples: Most samples on one ray.
     """
@@ -55,7 +55,7 @@ class Samples:
     """Samples packed by ray.
 
     Attributes:
-        points: ``[N, 3]`` in box coordinates.
+        points: ``[N, 3]`` in box coordinates, or in the cube of a contracted field: where the field is asked.
         t_mid_m: Ray parameters ``[N]`` [m].
         widths: Intervals ``[N]`` in box coordinates.
         begins: First sample of each ray ``[R + 1]``.
@@ -79,10 +79,11 @@ class Marcher:
         capacity: Most samples in a batch. Rays that do not fit are left out.
         config: How samples are placed.
         box_high: High corner of the box in box coordinates ``[3]``.
+        contracted: Whether the field is contracted: rays then go on outside the box.
     """
 
-    def __init__(self, capacity: int, config: MarchConfig, box_high: Array32) -> None:
-        self.config, self.box_high = config, box_high
+    def __init__(self, capacity: int, config: MarchConfig, box_high: Array32, contracted: bool = False) -> None:
+        self.config, self.box_high, self.contracted = config, box_high, contracted
         room = max(capacity // SLOTS, config.max_samples)
         self._points, self._t = np.empty((SLOTS, room, 3), np.float32), np.empty((SLOTS, room), np.float32)
         self._widths = np.empty((SLOTS, room), np.float32)
@@ -100,7 +101,7 @@ class Marcher:
             start, stop = bounds[slot]
             fitted[slot] = march(
                 rays, jitter, start, stop, self.box_high, near, steps, leaps.distance, leaps.cells, self._points[slot],
-                self._t[slot], self._widths[slot], begins[slot], self.config.max_samples,
+                self._t[slot], self._widths[slot], begins[slot], self.config.max_samples, self.contracted,
             )  # fmt: skip
 
         run_slots(work, SLOTS)

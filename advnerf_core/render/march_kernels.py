@@ -2,7 +2,8 @@
 
 Rays live in box coordinates: positions are metres divided by the longest side of the box, measured from its low corner, so the box
 is ``[0, high]`` with ``max(high) = 1``; the ray parameter stays in metres. ``distance`` tells per cell how many cells one may go in any
-direction: 0 is occupied, d > 0 means that all cells at Chebyshev distance below d are empty.
+direction: 0 is occupied, d > 0 means that all cells at Chebyshev distance below d are empty. With a contracted field the box is only the
+inner region: rays go on outside it, and cells and sample positions are those of the unit cube that ``contraction`` maps all space to.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from advnerf_core.parallel import KERNEL_OPTIONS
+from advnerf_core.render.contraction import growing_step, into_cube, next_sample_contracted, span_before_far
 
 Array32 = NDArray[np.float32]
 Array8 = NDArray[np.uint8]
@@ -86,7 +88,7 @@ def step_size(t: np.float32, steps: Array32) -> np.float32:
 def march(
     rays: Array32, jitter: Array32, first: int, stop: int, high: Array32, near: np.float32, steps: Array32,
     distance: Array8, cells: Array32, points: Array32, t_mid: Array32, widths: Array32, begins: NDArray[np.int64],
-    max_samples: int,
+    max_samples: int, contracted: bool = False,
 ) -> int:  # fmt: skip
     """Place samples on rays ``first..stop`` until they are through or the room for samples is used up.
 
@@ -100,11 +102,12 @@ def march(
         steps: Smallest and largest interval [m] and growth per metre ``[3]``.
         distance: Leap distances ``[X, Y, Z]``.
         cells: Cells per unit ``[3]``.
-        points: Sample positions ``[capacity, 3]``, written.
+        points: Sample positions ``[capacity, 3]``, written; in the contracted cube if ``contracted``.
         t_mid: Ray parameter of each sample [m] ``[capacity]``, written.
         widths: Interval of each sample in box coordinates ``[capacity]``, written.
         begins: First sample of each ray, counted from ``first``'s, ``[stop - first + 1]``, written as far as rays fit.
         max_samples: Most samples on one ray.
+        contracted: Whether the field is contracted.
 
     Returns:
         How many rays fit.
@@ -115,17 +118,23 @@ def march(
         begins[r - first] = at
         if at + max_samples > capacity:
             return r - first
-        t, end = span_in_box(ray, high, near)
+        t, end = span_before_far(ray, near) if contracted else span_in_box(ray, high, near)
         limit = at + max_samples
         # Box units per metre along this ray: widths times densities must not depend on the unit of length.
         scale = np.sqrt(ray[3] * ray[3] + ray[4] * ray[4] + ray[5] * ray[5])
         while at < limit:
-            t = next_sample(ray, t, end, distance, cells)
+            if contracted:
+                t = next_sample_contracted(ray, t, end, distance, cells)
+            else:
+                t = next_sample(ray, t, end, distance, cells)
             if t >= end:
                 break
-            width = step_size(t, steps)
+            width = growing_step(ray, t, steps) if contracted else step_size(t, steps)
             s = t + width * jitter[r]
-            points[at, 0], points[at, 1], points[at, 2] = ray[0] + s * ray[3], ray[1] + s * ray[4], ray[2] + s * ray[5]
+            x, y, z = ray[0] + s * ray[3], ray[1] + s * ray[4], ray[2] + s * ray[5]
+            if contracted:
+                x, y, z = into_cube(x, y, z)
+            points[at, 0], points[at, 1], points[at, 2] = x, y, z
             t_mid[at], widths[at] = s, width * scale
             at += 1
             t += width

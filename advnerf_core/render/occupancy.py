@@ -10,6 +10,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from advnerf_core.parallel import KERNEL_OPTIONS
+from advnerf_core.render.contraction import radial_stretch
 
 Array32 = NDArray[np.float32]
 LogDensity = Callable[[Array32], Array32]
@@ -38,14 +39,19 @@ class OccupancyGrid:
         box_high: High corner of the box in box coordinates ``[3]``.
         resolution: Cells along the longest side.
         seed: Seed of the places inside cells where density is probed.
+        contracted: Whether the grid is over the cube of a contracted field. The resolution is then made a multiple of 4, and an
+            estimate counts by how long its cell is: thin haze in a large cell hides as much as dense fog in a small one.
     """
 
-    def __init__(self, box_high: Array32, resolution: int = 128, seed: int = 0) -> None:
+    def __init__(self, box_high: Array32, resolution: int = 128, seed: int = 0, contracted: bool = False) -> None:
         self.box_high = np.asarray(box_high, np.float32)
+        if contracted:
+            resolution = -(-resolution // 4) * 4
         shape = np.maximum(1, np.ceil(self.box_high * resolution - 1e-4)).astype(int)
         self.shape: tuple[int, int, int] = (int(shape[0]), int(shape[1]), int(shape[2]))
         self.density = np.full(self.shape, np.inf, np.float32)
         self.seed = seed
+        self._stretch = radial_stretch(self.shape) if contracted else None
 
     @property
     def cells(self) -> Array32:
@@ -76,7 +82,11 @@ class OccupancyGrid:
         """Cells ``[X, Y, Z]`` whose density may exceed ``threshold`` or, early on, the mean."""
         finite = self.density[np.isfinite(self.density)]
         mean = float(finite.mean()) if finite.size else 0.0
-        return np.asarray(self.density > min(threshold, mean))
+        least = min(threshold, mean)
+        if self._stretch is None:
+            return np.asarray(self.density > least)
+        # Cells that no place is mapped to have no length.
+        return np.asarray((self._stretch > 0.0) & (np.minimum(self.density, np.float32(1e30)) * self._stretch > least))
 
 
 def refine_occupied(
@@ -87,6 +97,7 @@ def refine_occupied(
     factor: int = 2,
     probes: int = 6,
     seed: int = 0,
+    contracted: bool = False,
 ) -> NDArray[np.bool_]:
     """Split occupied cells and keep the parts that a ray would notice.
 
@@ -98,6 +109,7 @@ def refine_occupied(
         factor: Parts along each side of a cell.
         probes: Random places in each part where density is looked at.
         seed: Seed of those places.
+        contracted: Whether the grid is over the cube of a contracted field.
 
     Returns:
         ``[factor * X, factor * Y, factor * Z]``.
@@ -105,6 +117,8 @@ def refine_occupied(
     fine = occupied.repeat(factor, 0).repeat(factor, 1).repeat(factor, 2)
     rng = np.random.Generator(np.random.Philox(key=[seed, 1]))
     cells = np.array(fine.shape) / np.asarray(box_high)
+    least = least_depth * cells.max()
+    stretch = radial_stretch((fine.shape[0], fine.shape[1], fine.shape[2])).reshape(-1) if contracted else None
     kept = np.zeros(fine.size, np.bool_)
     for part in np.array_split(np.flatnonzero(fine), max(1, int(fine.sum()) // 262144)):
         index = np.stack(np.unravel_index(part, fine.shape), axis=-1)
@@ -112,7 +126,9 @@ def refine_occupied(
         for _ in range(probes):
             places = (index + rng.random((len(part), 3), dtype=np.float32)) / cells
             largest = np.maximum(largest, log_density(places.astype(np.float32)))
-        kept[part] = np.exp(np.minimum(largest, 15.0)) >= least_depth * cells.max()
+        # The cube is two inner regions wide: a part of the inner region is twice as long as its share of the cube.
+        length = 1.0 if stretch is None else 2.0 * stretch[part]
+        kept[part] = np.exp(np.minimum(largest, 15.0)) * length >= least
     return kept.reshape(fine.shape)
 
 

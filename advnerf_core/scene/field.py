@@ -24,9 +24,12 @@ from advnerf_core.errors import AdvnerfError
 from advnerf_core.fields.hash_grid import HashGrid, HashGridConfig
 from advnerf_core.fields.spherical_harmonics import spherical_harmonics
 from advnerf_core.files import write_atomically
+from advnerf_core.render.contraction import contract
 from advnerf_core.render.volume_kernels import MAX_LOG_DENSITY
 
 FORMAT = "advnerf-scene-1"
+# Settings that the first scene files of this format do not name, and what they mean there.
+_YOUNGER = {"contraction": False, "learned_background": True}
 
 
 class SceneFileError(AdvnerfError):
@@ -45,6 +48,10 @@ class SceneFieldConfig:
         features: Features per sample that are accumulated and decoded to a colour.
         direction_bands: Bands of spherical harmonics of the viewing direction; 1 means colours do not depend on it, as
             in a matte room: fog that looks different from every side then explains nothing, and geometry is found sooner.
+        contraction: Whether the field goes on outside the box, with detail that fades with distance; the cube around the box is
+            then the inner region of ``render.contraction``.
+        learned_background: Whether what lies behind everything is one learned colour. Without, the field is transparent there,
+            as in images with alpha.
     """
 
     box_low_m: tuple[float, float, float]
@@ -53,6 +60,8 @@ class SceneFieldConfig:
     hidden: int = 64
     features: int = 15
     direction_bands: int = 1
+    contraction: bool = False
+    learned_background: bool = True
 
     def __post_init__(self) -> None:
         if not all(low < high for low, high in zip(self.box_low_m, self.box_high_m, strict=True)):
@@ -71,8 +80,19 @@ class SceneFieldConfig:
         return max(high - low for low, high in zip(self.box_low_m, self.box_high_m, strict=True))
 
     @property
+    def origin_m(self) -> tuple[float, float, float]:
+        """Where box coordinates are zero, in the world [m]: the low corner of the box, or of the cube around it if contracted."""
+        if not self.contraction:
+            return self.box_low_m
+        half = 0.5 * self.extent_m
+        x, y, z = (0.5 * (low + high) - half for low, high in zip(self.box_low_m, self.box_high_m, strict=True))
+        return x, y, z
+
+    @property
     def box_high(self) -> NDArray[np.float32]:
-        """High corner of the box in box coordinates ``[3]``."""
+        """High corner of what the grids cover ``[3]``: of the box in box coordinates, or of the contracted cube."""
+        if self.contraction:
+            return np.ones(3, np.float32)
         return ((np.array(self.box_high_m) - np.array(self.box_low_m)) / self.extent_m).astype(np.float32)
 
     @property
@@ -80,15 +100,20 @@ class SceneFieldConfig:
         """Inputs of the colour network: features and directions, filled up to a multiple of 4."""
         return -(-(self.features + self.direction_bands**2) // 4) * 4
 
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON and hashes. Settings younger than the file format appear only if they are not the default."""
+        values = asdict(self)
+        return {k: v for k, v in values.items() if k not in _YOUNGER or v != _YOUNGER[k]}
+
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> SceneFieldConfig:
-        """Inverse of ``dataclasses.asdict``, from JSON."""
+        """Inverse of ``to_dict``, from JSON."""
         low, high = tuple(values["box_low_m"]), tuple(values["box_high_m"])
         return cls(**{**values, "box_low_m": low, "box_high_m": high, "grid": HashGridConfig(**values["grid"])})
 
 
 class SceneField(nn.Module):
-    """Density and colour everywhere in a box; all points are in box coordinates (see ``to_box``)."""
+    """Density and colour everywhere in a box, or with a contraction everywhere; all points are those of ``to_box``."""
 
     def __init__(self, config: SceneFieldConfig, seed: int = 0) -> None:
         super().__init__()
@@ -99,15 +124,20 @@ class SceneField(nn.Module):
         self.density_2 = _linear(config.hidden, 1 + config.features, generator)
         self.colour_1 = _linear(config.colour_inputs, config.hidden, generator)
         self.colour_2 = _linear(config.hidden, 4, generator)  # red, green, blue, unused: kernels take outputs in fours
-        self.background = nn.Parameter(torch.zeros(config.features))
+        self.background = nn.Parameter(torch.zeros(config.features), requires_grad=config.learned_background)
 
     def to_box(self, points_in_world: Tensor) -> Tensor:
-        """World points ``[..., 3]`` [m] in box coordinates: from the low corner, in units of the longest side."""
-        low = torch.tensor(self.config.box_low_m, dtype=points_in_world.dtype, device=points_in_world.device)
-        return (points_in_world - low) / self.config.extent_m
+        """World points ``[..., 3]`` [m] where the field is asked: box coordinates, from the low corner in units of the longest side,
+        or in the cube that they are contracted to.
+        """
+        low = torch.tensor(self.config.origin_m, dtype=points_in_world.dtype, device=points_in_world.device)
+        in_box = (points_in_world - low) / self.config.extent_m
+        if not self.config.contraction:
+            return in_box
+        return torch.from_numpy(contract(in_box.detach().cpu().numpy())).to(in_box)
 
     def density_and_features(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Density per box side ``[N]`` and features ``[N, C]`` in (-1, 1) at points ``[N, 3]`` in box coordinates."""
+        """Density per box side ``[N]`` and features ``[N, C]`` in (-1, 1) at points ``[N, 3]`` from ``to_box``."""
         hidden = torch.relu(self.density_1(self.grid(points)))
         out = self.density_2(hidden)
         return torch.exp(out[:, 0].clamp(max=MAX_LOG_DENSITY)), nn.functional.softsign(out[:, 1:])
@@ -138,7 +168,7 @@ def _linear(inputs: int, outputs: int, generator: torch.Generator) -> nn.Linear:
 
 def scene_hash(scene: SceneField, occupancy: NDArray[np.bool_]) -> str:
     """Content hash of a trained scene: its configuration, weights and occupancy; 16 hexadecimal digits."""
-    digest = hashlib.sha256(json.dumps(asdict(scene.config), sort_keys=True).encode())
+    digest = hashlib.sha256(json.dumps(scene.config.to_dict(), sort_keys=True).encode())
     for name, value in sorted(scene.named_parameters()):
         digest.update(name.encode() + value.detach().cpu().numpy().tobytes())
     digest.update(np.packbits(occupancy).tobytes())
@@ -164,7 +194,7 @@ def save_scene(
     content = scene_hash(scene, occupancy)
     header = {
         "format": FORMAT,
-        "config": json.dumps(asdict(scene.config)),
+        "config": json.dumps(scene.config.to_dict()),
         "occupancy_shape": json.dumps(list(occupancy.shape)),
         "scene_hash": content,
         "metadata": json.dumps(metadata or {}),

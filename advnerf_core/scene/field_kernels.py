@@ -126,6 +126,47 @@ def colour_loss(
 
 
 @njit(**KERNEL_OPTIONS)
+def matte_loss(
+    raw: Array32, targets: NDArray[np.uint8], opacities: NDArray[np.uint8], behind: Array32, alpha: Array32,
+    first: int, stop: int, huber: np.float32, scale: np.float32, grad_alpha: Array32,
+) -> tuple[float, float]:  # fmt: skip
+    """``colour_loss`` of rays that let light through: field and pixel are compared before the same colour.
+
+    Args:
+        raw: Network outputs ``[ray tiles, 4, TILE]``, overwritten by the gradient; the fourth row is unused.
+        targets: Pixels ``[R, 3]``, not premultiplied.
+        opacities: Of the pixels ``[R]``.
+        behind: Colour behind both ``[R, 3]`` in 0..1.
+        alpha: Opacity of the field ``[R]``.
+        first: First ray.
+        stop: One past the last ray.
+        huber: Where the loss turns from square to linear.
+        scale: Factor on the gradient: 1 / number of values.
+        grad_alpha: ``[R]``, written: gradient to ``alpha`` where it mixes the two colours.
+
+    Returns:
+        Sum of the Huber losses and sum of the squared errors.
+    """
+    loss, square = 0.0, 0.0
+    for r in range(first, stop):
+        block, column = r // TILE, r % TILE
+        opacity, total = _f(opacities[r]) * _f(1.0 / 255.0), _f(0.0)
+        for c in range(3):
+            value = _ONE / (_ONE + np.exp(-raw[block, c, column]))
+            real = opacity * (_f(targets[r, c]) * _f(1.0 / 255.0)) + (_ONE - opacity) * behind[r, c]
+            error = alpha[r] * value + (_ONE - alpha[r]) * behind[r, c] - real
+            size = abs(error)
+            square += error * error
+            loss += 0.5 * error * error if size <= huber else huber * (size - _f(0.5) * huber)
+            slope = min(max(error, -huber), huber) * scale
+            total += slope * (value - behind[r, c])
+            raw[block, c, column] = slope * alpha[r] * value * (_ONE - value)
+        raw[block, 3, column] = _f(0.0)
+        grad_alpha[r] = total
+    return loss, square
+
+
+@njit(**KERNEL_OPTIONS)
 def background_backward(
     grad_inputs: Array32, alpha: Array32, background: Array32, first: int, stop: int, grad_alpha: Array32,
     grad: Array32, pull: np.float32,

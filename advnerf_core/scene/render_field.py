@@ -30,6 +30,7 @@ class FieldRenderer:
         march: How samples are placed, from training.
         colour_map: Applied to all colours: from the camera that learned the scene to the one that is rendered.
         least_transmittance: A ray stops when so little light would still come through.
+        behind: Colour ``[3]`` behind a scene that was learned from images with alpha; black leaves colours times opacity.
     """
 
     def __init__(
@@ -39,23 +40,29 @@ class FieldRenderer:
         march: MarchConfig | None = None,
         colour_map: ColourMap | None = None,
         least_transmittance: float = 5e-3,
+        behind: tuple[float, float, float] = (1.0, 1.0, 1.0),
     ) -> None:
         self.config, self.march, self.colour_map = scene.config, march or MarchConfig(), colour_map
-        self.least_transmittance = least_transmittance
+        self.least_transmittance, self.behind = least_transmittance, behind
         self.samples = 0  # evaluated by the last call, for benchmarks
-        self._weights = {name: value.copy() for name, value in scene.arrays().items()}
+        self._weights = {name: value.detach().cpu().numpy().copy() for name, value in scene.named_parameters()}
         self._levels = scene.grid.levels
         cells = (np.array(occupied.shape) / self.config.box_high).astype(np.float32)
         self._leaps = leap_distances(occupied, cells)
 
     @classmethod
-    def from_file(cls, path: str | Path, colour_map: ColourMap | None = None) -> FieldRenderer:
+    def from_file(
+        cls,
+        path: str | Path,
+        colour_map: ColourMap | None = None,
+        behind: tuple[float, float, float] = (1.0, 1.0, 1.0),
+    ) -> FieldRenderer:
         """Renderer of a scene file; the colour map in the file, if any, applies unless another is given."""
         scene, occupied, metadata = load_scene(Path(path))
         march = MarchConfig(**metadata["march"]) if "march" in metadata else None
         if colour_map is None and "colour_map" in metadata:
             colour_map = ColourMap.from_dict(metadata["colour_map"])
-        return cls(scene, occupied, march, colour_map)
+        return cls(scene, occupied, march, colour_map, behind=behind)
 
     def render(self, T_world_from_camera: ArrayLike | Tensor, pinhole: Pinhole) -> tuple[Tensor, Tensor, Tensor]:
         """Render a batch of views.
@@ -81,16 +88,18 @@ class FieldRenderer:
         )
         tiles = len(poses) * -(-pinhole.height // SIDE) * -(-pinhole.width // SIDE)
         bounds, samples = slot_bounds(tiles, _SLOTS), np.zeros(_SLOTS, np.int64)
-        in_box = poses_in_box(poses, self.config.box_low_m, self.config.extent_m)
+        in_box = poses_in_box(poses, self.config.origin_m, self.config.extent_m)
 
         def work(slot: int) -> None:
             samples[slot] = self._render_tiles(in_box, intrinsics_row(pinhole), bounds[slot], rgb, depth_m, alpha)
 
         run_slots(work, _SLOTS)
         self.samples = int(samples.sum())
-        if self.colour_map is not None:
-            return torch.from_numpy(self.colour_map.apply(rgb)), torch.from_numpy(depth_m), torch.from_numpy(alpha)
-        return torch.from_numpy(rgb), torch.from_numpy(depth_m), torch.from_numpy(alpha)
+        colours = rgb if self.colour_map is None else self.colour_map.apply(rgb)
+        if not self.config.learned_background:
+            opacity = alpha[..., None]
+            colours = opacity * colours + (np.float32(1.0) - opacity) * np.array(self.behind, np.float32)
+        return torch.from_numpy(colours), torch.from_numpy(depth_m), torch.from_numpy(alpha)
 
     __call__ = render
 
@@ -106,6 +115,6 @@ class FieldRenderer:
                 w["density_1.weight"], w["density_1.bias"], w["density_2.weight"], w["density_2.bias"],
                 w["colour_1.weight"], w["colour_1.bias"], w["colour_2.weight"], w["colour_2.bias"], w["background"],
                 self.config.direction_bands, np.float32(self.least_transmittance), self.march.max_samples,
-                rgb, depth_m, alpha,
+                rgb, depth_m, alpha, self.config.contraction,
             )
         )  # fmt: skip

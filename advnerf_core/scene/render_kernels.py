@@ -14,6 +14,7 @@ from advnerf_core.fields.hash_grid_kernels import encode_level
 from advnerf_core.fields.mlp_kernels import TILE, dense
 from advnerf_core.fields.spherical_harmonics import write_spherical_harmonics
 from advnerf_core.parallel import KERNEL_OPTIONS
+from advnerf_core.render.contraction import growing_step, into_cube, next_sample_contracted, span_before_far
 from advnerf_core.render.march_kernels import next_sample, span_in_box, step_size
 from advnerf_core.render.rays import write_ray
 from advnerf_core.render.volume_kernels import MAX_LOG_DENSITY, squash_features
@@ -34,6 +35,7 @@ def render_tiles(
     distance: NDArray[np.uint8], cells: Array32, table: Array32, levels: Array64i, w1: Array32, b1: Array32, w2: Array32,
     b2: Array32, c1: Array32, d1: Array32, c2: Array32, d2: Array32, background: Array32, bands: int,
     least_through: np.float32, max_samples: int, rgb: Array32, depth_m: Array32, alpha: Array32,
+    contracted: bool,
 ) -> int:  # fmt: skip
     """Render pixel tiles ``first..stop`` of a batch of images.
 
@@ -64,6 +66,7 @@ def render_tiles(
         rgb: ``[B, H, W, 3]``, written.
         depth_m: Planar depth ``[B, H, W]`` [m], written; infinite where nothing is.
         alpha: ``[B, H, W]``, written.
+        contracted: Whether the field is contracted.
 
     Returns:
         Number of samples evaluated.
@@ -90,7 +93,7 @@ def render_tiles(
             if row >= height or column >= width:
                 continue
             scale[n] = write_ray(poses[image], intrinsics, _f(column) + _f(0.5), _f(row) + _f(0.5), rays[n])
-            t[n], end[n] = span_in_box(rays[n], high, near)
+            t[n], end[n] = span_before_far(rays[n], near) if contracted else span_in_box(rays[n], high, near)
             through[n], reach[n], taken[n] = _ONE, _ZERO, 0
             active[count] = n
             count += 1
@@ -103,15 +106,19 @@ def render_tiles(
                 ray = rays[n]
                 units = np.sqrt(ray[3] * ray[3] + ray[4] * ray[4] + ray[5] * ray[5])
                 for _ in range(each):
-                    t[n] = next_sample(ray, t[n], end[n], distance, cells)
+                    if contracted:
+                        t[n] = next_sample_contracted(ray, t[n], end[n], distance, cells)
+                    else:
+                        t[n] = next_sample(ray, t[n], end[n], distance, cells)
                     if t[n] >= end[n] or taken[n] >= max_samples:
                         t[n] = end[n]
                         break
-                    span = step_size(t[n], steps)
+                    span = growing_step(ray, t[n], steps) if contracted else step_size(t[n], steps)
                     s = t[n] + _f(0.5) * span
-                    points[used, 0], points[used, 1], points[used, 2] = (
-                        ray[0] + s * ray[3], ray[1] + s * ray[4], ray[2] + s * ray[5],
-                    )  # fmt: skip
+                    px, py, pz = ray[0] + s * ray[3], ray[1] + s * ray[4], ray[2] + s * ray[5]
+                    if contracted:
+                        px, py, pz = into_cube(px, py, pz)
+                    points[used, 0], points[used, 1], points[used, 2] = px, py, pz
                     spans[used], middles[used], owner[used] = span * units, s, n
                     t[n] += span
                     taken[n] += 1

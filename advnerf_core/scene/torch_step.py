@@ -14,7 +14,7 @@ from torch.nn.functional import huber_loss
 from advnerf_core.render.march import Samples
 from advnerf_core.render.volume_kernels import MIN_TRANSMITTANCE
 from advnerf_core.scene.field import SceneField
-from advnerf_core.scene.train_step import Array32, StepResult
+from advnerf_core.scene.train_step import Array32, Matte, StepResult, distortion_distances
 
 _MEAN_DECAY, _SQUARE_DECAY, _TINY = 0.9, 0.99, 1e-15
 
@@ -25,7 +25,7 @@ class TorchStep:
     Args:
         scene: The field; its parameters are changed in place.
         huber: Where the loss turns from square to linear.
-        distortion: Weight of the distortion loss, with distances in box sides.
+        distortion: Weight of the distortion loss, with the distances of ``distortion_distances``.
         opacity: Weight of the mean transmittance of rays in the loss.
     """
 
@@ -41,9 +41,11 @@ class TorchStep:
         """Gradients gathered since the last update, by the parameter's name."""
         return {n: torch.zeros_like(v) if v.grad is None else v.grad for n, v in self.values.items()}
 
-    def step(self, rays: Array32, targets: NDArray[np.uint8], samples: Samples) -> StepResult:
+    def step(
+        self, rays: Array32, targets: NDArray[np.uint8], samples: Samples, matte: Matte | None = None
+    ) -> StepResult:
         """Add the gradient of a batch, of the samples that show; arguments as in ``gradients``."""
-        return self.gradients(rays, targets, self.visible(samples))
+        return self.gradients(rays, targets, self.visible(samples), matte)
 
     def visible(self, samples: Samples, least_weight: float = 5e-4) -> Samples:
         """Samples that show in the image."""
@@ -54,22 +56,29 @@ class TorchStep:
         kept, before = np.flatnonzero(keep), np.concatenate([[0], np.cumsum(keep)])
         return Samples(samples.points[kept], samples.t_mid_m[kept], samples.widths[kept], before[samples.begins])
 
-    def gradients(self, rays: Array32, targets: NDArray[np.uint8], samples: Samples) -> StepResult:
+    def gradients(
+        self, rays: Array32, targets: NDArray[np.uint8], samples: Samples, matte: Matte | None = None
+    ) -> StepResult:
         """Add the gradient of the mean Huber loss of a batch to the parameters' ``grad``.
 
         Args:
             rays: ``[R, 6]`` in box coordinates.
             targets: Pixels ``[R, 3]``.
             samples: Samples of those rays.
+            matte: Opacities of the pixels and what is behind them; for a field without a learned background.
         """
         with torch.enable_grad():
             colours, weights, alpha = render_rays(self.scene, self._tensor(rays), samples)
             real = self._tensor(targets) / 255.0
+            if matte is not None:
+                behind, opacity = self._tensor(matte.behind), self._tensor(matte.opacities)[:, None] / 255.0
+                colours = alpha[:, None] * colours + (1.0 - alpha[:, None]) * behind
+                real = opacity * real + (1.0 - opacity) * behind
             loss = huber_loss(colours, real, delta=float(self.huber))
             total = loss + self.opacity * (1.0 - alpha).mean()
             if self.distortion > 0.0:
-                middles = self._tensor(samples.t_mid_m) / self.scene.config.extent_m
-                spread = distortion_loss(weights, middles, self._tensor(samples.widths), samples)
+                middles, lengths = distortion_distances(samples, self.scene.config)
+                spread = distortion_loss(weights, self._tensor(middles), self._tensor(lengths), samples)
                 total = total + self.distortion * spread / max(len(rays), 1)
             total.backward()
         mse = torch.mean((colours.detach() - real) ** 2)

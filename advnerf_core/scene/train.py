@@ -7,7 +7,7 @@ import json
 import math
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -19,139 +19,48 @@ from safetensors.numpy import save as save_arrays
 
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.files import write_atomically
-from advnerf_core.render.march import MarchConfig, Marcher, Samples
+from advnerf_core.render.march import Marcher, Samples
 from advnerf_core.render.occupancy import Leaps, OccupancyGrid, leap_distances, refine_occupied
 from advnerf_core.render.rays import intrinsics_row, pixel_rays, poses_in_box
 from advnerf_core.scene.dataset import ImageSet
 from advnerf_core.scene.field import SceneField, SceneFieldConfig
 from advnerf_core.scene.torch_step import TorchStep
-from advnerf_core.scene.train_step import CpuStep, StepResult
+from advnerf_core.scene.train_config import Progress, TrainConfig, TrainedScene
+from advnerf_core.scene.train_step import CpuStep, Matte, StepResult
 
 Array32 = NDArray[np.float32]
-BACKENDS = ("auto", "numba", "torch")
 
 
 class CheckpointError(AdvnerfError):
     """A checkpoint cannot be resumed from; the message says why and what to do."""
 
 
-@dataclass(frozen=True)
-class TrainConfig:
-    """How a scene is trained.
-
-    Attributes:
-        steps: Number of optimisation steps.
-        max_seconds: Stop after this much training time, if sooner [s]; the learning rate then decays with time. Results with a
-            time limit depend on the machine's speed; without one they are the same to the bit.
-        samples_per_step: Samples that a step aims at; the number of rays follows from it.
-        max_rays: Most rays in a step.
-        learning_rate: Adam's rate at the start.
-        final_rate: Factor on the rate at the end; between, it falls exponentially.
-        huber: Where the loss turns from square to linear, in colour units 0..1.
-        distortion: Weight of the distortion loss, which turns fog into surfaces.
-        occupancy_resolution: Cells along the longest side of the box.
-        occupancy_every: Steps between updates of the occupancy grid.
-        warmup_steps: Steps during which sample intervals shrink to their final size and all cells are probed.
-        march: How samples are placed.
-        opacity: Weight of the rays' mean transmittance in the loss. A constant background is learned for what is left; without
-            this pull it explains walls that all cameras see from one side, and is wrong from any other.
-        render_step_scale: Sample intervals for rendering, in those of the training: a finished field is smooth along rays.
-        refine_depth: Optical depth of crossing a fine cell from which rendering looks into it. Surfaces of a finished room are
-            dense; where they may still be haze, as in large boxes or after short trainings, 0.005 keeps them whole.
-        seed: Seed of everything random.
-        checkpoint_every_s: Time between checkpoints [s].
-        backend: ``numba`` (CPU kernels), ``torch`` (any device), or ``auto``: torch where it sees an accelerator, else numba.
-    """
-
-    steps: int = 1000
-    max_seconds: float | None = None
-    samples_per_step: int = 1 << 17
-    max_rays: int = 1 << 14
-    learning_rate: float = 1e-2
-    final_rate: float = 0.03
-    huber: float = 0.1
-    distortion: float = 1e-2
-    occupancy_resolution: int = 128
-    occupancy_every: int = 16
-    warmup_steps: int = 256
-    march: MarchConfig = field(default_factory=MarchConfig)
-    opacity: float = 1.5e-3
-    render_step_scale: float = 2.0
-    refine_depth: float = 0.05
-    seed: int = 0
-    checkpoint_every_s: float = 60.0
-    backend: str = "auto"
-
-    def __post_init__(self) -> None:
-        if self.steps < 1 or self.samples_per_step < 1 or self.max_rays < 1:
-            raise ValueError(f"expected at least one step, sample and ray, got {self}")
-        if self.max_seconds is not None and not self.max_seconds > 0.0:
-            raise ValueError(f"expected max_seconds > 0 or none, got {self.max_seconds}")
-        if self.backend not in BACKENDS:
-            raise ValueError(f"expected a backend of {', '.join(BACKENDS)}, got {self.backend!r}")
-
-
-@dataclass(frozen=True)
-class Progress:
-    """What a running training reports.
-
-    Attributes:
-        step: Steps done.
-        fraction: Share of the training that is done, by steps or time, whichever is ahead.
-        loss: Huber loss, averaged over recent steps.
-        psnr_db: PSNR of recent batches [dB].
-        eta_s: Estimated time left [s].
-        rays: Rays in the last step.
-        samples_per_ray: Mean samples on a ray.
-    """
-
-    step: int
-    fraction: float
-    loss: float
-    psnr_db: float
-    eta_s: float
-    rays: int
-    samples_per_ray: float
-
-
-@dataclass(frozen=True, eq=False)
-class TrainedScene:
-    """A trained field with what a renderer needs.
-
-    Attributes:
-        scene: The field.
-        occupied: Cells where something is ``[X, Y, Z]``, finer than in training.
-        march: How to place samples for rendering.
-        history: One row per report: step, elapsed [s], PSNR [dB].
-    """
-
-    scene: SceneField
-    occupied: NDArray[np.bool_]
-    march: MarchConfig
-    history: list[tuple[int, float, float]]
-
-
 class Trainer:
     """Holds the state of a training; ``run`` goes on until it is done.
 
     Args:
-        images: Training images.
+        images: Training images. Their alpha counts if the field has no learned background: each ray is then compared before a
+            random colour, so that nothing but the true opacity fits.
         field_config: Sizes of the field, and its box.
         config: How to train.
     """
 
     def __init__(self, images: ImageSet, field_config: SceneFieldConfig, config: TrainConfig | None = None) -> None:
         self.images, self.config = images, config or TrainConfig()
+        if images.alpha is None and not field_config.learned_background:
+            raise AdvnerfError("expected images with alpha for a field without a learned background, got opaque ones")
         self.scene = SceneField(field_config, seed=self.config.seed)
         self.stepper = _stepper(self.scene, self.config)
-        self.occupancy = OccupancyGrid(field_config.box_high, self.config.occupancy_resolution, self.config.seed)
+        self.occupancy = OccupancyGrid(
+            field_config.box_high, self.config.occupancy_resolution, self.config.seed, field_config.contraction
+        )
         self.step, self.elapsed_s = 0, 0.0
         self.rays_per_step = min(self.config.max_rays, 2048)
         self.history: list[tuple[int, float, float]] = []
-        self._poses = poses_in_box(images.T_world_from_camera, field_config.box_low_m, field_config.extent_m)
+        self._poses = poses_in_box(images.T_world_from_camera, field_config.origin_m, field_config.extent_m)
         self._intrinsics = np.stack([intrinsics_row(p) for p in images.pinholes])
         capacity = int(1.25 * self.config.samples_per_step)
-        self._marcher = Marcher(capacity, self.config.march, field_config.box_high)
+        self._marcher = Marcher(capacity, self.config.march, field_config.box_high, field_config.contraction)
         # Pixels to learn from, where a mask or an undistortion leaves some out.
         self._usable = None if images.valid is None else np.flatnonzero(images.valid)
         if self._usable is not None and not len(self._usable):
@@ -197,8 +106,9 @@ class Trainer:
         if checkpoint is not None:
             self.save(checkpoint)
         occupied = refine_occupied(
-            self.occupied(), self.occupancy.box_high, self.stepper.log_density, self.config.refine_depth
-        )
+            self.occupied(), self.occupancy.box_high, self.stepper.log_density, self.config.refine_depth,
+            contracted=self.scene.config.contraction,
+        )  # fmt: skip
         march = self.config.march.coarser(self.config.render_step_scale)
         return TrainedScene(self.scene.cpu(), occupied, march, self.history)
 
@@ -216,7 +126,7 @@ class Trainer:
         colours = np.empty((self.rays_per_step, 3), np.uint8)
         pixel_rays(pixels, self.images.rgb, self._poses, self._intrinsics, rays, colours)
         samples, kept = self._marcher(rays, rng.random(len(rays), dtype=np.float32), self._leaps, self._step_scale())
-        result = self._optimise(rays[kept], colours[kept], samples)
+        result = self._optimise(rays[kept], colours[kept], samples, self._matte(pixels, kept, rng))
         per_ray = max(len(samples.points) / max(len(kept), 1), 1.0)
         wanted = config.samples_per_step / per_ray
         # Follow slowly: the next batch may hold more samples per ray than this one.
@@ -268,10 +178,17 @@ class Trainer:
         # The grid in use is the one of the last update, which the saved densities are.
         self._leaps = leap_distances(self.occupied(), self.occupancy.cells) if self.step else None
 
-    def _optimise(self, rays: Array32, colours: NDArray[np.uint8], samples: Samples) -> StepResult:
+    def _matte(self, pixels: NDArray[np.int64], kept: NDArray[np.int64], rng: np.random.Generator) -> Matte | None:
+        """Opacities of pixels, and a random colour behind each; None where the background is learned."""
+        if self.images.alpha is None or self.scene.config.learned_background:
+            return None
+        behind = rng.random((len(pixels), 3), dtype=np.float32)
+        return Matte(self.images.alpha.reshape(-1)[pixels[kept]], behind[kept])
+
+    def _optimise(self, rays: Array32, colours: NDArray[np.uint8], samples: Samples, matte: Matte | None) -> StepResult:
         # Only once geometry is found: earlier, pulling weights together freezes surfaces at wrong depths.
         self.stepper.distortion = self.config.distortion * min(1.0, max(0.0, 4.0 * self.fraction - 2.0))
-        result = self.stepper.step(rays, colours, samples)
+        result = self.stepper.step(rays, colours, samples, matte)
         if not math.isfinite(result.loss):
             raise AdvnerfError(
                 f"expected a finite loss, got {result.loss} at step {self.step}; lower the learning rate "
@@ -305,9 +222,11 @@ class Trainer:
         progress(Progress(self.step, self.fraction, loss, psnr_db, left, recent[-1].rays, samples / max(rays, 1)))
 
     def _fingerprint(self) -> str:
-        digest = hashlib.sha256(json.dumps([asdict(self.scene.config), asdict(self.config)], sort_keys=True).encode())
+        digest = hashlib.sha256(json.dumps([self.scene.config.to_dict(), asdict(self.config)], sort_keys=True).encode())
         digest.update(str(self.images.rgb.shape).encode() + self.images.T_world_from_camera.tobytes())
         digest.update(self.images.rgb[:, ::16, ::16].tobytes())
+        if self.images.alpha is not None and not self.scene.config.learned_background:
+            digest.update(self.images.alpha[:, ::16, ::16].tobytes())
         if self._usable is not None:
             digest.update(self._usable.tobytes())
         return digest.hexdigest()[:16]
@@ -315,9 +234,10 @@ class Trainer:
 
 def _stepper(scene: SceneField, config: TrainConfig) -> CpuStep | TorchStep:
     device = "cuda" if torch.cuda.is_available() else "cpu"
+    opacity = config.opacity if scene.config.learned_background else 0.0
     if config.backend == "torch" or (config.backend == "auto" and device != "cpu"):
-        return TorchStep(scene.to(device), config.huber, opacity=config.opacity)
-    return CpuStep(scene, config.huber, opacity=config.opacity)
+        return TorchStep(scene.to(device), config.huber, opacity=opacity)
+    return CpuStep(scene, config.huber, opacity=opacity)
 
 
 def train_scene(

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from advnerf_core.fields.hash_grid import encode, scatter
 from advnerf_core.fields.mlp_kernels import TILE
 from advnerf_core.parallel import SLOTS, run_slots, slot_bounds
+from advnerf_core.render.contraction import bounded_distances
 from advnerf_core.render.march import Samples
 from advnerf_core.render.volume_kernels import (
     accumulate,
@@ -22,13 +23,14 @@ from advnerf_core.render.volume_kernels import (
     gather_columns,
     mark_visible,
 )  # fmt: skip
-from advnerf_core.scene.field import SceneField
+from advnerf_core.scene.field import SceneField, SceneFieldConfig
 from advnerf_core.scene.field_kernels import (
     adam,
     background_backward,
     colour_loss,
     complete_colour_inputs,
     density_network,
+    matte_loss,
     two_layers,
     two_layers_backward,
 )  # fmt: skip
@@ -53,13 +55,26 @@ class StepResult:
     samples: int
 
 
+@dataclass(frozen=True, eq=False)
+class Matte:
+    """What makes transparency measurable: with a random colour behind field and pixel, only the true opacity fits always.
+
+    Attributes:
+        opacities: Of the pixels ``[R]`` uint8.
+        behind: Colour behind each ray ``[R, 3]`` in 0..1.
+    """
+
+    opacities: NDArray[np.uint8]
+    behind: Array32
+
+
 class CpuStep:
     """Gradients and Adam for a scene field on the CPU.
 
     Args:
         scene: The field; its parameters are changed in place.
         huber: Where the loss turns from square to linear.
-        distortion: Weight of the distortion loss, with distances in box sides.
+        distortion: Weight of the distortion loss, with the distances of ``distortion_distances``.
         opacity: Weight of the mean transmittance of rays in the loss.
     """
 
@@ -72,9 +87,11 @@ class CpuStep:
         self.squares = {name: np.zeros_like(value) for name, value in self.values.items()}
         self._buffers: dict[str, Array32] = {}
 
-    def step(self, rays: Array32, targets: NDArray[np.uint8], samples: Samples) -> StepResult:
+    def step(
+        self, rays: Array32, targets: NDArray[np.uint8], samples: Samples, matte: Matte | None = None
+    ) -> StepResult:
         """Add the gradient of a batch, of the samples that show; arguments as in ``gradients``."""
-        return self.gradients(rays, targets, *self.visible(samples))
+        return self.gradients(rays, targets, *self.visible(samples), matte)
 
     def visible(self, samples: Samples, least_weight: float = 5e-4) -> tuple[Samples, Array32]:
         """Samples that show in the image, and their encodings in tiles ``[tiles, K, TILE]``.
@@ -103,7 +120,9 @@ class CpuStep:
             compact,
         )
 
-    def gradients(self, rays: Array32, targets: NDArray[np.uint8], samples: Samples, encoded: Array32) -> StepResult:
+    def gradients(
+        self, rays: Array32, targets: NDArray[np.uint8], samples: Samples, encoded: Array32, matte: Matte | None = None
+    ) -> StepResult:
         """Add the gradient of the mean Huber loss of a batch to ``grads``.
 
         Args:
@@ -111,6 +130,7 @@ class CpuStep:
             targets: Pixels ``[R, 3]``.
             samples: Samples of those rays.
             encoded: Their encodings ``[tiles, K, TILE]``, overwritten.
+            matte: Opacities of the pixels and what is behind them; for a field without a learned background.
         """
         v, n_rays, n = self.values, len(rays), len(samples.points)
         tiles, ray_tiles = -(-n // TILE), -(-n_rays // TILE)
@@ -128,18 +148,16 @@ class CpuStep:
         if n_rays % TILE:
             inputs[-1], colours[-1] = 0.0, 0.0
 
-        middles = samples.t_mid_m / np.float32(self.scene.config.extent_m)
+        middles, lengths = distortion_distances(samples, self.scene.config)
         pull = np.float32(self.distortion / max(n_rays, 1))
 
         def shade(slot: int) -> None:
             accumulate(field, samples.widths, samples.begins, *ray_slots[slot], weights, inputs, alpha)
             sums[slot] = self._shade(
-                slot_grads[slot], rays, targets, inputs, colours, alpha, grad_alpha, ray_slots[slot]
+                slot_grads[slot], rays, targets, inputs, colours, alpha, grad_alpha, ray_slots[slot], matte
             )
             if self.distortion > 0.0:
-                add_distortion_gradient(
-                    weights, middles, samples.widths, samples.begins, *ray_slots[slot], pull, grad_weights
-                )
+                add_distortion_gradient(weights, middles, lengths, samples.begins, *ray_slots[slot], pull, grad_weights)
             accumulate_backward(
                 field, samples.widths, samples.begins, *ray_slots[slot], weights, inputs, grad_alpha, grad_weights
             )
@@ -172,7 +190,7 @@ class CpuStep:
 
     def _shade(
         self, grads: dict[str, Array32], rays: Array32, targets: NDArray[np.uint8], inputs: Array32,
-        colours: Array32, alpha: Array32, grad_alpha: Array32, bounds: tuple[int, int],
+        colours: Array32, alpha: Array32, grad_alpha: Array32, bounds: tuple[int, int], matte: Matte | None,
     ) -> tuple[float, float]:  # fmt: skip
         """Decode, compare and differentiate the rays of a slot; ``inputs`` become their gradient."""
         v, (start, stop) = self.values, bounds
@@ -183,13 +201,23 @@ class CpuStep:
         scale = np.float32(1.0 / (3.0 * len(rays)))
         if stop % TILE:
             colours[tiles[1] - 1, :, stop % TILE :] = 0.0  # columns without a ray have no gradient
-        sums = colour_loss(colours, targets, start, stop, self.huber, scale)
+        mixed = np.zeros(0 if matte is None else len(rays), np.float32)
+        if matte is None:
+            sums = colour_loss(colours, targets, start, stop, self.huber, scale)
+        else:
+            sums = matte_loss(
+                colours, targets, matte.opacities, matte.behind, alpha, start, stop, self.huber, scale, mixed
+            )
         two_layers_backward(
             w1, b1, w2, inputs, colours, *tiles,
             grads["colour_1.weight"], grads["colour_1.bias"], grads["colour_2.weight"], grads["colour_2.bias"],
         )  # fmt: skip
         pull = np.float32(self.opacity / max(len(rays), 1))
         background_backward(inputs, alpha, v["background"], start, stop, grad_alpha, grads["background"], pull)
+        if matte is not None:
+            grad_alpha[start:stop] += mixed[start:stop]
+        if not self.scene.config.learned_background:
+            grads["background"][...] = 0.0
         return sums
 
     def update(self, step: int, rate: float) -> None:
@@ -229,8 +257,17 @@ class CpuStep:
         return held[:tiles]
 
 
+def distortion_distances(samples: Samples, config: SceneFieldConfig) -> tuple[Array32, Array32]:
+    """Where samples lie along their rays, and their intervals, as the distortion loss takes them ``[N]``.
+
+    In box sides; in a contracted field bounded.
+    """
+    t = samples.t_mid_m / np.float32(config.extent_m)
+    return bounded_distances(t, samples.widths) if config.contraction else (t, samples.widths)
+
+
 def log_density(scene: SceneField, points: Array32) -> Array32:
-    """Logarithm of density per box side ``[N]`` at points ``[N, 3]`` in box coordinates (CPU kernels)."""
+    """Logarithm of density per box side ``[N]`` at points ``[N, 3]`` from ``SceneField.to_box`` (CPU kernels)."""
     v, n = scene.arrays(), len(points)
     tiles = -(-n // TILE)
     encoded = np.zeros((tiles, scene.config.grid.width, TILE), np.float32)

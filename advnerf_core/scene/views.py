@@ -195,6 +195,13 @@ class PosedImages:
         centre = (0.5 - np.array(self.offset)) / self.scale
         return centre - half, centre + half
 
+    def inner_box(self) -> tuple[Array, Array]:
+        """The part of Instant-NGP's box that a contracted field sees in full detail: its unit cube, larger if cameras need it."""
+        centre = (0.5 - np.array(self.offset)) / self.scale
+        places = np.stack([frame.T_world_from_camera[:3, 3] for frame in self.frames])
+        half = max(0.5 / self.scale, float(np.abs(places - centre).max()))
+        return centre - half, centre + half
+
     @property
     def _name(self) -> str:
         return str(self.file) if self.file is not None else "the data set"

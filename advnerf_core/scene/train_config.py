@@ -1,0 +1,110 @@
+"""How a scene field is trained, what a running training reports, and what it ends with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from advnerf_core.render.march import MarchConfig
+from advnerf_core.scene.field import SceneField
+
+BACKENDS = ("auto", "numba", "torch")
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """How a scene is trained.
+
+    Attributes:
+        steps: Number of optimisation steps.
+        max_seconds: Stop after this much training time, if sooner [s]; the learning rate then decays with time. Results with a
+            time limit depend on the machine's speed; without one they are the same to the bit.
+        samples_per_step: Samples that a step aims at; the number of rays follows from it.
+        max_rays: Most rays in a step.
+        learning_rate: Adam's rate at the start.
+        final_rate: Factor on the rate at the end; between, it falls exponentially.
+        huber: Where the loss turns from square to linear, in colour units 0..1.
+        distortion: Weight of the distortion loss, which turns fog into surfaces.
+        occupancy_resolution: Cells along the longest side of the box, or of the cube that a contracted field lies in.
+        occupancy_every: Steps between updates of the occupancy grid.
+        warmup_steps: Steps during which sample intervals shrink to their final size and all cells are probed.
+        march: How samples are placed.
+        opacity: Weight of the rays' mean transmittance in the loss. A constant background is learned for what is left; without
+            this pull it explains walls that all cameras see from one side, and is wrong from any other. Not used for images with
+            alpha, which tell what is transparent.
+        render_step_scale: Sample intervals for rendering, in those of the training: a finished field is smooth along rays.
+        refine_depth: Optical depth of crossing a fine cell from which rendering looks into it. Surfaces of a finished room are
+            dense; where they may still be haze, as in large boxes or after short trainings, 0.005 keeps them whole.
+        seed: Seed of everything random.
+        checkpoint_every_s: Time between checkpoints [s].
+        backend: ``numba`` (CPU kernels), ``torch`` (any device), or ``auto``: torch where it sees an accelerator, else numba.
+    """
+
+    steps: int = 1000
+    max_seconds: float | None = None
+    samples_per_step: int = 1 << 17
+    max_rays: int = 1 << 14
+    learning_rate: float = 1e-2
+    final_rate: float = 0.03
+    huber: float = 0.1
+    distortion: float = 1e-2
+    occupancy_resolution: int = 128
+    occupancy_every: int = 16
+    warmup_steps: int = 256
+    march: MarchConfig = field(default_factory=MarchConfig)
+    opacity: float = 1.5e-3
+    render_step_scale: float = 2.0
+    refine_depth: float = 0.05
+    seed: int = 0
+    checkpoint_every_s: float = 60.0
+    backend: str = "auto"
+
+    def __post_init__(self) -> None:
+        if self.steps < 1 or self.samples_per_step < 1 or self.max_rays < 1:
+            raise ValueError(f"expected at least one step, sample and ray, got {self}")
+        if self.max_seconds is not None and not self.max_seconds > 0.0:
+            raise ValueError(f"expected max_seconds > 0 or none, got {self.max_seconds}")
+        if self.backend not in BACKENDS:
+            raise ValueError(f"expected a backend of {', '.join(BACKENDS)}, got {self.backend!r}")
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What a running training reports.
+
+    Attributes:
+        step: Steps done.
+        fraction: Share of the training that is done, by steps or time, whichever is ahead.
+        loss: Huber loss, averaged over recent steps.
+        psnr_db: PSNR of recent batches [dB].
+        eta_s: Estimated time left [s].
+        rays: Rays in the last step.
+        samples_per_ray: Mean samples on a ray.
+    """
+
+    step: int
+    fraction: float
+    loss: float
+    psnr_db: float
+    eta_s: float
+    rays: int
+    samples_per_ray: float
+
+
+@dataclass(frozen=True, eq=False)
+class TrainedScene:
+    """A trained field with what a renderer needs.
+
+    Attributes:
+        scene: The field.
+        occupied: Cells where something is ``[X, Y, Z]``, finer than in training.
+        march: How to place samples for rendering.
+        history: One row per report: step, elapsed [s], PSNR [dB].
+    """
+
+    scene: SceneField
+    occupied: NDArray[np.bool_]
+    march: MarchConfig
+    history: list[tuple[int, float, float]]
