@@ -35,7 +35,7 @@ class MountConfig:
 
     min_views: int = 10
     least_second_axis_rad: float = 0.08
-    outlier_factor: float = 4.0
+    outlier_factor: float = 6.0
     most_share_left_out: float = 0.4
     most_rms_px: float = 2.0
     most_median_rad: float = 0.05

@@ -8,21 +8,20 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from nodes.runtime.terminal import RunDir, print_table, table
+from nodes import cli_calibrate_display
+from nodes.calibrating.output import save_and_print
+from nodes.runtime.terminal import RunDir
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from matplotlib.figure import Figure
-
     from advnerf_core.geometry import Array
     from calibration.charuco import Board
     from calibration.measured import LensCalibration
-    from calibration.schema import Calibration
 
 app = typer.Typer(
     no_args_is_help=True, help="Measure camera, car, room, monitor and clocks; poor data are refused with the reason."
 )
+
+cli_calibrate_display.add_to(app)
 
 Output = Annotated[Path, typer.Option("--output", "-o", help="YAML file to write; its picture goes beside it.")]
 Source = Annotated[Path | None, typer.Argument(help="Bag folder or .mcap file.", exists=True, show_default="--live")]
@@ -90,7 +89,7 @@ def intrinsics(
     step = max(1, -(-len(views) // most))
     print(f"board found in {len(views)} of {-(-seen // every)} pictures")
     fit = calibrate_intrinsics(views[::step], size, IntrinsicsConfig(model=model))  # type: ignore[arg-type]
-    _save(fit.calibration, output, intrinsics_plot(fit))
+    save_and_print(fit.calibration, output, intrinsics_plot(fit))
 
 
 @app.command("camera-to-car")
@@ -117,7 +116,7 @@ def camera_to_car(
     views, frames = still_views(bag, detector, tracked)
     print(f"{len(views)} stops with the board in view among {frames} frames")
     fit = calibrate_mount(views, camera, None if pattern is None else _transform(pattern))
-    _save(fit.calibration(camera), output, mount_plot(fit))
+    save_and_print(fit.calibration(camera), output, mount_plot(fit))
 
 
 @app.command("mocap-to-scene")
@@ -136,7 +135,7 @@ def mocap_to_scene(
         for file in (scene, mocap)
     )
     fit = place_scene(one, two)
-    _save(fit.calibration, output, scene_plot(fit))
+    save_and_print(fit.calibration, output, scene_plot(fit))
 
 
 @app.command("vehicle")
@@ -159,7 +158,7 @@ def vehicle(
     gains = fit_gains(drive, wheelbase_m or old.wheelbase_m)
     response = fit_response(drive, gains)
     new = vehicle_calibration(gains, response, old)
-    _save(new, output, vehicle_plot(gains, response))
+    save_and_print(new, output, vehicle_plot(gains, response))
     g, ahead = new.gains, 1000.0 * gains.origin_ahead_m
     print(f"servo {g.servo_per_rad:.4f} per rad, offset {g.servo_offset:.4f}; {g.erpm_per_mps:.1f} erpm per m/s")
     if abs(ahead) > 10.0:
@@ -169,47 +168,6 @@ def vehicle(
     if new.response is not None:
         values = ", ".join(f"{key}: {value}" for key, value in new.response.attack_dynamics().items())
         print(f"for an attack request:\ndynamics: {{{values}}}")
-
-
-@app.command("display-colours")
-def display_colours(
-    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the pictures to show and a shown.csv to fill in.")],
-    width: Annotated[int, typer.Option("--width", min=16, help="Of the monitor [px].")] = 1920,
-    height: Annotated[int, typer.Option("--height", min=16, help="Of the monitor [px].")] = 1080,
-    seed: Annotated[int, typer.Option("--seed", help="Of the mixed colours.")] = 0,
-) -> None:  # fmt: skip
-    """Write the sequence of plain pictures to show full-screen for ``calibrate display``."""
-    import cv2
-    import numpy as np
-
-    from advnerf_core.files import write_atomically
-    from calibration.display_colour import colours_to_show
-
-    colours = colours_to_show(seed=seed)
-    lines = ["file,red,green,blue"]
-    for index, (red, green, blue) in enumerate(colours.tolist()):
-        picture = np.full((height, width, 3), (blue, green, red), np.uint8)
-        write_atomically(output / "show" / f"{index:03d}.png", cv2.imencode(".png", picture)[1].tobytes())
-        lines.append(f"seen/{index:03d}.png,{red},{green},{blue}")
-    write_atomically(output / "shown.csv", "\n".join(lines) + "\n")
-    print(
-        f"{len(colours)} pictures in {output / 'show'}; put what the camera sees of each into {output / 'seen'} under the same name"
-    )
-
-
-@app.command("display")
-def display(
-    output: Output,
-    folder: Annotated[Path, typer.Argument(help="Folder with shown.csv and what the camera saw.", exists=True, file_okay=False)],
-    conditions: Annotated[str, typer.Option("--conditions", help="Light, exposure, monitor settings; kept in the file.")] = "exposure and white balance locked",
-) -> None:  # fmt: skip
-    """What the camera sees of the monitor's colours: curves, mixing, ambient light, response."""
-    from calibration.display_colour import fit_display
-    from calibration.plots import display_plot
-    from nodes.calibrating.bags import read_shown
-
-    fit = fit_display(*read_shown(folder))
-    _save(fit.calibration(conditions), output, display_plot(fit))
 
 
 @app.command("time-offset")
@@ -233,7 +191,7 @@ def time_offset(
     turns = image_turns((((stamp - start) / 1e9, image) for stamp, image in read_frames(bag)), known)
     yaw = np.unwrap(np.arctan2(poses.T[:, 1, 0], poses.T[:, 0, 0]))
     fit = fit_offset(turns, (poses.stamps_ns - start) / 1e9, yaw)
-    _save(fit.calibration, output, offset_plot(fit))
+    save_and_print(fit.calibration, output, offset_plot(fit))
     offset = fit.calibration.camera_minus_mocap_s
     # The stamps in the bag are what the camera node made of them with its present latency.
     total = known.latency_s + offset
@@ -296,14 +254,3 @@ def _transform(file: Path) -> Array:
     except ValueError as error:
         raise CalibrationError(f"{file}: {error}") from error
     return rows
-
-
-def _save(calibration: Calibration, output: Path, draw: Callable[[Figure], None]) -> None:
-    from calibration.plots import save_with_plot
-
-    picture = save_with_plot(calibration, output, draw)
-    rows = table("residual", "value")
-    for key, value in calibration.residuals.items():
-        rows.add_row(key, f"{value:.5g}")
-    print_table(rows)
-    print(f"{output}\n{picture}")

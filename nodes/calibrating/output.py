@@ -1,0 +1,26 @@
+"""What every calibration command ends with."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from nodes.runtime.terminal import print_table, table
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from calibration.schema import Calibration
+
+
+def save_and_print(calibration: Calibration, output: Path, draw: Callable[[Figure], None]) -> None:
+    """Write the file and its picture, and say what the fit left."""
+    from calibration.plots import save_with_plot
+
+    picture = save_with_plot(calibration, output, draw)
+    rows = table("residual", "value")
+    for key, value in calibration.residuals.items():
+        rows.add_row(key, f"{value:.5g}")
+    print_table(rows)
+    print(f"{output}\n{picture}")
