@@ -7,11 +7,12 @@ from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
-from mcap.reader import McapReader, make_reader
+from mcap.reader import make_reader
 from mcap.records import Statistics
 from mcap.summary import Summary
 
 from advnerf_core.files import write_atomically
+from nodes.runtime.bag_chunks import messages_in_order
 from nodes.runtime.bag_repair import mcap_file, read_summary
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import BagError, TopicError
@@ -152,10 +153,17 @@ def read_messages(bag: Path, topics: Sequence[str] | None = None, start_offset_s
         raise BagError(
             f"expected a start offset between 0 and {info.duration_s:.1f} s, the length of {path}, got {start_offset_s}"
         )
+    _, summary, statistics = _whole_file(bag)
+    names = {
+        channel.id: channel.topic for channel in summary.channels.values() if not topics or channel.topic in topics
+    }
     with open(path, "rb") as file:
-        reader: McapReader = make_reader(file)
-        for _, channel, message in reader.iter_messages(topics, starting_at=start_ns, log_time_order=True):
-            yield BagMessage(channel.topic, message.data, message.log_time, message.publish_time, message.sequence)
+        if statistics.message_count and not summary.chunk_indexes:  # written by others, without chunks
+            for _, channel, message in make_reader(file).iter_messages(topics, starting_at=start_ns, log_time_order=True):
+                yield BagMessage(channel.topic, message.data, message.log_time, message.publish_time, message.sequence)
+            return
+        for raw in messages_in_order(file, summary, names, start_ns):
+            yield BagMessage(names[raw.channel_id], raw.data, raw.log_ns, raw.publish_ns, raw.sequence)
 
 
 def require_our_types(bag: Path, topics: Sequence[str]) -> None:

@@ -102,6 +102,7 @@ class Lockstep:
         self._hash = hashlib.sha256()
         self._streams: dict[str, _Stream] = {}
         self._sequences: Counter[str] = Counter()
+        self._next_due_ns = start_ns
         self._timers = [
             _Timer(start_ns, round(NS_PER_S / node.tick_rate_hz), name, False)
             for name, node in nodes.items()
@@ -124,8 +125,11 @@ class Lockstep:
     def advance_to(self, real_ns: int) -> list[BagMessage]:
         """Run the ticks and statuses that are due by a time [ns since 1970]."""
         made: list[BagMessage] = []
+        if real_ns < self._next_due_ns:
+            return made
         while self._timers:
             timer = min(self._timers, key=lambda timer: timer.due_ns)
+            self._next_due_ns = timer.due_ns
             if timer.due_ns > real_ns:
                 break
             now = self._clock.move_to(timer.due_ns)

@@ -10,6 +10,7 @@ import pytest
 import yaml
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
+from mcap.writer import CompressionType, Writer
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
@@ -178,6 +179,47 @@ def test_info_attachments_and_selection(tmp_path):
     with pytest.raises(BagError, match=r"between 0 and 0\.\d s"):
         list(read_messages(tmp_path / "bag", start_offset_s=9))
     require_our_types(tmp_path / "bag", list(TOPICS))
+
+
+@pytest.mark.parametrize("compression", [CompressionType.NONE, CompressionType.ZSTD, CompressionType.LZ4, None])
+def test_messages_come_in_the_order_of_the_general_reader(tmp_path, compression):
+    """Late messages, equal log times, small chunks that overlap, all compressions, and a file without chunks."""
+    rng = np.random.default_rng(1)
+    path = tmp_path / "x.mcap"
+    writer = Writer(
+        str(path), chunk_size=300, compression=compression or CompressionType.NONE, use_chunking=compression is not None
+    )
+    writer.start()
+    schema = writer.register_schema("geometry_msgs/msg/PoseStamped", "ros2msg", b"")
+    ids = [writer.register_channel(topic, "cdr", schema) for topic in ("/vicon/car", "/vicon/board", "/vicon/monitor")]
+    for i in range(500):
+        time_ns = START_NS + i * 10 + int(rng.integers(-8, 9)) * 40
+        writer.add_message(ids[int(rng.integers(3))], time_ns, bytes(rng.integers(0, 255, 20, np.uint8)), i, i)
+    writer.finish()
+    for topics, offset_s in [(None, 0.0), (["/vicon/car"], 0.0), (None, 2e-6), (["/vicon/board", "/vicon/car"], 1e-6)]:
+        start_ns = read_info(path).start_ns + round(offset_s * 1e9)
+        with open(path, "rb") as file:
+            expected = [
+                (c.topic, bytes(m.data), m.log_time, m.publish_time, m.sequence)
+                for _, c, m in make_reader(file).iter_messages(topics, starting_at=start_ns, log_time_order=True)
+            ]
+        got = [(m.topic, m.cdr, m.log_ns, m.publish_ns, m.sequence) for m in read_messages(path, topics, offset_s)]
+        assert got == expected
+        assert len(got) > 100
+
+
+def test_a_summary_that_lies_is_an_error_and_takes_no_memory(tmp_path):
+    write_all_topics(tmp_path / "bag", rounds=1).close()
+    path = tmp_path / "bag" / "bag.mcap"
+    content = bytearray(path.read_bytes())
+    with open(path, "rb") as file:
+        chunk = make_reader(file).get_summary().chunk_indexes[0]
+    index = content.rindex(chunk.chunk_start_offset.to_bytes(8, "little") + chunk.chunk_length.to_bytes(8, "little"))
+    for wrong in (1 << 60, chunk.chunk_length + 10**9, 5):
+        content[index + 8 : index + 16] = wrong.to_bytes(8, "little")
+        path.write_bytes(content)
+        with pytest.raises(BagError, match=r"damaged|cannot be read"):
+            list(read_messages(path))
 
 
 def test_attachments_are_taken_out_and_nothing_is_overwritten(tmp_path):
