@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from nodes.runtime.replay_nodes import Choice
 
 _DIFFERENT_EXIT = 1
+_DEG = 57.29577951308232
 _RETRO_NODES = "compositor,policy"
 
 
@@ -90,7 +92,7 @@ def _choice(nodes: str, replace: list[str], launch: Path | None, policy: str, ov
         if "policy" not in names:
             raise BagError(f"--policy needs the node policy among --nodes, got {', '.join(names) or 'none'}")
         # Another policy has another hash than the recorded one.
-        overrides = [f'policy.policy="{policy}"', 'policy.sha256=""', *overrides]
+        overrides = [f"policy.policy={json.dumps(policy)}", 'policy.sha256=""', *overrides]
     return Choice(names, replacements, launch, tuple(overrides))
 
 
@@ -143,6 +145,8 @@ def _retro(bag: Path, attack: Path, choice: Choice, json_file: Path | None, plot
     result = retro_attack(bag, attack, choice)
     _print_steering(result)
     print(result.verdict())
+    if (changed := result.numbers()["clean_against_recorded_rad"]) is not None:
+        print(f"clean against recorded: {changed * _DEG:.3f} degrees on average; 0 if nothing changed since")
     if json_file is not None:
         result.write_json(json_file)
         print(f"wrote {json_file}")
@@ -155,7 +159,7 @@ def _print_steering(result: RetroAttack) -> None:
     rows = table("time [s]", "recorded [deg]", "clean [deg]", "attacked [deg]", "delta [deg]", "face")
     for row in result.rows():
         angles = [row[key] for key in ("recorded_rad", "clean_rad", "attacked_rad", "delta_rad")]
-        words = ["-" if angle is None else f"{angle * 57.29577951308232:.2f}" for angle in angles]
+        words = ["-" if angle is None else f"{angle * _DEG:.2f}" for angle in angles]
         rows.add_row(f"{row['time_s']:.2f}", *words, "in view" if row["drawn"] else "")
     print_table(rows)
 

@@ -15,6 +15,7 @@ from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
+from nodes import cli
 from nodes.runtime import bag as bag_module
 from nodes.runtime.bag import BagWriter
 from nodes.runtime.bag_journal import journal_of
@@ -255,6 +256,19 @@ def test_delays_are_those_that_were_written(tmp_path):
     assert (car.receive_ms, car.receive_worst_ms) == (3.0, 15.0)  # of 1, 5, 15 and 1
     assert (car.backwards, car.future) == (1, 1)
     assert (delays["/clock"].publish_ms, delays["/clock"].receive_ms) == (None, 3.0)
+
+
+def test_the_commands_say_what_was_lost_how_late_it_came_and_what_rides_along(tmp_path, capsys):
+    writer = write_all_topics(tmp_path / "bag", attachments={"a.yaml": b"1"})
+    writer.close({"lost /arm": "3"})
+    cli.app(["bag", "info", str(tmp_path / "bag"), "--stamps"], standalone_mode=False)
+    printed = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert ["attachments:", "a.yaml"] in printed
+    (counted, timed) = (line for line in printed if line[:1] == ["/arm"])
+    assert (counted[2], counted[-1]) == ("5", "3")
+    assert timed == ["/arm", "4.0", "4.0", "1.0", "1.0", "0", "0"]
+    cli.app(["bag", "extract", str(tmp_path / "bag"), "-o", str(tmp_path / "out")], standalone_mode=False)
+    assert (tmp_path / "out" / "a.yaml").read_bytes() == b"1"
 
 
 def journal_bag(tmp_path, count=10):

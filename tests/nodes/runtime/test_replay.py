@@ -1,4 +1,5 @@
 import hashlib
+import json
 import sys
 from pathlib import Path
 
@@ -6,6 +7,7 @@ import numpy as np
 import pytest
 import yaml
 
+from nodes import cli
 from nodes.runtime.bag import BagWriter
 from nodes.runtime.bag_read import BagMessage, read_attachments, read_info, read_messages
 from nodes.runtime.clock import ManualClock
@@ -13,6 +15,7 @@ from nodes.runtime.errors import BagError, MessageError, NodeFinished
 from nodes.runtime.messages import decode, drive_message, encode, pose_message, stamp_ns, type_name, types
 from nodes.runtime.node import Node, Out
 from nodes.runtime.replay import Replay, write_replay
+from nodes.runtime.replay_attack import plot_retro_attack, retro_attack
 from nodes.runtime.replay_golden import Golden, Tolerances, compare
 from nodes.runtime.replay_lockstep import BagClock, Lockstep
 from nodes.runtime.replay_nodes import Choice
@@ -207,6 +210,80 @@ def test_replay_written_as_a_bag_keeps_the_rest_and_is_the_same_every_time(tmp_p
     assert kept == list(read_messages(CORNER, ["/vicon/car"]))
     # What it made can be replayed in turn: recorded outputs are dropped and made again.
     assert run(bag=out)[1].digest == run()[1].digest
+
+
+@pytest.fixture(scope="module")
+def clean_drive(tmp_path_factory):
+    """The little bag as it would have been recorded without an attack, with what the policy said then."""
+    folder = tmp_path_factory.mktemp("clean") / "drive"
+    sys.path.insert(0, str(GOLDEN_FOLDER))
+    try:
+        with Replay(CORNER, clean(), whole=True) as replay:
+            write_replay(replay, folder)
+    finally:
+        sys.path.remove(str(GOLDEN_FOLDER))
+    return folder
+
+
+def clean(*overrides):
+    return Choice(GREEN.nodes, GREEN.replacements, None, ("compositor.attack=null", *overrides))
+
+
+def test_retro_attack_is_the_difference_of_two_drives(clean_drive, tmp_path):
+    attack = tmp_path / "new.attack.safetensors"
+    attack.write_bytes(read_attachments(CORNER)["corner.attack.safetensors"])
+    result = retro_attack(clean_drive, attack, GREEN)
+    # Truth: the policy by hand on the images that were recorded and those with the face, made above in another way.
+    green = {}
+    for name, choice in (("attacked", GREEN), ("clean", clean())):
+        images = [decode("sensor_msgs/msg/Image", m.cdr) for m in run(choice)[0] if m.topic == "/compositor/image"]
+        pixels = np.array([np.asarray(image.data).reshape(27, 48, 3)[..., 1] for image in images], float)
+        green[name] = 0.01 * (pixels[:, :, 24:].sum((1, 2)) - pixels[:, :, :24].sum((1, 2))) / pixels[0].size
+    np.testing.assert_allclose(result.clean_rad, green["clean"], atol=1e-7)
+    np.testing.assert_allclose(result.attacked_rad, green["attacked"], atol=1e-7)
+    np.testing.assert_array_equal(result.recorded_rad, result.clean_rad)
+    delta = green["attacked"] - green["clean"]
+    numbers = result.numbers()
+    assert (numbers["frames"], numbers["frames_drawn"], numbers["clean_against_recorded_rad"]) == (12, 12, 0.0)
+    assert numbers["mean_abs_delta_rad"] == pytest.approx(np.abs(delta).mean(), abs=1e-7)
+    assert numbers["largest_delta_rad"] == pytest.approx(delta[np.abs(delta).argmax()], abs=1e-7)
+    side = "left" if delta.mean() > 0 else "right"
+    assert f"{abs(np.rad2deg(delta.mean())):.2f} degrees more to the {side} on average" in result.verdict()
+    result.write_json(tmp_path / "out" / "retro.json")
+    saved = json.loads((tmp_path / "out" / "retro.json").read_text())
+    assert saved["attack_id"] == result.attack_id
+    assert [row["delta_rad"] for row in saved["images"]] == pytest.approx(delta, abs=1e-7)
+    plot_retro_attack(result, tmp_path / "retro.png")
+    assert (tmp_path / "retro.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_retro_attack_on_the_command_line(clean_drive, tmp_path, capsys):
+    attack = tmp_path / "new.attack.safetensors"
+    attack.write_bytes(read_attachments(CORNER)["corner.attack.safetensors"])
+    command = ["replay", str(clean_drive), "--attack", str(attack), "--replace", "policy=green_policy"]
+    cli.app([*command, "--json", str(tmp_path / "r.json")], standalone_mode=False)
+    printed = capsys.readouterr().out
+    assert "with the face in view (12 of 12 images) the policy would have steered" in printed
+    assert "clean against recorded: 0.000 degrees" in printed
+    assert printed.count("in view") == 13
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--nodes", "policy", "--json", "x.json"], "--json and --plot belong to --attack"),
+        (["--nodes", "policy", "--update-golden"], "--update-golden needs to know which one"),
+        (["--nodes", "policy", "--golden", "x.mcap", "-o", "out"], "expected one of --golden, --output and --attack"),
+        (["--nodes", "policy", "--tolerance", "1"], "--topics and --tolerance belong to --golden"),
+        (["--nodes", "policy", "--replace", "policy"], "expected NODE=MODULE or NODE=MODULE:CLASS"),
+        (["--nodes", "compositor", "--policy", "x.onnx"], "--policy needs the node policy among --nodes"),
+        (["--nodes", "compositor", "--golden", "nothing.mcap"], "no golden bag nothing.mcap; write it with"),
+        ([], "expected at least one node to replay"),
+    ],
+)
+def test_options_that_do_not_go_together_are_one_clear_error(arguments, words):
+    with pytest.raises(BagError, match=words):
+        cli.app(["replay", str(CORNER), *arguments], standalone_mode=False)
 
 
 def bag_with_launch(tmp_path, nodes, name="bag"):
