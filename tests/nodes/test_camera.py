@@ -16,7 +16,8 @@ from hardware.cameras.steady import SteadyCamera
 from hardware.cameras.v4l2 import V4l2Camera
 from hardware.cameras.v4l2_negotiation import Mode
 from hardware.cameras.zed import ZedCamera
-from hardware.twin.v4l2_emulator import VideoDevice, VideoPortEmulator
+from hardware.twin.v4l2_device import VideoDevice
+from hardware.twin.v4l2_emulator import VideoPortEmulator
 from hardware.twin.zed_emulator import ZedRegisters
 from nodes.camera import CameraConfig, CameraNode
 from nodes.camera_sources import CameraSource

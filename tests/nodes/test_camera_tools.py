@@ -9,7 +9,8 @@ from typer.testing import CliRunner
 
 from calibration.schema import CameraCalibration, load_calibration
 from hardware.cameras.zed_calibration import Rectifier, load_factory_calibration
-from hardware.twin.v4l2_emulator import VideoDevice, VideoPortEmulator
+from hardware.twin.v4l2_device import VideoDevice
+from hardware.twin.v4l2_emulator import VideoPortEmulator
 from hardware.twin.zed_emulator import ZedRegisters
 from nodes.camera_tools import CameraToolError, describe_devices, parse_source, try_source
 from nodes.cli_camera import app

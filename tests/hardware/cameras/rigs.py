@@ -15,7 +15,8 @@ from hardware.cameras.v4l2_negotiation import Mode
 from hardware.cameras.video import VideoCamera
 from hardware.cameras.zed import ZedCamera
 from hardware.twin.frame_server import FrameServer
-from hardware.twin.v4l2_emulator import VideoDevice, VideoPortEmulator
+from hardware.twin.v4l2_device import VideoDevice
+from hardware.twin.v4l2_emulator import VideoPortEmulator
 from hardware.twin.zed_emulator import ZedRegisters
 
 PATH = "/dev/v4l/by-id/usb-Camera-video-index0"

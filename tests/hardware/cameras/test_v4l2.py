@@ -1,5 +1,11 @@
 """The V4L2 driver against a device that answers the kernel's requests byte by byte."""
 
+import ctypes
+import fcntl
+import os
+import pty
+import struct
+import termios
 import time
 
 import cv2
@@ -13,7 +19,7 @@ from hardware.cameras.v4l2_controls import Controls
 from hardware.cameras.v4l2_negotiation import Mode
 from hardware.cameras.v4l2_port import KernelPort
 from hardware.errors import DeviceBusy, DeviceNotFound, HardwareError, LinkLost, ProtocolError
-from hardware.twin.v4l2_emulator import (
+from hardware.twin.v4l2_device import (
     AUTO_EXPOSURE,
     AUTO_WHITE_BALANCE,
     EXPOSURE,
@@ -21,8 +27,8 @@ from hardware.twin.v4l2_emulator import (
     GAIN,
     WHITE_BALANCE,
     VideoDevice,
-    VideoPortEmulator,
 )
+from hardware.twin.v4l2_emulator import VideoPortEmulator
 
 PATH = "/dev/v4l/by-id/usb-Emulated_Camera-video-index0"
 MODE = Mode(32, 16, 30.0)
@@ -334,6 +340,37 @@ def test_kernel_port_on_what_is_no_camera(tmp_path):
     cam.close()
     with pytest.raises(LinkLost, match="call open"):
         cam.read(0.1)
+
+
+class WindowSize(ctypes.Structure):
+    _fields_ = (("rows", ctypes.c_uint16), ("columns", ctypes.c_uint16), ("x", ctypes.c_uint16), ("y", ctypes.c_uint16))
+
+
+def test_kernel_port_makes_real_system_calls(tmp_path):
+    """On a terminal and a file: the kernel fills structures in place, wakes up, hangs up, maps at an offset."""
+    port = KernelPort()
+    master, slave = pty.openpty()
+    fcntl.ioctl(slave, termios.TIOCSWINSZ, struct.pack("HHHH", 33, 77, 0, 0))
+    size = WindowSize()
+    port.ioctl(slave, termios.TIOCGWINSZ, size)
+    assert (size.rows, size.columns) == (33, 77)
+    assert not port.wait(master, 0.0)
+    os.write(slave, b"x")
+    assert port.wait(master, 1.0)
+    os.read(master, 1)
+    os.close(slave)
+    with pytest.raises(OSError, match="No such device"):
+        port.wait(master, 1.0)
+    os.close(master)
+    path = tmp_path / "pages"
+    path.write_bytes(bytes(4096) + b"frame" + bytes(4091))
+    fd = port.open(path)
+    mapped = port.map(fd, 4096, 4096)
+    assert mapped[:5] == b"frame"
+    mapped.close()
+    port.close(fd)
+    with pytest.raises(OSError, match="Bad file descriptor"):
+        os.fstat(fd)
 
 
 @pytest.mark.hardware

@@ -20,7 +20,8 @@ from hardware.cameras.zed_exposure import (
     read_gain,
 )
 from hardware.errors import HardwareError, ProtocolError
-from hardware.twin.v4l2_emulator import VideoDevice, VideoPortEmulator
+from hardware.twin.v4l2_device import VideoDevice
+from hardware.twin.v4l2_emulator import VideoPortEmulator
 from hardware.twin.zed_emulator import ZedRegisters
 
 PATH = "/dev/v4l/by-id/usb-Technologies__Inc._ZED-video-index0"
