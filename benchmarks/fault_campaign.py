@@ -18,6 +18,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +44,13 @@ SEED, COUNT, LIMIT_MS = 20261121, 200, 350.0
 STOP_S, AFTER_S = 1.6, 1.2
 VICON_PORT = 51087
 _STOPS = ("SET_CURRENT_BRAKE", "TIMEOUT")
+_RULE = "{max_restarts: 1000, delay_s: 0.2, max_delay_s: 0.2}"
+_RESPAWNING = (
+    "record=false",
+    "policy.module=benchmarks.mad_policy",
+    *(f"{name}.required=false" for name in VICTIMS),
+    *(f"{name}.respawn={_RULE}" for name in VICTIMS),
+)
 
 
 def plan(count: int, seed: int = SEED) -> list[tuple[str, float]]:
@@ -55,30 +63,27 @@ def plan(count: int, seed: int = SEED) -> list[tuple[str, float]]:
 
 
 class Graph:
-    """The simulated lab in a process of its own, and beside it the launch, which is started again when it was killed."""
+    """The simulated lab in a process of its own, and beside it the launch, which is started again when it was killed.
 
-    def __init__(self, folder: Path) -> None:
+    Args:
+        folder: Run folder.
+        settings: Overrides of the launch file; None lets nodes that die come back, with a policy that can go mad.
+    """
+
+    def __init__(self, folder: Path, settings: Sequence[str] | None = None) -> None:
         self.folder = folder
+        self.settings = _RESPAWNING if settings is None else tuple(settings)
         config = folder / "twin.yaml"
         config.write_text(json.dumps({"vesc": CONFIGURED, "vicon": {"port": VICON_PORT}}), encoding="utf-8")
         self.log = (folder / "campaign.log").open("ab")
         arguments = ("--name", "twin", "--config", str(config), "--run-dir", str(folder))
         self.twin = self._start("benchmarks.faulty_twin", *arguments, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
         self.operator = LiveOperator(folder, NODES)
-        self.supervisor = self._launch()
+        self.supervisor = self.launch()
 
-    def _launch(self) -> subprocess.Popen[bytes]:
-        settings = [
-            "record=false",
-            "twin.if=false",
-            f"params.vicon_port={VICON_PORT}",
-            "policy.module=benchmarks.mad_policy",
-        ]
-        for name in VICTIMS:
-            settings += [
-                f"{name}.required=false",
-                f"{name}.respawn={{max_restarts: 1000, delay_s: 0.2, max_delay_s: 0.2}}",
-            ]
+    def launch(self) -> subprocess.Popen[bytes]:
+        """Start the launch; its process."""
+        settings = ("twin.if=false", f"params.vicon_port={VICON_PORT}", *self.settings)
         overrides = [part for setting in settings for part in ("--set", setting)]
         return self._start("nodes.cli", "launch", str(LAUNCH_FILE), "--run-dir", str(self.folder), *overrides)
 
@@ -101,12 +106,12 @@ class Graph:
         """All nodes up; the launch is started if it is not running."""
         if self.supervisor.poll() is not None:
             self.operator.seen.clear()
-            self.supervisor = self._launch()
+            self.supervisor = self.launch()
         self.operator.wait_ready(timeout_s=90.0)
 
-    def put_back(self) -> None:
-        """Lift the car to its start, once it stands."""
-        pose = encode(pose_message(planar_pose(*START), time.time_ns()))
+    def put_back(self, start: tuple[float, float, float] = START) -> None:
+        """Lift the car to a start pose (x [m], y [m], yaw [rad]), once it stands."""
+        pose = encode(pose_message(planar_pose(*start), time.time_ns()))
         offset, operator = self.wire_size(), self.operator
 
         def placed() -> bool:
