@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from advnerf_core.driving.metrics import DriveMetrics, Horizon, drive_metrics, s
 from advnerf_core.driving.path import Array
 from advnerf_core.driving.path import Path as DrivingPath
 from advnerf_core.geometry import yaw_of
-from nodes.runtime.bag_read import read_messages
+from nodes.runtime.bag_read import read_info, read_messages
 from nodes.runtime.errors import BagError
 from nodes.runtime.messages import decode, image_array, ns_from_stamp, pose_matrix
 from nodes.runtime.topics import topic as topic_row
@@ -26,6 +26,8 @@ HOPS = {
     "policy": "/policy/drive",
     "safety": "/safety/drive",
 }
+# Who shows an attack says so here, with the attack's id.
+SHOWN_BY = ("/compositor/attack", "/monitor/attack")
 _NS_PER_MS = 1e6
 
 
@@ -104,9 +106,10 @@ def frames(bag: Path, start_real_ns: int, count: int, period_s: float = 0.1) -> 
     return np.stack([images[index] for index in newest])
 
 
-def attack_ids(bag: Path) -> set[str]:
-    """Ids of the attacks that were drawn into at least one frame."""
-    return {str(m.attack_id) for m in _decoded(bag, "/compositor/attack") if m.drawn}
+def attack_ids(bag: Path, topics: Sequence[str] = SHOWN_BY) -> set[str]:
+    """Ids of the attacks that were drawn into at least one frame, or were on the monitor."""
+    present = {topic.name for topic in read_info(bag).topics}
+    return {str(m.attack_id) for name in topics if name in present for m in _decoded(bag, name) if m.drawn}
 
 
 def _decoded(bag: Path, topic: str) -> Iterator[Any]:

@@ -1,7 +1,8 @@
 """One measured drive: put the car on its start, arm, let it drive for the horizon, disarm, wait until it stands.
 
-The operator of a trial is a node like the others, so that it runs in tests and in replay without sockets. It arms by itself
-only when the motor's peer says that it is the twin; on a real car arming is a person's act.
+The operator of a trial is a node like the others, so that it runs in tests and in replay without sockets. It lifts the car and
+arms by itself only when the motor's peer says that it is the twin. On a real car both are a person's acts: the node guides the
+person to the start pose, asks for the arming, and waits.
 """
 
 from __future__ import annotations
@@ -23,10 +24,11 @@ from nodes.runtime.topics import status_topic
 TWIN_PEER = "TWIN"
 _REPEAT_S = 0.5
 _SETTLE_S = 0.5
-_MOVED_M = 0.01
+MOVED_M = 0.01
 _AT_START_M, _AT_START_RAD = 0.03, 0.05
 _SPOT_M = 0.005
 _STANDING_S = 0.5
+_GUIDE_S = 0.25
 
 
 class TrialError(RuntimeFault):
@@ -52,13 +54,15 @@ class TrialPlan:
         start_pose: Pose of the rear axle: x [m], y [m], yaw [rad].
         duration_s: Time from the first motion to the disarming [s].
         nodes: Nodes that must be ready before anything moves.
-        patience_s: Time that each phase but driving may take [s].
+        patience_s: Time that each phase but driving may take, as far as it does not depend on a person [s].
+        by_hand: Whether a real car may be driven, by a person who places and arms it.
     """
 
     start_pose: tuple[float, float, float]
     duration_s: float
     nodes: tuple[str, ...]
     patience_s: float = 20.0
+    by_hand: bool = False
 
 
 @dataclass
@@ -101,14 +105,19 @@ class TrialNode(Node):
     Args:
         plan: What is driven.
         trouble: Asked at every tick whether the graph has failed; a text ends the trial.
+        guide: Told what a person has to do, several times a second.
     """
 
     tick_rate_hz = 20.0
     publications = ("/arm", "/twin/reset")
 
-    def __init__(self, plan: TrialPlan, trouble: Callable[[], str] = str) -> None:
+    def __init__(
+        self, plan: TrialPlan, trouble: Callable[[], str] = str, guide: Callable[[str], None] | None = None
+    ) -> None:
         self.plan = plan
         self._trouble = trouble
+        self._guide = guide or (lambda text: None)
+        self._by_hand = False
         self.outcome = TrialOutcome()
         self.phase = Phase.GATHERING
         self.subscriptions = ("/vicon/car", "/safety/state", "/motor/sent", *map(status_topic, plan.nodes))
@@ -142,7 +151,8 @@ class TrialNode(Node):
         if trouble := self._trouble():
             raise TrialError(f"the graph failed while {self.phase.value}: {trouble}")
         waited_s = (now.mono_ns - self._phase_began_ns) / NS_PER_S
-        if self.phase is not Phase.DRIVING and waited_s > self.plan.patience_s:
+        a_persons_turn = self._by_hand and self.phase in (Phase.PLACING, Phase.ARMING)
+        if self.phase is not Phase.DRIVING and not a_persons_turn and waited_s > self.plan.patience_s:
             raise TrialError(f"gave up after {waited_s:.0f} s {self.phase.value}: {self._what_is_missing()}")
         return step[self.phase](now)
 
@@ -159,7 +169,7 @@ class TrialNode(Node):
         seen.T_world_from_car = T
         if self.phase in (Phase.ARMING, Phase.DRIVING) and not self.outcome.start_real_ns:
             offset_m = float(np.linalg.norm(T[:2, 3] - self._start_xy))
-            if offset_m > _MOVED_M:
+            if offset_m > MOVED_M:
                 self.outcome.start_real_ns = stamp_ns
 
     def _see_status(self, message: Any) -> None:
@@ -171,7 +181,8 @@ class TrialNode(Node):
     def _gather(self, now: Now) -> list[Out]:
         seen = self._seen
         if set(self.plan.nodes) <= seen.ready and seen.T_world_from_car is not None and seen.peer:
-            if TWIN_PEER not in seen.peer.upper():
+            self._by_hand = TWIN_PEER not in seen.peer.upper()
+            if self._by_hand and not self.plan.by_hand:
                 raise TrialError(
                     f"expected the motor's peer to say that it is the twin, got {seen.peer!r}: a real car is armed by a person"
                 )
@@ -184,12 +195,20 @@ class TrialNode(Node):
             self._start_xy = self._seen.T_world_from_car[:2, 3].copy()
             self._enter(Phase.ARMING, now)
             return []
+        if self._by_hand:
+            return self._tell(self._way_to_start(now), now)
         return self._say(Out("/twin/reset", pose_message(planar_pose(*self.plan.start_pose), now.real_ns)), now)
 
     def _arm(self, now: Now) -> list[Out]:
         if self._seen.armed:
             self._enter(Phase.DRIVING, now)
             return []
+        if self._by_hand:
+            if not self._at_start():
+                self._enter(Phase.PLACING, now)
+                return []
+            why = self._seen.safety_reason or "nobody has armed"
+            return self._tell(f"on the start. ARM to drive (gamepad, or: advnerf arm). Not armed: {why}", now)
         return self._say(self._arm_message(True, now), now)
 
     def _drive(self, now: Now) -> list[Out]:
@@ -234,6 +253,25 @@ class TrialNode(Node):
             return []
         self._said_ns = now.mono_ns
         return [out]
+
+    def _tell(self, text: str, now: Now) -> list[Out]:
+        if now.mono_ns - self._said_ns >= _GUIDE_S * NS_PER_S:
+            self._said_ns = now.mono_ns
+            self._guide(text)
+        return []
+
+    def _way_to_start(self, now: Now) -> str:
+        """Where the start is, seen from the car: what a person who pushes it needs."""
+        T, (x_m, y_m, yaw_rad) = self._seen.T_world_from_car, self.plan.start_pose
+        forward_m, left_m = T[:2, :2].T @ (np.array([x_m, y_m]) - T[:2, 3])
+        turn_deg = np.rad2deg(float(wrap_angle(yaw_rad - yaw_of(T))))
+        if self._at_start():
+            return f"on the start, hold still ({self._stood_s(now):.1f} s)"
+        return (
+            f"to the start: {abs(100 * forward_m):.1f} cm {'forward' if forward_m >= 0 else 'back'}, "
+            f"{abs(100 * left_m):.1f} cm {'left' if left_m >= 0 else 'right'}, turn {abs(turn_deg):.1f} deg "
+            f"{'left' if turn_deg >= 0 else 'right'}"
+        )
 
     def _arm_message(self, arm: bool, now: Now) -> Out:
         reason = "trial starts" if arm else "trial is over"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from advnerf_core.files import write_atomically
@@ -19,7 +19,12 @@ OPERATOR = "operator"
 
 
 def run_trial(
-    launch_file: Path, overrides: Sequence[str], run_dir: Path, plan: TrialPlan, ready_timeout_s: float
+    launch_file: Path,
+    overrides: Sequence[str],
+    run_dir: Path,
+    plan: TrialPlan,
+    ready_timeout_s: float,
+    guide: Callable[[str], None] | None = None,
 ) -> TrialOutcome:
     """Start the graph, carry out the plan, stop the graph.
 
@@ -29,6 +34,7 @@ def run_trial(
         run_dir: Folder of the run; gets ``trial.json``, the bag and the logs.
         plan: What is driven.
         ready_timeout_s: How long the graph may take to become ready [s].
+        guide: Told what a person has to do, where the car is a real one.
 
     Raises:
         LaunchError: A node died or never became ready.
@@ -36,7 +42,7 @@ def run_trial(
     """
     with Launch(launch_file, overrides, run_dir) as launch:
         launch.wait_ready(ready_timeout_s)
-        node = TrialNode(plan, lambda: launch.failure)
+        node = TrialNode(plan, lambda: launch.failure, guide)
         _operate(node, launch.run_dir)
     if launch.failure:
         raise LaunchError(launch.failure)

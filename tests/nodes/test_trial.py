@@ -126,3 +126,41 @@ def test_a_failed_graph_ends_the_trial():
     stage.node = TrialNode(stage.node.plan, lambda: "required node camera died")
     with pytest.raises(TrialError, match="camera died"):
         stage.step()
+
+
+class HandStage(Stage):
+    """A real car: it is where a person pushes it, and only a person arms it."""
+
+    def __init__(self):
+        super().__init__(peer="60_MK5 5.2")
+        self.told = []
+        self.node = TrialNode(
+            TrialPlan(START, 1.0, ("camera", "motor"), patience_s=3.0, by_hand=True), str, self.told.append
+        )
+
+
+def test_a_person_is_guided_to_the_start_and_arms_the_real_car():
+    stage = HandStage()
+    stage.pose = np.array([-1.3, -2.05, 0.2])
+    stage.nodes_are_ready()
+    stage.run_until(Phase.PLACING)
+    for _ in range(200):  # a person may take longer than any patience
+        stage.step()
+    # Seen from a car turned by 0.2 rad, (0.2, 0.05) m is 20.6 cm forward and 0.9 cm left.
+    assert "20.6 cm forward, 0.9 cm left, turn 11.5 deg right" in stage.told[-1]
+    stage.pose = np.array(START)
+    stage.run_until(Phase.ARMING, limit_s=60.0)
+    for _ in range(100):
+        stage.step()
+    assert "ARM to drive" in stage.told[-1]
+    stage.pose = np.array([-1.0, -2.0, 0.0])  # somebody knocked against it
+    stage.step()
+    assert stage.node.phase is Phase.PLACING
+    stage.pose = np.array(START)
+    stage.run_until(Phase.ARMING, limit_s=60.0)
+    assert stage.sent == []  # it never armed and never lifted the car
+    stage.armed = True
+    stage.run_until(Phase.DONE, limit_s=60.0)
+    assert set(stage.sent) == {"/arm"}  # the disarming at the end
+    assert not stage.armed
+    assert stage.node.outcome.stopped_early == ""

@@ -1,0 +1,1 @@
+"""Trials: many measured drives in a fair order, and what bags of drives say."""

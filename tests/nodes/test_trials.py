@@ -1,0 +1,171 @@
+import json
+from collections import Counter
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from advnerf_core.attack.artifact import AttackFile, face_texture, save_attack
+from advnerf_core.driving.path import Path as DrivingPath
+from advnerf_core.geometry import Pinhole, planar_pose
+from nodes.runtime.bag import BagWriter
+from nodes.runtime.errors import BagError, ConfigError
+from nodes.runtime.messages import encode, header, pose_message, types
+from nodes.trials.bags import evaluate_bag, find_drives
+from nodes.trials.campaign import prepare_series, summarise
+from nodes.trials.plan import CampaignError, finished, make_order, williams_rows
+
+ROOT = Path(__file__).parents[2]
+START_NS = 1_700_000_000_000_000_000
+CONDITIONS = ["none", "random", "gradient"]
+
+
+def test_the_design_balances_places_and_neighbours():
+    for count in (2, 3, 4, 5):
+        rows = williams_rows(count)
+        places = Counter((place, value) for row in rows for place, value in enumerate(row))
+        neighbours = Counter(pair for row in rows for pair in pairwise(row))
+        assert len(places) == count * count
+        assert len(set(places.values())) == 1
+        assert len(neighbours) == count * (count - 1)
+        assert len(set(neighbours.values())) == 1
+
+
+def test_the_order_is_seeded_balanced_and_complete():
+    order = make_order(CONDITIONS, 6, 3)
+    assert order == make_order(CONDITIONS, 6, 3)
+    assert order != make_order(CONDITIONS, 6, 4)
+    assert Counter(name for name, _ in order) == dict.fromkeys(CONDITIONS, 6)
+    blocks = [order[k : k + 3] for k in range(0, 18, 3)]
+    assert all(len({name for name, _ in block}) == 3 for block in blocks)
+    first = Counter(block[0][0] for block in blocks)
+    assert set(first.values()) == {2}
+
+
+def attack_file(folder, seed):
+    theta = np.random.default_rng(seed).normal(size=(4, 4, 3)).astype(np.float32)
+    corners = [[0.0, y, z] for y, z in ((-0.5, 0.5), (0.5, 0.5), (0.5, -0.5), (-0.5, -0.5))]
+    attack = AttackFile(
+        method="random", theta=theta, texture=face_texture(theta, 16), size_m=(1.0, 1.0), T_world_from_object=np.eye(4),
+        subject="board", corners_in_subject=np.array(corners), camera=Pinhole(200, 66, 103.6, 103.4, 100, 32),
+        scene_sha256="", policy_sha256="", config_sha256="", seed=seed, predicted_total_cte_m=None, software_version="0",
+    )  # fmt: skip
+    save_attack(folder / f"{seed}.safetensors", attack)
+    return folder / f"{seed}.safetensors", attack.attack_id
+
+
+def series(tmp_path, folder="trials", **changes):
+    files = [attack_file(tmp_path, seed)[0] for seed in range(3)]
+    arguments = {
+        "attacks": {"random": files[:1], "gradient": files[1:]}, "repeats": 3, "seed": 0, "ticks": 60, **changes,
+    }  # fmt: skip
+    calibration = [f"params.calibration={ROOT / 'calibration' / 'twin'}"]
+    return prepare_series(ROOT / "launch" / "green_screen.launch.yaml", calibration, tmp_path / folder, **arguments)
+
+
+def test_attack_files_of_a_condition_take_turns_and_the_plan_is_kept(tmp_path):
+    made = series(tmp_path)
+    by_repeat = {(run.condition, run.repeat): run.attack_id for run in made.plan.runs}
+    ids = [attack_file(tmp_path, seed)[1] for seed in range(3)]
+    assert [by_repeat["gradient", k] for k in range(3)] == [ids[1], ids[2], ids[1]]
+    assert {by_repeat["random", k] for k in range(3)} == {ids[0]}
+    assert {by_repeat["none", k] for k in range(3)} == {""}
+    assert set(made.nodes) == {"twin", "camera", "vicon", "compositor", "policy", "safety", "motor"}
+    assert series(tmp_path).plan == made.plan  # another day
+    assert made.plan.start_pose == (-1.1, -2.0, 0.0)
+
+
+@pytest.mark.parametrize("changed", [{"seed": 1}, {"ticks": 40}, {"repeats": 4}, {"start_pose": (0.0, -2.0, 0.0)}])
+def test_a_folder_is_finished_as_it_was_begun(tmp_path, changed):
+    series(tmp_path)
+    with pytest.raises(CampaignError, match="finished as it was begun"):
+        series(tmp_path, **changed)
+
+
+def test_what_is_done_is_found_again_and_a_damaged_result_named(tmp_path):
+    made = series(tmp_path)
+    name = made.plan.runs[2].name
+    (made.folder / f"{name}.json").write_text(json.dumps({"condition": "none"}))
+    assert list(finished(made.folder, made.plan)) == [name]
+    (made.folder / f"{name}.json").write_text("{")
+    with pytest.raises(CampaignError, match="remove it to drive that run again"):
+        finished(made.folder, made.plan)
+
+
+def test_a_launch_file_that_cannot_be_measured_is_refused(tmp_path):
+    (tmp_path / "a.launch.yaml").write_text("name: a\nnodes:\n  camera: {module: nodes.camera}\n")
+    with pytest.raises(ConfigError, match="expected a node safety with a room"):
+        prepare_series(tmp_path / "a.launch.yaml", [], tmp_path / "t", {}, 1, 0, 60)
+
+
+def test_the_table_divides_by_no_attack():
+    def result(condition, total):
+        return {"condition": condition, "total_cte_m": total, "off_track": total > 9, "stopped_early": ""}
+
+    rows = summarise([result("gradient", 10.0), result("none", 2.0), result("gradient", 14.0), result("none", 4.0)])
+    assert [row["condition"] for row in rows] == ["none", "gradient"]
+    assert rows[1]["mean_m"] == 12.0
+    assert rows[1]["std_m"] == pytest.approx(np.sqrt(8.0))
+    assert (rows[1]["ratio"], rows[1]["off_track"]) == (4.0, 2)
+    assert summarise([result("gradient", 10.0)])[0]["ratio"] is None
+
+
+def write_bag(folder, drives, offset_m=0.1, rate_hz=100):
+    """Straight drives along the bottom of the track, each (stand, drive, reason) in seconds, at 0.8 m/s."""
+    room = (ROOT / "calibration" / "twin" / "room.yaml").read_bytes()
+    writer = BagWriter(folder / "bag", attachments={"room.yaml": room})
+    t, sequence = 0.0, 0
+
+    def put(topic, message):
+        nonlocal sequence
+        sequence += 1
+        at_ns = START_NS + round(t * 1e9)
+        writer.write(topic, encode(message), at_ns, at_ns, sequence)
+
+    def state(armed, reason=""):
+        stamp = START_NS + round(t * 1e9)
+        put("/safety/state", types.SafetyState(
+            header=header(stamp), armed=armed, stopping=not armed, reason=reason, source="", command_age_s=0.0, pose_age_s=0.0,
+        ))  # fmt: skip
+
+    for stand_s, drive_s, reason in drives:
+        state(False, "nobody has armed")
+        for k in range(round((stand_s + drive_s) * rate_hz)):
+            if k == round(stand_s * rate_hz) - 5:
+                state(True)
+            t += 1.0 / rate_hz
+            x = -0.9 + 0.8 * max(0.0, (k + 1) / rate_hz - stand_s)
+            put("/vicon/car", pose_message(planar_pose(x, -2.0 + offset_m, 0.0), START_NS + round(t * 1e9)))
+        state(False, reason)
+    for _ in range(rate_hz):
+        t += 1.0 / rate_hz
+        put("/vicon/car", pose_message(planar_pose(x, -2.0 + offset_m, 0.0), START_NS + round(t * 1e9)))
+    writer.close()
+    return folder / "bag"
+
+
+def test_the_numbers_of_a_bag_follow_from_the_bag_alone(tmp_path):
+    bag = write_bag(tmp_path, [(1.0, 2.2, "disarmed by trial: trial is over"), (0.5, 1.0, "outside the fence")])
+    whole, broken = evaluate_bag(bag, None, ticks=20)
+    # On the straight the error is the offset at each of the 20 ticks, and the held one after an early stop too.
+    assert whole["total_cte_m"] == pytest.approx(20 * 0.1, abs=1e-6)
+    assert (whole["stopped_early"], whole["off_track"]) == ("", False)
+    assert broken["total_cte_m"] == pytest.approx(20 * 0.1, abs=1e-6)
+    assert broken["stopped_early"] == "outside the fence"
+    first = find_drives(bag)[0]
+    # 1 cm at 0.8 m/s is passed with the second pose after the start.
+    assert (first.start_real_ns - START_NS) / 1e9 == pytest.approx(1.02, abs=0.011)
+    np.testing.assert_allclose(np.array(whole["states"])[:, 1], -1.9, atol=1e-9)
+    path = DrivingPath.rounded_square(4.0, 1.1)
+    np.testing.assert_allclose(whole["cte_m"], path.project(np.array(whole["states"])[:, :2]).cte_m, atol=1e-9)
+
+
+def test_bags_without_a_drive_say_what_they_lack(tmp_path):
+    writer = BagWriter(tmp_path / "empty", {}, {})
+    writer.write("/vicon/car", encode(pose_message(np.eye(4), START_NS)), START_NS, START_NS, 1)
+    writer.close()
+    with pytest.raises(BagError, match=r"carries no room.yaml"):
+        evaluate_bag(tmp_path / "empty", None)
+    with pytest.raises(BagError, match="lacks /safety/state"):
+        find_drives(tmp_path / "empty")
