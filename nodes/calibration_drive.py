@@ -1,0 +1,138 @@
+"""The drive that ``advnerf calibrate vehicle`` wants, in place of the policy: ``--set policy.module=nodes.calibration_drive``.
+
+Circles to both sides, straight runs and wide curves at two speeds, then steps of steering and speed; about 45 seconds in 6 x 5.5 m, of
+which 3.5 m lie behind the start and 3.2 m to its right. It drives only while the safety node has armed the car, under fence and limits as any policy, stands
+still otherwise, and after a stop begins the interrupted part again: the operator may carry the car back first.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from nodes.runtime.clock import NS_PER_S
+from nodes.runtime.messages import drive_message, stamp_ns
+from nodes.runtime.node import MessageInfo, Node, NodeContext, Now, Out, run_node_main
+
+IMAGE, STATE, DRIVE = "/compositor/image", "/safety/state", "/policy/drive"
+STRAIGHT_SLOW_S, STRAIGHT_FAST_S = 1.8, 1.4
+STEPS = 6
+
+
+@dataclass(frozen=True)
+class Part:
+    """One command, held.
+
+    Attributes:
+        duration_s: For how long [s].
+        steering_rad: Wheel angle, left positive [rad].
+        speed_mps: Speed [m/s].
+    """
+
+    duration_s: float
+    steering_rad: float
+    speed_mps: float
+
+
+class CalibrationDriveConfig(BaseModel):
+    """Configuration; other keys of the policy node are ignored, so that it can stand in for it.
+
+    Attributes:
+        slow_mps: One speed [m/s].
+        fast_mps: The other [m/s].
+        tight_rad: Wheel angle of the circles [rad].
+        wide_rad: Wheel angle of the wide curves [rad].
+        wheelbase_m: For the length of a half circle [m].
+    """
+
+    model_config = ConfigDict(extra="ignore", frozen=True)
+
+    slow_mps: float = Field(default=0.5, gt=0.0)
+    fast_mps: float = Field(default=0.9, gt=0.0)
+    tight_rad: float = Field(default=0.25, gt=0.05, lt=0.6)
+    wide_rad: float = Field(default=0.12, gt=0.02, lt=0.6)
+    wheelbase_m: float = Field(default=0.25, gt=0.0)
+
+    @model_validator(mode="after")
+    def _apart(self) -> CalibrationDriveConfig:
+        if self.fast_mps < 1.3 * self.slow_mps or self.tight_rad < 1.3 * self.wide_rad:
+            raise ValueError(
+                "expected fast_mps and tight_rad at least 1.3 times slow_mps and wide_rad: the fits need both"
+            )
+        return self
+
+
+def program(config: CalibrationDriveConfig) -> list[Part]:
+    """The drive: a loop to the left, a faster loop to the right, then two rows of steps with half circles between them."""
+    slow, fast, tight, wide = config.slow_mps, config.fast_mps, config.tight_rad, config.wide_rad
+
+    def half_circle(steering: float, speed: float) -> Part:
+        return Part(math.pi * config.wheelbase_m / math.tan(abs(steering)) / speed, steering, speed)
+
+    parts = []
+    for speed, hold_s, turn in ((slow, STRAIGHT_SLOW_S, tight), (fast, STRAIGHT_FAST_S, -tight)):
+        parts += [Part(hold_s, 0.0, speed), half_circle(turn, speed)]
+        parts += [Part(hold_s, wide, speed), Part(hold_s, -wide, speed), half_circle(turn, speed)]
+    for row in (0, 1):
+        side = 1.0 if row else -1.0
+        for k in range(STEPS):
+            speed = (slow, fast)[(k // 2 + row) % 2]
+            parts.append(Part(0.46 + 0.05 * k, side * (-1.0) ** k * tight * (0.96 - 0.08 * k), speed))
+        parts.append(half_circle(tight, fast))
+    return parts
+
+
+class CalibrationDrive(Node):
+    """Answers every image with the command that is due."""
+
+    subscriptions = (IMAGE, STATE)
+    publications = (DRIVE,)
+
+    def __init__(self, parts: Sequence[Part]) -> None:
+        self._parts = parts
+        self._index, self._since_ns = 0, 0
+        self._armed = False
+
+    @classmethod
+    def build(cls, config: CalibrationDriveConfig, context: NodeContext) -> CalibrationDrive:
+        """Make the node of a process."""
+        del context
+        return cls(program(config))
+
+    def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
+        """Note the state of the safety node; answer an image."""
+        if topic == STATE:
+            armed = bool(message.armed) and not bool(message.stopping)
+            if armed and not self._armed:
+                self._since_ns = now.mono_ns
+            self._armed = armed
+            return []
+        speed, steering = self._due(now.mono_ns)
+        return [Out(DRIVE, drive_message(speed, steering, stamp_ns(message)))]
+
+    def status(self) -> tuple[str, str]:
+        """Which part it is at."""
+        if self._index == len(self._parts):
+            return "ready", "done: stop the recording"
+        where = f"part {self._index + 1} of {len(self._parts)}"
+        return ("active", where) if self._armed else ("ready", f"{where}, waits for arming")
+
+    def _due(self, mono_ns: int) -> tuple[float, float]:
+        """Speed and steering now; without arming it stands, and the time of the part does not run."""
+        if not self._armed:
+            return 0.0, 0.0
+        while self._index < len(self._parts):
+            part = self._parts[self._index]
+            end_ns = self._since_ns + round(part.duration_s * NS_PER_S)
+            if mono_ns < end_ns:
+                return part.speed_mps, part.steering_rad
+            self._index, self._since_ns = self._index + 1, end_ns
+        return 0.0, 0.0
+
+
+if __name__ == "__main__":
+    raise SystemExit(run_node_main(CalibrationDriveConfig, CalibrationDrive.build))
