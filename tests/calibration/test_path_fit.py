@@ -1,0 +1,80 @@
+import numpy as np
+import pytest
+
+from advnerf_core.driving.path import Arc, Line, Path
+from calibration.degeneracy import DegenerateDataError
+from calibration.path_fit import PathFitConfig, fit_path
+
+SQUARE = Path.rounded_square(4.0, 1.1)
+
+
+def driven(path, laps=1.0, start_s=0.0, noise_m=0.002, seed=0, step_m=0.008, wobble_m=0.0):
+    """What motion capture records at 100 Hz and 0.8 m/s."""
+    s = start_s + np.arange(0.0, laps * path.length_m, step_m)
+    pose = path.pose_at(s)
+    rng = np.random.default_rng(seed)
+    normal = np.stack([-np.sin(pose[:, 2]), np.cos(pose[:, 2])], axis=1)
+    sway = wobble_m * np.sin(s / 0.7)[:, None] * normal
+    return pose[:, :2] + sway + rng.normal(0.0, noise_m, (len(s), 2))
+
+
+def distance(fitted, truth):
+    """Greatest distance of the fitted path from the true one [m]."""
+    return np.abs(truth.project(fitted.pose_at(np.linspace(0.0, fitted.length_m, 500))[:, :2]).cte_m).max()
+
+
+@pytest.mark.parametrize(("laps", "start_s"), [(1.05, 0.0), (3.1, 0.9), (1.1, 2.6)])
+def test_the_track_comes_back_wherever_the_trace_begins(laps, start_s):
+    fit = fit_path(driven(SQUARE, laps, start_s))
+    assert fit.path.closed
+    assert len(fit.path.segments) == 8
+    assert distance(fit.path, SQUARE) < 0.01
+    radii = [piece.radius_m for piece in fit.path.segments if isinstance(piece, Arc)]
+    np.testing.assert_allclose(radii, 1.1, atol=0.05)
+    assert fit.path.length_m == pytest.approx(SQUARE.length_m, abs=0.03)
+    assert fit.rms_m < 0.003
+    # Closed to the path's own tolerance, or Path would have refused it; and tangents continue by construction.
+    end = fit.path.pose_at(fit.path.length_m - 1e-9)
+    np.testing.assert_allclose(end[:2], fit.path.pose_at(0.0)[:2], atol=1e-6)
+
+
+def test_standing_still_before_and_after_changes_nothing():
+    rng = np.random.default_rng(1)
+    trace = driven(SQUARE, 1.05)
+    still = [np.repeat(point[None], 300, axis=0) + rng.normal(0, 0.001, (300, 2)) for point in (trace[0], trace[-1])]
+    fit = fit_path(np.concatenate([still[0], trace, still[1]]))
+    assert distance(fit.path, SQUARE) < 0.01
+
+
+def test_an_open_path_with_both_turns():
+    truth = Path.from_segments(
+        (0.5, -1.0, 0.4), [Line(1.5), Arc(0.8, 1.2), Line(1.0), Arc(1.5, -0.9), Line(0.7)], closed=False
+    )
+    fit = fit_path(driven(truth))
+    assert not fit.path.closed
+    assert [type(piece) for piece in fit.path.segments] == [Line, Arc, Line, Arc, Line]
+    assert distance(fit.path, truth) < 0.01
+    assert fit.path.length_m == pytest.approx(truth.length_m, abs=0.06)
+    assert [piece.angle_rad for piece in fit.path.segments[1::2]] == pytest.approx([1.2, -0.9], abs=0.06)
+
+
+def test_a_clockwise_circle_and_a_swaying_driver():
+    circle = Path.from_segments((0.0, 1.5, 0.0), [Arc(1.5, -2.0 * np.pi)], closed=True)
+    fit = fit_path(driven(circle, 2.05))
+    assert distance(fit.path, circle) < 0.01
+    swaying = fit_path(driven(SQUARE, 3.05, wobble_m=0.02))
+    assert distance(swaying.path, SQUARE) < 0.04
+    assert 0.005 < swaying.rms_m < 0.03
+
+
+def test_traces_that_are_none_are_refused_with_the_reason():
+    with pytest.raises(DegenerateDataError, match="at least 1 m"):
+        fit_path(np.random.default_rng(0).normal(0.0, 0.002, (500, 2)))
+    with pytest.raises(DegenerateDataError, match=r"ends are \d.\d+ m apart"):
+        fit_path(driven(SQUARE, 0.6), PathFitConfig(closed=True))
+    with pytest.raises(DegenerateDataError, match="finite positions"):
+        fit_path([[0.0, np.nan], [1.0, 1.0]])
+    s = np.linspace(0.0, 6.0, 800)
+    zigzag = np.stack([s, 0.3 * np.abs((s / 0.25) % 2 - 1)], axis=1)
+    with pytest.raises(DegenerateDataError, match="lines and arcs leave"):
+        fit_path(zigzag, PathFitConfig(worst_rms_m=0.01))
