@@ -25,6 +25,7 @@ from nodes import (
     cli_replay,
     cli_scene,
     cli_topic,
+    cli_trial,
 )
 from nodes.runtime.terminal import Overrides, RunDir, print_table, say_error, table
 
@@ -54,6 +55,7 @@ app.add_typer(cli_object.app, name="object")
 app.add_typer(cli_policy.app, name="policy")
 app.add_typer(cli_scene.app, name="scene")
 cli_replay.add_to(app)
+cli_trial.add_to(app)
 stage_app = typer.Typer(
     no_args_is_help=True,
     help="One stage of an experiment, and what it needs first: capture, scene, policy, object, attack, deploy, report.",
