@@ -21,6 +21,7 @@ from hardware.twin.v4l2_emulator import VideoPortEmulator
 from hardware.twin.zed_emulator import ZedRegisters
 from nodes.camera import CameraConfig, CameraNode
 from nodes.camera_sources import CameraSource
+from nodes.runtime.bus import Bus
 from nodes.runtime.clock import SystemClock
 from nodes.runtime.errors import RuntimeFault
 from nodes.runtime.messages import image_array, ns_from_stamp, pinhole_from_camera_info
@@ -165,6 +166,43 @@ def test_folder_and_video_through_the_whole_node(tmp_path):
         assert made.status()[0] == "active"
 
 
+def test_camera_process_sends_both_kinds_of_picture_over_the_bus(tmp_path):
+    for k in range(4):
+        cv2.imwrite(str(tmp_path / f"{k}.png"), np.full((188, 336, 3), 30 * k + 20, np.uint8))
+    command = [sys.executable, "-m", "nodes.camera", "--run-dir", str(tmp_path), "--set", f"calibration={TWIN}"]
+    command += [
+        "--set",
+        f"source={{kind: folder, folder: {tmp_path}, rate_hz: 50}}",
+        "--set",
+        "compressed={rate_hz: 25}",
+    ]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    raw, small, resident_kb = {}, {}, 0
+    try:
+        with Bus(tmp_path) as bus:
+            bus.subscribe("/camera/image_raw", queue=1000)
+            bus.subscribe("/camera/image_raw/compressed", queue=1000)
+            deadline = time.monotonic() + 10.0
+            while len(small) < 5 and time.monotonic() < deadline:
+                bus.wait(0.1)
+                for received in bus.receive():
+                    message = received.message()
+                    kind = raw if received.topic == "/camera/image_raw" else small
+                    kind[ns_from_stamp(message.header.stamp)] = picture_array(message)
+            status = Path(f"/proc/{process.pid}/status").read_text()
+            resident_kb = int(status.split("VmRSS:")[1].split()[0])
+    finally:
+        process.terminate()
+        _, errors = process.communicate(timeout=5.0)
+    assert (process.returncode, errors) == (0, "")
+    both = sorted(raw.keys() & small.keys())
+    assert len(both) >= 3
+    for stamp in both:
+        assert np.abs(small[stamp].astype(int) - raw[stamp]).max() <= 2
+    assert len(small) < len(raw)
+    assert resident_kb < 80_000
+
+
 # Devices that misbehave, through the whole node
 
 
@@ -174,7 +212,7 @@ def webcam():
     port = VideoPortEmulator({PATH: device})
     driver = V4l2Camera(PATH, Mode(336, 188, 30.0), skip_frames=0, port=port)
     steady = SteadyCamera(driver, stall_s=0.2, first_frame_s=0.5, pauses_s=(0.02, 0.05))
-    made = CameraNode(config(silence_s=0.15), load_calibration(CameraCalibration, TWIN), device=steady)
+    made = CameraNode(config(silence_s=0.4), load_calibration(CameraCalibration, TWIN), device=steady)
     made._reader.start()
     yield made, device
     made.close()

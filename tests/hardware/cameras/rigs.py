@@ -86,7 +86,7 @@ class ZedRig(V4l2Rig):
         return ZedCamera("/dev/v4l/by-id/none", self.conf, port=self.port)
 
 
-def host_stream(feed, pipelines):
+def host_stream(feed, pipelines, sent):
     """A builder of a pipeline on the host whose frames come out of a Python queue."""
 
     def build(dai, settings):
@@ -106,6 +106,7 @@ def host_stream(feed, pipelines):
                     message.setSequenceNum(number)
                     message.setTimestamp(dai.Clock.now())
                     self.output.send(message)
+                    sent.append(number)
 
         pipeline = dai.Pipeline(False)
         feeder = pipeline.create(Feeder)
@@ -132,8 +133,8 @@ class OakRig:
     shape = SHAPE
 
     def __init__(self, tmp_path):
-        self.feed, self.pipelines, self.gone, self.count = queue.Queue(), [], False, 0
-        build = host_stream(self.feed, self.pipelines)
+        self.feed, self.pipelines, self.sent, self.gone, self.count = queue.Queue(), [], [], False, 0
+        build = host_stream(self.feed, self.pipelines, self.sent)
 
         def plugged(dai, settings):
             if self.gone:
@@ -144,16 +145,16 @@ class OakRig:
 
     def produce(self):
         self.feed.put((self.count, np.full(SHAPE, 40 + self.count, np.uint8)))
-        self.count += 1
         deadline = time.monotonic() + 2.0
-        while not self.feed.empty():
+        while self.count not in self.sent:  # by depthai's own thread
             assert time.monotonic() < deadline
             time.sleep(0.001)
-        time.sleep(0.01)  # through depthai's own thread into the queue
+        self.count += 1
 
     def unplug(self):
         self.gone = True
         self.pipelines[-1].stop()
+        self.pipelines[-1].wait()  # its thread must not take what is meant for the next one
 
     def plug(self):
         self.gone = False
