@@ -54,12 +54,12 @@ _RESPAWNING = (
 
 
 def plan(count: int, seed: int = SEED) -> list[tuple[str, float]]:
-    """Faults in random order, every kind about equally often, each with the time driven before it [s]."""
-    rng = random.Random(seed)
+    """Faults in random order, every kind about equally often, each with the time driven before it [s]; more of them begin alike."""
+    order, moments = random.Random(seed), random.Random(f"moments of {seed}")
     faults: list[str] = []
     while len(faults) < count:
-        faults += rng.sample(FAULTS, len(FAULTS))
-    return [(fault, rng.uniform(0.6, 1.6)) for fault in faults[:count]]
+        faults += order.sample(FAULTS, len(FAULTS))
+    return [(fault, moments.uniform(0.6, 1.6)) for fault in faults[:count]]
 
 
 class Graph:

@@ -33,6 +33,10 @@ class ViconEmulatorConfig(BaseModel):
         noise_m: Standard deviation of each coordinate [m].
         noise_rad: Standard deviation of each angle [rad].
         seed: Seed of the noise.
+        shuffle: Whether objects come in another order in every frame.
+        loss: Probability that a datagram is lost on the way.
+        duplication: Probability that it comes twice.
+        reordering: Probability that it comes only after its successor.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -44,6 +48,10 @@ class ViconEmulatorConfig(BaseModel):
     noise_m: float = Field(default=1e-4, ge=0.0)
     noise_rad: float = Field(default=3e-4, ge=0.0)
     seed: int = 0
+    shuffle: bool = False
+    loss: float = Field(default=0.0, ge=0.0, le=1.0)
+    duplication: float = Field(default=0.0, ge=0.0, le=1.0)
+    reordering: float = Field(default=0.0, ge=0.0, le=1.0)
 
 
 class ViconFrames:
@@ -53,6 +61,9 @@ class ViconFrames:
         self.config = config
         self.frame_number = 0
         self._rng = np.random.default_rng(config.seed)
+        # Of its own, so that a bad network does not change the noise of the measurements.
+        self._network = np.random.default_rng([config.seed, 1])
+        self._held_back: list[bytes] = []
         self._occluded: dict[str, str] = {}
         self._last: dict[str, ObjectPose] = {}
 
@@ -72,9 +83,22 @@ class ViconFrames:
             if (item := self._seen(name, T)) is not None:
                 self._last[name] = item
                 objects.append(item)
+        if self.config.shuffle:
+            objects = [objects[i] for i in self._network.permutation(len(objects))]
         datagrams = encode_blocks(self.frame_number, objects, self.config.block_bytes)
         self.frame_number = (self.frame_number + 1) % 2**32
-        return datagrams
+        return self._transmit(datagrams)
+
+    def _transmit(self, datagrams: list[bytes]) -> list[bytes]:
+        config, late, sent = self.config, self._held_back, []
+        self._held_back = []
+        for datagram in datagrams:
+            lost, twice, held = self._network.random(3) < (config.loss, config.duplication, config.reordering)
+            if held and not lost:
+                self._held_back.append(datagram)
+            elif not lost:
+                sent += [datagram] * (1 + int(twice))
+        return sent + late
 
     def _seen(self, name: str, T: Array) -> ObjectPose | None:
         form = self._occluded.get(name)

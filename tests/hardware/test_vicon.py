@@ -178,3 +178,60 @@ def test_port_in_use_is_one_clear_error():
         pytest.raises(DeviceBusy, match="set another port"),
     ):
         ViconReceiver(ViconConfig(subjects=("car",), port=first.port))
+
+
+# The whole way from the emulator's network to trusted poses.
+
+
+def through_the_network(frames=2000, **network):
+    from hardware.twin.vicon_emulator import ViconEmulatorConfig, ViconFrames
+
+    emulator = ViconFrames(ViconEmulatorConfig(noise_m=1e-4, noise_rad=1e-4, **network))
+    feed = Feed(ViconConfig(subjects=("car", "a_name_of_24_characters_"), frozen_frames=5))
+    poses = []
+    for frame in range(frames):
+        true = planar_pose(0.001 * frame, 1.0, 0.2)
+        for datagram in emulator.next({"stranger": true, "car": true, "a_name_of_24_characters_": true, "other": true}):
+            poses += feed(datagram, after_s=0.005)
+    return feed, poses
+
+
+def test_a_perfect_network_brings_every_pose_of_every_subject():
+    feed, poses = through_the_network(block_bytes=256, shuffle=True)
+    counts = feed.tracker.counts
+    assert len(poses) == 2 * 2000  # four objects in blocks of three: two datagrams a frame
+    assert (counts.datagrams, counts.late, counts.missed_frames, counts.restarts) == (4000, 0, 0, 0)
+
+
+def test_a_bad_network_costs_poses_and_never_gives_a_wrong_or_an_old_one():
+    feed, poses = through_the_network(loss=0.1, duplication=0.1, reordering=0.1, shuffle=True)
+    cars = [p for p in poses if p.name == "car"]
+    numbers = [p.frame_number for p in cars]
+    assert numbers == sorted(set(numbers))  # no frame twice, none after a newer one
+    assert all(abs(p.T_world_from_subject[0, 3] - 0.001 * p.frame_number) < 1e-3 for p in cars)
+    assert 1500 < len(cars) < 1750  # 0.9 x 0.9, and what arrived a frame late is gone
+    counts = feed.tracker.counts
+    assert counts.late > 100
+    assert counts.missed_frames + len(set(numbers)) == pytest.approx(2000, abs=2)
+    assert counts.restarts == 0
+
+
+@pytest.mark.parametrize("form", ["missing", "zeros", "nan", "frozen"])
+def test_an_occluded_subject_is_lost_and_the_other_is_not(form):
+    from hardware.twin.vicon_emulator import ViconEmulatorConfig, ViconFrames
+
+    emulator, feed, seen = ViconFrames(ViconEmulatorConfig()), Feed(ViconConfig(("car", "board"), frozen_frames=5)), []
+    for frame in range(60):
+        if frame in (20, 40):
+            emulator.occlude("car", form if frame == 20 else None)
+        if frame == 50:
+            emulator.frame_number = 0  # Tracker is started again
+        for datagram in emulator.next(
+            {"car": planar_pose(0.01 * frame, 1.0, 0.0), "board": planar_pose(3.0, 1.0, 0.0)}
+        ):
+            # A restart takes Tracker longer than the network takes to overtake itself.
+            seen += [(frame, p.name) for p in feed(datagram, after_s=0.01 if frame != 50 else 0.5)]
+    assert [f for f, name in seen if name == "board"] == list(range(60))
+    hidden = [f for f in range(60) if (f, "car") not in seen]
+    assert hidden == list(range(24 if form == "frozen" else 20, 40))
+    assert feed.tracker.counts.restarts == 1
