@@ -87,9 +87,13 @@ def read_pictures(source: Path) -> Iterator[tuple[str, Rgb]]:
 
 def read_picture(file: Path) -> Rgb:
     """A picture file ``[H, W, 3]`` RGB."""
-    bgr = cv2.imread(str(file), cv2.IMREAD_COLOR)
+    try:
+        data = np.frombuffer(file.read_bytes(), np.uint8)
+    except OSError as error:
+        raise CalibrationError(f"expected a picture at {file}: {error.strerror or error}") from error
+    bgr = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
     if bgr is None:
-        raise CalibrationError(f"expected a picture, cannot read {file}")
+        raise CalibrationError(f"expected a picture at {file}, cannot decode its {data.size} bytes")
     return np.ascontiguousarray(bgr[..., ::-1], np.uint8)
 
 
@@ -190,7 +194,13 @@ def read_shown(folder: Path) -> tuple[Array, Array, Array]:
     shown, seen, angles = [], [], []
     for key, group in groupby(keyed, key=lambda row: row[0]):
         shown.append(np.array(key[:3]) / 255.0)
-        seen.append(mean_colour([read_picture(file) for _, file in group], regions[key[3]]))
+        pictures = [read_picture(file) for _, file in group]
+        region = regions[key[3]]
+        if any(picture.shape[:2] != region.shape for picture in pictures):
+            raise CalibrationError(
+                f"expected pictures of {region.shape[1]} x {region.shape[0]} in {folder}, as the black one, got others too"
+            )
+        seen.append(mean_colour(pictures, region))
         angles.append(key[3])
     return np.array(shown).reshape(-1, 3), np.array(seen).reshape(-1, 3), np.array(angles)
 
@@ -231,10 +241,12 @@ def _still_pose(series: PoseSeries, stamp: int, config: StillConfig) -> Array | 
 
 
 def _region(keyed: Sequence[tuple[tuple[float, ...], Path]], angle: float) -> NDArray[np.bool_]:
-    ends = []
+    ends: list[Rgb] = []
     for level, name in ((0.0, "black"), (255.0, "white")):
         file = next((file for key, file in keyed if key[:3] == (level,) * 3 and key[3] == angle), None)
         if file is None:
             raise DegenerateDataError(f"expected a {name} picture at every angle, got none: the screen is found by it")
         ends.append(read_picture(file))
+    if ends[0].shape != ends[1].shape:
+        raise CalibrationError("expected the black and the white picture to have one size")
     return screen_region(ends[0], ends[1])

@@ -258,6 +258,14 @@ def test_display_from_a_folder(tmp_path, capsys):
     found = load_calibration(DisplayCalibration, tmp_path / "display.yaml")
     assert found.residuals["held_out_rmse"] < 0.01
     assert yaml.safe_load((tmp_path / "display.yaml").read_text())["conditions"] == "lamps on"
+    capsys.readouterr()
+    cv2.imwrite(str(tmp_path / "seen" / "005.png"), np.zeros((4, 4, 3), np.uint8))
+    (tmp_path / "seen" / "006.png").write_bytes(b"no picture")
+    for name, words in (("005", "pictures of 90 x 60"), ("006", "cannot decode its 10 bytes"), ("666", "No such file")):
+        rows = ["file,red,green,blue", "seen/000.png,0,0,0", "seen/001.png,255,255,255", f"seen/{name}.png,9,9,9"]
+        (tmp_path / "shown.csv").write_text("\n".join(rows))
+        assert run("calibrate", "display", tmp_path, "-o", tmp_path / "no.yaml") == 2
+        assert words in capsys.readouterr().err
     (tmp_path / "shown.csv").write_text("file,red\nseen/000.png,0\n")
     capsys.readouterr()
     assert run("calibrate", "display", tmp_path, "-o", tmp_path / "no.yaml") == 2
