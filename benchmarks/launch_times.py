@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import shutil
 import signal
 import subprocess
 import tempfile
@@ -27,6 +28,7 @@ def drive_after_launch(graph: Graph) -> float:
     """Seconds from starting the command until the controller read the first command to move."""
     operator, offset = graph.operator, graph.wire_size()
     operator.seen.clear()
+    shutil.rmtree(graph.folder / "bag", ignore_errors=True)  # a recorder does not write over a bag
     began_ns = time.monotonic_ns()
     graph.supervisor = graph.launch()
     while True:

@@ -29,6 +29,7 @@ from nodes.motor_watch import ControllerWatch
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.messages import header, ns_from_stamp, types
 from nodes.runtime.node import ACTIVE, FAULT, READY, STARTING, MessageInfo, Node, NodeContext, Now, Out, run_node_main
+from nodes.steering_check import CheckSettings
 
 _TICK_RATE_HZ = 50.0
 _RETRY_S = 0.5
@@ -52,6 +53,7 @@ class MotorConfig(BaseModel):
         controller_brake_current_a: The smallest brake current it may then use; not ready with less [A].
         steering_check: Whether somebody must have seen the wheels turn before arming; the twin's controller always steers.
         steering_angle_rad: Front wheel angle shown in that check [rad].
+        steering_hold_s: Time for which each side is shown [s].
         battery_warning_v: Supply voltage below which the diagnostics warn [V].
     """
 
@@ -69,6 +71,7 @@ class MotorConfig(BaseModel):
     controller_brake_current_a: float = Field(default=0.0, ge=0.0)
     steering_check: Literal["required", "unless_twin", "never"] = "unless_twin"
     steering_angle_rad: float = Field(default=0.2, gt=0.0, le=0.4)
+    steering_hold_s: float = Field(default=4.0, ge=1.0)
     battery_warning_v: float = Field(default=13.2, ge=0.0)
 
 
@@ -90,7 +93,8 @@ class MotorNode(Node):
         self._config = config
         self._vesc = make_vesc()
         wanted = TimeoutSettings(config.controller_timeout_ms, config.controller_brake_current_a)
-        self._watch = ControllerWatch(wanted, config.steering_check, config.steering_angle_rad, wheelbase_m)
+        shown = CheckSettings(wheelbase_m, config.steering_angle_rad, config.steering_hold_s)
+        self._watch = ControllerWatch(wanted, config.steering_check, shown)
         self._diagnosed_ns = 0
         settings = GateSettings(
             config.command_age_limit_s, config.brake_current_a, config.brake_ramp_s, config.brake_hold_s

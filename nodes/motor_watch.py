@@ -27,8 +27,7 @@ class ControllerWatch:
     Args:
         wanted: The longest time-out and the smallest brake current that the controller may have.
         steering_check: ``required``, ``unless_twin`` or ``never``.
-        steering_angle_rad: Front wheel angle shown in the check [rad].
-        wheelbase_m: Distance between the axles [m].
+        shown: Numbers of the steering check.
 
     Attributes:
         check: The steering check.
@@ -36,15 +35,13 @@ class ControllerWatch:
         timeout: Time-out as read back; None where the controller does not tell.
     """
 
-    def __init__(
-        self, wanted: TimeoutSettings, steering_check: str, steering_angle_rad: float, wheelbase_m: float
-    ) -> None:
-        self.check = SteeringCheck(CheckSettings(wheelbase_m, steering_angle_rad))
+    def __init__(self, wanted: TimeoutSettings, steering_check: str, shown: CheckSettings) -> None:
+        self.check = SteeringCheck(shown)
         self.values: Values | None = None
         self.timeout: TimeoutSettings | None = None
         self._wanted = wanted
         self._policy = steering_check
-        self._odometry = Odometry(wheelbase_m)
+        self._odometry = Odometry(shown.wheelbase_m)
         self._firmware: FirmwareVersion | None = None
         self._checked_with: FirmwareVersion | None = None
         self._asks_left = _SETTINGS_ASKS

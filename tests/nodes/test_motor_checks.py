@@ -1,6 +1,10 @@
 """What keeps a car from being armed before it can be trusted: telemetry, the controller's time-out, steering that was seen."""
 
+import json
 import math
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -39,8 +43,6 @@ class Car:
         return CLOCK.now()
 
     def settle(self, until, timeout_s=2.0):
-        import time
-
         deadline = time.monotonic() + timeout_s
         while not until():
             assert time.monotonic() < deadline, self.node.status()
@@ -234,3 +236,41 @@ def test_command_line(tmp_path):
         assert "was 1000 ms with 0 A, is 250 ms with 20 A" in stored.output
         assert str(emulator.timeout) == "250 ms with 20 A"
     assert CliRunner().invoke(app, ["motor", "set-timeout", "--timeout-ms", "0"]).exit_code == 2
+
+
+@pytest.mark.parametrize(
+    ("answer", "code", "text"),
+    [
+        pytest.param("y", 0, "steering confirmed by operator"),
+        pytest.param("n", 1, "steering denied by operator", marks=pytest.mark.slow),
+    ],
+)
+def test_a_person_confirms_over_the_bus(tmp_path, answer, code, text):
+    config = {"port": str(tmp_path / "vesc"), "calibration": str(VEHICLE), "steering_hold_s": 1.0}
+    (tmp_path / "motor.json").write_text(json.dumps(config))
+    car = TwinVehicle(CarConfig())
+    with VescEmulator(VescEmulatorConfig(hardware_name="60"), car, tmp_path / "vesc") as emulator:
+        command = [
+            sys.executable,
+            "-m",
+            "nodes.motor",
+            "--config",
+            str(tmp_path / "motor.json"),
+            "--run-dir",
+            str(tmp_path),
+        ]
+        node = subprocess.Popen(command, cwd=Path(__file__).parents[2])
+        try:
+            deadline = time.monotonic() + 20.0
+            while not any(event.name == "GET_VALUES" for event in emulator.events()):
+                assert time.monotonic() < deadline
+                time.sleep(0.05)
+            done = CliRunner().invoke(app, ["motor", "check-steering", "--run-dir", str(tmp_path)], input=answer + "\n")
+        finally:
+            node.terminate()
+            node.wait(10.0)
+    assert done.exit_code == code, done.output
+    assert text in done.output
+    servo = [round((e.value - 0.5304) / -1.2135, 2) for e in emulator.events() if e.name == "SET_SERVO_POS"]
+    assert {0.2, -0.2, 0.0} <= set(servo)
+    assert not [e for e in emulator.events() if e.name == "SET_RPM"]
