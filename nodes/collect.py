@@ -1,0 +1,130 @@
+"""The collector: lets the expert (or a policy) drive from every declared start, one drive after the other, on the twin.
+
+It is the operator of one trial after another, and arms by itself only where the motor's peer says that it is the twin. With a
+real car, leave it out (``--set collect.if=false``), put the car down at each start, and hold the button.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from advnerf_core.driving.path import Path as DrivingPath
+from calibration.schema import RoomCalibration, load_calibration
+from nodes.runtime.errors import NodeFinished
+from nodes.runtime.node import MessageInfo, Node, NodeContext, Now, Out, run_node_main
+from nodes.trial import TrialNode, TrialPlan
+
+
+class Start(BaseModel):
+    """Where a drive begins.
+
+    Attributes:
+        s_m: Along the path, from its begin [m].
+        lateral_m: Left of the path positive [m].
+        heading_rad: Turned left of the path's heading positive [rad].
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    s_m: float = 0.0
+    lateral_m: float = Field(default=0.0, ge=-1.0, le=1.0)
+    heading_rad: float = Field(default=0.0, ge=-1.0, le=1.0)
+
+    def pose_on(self, path: DrivingPath) -> tuple[float, float, float]:
+        """Pose of the rear axle: x [m], y [m], yaw [rad]."""
+        x_m, y_m, yaw_rad = (float(v) for v in path.pose_at(self.s_m))
+        left = (-math.sin(yaw_rad), math.cos(yaw_rad))
+        return x_m + self.lateral_m * left[0], y_m + self.lateral_m * left[1], yaw_rad + self.heading_rad
+
+
+class CollectConfig(BaseModel):
+    """Configuration of the collector.
+
+    Attributes:
+        room: Room calibration file: the path.
+        starts: Where the drives begin.
+        laps: Laps of each drive.
+        speed_mps: Speed at which laps are counted as time [m/s].
+        nodes: Nodes that must be ready before anything moves.
+        patience_s: Time that getting ready, placing, arming and stopping may take each [s].
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    room: Path
+    starts: tuple[Start, ...] = Field(default=(Start(),), min_length=1)
+    laps: float = Field(default=3.0, gt=0.0)
+    speed_mps: float = Field(default=0.8, gt=0.0)
+    nodes: tuple[str, ...] = ("camera", "vicon", "expert", "safety", "motor")
+    patience_s: float = Field(default=30.0, gt=0.0)
+
+
+class CollectNode(Node):
+    """Hands everything to the trial that is on; goes on to the next when it is done.
+
+    Args:
+        plans: The drives.
+    """
+
+    tick_rate_hz = TrialNode.tick_rate_hz
+    publications = TrialNode.publications
+
+    def __init__(self, plans: list[TrialPlan]) -> None:
+        self._waiting = [TrialNode(plan) for plan in plans]
+        self._drives = len(plans)
+        self._trial = self._waiting.pop(0)
+        self.subscriptions = self._trial.subscriptions
+        self._stopped_early: list[str] = []
+
+    @classmethod
+    def build(cls, config: CollectConfig, context: NodeContext) -> CollectNode:
+        """Make the node of a process."""
+        del context  # it needs no clock of its own
+        path = load_calibration(RoomCalibration, config.room).reference_path
+        duration_s = config.laps * path.length_m / config.speed_mps
+        poses = [start.pose_on(path) for start in config.starts]
+        return cls([TrialPlan(pose, duration_s, config.nodes, config.patience_s) for pose in poses])
+
+    def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
+        """The trial's business."""
+        return self._trial.handle(topic, message, info, now)
+
+    def tick(self, now: Now) -> list[Out]:
+        """The trial's business, until there is none left."""
+        try:
+            return self._trial.tick(now)
+        except NodeFinished:
+            number = self._drives - len(self._waiting)
+            stopped = self._trial.outcome.stopped_early
+            print(
+                f"drive {number} of {self._drives} is done{f', stopped early: {stopped}' if stopped else ''}",
+                flush=True,
+            )
+            if stopped:
+                self._stopped_early.append(stopped)
+            if not self._waiting:
+                raise
+            self._trial = self._waiting.pop(0)
+            return []
+
+    def status(self) -> tuple[str, str]:
+        """Which drive is on."""
+        number = self._drives - len(self._waiting)
+        return "active", f"drive {number} of {self._drives}: {self._trial.phase.value}"
+
+    def counters(self) -> dict[str, float]:
+        """Drives begun, and those that the stack stopped."""
+        return {"drives": self._drives - len(self._waiting), "stopped_early": len(self._stopped_early)}
+
+
+def main() -> int:
+    """Run the node as a process."""
+    return run_node_main(CollectConfig, CollectNode.build)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

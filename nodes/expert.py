@@ -1,0 +1,259 @@
+"""The expert node: drives the reference path from motion capture, so that a policy can learn from it ("PID with VICON position").
+
+The pose it acts on is old when the wheels have turned, so it is carried forward along the arc that was last commanded, at the
+measured speed. Two slow integrals take out what a calibration left: a steering trim and a speed that is a few percent off. Both
+work only while the car is armed, and are bounded.
+
+A policy that only ever saw perfect driving cannot come back to the path. So the node can disturb itself now and then, by a
+steering offset over a short distance, and then correct it. `/expert/state` carries the steering without the disturbance.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from advnerf_core.driving.expert import Expert, ExpertConfig
+from advnerf_core.geometry import wrap_angle, yaw_of
+from calibration.schema import RoomCalibration, VehicleCalibration, load_calibration
+from nodes.runtime.clock import NS_PER_S
+from nodes.runtime.messages import drive_message, header, pose_matrix, stamp_ns, types
+from nodes.runtime.node import ACTIVE, READY, MessageInfo, Node, NodeContext, Now, Out, run_node_main
+
+_CAR, _STATE = "/vicon/car", "/safety/state"
+_SPEED_BASE_S = 0.15
+_JUMP_M = 0.5
+_ARMED_AGE_S = 0.5
+
+
+class Disturbance(BaseModel):
+    """When and how the expert disturbs itself.
+
+    Attributes:
+        every_m: Distance between the end of one and the begin of the next, drawn from this range [m].
+        over_m: Length of one [m].
+        steering_rad: Largest steering offset; drawn between half of it and all of it, to either side [rad].
+        within_m: None begins further than this from the path, and one ends beyond it [m].
+        seed: Of the draws.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    every_m: tuple[float, float] = (1.5, 3.0)
+    over_m: tuple[float, float] = (0.3, 0.6)
+    steering_rad: float = Field(default=0.2, gt=0.0, le=0.4)
+    within_m: float = Field(default=0.25, gt=0.0)
+    seed: int = 0
+
+    @model_validator(mode="after")
+    def _ranges(self) -> Disturbance:
+        for name in ("every_m", "over_m"):
+            low, high = getattr(self, name)
+            if not 0.0 < low <= high:
+                raise ValueError(f"expected {name} as two rising distances > 0 m, got [{low}, {high}]")
+        return self
+
+
+class ExpertNodeConfig(BaseModel):
+    """Configuration of the expert node.
+
+    Attributes:
+        room: Room calibration file: the path.
+        vehicle: Vehicle calibration file: wheelbase and limits.
+        speed_mps: Driving speed [m/s].
+        delay_s: From the capture of a pose to wheels that have turned [s].
+        stiffness_1pm: Natural frequency of the return to the path, per metre driven [1/m].
+        integral_radpm2: Steering trim for one metre of offset over one metre driven [rad/m^2].
+        trim_limit_rad: Bound of that trim [rad].
+        speed_integral_1ps: Rate at which a speed error is taken out [1/s].
+        speed_trim_limit: Bound of that correction, as a share of the speed.
+        rate_hz: Commands per second [Hz].
+        max_age_s: Oldest pose, since capture, that is acted upon [s].
+        disturb: None drives as well as it can.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    room: Path
+    vehicle: Path
+    speed_mps: float = Field(default=0.8, gt=0.0, le=2.0)
+    delay_s: float = Field(default=0.1, ge=0.0, le=0.5)
+    stiffness_1pm: float = Field(default=2.0, gt=0.0, le=6.0)
+    integral_radpm2: float = Field(default=0.02, ge=0.0)
+    trim_limit_rad: float = Field(default=0.05, ge=0.0, le=0.2)
+    speed_integral_1ps: float = Field(default=0.5, ge=0.0)
+    speed_trim_limit: float = Field(default=0.1, ge=0.0, le=0.3)
+    rate_hz: float = Field(default=20.0, gt=0.0, le=100.0)
+    max_age_s: float = Field(default=0.1, gt=0.0, le=0.2)
+    disturb: Disturbance | None = None
+
+
+class _Disturber:
+    """Offsets by distance driven."""
+
+    def __init__(self, config: Disturbance) -> None:
+        self._config = config
+        self._rng = np.random.default_rng(config.seed)
+        self._begin_m = float(self._rng.uniform(*config.every_m))
+        self._end_m = 0.0
+        self._offset_rad = 0.0
+
+    def at(self, driven_m: float, cte_m: float) -> float:
+        """Offset of the steering [rad] here."""
+        config = self._config
+        if self._offset_rad == 0.0 and driven_m >= self._begin_m and abs(cte_m) <= config.within_m:
+            self._end_m = driven_m + float(self._rng.uniform(*config.over_m))
+            side = 1.0 if self._rng.random() < 0.5 else -1.0
+            self._offset_rad = side * config.steering_rad * float(self._rng.uniform(0.5, 1.0))
+        elif self._offset_rad and (driven_m >= self._end_m or abs(cte_m) > config.within_m):
+            self._offset_rad = 0.0
+            self._begin_m = driven_m + float(self._rng.uniform(*config.every_m))
+        return self._offset_rad
+
+
+class ExpertNode(Node):
+    """Poses in, drive commands out."""
+
+    subscriptions = (_CAR, _STATE)
+    publications = ("/expert/drive", "/expert/state")
+    tick_rate_hz = 10.0
+
+    def __init__(self, expert: Expert, config: ExpertNodeConfig) -> None:
+        self._expert, self._config = expert, config
+        self._disturber = None if config.disturb is None else _Disturber(config.disturb)
+        self._track: deque[tuple[int, float, float]] = deque()
+        self._armed_ns: int | None = None
+        self._commanded_ns = 0
+        self._driven_m, self._s_m = 0.0, 0.0
+        self._steering_rad = self._trim_rad = self._speed_trim = 0.0
+        self._cte_m = 0.0
+        self._stale = 0
+        self._now_ns = 0
+
+    @classmethod
+    def build(cls, config: ExpertNodeConfig, context: NodeContext) -> ExpertNode:
+        """Make the node of a process."""
+        del context  # it needs no clock of its own
+        car = load_calibration(VehicleCalibration, config.vehicle)
+        settings = ExpertConfig(
+            wheelbase_m=car.wheelbase_m, speed_mps=config.speed_mps, delay_s=0.0, stiffness_1pm=config.stiffness_1pm,
+            steering_limits_rad=(car.limits.steering_min_rad, car.limits.steering_max_rad),
+        )  # fmt: skip
+        return cls(Expert(load_calibration(RoomCalibration, config.room).reference_path, settings), config)
+
+    def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
+        """Steer by a pose, unless it is old, lost, or comes sooner than the next command is due."""
+        self._now_ns = now.mono_ns
+        if topic == _STATE:
+            self._armed_ns = info.publish_mono_ns if message.armed else None
+            return []
+        capture_ns = stamp_ns(message)
+        T = pose_matrix(message)
+        if not np.isfinite(T).all() or now.real_ns - capture_ns > self._config.max_age_s * NS_PER_S:
+            self._stale += 1
+            return []
+        x_m, y_m, yaw_rad = float(T[0, 3]), float(T[1, 3]), yaw_of(T)
+        if self._track and capture_ns <= self._track[-1][0]:
+            return []
+        speed_mps = self._follow(capture_ns, x_m, y_m, yaw_rad)
+        # A tenth of a period early is on time: poses come on a grid of their own.
+        if now.mono_ns - self._commanded_ns < 0.9 / self._config.rate_hz * NS_PER_S:
+            return []
+        since_s = min(0.1, (now.mono_ns - self._commanded_ns) / NS_PER_S)
+        self._commanded_ns = now.mono_ns
+        return self._command(capture_ns, (x_m, y_m, yaw_rad), speed_mps, since_s)
+
+    def tick(self, now: Now) -> list[Out]:
+        """Only notes the time, so that the status shows when poses stop."""
+        self._now_ns = now.mono_ns
+        return []
+
+    def status(self) -> tuple[str, str]:
+        """Active while it commands."""
+        if self._now_ns - self._commanded_ns > NS_PER_S or not self._commanded_ns:
+            return READY, f"no fresh pose of the car on {_CAR}"
+        laps = self._driven_m / self._expert.path.length_m
+        return ACTIVE, f"{100 * self._cte_m:+.0f} cm from the path, {self._driven_m:.1f} m driven, {laps:.1f} laps"
+
+    def counters(self) -> dict[str, float]:
+        """Poses that could not be used, and the trims found."""
+        return {"stale_poses": self._stale, "trim_rad": self._trim_rad, "speed_trim": self._speed_trim}
+
+    def _armed(self) -> bool:
+        return self._armed_ns is not None and self._now_ns - self._armed_ns < _ARMED_AGE_S * NS_PER_S
+
+    def _follow(self, capture_ns: int, x_m: float, y_m: float, yaw_rad: float) -> float:
+        """Measured speed [m/s], forward positive; a car that was lifted elsewhere begins anew."""
+        track = self._track
+        if track and math.hypot(x_m - track[-1][1], y_m - track[-1][2]) > _JUMP_M:
+            track.clear()
+        track.append((capture_ns, x_m, y_m))
+        while len(track) > 2 and capture_ns - track[1][0] >= _SPEED_BASE_S * NS_PER_S:
+            track.popleft()
+        first_ns, first_x, first_y = track[0]
+        span_s = (capture_ns - first_ns) / NS_PER_S
+        if span_s < 0.5 * _SPEED_BASE_S:
+            return 0.0
+        along = (x_m - first_x) * math.cos(yaw_rad) + (y_m - first_y) * math.sin(yaw_rad)
+        return along / span_s
+
+    def _command(
+        self, capture_ns: int, pose: tuple[float, float, float], speed_mps: float, since_s: float
+    ) -> list[Out]:
+        config = self._config
+        at = self._expert.path.project(np.array(pose[:2]))
+        self._cte_m = cte_m = float(at.cte_m)
+        armed = self._armed()
+        if armed:
+            moved_m = float(at.s_m) - self._s_m
+            length_m = self._expert.path.length_m
+            moved_m -= length_m * round(moved_m / length_m)
+            self._driven_m += moved_m if 0.0 < moved_m < _JUMP_M else 0.0
+        self._s_m = float(at.s_m)
+        disturbance = self._disturber.at(self._driven_m, cte_m) if armed and self._disturber else 0.0
+        wanted = float(self._expert.steer(*self._ahead(pose, speed_mps))) + self._trim_rad
+        if armed and not disturbance:
+            self._integrate(cte_m, speed_mps, since_s)
+        low, high = self._expert.config.steering_limits_rad
+        steering = min(max(wanted + disturbance, low), high)
+        self._steering_rad = steering
+        speed = config.speed_mps * (1.0 + self._speed_trim)
+        state = types.ExpertState(
+            header=header(capture_ns, "world"), cte_m=cte_m,
+            heading_error_rad=float(wrap_angle(pose[2] - float(at.heading_rad))), s_m=self._s_m, driven_m=self._driven_m,
+            speed_mps=speed_mps, steering_rad=wanted, disturbance_rad=steering - wanted if disturbance else 0.0,
+        )  # fmt: skip
+        return [Out("/expert/drive", drive_message(speed, steering, capture_ns)), Out("/expert/state", state)]
+
+    def _ahead(self, pose: tuple[float, float, float], speed_mps: float) -> tuple[float, float, float]:
+        """Where the car will be after the delay, on the arc of the last command."""
+        x_m, y_m, yaw_rad = pose
+        distance_m = max(speed_mps, 0.0) * self._config.delay_s
+        turn_rad = distance_m * math.tan(self._steering_rad) / self._expert.config.wheelbase_m
+        chord_rad = yaw_rad + 0.5 * turn_rad
+        chord_m = distance_m * float(np.sinc(0.5 * turn_rad / math.pi))
+        return x_m + chord_m * math.cos(chord_rad), y_m + chord_m * math.sin(chord_rad), yaw_rad + turn_rad
+
+    def _integrate(self, cte_m: float, speed_mps: float, since_s: float) -> None:
+        config = self._config
+        moved_m = max(speed_mps, 0.0) * since_s
+        trim = self._trim_rad - config.integral_radpm2 * cte_m * moved_m
+        self._trim_rad = min(max(trim, -config.trim_limit_rad), config.trim_limit_rad)
+        if speed_mps > 0.5 * config.speed_mps:  # not while it still speeds up
+            error = (config.speed_mps - speed_mps) / config.speed_mps
+            speed_trim = self._speed_trim + config.speed_integral_1ps * error * since_s
+            self._speed_trim = min(max(speed_trim, -config.speed_trim_limit), config.speed_trim_limit)
+
+
+def main() -> int:
+    """Run the node as a process."""
+    return run_node_main(ExpertNodeConfig, ExpertNode.build)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
