@@ -159,10 +159,11 @@ def _explain(model: type[BaseModel], document: Document, error: ValidationError)
     # A misspelt key is often the reason why another one is missing, so it is told first.
     problems = sorted(error.errors(include_url=False), key=lambda problem: problem["type"] != "extra_forbidden")
     first = problems[0]
-    key = tuple(first["loc"])
+    location = tuple(first["loc"])
+    key = _as_written(document.data, location)
     name = ".".join(map(str, key)) or "the whole"
     if first["type"] == "extra_forbidden":
-        what = f"unknown key {name}; valid keys here: {', '.join(_valid_keys(model, key[:-1])) or 'none'}"
+        what = f"unknown key {name}; valid keys here: {', '.join(_valid_keys(model, location[:-1])) or 'none'}"
     elif first["type"] == "missing":
         what = f"{name} is missing"
     else:
@@ -170,6 +171,18 @@ def _explain(model: type[BaseModel], document: Document, error: ValidationError)
         what = f"{name}: {message[:1].lower()}{message[1:]}, got {first['input']!r:.80}"
     more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
     return f"{document.place(key)}: {what}{more}"
+
+
+def _as_written(data: Any, location: Key) -> Key:
+    """Path of a key as the user wrote it: where a section's ``kind`` chose the model, pydantic puts that into the path."""
+    key: list[str | int] = []
+    for part in location:
+        if isinstance(data, dict) and part not in data and data.get("kind") == part:
+            continue
+        key.append(part)
+        inside = isinstance(data, dict) or (isinstance(data, list) and isinstance(part, int) and part < len(data))
+        data = (data.get(part) if isinstance(data, dict) else data[part]) if inside else None
+    return tuple(key)
 
 
 def _valid_keys(annotation: Any, key: Key) -> list[str]:
@@ -184,7 +197,15 @@ def _valid_keys(annotation: Any, key: Key) -> list[str]:
     arguments = typing.get_args(annotation)
     origin = typing.get_origin(annotation)
     if origin in (Union, types.UnionType):
+        if key and (chosen := [option for option in arguments if _kind(option) == key[0]]):
+            return _valid_keys(chosen[0], key[1:])
         return next((keys for option in arguments if (keys := _valid_keys(option, key))), [])
     if key and arguments and isinstance(origin, type) and issubclass(origin, typing.Iterable):
         return _valid_keys(arguments[-1] if issubclass(origin, dict) else arguments[0], key[1:])
     return []
+
+
+def _kind(option: Any) -> Any:
+    """The ``kind`` by which an alternative is chosen; None if it has none."""
+    fields = option.model_fields if isinstance(option, type) and issubclass(option, BaseModel) else {}
+    return fields["kind"].default if "kind" in fields else None

@@ -196,6 +196,10 @@ def _read_with_includes(file: Path, above: tuple[Path, ...]) -> Document:
 
 def _merge(below: Any, above: Any) -> Any:
     if isinstance(below, dict) and isinstance(above, dict):
+        kinds = below.get("kind"), above.get("kind")
+        # A section of another kind (of camera, of motion capture) has other keys: it replaces the one below.
+        if None not in kinds and kinds[0] != kinds[1]:
+            return above
         return {**below, **{key: _merge(below.get(key), value) for key, value in above.items()}}
     return above
 

@@ -23,7 +23,9 @@ from nodes.camera import CameraConfig, CameraNode
 from nodes.camera_sources import CameraSource
 from nodes.runtime.bus import Bus
 from nodes.runtime.clock import SystemClock
-from nodes.runtime.errors import RuntimeFault
+from nodes.runtime.config import load_node_config
+from nodes.runtime.errors import ConfigError, RuntimeFault
+from nodes.runtime.launch_file import load_launch
 from nodes.runtime.messages import image_array, ns_from_stamp, pinhole_from_camera_info
 from nodes.runtime.node import NodeContext
 from nodes.runtime.pictures import picture_array
@@ -275,3 +277,46 @@ def test_calibration_of_another_camera_is_refused(tmp_path):
     made = node(config(), device=zed(tmp_path, 280.0))
     with pytest.raises(RuntimeFault, match=r"fx 17\d.\d.*own\s+calibration fx 14\d.\d.*another camera or\s+mode"):
         made.receive(frame(), CLOCK.now())
+
+
+# The source in a launch file
+
+
+@pytest.mark.parametrize(
+    ("source", "message"),
+    [
+        (
+            "{kind: v4l2, device: d, width: 6, height: 4, colour: 1}",
+            r":1: unknown key source.colour; valid keys here: controls, device,",
+        ),
+        ("{kind: v4l2, device: d, width: 6}", r":1: source.height is missing"),
+        (
+            "{kind: v4l2, device: d, width: 6, height: four}",
+            r":1: source.height: input should be a valid integer.*got 'four'",
+        ),
+    ],
+)
+def test_error_in_a_source_is_told_as_it_was_written(tmp_path, source, message):
+    path = tmp_path / "camera.yaml"
+    path.write_text(f"source: {source}\ncalibration: c\n", encoding="utf-8")
+    with pytest.raises(ConfigError, match=message):
+        load_node_config(CameraConfig, "camera", path)
+
+
+def test_source_of_another_kind_replaces_the_one_of_the_included_launch_file(tmp_path):
+    (tmp_path / "base.launch.yaml").write_text(
+        "name: base\nnodes:\n  camera: {module: nodes.camera, config: {source: {kind: socket, path: s}, calibration: c}}\n"
+    )
+    above = "name: car\ninclude: [base.launch.yaml]\nnodes:\n  camera: {config: {source: SOURCE}}\n"
+    configs = {}
+    for name, source in (
+        ("other", "{kind: folder, folder: f}"),
+        ("same", "{kind: socket, stall_s: 2}"),
+        ("none", "{stall_s: 2}"),
+    ):
+        file = tmp_path / f"{name}.launch.yaml"
+        file.write_text(above.replace("SOURCE", source))
+        configs[name] = load_launch(file).nodes["camera"].config
+    assert configs["other"] == {"source": {"kind": "folder", "folder": "f"}, "calibration": "c"}
+    assert configs["same"] == configs["none"]
+    assert configs["none"]["source"] == {"kind": "socket", "path": "s", "stall_s": 2}
