@@ -134,7 +134,7 @@ def test_a_far_environment_is_learned_only_with_the_contraction(backend: str) ->
     images = ImageSet(np.stack([environment(T) for T in poses]), (CAMERA,) * 150, poses)
     real = np.stack([environment(T) for T in held_out]) / 255.0
     config = TrainConfig(
-        steps=300, samples_per_step=1 << 14, max_rays=1024, occupancy_resolution=32, warmup_steps=40, march=WIDE,
+        steps=600, samples_per_step=1 << 14, max_rays=1024, occupancy_resolution=32, warmup_steps=40, march=WIDE,
         opacity=0.0, distortion=2e-3, backend=backend,
     )  # fmt: skip
     field = dataclasses.replace(FIELD, box_low_m=(-1.0, -1.0, -1.0), box_high_m=(1.0, 1.0, 1.0))
