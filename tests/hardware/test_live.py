@@ -61,7 +61,7 @@ def test_every_form_of_occlusion_is_recognised(form):
             frames.occlude("car", form)
         for datagram in frames.next({"car": np.eye(4) + 0.0}):
             seen.append(len(tracker.update(datagram, 0, k * 10_000_000)))
-    # Noise makes a standing car look alive; "frozen" needs ten equal frames to be noticed.
+    # Noise makes a standing car look alive; "frozen" needs five equal frames to be noticed.
     assert sum(seen[:20]) == 20
     assert sum(seen[30:]) == (30 if form is None else 0)
 
@@ -128,3 +128,26 @@ def test_an_impossible_start_pose_leaves_nothing_behind(tmp_path):
         LiveLab(LiveLabConfig(start_pose=(3.9, 0.0, 0.0)), tmp_path)
     assert not (tmp_path / "frames").exists()
     assert not (tmp_path / "vesc").is_symlink()
+
+
+@pytest.mark.parametrize("fault", ["silent", "repeated"])
+def test_a_frozen_camera_gives_no_new_stamp(lab, fault):
+    def newest_stamps(camera, duration_s):
+        stamps, deadline = [], time.monotonic() + duration_s
+        while time.monotonic() < deadline:
+            if (frame := camera.read(0.05)) is not None:
+                stamps.append(frame.stamp_realtime_ns)
+        return stamps
+
+    with SocketCamera(lab.frames_path) as camera:
+        before = newest_stamps(camera, 0.4)
+        lab.freeze_camera(fault)
+        newest_stamps(camera, 0.2)  # what was on its way
+        frozen = newest_stamps(camera, 0.4)
+        lab.freeze_camera(None)
+        after = newest_stamps(camera, 0.4)
+    assert len(before) >= 2
+    assert len(set(frozen)) == (1 if fault == "repeated" else 0)
+    assert len(set(after)) >= 2
+    with pytest.raises(ValueError, match=r"expected a fault of silent, repeated, got 'dusty'"):
+        lab.freeze_camera("dusty")
