@@ -8,12 +8,12 @@ from collections.abc import Collection, Iterator
 from heapq import heappop, heappush
 from typing import BinaryIO, NamedTuple
 
-from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Chunk, ChunkIndex
 from mcap.stream_reader import get_chunk_data_stream
 from mcap.summary import Summary
 
+from nodes.runtime.bag_file import NONSENSE
 from nodes.runtime.errors import BagError
 
 _RECORD_HEAD = struct.Struct("<BQ")
@@ -21,7 +21,7 @@ _MESSAGE_HEAD = struct.Struct("<HIQQ")
 # Before the data of a chunk: start and end time, uncompressed size, CRC; then the name of the compression, then a length.
 _CHUNK_HEAD = struct.Struct("<QQQI")
 # What a damaged or hostile file may make us ask for.
-_MOST_BYTES = 1 << 30
+_MOST_BYTES = 1 << 28
 
 
 class RawMessage(NamedTuple):
@@ -81,7 +81,7 @@ def _messages(data: bytes, wanted: frozenset[int], chunk_offset: int) -> Iterato
 
 def _chunk_data(file: BinaryIO, index: ChunkIndex) -> bytes:
     """Records of a chunk, unpacked."""
-    size = os.fstat(file.fileno()).st_size
+    size = file.seek(0, os.SEEK_END)
     if index.chunk_start_offset + index.chunk_length > size or index.uncompressed_size > _MOST_BYTES:
         raise BagError(
             f"the bag's summary has a chunk of {index.chunk_length} bytes ({index.uncompressed_size} unpacked) at byte "
@@ -112,5 +112,5 @@ def _chunk_data(file: BinaryIO, index: ChunkIndex) -> bytes:
         )  # fmt: skip
         stream, length = get_chunk_data_stream(chunk)
         return bytes(stream.read(length))
-    except (struct.error, UnicodeDecodeError, McapError, ValueError) as error:
+    except NONSENSE as error:
         raise BagError(f"the chunk at byte {index.chunk_start_offset} of the bag cannot be read: {error}") from error

@@ -13,7 +13,8 @@ from mcap.summary import Summary
 
 from advnerf_core.files import write_atomically
 from nodes.runtime.bag_chunks import messages_in_order
-from nodes.runtime.bag_repair import mcap_file, read_summary
+from nodes.runtime.bag_file import open_bag
+from nodes.runtime.bag_repair import mcap_file, read_summary, type_of
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import BagError, TopicError
 from nodes.runtime.messages import type_hash
@@ -74,13 +75,13 @@ class BagMessage:
 def read_info(bag: Path) -> BagInfo:
     """Summary of a bag."""
     path, summary, statistics = _whole_file(bag)
-    with open(path, "rb") as file:
+    with open_bag(path) as file:
         records = {record.name: dict(record.metadata) for record in make_reader(file).iter_metadata()}
     ends = records.get("advnerf_end")
     topics = tuple(
         TopicInfo(
-            channel.topic, summary.schemas[channel.schema_id].name, statistics.channel_message_counts.get(channel.id, 0),
-            None if ends is None else int(ends.get(f"lost {channel.topic}", 0)),
+            channel.topic, type_of(summary, channel), statistics.channel_message_counts.get(channel.id, 0),
+            None if ends is None else _count(ends.get(f"lost {channel.topic}", "0")),
         )
         for channel in sorted(summary.channels.values(), key=lambda channel: channel.topic)
     )  # fmt: skip
@@ -92,7 +93,7 @@ def read_info(bag: Path) -> BagInfo:
 
 def read_attachment(bag: Path, name: str) -> bytes:
     """Content of an attached file."""
-    with open(_whole_file(bag)[0], "rb") as file:
+    with open_bag(_whole_file(bag)[0]) as file:
         names = []
         for attachment in make_reader(file).iter_attachments():
             if attachment.name == name:
@@ -103,7 +104,7 @@ def read_attachment(bag: Path, name: str) -> bytes:
 
 def read_attachments(bag: Path) -> dict[str, bytes]:
     """Content of all attached files by name; of two with one name the later."""
-    with open(_whole_file(bag)[0], "rb") as file:
+    with open_bag(_whole_file(bag)[0]) as file:
         return {attachment.name: bytes(attachment.data) for attachment in make_reader(file).iter_attachments()}
 
 
@@ -157,9 +158,11 @@ def read_messages(bag: Path, topics: Sequence[str] | None = None, start_offset_s
     names = {
         channel.id: channel.topic for channel in summary.channels.values() if not topics or channel.topic in topics
     }
-    with open(path, "rb") as file:
+    with open_bag(path) as file:
         if statistics.message_count and not summary.chunk_indexes:  # written by others, without chunks
-            for _, channel, message in make_reader(file).iter_messages(topics, starting_at=start_ns, log_time_order=True):
+            for _, channel, message in make_reader(file).iter_messages(
+                topics, starting_at=start_ns, log_time_order=True
+            ):
                 yield BagMessage(channel.topic, message.data, message.log_time, message.publish_time, message.sequence)
             return
         for raw in messages_in_order(file, summary, names, start_ns):
@@ -172,7 +175,7 @@ def require_our_types(bag: Path, topics: Sequence[str]) -> None:
     for channel in summary.channels.values():
         if channel.topic not in topics:
             continue
-        typename = summary.schemas[channel.schema_id].name
+        typename = type_of(summary, channel)
         try:
             ours = topic_row(channel.topic).type
         except TopicError as error:
@@ -182,6 +185,10 @@ def require_our_types(bag: Path, topics: Sequence[str]) -> None:
             raise BagError(
                 f"{path}: {channel.topic} is {typename} {found}, but here it is {ours} {type_hash(ours)}; leave it out with --topics"
             )
+
+
+def _count(text: str) -> int | None:
+    return int(text) if text.isascii() and text.isdigit() else None
 
 
 def _whole_file(bag: Path) -> tuple[Path, Summary, Statistics]:

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from mcap.data_stream import RecordBuilder
-from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.records import (
@@ -34,6 +33,7 @@ from mcap.writer import MCAP0_MAGIC
 
 from advnerf_core.files import write_atomically
 from nodes.runtime.bag import METADATA_FILE, Contents, rosbag2_metadata
+from nodes.runtime.bag_file import NONSENSE, BoundedFile
 from nodes.runtime.bag_journal import journal_of, read_journal
 from nodes.runtime.bag_scan import RECORD_HEAD, Scan, note_chunk, redo_last_index, scan_file
 from nodes.runtime.errors import BagError
@@ -73,10 +73,16 @@ def read_summary(path: Path) -> tuple[Summary, Statistics] | None:
     """Summary of a file, or None if it has none: its recorder was killed, or is still at work."""
     try:
         with open(path, "rb") as file:
-            summary = make_reader(file).get_summary()
-    except (McapError, ValueError, struct.error):
+            summary = make_reader(BoundedFile(file)).get_summary()  # type: ignore[arg-type]
+    except NONSENSE:
         return None
     return None if summary is None or summary.statistics is None else (summary, summary.statistics)
+
+
+def type_of(summary: Summary, channel: Channel) -> str:
+    """Type of a channel's messages; empty if the file does not say."""
+    schema = summary.schemas.get(channel.schema_id)
+    return schema.name if schema is not None else ""
 
 
 def repair(bag: Path) -> Repaired:
@@ -106,7 +112,7 @@ def _contents_of(summary: Summary, statistics: Statistics) -> Contents:
     contents = Contents(start_ns=statistics.message_start_time, end_ns=statistics.message_end_time)
     for channel in summary.channels.values():
         rihs = channel.metadata.get("topic_type_hash", "")
-        contents.add_topic(channel.topic, summary.schemas[channel.schema_id].name, rihs)
+        contents.add_topic(channel.topic, type_of(summary, channel), rihs)
         contents.counts[channel.topic] += statistics.channel_message_counts.get(channel.id, 0)
     return contents
 

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from mcap.data_stream import ReadDataStream, RecordBuilder
-from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import (
     Attachment,
@@ -30,6 +29,7 @@ from mcap.stream_reader import breakup_chunk
 from mcap.writer import MCAP0_MAGIC
 
 from nodes.runtime.bag import Contents
+from nodes.runtime.bag_file import NONSENSE
 from nodes.runtime.errors import BagError
 
 RECORD_HEAD = struct.Struct("<BQ")
@@ -108,7 +108,7 @@ def _note(scan: Scan, opcode: int, body: bytes) -> bool:
             Header.read(stream)
         else:
             return False
-    except (McapError, ValueError, struct.error, KeyError):
+    except NONSENSE:
         return False
     return True
 

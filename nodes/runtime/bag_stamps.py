@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import struct
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nodes.runtime.bag_read import read_info, read_messages
 from nodes.runtime.errors import TopicError
@@ -47,18 +47,20 @@ def read_delays(bag: Path) -> dict[str, Delays]:
     for message in read_messages(bag):
         stamp_ns = _stamp_ns(message.cdr) if names[message.topic] else 0
         rows.setdefault(message.topic, []).append((stamp_ns, message.publish_ns, message.log_ns))
-    return {topic: _delays(np.array(found, dtype=np.int64)) for topic, found in rows.items()}
+    return {topic: _delays(found) for topic, found in rows.items()}
 
 
-def _delays(times_ns: NDArray[np.int64]) -> Delays:
-    received = (times_ns[:, 2] - times_ns[:, 1]) / _NS_PER_MS
-    stamped = times_ns[times_ns[:, 0] > 0]
-    published = (stamped[:, 1] - stamped[:, 0]) / _NS_PER_MS
+def _delays(times_ns: list[tuple[int, int, int]]) -> Delays:
+    """Of stamp, publish and log time of each message [ns]; whole numbers, because a damaged bag may say anything."""
+    received = [(log - publish) / _NS_PER_MS for _, publish, log in times_ns]
+    stamped = [row for row in times_ns if row[0] > 0]
+    published = [(publish - stamp) / _NS_PER_MS for stamp, publish, _ in stamped]
     return Delays(
-        float(np.median(published)) if len(published) else None,
-        float(published.max()) if len(published) else None,
-        float(np.median(received)), float(received.max()),
-        int((np.diff(stamped[:, 0]) < 0).sum()), int((stamped[:, 0] > stamped[:, 2]).sum()),
+        float(np.median(published)) if published else None,
+        max(published, default=None),
+        float(np.median(received)), max(received),
+        sum(after[0] < before[0] for before, after in pairwise(stamped)),
+        sum(stamp > log for stamp, _, log in stamped),
     )  # fmt: skip
 
 

@@ -99,6 +99,10 @@ class Lockstep:
         )
         self._nodes = dict(nodes)
         self._clock = clock
+        self._listeners: dict[str, list[str]] = {}
+        for name, node in nodes.items():
+            for topic in node.subscriptions:
+                self._listeners.setdefault(topic, []).append(name)
         self._hash = hashlib.sha256()
         self._streams: dict[str, _Stream] = {}
         self._sequences: Counter[str] = Counter()
@@ -113,7 +117,7 @@ class Lockstep:
     @property
     def heard_topics(self) -> set[str]:
         """Topics that at least one node listens to."""
-        return {topic for node in self._nodes.values() for topic in node.subscriptions}
+        return set(self._listeners)
 
     def feed(self, message: BagMessage) -> list[BagMessage]:
         """Give the nodes a message of the bag, when the time before it has passed; what they say because of it, in order."""
@@ -158,8 +162,9 @@ class Lockstep:
         while waiting:
             message, lost = waiting.popleft()
             decoded: Any = None
-            for name, node in list(self._nodes.items()):
-                if message.topic not in node.subscriptions:
+            for name in self._listeners.get(message.topic, ()):
+                node = self._nodes.get(name)
+                if node is None:  # it has finished
                     continue
                 if decoded is None and not node.raw:
                     try:

@@ -1,3 +1,4 @@
+import contextlib
 import errno
 import hashlib
 import os
@@ -19,7 +20,14 @@ from nodes import cli
 from nodes.runtime import bag as bag_module
 from nodes.runtime.bag import BagWriter
 from nodes.runtime.bag_journal import journal_of
-from nodes.runtime.bag_read import extract_attachments, read_attachment, read_info, read_messages, require_our_types
+from nodes.runtime.bag_read import (
+    extract_attachments,
+    read_attachment,
+    read_attachments,
+    read_info,
+    read_messages,
+    require_our_types,
+)
 from nodes.runtime.bag_repair import repair
 from nodes.runtime.bag_stamps import read_delays
 from nodes.runtime.errors import BagError
@@ -221,6 +229,37 @@ def test_a_summary_that_lies_is_an_error_and_takes_no_memory(tmp_path):
         path.write_bytes(content)
         with pytest.raises(BagError, match=r"damaged|cannot be read"):
             list(read_messages(path))
+
+
+def test_no_damage_makes_a_reader_do_anything_but_say_so(tmp_path):
+    """Bytes changed, lengths that ask for the moon, pieces cut out and put in; seeds 0 to 59, and short files."""
+    write_all_topics(tmp_path / "bag", rounds=1, attachments={"a": b"x" * 50}).close({"lost /arm": "1"})
+    content = (tmp_path / "bag" / "bag.mcap").read_bytes()
+    path = tmp_path / "x.mcap"
+
+    def read_everything():
+        for read in (read_info, read_attachments, read_delays, lambda bag: list(read_messages(bag)), repair, read_info):
+            with contextlib.suppress(BagError):
+                read(path)
+
+    for seed in range(60):
+        rng, damaged = np.random.default_rng(seed), bytearray(content)
+        for _ in range(int(rng.integers(1, 6))):
+            at = int(rng.integers(0, len(damaged)))
+            change = rng.integers(0, 4)
+            if change == 0:
+                damaged[at] ^= int(rng.integers(1, 256))
+            elif change == 1:
+                damaged[at : at + 8] = int(rng.choice([2**63 - 1, 2**40, 0])).to_bytes(8, "little")
+            elif change == 2:
+                del damaged[at : at + int(rng.integers(1, 60))]
+            else:
+                damaged[at:at] = rng.bytes(int(rng.integers(1, 20)))
+        path.write_bytes(damaged)
+        read_everything()
+    for length in range(0, 60, 7):
+        path.write_bytes(content[:length])
+        read_everything()
 
 
 def test_attachments_are_taken_out_and_nothing_is_overwritten(tmp_path):

@@ -1,0 +1,62 @@
+"""Reading MCAP files that may be damaged, or made to do damage: bounded reads, and one kind of error."""
+
+from __future__ import annotations
+
+import os
+import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from mcap.exceptions import McapError
+from zstandard import ZstdError
+
+from nodes.runtime.errors import BagError
+
+# What the readers of the format raise when the bytes make no sense.
+NONSENSE = (
+    McapError, ZstdError, ValueError, KeyError, IndexError, TypeError, RuntimeError, OverflowError, MemoryError, EOFError,
+    struct.error,
+)  # fmt: skip
+
+
+class BoundedFile:
+    """A file of which no more is asked than there is: a length in a damaged file may say anything."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+        self._size = os.fstat(file.fileno()).st_size
+
+    def read(self, size: int = -1) -> bytes:
+        """Read so many bytes, or what is left."""
+        left = max(0, self._size - self._file.tell())
+        return self._file.read(left if size < 0 else min(size, left))
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        """Go to a place; outside the file is an error."""
+        place = offset + {os.SEEK_SET: 0, os.SEEK_CUR: self._file.tell(), os.SEEK_END: self._size}[whence]
+        if not 0 <= place <= self._size:
+            raise EOFError(f"byte {place} of {self._size}")
+        return self._file.seek(place)
+
+    def tell(self) -> int:
+        """The present place."""
+        return self._file.tell()
+
+    def seekable(self) -> bool:
+        """Yes."""
+        return True
+
+
+@contextmanager
+def open_bag(path: Path) -> Iterator[Any]:
+    """A bag's file for the readers of the format; whatever they stumble over inside is one `BagError`."""
+    try:
+        with open(path, "rb") as file:
+            yield BoundedFile(file)
+    except NONSENSE as error:
+        what = f"{type(error).__name__} {error}".strip()
+        raise BagError(
+            f"{path} is damaged and cannot be read ({what:.120}); try a copy of it with: advnerf bag repair"
+        ) from error
