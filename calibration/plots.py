@@ -60,7 +60,8 @@ def mount_plot(fit: MountFit) -> Callable[[Figure], None]:
         axes = figure.subplots()
         index, rms = np.arange(len(fit.view_rms_px)), fit.view_rms_px
         axes.bar(index[fit.used], rms[fit.used], label="fitted")
-        axes.bar(index[~fit.used], np.nan_to_num(rms[~fit.used]), color="tab:red", label="left out")
+        if not fit.used.all():
+            axes.bar(index[~fit.used], np.nan_to_num(rms[~fit.used]), color="tab:red", label="left out")
         degrees, mm = np.degrees(fit.rotation_stddev_rad), 1000.0 * fit.translation_stddev_m
         axes.set(
             title=f"{fit.method}\nstandard deviation {degrees:.3f} degrees, {mm:.2f} mm", xlabel="view", ylabel="reprojection error [px]"

@@ -170,7 +170,7 @@ def vehicle_calibration(gains: GainsFit, response: ResponseFit, before: VehicleC
         method="constant-command circles and straight runs by motion capture; delay and lag by least squares on its yaw and way",
         residuals={key: round(float(value), 6) for key, value in residuals.items()}, response=response.section,
         gains=GainsSection(
-            erpm_per_mps=round(gains.erpm_per_mps, 3), erpm_offset=round(gains.erpm_offset, 3),
+            erpm_per_mps=round(gains.erpm_per_mps, 3), erpm_offset=round(gains.erpm_offset, 3) + 0.0,
             servo_per_rad=round(gains.servo_per_rad, 6), servo_offset=round(gains.servo_offset, 6),
             servo_min=g.servo_min, servo_max=g.servo_max,
         ),
