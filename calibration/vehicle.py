@@ -18,10 +18,10 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from advnerf_core.geometry import Array
 from calibration.degeneracy import DegenerateDataError, PoorFitError, require_count
+from calibration.linear import line_stddev, linear_fit
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,20 +165,20 @@ def fit_gains(drive: Drive, wheelbase_m: float, config: GainsConfig | None = Non
     _require_variety(segments, config)
     w = np.array([s.yaw_rate_radps for s in segments])
     vx, vy = (np.array([getattr(s, name) for s in segments]) for name in ("vx_mps", "vy_mps"))
-    (ahead, turned), _ = _least_squares(np.stack([w, -vx], axis=1), vy)
+    (ahead, turned), _ = linear_fit(np.stack([w, -vx], axis=1), vy)
     # The tracked point's speed along the way of the rear axle; b is not told from the gain's asymmetry and is taken as 0.
     speed = vx * np.cos(turned) - (vy - ahead * w) * np.sin(turned)
     steering = np.arctan(wheelbase_m * w / speed)
     servo, erpm = (np.array([getattr(s, name) for s in segments]) for name in ("servo", "erpm"))
     # The servo value is exact, the angle is measured: angle over servo, then inverted.
-    (slope, at_zero), (slope_sd, _) = _least_squares(np.stack([servo, np.ones_like(servo)], axis=1), steering)
+    (slope, at_zero), (slope_sd, _) = linear_fit(np.stack([servo, np.ones_like(servo)], axis=1), steering)
     if abs(slope) < 1e-3:
         raise PoorFitError(
             "expected the curvature to follow the servo, got none; is the servo output on, the stamp right?"
         )
     gain, offset = 1.0 / slope, -at_zero / slope
     # Near the middle of the data the line is known best; the offset's error is that of the line at angle zero.
-    offset_sd = _line_stddev(servo, steering, slope, at_zero, offset) * abs(gain)
+    offset_sd = line_stddev(servo, steering, slope, at_zero, offset) * abs(gain)
     speed_gain, speed_offset, speed_sd = _speed_line(speed, erpm)
     stddev = {
         "servo_per_rad": slope_sd * gain**2, "servo_offset": offset_sd, "erpm_per_mps": speed_sd,
@@ -218,7 +218,7 @@ def twist(time_s: Array, poses: Array) -> tuple[float, float, float]:
     yaw at the middle, so for a yaw rate from the yaw alone everything else is linear.
     """
     t = time_s - time_s.mean()
-    (w, yaw), _ = _least_squares(np.stack([t, np.ones_like(t)], axis=1), poses[:, 2])
+    (w, yaw), _ = linear_fit(np.stack([t, np.ones_like(t)], axis=1), poses[:, 2])
     sine = t * np.sinc(w * t / np.pi)
     cosine = 0.5 * w * t**2 * np.sinc(0.5 * w * t / np.pi) ** 2
     one, zero = np.ones_like(t), np.zeros_like(t)
@@ -226,7 +226,7 @@ def twist(time_s: Array, poses: Array) -> tuple[float, float, float]:
     c, s = np.cos(yaw), np.sin(yaw)
     along, across = c * poses[:, 0] + s * poses[:, 1], c * poses[:, 1] - s * poses[:, 0]
     rows = np.concatenate([np.stack([sine, -cosine, one, zero], axis=1), np.stack([cosine, sine, zero, one], axis=1)])
-    (vx, vy, _, _), _ = _least_squares(rows, np.concatenate([along, across]))
+    (vx, vy, _, _), _ = linear_fit(rows, np.concatenate([along, across]))
     return vx, vy, w
 
 
@@ -277,9 +277,9 @@ def _require_variety(segments: list[Segment], config: GainsConfig) -> None:
 
 def _speed_line(speed: Array, erpm: Array) -> tuple[float, float, float]:
     """Gain, offset and the gain's standard deviation; no offset unless the data show one beyond doubt."""
-    (slope, at_zero), (slope_sd, zero_sd) = _least_squares(np.stack([erpm, np.ones_like(erpm)], axis=1), speed)
+    (slope, at_zero), (slope_sd, zero_sd) = linear_fit(np.stack([erpm, np.ones_like(erpm)], axis=1), speed)
     if abs(at_zero) < 3.0 * zero_sd or abs(at_zero) < 0.005:
-        (slope,), (slope_sd,) = _least_squares(erpm[:, None], speed)
+        (slope,), (slope_sd,) = linear_fit(erpm[:, None], speed)
         at_zero = 0.0
     if abs(slope) < 1e-6:
         raise PoorFitError("expected the speed to follow the command, got none; is the motor on, the car on the floor?")
@@ -298,24 +298,3 @@ def _require_lines(fit: GainsFit, config: GainsConfig) -> None:
             f"expected speeds on a line within {100 * config.most_speed_rms:.0f} %, got {fit.speed_rms_mps:.3f} m/s at up to {fast:.2f} m/s; was the "
             "floor level, the battery full, the car lifted?"
         )
-
-
-def _least_squares(rows: Array, values: Array) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Coefficients and their standard deviations."""
-    found, _, rank, _ = np.linalg.lstsq(rows, values, rcond=None)
-    left = values - rows @ found
-    freedom = max(len(values) - rows.shape[1], 1)
-    covariance = np.linalg.pinv(rows.T @ rows) * float(left @ left) / freedom
-    if rank < rows.shape[1]:
-        raise DegenerateDataError(
-            "expected commands that differ, got the same everywhere: gain and offset cannot be told apart"
-        )
-    return tuple(float(v) for v in found), tuple(float(v) for v in np.sqrt(np.diag(covariance)))
-
-
-def _line_stddev(x: Array, y: Array, slope: float, at_zero: float, where: float) -> float:
-    """Standard deviation of a fitted line at one place."""
-    left: NDArray[np.float64] = y - slope * x - at_zero
-    variance = float(left @ left) / max(len(x) - 2, 1)
-    spread = float(np.sum((x - x.mean()) ** 2))
-    return float(np.sqrt(variance * (1.0 / len(x) + (where - x.mean()) ** 2 / spread)))
