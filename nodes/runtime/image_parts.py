@@ -66,7 +66,7 @@ class PartedInfo(MessageInfo):
     parts: tuple[bytes, bytes]
 
     @cached_property
-    def raw(self) -> bytes:  # type: ignore[override]
+    def raw(self) -> bytes:
         """The CDR bytes."""
         return b"".join(self.parts)
 
