@@ -76,5 +76,8 @@ def test_traces_that_are_none_are_refused_with_the_reason():
         fit_path([[0.0, np.nan], [1.0, 1.0]])
     s = np.linspace(0.0, 6.0, 800)
     zigzag = np.stack([s, 0.3 * np.abs((s / 0.25) % 2 - 1)], axis=1)
+    with pytest.raises(DegenerateDataError, match=r"needs \d+ lines and arcs on"):
+        fit_path(zigzag)
+    wavy = np.stack([s, 0.1 * np.sin(s / 0.5)], axis=1)
     with pytest.raises(DegenerateDataError, match="lines and arcs leave"):
-        fit_path(zigzag, PathFitConfig(worst_rms_m=0.01))
+        fit_path(wavy, PathFitConfig(worst_rms_m=0.0005))

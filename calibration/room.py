@@ -1,0 +1,236 @@
+"""The room by motion capture: a fence from a walk around it, a start before a corner, and where a target's corners are.
+
+Everything is measured with what a lab has anyway: the car driven by hand, or a wand whose tip is known.
+"""
+
+from __future__ import annotations
+
+import datetime
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from advnerf_core.driving.path import Arc, Path
+from advnerf_core.geometry import Array, invert_transform, transform_points
+from calibration.degeneracy import DegenerateDataError
+from calibration.schema import TargetCalibration
+
+_CELL_M = 0.01
+_LARGEST_ROOM_M = 50.0
+_SIMPLIFY_M = 0.03
+_STILL_M = 0.004
+_STILL_S = 0.8
+_RECTANGLE_M = 0.01
+CORNERS = ("top left", "top right", "bottom right", "bottom left")
+
+
+def fence_from_trace(trace: ArrayLike, margin_m: float) -> tuple[tuple[float, float], ...]:
+    """Polygon ``[n][2]`` [m] a margin inside of a closed walk around the free floor.
+
+    Args:
+        trace: Positions in the order of time ``[N, 2]`` [m].
+        margin_m: How far inside the fence lies [m].
+
+    Raises:
+        DegenerateDataError: The walk encloses nothing, or nothing is left inside the margin.
+    """
+    xy = _finite(trace)
+    canvas, origin = _canvas(xy, 0.2)
+    pixels = _to_pixels(xy, origin)
+    cv2.fillPoly(canvas, [pixels], 1)
+    inside = cv2.distanceTransform(np.pad(canvas, 1), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[1:-1, 1:-1] * _CELL_M
+    return _outline((inside > margin_m).astype(np.uint8), origin, f"inside of a margin of {margin_m:g} m")
+
+
+def fence_around(path: Path, margin_m: float) -> tuple[tuple[float, float], ...]:
+    """Polygon ``[n][2]`` [m] a margin outside of a path; the inside of a loop belongs to it."""
+    xy = path.pose_at(np.linspace(0.0, path.length_m, 1000))[:, :2]
+    canvas, origin = _canvas(xy, margin_m + 0.2)
+    pixels = _to_pixels(xy, origin)
+    if path.closed:
+        cv2.fillPoly(canvas, [pixels], 1)
+    else:
+        cv2.polylines(canvas, [pixels], False, 1)
+    away = cv2.distanceTransform(1 - canvas, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) * _CELL_M
+    return _outline((away < margin_m).astype(np.uint8), origin, "around the path")
+
+
+def clearance(path: Path, fence: ArrayLike) -> float:
+    """Least distance of a path to the inside of a fence [m]; negative where it leaves it."""
+    polygon = np.asarray(fence, np.float32)[:, None]
+    points = path.pose_at(np.linspace(0.0, path.length_m, 1000))[:, :2].astype(np.float32)
+    return min(cv2.pointPolygonTest(polygon, (float(x), float(y)), True) for x, y in points)
+
+
+def start_before_corner(path: Path, corner: int, before_m: float) -> tuple[float, float, float]:
+    """Pose on a path a distance before one of its arcs.
+
+    Args:
+        path: The path.
+        corner: Which arc, from 1.
+        before_m: Distance along the path [m].
+    """
+    starts = np.concatenate([[0.0], np.cumsum([piece.length_m for piece in path.segments])])
+    corners = [float(s) for s, piece in zip(starts, path.segments, strict=False) if isinstance(piece, Arc)]
+    if not 1 <= corner <= len(corners):
+        raise DegenerateDataError(f"expected a corner from 1 to {len(corners)}, the arcs of the path, got {corner}")
+    s = corners[corner - 1] - before_m
+    if not path.closed and s < 0.0:
+        raise DegenerateDataError(
+            f"expected {before_m:g} m of path before corner {corner}, there are {corners[corner - 1]:.2f} m"
+        )
+    x, y, yaw = (round(float(value), 4) for value in path.pose_at(s % path.length_m if path.closed else s))
+    return x, y, yaw
+
+
+def target_of_size(
+    subject: str, size_m: tuple[float, float], centre_m: tuple[float, float, float], normal_yaw_rad: float, method: str
+) -> TargetCalibration:
+    """An upright rectangle in its subject's frame, from a ruler.
+
+    Args:
+        subject: Motion-capture subject.
+        size_m: Width and height [m].
+        centre_m: Its middle in the subject's frame [m].
+        normal_yaw_rad: Where it looks, about the subject's z axis [rad]; 0 is along x.
+        method: How it was measured.
+    """
+    if min(size_m) <= 0.0:
+        raise DegenerateDataError(f"expected a width and a height > 0, got {size_m[0]:g} x {size_m[1]:g} m")
+    # For somebody who faces it, left is the side of the negative y axis of its own frame.
+    right = np.array([-np.sin(normal_yaw_rad), np.cos(normal_yaw_rad), 0.0])
+    up = np.array([0.0, 0.0, 1.0])
+    half_w, half_h = 0.5 * size_m[0], 0.5 * size_m[1]
+    corners = [
+        np.asarray(centre_m) + x * half_w * right + z * half_h * up for x, z in ((-1, 1), (1, 1), (1, -1), (-1, -1))
+    ]
+    return _target(subject, np.array(corners), method, None, {})
+
+
+@dataclass(frozen=True, eq=False)
+class Touches:
+    """Where a wand's tip was held still.
+
+    Attributes:
+        points_in_subject_m: ``[K, 3]`` in the order of time [m].
+        spread_m: Standard deviation of each ``[K]`` [m].
+    """
+
+    points_in_subject_m: Array
+    spread_m: Array
+
+
+def find_touches(
+    stamps_ns: NDArray[np.int64], T_world_from_wand: Array, T_world_from_subject: Array, tip_in_wand_m: ArrayLike
+) -> Touches:
+    """Moments at which the wand's tip rested, in the subject's frame.
+
+    Args:
+        stamps_ns: ``[N]`` [ns].
+        T_world_from_wand: ``[N, 4, 4]``.
+        T_world_from_subject: ``[N, 4, 4]`` at the same moments.
+        tip_in_wand_m: Where the wand touches, in its own frame ``[3]`` [m].
+    """
+    tip = np.asarray(tip_in_wand_m, dtype=np.float64)
+    tips = np.stack([
+        transform_points(invert_transform(subject) @ wand, tip)
+        for wand, subject in zip(T_world_from_wand, T_world_from_subject, strict=True)
+    ])  # fmt: skip
+    seconds = (stamps_ns - stamps_ns[0]) / 1e9
+    points, spreads, begin = [], [], 0
+    for index in range(1, len(tips) + 1):
+        moved = index == len(tips) or np.linalg.norm(tips[index] - np.median(tips[begin:index], axis=0)) > _STILL_M
+        if not moved:
+            continue
+        if seconds[index - 1] - seconds[begin] >= _STILL_S:
+            rest = tips[begin:index]
+            points.append(rest.mean(axis=0))
+            spreads.append(float(rest.std(axis=0).max()))
+        begin = index
+    return Touches(np.array(points).reshape(-1, 3), np.array(spreads))
+
+
+def target_of_touches(subject: str, touches: Touches) -> TargetCalibration:
+    """A target from its four corners, touched in the order top left, top right, bottom right, bottom left.
+
+    The corners become the nearest rectangle; how far they were from it is written down.
+
+    Raises:
+        DegenerateDataError: Not four touches, or no rectangle in that order.
+    """
+    points = touches.points_in_subject_m
+    if len(points) != 4:
+        raise DegenerateDataError(
+            f"expected the wand to rest at four corners for {_STILL_S:g} s each ({', '.join(CORNERS)}), found {len(points)} rests"
+        )
+    middle = points.mean(axis=0)
+    across = 0.5 * (points[1] - points[0] + points[2] - points[3])
+    down = 0.5 * (points[3] - points[0] + points[2] - points[1])
+    width, height = float(np.linalg.norm(across)), float(np.linalg.norm(down))
+    if min(width, height) < 0.05:
+        raise DegenerateDataError(
+            f"expected a face, the corners span {width:.3f} x {height:.3f} m: touched in another order?"
+        )
+    right = across / width
+    down = down - (down @ right) * right
+    down /= np.linalg.norm(down)
+    half = 0.5 * np.array([[-width, -height], [width, -height], [width, height], [-width, height]])
+    corners = middle + half[:, :1] * right + half[:, 1:] * down
+    off = np.linalg.norm(corners - points, axis=1)
+    if off.max() > _RECTANGLE_M:
+        worst = CORNERS[int(off.argmax())]
+        raise DegenerateDataError(
+            f"expected four corners of a rectangle, the {worst} one is {1000 * off.max():.0f} mm off: touch them again in the order "
+            f"{', '.join(CORNERS)}, as seen by somebody who faces it"
+        )
+    residuals = {
+        "rectangle_mm": round(1000.0 * float(off.max()), 3),
+        "rest_mm": round(1000.0 * float(touches.spread_m.max()), 3),
+    }
+    return _target(subject, corners, "touched with a wand", 4, residuals)
+
+
+def _target(
+    subject: str, corners: Array, method: str, views: int | None, residuals: dict[str, float]
+) -> TargetCalibration:
+    rows = tuple(tuple(round(float(v), 5) for v in corner) for corner in corners)
+    return TargetCalibration.model_validate(
+        {
+            "date": datetime.date.today(), "method": method, "subject": subject, "corners_in_subject_m": rows,
+            "views": views, "residuals": residuals,
+        }
+    )  # fmt: skip
+
+
+def _finite(trace: ArrayLike) -> Array:
+    xy = np.asarray(trace, dtype=np.float64)
+    if xy.ndim != 2 or xy.shape[1] != 2 or len(xy) < 3 or not np.isfinite(xy).all():
+        raise DegenerateDataError(f"expected a trace of finite positions [N >= 3, 2], got shape {list(xy.shape)}")
+    return xy
+
+
+def _canvas(xy: Array, margin_m: float) -> tuple[NDArray[np.uint8], Array]:
+    low, high = xy.min(axis=0) - margin_m, xy.max(axis=0) + margin_m
+    if (high - low).max() > _LARGEST_ROOM_M:
+        raise DegenerateDataError(
+            f"expected a room of at most {_LARGEST_ROOM_M:g} m, the trace spans {(high - low).max():.0f} m"
+        )
+    columns, rows = np.ceil((high - low) / _CELL_M).astype(int) + 1
+    return np.zeros((rows, columns), np.uint8), low
+
+
+def _to_pixels(xy: Array, origin: Array) -> NDArray[np.int32]:
+    return np.round((xy - origin) / _CELL_M).astype(np.int32)[:, None]
+
+
+def _outline(mask: NDArray[np.uint8], origin: Array, what: str) -> tuple[tuple[float, float], ...]:
+    contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    if not contours:
+        raise DegenerateDataError(f"no floor is left {what}: walk around all of it, or take a smaller margin")
+    largest = max(contours, key=cv2.contourArea)
+    corners = cv2.approxPolyDP(largest, _SIMPLIFY_M / _CELL_M, True)[:, 0]
+    if len(corners) < 3:
+        raise DegenerateDataError(f"no floor is left {what}: walk around all of it, or take a smaller margin")
+    return tuple((round(float(x), 3), round(float(y), 3)) for x, y in origin + corners * _CELL_M)

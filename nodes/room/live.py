@@ -1,0 +1,49 @@
+"""Where a subject stands now: the middle of its poses over a moment, and nothing when motion capture has lost it."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from advnerf_core.geometry import Array, make_transform
+from calibration.degeneracy import mean_rotation
+from nodes.runtime.bus import Bus
+from nodes.runtime.messages import pose_matrix
+
+_LOST_S = 0.5
+_LEAST_POSES = 5
+
+
+def standing_poses(run_dir: Path, topic: str, period_s: float, window_s: float = 0.5) -> Iterator[Array | None]:
+    """Mean pose ``[4, 4]`` over a moment, once per period, for ever; None while the subject is lost.
+
+    Args:
+        run_dir: Folder of the running launch.
+        topic: The subject's topic.
+        period_s: Time between two answers [s].
+        window_s: Over how long poses are averaged [s].
+    """
+    recent: deque[tuple[float, Array]] = deque()
+    with Bus(run_dir) as bus:
+        bus.subscribe(topic, queue=1000)
+        due = time.monotonic() + period_s
+        while True:
+            bus.wait(max(0.0, min(0.05, due - time.monotonic())))
+            now = time.monotonic()
+            recent.extend((now, pose_matrix(received.message())) for received in bus.receive())
+            while recent and now - recent[0][0] > window_s:
+                recent.popleft()
+            if now < due:
+                continue
+            due = now + period_s
+            fresh = len(recent) >= _LEAST_POSES and now - recent[-1][0] < _LOST_S
+            yield _mean([T for _, T in recent]) if fresh else None
+
+
+def _mean(poses: list[Array]) -> Array:
+    stack = np.stack(poses)
+    return make_transform(mean_rotation(stack[:, :3, :3]), stack[:, :3, 3].mean(axis=0))

@@ -1,0 +1,37 @@
+"""An attack request at the pose that was measured: the other way to bring face and attack together."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import yaml
+
+from advnerf_core.files import write_atomically
+from nodes.runtime.config import read_yaml
+from nodes.runtime.errors import ConfigError
+
+_POSE_KEYS = ("T_world_from_object", "x_m", "y_m", "z_m", "yaw_rad")
+
+
+def write_measured_request(request: Path, pose: dict[str, float]) -> Path:
+    """Write the request again, beside it, with the face's pose replaced.
+
+    Args:
+        request: A ``*.attack.yaml`` file with one object of kind ``face``.
+        pose: ``x_m``, ``y_m``, ``z_m`` and ``yaw_rad``.
+
+    Returns:
+        The new file; its relative paths mean the same, because it is in the same folder.
+    """
+    data = read_yaml(request).data
+    objects = data.get("objects") if isinstance(data, dict) else None
+    faces = [each for each in objects or [] if isinstance(each, dict) and each.get("kind") == "face"]
+    if len(faces) != 1:
+        raise ConfigError(f"{request}: expected one object of kind face, got {len(faces)}; change the pose by hand")
+    for key in _POSE_KEYS:
+        faces[0].pop(key, None)
+    faces[0].update(pose)
+    stem = request.name.removesuffix(".yaml").removesuffix(".attack")
+    output = request.with_name(f"{stem}.measured.attack.yaml")
+    write_atomically(output, yaml.safe_dump(data, sort_keys=False))
+    return output
