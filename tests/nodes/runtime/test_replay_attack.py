@@ -1,0 +1,163 @@
+"""Retro-attack, golden comparison, and the options of ``advnerf replay``."""
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from nodes import cli
+from nodes.runtime.bag_read import BagMessage, read_attachments, read_messages
+from nodes.runtime.errors import BagError
+from nodes.runtime.messages import decode, drive_message, encode, pose_message, type_name
+from nodes.runtime.replay import Replay, write_replay
+from nodes.runtime.replay_attack import plot_retro_attack, retro_attack
+from nodes.runtime.replay_golden import Golden, Tolerances, compare
+from nodes.runtime.replay_nodes import Choice
+from nodes.runtime.topics import topic as topic_row
+
+START_NS = 1_800_000_000_000_000_000
+MS = 1_000_000
+GOLDEN_FOLDER = Path(__file__).parents[2] / "replay"
+CORNER = GOLDEN_FOLDER / "corner.mcap"
+GREEN = Choice(("compositor", "policy"), {"policy": "green_policy"})
+
+
+@pytest.fixture(autouse=True)
+def _green_policy_is_found(monkeypatch):
+    monkeypatch.syspath_prepend(str(GOLDEN_FOLDER))
+
+
+def pose(ms, sequence=0, x=0.0):
+    T = np.eye(4)
+    T[0, 3] = x
+    ns = START_NS + ms * MS
+    return BagMessage("/vicon/car", encode(pose_message(T, ns)), ns, ns - MS, sequence)
+
+
+def run(choice=GREEN, bag=CORNER):
+    with Replay(bag, choice) as replay:
+        made = [entry.message for entry in replay]
+        return made, replay.summary
+
+
+@pytest.fixture(scope="module")
+def clean_drive(tmp_path_factory):
+    """The little bag as it would have been recorded without an attack, with what the policy said then."""
+    folder = tmp_path_factory.mktemp("clean") / "drive"
+    sys.path.insert(0, str(GOLDEN_FOLDER))
+    try:
+        with Replay(CORNER, clean(), whole=True) as replay:
+            write_replay(replay, folder)
+    finally:
+        sys.path.remove(str(GOLDEN_FOLDER))
+    return folder
+
+
+def clean(*overrides):
+    return Choice(GREEN.nodes, GREEN.replacements, None, ("compositor.attack=null", *overrides))
+
+
+def test_retro_attack_is_the_difference_of_two_drives(clean_drive, tmp_path):
+    attack = tmp_path / "new.attack.safetensors"
+    attack.write_bytes(read_attachments(CORNER)["corner.attack.safetensors"])
+    result = retro_attack(clean_drive, attack, GREEN)
+    # Truth: the policy by hand on the images that were recorded and those with the face, made above in another way.
+    green = {}
+    for name, choice in (("attacked", GREEN), ("clean", clean())):
+        images = [decode("sensor_msgs/msg/Image", m.cdr) for m in run(choice)[0] if m.topic == "/compositor/image"]
+        pixels = np.array([np.asarray(image.data).reshape(27, 48, 3)[..., 1] for image in images], float)
+        green[name] = 0.01 * (pixels[:, :, 24:].sum((1, 2)) - pixels[:, :, :24].sum((1, 2))) / pixels[0].size
+    np.testing.assert_allclose(result.clean_rad, green["clean"], atol=1e-7)
+    np.testing.assert_allclose(result.attacked_rad, green["attacked"], atol=1e-7)
+    np.testing.assert_array_equal(result.recorded_rad, result.clean_rad)
+    delta = green["attacked"] - green["clean"]
+    numbers = result.numbers()
+    assert (numbers["frames"], numbers["frames_drawn"], numbers["clean_against_recorded_rad"]) == (12, 12, 0.0)
+    assert numbers["mean_abs_delta_rad"] == pytest.approx(np.abs(delta).mean(), abs=1e-7)
+    assert numbers["largest_delta_rad"] == pytest.approx(delta[np.abs(delta).argmax()], abs=1e-7)
+    side = "left" if delta.mean() > 0 else "right"
+    assert f"{abs(np.rad2deg(delta.mean())):.2f} degrees more to the {side} on average" in result.verdict()
+    result.write_json(tmp_path / "out" / "retro.json")
+    saved = json.loads((tmp_path / "out" / "retro.json").read_text())
+    assert saved["attack_id"] == result.attack_id
+    assert [row["delta_rad"] for row in saved["images"]] == pytest.approx(delta, abs=1e-7)
+    plot_retro_attack(result, tmp_path / "retro.png")
+    assert (tmp_path / "retro.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_retro_attack_on_the_command_line(clean_drive, tmp_path, capsys):
+    attack = tmp_path / "new.attack.safetensors"
+    attack.write_bytes(read_attachments(CORNER)["corner.attack.safetensors"])
+    command = ["replay", str(clean_drive), "--attack", str(attack), "--replace", "policy=green_policy"]
+    cli.app([*command, "--json", str(tmp_path / "r.json")], standalone_mode=False)
+    printed = capsys.readouterr().out
+    assert "with the face in view (12 of 12 images) the policy would have steered" in printed
+    assert "clean against recorded: 0.000 degrees" in printed
+    assert printed.count("in view") == 13
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--nodes", "policy", "--json", "x.json"], "--json and --plot belong to --attack"),
+        (["--nodes", "policy", "--update-golden"], "--update-golden needs to know which one"),
+        (["--nodes", "policy", "--golden", "x.mcap", "-o", "out"], "expected one of --golden, --output and --attack"),
+        (["--nodes", "policy", "--tolerance", "1"], "--topics and --tolerance belong to --golden"),
+        (["--nodes", "policy", "--replace", "policy"], "expected NODE=MODULE or NODE=MODULE:CLASS"),
+        (["--nodes", "compositor", "--policy", "x.onnx"], "--policy needs the node policy among --nodes"),
+        (["--nodes", "compositor", "--golden", "nothing.mcap"], "no golden bag nothing.mcap; write it with"),
+        ([], "expected at least one node to replay"),
+    ],
+)
+def test_options_that_do_not_go_together_are_one_clear_error(arguments, words):
+    with pytest.raises(BagError, match=words):
+        cli.app(["replay", str(CORNER), *arguments], standalone_mode=False)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "tolerances", "name", "by"),
+    [
+        (drive_message(1, 0.25, 5), drive_message(1, 0.25, 5), [], None, None),
+        (drive_message(1, 0.25, 5), drive_message(1, 0.5, 5), [], "drive.steering_angle", 0.25),
+        (drive_message(1, 0.25, 5), drive_message(1, 0.5, 5), ["0.3"], None, None),
+        (drive_message(1, 0.25, 5), drive_message(1, 0.5, 5), ["0.3", "/policy/drive:drive.steering_angle=0.2"],
+         "drive.steering_angle", 0.25),
+        (drive_message(1, 0.25, 5), drive_message(1, 0.25, 9), [], "header.stamp.nanosec", 4),
+        (drive_message(1, 0.25, 5, "a"), drive_message(1, 0.25, 5, "b"), ["9"], "header.frame_id", None),
+        (drive_message(1, np.nan, 5), drive_message(1, np.nan, 5), [], None, None),
+        (drive_message(1, 0.0, 5), drive_message(1, np.nan, 5), ["9"], "drive.steering_angle", np.inf),
+    ],
+)  # fmt: skip
+def test_fields_are_compared_one_by_one(old, new, tolerances, name, by):
+    pair = [BagMessage("/policy/drive", encode(message), 1, 1, 0) for message in (old, new)]
+    found = compare(*pair, 3, Tolerances.parse(tolerances))
+    assert (found and found.name, found and found.by) == (name, by)
+    assert type_name(old) == topic_row("/policy/drive").type
+
+
+def test_another_time_another_count_and_another_topic_are_differences(tmp_path):
+    golden = GOLDEN_FOLDER / "corner.golden.mcap"
+    messages = list(read_messages(golden))
+
+    def difference(changed):
+        comparison = Golden(golden)
+        for message in changed:
+            comparison.take(message)
+        return comparison.finish()
+
+    assert difference(messages) is None
+    late = [BagMessage(m.topic, m.cdr, m.log_ns + 5, m.publish_ns, m.sequence) for m in messages]
+    assert (difference(late).name, difference(late).by) == ("time", pytest.approx(5e-9))
+    missing = difference(messages[:-1])
+    assert (missing.index, missing.golden, missing.got) == (11, "there", "not there")
+    extra = difference([*messages, pose(2000)])
+    assert (extra.topic, extra.golden) == ("/vicon/car", "not there")
+    assert "2.0" in extra.text(START_NS)
+
+
+@pytest.mark.parametrize("text", ["x", "-1", "nan", "/policy/drive=1", "policy:drive=1", "/policy/drive:=1", "inf"])
+def test_a_tolerance_that_is_none_is_refused(text):
+    with pytest.raises(BagError, match="expected VALUE or TOPIC:FIELD=VALUE"):
+        Tolerances.parse([text])
