@@ -20,6 +20,7 @@ from nodes import (
     cli_camera,
     cli_keys,
     cli_motor,
+    cli_node,
     cli_object,
     cli_policy,
     cli_replay,
@@ -46,6 +47,8 @@ app = typer.Typer(
 app.add_typer(cli_topic.app, name="topic")
 app.add_typer(cli_bag.app, name="bag")
 app.add_typer(cli_keys.app, name="keys")
+app.add_typer(cli_node.app, name="node")
+cli_node.add_to(app)
 app.add_typer(cli_motor.app, name="motor")
 app.add_typer(cli_calibrate.app, name="calibrate")
 app.add_typer(cli_camera.app, name="camera")

@@ -58,3 +58,24 @@ def topic_echo(
             print(f"{describe(received.message())}\n---", flush=True)
             if count is not None and shown >= count:
                 return
+
+
+@app.command("delay")
+def topic_delay(
+    topic: str,
+    duration_s: Annotated[float, typer.Option("--duration", min=0.1, help="Listen for so many seconds.")] = 5.0,
+    run_dir: RunDir = None,
+) -> None:
+    """Measure where the time of a topic goes: from capture to publication, and from there to a reader."""
+    from nodes.runtime.watching import find_run_dir
+    from nodes.runtime.watching_nodes import measure_delay
+
+    report = measure_delay(find_run_dir(run_dir), topic, duration_s)
+    rows = table("way", "median", "99 %", "worst")
+    ways = (("capture to publish", report.capture_to_publish), ("publish to receive", report.publish_to_receive))
+    for name, delay in ways:
+        if delay is not None:
+            times = (delay.median_s, delay.p99_s, delay.worst_s)
+            rows.add_row(name, *(f"{value * 1e3:.2f} ms" for value in times))
+    print(f"{topic}: {report.messages} messages")
+    print_table(rows)

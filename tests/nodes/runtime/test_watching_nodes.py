@@ -1,0 +1,60 @@
+import os
+import subprocess
+import sys
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from nodes.runtime.bus import Bus
+from nodes.runtime.errors import MessageError
+from nodes.runtime.messages import pose_message
+from nodes.runtime.watching_nodes import NodeWatch, measure_delay
+
+
+def test_delay_of_a_topic_is_split_at_publication(tmp_path):
+    stop = threading.Event()
+
+    def publish():
+        with Bus(tmp_path) as bus:
+            while not stop.is_set():
+                bus.publish("/vicon/car", pose_message(np.eye(4), time.time_ns() - 30_000_000))
+                time.sleep(0.01)
+
+    thread = threading.Thread(target=publish)
+    thread.start()
+    try:
+        report = measure_delay(tmp_path, "/vicon/car", 0.5)
+    finally:
+        stop.set()
+        thread.join()
+    assert report.messages > 5
+    assert report.capture_to_publish.median_s == pytest.approx(0.03, abs=0.01)
+    assert 0.0 <= report.publish_to_receive.median_s < 0.02
+    with pytest.raises(MessageError, match="nothing came"):
+        measure_delay(tmp_path, "/vicon/board", 0.1)
+
+
+def test_top_shows_process_memory_rate_and_restarts(tmp_path):
+    command = [sys.executable, "-m", "nodes.safety", "--run-dir", str(tmp_path), "--name", "safety"]
+    command += ["--set", f"room={os.path.abspath('calibration/twin/room.yaml')}"]
+    process = subprocess.Popen(command)
+    try:
+        with NodeWatch(tmp_path) as watch:
+            deadline = time.monotonic() + 15.0
+            while not (rows := watch.rows(0.5)) and time.monotonic() < deadline:
+                pass
+            (row,) = watch.rows(1.0)
+            assert (row.name, row.pid, row.restarts) == ("safety", process.pid, 0)
+            assert row.rate_hz == pytest.approx(50.0, rel=0.3)  # its ticks
+            assert 20 < row.memory_mib < 120
+            process.terminate()
+            process.wait()
+            process = subprocess.Popen(command)
+            while not (rows and rows[0].restarts) and time.monotonic() < deadline + 15.0:
+                rows = watch.rows(0.5)
+            assert rows[0].restarts == 1
+    finally:
+        process.terminate()
+        process.wait()
