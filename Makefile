@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 export MUJOCO_GL ?= egl
 
-.PHONY: help setup demo experiment test test-slow check bench fmt clean
+.PHONY: help setup demo experiment test test-slow check bench campaign fmt clean
 
 help:  ## Show this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
@@ -41,6 +41,9 @@ check: setup  ## Lint, types, import contracts
 
 bench: setup  ## The benchmarks (about an hour); each writes its rows to docs/results.json
 	@$(BIN)/python -m benchmarks.run_all
+
+campaign: setup  ## What the live stack must bear: faults, strangers, kills, half an hour (hours; goes on where it was stopped)
+	@$(BIN)/python -m benchmarks.run_all --campaign
 
 fmt: setup  ## Format and fix what can be fixed
 	@$(BIN)/ruff check --fix .

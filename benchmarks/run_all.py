@@ -1,7 +1,8 @@
 """``make bench``: every benchmark that needs no other data, one after the other.
 
 Those that look at a learned scene use the run folder of ``make experiment`` and are left out without one; ``--quick`` leaves out
-those that take more than a few minutes.
+those that take more than a few minutes. ``make campaign`` (``--campaign``) is the live stack's turn instead: faults, strangers, killed
+recorders, half an hour of driving. They take hours together, and go on where they were stopped.
 """
 
 from __future__ import annotations
@@ -18,6 +19,10 @@ QUICK = (
     "hash_encoding", "adjoint_gradient", "adjoint_memory", "fault_stops", "hydrant", "structure_from_motion", "training_step",
 )  # fmt: skip
 LONG = ("attack_kill", "scene_kill", "adjoint_memory --compare", "newcomer")
+CAMPAIGN = (
+    "one_hop", "frame_age", "car_nodes", "launch_times", "calibrations", "lockstep_replay", "strangers", "two_hosts", "bag_kill",
+    "fuzz", "policy_from_bags", "fault_campaign", "thirty_minutes",
+)  # fmt: skip
 OF_A_RUN = ("gradient_pass", "objects", "phone_to_car")
 
 
@@ -35,10 +40,11 @@ def main() -> int:
     """Run them all; the exit code is 1 if one failed."""
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("--run-folder", type=Path, default=Path("runs/full"))
+    parser.add_argument("--campaign", action="store_true", help="what the live stack must bear, instead")
     parser.add_argument("--quick", action="store_true", help="leave out what takes more than a few minutes")
     options = parser.parse_args()
     failed = []
-    for command in commands(options.run_folder, options.quick):
+    for command in CAMPAIGN if options.campaign else commands(options.run_folder, options.quick):
         began = time.monotonic()
         module, *arguments = command.split()
         code = subprocess.run([sys.executable, "-m", f"benchmarks.{module}", *arguments], cwd=REPOSITORY).returncode
