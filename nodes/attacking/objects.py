@@ -95,9 +95,9 @@ def _face(wanted: ObjectRequest) -> Face:
 def object_sha256(field: VoxelGridObject) -> str:
     """Hash of everything about an object except the colours that are searched for."""
     digest = hashlib.sha256(repr((field.theta_shape, field.scale, field.one_sided, field.step_units)).encode())
-    parts = (field.slots, field.fixed_colours, field.box_min, field.box_max, field.T_world_from_object, field.density)
+    parts = [field.slots, field.fixed_colours, field.box_min, field.box_max, field.T_world_from_object, field.density]
     if field.mixing is not None:
-        parts = (*parts, field.mixing.data, field.mixing.indices, field.mixing.indptr)
+        parts += [field.mixing.data, field.mixing.indices, field.mixing.indptr]
     for part in parts:
         array: NDArray[np.generic] = np.zeros(0) if part is None else np.ascontiguousarray(part)
         digest.update(f"{array.dtype} {array.shape}".encode())
