@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from nodes import cli_policy_train
 from nodes.runtime.terminal import print_table, table
 
 if TYPE_CHECKING:
@@ -14,11 +15,13 @@ if TYPE_CHECKING:
     from nodes.policy_reference import Reference
 
 app = typer.Typer(
-    no_args_is_help=True, help="Bring a policy of any origin: check its adapter, export it, look into it."
+    no_args_is_help=True,
+    help="A policy from recordings or of any origin: train, evaluate, check its adapter, export it, look into it.",
 )
 Spec = Annotated[
     str, typer.Argument(metavar="POLICY", help="A .safetensors, .onnx or .pt2 file, or package.module:factory.")
 ]
+cli_policy_train.add_to(app)
 _COLOURS = {"ok": "green", "warning": "yellow", "failure": "red"}
 _FAILURE_EXIT = 1
 

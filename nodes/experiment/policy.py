@@ -49,7 +49,7 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
         plans = [
             SourcePlan(_lab_source(experiment, lab), config.lab_stills, config.lab_drives, config.drive_steps),
             SourcePlan(
-                _surrogate_source(experiment), config.surrogate_stills, config.surrogate_drives, config.drive_steps
+                surrogate_source(experiment), config.surrogate_stills, config.surrogate_drives, config.drive_steps
             ),
         ]
         trained = train_policy(
@@ -107,7 +107,8 @@ def _lab_overlay(experiment: Experiment) -> Overlay:
     return overlay
 
 
-def _surrogate_source(experiment: Experiment) -> RenderedSource:
+def surrogate_source(experiment: Experiment) -> RenderedSource:
+    """Frames of the learned room, with the object plain and with random textures."""
     background = last_result_kept(load_background(experiment))
     bare = surrogate_of(experiment, [], background)
     with_object = surrogate_of(experiment, [attacked_object(experiment)], background)
