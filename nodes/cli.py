@@ -24,6 +24,7 @@ from nodes import (
     cli_object,
     cli_policy,
     cli_replay,
+    cli_room,
     cli_scene,
     cli_topic,
     cli_trial,
@@ -57,6 +58,7 @@ app.add_typer(cli_attack.app, name="attack")
 app.add_typer(cli_object.app, name="object")
 app.add_typer(cli_policy.app, name="policy")
 app.add_typer(cli_scene.app, name="scene")
+app.add_typer(cli_room.app, name="room")
 cli_replay.add_to(app)
 cli_trial.add_to(app)
 stage_app = typer.Typer(
