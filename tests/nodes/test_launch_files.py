@@ -1,0 +1,50 @@
+"""The shipped launch files: they resolve, and each node of a real car takes the configuration that is meant for it."""
+
+from pathlib import Path
+
+import pytest
+
+from nodes.runtime.launch_check import check_nodes
+from nodes.runtime.launch_file import load_launch
+
+LAUNCH = Path(__file__).parents[2] / "launch"
+
+
+@pytest.mark.parametrize(
+    ("file", "host", "nodes"),
+    [
+        (
+            "monitor",
+            None,
+            {"twin", "camera", "vicon", "compositor", "monitor", "policy", "safety", "motor", "recorder"},
+        ),
+        ("robot", None, {"camera", "vicon", "safety", "motor", "recorder"}),
+        ("workstation", None, {"compositor", "policy", "player", "recorder"}),
+        ("two_hosts", "robot", {"camera", "vicon", "safety", "motor", "gateway"}),
+        ("two_hosts", "workstation", {"compositor", "policy", "gateway", "recorder"}),
+    ],
+)
+def test_each_starts_what_it_says(file, host, nodes):
+    assert set(load_launch(LAUNCH / f"{file}.launch.yaml", host=host).nodes) == nodes
+
+
+def test_the_monitor_launch_shows_the_attack_on_the_monitor_only():
+    plan = load_launch(LAUNCH / "monitor.launch.yaml", ["params.attack=a.safetensors"])
+    assert plan.documents["monitor"].data["attack"] == "a.safetensors"
+    assert plan.documents["compositor"].data["attack"] is None
+    assert plan.documents["monitor"].data["display"]["kind"] == "twin"
+
+
+def test_a_real_screen_and_no_twin_are_two_options():
+    screen = "monitor.display={kind: screen, index: 1, connector: HDMI-A-1}"
+    plan = load_launch(LAUNCH / "monitor.launch.yaml", ["twin.if=false", screen])
+    assert "twin" not in plan.nodes
+    assert plan.documents["monitor"].data["display"] == {"kind": "screen", "index": 1, "connector": "HDMI-A-1"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("file", "host"), [("monitor", None), ("robot", None), ("workstation", None), ("two_hosts", "all")]
+)
+def test_every_node_accepts_its_configuration(file, host):
+    assert check_nodes(load_launch(LAUNCH / f"{file}.launch.yaml", host=host)) == {}
