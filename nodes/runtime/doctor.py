@@ -2,24 +2,29 @@
 
 from __future__ import annotations
 
+import ctypes
 import importlib.metadata
 import os
 import platform
 import shutil
 import socket
+import struct
 import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from nodes.runtime.errors import BusError
+from nodes.runtime.errors import BusError, SecurityError
 from nodes.runtime.launch import active_launches
 from nodes.runtime.paths import user_folder
+from nodes.runtime.security import DRIVE, KeyFolder, default_folder
 
 OK, WARNING, FAILURE = "ok", "warning", "failure"
 _DISK_WARNING_BYTES, _DISK_FAILURE_BYTES = 5 * 2**30, 2**29
 _MEMORY_WARNING_BYTES = 4 * 2**30
+# Beyond it the safety node does not arm with two hosts.
+_CLOCK_ERROR_S = 0.005
 # A broken driver may end the process that tries it, so the attempt has a process of its own.
 _RENDER = (
     "import os; os.environ.setdefault('MUJOCO_GL', 'egl'); import mujoco; context = mujoco.GLContext(16, 16); "
@@ -52,7 +57,7 @@ def examine(folder: Path, vicon_port: int) -> list[Check]:
     """
     checks: list[Callable[[], Check]] = [
         _python, _machine, _render, _torch, lambda: _disk(folder), _sockets, lambda: _udp_port(vicon_port), _serial_ports,
-        _launches,
+        _keys, _clock, _launches,
     ]  # fmt: skip
     return [check() for check in checks]
 
@@ -131,6 +136,47 @@ def _serial_ports() -> Check:
         )
     found = ", ".join(f"{port.device} ({port.description})" for port in ports)
     return Check("serial", OK, found or "no USB serial device; the twin brings its own")
+
+
+def _keys() -> Check:
+    folder = default_folder()
+    keys = KeyFolder(folder)
+    try:
+        rows = keys.rows()
+        for row in rows:
+            if row.ours:
+                keys.secret(row.name)
+    except (SecurityError, OSError) as error:
+        return Check("keys", WARNING, str(error))
+    ours = ", ".join(row.name for row in rows if row.ours)
+    drivers = ", ".join(row.name for row in rows if DRIVE in row.rights) or "nobody"
+    if not ours:
+        return Check("keys", OK, f"none in {folder}; two hosts need them: advnerf keys new NAME")
+    return Check("keys", OK, f"ours: {ours}; {drivers} may drive over the network")
+
+
+def _clock() -> Check:
+    """Whether this computer's clock is kept by somebody: ages between hosts are no better than their clocks."""
+    seconds = _adjtimex_error_s()
+    if seconds is None:
+        return Check(
+            "clock",
+            WARNING,
+            "not synchronised, says the kernel; with two hosts install chrony on both: apt-get install chrony",
+        )
+    if seconds > _CLOCK_ERROR_S:
+        return Check("clock", WARNING, f"may be off by {seconds * 1e3:.0f} ms; wait for chrony, see: chronyc tracking")
+    return Check("clock", OK, f"synchronised, off by at most {seconds * 1e3:.1f} ms")
+
+
+def _adjtimex_error_s() -> float | None:
+    """Estimated error of the clock [s] from adjtimex(2); None when the kernel calls it unsynchronised."""
+    # struct timex of 64-bit Linux: modes, offset, freq, maxerror, esterror, status, ...; 208 bytes in all.
+    buffer = ctypes.create_string_buffer(208)
+    state = ctypes.CDLL(None, use_errno=True).adjtimex(buffer)
+    esterror_us, status = struct.unpack_from("<qi", buffer, 32)
+    unsynchronised = 0x0040
+    return None if state < 0 or status & unsynchronised else float(esterror_us) / 1e6
 
 
 def _launches() -> Check:
