@@ -26,6 +26,7 @@ from nodes import (
     cli_replay,
     cli_room,
     cli_scene,
+    cli_teleop,
     cli_topic,
     cli_trial,
 )
@@ -60,6 +61,7 @@ app.add_typer(cli_policy.app, name="policy")
 app.add_typer(cli_scene.app, name="scene")
 app.add_typer(cli_room.app, name="room")
 cli_replay.add_to(app)
+cli_teleop.add_to(app)
 cli_trial.add_to(app)
 stage_app = typer.Typer(
     no_args_is_help=True,

@@ -1,0 +1,162 @@
+"""The teleop node: a person's hand on a gamepad or keyboard, over the bus, again and again.
+
+The safety node lets the car move only while a button is held (``safety.teleop: hold``); silence of this node means that it was
+let go. Left shoulder button (or w, a, d, s): the hand drives. Right one (or o): the software drives. Both: the hand does.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from hardware.gamepad import EVENT_LAYOUT, JS_LAYOUT, Gamepad, Layout
+from hardware.hands import Hands
+from hardware.keyboard import Keyboard
+from nodes.runtime.clock import NS_PER_S
+from nodes.runtime.messages import header, types
+from nodes.runtime.node import (
+    ACTIVE,
+    FAULT,
+    READY,
+    Inbox,
+    MessageInfo,
+    Node,
+    NodeContext,
+    Now,
+    Out,
+    ReaderThread,
+    run_node_main,
+)
+
+_STALE_S = 0.15
+
+
+class TeleopConfig(BaseModel):
+    """Configuration of the teleop node.
+
+    Attributes:
+        device: ``keyboard``, or the device file of a gamepad, best one under ``/dev/input/by-id``.
+        axes: Numbers of the axes of throttle and steering, where they are not the usual ones.
+        speed_mps: Speed at full throttle [m/s].
+        steering_rad: Steering at full deflection [rad].
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    device: Path | Literal["keyboard"] = "keyboard"
+    axes: tuple[int, int] | None = None
+    speed_mps: float = Field(default=0.8, gt=0.0, le=2.0)
+    steering_rad: float = Field(default=0.25, gt=0.0, le=0.4)
+
+
+class TeleopNode(Node):
+    """Hands in, their state out.
+
+    Args:
+        config: Its configuration.
+        read: Blocks for a bounded time and says what is held.
+        release: Lets the device go.
+    """
+
+    publications = ("/teleop/state", "/arm")
+    tick_rate_hz = 20.0
+
+    def __init__(self, config: TeleopConfig, read: Callable[[], Hands | None], release: Callable[[], None]) -> None:
+        self._config, self._release = config, release
+        self.inbox: Inbox[Hands] = Inbox(capacity=4)
+        self._hands, self._heard_ns = Hands(connected=False, text="not read yet"), 0
+        self._stops = self._rearms = 0
+        self._estop = False
+        self._arm_in_ticks = 0
+        self._mode = "idle"
+        self._reader = ReaderThread(read, self.inbox, "hands")
+        self._reader.start()
+
+    @classmethod
+    def build(cls, config: TeleopConfig, context: NodeContext) -> TeleopNode:
+        """Make the node of a process; its keyboard is the terminal that it was started in."""
+        del context
+        device: Keyboard | Gamepad
+        if config.device == "keyboard":
+            device = Keyboard(sys.stdin.fileno(), time.monotonic_ns)
+        else:
+            path = Path(config.device)
+            device = Gamepad(path, time.monotonic_ns, _layout(path, config.axes))
+        return cls(config, device.read, device.close)
+
+    def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
+        """It listens to nobody."""
+        raise NotImplementedError(topic)
+
+    def receive(self, item: Hands, now: Now) -> list[Out]:
+        """What the hand does now; a change is said at once."""
+        self._hands, self._heard_ns, before = item, now.mono_ns, (self._mode, self._estop)
+        if item.rearms > self._rearms:
+            self._estop, self._arm_in_ticks = False, 2
+        if item.stops > self._stops:
+            self._estop, self._arm_in_ticks = True, 0  # of both at once, stopping counts
+        self._stops, self._rearms = item.stops, item.rearms
+        state = self._state(now)
+        return [state] if (self._mode, self._estop) != before else []
+
+    def tick(self, now: Now) -> list[Out]:
+        """Say it again; re-arm a moment after the e-stop was said to be over, for the two travel apart."""
+        outs = [self._state(now)]
+        if self._arm_in_ticks:
+            self._arm_in_ticks -= 1
+            if not self._arm_in_ticks:
+                outs.append(self._arm(now))
+        return outs
+
+    def status(self) -> tuple[str, str]:
+        """Active while something is held."""
+        if not self._hands.connected:
+            return FAULT, self._hands.text
+        if self._estop:
+            return READY, f"{self._hands.text}: e-stop, re-arm to go on"
+        return (ACTIVE if self._mode != "idle" else READY), f"{self._hands.text}: {self._mode}"
+
+    def close(self) -> None:
+        """Let the device go."""
+        self._reader.stop()
+        self._release()
+
+    def _state(self, now: Now) -> Out:
+        hands, config = self._hands, self._config
+        # A reader that hangs must not hold the button.
+        fresh = hands.connected and now.mono_ns - self._heard_ns <= _STALE_S * NS_PER_S
+        self._mode = ("human" if hands.human else "autonomy" if hands.autonomy else "idle") if fresh else "idle"
+        drives = self._mode == "human" and not self._estop
+        message = types.Teleop(
+            header=header(now.real_ns), mode=self._mode, estop=self._estop,
+            speed_mps=config.speed_mps * hands.throttle if drives else 0.0,
+            steering_rad=config.steering_rad * hands.steering if drives else 0.0, device=hands.text,
+        )  # fmt: skip
+        return Out("/teleop/state", message)
+
+    def _arm(self, now: Now) -> Out:
+        request = types.Arm(header=header(now.real_ns), arm=True, source="operator", reason="re-armed by hand")
+        return Out("/arm", request)
+
+
+def _layout(path: Path, axes: tuple[int, int] | None) -> Layout | None:
+    if axes is None:
+        return None
+    from dataclasses import replace
+
+    usual = JS_LAYOUT if path.name.startswith("js") else EVENT_LAYOUT
+    return replace(usual, throttle=axes[0], steering=axes[1])
+
+
+def main() -> int:
+    """Run the node as a process."""
+    return run_node_main(TeleopConfig, TeleopNode.build)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
