@@ -1,0 +1,165 @@
+"""What `advnerf scene train` decides for its user: contraction, alpha, presets; and an end-to-end training of pictures with alpha."""
+
+import dataclasses
+import json
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from advnerf_core.geometry import Array, Pinhole, look_at
+from advnerf_core.render.march import MarchConfig
+from advnerf_core.scene.dataset import load_transforms
+from advnerf_core.scene.render_field import FieldRenderer
+from advnerf_core.scene.train import TrainConfig, train_scene
+from nodes import cli, scene_training
+from nodes.runtime.errors import ConfigError
+from nodes.scene_training import TrainingRequest, scene_field
+
+TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+CAMERA = Pinhole(40, 40, 50.0, 50.0, 20.0, 20.0)
+RADIUS = 0.5
+
+
+def ball(T: Array) -> NDArray[np.uint8]:
+    """An opaque striped ball, blue first, with alpha; 3 x 3 rays a pixel."""
+    wide = Pinhole(120, 120, 150.0, 150.0, 60.0, 60.0)
+    o, d = T[:3, 3], wide.directions() @ T[:3, :3].T
+    d = d / np.linalg.norm(d, axis=-1, keepdims=True)
+    b = d @ o
+    under = b * b - o @ o + RADIUS**2
+    hit = o + (-b - np.sqrt(np.maximum(under, 0.0)))[..., None] * d
+    colour = (0.5 + 0.4 * np.sin(6.0 * hit)) * (under > 0.0)[..., None]
+    sums = np.concatenate([colour, (under > 0.0)[..., None]], axis=-1).reshape(40, 3, 40, 3, 4).mean(axis=(1, 3))
+    sums[..., :3] /= np.maximum(sums[..., 3:], 1e-9)
+    return np.rint(255 * sums).astype(np.uint8)
+
+
+def write_set(folder: Path, count: int, **extra: object) -> Path:
+    """Pictures of the ball from all around, and their ``transforms.json``."""
+    eyes = np.random.default_rng(0).normal(size=(count, 3))
+    eyes *= 1.45 / np.abs(eyes).max(axis=1, keepdims=True)
+    frames = []
+    for k, eye in enumerate(eyes):
+        T = look_at(eye, [0.0, 0.0, 0.0])
+        cv2.imwrite(str(folder / f"{k:02d}.png"), ball(T))
+        frames.append({"file_path": f"{k:02d}.png", "transform_matrix": (T @ TO_OPENGL).tolist()})
+    content = {"fl_x": 50.0, "frames": frames, **extra}
+    (folder / "transforms.json").write_text(json.dumps(content))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_set(tmp_path_factory.mktemp("ball"), 48)
+
+
+def request_for(folder: Path, **changes: object) -> TrainingRequest:
+    return dataclasses.replace(TrainingRequest(folder, folder / "learned"), **changes)  # type: ignore[arg-type]
+
+
+def test_a_box_larger_than_the_unit_cube_means_unbounded_unless_told_otherwise(tmp_path: Path) -> None:
+    listed = load_transforms(write_set(tmp_path, 4, aabb_scale=4))
+    field = scene_field(request_for(tmp_path), listed)
+    assert field.contraction
+    # The unit cube is 1 / 0.33 wide and holds the cameras, which stand at 1.45.
+    np.testing.assert_allclose(field.box_high_m, 0.5 / 0.33)
+    assert field.grid.finest == 2 * 2048
+    bounded = scene_field(request_for(tmp_path, unbounded=False), listed)
+    assert not bounded.contraction
+    np.testing.assert_allclose(bounded.box_high_m, 4 * 0.5 / 0.33)
+    assert not scene_field(request_for(tmp_path), dataclasses.replace(listed, aabb_scale=1.0)).contraction
+    # Cameras outside the unit cube make the inner region larger.
+    far = [dataclasses.replace(f, T_world_from_camera=look_at([5.0, 0.0, 1.0], [0.0, 0.0, 0.0])) for f in listed.frames]
+    np.testing.assert_allclose(scene_field(request_for(tmp_path), listed.with_frames(far)).box_high_m, 5.0)
+
+
+def test_unbounded_needs_no_box(tmp_path: Path) -> None:
+    listed = load_transforms(write_set(tmp_path, 4, scale=1.0))
+    with pytest.raises(ConfigError, match="or --unbounded"):
+        scene_field(request_for(tmp_path), listed)
+    field = scene_field(request_for(tmp_path, unbounded=True), listed)
+    np.testing.assert_allclose(field.box_high_m, 0.5 + 1.45 - 0.5)
+    own = ((-2.0, -2.0, -1.0), (2.0, 2.0, 1.0))
+    given = scene_field(request_for(tmp_path, unbounded=True, box_m=own), listed)
+    assert (given.box_low_m, given.box_high_m) == own
+
+
+@pytest.mark.parametrize(("preset", "aabb_scale", "sizes"), [
+    ("room", 1, (8, 4, 17, 16, 2048, 1)),
+    ("instant-ngp", 1, (16, 2, 19, 16, 2048, 4)),
+    ("instant-ngp", 2, (16, 2, 19, 16, 4096, 4)),
+])  # fmt: skip
+def test_presets_have_their_sizes_train_and_render(
+    pictures: Path, preset: str, aabb_scale: int, sizes: tuple[int, ...]
+) -> None:
+    listed = dataclasses.replace(load_transforms(pictures), aabb_scale=float(aabb_scale))
+    images = listed.with_frames(listed.frames[:3]).load()
+    field = scene_field(request_for(pictures, preset=preset), listed, transparent=True)
+    grid = field.grid
+    got = (grid.levels, grid.features, grid.log2_entries, grid.coarsest, grid.finest, field.direction_bands)
+    assert got == sizes
+    march = MarchConfig(near_m=0.3, smallest_step_m=0.02, largest_step_m=0.1, step_growth=0.03, max_samples=200)
+    config = TrainConfig(steps=3, samples_per_step=2048, max_rays=256, occupancy_resolution=8, march=march)
+    trained = train_scene(images, field, config)
+    rgb, depth_m, alpha = FieldRenderer(trained.scene, trained.occupied, trained.march).render(
+        images.T_world_from_camera[:1], CAMERA
+    )
+    assert rgb.shape == (1, 40, 40, 3)
+    assert torch.isfinite(rgb).all()
+    assert 0.0 < alpha.mean() <= 1.0
+    assert (depth_m > 0.0).all()
+
+
+def test_an_unknown_preset_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="room, instant-ngp, got 'huge'"):
+        request_for(tmp_path, preset="huge")
+
+
+def test_alpha_that_is_opaque_everywhere_is_none(pictures: Path) -> None:
+    images = load_transforms(pictures).load()
+    assert scene_training._transparent(images)
+    assert images.alpha is not None
+    opaque = dataclasses.replace(images, alpha=np.full_like(images.alpha, 255))
+    assert not scene_training._transparent(opaque)
+
+
+def test_help_says_what_presets_are_for(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "argv", ["advnerf", "scene", "train", "--help"])
+    monkeypatch.setenv("COLUMNS", "200")
+    with pytest.raises(SystemExit):
+        cli.main()
+    text = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert "--unbounded" in text
+    assert "instant-ngp" in text
+    assert "2^19" in text
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(400)
+def test_pictures_with_alpha_are_learned_with_it_end_to_end(
+    pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "learned"
+    for arguments in (
+        ["train", pictures, "-o", out, "--steps", "200", "--box-low", *["-0.8"] * 3, "--box-high", *["0.8"] * 3],
+        ["render", out / "scene.safetensors", pictures, "--held-out", "-o", tmp_path / "views"],
+    ):
+        monkeypatch.setattr(sys, "argv", ["advnerf", "scene", *map(str, arguments)])
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+        assert not ended.value.code
+    assert "images have alpha" in capsys.readouterr().out
+    figures = json.loads((out / "held_out.json").read_text())
+    assert figures["mean"]["psnr_db"] > 26.0
+    for k, row in enumerate(figures["images"]):
+        real = cv2.imread(str(pictures / row["image"]), cv2.IMREAD_UNCHANGED) / 255.0
+        ours = cv2.imread(str(tmp_path / "views" / f"{k:04d}_{row['image']}"), cv2.IMREAD_UNCHANGED) / 255.0
+        assert ours.shape == (40, 40, 4)
+        assert np.abs(ours[..., 3] - real[..., 3]).mean() < 0.03
+        inside = real[..., 3] == 1.0
+        assert np.abs(ours[inside, :3] - real[inside, :3]).mean() < 0.06
