@@ -144,15 +144,22 @@ def config_reader() -> tuple[Sequence[bytes], Callable[[bytes], None]]:
     return [good], read
 
 
-def attack_reader() -> tuple[Sequence[bytes], Callable[[bytes], None]]:
-    """An attack file's bytes: container and header, with the tensors cut short."""
-    from safetensors.numpy import save
+def attack_reader(folder: Path) -> tuple[Sequence[bytes], Callable[[bytes], None]]:
+    """An attack file's bytes: container, header and tensors."""
+    from advnerf_core.attack.artifact import AttackFile, attack_from_bytes, face_texture, save_attack
+    from advnerf_core.geometry import Pinhole
 
-    from advnerf_core.attack.artifact import FILE_FORMAT, attack_from_bytes
-
-    tensors = {"theta": np.zeros((4, 4, 4, 4), np.float32), "texture": np.zeros((8, 8, 3), np.uint8)}
-    good = save(tensors, metadata={"format": FILE_FORMAT, "metadata": "{}", "version": "1"})
-    return [good], lambda data: void(attack_from_bytes(data, "fuzz"))
+    theta = np.zeros((2, 2, 3), np.float32)
+    corners = np.array([[0.0, 0.4, 0.4], [0.0, -0.4, 0.4], [0.0, -0.4, -0.4], [0.0, 0.4, -0.4]])
+    attack = AttackFile(
+        method="gradient", theta=theta, texture=face_texture(theta, 4), size_m=(0.8, 0.8), T_world_from_object=np.eye(4),
+        subject="board", corners_in_subject=corners, camera=Pinhole(200, 66, 103.6, 103.4, 100, 32),
+        scene_sha256="a" * 64, policy_sha256="b" * 64, config_sha256="c" * 64, seed=3, predicted_total_cte_m=9.25,
+        software_version="0.1.0",
+    )  # fmt: skip
+    path = folder / "good.attack.safetensors"
+    save_attack(path, attack)
+    return [path.read_bytes()], lambda data: void(attack_from_bytes(data, "fuzz"))
 
 
 def bag_reader(folder: Path) -> tuple[Sequence[bytes], Callable[[bytes], None]]:
@@ -180,9 +187,12 @@ def void(result: object) -> None:
 def run(name: str, count: int, seed: int, folder: Path) -> Outcome:
     """Feed one reader; raises on the first crash or hang, with the seed and the input in the message."""
     makers = {
-        "vesc": vesc_reader, "vicon": vicon_reader, "bus": bus_reader, "config": config_reader, "attack": attack_reader,
+        "vesc": vesc_reader, "vicon": vicon_reader, "bus": bus_reader, "config": config_reader,
+        "attack": lambda: attack_reader(folder), "bag": lambda: bag_reader(folder),
     }  # fmt: skip
-    good, read = bag_reader(folder) if name == "bag" else makers[name]()
+    good, read = makers[name]()
+    for data in good:  # a reader that refuses everything would be tested by nothing
+        read(data)
     random_ = random.Random(f"{name} {seed}")
     refused, worst_s = 0, 0.0
     for index in range(count):

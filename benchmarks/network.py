@@ -56,7 +56,8 @@ class Cable:
 
     def carry(self, ends: tuple[int, int], seed: int) -> None:
         """Carry packets until told to stop."""
-        random_, waiting, count = random.Random(seed), [], 0
+        random_, count = random.Random(seed), 0
+        waiting: list[tuple[float, int, int, bytes]] = []
         while not self._stop.is_set():
             now = time.monotonic()
             late = max(0.0, waiting[0][0] - now) if waiting else 0.1

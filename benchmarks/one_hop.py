@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from statistics import median
+from typing import Any
 
 import numpy as np
 import zmq
@@ -54,7 +55,7 @@ def bus_round_trip(bus: Bus, kind: str) -> Callable[[], float]:
     return play
 
 
-def _take(bus: Bus, kind: str) -> object:
+def _take(bus: Bus, kind: str) -> Any:
     deadline = time.monotonic() + _TIMEOUT_S
     while True:
         bus.wait(_TIMEOUT_S)  # as a node's loop does: sleep first, then look
@@ -69,7 +70,7 @@ def _take(bus: Bus, kind: str) -> object:
 
 def answer(folder: Path, kind: str) -> None:
     """The other process: answers raw rounds and rounds over the bus."""
-    raw = zmq.Context.instance().socket(zmq.PAIR)
+    raw: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.PAIR)
     raw.linger = 0
     raw.bind(f"ipc://{folder}/raw.{kind}")
     with Bus(folder) as bus:
@@ -97,7 +98,7 @@ def compare(kind: str, blocks: int, rounds: int) -> tuple[float, float, float]:
         folder = Path(name)
         command = [sys.executable, "-m", "benchmarks.one_hop", "--answer", kind, "--folder", name]
         other = subprocess.Popen(command)
-        control = zmq.Context.instance().socket(zmq.PAIR)
+        control: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.PAIR)
         control.linger = 0
         control.rcvtimeo = 20_000
         control.connect(f"ipc://{folder}/raw.{kind}")
