@@ -196,7 +196,7 @@ def test_watch_only_key_sees_but_cannot_drive_or_arm(lab, capfd):
         hello(visitor)()
         visitor.eyes.publish("/arm", arm)
 
-    got = lab.run(2.0, act=act)
+    got = lab.run(1.2, act=act)
     assert any(r.topic == "/vicon/car" and h is visitor for h, r in got)
     assert not [r for _, r in got if r.topic in ("/policy/drive", "/arm")]
     assert robot.node.counters()["refused"] > 0
@@ -213,8 +213,8 @@ def test_revocation_ends_a_running_connection(lab):
     workstation = lab.workstation()
     assert lab.run(8.0, drives, hello(workstation))
     lab.keys["robot"].revoke("workstation", DRIVE)
-    lab.run(1.0, act=hello(workstation))
-    assert not drives(lab.run(1.5, act=hello(workstation)))
+    lab.run(0.8, act=hello(workstation))
+    assert not drives(lab.run(0.8, act=hello(workstation)))
     lab.keys["robot"].allow("workstation", DRIVE)
     assert drives(lab.run(8.0, drives, hello(workstation)))
 
@@ -251,7 +251,7 @@ def test_strangers_do_not_get_in(lab, kind, capfd):
     server = zmq.curve_keypair()[0].decode() if kind == "wrong server key" else None
     stranger = Stranger(lab, *(() if kind == "no key" else (secret, public, server)))
     try:
-        got = lab.run(1.5, act=lambda: stranger.say(*good_frames()))
+        got = lab.run(0.7, act=lambda: stranger.say(*good_frames()))
     finally:
         stranger.close()
     assert not drives(got)

@@ -36,6 +36,7 @@ def test_delay_of_a_topic_is_split_at_publication(tmp_path):
         measure_delay(tmp_path, "/vicon/board", 0.1)
 
 
+@pytest.mark.slow
 def test_top_shows_process_memory_rate_and_restarts(tmp_path):
     command = [sys.executable, "-m", "nodes.safety", "--run-dir", str(tmp_path), "--name", "safety"]
     command += ["--set", f"room={os.path.abspath('calibration/twin/room.yaml')}"]
