@@ -26,7 +26,7 @@ def teleop(
         raise ConfigError(
             "expected a terminal to read keys from, got none; run it in one, or give --device of a gamepad"
         )
-    config = TeleopConfig(device=device if device == "keyboard" else Path(device), speed_mps=speed_mps)
+    config = TeleopConfig(device="keyboard" if device == "keyboard" else Path(device), speed_mps=speed_mps)
     folder = find_run_dir(run_dir)
     print(HELP if device == "keyboard" else "hold LB: drive, hold RB: let the software drive, B: e-stop, Start: re-arm")
 

@@ -28,6 +28,7 @@ from calibration.schema import CameraCalibration, TargetCalibration, load_calibr
 from nodes.pose_buffer import PoseBuffer
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import ConfigError, MessageError
+from nodes.runtime.interlock import SAFETY_STATE, Interlock
 from nodes.runtime.messages import header, image_array, image_message, pose_matrix, stamp_ns, types
 from nodes.runtime.node import ACTIVE, READY, MessageInfo, Node, NodeContext, Now, Out, run_node_main
 from nodes.runtime.pictures import RAW_TOPIC, raw_image
@@ -50,6 +51,7 @@ class CompositorConfig(BaseModel):
         extrapolation_limit_s: How far poses are continued at constant velocity after that [s].
         max_gap_s: Longest gap in a pose stream across which is interpolated [s].
         supersample: Samples along each side of a pixel.
+        interlock: Show the attack only while the safety node says that the car is armed: inside the fence, poses fresh.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -62,6 +64,7 @@ class CompositorConfig(BaseModel):
     extrapolation_limit_s: float = Field(default=0.05, ge=0.0, le=0.2)
     max_gap_s: float = Field(default=0.1, gt=0.0, le=0.5)
     supersample: int = Field(default=2, ge=1, le=4)
+    interlock: bool = False
 
     @field_validator("attack", mode="before")
     @classmethod
@@ -104,6 +107,7 @@ class CompositorNode(Node):
         subject: Motion-capture subject that carries the face; that of ``showing``, if there is one.
         prepare: Makes a new attack ready to be shown, or refuses it; None listens to no new ones.
         image_topic: Where images come from, raw or compressed.
+        interlock: When the attack may be shown; None shows it always.
     """
 
     publications = ("/compositor/image", "/compositor/attack")
@@ -118,7 +122,9 @@ class CompositorNode(Node):
         subject: str = "board",
         prepare: Callable[[AttackFile], Showing] | None = None,
         image_topic: str = RAW_TOPIC,
+        interlock: Interlock | None = None,
     ) -> None:
+        self._interlock = interlock
         self._image_topic = image_topic
         self._showing = showing
         self._prepare = prepare
@@ -128,7 +134,8 @@ class CompositorNode(Node):
         self._wait_ns = round(wait_s * NS_PER_S)
         self._limit_s = extrapolation_limit_s
         self._face_topic = f"/vicon/{showing.subject if showing else subject}"
-        self.subscriptions = (image_topic, _CAR, self._face_topic, *((_FILE,) if prepare else ()))
+        optional = (_FILE,) * bool(prepare) + (SAFETY_STATE,) * bool(interlock)
+        self.subscriptions = (image_topic, _CAR, self._face_topic, *optional)
         self._poses = {topic: PoseBuffer(max_gap_s=max_gap_s) for topic in (_CAR, self._face_topic)}
         self._waiting: _Waiting | None = None
         self._counts = {"images": 0, "drawn": 0, "extrapolated": 0, "dropped_no_pose": 0, "dropped_bad": 0}
@@ -145,20 +152,18 @@ class CompositorNode(Node):
         prepare = partial(show, camera=camera, target=target, supersample=config.supersample)
         showing = None if config.attack is None else prepare(load_attack(config.attack))
         return cls(
-            showing,
-            config.wait_s,
-            config.extrapolation_limit_s,
-            config.max_gap_s,
-            target.subject,
-            prepare,
-            config.image_topic,
-        )
+            showing, config.wait_s, config.extrapolation_limit_s, config.max_gap_s, target.subject, prepare,
+            config.image_topic, Interlock() if config.interlock else None,
+        )  # fmt: skip
 
     def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
         """Take an image or a pose."""
         self._now_ns = now.mono_ns
         if topic == _FILE:
             return self._take_piece(message, info, now)
+        if topic == SAFETY_STATE and self._interlock is not None:
+            self._interlock.heard(message, info)
+            return []
         if topic != self._image_topic:
             self._poses[topic].add(stamp_ns(message), pose_matrix(message))
             return self._release(now)
@@ -170,13 +175,14 @@ class CompositorNode(Node):
             self._counts["dropped_bad"] += 1
             self._trouble = f"image dropped: {error}"
             return []
-        if self._showing is None:
-            self._trouble = ""
-            # A raw image passes on in the very bytes in which it came.
-            out = (info.raw or message) if image is message else image
-            return [Out("/compositor/image", out), self._label(image, False, "no attack file")]
+        refusal = self._interlock.refusal(now.mono_ns) if self._interlock else ""
         # An older image that still waits gets what there is now: two never wait.
         before = self._finish(now) if self._waiting else []
+        if self._showing is None or refusal:
+            self._trouble = refusal
+            # A raw image passes on in the very bytes in which it came.
+            out = (info.raw or message) if image is message else image
+            return [*before, Out("/compositor/image", out), self._label(image, False, refusal or "no attack file")]
         self._waiting = _Waiting(image, stamp_ns(image), now.mono_ns + self._wait_ns)
         return before + self._release(now)
 

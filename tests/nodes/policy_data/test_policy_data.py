@@ -1,0 +1,105 @@
+"""Foreign logs, error figures against numpy, saliency of a network whose gradient is known, training that resumes."""
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from advnerf_core.driving.expert import Expert
+from advnerf_core.driving.imitation import ImitationConfig
+from advnerf_core.driving.path import Path as DrivingPath
+from advnerf_core.driving.policy import load_policy
+from nodes.policy_data.evaluate import compare, saliency
+from nodes.policy_data.frames import frames_of_log, view_for_size
+from nodes.policy_data.train import Part, train_from_recordings
+from nodes.runtime.errors import ConfigError
+
+EXPERT = Expert(DrivingPath.rounded_square(4.0, 1.1))
+
+
+def write_log(folder, rows=8, unit=0.5, name="drive.csv"):
+    """Each image has one brightness, which is also what the log says about steering."""
+    lines = ["frame,angle"]
+    for number in range(rows):
+        cv2.imwrite(str(folder / f"{number}.png"), np.full((94, 168, 3), 20 * number, np.uint8))
+        lines.append(f"{number}.png, {unit * (number - 4) / 4}")
+    (folder / name).write_text("\n".join(lines) + "\n")
+    return folder / name
+
+
+def test_a_foreign_log_becomes_frames_with_its_own_view(tmp_path):
+    recording, view = frames_of_log(write_log(tmp_path), None, "frame", "angle", rad_per_unit=-0.5)
+    assert (view.camera.width, view.camera.height) == (168, 94)
+    assert recording.frames.images.shape == (8, 66, 200, 3)
+    assert recording.frames.images[:, 30, 100, 0].tolist() == [20 * n for n in range(8)]
+    assert recording.frames.steering_rad == pytest.approx([-0.25 * (n - 4) / 4 for n in range(8)])
+    assert np.isnan(recording.frames.states).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lambda t: t.replace("angle", "wheel"), "expected columns frame, angle .* got frame, wheel"),
+        (lambda t: t.replace("3.png", "no.png"), r"csv:5: expected an image, got 'no\.png'"),
+        (lambda t: t.replace("2.png, -0.25", "2.png, left"), r"csv:4: expected a steering angle"),
+        (lambda t: t.replace("2.png, -0.25", "2.png, 25"), "--log-scale"),
+        (lambda t: "\n".join(t.split("\n")[:3]), "at least 4 rows"),
+        (lambda t: "", "an empty file"),
+    ],
+)
+def test_what_is_wrong_with_a_log_is_said(tmp_path, change, reason):
+    log = write_log(tmp_path)
+    log.write_text(change(log.read_text()))
+    with pytest.raises(ConfigError, match=reason):
+        frames_of_log(log, None, "frame", "angle")
+
+
+def test_errors_against_numpy():
+    rng = np.random.default_rng(0)
+    true = rng.normal(0.0, 0.1, 200)
+    predicted = 0.8 * true + 0.01 + rng.normal(0.0, 0.02, 200)
+    true[::10] = np.nan
+    e = compare(predicted, true)
+    known = ~np.isnan(true)
+    error = (predicted - true)[known]
+    assert e.count == 180
+    assert (e.mean_abs_rad, e.bias_rad) == (pytest.approx(np.abs(error).mean()), pytest.approx(error.mean()))
+    assert e.rms_rad == pytest.approx(np.sqrt(error.var() + error.mean() ** 2))
+    assert e.correlation == pytest.approx(np.corrcoef(predicted[known], true[known])[0, 1])
+    with pytest.raises(ConfigError, match="to compare with"):
+        compare(predicted, np.full(200, np.nan))
+
+
+def test_saliency_is_where_the_gradient_is():
+    weight = torch.zeros(3, 66, 200)
+    weight[:, 20, 150] = 1.0
+    maps = saliency(lambda images, goals: (images * weight).sum((1, 2, 3)), np.zeros((3, 66, 200, 3), np.uint8))
+    assert maps.shape == (3, 66, 200)
+    assert np.unravel_index(maps[1].argmax(), (66, 200)) == (20, 150)
+    assert maps.max() == pytest.approx(1.0)
+    assert maps[:, 40:].max() == 0.0
+
+
+def test_training_learns_is_kept_and_begins_anew_for_other_recordings(tmp_path):
+    log = write_log(tmp_path)
+    view = view_for_size(168, 94)
+    cuts = []
+
+    def train(steps=8):
+        def cut():
+            cuts.append(1)
+            return frames_of_log(log, view, "frame", "angle", 0.5)[0]
+
+        parts = [Part("log", (log,), {}, cut)]
+        config = ImitationConfig(first_steps=steps, batch_size=16, dagger_rounds=0)
+        return train_from_recordings(parts, view, EXPERT, config, tmp_path / "out")
+
+    first = train()
+    assert first.frames == {"log": 8}
+    assert load_policy(first.path).sha256 == first.sha256
+    assert train().sha256 == first.sha256
+    assert len(cuts) == 1
+    write_log(tmp_path, rows=9)
+    assert train().frames == {"log": 9}
+    assert len(cuts) == 2
+    assert len(list((tmp_path / "out" / "work").iterdir())) == 1

@@ -1,0 +1,160 @@
+"""The expert node drives a kinematic car with delay and a wrong trim; hands and starts as the nodes see them."""
+
+import math
+from collections import deque
+
+import numpy as np
+import pytest
+
+from advnerf_core.driving.expert import Expert, ExpertConfig
+from advnerf_core.driving.path import Path as DrivingPath
+from advnerf_core.geometry import planar_pose
+from hardware.hands import Hands
+from nodes.collect import Start
+from nodes.expert import Disturbance, ExpertNode, ExpertNodeConfig
+from nodes.runtime.clock import ManualClock
+from nodes.runtime.messages import header, pose_message, types
+from nodes.runtime.wire import MessageInfo
+from nodes.teleop import TeleopConfig, TeleopNode
+
+PATH = DrivingPath.rounded_square(4.0, 1.1)
+T0 = 1_700_000_000_000_000_000
+
+
+class Car:
+    """Poses at 100 Hz, commands obeyed after a delay, wheels that are off by a constant."""
+
+    def __init__(self, start, delay_s=0.1, wheels_off_rad=0.0, slow=1.0, armed=True, **config):
+        config = ExpertNodeConfig(room="r", vehicle="v", **config)
+        self.node = ExpertNode(Expert(PATH, ExpertConfig(delay_s=0.0, stiffness_1pm=config.stiffness_1pm)), config)
+        self.clock = ManualClock(mono_ns=10**10, real_ns=T0)
+        self.x, self.y, self.yaw = start
+        self.pipe = deque([(0.0, 0.0)] * round(delay_s / 0.01))
+        self.off, self.slow, self.armed = wheels_off_rad, slow, armed
+        self.command = (0.0, 0.0)
+        self.states = []
+
+    def run(self, duration_s):
+        for step in range(round(duration_s / 0.01)):
+            now = self.clock.now()
+            info = MessageInfo(now.mono_ns, now.mono_ns, instance_id=1)
+            if step % 10 == 0:
+                state = types.SafetyState(
+                    header=header(0), armed=self.armed, stopping=False, reason="", source="", command_age_s=0.0,
+                    pose_age_s=0.0,
+                )  # fmt: skip
+                self.node.handle("/safety/state", state, info, now)
+            pose = pose_message(planar_pose(self.x, self.y, self.yaw), now.real_ns)
+            for topic, message in self.node.handle("/vicon/car", pose, info, now):
+                if topic == "/expert/drive":
+                    self.command = (message.drive.speed, message.drive.steering_angle)
+                else:
+                    self.states.append(message)
+            self.pipe.append(self.command)
+            speed, steering = self.pipe.popleft()
+            speed *= self.slow
+            self.yaw += 0.01 * speed * math.tan(steering + (self.off if speed else 0.0)) / 0.25
+            self.x += 0.01 * speed * math.cos(self.yaw)
+            self.y += 0.01 * speed * math.sin(self.yaw)
+            self.clock.advance(0.01)
+        return np.array([s.cte_m for s in self.states])
+
+
+def test_it_comes_back_to_the_path_and_stays_there():
+    cte = Car((-0.9, -2.0 + 0.3, 0.0)).run(25.0)
+    assert cte[0] == pytest.approx(0.3, abs=1e-6)
+    assert np.abs(cte[len(cte) // 3 :]).max() < 0.02
+
+
+def test_the_integrals_take_out_wheels_and_speed_that_are_off():
+    car = Car((-0.9, -2.0, 0.0), wheels_off_rad=0.03, slow=0.95, integral_radpm2=0.1)
+    cte = car.run(45.0)
+    without = Car((-0.9, -2.0, 0.0), wheels_off_rad=0.03, slow=0.95, integral_radpm2=0.0).run(45.0)
+    assert abs(cte[-350:].mean()) < 0.25 * abs(without[-350:].mean())
+    assert car.node.counters()["trim_rad"] == pytest.approx(-0.03, abs=0.015)
+    assert car.states[-1].speed_mps == pytest.approx(0.8, abs=0.01)
+
+
+def test_disturbances_are_declared_repeatable_and_not_in_what_it_wants():
+    def drive():
+        car = Car((-0.9, -2.0, 0.0), disturb=Disturbance(steering_rad=0.2, seed=3))
+        car.run(25.0)
+        return car.states
+
+    states = drive()
+    off = np.array([s.disturbance_rad for s in states])
+    assert 0.05 < np.mean(off != 0.0) < 0.5
+    assert (off > 0.0).any()
+    assert (off < 0.0).any()
+    assert np.abs(off).max() <= 0.2 + 1e-9
+    cte = np.array([s.cte_m for s in states])
+    assert 0.05 < np.abs(cte).max() < 0.4
+    assert [s.disturbance_rad for s in drive()] == off.tolist()
+
+
+def test_disarmed_it_disturbs_and_integrates_nothing():
+    car = Car((-0.9, -1.8, 0.0), armed=False, disturb=Disturbance())
+    car.run(10.0)
+    assert {s.disturbance_rad for s in car.states} == {0.0}
+    assert car.node.counters()["trim_rad"] == 0.0
+
+
+def test_old_poses_are_not_steered_by():
+    car = Car((-0.9, -2.0, 0.0))
+    now = car.clock.now()
+    pose = pose_message(planar_pose(0.0, -2.0, 0.0), now.real_ns - 150_000_000)
+    assert car.node.handle("/vicon/car", pose, MessageInfo(now.mono_ns, now.mono_ns), now) == []
+    assert car.node.counters()["stale_poses"] == 1
+    assert car.node.status()[0] == "ready"
+
+
+def test_starts_lie_beside_the_path_as_declared():
+    x_m, y_m, yaw_rad = Start(s_m=1.0, lateral_m=0.25, heading_rad=-0.2).pose_on(PATH)
+    at = PATH.project(np.array([x_m, y_m]))
+    assert (float(at.s_m), float(at.cte_m)) == (pytest.approx(1.0), pytest.approx(0.25))
+    assert yaw_rad == pytest.approx(float(at.heading_rad) - 0.2)
+
+
+class Hand:
+    def __init__(self):
+        self.clock = ManualClock(mono_ns=10**10, real_ns=T0)
+        self.node = TeleopNode(TeleopConfig(), lambda: None, lambda: None)
+
+    def does(self, **hands):
+        return [(t, m) for t, m in self.node.receive(Hands(**hands), self.clock.now())]
+
+    def tick(self, after_s=0.05):
+        self.clock.advance(after_s)
+        return self.node.tick(self.clock.now())
+
+
+@pytest.fixture
+def hand():
+    hand = Hand()
+    yield hand
+    hand.node.close()
+
+
+def test_the_hand_goes_before_the_software_and_silence_is_letting_go(hand):
+    ((_, state),) = hand.does(human=True, autonomy=True, throttle=0.5, steering=-1.0)
+    assert (state.mode, state.speed_mps, state.steering_rad) == ("human", pytest.approx(0.4), pytest.approx(-0.25))
+    assert hand.tick()[0].message.mode == "human"
+    assert hand.tick(0.15)[0].message.mode == "idle"
+    ((_, state),) = hand.does(autonomy=True, throttle=1.0)
+    assert (state.mode, state.speed_mps) == ("autonomy", 0.0)
+    ((_, state),) = hand.does(autonomy=True, connected=False, text="gone")
+    assert state.mode == "idle"
+    assert hand.node.status() == ("fault", "gone")
+
+
+def test_the_estop_stays_until_re_armed_which_is_asked_for_a_moment_later(hand):
+    ((_, state),) = hand.does(human=True, throttle=1.0, stops=1)
+    assert (state.estop, state.speed_mps) == (True, 0.0)
+    hand.does(stops=1)
+    assert hand.tick()[0].message.estop
+    ((_, state),) = hand.does(stops=1, rearms=1)
+    assert not state.estop
+    assert [t for t, _ in hand.tick() + hand.tick()] == ["/teleop/state", "/teleop/state", "/arm"]
+    hand.does(stops=2, rearms=2)  # both at once: stopping counts
+    assert [t for t, _ in hand.tick() + hand.tick()] == ["/teleop/state"] * 2
+    assert hand.tick()[0].message.estop
