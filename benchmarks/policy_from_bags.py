@@ -13,6 +13,7 @@ import json
 import os
 import shutil
 import socket
+from functools import partial
 from pathlib import Path
 
 from advnerf_core.driving.expert import Expert, ExpertConfig
@@ -61,9 +62,7 @@ def train(bags: list[Path], out: Path, steps: int) -> Training:
     room = load_calibration(RoomCalibration, _CALIBRATION / "room.yaml")
     view = PolicyView(camera.pinhole, distortion=camera.distortion)
     expert = Expert(room.reference_path, ExpertConfig(speed_mps=_SPEED_MPS))
-    parts = [
-        Part(str(bag), (read_info(bag).path,), {}, lambda bag=bag: frames_of_bag(bag, view, expert)) for bag in bags
-    ]
+    parts = [Part(str(bag), (read_info(bag).path,), {}, partial(frames_of_bag, bag, view, expert)) for bag in bags]
     return train_from_recordings(parts, view, expert, ImitationConfig(first_steps=steps), out, progress=_say)
 
 

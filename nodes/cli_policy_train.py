@@ -127,7 +127,7 @@ def evaluate(
     goals = tuple(goal or ())
     predicted = measure.predict(loaded.policy, found.frames.images, goals)
     rows = table("predicted against", "frames", "mean |error|", "RMS", "worst", "bias", "r", "straight on")
-    pairs = [(labels, np.asarray(found.frames.steering_rad))]
+    pairs: list[tuple[str, Any]] = [(labels, np.asarray(found.frames.steering_rad))]
     if labels == "expert" and np.isfinite(found.recorded_rad).any():
         pairs.append(("recorded", found.recorded_rad))
     for name, true in pairs:
@@ -163,9 +163,7 @@ def _parts(
         parts.append(Part(str(bag), (read_info(bag).path,), {"labels": labels, "images": image_topic}, cut))
     for log in logs:
         options = {"columns": columns, "scale": scale}
-        parts.append(
-            Part(str(log), (log,), options, lambda log=log: _own_view(frames_of_log, log, view, columns, scale))
-        )
+        parts.append(Part(str(log), (log,), options, partial(_own_view, frames_of_log, log, view, columns, scale)))
     return parts
 
 

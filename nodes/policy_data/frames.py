@@ -147,7 +147,7 @@ def frames_of_log(
                 f"{log}:{number}: expected a steering angle below 1 rad, got {row[steering_column]!r} times {rad_per_unit:g};"
                 " give the factor from the log's unit to radians with --log-scale"
             )
-        rgb = np.ascontiguousarray(picture[..., ::-1])
+        rgb = np.ascontiguousarray(picture[..., ::-1], dtype=np.uint8)
         view = view or view_for_size(rgb.shape[1], rgb.shape[0])
         _require_size(rgb, view, str(log))
         images.append(view.image(rgb))
