@@ -76,7 +76,9 @@ def evaluate(
     """Say how far the car left its path in a bag: the same numbers as a trial's, from any recording of a drive."""
     from nodes.trials.bags import evaluate_bag
 
-    rows = table("bag", "attack", "total CTE [m]", "mean [m]", "max [m]", "off track", "left after", "stopped early")
+    rows = table(
+        "bag", "attack", "total CTE \\[m]", "mean \\[m]", "max \\[m]", "off track", "left after", "stopped early"
+    )
     for bag in bags:
         for found in evaluate_bag(bag, room, ticks):
             if as_json:
@@ -117,7 +119,7 @@ def _pose(text: str) -> tuple[float, float, float]:
 def _print_summary(results: list[dict[str, Any]]) -> None:
     from nodes.trials.campaign import summarise
 
-    rows = table("condition", "runs", "total CTE [m]", "ratio", "off track", "stopped early", "capture to serial p50")
+    rows = table("condition", "runs", "total CTE \\[m]", "ratio", "off track", "stopped early", "capture to serial p50")
     for row in summarise(results):
         spread = "" if row["std_m"] is None else f" +- {row['std_m']:.3f}"
         rows.add_row(

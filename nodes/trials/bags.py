@@ -101,13 +101,17 @@ def measure_drive(bag: Path, span: DriveSpan, path: DrivingPath, horizon: Horizo
 
 def evaluate_bag(bag: Path, room: Path | None, ticks: int = 60) -> list[dict[str, Any]]:
     """Measure every drive of a bag against the path of a room file, or of the one that rides along in the bag."""
-    calibration = _room_of(bag) if room is None else load_calibration(RoomCalibration, room)
-    wanted = Horizon(ticks, off_track_m=calibration.off_track_m)
+    return measure_drives(bag, _room_of(bag) if room is None else load_calibration(RoomCalibration, room), ticks)
+
+
+def measure_drives(bag: Path, room: RoomCalibration, ticks: int) -> list[dict[str, Any]]:
+    """Measure every drive of a bag against the path of a room."""
+    wanted = Horizon(ticks, off_track_m=room.off_track_m)
     results = []
     for span in find_drives(bag):
         early = (span.end_real_ns - span.start_real_ns) / NS_PER_S < wanted.ticks * wanted.dt_s
         stopped = (span.reason or "the bag ends") if early else ""
-        found = measure_drive(bag, span, calibration.reference_path, wanted, stopped)
+        found = measure_drive(bag, span, room.reference_path, wanted, stopped)
         results.append({"bag": str(bag), "start_real_ns": span.start_real_ns, **found})
     return results
 

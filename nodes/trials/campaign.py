@@ -15,19 +15,21 @@ from typing import Any
 
 import numpy as np
 
-from advnerf_core.driving.metrics import Horizon
 from advnerf_core.files import write_atomically
 from calibration.schema import RoomCalibration, load_calibration
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.launch_file import Plan, load_launch
 from nodes.trial import TrialPlan
 from nodes.trial_runner import run_trial
-from nodes.trials.bags import DriveSpan, measure_drive
+from nodes.trials.bags import measure_drives
 from nodes.trials.plan import NONE, CampaignError, Run, TrialsPlan, finished, keep_plan, make_runs, sha256_of
 
 TICK_S = 0.1
 # After the last tick the car drives on for a moment, so that the poses reach over it.
 _TAIL_S = 0.2
+# A stop that belongs to the drive: the car left the floor it has, or a person ended it. Any other is a fault of the stack.
+COUNTED_STOPS = ("fence", "disarmed by", "released")
+_ATTEMPTS = 3
 _NOT_WATCHED = ("recorder", "viewer")
 
 
@@ -46,11 +48,6 @@ class Series:
     plan: TrialsPlan
     room: RoomCalibration
     nodes: tuple[str, ...]
-
-    @property
-    def horizon(self) -> Horizon:
-        """What is summed."""
-        return Horizon(self.plan.ticks, TICK_S, self.room.off_track_m)
 
     @property
     def results(self) -> dict[str, dict[str, Any]]:
@@ -110,22 +107,31 @@ def drive_series(
 
 
 def drive_run(series: Series, run: Run, ready_timeout_s: float, guide: Callable[[str], None]) -> dict[str, Any]:
-    """Drive one run and write its result."""
+    """Drive one run and write its result; a run that a fault of the stack ended is driven again, a few times."""
+    for attempt in range(1, _ATTEMPTS + 1):
+        result = _attempt(series, run, ready_timeout_s, guide)
+        stopped = result["stopped_early"]
+        if not stopped or any(word in stopped for word in COUNTED_STOPS):
+            write_atomically(series.folder / f"{run.name}.json", json.dumps(result) + "\n")
+            return result
+        guide(f"this run does not count, the stack stopped it: {stopped} (attempt {attempt} of {_ATTEMPTS})")
+    raise CampaignError(f"run {run.name} was stopped {_ATTEMPTS} times by the stack itself: {stopped}; cure that first")
+
+
+def _attempt(series: Series, run: Run, ready_timeout_s: float, guide: Callable[[str], None]) -> dict[str, Any]:
     plan, run_dir = series.plan, series.folder / run.name
     shutil.rmtree(run_dir, ignore_errors=True)  # of a run that was broken off
     trial = TrialPlan(plan.start_pose, plan.ticks * TICK_S + _TAIL_S, series.nodes, by_hand=True)
     overrides = [*plan.overrides, f"params.attack={run.attack}"]
     outcome = run_trial(Path(plan.launch), overrides, run_dir, trial, ready_timeout_s, guide)
-    span = DriveSpan(outcome.start_real_ns, outcome.end_real_ns, outcome.stopped_early)
-    if not span.start_real_ns:
+    if not outcome.start_real_ns:
         raise CampaignError(f"run {run.name}: stopped before the car moved ({outcome.stopped_early}); start it again")
-    found = measure_drive(run_dir / "bag", span, series.room.reference_path, series.horizon, outcome.stopped_early)
+    # From the bag alone, as `advnerf evaluate` does: the same numbers, to the last digit.
+    found = measure_drives(run_dir / "bag", series.room, plan.ticks)[-1]
     wanted = [run.attack_id] if run.attack_id else []
     if found["attack_ids"] != wanted:
         raise CampaignError(f"expected the attacks {wanted} to be shown in run {run.name}, got {found['attack_ids']}")
-    result = {"condition": run.condition, "repeat": run.repeat, "outcome": outcome.to_dict(), **found}
-    write_atomically(series.folder / f"{run.name}.json", json.dumps(result) + "\n")
-    return result
+    return {"condition": run.condition, "repeat": run.repeat, "peer": outcome.peer, **found}
 
 
 def summarise(results: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:

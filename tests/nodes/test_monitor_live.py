@@ -53,6 +53,7 @@ def test_the_lab_camera_sees_the_attack_while_armed_and_not_before(tmp_path):
         redness = (rgb[..., 0] - rgb[..., 1:].max(axis=-1) > 80).sum()
         inside = outcome.start_real_ns < stamp < outcome.end_real_ns - 2 * 10**8
         (armed if inside else before if stamp < outcome.start_real_ns - 10**9 else []).append(redness)
-    assert max(before) == 0
-    assert min(armed) > 40
+    # The room has some red of its own; the face is 16 px wide from where the car stands.
+    assert max(before) - min(before) < 20
+    assert min(armed) > max(before) + 100
     assert attack_ids(bag, ["/monitor/attack"]) == {attack_id}

@@ -169,3 +169,25 @@ def test_bags_without_a_drive_say_what_they_lack(tmp_path):
         evaluate_bag(tmp_path / "empty", None)
     with pytest.raises(BagError, match="lacks /safety/state"):
         find_drives(tmp_path / "empty")
+
+
+@pytest.mark.slow
+def test_a_series_on_the_twin_counts_what_its_bags_say_and_goes_on(tmp_path):
+    from nodes.trials.campaign import drive_series
+
+    calibration = [f"params.calibration={ROOT / 'calibration' / 'twin'}", "params.vicon_port=52871"]
+    stands_in = ["policy.module=benchmarks.straight_policy", "policy.speed_mps=0.5"]
+    made = prepare_series(
+        ROOT / "launch" / "green_screen.launch.yaml", calibration + stands_in, tmp_path / "t",
+        {"random": [attack_file(tmp_path, 0)[0]]}, 1, 0, 10,
+    )  # fmt: skip
+    begun = []
+    drive_series(made, 60.0, lambda run: begun.append(run.name), print)
+    assert len(begun) == 2
+    for run in made.plan.runs:
+        (again,) = evaluate_bag(made.folder / run.name / "bag", None, 10)
+        assert again["total_cte_m"] == made.results[run.name]["total_cte_m"]
+        assert again["attack_ids"] == ([run.attack_id] if run.attack_id else [])
+    (made.folder / f"{begun[1]}.json").unlink()
+    drive_series(made, 60.0, lambda run: begun.append(run.name), print)
+    assert begun[2:] == [begun[1]]
