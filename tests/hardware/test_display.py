@@ -22,6 +22,7 @@ def noise(width, height, seed=0):
     return np.random.default_rng(seed).integers(0, 256, (height, width, 3), dtype=np.uint8)
 
 
+@pytest.mark.own_process
 @pytest.mark.filterwarnings("default::DeprecationWarning")
 def test_a_real_sdl_window_holds_exactly_the_pixels_that_were_shown(offscreen):
     display = PygameDisplay(0, (1920, 1080))
@@ -40,6 +41,7 @@ def test_a_real_sdl_window_holds_exactly_the_pixels_that_were_shown(offscreen):
         display.close()
 
 
+@pytest.mark.own_process
 def test_a_screen_that_does_not_exist_is_named(offscreen):
     with pytest.raises(DeviceNotFound, match="index 3, found 0: "):
         PygameDisplay(3)

@@ -272,6 +272,7 @@ def test_display_from_a_folder(tmp_path, capsys):
     assert "columns file, red, green, blue" in capsys.readouterr().err
 
 
+@pytest.mark.own_process
 @pytest.mark.filterwarnings("default::DeprecationWarning")
 def test_a_session_on_a_real_sdl_screen_keeps_only_frames_of_the_colour_that_is_shown(tmp_path, monkeypatch):
     """The camera here photographs what SDL holds, one frame late: as a real one whose exposure began before the flip."""
