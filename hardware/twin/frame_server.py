@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import socket
 import threading
 from pathlib import Path
 
 from hardware.cameras.frame_wire import REQUEST, encode_head
 from hardware.cameras.interface import Frame
-from hardware.errors import DeviceBusy, HardwareError
+from hardware.twin.unix_socket import listen
 
 
 class FrameServer:
@@ -26,7 +25,7 @@ class FrameServer:
         self._condition = threading.Condition()
         self._stopping = False
         self._clients: set[socket.socket] = set()
-        self._listener = _listen(self.path)
+        self._listener = listen(self.path, "a frame server")
         self._thread = threading.Thread(target=self._accept, name="frame server", daemon=True)
         self._thread.start()
 
@@ -92,27 +91,3 @@ class FrameServer:
             while self._newest is last and not self._stopping:
                 self._condition.wait()
             return None if self._stopping else self._newest
-
-
-def _listen(path: Path) -> socket.socket:
-    listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-    if path.exists():
-        try:
-            listener.connect(str(path))
-        except OSError:
-            path.unlink()
-        else:
-            listener.close()
-            raise DeviceBusy(f"expected {path} to be free, a frame server answers there: stop the other twin first")
-        listener.close()
-        listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-    try:
-        listener.bind(str(path))
-        os.chmod(path, 0o600)
-        listener.listen()
-    except OSError as error:
-        listener.close()
-        raise HardwareError(
-            f"cannot serve frames at {path}: {error.strerror or error}; use a shorter --run-dir?"
-        ) from error
-    return listener

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hardware.edid import make_edid
-from hardware.errors import DeviceBusy, HardwareError
+from hardware.twin.unix_socket import listen
 
 Rgb = NDArray[np.uint8]
 SHOW, READ = b"S", b"R"
@@ -41,7 +41,7 @@ class MonitorPort:
         self._lock = threading.Lock()
         self._next: object | Rgb | None = None  # what the camera thread has not taken yet
         self._client: socket.socket | None = None
-        self._listener = _listen(self.path)
+        self._listener = listen(self.path, "a simulated monitor", backlog=1)
         self._thread = threading.Thread(target=self._accept, name="twin monitor", daemon=True)
         self._thread.start()
 
@@ -113,25 +113,3 @@ def receive_exactly(source: socket.socket, count: int) -> bytes | None:
             return None
         data += piece
     return bytes(data)
-
-
-def _listen(path: Path) -> socket.socket:
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
-        if path.exists():
-            try:
-                probe.connect(str(path))
-            except OSError:
-                path.unlink()
-            else:
-                raise DeviceBusy(f"expected {path} to be free, a simulated monitor answers there: stop the other twin")
-    listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-    try:
-        listener.bind(str(path))
-        path.chmod(0o600)
-        listener.listen(1)
-    except OSError as error:
-        listener.close()
-        raise HardwareError(
-            f"cannot serve the simulated monitor at {path}: {error.strerror or error}; use a shorter --run-dir?"
-        ) from error
-    return listener

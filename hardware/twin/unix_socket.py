@@ -1,0 +1,41 @@
+"""Unix sockets on which the twin offers what a device has a plug for."""
+
+from __future__ import annotations
+
+import socket
+from pathlib import Path
+
+from hardware.errors import DeviceBusy, HardwareError
+
+
+def listen(path: Path, who: str, backlog: int = 8) -> socket.socket:
+    """Listen at ``path`` for the owner of this process alone; a dead socket of an earlier run is replaced.
+
+    Args:
+        path: Path of the socket; its length is limited by the system (108 bytes on Linux).
+        who: What answers there, for messages, e.g. ``"a frame server"``.
+        backlog: Connections that may wait.
+
+    Raises:
+        DeviceBusy: A living one answers there.
+        HardwareError: The socket cannot be made.
+    """
+    if path.exists():
+        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+            try:
+                probe.connect(str(path))
+            except OSError:
+                path.unlink()
+            else:
+                raise DeviceBusy(f"expected {path} to be free, {who} answers there: stop the other twin first")
+    listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    try:
+        listener.bind(str(path))
+        path.chmod(0o600)
+        listener.listen(backlog)
+    except OSError as error:
+        listener.close()
+        raise HardwareError(
+            f"cannot serve {who} at {path}: {error.strerror or error}; use a shorter --run-dir?"
+        ) from error
+    return listener
