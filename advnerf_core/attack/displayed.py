@@ -6,13 +6,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
 
 from advnerf_core.attack.problem import Sensor
+from advnerf_core.attack.robustness import PosedSensor
 from advnerf_core.display import DARKEST, DisplayModel
+from advnerf_core.geometry import Array
 from advnerf_core.scene.surrogate import Rendered
 
 # The squash has no inverse at 0 and 1.
@@ -63,10 +66,27 @@ class DisplayedSensor:
 
     def sense(self, states: Tensor, theta: Tensor) -> Rendered:
         """Images at detached states with their vjp with respect to what is shown."""
+        return self._shown(lambda seen: self.sensor.sense(states, seen), theta)
+
+    def camera_poses(self, states: Tensor) -> Array:
+        """Of the sensor behind it, which must have them (`PosedSensor`)."""
+        return self._posed.camera_poses(states)
+
+    def render(self, T_world_from_camera: Array, theta: Tensor) -> Rendered:
+        """The same as `sense` at camera poses ``[B, 4, 4]``."""
+        return self._shown(lambda seen: self._posed.render(T_world_from_camera, seen), theta)
+
+    @property
+    def _posed(self) -> PosedSensor:
+        if not isinstance(self.sensor, PosedSensor):
+            raise TypeError(f"expected a sensor with camera_poses and render, got {type(self.sensor).__name__}")
+        return self.sensor
+
+    def _shown(self, render: Callable[[Tensor], Rendered], theta: Tensor) -> Rendered:
         leaf = theta.detach().requires_grad_(True)
         with torch.enable_grad():
             seen = self.seen_theta(leaf)
-        rendered = self.sensor.sense(states, seen.detach())
+        rendered = render(seen.detach())
 
         def vjp(gradient: Tensor) -> Tensor:
             (shown,) = torch.autograd.grad(seen, leaf, rendered.vjp(gradient), retain_graph=True)

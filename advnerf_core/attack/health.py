@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from advnerf_core.attack.adjoint import AdjointResult, RenderCache, adjoint_gradient, evaluate, gradient_pass, roll_out
+from advnerf_core.attack.displayed import DisplayedSensor
 from advnerf_core.attack.problem import AttackProblem
 from advnerf_core.driving.rollout import Rollout
 from advnerf_core.geometry import Array
@@ -64,8 +65,12 @@ class RememberedFrames:
 
 def with_remembered_frames(problem: AttackProblem) -> AttackProblem:
     """The problem with a sensor that prepares each pose once; memory grows with the poses."""
-    assert isinstance(problem.sensor, Surrogate)
-    return replace(problem, sensor=RememberedFrames(problem.sensor))
+    sensor = problem.sensor
+    if isinstance(sensor, DisplayedSensor):
+        assert isinstance(sensor.sensor, Surrogate)
+        return replace(problem, sensor=replace(sensor, sensor=RememberedFrames(sensor.sensor)))
+    assert isinstance(sensor, Surrogate)
+    return replace(problem, sensor=RememberedFrames(sensor))
 
 
 def frozen_loss(problem: AttackProblem, theta: Tensor, rollout: Rollout) -> float:

@@ -30,7 +30,7 @@ from advnerf_core.attack.health import (
 from advnerf_core.attack.health_plot import draw_health
 from advnerf_core.files import write_atomically
 from nodes.attacking.memory import measured_mib
-from nodes.attacking.prepare import Prepared, prepare
+from nodes.attacking.prepare import Prepared, prepare, sensor_of
 from nodes.attacking.request import AttackRequest
 from nodes.runtime.stages import Report
 
@@ -114,7 +114,8 @@ def in_double(prepared: Prepared) -> AttackProblem:
     if isinstance(policy, nn.Module):
         policy = copy.deepcopy(policy).double().eval()
     goals = None if problem.goals is None else problem.goals.double()
-    return replace(problem, policy=policy, sensor=prepared.surrogate.in_type(torch.float64), goals=goals)
+    sensor = sensor_of(prepared.request, prepared.surrogate.in_type(torch.float64))
+    return replace(problem, policy=policy, sensor=sensor, goals=goals)
 
 
 def _frozen_slopes(problem: AttackProblem, theta: Tensor, along: Tensor) -> tuple[AdjointResult, Any]:

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from advnerf_core.attack.adjoint import AttackProblem
 from advnerf_core.attack.artifact import AttackedObject, AttackFile, face_texture
+from advnerf_core.attack.displayed import DisplayedSensor
 from advnerf_core.attack.robustness import Disturbances, Smoothness
 from advnerf_core.attack.search import SearchResult, draw_start_states
 from advnerf_core.driving.actuated import ActuatedAckermann
@@ -22,6 +23,7 @@ from advnerf_core.policies.load import load_any_policy
 from advnerf_core.scene.field import load_scene
 from advnerf_core.scene.render_field import FieldRenderer
 from advnerf_core.scene.surrogate import Surrogate, split_theta
+from calibration.display_colour import DisplayCalibration
 from calibration.schema import CameraCalibration, RoomCalibration, VehicleCalibration, load_calibration
 from nodes.attacking.objects import PlacedObject, place
 from nodes.attacking.request import AttackRequest
@@ -136,11 +138,15 @@ def request_hash(request: AttackRequest) -> str:
         asked["search"].pop(key)
     for wanted in asked["objects"]:
         del wanted["file"], wanted["target"]
+        if wanted.pop("display") is None:
+            del wanted["display_cos"]
         if not wanted["levels"]:
             del wanted["levels"]
     digest = hashlib.sha256(hash_of(asked).encode())
     for name in ("camera", "vehicle", "room"):
         digest.update(request.calibration_file(name).read_bytes())
+    if request.objects[0].display is not None:
+        digest.update(request.objects[0].display.read_bytes())
     return digest.hexdigest()
 
 
@@ -179,12 +185,20 @@ def _problem(
     starts, search = start_states(request, room, dynamics, seed), request.search
     smoothness = request.robustness.smoothness
     return AttackProblem(
-        loaded.policy, surrogate, dynamics, room.reference_path, starts, request.horizon,
+        loaded.policy, sensor_of(request, surrogate), dynamics, room.reference_path, starts, request.horizon,
         goals=_goals(request, loaded, len(starts)), time_batch=search.time_batch,
         cache_bytes=int(search.cache_mib * 2**20), fence_m=float(np.abs(np.array(room.fence_m)).min()),
         disturbances=disturbances(request, seed),
         regulariser=Smoothness(surrogate.objects, smoothness) if smoothness else None,
     )  # fmt: skip
+
+
+def sensor_of(request: AttackRequest, surrogate: Surrogate) -> Surrogate | DisplayedSensor:
+    """The surrogate, seen through the monitor's colours where a monitor shows the face."""
+    wanted = request.objects[0]
+    if wanted.display is None:
+        return surrogate
+    return DisplayedSensor(surrogate, load_calibration(DisplayCalibration, wanted.display).display, wanted.display_cos)
 
 
 def disturbances(request: AttackRequest, seed: int) -> Disturbances | None:

@@ -59,6 +59,13 @@ class ObjectRequest(_Section):
     target: Path | None = Field(
         default=None, description="Calibration file of the face that shows the attack: its subject and its corners."
     )
+    display: Path | None = Field(
+        default=None,
+        description="What 'advnerf calibrate display' wrote, where a monitor shows the face: its colours are in the loop.",
+    )
+    display_cos: Annotated[float, Field(gt=0, le=1)] = Field(
+        default=1.0, description="Cosine of the angle at which the camera looks at the monitor, in the mean of a drive."
+    )
     subject: str = Field(default="board", min_length=1, description="Motion-capture subject, where no target is given.")
 
     @model_validator(mode="after")
@@ -186,6 +193,9 @@ class AttackRequest(_Section):
         missing = [name for name in ("camera", "vehicle", "room") if getattr(self, name) is None]
         if self.search.together and self.search.method != "gradient":
             raise ValueError(f"search.together is for the gradient method only, got method {self.search.method}")
+        one_face = len(self.objects) == 1 and self.objects[0].kind != "file"
+        if any(wanted.display is not None for wanted in self.objects) and (not one_face or self.search.together):
+            raise ValueError("display: expected one object, a face or cube, and seeds searched one after the other")
         if self.calibration is None and missing:
             raise ValueError(f"expected a calibration folder, or files for {', '.join(missing)}")
         count = len(self.starts.poses) or self.starts.count
@@ -232,7 +242,7 @@ def _resolve(document: Document, folder: Path, overrides: Sequence[str]) -> Atta
 
     changes: dict[str, Any] = {name: absolute(getattr(request, name)) for name in _PATHS}
     changes["objects"] = tuple(
-        wanted.model_copy(update={"file": absolute(wanted.file), "target": absolute(wanted.target)})
+        wanted.model_copy(update={name: absolute(getattr(wanted, name)) for name in ("file", "target", "display")})
         for wanted in request.objects
     )
     return request.model_copy(update=changes)

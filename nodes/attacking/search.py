@@ -21,6 +21,7 @@ from nodes.runtime.errors import ConfigError
 from nodes.runtime.stages import Display
 
 REQUEST = "request.attack.yaml"
+TOGETHER_STATE = "together.state.safetensors"
 
 
 def search(
@@ -128,7 +129,7 @@ def _run_together(
     on_prepared: Callable[[Prepared], None] | None,
 ) -> list[Path]:  # fmt: skip
     """All seeds of a gradient attack in one batch; their files are written when all are done."""
-    seeds, state_path = request.search.seeds, folder / "together.state.safetensors"
+    seeds, state_path = request.search.seeds, folder / TOGETHER_STATE
     files = [attack_file(folder, seed) for seed in seeds]
     if all(file.exists() for file in files):
         for seed in seeds:

@@ -22,7 +22,7 @@ from advnerf_core.attack.search import Evaluation
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.scene.surrogate import split_theta
 from nodes.attacking.prepare import Prepared
-from nodes.attacking.search import kept_request, run_attack
+from nodes.attacking.search import TOGETHER_STATE, kept_request, run_attack
 from nodes.runtime.stages import Report
 
 TEXTURE, PREVIEW = "texture", "preview"
@@ -74,14 +74,24 @@ class Speaker:
 
     def _show(self, prepared: Prepared) -> None:
         """The best texture so far, and what the policy sees of it from the first start."""
-        with safe_open(self._state(prepared), framework="pt") as handle:
-            theta = handle.get_tensor("best_theta")
+        theta = self._best_theta(prepared)
         texture = _texture(prepared, theta)
         if texture is not None:
             self._image(TEXTURE, texture)
-        seen = prepared.surrogate.sense(prepared.problem.start_states[:1], theta).images[0]
+        seen = prepared.problem.sensor.sense(prepared.problem.start_states[:1], theta).images[0]
         pixels = np.round(255.0 * seen.detach().permute(1, 2, 0).clamp(0.0, 1.0).numpy()).astype(np.uint8)
         self._image(PREVIEW, pixels.repeat(_PREVIEW_SCALE, 0).repeat(_PREVIEW_SCALE, 1))
+
+    def _best_theta(self, prepared: Prepared) -> Tensor:
+        """Of the seed at work; of the best, where all are searched together."""
+        together = prepared.request.search.together
+        with safe_open(self._folder / TOGETHER_STATE if together else self._state(prepared), framework="pt") as handle:
+            best: Tensor = handle.get_tensor("best_theta")
+            histories = json.loads((handle.metadata() or {}).get("histories", "[]"))
+        if not together:
+            return best
+        totals = [max(sum(entry["protocol_cte_m"]) for entry in history) for history in histories]
+        return best[totals.index(max(totals))]
 
     def _state(self, prepared: Prepared) -> Path:
         return self._folder / f"seed_{prepared.seed}.state.safetensors"

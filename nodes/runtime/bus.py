@@ -237,7 +237,7 @@ class Bus:
         kept: list[Received] = []
         for _ in range(subscription.limit if subscription.take_all else _DRAIN_LIMIT):
             # Asking first costs a tenth of the exception that an empty socket raises.
-            if not subscription.socket.get(_EVENTS) & _POLLIN:
+            if not int(subscription.socket.get(_EVENTS)) & _POLLIN:
                 break
             frames = _frames(subscription.socket)
             try:

@@ -1,15 +1,21 @@
 """A request run in a folder: killed and gone on with, shown, checked."""
 
+import datetime
 import json
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from advnerf_core.attack.artifact import load_attack
+from advnerf_core.display import DisplayModel
+from calibration.display_colour import DisplayCalibration
+from calibration.schema import save_calibration
 from nodes import cli
 from nodes.attacking.check import check
+from nodes.attacking.prepare import prepare
 from nodes.attacking.request import load_request
 from nodes.attacking.search import attack_file, run_attack
 from nodes.runtime.errors import ConfigError
@@ -63,6 +69,29 @@ def test_seeds_searched_together_resume_to_the_same_bytes_and_end_as_they_do_alo
         np.testing.assert_allclose(load_attack(one).theta, load_attack(other).theta, atol=1e-3)
     with pytest.raises(ConfigError, match="gradient method only"):
         load_request(file, ["search.method=random", "search.together=true"])
+
+
+def test_a_monitor_in_the_loop_is_searched_through_its_colours_and_the_gradient_is_sound(tmp_path):
+    dim = DisplayModel(np.tile(np.linspace(0.0, 1.0, 9) ** 2.2, (3, 1)), 0.8 * np.eye(3) + 0.03, np.full(3, 0.05), 2.2)
+    calibration = DisplayCalibration(date=datetime.date(2026, 1, 1), method="computed", model=dim.to_dict())
+    save_calibration(calibration, tmp_path / "display.yaml")
+    file = tiny_request(tmp_path)
+    changes = ["search.evaluations=2", "robustness.jitter_m=0.001"]
+    shown = load_request(file, changes)
+    text = file.read_text().replace("resolution: 8,", "resolution: 8, display: display.yaml, display_cos: 0.9,")
+    file.write_text(text)
+    request = load_request(file, changes)
+    prepared = prepare(request)
+    theta = torch.randn(prepared.problem.sensor.theta_shape, generator=torch.manual_seed(0))
+    seen = torch.logit(torch.tensor(dim.forward(torch.sigmoid(theta).numpy(), 0.9)), eps=1e-4).float()
+    images = prepared.problem.sensor.sense(prepared.problem.start_states, theta).images
+    torch.testing.assert_close(images, prepared.surrogate.sense(prepared.problem.start_states, seen).images)
+    assert prepared.settings_hash != prepare(shown).settings_hash
+    (attack,) = run_attack(request, tmp_path / "out", ProgressDisplay())
+    assert load_attack(attack).subject == "board"
+    assert check(load_request(file), 2, False, lambda fraction, text="": None).sound
+    with pytest.raises(ConfigError, match="display: expected one object"):
+        load_request(file, ["search.together=true"])
 
 
 def test_show_writes_the_texture_and_resume_needs_a_folder_of_a_run(tmp_path, monkeypatch, capsys):
