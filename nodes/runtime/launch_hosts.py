@@ -24,6 +24,10 @@ _OPERATOR = "operator"
 _HOST_COUNT = 2
 # A command to move must reach the motor through a check on the same computer, whatever the network does.
 _TOGETHER = ("safety", "motor")
+_SAFETY_MODULE = "nodes.safety"
+_COMMANDS = ("/policy/drive", "/expert/drive")
+# What the gateway calls whoever comes without a key.
+_NO_KEY = "loopback"
 
 
 class HostEntry(BaseModel):
@@ -68,6 +72,17 @@ def choose_host(document: Document, launch: LaunchFile, host: str | None) -> Non
     config = _gateway_config(launch, host, exports, imports)
     document.data["nodes"][GATEWAY] = {"module": "nodes.gateway", "host": host, "stop_last": True, "config": config}
     document.places[("nodes", GATEWAY)] = document.place(("hosts",))
+    if host == _listener(launch) and not set(_COMMANDS).isdisjoint(imports):
+        _require_clock(document, launch, host)
+
+
+def _require_clock(document: Document, launch: LaunchFile, host: str) -> None:
+    """Commands come from the other host: their age is known only as well as its clock is, so nobody arms before that."""
+    other = next(name for name in launch.hosts if name != host)
+    peer = _NO_KEY if launch.keys is None else launch.hosts[other].key or other
+    for name, node in document.data["nodes"].items():
+        if launch.nodes.get(name) is not None and launch.nodes[name].module == _SAFETY_MODULE:
+            node["config"] = {"clock_peers": [peer], **(node.get("config") or {})}
 
 
 def routes(launch: LaunchFile, host: str) -> tuple[list[str], list[str]]:

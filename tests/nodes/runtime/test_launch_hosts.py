@@ -55,6 +55,26 @@ def test_all_runs_everything_here_without_a_gateway(launch_file):
     }  # fmt: skip
 
 
+@pytest.mark.parametrize(
+    ("change", "peers"),
+    [
+        (("", ""), ["workstation"]),
+        (("workstation: {}", "workstation: {key: desk}"), ["desk"]),
+        (("keys: ~/keys", ""), ["loopback"]),
+        (("nodes.safety, host: robot", "nodes.safety, host: robot, config: {clock_peers: []}"), []),
+        # Nothing that moves the car comes from there: it may drive without the workstation.
+        (("nodes.policy, host: workstation", "nodes.policy, host: robot"), None),
+    ],
+)
+def test_commands_from_the_other_host_need_its_clock_to_be_known(launch_file, change, peers):
+    plan = load_launch(launch_file(FILE.replace(*change)), host="robot")
+    assert plan.documents["safety"].data.get("clock_peers") == peers
+
+
+def test_all_on_one_host_has_one_clock(launch_file):
+    assert "clock_peers" not in load_launch(launch_file(), host="all").documents["safety"].data
+
+
 def test_people_may_be_at_the_car(launch_file):
     _, robot = gateway(launch_file(FILE + "operator: robot\n"), "robot")
     assert "/arm" in robot["exports"]
