@@ -97,6 +97,9 @@ def two_hosts(cable: Cable, seed: int = 0) -> Iterator[Cable]:
                 ("link", "set", "lo", "up"),
             ):
                 _ip("-n", name, *command)
+            # The same on every computer: the algorithm decides how losses are borne. Reno may be chosen in any namespace, and
+            # slows down for a loss at least as much as the cubic that most computers have.
+            _ip("netns", "exec", name, "sysctl", "-qw", "net.ipv4.tcp_congestion_control=reno")
         thread = threading.Thread(target=cable.carry, args=((ends[0], ends[1]), seed), daemon=True)
         thread.start()
         yield cable
