@@ -31,14 +31,17 @@ from nodes.runtime.wire import Meta, Relayed, pack_meta, unpack
 # Enough for a breath of poses and images; what waits longer is stale, and PUB drops new messages while the pipe is full.
 _LINK_QUEUE = 50
 _OUTBOX = 256
-_POLL_MS = 100
+_POLL_MS = 20
 _LOOK_S = 0.5
 _PING_S = 0.2
 _KNOCK_S = 1.0
 _HEARTBEAT_MS, _HEARTBEAT_TIMEOUT_MS = 500, 3000
 _LARGE = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "advnerf_msgs/msg/FileChunk")
 _LARGE_BYTES, _SMALL_BYTES = 16 * 2**20, 64 * 2**10
-_CLOCK = b"_clock"
+_CLOCK, _PULSE = b"_clock", b"_pulse"
+# TCP notices that a packet was lost when a later one arrives, and otherwise only after 200 ms or more, which is as long as a
+# command lives. So something follows every message soon; a topic that nobody wants does not travel, hence this.
+_PULSE_S = 0.015
 _PING, _PONG = struct.Struct("<Q"), struct.Struct("<QQQ")
 _FAILURES = {
     int(zmq.EVENT_HANDSHAKE_FAILED_AUTH): "refused: its key is not on the list",
@@ -180,6 +183,7 @@ class Link:
         self._poller.register(monitor, zmq.POLLIN)
         if right == self._inward():
             socket.subscribe(_CLOCK)
+            socket.subscribe(_PULSE)
             self._subscribed = set()
             self._poller.register(socket, zmq.POLLIN)
         self._attach(socket, config.watch_port if right == WATCH else config.drive_port)
@@ -233,7 +237,7 @@ class Link:
         self._context.term()
 
     def _run(self) -> None:
-        looked = pinged = 0.0
+        looked = pinged = pulsed = 0.0
         try:
             while not self._stopping:
                 ready = {entry for entry, _ in self._poller.poll(_POLL_MS)}
@@ -249,6 +253,9 @@ class Link:
                 if self._config.listens and now - pinged >= _PING_S:
                     pinged = now
                     self._doors[WATCH].send_multipart([_CLOCK, _PING.pack(time.time_ns())], zmq.NOBLOCK)
+                if now - pulsed >= _PULSE_S:
+                    pulsed = now
+                    self._say([_PULSE])
                 if now - looked >= _LOOK_S:
                     looked = now
                     self._look_for_revocations()
@@ -263,11 +270,13 @@ class Link:
         if self._wake in ready:
             with contextlib.suppress(BlockingIOError):
                 os.eventfd_read(self._wake)
-        door = self._doors.get(WATCH if self._config.listens else DRIVE)
         while self._outbox:
-            frames = self._outbox.popleft()
-            if door is not None:
-                door.send_multipart(frames, zmq.NOBLOCK)
+            self._say(self._outbox.popleft())
+
+    def _say(self, frames: list[bytes]) -> None:
+        door = self._doors.get(WATCH if self._config.listens else DRIVE)
+        if door is not None:
+            door.send_multipart(frames, zmq.NOBLOCK)
 
     def _follow_wishes(self) -> None:
         wanted, socket = self._wanted & set(self._config.imports), self._doors[self._inward()]
@@ -294,6 +303,8 @@ class Link:
         self.heard_mono_ns = time.monotonic_ns()
         if name == _CLOCK:
             self._clock(parts)
+            return
+        if name == _PULSE and len(parts) == 1:
             return
         # A subscription is a prefix: what comes may be longer than what was asked for.
         topic = name.decode("utf-8", "replace")

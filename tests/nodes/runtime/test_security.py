@@ -11,9 +11,10 @@ from nodes.runtime.bus import Bus
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.clock_offset import Exchange, OffsetFilter
 from nodes.runtime.errors import SecurityError, TopicError
+from nodes.runtime.inbox import Inbox
 from nodes.runtime.messages import drive_message, encode, header, type_hash_prefix, types
 from nodes.runtime.security import DRIVE, WATCH, KeyFolder
-from nodes.runtime.security_link import on_our_clock
+from nodes.runtime.security_link import Link, LinkConfig, on_our_clock
 from nodes.runtime.wire import Meta, pack_meta
 
 ACKERMANN = "ackermann_msgs/msg/AckermannDriveStamped"
@@ -288,6 +289,34 @@ def test_malformed_and_oversized_messages_of_an_allowed_key_are_refused(lab, cap
     finally:
         friend.close()
     assert "expected three frames" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize("listens", [True, False])
+def test_something_follows_every_message_soon_so_that_tcp_notices_a_loss(listens):
+    watch_port, drive_port = free_ports(2)
+    context = zmq.Context()
+    other = context.socket(zmq.SUB)
+    other.subscribe(b"_pulse")
+    if listens:
+        other.connect(f"tcp://127.0.0.1:{watch_port}")
+    else:
+        other.bind(f"tcp://127.0.0.1:{drive_port}")
+    config = LinkConfig("127.0.0.1", listens, watch_port, drive_port, None, "robot", "robot", ())
+    inbox = Inbox(10)
+    link = Link(config, inbox)
+    try:
+        assert other.poll(5000)
+        began = time.monotonic()
+        for _ in range(6):
+            assert other.poll(1000)
+            assert other.recv_multipart() == [b"_pulse"]
+        # 20 ms apart, twice that at most; the rest is for a busy computer. Without pulses nothing comes by itself.
+        assert time.monotonic() - began < 1.0
+    finally:
+        link.close()
+        inbox.close()
+        other.close(linger=0)
+        context.term()
 
 
 def test_a_topic_that_nobody_reads_does_not_travel(lab):
