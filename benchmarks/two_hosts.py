@@ -1,9 +1,10 @@
 """Does the car drive when it should and stop when it must, with the policy on another host? ``python -m benchmarks.two_hosts``.
 
 Two network namespaces joined by a bad cable (`benchmarks.network`), ``launch/two_hosts.launch.yaml`` with keys in both of them, and
-a trained policy that drives at 0.8 m/s. Five conditions: a clean link, 5 % of the packets lost each way, 300 ms of delay each way,
-a stall of 2 s, and a workstation whose clock is 50 ms ahead. What counts is what the motor controller reads at its end of the wire.
-About three minutes, real time; every finished condition is a file in ``runs/two_hosts``, and only what is missing is run.
+a trained policy that drives at 0.8 m/s. The conditions: a clean link, 5 % of the packets lost each way (with the kernel's TCP as
+docs/two_hosts.md sets it for wireless, and as delivered), 300 ms of delay each way, a stall of 2 s, and a workstation whose clock is
+50 ms ahead. What counts is what the motor controller reads at its end of the wire.
+About four minutes, real time; every finished condition is a file in ``runs/two_hosts``, and only what is missing is run.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from typing import Any
 from advnerf_core.files import write_atomically
 from benchmarks.fault_stops import BrokenPromise
 from benchmarks.host_pair import HostPair, Person, skewed_clock, stop_of
-from benchmarks.network import Cable, available, two_hosts
+from benchmarks.network import Cable, available, resend_early, two_hosts
 from benchmarks.results import REPOSITORY, record_row
 
 COMMAND = "python -m benchmarks.two_hosts"
@@ -100,17 +101,25 @@ def clean(pair: HostPair) -> Result:
 
 
 def loss(pair: HostPair) -> Result:
-    """Lost packets: TCP sends them again; it drives, and where that takes too long it stops."""
+    """Drive while packets are lost and TCP sends them again."""
     pair.cable.loss, lost, carried = LOSS, pair.cable.lost, pair.cable.carried
     distance_m, stops = _drive(pair, LOSSY_S)
     lost, carried = pair.cable.lost - lost, pair.cable.carried - carried
-    # Every stop costs its rest, and the time to arm and to gain speed again.
-    possible_m = SPEED_MPS * (LOSSY_S - len(stops) * (REST_S + 1.0))
     in_time = all(stop["brake_ms"] <= LIMIT_MS for stop in stops)
-    return {
-        "distance_m": distance_m, "stops": stops, "met": in_time and distance_m >= max(0.7 * possible_m, LOSSY_S * 0.2),
-        "lost": lost / max(1, lost + carried),
-    }  # fmt: skip
+    share = lost / max(1, lost + carried)
+    return {"distance_m": distance_m, "stops": stops, "in_time": in_time, "lost": share}
+
+
+def loss_tuned(pair: HostPair) -> Result:
+    """Lost packets that are sent again soon: it must drive."""
+    found = loss(pair)
+    return found | {"met": found["in_time"] and found["distance_m"] >= 0.7 * SPEED_MPS * LOSSY_S}
+
+
+def loss_untuned(pair: HostPair) -> Result:
+    """Lost packets, and a kernel that waits for 200 ms, nearly a command's life: it may stop, in time, and must stay."""
+    found = loss(pair)
+    return found | {"met": found["in_time"] and found["distance_m"] > 1.0}
 
 
 def delay(pair: HostPair) -> Result:
@@ -148,7 +157,7 @@ def skew(pair: HostPair) -> Result:
 
 
 CONDITIONS: dict[str, Callable[[HostPair], Result]] = {
-    "clean": clean, "loss": loss, "delay": delay, "stall": stall, "skew": skew,
+    "clean": clean, "loss": loss_tuned, "loss_untuned": loss_untuned, "delay": delay, "stall": stall, "skew": skew,
 }  # fmt: skip
 
 
@@ -156,6 +165,8 @@ def measure(name: str, policy: Path) -> Result:
     """One condition, on hosts of its own."""
     folder = Path(tempfile.mkdtemp(prefix="advnerf-"))
     with two_hosts(Cable(), seed=len(name)) as cable:
+        if name == "loss":
+            resend_early(cable)
         try:
             pair = HostPair(cable, folder, policy, skewed_clock(folder, SKEW_S) if name == "skew" else None)
             try:
@@ -182,12 +193,17 @@ def run(folder: Path, policy: Path, names: list[str]) -> dict[str, Result]:
 def record(found: dict[str, Result]) -> None:
     """Write the rows."""
     how = "netem is not needed: two TUN ends and a thread that carries the packets"
+    lossy = f"{LOSS:.0%} of packets lost each way, {LOSSY_S:g} s"
     stop = f"brake <= {LIMIT_MS:g} ms after the last fresh command; stays stopped; "
     rows = {
         "clean": ("clean link", "distance_m", "m", f"drives {DRIVE_S:g} s without a stop", how),
         "loss": (
-            f"{LOSS:.0%} of packets lost each way, {LOSSY_S:g} s", "distance_m", "m",
-            f"drives; a stop only by age, within {LIMIT_MS:g} ms, and it stays", "",
+            f"{lossy}, rto_min 20 ms", "distance_m", "m",
+            f">= {0.7 * SPEED_MPS * LOSSY_S:.0f} m; a stop only by age, within {LIMIT_MS:g} ms, and it stays", "as docs/two_hosts.md advises",
+        ),
+        "loss_untuned": (
+            f"{lossy}, TCP as delivered", "distance_m", "m", f"drives; a stop only by age, within {LIMIT_MS:g} ms, and it stays",
+            "the kernel waits 200 ms before it sends again; a command lives for 220 ms",
         ),
         "delay": (f"{1e3 * DELAY_S:g} ms of delay each way while driving", "brake_ms", "ms", stop + "refuses to arm", ""),
         "stall": (f"{STALL_S:g} s stall while driving", "brake_ms", "ms", stop + "drives when armed again", ""),
