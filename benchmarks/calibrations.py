@@ -14,13 +14,12 @@ import math
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from advnerf_core.geometry import Array, make_transform, planar_pose
+from advnerf_core.geometry import Array, make_transform
 from advnerf_core.scene.similarity import rotation_angles
 from benchmarks.results import record_row
 from calibration.by_construction import twin_calibrations
 from calibration.camera_to_car import MountView, calibrate_mount
 from calibration.charuco import Board, BoardDetector
-from calibration.display_colour import colours_to_show, fit_display, mean_colour, screen_region
 from calibration.measured import LensCalibration
 from calibration.schema import CameraCalibration
 from calibration.time_offset import fit_offset, image_turns
@@ -28,9 +27,8 @@ from calibration.vehicle import Drive, fit_gains
 from calibration.vehicle_response import fit_response
 from hardware.twin.config import CarConfig, LabConfig, MonitorOpticsConfig
 from hardware.twin.lab import Lab
-from hardware.twin.monitor import ScreenOptics
 from hardware.twin.vehicle import TwinVehicle
-from hardware.twin.world import MONITOR_PIXELS
+from nodes.experiment import screen
 
 COMMAND = "python -m benchmarks.calibrations"
 MOCAP_M, MOCAP_RAD, PIXEL_STDDEV = 0.0005, 0.001, 1.5
@@ -178,32 +176,12 @@ def measure_time_offset(lab: Lab, seed: int) -> float:
 
 def measure_display(lab: Lab, seed: int) -> tuple[float, float]:
     """RMSE on held-out colours, of the model and of a monitor taken for ideal, over three places of the car."""
-    rng, colours = np.random.default_rng(seed), colours_to_show(seed=seed)
-    optics = ScreenOptics(lab.config.monitor_optics, lab.config.monitor, MONITOR_PIXELS)
-    face = lab.config.monitor.T_world_from_face
-    shown, seen, cosines = [], [], []
-    for angle in (0.0, 0.5, -0.85):
-        place = face @ np.array([1.1 * math.cos(angle), 1.1 * math.sin(angle), 0.0, 1.0])
-        towards = face[:3, 3] - place[:3]
-        heading = math.atan2(towards[1], towards[0])
-        camera = lab.config.camera
-        # Car on the floor, its camera over that place.
-        car = planar_pose(place[0] - camera.x_m * math.cos(heading), place[1] - camera.x_m * math.sin(heading), heading)
-        cosine = optics.cos_angle((car @ camera.T_car_from_camera)[:3, 3])
-        pictures = []
-        for colour in colours:
-            lab.set_monitor_image(np.full((2, 2, 3), colour, np.uint8))
-            clean = lab.observe_held(car)
-            pictures.append([noisy_image(clean, rng) for _ in range(8)])
-        region = screen_region(pictures[0][0], pictures[1][0])
-        seen += [mean_colour(frames, region) for frames in pictures]
-        shown += list(colours / 255.0)
-        cosines += [cosine] * len(colours)
-    fit = fit_display(np.array(shown), np.array(seen), np.array(cosines))
+    rng = np.random.default_rng(seed)
+    fit = screen.measure_display(lab, seed, lambda clean: [noisy_image(clean, rng) for _ in range(8)])
     ideal = float(np.sqrt(np.mean((fit.shown[fit.held_out] - fit.seen[fit.held_out]) ** 2)))
     print(
         f"display: held out {100 * fit.rmse(True):.2f} %, taken for ideal {100 * ideal:.1f} %; falloff {fit.model.falloff:.2f} "
-        f"(true {lab.config.monitor_optics.falloff}), {len(shown)} colours",
+        f"(true {lab.config.monitor_optics.falloff}), {len(fit.shown)} colours",
         flush=True,
     )
     return fit.rmse(True), ideal

@@ -15,6 +15,7 @@ import torch
 from advnerf_core.attack.adjoint import AttackProblem, evaluate
 from advnerf_core.attack.artifact import AttackFile, face_texture, save_attack
 from advnerf_core.attack.baselines import random_search
+from advnerf_core.attack.displayed import DisplayedSensor
 from advnerf_core.attack.optimise import gradient_attack
 from advnerf_core.attack.search import Evaluation, SearchResult, draw_start_states
 from advnerf_core.driving.policy import LoadedPolicy, load_policy
@@ -24,6 +25,7 @@ from nodes.experiment.context import Experiment
 from nodes.experiment.objects import attacked_object, surrogate_of
 from nodes.experiment.policy import HARDENED, NAIVE, victim_file
 from nodes.experiment.scene import load_background, scene_sha256
+from nodes.experiment.screen import shown
 from nodes.runtime.stages import Report, hash_of
 
 Method = Literal["random", "gradient"]
@@ -83,7 +85,7 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
     write_atomically(folder / "frozen.json", json.dumps(frozen_hashes(experiment), indent=1) + "\n")
     background = load_background(experiment)
     bare = surrogate_of(experiment, [], background)
-    attacked = surrogate_of(experiment, [attacked_object(experiment)], background)
+    attacked = sensor_of(experiment, surrogate_of(experiment, [attacked_object(experiment)], background))
     plan = searches(experiment)
     for victim in victims(experiment):
         for seed in experiment.config.attack.seeds:
@@ -98,7 +100,15 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
         _search(experiment, attacked, search, folder, progress)
 
 
-def attack_problem(experiment: Experiment, surrogate: Surrogate, policy: LoadedPolicy, seed: int) -> AttackProblem:
+def sensor_of(experiment: Experiment, surrogate: Surrogate) -> Surrogate | DisplayedSensor:
+    """What the attack looks through: on a monitor, the surrogate behind what the monitor does to colours."""
+    in_loop = experiment.shown_on_monitor and experiment.config.attack.display_model
+    return shown(experiment, surrogate) if in_loop else surrogate
+
+
+def attack_problem(
+    experiment: Experiment, surrogate: Surrogate | DisplayedSensor, policy: LoadedPolicy, seed: int
+) -> AttackProblem:
     """The attack on one victim with the starts of one seed."""
     attack = experiment.config.attack
     fence = np.abs(np.array(experiment.room.fence_m)).min()
@@ -122,7 +132,11 @@ def _drive_without_attack(experiment: Experiment, bare: Surrogate, victim: str, 
 
 
 def _search(
-    experiment: Experiment, surrogate: Surrogate, search: Search, folder: Path, progress: Callable[..., None]
+    experiment: Experiment,
+    surrogate: Surrogate | DisplayedSensor,
+    search: Search,
+    folder: Path,
+    progress: Callable[..., None],
 ) -> None:
     attack = experiment.config.attack
     policy = load_policy(victim_file(experiment, search.victim))
@@ -164,9 +178,9 @@ def attack_path(folder: Path, search: Search) -> Path:
 
 
 def _attack_file(experiment: Experiment, policy: LoadedPolicy, search: Search, result: SearchResult) -> AttackFile:
-    board, theta = experiment.lab_config.board, result.theta.numpy().astype(np.float32)
+    theta = result.theta.numpy().astype(np.float32)
     return AttackFile(
-        method=search.method, theta=theta, texture=face_texture(theta), size_m=(board.width_m, board.height_m),
+        method=search.method, theta=theta, texture=face_texture(theta), size_m=(experiment.face_m, experiment.face_m),
         T_world_from_object=np.asarray(attacked_object(experiment).T_world_from_object),
         subject=experiment.target.subject, corners_in_subject=experiment.target.corners,
         camera=experiment.view.pinhole, scene_sha256=scene_sha256(experiment), policy_sha256=policy.sha256,

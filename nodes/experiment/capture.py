@@ -13,10 +13,12 @@ from advnerf_core.files import write_atomically
 from advnerf_core.geometry import Array, planar_pose
 from advnerf_core.scene.dataset import write_transforms
 from calibration.by_construction import write_twin_calibrations
+from calibration.schema import save_calibration
 from hardware.twin.lab import Lab
 from hardware.twin.phone import car_mounted_poses, walk_around_poses
 from nodes.experiment.config import CaptureConfig
-from nodes.experiment.context import CALIBRATION, Experiment
+from nodes.experiment.context import CALIBRATION, DISPLAY, Experiment
+from nodes.experiment.screen import measure_display, plain_picture
 from nodes.runtime.stages import Report
 
 PHONE, COLOUR_PAIRS, HELD_OUT = "phone", "colour_pairs", "held_out"
@@ -35,6 +37,11 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
     driving_poses = [planar_pose(*state) @ experiment.camera.mount for state in car_states]
     total = len(phone_poses) + len(driving_poses)
     with Lab(lab_config) as lab:
+        if experiment.shown_on_monitor:
+            report(0.0, "measuring the monitor's colours")
+            fit = measure_display(lab, capture.seed)
+            save_calibration(fit.calibration(), folder / CALIBRATION / f"{DISPLAY}.yaml")
+            lab.set_monitor_image(plain_picture(experiment))
 
         def photograph(name: str, poses: list[Array], take: Callable[[int], NDArray[np.uint8]], done: int) -> None:
             names = []

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -60,7 +60,11 @@ class PolicyConfig(_Section):
 
 
 class ObjectConfig(_Section):
-    """The attacked object: one face of a cube where the lab's green board stands."""
+    """The attacked object: one face of a cube, projected where the green board stands or shown on the monitor."""
+
+    target: Literal["board", "monitor"] = Field(
+        default="board", description="What carries the face: the board, or the centre square of the monitor."
+    )
 
     resolution: Annotated[int, Field(ge=2, le=128)] = Field(
         default=64, description="Grid cells along each side of the face."
@@ -87,6 +91,10 @@ class AttackConfig(_Section):
     seeds: tuple[int, ...] = Field(default=(0,), min_length=1, description="One attack per seed.")
     time_batch: Positive = Field(default=16, description="Frames per gradient batch.")
     cache_mib: Annotated[float, Field(ge=0)] = Field(default=512.0, description="Budget of the frame cache [MiB].")
+    display_model: bool = Field(
+        default=True,
+        description="On a monitor: search with its measured colours in the loop; false takes it for ideal.",
+    )
 
 
 class DeployConfig(_Section):
@@ -98,7 +106,7 @@ class DeployConfig(_Section):
         description="Nodes that must be ready before the car moves.",
     )
     laps: Count = Field(default=0, description="Laps driven live without attack before the runs.")
-    empty_scene: bool = Field(default=False, description="Also drive with the board taken away.")
+    empty_scene: bool = Field(default=False, description="Also drive with the board, or the monitor, taken away.")
     ready_timeout_s: Annotated[float, Field(gt=0)] = Field(
         default=60.0, description="Time for the graph to become ready [s]."
     )

@@ -6,9 +6,12 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path as FilePath
 
+from advnerf_core.display import DisplayModel
 from advnerf_core.driving.dynamics import Ackermann
 from advnerf_core.driving.path import Path
 from advnerf_core.driving.policy_view import PolicyView
+from calibration.display_colour import DisplayCalibration
+from calibration.panel import centre_square
 from calibration.schema import (
     CameraCalibration,
     RoomCalibration,
@@ -16,11 +19,12 @@ from calibration.schema import (
     VehicleCalibration,
     load_calibration,
 )
-from hardware.twin.config import LabConfig
+from hardware.twin.config import LabConfig, PanelConfig
 from nodes.experiment.config import ExperimentConfig
 
 CONTROL_PERIOD_S = 0.1
 CALIBRATION = "calibration"
+DISPLAY = "display"
 
 
 @dataclass(frozen=True)
@@ -69,8 +73,29 @@ class Experiment:
 
     @cached_property
     def target(self) -> TargetCalibration:
-        """The face on which an attack is shown."""
-        return load_calibration(TargetCalibration, self.calibration_file("board"))
+        """The face on which an attack is shown: the board, or the monitor's centre square."""
+        target = load_calibration(TargetCalibration, self.calibration_file(self.config.object.target))
+        return centre_square(target) if self.shown_on_monitor else target
+
+    @property
+    def shown_on_monitor(self) -> bool:
+        """Whether the face is shown on the monitor; else it is projected onto the board."""
+        return self.config.object.target == "monitor"
+
+    @property
+    def panel(self) -> PanelConfig:
+        """What carries the face in the lab."""
+        return self.lab_config.monitor if self.shown_on_monitor else self.lab_config.board
+
+    @property
+    def face_m(self) -> float:
+        """Side of the square face [m]."""
+        return min(self.panel.width_m, self.panel.height_m)
+
+    @cached_property
+    def display(self) -> DisplayModel:
+        """What the driving camera sees of the monitor's colours, as measured in the capture stage."""
+        return load_calibration(DisplayCalibration, self.calibration_file(DISPLAY)).display
 
     @cached_property
     def path(self) -> Path:

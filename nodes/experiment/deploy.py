@@ -24,7 +24,7 @@ from nodes.trial import TrialPlan
 from nodes.trial_runner import run_trial
 
 Condition = Literal["none", "random", "gradient", "empty", "laps"]
-# The absent board of the empty scene stands outside the room, out of every camera's sight.
+# The absent board or monitor of the empty scene stands outside the room, out of every camera's sight.
 _OUT_OF_SIGHT_M = 60.0
 
 
@@ -129,10 +129,15 @@ def _overrides(experiment: Experiment, live: LiveRun) -> list[str]:
         f"policy.sha256={load_policy(policy).sha256}",
         f"twin.lab={json.dumps(experiment.lab_config.model_dump(mode='json'))}",
     ]
+    if experiment.shown_on_monitor:
+        overrides += [
+            f"monitor.plain_rgb={json.dumps(experiment.config.object.plain_rgb)}",
+            f"monitor.face_m={experiment.face_m}",
+        ]
     if live.condition in METHODS:
         overrides.append(f"params.attack={_attack_file(experiment, live)}")
     if live.condition == "empty":
-        overrides.append(f"twin.lab.board.x_m={_OUT_OF_SIGHT_M}")
+        overrides.append(f"twin.lab.{experiment.config.object.target}.x_m={_OUT_OF_SIGHT_M}")
     return overrides
 
 

@@ -20,15 +20,15 @@ from nodes.experiment.context import Experiment
 from nodes.experiment.scene import load_background
 from nodes.runtime.stages import Report
 
-# The deployed face lies this far in front of the board that carries it, so that it is never inside it.
+# The deployed face lies this far in front of the board or monitor that carries it, so that it is never inside it.
 FACE_OFFSET_M = 0.01
 
 
 def attacked_object(experiment: Experiment) -> VoxelGridObject:
-    """The cube's deployed face on the lab's board, plain."""
-    board, wanted = experiment.lab_config.board, experiment.config.object
-    T_world_from_object = board.T_world_from_face @ make_transform(np.eye(3), [FACE_OFFSET_M, 0.0, 0.0])
-    return cube_face_object(board.width_m, wanted.resolution, wanted.plain_rgb, T_world_from_object)
+    """The cube's deployed face on the lab's board or monitor, plain."""
+    wanted = experiment.config.object
+    T_world_from_object = experiment.panel.T_world_from_face @ make_transform(np.eye(3), [FACE_OFFSET_M, 0.0, 0.0])
+    return cube_face_object(experiment.face_m, wanted.resolution, wanted.plain_rgb, T_world_from_object)
 
 
 def surrogate_of(
@@ -58,7 +58,7 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
     description = {
         "resolution": experiment.config.object.resolution,
         "plain_rgb": list(experiment.config.object.plain_rgb),
-        "size_m": experiment.lab_config.board.width_m,
+        "size_m": experiment.face_m,
         "T_world_from_object": np.asarray(field.T_world_from_object).tolist(),
         "subject": experiment.target.subject,
         "corners_in_subject_m": [list(corner) for corner in experiment.target.corners_in_subject_m],

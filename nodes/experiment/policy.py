@@ -25,6 +25,7 @@ from nodes.experiment import capture
 from nodes.experiment.context import CONTROL_PERIOD_S, Experiment
 from nodes.experiment.objects import attacked_object, last_result_kept, surrogate_of
 from nodes.experiment.scene import load_background
+from nodes.experiment.screen import face_picture, plain_picture, shown
 from nodes.runtime.stages import Report
 
 HARDENED, NAIVE = "hardened", "naive"
@@ -46,6 +47,8 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
         ),
     )
     with Lab(experiment.lab_config) as lab:
+        if experiment.shown_on_monitor:
+            lab.set_monitor_image(plain_picture(experiment))
         plans = [
             SourcePlan(_lab_source(experiment, lab), config.lab_stills, config.lab_drives, config.drive_steps),
             SourcePlan(
@@ -85,16 +88,32 @@ def steering_on_held_out_views(experiment: Experiment) -> list[dict[str, float]]
 
 
 def _lab_source(experiment: Experiment, lab: Lab) -> SceneSource:
+    overlay = _monitor_overlay(experiment, lab) if experiment.shown_on_monitor else _board_overlay(experiment)
     return SceneSource(
-        "lab", lab, experiment.view, experiment.speed_mps, CONTROL_PERIOD_S, _lab_overlay(experiment),
+        "lab", lab, experiment.view, experiment.speed_mps, CONTROL_PERIOD_S, overlay,
         experiment.config.object.resolution,
     )  # fmt: skip
 
 
-def _lab_overlay(experiment: Experiment) -> Overlay:
+def _monitor_overlay(experiment: Experiment, lab: Lab) -> Overlay:
+    """Shows textures on the lab's own monitor and looks again: its optics are not known to any projection."""
+    plain = plain_picture(experiment)
+
+    def overlay(rgb: NDArray[np.uint8], state: Array, texture: Texture) -> NDArray[np.uint8]:
+        del rgb  # the screen is seen again, not drawn over
+        lab.set_monitor_image(face_picture(experiment, face_texture(inverse_squash(texture), _TRAINING_TEXTURE_PX)))
+        x, y, yaw = map(float, state[:3])
+        painted, _ = lab.observe_at(x, y, yaw, depth=False)
+        lab.set_monitor_image(plain)
+        return painted
+
+    return overlay
+
+
+def _board_overlay(experiment: Experiment) -> Overlay:
     """Paints textures on the board's face with the compositor's own projection."""
     T_camera_from_car = invert_transform(experiment.camera.mount)
-    T_world_from_face = experiment.lab_config.board.T_world_from_face
+    T_world_from_face = experiment.panel.T_world_from_face
 
     def overlay(rgb: NDArray[np.uint8], state: Array, texture: Texture) -> NDArray[np.uint8]:
         displayed = face_texture(inverse_squash(texture), _TRAINING_TEXTURE_PX)
@@ -113,11 +132,18 @@ def surrogate_source(experiment: Experiment) -> RenderedSource:
     bare = surrogate_of(experiment, [], background)
     with_object = surrogate_of(experiment, [attacked_object(experiment)], background)
     sigma = experiment.config.attack.random_sigma
+    seen = shown(experiment, with_object).seen_theta if experiment.shown_on_monitor else None
 
     def prepare(states: Array) -> Show:
         poses = with_object.camera_poses(torch.from_numpy(np.asarray(states)))
         plain, attacked = bare.prepare(poses), with_object.prepare(poses)
-        return lambda theta: plain.render(None).images if theta is None else attacked.render(theta).images
+
+        def show(theta: torch.Tensor | None) -> torch.Tensor:
+            if theta is None:
+                return plain.render(None).images
+            return attacked.render(theta if seen is None else seen(theta)).images
+
+        return show
 
     def sample(rng: np.random.Generator) -> torch.Tensor:
         return torch.from_numpy(sigma * rng.standard_normal(with_object.theta_shape)).float()

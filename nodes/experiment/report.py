@@ -25,7 +25,7 @@ from advnerf_core.report.page import write_report
 from advnerf_core.report.results import read_results
 from nodes import evaluation
 from nodes.experiment import memory
-from nodes.experiment.attack import METHODS, attack_path, searches, start_states
+from nodes.experiment.attack import METHODS, attack_path, searches, sensor_of, start_states
 from nodes.experiment.context import CONTROL_PERIOD_S, Experiment
 from nodes.experiment.deploy import LiveRun, live_runs
 from nodes.experiment.objects import as_uint8, attacked_object, surrogate_of
@@ -239,8 +239,9 @@ def _surrogate_track(experiment: Experiment, seed: int) -> ClipTrack:
     attack = load_attack(attack_path(folder, search))
     surrogate = surrogate_of(experiment, [attacked_object(experiment)])
     surrogate.camera = experiment.camera.pinhole
+    sensor = sensor_of(experiment, surrogate)
     poses = planar_poses(states) @ experiment.camera.mount
-    images = [surrogate.render(pose[None], torch.from_numpy(attack.theta)).images[0] for pose in poses]
+    images = [sensor.render(pose[None], torch.from_numpy(attack.theta)).images[0] for pose in poses]
     frames = [as_uint8(image) for image in images]
     cte_m = experiment.path.project(states[:, :2]).cte_m
     return ClipTrack("learned scene, attacked", "gradient", frames, cte_m, attack.attack_id)
