@@ -9,7 +9,7 @@ import pytest
 from advnerf_core.report.results import read_results
 from nodes.experiment.run import load_experiment, run_experiment
 
-ROOM = Path(__file__).parents[3] / "launch" / "room.experiment.yaml"
+LAUNCH = Path(__file__).parents[3] / "launch"
 SMALL = [
     "capture.walk_around=12", "capture.car_mounted=12", "capture.colour_pairs=2", "capture.held_out=2", "scene.steps=60",
     "policy.lab_stills=12", "policy.surrogate_stills=8", "policy.lab_drives=2", "policy.surrogate_drives=2",
@@ -20,9 +20,11 @@ SMALL = [
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-def test_from_photographs_to_report_and_nothing_twice(tmp_path):
+@pytest.mark.parametrize("file", ["room", "monitor"])
+def test_from_photographs_to_report_and_nothing_twice(tmp_path, file):
     os.environ.setdefault("MUJOCO_GL", "egl")
-    first = run_experiment(load_experiment(ROOM, "demo", SMALL, tmp_path))
+    experiment = LAUNCH / f"{file}.experiment.yaml"
+    first = run_experiment(load_experiment(experiment, "demo", SMALL, tmp_path))
     page = (tmp_path / "report" / "report.html").read_text()
     assert "<html" in page
     data = read_results(tmp_path / "report" / "results.json")
@@ -33,6 +35,6 @@ def test_from_photographs_to_report_and_nothing_twice(tmp_path):
     drawn = json.loads((tmp_path / "deploy" / "hardened_gradient_0.json").read_text())["attack_ids"]
     assert len(drawn) == 1
     kept = (tmp_path / "report" / "report.html").stat().st_mtime_ns
-    again = run_experiment(load_experiment(ROOM, "demo", SMALL, tmp_path))
+    again = run_experiment(load_experiment(experiment, "demo", SMALL, tmp_path))
     assert {name: record.digest for name, record in again.items()} == {n: r.digest for n, r in first.items()}
     assert (tmp_path / "report" / "report.html").stat().st_mtime_ns == kept
