@@ -16,65 +16,29 @@ from dataclasses import dataclass
 from typing import Any
 
 import zmq
-from zmq.utils.monitor import recv_monitor_message
 
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.clock_offset import Exchange, OffsetFilter
-from nodes.runtime.errors import BusError, MessageError
+from nodes.runtime.errors import MessageError
 from nodes.runtime.inbox import Inbox
 from nodes.runtime.messages import decode
-from nodes.runtime.security import DRIVE, WATCH, KeyFolder, require_keys
+from nodes.runtime.security import DRIVE, WATCH, require_keys
 from nodes.runtime.security_doors import Doorkeeper, RefusalLog
+from nodes.runtime.security_sockets import CLOCK, LINK_QUEUE, MOST_BYTES, PULSE, Doors, Handshake, LinkConfig
 from nodes.runtime.topics import topic as topic_row
 from nodes.runtime.wire import Meta, Relayed, pack_meta, unpack
 
-# Enough for a breath of poses and images; what waits longer is stale, and PUB drops new messages while the pipe is full.
-_LINK_QUEUE = 50
 _OUTBOX = 256
 _POLL_MS = 20
 _LOOK_S = 0.5
 _PING_S = 0.2
 _KNOCK_S = 1.0
-_HEARTBEAT_MS, _HEARTBEAT_TIMEOUT_MS = 500, 3000
 _LARGE = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "advnerf_msgs/msg/FileChunk")
-_LARGE_BYTES, _SMALL_BYTES = 16 * 2**20, 64 * 2**10
-_CLOCK, _PULSE = b"_clock", b"_pulse"
+_SMALL_BYTES = 64 * 2**10
 # TCP notices that a packet was lost when a later one arrives, and otherwise only after 200 ms or more, which is as long as a
 # command lives. So something follows every message soon; a topic that nobody wants does not travel, hence this.
 _PULSE_S = 0.015
 _PING, _PONG = struct.Struct("<Q"), struct.Struct("<QQQ")
-_FAILURES = {
-    int(zmq.EVENT_HANDSHAKE_FAILED_AUTH): "refused: its key is not on the list",
-    int(zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL): "refused: no CURVE key at all, or the wrong key of this host",
-    int(zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL): "failed",
-}
-
-
-@dataclass(frozen=True)
-class LinkConfig:
-    """Both ends of a link.
-
-    Attributes:
-        address: Address to listen on, or to connect to.
-        listens: Which end this is.
-        watch_port: TCP port of what the listener says.
-        drive_port: TCP port of what the listener hears.
-        keys: Key folder; none only on a loopback address.
-        own: Name of our own key.
-        peer: Name of the listener's key, at the end that connects.
-        imports: Topics taken from the other end; anything else is refused.
-        sends: Whether to use the drive door at the end that connects; false for one that only watches.
-    """
-
-    address: str
-    listens: bool
-    watch_port: int
-    drive_port: int
-    keys: KeyFolder | None
-    own: str
-    peer: str
-    imports: tuple[str, ...]
-    sends: bool = True
 
 
 @dataclass(frozen=True)
@@ -112,7 +76,6 @@ class Link:
         self.heard_mono_ns: int | None = None
         self._outbox: deque[list[bytes]] = deque(maxlen=_OUTBOX)
         self._wanted: frozenset[str] = frozenset()
-        self._subscribed: set[str] = set()
         self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         self._stopping = False
         self._log = RefusalLog()
@@ -122,8 +85,7 @@ class Link:
         self._poller = zmq.Poller()
         self._poller.register(self._wake, zmq.POLLIN)
         self._keeper: Doorkeeper | None = None
-        self._doors: dict[str, zmq.Socket[Any]] = {}
-        self._monitors: dict[str, zmq.Socket[Any]] = {}
+        self._doors = Doors(config, self._context, self._poller)
         self._thread = threading.Thread(target=self._run, name="link", daemon=True)
         try:
             self._open()
@@ -158,80 +120,12 @@ class Link:
             # Before any door is open: without a keeper ZeroMQ lets every key in.
             self._keeper = Doorkeeper(self._context, self._config.keys, self._log)
             self._poller.register(self._keeper.socket, zmq.POLLIN)
-        self._open_door(WATCH)
+        self._doors.open(WATCH)
         if self._config.listens or self._config.sends:
-            self._open_door(DRIVE)
-
-    def _inward(self) -> str:
-        return DRIVE if self._config.listens else WATCH
-
-    def _open_door(self, right: str) -> None:
-        config = self._config
-        socket = self._context.socket(zmq.SUB if right == self._inward() else zmq.PUB)
-        socket.linger = 0
-        socket.sndhwm = socket.rcvhwm = _LINK_QUEUE
-        socket.setsockopt(zmq.MAXMSGSIZE, _LARGE_BYTES)
-        socket.setsockopt(zmq.HEARTBEAT_IVL, _HEARTBEAT_MS)
-        socket.setsockopt(zmq.HEARTBEAT_TIMEOUT, _HEARTBEAT_TIMEOUT_MS)
-        socket.setsockopt(zmq.RECONNECT_IVL, 100)
-        socket.setsockopt(zmq.RECONNECT_IVL_MAX, 1000)
-        socket.setsockopt(zmq.IPV6, ":" in config.address)
-        if config.keys is not None:
-            self._arm_curve(socket, right)
-        monitor = socket.get_monitor_socket(zmq.EVENT_HANDSHAKE_SUCCEEDED | zmq.EVENT_DISCONNECTED | sum(_FAILURES))
-        self._doors[right], self._monitors[right] = socket, monitor
-        self._poller.register(monitor, zmq.POLLIN)
-        if right == self._inward():
-            socket.subscribe(_CLOCK)
-            socket.subscribe(_PULSE)
-            self._subscribed = set()
-            self._poller.register(socket, zmq.POLLIN)
-        self._attach(socket, config.watch_port if right == WATCH else config.drive_port)
-
-    def _arm_curve(self, socket: zmq.Socket[Any], right: str) -> None:
-        keys, own = self._config.keys, self._config.own
-        assert keys is not None
-        socket.curve_secretkey = keys.secret(own).encode()
-        socket.curve_publickey = keys.public(own).encode()
-        if self._config.listens:
-            socket.curve_server = True
-            # Named, never "*": to pyzmq's own authenticator that is a name like any other, and no wildcard.
-            socket.setsockopt(zmq.ZAP_DOMAIN, right.encode())
-            socket.setsockopt(zmq.ZAP_ENFORCE_DOMAIN, 1)
-        else:
-            socket.curve_serverkey = keys.public(self._config.peer).encode()
-
-    def _attach(self, socket: zmq.Socket[Any], port: int) -> None:
-        address = f"[{self._config.address}]" if ":" in self._config.address else self._config.address
-        endpoint = f"tcp://{address}:{port}"
-        if not self._config.listens:
-            socket.connect(endpoint)
-            return
-        deadline = time.monotonic() + 2.0
-        while True:
-            try:
-                socket.bind(endpoint)
-                return
-            except zmq.ZMQError as error:
-                # After a revocation the old door is still being closed by ZeroMQ's own thread.
-                if error.errno != zmq.EADDRINUSE or time.monotonic() > deadline:
-                    raise BusError(
-                        f"cannot listen on {endpoint}: {error.strerror}; is another launch running?"
-                    ) from error
-                time.sleep(0.02)
-
-    def _close_door(self, right: str) -> None:
-        socket, monitor = self._doors.pop(right), self._monitors.pop(right)
-        self._poller.unregister(monitor)
-        if right == self._inward():
-            self._poller.unregister(socket)
-        socket.disable_monitor()
-        monitor.close(linger=0)
-        socket.close(linger=0)
+            self._doors.open(DRIVE)
 
     def _close_all(self) -> None:
-        for right in list(self._doors):
-            self._close_door(right)
+        self._doors.close_all()
         if self._keeper is not None:
             self._keeper.socket.close(linger=0)
         self._context.term()
@@ -244,23 +138,22 @@ class Link:
                 self._drain_outbox(ready)
                 if self._keeper is not None and self._keeper.socket in ready:
                     self._keeper.judge()
-                for right, monitor in list(self._monitors.items()):
-                    if monitor in ready:
-                        self._note_event(right, monitor)
-                if self._doors[self._inward()] in ready:
-                    self._hear(self._doors[self._inward()])
+                for event in self._doors.handshakes(ready):
+                    self._note(event)
+                if self._doors.inward in ready:
+                    self._hear(self._doors.inward)
                 now = time.monotonic()
                 if self._config.listens and now - pinged >= _PING_S:
                     pinged = now
-                    self._doors[WATCH].send_multipart([_CLOCK, _PING.pack(time.time_ns())], zmq.NOBLOCK)
+                    self._say([CLOCK, _PING.pack(time.time_ns())])
                 if now - pulsed >= _PULSE_S:
                     pulsed = now
-                    self._say([_PULSE])
+                    self._say([PULSE])
                 if now - looked >= _LOOK_S:
                     looked = now
                     self._look_for_revocations()
                     self._knock_again(now)
-                self._follow_wishes()
+                self._doors.follow(self._wanted & frozenset(self._config.imports))
         except Exception as failure:  # the gateway must not go on without its link
             self._inbox.fail(failure)
         finally:
@@ -274,20 +167,12 @@ class Link:
             self._say(self._outbox.popleft())
 
     def _say(self, frames: list[bytes]) -> None:
-        door = self._doors.get(WATCH if self._config.listens else DRIVE)
+        door = self._doors.outward
         if door is not None:
             door.send_multipart(frames, zmq.NOBLOCK)
 
-    def _follow_wishes(self) -> None:
-        wanted, socket = self._wanted & set(self._config.imports), self._doors[self._inward()]
-        for topic in wanted - self._subscribed:
-            socket.subscribe(topic.encode())
-        for topic in self._subscribed - wanted:
-            socket.unsubscribe(topic.encode())
-        self._subscribed = set(wanted)
-
     def _hear(self, socket: zmq.Socket[Any]) -> None:
-        for _ in range(_LINK_QUEUE):
+        for _ in range(LINK_QUEUE):
             try:
                 parts = socket.recv_multipart(zmq.NOBLOCK, copy=False)
             except zmq.Again:
@@ -301,17 +186,17 @@ class Link:
     def _take(self, parts: list[zmq.Frame]) -> None:
         name = parts[0].bytes if len(parts[0]) <= 64 else b"?"
         self.heard_mono_ns = time.monotonic_ns()
-        if name == _CLOCK:
+        if name == CLOCK:
             self._clock(parts)
             return
-        if name == _PULSE and len(parts) == 1:
+        if name == PULSE and len(parts) == 1:
             return
         # A subscription is a prefix: what comes may be longer than what was asked for.
         topic = name.decode("utf-8", "replace")
         if topic not in self._config.imports:
             raise MessageError(f"{topic!r:.80} is nothing this host takes from there")
         typename = topic_row(topic).type
-        limit = _LARGE_BYTES if typename in _LARGE else _SMALL_BYTES
+        limit = MOST_BYTES if typename in _LARGE else _SMALL_BYTES
         if len(parts) != 3 or len(parts[2]) > limit:
             sizes = [len(part) for part in parts[:8]]
             raise MessageError(f"expected three frames and at most {limit} bytes of {typename} on {topic}, got {sizes}")
@@ -323,10 +208,8 @@ class Link:
         heard_ns = time.time_ns()
         body = parts[1].bytes if len(parts) == 2 and len(parts[1]) <= _PONG.size else b""
         if not self._config.listens and len(body) == _PING.size:
-            door = self._doors.get(DRIVE)
-            if door is not None:
-                (asked_ns,) = _PING.unpack(body)
-                door.send_multipart([_CLOCK, _PONG.pack(asked_ns, heard_ns, time.time_ns())], zmq.NOBLOCK)
+            (asked_ns,) = _PING.unpack(body)
+            self._say([CLOCK, _PONG.pack(asked_ns, heard_ns, time.time_ns())])
         elif self._config.listens and len(body) == _PONG.size:
             asked_ns, received_ns, answered_ns = _PONG.unpack(body)
             newest = Exchange(asked_ns, received_ns, answered_ns, heard_ns)
@@ -344,29 +227,30 @@ class Link:
             return
         for right, gone in self._keeper.revoked().items():
             self._log.say(f"{', '.join(gone)} may no longer {right}: all at that door must show their keys again")
-            self._close_door(right)
-            self._open_door(right)
+            self._doors.close(right)
+            self._doors.open(right)
 
     def _knock_again(self, now: float) -> None:
         """ZeroMQ itself gives up for good when its key is refused; it may be allowed a minute later."""
         for right, since in list(self._locked_out.items()):
             if now - since >= _KNOCK_S:
                 del self._locked_out[right]
-                self._close_door(right)
-                self._open_door(right)
+                self._doors.close(right)
+                self._doors.open(right)
 
-    def _note_event(self, right: str, monitor: zmq.Socket[Any]) -> None:
-        with contextlib.suppress(zmq.Again):
-            while True:
-                event = recv_monitor_message(monitor, zmq.NOBLOCK)
-                if what := _FAILURES.get(int(event["event"])):
-                    self._log.refuse(f"handshake at the {right} door {what}")
-                if not self._config.listens:
-                    self._locked_out[right] = time.monotonic()
-                elif event["event"] == zmq.EVENT_DISCONNECTED:
-                    self._log.say(f"the {right} door: a connection ended")
-                else:
-                    self._log.say(f"the {right} door: a connection with a good key began")
+    def _note(self, event: Handshake) -> None:
+        if event.refusal:
+            self._log.refuse(f"handshake at the {event.right} door {event.refusal}")
+        if not self._config.listens:
+            # Whoever is let in stays: an end that knocked on an open door would cut itself off.
+            if event.refusal or event.ended:
+                self._locked_out.setdefault(event.right, time.monotonic())
+            else:
+                self._locked_out.pop(event.right, None)
+        elif event.ended:
+            self._log.say(f"the {event.right} door: a connection ended")
+        elif not event.refusal:
+            self._log.say(f"the {event.right} door: a connection with a good key began")
 
 
 def on_our_clock(meta: Meta, real_ns: int, mono_ns: int) -> Meta:

@@ -1,6 +1,7 @@
 import socket
 import stat
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -319,6 +320,24 @@ def test_something_follows_every_message_soon_so_that_tcp_notices_a_loss(listens
         context.term()
 
 
+def connections(ports):
+    """Both ends of every established TCP connection of this host to one of the ports, as the kernel writes them."""
+    rows = [line.split() for line in Path("/proc/net/tcp").read_text().splitlines()[1:]]
+    wanted = {f"{port:04X}" for port in ports}
+    return {(row[1], row[2]) for row in rows if row[3] == "01" and row[2].split(":")[1] in wanted}
+
+
+def test_whoever_was_let_in_stays_and_does_not_knock_again(lab):
+    workstation, ports = lab.workstation(), lab.ports.values()
+    lab.robot()
+    lab.run(3.0, until=lambda got: len(connections(ports)) == 2)
+    before = connections(ports)
+    lab.run(1.7)  # an end that was refused knocks again after a second
+    assert len(before) == 2
+    assert connections(ports) == before
+    assert workstation.node.counters()["refused"] == 0
+
+
 def test_a_topic_that_nobody_reads_does_not_travel(lab):
     robot = lab.robot()
     workstation = lab.workstation(imports=("/camera/image_raw", "/vicon/car"))
@@ -328,7 +347,7 @@ def test_a_topic_that_nobody_reads_does_not_travel(lab):
         lambda: robot.eyes.publish("/vicon/car", encode(types.PoseStamped(header=header(0), pose=IDENTITY))),
     )  # fmt: skip
     assert any(r.topic == "/vicon/car" for _, r in got)
-    assert workstation.node._link._subscribed == {"/vicon/car"}
+    assert workstation.node._link._doors._subscribed == {"/vicon/car"}
 
 
 def test_publish_time_moves_to_our_clock_by_its_age():
