@@ -1,29 +1,32 @@
 """Renders of voxel-grid objects that are differentiable with respect to where the objects stand: position, yaw and scale.
 
 Where an object's density is soft, a picture changes smoothly as the object moves. Here rays are sampled at depths that do not depend
-on the placement, so that the sum which makes the picture is a smooth function of it, and autograd gives its exact derivative.
-Which samples to look at (those in cells that are not empty, until nearly no light is left) is found first and held. Not
-differentiated: which of two layers is nearer, and edges of a solid without density, which have no derivative.
+on the placement, so that the sum which makes the picture is a smooth function of it, and its derivative is exact and in closed
+form (``pose_kernels``). Which samples to look at (those in cells that are not empty, until nearly no light is left) is found
+first and held. Not differentiated: which of two layers is nearer, and edges of a solid without density, which have no
+derivative (``fields/soft_edges`` gives it a density).
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
-from torch.nn.functional import grid_sample
+from torch.autograd.function import once_differentiable
 
 from advnerf_core.fields.voxel_grid import VoxelGridObject
 from advnerf_core.geometry import Array, Pinhole, invert_transform, rotation_z, yaw_of
-from advnerf_core.parallel import KERNEL_OPTIONS
-from advnerf_core.render.cast_kernels import NEAR_M, cell_of, share_of, span_in_box, steps_to_leap
-from advnerf_core.render.cast_object import prepared, windows
+from advnerf_core.parallel import run_slots, slot_bounds
+from advnerf_core.render.cast_object import KernelGrids, prepared, windows
+from advnerf_core.render.pose_kernels import SUMS, pull_pixels, shade_pixels
 
 LEAST_TRANSMITTANCE = 1e-4
+# Fixed parts of the work, so that sums have the same bits on any number of threads; each has its own sum over the colours.
+_SLOTS = 4
 
 
 def placement_of(field: VoxelGridObject) -> Tensor:
@@ -51,6 +54,81 @@ def placed_at(field: VoxelGridObject, placement: Tensor) -> VoxelGridObject:
     return field.moved(T, float(placement.detach()[3]))
 
 
+@dataclass(frozen=True, eq=False)
+class SoftLayer:
+    """What one object shows in a batch of images, with its derivative; made by `soft_layer`.
+
+    Attributes:
+        pixels: Flat indices into ``[B, H, W]`` of the pixels that the object covers at least in part, ``[P]`` int64, ascending.
+        colour: Premultiplied, ``[P, 3]``.
+        alpha: ``[P]`` in 0..1.
+        depth_m: Planar depth, averaged with the rendering weights ``[P]`` [m]; without derivative.
+    """
+
+    pixels: NDArray[np.int64]
+    colour: Array
+    alpha: Array
+    depth_m: Array
+    _walk: _Walk
+
+    @property
+    def nbytes(self) -> int:
+        """Memory held by the arrays [bytes], that of the object's grids and colours not counted."""
+        return int(sum(part.nbytes for part in (self.pixels, self.colour, self.alpha, self.depth_m)))
+
+    def pull(self, slopes: Array, with_colours: bool = True) -> tuple[Array, Array]:
+        """The vector-Jacobian product.
+
+        Args:
+            slopes: Derivatives of a scalar with respect to red, green, blue and alpha of each pixel, ``[P, 4]``.
+            with_colours: Whether the second result is wanted.
+
+        Returns:
+            Its derivatives with respect to ``(x_m, y_m, yaw_rad, scale)`` ``[4]``, and to the colour vector ``[rows, 3]`` (of no rows if
+            it is not wanted).
+        """
+        return self._walk.pull(self.pixels, np.ascontiguousarray(slopes, np.float64), with_colours)
+
+
+def soft_layer(
+    field: VoxelGridObject,
+    placement: ArrayLike,
+    colours: ArrayLike,
+    T_world_from_camera: ArrayLike,
+    pinhole: Pinhole,
+    supersample: int = 2,
+    least_transmittance: float = LEAST_TRANSMITTANCE,
+) -> SoftLayer:
+    """One object at a placement, as the pixels that it covers.
+
+    Args:
+        field: The object; must have a density.
+        placement: ``(x_m, y_m, yaw_rad, scale)``, finite, with a positive scale.
+        colours: Its colour vector ``[rows, 3]`` (``VoxelGridObject.colours``).
+        T_world_from_camera: ``[B, 4, 4]``.
+        pinhole: Intrinsics.
+        supersample: Rays along each side of a pixel.
+        least_transmittance: A ray is followed until so little light is left.
+
+    Raises:
+        ValueError: No density, or a placement that is none.
+    """
+    if field.density is None:
+        raise ValueError("expected an object with a density, got an opaque solid: its edges have no derivative")
+    place = torch.as_tensor(placement, dtype=torch.float64).detach()
+    if place.shape != (4,) or not bool(torch.isfinite(place).all()) or float(place[3]) <= 0:
+        raise ValueError(f"expected a finite placement (x, y, yaw, scale) with scale > 0, got {place.tolist()}")
+    poses = np.asarray(T_world_from_camera, dtype=np.float64).reshape(-1, 4, 4)
+    placed = placed_at(field, place)
+    walk = _Walk.of(placed, field, np.ascontiguousarray(colours, np.float64), poses, pinhole, supersample,
+                    least_transmittance)  # fmt: skip
+    pixels = _window_pixels(placed, poses, pinhole)
+    shown = walk.shade(pixels)
+    kept = shown[:, 3] > 0.0
+    alpha = shown[kept, 3]
+    return SoftLayer(pixels[kept], shown[kept, :3], np.minimum(alpha, 1.0), shown[kept, 4] / alpha, walk)
+
+
 def render_soft(
     field: VoxelGridObject,
     placement: Tensor,
@@ -60,11 +138,11 @@ def render_soft(
     supersample: int = 2,
     least_transmittance: float = LEAST_TRANSMITTANCE,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """One object, differentiable with respect to its placement and its colours.
+    """One object as dense layers, differentiable once by autograd with respect to its placement and its colours.
 
     Args:
         field: The object; must have a density.
-        placement: ``(x_m, y_m, yaw_rad, scale)`` ``[4]``, float64, finite, with a positive scale.
+        placement: ``(x_m, y_m, yaw_rad, scale)`` ``[4]``, finite, with a positive scale.
         theta: Its parameters.
         T_world_from_camera: ``[B, 4, 4]``.
         pinhole: Intrinsics.
@@ -75,130 +153,101 @@ def render_soft(
         Premultiplied colours ``[B, H, W, 3]``, alpha ``[B, H, W]`` and planar depth ``[B, H, W]`` [m] (infinite where nothing is),
         all float64; depth has no history.
     """
-    if field.density is None:
-        raise ValueError("expected an object with a density, got an opaque solid: its edges have no derivative")
-    if placement.shape != (4,) or not bool(torch.isfinite(placement).all()) or float(placement.detach()[3]) <= 0:
-        raise ValueError(f"expected a finite placement (x, y, yaw, scale) with scale > 0, got {placement.tolist()}")
-    poses = np.asarray(T_world_from_camera, dtype=np.float64).reshape(-1, 4, 4)
-    placement = placement.double()
-    rays, rows, depths = _samples(placed_at(field, placement), poses, pinhole, supersample, least_transmittance, field)
-    centres, directions, pixels = (torch.from_numpy(part) for part in rays)
-    row, t = torch.from_numpy(rows), torch.from_numpy(depths)
-    R, position = pose_of(field, placement)
-    scale = placement[3]
-    points = ((centres[row] + t[:, None] * directions[row] - position) @ R) / scale
-    values = _grid_values(field, theta.double(), points)
-    step_m = field.step_units * field.scale
-    tau = values[:, 0] * step_m * directions[row].norm(dim=1) / scale
-    weights = _weights(tau, row) / supersample**2
-    count = len(poses) * pinhole.height * pinhole.width
-    pixel = pixels[row]
-    shape = (len(poses), pinhole.height, pinhole.width)
-    colour = torch.zeros(count, 3, dtype=torch.float64).index_add(0, pixel, weights[:, None] * values[:, 1:])
-    alpha = torch.zeros(count, dtype=torch.float64).index_add(0, pixel, weights)
-    reach = torch.zeros(count, dtype=torch.float64).index_add(0, pixel, weights.detach() * t)
-    depth = torch.where(alpha > 0, reach / alpha.detach().clamp_min(1e-300), torch.inf)
-    return colour.reshape(*shape, 3), alpha.reshape(shape), depth.detach().reshape(shape)
+    settings = (field, T_world_from_camera, pinhole, supersample, least_transmittance)
+    shown: tuple[Tensor, Tensor, Tensor] = _RenderSoft.apply(placement, field.colours(theta), settings)
+    return shown
 
 
-def _grid_values(field: VoxelGridObject, theta: Tensor, points: Tensor) -> Tensor:
-    """Density and colours ``[N, 4]`` at points in object units."""
-    low, high = (torch.as_tensor(np.asarray(corner, np.float64)) for corner in (field.box_min, field.box_max))
-    colours = field.colours(theta)[torch.from_numpy(np.asarray(field.slots, np.int64))]
-    density = torch.from_numpy(np.asarray(field.density, np.float64))
-    grid = torch.cat([density[..., None], colours], dim=-1).permute(3, 0, 1, 2)
-    where = (2.0 * (points - low) / (high - low) - 1.0).flip(-1)
-    out = grid_sample(grid[None], where[None, None, None], mode="bilinear", padding_mode="border", align_corners=False)
-    return out[0, :, 0, 0].T
+class _RenderSoft(torch.autograd.Function):
+    """`soft_layer` as dense layers."""
+
+    @staticmethod
+    def forward(ctx: Any, placement: Tensor, colours: Tensor, settings: tuple[Any, ...]) -> tuple[Tensor, ...]:
+        field, poses, pinhole, supersample, least = settings
+        layer = soft_layer(field, placement.detach(), colours.detach().numpy(), poses, pinhole, supersample, least)
+        ctx.layer, ctx.types = layer, (placement.dtype, colours.dtype)
+        shape = (np.asarray(poses).reshape(-1, 4, 4).shape[0], pinhole.height, pinhole.width)
+        colour, alpha = np.zeros((int(np.prod(shape)), 3)), np.zeros(int(np.prod(shape)))
+        depth_m = np.full(len(alpha), np.inf)
+        colour[layer.pixels], alpha[layer.pixels], depth_m[layer.pixels] = layer.colour, layer.alpha, layer.depth_m
+        out = tuple(torch.from_numpy(part) for part in (colour.reshape(*shape, 3), alpha.reshape(shape), depth_m.reshape(shape)))  # fmt: skip
+        ctx.mark_non_differentiable(out[2])
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, Tensor, None]:
+        pixels = torch.from_numpy(ctx.layer.pixels)
+        slopes = torch.cat([grads[0].reshape(-1, 3)[pixels], grads[1].reshape(-1, 1)[pixels]], dim=1)
+        by_place, by_colour = ctx.layer.pull(slopes.double().numpy())
+        return torch.from_numpy(by_place).to(ctx.types[0]), torch.from_numpy(by_colour).to(ctx.types[1]), None
 
 
-def _weights(tau: Tensor, row: Tensor) -> Tensor:
-    """Rendering weights of samples, given ray by ray in order, of their optical depths."""
-    total = tau.cumsum(0)
-    first = (
-        torch.cat([torch.ones(1, dtype=torch.bool), row[1:] != row[:-1]])
-        if len(row)
-        else torch.zeros(0, dtype=torch.bool)
-    )
-    before = (total - tau)[first][first.long().cumsum(0) - 1]
-    passed = total - before
-    return torch.exp(-(passed - tau)) * -torch.expm1(-tau)
+@dataclass(frozen=True, eq=False)
+class _Walk:
+    """How the rays of a batch of images meet one object."""
 
+    grids: KernelGrids
+    field: VoxelGridObject
+    colours: Array
+    R: Array
+    o: Array
+    edges: Array
+    lens: Pinhole
+    supersample: int
+    step_m: float
+    least: float
 
-def _samples(field: VoxelGridObject, poses: Array, pinhole: Pinhole, supersample: int, least: float,
-             nominal: VoxelGridObject) -> tuple[tuple[Any, Any, Any], NDArray[np.int64], Array]:  # fmt: skip
-    """Rays (centres, directions of unit planar depth, pixels), and per sample its ray and planar depth, ray by ray."""
-    centres, directions, pixels, owners, depths = [], [], [], [], []
-    grids, before = prepared(field, np.float64), 0
-    edges = (np.asarray(field.box_max, np.float64) - field.box_min) / grids.slots.shape
-    for b, (T, window) in enumerate(zip(poses, windows(field, poses, pinhole), strict=True)):
-        v, u = np.mgrid[window[0] : window[1], window[2] : window[3]]
-        inner = (np.arange(supersample) + 0.5) / supersample
-        x = (u[..., None, None] + inner[None, :] - pinhole.cx) / pinhole.fx
-        y = (v[..., None, None] + inner[:, None] - pinhole.cy) / pinhole.fy
-        x, y = np.broadcast_arrays(x, y)
-        rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3) @ T[:3, :3].T
-        to_object = invert_transform(field.T_world_from_object)
-        d = rays @ to_object[:3, :3].T / field.scale / edges
-        o = ((to_object @ T)[:3, 3] / field.scale - field.box_min) / edges - 0.5
+    @classmethod
+    def of(cls, placed: VoxelGridObject, nominal: VoxelGridObject, colours: Array, poses: Array, lens: Pinhole,
+           supersample: int, least: float) -> _Walk:  # fmt: skip
+        grids = prepared(placed, np.float64)
+        edges = (np.asarray(placed.box_max, np.float64) - placed.box_min) / grids.slots.shape
+        T = invert_transform(placed.T_world_from_object) @ poses
+        R = np.ascontiguousarray(T[:, :3, :3] / placed.scale / edges[:, None])
+        o = np.ascontiguousarray((T[:, :3, 3] / placed.scale - placed.box_min) / edges - 0.5)
         step_m = nominal.step_units * nominal.scale
-        # How much a metre of planar depth counts against an extinction per object unit.
-        lengths = np.linalg.norm(rays, axis=1) * step_m / field.scale
-        need = _walk(d, o, grids.density, grids.clear, step_m, lengths, least, np.zeros(0, np.int64), np.zeros(0))
-        owner, depth = np.empty(need, np.int64), np.empty(need)
-        _walk(d, o, grids.density, grids.clear, step_m, lengths, least, owner, depth)
-        centres.append(np.broadcast_to(T[:3, 3], rays.shape))
-        directions.append(rays)
-        pixels.append(np.repeat((b * pinhole.height + v.ravel()) * pinhole.width + u.ravel(), supersample**2))
-        owners.append(owner + before)
-        depths.append(depth)
-        before += len(rays)
-    kept = (np.concatenate(centres), np.concatenate(directions), np.concatenate(pixels).astype(np.int64))
-    return kept, np.concatenate(owners), np.concatenate(depths)
+        return cls(grids, placed, colours, R, o, edges, lens, supersample, step_m, least)
+
+    def shade(self, pixels: NDArray[np.int64]) -> Array:
+        """Red, green, blue, alpha and alpha-weighted depth of pixels, ``[P, 5]``."""
+        out = np.zeros((len(pixels), 5))
+        bounds = slot_bounds(len(pixels), _SLOTS)
+        run_slots(lambda k: shade_pixels(*bounds[k], *self._common(pixels), out), _SLOTS)
+        return out
+
+    def pull(self, pixels: NDArray[np.int64], slopes: Array, with_colours: bool) -> tuple[Array, Array]:
+        """See `SoftLayer.pull`."""
+        bounds = slot_bounds(len(pixels), _SLOTS)
+        rows = np.zeros((_SLOTS, len(self.colours) if with_colours else 0, 3))
+        sums, low = np.zeros((_SLOTS, SUMS)), np.asarray(self.field.box_min, np.float64)
+        run_slots(
+            lambda k: pull_pixels(*bounds[k], *self._common(pixels), slopes, low, self.edges, rows[k], sums[k]), _SLOTS
+        )
+        return self._by_placement(sums.sum(axis=0)), rows.sum(axis=0)
+
+    def _by_placement(self, sums: Array) -> Array:
+        # A point of the world is at p = R^T (q - position) / scale; d(R^T q)/dyaw turns it about the world's z axis.
+        R, scale = self.field.T_world_from_object[:3, :3], self.field.scale
+        by_position = -(R @ sums[:3]) / scale
+        by_yaw = -(R[2] @ sums[3:6])
+        return np.array([by_position[0], by_position[1], by_yaw, -(sums[6] + sums[7]) / scale])
+
+    def _common(self, pixels: NDArray[np.int64]) -> tuple[Any, ...]:
+        field, lens, grids = self.field, self.lens, self.grids
+        extent_m = float(np.linalg.norm(np.asarray(field.box_max, np.float64) - field.box_min)) * field.scale
+        room = int(extent_m / self.step_m) + 4
+        return (
+            pixels, self.R, self.o, np.array([lens.fx, lens.fy, lens.cx, lens.cy]), np.array([lens.height, lens.width]),
+            self.supersample, grids.slots, grids.density, grids.clear, field.one_sided, self.step_m, float(field.scale),
+            self.least, self.colours, np.empty(room), np.empty(room),
+        )  # fmt: skip
 
 
-@njit(**KERNEL_OPTIONS)
-def _walk(
-    d: Any, o: Any, density: Any, clear: Any, step_m: float, lengths: Any, least: float, owner: Any, depth: Any
-) -> int:
-    """Samples at multiples of ``step_m`` in cells that are not empty; counts them, and writes as many as there is room for."""
-    nx, ny, nz = density.shape
-    count = 0
-    for r in range(len(d)):
-        t_in, t_out, _ = span_in_box(o, d[r], density.shape, NEAR_M)
-        if t_out <= t_in:
-            continue
-        k, light = int(np.ceil(t_in / step_m - 0.5)), 1.0
-        while (k + 0.5) * step_m < t_out:
-            t = (k + 0.5) * step_m
-            x, y, z = o[0] + t * d[r, 0], o[1] + t * d[r, 1], o[2] + t * d[r, 2]
-            cx, cy, cz = cell_of(x, nx), cell_of(y, ny), cell_of(z, nz)
-            reach = int(clear[cx, cy, cz])
-            if reach > 0:
-                leap = min(
-                    steps_to_leap(x, step_m * d[r, 0], cx, reach),
-                    steps_to_leap(y, step_m * d[r, 1], cy, reach),
-                    steps_to_leap(z, step_m * d[r, 2], cz, reach),
-                )
-                k += max(leap, 1)
-                continue
-            if count < len(owner):
-                owner[count], depth[count] = r, t
-            count += 1
-            fx, fy, fz = share_of(x, cx, nx), share_of(y, cy, ny), share_of(z, cz, nz)
-            sigma = 0.0
-            for corner in range(8):
-                ax = min(cx + (corner & 1), nx - 1)
-                ay = min(cy + ((corner >> 1) & 1), ny - 1)
-                az = min(cz + (corner >> 2), nz - 1)
-                share = (
-                    (fx if corner & 1 else 1.0 - fx)
-                    * (fy if corner & 2 else 1.0 - fy)
-                    * (fz if corner & 4 else 1.0 - fz)
-                )
-                sigma += share * density[ax, ay, az]
-            light *= np.exp(-sigma * lengths[r])
-            if light < least:
-                break
-            k += 1
-    return count
+def _window_pixels(field: VoxelGridObject, poses: Array, pinhole: Pinhole) -> NDArray[np.int64]:
+    """Flat indices of the pixels that may show the object."""
+    found = [np.zeros(0, np.int64)]
+    for b, window in enumerate(windows(field, poses, pinhole)):
+        v, u = np.mgrid[window[0] : window[1], window[2] : window[3]]
+        found.append(((b * pinhole.height + v) * pinhole.width + u).ravel())
+    return np.concatenate(found).astype(np.int64)
