@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from advnerf_core.fields.voxel_grid import VoxelGridObject, squash, squash_derivative
+from advnerf_core.fields.coloured import ColouredObject
+from advnerf_core.fields.voxel_grid import squash, squash_derivative
 from advnerf_core.geometry import Array
 from advnerf_core.scene.surrogate import Rendered, split_theta
 
@@ -120,12 +121,12 @@ class Smoothness:
         weight: What a TV of one adds to the loss [m].
     """
 
-    def __init__(self, objects: Sequence[VoxelGridObject], weight: float) -> None:
+    def __init__(self, objects: Sequence[ColouredObject], weight: float) -> None:
         if not 0.0 <= weight < np.inf:
             raise ValueError(f"expected a finite weight >= 0, got {weight}")
         self.weight = weight
         self._objects = tuple(objects)
-        self._pairs = [torch.from_numpy(neighbours(field)) for field in objects]
+        self._pairs = [torch.from_numpy(field.neighbours()) for field in objects]
         self._count = max(1, sum(len(pairs) for pairs in self._pairs))
 
     def __call__(self, theta: Tensor) -> tuple[float, Tensor]:
@@ -142,15 +143,3 @@ class Smoothness:
             slopes.append(slope * squash_derivative(part).reshape(-1, 3))
         scale = self.weight / self._count
         return scale * total, scale * torch.cat(slopes).reshape(theta.shape)
-
-
-def neighbours(field: VoxelGridObject) -> NDArray[np.int64]:
-    """Pairs ``[P, 2]`` of different free rows of theta that are shown by voxels next to each other, each pair once."""
-    pairs = []
-    for axis in range(3):
-        first = np.moveaxis(field.slots, axis, 0)[:-1].reshape(-1)
-        second = np.moveaxis(field.slots, axis, 0)[1:].reshape(-1)
-        pairs.append(np.stack([np.minimum(first, second), np.maximum(first, second)], axis=1))
-    together = np.concatenate(pairs).astype(np.int64)
-    together = together[(together[:, 1] < field.free_count) & (together[:, 0] != together[:, 1])]
-    return np.unique(together, axis=0)

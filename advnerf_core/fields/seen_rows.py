@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from scipy import sparse
 from torch import Tensor
 
-from advnerf_core.fields.voxel_grid import VoxelGridObject, squash, squash_derivative
+from advnerf_core.fields.coloured import ColouredObject
+from advnerf_core.fields.voxel_grid import squash, squash_derivative
 
 
 class SeenRows:
@@ -23,7 +24,7 @@ class SeenRows:
         rows: Which rows, ascending, ``[V]`` int64.
     """
 
-    def __init__(self, field: VoxelGridObject, rows: NDArray[np.int64]) -> None:
+    def __init__(self, field: ColouredObject, rows: NDArray[np.int64]) -> None:
         self.field, self.rows = field, rows
         free = rows[: int(np.searchsorted(rows, field.free_count))]
         self._free = torch.from_numpy(free)
@@ -59,7 +60,7 @@ class SeenRows:
         return out
 
 
-def compact(weights: sparse.csr_matrix, field: VoxelGridObject) -> tuple[sparse.csr_matrix, SeenRows]:
+def compact(weights: sparse.csr_matrix, field: ColouredObject) -> tuple[sparse.csr_matrix, SeenRows]:
     """Weights ``[P, slots]`` with only the columns that are used ``[P, V]``, and what these are."""
     used = np.zeros(weights.shape[1], dtype=np.bool_)
     used[weights.indices] = True

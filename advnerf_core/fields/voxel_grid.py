@@ -136,6 +136,17 @@ class VoxelGridObject:
             rows = matrix @ rows
         return torch.cat([squash(rows), fixed])
 
+    def neighbours(self) -> NDArray[np.int64]:
+        """Pairs ``[P, 2]`` of different free rows that are shown by voxels next to each other, each pair once."""
+        pairs = []
+        for axis in range(3):
+            first = np.moveaxis(self.slots, axis, 0)[:-1].reshape(-1)
+            second = np.moveaxis(self.slots, axis, 0)[1:].reshape(-1)
+            pairs.append(np.stack([np.minimum(first, second), np.maximum(first, second)], axis=1))
+        together = np.concatenate(pairs).astype(np.int64)
+        together = together[(together[:, 1] < self.free_count) & (together[:, 0] != together[:, 1])]
+        return np.unique(together, axis=0)
+
     def moved(self, T_world_from_object: ArrayLike, scale: float | None = None) -> VoxelGridObject:
         """The same object elsewhere, and with another scale if one is given; what renderers derived from it is shared."""
         pose = np.asarray(T_world_from_object, dtype=np.float64)

@@ -14,14 +14,15 @@ from __future__ import annotations
 
 import itertools
 import threading
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage, sparse
 
+from advnerf_core.fields.coloured import ColouredObject
 from advnerf_core.fields.voxel_grid import VoxelGridObject
 from advnerf_core.geometry import Array, Pinhole, invert_transform, transform_points
 from advnerf_core.parallel import run_slots
@@ -57,8 +58,16 @@ class ObjectCast:
         return int(sum(part.nbytes for part in parts))
 
 
+@runtime_checkable
+class CastsItself(Protocol):
+    """An object that is no voxel grid and knows how to be cast."""
+
+    def cast(self, T_world_from_camera: Array, pinhole: Pinhole, supersample: int, dtype: Any) -> ObjectCast:
+        """Cast into cameras ``[B, 4, 4]``; see :func:`cast_objects`."""
+
+
 def cast_object(
-    field: VoxelGridObject,
+    field: ColouredObject,
     T_world_from_camera: ArrayLike,
     pinhole: Pinhole,
     supersample: int = 2,
@@ -69,7 +78,7 @@ def cast_object(
 
 
 def cast_objects(
-    fields: Sequence[VoxelGridObject],
+    fields: Sequence[ColouredObject],
     T_world_from_camera: ArrayLike,
     pinhole: Pinhole,
     supersample: int = 2,
@@ -90,15 +99,26 @@ def cast_objects(
     poses = np.asarray(T_world_from_camera, dtype=np.float64).reshape(-1, 4, 4)
     if supersample < 1:
         raise ValueError(f"expected at least 1 ray along a pixel's side, got {supersample}")
+    grids = {k: field for k, field in enumerate(fields) if isinstance(field, VoxelGridObject)}
+    casts = _cast_grids(grids, poses, pinhole, supersample, dtype)
+    for k, field in enumerate(fields):
+        if isinstance(field, CastsItself):
+            casts[k] = field.cast(poses, pinhole, supersample, dtype)
+    return [casts[k] for k in range(len(fields))]
+
+
+def _cast_grids(
+    fields: Mapping[int, VoxelGridObject], poses: Array, pinhole: Pinhole, supersample: int, dtype: Any
+) -> dict[int, ObjectCast]:
     bands = max(1, -(-_LEAST_PARTS // max(1, len(poses))))
     jobs = [
         (k, _Part(prepared(field, dtype), field, T, pinhole, supersample, window, b * pinhole.width * pinhole.height))
-        for k, field in enumerate(fields)
+        for k, field in fields.items()
         for b, T, whole in zip(range(len(poses)), poses, windows(field, poses, pinhole), strict=True)
         for window in _bands(whole, bands)
     ]
     run_slots(lambda slot: jobs[slot][1].cast(), len(jobs))
-    return [_joined([part for owner, part in jobs if owner == k], field, dtype) for k, field in enumerate(fields)]
+    return {k: _joined([part for owner, part in jobs if owner == k], field, dtype) for k, field in fields.items()}
 
 
 def made_opaque(cast: ObjectCast) -> ObjectCast:

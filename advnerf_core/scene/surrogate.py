@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 from scipy import sparse
 from torch import Tensor
 
+from advnerf_core.fields.coloured import ColouredObject
 from advnerf_core.fields.seen_rows import SeenRows, compact
 from advnerf_core.fields.voxel_grid import INITIAL_NOISE, VoxelGridObject
 from advnerf_core.geometry import Array, Pinhole, planar_poses
@@ -116,7 +117,7 @@ class Surrogate:
         background: BackgroundRenderer,
         camera: Pinhole,
         T_car_from_camera: ArrayLike,
-        objects: Sequence[VoxelGridObject] | VoxelGridObject | None = None,
+        objects: Sequence[ColouredObject] | ColouredObject | None = None,
         depth_tolerance_m: float = 0.15,
         supersample: int = 2,
         background_colour: Callable[[Tensor], Tensor] | None = None,
@@ -126,7 +127,8 @@ class Surrogate:
         self._background = background
         self.camera = camera
         self.T_car_from_camera = np.asarray(T_car_from_camera, dtype=np.float64)
-        self.objects = (objects,) if isinstance(objects, VoxelGridObject) else tuple(objects or ())
+        listed = () if objects is None else objects
+        self.objects = tuple(listed) if isinstance(listed, Sequence) else (listed,)
         self._tolerance_m = depth_tolerance_m
         self._supersample = supersample
         self._background_colour = background_colour
@@ -147,7 +149,7 @@ class Surrogate:
         return (sum(field.parameter_count for field in self.objects), 3)
 
     def plain_theta(self, dtype: torch.dtype | None = None) -> Tensor:
-        """The colours without an attack (``VoxelGridObject.plain_theta``); ``theta_shape``."""
+        """The colours without an attack (``ColouredObject.plain_theta``); ``theta_shape``."""
         rows = [torch.zeros(0, 3, dtype=torch.float64)]
         rows += [torch.tensor(field.plain_theta) for field in self.objects]
         return torch.cat(rows).reshape(self.theta_shape).to(dtype or self.dtype)
@@ -221,11 +223,16 @@ class Surrogate:
         """
         if placements.shape != (len(self.objects), 4):
             raise ValueError(f"expected placements [{len(self.objects)}, 4], got {list(placements.shape)}")
+        grids = [field for field in self.objects if isinstance(field, VoxelGridObject)]
+        if len(grids) != len(self.objects):
+            raise ValueError(
+                "expected objects made of voxels, got a mesh: only voxels are differentiable in their pose"
+            )
         poses = np.asarray(T_world_from_camera, dtype=np.float64).reshape(-1, 4, 4)
         rgb, depth_m = self._coloured_background(poses)
         layers = [
             render_soft(field, placement, part, poses, self.camera, self._supersample)
-            for field, placement, part in zip(self.objects, placements, split_theta(self.objects, theta), strict=True)
+            for field, placement, part in zip(grids, placements, split_theta(grids, theta), strict=True)
         ]
         colours = torch.stack([*(layer[0] for layer in layers), rgb.double()])
         alphas = torch.stack([*(layer[1] for layer in layers), torch.ones_like(depth_m).double()])
@@ -256,7 +263,7 @@ class Surrogate:
             raise ValueError(f"expected a background of shapes {(*size, 3)} and {size}, got {got}")
 
 
-def _seen(cast: ObjectCast, share: Array, field: VoxelGridObject) -> tuple[Tensor, sparse.csr_matrix, SeenRows]:
+def _seen(cast: ObjectCast, share: Array, field: ColouredObject) -> tuple[Tensor, sparse.csr_matrix, SeenRows]:
     """Pixels, weights and colours of what is seen of a cast whose pixels keep ``share [P]`` of their light."""
     W, kept = cast.weights, share > 0.0
     if not kept.all():
@@ -265,7 +272,7 @@ def _seen(cast: ObjectCast, share: Array, field: VoxelGridObject) -> tuple[Tenso
     return torch.from_numpy(cast.pixels[kept]), *compact(sparse.csr_matrix((data, W.indices, W.indptr), W.shape), field)
 
 
-def split_theta(objects: Sequence[VoxelGridObject], theta: Tensor | None) -> list[Tensor]:
+def split_theta(objects: Sequence[ColouredObject], theta: Tensor | None) -> list[Tensor]:
     """Each object's part of a surrogate's ``theta``, in the object's own shape."""
     if not objects:
         return []

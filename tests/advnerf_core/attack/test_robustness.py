@@ -15,7 +15,7 @@ from advnerf_core.attack.health import (
     slopes_of,
     with_remembered_frames,
 )
-from advnerf_core.attack.robustness import Disturbances, Smoothness, neighbours
+from advnerf_core.attack.robustness import Disturbances, Smoothness
 from advnerf_core.driving.actuated import ActuatedAckermann
 from advnerf_core.fields.voxel_grid import VoxelGridObject, squash
 from benchmarks.attack_toy import face, toy_problem
@@ -104,7 +104,7 @@ def test_the_delayed_lagging_car_has_the_right_gradient_too(problem, theta):
 
 def test_total_variation_written_out_and_its_gradient():
     field = face(4)
-    pairs = neighbours(field)
+    pairs = field.neighbours()
     assert len(pairs) == 2 * 4 * 3  # a 4 x 4 grid has 24 edges; the depth of the slab shows the same rows
     theta = torch.randn(field.theta_shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     smooth = Smoothness([field], weight=2.0)
@@ -122,7 +122,7 @@ def test_smoothness_of_a_volume_counts_its_neighbours_in_space():
     slots = np.arange(8, dtype=np.int32).reshape(2, 2, 2)
     slots[1, 1, 1] = 7  # the last is fixed
     cube = VoxelGridObject(slots, (7, 3), np.zeros((1, 3)), np.zeros(3), np.ones(3), np.eye(4))
-    assert sorted(map(tuple, neighbours(cube))) == [
+    assert sorted(map(tuple, cube.neighbours())) == [
         (0, 1), (0, 2), (0, 4), (1, 3), (1, 5), (2, 3), (2, 6), (4, 5), (4, 6),
     ]  # fmt: skip
 
