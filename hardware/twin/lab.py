@@ -38,7 +38,8 @@ class Lab:
         self.config = LabConfig() if config is None else config
         self.camera_pinhole: Pinhole = self.config.camera.pinhole
         self.phone_pinhole: Pinhole = self.config.phone.pinhole
-        self._T_car_from_camera = self.config.camera.T_car_from_camera
+        self.photo_pinhole: Pinhole = self.phone_pinhole
+        self.T_car_from_camera: Array = self.config.camera.T_car_from_camera
         self._vehicle = vehicle_in_room(self.config)
         self._pending: list[tuple[float, float, float]] = []  # due time [s], servo, erpm
         self._time_s = 0.0
@@ -192,7 +193,7 @@ class Lab:
         return state.x_m, state.y_m, state.yaw_rad
 
     def _see(self, T_world_from_car: Array, depth: bool) -> tuple[Rgb, Depth | None]:
-        T = T_world_from_car @ self._T_car_from_camera
+        T = T_world_from_car @ self.T_car_from_camera
         self._light_screen(T)
         rgb = self._renderer.render_rgb(T, self.camera_pinhole)
         return rgb, self._renderer.render_depth(T, self.camera_pinhole) if depth else None

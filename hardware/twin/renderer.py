@@ -27,11 +27,21 @@ class Renderer:
         model: A ``mujoco.MjModel``.
         supersampling: Factor per axis.
         hidden_groups: Geom groups that are not drawn unless asked for.
+        range_m: Planar depth of the nearest and the farthest thing that is drawn [m].
     """
 
-    def __init__(self, model: Any, supersampling: int, hidden_groups: tuple[int, ...] = ()) -> None:
+    def __init__(
+        self,
+        model: Any,
+        supersampling: int,
+        hidden_groups: tuple[int, ...] = (),
+        range_m: tuple[float, float] = (NEAR_M, FAR_M),
+    ) -> None:
+        if not 0.0 < range_m[0] < range_m[1]:
+            raise ValueError(f"expected 0 < nearest < farthest distance to draw, got {range_m} m")
         self._mujoco = load_mujoco()
         mujoco = self._mujoco
+        self._range_m = range_m
         self._model, self._scale = model, supersampling
         self._gl = create_context(64, 64)
         self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
@@ -72,7 +82,8 @@ class Renderer:
             np.copyto(self._scene.flags, flags)
         # Reversed depth buffer d in 0 (far) .. 1 (near): 1 / z is linear in d.
         d = depth[::-1].astype(np.float64)
-        inverse = d * (1.0 / NEAR_M - 1.0 / FAR_M) + 1.0 / FAR_M
+        near, far = self._range_m
+        inverse = d * (1.0 / near - 1.0 / far) + 1.0 / far
         return np.where(d > 0.0, 1.0 / inverse, np.inf).astype(np.float32)
 
     def set_texture(self, name: str, rgb: NDArray[np.uint8]) -> None:
@@ -85,6 +96,10 @@ class Renderer:
         model.tex_data[start : start + 3 * width * height] = textures.fit(rgb, width, height).ravel()
         self._gl.make_current()
         mujoco.mjr_uploadTexture(model, self._context, index)
+
+    def hide(self, hidden_groups: tuple[int, ...]) -> None:
+        """Choose which geom groups are hidden from now on."""
+        self._update_scene(hidden_groups)
 
     def place(self, body: str, T_world_from_body: Array, hidden_groups: tuple[int, ...]) -> None:
         """Move a mocap body and choose which geom groups are hidden from now on."""
@@ -129,7 +144,7 @@ class Renderer:
         if self._size != (width, height):
             mujoco.mjr_resizeOffscreen(width, height, self._context)
             self._size = (width, height)
-        _aim(self._scene, T_world_from_camera, pinhole)
+        _aim(self._scene, T_world_from_camera, pinhole, self._range_m)
         viewport = mujoco.MjrRect(0, 0, width, height)
         mujoco.mjr_render(viewport, self._scene, self._context)
         mujoco.mjr_readPixels(rgb, depth, viewport, self._context)
@@ -141,15 +156,16 @@ def _free(gl: Any, context: Any) -> None:
     gl.free()
 
 
-def _aim(scene: Any, T_world_from_camera: Array, pinhole: Pinhole) -> None:
+def _aim(scene: Any, T_world_from_camera: Array, pinhole: Pinhole, range_m: tuple[float, float]) -> None:
     """Set both eyes of the scene to a pinhole camera by its frustum at the near plane."""
+    near, far = range_m
     for eye in scene.camera:
         eye.pos = T_world_from_camera[:3, 3]
         eye.forward = T_world_from_camera[:3, 2]
         eye.up = -T_world_from_camera[:3, 1]
         eye.orthographic = 0
-        eye.frustum_near, eye.frustum_far = NEAR_M, FAR_M
-        eye.frustum_center = (0.5 * pinhole.width - pinhole.cx) / pinhole.fx * NEAR_M
-        eye.frustum_width = 0.5 * pinhole.width / pinhole.fx * NEAR_M
-        eye.frustum_top = pinhole.cy / pinhole.fy * NEAR_M
-        eye.frustum_bottom = -(pinhole.height - pinhole.cy) / pinhole.fy * NEAR_M
+        eye.frustum_near, eye.frustum_far = near, far
+        eye.frustum_center = (0.5 * pinhole.width - pinhole.cx) / pinhole.fx * near
+        eye.frustum_width = 0.5 * pinhole.width / pinhole.fx * near
+        eye.frustum_top = pinhole.cy / pinhole.fy * near
+        eye.frustum_bottom = -(pinhole.height - pinhole.cy) / pinhole.fy * near

@@ -73,23 +73,24 @@ def shading(normal: Array) -> float:
 def _add_surface(mujoco: Any, spec: Any, surface: Surface) -> Any:
     """Add a one-sided rectangle whose picture is seen as it is, whatever the rasteriser's lights do to its normal."""
     factor = shading(surface.normal)
-    _texture(mujoco, spec, surface.name, textures.to_uint8(surface.image / np.float32(max(factor, 1.0))))
-    material = _material(mujoco, spec, surface.name)
+    add_texture(mujoco, spec, surface.name, textures.to_uint8(surface.image / np.float32(max(factor, 1.0))))
+    material = add_material(mujoco, spec, surface.name)
     material.emission = max(1.0 - factor, 0.0)
-    geom = _geom(spec.worldbody, mujoco.mjtGeom.mjGEOM_PLANE, (*surface.half_m, 0.1))
+    geom = add_geom(spec.worldbody, mujoco.mjtGeom.mjGEOM_PLANE, (*surface.half_m, 0.1))
     geom.pos = surface.centre_m
-    geom.quat = _quaternion(np.stack([surface.right, surface.up, surface.normal], axis=1))
+    geom.quat = wxyz(np.stack([surface.right, surface.up, surface.normal], axis=1))
     geom.material = surface.name
     return geom
 
 
-def _quaternion(rotation: Array) -> list[float]:
+def wxyz(rotation: Array) -> list[float]:
     """A rotation in MuJoCo's order w, x, y, z."""
     x, y, z, w = quaternion_from_rotation(rotation)
     return [w, x, y, z]
 
 
-def _texture(mujoco: Any, spec: Any, name: str, rgb: textures.Rgb) -> None:
+def add_texture(mujoco: Any, spec: Any, name: str, rgb: textures.Rgb) -> None:
+    """Add a 2D texture of a picture ``[h, w, 3]``."""
     texture = spec.add_texture()
     texture.name = name
     texture.type = mujoco.mjtTexture.mjTEXTURE_2D
@@ -97,7 +98,8 @@ def _texture(mujoco: Any, spec: Any, name: str, rgb: textures.Rgb) -> None:
     texture.data = np.ascontiguousarray(rgb).tobytes()
 
 
-def _material(mujoco: Any, spec: Any, name: str) -> Any:
+def add_material(mujoco: Any, spec: Any, name: str) -> Any:
+    """Add a matte material that wears the texture of the same name."""
     material = spec.add_material()
     material.name = name
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
@@ -105,7 +107,8 @@ def _material(mujoco: Any, spec: Any, name: str) -> Any:
     return material
 
 
-def _geom(body: Any, kind: Any, size: tuple[float, ...]) -> Any:
+def add_geom(body: Any, kind: Any, size: tuple[float, ...]) -> Any:
+    """Add a geom that is only looked at."""
     geom = body.add_geom()
     geom.type = kind
     geom.size = size
@@ -117,7 +120,7 @@ def _add_solid(mujoco: Any, body: Any, solid: Solid) -> Any:
     kinds = {"box": "mjGEOM_BOX", "cylinder": "mjGEOM_CYLINDER", "ellipsoid": "mjGEOM_ELLIPSOID"}
     x, y, z = solid.half_m
     size = (x, z, 0.0) if solid.kind == "cylinder" else (x, y, z)
-    geom = _geom(body, getattr(mujoco.mjtGeom, kinds[solid.kind]), size)
+    geom = add_geom(body, getattr(mujoco.mjtGeom, kinds[solid.kind]), size)
     geom.pos = solid.centre_m
     geom.quat = [math.cos(0.5 * solid.yaw_rad), 0.0, 0.0, math.sin(0.5 * solid.yaw_rad)]
     geom.rgba = [*solid.rgb, 1.0]
@@ -127,20 +130,20 @@ def _add_solid(mujoco: Any, body: Any, solid: Solid) -> Any:
 def _add_panel(mujoco: Any, spec: Any, name: str, panel: PanelConfig, pixels: tuple[int, int], image: Image) -> None:
     T = panel.T_world_from_face
     full = textures.fit(textures.to_uint8(image), *pixels)
-    _texture(mujoco, spec, name, full)
-    material = _material(mujoco, spec, name)
+    add_texture(mujoco, spec, name, full)
+    material = add_material(mujoco, spec, name)
     material.emission = max(1.0 - shading(T[:3, 0]), 0.0)
-    geom = _geom(spec.worldbody, mujoco.mjtGeom.mjGEOM_PLANE, (0.5 * panel.width_m, 0.5 * panel.height_m, 0.1))
+    geom = add_geom(spec.worldbody, mujoco.mjtGeom.mjGEOM_PLANE, (0.5 * panel.width_m, 0.5 * panel.height_m, 0.1))
     geom.pos = T[:3, 3]
     # A MuJoCo plane faces its z; its x is to the viewer's right, which is the panel's +y.
-    geom.quat = _quaternion(T[:3, [1, 2, 0]])
+    geom.quat = wxyz(T[:3, [1, 2, 0]])
     geom.material = name
 
 
 def _add_tape(mujoco: Any, spec: Any, config: LabConfig, picture: Image) -> None:
     """The tape as a flat ring of triangles: a texture would blur it at the grazing angle of the driving camera."""
-    _texture(mujoco, spec, "tape", textures.to_uint8(picture))
-    material = _material(mujoco, spec, "tape")
+    add_texture(mujoco, spec, "tape", textures.to_uint8(picture))
+    material = add_material(mujoco, spec, "tape")
     material.emission = max(1.0 - shading(UP), 0.0)
     inner, outer = tape_edges(config)
     count = len(inner)
@@ -157,7 +160,7 @@ def _add_tape(mujoco: Any, spec: Any, config: LabConfig, picture: Image) -> None
     uv = vertices[:, :2] / config.room.side_m + 0.5
     mesh.usertexcoord = uv.ravel().tolist()
     mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
-    geom = _geom(spec.worldbody, mujoco.mjtGeom.mjGEOM_MESH, (0.0, 0.0, 0.0))
+    geom = add_geom(spec.worldbody, mujoco.mjtGeom.mjGEOM_MESH, (0.0, 0.0, 0.0))
     geom.meshname = "tape"
     geom.material = "tape"
 
@@ -193,7 +196,7 @@ def _add_car(mujoco: Any, spec: Any, config: LabConfig) -> None:
     ]
     for x in (0.0, car.wheelbase_m):
         for y in (-1, 1):
-            wheel = _geom(body, mujoco.mjtGeom.mjGEOM_CYLINDER, (0.055, 0.025, 0.0))
+            wheel = add_geom(body, mujoco.mjtGeom.mjGEOM_CYLINDER, (0.055, 0.025, 0.0))
             wheel.pos = [x, y * (half_w - 0.025), 0.055]
             wheel.quat = [math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0]
             wheel.rgba = [0.08, 0.08, 0.08, 1.0]

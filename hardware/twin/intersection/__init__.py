@@ -1,0 +1,1 @@
+"""The simulated intersection: an urban junction of three roads at real scale, with a Dubins car in it."""
