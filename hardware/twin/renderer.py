@@ -97,10 +97,6 @@ class Renderer:
         self._gl.make_current()
         mujoco.mjr_uploadTexture(model, self._context, index)
 
-    def hide(self, hidden_groups: tuple[int, ...]) -> None:
-        """Choose which geom groups are hidden from now on."""
-        self._update_scene(hidden_groups)
-
     def place(self, body: str, T_world_from_body: Array, hidden_groups: tuple[int, ...]) -> None:
         """Move a mocap body and choose which geom groups are hidden from now on."""
         index = int(self._model.body(body).mocapid[0])

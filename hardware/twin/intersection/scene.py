@@ -13,7 +13,7 @@ from advnerf_core.geometry import Array, Pinhole, VehicleState, invert_transform
 from hardware.twin.intersection.car import DubinsCar
 from hardware.twin.intersection.config import IntersectionConfig
 from hardware.twin.intersection.town import obstacles
-from hardware.twin.intersection.world import SKY_GROUP, build_model
+from hardware.twin.intersection.world import build_model
 from hardware.twin.renderer import Renderer
 from hardware.twin.vehicle import Footprint
 
@@ -115,11 +115,7 @@ class Intersection:
         focal = 1.0 * width
         pinhole = Pinhole(width, height, focal, focal, 0.5 * width, 0.5 * height)
         T = look_at([0.0, -46.0, 62.0], [0.0, -7.0, 0.0])
-        self._renderer.hide((SKY_GROUP,))
-        try:
-            picture = self._renderer.render_rgb(T, pinhole)
-        finally:
-            self._renderer.hide(())
+        picture = self._renderer.render_rgb(T, pinhole)  # the sky is seen from inside only
         for name, path in self.config.paths().items():
             along = np.arange(0.0, self.config.car.speed_mps * 6.0, 0.25)
             points = np.array([[*path.pose_at(float(s))[:2], 0.05] for s in along])

@@ -27,9 +27,7 @@ from hardware.twin.intersection.solids import (
 )
 from hardware.twin.intersection.town import HOUSES, LAMPS, STOP_SIGN, TREES, House
 from hardware.twin.surfaces import EAST, NORTH, UP, Surface
-from hardware.twin.world import add_geom, add_material, add_texture, wxyz
-
-SKY_GROUP = 2  # geom group that views from outside leave out
+from hardware.twin.world import add_geom, add_material, add_texture
 
 
 def build_model(config: IntersectionConfig) -> Any:
@@ -44,7 +42,7 @@ def build_model(config: IntersectionConfig) -> Any:
     spec.visual.quality.offsamples = 0  # the renderer averages a larger image instead, which also filters textures
     surfaces, solids, plans = _painted(config.road)
     for surface in surfaces:
-        _add_surface(mujoco, spec, surface).group = SKY_GROUP if surface.name.startswith("sky") else 0
+        _add_solid(mujoco, spec, surface.name, _rectangle(surface), surface.image)
     for name, solid in solids.items():
         _add_solid(mujoco, spec, name, solid, plans[name])
     return spec.compile()
@@ -140,15 +138,11 @@ def _furniture(road: RoadConfig, rng: np.random.Generator) -> list[Solid]:
     return solids
 
 
-def _add_surface(mujoco: Any, spec: Any, surface: Surface) -> Any:
-    """Add a one-sided rectangle whose picture is seen as it is."""
-    add_texture(mujoco, spec, surface.name, textures.to_uint8(surface.image))
-    add_material(mujoco, spec, surface.name).emission = 1.0
-    geom = add_geom(spec.worldbody, mujoco.mjtGeom.mjGEOM_PLANE, (*surface.half_m, 0.1))
-    geom.pos = surface.centre_m
-    geom.quat = wxyz(np.stack([surface.right, surface.up, surface.normal], axis=1))
-    geom.material = surface.name
-    return geom
+def _rectangle(surface: Surface) -> Solid:
+    """A picture's rectangle as triangles: MuJoCo's own planes are far slower to draw, and are seen from behind too."""
+    right, up = surface.half_m[0] * surface.right, surface.half_m[1] * surface.up
+    corners = [surface.centre_m + a * right + b * up for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+    return polygon(corners, [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)])
 
 
 def _add_solid(mujoco: Any, spec: Any, name: str, solid: Solid, image: textures.Image) -> None:
