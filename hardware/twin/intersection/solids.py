@@ -19,8 +19,8 @@ from advnerf_core.geometry import Array
 Faces = NDArray[np.int32]
 
 # The sky lights everything alike, the sun (a unit vector towards it) what faces it: matte, the same from every side.
-SUN: Array = np.array([-0.42, -0.58, 0.70]) / math.hypot(0.42, 0.58, 0.70)
-SKY_LIGHT, SUN_LIGHT = 0.62, 0.46
+SUN: Array = np.array([-0.32, -0.42, 0.85]) / math.hypot(0.32, 0.42, 0.85)
+SKY_LIGHT, SUN_LIGHT = 0.62, 0.48
 BRIGHTEST = 1.15  # brightness at v = 1; it is 0 at v = 0
 
 

@@ -12,8 +12,10 @@ from hardware.twin import textures
 from hardware.twin.gl import load_mujoco
 from hardware.twin.intersection import pictures
 from hardware.twin.intersection.config import IntersectionConfig, RoadConfig
+from hardware.twin.intersection.facades import facade
 from hardware.twin.intersection.ground import PAINT_M, ground, markings
 from hardware.twin.intersection.pictures import swatch_u
+from hardware.twin.intersection.sky import backdrop
 from hardware.twin.intersection.solids import (
     BRIGHTEST,
     Solid,
@@ -25,7 +27,7 @@ from hardware.twin.intersection.solids import (
     post,
     shade,
 )
-from hardware.twin.intersection.town import HOUSES, LAMPS, STOP_SIGN, TREES, House
+from hardware.twin.intersection.town import BOXES, HEDGES, HOUSES, LAMPS, STOP_SIGN, TREES, WALLS, House
 from hardware.twin.surfaces import EAST, NORTH, UP, Surface
 from hardware.twin.world import add_geom, add_material, add_texture
 
@@ -60,32 +62,11 @@ def _painted(road: RoadConfig) -> tuple[list[Surface], dict[str, Solid], dict[st
         "garden": pictures.garden(road, rng),
         "swatches": pictures.swatches(BRIGHTEST),
     }
-    surfaces += _sky(road)
+    surfaces += backdrop(road, rng)
     for index, house in enumerate(HOUSES):
         surfaces += _walls(f"house{index}", house, road.kerb_height_m, rng)
     solids["swatches"] = joined([solids["swatches"], *_furniture(road, rng)])
     return surfaces, solids, plans
-
-
-def _sky(road: RoadConfig) -> list[Surface]:
-    half, high = road.half_m, road.sky_m
-    middle = 0.5 * high * UP
-    surfaces = []
-    for name, inward in (("south", NORTH), ("east", -EAST), ("north", -NORTH), ("west", EAST)):
-        right = np.asarray(np.cross(UP, inward), dtype=np.float64)
-        surfaces.append(_sky_panel(f"sky_{name}", middle - half * inward, right, UP, (half, 0.5 * high)))
-    surfaces.append(_sky_panel("sky_top", high * UP, EAST, -NORTH, (half, half)))
-    return surfaces
-
-
-def _sky_panel(name: str, centre: Any, right: Any, up: Any, half_m: tuple[float, float]) -> Surface:
-    per_m = 6.0
-    columns, rows = (round(2.0 * half * per_m) for half in half_m)
-    u = ((np.arange(columns) + 0.5) / columns * 2.0 - 1.0) * half_m[0]
-    v = (1.0 - (np.arange(rows) + 0.5) / rows * 2.0) * half_m[1]
-    points = centre + u[None, :, None] * right + v[:, None, None] * up - (0.0, 0.0, 1.5)
-    directions = (points / np.linalg.norm(points, axis=-1, keepdims=True)).astype(np.float32)
-    return Surface(name, centre, right, up, half_m, pictures.sky(directions))
 
 
 def _walls(name: str, house: House, ground_m: float, rng: np.random.Generator) -> list[Surface]:
@@ -99,7 +80,7 @@ def _walls(name: str, house: House, ground_m: float, rng: np.random.Generator) -
             continue
         along_x = side in ("north", "south")
         width, depth = (x1 - x0, y1 - y0) if along_x else (y1 - y0, x1 - x0)
-        image = pictures.facade(width, house.eaves_m, house.wall_rgb, house.style, side == house.front, rng)
+        image = facade(width, house.eaves_m, WALLS[house.wall], house.style, side == house.front, rng)
         right = np.asarray(np.cross(UP, normal), dtype=np.float64)
         half = (0.5 * width, 0.5 * house.eaves_m)
         lit = image * np.float32(shade(normal))
@@ -116,7 +97,7 @@ def _furniture(road: RoadConfig, rng: np.random.Generator) -> list[Solid]:
         top, u = kerb + house.eaves_m, swatch_u(house.roof)
         if house.ridge_m > 0.0:
             along_x = house.front in ("north", "south")
-            solids += gable(house.x, house.y, top, top + house.ridge_m, u, swatch_u("white"), along_x)
+            solids += gable(house.x, house.y, top, top + house.ridge_m, u, swatch_u(house.wall), along_x)
         else:
             solids.append(
                 block((house.x[0] - 0.2, house.x[1] + 0.2), (house.y[0] - 0.2, house.y[1] + 0.2), (top, top + 0.4), u)
@@ -126,6 +107,10 @@ def _furniture(road: RoadConfig, rng: np.random.Generator) -> list[Solid]:
         solids.append(post(tree.x_m, tree.y_m, (kerb, middle), 0.16, swatch_u("trunk")))
         radii = (tree.radius_m, 1.15 * tree.radius_m)
         solids.append(crown((tree.x_m, tree.y_m, middle), radii, swatch_u(tree.leaves), rng))
+    for x0, x1, y0, y1 in HEDGES:
+        solids.append(block((x0, x1), (y0, y1), (kerb, kerb + 0.85), swatch_u("hedge")))
+    for x0, x1, y0, y1, height, name in BOXES:
+        solids.append(block((x0, x1), (y0, y1), (kerb, kerb + height), swatch_u(name)))
     for x, y in LAMPS:
         solids.append(post(x, y, (kerb, 5.6), 0.07, swatch_u("post")))
         solids.append(block((x - 0.25, x + 0.25), (y - 0.25, y + 0.25), (5.6, 5.75), swatch_u("lamp")))
