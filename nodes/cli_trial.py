@@ -36,6 +36,10 @@ def trial(
         str | None, typer.Option("--start", metavar="X,Y,YAW", help="Start pose [m, rad].", show_default="the room's")
     ] = None,
     ready_timeout_s: Annotated[float, typer.Option("--ready-timeout", min=1.0)] = 60.0,
+    host: Annotated[
+        str | None,
+        typer.Option("--host", help="Which of the file's hosts this computer is, or all; the other must be running."),
+    ] = None,
     show: Annotated[bool, typer.Option("--show", help="Only print the order and what is done.")] = False,
     overrides: Overrides = None,
 ) -> None:
@@ -44,8 +48,8 @@ def trial(
 
     attacks = _attacks(attack or [])
     series = prepare_series(
-        file, overrides or [], folder, attacks, repeats, seed, ticks, None if start is None else _pose(start)
-    )
+        file, overrides or [], folder, attacks, repeats, seed, ticks, None if start is None else _pose(start), host,
+    )  # fmt: skip
     count = len(series.plan.runs)
     if show:
         done = series.results

@@ -25,6 +25,7 @@ def run_trial(
     plan: TrialPlan,
     ready_timeout_s: float,
     guide: Callable[[str], None] | None = None,
+    host: str | None = None,
 ) -> TrialOutcome:
     """Start the graph, carry out the plan, stop the graph.
 
@@ -35,12 +36,13 @@ def run_trial(
         plan: What is driven.
         ready_timeout_s: How long the graph may take to become ready [s].
         guide: Told what a person has to do, where the car is a real one.
+        host: Which of the launch file's hosts this computer is; its other host must be running.
 
     Raises:
         LaunchError: A node died or never became ready.
         TrialError: The trial could not be carried out.
     """
-    with Launch(launch_file, overrides, run_dir) as launch:
+    with Launch(launch_file, overrides, run_dir, host=host) as launch:
         launch.wait_ready(ready_timeout_s)
         node = TrialNode(plan, lambda: launch.failure, guide)
         _operate(node, launch.run_dir)

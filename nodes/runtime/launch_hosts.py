@@ -88,7 +88,7 @@ def _require_clock(document: Document, launch: LaunchFile, host: str) -> None:
 def routes(launch: LaunchFile, host: str) -> tuple[list[str], list[str]]:
     """Topics that a host exports, and those it imports."""
     listener = _listener(launch)
-    operator = launch.operator or next(name for name in launch.hosts if name != listener)
+    operator = operator_of(launch)
     exports, imports = [], []
     entries = {name: entry for name, entry in launch.nodes.items() if entry.enabled}
     for topic, row in TOPICS.items():
@@ -105,6 +105,12 @@ def routes(launch: LaunchFile, host: str) -> tuple[list[str], list[str]]:
     for name, entry in entries.items():
         (exports if entry.host == host else imports).append(status_topic(name))
     return exports, imports
+
+
+def operator_of(launch: LaunchFile) -> str:
+    """Host from which people arm and ask."""
+    listener = _listener(launch)
+    return launch.operator or next(name for name in launch.hosts if name != listener)
 
 
 def _host_of(role: str, entries: Mapping[str, _Entry]) -> str | None:

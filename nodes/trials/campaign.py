@@ -19,6 +19,7 @@ from advnerf_core.files import write_atomically
 from calibration.schema import RoomCalibration, load_calibration
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.launch_file import Plan, load_launch
+from nodes.runtime.launch_hosts import ALL_HOSTS, operator_of
 from nodes.trial import TrialPlan
 from nodes.trial_runner import run_trial
 from nodes.trials.bags import measure_drives
@@ -57,7 +58,7 @@ class Series:
 
 def prepare_series(
     launch_file: Path, overrides: Sequence[str], folder: Path, attacks: dict[str, list[Path]], repeats: int, seed: int,
-    ticks: int, start_pose: tuple[float, float, float] | None = None,
+    ticks: int, start_pose: tuple[float, float, float] | None = None, host: str | None = None,
 ) -> Series:  # fmt: skip
     """Read everything, fix the order, and keep the plan in the folder.
 
@@ -70,21 +71,25 @@ def prepare_series(
         seed: Of the order.
         ticks: Control ticks of each drive, 10 a second.
         start_pose: Where each drive starts; None is the room's.
+        host: Which of the file's hosts this computer is, or all; the operator's, with the recorder.
 
     Raises:
         CampaignError: The folder belongs to another series.
     """
-    launched = load_launch(launch_file, overrides)
-    room_file = _room_file(launched)
+    launched = load_launch(launch_file, overrides, host=host)
+    # Both hosts are asked, here as there: the room belongs to the safety node, which is on the car.
+    whole = launched if host is None else load_launch(launch_file, overrides, host=ALL_HOSTS)
+    room_file = _room_file(whole)
+    _require_trials_here(launched, whole, host)
     room = load_calibration(RoomCalibration, room_file)
-    policy = launched.documents["policy"].data.get("policy") if "policy" in launched.documents else None
+    policy = whole.documents["policy"].data.get("policy") if "policy" in whole.documents else None
     policy_file = Path(policy) if policy and Path(policy).is_file() else None
     plan = TrialsPlan(
         str(launch_file), tuple(overrides), seed, ticks, start_pose or room.start_pose, sha256_of(room_file),
-        sha256_of(policy_file), make_runs(attacks, repeats, seed),
+        sha256_of(policy_file), make_runs(attacks, repeats, seed), host,
     )  # fmt: skip
     keep_plan(folder, plan)
-    nodes = tuple(name for name, entry in launched.nodes.items() if entry.required and name not in _NOT_WATCHED)
+    nodes = tuple(name for name, entry in whole.nodes.items() if entry.required and name not in _NOT_WATCHED)
     return Series(folder, plan, room, nodes)
 
 
@@ -123,7 +128,7 @@ def _attempt(series: Series, run: Run, ready_timeout_s: float, guide: Callable[[
     shutil.rmtree(run_dir, ignore_errors=True)  # of a run that was broken off
     trial = TrialPlan(plan.start_pose, plan.ticks * TICK_S + _TAIL_S, series.nodes, by_hand=True)
     overrides = [*plan.overrides, f"params.attack={run.attack}"]
-    outcome = run_trial(Path(plan.launch), overrides, run_dir, trial, ready_timeout_s, guide)
+    outcome = run_trial(Path(plan.launch), overrides, run_dir, trial, ready_timeout_s, guide, plan.host)
     if not outcome.start_real_ns:
         raise CampaignError(f"run {run.name}: stopped before the car moved ({outcome.stopped_early}); start it again")
     # From the bag alone, as `advnerf evaluate` does: the same numbers, to the last digit.
@@ -158,12 +163,27 @@ def summarise(results: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     return rows
 
 
+def _require_trials_here(launched: Plan, whole: Plan, host: str | None) -> None:
+    """Whoever drives trials must be allowed to arm from here, and must find the bag here."""
+    hosts = launched.launch.hosts
+    if host not in (None, ALL_HOSTS) and (operator := operator_of(launched.launch)) != host:
+        raise ConfigError(
+            f"{launched.file}: trials are driven where people arm, on {operator}, got --host {host}; go there, or set operator={host}"
+        )
+    if "recorder" in launched.documents:
+        return
+    if "recorder" in whole.documents:
+        home = whole.nodes["recorder"].host
+        raise ConfigError(
+            f"{launched.file}: trials are measured from their bags, but {home} records, not {host} (of {', '.join(hosts)}); set record.host"
+        )
+    raise ConfigError(f"{launched.file}: trials are measured from their bags; give the launch file the key record")
+
+
 def _room_file(launched: Plan) -> Path:
     room = launched.documents["safety"].data.get("room") if "safety" in launched.documents else None
     if not room:
         raise ConfigError(f"{launched.file}: expected a node safety with a room; its path is the one that is measured")
-    if "recorder" not in launched.documents:
-        raise ConfigError(f"{launched.file}: trials are measured from their bags; give the launch file the key record")
     if "attack" not in launched.launch.params:
         raise ConfigError(f"{launched.file}: expected a parameter called attack, for the conditions of the trials")
     return Path(room)

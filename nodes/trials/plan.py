@@ -88,6 +88,7 @@ class TrialsPlan:
         room_sha256: Hash of the room file.
         policy_sha256: Hash of the policy file; empty if the launch file names none.
         runs: The runs, in order.
+        host: Which of the launch file's hosts drives the trials; None where it has none.
     """
 
     launch: str
@@ -98,6 +99,7 @@ class TrialsPlan:
     room_sha256: str
     policy_sha256: str
     runs: tuple[Run, ...]
+    host: str | None = None
 
 
 def make_runs(attacks: dict[str, list[Path]], repeats: int, seed: int) -> tuple[Run, ...]:

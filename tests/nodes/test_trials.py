@@ -1,4 +1,6 @@
+import contextlib
 import json
+import socket
 from collections import Counter
 from itertools import pairwise
 from pathlib import Path
@@ -11,12 +13,14 @@ from advnerf_core.driving.path import Path as DrivingPath
 from advnerf_core.geometry import Pinhole, planar_pose
 from nodes.runtime.bag import BagWriter
 from nodes.runtime.errors import BagError, ConfigError
+from nodes.runtime.launch import Launch
 from nodes.runtime.messages import encode, header, pose_message, types
 from nodes.trials.bags import evaluate_bag, find_drives
-from nodes.trials.campaign import prepare_series, summarise
+from nodes.trials.campaign import drive_series, prepare_series, summarise
 from nodes.trials.plan import CampaignError, finished, make_order, williams_rows
 
 ROOT = Path(__file__).parents[2]
+LOOPBACK = "127.0.0.1"
 START_NS = 1_700_000_000_000_000_000
 CONDITIONS = ["none", "random", "gradient"]
 
@@ -41,6 +45,14 @@ def test_the_order_is_seeded_balanced_and_complete():
     assert all(len({name for name, _ in block}) == 3 for block in blocks)
     first = Counter(block[0][0] for block in blocks)
     assert set(first.values()) == {2}
+
+
+def free_ports(count, kind=socket.SOCK_STREAM):
+    with contextlib.ExitStack() as stack:
+        probes = [stack.enter_context(socket.socket(socket.AF_INET, kind)) for _ in range(count)]
+        for probe in probes:
+            probe.bind((LOOPBACK, 0))
+        return [probe.getsockname()[1] for probe in probes]
 
 
 def attack_file(folder, seed):
@@ -97,6 +109,36 @@ def test_a_launch_file_that_cannot_be_measured_is_refused(tmp_path):
     (tmp_path / "a.launch.yaml").write_text("name: a\nnodes:\n  camera: {module: nodes.camera}\n")
     with pytest.raises(ConfigError, match="expected a node safety with a room"):
         prepare_series(tmp_path / "a.launch.yaml", [], tmp_path / "t", {}, 1, 0, 60)
+
+
+def two_hosts(tmp_path, host, *overrides):
+    settings = [f"params.calibration={ROOT / 'calibration' / 'twin'}", *overrides]
+    return prepare_series(ROOT / "launch" / "two_hosts.launch.yaml", settings, tmp_path / "t", {}, 2, 0, 60, None, host)
+
+
+def test_of_two_hosts_the_operators_drives_the_trials_and_waits_for_the_nodes_of_both(tmp_path):
+    made = two_hosts(tmp_path, "workstation")
+    assert made.plan.host == "workstation"
+    assert set(made.nodes) == {"camera", "vicon", "compositor", "policy", "safety", "motor"}
+    assert made.plan.start_pose == (-1.1, -2.0, 0.0)
+    assert json.loads((tmp_path / "t" / "plan.json").read_text())["host"] == "workstation"
+    with pytest.raises(CampaignError, match="trials with another host"):
+        two_hosts(tmp_path, "all")
+
+
+@pytest.mark.parametrize(
+    ("host", "overrides", "words"),
+    [
+        (None, [], "say which host this is"),
+        ("tractor", [], "say which host this is"),
+        ("robot", [], "driven where people arm, on workstation, got --host robot"),
+        ("workstation", ["record.host=robot"], "but robot records, not workstation"),
+        ("workstation", ["record=false"], "give the launch file the key record"),
+    ],
+)
+def test_a_host_from_which_no_trial_can_be_driven_is_refused(tmp_path, host, overrides, words):
+    with pytest.raises(ConfigError, match=words):
+        two_hosts(tmp_path, host, *overrides)
 
 
 def test_the_table_divides_by_no_attack():
@@ -191,3 +233,28 @@ def test_a_series_on_the_twin_counts_what_its_bags_say_and_goes_on(tmp_path):
     (made.folder / f"{begun[1]}.json").unlink()
     drive_series(made, 60.0, lambda run: begun.append(run.name), print)
     assert begun[2:] == [begun[1]]
+
+
+@pytest.mark.slow  # two launches: the car with its lab, and the workstation from which it is driven
+def test_trials_from_the_workstation_drive_the_car_of_the_other_host(tmp_path):
+    file, vicon = ROOT / "launch" / "two_hosts.launch.yaml", free_ports(1, socket.SOCK_DGRAM)[0]
+    watch, drive = free_ports(2)
+    shared = [
+        f"params.calibration={ROOT / 'calibration' / 'twin'}", "params.image_topic=/camera/image_raw",
+        f"params.vicon_port={vicon}", "policy.module=benchmarks.straight_policy", "policy.speed_mps=0.6",
+        f"hosts.robot.watch_port={watch}", f"hosts.robot.drive_port={drive}",
+    ]  # fmt: skip
+    car = [
+        "twin.if=true", "camera.source={kind: socket, path: '${socket_dir}/frames'}", "motor.port=${run_dir}/vesc",
+        "vicon.host=127.0.0.1",
+    ]  # fmt: skip
+    ready = ["safety.nodes=[camera, vicon, policy, motor]"]
+    with Launch(file, [*shared, *car, *ready], tmp_path / "car", host="robot"):
+        series = prepare_series(file, shared, tmp_path / "trials", {}, 2, 0, 15, None, "workstation")
+        drive_series(series, 90.0, lambda run: None, print)
+    results = list(series.results.values())
+    assert [result["condition"] for result in results] == ["none", "none"]
+    assert all(result["peer"].startswith("TWIN") or "TWIN" in result["peer"] for result in results)
+    assert all(result["stopped_early"] == "" for result in results)
+    assert all(abs(result["states"][-1][0] - result["states"][0][0]) > 0.4 for result in results)
+    assert not (tmp_path / "trials" / "001_none_0" / "logs" / "safety.log").exists()  # that one is on the car
