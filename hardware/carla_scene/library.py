@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
+from collections.abc import Iterator
 from typing import Any
 
-from hardware.carla_scene.errors import CarlaNotInstalled
+from hardware.carla_scene.errors import CarlaError, CarlaNotInstalled, CarlaUnreachable
 
 
 def load_carla() -> Any:
@@ -20,4 +22,22 @@ def load_carla() -> Any:
         raise CarlaNotInstalled(
             f"expected the Python package carla, it cannot be imported ({error}): pip install 'advnerf[carla]' (x86-64, "
             "Python 3.10 to 3.12), of the same version as the server"
+        ) from error
+
+
+@contextlib.contextmanager
+def server_answers(doing: str) -> Iterator[None]:
+    """Turn what the library raises when the server does not answer (a bare ``RuntimeError``) into `CarlaUnreachable`.
+
+    Args:
+        doing: What the server was asked for, for the message.
+    """
+    try:
+        yield
+    except CarlaError:
+        raise
+    except RuntimeError as error:
+        raise CarlaUnreachable(
+            f"the CARLA server did not answer to {doing}: {error}; is it still running? Another client that ticks, or a map that still "
+            "loads, looks the same"
         ) from error
