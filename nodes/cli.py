@@ -18,6 +18,7 @@ from nodes import (
     cli_bag,
     cli_calibrate,
     cli_camera,
+    cli_campaign,
     cli_keys,
     cli_motor,
     cli_node,
@@ -54,6 +55,7 @@ cli_node.add_to(app)
 app.add_typer(cli_motor.app, name="motor")
 app.add_typer(cli_calibrate.app, name="calibrate")
 app.add_typer(cli_camera.app, name="camera")
+app.add_typer(cli_campaign.app, name="campaign")
 cli_attack_node.add_to(cli_attack.app)
 app.add_typer(cli_attack.app, name="attack")
 app.add_typer(cli_object.app, name="object")

@@ -17,6 +17,7 @@ from advnerf_core.attack.artifact import AttackFile, face_texture, save_attack
 from advnerf_core.attack.baselines import random_search
 from advnerf_core.attack.displayed import DisplayedSensor
 from advnerf_core.attack.optimise import gradient_attack
+from advnerf_core.attack.population import CrossEntropy, population_search
 from advnerf_core.attack.search import Evaluation, SearchResult, draw_start_states
 from advnerf_core.driving.policy import LoadedPolicy, load_policy
 from advnerf_core.files import write_atomically
@@ -28,8 +29,11 @@ from nodes.experiment.scene import load_background, scene_sha256
 from nodes.experiment.screen import shown
 from nodes.runtime.stages import Report, hash_of
 
-Method = Literal["random", "gradient"]
-METHODS: tuple[Method, ...] = ("random", "gradient")
+Method = Literal["random", "cem", "gradient"]
+METHODS: tuple[Method, ...] = (
+    "random",
+    "gradient",
+)  # of an experiment; a campaign compares with the cross-entropy method too
 
 
 @dataclass(frozen=True)
@@ -89,7 +93,7 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
     plan = searches(experiment)
     for victim in victims(experiment):
         for seed in experiment.config.attack.seeds:
-            _drive_without_attack(experiment, bare, victim, seed, folder)
+            drive_without_attack(experiment, bare, victim, seed, folder)
     for index, search in enumerate(plan):
         if (folder / f"{search.name}.json").exists():
             continue
@@ -97,7 +101,7 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
         def progress(fraction: float, text: str = "", index: int = index, search: Search = search) -> None:
             report((index + fraction) / len(plan), f"{search.victim} {search.method} seed {search.seed}: {text}")
 
-        _search(experiment, attacked, search, folder, progress)
+        run_search(experiment, attacked, search, folder, progress)
 
 
 def sensor_of(experiment: Experiment, surrogate: Surrogate) -> Surrogate | DisplayedSensor:
@@ -123,7 +127,8 @@ def measured(experiment: Experiment, problem: AttackProblem) -> AttackProblem:
     return replace(problem, steps=experiment.config.horizon)
 
 
-def _drive_without_attack(experiment: Experiment, bare: Surrogate, victim: str, seed: int, folder: Path) -> None:
+def drive_without_attack(experiment: Experiment, bare: Surrogate, victim: str, seed: int, folder: Path) -> None:
+    """Drive in the learned scene without attack; leaves a JSON of the drives."""
     policy = load_policy(victim_file(experiment, victim))
     problem = measured(experiment, attack_problem(experiment, bare, policy, seed))
     rollout, totals = evaluate(problem, torch.zeros(bare.theta_shape))
@@ -131,13 +136,14 @@ def _drive_without_attack(experiment: Experiment, bare: Surrogate, victim: str, 
     write_atomically(folder / f"{victim}_none_{seed}.json", json.dumps(drives) + "\n")
 
 
-def _search(
+def run_search(
     experiment: Experiment,
     surrogate: Surrogate | DisplayedSensor,
     search: Search,
     folder: Path,
     progress: Callable[..., None],
 ) -> None:
+    """One search; leaves its attack file and a JSON of surrogate drives, and goes on from its state file if it was stopped."""
     attack = experiment.config.attack
     policy = load_policy(victim_file(experiment, search.victim))
     problem = attack_problem(experiment, surrogate, policy, search.seed)
@@ -157,6 +163,8 @@ def _search(
     }  # fmt: skip
     if search.method == "gradient":
         result = gradient_attack(problem, attack.iterations, attack.learning_rate, **common)
+    elif search.method == "cem":
+        result = population_search(problem, CrossEntropy(), attack.random_evaluations, **common)
     else:
         result = random_search(problem, attack.random_evaluations, attack.random_sigma, **common)
     attack_id = save_attack(attack_path(folder, search), _attack_file(experiment, policy, search, result))

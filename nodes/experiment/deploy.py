@@ -23,7 +23,7 @@ from nodes.runtime.stages import Report
 from nodes.trial import TrialPlan
 from nodes.trial_runner import run_trial
 
-Condition = Literal["none", "random", "gradient", "empty", "laps"]
+Condition = Literal["none", "random", "cem", "gradient", "empty", "laps"]
 # The absent board or monitor of the empty scene stands outside the room, out of every camera's sight.
 _OUT_OF_SIGHT_M = 60.0
 
@@ -70,7 +70,8 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
         report(index / len(plan), f"{live.victim} {live.condition} seed {live.seed}")
         if not (folder / f"{live.name}.json").exists():
             shutil.rmtree(folder / live.name, ignore_errors=True)
-            _drive(experiment, live, folder)
+            attack = _attack_file(experiment, live) if live.condition in METHODS else None
+            drive_live(experiment, live, folder, attack)
 
 
 def _check_frozen(experiment: Experiment) -> None:
@@ -82,12 +83,15 @@ def _check_frozen(experiment: Experiment) -> None:
         )
 
 
-def _drive(experiment: Experiment, live: LiveRun, folder: Path) -> None:
+def drive_live(experiment: Experiment, live: LiveRun, folder: Path, attack: Path | None) -> None:
+    """Drive one run through the node graph, with an attack file or none; leaves its bag and a JSON of what was measured in it."""
     deploy = experiment.config.deploy
     horizon = live_horizon(experiment, live)
     plan = TrialPlan(experiment.room.start_pose, horizon.ticks * horizon.dt_s + 0.2, deploy.nodes)
     run_dir = folder / live.name
-    outcome = run_trial(experiment.launch_file, _overrides(experiment, live), run_dir, plan, deploy.ready_timeout_s)
+    outcome = run_trial(
+        experiment.launch_file, _overrides(experiment, live, attack), run_dir, plan, deploy.ready_timeout_s
+    )
     bag = run_dir / "bag"
     states = trajectory(bag, outcome.start_real_ns, horizon)
     stopped_s = (outcome.end_real_ns - outcome.start_real_ns) / NS_PER_S if outcome.stopped_early else None
@@ -96,7 +100,7 @@ def _drive(experiment: Experiment, live: LiveRun, folder: Path) -> None:
     last_frame_ns = outcome.end_real_ns - round(CONTROL_PERIOD_S * NS_PER_S)
     times = timing(bag, outcome.start_real_ns, last_frame_ns)
     drawn = sorted(attack_ids(bag))
-    _check_drawn(experiment, live, drawn)
+    _check_drawn(live, drawn, attack)
     result: dict[str, Any] = {
         "victim": live.victim, "condition": live.condition, "seed": live.seed, "attack_ids": drawn,
         "outcome": outcome.to_dict(), "states": held.tolist(),
@@ -119,7 +123,7 @@ def live_horizon(experiment: Experiment, live: LiveRun) -> Horizon:
     return Horizon(ticks, CONTROL_PERIOD_S, experiment.room.off_track_m)
 
 
-def _overrides(experiment: Experiment, live: LiveRun) -> list[str]:
+def _overrides(experiment: Experiment, live: LiveRun, attack: Path | None) -> list[str]:
     policy = victim_file(experiment, live.victim)
     calibration = experiment.calibration_file("camera").parent
     overrides = [
@@ -134,8 +138,8 @@ def _overrides(experiment: Experiment, live: LiveRun) -> list[str]:
             f"monitor.plain_rgb={json.dumps(experiment.config.object.plain_rgb)}",
             f"monitor.face_m={experiment.face_m}",
         ]
-    if live.condition in METHODS:
-        overrides.append(f"params.attack={_attack_file(experiment, live)}")
+    if attack is not None:
+        overrides.append(f"params.attack={attack}")
     if live.condition == "empty":
         overrides.append(f"twin.lab.{experiment.config.object.target}.x_m={_OUT_OF_SIGHT_M}")
     return overrides
@@ -153,7 +157,7 @@ def _attack_file(experiment: Experiment, live: LiveRun) -> Path:
     return attack_path(experiment.stage_folder("attack"), Search(live.victim, live.condition, live.seed))
 
 
-def _check_drawn(experiment: Experiment, live: LiveRun, drawn: list[str]) -> None:
-    expected = [load_attack(_attack_file(experiment, live)).attack_id] if live.condition in METHODS else []
+def _check_drawn(live: LiveRun, drawn: list[str], attack: Path | None) -> None:
+    expected = [load_attack(attack).attack_id] if attack is not None else []
     if drawn != expected:
         raise RuntimeFault(f"expected the attacks {expected} in the frames of run {live.name}, got {drawn}")

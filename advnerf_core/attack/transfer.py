@@ -1,0 +1,142 @@
+"""A prediction of how far an attack drives the car where it is deployed, before it is deployed.
+
+Model. On held-out real views the object is composed into the picture, and the policy is asked with and without it. That gives the share
+``r`` of the attack's effect on the steering that survives in real pictures, its residuals, and the disagreement ``d = learned - real`` of
+the steering on views without the attack. Then the loop is driven in the surrogate with a steering as a real picture would give it::
+
+    u_t = pi(plain_t) - d_t + r (pi(attacked_t) - pi(plain_t)) + e_t
+
+where ``d`` and ``e`` are drawn from what was measured, in blocks of neighbouring views, as errors along a path are alike from tick to tick
+(block bootstrap, Kunsch 1989). Several draws give a distribution of the total CTE. The baseline without attack is predicted alike, so that
+a ratio is predicted too. What the model does not know: delay, slew and gain of the deployed car, and states far from the held-out views.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from advnerf_core.attack.problem import AttackProblem
+from advnerf_core.driving.metrics import Horizon, drive_metrics
+from advnerf_core.driving.rollout import drive
+from advnerf_core.scene.fidelity import Agreement, Effect
+
+Floats = NDArray[np.float64]
+_BLOCK = 8
+
+
+class Scene(Protocol):
+    """Pictures with or without the attack from the same states."""
+
+    def __call__(self, states: Tensor, attacked: bool) -> Tensor:
+        """Images ``[B, 3, H, W]`` seen from states ``[B, n]``."""
+
+
+@dataclass(frozen=True)
+class TransferPrediction:
+    """Total CTE to be expected where an attack is deployed.
+
+    Attributes:
+        attacked_m: Of each draw, with the attack [m].
+        none_m: Of each draw, without [m].
+        retained: Share of the effect on the steering that survives in real pictures.
+    """
+
+    attacked_m: tuple[float, ...]
+    none_m: tuple[float, ...]
+    retained: float
+
+    @property
+    def ratio(self) -> float:
+        """Expected ratio to no attack: of the means over the draws."""
+        return float(np.mean(self.attacked_m) / np.mean(self.none_m))
+
+    @property
+    def ratio_band(self) -> tuple[float, float]:
+        """Ratios of the 10 % and 90 % quantiles of the attacked draws to the mean without attack."""
+        low, high = np.quantile(self.attacked_m, (0.1, 0.9)) / np.mean(self.none_m)
+        return float(low), float(high)
+
+    def record(self) -> dict[str, Any]:
+        """JSON-ready values."""
+        low, high = self.ratio_band
+        return {
+            "ratio": self.ratio, "ratio_low": low, "ratio_high": high, "retained": self.retained, "draws": len(self.attacked_m),
+            "total_cte_m": float(np.mean(self.attacked_m)), "none_total_cte_m": float(np.mean(self.none_m)),
+        }  # fmt: skip
+
+
+def predict_transfer(
+    problem: AttackProblem, images: Scene, clean: Agreement, effect: Effect, start: Tensor, horizon: Horizon,
+    draws: int = 12, seed: int = 0,
+) -> TransferPrediction:  # fmt: skip
+    """Predict deployed drives with and without an attack.
+
+    Args:
+        problem: Policy, dynamics, path, goals and limits; its start states are not used.
+        images: What the surrogate shows.
+        clean: Agreement of the steering on held-out views without attack, in the order of the path.
+        effect: Effect of this attack on the same views.
+        start: Start state ``[n]`` of the deployed drive.
+        horizon: Over which a drive is measured.
+        draws: Drives of each kind.
+        seed: Of what is drawn.
+
+    Returns:
+        The prediction.
+    """
+    if draws < 2:
+        raise ValueError(f"expected at least two draws, got {draws}")
+    rng = np.random.default_rng(seed)
+    disagreement = _blocks(clean.difference, horizon.ticks, draws, rng)
+    residual = _blocks(effect.residual, horizon.ticks, draws, rng)
+    starts = start.expand(draws, -1).contiguous()
+    goals = None if problem.goals is None else problem.goals[:1].expand(draws, -1)
+    totals = {}
+    for attacked in (True, False):
+        share = effect.retained if attacked else 0.0
+        noise = torch.from_numpy(residual - disagreement if attacked else -disagreement)
+        policy = _AsDeployed(problem.policy, images, share, noise, attacked)
+        rollout = drive(policy, lambda states: states, problem.dynamics, starts, horizon.ticks, goals)
+        totals[attacked] = _totals(problem, rollout.states, horizon)
+    return TransferPrediction(totals[True], totals[False], effect.retained)
+
+
+def _blocks(values: Floats, ticks: int, draws: int, rng: np.random.Generator) -> Floats:
+    """Blocks of neighbouring values, one after the other, ``[ticks, draws]``."""
+    length = min(_BLOCK, len(values))
+    starts = rng.integers(0, len(values) - length + 1, (draws, -(-ticks // length)))
+    indices = (starts[..., None] + np.arange(length)).reshape(draws, -1)[:, :ticks]
+    return np.ascontiguousarray(values[indices].T)
+
+
+class _AsDeployed:
+    """The policy as `drive` sees it: its image is the state itself, from which it looks with and without the attack."""
+
+    stateless = True
+
+    def __init__(self, policy: Any, images: Scene, share: float, noise: Tensor, attacked: bool) -> None:
+        self._policy, self._images, self._share, self._noise, self._attacked = policy, images, share, noise, attacked
+        self._tick = 0
+
+    def __call__(self, images: Tensor, goals: Tensor | None = None) -> Tensor:
+        plain = self._policy(self._images(images, False), goals)
+        steering = plain
+        if self._attacked:
+            steering = plain + self._share * (self._policy(self._images(images, True), goals) - plain)
+        self._tick += 1
+        return torch.as_tensor(steering + self._noise[self._tick - 1].to(steering.dtype))
+
+
+def _totals(problem: AttackProblem, states: Tensor, horizon: Horizon) -> tuple[float, ...]:
+    found, limits = [], replace(horizon, held_cap_m=problem.held_cap_m)
+    for one in states.double().transpose(0, 1).numpy():
+        outside = np.flatnonzero((np.abs(one[:, :2]) > (problem.fence_m or np.inf)).any(axis=1))
+        stopped = int(outside[0]) if outside.size else None
+        found.append(drive_metrics(problem.path, one, limits, stopped).total_cte_m)
+    return tuple(found)

@@ -1,0 +1,125 @@
+"""One cell of a campaign: a scenario, a victim, a method and a seed, with its drives in the surrogate and where it is deployed."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from advnerf_core.errors import AdvnerfError
+
+NONE = "none"
+Metres = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
+
+
+class CellError(AdvnerfError, ValueError):
+    """A cell's file is not what a cell's file is."""
+
+
+class Drives(BaseModel):
+    """The drives of one cell in one domain, one entry per start pose.
+
+    Attributes:
+        total_cte_m: Total CTE of each drive [m].
+        off_track: Whether each left its track.
+        none_total_cte_m: Total CTE of each start without attack, in the same domain [m].
+    """
+
+    model_config = ConfigDict(extra="allow", frozen=True)
+
+    total_cte_m: tuple[Metres, ...] = Field(min_length=1)
+    off_track: tuple[bool, ...]
+    none_total_cte_m: tuple[Metres, ...] = Field(min_length=1)
+
+    @model_validator(mode="after")
+    def _of_one_length(self) -> Drives:
+        counts = (len(self.off_track), len(self.none_total_cte_m))
+        if any(count != len(self.total_cte_m) for count in counts):
+            raise ValueError(
+                f"expected one off_track and one none_total_cte_m for each of {len(self.total_cte_m)} drives, got {counts[0]} and {counts[1]}"
+            )
+        return self
+
+    @property
+    def mean_m(self) -> float:
+        """Mean total CTE over the drives [m]."""
+        return sum(self.total_cte_m) / len(self.total_cte_m)
+
+
+class CellResult(BaseModel):
+    """What a finished cell found.
+
+    Attributes:
+        scenario: straight, right, left, green_screen, monitor or another.
+        victim: ``hardened`` or ``naive``.
+        method: ``none``, ``random``, ``cem`` or ``gradient``.
+        seed: Seed of starts and search.
+        placement: Name of the placement; empty for the scenario's own.
+        attack_id: Id of the attack file; None for none.
+        settings_hash: Hash of everything that the result depends on.
+        seconds: Time it took [s].
+        machine: Where.
+        date: When, ISO.
+        surrogate: Drives in the learned scene.
+        deployed: Drives where it is deployed; None as long as they were not driven.
+        extra: Anything else, such as the file of a clip.
+    """
+
+    model_config = ConfigDict(extra="allow", frozen=True)
+
+    scenario: str = Field(min_length=1)
+    victim: str = Field(min_length=1)
+    method: str = Field(min_length=1)
+    seed: int
+    placement: str = ""
+    attack_id: str | None = None
+    settings_hash: str
+    seconds: Annotated[float, Field(ge=0.0)]
+    machine: str
+    date: str
+    surrogate: Drives
+    deployed: Drives | None = None
+    extra: dict[str, Any] = Field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        """Name of the cell and of its file."""
+        return cell_name(self.scenario, self.victim, self.method, self.seed, self.placement)
+
+
+def cell_name(scenario: str, victim: str, method: str, seed: int, placement: str = "") -> str:
+    """Name of a cell, e.g. ``straight_hardened_gradient_0`` or ``straight.near_hardened_gradient_0``."""
+    where = f"{scenario}.{placement}" if placement else scenario
+    return f"{where}_{victim}_{method}_{seed}"
+
+
+def cell_from(data: Any, source: str) -> CellResult:
+    """A cell of JSON values; ``source`` is what the error calls it."""
+    try:
+        return CellResult.model_validate(data)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        where = ".".join(map(str, first["loc"])) or "the whole"
+        raise CellError(
+            f"{source}: not a campaign's cell: {where}: {first['msg']}; remove it to run the cell again"
+        ) from None
+
+
+def read_cell(path: Path) -> CellResult:
+    """Read one cell's file.
+
+    Raises:
+        CellError: It is not there, not JSON, or not a cell's.
+    """
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise CellError(f"{path}: cannot be read: {error}; remove it to run the cell again") from None
+    return cell_from(data, str(path))
+
+
+def read_cells(folder: Path) -> list[CellResult]:
+    """All cells of a folder, in the order of their names."""
+    return [read_cell(path) for path in sorted(folder.glob("*.json"))]

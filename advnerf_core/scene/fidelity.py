@@ -1,0 +1,176 @@
+"""The fidelity gate: is a surrogate good enough that attacks found in it mean something where they are deployed?
+
+Two questions are asked of pictures alone, before anything is deployed. Do learned and real pictures of one place look alike (PSNR, SSIM),
+and does the policy steer alike on them? And, with an attack: does the object move the steering in the real picture as it does in the
+learned one (the *effect*: steering with the attack minus steering without, on the same view)? From the second follows a prediction of
+transfer, see `advnerf_core/attack/transfer.py`. Nothing here has seen a deployed drive with the attack.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+from advnerf_core.scene.metrics import psnr, ssim
+
+Floats = NDArray[np.float64]
+Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+
+
+class GateLimits(BaseModel):
+    """What a surrogate must reach; the first two follow the targets of the room's experiment."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    psnr_db: Positive = Field(default=25.0, description="Least mean PSNR at the policy's size [dB].")
+    ssim: Annotated[float, Field(ge=0.0, le=1.0)] = Field(
+        default=0.8, description="Least mean SSIM at the policy's size."
+    )
+    steering: Positive = Field(
+        default=0.03,
+        description="Greatest mean steering difference [rad], or turn-rate difference [rad/s] for a Dubins car.",
+    )
+    correlation: Annotated[float, Field(ge=-1.0, le=1.0)] = Field(
+        default=0.8, description="Least correlation of the steering on learned and real pictures."
+    )
+    views: Annotated[int, Field(ge=3)] = Field(default=10, description="Fewer pictures than this decide nothing.")
+
+
+@dataclass(frozen=True, eq=False)
+class Agreement:
+    """Learned against real pictures of the same places, as the policy sees them.
+
+    Attributes:
+        psnr_db: PSNR of each view [dB].
+        ssim: SSIM of each view.
+        real: Steering on each real picture.
+        learned: Steering on each learned one.
+    """
+
+    psnr_db: Floats
+    ssim: Floats
+    real: Floats
+    learned: Floats
+
+    def __post_init__(self) -> None:
+        shapes = {np.shape(values) for values in (self.psnr_db, self.ssim, self.real, self.learned)}
+        if len(shapes) != 1 or len(next(iter(shapes))) != 1 or not len(self.real):
+            raise ValueError(f"expected one number per view in each, got shapes {sorted(shapes)}")
+        if not all(np.isfinite(values).all() for values in (self.ssim, self.real, self.learned)):
+            raise ValueError("expected finite similarity and steering; a policy or picture is broken")
+
+    @property
+    def difference(self) -> Floats:
+        """Steering on the learned picture minus that on the real one, per view."""
+        return self.learned - self.real
+
+    @property
+    def correlation(self) -> float:
+        """Pearson's correlation of the steering; 1 where both are constant and equal, 0 where one is constant."""
+        if np.ptp(self.real) == 0.0 or np.ptp(self.learned) == 0.0:
+            return 1.0 if np.array_equal(self.real, self.learned) else 0.0
+        return float(np.corrcoef(self.real, self.learned)[0, 1])
+
+    def summary(self) -> dict[str, float | int]:
+        """Numbers for a page."""
+        return {
+            "views": len(self.real), "psnr_db": float(self.psnr_db.mean()), "ssim": float(self.ssim.mean()),
+            "steering": float(np.abs(self.difference).mean()), "steering_worst": float(np.abs(self.difference).max()),
+            "steering_bias": float(self.difference.mean()), "correlation": self.correlation,
+        }  # fmt: skip
+
+
+def agreement(
+    real: Sequence[Any], learned: Sequence[Any], steer_real: ArrayLike, steer_learned: ArrayLike
+) -> Agreement:
+    """Compare pictures.
+
+    Args:
+        real: Real pictures ``[H, W, 3]``, uint8 or 0..1, at the policy's size.
+        learned: Learned ones of the same places.
+        steer_real: The policy's output ``[N]`` on the real ones.
+        steer_learned: The same on the learned ones.
+    """
+    if len(real) != len(learned) or not len(real):
+        raise ValueError(f"expected as many learned as real pictures, and some, got {len(learned)} and {len(real)}")
+    pairs = list(zip(learned, real, strict=True))
+    return Agreement(
+        np.array([psnr(a, b) for a, b in pairs]), np.array([ssim(a, b) for a, b in pairs]),
+        np.asarray(steer_real, np.float64), np.asarray(steer_learned, np.float64),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What the gate says of one set of pictures.
+
+    Attributes:
+        passed: Whether attacks may go on.
+        reasons: What was not reached, in words; empty if all was.
+        numbers: What was measured.
+    """
+
+    passed: bool
+    reasons: tuple[str, ...]
+    numbers: dict[str, float | int]
+
+    def record(self) -> dict[str, Any]:
+        """JSON-ready values."""
+        return asdict(self)
+
+
+def judge(found: Agreement, limits: GateLimits, of: str = "held-out views") -> Verdict:
+    """Hold what was measured against the limits.
+
+    Args:
+        found: The comparison.
+        limits: What must be reached.
+        of: What was compared, for the reasons.
+    """
+    n = found.summary()
+    checks = (
+        (n["views"] >= limits.views, f"{n['views']} pictures, at least {limits.views} needed"),
+        (n["psnr_db"] >= limits.psnr_db, f"PSNR {n['psnr_db']:.2f} dB, at least {limits.psnr_db:g} needed: train the scene longer, or take more pictures"),
+        (n["ssim"] >= limits.ssim, f"SSIM {n['ssim']:.3f}, at least {limits.ssim:g} needed"),
+        (n["steering"] <= limits.steering, f"mean steering difference {n['steering']:.4f}, at most {limits.steering:g} allowed: train the policy on learned pictures too"),
+        (n["correlation"] >= limits.correlation, f"correlation of the steering {n['correlation']:.3f}, at least {limits.correlation:g} needed"),
+    )  # fmt: skip
+    reasons = tuple(f"{of}: {text}" for good, text in checks if not good)
+    return Verdict(not reasons, reasons, n)
+
+
+@dataclass(frozen=True, eq=False)
+class Effect:
+    """What an attack does to the steering on single views, learned and real.
+
+    Attributes:
+        learned: Steering with minus without the attack, on the learned picture of each view.
+        real: The same on the real picture, into which the object was composed.
+    """
+
+    learned: Floats
+    real: Floats
+
+    def __post_init__(self) -> None:
+        if np.ndim(self.learned) != 1 or np.shape(self.learned) != np.shape(self.real) or not len(self.real):
+            raise ValueError(
+                f"expected one effect per view, got shapes {np.shape(self.learned)} and {np.shape(self.real)}"
+            )
+        if not (np.isfinite(self.learned).all() and np.isfinite(self.real).all()):
+            raise ValueError("expected finite effects, got some that are not")
+
+    @property
+    def retained(self) -> float:
+        """Share of the effect that survives in real pictures: the slope of least squares through the origin; 0 without an effect."""
+        energy = float(self.learned @ self.learned)
+        return float(self.learned @ self.real) / energy if energy > 0.0 else 0.0
+
+    @property
+    def residual(self) -> Floats:
+        """What the share does not explain, per view."""
+        return self.real - self.retained * self.learned

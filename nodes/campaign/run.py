@@ -1,0 +1,226 @@
+"""Runs a campaign: prepares its experiments, then its cells, over cores or over a cluster; what is there and fits is not run again."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import joblib
+
+from nodes.campaign.config import Campaign, Cell, ScenarioConfig
+from nodes.campaign.kinds import load_kind, settings_hash
+from nodes.campaign.store import CellStatus, Store, store_of
+from nodes.campaign.worker import Ended, Job, run_in_process
+from nodes.runtime.errors import ConfigError, RuntimeFault
+from nodes.runtime.stages import Report
+
+Backend = Literal["local", "ray"]
+Say = Callable[[str], None]
+# How often cells are handed out again after a whole machine of a cluster was lost.
+_ROUNDS = 3
+
+
+@dataclass(frozen=True)
+class Options:
+    """How a campaign is run.
+
+    Attributes:
+        jobs: Cells at a time; 0 takes one per core, or the cores of the cluster.
+        threads: Threads per cell; 0 shares the cores among the jobs.
+        backend: ``local`` or ``ray``.
+        address: Of a running Ray cluster; empty takes the one in RAY_ADDRESS, or starts one here.
+        retry: Also run cells that failed before.
+    """
+
+    jobs: int = 0
+    threads: int = 0
+    backend: Backend = "local"
+    address: str = ""
+    retry: bool = False
+
+
+@dataclass(frozen=True)
+class Planned:
+    """A cell with its settings, as they are now.
+
+    Attributes:
+        cell: Which.
+        job: How it is run; without threads and phase.
+        live: Whether it drives a live graph.
+        searches: Whether it has a part that may run beside others.
+    """
+
+    cell: Cell
+    job: Job
+    live: bool
+    searches: bool
+
+
+def plan_cells(campaign: Campaign, cells: Sequence[Cell]) -> list[Planned]:
+    """Settings of every cell as they are; reads experiments and digests of their stages, prepares nothing."""
+    experiments: dict[tuple[str, str], Any] = {}
+    planned = []
+    for cell in cells:
+        scenario = campaign.scenario(cell)
+        kind = load_kind(scenario.kind)
+        key = (cell.scenario, cell.placement)
+        if key not in experiments:
+            experiments[key] = _experiment(campaign, cell)
+        inside = _inside(scenario, cell)
+        digest = settings_hash(kind, experiments[key], inside, cell.victim, cell.method, cell.seed)
+        job = Job(
+            str(campaign.folder), cell.name, scenario.kind, str(campaign.experiment_file(cell)), scenario.setting,
+            tuple(campaign.overrides(cell)), str(campaign.run_folder(cell)), inside, cell.scenario, cell.placement,
+            cell.victim, cell.method, cell.seed, digest, threads=1,
+        )  # fmt: skip
+        planned.append(Planned(cell, job, kind.live, kind.search_cell is not None))
+    return planned
+
+
+def statuses(campaign: Campaign, cells: Sequence[Cell]) -> list[CellStatus]:
+    """Where every cell is; one whose experiment cannot be read, as it is not made yet, is missing."""
+    store, found = store_of(campaign), []
+    for cell in cells:
+        try:
+            digest: str | None = plan_cells(campaign, [cell])[0].job.settings_hash
+        except ConfigError:
+            raise
+        except (RuntimeFault, OSError):
+            digest = None
+        found.append(store.status(cell, digest))
+    return found
+
+
+def run_campaign(campaign: Campaign, cells: Sequence[Cell], options: Options, say: Say) -> list[Ended]:
+    """Run the cells that are not there yet.
+
+    Args:
+        campaign: The campaign.
+        cells: Those of its cells that are wanted.
+        options: Over what, and how many at a time.
+        say: Told of every start and end.
+
+    Returns:
+        How every cell that was run ended, in the order of their ends.
+
+    Raises:
+        ConfigError: An experiment or a kind of scenario is wrong; nothing was run.
+    """
+    store = store_of(campaign)
+    _prepare(campaign, cells, say)
+    wanted = [each for each in plan_cells(campaign, cells) if _is_wanted(store, each, options, say)]
+    if not wanted:
+        say("nothing to do: every cell is there")
+        return []
+    jobs, threads = _shares(options)
+    say(f"{len(wanted)} of {len(cells)} cells to run, {jobs} at a time, {threads} threads each")
+    beside = [replace(each.job, threads=threads) for each in wanted if not each.live]
+    beside += [replace(each.job, threads=threads, phase="search") for each in wanted if each.live and each.searches]
+    ended = _run_beside(beside, jobs, options, say)
+    lost = {end.name for end in ended if end.how != "done"}
+    searched = {job.name for job in beside if job.phase == "search"}
+    ended = [end for end in ended if end.name not in searched or end.how != "done"]
+    # The live graphs have the machine to themselves, one after the other.
+    for each in wanted:
+        if each.live and each.cell.name not in lost:
+            ended.append(_tell(run_in_process(replace(each.job, threads=_cores())), say))
+    return ended
+
+
+def _inside(scenario: ScenarioConfig, cell: Cell) -> str:
+    return scenario.as_scenario or cell.scenario
+
+
+def _experiment(campaign: Campaign, cell: Cell) -> Any:
+    scenario = campaign.scenario(cell)
+    kind = load_kind(scenario.kind)
+    return kind.load(
+        campaign.experiment_file(cell), scenario.setting, campaign.overrides(cell), campaign.run_folder(cell)
+    )
+
+
+def _prepare(campaign: Campaign, cells: Sequence[Cell], say: Say) -> None:
+    done: set[Path] = set()
+    # All files are read before anything is made, so that a mistake in the last does not cost the hours of the first.
+    experiments = {(cell.scenario, cell.placement): (cell, _experiment(campaign, cell)) for cell in cells}
+    for cell, experiment in experiments.values():
+        folder = campaign.run_folder(cell)
+        if folder in done:
+            continue
+        done.add(folder)
+        say(f"{cell.scenario}{'.' * bool(cell.placement)}{cell.placement}: {folder}")
+        load_kind(campaign.scenario(cell).kind).prepare(experiment, _PrintedReport(say))
+
+
+class _PrintedReport(Report):
+    def __init__(self, say: Say) -> None:
+        self._say, self._text = say, ""
+
+    def __call__(self, fraction: float, text: str = "") -> None:
+        """Say what is new."""
+        if text and text != self._text:
+            self._text = text
+            self._say(f"  {100 * fraction:.0f} % {text}")
+
+
+def _is_wanted(store: Store, each: Planned, options: Options, say: Say) -> bool:
+    status = store.status(each.cell, each.job.settings_hash)
+    if status.state == "failed" and not options.retry:
+        say(f"{each.cell.name}: failed before, not run again without --retry: {status.text}")
+        return False
+    if status.state == "running":
+        say(f"{each.cell.name}: another process runs it")
+        return False
+    return status.state != "done"
+
+
+def _run_beside(jobs: list[Job], at_a_time: int, options: Options, say: Say) -> list[Ended]:
+    if not jobs:
+        return []
+    if options.backend == "local":
+        with joblib.parallel_config(backend="threading", n_jobs=at_a_time):
+            return _collect(jobs, say)
+    return _run_on_ray(jobs, at_a_time, options, say)
+
+
+def _collect(jobs: list[Job], say: Say) -> list[Ended]:
+    """Hand the jobs out to joblib's backend in force; tell of each as it ends."""
+    parallel = joblib.Parallel(return_as="generator_unordered", batch_size=1, pre_dispatch="all")
+    return [_tell(end, say) for end in parallel(joblib.delayed(run_in_process)(job) for job in jobs)]
+
+
+def _run_on_ray(jobs: list[Job], at_a_time: int, options: Options, say: Say) -> list[Ended]:
+    from nodes.campaign.cluster import collect_on_ray, ray_session
+
+    with ray_session(options.address, at_a_time) as cores:
+        say(f"Ray cluster with {cores} cores")
+        ended: list[Ended] = []
+        left = jobs
+        for _ in range(_ROUNDS):
+            ended += collect_on_ray(left, min(at_a_time, cores), lambda end: _tell(end, say))
+            finished = {end.name for end in ended}
+            left = [job for job in left if job.name not in finished]
+            if not left:
+                return ended
+            say(f"a machine of the cluster was lost: {len(left)} cells are handed out again")
+        text = "its machine was lost again and again; it goes on when the campaign is run again"
+        return ended + [_tell(Ended(job.name, "lost", text, 0.0), say) for job in left]
+
+
+def _tell(end: Ended, say: Say) -> Ended:
+    say(f"{end.name}: {end.how} after {end.seconds:.1f} s{': ' * bool(end.text)}{end.text}")
+    return end
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0))
+
+
+def _shares(options: Options) -> tuple[int, int]:
+    if options.jobs < 0 or options.threads < 0:
+        raise ConfigError(f"expected --jobs and --threads of at least 1, got {options.jobs} and {options.threads}")
+    jobs = options.jobs or (_cores() // options.threads if options.threads else _cores()) or 1
+    return jobs, options.threads or (max(1, _cores() // jobs) if options.backend == "local" else 1)

@@ -1,0 +1,300 @@
+"""Cells of a campaign on the simulated lab: one search in the learned room, one live drive through the node graph.
+
+A finished run folder of the same settings is taken as it is: its searches and live drives are cells already. Whatever it lacks (other seeds,
+the cross-entropy method, the naive victim's other seeds) is computed here, by the same code.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any, Literal, cast
+
+import numpy as np
+from pydantic import ValidationError
+
+from advnerf_core.attack.artifact import load_attack
+from advnerf_core.driving.metrics import Horizon
+from advnerf_core.report.clips import ClipTrack, write_clip
+from hardware.twin.config import LabConfig
+from nodes import evaluation
+from nodes.experiment import attack, deploy
+from nodes.experiment.config import ExperimentConfig
+from nodes.experiment.context import CONTROL_PERIOD_S, Experiment
+from nodes.experiment.objects import attacked_object, surrogate_of
+from nodes.experiment.run import load_experiment, run_experiment
+from nodes.experiment.scene import load_background
+from nodes.runtime.errors import ConfigError, RuntimeFault
+from nodes.runtime.launch_file import load_launch
+from nodes.runtime.stages import Report, hash_of, read_record
+from nodes.trials.campaign import COUNTED_STOPS
+
+__all__ = ["LIVE", "cell_inputs", "load_experiment", "prepare", "run_cell", "search_cell"]
+
+LIVE = True
+_VERSION = 1
+_NEEDED = ("capture", "scene", "policy", "object")
+# What each search may spend; the rest of the attack's settings concerns all of them.
+_SPENT_BY = {"none": (), "random": ("random_evaluations", "random_sigma"), "cem": ("random_evaluations",), "gradient": ("iterations", "learning_rate")}  # fmt: skip
+_TITLES = {"none": "no attack", "random": "best random", "cem": "cross-entropy", "gradient": "gradient"}
+
+
+class CellFault(RuntimeFault):
+    """A live drive of a cell was ended by a fault of the stack, so that it measures nothing."""
+
+
+@dataclass(frozen=True)
+class _Cell:
+    """One cell with its own seed in the experiment's settings, and where its parts are or will be."""
+
+    experiment: Experiment
+    victim: str
+    method: str
+    seed: int
+    folder: Path
+
+    @property
+    def search(self) -> attack.Search:
+        return attack.Search(self.victim, cast("attack.Method", self.method), self.seed)
+
+    def live(self, condition: str) -> deploy.LiveRun:
+        return deploy.LiveRun(self.victim, cast("deploy.Condition", condition), self.seed)
+
+    def searched_in(self, method: str) -> Path:
+        """Folder of the drives in the learned room: the run folder's, if it has them."""
+        taken = self.experiment.stage_folder("attack")
+        if _is_finished(taken) and (taken / f"{self.victim}_{method}_{self.seed}.json").exists():
+            return taken
+        return self.folder
+
+    def driven_in(self, condition: str) -> Path:
+        """Folder of a live drive; the drive without attack belongs to all methods."""
+        taken = self.experiment.stage_folder("deploy")
+        if self.searched_in(condition) != self.folder and (taken / f"{self.live(condition).name}.json").exists():
+            return taken
+        if condition != "none":
+            return self.folder
+        inputs = hash_of(cell_inputs(self.experiment, "", self.victim, "none", self.seed))
+        return self.folder.parent / "shared" / f"{self.experiment.config.name}_{self.live('none').name}_{inputs[:12]}"
+
+
+def prepare(experiment: Experiment, report: Report) -> None:
+    """Make room, scene, policies and object; a finished run folder of other settings is refused, never overwritten."""
+    if all(_is_finished(experiment.stage_folder(stage)) for stage in _NEEDED):
+        if changed := _changed(experiment):
+            raise ConfigError(
+                f"{experiment.folder} was made with another {', '.join(changed)} than {experiment.file.name} ({experiment.setting}) says; "
+                "name another run_folder in the campaign, or the changes under set"
+            )
+        return
+    report(0.0, f"making what its cells need: {', '.join(_NEEDED)}")
+    run_experiment(experiment, until=_NEEDED[-1])
+
+
+def cell_inputs(experiment: Experiment, scenario: str, victim: str, method: str, seed: int) -> dict[str, Any]:
+    """What the result of a cell depends on."""
+    del scenario, seed
+    _require_victim(experiment, victim)
+    config = experiment.config
+    searched = config.attack.model_dump(mode="json")
+    other = {key for keys in _SPENT_BY.values() for key in keys} - set(_SPENT_BY[method])
+    records = {stage: read_record(experiment.stage_folder(stage)) for stage in _NEEDED}
+    return {
+        "version": _VERSION, "horizon": config.horizon, "lab": experiment.lab_config.model_dump(mode="json"),
+        "object": config.object.model_dump(mode="json"),
+        "attack": {key: value for key, value in searched.items() if key not in {*other, "seeds"}},
+        "graph": load_launch(experiment.launch_file).resolved, "nodes": list(config.deploy.nodes),
+        "stages": {stage: record.digest if record else None for stage, record in records.items()},
+    }  # fmt: skip
+
+
+def search_cell(
+    experiment: Experiment, scenario: str, victim: str, method: str, seed: int, folder: Path, report: Report
+) -> None:
+    """The part of a cell that needs no live graph: drives without attack in the learned room, and the search."""
+    cell = _cell(experiment, scenario, victim, method, seed, folder)
+    wanted = [
+        each for each in ("none", method) if not (cell.searched_in(each) / f"{victim}_{each}_{seed}.json").exists()
+    ]
+    if not wanted:
+        return
+    background = load_background(cell.experiment)
+    if "none" in wanted:
+        bare = surrogate_of(cell.experiment, [], background)
+        attack.drive_without_attack(cell.experiment, bare, victim, seed, folder)
+    if method in wanted and method != "none":
+        surrogate = surrogate_of(cell.experiment, [attacked_object(cell.experiment)], background)
+        attack.run_search(cell.experiment, attack.sensor_of(cell.experiment, surrogate), cell.search, folder, report)
+
+
+def run_cell(
+    experiment: Experiment, scenario: str, victim: str, method: str, seed: int, folder: Path, report: Report
+) -> dict[str, Any]:
+    """The whole cell; see `advnerf_core.report.cells`. Goes on where it was stopped.
+
+    Raises:
+        CellFault: The stack stopped the live drive by a fault of its own.
+    """
+    search_cell(experiment, scenario, victim, method, seed, folder, report)
+    cell = _cell(experiment, scenario, victim, method, seed, folder)
+    found = _surrogate(cell)
+    report(0.9, "driving live")
+    none = _drive(cell, "none")
+    driven = none if method == "none" else _drive(cell, method)
+    deployed = {
+        "total_cte_m": [driven["total_cte_m"]], "off_track": [driven["off_track"]], "none_total_cte_m": [none["total_cte_m"]],
+    }  # fmt: skip
+    where = cell.driven_in(method)
+    extra: dict[str, Any] = {
+        "clip": _clip(cell, driven, where), "stopped_early": driven["outcome"]["stopped_early"],
+        "missed_frames": driven["missed"], "mean_abs_cte_m": driven["mean_abs_cte_m"], "time_to_leave_s": driven["time_to_leave_s"],
+    }  # fmt: skip
+    result = {**found, "deployed": deployed, "extra": extra}
+    if where == experiment.stage_folder("deploy"):
+        driven_at = (where / f"{cell.live(method).name}.json").stat().st_mtime
+        result["date"] = datetime.fromtimestamp(driven_at, timezone.utc).isoformat(timespec="seconds")
+        extra["taken_from"] = experiment.folder.name
+    return result
+
+
+def _cell(experiment: Experiment, scenario: str, victim: str, method: str, seed: int, folder: Path) -> _Cell:
+    del scenario
+    _require_victim(experiment, victim)
+    config = experiment.config.model_copy(
+        update={"attack": experiment.config.attack.model_copy(update={"seeds": (seed,)})}
+    )
+    cell = _Cell(replace(experiment, config=config), victim, method, seed, folder)
+    if cell.searched_in(method) != folder:
+        _require_same_attacks(cell.experiment)
+    return cell
+
+
+def _require_victim(experiment: Experiment, victim: str) -> None:
+    if victim not in attack.victims(experiment):
+        raise ConfigError(
+            f"expected one of the victims {', '.join(attack.victims(experiment))} of {experiment.file.name}, got {victim}; "
+            "set policy.naive_steps, or leave it out of the campaign"
+        )
+
+
+def _require_same_attacks(experiment: Experiment) -> None:
+    """The run folder's attacks must be those of these settings, on the scene and policies that are there now."""
+    then = json.loads((experiment.stage_folder("attack") / "frozen.json").read_text())
+    now = attack.frozen_hashes(experiment)
+    # Starts depend on the seed alone; which seeds the folder had, and hence this hash, does not matter here.
+    changed = [name for name in now if name not in ("config", "starts_and_seeds") and then.get(name) != now[name]]
+    old = _manifest_config(experiment)
+    ignored = {"seeds", "cache_mib"}
+    changed += [
+        f"attack.{name}"
+        for name, value in old.attack.model_dump().items()
+        if name not in ignored and getattr(experiment.config.attack, name) != value
+    ]
+    changed += ["horizon"] * (old.horizon != experiment.config.horizon)
+    if changed:
+        raise ConfigError(
+            f"the attacks in {experiment.folder} were found with another {', '.join(changed)}; name another run_folder in the campaign"
+        )
+
+
+def _manifest_config(experiment: Experiment) -> ExperimentConfig:
+    try:
+        manifest = json.loads((experiment.folder / "manifest.json").read_text())
+        return ExperimentConfig.model_validate(manifest["config"])
+    except (OSError, ValueError, KeyError, ValidationError) as error:
+        first = str(error).splitlines()[0]
+        raise ConfigError(
+            f"expected {experiment.folder}/manifest.json to say with which settings the folder was made, got: {first}; name another run_folder"
+        ) from None
+
+
+def _changed(experiment: Experiment) -> list[str]:
+    """What the run folder was made with that the experiment says otherwise; values that are new have their defaults."""
+    old, new = _manifest_config(experiment), experiment.config
+    changed = [
+        f"{section}.{name}"
+        for section in ("capture", "scene", "policy", "object")
+        for name, value in getattr(old, section).model_dump().items()
+        if getattr(getattr(new, section), name) != value
+    ]
+    lab = LabConfig.model_validate(old.lab).model_dump()
+    return changed + [f"lab.{name}" for name, value in experiment.lab_config.model_dump().items() if lab[name] != value]
+
+
+def _is_finished(folder: Path) -> bool:
+    record = read_record(folder)
+    return record is not None and record.digest is not None
+
+
+def _surrogate(cell: _Cell) -> dict[str, Any]:
+    name = f"{cell.victim}_{cell.method}_{cell.seed}.json"
+    drives = json.loads((cell.searched_in(cell.method) / name).read_text())
+    none_file = cell.searched_in("none") / f"{cell.victim}_none_{cell.seed}.json"
+    none = json.loads(none_file.read_text())
+    found = {
+        "attack_id": drives.get("attack_id"),
+        "surrogate": {
+            "total_cte_m": drives["total_cte_m"], "off_track": _off_track(cell.experiment, drives["states"]),
+            "none_total_cte_m": none["total_cte_m"],
+        },
+    }  # fmt: skip
+    return found | (
+        {"seconds": drives["seconds"]} if cell.searched_in(cell.method) != cell.folder and "seconds" in drives else {}
+    )
+
+
+def _off_track(experiment: Experiment, drives: Sequence[Any]) -> list[bool]:
+    horizon = Horizon(experiment.config.horizon, CONTROL_PERIOD_S, experiment.room.off_track_m)
+    fence_m = float(np.abs(np.array(experiment.room.fence_m)).min())
+    found = []
+    for drive in drives:
+        states = np.array(drive)[:, :3]
+        outside = np.flatnonzero((np.abs(states[:, :2]) > fence_m).any(axis=1))
+        stopped_s = float(outside[0]) * CONTROL_PERIOD_S if outside.size else None
+        found.append(bool(evaluation.score(states, experiment.path, horizon, stopped_s)[0].off_track))
+    return found
+
+
+def _drive(cell: _Cell, condition: str) -> dict[str, Any]:
+    """A live drive; driven if it is not there."""
+    folder, live = cell.driven_in(condition), cell.live(condition)
+    file = folder / f"{live.name}.json"
+    if not file.exists():
+        shutil.rmtree(folder / live.name, ignore_errors=True)  # of a drive that was broken off
+        shown = None if condition == "none" else attack.attack_path(cell.searched_in(condition), cell.search)
+        deploy.drive_live(cell.experiment, live, folder, shown)
+    driven: dict[str, Any] = json.loads(file.read_text())
+    stopped = driven["outcome"]["stopped_early"]
+    if stopped and not any(word in stopped for word in COUNTED_STOPS):
+        if folder != cell.experiment.stage_folder("deploy"):
+            file.unlink()
+        raise CellFault(
+            f"the stack stopped the live drive {live.name}: {stopped}; cure that, and run the campaign with --retry"
+        )
+    return driven
+
+
+def _clip(cell: _Cell, driven: dict[str, Any], where: Path) -> str | None:
+    """What the driving camera saw, as a clip beside the cell; None where the bag is gone."""
+    bag = where / cell.live(cell.method).name / "bag"
+    if not bag.exists():
+        return None
+    condition: Literal["none", "random", "gradient"] = "random" if cell.method == "cem" else cast("Any", cell.method)
+    frames = evaluation.frames(bag, driven["outcome"]["start_real_ns"], len(driven["cte_m"]), CONTROL_PERIOD_S)
+    title = f"live, {_TITLES[cell.method]}, {cell.victim} victim, seed {cell.seed}"
+    shown = "".join(driven["attack_ids"])
+    track = ClipTrack(
+        title, condition, list(frames), np.array(driven["cte_m"]), shown, driven["outcome"]["stopped_early"] or "ended"
+    )
+    path = write_clip(cell.folder / "clip.mp4", [track], 1.0 / CONTROL_PERIOD_S, cell.experiment.room.off_track_m)
+    return f"{cell.folder.name}/{path.name}"
+
+
+def attack_file(experiment: Experiment, victim: str, method: str, seed: int, folder: Path) -> Any:
+    """The attack of a finished cell, for the prediction of its transfer."""
+    cell = _cell(experiment, "", victim, method, seed, folder)
+    return load_attack(attack.attack_path(cell.searched_in(method), cell.search))
