@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import weakref
 from types import TracebackType
 from typing import Any
@@ -45,8 +46,10 @@ class Renderer:
         self._model, self._scale = model, supersampling
         self._gl = create_context(64, 64)
         self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
-        # Runs at exit too, while the OpenGL library is still loaded.
+        # Runs at exit too, and there before MuJoCo's own handler, registered earlier, ends the display.
         self._free = weakref.finalize(self, _free, self._gl, self._context)
+        self._free.atexit = False
+        atexit.register(self._free)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
         self._context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR
         self._size = (0, 0)
@@ -106,6 +109,7 @@ class Renderer:
 
     def close(self) -> None:
         """Free the OpenGL resources; safe to call twice."""
+        atexit.unregister(self._free)
         self._free()
 
     def __enter__(self) -> Renderer:

@@ -13,7 +13,7 @@ from hardware.twin.intersection.paths import PathName, ReferencePath, junction_p
 
 ObjectKind = Literal["small_car", "hydrant"]
 # Length and width [m] at scale 1 of the objects that ``advnerf object build --generate`` makes.
-OBJECT_SIZES_M: dict[ObjectKind, tuple[float, float]] = {"small_car": (3.6, 1.7), "hydrant": (0.48, 0.48)}
+OBJECT_SIZES_M: dict[ObjectKind, tuple[float, float]] = {"small_car": (3.64, 1.7), "hydrant": (0.48, 0.48)}
 
 
 class _Frozen(BaseModel):
@@ -143,17 +143,30 @@ class IntersectionConfig(_Frozen):
     camera: CameraConfig = CameraConfig(x_m=1.2, z_m=1.5, pitch_down_rad=math.radians(8.0))
     photo: PhotoConfig = PhotoConfig()
     car: DubinsConfig = DubinsConfig()
+    # Cars on the pavements of the far side and of the near corner, hydrants at the kerb beside the three exits: each drive
+    # sees some of them close and most of them from afar.
     objects: tuple[PlacedObject, ...] = (
-        PlacedObject(name="car_north", kind="small_car", x_m=1.0, y_m=5.0, yaw_rad=math.pi),
-        PlacedObject(name="car_corner", kind="small_car", x_m=6.6, y_m=-6.6, yaw_rad=math.radians(45.0)),
-        PlacedObject(name="hydrant_corner", kind="hydrant", x_m=-6.2, y_m=-6.2, scale=1.6),
-        PlacedObject(name="hydrant_east", kind="hydrant", x_m=4.1, y_m=-12.0, scale=1.6),
-        PlacedObject(name="hydrant_west", kind="hydrant", x_m=-4.1, y_m=-14.0, scale=1.6),
+        PlacedObject(name="car_north", kind="small_car", x_m=-4.5, y_m=4.65, yaw_rad=math.pi, scale=1.2),
+        PlacedObject(name="car_corner", kind="small_car", x_m=5.47, y_m=-7.62, yaw_rad=math.radians(65.0), scale=1.2),
+        PlacedObject(
+            name="hydrant_corner", kind="hydrant", x_m=-5.75, y_m=-5.75, yaw_rad=math.radians(45.0), scale=1.6
+        ),
+        PlacedObject(name="hydrant_south", kind="hydrant", x_m=-3.95, y_m=-14.0, scale=1.6),
+        PlacedObject(name="hydrant_east", kind="hydrant", x_m=11.0, y_m=-3.95, yaw_rad=math.radians(90.0), scale=1.6),
     )
     approach_m: float = Field(default=24.0, gt=0.0)
     left_radius_m: float = Field(default=8.75, gt=0.0)
     beyond_m: float = Field(default=30.0, gt=0.0)
     supersampling: int = Field(default=2, ge=1, le=4)
+
+    @model_validator(mode="after")
+    def _corners_have_a_pavement(self) -> IntersectionConfig:
+        road = self.road
+        if road.pavement_width_m >= road.corner_radius_m:
+            raise ValueError(
+                f"expected a pavement narrower than the corners' radius of {road.corner_radius_m} m, got {road.pavement_width_m} m"
+            )
+        return self
 
     @model_validator(mode="after")
     def _drivable(self) -> IntersectionConfig:

@@ -61,9 +61,8 @@ def markings(road: RoadConfig) -> list[Array]:
         ]
     pieces.append(_along_y(-mouth - 4.4, -mouth - 14.4, 0.0, 0.15))
     pieces += [_along_y(-s, -s - 3.0, 0.0, 0.15) for s in np.arange(mouth + 16.9, half - 1.0, 6.0).tolist()]
-    pieces += [
-        _along_x(x, x + 0.6, -width, 0.25) for x in np.arange(-mouth + 0.4, mouth - 0.9, 1.2).tolist()
-    ]  # give-way line
+    dashes = np.arange(-mouth + 1.2, mouth - 1.7, 1.2).tolist()
+    pieces += [_along_x(x, x + 0.6, -width + 0.05, 0.25) for x in dashes]  # give-way line
     pieces.append(_along_y(-mouth - 4.2, -mouth - 4.6, 0.5 * width, width - 0.3))  # stop line
     stripes = np.arange(-width + 0.45, width - 0.3, 1.0).tolist()
     pieces += [_along_y(-mouth - 0.6, -mouth - 3.4, x + 0.05, 0.5) for x in stripes]  # zebra over the side road

@@ -69,7 +69,7 @@ class Plan(Canvas):
             self.polygon([tuple(p) for p in (a - aside, b - aside, b + aside, a + aside)], rgb)
 
 
-def asphalt(road: RoadConfig, rng: np.random.Generator, pixels_per_m: float = 14.0) -> Image:
+def asphalt(road: RoadConfig, rng: np.random.Generator, pixels_per_m: float = 12.0) -> Image:
     """Plan of the roads: newer and older stretches, repaired patches, a few cracks, and manhole covers."""
     plan = Plan(road.half_m, pixels_per_m, (0.385, 0.385, 0.39))
     width, half = road.lane_width_m, road.half_m
@@ -119,7 +119,7 @@ def _crack(plan: Plan, x: float, y: float, rng: np.random.Generator) -> None:
     plan.line(points, 0.07, (0.31, 0.31, 0.315))
 
 
-def pavement(road: RoadConfig, rng: np.random.Generator, pixels_per_m: float = 14.0) -> Image:
+def pavement(road: RoadConfig, rng: np.random.Generator, pixels_per_m: float = 12.0) -> Image:
     """Plan of the pavements: slabs of slightly different tone, each block of houses in its own colour, and shadows."""
     half, width = road.half_m, road.lane_width_m
     plan = Plan(half, pixels_per_m, (0.64, 0.59, 0.55))
@@ -140,7 +140,7 @@ def pavement(road: RoadConfig, rng: np.random.Generator, pixels_per_m: float = 1
     return _shadowed(plan.image, road, pixels_per_m)
 
 
-def garden(road: RoadConfig, rng: np.random.Generator, pixels_per_m: float = 10.0) -> Image:
+def garden(road: RoadConfig, rng: np.random.Generator, pixels_per_m: float = 8.0) -> Image:
     """Plan of front gardens and park: grass, paths to the doors, beds, forecourts of the shops, and shadows."""
     plan = Plan(road.half_m, pixels_per_m, (0.38, 0.50, 0.27))
     plan.image *= slow(plan.image, 18.0, rng, 0.07)

@@ -34,7 +34,9 @@ def backdrop(road: RoadConfig, rng: np.random.Generator) -> list[Surface]:
 def _paint(
     centre: Array, right: Array, up: Array, half_m: tuple[float, float], road: RoadConfig, phases: Array
 ) -> Image:
-    columns, rows = (round(2.0 * half * _PIXELS_PER_M) for half in half_m)
+    # The ceiling is plain blue with clouds; only the sides carry a horizon.
+    per_m = _PIXELS_PER_M if up[2] > 0.0 else 0.25 * _PIXELS_PER_M
+    columns, rows = (round(2.0 * half * per_m) for half in half_m)
     u = ((np.arange(columns) + 0.5) / columns * 2.0 - 1.0) * half_m[0]
     v = (1.0 - (np.arange(rows) + 0.5) / rows * 2.0) * half_m[1]
     points = centre + u[None, :, None] * right + v[:, None, None] * up - EYE_M * UP

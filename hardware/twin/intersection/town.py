@@ -105,7 +105,7 @@ HEDGES: tuple[tuple[float, float, float, float], ...] = (
 )  # fmt: skip
 # A post box, a bench, two bins: x0, x1, y0, y1 [m], height [m], swatch.
 BOXES: tuple[tuple[float, float, float, float, float, str], ...] = (
-    (-17.3, -16.7, 5.6, 6.1, 1.3, "yellow"), (12.8, 14.6, -11.6, -11.1, 0.5, "wood"), (-4.9, -4.4, 5.8, 6.3, 1.0, "blue"),
+    (-17.3, -16.7, 5.6, 6.1, 1.3, "yellow"), (12.8, 14.6, -11.6, -11.1, 0.5, "wood"), (-1.2, -0.7, 5.8, 6.3, 1.0, "blue"),
     (-5.6, -5.1, -17.6, -17.1, 1.0, "blue"), (24.0, 24.6, 5.7, 6.2, 1.1, "sign_red"),
 )  # fmt: skip
 # Where the stop sign of the side road stands; it faces south.

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from advnerf_core.geometry import planar_pose
+from hardware.deployment_scene import DeploymentScene
 from hardware.twin.config import CameraConfig, CarConfig, LabConfig
 from hardware.twin.lab import Lab
 from hardware.twin.phone import track_length, track_pose
@@ -26,6 +27,11 @@ def test_observation_has_the_documented_form(lab):
     assert depth.dtype == np.float32
     assert np.isfinite(depth).all()
     assert lab.observe(depth=False)[1] is None
+
+
+def test_the_lab_is_a_deployment_scene(lab):
+    assert isinstance(lab, DeploymentScene)
+    assert lab.photo_pinhole == lab.config.phone.pinhole
 
 
 def test_two_labs_of_one_configuration_agree_to_the_byte(lab):
