@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -101,4 +102,57 @@ def status(file: File, folder: Folder = None, only: Only = "", overrides: Overri
     print(
         ", ".join(f"{count} {state}" for state, count in counts.most_common())
         + f" of {len(found)} cells in {campaign.folder}"
+    )
+
+
+@app.command(name="table")
+def table_command(
+    file: File,
+    folder: Folder = None,
+    only: Only = "",
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", help="Folder of the page.", show_default="table in the campaign's folder"),
+    ] = None,
+    overrides: Overrides = None,
+) -> None:
+    """Print the transfer table and the targets, and write them as JSON, CSV, Markdown and a page with the clips by outcome."""
+    from rich.console import Console
+
+    from advnerf_core.report.transfer_page import target_table, text_table
+    from advnerf_core.report.transfer_targets import table_targets
+    from nodes.campaign.run import statuses
+    from nodes.campaign.table import campaign_table, write_table
+
+    campaign, cells = _load(file, folder, overrides, only)
+    found = statuses(campaign, cells)
+    full = campaign_table(campaign, found)
+    page = write_table(full, campaign.folder / "cells", output or campaign.folder / "table")
+    console = Console(width=None if sys.stdout.isatty() else 200)
+    console.print(text_table(full).rich())
+    console.print(target_table(table_targets(full)).rich())
+    left_out = [each for each in found if each.state in ("changed", "unreadable")]
+    for each in left_out:
+        say_error(f"{each.cell.name} is left out: {each.text}")
+    print(f"{len(full.cells)} of {len(cells)} cells; page: {page}")
+
+
+@app.command()
+def publish(
+    file: File,
+    folder: Folder = None,
+    only: Only = "",
+    to: Annotated[Path, typer.Option("--to", help="Gets a folder with the campaign's name.")] = Path("docs/results"),
+    overrides: Overrides = None,
+) -> None:
+    """Copy the finished cells to where they are kept with the code."""
+    from nodes.campaign.run import statuses
+    from nodes.campaign.table import publish as copy_cells
+
+    campaign, cells = _load(file, folder, overrides, only)
+    changed, same = copy_cells(campaign, statuses(campaign, cells), to)
+    for name in changed:
+        print(f"{to / campaign.config.name / name}.json")
+    print(
+        f"{len(changed)} cells written, {len(same)} were there, {len(cells) - len(changed) - len(same)} are not finished"
     )

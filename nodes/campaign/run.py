@@ -59,9 +59,17 @@ class Planned:
     searches: bool
 
 
-def plan_cells(campaign: Campaign, cells: Sequence[Cell]) -> list[Planned]:
-    """Settings of every cell as they are; reads experiments and digests of their stages, prepares nothing."""
-    experiments: dict[tuple[str, str], Any] = {}
+def plan_cells(
+    campaign: Campaign, cells: Sequence[Cell], experiments: dict[tuple[str, str], Any] | None = None
+) -> list[Planned]:
+    """Settings of every cell as they are; reads experiments and digests of their stages, prepares nothing.
+
+    Args:
+        campaign: The campaign.
+        cells: Which of its cells.
+        experiments: Those that were read already, by scenario and placement; it gets what is read.
+    """
+    experiments = {} if experiments is None else experiments
     planned = []
     for cell in cells:
         scenario = campaign.scenario(cell)
@@ -83,9 +91,10 @@ def plan_cells(campaign: Campaign, cells: Sequence[Cell]) -> list[Planned]:
 def statuses(campaign: Campaign, cells: Sequence[Cell]) -> list[CellStatus]:
     """Where every cell is; one whose experiment cannot be read, as it is not made yet, is missing."""
     store, found = store_of(campaign), []
+    experiments: dict[tuple[str, str], Any] = {}
     for cell in cells:
         try:
-            digest: str | None = plan_cells(campaign, [cell])[0].job.settings_hash
+            digest: str | None = plan_cells(campaign, [cell], experiments)[0].job.settings_hash
         except ConfigError:
             raise
         except (RuntimeFault, OSError):

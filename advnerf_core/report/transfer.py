@@ -1,0 +1,197 @@
+"""The transfer table: every scenario, victim and method, in the surrogate and deployed, from the cells of a campaign.
+
+Total CTE is averaged over the drives of a seed, then over seeds; its spread is that over seeds. A ratio to no attack is of sums, each drive
+against the drive from the same start in the same domain. The transfer ratio is the deployed ratio over the surrogate's, of the seeds that
+have both. Intervals resample whole seeds. What was not run is missing, and says so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any, Literal
+
+from advnerf_core.report.cells import NONE, CellResult, Drives
+from advnerf_core.report.statistics import Interval, mean_and_std, ratio_interval, ratio_of_sums, transfer_interval
+
+Domain = Literal["surrogate", "deployed"]
+DOMAINS: tuple[Domain, ...] = ("surrogate", "deployed")
+
+# Total CTE of the paper, mean and standard deviation of 5 seeds: its tables of the intersection and of the car. Units differ between scenarios.
+PAPER: dict[tuple[str, str, str], tuple[float, float | None]] = {
+    ("straight", "deployed", "none"): (1166, None), ("right", "deployed", "none"): (1315, None),
+    ("left", "deployed", "none"): (1448, None), ("green_screen", "deployed", "none"): (48, None), ("monitor", "deployed", "none"): (48, None),
+    ("straight", "surrogate", "random"): (1132, 7), ("straight", "surrogate", "gradient"): (2347, 49),
+    ("straight", "deployed", "random"): (1193, 19), ("straight", "deployed", "gradient"): (1702, 160),
+    ("right", "surrogate", "random"): (2084, 10), ("right", "surrogate", "gradient"): (4105, 847),
+    ("right", "deployed", "random"): (1476, 12), ("right", "deployed", "gradient"): (2101, 75),
+    ("left", "surrogate", "random"): (1460, 8), ("left", "surrogate", "gradient"): (4125, 124),
+    ("left", "deployed", "random"): (1158, 163), ("left", "deployed", "gradient"): (2240, 574),
+    ("green_screen", "surrogate", "random"): (34, 4), ("green_screen", "surrogate", "gradient"): (157, 1),
+    ("green_screen", "deployed", "random"): (46, 3), ("green_screen", "deployed", "gradient"): (248, 72),
+    ("monitor", "surrogate", "random"): (34, 4), ("monitor", "surrogate", "gradient"): (157, 1),
+    ("monitor", "deployed", "random"): (47, 3), ("monitor", "deployed", "gradient"): (76, 48),
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """A row that a table should have, and how many seeds.
+
+    Attributes:
+        scenario: Name of the scenario.
+        placement: Name of the placement; empty for the scenario's own.
+        victim: Which policy.
+        method: Which search.
+        seeds: Its seeds.
+    """
+
+    scenario: str
+    placement: str
+    victim: str
+    method: str
+    seeds: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class TableRow:
+    """One line of the table: all seeds of a scenario, victim and method in one domain. None where nothing was run.
+
+    Attributes:
+        scenario: Name of the scenario.
+        placement: Name of the placement.
+        victim: Which policy.
+        method: Which search.
+        domain: surrogate or deployed.
+        seeds: Seeds that are there.
+        missing: Seeds that are not.
+        drives: Number of drives.
+        mean_m: Mean total CTE [m].
+        std_m: Its sample standard deviation over seeds [m]; None of one seed.
+        ratio: Ratio to no attack in the same domain.
+        ratio_interval: Its bootstrap interval over seeds.
+        transfer: Deployed ratio over surrogate ratio; on deployed rows only.
+        transfer_interval: Its interval.
+        off_track: Drives that left the track.
+        paper_m: The paper's mean.
+        paper_std_m: The paper's standard deviation.
+        paper_ratio: The paper's mean over its deployed drive without attack.
+    """
+
+    scenario: str
+    placement: str
+    victim: str
+    method: str
+    domain: Domain
+    seeds: tuple[int, ...]
+    missing: tuple[int, ...]
+    drives: int = 0
+    mean_m: float | None = None
+    std_m: float | None = None
+    ratio: float | None = None
+    ratio_interval: Interval | None = None
+    transfer: float | None = None
+    transfer_interval: Interval | None = None
+    off_track: int = 0
+    paper_m: float | None = None
+    paper_std_m: float | None = None
+    paper_ratio: float | None = None
+
+    def record(self) -> dict[str, Any]:
+        """JSON-ready values."""
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class TransferTable:
+    """All lines, and the cells they came from.
+
+    Attributes:
+        rows: The lines, in the order asked for.
+        cells: The cells, by name.
+        name: Name of the campaign.
+    """
+
+    rows: tuple[TableRow, ...]
+    cells: dict[str, CellResult] = field(default_factory=dict)
+    name: str = ""
+
+    def find(self, scenario: str, victim: str, method: str, domain: Domain, placement: str = "") -> TableRow | None:
+        """One line; None where it was not asked for."""
+        key = (scenario, placement, victim, method, domain)
+        return next((r for r in self.rows if (r.scenario, r.placement, r.victim, r.method, r.domain) == key), None)
+
+
+def make_table(wanted: Sequence[Wanted], cells: Iterable[CellResult], name: str = "") -> TransferTable:
+    """Sum the cells up.
+
+    Args:
+        wanted: What the table should have; it says what is missing.
+        cells: What is there; cells that were not asked for are left out.
+        name: Name of the campaign.
+    """
+    by_name = {cell.name: cell for cell in cells}
+    of_row = {_key(cell): [c for c in by_name.values() if _key(c) == _key(cell)] for cell in by_name.values()}
+    rows: list[TableRow] = []
+    used: dict[str, CellResult] = {}
+    for want in wanted:
+        found = sorted(of_row.get(_key(want), []), key=lambda cell: cell.seed)
+        found = [cell for cell in found if cell.seed in want.seeds]
+        used |= {cell.name: cell for cell in found}
+        rows += [_row(want, found, domain) for domain in DOMAINS]
+    return TransferTable(tuple(rows), used, name)
+
+
+def wanted_of(cells: Iterable[CellResult]) -> list[Wanted]:
+    """The lines that cells make where nobody says what else there should be."""
+    seeds: dict[tuple[str, str, str, str], set[int]] = {}
+    for cell in cells:
+        seeds.setdefault(_key(cell), set()).add(cell.seed)
+    return [Wanted(*key, tuple(sorted(found))) for key, found in seeds.items()]
+
+
+def _key(cell: CellResult | Wanted) -> tuple[str, str, str, str]:
+    return cell.scenario, cell.placement, cell.victim, cell.method
+
+
+def _row(want: Wanted, cells: Sequence[CellResult], domain: Domain) -> TableRow:
+    paper_m, paper_std_m = PAPER.get((want.scenario, domain, want.method), (None, None))
+    paper_none_m, _ = PAPER.get((want.scenario, "deployed", NONE), (None, None))
+    have = [(cell, drives) for cell in cells if (drives := _drives(cell, domain)) is not None]
+    seeds = tuple(cell.seed for cell, _ in have)
+    empty = TableRow(
+        want.scenario, want.placement, want.victim, want.method, domain, seeds, tuple(s for s in want.seeds if s not in seeds),
+        paper_m=paper_m, paper_std_m=paper_std_m, paper_ratio=paper_m / paper_none_m if paper_m and paper_none_m else None,
+    )  # fmt: skip
+    if not have:
+        return empty
+    mean_m, std_m = mean_and_std([drives.mean_m for _, drives in have])
+    sums, none_sums = _sums([drives for _, drives in have])
+    transfer, its_interval = _transfer(cells) if domain == "deployed" else (None, None)
+    found = {
+        "drives": sum(len(drives.total_cte_m) for _, drives in have), "mean_m": mean_m, "std_m": std_m,
+        "ratio": ratio_of_sums(sums, none_sums), "ratio_interval": ratio_interval(sums, none_sums),
+        "transfer": transfer, "transfer_interval": its_interval, "off_track": sum(sum(drives.off_track) for _, drives in have),
+    }  # fmt: skip
+    return TableRow(**{**{name: getattr(empty, name) for name in empty.__dataclass_fields__}, **found})
+
+
+def _drives(cell: CellResult, domain: Domain) -> Drives | None:
+    return cell.surrogate if domain == "surrogate" else cell.deployed
+
+
+def _sums(drives: Sequence[Drives]) -> tuple[list[float], list[float]]:
+    """Attacked and unattacked sum of each seed."""
+    return [sum(d.total_cte_m) for d in drives], [sum(d.none_total_cte_m) for d in drives]
+
+
+def _transfer(cells: Sequence[CellResult]) -> tuple[float | None, Interval | None]:
+    both = [cell for cell in cells if cell.deployed is not None]
+    deployed, surrogate = (
+        _sums([cell.deployed for cell in both if cell.deployed]),
+        _sums([cell.surrogate for cell in both]),
+    )
+    there, here = ratio_of_sums(*deployed), ratio_of_sums(*surrogate)
+    if not there or not here:
+        return None, None
+    return there / here, transfer_interval(deployed, surrogate)

@@ -1,0 +1,222 @@
+"""The transfer table to look at: in the terminal, as CSV, Markdown and JSON, and as a page with the drives' clips."""
+
+# ruff: noqa: RUF001 (typography for readers: multiplication signs and dashes)
+
+from __future__ import annotations
+
+import csv
+import io
+import os
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import jinja2
+from markupsafe import Markup
+
+from advnerf_core.report.cells import CellResult
+from advnerf_core.report.palette import DARK, LIGHT, css_variables
+from advnerf_core.report.statistics import Interval
+from advnerf_core.report.tables import Table, number, spread
+from advnerf_core.report.transfer import TableRow, TransferTable
+from advnerf_core.report.transfer_targets import TableTarget, table_targets
+
+SCHEMA = "advnerf-transfer/1"
+METHOD_NAMES = {"none": "no attack", "random": "best random", "cem": "cross-entropy", "gradient": "gradient"}
+STRAYED_FROM = 1.5
+OUTCOMES = ("left the track", "strayed", "held its course")
+_EXPLAINED = {
+    "left the track": "The drive left its track at least once.",
+    "strayed": f"Total CTE at least {STRAYED_FROM:g} times that of the same drive without attack, on the track.",
+    "held its course": "Neither; drives without attack belong here.",
+}
+_MISSING = "missing"
+
+
+@dataclass(frozen=True)
+class ShownClip:
+    """A clip of a cell.
+
+    Attributes:
+        cell: Whose drive it is.
+        outcome: One of `OUTCOMES`.
+        file: Where it is, relative to the page.
+    """
+
+    cell: CellResult
+    outcome: str
+    file: str
+
+    @property
+    def caption(self) -> str:
+        """What is seen."""
+        drives = self.cell.deployed or self.cell.surrogate
+        return f"total CTE {sum(drives.total_cte_m):.2f} m, without attack {sum(drives.none_total_cte_m):.2f} m"
+
+
+def outcome_of(cell: CellResult) -> str:
+    """How the deployed drives of a cell ended; those in the surrogate where it was not deployed."""
+    drives = cell.deployed or cell.surrogate
+    if any(drives.off_track):
+        return OUTCOMES[0]
+    strayed = sum(drives.total_cte_m) >= STRAYED_FROM * sum(drives.none_total_cte_m)
+    return OUTCOMES[1] if strayed and cell.method != "none" else OUTCOMES[2]
+
+
+def text_table(table: TransferTable) -> Table:
+    """All lines as text."""
+    columns = (
+        "scenario", "victim", "object shows", "domain", "seeds", "total CTE", "× no attack", "95 %", "transfer", "95 %", "off-track",
+        "paper", "paper ×",
+    )  # fmt: skip
+    cells, groups, classes = [], [], []
+    for index, row in enumerate(table.rows):
+        last = table.rows[index - 1] if index else None
+        new_scenario = last is None or (row.scenario, row.placement) != (last.scenario, last.placement)
+        new_victim = new_scenario or (last is not None and row.victim != last.victim)
+        if new_victim:
+            groups.append(index)
+        where = f"{row.scenario}, {row.placement}" if row.placement else row.scenario
+        name = METHOD_NAMES.get(row.method, row.method) if row.domain == "surrogate" else ""
+        cells.append((where if new_scenario else "", row.victim if new_victim else "", name, *_numbers(row)))
+        classes.append(row.method if row.seeds else "unmeasured")
+    right = (False, False, False, False, *[True] * 9)
+    return Table("Transfer", columns, tuple(cells), right, tuple(groups), tuple(classes))
+
+
+def _numbers(row: TableRow) -> tuple[str, ...]:
+    seeds = f"{len(row.seeds)} of {len(row.seeds) + len(row.missing)}"
+    if not row.seeds:
+        return (
+            row.domain,
+            seeds,
+            _MISSING,
+            "",
+            "",
+            "",
+            "",
+            "",
+            spread(row.paper_m, row.paper_std_m, 0),
+            number(row.paper_ratio),
+        )
+    return (
+        row.domain, seeds, spread(row.mean_m, row.std_m), number(row.ratio), _interval(row.ratio_interval),
+        "" if row.domain == "surrogate" or row.method == "none" else number(row.transfer),
+        "" if row.method == "none" else _interval(row.transfer_interval),
+        f"{row.off_track} of {row.drives}", spread(row.paper_m, row.paper_std_m, 0), number(row.paper_ratio),
+    )  # fmt: skip
+
+
+def _interval(interval: Interval | None) -> str:
+    return "" if interval is None else f"{interval.low:.2f} – {interval.high:.2f}"
+
+
+def target_table(targets: Sequence[TableTarget]) -> Table:
+    """The targets as text."""
+    cells = tuple(
+        (t.scenario, METHOD_NAMES[t.method], t.domain, t.what, t.target, number(t.value), str(t.seeds), t.verdict)
+        for t in targets
+    )
+    classes = tuple({True: "met", False: "missed", None: "unmeasured"}[t.met] for t in targets)
+    columns = ("scenario", "object shows", "domain", "what", "target", "measured", "seeds", "verdict")
+    return Table("Targets", columns, cells, (False, False, False, False, True, True, True, False), classes=classes)
+
+
+def as_json(table: TransferTable) -> dict[str, Any]:
+    """Lines, targets and cells as JSON-ready values."""
+    return {
+        "schema": SCHEMA, "name": table.name, "rows": [row.record() for row in table.rows],
+        "targets": [target.record() for target in table_targets(table)],
+        "cells": {name: cell.model_dump(mode="json") for name, cell in table.cells.items()},
+    }  # fmt: skip
+
+
+def as_csv(table: TransferTable) -> str:
+    """The lines, one column per number; empty where there is none."""
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    plain = [name for name in TableRow.__dataclass_fields__ if not name.endswith("_interval")]
+    ends = ("ratio_low", "ratio_high", "transfer_low", "transfer_high")
+    writer.writerow([*plain, *ends])
+    for row in table.rows:
+        values = [getattr(row, name) for name in plain]
+        intervals = [row.ratio_interval, row.transfer_interval]
+        bounds = [value for each in intervals for value in ((each.low, each.high) if each else ("", ""))]
+        writer.writerow([_field(value) for value in (*values, *bounds)])
+    return stream.getvalue()
+
+
+def _field(value: Any) -> Any:
+    if isinstance(value, tuple):
+        return " ".join(map(str, value))
+    return "" if value is None else value
+
+
+def as_markdown(table: TransferTable) -> str:
+    """Lines and targets as a Markdown page."""
+    parts = [f"# {table.name or 'Transfer table'}", "", *_markdown_rows(text_table(table)), "", "## Targets", ""]
+    return "\n".join([*parts, *_markdown_rows(target_table(table_targets(table))), ""])
+
+
+def _markdown_rows(table: Table) -> list[str]:
+    rule = "|" + "|".join("---:" if right else "---" for right in table.right) + "|"
+    return [_markdown_row(table.columns), rule, *(_markdown_row(row) for row in table.rows)]
+
+
+def _markdown_row(cells: Sequence[str]) -> str:
+    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+
+
+def gather_clips(table: TransferTable, cells_folder: Path, page_folder: Path) -> list[ShownClip]:
+    """Put the cells' clips beside the page, in one folder per outcome; as links of the same file where the disk has them.
+
+    Args:
+        table: Whose cells.
+        cells_folder: What the cells' clip names are relative to.
+        page_folder: Folder of the page; older clips in its ``videos`` go.
+    """
+    shutil.rmtree(page_folder / "videos", ignore_errors=True)
+    shown = []
+    for name, cell in table.cells.items():
+        clip = cell.extra.get("clip")
+        source = cells_folder / clip if isinstance(clip, str) else None
+        if source is None or not source.is_file():
+            continue
+        outcome = outcome_of(cell)
+        target = page_folder / "videos" / outcome.replace(" ", "_") / f"{name}{source.suffix}"
+        target.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            os.link(source, target)
+        except OSError:
+            shutil.copyfile(source, target)
+        shown.append(ShownClip(cell, outcome, target.relative_to(page_folder).as_posix()))
+    return shown
+
+
+def render_transfer_page(
+    table: TransferTable, clips: Sequence[ShownClip] = (), sections: Sequence[tuple[str, Markup]] = ()
+) -> str:
+    """The page as HTML text; it loads nothing but the clips beside it.
+
+    Args:
+        table: The table.
+        clips: Clips beside the page.
+        sections: Further parts: heading and HTML.
+    """
+    environment = jinja2.Environment(
+        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    resources = files("advnerf_core.report")
+    template = environment.from_string(resources.joinpath("transfer.html").read_text(encoding="utf-8"))
+    groups = [(name, _EXPLAINED[name], [clip for clip in clips if clip.outcome == name]) for name in OUTCOMES]
+    return template.render(
+        name=table.name or "Transfer table",
+        style=Markup(resources.joinpath("page.css").read_text(encoding="utf-8")),
+        light=Markup(css_variables(LIGHT)), dark=Markup(css_variables(DARK)),
+        table=text_table(table).html(), targets=target_table(table_targets(table)).html(),
+        missing=sum(len(row.missing) for row in table.rows if row.domain == "surrogate"), cells=len(table.cells),
+        machines=sorted({cell.machine for cell in table.cells.values()}), groups=groups, sections=sections, methods=METHOD_NAMES,
+    )  # fmt: skip

@@ -1,0 +1,108 @@
+"""The table of a campaign from its cells, and copies of the cells that are kept with the code."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+from markupsafe import Markup
+
+from advnerf_core.files import write_atomically
+from advnerf_core.report.cells import CellResult, read_cells
+from advnerf_core.report.transfer import TransferTable, Wanted, make_table, wanted_of
+from advnerf_core.report.transfer_page import as_csv, as_json, as_markdown, gather_clips, render_transfer_page
+from nodes.campaign.config import Campaign
+from nodes.campaign.store import CellStatus, store_of
+from nodes.runtime.errors import ConfigError
+
+PUBLISHED = Path("docs/results")
+
+
+def wanted_rows(campaign: Campaign) -> list[Wanted]:
+    """The lines that a campaign asks for."""
+    seeds: dict[tuple[str, str, str, str], list[int]] = {}
+    for cell in campaign.cells:
+        seeds.setdefault((cell.scenario, cell.placement, cell.victim, cell.method), []).append(cell.seed)
+    # By victim before method: the reader compares the methods on one victim.
+    order = sorted(seeds, key=lambda key: (list(campaign.config.scenarios).index(key[0]), key[1]))
+    return [Wanted(*key, tuple(seeds[key])) for key in order]
+
+
+def campaign_table(campaign: Campaign, found: Sequence[CellStatus] | None = None) -> TransferTable:
+    """The table of the cells that are there.
+
+    Args:
+        campaign: The campaign.
+        found: Where its cells are; only results of the settings as they are now are taken. None takes what lies in its folder.
+    """
+    if found is None:
+        cells = [cell for cell in _lying(campaign) if cell is not None]
+    else:
+        cells = [each.result for each in found if each.result is not None and each.state == "done"]
+    return make_table(wanted_rows(campaign), cells, campaign.config.name)
+
+
+def _lying(campaign: Campaign) -> list[CellResult | None]:
+    store = store_of(campaign)
+    return [store.result(cell.name) for cell in campaign.cells]
+
+
+def write_table(
+    table: TransferTable, cells_folder: Path, folder: Path, sections: Sequence[tuple[str, Markup]] = ()
+) -> Path:
+    """Write JSON, CSV, Markdown and the page with the clips beside it.
+
+    Args:
+        table: The table.
+        cells_folder: Where the cells' clips are.
+        folder: Where to write.
+        sections: Further parts of the page.
+
+    Returns:
+        The page.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    clips = gather_clips(table, cells_folder, folder)
+    write_atomically(folder / "table.json", json.dumps(as_json(table), indent=1, allow_nan=False) + "\n")
+    write_atomically(folder / "table.csv", as_csv(table))
+    write_atomically(folder / "table.md", as_markdown(table))
+    write_atomically(folder / "index.html", render_transfer_page(table, clips, sections))
+    return folder / "index.html"
+
+
+def publish(campaign: Campaign, found: Sequence[CellStatus], folder: Path) -> tuple[list[str], list[str]]:
+    """Copy finished cells to where they are kept with the code; cells there that the campaign no longer has stay.
+
+    Args:
+        campaign: The campaign.
+        found: Where its cells are.
+        folder: Gets one folder per campaign.
+
+    Returns:
+        Names of the cells that are new or changed there, and of those that were the same.
+    """
+    changed, same = [], []
+    for each in found:
+        if each.state != "done":
+            continue
+        text = store_of(campaign).result_file(each.cell.name).read_text(encoding="utf-8")
+        target = folder / campaign.config.name / f"{each.cell.name}.json"
+        if target.exists() and target.read_text(encoding="utf-8") == text:
+            same.append(each.cell.name)
+            continue
+        write_atomically(target, text)
+        changed.append(each.cell.name)
+    return changed, same
+
+
+def published_table(folder: Path) -> TransferTable:
+    """The table of published cells.
+
+    Raises:
+        ConfigError: There are none.
+    """
+    cells = read_cells(folder)
+    if not cells:
+        raise ConfigError(f"expected published cells in {folder}, got none; run advnerf campaign publish")
+    return make_table(wanted_of(cells), cells, folder.name)
