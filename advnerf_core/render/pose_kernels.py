@@ -49,8 +49,8 @@ def _walk(o: Any, d: Any, density: Any, clear: Any, one_sided: bool, step_m: flo
           depths: Any, taus: Any) -> int:  # fmt: skip
     """Samples of one ray that lie in cells that are not empty, until little light is left: planar depths and optical depths."""
     nx, ny, nz = density.shape
-    t_in, t_out, by_face = span_in_box(o, d, density.shape, NEAR_M)
-    if t_out <= t_in or (one_sided and not by_face):
+    t_in, t_out, _ = span_in_box(o, d, density.shape, NEAR_M)
+    if t_out <= t_in or (one_sided and d[0] >= 0.0):
         return 0
     count, k, light = 0, int(np.ceil(t_in / step_m - 0.5)), 1.0
     while (k + 0.5) * step_m < t_out:
@@ -122,7 +122,7 @@ def shade_pixels(first: int, last: int, pixels: Any, R: Any, o: Any, intrinsics:
         slots: ``[nx, ny, nz]``.
         density: ``[nx, ny, nz]`` per object unit.
         clear: Cells around each cell that are empty.
-        one_sided: Only rays through the ``+x`` face count.
+        one_sided: Only rays that come from in front (``+x``) count.
         step_m: Planar depth between samples [m].
         scale: World metres per object unit.
         least: A ray is followed until so little light is left.

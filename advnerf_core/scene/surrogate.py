@@ -129,8 +129,8 @@ class Surrogate:
         self.T_car_from_camera = np.asarray(T_car_from_camera, dtype=np.float64)
         listed = () if objects is None else objects
         self.objects = tuple(listed) if isinstance(listed, Sequence) else (listed,)
-        self._tolerance_m = depth_tolerance_m
-        self._supersample = supersample
+        self.depth_tolerance_m = depth_tolerance_m
+        self.supersample = supersample
         self._background_colour = background_colour
         self.dtype = dtype
         self.opaque = opaque
@@ -139,6 +139,13 @@ class Surrogate:
         """The same surrogate with images and weights of another type; geometry is float64 in any case."""
         other = copy.copy(self)
         other.dtype = dtype
+        return other
+
+    def with_objects(self, objects: Sequence[ColouredObject], opaque: bool | None = None) -> Surrogate:
+        """The same surrogate with other objects, for example the same ones elsewhere; composed as before unless ``opaque`` says."""
+        other = copy.copy(self)
+        other.objects = tuple(objects)
+        other.opaque = self.opaque if opaque is None else opaque
         return other
 
     @property
@@ -168,7 +175,7 @@ class Surrogate:
     def prepare(self, T_world_from_camera: ArrayLike) -> Frames:
         """Render the background and cast the objects for camera poses ``[B, 4, 4]``."""
         poses = np.asarray(T_world_from_camera, dtype=np.float64).reshape(-1, 4, 4)
-        return self._composed(poses, *self._coloured_background(poses))
+        return self._composed(poses, *self.coloured_background(poses))
 
     @torch.no_grad()
     def overlay(
@@ -191,13 +198,13 @@ class Surrogate:
         return self._composed(poses, images, depths).render(None if theta is None else theta.detach()).images
 
     def _composed(self, poses: Array, rgb: Tensor, depth_m: Tensor) -> Frames:
-        casts = cast_objects(self.objects, poses, self.camera, self._supersample, rgb.numpy().dtype)
+        casts = cast_objects(self.objects, poses, self.camera, self.supersample, rgb.numpy().dtype)
         if self.opaque:
             casts = [made_opaque(cast) for cast in casts]
         background, shares = sparse_shares(
             [cast.pixels for cast in casts],
             [cast.alpha for cast in casts],
-            [cast.depth_m - self._tolerance_m for cast in casts],
+            [cast.depth_m - self.depth_tolerance_m for cast in casts],
             depth_m.reshape(-1).double().numpy(),
         )
         seen = [_seen(cast, share, field) for cast, share, field in zip(casts, shares, self.objects, strict=True)]
@@ -229,15 +236,15 @@ class Surrogate:
                 "expected objects made of voxels, got a mesh: only voxels are differentiable in their pose"
             )
         poses = np.asarray(T_world_from_camera, dtype=np.float64).reshape(-1, 4, 4)
-        rgb, depth_m = self._coloured_background(poses)
+        rgb, depth_m = self.coloured_background(poses)
         layers = [
-            render_soft(field, placement, part, poses, self.camera, self._supersample)
+            render_soft(field, placement, part, poses, self.camera, self.supersample)
             for field, placement, part in zip(grids, placements, split_theta(grids, theta), strict=True)
         ]
         colours = torch.stack([*(layer[0] for layer in layers), rgb.double()])
         alphas = torch.stack([*(layer[1] for layer in layers), torch.ones_like(depth_m).double()])
         behind = torch.nan_to_num(depth_m.double(), nan=torch.inf)
-        depths = torch.stack([*(layer[2] - self._tolerance_m for layer in layers), behind])
+        depths = torch.stack([*(layer[2] - self.depth_tolerance_m for layer in layers), behind])
         return composite(colours, alphas, depths)[0].permute(0, 3, 1, 2)
 
     def sense(self, states: Tensor, theta: Tensor | None) -> Rendered:
@@ -249,8 +256,8 @@ class Surrogate:
         return lambda states: self.sense(states, theta).images
 
     @torch.no_grad()
-    def _coloured_background(self, poses: Array) -> tuple[Tensor, Tensor]:
-        """Colours ``[B, H, W, 3]`` and depth ``[B, H, W]`` of the scene without objects."""
+    def coloured_background(self, poses: Array) -> tuple[Tensor, Tensor]:
+        """Colours ``[B, H, W, 3]`` and planar depth ``[B, H, W]`` of the scene without objects, from ``[B, 4, 4]``."""
         rgb, depth_m = self._background(poses, self.camera)[:2]
         self._check_background(rgb, depth_m, len(poses))
         rgb, depth_m = (torch.as_tensor(part, device="cpu").to(self.dtype) for part in (rgb, depth_m))
