@@ -107,9 +107,14 @@ class SceneFrame:
         y_m: Origin in CARLA's world, y mirrored [m].
         z_m: Height of our ground in CARLA's world [m].
         yaw_rad: Our x axis in CARLA's world, y mirrored: counter-clockwise [rad].
+
+    Attributes:
+        T_mirrored_from_world: From our world to CARLA's with y mirrored ``[4, 4]``.
+        yaw_rad: As given.
     """
 
     def __init__(self, x_m: float, y_m: float, z_m: float, yaw_rad: float) -> None:
+        self.yaw_rad = float(yaw_rad)
         self.T_mirrored_from_world: Array = planar_pose(x_m, y_m, yaw_rad)
         self.T_mirrored_from_world[2, 3] = z_m
 

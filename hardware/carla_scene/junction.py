@@ -9,21 +9,22 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from advnerf_core.geometry import Array, wrap_angle
+from hardware.carla_scene.drives import EXIT_OF, Drives
 from hardware.carla_scene.errors import CarlaMapError
 from hardware.carla_scene.fitting import fit_lines_and_arcs
 from hardware.carla_scene.frames import CarlaPose, SceneFrame
-from hardware.twin.intersection.paths import ExitName, PathName, ReferencePath
+from hardware.twin.intersection.paths import PathName, ReferencePath
 
 _STRAIGHT_RAD = math.radians(30.0)
 _TURN_RAD = (math.radians(50.0), math.radians(130.0))
 _SAMPLE_M = 1.0
 _SAME_LANE_M = 0.5
-_EXIT_OF: dict[PathName, ExitName] = {"straight": "east", "right": "south", "left": "west"}
 
 
 @dataclass(frozen=True)
@@ -67,28 +68,20 @@ class JunctionInfo:
     drives: int
 
 
-@dataclass(frozen=True)
-class Drives:
-    """The three drives, in the scene's own frame: x along the straight drive, origin in the junction's middle on the ground.
+def read_opendrive(file: Path, library: Any) -> Any:
+    """A ``carla.Map`` of an OpenDRIVE file; no server is needed.
 
-    The frame and the names are those of the simulated intersection: straight leaves to the east, right to the south; left comes
-    from the south and leaves to the west.
-
-    Attributes:
-        junction_id: OpenDRIVE id of the junction.
-        frame: Where the scene's frame is in CARLA's world.
-        paths: Straight, right and left.
-        lane_width_m: Width of the narrowest lane driven on [m].
-        height_range_m: Highest minus lowest point of all three drives [m].
-        right_hand: Whether traffic keeps to the right.
+    Raises:
+        CarlaMapError: The file cannot be read, or is not a map with roads.
     """
-
-    junction_id: int
-    frame: SceneFrame
-    paths: dict[PathName, ReferencePath]
-    lane_width_m: float
-    height_range_m: float
-    right_hand: bool
+    try:
+        carla_map = library.Map(file.stem, file.read_text(encoding="utf-8"))
+        roads = carla_map.get_topology()
+    except (OSError, UnicodeDecodeError, RuntimeError) as error:
+        raise CarlaMapError(f"expected an OpenDRIVE map in {file}, got: {error}") from error
+    if not roads:
+        raise CarlaMapError(f"expected an OpenDRIVE map with roads in {file}, got one without")
+    return carla_map
 
 
 def list_junctions(carla_map: Any, library: Any) -> list[JunctionInfo]:
@@ -137,7 +130,7 @@ def find_drives(
         waypoints[name] = _along(crossing, frame, approach_m, beyond_m, f"the drive {name} of junction {junction.id}")
     heights = np.array([point.transform.location.z for points in waypoints.values() for point in points])
     x, y = (float(value) for value in frame.T_mirrored_from_world[:2, 3])
-    frame = SceneFrame(x, y, float(np.median(heights)), _yaw(frame))
+    frame = SceneFrame(x, y, float(np.median(heights)), frame.yaw_rad)
     paths = {name: _path(name, points, frame, tolerance_m) for name, points in waypoints.items()}
     width = min(point.lane_width for points in waypoints.values() for point in points)
     return Drives(junction.id, frame, paths, float(width), float(np.ptp(heights)), bool(three["straight"].begin.is_rht))
@@ -259,17 +252,12 @@ def _path(name: PathName, waypoints: Sequence[Any], frame: SceneFrame, tolerance
         segments = fit_lines_and_arcs(poses, tolerance_m)
     except ValueError as error:
         raise CarlaMapError(f"the lanes of the drive {name} do not join: {error}; take another junction") from error
-    return ReferencePath(name, _EXIT_OF[name], start, segments)
+    return ReferencePath(name, EXIT_OF[name], start, segments)
 
 
 def _pose(waypoint: Any) -> Array:
     at = CarlaPose.of(waypoint.transform)
     return np.array([at.x_m, -at.y_m, float(wrap_angle(-math.radians(at.yaw_deg)))])
-
-
-def _yaw(frame: SceneFrame) -> float:
-    T = frame.T_mirrored_from_world
-    return math.atan2(T[1, 0], T[0, 0])
 
 
 def _heading(pose: Array) -> Array:

@@ -18,9 +18,10 @@ from hardware.carla_scene.body import CarlaCar
 from hardware.carla_scene.camera import DEPTH, RGB, Camera
 from hardware.carla_scene.config import CarlaConfig
 from hardware.carla_scene.connection import check_nobody_else, connect, open_world
+from hardware.carla_scene.drives import Drives
 from hardware.carla_scene.errors import CarlaError, CarlaFrameError, CarlaMapError
 from hardware.carla_scene.frames import CarlaPose
-from hardware.carla_scene.junction import Drives, find_drives
+from hardware.carla_scene.junction import find_drives
 from hardware.carla_scene.library import load_carla, server_answers
 from hardware.carla_scene.pixels import depth_of, rgb_of
 from hardware.carla_scene.synchronous import TickedWorld, set_scenery

@@ -1,0 +1,113 @@
+"""Photograph a junction: posed images for learning, and views of the driving camera that nothing learns from."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from advnerf_core.files import write_atomically
+from advnerf_core.geometry import Array, planar_pose
+from advnerf_core.scene.transforms_write import write_transforms
+from hardware.carla_scene.config import CarlaConfig
+from hardware.carla_scene.photos import held_out_states, photo_poses
+from hardware.carla_scene.scene import CarlaScene
+from nodes.runtime.errors import ConfigError
+from nodes.runtime.stages import Report
+
+PHOTOS, HELD_OUT, DRIVES, REQUEST = "photos", "held_out", "drives.json", "request.json"
+
+
+@dataclass(frozen=True)
+class CaptureRequest:
+    """What to photograph.
+
+    Attributes:
+        photos: Photographs that the scene is learned from; the paper has 1800.
+        held_out: Views of the driving camera along the drives.
+        seed: Of the poses.
+    """
+
+    photos: int = 1800
+    held_out: int = 60
+    seed: int = 0
+
+
+def capture(
+    config: CarlaConfig, request: CaptureRequest, folder: Path, report: Report, library: Any = None
+) -> tuple[int, int]:
+    """Write ``photos`` and ``held_out`` (images and ``transforms.json``) and ``drives.json`` (frame and reference paths).
+
+    A capture that was stopped goes on: pictures that are there are kept. They are in the scene's frame: right-handed, metres, z up.
+
+    Args:
+        config: The scene.
+        request: What to photograph.
+        folder: Where to; one that holds another capture is refused.
+        report: Gets the share done and what is being done.
+        library: The ``carla`` module; None imports it.
+
+    Returns:
+        How many pictures were taken now, and how many were there.
+
+    Raises:
+        ConfigError: The folder holds a capture of something else.
+        CarlaError: Something is wrong with the server.
+    """
+    with CarlaScene(config, library) as scene:
+        drives = scene.drives.to_dict()
+        _claim(folder, config, request, drives)
+        rng = np.random.default_rng(request.seed)
+        poses = photo_poses(scene.drives, config, request.photos, rng)
+        states = held_out_states(scene.drives, request.held_out, rng)
+        write_atomically(folder / DRIVES, json.dumps(drives, indent=1) + "\n")
+        total, counts = len(poses) + len(states), [0, 0]
+
+        def keep(name: str, count: int, see: Callable[[int], NDArray[np.uint8]], before: int) -> list[str]:
+            names = [f"images/{index:05d}.{'jpg' if name == PHOTOS else 'png'}" for index in range(count)]
+            for index, file in enumerate(names):
+                there = (folder / name / file).exists()
+                if not there:
+                    _write_image(folder / name / file, see(index))
+                counts[there] += 1
+                report((before + index + 1) / total, f"{name} {index + 1}/{count}")
+            return names
+
+        names = keep(PHOTOS, len(poses), lambda i: scene.photograph(poses[i]), 0)
+        _list(folder / PHOTOS, names, poses, scene.photo_pinhole)
+        names = keep(HELD_OUT, len(states), lambda i: scene.observe_at(*states[i], depth=False)[0], len(poses))
+        _list(
+            folder / HELD_OUT, names, [planar_pose(*s) @ scene.T_car_from_camera for s in states], scene.camera_pinhole
+        )
+    return counts[0], counts[1]
+
+
+def _claim(folder: Path, config: CarlaConfig, request: CaptureRequest, drives: dict[str, Any]) -> None:
+    """Note what is captured into a folder, or see that it is the same as before; the server's address does not count."""
+    about = config.model_dump(mode="json", exclude={"server", "objects", "car", "body"}) | {"town": config.server.town}
+    text = json.dumps({"config": about, "request": vars(request), "drives": drives}, sort_keys=True)
+    digest, file = hashlib.sha256(text.encode()).hexdigest(), folder / REQUEST
+    if file.exists():
+        if json.loads(file.read_text(encoding="utf-8")).get("sha256") != digest:
+            raise ConfigError(f"{folder} holds a capture with other settings: name another folder, or remove it")
+        return
+    if folder.exists() and any(folder.iterdir()):
+        raise ConfigError(f"{folder} is not empty and holds no capture: name another folder")
+    write_atomically(file, json.dumps({"sha256": digest, **json.loads(text)}, indent=1) + "\n")
+
+
+def _list(folder: Path, names: Sequence[str], poses: Sequence[Array], pinhole: Any) -> None:
+    if names:
+        write_transforms(folder / "transforms.json", names, np.stack(poses), pinhole)
+
+
+def _write_image(path: Path, rgb: NDArray[np.uint8]) -> None:
+    options = [cv2.IMWRITE_JPEG_QUALITY, 95] if path.suffix == ".jpg" else []
+    write_atomically(path, cv2.imencode(path.suffix, cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), options)[1].tobytes())
