@@ -19,6 +19,7 @@ from nodes import (
     cli_calibrate,
     cli_camera,
     cli_campaign,
+    cli_doctor,
     cli_keys,
     cli_motor,
     cli_node,
@@ -62,6 +63,7 @@ app.add_typer(cli_object.app, name="object")
 app.add_typer(cli_policy.app, name="policy")
 app.add_typer(cli_scene.app, name="scene")
 app.add_typer(cli_room.app, name="room")
+cli_doctor.add_to(app)
 cli_replay.add_to(app)
 cli_teleop.add_to(app)
 cli_trial.add_to(app)
@@ -235,24 +237,6 @@ def _send_arm(wanted: bool, run_dir: Path | None, reason: str) -> None:
     armed, why = ask_to_arm(find_run_dir(run_dir), wanted, reason)
     print(f"armed by {why}" if armed else f"not armed: {why}")
     if armed != wanted:
-        raise typer.Exit(FAILURE_EXIT)
-
-
-@app.command()
-def doctor(
-    folder: Annotated[Path, typer.Option("--folder", help="Where results will be written.")] = Path("runs"),
-    vicon_port: Annotated[int, typer.Option("--vicon-port", min=1, max=65535)] = 51001,
-) -> None:
-    """Say what this machine has, what it lacks, and what to do about it."""
-    from nodes.runtime.doctor import FAILURE, OK, examine
-
-    rows = table("check", "state", "found")
-    checks = examine(folder, vicon_port)
-    for check in checks:
-        colour = "green" if check.state == OK else "red" if check.state == FAILURE else "yellow"
-        rows.add_row(check.name, f"[{colour}]{check.state}[/]", check.text)
-    print_table(rows)
-    if any(check.state == FAILURE for check in checks):
         raise typer.Exit(FAILURE_EXIT)
 
 

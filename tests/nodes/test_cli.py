@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from nodes import cli
-from nodes.runtime import doctor
 from nodes.runtime.bag import BagWriter
 from nodes.runtime.bag_read import read_info
 from nodes.runtime.messages import encode, pose_message
@@ -244,30 +243,6 @@ def test_defect_of_ours_keeps_its_traceback(monkeypatch):
     monkeypatch.setattr(cli, "app", broken)
     with pytest.raises(IndexError):
         cli.main()
-
-
-@pytest.mark.slow  # imports torch and starts EGL
-def test_doctor_says_what_is_there(command, tmp_path):
-    code, output, _ = command("doctor", "--folder", tmp_path)
-    assert code == 0
-    for name in ("python", "machine", "EGL", "torch", "disk", "sockets", "VICON port", "serial", "launches"):
-        assert name in output
-
-
-def test_doctor_finds_a_full_disk_and_a_port_in_use(command, tmp_path, monkeypatch):
-    import socket
-    from collections import namedtuple
-
-    usage = namedtuple("usage", "total used free")
-    monkeypatch.setattr(doctor.shutil, "disk_usage", lambda path: usage(10**9, 10**9, 1000))
-    monkeypatch.setattr(doctor, "_try", lambda program: (False, "ImportError: libEGL.so.1"))
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as occupied:
-        occupied.bind(("0.0.0.0", 0))
-        code, output, _ = command("doctor", "--folder", tmp_path / "new", "--vicon-port", occupied.getsockname()[1])
-    assert code == 1
-    assert "Address already in use; stop what uses it" in output
-    assert "free some" in output
-    assert "apt-get install libegl1" in output
 
 
 def test_play_refuses_what_is_not_there(command, tmp_path):

@@ -1,0 +1,60 @@
+"""How much a recording takes: pictures by their size and rate, everything else by the topic table."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from nodes.runtime.topics import STATUS_RATE_HZ, TOPICS
+from nodes.runtime.topics import topic as topic_row
+
+_PICTURES = ("sensor_msgs/msg/Image",)
+_COMPRESSED = "sensor_msgs/msg/CompressedImage"
+# JPEG of quality 90 of a room, as a share of the raw picture; and what messages without pictures take with their frame in the bag.
+_JPEG_SHARE, _SMALL_BYTES = 0.17, 400
+_BY_CAMERA = ("camera", "compositor")
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """What the camera delivers.
+
+    Attributes:
+        width: Columns [px].
+        height: Rows [px].
+        rate_hz: Pictures per second.
+        compressed: Whether it also publishes JPEG pictures.
+    """
+
+    width: int = 336
+    height: int = 188
+    rate_hz: float = 10.0
+    compressed: bool = False
+
+
+def bytes_per_s(
+    pictures: Pictures, topics: Iterable[str] | None = None, publishers: Iterable[str] | None = None, statuses: int = 8
+) -> float:
+    """What a bag grows by [bytes/s].
+
+    Args:
+        pictures: What the camera delivers.
+        topics: What is recorded; None means the whole topic table.
+        publishers: Roles that are there; None means all.
+        statuses: Nodes whose status is recorded.
+    """
+    roles = None if publishers is None else set(publishers)
+    total = statuses * STATUS_RATE_HZ * _SMALL_BYTES
+    for name in TOPICS if topics is None else topics:
+        row = topic_row(name)
+        if row.rate_hz is None or (roles is not None and row.publisher not in roles):
+            continue
+        by_camera = row.publisher in _BY_CAMERA
+        raw = pictures.width * pictures.height * 3
+        if row.type in _PICTURES:
+            total += pictures.rate_hz * raw
+        elif row.type == _COMPRESSED:
+            total += pictures.compressed * pictures.rate_hz * raw * _JPEG_SHARE
+        else:
+            total += (pictures.rate_hz if by_camera else row.rate_hz) * _SMALL_BYTES
+    return total

@@ -1,0 +1,101 @@
+"""Deadlines and child processes: libraries that are missing, broken, hung, or take their process with them."""
+
+import threading
+import time
+
+import pytest
+
+from hardware.errors import LinkLost
+from nodes.doctor import cameras, graphics
+from nodes.doctor.check import ABSENT, FAILURE, OK, WARNING, Check, Finding, examine, in_child, worst
+
+
+def test_a_hung_check_costs_its_deadline_and_the_others_are_told_in_order():
+    never = threading.Event()
+
+    def fine(name):
+        return lambda: [Finding(name, OK, "there")]
+
+    def lost():
+        raise LinkLost("lost the camera")
+
+    def defect():
+        return [][1]
+
+    began = time.monotonic()
+    found = list(
+        examine([
+            Check("a", fine("a")), Check("b", never.wait, 0.2, "unplug it"), Check("c", lost), Check("d", defect),
+            Check("e", fine("e")),
+        ])
+    )  # fmt: skip
+    never.set()
+    assert time.monotonic() - began < 2.0
+    assert [(row.check, row.state) for row in found] == [
+        ("a", OK), ("b", FAILURE), ("c", FAILURE), ("d", WARNING), ("e", OK),
+    ]  # fmt: skip
+    assert (found[1].found, found[1].do) == ("no answer within 0.2 s", "unplug it")
+    assert found[2].found == "lost the camera"
+    assert "IndexError" in found[3].found
+    assert worst(found) == FAILURE
+    assert worst([]) == OK
+    assert worst([Finding("x", ABSENT, ""), Finding("y", WARNING, "")]) == WARNING
+
+
+@pytest.fixture
+def library(tmp_path, monkeypatch):
+    """Puts a Python package of the given name and text before all others, for child processes."""
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    return lambda name, text: (tmp_path / f"{name}.py").write_text(text)
+
+
+def test_a_vendors_library_that_hangs_is_killed(library):
+    library("depthai", "import time\ntime.sleep(600)\n")
+    began = time.monotonic()
+    (found,) = cameras.oaks(timeout_s=1.0)
+    assert time.monotonic() - began < 4.0
+    assert found.state == WARNING
+    assert "no answer within 1 s" in found.found
+
+
+def test_a_library_that_crashes_or_refuses_is_one_line(library):
+    library("mujoco", "import os\nos.abort()\n")
+    (found,) = graphics.egl(required=True)
+    assert (found.state, "ended by signal 6" in found.found) == (FAILURE, True)
+    library("mujoco", "raise ImportError('libEGL.so.1: cannot open\\nshared object file')\n")
+    (found,) = graphics.egl()
+    assert found.state == WARNING
+    assert "ImportError: libEGL.so.1: cannot open shared object file" in found.found
+    assert "apt-get install libegl1" in found.do
+
+
+def test_what_is_not_installed_is_absent_unless_it_is_needed(library):
+    library("depthai", "raise ModuleNotFoundError('No module named depthai', name='depthai')\n")
+    assert [row.state for row in (*cameras.oaks(), *cameras.oaks(required=True))] == [ABSENT, FAILURE]
+    library("torch", "raise ModuleNotFoundError('No module named torch', name='torch')\n")
+    assert [row.state for row in (*graphics.torch(), *graphics.torch(required=True))] == [ABSENT, FAILURE]
+    assert graphics.torch()[0].do == "pip install 'advnerf[core]'"
+
+
+CUDA = """
+class cuda:
+    is_available, device_count = staticmethod(lambda: {gpus} > 0), staticmethod(lambda: {gpus})
+    get_device_name = staticmethod(lambda k: "H200")
+class version:
+    cuda = "12.8"
+__version__ = "2.9.0"
+"""
+
+
+def test_gpus_are_named_and_a_build_that_sees_none_is_a_warning(library):
+    library("torch", CUDA.format(gpus=1))
+    assert graphics.torch() == [Finding("torch", OK, "2.9.0, CUDA 12.8: H200")]
+    library("torch", CUDA.format(gpus=0))
+    (found,) = graphics.torch()
+    assert (found.state, "nvidia-smi" in found.do) == (WARNING, True)
+
+
+def test_output_of_a_library_does_not_disturb_the_answer(library):
+    library("depthai", "print('[info] hello')\nclass Device:\n    getAllAvailableDevices = staticmethod(lambda: [])\n")
+    assert in_child("oaks").data == []
+    assert cameras.oaks()[0].state == ABSENT

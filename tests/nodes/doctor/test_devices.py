@@ -1,0 +1,318 @@
+"""The doctor and the emulators: a VESC on a pty, Tracker's datagrams, video devices; absent, wrong, busy and hung."""
+
+import contextlib
+import os
+import pty
+import socket
+import threading
+import time
+import tty
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calibration.schema import CameraCalibration, load_calibration
+from hardware.cameras.v4l2 import V4l2Camera
+from hardware.cameras.v4l2_negotiation import Mode
+from hardware.errors import LinkLost
+from hardware.twin.config import CarConfig
+from hardware.twin.v4l2_device import VideoDevice
+from hardware.twin.v4l2_emulator import VideoPortEmulator
+from hardware.twin.vehicle import TwinVehicle
+from hardware.twin.vesc_emulator import VescEmulator
+from hardware.twin.vesc_firmware import VescEmulatorConfig
+from hardware.twin.vicon_emulator import ViconEmulator, ViconEmulatorConfig
+from hardware.vesc_settings import TimeoutSettings
+from hardware.vicon import ViconConfig
+from nodes.camera_sources import V4l2Source
+from nodes.doctor import cameras, graphics, mocap, motor
+from nodes.doctor.check import ABSENT, FAILURE, OK, WARNING, Check, examine
+
+TWIN = Path(__file__).parents[3] / "calibration" / "twin"
+GOOD = {"timeout_ms": 250.0, "timeout_brake_current_a": 20.0}
+
+
+def vesc(config=None, fault=0, wire=None):
+    with VescEmulator(VescEmulatorConfig(**(config or GOOD)), TwinVehicle(CarConfig())) as emulator:
+        emulator.report_fault(fault)
+        emulator.disturb(wire)
+        found = motor.vesc(emulator.port)
+        assert not [event for event in emulator.events() if event.name.startswith("SET")]  # it is only asked
+        return {(row.check, row.state): row for row in found}
+
+
+def test_a_good_controller():
+    assert list(vesc()) == [("VESC", OK), ("VESC time-out", OK), ("battery", OK)]
+    found = vesc()["VESC", OK].found
+    assert "TWIN firmware 5.02 at /dev/pts/" in found
+    assert vesc()["VESC time-out", OK].found == "250 ms with 20 A; at most 250 ms with 20 A wanted"
+
+
+def test_as_delivered_the_car_rolls_on_and_the_cure_is_a_command():
+    row = vesc({"timeout_ms": 1000.0})["VESC time-out", FAILURE]
+    assert "1000 ms with 0 A" in row.found
+    assert row.do.startswith("advnerf motor set-timeout --port /dev/pts/")
+    assert row.do.endswith("--timeout-ms 250 --brake-current 20")
+    assert ("VESC time-out", FAILURE) in vesc({**GOOD, "timeout_ms": 0.0})
+
+
+def test_battery_fault_and_a_firmware_that_does_not_tell():
+    assert "11.0 V" in vesc({**GOOD, "supply_v": 11.0})["battery", WARNING].found
+    assert "under voltage" in vesc(fault=2)["VESC", WARNING].found
+    assert "VESC Tool" in vesc({**GOOD, "readable_settings": False})["VESC time-out", WARNING].do
+
+
+@pytest.mark.parametrize("wire", ["silent", "garbage"])
+def test_a_line_without_a_sensible_word(wire):
+    row = vesc(wire=wire)["VESC", FAILURE]
+    assert "got nothing" in row.found
+    assert "right port" in row.do
+
+
+def test_absent_busy_and_something_else_at_the_port(tmp_path):
+    (row,) = motor.vesc(str(tmp_path / "nothing"), required=True)
+    assert (row.state, "udev rule" in row.do) == (FAILURE, True)
+    with VescEmulator(VescEmulatorConfig(), TwinVehicle(CarConfig())) as emulator:
+        held = motor.Vesc(emulator.port, motor.VehicleGains(), motor.DriveLimits())
+        held.open()
+        (row,) = motor.vesc(emulator.port)
+        held.abandon()
+    assert (row.state, row.do) == (WARNING, "stop the launch, or close VESC Tool")
+    (tmp_path / "file").write_text("not a terminal")
+    assert motor.vesc(str(tmp_path / "file"))[0].state == FAILURE
+
+
+def test_no_controller_is_absent_unless_it_is_needed(monkeypatch):
+    monkeypatch.setattr(motor, "find_vesc", lambda: None)
+    assert [motor.vesc(None)[0].state, motor.vesc(None, required=True)[0].state] == [ABSENT, FAILURE]
+
+
+def test_a_terminal_that_takes_no_bytes_does_not_hang_the_doctor():
+    master, slave = pty.openpty()
+    tty.setraw(slave)
+    port = os.ttyname(slave)
+    os.set_blocking(slave, False)
+    with contextlib.suppress(BlockingIOError):
+        while True:
+            os.write(slave, bytes(4096))
+    began = time.monotonic()
+    (row,) = motor.vesc(port)
+    os.close(slave)
+    os.close(master)
+    assert row.state == FAILURE
+    assert time.monotonic() - began < 3.0
+
+
+class Port:
+    def __init__(self, device, vid=0x0483, pid=0x5740):
+        self.device, self.vid, self.pid, self.description = str(device), vid, pid, "ChibiOS/RT Virtual COM Port"
+
+
+def test_a_serial_device_is_told_with_what_it_lacks(tmp_path, monkeypatch):
+    device = tmp_path / "ttyACM0"
+    device.touch()
+    monkeypatch.setattr(motor, "ports", lambda: [Port(device)])
+    monkeypatch.setattr(motor, "_running", lambda name: None)
+    assert "install the udev rule" in motor.serial_ports()[0].do
+    monkeypatch.setattr(motor, "stable_names", lambda device: [motor.FIXED_NAME])
+    assert [row.state for row in motor.serial_ports()] == [OK]
+    monkeypatch.setattr(motor, "_running", lambda name: 4711)
+    assert "ModemManager runs (process 4711)" in motor.serial_ports()[1].found
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    assert motor.serial_ports()[0].found.startswith("no permission for")
+    monkeypatch.setattr(motor, "ports", list)
+    assert motor.serial_ports()[0].state == ABSENT
+
+
+def test_a_program_is_found_by_its_name():
+    assert motor._running("no such program") is None
+    assert motor._running(Path("/proc/self/comm").read_text().strip()) is not None
+
+
+def free_port():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+@contextmanager
+def tracker(names=("car", "board")):
+    emulator = ViconEmulator(
+        ViconEmulatorConfig(port=free_port()), lambda ns: {name: np.eye(4) + np.eye(4, k=3) for name in names}
+    )
+    try:
+        yield emulator
+    finally:
+        emulator.close()
+
+
+def listen(port, subjects=("car", "board"), **options):
+    config = ViconConfig(tuple(subjects), "127.0.0.1", port)
+    return mocap.listen(config, **{"required": True, "listen_s": 0.4, **options})
+
+
+def test_the_stream_its_rate_and_its_subjects():
+    with tracker() as emulator:
+        stream, *subjects = listen(emulator.config.port)
+        assert stream.state == OK
+        assert 60 < float(stream.found.split()[0]) < 140
+        assert [(row.state, row.found.split(":")[0]) for row in subjects] == [(OK, "car"), (OK, "board")]
+        rows = listen(emulator.config.port, ("car", "wand"))
+        assert [(row.state, row.found) for row in rows[2:]] == [(FAILURE, "wand is not seen")]
+        assert listen(emulator.config.port, ("car", "wand"), needed=("car",))[-1].state == WARNING
+        unasked = listen(emulator.config.port, ())
+        assert {row.found.split(":")[0] for row in unasked[1:]} == {"car", "board"}
+
+
+@pytest.mark.parametrize("form", ["missing", "zeros", "nan", "frozen"])
+def test_an_occluded_car_is_not_seen(form):
+    with tracker() as emulator:
+        emulator.occlude("car", form)
+        time.sleep(0.1)
+        car = next(row for row in listen(emulator.config.port) if row.found.startswith("car"))
+        # Frozen poses count until the same bits came five times.
+        assert car.state == FAILURE or (form == "frozen" and float(car.found.split()[1]) < 20)
+
+
+def test_silence_a_stranger_and_a_taken_port():
+    port = free_port()
+    (row,) = listen(port)
+    assert row.state == FAILURE
+    assert "UDP Object Stream on" in row.do
+    assert listen(port, required=False)[0].state == ABSENT
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as holder:
+        holder.bind(("127.0.0.1", port))
+        (row,) = listen(port)
+        assert (row.state, "ss -ulpn" in row.do) == (FAILURE, True)
+        assert mocap.free_port(port, "127.0.0.1") == [row]
+    assert "give an address of this computer" in mocap.free_port(port, "203.0.113.7")[0].do
+    stop = threading.Event()
+
+    def shout():
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+            while not stop.wait(0.01):
+                stranger.sendto(b"\xff" * 40, ("127.0.0.1", port))
+
+    thread = threading.Thread(target=shout)
+    thread.start()
+    try:
+        assert "not Tracker's" in listen(port)[0].found
+        assert "not Tracker's" in listen(port, ())[0].found
+    finally:
+        stop.set()
+        thread.join()
+
+
+def test_video_devices_with_their_formats_and_without_metadata():
+    webcam = VideoDevice(formats={"YUYV": [(640, 480)], "MJPG": [(1280, 720)]})
+    port = VideoPortEmulator({"/dev/a": webcam, "/dev/b": VideoDevice(metadata_only=True)})
+    (row,) = cameras.video_devices(port)
+    assert (row.state, row.found) == (OK, "/dev/a: Emulated Camera (uvcvideo), YUYV 640x480@30/15; MJPG 1280x720@30/15")
+    assert port.open_files == 0
+    assert cameras.video_devices(VideoPortEmulator({}))[0].state == ABSENT
+
+
+def test_a_driver_that_hangs_in_the_kernel_costs_the_deadline():
+    never = threading.Event()
+
+    class Hung(VideoPortEmulator):
+        def ioctl(self, fd, request, argument):
+            never.wait()
+
+    port = Hung({"/dev/a": VideoDevice()})
+    began = time.monotonic()
+    (row,) = examine([Check("camera", lambda: cameras.video_devices(port), 0.2, "unplug it")])
+    never.set()
+    assert (row.state, row.found, row.do) == (FAILURE, "no answer within 0.2 s", "unplug it")
+    assert time.monotonic() - began < 2.0
+
+
+class Emulated(V4l2Source):
+    """The source of a launch file, before an emulated device."""
+
+    def camera(self):
+        mode = Mode(self.width, self.height, self.fps, self.pixel_format)
+        return V4l2Camera(self.device, mode, rate_hz=self.rate_hz, size=self.size, port=PORTS.get(str(self.device)))
+
+
+PORTS = {}
+
+
+@contextmanager
+def exposing(device, value=128, rate_hz=30.0):
+    stop = threading.Event()
+    data = bytes([value, 128]) * (device.width * device.height)
+
+    def expose():
+        while not stop.wait(1.0 / rate_hz):
+            device.expose(data)
+
+    thread = threading.Thread(target=expose)
+    thread.start()
+    PORTS["/dev/video7"] = VideoPortEmulator({"/dev/video7": device})
+    try:
+        yield Emulated(device="/dev/video7", width=320, height=240, rate_hz=None, stall_s=0.2)
+    finally:
+        stop.set()
+        thread.join()
+        PORTS.clear()
+
+
+def test_a_source_is_measured_and_compared():
+    device = VideoDevice(formats={"YUYV": [(320, 240)]})
+    with exposing(device) as source:
+        camera = load_calibration(CameraCalibration, TWIN / "camera.yaml")
+        rows = cameras.source(source, camera)
+        assert rows[0].found.startswith("v4l2: 320 x 240, ")
+        assert "brightness 1" in rows[0].found
+        assert ("calibrated for 336 x 188", FAILURE) in {(row.found, row.state) for row in rows}
+        assert "by-id" in rows[-1].do
+        assert [row.state for row in cameras.source(source)] == [OK, WARNING]
+        slow = source.model_copy(update={"rate_hz": 30.0, "fps": 30.0})
+        device.rates = (30.0,)
+    with exposing(device, value=16, rate_hz=12.0):
+        found = [row.found for row in cameras.source(slow)]
+        assert "expected 30.0 Hz" in found
+        assert "the picture is black or white" in found
+
+
+def test_a_source_that_is_absent_silent_or_taken():
+    device = VideoDevice(formats={"YUYV": [(320, 240)]})
+    with exposing(device, rate_hz=0.01) as source:
+        (row,) = cameras.source(source, timeout_s=0.6)
+        assert (row.state, "got 0 in 0.6 s" in row.found) == (FAILURE, True)
+    PORTS["/dev/video7"] = VideoPortEmulator({})
+    (row,) = cameras.source(source, timeout_s=0.3)
+    PORTS.clear()
+    assert "expected a camera at /dev/video7, found none" in row.found
+
+
+def test_screens_come_from_a_process_of_their_own(monkeypatch):
+    pytest.importorskip("pygame")
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.delenv("SDL_VIDEODRIVER", raising=False)
+    (row,) = graphics.screens()
+    assert (row.state, "no window system" in row.found) == (ABSENT, True)
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    from nodes.monitor import ScreenConfig
+
+    assert graphics.screens()[0].state == OK
+    rows = graphics.screens(ScreenConfig(index=9, connector="HDMI-A-7"))
+    assert rows[1].found == "no screen with index 9"
+    assert "no monitor at HDMI-A-7" in graphics.screens(ScreenConfig(connector="HDMI-A-7"))[1].found
+
+
+def test_time_out_that_a_launch_file_asks_for():
+    with VescEmulator(VescEmulatorConfig(timeout_ms=400.0), TwinVehicle(CarConfig())) as emulator:
+        rows = motor.vesc(emulator.port, TimeoutSettings(500, 0.0))
+    assert [row.state for row in rows] == [OK, OK, OK]
+
+
+def test_what_a_lost_line_says_is_the_finding():
+    def lost():
+        raise LinkLost("lost the VESC")
+
+    assert [row.found for row in examine([Check("VESC", lost)])] == ["lost the VESC"]

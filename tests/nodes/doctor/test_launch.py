@@ -1,0 +1,220 @@
+"""``advnerf doctor LAUNCH``: what a launch file needs here, with the emulators in the place of the car's devices."""
+
+import json
+import socket
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from hardware.twin.config import CarConfig
+from hardware.twin.vehicle import TwinVehicle
+from hardware.twin.vesc_emulator import VescEmulator
+from hardware.twin.vesc_firmware import VescEmulatorConfig
+from hardware.twin.vicon_emulator import ViconEmulator, ViconEmulatorConfig
+from nodes import cli
+from nodes.doctor import graphics, launch, machine
+from nodes.doctor.check import ABSENT, FAILURE, OK, WARNING, examine
+from nodes.doctor.launch import checks_of, pictures_of
+from nodes.runtime.launch_file import load_launch
+from nodes.runtime.security import DRIVE, KeyFolder
+
+ROOT = Path(__file__).parents[3]
+TWIN = ROOT / "calibration" / "twin"
+# Each of them starts as many processes as there are nodes; one test does, the others are about devices.
+SLOW = ("nodes", "policy", "EGL")
+
+
+def plan_of(name, *overrides, host=None):
+    return load_launch(ROOT / "launch" / f"{name}.launch.yaml", [f"params.calibration={TWIN}", *overrides], host=host)
+
+
+def findings(plan, folder, leave_out=SLOW):
+    checks = [check for check in checks_of(plan, folder) if check.name not in leave_out]
+    return list(examine(checks))
+
+
+def states(rows, check):
+    return [row.state for row in rows if row.check == check]
+
+
+def free_port(kind=socket.SOCK_DGRAM):
+    with socket.socket(socket.AF_INET, kind) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+def test_the_twin_needs_its_files_a_port_and_a_disk(tmp_path):
+    policy = tmp_path / "policy.safetensors"
+    policy.touch()
+    plan = plan_of("green_screen", f"params.policy={policy}", f"params.vicon_port={free_port()}")
+    assert [check.name for check in checks_of(plan, tmp_path)] == [
+        "versions", "machine", "sockets", "launches", "nodes", "calibration", "files", "EGL", "VICON", "policy", "disk",
+    ]  # fmt: skip
+    rows = findings(plan, tmp_path)
+    assert states(rows, "calibration") == [OK]
+    assert states(rows, "files") == [OK]
+    assert states(rows, "VICON") == [OK]
+    (disk,) = [row for row in rows if row.check == "disk"]
+    assert "14.4 GB an hour" in disk.found
+    assert pictures_of(plan).width == 336
+
+
+def test_files_that_are_missing_or_damaged_are_named(tmp_path):
+    attack = tmp_path / "a.attack.safetensors"
+    attack.write_bytes(b"no attack")
+    broken = tmp_path / "room.yaml"
+    broken.write_text((TWIN / "room.yaml").read_text().replace("date:", "day:"))
+    rows = findings(plan_of("green_screen", f"params.attack={attack}", f"safety.room={broken}"), tmp_path)
+    found = {row.found for row in rows if row.state == FAILURE}
+    assert "policy: no file policy.safetensors" in found
+    assert any(str(broken) in text for text in found)
+    assert states(rows, "attack") == [FAILURE]
+    assert "policy" not in {check.name for check in checks_of(plan_of("green_screen"), tmp_path)}  # said under files
+
+
+@pytest.fixture
+def car():
+    """The car's controller on a pty and a tracker that sends where it is."""
+    eye = np.eye(4) + np.eye(4, k=3)
+    tracker = ViconEmulator(ViconEmulatorConfig(port=free_port()), lambda ns: {"car": eye, "board": eye})
+    with VescEmulator(VescEmulatorConfig(), TwinVehicle(CarConfig())) as vesc:
+        yield vesc, tracker.config.port
+    tracker.close()
+
+
+def test_the_car_is_asked_for_what_its_launch_file_wants(car, tmp_path, monkeypatch):
+    monkeypatch.setattr(launch.mocap, "LISTEN_S", 0.3)
+    vesc, vicon_port = car
+    overrides = [
+        f"params.vesc={vesc.port}", f"params.vicon_port={vicon_port}", "params.camera={kind: v4l2, device: /dev/video99, width: 640, height: 480}",
+    ]  # fmt: skip
+    rows = findings(plan_of("robot", *overrides), tmp_path)
+    assert states(rows, "VESC") == [OK]
+    (timeout,) = [row for row in rows if row.check == "VESC time-out"]
+    assert (timeout.state, "1000 ms with 0 A, at most 250 ms with 20 A wanted" in timeout.found) == (FAILURE, True)
+    assert states(rows, "battery") == [OK]
+    seen = {row.found.split(":")[0]: row.state for row in rows if row.check == "VICON"}
+    assert (seen["car"], seen["board"], seen["wand is not seen"]) == (OK, OK, WARNING)
+    (camera,) = [row for row in rows if row.check == "camera"]
+    assert (camera.state, "expected a camera at /dev/video99, found none" in camera.found) == (FAILURE, True)
+    assert states(rows, "gamepad")[0] in (OK, WARNING)  # teleop: hold
+
+
+def test_devices_of_a_twin_that_is_switched_off_are_missed(tmp_path):
+    rows = findings(plan_of("green_screen", "twin.if=false", "vicon.source=127.0.0.1"), tmp_path)
+    for check in ("camera", "VESC"):
+        (row,) = [row for row in rows if row.check == check]
+        assert (row.state, "this launch has no node that makes it" in row.found) == (FAILURE, True)
+    assert states(rows, "VICON") == [FAILURE]  # a real stream is wanted now
+    assert states(rows, "EGL") == []
+
+
+def test_each_host_has_its_own_needs(tmp_path):
+    watch, drive = free_port(socket.SOCK_STREAM), free_port(socket.SOCK_STREAM)
+    keys = KeyFolder(tmp_path / "keys")
+    keys.new("robot")
+    shared = [f"hosts.robot.watch_port={watch}", f"hosts.robot.drive_port={drive}", f"keys={keys.path}"]
+    there = plan_of("two_hosts", *shared, "params.policy=p.onnx", host="workstation")
+    names = [check.name for check in checks_of(there, tmp_path)]
+    assert "VESC" not in names
+    assert names[-3:] == ["clock", "network", "disk"]
+    rows = findings(there, tmp_path)
+    assert states(rows, "network") == [WARNING, WARNING]  # the car's launch does not run yet
+    assert states(rows, "keys") == [FAILURE]  # no key of its own
+    robot = plan_of("two_hosts", *shared, "camera.source={kind: folder, folder: nowhere}", host="robot")
+    rows = findings(robot, tmp_path, (*SLOW, "VICON", "camera", "VESC"))
+    assert states(rows, "network") == [OK, OK]
+    assert [row.do for row in rows if row.check == "keys"] == ["advnerf keys allow workstation --to drive"]
+    keys.add("workstation", keys.public("robot"))
+    keys.allow("workstation", DRIVE)
+    with socket.create_server(("127.0.0.1", watch)):
+        rows = findings(robot, tmp_path, (*SLOW, "VICON", "camera", "VESC"))
+        assert states(rows, "network") == [FAILURE, OK]
+        assert "cannot listen on" in next(row.found for row in rows if row.check == "network")
+    assert states(rows, "keys") == [OK]
+    away = plan_of("two_hosts", *shared, "params.robot=203.0.113.7", host="robot")
+    rows = findings(away, tmp_path, (*SLOW, "VICON", "camera", "VESC"))
+    assert "ip addr says" in next(row.do for row in rows if row.check == "network")
+
+
+def run(monkeypatch, capsys, *arguments):
+    monkeypatch.setattr(sys, "argv", ["advnerf", "doctor", *map(str, arguments)])
+    try:
+        cli.main()
+        code = 0
+    except SystemExit as end:
+        code = int(end.code or 0)
+    return code, *capsys.readouterr()
+
+
+def test_the_command_prints_one_line_per_finding_and_tells_by_its_exit_code(tmp_path, monkeypatch, capsys):
+    file = tmp_path / "small.launch.yaml"
+    room = yaml.safe_load((TWIN / "room.yaml").read_text())
+    (tmp_path / "room.yaml").write_text(yaml.safe_dump(room))
+    file.write_text(
+        f"name: small\nnodes:\n  safety: {{module: nodes.safety, config: {{room: {tmp_path / 'room.yaml'}}}}}\n"
+    )
+    code, output, _ = run(monkeypatch, capsys, file)
+    lines = output.splitlines()
+    assert code == 0
+    assert any(line.startswith("ok       calibration") and str(tmp_path / "room.yaml") in line for line in lines)
+    assert any("safety accept their configuration" in line for line in lines)
+    assert lines[-1].startswith("0 failures")
+    (tmp_path / "room.yaml").unlink()
+    code, output, _ = run(monkeypatch, capsys, file, "--json")
+    told = json.loads(output)
+    assert (code, told["state"]) == (1, FAILURE)
+    rows = [row for row in told["findings"] if row["check"] == "calibration"]
+    assert (rows[0]["state"], "advnerf calibrate" in rows[0]["do"]) == (FAILURE, True)
+
+
+def test_what_the_command_cannot_understand_is_exit_code_2(tmp_path, monkeypatch, capsys):
+    broken = tmp_path / "broken.launch.yaml"
+    broken.write_text("name: broken\nnodes: [\n")
+    assert run(monkeypatch, capsys, broken)[0] == 2
+    assert run(monkeypatch, capsys, tmp_path / "none.launch.yaml")[0] == 2
+    assert run(monkeypatch, capsys, ROOT / "launch" / "two_hosts.launch.yaml")[0] == 2  # which host?
+    code, _, errors = run(monkeypatch, capsys, "--set", "twin.if=false")
+    assert (code, "name one" in errors) == (2, True)
+
+
+def test_a_computer_without_a_launch_file_in_mind(tmp_path, monkeypatch, capsys):
+    for name in ("torch", "egl", "llvm", "screens"):  # processes that take seconds; tests of their own
+        monkeypatch.setattr(graphics, name, lambda required=False: [])
+    monkeypatch.setattr(machine, "clock", lambda: [])
+    code, output, _ = run(monkeypatch, capsys, "--folder", tmp_path, "--vicon-port", free_port(), "--json")
+    told = json.loads(output)["findings"]
+    assert code == 0
+    assert {"python", "extras", "machine", "disk", "sockets", "keys", "VICON", "camera", "gamepad", "launches"} <= {
+        row["check"] for row in told
+    }
+    assert ABSENT in {row["state"] for row in told if row["check"] == "VICON"}
+    with VescEmulator(VescEmulatorConfig(), TwinVehicle(CarConfig())) as vesc:
+        code, output, _ = run(
+            monkeypatch, capsys, "--folder", tmp_path, "--vesc", vesc.port, "--vicon-port", free_port()
+        )
+    assert code == 1
+    assert f"-> advnerf motor set-timeout --port {vesc.port}" in output
+
+
+@pytest.mark.slow  # imports torch, starts EGL and compiles with LLVM
+def test_libraries_of_this_computer_answer(tmp_path):
+    assert [row.state for row in (*graphics.torch(True), *graphics.egl(True))] == [OK, OK]
+    assert graphics.llvm()[0].state in (OK, ABSENT, WARNING)
+
+
+@pytest.mark.slow  # a policy in a process of its own, and every node
+def test_a_policy_is_loaded_and_timed(tmp_path):
+    from advnerf_core.driving.policy import PilotNet, save_policy
+    from advnerf_core.driving.policy_view import PolicyView
+    from advnerf_core.geometry import Pinhole
+
+    view = PolicyView(Pinhole(336, 188, 174.0, 174.0, 168.0, 94.0))
+    save_policy(tmp_path / "policy.safetensors", PilotNet(), view, {})
+    plan = plan_of("green_screen", f"params.policy={tmp_path / 'policy.safetensors'}")
+    rows = findings(plan, tmp_path, ("EGL", "VICON"))
+    assert states(rows, "nodes") == [OK]
+    assert states(rows, "policy")[0] == OK
