@@ -43,10 +43,11 @@ def build_model(config: IntersectionConfig) -> Any:
     spec.visual.headlight.active = 0
     spec.visual.quality.offsamples = 0  # the renderer averages a larger image instead, which also filters textures
     surfaces, solids, plans = _painted(config.road)
-    for surface in surfaces:
+    # Drawn in this order, so from what hides others (trees, houses) to what is hidden (the road, the sky behind it).
+    for name in ("swatches", "pavement", "garden"):
+        _add_solid(mujoco, spec, name, solids[name], plans[name])
+    for surface in reversed(surfaces):
         _add_solid(mujoco, spec, surface.name, _rectangle(surface), surface.image)
-    for name, solid in solids.items():
-        _add_solid(mujoco, spec, name, solid, plans[name])
     return spec.compile()
 
 
