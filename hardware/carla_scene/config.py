@@ -45,7 +45,7 @@ class JunctionConfig(_Frozen):
     """Which junction, and how much road around it.
 
     Attributes:
-        id: OpenDRIVE id; None takes the map's first junction of three roads.
+        id: OpenDRIVE id; None takes the map's first junction of three roads that is flat and has roads long enough.
         choice: Which of its sets of drives.
         approach_m: The drives start so far before the junction's middle [m].
         beyond_m: Length of the road after the junction that belongs to the reference paths [m].

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -68,31 +67,24 @@ class JunctionInfo:
     drives: int
 
 
-def read_opendrive(file: Path, library: Any) -> Any:
-    """A ``carla.Map`` of an OpenDRIVE file; no server is needed.
-
-    Raises:
-        CarlaMapError: The file cannot be read, or is not a map with roads.
-    """
-    try:
-        carla_map = library.Map(file.stem, file.read_text(encoding="utf-8"))
-        roads = carla_map.get_topology()
-    except (OSError, UnicodeDecodeError, RuntimeError) as error:
-        raise CarlaMapError(f"expected an OpenDRIVE map in {file}, got: {error}") from error
-    if not roads:
-        raise CarlaMapError(f"expected an OpenDRIVE map with roads in {file}, got one without")
-    return carla_map
-
-
 def list_junctions(carla_map: Any, library: Any) -> list[JunctionInfo]:
     """All junctions of a map, by id."""
     infos = []
     for number, junction in sorted(_junctions(carla_map).items()):
         crossings = _crossings(junction, library)
-        headings = {round(math.degrees(float(c.entry[2])) / 30.0) % 12 for c in crossings}
         at = junction.bounding_box.location
-        infos.append(JunctionInfo(number, at.x, at.y, len(headings), len(_sets_of_three(crossings))))
+        infos.append(JunctionInfo(number, at.x, at.y, _arms(crossings), len(_sets_of_three(crossings))))
     return infos
+
+
+def _arms(crossings: Sequence[Crossing]) -> int:
+    """How many roads lanes come from; lanes that head the same way come from one."""
+    headings: list[float] = []
+    for crossing in crossings:
+        heading = float(crossing.entry[2])
+        if all(abs(float(wrap_angle(heading - other))) > _STRAIGHT_RAD for other in headings):
+            headings.append(heading)
+    return len(headings)
 
 
 def find_drives(
@@ -102,6 +94,7 @@ def find_drives(
     choice: int = 0,
     approach_m: float = 24.0,
     beyond_m: float = 40.0,
+    max_height_range_m: float = math.inf,
     tolerance_m: float = 0.02,
 ) -> Drives:
     """The drives through one junction.
@@ -109,16 +102,35 @@ def find_drives(
     Args:
         carla_map: A ``carla.Map``.
         library: The ``carla`` module.
-        junction_id: OpenDRIVE id; None takes the first three-way junction that has the drives.
+        junction_id: OpenDRIVE id; None takes the first junction of three roads that has such drives.
         choice: Which of the junction's sets of drives, by the heading of the straight one; a crossing of four roads has four.
         approach_m: The drives start so far before the junction's middle, along the road [m].
         beyond_m: Length of the road after the junction that belongs to the paths [m].
+        max_height_range_m: The drives' points may differ so much in height [m].
         tolerance_m: How closely lines and arcs follow the lanes [m].
 
     Raises:
-        CarlaMapError: There is no such junction, it has no such drives, or its roads are too short.
+        CarlaMapError: There is no such junction, or it has no such drives: its roads are too short, or not flat enough.
     """
-    junction = _chosen(carla_map, library, junction_id)
+    candidates, reasons = _candidates(carla_map, library, junction_id), []
+    for junction in candidates:
+        try:
+            drives = _drives_at(junction, library, choice, approach_m, beyond_m, tolerance_m)
+            if drives.height_range_m <= max_height_range_m:
+                return drives
+            reasons.append(
+                f"expected a flat junction, heights within {max_height_range_m:g} m, got {drives.height_range_m:.2f} m at junction "
+                f"{drives.junction_id}; take another one (`advnerf carla junctions`), or shorter roads"
+            )
+        except CarlaMapError as error:
+            reasons.append(str(error))
+    more = f" (none of {len(candidates)} junctions will do; this is the first)" if len(candidates) > 1 else ""
+    raise CarlaMapError(reasons[0] + more)
+
+
+def _drives_at(
+    junction: Any, library: Any, choice: int, approach_m: float, beyond_m: float, tolerance_m: float
+) -> Drives:
     sets = _sets_of_three(_crossings(junction, library))
     if not 0 <= choice < len(sets):
         raise CarlaMapError(
@@ -145,7 +157,7 @@ def _junctions(carla_map: Any) -> dict[int, Any]:
     return found
 
 
-def _chosen(carla_map: Any, library: Any, junction_id: int | None) -> Any:
+def _candidates(carla_map: Any, library: Any, junction_id: int | None) -> list[Any]:
     junctions = _junctions(carla_map)
     if junction_id is not None:
         if junction_id not in junctions:
@@ -153,14 +165,14 @@ def _chosen(carla_map: Any, library: Any, junction_id: int | None) -> Any:
                 f"expected junction {junction_id} in the map {carla_map.name}, which has {sorted(junctions) or 'none'}; "
                 "`advnerf carla junctions` lists them"
             )
-        return junctions[junction_id]
+        return [junctions[junction_id]]
     fit = [info.id for info in list_junctions(carla_map, library) if info.arms == 3 and info.drives]
     if not fit:
         raise CarlaMapError(
             f"expected a junction of three roads in the map {carla_map.name}, found none: name a map that has one, or a crossing's id "
-            "in `junction_id`"
+            "in junction.id"
         )
-    return junctions[fit[0]]
+    return [junctions[each] for each in fit]
 
 
 def _crossings(junction: Any, library: Any) -> list[Crossing]:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import contextlib
 import importlib
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
-from hardware.carla_scene.errors import CarlaError, CarlaNotInstalled, CarlaUnreachable
+from hardware.carla_scene.errors import CarlaError, CarlaMapError, CarlaNotInstalled, CarlaUnreachable
 
 
 def load_carla() -> Any:
@@ -41,3 +42,19 @@ def server_answers(doing: str) -> Iterator[None]:
             f"the CARLA server did not answer to {doing}: {error}; is it still running? Another client that ticks, or a map that still "
             "loads, looks the same"
         ) from error
+
+
+def read_opendrive(file: Path, library: Any) -> Any:
+    """A ``carla.Map`` of an OpenDRIVE file; no server is needed.
+
+    Raises:
+        CarlaMapError: The file cannot be read, or is not a map with roads.
+    """
+    try:
+        carla_map = library.Map(file.stem, file.read_text(encoding="utf-8"))
+        roads = carla_map.get_topology()
+    except (OSError, UnicodeDecodeError, RuntimeError) as error:
+        raise CarlaMapError(f"expected an OpenDRIVE map in {file}, got: {error}") from error
+    if not roads:
+        raise CarlaMapError(f"expected an OpenDRIVE map with roads in {file}, got one without")
+    return carla_map

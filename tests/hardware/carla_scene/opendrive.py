@@ -21,6 +21,7 @@ class TJunction:
         slope: Rise of the main road east of the junction [m/m].
         left_hand: Traffic keeps to the left.
         bend_1pm: Curvature of the west road, seen when driving east [1/m]; the road still ends at the junction.
+        first_id: Added to the ids of roads (1 to 15) and junction (100).
     """
 
     x_m: float = 0.0
@@ -33,9 +34,21 @@ class TJunction:
     slope: float = 0.0
     left_hand: bool = False
     bend_1pm: float = 0.0
+    first_id: int = 0
 
-    def text(self) -> str:
-        """The file."""
+    def text(self, *others: TJunction) -> str:
+        """The file, with other junctions in it too."""
+        parts = [each.parts() for each in (self, *others)]
+        return (
+            '<?xml version="1.0" standalone="yes"?><OpenDRIVE><header revMajor="1" revMinor="4" name="t" version="1" '
+            'north="500" south="-500" east="500" west="-500"><geoReference>+proj=tmerc +lat_0=0 +lon_0=0</geoReference></header>'
+            + "".join(roads for roads, _ in parts)
+            + "".join(junction for _, junction in parts)
+            + "</OpenDRIVE>"
+        )
+
+    def parts(self) -> tuple[str, str]:
+        """Roads and junction."""
         h, q = self.half_m, 0.5 * math.pi
         west = self._west_start()
         roads = [
@@ -57,15 +70,10 @@ class TJunction:
         for index, (number, start, length, curvature, before, after) in enumerate(turns):
             roads.append(self._road(number, 100, start, length, curvature, link=(before, after)))
             connections += (
-                f'<connection id="{index}" incomingRoad="{before[0]}" connectingRoad="{number}" contactPoint="start">'
+                f'<connection id="{index}" incomingRoad="{before[0] + self.first_id}" connectingRoad="{number + self.first_id}" contactPoint="start">'
                 f'<laneLink from="{before[2]}" to="-1"/></connection>'
             )
-        return (
-            '<?xml version="1.0" standalone="yes"?><OpenDRIVE><header revMajor="1" revMinor="4" name="t" version="1" '
-            'north="500" south="-500" east="500" west="-500"><geoReference>+proj=tmerc +lat_0=0 +lon_0=0</geoReference></header>'
-            + "".join(roads)
-            + f'<junction id="100" name="t">{connections}</junction></OpenDRIVE>'
-        )
+        return "".join(roads), f'<junction id="{100 + self.first_id}" name="t">{connections}</junction>'
 
     def _west_start(self) -> tuple[float, float, float]:
         """Where a road of the wanted bend must start to end at the junction heading along x."""
@@ -84,18 +92,19 @@ class TJunction:
         shape = "<line/>" if curvature == 0.0 else f'<arc curvature="{curvature:.12g}"/>'
         links = ""
         if predecessor:
-            links += '<predecessor elementType="junction" elementId="100"/>'
+            links += f'<predecessor elementType="junction" elementId="{100 + self.first_id}"/>'
         if successor:
-            links += '<successor elementType="junction" elementId="100"/>'
+            links += f'<successor elementType="junction" elementId="{100 + self.first_id}"/>'
         lane_links = ""
         if link:
             for name, (road, contact, lane) in zip(("predecessor", "successor"), link, strict=True):
-                links += f'<{name} elementType="road" elementId="{road}" contactPoint="{contact}"/>'
+                links += f'<{name} elementType="road" elementId="{road + self.first_id}" contactPoint="{contact}"/>'
                 lane_links += f'<{name} id="{lane}"/>'
+        owner = junction if junction < 0 else junction + self.first_id
         rule = "LHT" if self.left_hand else "RHT"
         left = f"<left>{self._lane(1, '')}</left>" if both else ""
         return (
-            f'<road name="r{number}" length="{length:.12g}" id="{number}" junction="{junction}" rule="{rule}"><link>{links}</link>'
+            f'<road name="r{number}" length="{length:.12g}" id="{number + self.first_id}" junction="{owner}" rule="{rule}"><link>{links}</link>'
             f'<planView><geometry s="0" x="{x:.12g}" y="{y:.12g}" hdg="{heading + self.yaw_rad:.12g}" length="{length:.12g}">'
             f'{shape}</geometry></planView><elevationProfile><elevation s="0" a="{self.z_m}" b="{slope}" c="0" d="0"/>'
             f'</elevationProfile><lateralProfile/><lanes><laneSection s="0">{left}'

@@ -20,11 +20,14 @@ def path_of(reference):
     return Path.from_segments(reference.start_pose, pieces, closed=False)
 
 
-def test_the_junction_is_found(carla, TJunction):
-    (info,) = list_junctions(carla.Map("written", TJunction(x_m=30.0, y_m=20.0).text()), carla)
+@pytest.mark.parametrize("yaw_deg", [0.0, 15.0, 45.0, 180.0])
+def test_the_junction_is_found(carla, TJunction, yaw_deg):
+    text = TJunction(x_m=30.0, y_m=20.0, yaw_rad=math.radians(yaw_deg)).text()
+    (info,) = list_junctions(carla.Map("written", text), carla)
     assert (info.id, info.arms, info.drives) == (100, 3, 1)
-    assert info.x_m == pytest.approx(30.0, abs=0.1)
-    assert info.y_m == pytest.approx(-20.0, abs=6.0)  # mirrored; the box is not centred on the roads
+    assert (info.x_m, info.y_m) == pytest.approx(
+        (30.0, -20.0), abs=6.0
+    )  # mirrored; the box is not centred on the roads
 
 
 @pytest.mark.parametrize(
@@ -94,3 +97,15 @@ def test_what_a_map_lacks_is_said(carla, TJunction):
     )
     with pytest.raises(CarlaMapError, match="junction of three roads in the map road, found none"):
         find_drives(carla.Map("road", only_a_road + "</OpenDRIVE>"), carla)
+
+
+def test_of_several_junctions_the_first_that_will_do_is_taken(carla, TJunction):
+    """One file with a hill's junction (100) and a flat one (200) beside it."""
+    both = carla.Map("both", TJunction(slope=0.05).text(TJunction(y_m=-400.0, first_id=100)))
+    assert [info.id for info in list_junctions(both, carla)] == [100, 200]
+    assert find_drives(both, carla).junction_id == 100
+    drives = find_drives(both, carla, max_height_range_m=0.15)
+    assert drives.junction_id == 200
+    assert drives.paths["left"].start_pose == pytest.approx((1.75, -24.0, math.pi / 2), abs=1e-3)
+    with pytest.raises(CarlaMapError, match=r"none of 2 junctions will do; this is the first"):
+        find_drives(both, carla, max_height_range_m=0.15, beyond_m=300.0)

@@ -10,6 +10,8 @@ from advnerf_core.scene.dataset import load_transforms
 from hardware.carla_scene import CarlaConfig, CarlaUnreachable
 from hardware.carla_scene.drives import Drives
 from hardware.carla_scene.errors import CarlaMapError
+from hardware.carla_scene.junction import find_drives
+from hardware.carla_scene.photos import photo_poses
 from nodes.carla_tools.capture import CaptureRequest, capture
 from nodes.runtime.errors import ConfigError
 
@@ -41,19 +43,22 @@ def test_images_and_poses_belong_together(library, settings, tmp_path):
             assert np.median(error) <= (2.0 if name == "photos" else 1.0)
 
 
-def test_photographs_are_along_the_lanes_and_above(library, settings, tmp_path):
-    run(library, settings, tmp_path / "set", CaptureRequest(photos=60, held_out=0))
-    T = _poses(tmp_path / "set" / "photos")
+def test_photographs_are_along_the_lanes_and_above(carla, TJunction):
+    drives = find_drives(carla.Map("written", TJunction().text()), carla)
+    T = np.array(photo_poses(drives, CarlaConfig(), 300, np.random.default_rng(1)))
     raised = T[:, 2, 3] > 2.5
-    assert raised.sum() == 12
-    assert np.abs(T[:, :2, 3]).max() < 60.0
-    looks_down = np.degrees(np.arcsin(-T[~raised, 2, 2]))
-    assert 0.0 < np.median(looks_down) < 16.0  # about the driving camera's 8 degrees
-
-
-def _poses(folder):
-    frames = json.loads((folder / "transforms.json").read_text())["frames"]
-    return np.array([frame["transform_matrix"] for frame in frames]) @ np.diag([1.0, -1.0, -1.0, 1.0])
+    assert raised.sum() == 60
+    assert 0.0 < np.median(np.degrees(np.arcsin(-T[~raised, 2, 2]))) < 16.0  # about the driving camera's 8 degrees
+    # Every camera is over the asphalt, or as far beside it as it is ahead of a car that has turned in its lane.
+    x, y = T[:, 0, 3], T[:, 1, 3]
+    assert (
+        (np.abs(y) < 3.5 + 3.2) | ((y < 0.0) & (np.abs(x) < 3.5 + 3.2)) | ((np.hypot(x, y) < 15.0) & (y < 0.0))
+    ).all()
+    for path in drives.paths.values():
+        start = np.hypot(x - path.start_pose[0], y - path.start_pose[1])
+        assert (start < 12.0).sum() > 5
+    repeated = photo_poses(drives, CarlaConfig(), 30, np.random.default_rng(1))
+    np.testing.assert_array_equal(repeated, T[:30])
 
 
 def test_a_stopped_capture_goes_on_to_the_same_result(library, settings, tmp_path):
