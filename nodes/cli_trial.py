@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -81,8 +82,9 @@ def evaluate(
     from nodes.trials.bags import evaluate_bag
 
     rows = table(
-        "bag", "attack", "total CTE \\[m]", "mean \\[m]", "max \\[m]", "off track", "left after", "stopped early"
-    )
+        "bag", "attack", "total CTE \\[m]", "mean \\[m]", "max \\[m]", "off track", "left after", "attack adds",
+        "stopped early",
+    )  # fmt: skip
     for bag in bags:
         for found in evaluate_bag(bag, room, ticks):
             if as_json:
@@ -92,10 +94,19 @@ def evaluate(
             rows.add_row(
                 str(bag), " ".join(found["attack_ids"]) or "none", f"{found['total_cte_m']:.3f}",
                 f"{found['mean_abs_cte_m']:.3f}", f"{found['max_abs_cte_m']:.3f}", "yes" if found["off_track"] else "no",
-                "" if leaving is None else f"{leaving:.1f} s", found["stopped_early"],
+                "" if leaving is None else f"{leaving:.1f} s", _added(found.get("counterfactual")), found["stopped_early"],
             )  # fmt: skip
     if not as_json:
         print_table(rows)
+
+
+def _added(compared: dict[str, Any] | None) -> str:
+    """What the attack added to the steering, in degrees; nothing where nobody compared."""
+    if compared is None:
+        return ""
+    mean, largest = compared["mean_abs_delta_rad"], math.degrees(compared["max_abs_delta_rad"])
+    seen = f"mean {math.degrees(mean):.2f}" if mean is not None else "never in view"
+    return f"{seen}, max {largest:.2f} deg ({compared['frames_drawn']} of {compared['frames']} images)"
 
 
 def _attacks(texts: list[str]) -> dict[str, list[Path]]:

@@ -28,7 +28,29 @@ HOPS = {
 }
 # Who shows an attack says so here, with the attack's id.
 SHOWN_BY = ("/compositor/attack", "/monitor/attack")
+COUNTERFACTUAL = "/policy/counterfactual"
 _NS_PER_MS = 1e6
+
+
+@dataclass(frozen=True)
+class Counterfactual:
+    """What the attack added to the steering of a drive, image by image; see `nodes.counterfactual`.
+
+    Attributes:
+        frames: Images that were compared.
+        frames_drawn: Those into which the attack was drawn.
+        mean_abs_delta_rad: Mean size of the difference over the images with the attack in them [rad]; None without any.
+        mean_delta_rad: Mean difference over these, left positive [rad]; None without any.
+        max_abs_delta_rad: Largest difference [rad].
+        max_at_s: When that was, since the beginning [s].
+    """
+
+    frames: int
+    frames_drawn: int
+    mean_abs_delta_rad: float | None
+    mean_delta_rad: float | None
+    max_abs_delta_rad: float
+    max_at_s: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,6 +132,26 @@ def attack_ids(bag: Path, topics: Sequence[str] = SHOWN_BY) -> set[str]:
     """Ids of the attacks that were drawn into at least one frame, or were on the monitor."""
     present = {topic.name for topic in read_info(bag).topics}
     return {str(m.attack_id) for name in topics if name in present for m in _decoded(bag, name) if m.drawn}
+
+
+def counterfactual(bag: Path, start_real_ns: int, end_real_ns: int) -> Counterfactual | None:
+    """What the attack added to the steering between two moments [ns, CLOCK_REALTIME]; None if nobody compared."""
+    if COUNTERFACTUAL not in {topic.name for topic in read_info(bag).topics}:
+        return None
+    rows = [
+        (stamp, float(message.delta_rad), bool(message.drawn))
+        for message in _decoded(bag, COUNTERFACTUAL)
+        if start_real_ns <= (stamp := ns_from_stamp(message.header.stamp)) < end_real_ns
+    ]
+    if not rows:
+        return None
+    delta, drawn = np.array([row[1] for row in rows]), np.array([row[2] for row in rows])
+    worst = int(np.abs(delta).argmax())
+    return Counterfactual(
+        len(rows), int(drawn.sum()), float(np.abs(delta[drawn]).mean()) if drawn.any() else None,
+        float(delta[drawn].mean()) if drawn.any() else None, float(np.abs(delta[worst])),
+        (rows[worst][0] - start_real_ns) / 1e9,
+    )  # fmt: skip
 
 
 def _decoded(bag: Path, topic: str) -> Iterator[Any]:

@@ -51,6 +51,7 @@ _ROWS = (
     Topic("/monitor/attack", "advnerf_msgs/msg/AttackStamp", 5.0, 50, None, "monitor"),
     Topic("/monitor/shown", "advnerf_msgs/msg/DisplayShown", 5.0, 50, None, "monitor"),
     Topic("/policy/drive", _ACKERMANN, 10.0, 1, 0.25, "policy"),
+    Topic("/policy/counterfactual", "advnerf_msgs/msg/Counterfactual", 10.0, 20, None, "counterfactual"),
     Topic("/expert/drive", _ACKERMANN, 20.0, 1, 0.25, "expert"),
     Topic("/expert/state", "advnerf_msgs/msg/ExpertState", 20.0, 20, None, "expert"),
     Topic("/teleop/state", "advnerf_msgs/msg/Teleop", 20.0, 1, 0.2, "teleop"),

@@ -5,7 +5,7 @@ old recording are measured alike.
 from __future__ import annotations
 
 import tempfile
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from advnerf_core.driving.metrics import Horizon
 from advnerf_core.driving.path import Path as DrivingPath
 from advnerf_core.geometry import yaw_of
 from calibration.schema import RoomCalibration, load_calibration
-from nodes.evaluation import attack_ids, score, timing, trajectory
+from nodes.evaluation import attack_ids, counterfactual, score, timing, trajectory
 from nodes.runtime.bag_read import extract_attachments, read_info, read_messages
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import BagError
@@ -96,6 +96,8 @@ def measure_drive(bag: Path, span: DriveSpan, path: DrivingPath, horizon: Horizo
         found |= {
             "frames": times.frames, "missed": times.missed, "capture_to_serial_ms": times.capture_to_serial_ms.tolist(),
         }  # fmt: skip
+    if (compared := counterfactual(bag, span.start_real_ns, span.end_real_ns)) is not None:
+        found["counterfactual"] = asdict(compared)
     return found
 
 

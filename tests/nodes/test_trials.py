@@ -246,7 +246,6 @@ def test_trials_from_the_workstation_drive_the_car_of_the_other_host(tmp_path):
     ]  # fmt: skip
     car = [
         "twin.if=true", "camera.source={kind: socket, path: '${socket_dir}/frames'}", "motor.port=${run_dir}/vesc",
-        "vicon.host=127.0.0.1",
     ]  # fmt: skip
     ready = ["safety.nodes=[camera, vicon, policy, motor]"]
     with Launch(file, [*shared, *car, *ready], tmp_path / "car", host="robot"):

@@ -1,0 +1,204 @@
+"""The counterfactual node: what would the policy steer, at this very image, had the attack not been drawn?
+
+The camera's image and the compositor's image of the same stamp go through the same policy, and the difference is published. It
+only listens: nobody waits for it, nothing that drives reads it, and its process gives way to all others (nice). Where it cannot
+keep up it leaves images out and counts them. Between camera and policy nothing is added, so the way of a command is unchanged.
+
+There is no clean image of an attack on a monitor: the camera itself sees that one.
+"""
+
+from __future__ import annotations
+
+import os
+from collections import OrderedDict
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+
+from advnerf_core.policies.load import Driver, load_driver
+from nodes.runtime.clock import NS_PER_S
+from nodes.runtime.errors import ConfigError, MessageError
+from nodes.runtime.messages import header, image_array, stamp_ns, types
+from nodes.runtime.node import ACTIVE, FAULT, READY, MessageInfo, Node, NodeContext, Now, Out, run_node_main
+from nodes.runtime.pictures import RAW_TOPIC, raw_image
+
+COUNTERFACTUAL_TOPIC = "/policy/counterfactual"
+_ATTACKED, _LABEL = "/compositor/image", "/compositor/attack"
+_ACTIVE_S = 1.0
+_WARM_UP_RUNS = 3
+# Partners of one stamp come within the compositor's wait for poses; more than these are never open.
+_OPEN = 12
+_QUEUE = 12
+_NICE = 15
+
+
+class CounterfactualConfig(BaseModel):
+    """Configuration of the counterfactual node.
+
+    Attributes:
+        policy: The policy that drives, as the policy node has it.
+        sha256: Its hash, if it must be that very policy; empty accepts any.
+        clean_topic: Where the compositor takes its images from.
+        shown_by: Who shows the attack; only a compositor leaves a clean image to compare with.
+        goal: Goal vector of a goal-conditioned policy.
+        max_age_s: A pair that was published longer ago is left out, so that a busy computer does not fall further behind [s].
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    policy: str = Field(min_length=1)
+    sha256: str = ""
+    clean_topic: Literal["/camera/image_raw", "/camera/image_raw/compressed"] = "/camera/image_raw"
+    shown_by: Literal["compositor", "monitor"] = "compositor"
+    goal: tuple[float, ...] = ()
+    max_age_s: float = Field(default=1.0, gt=0.0, le=10.0)
+
+    @field_validator("shown_by")
+    @classmethod
+    def _leaves_a_clean_image(cls, shown_by: str) -> str:
+        if shown_by == "monitor":
+            raise ValueError(
+                "expected an attack that a compositor draws; one on a monitor is in the camera's own image, so there is no clean "
+                "image to compare with: leave the counterfactual node out (params.counterfactual=false)"
+            )
+        return shown_by
+
+
+class CounterfactualNode(Node):
+    """Joins both images by their stamp and steers by each; see the module's docstring.
+
+    Args:
+        clean: The policy for the camera's images.
+        attacked: The same policy for the compositor's images; of its own, because a policy may have a memory.
+        clean_topic: Where the camera's images come from, raw or compressed.
+        goal: Goal vector, of the length that the policy wants.
+        max_age_s: A pair that was published longer ago is left out [s].
+    """
+
+    publications = (COUNTERFACTUAL_TOPIC,)
+    tick_rate_hz = 5.0
+
+    def __init__(
+        self,
+        clean: Driver,
+        attacked: Driver,
+        clean_topic: str = RAW_TOPIC,
+        goal: tuple[float, ...] = (),
+        max_age_s: float = 1.0,
+    ) -> None:
+        if clean.sha256 != attacked.sha256:
+            raise ConfigError(f"expected one policy twice, got {clean.sha256[:12]} and {attacked.sha256[:12]}")
+        if len(goal) != clean.goal_size:
+            raise ConfigError(
+                f"expected a goal of {clean.goal_size} numbers for this policy, got {len(goal)}; set 'goal'"
+            )
+        self.subscriptions = (clean_topic, _ATTACKED, _LABEL)
+        # Not only the newest: the two images and the label of one stamp come one after the other.
+        self.queues = dict.fromkeys(self.subscriptions, _QUEUE)
+        self._clean_topic = clean_topic
+        self._clean, self._attacked, self._goal = clean, attacked, goal
+        self._max_age_ns = round(max_age_s * NS_PER_S)
+        self._open: OrderedDict[int, dict[str, Any]] = OrderedDict()
+        self._counts = {"pairs": 0, "without_partner": 0, "dropped_late": 0, "dropped_bad": 0}
+        self._largest_rad = 0.0
+        self._last_ns: int | None = None
+        self._now_ns = 0
+        self._trouble = ""
+        self._warm_up()
+
+    @classmethod
+    def build(cls, config: CounterfactualConfig, context: NodeContext) -> CounterfactualNode:
+        """Make the node of a process: load the policy twice, check and warm it up."""
+        del context  # it needs no clock of its own
+        cv2.setNumThreads(1)
+        clean, attacked = (load_driver(config.policy, config.sha256 or None) for _ in range(2))
+        return cls(clean, attacked, config.clean_topic, config.goal, config.max_age_s)
+
+    def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
+        """Keep what came until its partners are there; then steer by both images."""
+        self._now_ns = now.mono_ns
+        stamp = stamp_ns(message)
+        entry = self._open.setdefault(stamp, {})
+        entry[topic] = message
+        if len(entry) < len(self.subscriptions):
+            if len(self._open) > _OPEN:
+                self._open.popitem(last=False)
+                self._counts["without_partner"] += 1
+            return []
+        del self._open[stamp]
+        if now.mono_ns - info.publish_mono_ns > self._max_age_ns:
+            self._counts["dropped_late"] += 1
+            return []
+        try:
+            clean, attacked = (self._seen(entry[name]) for name in (self._clean_topic, _ATTACKED))
+        except MessageError as error:
+            self._counts["dropped_bad"] += 1
+            self._trouble = str(error)
+            return []
+        self._trouble, self._last_ns = "", now.mono_ns
+        return self._compare(clean, attacked, entry[_LABEL], stamp)
+
+    def tick(self, now: Now) -> list[Out]:
+        """Only notes the time, so that the status shows when images stop."""
+        self._now_ns = now.mono_ns
+        return []
+
+    def status(self) -> tuple[str, str]:
+        """Active while pairs come."""
+        if self._trouble:
+            return FAULT, self._trouble
+        name = f"policy {self._clean.sha256[:12]}"
+        if self._last_ns is None or self._now_ns - self._last_ns > _ACTIVE_S * NS_PER_S:
+            return READY, f"{name}, waiting for pairs of images"
+        return ACTIVE, f"{name}, largest difference {np.rad2deg(self._largest_rad):.1f} degrees"
+
+    def counters(self) -> dict[str, float]:
+        """Pairs compared, and what was left out."""
+        return {key: float(value) for key, value in self._counts.items()} | {"largest_delta_rad": self._largest_rad}
+
+    def _seen(self, message: Any) -> NDArray[np.uint8]:
+        """What the policy sees of an image."""
+        image = raw_image(message)
+        camera = self._clean.view.camera
+        if (image.encoding, int(image.width), int(image.height)) != ("rgb8", camera.width, camera.height):
+            raise MessageError(
+                f"expected rgb8 {camera.width} x {camera.height}, got {image.encoding} {image.width} x {image.height}; name the policy "
+                "that drives"
+            )
+        return self._clean.view.image(image_array(image))
+
+    def _compare(self, clean: NDArray[np.uint8], attacked: NDArray[np.uint8], label: Any, stamp: int) -> list[Out]:
+        clean_rad, attacked_rad = self._clean.steer(clean, self._goal), self._attacked.steer(attacked, self._goal)
+        if not np.isfinite([clean_rad, attacked_rad]).all():
+            self._counts["dropped_bad"] += 1
+            self._trouble = "the policy's output is not finite"
+            return []
+        self._counts["pairs"] += 1
+        self._largest_rad = max(self._largest_rad, abs(attacked_rad - clean_rad))
+        message = types.Counterfactual(
+            header=header(stamp, label.header.frame_id), attack_id=label.attack_id, drawn=bool(label.drawn),
+            clean_rad=clean_rad, attacked_rad=attacked_rad, delta_rad=attacked_rad - clean_rad,
+            changed=float((clean != attacked).any(axis=-1).mean()), policy_sha256=self._clean.sha256,
+        )  # fmt: skip
+        return [Out(COUNTERFACTUAL_TOPIC, message)]
+
+    def _warm_up(self) -> None:
+        camera = self._clean.view.camera
+        blank = self._clean.view.image(np.zeros((camera.height, camera.width, 3), np.uint8))
+        for driver in (self._clean, self._attacked):
+            for _ in range(_WARM_UP_RUNS):
+                driver.steer(blank, self._goal)
+            driver.reset()
+
+
+def main() -> int:
+    """Run the node as a process that gives way to those that drive."""
+    os.nice(_NICE)
+    return run_node_main(CounterfactualConfig, CounterfactualNode.build)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
