@@ -1,4 +1,4 @@
-"""The doctor and the emulators: a VESC on a pty, Tracker's datagrams, video devices; absent, wrong, busy and hung."""
+"""The doctor and the emulators: a VESC on a pty, Tracker's datagrams; absent, wrong, busy and hung."""
 
 import contextlib
 import os
@@ -13,21 +13,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibration.schema import CameraCalibration, load_calibration
-from hardware.cameras.v4l2 import V4l2Camera
-from hardware.cameras.v4l2_negotiation import Mode
 from hardware.errors import LinkLost
 from hardware.twin.config import CarConfig
-from hardware.twin.v4l2_device import VideoDevice
-from hardware.twin.v4l2_emulator import VideoPortEmulator
 from hardware.twin.vehicle import TwinVehicle
 from hardware.twin.vesc_emulator import VescEmulator
 from hardware.twin.vesc_firmware import VescEmulatorConfig
 from hardware.twin.vicon_emulator import ViconEmulator, ViconEmulatorConfig
 from hardware.vesc_settings import TimeoutSettings
 from hardware.vicon import ViconConfig
-from nodes.camera_sources import V4l2Source
-from nodes.doctor import cameras, graphics, mocap, motor
+from nodes.doctor import mocap, motor
 from nodes.doctor.check import ABSENT, FAILURE, OK, WARNING, Check, examine
 
 TWIN = Path(__file__).parents[3] / "calibration" / "twin"
@@ -203,106 +197,6 @@ def test_silence_a_stranger_and_a_taken_port():
     finally:
         stop.set()
         thread.join()
-
-
-def test_video_devices_with_their_formats_and_without_metadata():
-    webcam = VideoDevice(formats={"YUYV": [(640, 480)], "MJPG": [(1280, 720)]})
-    port = VideoPortEmulator({"/dev/a": webcam, "/dev/b": VideoDevice(metadata_only=True)})
-    (row,) = cameras.video_devices(port)
-    assert (row.state, row.found) == (OK, "/dev/a: Emulated Camera (uvcvideo), YUYV 640x480@30/15; MJPG 1280x720@30/15")
-    assert port.open_files == 0
-    assert cameras.video_devices(VideoPortEmulator({}))[0].state == ABSENT
-
-
-def test_a_driver_that_hangs_in_the_kernel_costs_the_deadline():
-    never = threading.Event()
-
-    class Hung(VideoPortEmulator):
-        def ioctl(self, fd, request, argument):
-            never.wait()
-
-    port = Hung({"/dev/a": VideoDevice()})
-    began = time.monotonic()
-    (row,) = examine([Check("camera", lambda: cameras.video_devices(port), 0.2, "unplug it")])
-    never.set()
-    assert (row.state, row.found, row.do) == (FAILURE, "no answer within 0.2 s", "unplug it")
-    assert time.monotonic() - began < 2.0
-
-
-class Emulated(V4l2Source):
-    """The source of a launch file, before an emulated device."""
-
-    def camera(self):
-        mode = Mode(self.width, self.height, self.fps, self.pixel_format)
-        return V4l2Camera(self.device, mode, rate_hz=self.rate_hz, size=self.size, port=PORTS.get(str(self.device)))
-
-
-PORTS = {}
-
-
-@contextmanager
-def exposing(device, value=128, rate_hz=30.0):
-    stop = threading.Event()
-    data = bytes([value, 128]) * (device.width * device.height)
-
-    def expose():
-        while not stop.wait(1.0 / rate_hz):
-            device.expose(data)
-
-    thread = threading.Thread(target=expose)
-    thread.start()
-    PORTS["/dev/video7"] = VideoPortEmulator({"/dev/video7": device})
-    try:
-        yield Emulated(device="/dev/video7", width=320, height=240, rate_hz=None, stall_s=0.2)
-    finally:
-        stop.set()
-        thread.join()
-        PORTS.clear()
-
-
-def test_a_source_is_measured_and_compared():
-    device = VideoDevice(formats={"YUYV": [(320, 240)]})
-    with exposing(device) as source:
-        camera = load_calibration(CameraCalibration, TWIN / "camera.yaml")
-        rows = cameras.source(source, camera)
-        assert rows[0].found.startswith("v4l2: 320 x 240, ")
-        assert "brightness 1" in rows[0].found
-        assert ("calibrated for 336 x 188", FAILURE) in {(row.found, row.state) for row in rows}
-        assert "by-id" in rows[-1].do
-        assert [row.state for row in cameras.source(source)] == [OK, WARNING]
-        slow = source.model_copy(update={"rate_hz": 30.0, "fps": 30.0})
-        device.rates = (30.0,)
-    with exposing(device, value=16, rate_hz=12.0):
-        found = [row.found for row in cameras.source(slow)]
-        assert "expected 30.0 Hz" in found
-        assert "the picture is black or white" in found
-
-
-def test_a_source_that_is_absent_silent_or_taken():
-    device = VideoDevice(formats={"YUYV": [(320, 240)]})
-    with exposing(device, rate_hz=0.01) as source:
-        (row,) = cameras.source(source, timeout_s=0.6)
-        assert (row.state, "got 0 in 0.6 s" in row.found) == (FAILURE, True)
-    PORTS["/dev/video7"] = VideoPortEmulator({})
-    (row,) = cameras.source(source, timeout_s=0.3)
-    PORTS.clear()
-    assert "expected a camera at /dev/video7, found none" in row.found
-
-
-def test_screens_come_from_a_process_of_their_own(monkeypatch):
-    pytest.importorskip("pygame")
-    monkeypatch.delenv("DISPLAY", raising=False)
-    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    monkeypatch.delenv("SDL_VIDEODRIVER", raising=False)
-    (row,) = graphics.screens()
-    assert (row.state, "no window system" in row.found) == (ABSENT, True)
-    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-    from nodes.monitor import ScreenConfig
-
-    assert graphics.screens()[0].state == OK
-    rows = graphics.screens(ScreenConfig(index=9, connector="HDMI-A-7"))
-    assert rows[1].found == "no screen with index 9"
-    assert "no monitor at HDMI-A-7" in graphics.screens(ScreenConfig(connector="HDMI-A-7"))[1].found
 
 
 def test_time_out_that_a_launch_file_asks_for():

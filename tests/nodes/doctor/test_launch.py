@@ -2,6 +2,7 @@
 
 import json
 import socket
+import subprocess
 import sys
 from pathlib import Path
 
@@ -138,6 +139,15 @@ def test_each_host_has_its_own_needs(tmp_path):
     away = plan_of("two_hosts", *shared, "params.robot=203.0.113.7", host="robot")
     rows = findings(away, tmp_path, (*SLOW, "VICON", "camera", "VESC"))
     assert "ip addr says" in next(row.do for row in rows if row.check == "network")
+
+
+def test_it_runs_where_no_large_library_is_installed():
+    """As on the car; and none of them is imported into the doctor's own process where it is."""
+    program = (
+        "import sys\nfor name in ('torch', 'scipy', 'mujoco', 'numba', 'depthai', 'pygame', 'mitsuba', 'foxglove', 'av'): "
+        "sys.modules[name] = None\nimport nodes.cli_doctor, nodes.doctor.general, nodes.doctor.launch, nodes.doctor.probes"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True, timeout=60, cwd=ROOT)
 
 
 def run(monkeypatch, capsys, *arguments):
