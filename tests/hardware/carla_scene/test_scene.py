@@ -313,9 +313,10 @@ def test_a_scene_that_nobody_closes_puts_the_world_back(library, settings):
     ],
 )
 def test_a_scene_that_cannot_open_changes_nothing(library, settings, changes, error, message):
-    with pytest.raises(error, match=message):
+    with pytest.raises(error, match=message) as caught:
         scene_of(library, settings, **changes)
     assert is_put_back(library.world)
+    del caught  # kept till here: what is put back is not left to the garbage collector
 
 
 def test_blueprints_that_the_server_lacks(library, settings):
