@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import os
 import sys
 from collections import Counter
 from pathlib import Path
@@ -68,16 +70,20 @@ def run(
         typer.Option("--address", help="Of a running Ray cluster.", show_default="RAY_ADDRESS, or one started here"),
     ] = "",
     retry: Annotated[bool, typer.Option("--retry", help="Also run cells that failed before.")] = False,
+    gate: Annotated[
+        bool, typer.Option("--gate/--no-gate", help="Leave out scenarios whose surrogate the fidelity gate refuses.")
+    ] = True,
     overrides: Overrides = None,
 ) -> None:
     """Run the cells that are not there yet; each is kept when it is finished, so that a run may be stopped at any time."""
+    os.environ.setdefault("MUJOCO_GL", "egl")
     from nodes.campaign.run import Options, run_campaign
     from nodes.runtime.errors import ConfigError
 
     if backend not in ("local", "ray"):
         raise ConfigError(f"expected --backend local or ray, got {backend!r}")
     campaign, cells = _load(file, folder, overrides, only)
-    options = Options(jobs or 0, threads or 0, backend, address, retry)  # type: ignore[arg-type]
+    options = Options(jobs or 0, threads or 0, backend, address, retry, gate)  # type: ignore[arg-type]
     ended = run_campaign(campaign, cells, options, lambda text: print(text, flush=True))
     wrong = [end for end in ended if end.how != "done"]
     for end in wrong:
@@ -119,22 +125,50 @@ def table_command(
     """Print the transfer table and the targets, and write them as JSON, CSV, Markdown and a page with the clips by outcome."""
     from rich.console import Console
 
+    from advnerf_core.files import write_atomically
     from advnerf_core.report.transfer_page import target_table, text_table
+    from advnerf_core.report.transfer_prediction import prediction_section, prediction_table, skill_text
     from advnerf_core.report.transfer_targets import table_targets
+    from nodes.campaign.predictions import predicted
     from nodes.campaign.run import statuses
     from nodes.campaign.table import campaign_table, write_table
 
     campaign, cells = _load(file, folder, overrides, only)
     found = statuses(campaign, cells)
     full = campaign_table(campaign, found)
-    page = write_table(full, campaign.folder / "cells", output or campaign.folder / "table")
+    pairs = predicted(campaign, found)
+    sections = [("Predicted and measured transfer", prediction_section(pairs))] if pairs else []
+    target = output or campaign.folder / "table"
+    page = write_table(full, campaign.folder / "cells", target, sections)
+    if pairs:
+        write_atomically(target / "predictions.json", json.dumps([pair.record() for pair in pairs], indent=1) + "\n")
     console = Console(width=None if sys.stdout.isatty() else 200)
     console.print(text_table(full).rich())
     console.print(target_table(table_targets(full)).rich())
+    if pairs:
+        console.print(prediction_table(pairs).rich())
+        print(skill_text(pairs))
     left_out = [each for each in found if each.state in ("changed", "unreadable")]
     for each in left_out:
         say_error(f"{each.cell.name} is left out: {each.text}")
     print(f"{len(full.cells)} of {len(cells)} cells; page: {page}")
+
+
+@app.command()
+def predict(
+    file: File,
+    folder: Folder = None,
+    only: Only = "",
+    draws: Annotated[int, typer.Option("--draws", min=2, help="Drives per prediction.")] = 6,
+    overrides: Overrides = None,
+) -> None:
+    """Predict how the attacks transfer from pictures without a deployed drive with them; the table then says how good that was."""
+    os.environ.setdefault("MUJOCO_GL", "egl")
+    from nodes.campaign.predictions import predict_campaign
+
+    campaign, cells = _load(file, folder, overrides, only)
+    made = predict_campaign(campaign, cells, lambda text: print(text, flush=True), draws)
+    print(f"{made} predictions made")
 
 
 @app.command()

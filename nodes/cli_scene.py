@@ -7,13 +7,14 @@ from typing import Annotated, Any
 
 import typer
 
-from nodes import cli_scene_import
+from nodes import cli_scene_gate, cli_scene_import
 from nodes.runtime.terminal import print_table, table
 
 app = typer.Typer(
     no_args_is_help=True, help="Scenes: posed images from videos, photographs and bags, and what is learned from them."
 )
 app.add_typer(cli_scene_import.app)
+cli_scene_gate.add_to(app)
 
 DataSet = Annotated[Path, typer.Argument(help="A transforms.json, or its folder.", exists=True)]
 SceneFile = Annotated[Path, typer.Argument(help="A scene file (scene.safetensors).", dir_okay=False)]

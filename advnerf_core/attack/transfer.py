@@ -72,8 +72,8 @@ class TransferPrediction:
 
 
 def predict_transfer(
-    problem: AttackProblem, images: Scene, clean: Agreement, effect: Effect, start: Tensor, horizon: Horizon,
-    draws: int = 12, seed: int = 0,
+    problem: AttackProblem, images: Scene, clean: Agreement, effect: Effect, starts: Tensor, horizon: Horizon,
+    draws: int = 6, seed: int = 0,
 ) -> TransferPrediction:  # fmt: skip
     """Predict deployed drives with and without an attack.
 
@@ -82,7 +82,7 @@ def predict_transfer(
         images: What the surrogate shows.
         clean: Agreement of the steering on held-out views without attack, in the order of the path.
         effect: Effect of this attack on the same views.
-        start: Start state ``[n]`` of the deployed drive.
+        starts: Start states ``[S, n]`` of the deployed drives; the draws take turns.
         horizon: Over which a drive is measured.
         draws: Drives of each kind.
         seed: Of what is drawn.
@@ -95,7 +95,7 @@ def predict_transfer(
     rng = np.random.default_rng(seed)
     disagreement = _blocks(clean.difference, horizon.ticks, draws, rng)
     residual = _blocks(effect.residual, horizon.ticks, draws, rng)
-    starts = start.expand(draws, -1).contiguous()
+    starts = starts[torch.arange(draws) % len(starts)].contiguous()
     goals = None if problem.goals is None else problem.goals[:1].expand(draws, -1)
     totals = {}
     for attacked in (True, False):

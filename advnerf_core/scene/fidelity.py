@@ -174,3 +174,24 @@ class Effect:
     def residual(self) -> Floats:
         """What the share does not explain, per view."""
         return self.real - self.retained * self.learned
+
+
+@dataclass(frozen=True, eq=False)
+class Pictures:
+    """Real and learned pictures of the same places, as the policy sees them, in the order of the path where there is one.
+
+    Attributes:
+        of: What they are of, in words.
+        real: ``[N, H, W, 3]`` uint8 from where attacks are deployed.
+        learned: The same from the surrogate.
+    """
+
+    of: str
+    real: NDArray[np.uint8]
+    learned: NDArray[np.uint8]
+
+    def __post_init__(self) -> None:
+        if self.real.ndim != 4 or self.real.shape != self.learned.shape or not len(self.real):
+            raise ValueError(
+                f"expected real and learned pictures [N, H, W, 3], got {self.real.shape} and {self.learned.shape}"
+            )

@@ -33,6 +33,7 @@ class Options:
         backend: ``local`` or ``ray``.
         address: Of a running Ray cluster; empty takes the one in RAY_ADDRESS, or starts one here.
         retry: Also run cells that failed before.
+        gate: Whether scenarios whose surrogate the fidelity gate refuses are left out; else it is only told.
     """
 
     jobs: int = 0
@@ -40,6 +41,7 @@ class Options:
     backend: Backend = "local"
     address: str = ""
     retry: bool = False
+    gate: bool = True
 
 
 @dataclass(frozen=True)
@@ -120,6 +122,7 @@ def run_campaign(campaign: Campaign, cells: Sequence[Cell], options: Options, sa
     """
     store = store_of(campaign)
     _prepare(campaign, cells, say)
+    cells = _past_the_gate(campaign, cells, options, say)
     wanted = [each for each in plan_cells(campaign, cells) if _is_wanted(store, each, options, say)]
     if not wanted:
         say("nothing to do: every cell is there")
@@ -162,6 +165,37 @@ def _prepare(campaign: Campaign, cells: Sequence[Cell], say: Say) -> None:
         done.add(folder)
         say(f"{cell.scenario}{'.' * bool(cell.placement)}{cell.placement}: {folder}")
         load_kind(campaign.scenario(cell).kind).prepare(experiment, _PrintedReport(say))
+
+
+def _past_the_gate(campaign: Campaign, cells: Sequence[Cell], options: Options, say: Say) -> list[Cell]:
+    """The cells whose surrogate is good enough; judged once per scenario and victim, and kept."""
+    from nodes.campaign.gate import cached_verdict
+
+    verdicts: dict[str, bool] = {}
+    for cell in cells:
+        key = gate_key(cell)
+        if key in verdicts:
+            continue
+        scenario = campaign.scenario(cell)
+        file = campaign.folder / "gate" / f"{key}.json"
+        found = cached_verdict(
+            load_kind(scenario.kind),
+            _experiment(campaign, cell),
+            _inside(scenario, cell),
+            cell.victim,
+            campaign.config.gate,
+            file,
+        )
+        verdicts[key] = found is None or found.passed or not options.gate
+        for reason in found.reasons if found is not None else ():
+            left_out = "" if verdicts[key] else "; its cells are left out (--no-gate runs them all the same)"
+            say(f"fidelity gate, {key}: {reason}{left_out}")
+    return [cell for cell in cells if verdicts[gate_key(cell)]]
+
+
+def gate_key(cell: Cell) -> str:
+    """Name of what the fidelity gate judges for a cell."""
+    return f"{cell.scenario}{'.' * bool(cell.placement)}{cell.placement}_{cell.victim}"
 
 
 class _PrintedReport(Report):

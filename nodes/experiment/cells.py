@@ -15,16 +15,14 @@ from pathlib import Path
 from typing import Any, Literal, cast
 
 import numpy as np
-from pydantic import ValidationError
 
-from advnerf_core.attack.artifact import load_attack
+from advnerf_core.attack.artifact import AttackFile, load_attack
 from advnerf_core.driving.metrics import Horizon
 from advnerf_core.report.clips import ClipTrack, write_clip
-from hardware.twin.config import LabConfig
 from nodes import evaluation
 from nodes.experiment import attack, deploy
-from nodes.experiment.config import ExperimentConfig
 from nodes.experiment.context import CONTROL_PERIOD_S, Experiment
+from nodes.experiment.finished import changed_settings, is_finished, require_same_attacks
 from nodes.experiment.objects import attacked_object, surrogate_of
 from nodes.experiment.run import load_experiment, run_experiment
 from nodes.experiment.scene import load_background
@@ -67,7 +65,7 @@ class _Cell:
     def searched_in(self, method: str) -> Path:
         """Folder of the drives in the learned room: the run folder's, if it has them."""
         taken = self.experiment.stage_folder("attack")
-        if _is_finished(taken) and (taken / f"{self.victim}_{method}_{self.seed}.json").exists():
+        if is_finished(taken) and (taken / f"{self.victim}_{method}_{self.seed}.json").exists():
             return taken
         return self.folder
 
@@ -84,8 +82,8 @@ class _Cell:
 
 def prepare(experiment: Experiment, report: Report) -> None:
     """Make room, scene, policies and object; a finished run folder of other settings is refused, never overwritten."""
-    if all(_is_finished(experiment.stage_folder(stage)) for stage in _NEEDED):
-        if changed := _changed(experiment):
+    if all(is_finished(experiment.stage_folder(stage)) for stage in _NEEDED):
+        if changed := changed_settings(experiment):
             raise ConfigError(
                 f"{experiment.folder} was made with another {', '.join(changed)} than {experiment.file.name} ({experiment.setting}) says; "
                 "name another run_folder in the campaign, or the changes under set"
@@ -169,7 +167,7 @@ def _cell(experiment: Experiment, scenario: str, victim: str, method: str, seed:
     )
     cell = _Cell(replace(experiment, config=config), victim, method, seed, folder)
     if cell.searched_in(method) != folder:
-        _require_same_attacks(cell.experiment)
+        require_same_attacks(cell.experiment)
     return cell
 
 
@@ -179,55 +177,6 @@ def _require_victim(experiment: Experiment, victim: str) -> None:
             f"expected one of the victims {', '.join(attack.victims(experiment))} of {experiment.file.name}, got {victim}; "
             "set policy.naive_steps, or leave it out of the campaign"
         )
-
-
-def _require_same_attacks(experiment: Experiment) -> None:
-    """The run folder's attacks must be those of these settings, on the scene and policies that are there now."""
-    then = json.loads((experiment.stage_folder("attack") / "frozen.json").read_text())
-    now = attack.frozen_hashes(experiment)
-    # Starts depend on the seed alone; which seeds the folder had, and hence this hash, does not matter here.
-    changed = [name for name in now if name not in ("config", "starts_and_seeds") and then.get(name) != now[name]]
-    old = _manifest_config(experiment)
-    ignored = {"seeds", "cache_mib"}
-    changed += [
-        f"attack.{name}"
-        for name, value in old.attack.model_dump().items()
-        if name not in ignored and getattr(experiment.config.attack, name) != value
-    ]
-    changed += ["horizon"] * (old.horizon != experiment.config.horizon)
-    if changed:
-        raise ConfigError(
-            f"the attacks in {experiment.folder} were found with another {', '.join(changed)}; name another run_folder in the campaign"
-        )
-
-
-def _manifest_config(experiment: Experiment) -> ExperimentConfig:
-    try:
-        manifest = json.loads((experiment.folder / "manifest.json").read_text())
-        return ExperimentConfig.model_validate(manifest["config"])
-    except (OSError, ValueError, KeyError, ValidationError) as error:
-        first = str(error).splitlines()[0]
-        raise ConfigError(
-            f"expected {experiment.folder}/manifest.json to say with which settings the folder was made, got: {first}; name another run_folder"
-        ) from None
-
-
-def _changed(experiment: Experiment) -> list[str]:
-    """What the run folder was made with that the experiment says otherwise; values that are new have their defaults."""
-    old, new = _manifest_config(experiment), experiment.config
-    changed = [
-        f"{section}.{name}"
-        for section in ("capture", "scene", "policy", "object")
-        for name, value in getattr(old, section).model_dump().items()
-        if getattr(getattr(new, section), name) != value
-    ]
-    lab = LabConfig.model_validate(old.lab).model_dump()
-    return changed + [f"lab.{name}" for name, value in experiment.lab_config.model_dump().items() if lab[name] != value]
-
-
-def _is_finished(folder: Path) -> bool:
-    record = read_record(folder)
-    return record is not None and record.digest is not None
 
 
 def _surrogate(cell: _Cell) -> dict[str, Any]:
@@ -285,7 +234,7 @@ def _clip(cell: _Cell, driven: dict[str, Any], where: Path) -> str | None:
         return None
     condition: Literal["none", "random", "gradient"] = "random" if cell.method == "cem" else cast("Any", cell.method)
     frames = evaluation.frames(bag, driven["outcome"]["start_real_ns"], len(driven["cte_m"]), CONTROL_PERIOD_S)
-    title = f"live, {_TITLES[cell.method]}, {cell.victim} victim, seed {cell.seed}"
+    title = f"{_TITLES[cell.method]}, {cell.victim}, seed {cell.seed}"
     shown = "".join(driven["attack_ids"])
     track = ClipTrack(
         title, condition, list(frames), np.array(driven["cte_m"]), shown, driven["outcome"]["stopped_early"] or "ended"
@@ -294,7 +243,22 @@ def _clip(cell: _Cell, driven: dict[str, Any], where: Path) -> str | None:
     return f"{cell.folder.name}/{path.name}"
 
 
-def attack_file(experiment: Experiment, victim: str, method: str, seed: int, folder: Path) -> Any:
-    """The attack of a finished cell, for the prediction of its transfer."""
+def attack_file(experiment: Experiment, victim: str, method: str, seed: int, folder: Path) -> AttackFile:
+    """The attack file of a cell whose search is finished."""
     cell = _cell(experiment, "", victim, method, seed, folder)
     return load_attack(attack.attack_path(cell.searched_in(method), cell.search))
+
+
+def drive_without_attack_of(experiment: Experiment, victim: str, seed: int, folder: Path) -> Path:
+    """The bag of the live drive that cells of this victim and seed are compared with.
+
+    Raises:
+        CellFault: It is not driven yet, or its bag is gone.
+    """
+    cell = _cell(experiment, "", victim, "none", seed, folder)
+    bag = cell.driven_in("none") / cell.live("none").name / "bag"
+    if not bag.exists():
+        raise CellFault(
+            f"expected the live drive without attack of the {victim} victim, seed {seed}, at {bag}, got none; run that cell first"
+        )
+    return bag

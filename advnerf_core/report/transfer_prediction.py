@@ -1,0 +1,152 @@
+"""How good predictions of transfer were: predicted against measured ratios of every attack that was deployed after it was predicted."""
+
+# ruff: noqa: RUF001 (typography for readers: multiplication signs and dashes)
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from markupsafe import Markup
+from matplotlib.figure import Figure
+from scipy.stats import spearmanr
+
+from advnerf_core.report.palette import LIGHT, MARKERS
+from advnerf_core.report.plots import new_axes, svg
+from advnerf_core.report.tables import Table
+
+# An attack that makes the car stray by this ratio counts as one that works.
+WORKS_FROM = 1.5
+_COLOUR_OF = {"cem": "empty"}
+
+
+@dataclass(frozen=True)
+class Predicted:
+    """One attack: what was expected of it, and what it did.
+
+    Attributes:
+        name: Name of the cell.
+        method: Which search found it.
+        ratio: Expected ratio to no attack.
+        low: 10 % quantile of the prediction.
+        high: 90 % quantile.
+        measured: Deployed ratio to no attack.
+        retained: Share of the effect on single views that survives in real pictures.
+        total_m: Expected total CTE [m].
+        measured_m: Deployed total CTE, mean over its drives [m].
+    """
+
+    name: str
+    method: str
+    ratio: float
+    low: float
+    high: float
+    measured: float
+    retained: float
+    total_m: float
+    measured_m: float
+
+    def record(self) -> dict[str, Any]:
+        """JSON-ready values."""
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class Skill:
+    """How good predictions were.
+
+    Attributes:
+        count: How many there were.
+        factor: Median factor between expected and measured ratio, at least 1; None without any.
+        factor_total: The same of the total CTE.
+        rank_correlation: Spearman's, of the ratios; None of fewer than three or where all are equal.
+        right: How many were rightly said to work, or not to (ratio of `WORKS_FROM`).
+    """
+
+    count: int
+    factor: float | None
+    factor_total: float | None
+    rank_correlation: float | None
+    right: int
+
+
+def skill_of(pairs: Sequence[Predicted]) -> Skill:
+    """Sum predictions up."""
+    if not pairs:
+        return Skill(0, None, None, None, 0)
+    ratios, measured = (np.array([getattr(pair, name) for pair in pairs]) for name in ("ratio", "measured"))
+    totals, measured_m = (np.array([getattr(pair, name) for pair in pairs]) for name in ("total_m", "measured_m"))
+    ranked = len(pairs) >= 3 and np.ptp(ratios) > 0.0 and np.ptp(measured) > 0.0
+    return Skill(
+        len(pairs), _median_factor(ratios, measured), _median_factor(totals, measured_m),
+        float(spearmanr(ratios, measured).statistic) if ranked else None,
+        int(np.sum((ratios >= WORKS_FROM) == (measured >= WORKS_FROM))),
+    )  # fmt: skip
+
+
+def _median_factor(expected: Any, measured: Any) -> float:
+    # Neither is ever exactly zero on a drive; a floor keeps a perfect drive from counting as infinitely wrong.
+    logs = np.abs(np.log(np.maximum(expected, 1e-9) / np.maximum(measured, 1e-9)))
+    return float(np.exp(np.median(logs)))
+
+
+def prediction_table(pairs: Sequence[Predicted]) -> Table:
+    """Expected and measured, one line per attack."""
+    cells = tuple(
+        (
+            pair.name, f"{pair.ratio:.2f}", f"{pair.low:.2f} – {pair.high:.2f}", f"{pair.measured:.2f}", f"{pair.total_m:.2f}",
+            f"{pair.measured_m:.2f}", f"{100 * pair.retained:.0f} %",
+        )
+        for pair in pairs
+    )  # fmt: skip
+    columns = ("attack", "expected ×", "80 % of draws", "measured ×", "expected [m]", "measured [m]", "effect retained")
+    return Table("Transfer, predicted before it was deployed", columns, cells, (False, *[True] * 6))
+
+
+def skill_text(pairs: Sequence[Predicted]) -> str:
+    """One sentence on how good the predictions were."""
+    skill = skill_of(pairs)
+    if skill.factor is None or skill.factor_total is None:
+        return "No attack was both predicted and deployed."
+    rank = "" if skill.rank_correlation is None else f", rank correlation {skill.rank_correlation:.2f}"
+    return (
+        f"{skill.count} attacks predicted and deployed: the ratio is off by a factor of {skill.factor:.2f} in the median, the total CTE by "
+        f"{skill.factor_total:.2f}{rank}; {skill.right} of {skill.count} rightly said to work (at least {WORKS_FROM:g} × no attack) or not."
+    )
+
+
+def prediction_plot(pairs: Sequence[Predicted]) -> Figure:
+    """Measured over expected ratio, both logarithmic; on the diagonal the prediction was right."""
+    with new_axes(5.4, 4.4) as ax:
+        values = [value for pair in pairs for value in (pair.ratio, pair.measured)]
+        low, high = min([0.5, *values]) / 1.3, max([4.0, *values]) * 1.3
+        ax.plot([low, high], [low, high], color=LIGHT["muted"], lw=1.0, ls="--", zorder=1)
+        for method in dict.fromkeys(pair.method for pair in pairs):
+            chosen = [pair for pair in pairs if pair.method == method]
+            expected = np.array([pair.ratio for pair in chosen])
+            bars = np.abs(np.array([[pair.low, pair.high] for pair in chosen]).T - expected)
+            key = _COLOUR_OF.get(method, method)
+            ax.errorbar(
+                expected, [pair.measured for pair in chosen], xerr=bars, fmt=MARKERS.get(key, "o"), ms=6, lw=1.2,
+                color=LIGHT.get(key, LIGHT["ink"]), label=method,
+            )  # fmt: skip
+        ax.set(xscale="log", yscale="log", xlim=(low, high), ylim=(low, high))
+        ax.set(xlabel="expected ratio to no attack", ylabel="measured ratio to no attack")
+        ax.legend(loc="upper left")
+        return ax.figure
+
+
+def prediction_section(pairs: Sequence[Predicted]) -> Markup:
+    """Sentence, plot and table for the page."""
+    parts = [Markup("<p>{}</p>").format(skill_text(pairs))]
+    if pairs:
+        picture = Markup(
+            svg(prediction_plot(pairs), "Measured over expected ratio to no attack")
+        )  # our own SVG, its texts escaped
+        parts += [
+            Markup('<figure class="single" style="max-width: 560px">{}</figure>').format(picture),
+            prediction_table(pairs).html(),
+        ]
+    return Markup("").join(parts)

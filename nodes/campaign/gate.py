@@ -1,0 +1,102 @@
+"""The fidelity gate of an experiment, and predictions of how its attacks transfer, for any kind of scenario.
+
+The package of a kind has a module ``fidelity`` with ``policy_of``, ``held_out``, ``driven``, ``attacked`` and ``loop``; a kind without one has
+no gate. See `nodes/experiment/fidelity.py`.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from advnerf_core.attack.transfer import TransferPrediction, predict_transfer
+from advnerf_core.files import write_atomically
+from advnerf_core.scene.fidelity import Agreement, Effect, GateLimits, Pictures, Verdict, agreement, judge
+from nodes.campaign.kinds import Kind, stage_digests
+from nodes.policy_data.evaluate import predict
+from nodes.runtime.errors import RuntimeFault
+from nodes.runtime.stages import hash_of
+
+
+class GateError(RuntimeFault):
+    """A surrogate is not good enough for attacks found in it to mean anything."""
+
+
+def fidelity_of(kind: Kind) -> Any:
+    """The module that has a kind's pictures; None where there is none."""
+    package = getattr(kind.module, "__package__", "")
+    name = f"{package}.fidelity"
+    return importlib.import_module(name) if package and find_spec(name) is not None else None
+
+
+def agreement_on(policy: Any, goal: tuple[float, ...], pictures: Pictures) -> Agreement:
+    """How alike pictures look, and how alike the policy steers on them."""
+    steering = [predict(policy, images, goal) for images in (pictures.real, pictures.learned)]
+    return agreement(list(pictures.real), list(pictures.learned), *steering)
+
+
+def judge_scene(
+    kind: Kind, experiment: Any, scenario: str, victim: str, limits: GateLimits, bag: Path | None = None
+) -> list[tuple[str, Verdict]]:
+    """The gate's verdicts: on held-out views, and on a driven bag if one is given.
+
+    Raises:
+        GateError: The kind has no pictures to judge by.
+    """
+    module = fidelity_of(kind)
+    if module is None:
+        raise GateError(f"expected a module fidelity beside the cells of kind {kind.name}, got none; it has no gate")
+    policy, goal = module.policy_of(experiment, victim, scenario)
+    sets = [module.held_out(experiment, scenario)]
+    if bag is not None:
+        sets.append(module.driven(experiment, scenario, victim, 0, Path(), bag))
+    return [(each.of, judge(agreement_on(policy, goal, each), limits, each.of)) for each in sets]
+
+
+def cached_verdict(
+    kind: Kind, experiment: Any, scenario: str, victim: str, limits: GateLimits, file: Path
+) -> Verdict | None:
+    """The verdict on held-out views, judged again only if scene, policy or limits changed; None where the kind has no gate."""
+    if fidelity_of(kind) is None:
+        return None
+    key = hash_of([stage_digests(experiment.folder), limits.model_dump(mode="json"), scenario, victim])
+    try:
+        kept = json.loads(file.read_text(encoding="utf-8"))
+        if kept["key"] == key:
+            return Verdict(kept["passed"], tuple(kept["reasons"]), kept["numbers"])
+    except (OSError, ValueError, KeyError, TypeError):
+        pass  # an unreadable verdict is judged again
+    verdict = judge_scene(kind, experiment, scenario, victim, limits)[0][1]
+    write_atomically(file, json.dumps({"key": key, **verdict.record()}, indent=1) + "\n")
+    return verdict
+
+
+def predict_cell(
+    kind: Kind, experiment: Any, scenario: str, victim: str, method: str, seed: int, folder: Path, draws: int = 6
+) -> TransferPrediction:
+    """Predict the deployed drives of a cell whose search is finished, from pictures and the surrogate alone.
+
+    Args:
+        kind: Kind of the scenario.
+        experiment: Its experiment.
+        scenario: What the experiment calls it.
+        victim: Which policy.
+        method: Which search.
+        seed: Of the search.
+        folder: The cell's folder.
+        draws: Drives per prediction.
+    """
+    module = fidelity_of(kind)
+    if module is None:
+        raise GateError(
+            f"expected a module fidelity beside the cells of kind {kind.name}, got none; it has no predictions"
+        )
+    policy, goal = module.policy_of(experiment, victim, scenario)
+    without = agreement_on(policy, goal, module.driven(experiment, scenario, victim, seed, folder))
+    with_attack = agreement_on(policy, goal, module.attacked(experiment, scenario, victim, method, seed, folder))
+    effect = Effect(with_attack.learned - without.learned, with_attack.real - without.real)
+    problem, images, starts, horizon = module.loop(experiment, scenario, victim, method, seed, folder)
+    return predict_transfer(problem, images, without, effect, starts, horizon, draws, seed)

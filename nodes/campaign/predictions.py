@@ -1,0 +1,80 @@
+"""Predicted against measured transfer: one prediction per attacked cell, made without its deployed drives, and how good they were."""
+
+# ruff: noqa: RUF001 (typography for readers: multiplication signs)
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from advnerf_core.files import write_atomically
+from advnerf_core.report.cells import NONE
+from advnerf_core.report.transfer_prediction import Predicted
+from nodes.campaign.config import Campaign, Cell
+from nodes.campaign.gate import fidelity_of, predict_cell
+from nodes.campaign.kinds import load_kind
+from nodes.campaign.run import plan_cells
+from nodes.campaign.store import CellStatus, store_of
+
+
+def predict_campaign(campaign: Campaign, cells: Sequence[Cell], say: Callable[[str], None], draws: int = 6) -> int:
+    """Predict every attacked cell that has been searched and is not predicted yet; returns how many were.
+
+    A prediction needs the finished search, which is there with the finished cell, and the drive without attack. It reads no drive with
+    the attack, so it is the same before and after that drive.
+    """
+    store, made = store_of(campaign), 0
+    experiments: dict[tuple[str, str], Any] = {}
+    for cell in cells:
+        if cell.method == NONE:
+            continue
+        planned = plan_cells(campaign, [cell], experiments)[0]
+        kind = load_kind(planned.job.kind)
+        if store.status(cell, planned.job.settings_hash).state != "done" or fidelity_of(kind) is None:
+            continue
+        file = _file(campaign, cell)
+        if _kept(file, planned.job.settings_hash) is not None:
+            continue
+        experiment = experiments[cell.scenario, cell.placement]
+        found = predict_cell(
+            kind, experiment, planned.job.scenario, cell.victim, cell.method, cell.seed, store.work(cell.name), draws
+        )
+        record = {"settings_hash": planned.job.settings_hash, **found.record()}
+        write_atomically(file, json.dumps(record, indent=1) + "\n")
+        say(f"{cell.name}: {found.ratio:.2f} × no attack expected, {100 * found.retained:.0f} % of the effect survives")
+        made += 1
+    return made
+
+
+def predicted(campaign: Campaign, found: Sequence[CellStatus]) -> list[Predicted]:
+    """Predictions of finished cells, each with what was measured."""
+    pairs = []
+    for each in found:
+        if each.state != "done" or each.result is None or each.result.deployed is None or each.cell.method == NONE:
+            continue
+        kept = _kept(_file(campaign, each.cell), each.result.settings_hash)
+        if kept is None:
+            continue
+        drives = each.result.deployed
+        none_m = sum(drives.none_total_cte_m)
+        measured = sum(drives.total_cte_m) / none_m if none_m > 0.0 else math.nan
+        pairs.append(Predicted(
+            each.cell.name, each.cell.method, kept["ratio"], kept["ratio_low"], kept["ratio_high"], measured, kept["retained"],
+            kept["total_cte_m"], drives.mean_m,
+        ))  # fmt: skip
+    return [pair for pair in pairs if math.isfinite(pair.measured)]
+
+
+def _file(campaign: Campaign, cell: Cell) -> Path:
+    return campaign.folder / "predictions" / f"{cell.name}.json"
+
+
+def _kept(file: Path, settings_hash: str) -> dict[str, Any] | None:
+    try:
+        kept: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    return kept if kept.get("settings_hash") == settings_hash else None
