@@ -15,6 +15,7 @@ import typer
 from nodes import (
     cli_attack,
     cli_attack_node,
+    cli_attack_poses,
     cli_bag,
     cli_calibrate,
     cli_camera,
@@ -58,6 +59,7 @@ app.add_typer(cli_calibrate.app, name="calibrate")
 app.add_typer(cli_camera.app, name="camera")
 app.add_typer(cli_campaign.app, name="campaign")
 cli_attack_node.add_to(cli_attack.app)
+cli_attack_poses.add_to(cli_attack.app)
 app.add_typer(cli_attack.app, name="attack")
 app.add_typer(cli_object.app, name="object")
 app.add_typer(cli_policy.app, name="policy")

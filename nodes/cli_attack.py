@@ -9,7 +9,9 @@ import typer
 
 from nodes.runtime.terminal import Overrides, print_table, table
 
-app = typer.Typer(no_args_is_help=True, help="Search for textures, go on with a search, look at and examine attacks.")
+app = typer.Typer(
+    no_args_is_help=True, help="Search for textures and poses, go on with a search, look at and examine attacks."
+)
 
 RequestFile = Annotated[Path, typer.Argument(help="A *.attack.yaml file.", exists=True, dir_okay=False)]
 

@@ -152,13 +152,15 @@ class PoseSpace:
             for axis, name in enumerate(AXES):
                 limits[k, axis] = getattr(bound, name) or (self.nominal[k, axis], self.nominal[k, axis])
         self.middle = torch.from_numpy(limits.mean(axis=2))
+        self._lowest, self._highest = torch.from_numpy(limits[..., 0].copy()), torch.from_numpy(limits[..., 1].copy())
         self.half = torch.from_numpy(0.5 * (limits[..., 1] - limits[..., 0]))
         self._turns = self.half[:, 2] >= np.pi
         self.half[:, 2] = self.half[:, 2].clamp(max=np.pi)
 
     def placements(self, unit: Tensor) -> Tensor:
-        """Placements ``[K, 4]`` of coordinates ``[K, 4]`` in the unit box."""
-        return self.middle + self.half * unit.double()
+        """Placements ``[K, 4]`` of coordinates ``[K, 4]``; within the bounds to the last bit where these are in the unit box."""
+        placements = self.middle + self.half * unit.double()
+        return torch.where(unit.abs() <= 1.0, placements.clamp(self._lowest, self._highest), placements)
 
     def unit(self, placements: Tensor) -> Tensor:
         """Coordinates ``[K, 4]`` of placements; 0 along an axis that is fixed.
@@ -177,7 +179,15 @@ class PoseSpace:
 
     def allows(self, unit: Tensor) -> bool:
         """Whether coordinates lie in the unit box, and all objects stand clear of the lane."""
-        return bool((unit.abs() <= 1.0).all()) and all(self._clear(k, unit[k]) for k in range(len(self.objects)))
+        return bool((unit.abs() <= 1.0).all()) and self.clear(self.placements(unit))
+
+    def clear(self, placements: Tensor) -> bool:
+        """Whether objects at ``placements [K, 4]``, within the bounds or not, all stand clear of the lane."""
+        lane = self.keep_out
+        return lane is None or all(
+            lane.distance_m(place.numpy(), rectangle) >= lane.clearance_m
+            for place, rectangle in zip(placements.detach().double(), self._footprints, strict=True)
+        )
 
     def draw(self, generator: torch.Generator) -> Tensor:
         """Coordinates ``[K, 4]`` drawn evenly from what is allowed.

@@ -80,13 +80,18 @@ class Prepared:
             seed=self.seed, predicted_total_cte_m=predicted, software_version=version("advnerf"), extra=extra,
         )  # fmt: skip
 
-    def _face(self, theta: Tensor) -> dict[str, Any]:
-        """What an attack file says about objects; the first that has a deployable face is the one that is shown."""
+    def attacked_objects(self, theta: Tensor) -> tuple[AttackedObject, ...]:
+        """All objects with their colours, as an attack file keeps them."""
         parts = [part.detach().numpy().astype(np.float32) for part in split_theta(self.surrogate.objects, theta)]
-        others = tuple(
+        return tuple(
             AttackedObject(each.name, part, each.field.T_world_from_object, each.field.scale, each.sha256)
             for each, part in zip(self.objects, parts, strict=True)
         )
+
+    def _face(self, theta: Tensor) -> dict[str, Any]:
+        """What an attack file says about objects; the first that has a deployable face is the one that is shown."""
+        others = self.attacked_objects(theta)
+        parts = [each.theta for each in others]
         for each, part in zip(self.objects, parts, strict=True):
             if each.face is not None:
                 return {
@@ -136,6 +141,11 @@ def request_hash(request: AttackRequest) -> str:
     )
     for key in ("evaluations", "cache_mib", "time_batch", "seeds", "together"):
         asked["search"].pop(key)
+    if asked["poses"] is None:
+        del asked["poses"]
+    else:
+        for key in ("attack", "landscape", "robustness"):
+            del asked["poses"][key]
     for wanted in asked["objects"]:
         del wanted["file"], wanted["target"]
         if wanted.pop("display") is None:

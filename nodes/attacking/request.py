@@ -15,6 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 
 from advnerf_core.geometry import Array, make_transform, rotation_z
 from advnerf_core.policies.load import is_factory
+from nodes.attacking.pose_request import PosesRequest
 from nodes.runtime.config import Document, apply_overrides, parse_yaml, read_yaml, validate
 
 Method = Literal["gradient", "random", "cem", "evolution"]
@@ -187,6 +188,7 @@ class AttackRequest(_Section):
     dynamics: DynamicsRequest = DynamicsRequest()
     search: SearchRequest = SearchRequest()
     robustness: RobustnessRequest = RobustnessRequest()
+    poses: PosesRequest | None = Field(default=None, description="Where objects may stand; 'advnerf attack poses'.")
 
     @model_validator(mode="after")
     def _complete(self) -> AttackRequest:
@@ -198,6 +200,8 @@ class AttackRequest(_Section):
             raise ValueError("display: expected one object, a face or cube, and seeds searched one after the other")
         if self.calibration is None and missing:
             raise ValueError(f"expected a calibration folder, or files for {', '.join(missing)}")
+        if self.poses is not None and len(self.poses.bounds) != len(self.objects):
+            raise ValueError(f"poses: expected bounds of {len(self.objects)} object(s), got {len(self.poses.bounds)}")
         count = len(self.starts.poses) or self.starts.count
         if len(self.goals) not in (0, 1, count):
             raise ValueError(f"expected no goal, one, or {count} (one per start), got {len(self.goals)}")
@@ -245,4 +249,6 @@ def _resolve(document: Document, folder: Path, overrides: Sequence[str]) -> Atta
         wanted.model_copy(update={name: absolute(getattr(wanted, name)) for name in ("file", "target", "display")})
         for wanted in request.objects
     )
+    if request.poses is not None:
+        changes["poses"] = request.poses.model_copy(update={"attack": absolute(request.poses.attack)})
     return request.model_copy(update=changes)

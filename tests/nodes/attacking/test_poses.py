@@ -1,0 +1,154 @@
+"""Pose attacks of a request, from its file to attack file, landscape and robustness map, by the command line too."""
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from advnerf_core.attack.artifact import load_attack
+from nodes import cli
+from nodes.attacking.poses import prepare_poses, run_poses
+from nodes.attacking.prepare import prepare
+from nodes.attacking.request import load_request, request_text
+from nodes.runtime.errors import ConfigError
+from nodes.runtime.progress import ProgressDisplay
+
+sys.path.insert(0, str(Path(__file__).parent))
+from tiny import tiny_request
+
+POSES = """\
+poses:
+  bounds: [{x_m: [0.9, 1.6], y_m: [-1.5, -1.2], yaw_rad: [2.8, 3.4]}]
+  keep_out_m: 0.3
+  samples: 2
+  steps: 2
+  landscape: {points: [2, 2]}
+  robustness: {sideways_m: [-0.1, 0.1], object_moves_m: [[0.0, 0.0], [0.1, 0.1]]}
+"""
+
+
+def request_file(folder, text=POSES):
+    file = tiny_request(folder)
+    file.write_text(file.read_text().replace("y_m: -1.7", "y_m: -1.3") + text)
+    return file
+
+
+def command(monkeypatch, *words):
+    monkeypatch.setattr(sys, "argv", ["advnerf", "attack", *map(str, words)])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    return ended.value.code
+
+
+def test_commands_search_map_and_find_their_work_again(tmp_path, monkeypatch, capsys):
+    file, folder = request_file(tmp_path), tmp_path / "out"
+    attack_path = folder / "seed_0.attack.safetensors"
+    assert command(monkeypatch, "poses", file, "-o", folder) == 0
+    attack, content = load_attack(attack_path), attack_path.read_bytes()
+    (placement,) = attack.extra["placements"]
+    assert 0.9 <= placement[0] <= 1.6
+    assert -1.5 <= placement[1] <= -1.2
+    np.testing.assert_allclose(attack.T_world_from_object[:2, 3], placement[:2], atol=1e-12)
+    np.testing.assert_allclose(attack.objects[0].T_world_from_object, attack.T_world_from_object)
+    assert attack.objects[0].theta.shape == attack.theta.shape
+    curve = json.loads((folder / "seed_0.json").read_text())
+    assert len(curve["searched_total_cte_m"]) == 4
+    assert curve["attack_id"] == attack.attack_id
+    assert (folder / "seed_0.poses.png").stat().st_size > 1000
+    for name in ("landscape", "robustness"):
+        assert command(monkeypatch, name, file, "-o", folder, "--attack", attack_path) == 0
+        assert (folder / f"{name}.png").stat().st_size > 1000
+    assert len(json.loads((folder / "landscape.json").read_text())["cells"]) == 4
+    assert np.array(json.loads((folder / "robustness.json").read_text())["cells"]["1"]).shape == (3, 2)
+    assert command(monkeypatch, "poses", file, "-o", folder) == 0
+    assert attack_path.read_bytes() == content
+    capsys.readouterr()
+    # Another question in the same folder is refused in one line.
+    assert command(monkeypatch, "landscape", file, "-o", folder) == 2
+    assert "belongs to a map with other settings" in capsys.readouterr().err
+
+
+def test_a_killed_run_ends_in_the_same_bytes_and_seeds_differ(tmp_path):
+    request = load_request(request_file(tmp_path), ["search.seeds=[0, 3]"])
+    whole = run_poses(request, tmp_path / "whole", ProgressDisplay())
+    places = [load_attack(file).extra["placements"] for file in whole]
+    assert places[0] != places[1]
+
+    class Impatient(ProgressDisplay):
+        def start(self, stage):
+            def report(fraction, text=""):
+                if fraction >= 0.75:
+                    raise KeyboardInterrupt
+
+            return report
+
+    with pytest.raises(KeyboardInterrupt):
+        run_poses(request, tmp_path / "killed", Impatient())
+    assert [f.read_bytes() for f in run_poses(request, tmp_path / "killed", ProgressDisplay())] == [
+        f.read_bytes() for f in whole
+    ]
+
+
+def test_poses_alone_keep_the_colours_they_are_given_and_random_ones_spend_as_much(tmp_path):
+    file = request_file(tmp_path)
+    (coloured,) = run_poses(load_request(file), tmp_path / "coloured", ProgressDisplay())
+    alone = ["poses.colours=false", f"poses.attack={coloured}", "search.method=random"]
+    request = load_request(file, alone)
+    ready = prepare_poses(request)
+    assert ready.sensor.theta_shape == (4,)
+    (found,) = run_poses(request, tmp_path / "alone", ProgressDisplay())
+    attack = load_attack(found)
+    assert attack.method == "random"
+    np.testing.assert_array_equal(attack.theta, load_attack(coloured).theta)
+    assert attack.extra["evaluations"] == 4
+    assert attack.config_sha256 != load_attack(coloured).config_sha256
+    np.testing.assert_allclose(ready.sensor.placements(ready.theta_of(found)), attack.extra["placements"], atol=1e-9)
+    with pytest.raises(ConfigError, match="expected the colours of the request"):
+        prepare_poses(load_request(file, ["poses.colours=false"])).theta_of(coloured)
+
+
+def test_the_request_says_the_same_again_and_its_hash_knows_the_bounds_but_not_the_maps(tmp_path):
+    file = request_file(tmp_path)
+    request = load_request(file)
+    again = tmp_path / "again.attack.yaml"
+    again.write_text(request_text(request))
+    assert load_request(again) == request
+    config = prepare(request).hashes["config"]
+    assert prepare(load_request(file, ["poses.landscape.points=[9, 9]"])).hashes["config"] == config
+    assert prepare(load_request(file, ["poses.keep_out_m=0.2"])).hashes["config"] != config
+
+
+@pytest.mark.parametrize(
+    ("changes", "what"),
+    [
+        (["poses.bounds=[{x_m: [2.0, 1.0]}]"], "expected the lower bound first"),
+        (["poses.bounds=[{}, {}]"], r"poses: expected bounds of 1 object\(s\), got 2"),
+        (["poses.bounds=[{z_m: [0.0, 1.0]}]"], "z_m"),
+        (["poses.bounds=[{scale: [0.5, 1.0]}]"], "no bounds of the scale of a face"),
+        (["poses.attack=some.file"], "expected colours: false"),
+        (["search.method=cem"], "expected gradient or random for poses"),
+        (["robustness.smoothness=0.1"], "expected no search.together, robustness.smoothness"),
+        (["poses.landscape.object=3"], None),
+    ],
+)
+def test_a_request_that_cannot_be_is_refused(tmp_path, changes, what):
+    from nodes.attacking.pose_maps import make_landscape
+
+    if what is None:
+        with pytest.raises(ConfigError, match=r"poses.landscape.object: expected 0..0, got 3"):
+            make_landscape(load_request(request_file(tmp_path), changes), tmp_path, None, lambda fraction, text: None)
+        return
+    with pytest.raises(ConfigError, match=what):
+        prepare_poses(load_request(request_file(tmp_path), changes))
+
+
+def test_a_request_without_poses_and_bounds_on_the_lane_end_in_one_line(tmp_path, monkeypatch, capsys):
+    assert command(monkeypatch, "poses", tiny_request(tmp_path / "plain"), "-o", tmp_path / "a") == 2
+    assert "expected the key poses in the request" in capsys.readouterr().err
+    on_lane = request_file(tmp_path / "lane", POSES.replace("[-1.5, -1.2]", "[-2.1, -1.9]"))
+    assert command(monkeypatch, "poses", on_lane, "-o", tmp_path / "b") == 2
+    said = capsys.readouterr().err
+    assert "expected bounds with a place at least 0.3 m beside the path" in said
+    assert "Traceback" not in said
