@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -27,7 +27,9 @@ class ExpertConfig:
         feed_forward: Share of the path's curvature that is steered ahead, 0..1. At 0 it is the plain PD law on the tracked pose,
             which runs wide in corners by ``curvature / stiffness^2``; at 1 it holds them.
         smoothing_m: Path curvature is averaged over this length, so that the steering is continuous in the state [m].
-        steering_limits_rad: Rightmost and leftmost steering [rad], inside what the policy can express.
+        steering_limits_rad: Rightmost and leftmost output, inside what the policy can express: wheel angle [rad], or turn
+            rate [rad/s].
+        output: What the expert commands: the wheel angle of a car with a wheelbase, or the turn rate of a Dubins car.
     """
 
     wheelbase_m: float = 0.25
@@ -39,6 +41,7 @@ class ExpertConfig:
     feed_forward: float = 1.0
     smoothing_m: float = 0.24
     steering_limits_rad: tuple[float, float] = (-0.26, 0.29)
+    output: Literal["wheel_angle", "turn_rate"] = "wheel_angle"
 
     def __post_init__(self) -> None:
         positive = (
@@ -46,6 +49,8 @@ class ExpertConfig:
         )  # fmt: skip
         if not (min(positive) > 0.0 and self.delay_s >= 0.0 and 0.0 <= self.feed_forward <= 1.0):
             raise ValueError(f"expected positive expert settings, a delay >= 0 and a feed-forward of 0..1, got {self}")
+        if self.output not in ("wheel_angle", "turn_rate"):
+            raise ValueError(f"expected an output of wheel_angle or turn_rate, got {self.output!r}")
 
 
 class Expert:
@@ -67,7 +72,7 @@ class Expert:
         self.config = config or ExpertConfig()
 
     def steer(self, x_m: ArrayLike, y_m: ArrayLike, yaw_rad: ArrayLike) -> Array:
-        """Steering ``[...]`` [rad], left positive, for rear-axle poses given as arrays ``[...]``."""
+        """Control ``[...]``, left positive, for rear-axle poses given as arrays ``[...]``: wheel angle [rad] or turn rate [rad/s]."""
         c = self.config
         x, y, yaw = np.broadcast_arrays(*(np.asarray(v, dtype=np.float64) for v in (x_m, y_m, yaw_rad)))
         at = self.path.project(np.stack([x, y], axis=-1))
@@ -77,16 +82,21 @@ class Expert:
         wanted = -c.max_approach_rad * np.tanh(c.stiffness_1pm / (2.0 * c.damping) * error / c.max_approach_rad)
         feed_forward = c.feed_forward * self._parallel_curvature(at.s_m + ahead * np.cos(heading_error), at.cte_m)
         curvature = feed_forward - 2.0 * c.damping * c.stiffness_1pm * (heading_error - wanted)
-        return np.clip(np.arctan(c.wheelbase_m * curvature), *c.steering_limits_rad)
+        control = np.arctan(c.wheelbase_m * curvature) if c.output == "wheel_angle" else c.speed_mps * curvature
+        return np.clip(control, *c.steering_limits_rad)
 
     def steer_states(self, states: ArrayLike) -> Array:
-        """Steering ``[...]`` [rad] for states ``[..., >= 3]``."""
+        """Control ``[...]`` for states ``[..., >= 3]``; see :meth:`steer`."""
         s = np.asarray(states, dtype=np.float64)
         return self.steer(s[..., 0], s[..., 1], s[..., 2])
 
     def to_dict(self) -> dict[str, Any]:
         """Settings and path as plain data, for manifests."""
-        return {**asdict(self.config), "path": self.path.to_dict()}
+        settings = asdict(self.config)
+        # Left out where it is the default, so that policies and training folders from before it existed keep their hashes.
+        if settings["output"] == "wheel_angle":
+            del settings["output"]
+        return {**settings, "path": self.path.to_dict()}
 
     def _parallel_curvature(self, s_m: Array, offset_m: Array) -> Array:
         """Path curvature, averaged over the smoothing length about ``s_m``, of the parallel curve at ``offset_m``."""

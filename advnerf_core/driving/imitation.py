@@ -10,120 +10,28 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict
 from pathlib import Path as FilePath
 from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
-from advnerf_core.driving.augment import AugmentConfig
 from advnerf_core.driving.expert import Expert
 from advnerf_core.driving.fit import FitConfig, fit, mean_absolute_error
 from advnerf_core.driving.frames import Frames, FrameSet, FrameStore, FrameStoreError
 from advnerf_core.driving.path import Array, Path
 from advnerf_core.driving.policy import PilotNet, save_policy
 from advnerf_core.driving.policy_view import PolicyView
-from advnerf_core.driving.sources import FrameSource, Seen, steer_with
+from advnerf_core.driving.recipe import ImitationConfig, SourcePlan, TrainedPolicy, recovery_states
+from advnerf_core.driving.sources import KeepDriving, Seen, steer_with
 from advnerf_core.files import write_atomically
+
+__all__ = ["ImitationConfig", "Progress", "SourcePlan", "TrainedPolicy", "recovery_states", "train_policy"]
 
 Progress = Callable[[float, str], None]
 """Told the finished fraction (0..1) and what is being done."""
-
-
-@dataclass(frozen=True)
-class SourcePlan:
-    """How much is taken from one source.
-
-    Attributes:
-        source: The domain.
-        stills: States that are looked at before the first training.
-        drives: Drives in each DAgger round.
-        drive_steps: Ticks of each of these drives.
-    """
-
-    source: FrameSource
-    stills: int
-    drives: int = 8
-    drive_steps: int = 40
-
-
-@dataclass(frozen=True)
-class ImitationConfig:
-    """Settings of the recipe.
-
-    Attributes:
-        seed: Of poses, textures, initial weights, batches and augmentation.
-        dagger_rounds: Rounds of driving, labelling and continued training.
-        first_steps: Optimiser steps of behaviour cloning.
-        round_steps: Optimiser steps after each DAgger round.
-        naive_steps: Optimiser steps of a second policy that never sees a random texture; 0 trains none.
-        batch_size: Frames per step.
-        learning_rate: Peak learning rate; continued training starts at half of it.
-        lateral_m: Stills are up to this far from the path [m].
-        heading_rad: Stills are turned up to this much from the path's heading [rad].
-        drive_lateral_m: DAgger drives start up to this far from the path [m].
-        drive_heading_rad: And turned up to this much [rad].
-        give_up_m: A drive ends when |CTE| exceeds this [m]; frames from further away teach little.
-        max_steering_rad: Bound of the policy's output [rad].
-        hidden: Widths of the policy's linear layers.
-        augment: Image augmentation.
-        holdout_every: One block in so many is kept for validation.
-    """
-
-    seed: int = 0
-    dagger_rounds: int = 2
-    first_steps: int = 500
-    round_steps: int = 250
-    naive_steps: int = 0
-    batch_size: int = 64
-    learning_rate: float = 1e-3
-    lateral_m: float = 0.35
-    heading_rad: float = 0.45
-    drive_lateral_m: float = 0.2
-    drive_heading_rad: float = 0.25
-    give_up_m: float = 0.7
-    max_steering_rad: float = 0.30
-    hidden: tuple[int, int, int] = (100, 50, 10)
-    augment: AugmentConfig = field(default_factory=AugmentConfig)
-    holdout_every: int = 20
-
-
-@dataclass(frozen=True)
-class TrainedPolicy:
-    """What the recipe made.
-
-    Attributes:
-        path: Policy file.
-        sha256: Its hash.
-        validation_mae_rad: Mean absolute steering error on held-out frames [rad].
-        naive_path: File of the policy that never saw a random texture, if one was asked for.
-        naive_sha256: Its hash.
-        naive_validation_mae_rad: Its error on held-out plain frames [rad].
-        frames: Number of collected frames.
-        seconds: Time spent in this call on each part: collect, train [s].
-    """
-
-    path: FilePath
-    sha256: str
-    validation_mae_rad: float
-    naive_path: FilePath | None
-    naive_sha256: str | None
-    naive_validation_mae_rad: float | None
-    frames: int
-    seconds: dict[str, float]
-
-
-def recovery_states(path: Path, count: int, rng: np.random.Generator, lateral_m: float, heading_rad: float) -> Array:
-    """Poses ``[count, 3]`` about the path, evenly along it: half spread over the full range, half near the path."""
-    s = (np.arange(count) + rng.random(count)) / max(count, 1) * path.length_m
-    pose = path.pose_at(rng.permutation(s))
-    spread = np.where(np.arange(count)[:, None] % 2 == 0, 1.0, 0.35)
-    lateral, heading = (rng.uniform(-1.0, 1.0, (count, 2)) * spread * [lateral_m, heading_rad]).T
-    pose[:, 0] -= lateral * np.sin(pose[:, 2])
-    pose[:, 1] += lateral * np.cos(pose[:, 2])
-    pose[:, 2] += heading
-    return pose
 
 
 def train_policy(
@@ -138,8 +46,9 @@ def train_policy(
 
     Args:
         config: Settings.
-        plans: At least one source with the amount to take from it; their names differ.
-        expert: The teacher; its path is where poses are drawn about.
+        plans: At least one source with the amount to take from it; their names differ. Plans with goals and experts of their own make
+            one policy that learns several paths.
+        expert: The teacher of plans without one; its path is where poses are drawn about.
         view: How camera images become policy images; stored in the policy file.
         out_dir: Keeps frames and checkpoints too. Calling again with the same settings continues or returns at once; with
             other settings it is an error.
@@ -161,9 +70,12 @@ class _Recipe:
         names = [plan.source.name for plan in plans]
         if not names or len(set(names)) != len(names):
             raise ValueError(f"expected at least one source, with different names, got {names}")
+        if len({len(plan.goal) for plan in plans}) != 1:
+            raise ValueError(f"expected goals of one length, got {[list(plan.goal) for plan in plans]}")
         self.config, self.plans, self.expert, self.view, self.out_dir = config, plans, expert, view, out_dir
         self.store = FrameStore(out_dir / "frames")
         self.seconds = {"collect": 0.0, "train": 0.0}
+        self._goal_size = len(plans[0].goal)
         self._progress = progress
         # Rough seconds of one look or driven tick, and of one optimiser step, only to make the bar move evenly.
         looks = sum(p.stills + config.dagger_rounds * p.drives * p.drive_steps for p in plans)
@@ -175,14 +87,14 @@ class _Recipe:
         self._claim_folder()
         config = self.config
         torch.manual_seed(config.seed)
-        policy = PilotNet(0, config.max_steering_rad, config.hidden)
+        policy = PilotNet(self._goal_size, config.max_steering_rad, config.hidden)
         for number, plan in enumerate(self.plans):
-            self._collect(f"stills-{plan.source.name}", plan.stills, self._stills(plan, number))
+            self._collect(f"stills-{plan.source.name}", plan, plan.stills, self._stills(plan, number))
         self._train(policy, "clone", config.first_steps, config.learning_rate)
         for turn in range(config.dagger_rounds):
             for number, plan in enumerate(self.plans):
                 name = f"drive{turn}-{plan.source.name}"
-                self._collect(name, plan.drives * plan.drive_steps, self._drives(plan, policy, turn, number))
+                self._collect(name, plan, plan.drives * plan.drive_steps, self._drives(plan, policy, turn, number))
             self._train(policy, f"dagger{turn}", config.round_steps, 0.5 * config.learning_rate)
         frames = self._frames(textured=True)
         mae = mean_absolute_error(policy, frames)
@@ -202,7 +114,7 @@ class _Recipe:
     def _naive(self) -> tuple[FilePath, str, float]:
         """A policy from the plain frames only, drives included."""
         torch.manual_seed(self.config.seed)
-        policy = PilotNet(0, self.config.max_steering_rad, self.config.hidden)
+        policy = PilotNet(self._goal_size, self.config.max_steering_rad, self.config.hidden)
         self._train(policy, "naive", self.config.naive_steps, self.config.learning_rate, textured=False)
         mae = mean_absolute_error(policy, self._frames(textured=False))
         return self.out_dir / "naive.safetensors", self._save("naive.safetensors", policy, mae, textured=False), mae
@@ -210,7 +122,10 @@ class _Recipe:
     def _stills(self, plan: SourcePlan, number: int) -> Callable[[], list[Seen]]:
         def collect() -> list[Seen]:
             rng = np.random.default_rng([self.config.seed, 0, number])
-            states = recovery_states(self.expert.path, plan.stills, rng, self.config.lateral_m, self.config.heading_rad)
+            path = self._expert_of(plan).path
+            states = recovery_states(
+                path, plan.stills, rng, self.config.lateral_m, self.config.heading_rad, plan.driven_m
+            )
             parts = []
             for start in range(0, plan.stills, plan.source.batch_size):
                 batch = states[start : start + plan.source.batch_size]
@@ -224,28 +139,34 @@ class _Recipe:
         def collect() -> list[Seen]:
             config = self.config
             rng = np.random.default_rng([config.seed, 1 + turn, number])
+            path = self._expert_of(plan).path
+            steer = steer_with(policy, torch.tensor([plan.goal]) if plan.goal else None)
             starts = recovery_states(
-                self.expert.path, plan.drives, rng, config.drive_lateral_m, config.drive_heading_rad
+                path, plan.drives, rng, config.drive_lateral_m, config.drive_heading_rad, plan.driven_m
             )
             parts = []
             # Two at a time at least, so that both plain and textured drives occur.
             size = max(2, plan.source.batch_size)
             for first in range(0, plan.drives, size):
                 batch = starts[first : first + size]
-                parts.append(plan.source.drive(steer_with(policy), batch, plan.drive_steps, self._near_path, rng))
+                parts.append(plan.source.drive(steer, batch, plan.drive_steps, self._near(path), rng))
                 work = 0.02 * len(batch) * plan.drive_steps
                 self._advance(work, f"driving: {plan.source.name} {first + len(batch)}/{plan.drives}")
             return parts
 
         return collect
 
-    def _near_path(self, states: Array) -> np.ndarray[Any, np.dtype[np.bool_]]:
-        near: np.ndarray[Any, np.dtype[np.bool_]] = (
-            np.abs(self.expert.path.project(states[:, :2]).cte_m) <= self.config.give_up_m
-        )
+    def _expert_of(self, plan: SourcePlan) -> Expert:
+        return plan.expert or self.expert
+
+    def _near(self, path: Path) -> KeepDriving:
+        def near(states: Array) -> NDArray[np.bool_]:
+            close: NDArray[np.bool_] = np.abs(path.project(states[:, :2]).cte_m) <= self.config.give_up_m
+            return close
+
         return near
 
-    def _collect(self, name: str, looks: int, collect: Callable[[], list[Seen]]) -> None:
+    def _collect(self, name: str, plan: SourcePlan, looks: int, collect: Callable[[], list[Seen]]) -> None:
         if looks == 0:
             return
         if name in self.store.names():
@@ -253,8 +174,8 @@ class _Recipe:
             return
         start = time.perf_counter()
         seen = Seen.join(collect())
-        labels = self.expert.steer_states(seen.states).astype(np.float32)
-        goals = np.zeros((len(labels), 0), np.float32)
+        labels = self._expert_of(plan).steer_states(seen.states).astype(np.float32)
+        goals = np.tile(np.array(plan.goal, np.float32), (len(labels), 1))
         self.store.append(name, Frames(seen.images, seen.states, labels, goals, seen.textured))
         self.seconds["collect"] += time.perf_counter() - start
 
@@ -302,10 +223,7 @@ class _Recipe:
         return save_policy(self.out_dir / name, policy, self.view, metadata)
 
     def _settings(self) -> dict[str, Any]:
-        plans = [
-            {"source": p.source.name, "stills": p.stills, "drives": p.drives, "drive_steps": p.drive_steps}
-            for p in self.plans
-        ]
+        plans = [plan.settings() for plan in self.plans]
         return {**asdict(self.config), "plans": plans}
 
     def _claim_folder(self) -> None:
