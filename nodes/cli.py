@@ -20,6 +20,7 @@ from nodes import (
     cli_calibrate,
     cli_camera,
     cli_campaign,
+    cli_carla,
     cli_doctor,
     cli_keys,
     cli_motor,
@@ -65,6 +66,7 @@ app.add_typer(cli_object.app, name="object")
 app.add_typer(cli_policy.app, name="policy")
 app.add_typer(cli_scene.app, name="scene")
 app.add_typer(cli_room.app, name="room")
+app.add_typer(cli_carla.app, name="carla")
 cli_doctor.add_to(app)
 cli_replay.add_to(app)
 cli_teleop.add_to(app)
@@ -188,9 +190,17 @@ def _run_experiment(
 ) -> None:
     # Rendering without a display is the only way the stages know; an import of MuJoCo decides on it.
     os.environ.setdefault("MUJOCO_GL", "egl")
+    from nodes.experiment.run import kind_of
+
+    folder = folder or Path("runs") / setting
+    if kind_of(file) == "intersection":
+        from nodes.intersection import run as intersection
+
+        intersection.run_experiment(intersection.load_experiment(file, setting, overrides or [], folder), until)
+        return
     from nodes.experiment.run import load_experiment, run_experiment
 
-    run_experiment(load_experiment(file, setting, overrides or [], folder or Path("runs") / setting), until)
+    run_experiment(load_experiment(file, setting, overrides or [], folder), until)
 
 
 def _add_stage(name: str, what: str) -> None:

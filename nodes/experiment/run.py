@@ -40,6 +40,22 @@ def load_experiment(file: Path, setting: str, overrides: Sequence[str], folder: 
     Raises:
         ConfigError: With file, line and the valid keys.
     """
+    document = read_setting(file, setting, overrides)
+    if document.data.pop("kind", "room") != "room":
+        raise ConfigError(f"{file}: expected kind room or intersection, got {kind_of(file)!r}")
+    config = validate(ExperimentConfig, document)
+    validate(LabConfig, document.part(("lab",)))
+    return Experiment(config, file.resolve(), folder.resolve(), setting)
+
+
+def kind_of(file: Path) -> str:
+    """Which experiment a file describes: ``room`` unless its ``kind`` says otherwise."""
+    data = read_yaml(file).data
+    return str(data.get("kind", "room")) if isinstance(data, dict) else "room"
+
+
+def read_setting(file: Path, setting: str, overrides: Sequence[str]) -> Document:
+    """An experiment file with one of its settings laid over its values, and overrides over that; see `load_experiment`."""
     document = read_yaml(file)
     if not isinstance(document.data, dict):
         raise ConfigError(f"{file}: expected an experiment file with keys and values")
@@ -48,9 +64,7 @@ def load_experiment(file: Path, setting: str, overrides: Sequence[str], folder: 
         raise ConfigError(f"{file}: no setting called {setting!r}; known are {', '.join(settings) or 'none'}")
     _lay_over(document, settings[setting] or {}, ("settings", setting), ())
     apply_overrides(document, overrides)
-    config = validate(ExperimentConfig, document)
-    validate(LabConfig, document.part(("lab",)))
-    return Experiment(config, file.resolve(), folder.resolve(), setting)
+    return document
 
 
 def run_experiment(

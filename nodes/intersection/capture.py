@@ -1,0 +1,76 @@
+"""Stage capture: photograph the junction, and keep views of the driving camera that nothing learns from."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from advnerf_core.driving.imitation import recovery_states
+from advnerf_core.files import write_atomically
+from advnerf_core.geometry import Array, Pinhole, planar_pose
+from advnerf_core.scene.dataset import write_transforms
+from hardware.twin.intersection.photos import photo_poses
+from hardware.twin.intersection.scene import Intersection
+from nodes.intersection.context import Experiment
+from nodes.runtime.stages import Report
+
+PHOTOS, HELD_OUT = "photos", "held_out"
+# Held-out views lie as far from a path as a fooled car drives [m], and as turned [rad].
+_LATERAL_M, _HEADING_RAD = 1.0, 0.2
+
+
+def run(experiment: Experiment, folder: Path, report: Report) -> None:
+    """Write two posed image sets: ``photos`` (learned from) and ``held_out`` (driving camera, without objects)."""
+    config = experiment.config.capture
+    rng = np.random.default_rng(config.seed)
+    poses = photo_poses(experiment.world, config.photos, rng)
+    states = held_out_states(experiment, rng)
+    total = len(poses) + len(states)
+    with Intersection(experiment.world) as scene:
+
+        def keep(
+            name: str, taken: Sequence[Array], pinhole: Pinhole, see: Callable[[int], NDArray[np.uint8]], done: int
+        ) -> None:
+            files = []
+            for index in range(len(taken)):
+                files.append(f"images/{index:04d}.{'jpg' if name == PHOTOS else 'png'}")
+                write_image(folder / name / files[-1], see(index))
+                report((done + index + 1) / total, f"{name} {index + 1}/{len(taken)}")
+            write_transforms(folder / name / "transforms.json", files, taken, pinhole)
+
+        def observed(index: int) -> NDArray[np.uint8]:
+            x, y, yaw = map(float, states[index])
+            return scene.observe_at(x, y, yaw, depth=False)[0]
+
+        keep(PHOTOS, poses, scene.photo_pinhole, lambda index: scene.photograph(poses[index]), 0)
+        keep(
+            HELD_OUT,
+            [planar_pose(*state) @ experiment.mount for state in states],
+            experiment.camera,
+            observed,
+            len(poses),
+        )
+
+
+def held_out_states(experiment: Experiment, rng: np.random.Generator) -> Array:
+    """Car states ``[held_out, 3]`` about the stretch of all drives that is measured."""
+    names, count = list(experiment.paths), experiment.config.capture.held_out
+    driven_m = experiment.config.horizon * experiment.config.dt_s * experiment.world.car.speed_mps
+    parts = []
+    for index, name in enumerate(names):
+        share = len(range(index, count, len(names)))
+        parts.append(recovery_states(experiment.paths[name], share, rng, _LATERAL_M, _HEADING_RAD, driven_m))
+    return np.concatenate(parts)
+
+
+def write_image(path: Path, rgb: NDArray[np.uint8]) -> None:
+    """Write one image; photographs as JPEG, what is compared without loss."""
+    options = [cv2.IMWRITE_JPEG_QUALITY, 95] if path.suffix == ".jpg" else []
+    encoded, data = cv2.imencode(path.suffix, cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), options)
+    if not encoded:
+        raise ValueError(f"expected an image that can be written as {path.suffix}, got shape {rgb.shape}")
+    write_atomically(path, data.tobytes())

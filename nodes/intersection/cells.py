@@ -1,0 +1,135 @@
+"""One entry of the transfer table, from the search to the deployed drive, as campaigns ask for it; a finished part is not done again."""
+
+from __future__ import annotations
+
+import json
+import platform
+from contextlib import AbstractContextManager, nullcontext
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from advnerf_core.driving.policy import load_policy
+from advnerf_core.files import write_atomically
+from hardware.twin.intersection.scene import Intersection
+from nodes.intersection.attack import Cell, Condition, cells, frozen_hashes, load_theta, surrogate_part
+from nodes.intersection.context import Experiment
+from nodes.intersection.deployed import DressedScene, drive_deployed
+from nodes.intersection.objects import placed_objects, surrogate_of
+from nodes.intersection.policy import victim_file, victims
+from nodes.runtime.errors import RuntimeFault
+from nodes.runtime.stages import Report, hash_of
+
+PREPARED_AT = "policy"  # the last stage that a cell needs of its experiment
+
+
+class CellError(RuntimeFault):
+    """A cell was asked for that this experiment does not have."""
+
+
+def run_cell(
+    experiment: Experiment, scenario: str, victim: str, method: Condition, seed: int, folder: Path, report: Report
+) -> dict[str, Any]:
+    """Search in the surrogate, drive in both domains, and keep the result in ``folder``.
+
+    Args:
+        experiment: Its scene, objects and policies must be there (``advnerf experiment FILE --until policy``).
+        scenario: Drive: straight, right or left.
+        victim: hardened or naive.
+        method: none, random, cem or gradient.
+        seed: Of the search and its starts.
+        folder: Where search states, attack files and results are kept.
+        report: Told the finished fraction.
+
+    Returns:
+        The cell as JSON data: see `deployed_part`.
+
+    Raises:
+        CellError: No such drive, victim or method.
+    """
+    known = (experiment.config.scenarios, victims(experiment), ("none", "random", "cem", "gradient"))
+    for what, value, choices in zip(("scenario", "victim", "method"), (scenario, victim, method), known, strict=True):
+        if value not in choices:
+            raise CellError(f"expected a {what} of {', '.join(choices)}, got {value!r}")
+    cell = Cell(scenario, victim, method, seed)
+    surrogate = surrogate_of(experiment, placed_objects(experiment))
+    for each in dict.fromkeys((cell.clean, cell)):
+        surrogate_part(experiment, surrogate, each, folder, report)
+    result = folder / f"{cell.name}.cell.json"
+    # A scene is opened only if there is something to drive.
+    opened: AbstractContextManager[Any] = nullcontext() if result.exists() else Intersection(experiment.world)
+    with opened as scene:
+        dressed = None if scene is None else DressedScene(scene, experiment.view, placed_objects(experiment))
+        return deployed_part(experiment, dressed, cell, folder, folder)
+
+
+def deployed_part(
+    experiment: Experiment, dressed: DressedScene | None, cell: Cell, searched: Path, folder: Path
+) -> dict[str, Any]:
+    """Drive a searched cell and its clean drive in the deployment scene; writes ``<cell>.cell.json`` and ``<cell>.drives.json``.
+
+    Args:
+        experiment: The experiment.
+        dressed: The scene with its objects; may be None if the result is there.
+        cell: Which.
+        searched: Where the surrogate's part is.
+        folder: Where the result goes.
+
+    Returns:
+        Scenario, victim, method, seed, attack id, hash of all settings, seconds, machine, date; for ``surrogate`` and ``deployed``
+        the total CTE [m] and whether the car left the track, per start, and the total CTE past the plain objects.
+    """
+    result = folder / f"{cell.name}.cell.json"
+    if result.exists():
+        found: dict[str, Any] = json.loads(result.read_text())
+        return found
+    assert dressed is not None
+    learned, clean = (json.loads((searched / f"{each.name}.json").read_text()) for each in (cell, cell.clean))
+    driven = _drives(experiment, dressed, cell, searched, folder)
+    undisturbed = _drives(experiment, dressed, cell.clean, searched, folder)
+    data = {
+        "scenario": cell.scenario, "victim": cell.victim, "method": cell.method, "seed": cell.seed,
+        "attack_id": learned["attack_id"], "settings_hash": hash_of(frozen_hashes(experiment)),
+        "seconds": round(learned["seconds"], 1), "machine": platform.processor() or platform.machine(),
+        "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        "surrogate": {
+            "total_cte_m": learned["total_cte_m"], "off_track": learned["off_track"], "none_total_cte_m": clean["total_cte_m"],
+        },
+        "deployed": {
+            "total_cte_m": driven["total_cte_m"], "off_track": driven["off_track"],
+            "none_total_cte_m": undisturbed["total_cte_m"],
+        },
+        "extra": {"evaluations": len(learned["curve_total_cte_m"]), "horizon": experiment.config.horizon},
+    }  # fmt: skip
+    write_atomically(result, json.dumps(data, indent=1) + "\n")
+    return data
+
+
+def _drives(experiment: Experiment, dressed: DressedScene, cell: Cell, searched: Path, folder: Path) -> dict[str, Any]:
+    """Deployed drives of a cell from all its starts; kept, as the clean ones are asked for again and again."""
+    kept = folder / f"{cell.name}.drives.json"
+    if kept.exists():
+        found: dict[str, Any] = json.loads(kept.read_text())
+        return found
+    policy = load_policy(victim_file(experiment, cell.victim)).policy
+    theta = dressed.plain_theta() if cell.method == "none" else load_theta(searched, cell)
+    drives = [
+        drive_deployed(
+            dressed, policy, experiment.goal(cell.scenario), np.asarray(start), experiment.paths[cell.scenario],
+            experiment.limits, experiment.world.car.speed_mps, theta,
+        )
+        for start in experiment.start_states(cell.scenario, cell.seed).numpy()
+    ]  # fmt: skip
+    data = {
+        "states": [drive.states.tolist() for drive in drives], "controls": [drive.controls.tolist() for drive in drives],
+        "total_cte_m": [drive.metrics.total_cte_m for drive in drives],
+        "mean_cte_m": [drive.metrics.mean_cte_m for drive in drives],
+        "off_track": [drive.metrics.off_track for drive in drives], "blocked_tick": [drive.blocked_tick for drive in drives],
+    }  # fmt: skip
+    write_atomically(kept, json.dumps(data) + "\n")
+    return data
+
+
+__all__ = ["Cell", "CellError", "cells", "deployed_part", "run_cell"]

@@ -1,0 +1,111 @@
+"""What all stages of the intersection's experiment share: the resolved configuration, the world, paths, camera, car."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path as FilePath
+
+import numpy as np
+import torch
+
+from advnerf_core.driving.dynamics import Dubins
+from advnerf_core.driving.expert import Expert, ExpertConfig
+from advnerf_core.driving.metrics import Horizon
+from advnerf_core.driving.path import Arc, Line, Path
+from advnerf_core.driving.policy_view import PolicyView
+from advnerf_core.geometry import Array, Pinhole
+from hardware.twin.intersection.config import IntersectionConfig
+from hardware.twin.intersection.paths import ReferencePath
+from nodes.intersection.config import IntersectionExperimentConfig
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """One resolved experiment.
+
+    Attributes:
+        config: The resolved configuration.
+        file: The experiment file.
+        folder: The run folder.
+        setting: Name of the setting, e.g. ``demo``.
+    """
+
+    config: IntersectionExperimentConfig
+    file: FilePath
+    folder: FilePath
+    setting: str
+
+    @cached_property
+    def world(self) -> IntersectionConfig:
+        """The simulated intersection with the experiment's changes."""
+        return IntersectionConfig.model_validate(self.config.world)
+
+    def stage_folder(self, stage: str) -> FilePath:
+        """Where a stage writes."""
+        return self.folder / stage
+
+    @cached_property
+    def references(self) -> dict[str, ReferencePath]:
+        """The drives of the experiment by scenario."""
+        known = self.world.paths()
+        return {name: known[name] for name in self.config.scenarios}
+
+    @cached_property
+    def paths(self) -> dict[str, Path]:
+        """Reference paths by scenario."""
+        return {name: as_path(reference) for name, reference in self.references.items()}
+
+    def goal(self, scenario: str) -> tuple[float, ...]:
+        """The exit as the policy is told it, one-hot."""
+        return self.references[scenario].goal
+
+    def expert(self, scenario: str) -> Expert:
+        """The teacher on one path; its output is a turn rate [rad/s]."""
+        wanted, bound = self.config.policy, self.world.car.max_turn_rate_radps
+        config = ExpertConfig(
+            speed_mps=self.world.car.speed_mps, delay_s=wanted.delay_s, stiffness_1pm=wanted.stiffness_1pm,
+            feed_forward=wanted.feed_forward, smoothing_m=self.world.car.speed_mps * self.config.dt_s,
+            steering_limits_rad=(-bound, bound), output="turn_rate",
+        )  # fmt: skip
+        return Expert(self.paths[scenario], config)
+
+    @property
+    def mount(self) -> Array:
+        """Driving camera on the car ``[4, 4]``."""
+        return self.world.camera.T_car_from_camera
+
+    @property
+    def camera(self) -> Pinhole:
+        """Intrinsics of the driving camera."""
+        return self.world.camera.pinhole
+
+    @cached_property
+    def view(self) -> PolicyView:
+        """What the policy sees of the driving camera."""
+        return PolicyView(self.camera)
+
+    @cached_property
+    def dynamics(self) -> Dubins:
+        """The surrogate's car, without the lag and the gain error of the deployed one."""
+        return Dubins(self.world.car.speed_mps, self.config.dt_s)
+
+    @property
+    def limits(self) -> Horizon:
+        """Over how many ticks a drive is measured, and what counts as off the track."""
+        return Horizon(self.config.horizon, self.config.dt_s, self.world.off_track_m, self.config.held_cap_m)
+
+    def start_states(self, scenario: str, seed: int) -> torch.Tensor:
+        """Start poses ``[B, 3]`` float64 of one attack: the nominal one first, the others drawn about it."""
+        wanted, nominal = self.config.attack, self.references[scenario].start_pose
+        noise = np.random.default_rng([seed, self.config.scenarios.index(scenario)]).standard_normal((wanted.starts, 3))
+        noise[0] = 0.0
+        # A tenth of a radian at the start would be 2.4 m of error at the junction.
+        spread = wanted.start_sigma * np.array([1.0, 1.0, 0.25])
+        return torch.from_numpy(np.array(nominal) + spread * noise)
+
+
+def as_path(reference: ReferencePath) -> Path:
+    """The path that lines and arcs describe; open at both ends."""
+    pieces = [Line(piece[1]) if piece[0] == "line" else Arc(piece[1], piece[2]) for piece in reference.segments]
+    return Path.from_segments(reference.start_pose, pieces, closed=False)
