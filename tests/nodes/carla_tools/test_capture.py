@@ -63,7 +63,7 @@ def test_photographs_are_along_the_lanes_and_above(carla, TJunction):
 
 def test_a_stopped_capture_goes_on_to_the_same_result(library, settings, tmp_path):
     run(library, settings, tmp_path / "whole")
-    library.world.script = {library.world.ticks + 20: "hang"}
+    library.world.script = {library.world.ticks + 9: "hang"}
     with pytest.raises(CarlaUnreachable):
         run(library, settings, tmp_path / "set")
     assert not (tmp_path / "set" / "photos" / "transforms.json").exists()
@@ -80,7 +80,7 @@ def test_another_capture_is_not_mixed_in(library, settings, tmp_path):
     with pytest.raises(ConfigError, match="holds a capture with other settings"):
         run(library, settings, tmp_path / "set", CaptureRequest(photos=12, held_out=3, seed=5))
     with pytest.raises(ConfigError, match="holds a capture with other settings"):
-        run(library, settings, tmp_path / "set", render={"settle_ticks": 2, "weather": "WetNoon"})
+        run(library, settings, tmp_path / "set", render={"settle_ticks": 0, "weather": "WetNoon"})
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "note.txt").write_text("mine")
     with pytest.raises(ConfigError, match="is not empty and holds no capture"):
