@@ -11,6 +11,7 @@ from scipy.ndimage import map_coordinates
 from advnerf_core.attack.adjoint import adjoint_gradient, evaluate
 from advnerf_core.attack.health import central_slopes, frozen_loss, random_directions, slopes_of
 from advnerf_core.attack.placement import footprint
+from advnerf_core.attack.pose_attack import pose_attack, randomly_placed
 from advnerf_core.attack.poses import (
     KeepOut,
     MultiStart,
@@ -256,3 +257,39 @@ def _lift(z_m):
     lift = np.zeros((4, 4))
     lift[2, 3] = z_m
     return lift
+
+
+def test_one_call_finds_poses_and_gives_what_a_deployment_shows():
+    placed_one = moving(2, objects=2)
+    surrogate, space = placed_one.sensor.surrogate, placed_one.sensor.space
+    problem = dataclasses.replace(placed_one, sensor=surrogate)
+    found = pose_attack(problem, space.bounds, space.keep_out, budget=MultiStart(2, 2), seed=7)
+    expected = multi_start(placed_one, MultiStart(2, 2), seed=7)
+    assert torch.equal(found.search.theta, expected.theta)
+    np.testing.assert_allclose(torch.stack([placement_of(each) for each in found.objects]), found.placements)
+    assert torch.equal(found.totals.protocol_cte_m, judge(placed_one, expected.theta).protocol_cte_m)
+    # Composed into a deployment's image: opaque objects at the found places, hidden by what is nearer.
+    T = surrogate.camera_poses(problem.start_states)
+    rgb, depth_m = surrogate.coloured_background(T)
+    deployed = found.deployed(surrogate)
+    shown = deployed.overlay(rgb, depth_m, T, found.colours)
+    assert torch.equal(shown, deployed.render(T, found.colours).images)
+    assert float((shown - rgb.permute(0, 3, 1, 2)).abs().max()) > 0.1
+    hidden = deployed.overlay(rgb, torch.full_like(depth_m, 0.1), T, found.colours)
+    assert torch.equal(hidden, rgb.permute(0, 3, 1, 2))
+    guessed = pose_attack(problem, space.bounds, space.keep_out, "random", MultiStart(2, 2), free_colours=False)
+    assert len(guessed.search.history) == 4
+    assert torch.equal(guessed.colours, surrogate.plain_theta())
+    with pytest.raises(TypeError, match="Surrogate as sensor"):
+        pose_attack(placed_one, space.bounds, space.keep_out)
+    with pytest.raises(ValueError, match="gradient or random"):
+        pose_attack(problem, space.bounds, space.keep_out, "cem")
+
+
+def test_surrogates_for_retraining_have_their_objects_at_allowed_places():
+    sensor = moving(1, objects=2).sensor
+    made = randomly_placed(sensor.surrogate, sensor.space.bounds, sensor.space.keep_out, 3, seed=1)
+    places = torch.stack([torch.stack([placement_of(each) for each in one.objects]) for one in made])
+    assert len(torch.unique(places, dim=0)) == 3
+    for placements in places:
+        sensor.space.unit(placements)  # refuses what is not allowed
