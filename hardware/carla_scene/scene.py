@@ -68,6 +68,7 @@ class CarlaScene:
         self.photo_pinhole: Pinhole = self.config.photo.pinhole
         self.T_car_from_camera: Array = self.config.camera.T_car_from_camera
         self.repeated_frames = 0
+        self._closed = False
         self._changed = True  # whether something stands elsewhere since the last tick
         self._library = load_carla() if library is None else library
         self._cameras: dict[str, Camera] = {}
@@ -119,6 +120,7 @@ class CarlaScene:
 
     def reset(self, x_m: float, y_m: float, yaw_rad: float) -> VehicleState:
         """Put the car down at rest, turning nowhere."""
+        self._require_open()
         self._changed = True
         with server_answers("putting the car down"):
             return self._car.reset(x_m, y_m, yaw_rad)
@@ -135,6 +137,7 @@ class CarlaScene:
             ValueError: The duration is not a whole number of ticks, or a value is not finite.
             CarlaError: The server did not answer.
         """
+        self._require_open()
         delta = self.config.render.fixed_delta_s
         ticks = round(duration_s / delta) if math.isfinite(duration_s) else -1
         if ticks < 0 or abs(ticks * delta - duration_s) > _WHOLE_TICK_S:
@@ -207,12 +210,19 @@ class CarlaScene:
             _log.warning("could not put back %s", what)
 
     def _put_back(self) -> list[str]:
+        self._closed = True
         self._cameras.clear()
         self._at_exit.detach()
         if self._client is not None:
             # A server that is gone is not waited for again and again.
             self._client.set_timeout(min(_CLOSING_TIMEOUT_S, self.config.server.timeout_s))
         return self._undo.run()
+
+    def _require_open(self) -> None:
+        if self._closed:
+            raise CarlaError(
+                "expected an open scene, this one is closed: its world is not ours any more; make another one"
+            )
 
     def _tick(self) -> None:
         self._ticked.tick()
@@ -242,6 +252,7 @@ class CarlaScene:
 
     def _pictures(self, wanted: dict[str, tuple[str, Pinhole]], T_world_from_camera: Array) -> list[Any]:
         """Raw pictures of one tick from one pose, by several cameras (made when they are first wanted)."""
+        self._require_open()
         pose = self.drives.frame.camera_pose(T_world_from_camera)
         for name, (kind, pinhole) in wanted.items():
             if name not in self._cameras:

@@ -352,6 +352,21 @@ def test_exposure_is_pinned_to_the_servers_upper_bound(library, settings):
         assert float(rgb.values["fov"]) == pytest.approx(88.0)
 
 
+def test_a_closed_scene_touches_nothing(library, settings):
+    scene = scene_of(library, settings)
+    scene.close()
+    calls = list(library.world.calls)
+    T = planar_pose(-10.0, 0.0, 0.0) @ camera_mount(0.0, 0.0, 2.0)
+    uses = (
+        lambda: scene.reset(0.0, 0.0, 0.0), lambda: scene.step(0.0, 6.0, 0.1), scene.observe,
+        lambda: scene.observe_at(0.0, 0.0, 0.0), lambda: scene.photograph(T),
+    )  # fmt: skip
+    for use in uses:
+        with pytest.raises(CarlaError, match="this one is closed"):
+            use()
+    assert library.world.calls == calls
+
+
 @pytest.mark.parametrize("duration", [0.05, -0.1, 0.149, math.nan])
 def test_a_step_is_whole_ticks(library, settings, duration):
     with scene_of(library, settings) as scene, pytest.raises(ValueError, match="whole ticks"):
