@@ -4,12 +4,15 @@ import numpy as np
 import pytest
 import torch
 
+from advnerf_core.driving.metrics import Horizon
+from advnerf_core.driving.policy_view import PolicyView
 from advnerf_core.fields.voxel_grid import VoxelGridObject
 from advnerf_core.geometry import make_transform
 from advnerf_core.scene.surrogate import Surrogate
 from hardware.carla_scene import CarlaConfig, CarlaScene
 from nodes.carla_tools.drive import drive_expert, turn_rate_expert
 from nodes.intersection.context import as_path
+from nodes.intersection.deployed import DressedScene, drive_deployed
 
 
 @pytest.mark.parametrize("name", ["straight", "right", "left"])
@@ -80,3 +83,30 @@ def test_objects_are_composed_by_carlas_depth(library, settings, carla):
     assert (np.isfinite(back) & (back > depth)).sum() > 5  # the wall hides a part of it
     assert (white != expected).mean() < 0.001
     np.testing.assert_allclose(image[~white], rgb[~white] / 255.0, atol=1e-6)
+
+
+def test_the_intersections_own_loop_drives_in_carla(library, settings):
+    """Observe, put the object in by depth, crop for the policy, command: the loop of the experiment, unchanged."""
+    config = CarlaConfig.model_validate({**settings, "camera": {**settings["camera"], "width": 336, "height": 188}})
+    seen = []
+
+    def policy(images, goals):
+        seen.append(images)
+        return torch.full((1,), 0.2)
+
+    with CarlaScene(config, library) as scene:
+        reference = scene.paths["left"]
+        x, y, yaw = reference.start_pose
+        cube = box(x + 14.0 * np.cos(yaw), y + 14.0 * np.sin(yaw))
+        dressed = DressedScene(scene, PolicyView(scene.camera_pinhole), [cube])
+        limits = Horizon(4, 0.1, scene.off_track_m, 6.0)
+        arguments = (dressed, policy, reference.goal, np.array(reference.start_pose), as_path(reference), limits, 6.0)
+        drive = drive_deployed(*arguments, torch.full(dressed.theta_shape, 9.0))
+    assert drive.states.shape == (5, 3)
+    assert np.hypot(*np.diff(drive.states[:, :2], axis=0).T) == pytest.approx(0.6, abs=0.01)
+    assert drive.metrics.total_cte_m == pytest.approx(
+        np.abs(as_path(reference).project(drive.states[1:, :2]).cte_m).sum(), rel=0.01
+    )
+    white = [(image > 0.95).all(1).sum().item() for image in seen]
+    assert min(white) > 20  # the cube is in every picture
+    assert white[-1] > white[0]  # and comes nearer
