@@ -51,7 +51,7 @@ class PolicyConfig(_Section):
     """How the goal-conditioned policy is trained: frames per path and domain, rounds, optimiser steps."""
 
     stiffness_1pm: PositiveNumber = Field(
-        default=0.25, description="How firmly the expert returns to the path [1/m]; see ExpertConfig."
+        default=0.2, description="How firmly the expert returns to the path [1/m]; see ExpertConfig."
     )
     feed_forward: Annotated[float, Field(ge=0, le=1)] = Field(
         default=1.0, description="Share of the path's curvature that the expert steers ahead."
@@ -60,18 +60,18 @@ class PolicyConfig(_Section):
         default=0.1, description="What the expert looks ahead by: half a tick and part of the deployed car's lag [s]."
     )
     driven_m: PositiveNumber = Field(default=44.0, description="Frames are taken so far along each path [m].")
-    deployed_stills: Count = Field(default=400, description="Poses about each path in the deployment scene.")
-    surrogate_stills: Count = Field(default=300, description="The same in the surrogate.")
+    deployed_stills: Count = Field(default=320, description="Poses about each path in the deployment scene.")
+    surrogate_stills: Count = Field(default=240, description="The same in the surrogate.")
     deployed_drives: Count = Field(
         default=2, description="Drives on each path in the deployment scene, per DAgger round."
     )
     surrogate_drives: Count = Field(default=2, description="The same in the surrogate.")
     drive_steps: Positive = Field(default=60, description="Control ticks of such a drive.")
     dagger_rounds: Count = Field(default=1, description="Rounds of DAgger.")
-    first_steps: Positive = Field(default=900, description="Optimiser steps of behaviour cloning.")
+    first_steps: Positive = Field(default=800, description="Optimiser steps of behaviour cloning.")
     round_steps: Positive = Field(default=400, description="Optimiser steps after each round.")
     naive_steps: Count = Field(
-        default=700, description="Optimiser steps of the victim that never sees a random texture; 0: none."
+        default=600, description="Optimiser steps of the victim that never sees a random texture; 0: none."
     )
     hidden: tuple[int, int, int] = Field(default=(200, 100, 20), description="Widths of the policy's linear layers.")
     seed: int = 0
@@ -84,7 +84,7 @@ class ObjectConfig(_Section):
         default=64, description="Voxels along a car's longest side."
     )
     hydrant_resolution: Annotated[int, Field(ge=8, le=128)] = Field(default=48, description="The same of a hydrant.")
-    fit_steps: Count = Field(default=150, description="Steps that refine the voxels on pictures of the mesh.")
+    fit_steps: Count = Field(default=300, description="Steps that refine the voxels on pictures of the mesh.")
 
 
 class AttackConfig(_Section):
@@ -104,6 +104,29 @@ class AttackConfig(_Section):
     cache_mib: Annotated[float, Field(ge=0)] = Field(default=512.0, description="Budget of the frame cache [MiB].")
 
 
+class RetrainConfig(_Section):
+    """The defence: how often the victim answers the attack, and what it learns from."""
+
+    rounds: Positive = Field(default=1, description="Rounds of attack and retraining, at most.")
+    pays_ratio: PositiveNumber = Field(
+        default=1.5,
+        description="The loop ends when no attack's total CTE in the surrogate is this many times that of none.",
+    )
+    stills: Positive = Field(
+        default=120, description="Poses about each path, per domain, seen plain and with a found texture."
+    )
+    drives: Positive = Field(
+        default=2,
+        description="Pairs of the victim's drives on each path, per domain: past plain objects and past a found texture.",
+    )
+    drive_steps: Positive = Field(default=60, description="Control ticks of such a drive.")
+    steps: Positive = Field(default=500, description="Optimiser steps of the fine-tuning.")
+    new_share: Annotated[float, Field(gt=0, lt=1)] = Field(
+        default=0.4, description="Share of new frames in the training."
+    )
+    seed: int = 0
+
+
 class IntersectionExperimentConfig(_Section):
     """One experiment, resolved: the file's values, one of its settings over them, then the command line."""
 
@@ -121,3 +144,6 @@ class IntersectionExperimentConfig(_Section):
     policy: PolicyConfig = PolicyConfig()
     object: ObjectConfig = ObjectConfig()
     attack: AttackConfig = AttackConfig()
+    retrain: RetrainConfig | None = Field(
+        default=None, description="Retrain the hardened victim on what was found; none: not."
+    )

@@ -70,15 +70,21 @@ def victim_file(experiment: Experiment, victim: str) -> Path:
     return experiment.stage_folder("policy") / FILES[victim]
 
 
-def plans(experiment: Experiment, scene: Intersection) -> list[SourcePlan]:
-    """For each drive its frames from the deployment scene and from the surrogate, with its goal and its teacher."""
+def plans(experiment: Experiment, scene: Intersection, sample: Sample | None = None) -> list[SourcePlan]:
+    """For each drive its frames from the deployment scene and from the surrogate, with its goal and its teacher.
+
+    Args:
+        experiment: The experiment.
+        scene: The deployment scene.
+        sample: Draws the colours of all objects ``[K, 3]``; None draws random ones.
+    """
     config, background = experiment.config.policy, load_background(experiment)
     objects = placed_objects(experiment)
     dressed = DressedScene(scene, experiment.view, objects)
     surrogate = surrogate_of(experiment, objects, background)
     sigma, shape = experiment.config.attack.random_sigma, surrogate.theta_shape
 
-    def sample(rng: np.random.Generator) -> torch.Tensor:
+    def any_colours(rng: np.random.Generator) -> torch.Tensor:
         return random_theta(shape, sigma, rng)
 
     def seen_in_surrogate(states: Array) -> Show:
@@ -100,7 +106,7 @@ def plans(experiment: Experiment, scene: Intersection) -> list[SourcePlan]:
             ("surrogate", seen_in_surrogate, config.surrogate_stills, config.surrogate_drives),
         )
         for domain, prepare, stills, drives in domains:
-            source = RenderedSource(f"{domain}-{name}", prepare, experiment.dynamics, sample)
+            source = RenderedSource(f"{domain}-{name}", prepare, experiment.dynamics, sample or any_colours)
             found.append(SourcePlan(source, stills, drives, **common))
     return found
 

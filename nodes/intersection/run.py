@@ -16,7 +16,7 @@ from rich.console import Console
 from advnerf_core.files import write_atomically
 from hardware.twin.intersection.config import IntersectionConfig
 from nodes.experiment.run import read_setting
-from nodes.intersection import attack, capture, deploy, objects, policy, report, scene
+from nodes.intersection import attack, capture, deploy, objects, policy, report, retrain, scene
 from nodes.intersection.config import IntersectionExperimentConfig
 from nodes.intersection.context import Experiment
 from nodes.runtime.config import validate
@@ -83,7 +83,7 @@ def stages_of(experiment: Experiment) -> list[Stage]:
     def part(name: str) -> Any:
         return getattr(config, name).model_dump(mode="json")
 
-    return [
+    stages = [
         stage("capture", capture, {"world": seen, "capture": part("capture"), **measured}, ()),
         stage("scene", scene, {"scene": part("scene")}, ("capture",)),
         stage("object", objects, {"object": part("object"), "kinds": kinds}, ()),
@@ -92,6 +92,10 @@ def stages_of(experiment: Experiment) -> list[Stage]:
         stage("deploy", deploy, {"world": world, **measured}, ("object", "policy", "attack")),
         stage("report", report, {"attack": part("attack"), **measured}, ("capture", "scene", "policy", "attack", "deploy")),
     ]  # fmt: skip
+    if config.retrain is not None:
+        settings = {"world": world, "retrain": part("retrain"), "attack": part("attack"), **measured}
+        stages.append(stage("retrain", retrain, settings, ("scene", "object", "policy", "attack")))
+    return stages
 
 
 def _write_manifest(experiment: Experiment) -> None:
