@@ -1,14 +1,16 @@
 """The counterfactual node: what would the policy steer, at this very image, had the attack not been drawn?
 
 The camera's image and the compositor's image of the same stamp go through the same policy, and the difference is published. It
-only listens: nobody waits for it, nothing that drives reads it, and its process gives way to all others (nice). Where it cannot
-keep up it leaves images out and counts them. Between camera and policy nothing is added, so the way of a command is unchanged.
+only listens: nobody waits for it, nothing that drives reads it, and its process has the processor only while no other wants it.
+Where it cannot keep up it leaves images out and counts them. Between camera and policy nothing is added, so the way of a command
+is unchanged.
 
 There is no clean image of an attack on a monitor: the camera itself sees that one.
 """
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections import OrderedDict
 from typing import Any, Literal
@@ -194,10 +196,19 @@ class CounterfactualNode(Node):
             driver.reset()
 
 
-def main() -> int:
-    """Run the node as a process that gives way to those that drive."""
+def build_to_give_way(config: CounterfactualConfig, context: NodeContext) -> CounterfactualNode:
+    """The node of a process that, once it is ready, runs only while nobody else wants the processor."""
+    # Loading a policy in the idle class could take for ever on a busy computer, and the launch waits for it.
     os.nice(_NICE)
-    return run_node_main(CounterfactualConfig, CounterfactualNode.build)
+    node = CounterfactualNode.build(config, context)
+    with contextlib.suppress(OSError):  # a container may forbid it; nice is what remains
+        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
+    return node
+
+
+def main() -> int:
+    """Run the node as a process."""
+    return run_node_main(CounterfactualConfig, build_to_give_way)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,8 @@
 """The counterfactual node in process, in lockstep over a bag, and what ``advnerf evaluate`` makes of its words."""
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import cv2
@@ -12,7 +14,6 @@ from advnerf_core.driving.policy import PilotNet, load_policy, save_policy
 from advnerf_core.driving.policy_view import PolicyView
 from advnerf_core.geometry import Pinhole, planar_pose
 from advnerf_core.policies.load import load_driver
-from nodes import counterfactual as module
 from nodes.cli import app
 from nodes.counterfactual import CounterfactualConfig, CounterfactualNode
 from nodes.evaluation import counterfactual
@@ -162,12 +163,18 @@ def test_one_policy_its_goal_and_a_compositor(drivers, policy):
     assert node.subscriptions == (CLEAN, ATTACKED, LABEL)
 
 
-def test_a_process_of_it_gives_way(monkeypatch):
-    given = []
-    monkeypatch.setattr(module.os, "nice", given.append)
-    monkeypatch.setattr(module, "run_node_main", lambda *arguments: 0)
-    assert module.main() == 0
-    assert given == [15]
+def test_a_process_of_it_gives_way_once_it_is_ready(policy):
+    """In a process of its own, because nobody gets his priority back."""
+    program = (
+        "import os, pathlib\nfrom nodes.counterfactual import CounterfactualConfig, build_to_give_way\n"
+        "from nodes.runtime.node import NodeContext\n"
+        f"node = build_to_give_way(CounterfactualConfig(policy={str(policy)!r}), NodeContext('c', pathlib.Path('.'), None))\n"
+        "print(os.sched_getscheduler(0) == os.SCHED_IDLE, os.nice(0) >= 15, node.status()[0])"
+    )
+    told = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=True, cwd=ROOT
+    )
+    assert told.stdout.split() == ["True", "True", "ready"]
 
 
 def drive(folder, policy):
