@@ -1,0 +1,103 @@
+"""Frames at given states that are looked at again with other textures.
+
+Geometry and background of a frame cost most of its render and do not depend on theta; a search that asks a policy about many textures
+from the same places keeps them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol, runtime_checkable
+
+import torch
+from torch import Tensor
+
+from advnerf_core.attack.adjoint import RenderCache
+from advnerf_core.attack.problem import AttackProblem
+from advnerf_core.driving.rollout import Rollout, drive
+from advnerf_core.geometry import Array
+from advnerf_core.scene.surrogate import Frames, Rendered
+
+
+@runtime_checkable
+class PreparingSensor(Protocol):
+    """A sensor whose frames can be kept without their colours, as a ``Surrogate``'s."""
+
+    def camera_poses(self, states: Tensor) -> Array:
+        """``T_world_from_camera [B, 4, 4]``."""
+
+    def prepare(self, T_world_from_camera: Array) -> Frames:
+        """Everything of these frames that does not depend on theta."""
+
+
+class Visited:
+    """The frames of some ticks, rendered for as many thetas as wanted.
+
+    A disturbed problem, or a sensor that cannot keep frames, renders each again: the same images, more slowly.
+
+    Args:
+        problem: Whose sensor looks.
+        ticks: Numbers of the ticks.
+        states: ``[ticks * B, n]``, ordered by tick.
+    """
+
+    def __init__(self, problem: AttackProblem, ticks: Sequence[int], states: Tensor) -> None:
+        self._problem, self._ticks, self._states = problem, tuple(ticks), states.clone()
+        self._frames: Frames | None = None
+        if problem.disturbances is None and isinstance(problem.sensor, PreparingSensor):
+            self._frames = problem.sensor.prepare(problem.sensor.camera_poses(states))
+
+    @property
+    def nbytes(self) -> int:
+        """Memory that the kept part holds [bytes]."""
+        if self._frames is None:
+            return 0
+        weights = sum(W.data.nbytes + W.indices.nbytes + W.indptr.nbytes for W in self._frames.weights)
+        return int(self._frames.background.nbytes + weights + sum(pixels.nbytes for pixels in self._frames.pixels))
+
+    def render(self, theta: Tensor) -> Rendered:
+        """What is seen with this theta."""
+        if self._frames is None:
+            return self._problem.sense(self._ticks, self._states, theta)
+        return self._frames.render(theta)
+
+    def forget(self) -> None:
+        """Give the memory back; from now on each render is made from the beginning."""
+        self._frames = None
+
+
+class VisitedDrive:
+    """A closed loop that was driven with ``theta``, and its frames by tick.
+
+    Half of the problem's cache budget is for frames without colours, half for the renders that the first gradient takes.
+
+    Attributes:
+        rollout: Its states and controls.
+        cache: Renders with ``theta``, for ``gradient_pass``.
+    """
+
+    def __init__(self, problem: AttackProblem, theta: Tensor) -> None:
+        self._frames: list[Visited] = []
+        self.cache = RenderCache(problem.cache_bytes // 2)
+        self._problem = problem
+        kept_bytes = 0
+
+        def observe(states: Tensor) -> Tensor:
+            nonlocal kept_bytes
+            tick = len(self._frames)
+            frames = Visited(problem, (tick,), states)
+            rendered = frames.render(theta)
+            kept_bytes += frames.nbytes
+            if kept_bytes > problem.cache_bytes // 2:
+                frames.forget()
+            self._frames.append(frames)
+            self.cache.offer(tick, rendered)
+            return rendered.images
+
+        self.rollout: Rollout = drive(
+            problem.policy, observe, problem.dynamics, problem.start_states, problem.steps, problem.goals
+        )
+
+    def images(self, theta: Tensor) -> Tensor:
+        """Images ``[T, B, 3, H, W]`` at the visited states with another theta."""
+        return torch.stack([frames.render(theta).images for frames in self._frames])
