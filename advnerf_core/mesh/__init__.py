@@ -1,0 +1,1 @@
+"""Attacks on textured meshes: colours and shapes by differentiable rendering, with Mitsuba."""
