@@ -39,7 +39,7 @@ def gate(
 ) -> None:
     """Compare learned with real views, in looks and in what the policy makes of them; exit code 1 refuses the surrogate."""
     os.environ.setdefault("MUJOCO_GL", "egl")
-    from advnerf_core.scene.fidelity import GateLimits
+    from advnerf_core.scene.gate_limits import GateLimits
     from nodes.campaign.gate import judge_scene
     from nodes.campaign.kinds import load_kind
 

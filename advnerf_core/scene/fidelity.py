@@ -10,35 +10,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import BaseModel, ConfigDict, Field
 
+from advnerf_core.scene.gate_limits import GateLimits
 from advnerf_core.scene.metrics import psnr, ssim
 
 Floats = NDArray[np.float64]
-Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
-
-
-class GateLimits(BaseModel):
-    """What a surrogate must reach; the first two follow the targets of the room's experiment."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    psnr_db: Positive = Field(default=25.0, description="Least mean PSNR at the policy's size [dB].")
-    ssim: Annotated[float, Field(ge=0.0, le=1.0)] = Field(
-        default=0.8, description="Least mean SSIM at the policy's size."
-    )
-    steering: Positive = Field(
-        default=0.03,
-        description="Greatest mean steering difference [rad], or turn-rate difference [rad/s] for a Dubins car.",
-    )
-    correlation: Annotated[float, Field(ge=-1.0, le=1.0)] = Field(
-        default=0.8, description="Least correlation of the steering on learned and real pictures."
-    )
-    views: Annotated[int, Field(ge=3)] = Field(default=10, description="Fewer pictures than this decide nothing.")
 
 
 @dataclass(frozen=True, eq=False)

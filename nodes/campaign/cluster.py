@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Callable, Iterator
+import socket
+from collections.abc import Iterator
 from contextlib import contextmanager
 
 import joblib
 
 from nodes.campaign.worker import Ended, Job, run_in_process
 from nodes.runtime.errors import ConfigError
+
+_CONNECT_S = 5.0
 
 
 @contextmanager
@@ -29,6 +32,7 @@ def ray_session(address: str, cores: int) -> Iterator[int]:
     except ModuleNotFoundError:
         raise ConfigError("--backend ray needs ray, which is not installed: pip install 'advnerf[cluster]'") from None
     joining = address or os.environ.get("RAY_ADDRESS", "")
+    _require_reachable(joining)
     try:
         if joining:
             ray.init(address=joining, log_to_driver=False, logging_level=logging.ERROR)
@@ -44,18 +48,33 @@ def ray_session(address: str, cores: int) -> Iterator[int]:
         ray.shutdown()
 
 
-def collect_on_ray(jobs: list[Job], at_a_time: int, tell: Callable[[Ended], Ended]) -> list[Ended]:
-    """Run jobs on the cluster in force; what a lost machine took with it is missing from what is returned."""
+def _require_reachable(address: str) -> None:
+    """Ray itself tries for minutes before it says that nobody is there."""
+    host, separator, port = address.removeprefix("ray://").rpartition(":")
+    if not separator or not port.isdigit():
+        return
+    try:
+        socket.create_connection((host, int(port)), _CONNECT_S).close()
+    except OSError as error:
+        raise ConfigError(
+            f"expected a Ray cluster at {address}, got {error}; start one with ray start --head"
+        ) from None
+
+
+def collect_on_ray(jobs: list[Job], at_a_time: int) -> list[Ended] | None:
+    """Run jobs on the cluster in force, all of them before it returns; None if a machine was lost, with which what it had told goes.
+
+    What was finished is in the campaign's folder all the same.
+    """
     from ray.exceptions import RayError
     from ray.util.joblib import register_ray
 
     register_ray()
-    ended: list[Ended] = []
     with joblib.parallel_config(backend="ray", n_jobs=at_a_time):
-        parallel = joblib.Parallel(batch_size=1, return_as="generator_unordered", pre_dispatch="all")
+        # This backend of joblib can only give everything at once.
+        parallel = joblib.Parallel(batch_size=1, pre_dispatch="all")
         try:
-            for end in parallel(joblib.delayed(run_in_process)(job) for job in jobs):
-                ended.append(tell(end))
+            found: list[Ended] = parallel(joblib.delayed(run_in_process)(job) for job in jobs)
         except RayError:
-            return ended
-    return ended
+            return None
+    return found

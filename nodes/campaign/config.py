@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, model_validator
 
 from advnerf_core.report.cells import cell_name
-from advnerf_core.scene.fidelity import GateLimits
+from advnerf_core.scene.gate_limits import GateLimits
 from nodes.runtime.config import load_config
 from nodes.runtime.errors import ConfigError
 

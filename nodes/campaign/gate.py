@@ -6,15 +6,14 @@ no gate. See `nodes/experiment/fidelity.py`.
 
 from __future__ import annotations
 
-import importlib
 import json
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 from advnerf_core.attack.transfer import TransferPrediction, predict_transfer
 from advnerf_core.files import write_atomically
-from advnerf_core.scene.fidelity import Agreement, Effect, GateLimits, Pictures, Verdict, agreement, judge
+from advnerf_core.scene.fidelity import Agreement, Effect, Pictures, Verdict, agreement, judge
+from advnerf_core.scene.gate_limits import GateLimits
 from nodes.campaign.kinds import Kind, stage_digests
 from nodes.policy_data.evaluate import predict
 from nodes.runtime.errors import RuntimeFault
@@ -23,13 +22,6 @@ from nodes.runtime.stages import hash_of
 
 class GateError(RuntimeFault):
     """A surrogate is not good enough for attacks found in it to mean anything."""
-
-
-def fidelity_of(kind: Kind) -> Any:
-    """The module that has a kind's pictures; None where there is none."""
-    package = getattr(kind.module, "__package__", "")
-    name = f"{package}.fidelity"
-    return importlib.import_module(name) if package and find_spec(name) is not None else None
 
 
 def agreement_on(policy: Any, goal: tuple[float, ...], pictures: Pictures) -> Agreement:
@@ -46,7 +38,7 @@ def judge_scene(
     Raises:
         GateError: The kind has no pictures to judge by.
     """
-    module = fidelity_of(kind)
+    module = kind.fidelity
     if module is None:
         raise GateError(f"expected a module fidelity beside the cells of kind {kind.name}, got none; it has no gate")
     policy, goal = module.policy_of(experiment, victim, scenario)
@@ -60,7 +52,7 @@ def cached_verdict(
     kind: Kind, experiment: Any, scenario: str, victim: str, limits: GateLimits, file: Path
 ) -> Verdict | None:
     """The verdict on held-out views, judged again only if scene, policy or limits changed; None where the kind has no gate."""
-    if fidelity_of(kind) is None:
+    if kind.fidelity is None:
         return None
     key = hash_of([stage_digests(experiment.folder), limits.model_dump(mode="json"), scenario, victim])
     try:
@@ -89,7 +81,7 @@ def predict_cell(
         folder: The cell's folder.
         draws: Drives per prediction.
     """
-    module = fidelity_of(kind)
+    module = kind.fidelity
     if module is None:
         raise GateError(
             f"expected a module fidelity beside the cells of kind {kind.name}, got none; it has no predictions"

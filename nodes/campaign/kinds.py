@@ -61,6 +61,13 @@ class Kind:
         found: Callable[..., None] | None = getattr(self.module, "search_cell", None)
         return found
 
+    @property
+    def fidelity(self) -> Any:
+        """The module with the pictures of the fidelity gate, beside the module of cells; None where there is none."""
+        package = getattr(self.module, "__package__", "")
+        name = f"{package}.fidelity"
+        return importlib.import_module(name) if package and find_spec(name) is not None else None
+
     def load(self, file: Path, setting: str, overrides: Sequence[str], folder: Path) -> Any:
         """Read the experiment."""
         load = getattr(self.module, "load_experiment", None) or self._run_module().load_experiment

@@ -14,7 +14,7 @@ from advnerf_core.files import write_atomically
 from advnerf_core.report.cells import NONE
 from advnerf_core.report.transfer_prediction import Predicted
 from nodes.campaign.config import Campaign, Cell
-from nodes.campaign.gate import fidelity_of, predict_cell
+from nodes.campaign.gate import predict_cell
 from nodes.campaign.kinds import load_kind
 from nodes.campaign.run import plan_cells
 from nodes.campaign.store import CellStatus, store_of
@@ -33,7 +33,7 @@ def predict_campaign(campaign: Campaign, cells: Sequence[Cell], say: Callable[[s
             continue
         planned = plan_cells(campaign, [cell], experiments)[0]
         kind = load_kind(planned.job.kind)
-        if store.status(cell, planned.job.settings_hash).state != "done" or fidelity_of(kind) is None:
+        if store.status(cell, planned.job.settings_hash).state != "done" or kind.fidelity is None:
             continue
         file = _file(campaign, cell)
         if _kept(file, planned.job.settings_hash) is not None:

@@ -169,14 +169,16 @@ def _prepare(campaign: Campaign, cells: Sequence[Cell], say: Say) -> None:
 
 def _past_the_gate(campaign: Campaign, cells: Sequence[Cell], options: Options, say: Say) -> list[Cell]:
     """The cells whose surrogate is good enough; judged once per scenario and victim, and kept."""
-    from nodes.campaign.gate import cached_verdict
-
     verdicts: dict[str, bool] = {}
     for cell in cells:
-        key = gate_key(cell)
+        key, scenario = gate_key(cell), campaign.scenario(cell)
         if key in verdicts:
             continue
-        scenario = campaign.scenario(cell)
+        verdicts[key] = True
+        if load_kind(scenario.kind).fidelity is None:
+            continue
+        from nodes.campaign.gate import cached_verdict  # loads torch
+
         file = campaign.folder / "gate" / f"{key}.json"
         found = cached_verdict(
             load_kind(scenario.kind),
@@ -239,18 +241,25 @@ def _run_on_ray(jobs: list[Job], at_a_time: int, options: Options, say: Say) -> 
     from nodes.campaign.cluster import collect_on_ray, ray_session
 
     with ray_session(options.address, at_a_time) as cores:
-        say(f"Ray cluster with {cores} cores")
+        say(f"Ray cluster with {cores} cores; advnerf campaign status tells how far it is")
         ended: list[Ended] = []
         left = jobs
         for _ in range(_ROUNDS):
-            ended += collect_on_ray(left, min(at_a_time, cores), lambda end: _tell(end, say))
-            finished = {end.name for end in ended}
-            left = [job for job in left if job.name not in finished]
-            if not left:
-                return ended
+            found = collect_on_ray(left, min(at_a_time, cores))
+            if found is not None:
+                return ended + [_tell(end, say) for end in found]
+            finished = [Ended(job.name, "done", "", 0.0) for job in left if _is_finished(job)]
+            ended += [_tell(end, say) for end in finished]
+            left = [job for job in left if not _is_finished(job)]
             say(f"a machine of the cluster was lost: {len(left)} cells are handed out again")
         text = "its machine was lost again and again; it goes on when the campaign is run again"
         return ended + [_tell(Ended(job.name, "lost", text, 0.0), say) for job in left]
+
+
+def _is_finished(job: Job) -> bool:
+    """Whether a result of these settings is there, whoever was to tell of it; a search has none of its own and goes on from its state."""
+    result = Store(Path(job.campaign_folder)).result(job.name)
+    return result is not None and result.settings_hash == job.settings_hash
 
 
 def _tell(end: Ended, say: Say) -> Ended:

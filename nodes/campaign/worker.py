@@ -154,8 +154,8 @@ def main() -> None:
 
 def _run(job: Job, store: Store, work: Path) -> None:
     began = time.monotonic()
-    _use_threads(job.threads)
     kind = load_kind(job.kind)
+    _use_threads(job.threads)
     experiment = kind.load(Path(job.experiment), job.setting, job.overrides, Path(job.run_folder))
     arguments = (experiment, job.scenario, job.victim, job.method, job.seed)
     if settings_hash(kind, *arguments) != job.settings_hash:
@@ -219,11 +219,8 @@ def _use_threads(threads: int) -> None:
     from advnerf_core.parallel import set_thread_count
 
     set_thread_count(threads)
-    try:
-        import torch
-    except ModuleNotFoundError:
-        return
-    torch.set_num_threads(threads)
+    if "torch" in sys.modules:  # importing it takes seconds, and not every kind of cell needs it
+        sys.modules["torch"].set_num_threads(threads)
 
 
 def _die_with(parent: int) -> None:

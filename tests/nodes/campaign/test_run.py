@@ -1,0 +1,181 @@
+"""Real processes: what is finished stays, what changed runs again, what is killed is lost alone."""
+
+import contextlib
+import json
+import os
+import signal
+import sys
+import time
+
+import pytest
+
+from nodes.campaign.config import load_campaign
+from nodes.campaign.run import Options, run_campaign, statuses
+
+
+@pytest.fixture
+def here(bench, monkeypatch):
+    """The bench, with its module importable in this process too, as the command line has it."""
+    monkeypatch.syspath_prepend(str(bench.folder))
+    monkeypatch.setenv("PYTHONPATH", bench.environment["PYTHONPATH"])
+    yield bench
+    sys.modules.pop("toy_cells", None)
+
+
+def run(bench, jobs=2, **options):
+    campaign = load_campaign(bench.file)
+    said = []
+    return run_campaign(campaign, campaign.cells, Options(jobs=jobs, **options), said.append), said
+
+
+def states(bench):
+    campaign = load_campaign(bench.file)
+    return {each.cell.name: each.state for each in statuses(campaign, campaign.cells)}
+
+
+def test_a_campaign_runs_once_and_only_what_changed_again(here):
+    ended, _ = run(here)
+    assert {end.how for end in ended} == {"done"}
+    assert len(ended) == 4
+    assert all(line.endswith(" 1") for line in here.calls if line.startswith("begin"))  # threads: two cores, two jobs
+    assert set(states(here).values()) == {"done"}
+    before = {path.name: path.stat().st_mtime_ns for path in here.cells.glob("*.json")}
+
+    ended, said = run(here)
+    assert ended == []
+    assert "nothing to do" in said[-1]
+
+    here.write("seeds: [0, 1, 2]\nmethods: [none, gradient]\nvictims: [hardened]\n")
+    ended, _ = run(here)
+    assert sorted(end.name for end in ended) == [f"straight_hardened_{m}_2" for m in ("gradient", "none")]
+    assert all(here.cells.joinpath(name).stat().st_mtime_ns == stamp for name, stamp in before.items())
+
+    (here.folder / "toy.experiment.yaml").write_text("base: 5.0\n")
+    assert set(states(here).values()) == {"changed"}
+    ended, _ = run(here)
+    assert len(ended) == 6
+    result = json.loads((here.cells / "straight_hardened_gradient_1.json").read_text())
+    assert result["surrogate"]["total_cte_m"] == [18.0]
+    assert result["scenario"] == "straight"
+    assert result["seconds"] >= 0.0
+
+
+def test_a_killed_worker_loses_its_cell_and_no_other(here):
+    (here.folder / "hang").touch()
+    process = here.start("run", str(here.file), "--jobs", "2")
+    victim = here.cells / "straight_hardened_gradient_0" / "pid"
+    other = here.cells / "straight_hardened_gradient_1" / "pid"
+    wait_for(lambda: victim.exists() and victim.read_text())
+    os.kill(int(victim.read_text()), signal.SIGKILL)
+    wait_for(lambda: other.exists() and other.read_text())
+    assert states(here)["straight_hardened_gradient_1"] == "running"
+    (here.folder / "hang").unlink()
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 1
+    assert "killed by SIGKILL" in err
+    assert "straight_hardened_gradient_0: lost" in out
+    found = states(here)
+    assert found.pop("straight_hardened_gradient_0") == "begun"
+    assert set(found.values()) == {"done"}
+    (here.cells / "straight_hardened_gradient_0" / "work").write_text("half of it")
+    ended, _ = run(here)
+    assert [(end.name, end.how) for end in ended] == [("straight_hardened_gradient_0", "done")]
+    assert (here.cells / "straight_hardened_gradient_0" / "work").exists()  # it went on in its own folder
+
+
+def test_a_killed_campaign_takes_its_workers_along_and_goes_on(here):
+    (here.folder / "hang").touch()
+    process = here.start("run", str(here.file), "--jobs", "1")
+    pid_file = here.cells / "straight_hardened_gradient_0" / "pid"
+    wait_for(lambda: pid_file.exists() and pid_file.read_text())
+    process.kill()
+    process.communicate()
+    worker = int(pid_file.read_text())
+    wait_for(lambda: not is_alive(worker))
+    done = set(here.cells.glob("*.json"))
+    (here.folder / "hang").unlink()
+    ended, _ = run(here)
+    assert len(ended) == 4 - len(done)
+    assert set(states(here).values()) == {"done"}
+
+
+def test_failed_cells_say_why_and_are_retried_when_asked(here):
+    here.write("seeds: [0, 1]\nmethods: [none, cem]\nvictims: [hardened]\n")
+    (here.folder / "fail").touch()
+    code, out, err = here.call("run", str(here.file), "--jobs", "2")
+    assert code == 1
+    assert "straight_hardened_cem_0: RuntimeError: the search came to nothing" in err
+    code, out, _ = here.call("status", str(here.file))
+    assert code == 0
+    assert "the search came to nothing" in out
+    assert "2 done, 2 failed of 4 cells" in out
+    (here.folder / "fail").unlink()
+    ended, said = run(here)
+    assert ended == []
+    assert any("--retry" in line for line in said)
+    ended, _ = run(here, retry=True)
+    assert sorted(end.name for end in ended) == ["straight_hardened_cem_0", "straight_hardened_cem_1"]
+    assert set(states(here).values()) == {"done"}
+
+
+def test_live_cells_run_alone_after_all_others(here):
+    module = here.folder / "toy_cells.py"
+    (here.folder / "toy_live.py").write_text(module.read_text() + "\nLIVE = True\nsearch_cell = lambda *a: None\n")
+    here.write(
+        "seeds: [0, 1]\nmethods: [none, cem]\nvictims: [hardened]\n",
+        f"  live: {{kind: toy_live, experiment: toy.experiment.yaml, run_folder: {here.folder / 'run'}}}\n",
+    )
+    ended, _ = run(here)
+    assert {end.how for end in ended} == {"done"}
+    calls = here.calls
+    first = next(index for index, line in enumerate(calls) if "live_" in line)
+    assert not any("straight_" in line for line in calls[first:])
+    # One after the other: whatever begins ends before the next begins.
+    lines = [line.split()[:2] for line in calls[first:]]
+    assert [kind for kind, _ in lines] == ["begin", "end"] * 4
+    assert all(lines[k][1] == lines[k + 1][1] for k in range(0, 8, 2))
+
+
+@pytest.mark.slow
+def test_a_ray_cluster_of_several_workers_runs_the_cells(here):
+    from ray.cluster_utils import Cluster
+
+    cluster = Cluster()
+    try:
+        for _ in range(2):
+            cluster.add_node(num_cpus=1)
+        cluster.wait_for_nodes()
+        code, out, err = here.call(
+            "run", str(here.file), "--backend", "ray", "--address", cluster.address, "--jobs", "2"
+        )
+        assert code == 0, err
+        assert "Ray cluster with 2 cores" in out
+        assert set(states(here).values()) == {"done"}
+        assert len(here.begun()) == 4
+        code, out, _ = here.call("run", str(here.file), "--backend", "ray", "--address", cluster.address)
+        assert "nothing to do" in out
+    finally:
+        cluster.shutdown()
+
+
+def test_no_cluster_is_one_clear_error(here):
+    code, _, err = here.call("run", str(here.file), "--backend", "ray", "--address", "127.0.0.1:1")
+    assert code == 2
+    assert "expected a Ray cluster at 127.0.0.1:1" in err
+    assert "ray start --head" in err
+    assert here.calls == []
+
+
+def is_alive(pid):
+    with contextlib.suppress(ProcessLookupError):
+        os.kill(pid, 0)
+        with open(f"/proc/{pid}/stat") as file:
+            return file.read().rsplit(")", 1)[1].split()[0] != "Z"
+    return False
+
+
+def wait_for(condition, timeout_s=60.0):
+    until = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < until
+        time.sleep(0.02)
