@@ -1,0 +1,91 @@
+"""The prediction against drives that are known: a policy that steers by what the picture says, and pictures that say the steering."""
+
+import numpy as np
+import pytest
+import torch
+
+from advnerf_core.attack.problem import AttackProblem
+from advnerf_core.attack.transfer import predict_transfer
+from advnerf_core.driving.dynamics import Dubins
+from advnerf_core.driving.metrics import Horizon, drive_metrics
+from advnerf_core.driving.path import Line, Path
+from advnerf_core.driving.rollout import drive
+from advnerf_core.scene.fidelity import Agreement, Effect
+
+PATH = Path.from_segments((0.0, 0.0, 0.0), [Line(50.0)], closed=False)
+HORIZON = Horizon(20, 0.1, 0.4)
+START = torch.zeros(1, 3, dtype=torch.float64)
+TURN = 0.8  # what the attack adds to the turn rate [rad/s]
+
+
+class Reads:
+    """Steers as the picture says."""
+
+    stateless = True
+
+    def __call__(self, images, goals=None):
+        return images[:, 0, 0, 0]
+
+
+class Nothing:
+    theta_shape = (1,)
+
+
+def images(states, attacked):
+    # Without the attack it steers back to the path; the attack adds a constant.
+    steering = -0.5 * states[:, 1] - 1.0 * states[:, 2] + (TURN if attacked else 0.0)
+    return steering[:, None, None, None]
+
+
+def problem():
+    return AttackProblem(Reads(), Nothing(), Dubins(1.0, 0.1), PATH, START, 20)
+
+
+def views(difference, effect_learned, effect_real):
+    ones = np.ones(len(difference))
+    return Agreement(30 * ones, ones, 0 * ones, np.asarray(difference)), Effect(
+        np.asarray(effect_learned), np.asarray(effect_real)
+    )
+
+
+def driven(turn):
+    rollout = drive(Reads(), lambda s: images(s, False) + turn, Dubins(1.0, 0.1), START, HORIZON.ticks)
+    return drive_metrics(PATH, rollout.states[:, 0].numpy(), HORIZON).total_cte_m
+
+
+@pytest.mark.parametrize("share", [1.0, 0.5, 0.0])
+def test_without_disagreement_it_is_the_drive_with_that_share_of_the_effect(share):
+    clean, effect = views(np.zeros(16), np.full(16, TURN), np.full(16, share * TURN))
+    found = predict_transfer(problem(), images, clean, effect, START, HORIZON, draws=3)
+    assert found.attacked_m == pytest.approx([driven(share * TURN)] * 3)
+    assert found.retained == pytest.approx(share)
+
+
+def test_a_constant_disagreement_moves_the_clean_drive_by_its_size():
+    # Learned pictures say 0.2 more than real ones, so the deployed car steers 0.2 less.
+    clean, effect = views(np.full(16, 0.2), np.full(16, TURN), np.full(16, TURN))
+    found = predict_transfer(problem(), images, clean, effect, START, HORIZON, draws=2)
+    assert found.none_m == pytest.approx([driven(-0.2)] * 2)
+    assert found.attacked_m == pytest.approx([driven(TURN - 0.2)] * 2)
+    assert found.ratio == pytest.approx(driven(TURN - 0.2) / driven(-0.2))
+
+
+def test_draws_differ_by_what_was_measured_and_repeat_with_the_seed():
+    noise = np.random.default_rng(0).normal(0.0, 0.3, 40)
+    clean, effect = views(noise, np.full(40, TURN), np.full(40, TURN) + noise)
+    first = predict_transfer(problem(), images, clean, effect, START, HORIZON, draws=8, seed=3)
+    again = predict_transfer(problem(), images, clean, effect, START, HORIZON, draws=8, seed=3)
+    assert first == again
+    assert len(set(first.attacked_m)) == 8
+    low, high = first.ratio_band
+    assert low < first.ratio < high
+    assert set(first.record()) >= {"ratio", "ratio_low", "ratio_high", "retained", "draws"}
+    with pytest.raises(ValueError, match="two draws"):
+        predict_transfer(problem(), images, clean, effect, START, HORIZON, draws=1)
+
+
+def test_the_fence_stops_a_car_as_the_protocol_does():
+    clean, effect = views(np.zeros(16), np.full(16, TURN), np.full(16, TURN))
+    fenced = AttackProblem(Reads(), Nothing(), Dubins(1.0, 0.1), PATH, START, 20, fence_m=1.0, held_cap_m=0.1)
+    found = predict_transfer(fenced, images, clean, effect, START, HORIZON, draws=2)
+    assert found.attacked_m[0] < driven(TURN)

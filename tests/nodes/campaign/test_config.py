@@ -1,0 +1,121 @@
+import json
+
+import pytest
+
+from nodes.campaign.config import load_campaign, select
+from nodes.campaign.kinds import load_kind
+from nodes.campaign.run import statuses
+from nodes.campaign.table import campaign_table, publish, published_table, write_table
+from nodes.runtime.errors import ConfigError
+
+CAMPAIGN = """name: mine
+seeds: [0, 1]
+scenarios:
+  straight:
+    experiment: one.experiment.yaml
+    run_folder: runs/one
+    methods: [none, gradient]
+    victims: [hardened]
+    placements:
+      near: {run_folder: runs/near, set: [lab.board.x_m=1.9]}
+  left: {experiment: one.experiment.yaml, run_folder: runs/one, seeds: [7], set: [horizon=40]}
+"""
+
+
+@pytest.fixture
+def file(tmp_path):
+    (tmp_path / "one.experiment.yaml").write_text("name: one\nsettings: {full: {}}\n")
+    path = tmp_path / "mine.campaign.yaml"
+    path.write_text(CAMPAIGN)
+    return path
+
+
+def test_a_campaign_is_the_product_of_what_it_lists(file):
+    campaign = load_campaign(file)
+    names = [cell.name for cell in campaign.cells]
+    assert len(names) == len(set(names)) == 2 * 2 * 2 + 1 * 2 * 4
+    assert names[:3] == ["straight_hardened_none_0", "straight_hardened_gradient_0", "straight_hardened_none_1"]
+    assert "straight.near_hardened_gradient_1" in names
+    near = next(cell for cell in campaign.cells if cell.placement)
+    assert campaign.overrides(near) == ["lab.board.x_m=1.9"]
+    assert campaign.run_folder(near).name == "near"
+    assert campaign.folder.parts[-3:] == ("runs", "campaigns", "mine")
+    left = [cell for cell in campaign.cells if cell.scenario == "left"]
+    assert {cell.seed for cell in left} == {7}
+    assert [cell.method for cell in left[:4]] == ["none", "random", "cem", "gradient"]
+
+
+def test_cells_are_selected_by_what_they_are(file):
+    cells = load_campaign(file).cells
+    chosen = select(cells, "scenario=left,method=random+cem,victim=naive")
+    assert [cell.name for cell in chosen] == ["left_naive_random_7", "left_naive_cem_7"]
+    assert select(cells, "") == cells
+    with pytest.raises(
+        ConfigError, match="expected KEY=VALUE with KEY one of scenario, placement, victim, method, seed"
+    ):
+        select(cells, "mode=random")
+    with pytest.raises(ConfigError, match="got none"):
+        select(cells, "scenario=monitor")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ("seeds: [0, 1]", "seed: [0, 1]", r"mine.campaign.yaml:2: unknown key seed; valid keys here: .*seeds"),
+        ("    run_folder: runs/one\n", "", r":4: scenarios.straight.run_folder is missing"),
+        ("placements:\n      near: {run", "placements:\n      near: {rum", r":10: unknown key .*near.rum_folder"),
+        ("[none, gradient]", "[none, gradiant]", r":7: scenarios.straight.methods.1: .*'gradient'.*got 'gradiant'"),
+        ("seeds: [0, 1]", "seeds: [0, 0]", "every one of seeds once"),
+        ("one.experiment", "two.experiment", "expected the experiment file of scenario straight at .*two.experiment"),
+        ("  left:", "  Left!:", "Left!"),
+    ],
+)
+def test_a_bad_file_is_told_with_its_line(file, old, new, says):
+    file.write_text(CAMPAIGN.replace(old, new))
+    with pytest.raises(ConfigError, match=says):
+        load_campaign(file)
+
+
+def test_an_unknown_kind_is_told_with_what_there_is():
+    with pytest.raises(ConfigError, match=r"\(room, intersection\).*got 'moon'"):
+        load_kind("moon")
+    with pytest.raises(ConfigError, match="function run_cell in json"):
+        load_kind("json")
+
+
+def test_a_table_and_published_cells_from_finished_cells(bench, monkeypatch, tmp_path):
+    """Without running: results are put where workers put them; one of other settings is not taken."""
+    monkeypatch.syspath_prepend(str(bench.folder))
+    campaign = load_campaign(bench.file)
+    found = statuses(campaign, campaign.cells)
+    assert {each.state for each in found} == {"missing"}
+    from nodes.campaign.run import plan_cells
+
+    plan = plan_cells(campaign, campaign.cells)
+    for each, settings_hash in ((plan[0], plan[0].job.settings_hash), (plan[1], "of before")):
+        drives = {"total_cte_m": [6.0], "off_track": [True], "none_total_cte_m": [2.0]}
+        cell = each.cell
+        data = {
+            "scenario": cell.scenario, "victim": cell.victim, "method": cell.method, "seed": cell.seed, "attack_id": None,
+            "settings_hash": settings_hash, "seconds": 1.0, "machine": "m", "date": "d", "surrogate": drives, "deployed": drives,
+        }  # fmt: skip
+        bench.cells.mkdir(exist_ok=True)
+        (bench.cells / f"{cell.name}.json").write_text(json.dumps(data))
+    found = statuses(campaign, campaign.cells)
+    assert sorted(each.state for each in found) == ["changed", "done", "missing", "missing"]
+    table = campaign_table(campaign, found)
+    assert list(table.cells) == [plan[0].cell.name]
+    page = write_table(table, bench.cells, tmp_path / "page")
+    assert {path.name for path in page.parent.iterdir()} == {"index.html", "table.csv", "table.json", "table.md"}
+    assert publish(campaign, found, tmp_path / "kept") == ([plan[0].cell.name], [])
+    assert publish(campaign, found, tmp_path / "kept") == ([], [plan[0].cell.name])
+    assert published_table(tmp_path / "kept" / "toy").find("straight", "hardened", "none", "deployed").ratio == 3.0
+    with pytest.raises(ConfigError, match="advnerf campaign publish"):
+        published_table(tmp_path / "nowhere")
+    (bench.cells / f"{plan[0].cell.name}.json").write_text("{")
+    assert sorted(each.state for each in statuses(campaign, campaign.cells)) == [
+        "changed",
+        "missing",
+        "missing",
+        "unreadable",
+    ]
