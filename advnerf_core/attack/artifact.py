@@ -27,7 +27,7 @@ from advnerf_core.geometry import Array, Pinhole
 FILE_FORMAT = "advnerf-attack-1"
 TEXTURE_PX = 512
 
-Method = Literal["none", "random", "gradient", "cem", "evolution"]
+Method = Literal["none", "random", "gradient", "cem", "evolution", "distilled", "guided"]
 
 
 class AttackFileError(AdvnerfError, ValueError):
