@@ -23,7 +23,7 @@ _HALF_OPAQUE = float(np.log(2.0))
 # Chord of a ray that grazes the outline of a body, in widths of the edge.
 _CHORD_WIDTHS = 3.0
 # What is inside lets through one part in 10^8; layers of a flat solid; ray-marching steps along the width of an edge.
-_DEEPEST, _LAYERS, _STEPS = 1e-8, 4, 4
+_DEEPEST, _LAYERS, _STEPS = 1e-8, 4, 2
 
 
 def with_soft_edges(field: VoxelGridObject, width: float | None = None) -> VoxelGridObject:
