@@ -14,6 +14,7 @@ from __future__ import annotations
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -86,6 +87,16 @@ class ShapeSensor:
     def initial_theta(self, generator: torch.Generator) -> Tensor:
         """The plain shapes, with a noise that tells seeds apart."""
         return INITIAL_NOISE * torch.randn(self.theta_shape, generator=generator)
+
+    @cached_property
+    def random_sigma(self) -> float:
+        """Spread of a random ``theta`` whose displacements are in the mean as large as the bound, before they are bounded [m]."""
+        noise = torch.randn(self.theta_shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+        moved = [
+            self._displaced(k, part) * field.scale
+            for k, (field, part) in enumerate(zip(self.meshes, noise.split(self._counts), strict=True))
+        ]
+        return self.limits.bound_m / float(torch.cat(moved).norm(dim=1).square().mean().sqrt())
 
     def camera_poses(self, states: Tensor) -> Array:
         """``T_world_from_camera [B, 4, 4]`` at car states ``[B, n]``, detached."""

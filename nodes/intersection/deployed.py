@@ -20,7 +20,7 @@ from advnerf_core.driving.path import Path
 from advnerf_core.driving.policy import Policy, images_to_tensor
 from advnerf_core.driving.policy_view import PolicyView
 from advnerf_core.driving.rollout import drive
-from advnerf_core.fields.voxel_grid import VoxelGridObject
+from advnerf_core.fields.coloured import ColouredObject
 from advnerf_core.geometry import Array, Pinhole, planar_poses
 from advnerf_core.scene.surrogate import Frames, Surrogate
 from hardware.deployment_scene import DeploymentScene, Depth, Rgb
@@ -39,7 +39,7 @@ class DressedScene:
         objects: The objects, opaque; none for the empty scene.
     """
 
-    def __init__(self, scene: DeploymentScene, view: PolicyView, objects: Sequence[VoxelGridObject]) -> None:
+    def __init__(self, scene: DeploymentScene, view: PolicyView, objects: Sequence[ColouredObject]) -> None:
         self.scene, self.view = scene, view
         window = view.camera.cropped(0, view.crop_top_px, view.camera.width, view.crop_height_px)
         self._window = Surrogate(

@@ -1,0 +1,227 @@
+"""Attacks on meshes at the junction: the textures or the shapes of the five objects, over the deployment scene's own frames.
+
+As in the paper nothing is learned for it: the background is what the simulator shows. What is found is then driven past like any other
+attack, by the scene's own car, composed by depth. One call is one entry of the table, resumable, in the form of `cells.run_cell`.
+"""
+
+from __future__ import annotations
+
+import json
+import platform
+from dataclasses import asdict, dataclass, field, replace
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from advnerf_core.attack.adjoint import AttackProblem, evaluate
+from advnerf_core.attack.baselines import random_search
+from advnerf_core.attack.optimise import gradient_attack
+from advnerf_core.attack.search import Evaluation, SearchResult
+from advnerf_core.driving.metrics import drive_metrics
+from advnerf_core.driving.policy import Policy, load_policy
+from advnerf_core.files import write_atomically
+from advnerf_core.mesh.field import MeshField
+from advnerf_core.mesh.glb import write_glb
+from advnerf_core.mesh.shape import ShapeLimits, ShapeSensor
+from advnerf_core.mesh.surface import sphere, unwrapped
+from advnerf_core.objects.generators import GENERATORS
+from advnerf_core.objects.mesh import SurfaceMesh, stand
+from advnerf_core.scene.surrogate import Surrogate, split_theta
+from hardware.deployment_scene import DeploymentScene
+from hardware.twin.intersection.scene import Intersection
+from nodes.attacking.frames import DeployedFrames
+from nodes.intersection.attack import attack_problem
+from nodes.intersection.cells import CellError
+from nodes.intersection.context import Experiment
+from nodes.intersection.deployed import DressedScene, drive_deployed
+from nodes.intersection.objects import GENERATOR_OF
+from nodes.intersection.policy import victim_file, victims
+from nodes.runtime.stages import Report, hash_of
+
+Target = Literal["texture", "shape"]
+MeshMethod = Literal["none", "random", "gradient"]
+
+
+@dataclass(frozen=True)
+class MeshSettings:
+    """What is attacked of the meshes, and how far it may go.
+
+    Attributes:
+        target: Their textures, or their shapes.
+        texels: Texels along the longest side of an object.
+        ball_m: Objects are balls of this radius, before their own scale [m]; None leaves cars and hydrants.
+        ball_rgb: Colour of the balls.
+        limits: Of shapes.
+        learning_rate: Of Adam; 0.1 for textures and a twentieth of the bound for shapes if not given.
+    """
+
+    target: Target = "texture"
+    texels: int = 32
+    ball_m: float | None = None
+    ball_rgb: tuple[float, float, float] = (0.75, 0.1, 0.08)
+    limits: ShapeLimits = field(default_factory=lambda: ShapeLimits(bound_m=0.4))
+    learning_rate: float | None = None
+
+
+def mesh_objects(experiment: Experiment, settings: MeshSettings) -> list[MeshField]:
+    """The world's objects as meshes, in their plain colours and shapes."""
+    found = []
+    for thing in experiment.world.objects:
+        mesh: SurfaceMesh = (
+            stand(GENERATORS[GENERATOR_OF[thing.kind]]())
+            if settings.ball_m is None
+            else sphere(settings.ball_m, settings.ball_rgb)
+        )
+        found.append(MeshField(unwrapped(mesh, settings.texels), thing.T_world_from_object, thing.scale))
+    return found
+
+
+def mesh_cell(
+    experiment: Experiment, scenario: str, victim: str, method: MeshMethod, seed: int, folder: Path, report: Report,
+    settings: MeshSettings | None = None, scene: DeploymentScene | None = None,
+) -> dict[str, Any]:  # fmt: skip
+    """Search over the deployment scene's frames, drive there, and keep the result in ``folder``.
+
+    Args:
+        experiment: Its policies must be there (``advnerf experiment FILE --until policy``).
+        scenario: Drive: straight, right or left.
+        victim: hardened or naive.
+        method: none, random or gradient.
+        seed: Of the search and its starts.
+        folder: Where the search state, the found meshes (GLB) and the results are kept.
+        report: Told the finished fraction.
+        settings: What is attacked.
+        scene: The deployment scene; the simulated intersection is opened if none is given.
+
+    Returns:
+        The cell as JSON data, as `cells.run_cell` gives it; ``surrogate`` is the drive of the ideal car over the scene's frames.
+
+    Raises:
+        CellError: No such drive, victim or method.
+        MeshEngineError: Mitsuba or LLVM is missing.
+    """
+    settings = settings or MeshSettings()
+    known = (experiment.config.scenarios, victims(experiment), ("none", "random", "gradient"))
+    for what, value, choices in zip(("scenario", "victim", "method"), (scenario, victim, method), known, strict=True):
+        if value not in choices:
+            raise CellError(f"expected a {what} of {', '.join(choices)}, got {value!r}")
+    result = folder / f"mesh_{settings.target}_{scenario}_{victim}_{method}_{seed}.cell.json"
+    if result.exists():
+        kept: dict[str, Any] = json.loads(result.read_text())
+        return kept
+    if scene is None:
+        with Intersection(experiment.world) as opened:
+            return _cell(experiment, scenario, victim, method, seed, result, report, settings, opened)
+    return _cell(experiment, scenario, victim, method, seed, result, report, settings, scene)
+
+
+def _cell(
+    experiment: Experiment, scenario: str, victim: str, method: MeshMethod, seed: int, result: Path, report: Report,
+    settings: MeshSettings, scene: DeploymentScene,
+) -> dict[str, Any]:  # fmt: skip
+    policy = load_policy(victim_file(experiment, victim))
+    fields = mesh_objects(experiment, settings)
+    view = DeployedFrames(scene, experiment.view)
+    surrogate = Surrogate(view, experiment.view.pinhole, experiment.mount, fields, depth_tolerance_m=0.0)
+    problem = attack_problem(experiment, surrogate, policy, scenario, seed)
+    if settings.target == "shape":
+        problem = replace(problem, sensor=ShapeSensor(surrogate, settings.limits))
+    frozen = hash_of({"objects": [each.sha256 for each in fields], "policy": policy.sha256, **_plain(settings)})
+    plain = surrogate.plain_theta() if settings.target == "texture" else torch.zeros(problem.sensor.theta_shape)
+    theta = plain
+    history: tuple[Evaluation, ...] = ()
+    if method != "none":
+        found = _search(experiment, problem, method, seed, settings, result, report, hash_of([frozen, scenario]))
+        theta, history = found.theta, found.history
+        _keep_meshes(experiment, problem, fields, theta, result)
+    clean, attacked = ({"surrogate": _ideal(experiment, problem, each)} for each in (plain, theta))
+    for drives, each in ((clean, plain), (attacked, theta)):
+        drives["deployed"] = _deployed(experiment, scene, problem, fields, each, scenario, policy.policy)
+    data = {
+        "scenario": scenario, "victim": victim, "method": method, "seed": seed, "attack_id": None, "settings_hash": frozen,
+        "seconds": round(sum(evaluation.seconds for evaluation in history), 1),
+        "machine": platform.processor() or platform.machine(),
+        "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        **{name: {**attacked[name], "none_total_cte_m": clean[name]["total_cte_m"]} for name in ("surrogate", "deployed")},
+        "extra": {
+            "mesh": _plain(settings), "frames": "deployment", "evaluations": len(history),
+            "curve_total_cte_m": [evaluation.predicted_total_cte_m for evaluation in history],
+        },
+    }  # fmt: skip
+    write_atomically(result, json.dumps(data, indent=1) + "\n")
+    _beside(result, ".state.safetensors").unlink(missing_ok=True)
+    return data
+
+
+def _search(
+    experiment: Experiment, problem: AttackProblem, method: MeshMethod, seed: int, settings: MeshSettings, result: Path,
+    report: Report, settings_hash: str,
+) -> SearchResult:  # fmt: skip
+    attack, best = experiment.config.attack, [0.0]
+
+    def told(evaluation: Evaluation) -> None:
+        best[0], done = max(best[0], evaluation.predicted_total_cte_m), evaluation.iteration + 1
+        now = f"total CTE {evaluation.predicted_total_cte_m:.1f} m, best {best[0]:.1f} m"
+        report(done / attack.evaluations, f"{done}/{attack.evaluations}, {now}")
+
+    common: dict[str, Any] = {
+        "seed": seed, "state_path": _beside(result, ".state.safetensors"), "on_evaluation": told,
+        "settings_hash": settings_hash,
+    }  # fmt: skip
+    sensor = problem.sensor
+    rate, sigma = settings.learning_rate or attack.learning_rate, attack.random_sigma
+    if isinstance(sensor, ShapeSensor):
+        rate, sigma = settings.learning_rate or sensor.limits.learning_rate, sensor.random_sigma
+    if method == "gradient":
+        return gradient_attack(problem, attack.evaluations, rate, **common)
+    return random_search(problem, attack.evaluations, sigma, **common)
+
+
+def _keep_meshes(
+    experiment: Experiment, problem: AttackProblem, fields: list[MeshField], theta: Tensor, result: Path
+) -> None:
+    """One GLB of each object as it was found, in its own frame."""
+    if isinstance(problem.sensor, ShapeSensor):
+        meshes = [shaped.mesh for shaped in problem.sensor.shaped(theta)]
+    else:
+        parts = split_theta(fields, theta)
+        meshes = [each.mesh.with_texture(each.texture(part)) for each, part in zip(fields, parts, strict=True)]
+    for thing, mesh in zip(experiment.world.objects, meshes, strict=True):
+        write_glb(_beside(result, f".{thing.name}.glb"), mesh)
+
+
+def _ideal(experiment: Experiment, problem: AttackProblem, theta: Tensor) -> dict[str, Any]:
+    rollout, _ = evaluate(problem, theta)
+    scores = [drive_metrics(problem.path, d, experiment.limits) for d in rollout.states.transpose(0, 1).numpy()]
+    return {"total_cte_m": [s.total_cte_m for s in scores], "off_track": [s.off_track for s in scores]}
+
+
+def _deployed(
+    experiment: Experiment, scene: DeploymentScene, problem: AttackProblem, fields: list[MeshField], theta: Tensor,
+    scenario: str, policy: Policy,
+) -> dict[str, Any]:  # fmt: skip
+    """Drives of the scene's own car from all starts, past opaque objects in the camera's own pixels."""
+    if isinstance(problem.sensor, ShapeSensor):
+        fields, theta = problem.sensor.shaped(theta), problem.sensor.colours
+    dressed = DressedScene(scene, experiment.view, fields)
+    drives = [
+        drive_deployed(
+            dressed, policy, experiment.goal(scenario), np.asarray(start), experiment.paths[scenario], experiment.limits,
+            experiment.world.car.speed_mps, theta,
+        )
+        for start in problem.start_states.numpy()
+    ]  # fmt: skip
+    return {"total_cte_m": [d.metrics.total_cte_m for d in drives], "off_track": [d.metrics.off_track for d in drives]}
+
+
+def _plain(settings: MeshSettings) -> dict[str, Any]:
+    data: dict[str, Any] = json.loads(json.dumps(asdict(settings)))
+    return data
+
+
+def _beside(result: Path, ending: str) -> Path:
+    return result.with_name(result.name.removesuffix(".cell.json") + ending)

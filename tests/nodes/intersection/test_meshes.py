@@ -1,0 +1,71 @@
+"""Attacks on meshes at the junction, over the frames of a scene in closed form."""
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from advnerf_core.geometry import planar_pose
+from advnerf_core.mesh.engine import MeshEngineError, engine
+from advnerf_core.mesh.glb import read_glb
+from advnerf_core.mesh.shape import ShapeLimits
+from nodes.attacking.frames import DeployedFrames
+from nodes.intersection.cells import CellError
+from nodes.intersection.meshes import MeshSettings, mesh_cell, mesh_objects
+
+
+@pytest.fixture(scope="module", autouse=True)
+def mitsuba_works():
+    try:
+        engine()
+    except MeshEngineError as error:
+        pytest.skip(str(error))
+
+
+def quiet(fraction, text=""):
+    pass
+
+
+def test_deployed_frames_are_what_the_policy_sees_with_depth(trained, wall):
+    frames = DeployedFrames(wall, trained.view)
+    pose = planar_pose(-24.0, -1.75, 0.1) @ wall.T_car_from_camera
+    rgb, depth_m = frames(pose[None], trained.view.pinhole)
+    image, depth = wall.observe_at(-24.0, -1.75, 0.1)
+    np.testing.assert_array_equal(np.round(255 * rgb[0]).astype(np.uint8), trained.view.image(image))
+    # Depth is that of a ray of the policy's own camera, up to the pixels of the finer image.
+    rows = slice(trained.view.crop_top_px, trained.view.crop_top_px + trained.view.crop_height_px)
+    mean = cv2.resize(depth[rows], (200, 66), interpolation=cv2.INTER_AREA)
+    flat = np.abs(depth_m[0] / mean - 1.0) < 0.05
+    assert flat.mean() > 0.9
+    with pytest.raises(ValueError, match="policy's view"):
+        frames(pose[None], wall.camera_pinhole)
+
+
+@pytest.mark.parametrize("target", ["texture", "shape"])
+def test_a_cell_of_a_mesh_is_searched_driven_kept_and_not_done_again(target, trained, wall, tmp_path):
+    settings = MeshSettings(target, texels=8, ball_m=0.5, limits=ShapeLimits(0.3, samples=1))
+    cell = mesh_cell(trained, "straight", "hardened", "gradient", 0, tmp_path, quiet, settings, wall)
+    assert cell["extra"]["evaluations"] == trained.config.attack.evaluations
+    assert len(cell["surrogate"]["total_cte_m"]) == len(cell["deployed"]["none_total_cte_m"]) == 1
+    assert all(np.isfinite(cell[where][key]).all() for where in ("surrogate", "deployed")
+               for key in ("total_cte_m", "none_total_cte_m"))  # fmt: skip
+    found = sorted(tmp_path.glob("*.glb"))
+    assert len(found) == len(trained.world.objects)
+    again = read_glb(found[0])
+    plain = mesh_objects(trained, settings)[0].mesh
+    assert len(again.vertices) == len(plain.vertices)
+    moved = np.abs(np.sort(again.vertices, axis=0) - np.sort(plain.vertices, axis=0)).max()
+    assert (moved < 1e-6) == (target == "texture")
+    assert not list(tmp_path.glob("*.state.safetensors"))
+    torch.manual_seed(1)
+    assert mesh_cell(trained, "straight", "hardened", "gradient", 0, tmp_path, quiet, settings, None) == cell
+
+
+def test_no_attack_is_one_everywhere_and_wrong_names_are_told(trained, wall, tmp_path):
+    cell = mesh_cell(trained, "right", "naive", "none", 0, tmp_path, quiet, MeshSettings(texels=8), wall)
+    for where in ("surrogate", "deployed"):
+        assert cell[where]["total_cte_m"] == cell[where]["none_total_cte_m"]
+    with pytest.raises(CellError, match="scenario of straight, right, left"):
+        mesh_cell(trained, "up", "naive", "none", 0, tmp_path, quiet)
+    with pytest.raises(CellError, match="method of none, random, gradient"):
+        mesh_cell(trained, "left", "naive", "cem", 0, tmp_path, quiet)
