@@ -23,9 +23,13 @@ from pathlib import Path
 from typing import Any
 
 from nodes.runtime.errors import ConfigError
-from nodes.runtime.stages import Report, hash_of, read_record
+from nodes.runtime.stages import Report, hash_of, is_current, read_record
 
-KINDS = {"room": "nodes.experiment.cells", "intersection": "nodes.intersection.cells"}
+KINDS = {
+    "room": "nodes.experiment.cells",
+    "room_search": "nodes.experiment.search_cells",
+    "intersection": "nodes.intersection.cells",
+}
 RunCell = Callable[[Any, str, str, str, int, Path, Report], dict[str, Any]]
 # The stages that a cell needs of its experiment; what comes after is the cell itself.
 _NEEDED = ("capture", "scene", "policy", "object", "objects")
@@ -60,6 +64,14 @@ class Kind:
         """The part of a live cell that may run beside others."""
         found: Callable[..., None] | None = getattr(self.module, "search_cell", None)
         return found
+
+    def finished(self, experiment: Any, scenario: str, victim: str, method: str, seed: int) -> dict[str, Any] | None:
+        """The cell as the experiment itself has run it, with these settings; None where it has not, or where the kind keeps none."""
+        file = experiment.folder / "deploy" / f"{scenario}_{victim}_{method}_{seed}.cell.json"
+        if not file.exists() or not is_current(self._run_module().stages_of(experiment), experiment.folder, "deploy"):
+            return None
+        data: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+        return data
 
     @property
     def fidelity(self) -> Any:

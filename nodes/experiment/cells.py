@@ -22,12 +22,11 @@ from advnerf_core.report.clips import ClipTrack, write_clip
 from nodes import evaluation
 from nodes.experiment import attack, deploy
 from nodes.experiment.context import CONTROL_PERIOD_S, Experiment
-from nodes.experiment.finished import changed_settings, is_finished, require_same_attacks
+from nodes.experiment.finished import changed_settings, has_same_attacks, is_finished
 from nodes.experiment.objects import attacked_object, surrogate_of
 from nodes.experiment.run import load_experiment, run_experiment
 from nodes.experiment.scene import load_background
 from nodes.runtime.errors import ConfigError, RuntimeFault
-from nodes.runtime.launch_file import load_launch
 from nodes.runtime.stages import Report, hash_of, read_record
 from nodes.trials.campaign import COUNTED_STOPS
 
@@ -54,6 +53,7 @@ class _Cell:
     method: str
     seed: int
     folder: Path
+    taken: bool
 
     @property
     def search(self) -> attack.Search:
@@ -65,7 +65,7 @@ class _Cell:
     def searched_in(self, method: str) -> Path:
         """Folder of the drives in the learned room: the run folder's, if it has them."""
         taken = self.experiment.stage_folder("attack")
-        if is_finished(taken) and (taken / f"{self.victim}_{method}_{self.seed}.json").exists():
+        if self.taken and (taken / f"{self.victim}_{method}_{self.seed}.json").exists():
             return taken
         return self.folder
 
@@ -94,7 +94,10 @@ def prepare(experiment: Experiment, report: Report) -> None:
 
 
 def cell_inputs(experiment: Experiment, scenario: str, victim: str, method: str, seed: int) -> dict[str, Any]:
-    """What the result of a cell depends on."""
+    """What the result of a cell depends on: settings, and what scene and policies were made to be.
+
+    Like the code, the node graph is not part of it: a new watching node must not throw hours of searches away.
+    """
     del scenario, seed
     _require_victim(experiment, victim)
     config = experiment.config
@@ -129,6 +132,14 @@ def search_cell(
         attack.run_search(cell.experiment, attack.sensor_of(cell.experiment, surrogate), cell.search, folder, report)
 
 
+def searched_part(
+    experiment: Experiment, scenario: str, victim: str, method: str, seed: int, folder: Path, report: Report
+) -> dict[str, Any]:
+    """The cell as far as the learned room goes: it is not deployed."""
+    search_cell(experiment, scenario, victim, method, seed, folder, report)
+    return _surrogate(_cell(experiment, scenario, victim, method, seed, folder))
+
+
 def run_cell(
     experiment: Experiment, scenario: str, victim: str, method: str, seed: int, folder: Path, report: Report
 ) -> dict[str, Any]:
@@ -137,9 +148,8 @@ def run_cell(
     Raises:
         CellFault: The stack stopped the live drive by a fault of its own.
     """
-    search_cell(experiment, scenario, victim, method, seed, folder, report)
+    found = searched_part(experiment, scenario, victim, method, seed, folder, report)
     cell = _cell(experiment, scenario, victim, method, seed, folder)
-    found = _surrogate(cell)
     report(0.9, "driving live")
     none = _drive(cell, "none")
     driven = none if method == "none" else _drive(cell, method)
@@ -165,10 +175,8 @@ def _cell(experiment: Experiment, scenario: str, victim: str, method: str, seed:
     config = experiment.config.model_copy(
         update={"attack": experiment.config.attack.model_copy(update={"seeds": (seed,)})}
     )
-    cell = _Cell(replace(experiment, config=config), victim, method, seed, folder)
-    if cell.searched_in(method) != folder:
-        require_same_attacks(cell.experiment)
-    return cell
+    own = replace(experiment, config=config)
+    return _Cell(own, victim, method, seed, folder, has_same_attacks(own))
 
 
 def _require_victim(experiment: Experiment, victim: str) -> None:

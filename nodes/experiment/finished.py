@@ -14,25 +14,23 @@ from nodes.experiment.context import Experiment
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.stages import read_record
 
+# What does not change a result: which other seeds there are, and how much memory may be used.
+_FREE = ("seeds", "cache_mib")
 
-def require_same_attacks(experiment: Experiment) -> None:
-    """The run folder's attacks must be those of these settings, on the scene and policies that are there now."""
-    then = json.loads((experiment.stage_folder("attack") / "frozen.json").read_text())
-    now = attack.frozen_hashes(experiment)
+
+def has_same_attacks(experiment: Experiment) -> bool:
+    """Whether the run folder's attacks are finished, and are those of these settings on the scene and policies that are there now."""
+    folder = experiment.stage_folder("attack")
+    if not is_finished(folder):
+        return False
+    then, now = json.loads((folder / "frozen.json").read_text()), attack.frozen_hashes(experiment)
     # Starts depend on the seed alone; which seeds the folder had, and hence this hash, does not matter here.
-    changed = [name for name in now if name not in ("config", "starts_and_seeds") and then.get(name) != now[name]]
-    old = _manifest_config(experiment)
-    ignored = {"seeds", "cache_mib"}
-    changed += [
-        f"attack.{name}"
-        for name, value in old.attack.model_dump().items()
-        if name not in ignored and getattr(experiment.config.attack, name) != value
-    ]
-    changed += ["horizon"] * (old.horizon != experiment.config.horizon)
-    if changed:
-        raise ConfigError(
-            f"the attacks in {experiment.folder} were found with another {', '.join(changed)}; name another run_folder in the campaign"
-        )
+    if any(then.get(name) != now[name] for name in now if name not in ("config", "starts_and_seeds")):
+        return False
+    old, new = _manifest_config(experiment), experiment.config
+    return old.horizon == new.horizon and all(
+        getattr(new.attack, name) == value for name, value in old.attack.model_dump().items() if name not in _FREE
+    )
 
 
 def _manifest_config(experiment: Experiment) -> ExperimentConfig:

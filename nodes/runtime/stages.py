@@ -114,6 +114,18 @@ def read_record(folder: Path) -> StageRecord | None:
         return None
 
 
+def is_current(stages: Sequence[Stage], folder: Path, name: str) -> bool:
+    """Whether a stage and all that it builds on are finished, and are what would be run now."""
+    records: dict[str, StageRecord] = {}
+    for stage in stages:
+        record = read_record(folder / stage.name)
+        if record is None or record.digest is None or any(earlier not in records for earlier in stage.after):
+            continue
+        if record.key == _key_of(stage, records):
+            records[stage.name] = record
+    return name in records
+
+
 def hash_of(value: Any) -> str:
     """SHA-256 of a JSON value, independent of the order of keys."""
     return hashlib.sha256(json.dumps(value, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
@@ -134,8 +146,7 @@ def _run_or_reuse(stage: Stage, folder: Path, records: Mapping[str, StageRecord]
     missing = [name for name in stage.after if name not in records]
     if missing:
         raise StageError(f"stage '{stage.name}' needs {', '.join(missing)} to run before it")
-    inputs = {name: records[name].digest for name in stage.after}
-    key = hash_of({"name": stage.name, "version": stage.version, "settings": stage.settings, "inputs": inputs})
+    key = _key_of(stage, records)
     old = read_record(folder)
     if old is not None and old.key == key and old.digest is not None:
         display.finish(stage.name, old.seconds, cached=True)
@@ -145,6 +156,11 @@ def _run_or_reuse(stage: Stage, folder: Path, records: Mapping[str, StageRecord]
         shutil.rmtree(folder)
     earlier_s = old.seconds if resumed and old is not None else 0.0
     return _run(stage, folder, key, earlier_s, display)
+
+
+def _key_of(stage: Stage, records: Mapping[str, StageRecord]) -> str:
+    inputs = {name: records[name].digest for name in stage.after}
+    return hash_of({"name": stage.name, "version": stage.version, "settings": stage.settings, "inputs": inputs})
 
 
 def _run(stage: Stage, folder: Path, key: str, earlier_s: float, display: Display) -> StageRecord:

@@ -1,0 +1,83 @@
+"""Question: how many attacks an hour does a campaign run here, with one worker and with two?
+
+The cells are real: gradient attacks on the finished room of ``make experiment``, each in a process of its own, shortened to a few
+iterations so that what a cell costs besides (starting Python, loading scene and policy) shows rather than hides.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import time
+from pathlib import Path
+
+from benchmarks.results import record_row
+from nodes.campaign.config import load_campaign
+from nodes.campaign.run import Options, run_campaign
+
+COMMAND = "python -m benchmarks.campaign_scaling runs/full"
+_FILE = """name: scaling
+seeds: [{seeds}]
+methods: [gradient]
+victims: [hardened]
+scenarios:
+  green_screen:
+    kind: room_search
+    experiment: {experiment}
+    setting: full
+    run_folder: {folder}
+    set: [attack.starts=1, attack.iterations={iterations}]
+"""
+
+
+def measure(folder: Path, work: Path, jobs: int, threads: int, cells: int, iterations: int) -> float:
+    """Wall time of a campaign of its own [s]."""
+    shutil.rmtree(work, ignore_errors=True)
+    work.mkdir(parents=True)
+    file = work / "scaling.campaign.yaml"
+    experiment = Path("launch/room.experiment.yaml").resolve()
+    seeds = ", ".join(str(100 + seed) for seed in range(cells))
+    file.write_text(_FILE.format(seeds=seeds, experiment=experiment, folder=folder.resolve(), iterations=iterations))
+    campaign = load_campaign(file, work)
+    began = time.monotonic()
+    ended = run_campaign(campaign, campaign.cells, Options(jobs, threads, gate=False), print)
+    seconds = time.monotonic() - began
+    wrong = [end for end in ended if end.how != "done"]
+    if wrong or len(ended) != cells:
+        raise SystemExit(f"expected {cells} finished cells, got {wrong or len(ended)}")
+    return seconds
+
+
+def main() -> None:
+    """Measure one and two workers, and write the rows."""
+    parser = argparse.ArgumentParser(description=main.__doc__)
+    parser.add_argument("run_folder", type=Path)
+    parser.add_argument("--cells", type=int, default=4)
+    parser.add_argument("--iterations", type=int, default=6)
+    parser.add_argument("--work", type=Path, default=Path("runs/campaigns/scaling"))
+    parser.add_argument("--dry", action="store_true", help="print only")
+    arguments = parser.parse_args()
+    load_before = os.getloadavg()[0]
+    seconds = {
+        (jobs, threads): measure(
+            arguments.run_folder, arguments.work, jobs, threads, arguments.cells, arguments.iterations
+        )
+        for jobs, threads in ((1, 1), (1, 2), (2, 1))
+    }
+    for (jobs, threads), wall_s in seconds.items():
+        print(
+            f"{jobs} workers x {threads} threads: {wall_s:.1f} s, {3600 * arguments.cells / wall_s:.0f} cells an hour"
+        )
+    gain = seconds[1, 1] / seconds[2, 1]
+    note = (
+        f"{arguments.cells} gradient attacks of {arguments.iterations} iterations on one start, one thread each: {seconds[1, 1]:.0f} s with 1 "
+        f"worker, {seconds[2, 1]:.0f} s with 2; 1 worker with 2 threads {seconds[1, 2]:.0f} s; load before {load_before:.1f}"
+    )
+    print(f"gain {gain:.2f}; {note}")
+    if not arguments.dry:
+        record_row("#5 campaign, 2 workers against 1", gain, "x", ">= 1.7 x", gain >= 1.7, COMMAND, note)
+
+
+if __name__ == "__main__":
+    main()
