@@ -147,8 +147,8 @@ def adjoint_gradient(problem: AttackProblem, theta: Tensor) -> AdjointResult:
     """
     if not problem.differentiable:
         raise BlackBoxError(
-            "expected a policy with a gradient, got one that declares differentiable = False; search with the methods random, "
-            "cem or evolution instead"
+            "expected a policy with a gradient, got one that declares differentiable = False; search with the methods "
+            "guided, distilled, evolution, cem or random instead"
         )
     theta = theta.detach()
     cache = RenderCache(problem.cache_bytes)

@@ -7,6 +7,7 @@ with two textures, and the student is charged for the error of the difference to
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -27,9 +28,9 @@ class Distillation:
 
     Attributes:
         warm_pairs: Pairs of the first lesson, at random places about the first drive in random textures.
-        warm_steps: Optimiser steps of the first lesson.
+        warm_passes: Passes over the first lesson.
         fresh_pairs: Pairs that each later drive adds, at most.
-        steps: Optimiser steps after each drive.
+        steps: Optimiser steps after each drive, at most; never more than two passes over all lessons.
         memory_pairs: Pairs that are kept; fresh ones then replace others at random.
         batch_pairs: Pairs of one step.
         learning_rate: Of Adam.
@@ -39,7 +40,7 @@ class Distillation:
     """
 
     warm_pairs: int = 300
-    warm_steps: int = 250
+    warm_passes: int = 20
     fresh_pairs: int = 96
     steps: int = 10
     memory_pairs: int = 768
@@ -50,7 +51,7 @@ class Distillation:
     texture_sigma: float = 2.0
 
     def __post_init__(self) -> None:
-        counts = (self.warm_pairs, self.warm_steps, self.fresh_pairs, self.steps, self.memory_pairs, self.batch_pairs)
+        counts = (self.warm_pairs, self.warm_passes, self.fresh_pairs, self.steps, self.memory_pairs, self.batch_pairs)
         if min(counts) < 1 or self.learning_rate <= 0.0 or self.difference_weight < 0.0 or self.place_sigma < 0.0:
             raise ValueError(f"expected counts >= 1, a learning rate > 0 and no negative weight or spread, got {self}")
 
@@ -156,12 +157,25 @@ class Student:
         steering: Tensor = self.network(images.to(self._dtype), given)
         return steering
 
+    def begin(self, generator: torch.Generator) -> float:
+        """The first lesson; see `learn`."""
+        passes = self.settings.warm_passes
+        return self.learn(math.ceil(passes * len(self.lessons) / self._batch), generator)
+
+    def go_on(self, generator: torch.Generator) -> float:
+        """What is learned after a drive; see `learn`."""
+        return self.learn(min(self.settings.steps, math.ceil(2 * len(self.lessons) / self._batch)), generator)
+
+    @property
+    def _batch(self) -> int:
+        return min(self.settings.batch_pairs, len(self.lessons))
+
     def learn(self, steps: int, generator: torch.Generator) -> float:
-        """Go on learning; the root mean square error of the last quarter of the steps [rad]."""
+        """So many steps; the root mean square error of their last quarter [rad]."""
         errors = []
         self.network.train().requires_grad_(True)
         for _ in range(steps):
-            chosen = torch.randint(len(self.lessons), (self.settings.batch_pairs,), generator=generator)
+            chosen = torch.randint(len(self.lessons), (self._batch,), generator=generator)
             images = self.lessons.images[chosen].flatten(0, 1).to(self._dtype) / 255.0
             goals = self.lessons.goals[chosen].repeat_interleave(2, dim=0)
             error = self(images, goals).reshape(-1, 2) - self.lessons.answers[chosen].to(self._dtype)

@@ -184,7 +184,7 @@ class _Loop:
         if self._student is None:
             lessons = _first_lessons(problem, driven, theta, self._coarse, self._search.distillation, self._generator)
             self._student = Student(lessons, self._search.distillation, self._seed, self._search.student)
-            self._student.learn(self._search.distillation.warm_steps, self._generator)
+            self._student.begin(self._generator)
         blind = replace(problem, policy=self._student, regulariser=None)
         result = gradient_pass(blind, theta, driven.rollout, driven.cache)
         directions = self._directions(result.gradient, known["m"])
@@ -198,7 +198,7 @@ class _Loop:
             loss_m, gradient = loss_m + extra, gradient + slope
         if not (math.isfinite(loss_m) and bool(torch.isfinite(gradient).all())):
             raise SearchDivergedError(f"expected a finite loss and gradient at evaluation {number}, got loss {loss_m}")
-        self._student.learn(self._search.distillation.steps, self._generator)
+        self._student.go_on(self._generator)
         evaluation = self._state.record(theta, loss_m, result.totals, time.perf_counter() - began)
         moved = _adam_step(theta, gradient, known["m"], known["v"], number + 1, self._search.learning_rate)
         kept = {"calls": known["calls"], "generator": self._generator.get_state()}

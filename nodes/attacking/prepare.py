@@ -19,12 +19,15 @@ from advnerf_core.attack.search import SearchResult, draw_start_states
 from advnerf_core.driving.actuated import ActuatedAckermann
 from advnerf_core.driving.dynamics import Ackermann, Dynamics
 from advnerf_core.driving.policy import LoadedPolicy
+from advnerf_core.mesh.surface import TexturedMesh
 from advnerf_core.policies.load import load_any_policy
 from advnerf_core.scene.field import load_scene
 from advnerf_core.scene.render_field import FieldRenderer
 from advnerf_core.scene.surrogate import Surrogate, split_theta
 from calibration.display_colour import DisplayCalibration
 from calibration.schema import CameraCalibration, RoomCalibration, VehicleCalibration, load_calibration
+from advnerf_core.mesh.shape import ShapeSensor
+from nodes.attacking.meshes import found_meshes, shape_sensor, shaped_objects
 from nodes.attacking.objects import PlacedObject, place
 from nodes.attacking.request import AttackRequest
 from nodes.runtime.errors import ConfigError
@@ -74,6 +77,8 @@ class Prepared:
             "name": self.request.name, "horizon": self.problem.steps, "evaluations": len(result.history),
             "start_states": self.problem.start_states[:, :3].tolist(), "objects_sha256": self.hashes["objects"],
         }  # fmt: skip
+        if self.request.shape is not None:
+            extra["shape"] = self.request.shape.model_dump(mode="json")
         return AttackFile(
             method=self.request.search.method, **self._face(result.theta), camera=self.surrogate.camera,
             scene_sha256=self.hashes["scene"], policy_sha256=self.hashes["policy"], config_sha256=self.hashes["config"],
@@ -81,12 +86,18 @@ class Prepared:
         )  # fmt: skip
 
     def attacked_objects(self, theta: Tensor) -> tuple[AttackedObject, ...]:
-        """All objects with their colours, as an attack file keeps them."""
+        """All objects with their colours, or what their shapes were made of, as an attack file keeps them."""
+        if isinstance(self.problem.sensor, ShapeSensor):
+            return shaped_objects(self.problem.sensor, [each.name for each in self.objects], theta)
         parts = [part.detach().numpy().astype(np.float32) for part in split_theta(self.surrogate.objects, theta)]
         return tuple(
             AttackedObject(each.name, part, each.field.T_world_from_object, each.field.scale, each.sha256)
             for each, part in zip(self.objects, parts, strict=True)
         )
+
+    def meshes(self, theta: Tensor) -> list[TexturedMesh | None]:
+        """The meshes that were found; None for an object that is none."""
+        return found_meshes(self.problem.sensor, self.surrogate.objects, theta)
 
     def _face(self, theta: Tensor) -> dict[str, Any]:
         """What an attack file says about objects; the first that has a deployable face is the one that is shown."""
@@ -141,13 +152,22 @@ def request_hash(request: AttackRequest) -> str:
     )
     for key in ("evaluations", "cache_mib", "time_batch", "seeds", "together"):
         asked["search"].pop(key)
+    for key in ("probes", "warm_pairs"):
+        if asked["search"][key] is None:  # so that hashes of requests without them stay what they were
+            del asked["search"][key]
     if asked["poses"] is None:
         del asked["poses"]
     else:
         for key in ("attack", "landscape", "robustness"):
             del asked["poses"][key]
+    if asked["shape"] is None:
+        del asked["shape"]
     for wanted in asked["objects"]:
         del wanted["file"], wanted["target"]
+        if wanted["mesh"] is None:
+            del wanted["mesh"]
+        else:
+            del wanted["mesh"]["file"]
         if wanted.pop("display") is None:
             del wanted["display_cos"]
         if not wanted["levels"]:
@@ -203,8 +223,10 @@ def _problem(
     )  # fmt: skip
 
 
-def sensor_of(request: AttackRequest, surrogate: Surrogate) -> Surrogate | DisplayedSensor:
-    """The surrogate, seen through the monitor's colours where a monitor shows the face."""
+def sensor_of(request: AttackRequest, surrogate: Surrogate) -> Surrogate | DisplayedSensor | ShapeSensor:
+    """The surrogate: seen through the monitor's colours where a monitor shows the face; with free shapes where these are attacked."""
+    if request.shape is not None:
+        return shape_sensor(surrogate, request.shape)
     wanted = request.objects[0]
     if wanted.display is None:
         return surrogate

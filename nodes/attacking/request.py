@@ -15,10 +15,11 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 
 from advnerf_core.geometry import Array, make_transform, rotation_z
 from advnerf_core.policies.load import is_factory
+from nodes.attacking.mesh_request import MeshRequest, ShapeRequest
 from nodes.attacking.pose_request import PosesRequest
 from nodes.runtime.config import Document, apply_overrides, parse_yaml, read_yaml, validate
 
-Method = Literal["gradient", "random", "cem", "evolution"]
+Method = Literal["gradient", "random", "cem", "evolution", "distilled", "guided"]
 Count = Annotated[int, Field(ge=1)]
 NotNegative = Annotated[float, Field(ge=0)]
 AboveZero = Annotated[float, Field(gt=0)]
@@ -35,12 +36,13 @@ class ObjectRequest(_Section):
     """One object: where it is, and which of its colours are free.
 
     A ``face`` is a thin slab seen from its front only, as a projected or displayed texture is; a ``cube`` has one textured face
-    and plain sides; a ``file`` is what ``advnerf object build`` wrote. The frame of a face or cube has its origin in the middle of
+    and plain sides; a ``file`` is what ``advnerf object build`` wrote; a ``mesh`` is a textured surface as it is. The frame of a face or cube has its origin in the middle of
     the textured face, x out of it, z up.
     """
 
-    kind: Literal["face", "cube", "file"] = "face"
+    kind: Literal["face", "cube", "file", "mesh"] = "face"
     file: Path | None = Field(default=None, description="Object file; with kind 'file' only.")
+    mesh: MeshRequest | None = Field(default=None, description="The mesh; with kind 'mesh' only.")
     T_world_from_object: tuple[Row, Row, Row, Row] | None = Field(default=None, description="Rigid pose, four rows.")
     x_m: float | None = Field(default=None, description="Position, instead of T_world_from_object [m].")
     y_m: float | None = None
@@ -75,6 +77,10 @@ class ObjectRequest(_Section):
             raise ValueError("expected levels with kind 'file' only: a face has one flat grid of colours")
         if (self.kind == "file") != (self.file is not None):
             raise ValueError("expected a file exactly with kind 'file'")
+        if (self.kind == "mesh") != (self.mesh is not None):
+            raise ValueError("expected the key mesh exactly with kind 'mesh'")
+        if self.kind == "mesh" and (self.free == "face" or self.target is not None):
+            raise ValueError("expected neither free: face nor a target with a mesh: it has no face that could be displayed")
         place = (self.x_m, self.y_m, self.z_m)
         if self.T_world_from_object is None and None in place:
             raise ValueError("expected either T_world_from_object or x_m, y_m and z_m (and yaw_rad)")
@@ -148,7 +154,7 @@ class SearchRequest(_Section):
     method: Method = "gradient"
     evaluations: Count = Field(default=50, description="Closed-loop evaluations; an iteration of the gradient is one.")
     learning_rate: AboveZero | None = Field(
-        default=None, description="Of Adam: 0.1 for the gradient, 0.5 for evolution, if not given."
+        default=None, description="Of Adam: 0.1 for gradient, distilled and guided, 0.5 for evolution, if not given."
     )
     sigma: AboveZero | None = Field(
         default=None,
@@ -156,7 +162,13 @@ class SearchRequest(_Section):
     )
     population: Annotated[int, Field(ge=4)] = Field(default=10, description="Candidates of a generation.")
     cells: Annotated[int, Field(ge=0)] = Field(
-        default=8, description="Cells along an edge that cem and evolution search over; 0 for the face's own."
+        default=8, description="Cells along an edge that cem, evolution and guided search over; 0 for the face's own."
+    )
+    probes: Count | None = Field(
+        default=None, description="Pairs of textures asked about after each drive: 8 for guided, 1 for distilled."
+    )
+    warm_pairs: Count | None = Field(
+        default=None, description="Pairs of the first lesson of distilled and guided; 300 if not given."
     )
     seeds: tuple[int, ...] = Field(default=(0,), min_length=1, description="One attack for each.")
     together: bool = Field(
@@ -189,19 +201,28 @@ class AttackRequest(_Section):
     search: SearchRequest = SearchRequest()
     robustness: RobustnessRequest = RobustnessRequest()
     poses: PosesRequest | None = Field(default=None, description="Where objects may stand; 'advnerf attack poses'.")
+    shape: ShapeRequest | None = Field(default=None, description="Attack the shapes of meshes, not their colours.")
 
     @model_validator(mode="after")
     def _complete(self) -> AttackRequest:
         missing = [name for name in ("camera", "vehicle", "room") if getattr(self, name) is None]
         if self.search.together and self.search.method != "gradient":
             raise ValueError(f"search.together is for the gradient method only, got method {self.search.method}")
-        one_face = len(self.objects) == 1 and self.objects[0].kind != "file"
+        one_face = len(self.objects) == 1 and self.objects[0].kind in ("face", "cube")
         if any(wanted.display is not None for wanted in self.objects) and (not one_face or self.search.together):
             raise ValueError("display: expected one object, a face or cube, and seeds searched one after the other")
         if self.calibration is None and missing:
             raise ValueError(f"expected a calibration folder, or files for {', '.join(missing)}")
         if self.poses is not None and len(self.poses.bounds) != len(self.objects):
             raise ValueError(f"poses: expected bounds of {len(self.objects)} object(s), got {len(self.poses.bounds)}")
+        meshes = [wanted.kind == "mesh" for wanted in self.objects]
+        if self.poses is not None and any(meshes):
+            raise ValueError("poses: expected objects made of voxels, got a mesh; 'advnerf object build' makes voxels of it")
+        if self.shape is not None:
+            if not all(meshes):
+                raise ValueError("shape: expected objects of kind 'mesh' only")
+            if self.search.method not in ("gradient", "random") or self.search.together or self.robustness.smoothness:
+                raise ValueError("shape: expected method gradient or random, no search.together and no smoothness of colours")
         count = len(self.starts.poses) or self.starts.count
         if len(self.goals) not in (0, 1, count):
             raise ValueError(f"expected no goal, one, or {count} (one per start), got {len(self.goals)}")
@@ -246,7 +267,10 @@ def _resolve(document: Document, folder: Path, overrides: Sequence[str]) -> Atta
 
     changes: dict[str, Any] = {name: absolute(getattr(request, name)) for name in _PATHS}
     changes["objects"] = tuple(
-        wanted.model_copy(update={name: absolute(getattr(wanted, name)) for name in ("file", "target", "display")})
+        wanted.model_copy(
+            update={name: absolute(getattr(wanted, name)) for name in ("file", "target", "display")}
+            | {"mesh": wanted.mesh and wanted.mesh.model_copy(update={"file": absolute(wanted.mesh.file)})}
+        )
         for wanted in request.objects
     )
     if request.poses is not None:

@@ -10,11 +10,16 @@ from typing import Any
 from advnerf_core.attack.adjoint import BlackBoxError, evaluate
 from advnerf_core.attack.artifact import AttackFile, save_attack
 from advnerf_core.attack.baselines import random_search
+from advnerf_core.attack.distil import Distillation
+from advnerf_core.attack.guided import BlackBoxSearch, black_box_attack
 from advnerf_core.attack.optimise import gradient_attack
 from advnerf_core.attack.population import CrossEntropy, Evolution, population_search
+from advnerf_core.attack.query_count import calls_per_evaluation
 from advnerf_core.attack.search import Evaluation, OnEvaluation, SearchResult
 from advnerf_core.attack.together import gradient_attacks
 from advnerf_core.files import write_atomically
+from advnerf_core.mesh.shape import ShapeSensor
+from nodes.attacking.meshes import write_meshes
 from nodes.attacking.prepare import Prepared, prepare
 from nodes.attacking.request import AttackRequest, load_request, request_text
 from nodes.runtime.errors import ConfigError
@@ -30,20 +35,50 @@ def search(
     """Search as the request asks; what ``on_evaluation`` raises ends it, and a state file then goes on from there."""
     wanted, problem = prepared.request.search, prepared.problem
     if wanted.method == "gradient" and not problem.differentiable:
-        raise BlackBoxError(f"{prepared.request.policy} has no gradient: use the method random, cem or evolution")
+        raise BlackBoxError(
+            f"{prepared.request.policy} has no gradient: use the method guided, distilled, evolution, cem or random"
+        )
     common: dict[str, Any] = {
         "seed": prepared.seed, "state_path": state_path, "on_evaluation": on_evaluation,
         "settings_hash": prepared.settings_hash,
     }  # fmt: skip
+    rate, sigma = 0.1, 5.0
+    if isinstance(problem.sensor, ShapeSensor):
+        rate, sigma = problem.sensor.limits.learning_rate, problem.sensor.random_sigma
     if wanted.method == "gradient":
-        return gradient_attack(problem, wanted.evaluations, wanted.learning_rate or 0.1, **common)
+        return gradient_attack(problem, wanted.evaluations, wanted.learning_rate or rate, **common)
     if wanted.method == "random":
-        return random_search(problem, wanted.evaluations, wanted.sigma or 5.0, **common)
+        return random_search(problem, wanted.evaluations, wanted.sigma or sigma, **common)
+    if (black_box := black_box_search(prepared.request)) is not None:
+        return black_box_attack(problem, black_box, policy_calls(prepared), **common)
     if wanted.method == "cem":
         strategy: CrossEntropy | Evolution = CrossEntropy(wanted.sigma or 3.0)
     else:
         strategy = Evolution(wanted.sigma or 1.0, wanted.learning_rate or 0.5)
     return population_search(problem, strategy, wanted.evaluations, wanted.population, wanted.cells, **common)
+
+
+def black_box_search(request: AttackRequest) -> BlackBoxSearch | None:
+    """The settings of the methods that ask the policy more than they drive; None for the others."""
+    wanted = request.search
+    if wanted.method != "distilled" and wanted.method != "guided":
+        return None
+    lessons = Distillation() if wanted.warm_pairs is None else Distillation(warm_pairs=wanted.warm_pairs)
+    probes = wanted.probes or (8 if wanted.method == "guided" else 1)
+    return BlackBoxSearch(wanted.method, wanted.learning_rate or 0.1, probes, cells=wanted.cells, distillation=lessons)
+
+
+def policy_calls(prepared: Prepared) -> int:
+    """The budget of a request in policy calls, the same for all methods: evaluations x starts x ticks."""
+    return prepared.request.search.evaluations * calls_per_evaluation(prepared.problem)
+
+
+def planned_evaluations(prepared: Prepared) -> int:
+    """Drives that the budget allows the method."""
+    black_box = black_box_search(prepared.request)
+    if black_box is None:
+        return prepared.request.search.evaluations
+    return black_box.evaluations(prepared.problem, policy_calls(prepared))
 
 
 def finish(prepared: Prepared, result: SearchResult) -> AttackFile:
@@ -118,7 +153,7 @@ def kept_request(folder: Path) -> AttackRequest:
 def _run_seed(prepared: Prepared, folder: Path, display: Display, on_evaluation: OnEvaluation | None) -> None:
     name, state_path = f"seed_{prepared.seed}", folder / f"seed_{prepared.seed}.state.safetensors"
     report = display.start(name)
-    result = search(prepared, state_path, _both(telling(prepared.request.search.evaluations, report), on_evaluation))
+    result = search(prepared, state_path, _both(telling(planned_evaluations(prepared), report), on_evaluation))
     _keep(prepared, result, folder)
     state_path.unlink(missing_ok=True)
     display.finish(name, sum(e.seconds for e in result.history), cached=False)
@@ -153,7 +188,10 @@ def _run_together(
 
 def _keep(prepared: Prepared, result: SearchResult, folder: Path) -> None:
     """Write the attack file of a finished search, and its curve beside it."""
-    attack_id = save_attack(attack_file(folder, prepared.seed), finish(prepared, result))
+    file, names = attack_file(folder, prepared.seed), [each.name for each in prepared.objects]
+    # Before the attack file, which says that the seed is done.
+    write_meshes(file, names, prepared.meshes(result.theta))
+    attack_id = save_attack(file, finish(prepared, result))
     curve = {
         "attack_id": attack_id, "method": prepared.request.search.method, "seed": prepared.seed,
         "best_evaluation": result.best.iteration, "loss_m": [e.loss_m for e in result.history],

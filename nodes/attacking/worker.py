@@ -22,7 +22,7 @@ from advnerf_core.attack.search import Evaluation
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.scene.surrogate import split_theta
 from nodes.attacking.prepare import Prepared
-from nodes.attacking.search import TOGETHER_STATE, kept_request, run_attack
+from nodes.attacking.search import TOGETHER_STATE, kept_request, planned_evaluations, run_attack
 from nodes.runtime.stages import Report
 
 TEXTURE, PREVIEW = "texture", "preview"
@@ -32,8 +32,8 @@ _PREVIEW_SCALE = 2
 class Speaker:
     """Tells the node what happens; stands in for the display of a command."""
 
-    def __init__(self, stream: BinaryIO, folder: Path, evaluations: int) -> None:
-        self._stream, self._folder, self._evaluations = stream, folder, evaluations
+    def __init__(self, stream: BinaryIO, folder: Path) -> None:
+        self._stream, self._folder, self._evaluations = stream, folder, 0
         self._prepared: Prepared | None = None
         self._best_m: float | None = None
 
@@ -53,7 +53,7 @@ class Speaker:
     def prepared(self, prepared: Prepared) -> None:
         """A seed can be searched."""
         done, self._best_m = _so_far(self._state(prepared))
-        self._prepared = prepared
+        self._prepared, self._evaluations = prepared, planned_evaluations(prepared)
         self.say(
             "progress", state="searching", seed=prepared.seed, evaluation=done, evaluations=self._evaluations, text="",
             total_cte_m=self._best_m or 0.0,
@@ -122,7 +122,7 @@ def _texture(prepared: Prepared, theta: Tensor) -> NDArray[np.uint8] | None:
 def work(folder: Path, stream: BinaryIO) -> None:
     """Search as the folder's request asks, and say which file is the best."""
     request = kept_request(folder)
-    speaker = Speaker(stream, folder, request.search.evaluations)
+    speaker = Speaker(stream, folder)
     files = run_attack(request, folder, speaker, speaker.told, speaker.prepared)
     attacks = [load_attack(file) for file in files]
     best = max(range(len(files)), key=lambda k: attacks[k].predicted_total_cte_m or 0.0)

@@ -87,7 +87,7 @@ def linear_student(shape, goal_size, bound_rad):
 
 
 LIGHT = Distillation(
-    warm_pairs=6, warm_steps=3, fresh_pairs=6, steps=2, memory_pairs=10, batch_pairs=4, learning_rate=1e-3
+    warm_pairs=6, warm_passes=2, fresh_pairs=6, steps=2, memory_pairs=10, batch_pairs=4, learning_rate=1e-3
 )
 GUIDED = BlackBoxSearch("guided", probes=3, cells=2, distillation=LIGHT, student=linear_student)
 DISTILLED = replace(GUIDED, method="distilled", probes=1)

@@ -9,8 +9,13 @@ import numpy as np
 import pytest
 import torch
 
+from advnerf_core.attack.adjoint import BlackBoxError
 from advnerf_core.attack.artifact import load_attack
+from advnerf_core.attack.guided import BudgetError
 from advnerf_core.display import DisplayModel
+from advnerf_core.driving.policy import load_policy
+from advnerf_core.policies.contract import PolicyContract
+from advnerf_core.policies.onnx_policy import export_onnx
 from calibration.display_colour import DisplayCalibration
 from calibration.schema import save_calibration
 from nodes import cli
@@ -51,6 +56,33 @@ def test_a_stopped_run_goes_on_to_the_same_bytes(tmp_path, method):
     assert len(json.loads((tmp_path / "whole" / "seed_0.json").read_text())["loss_m"]) == 3
     with pytest.raises(ConfigError, match="belongs to another attack"):
         run_attack(load_request(file), tmp_path / "whole", ProgressDisplay())
+
+
+@pytest.mark.parametrize("method", ["distilled", "guided"])
+def test_an_onnx_policy_is_attacked_by_questions_within_the_budget_and_resumes_to_the_same_bytes(tmp_path, method):
+    file = tiny_request(tmp_path)
+    loaded = load_policy(tmp_path / "policy.safetensors")
+    export_onnx(loaded.policy, PolicyContract(loaded.view), tmp_path / "policy.onnx")
+    # 4 calls for the first lesson, 9 for each drive of 3 ticks with one pair of questions: three of them fit into 11 x 3.
+    changes = [
+        "policy=policy.onnx",
+        f"search.method={method}",
+        "search.evaluations=11",
+        "search.probes=1",
+        "search.warm_pairs=2",
+    ]
+    request = load_request(file, changes)
+    (whole,) = run_attack(request, tmp_path / "whole", ProgressDisplay())
+    with pytest.raises(StoppedError):
+        run_attack(request, tmp_path / "stopped", ProgressDisplay(), stop_at_one)
+    (resumed,) = run_attack(request, tmp_path / "stopped", ProgressDisplay())
+    assert resumed.read_bytes() == whole.read_bytes()
+    assert load_attack(whole).method == method
+    assert len(json.loads((tmp_path / "whole" / "seed_0.json").read_text())["loss_m"]) == 3
+    with pytest.raises(BudgetError, match="allow more evaluations"):
+        run_attack(load_request(file, [*changes, "search.evaluations=4"]), tmp_path / "poor", ProgressDisplay())
+    with pytest.raises(BlackBoxError, match="guided"):
+        run_attack(load_request(file, [*changes, "search.method=gradient"]), tmp_path / "blind", ProgressDisplay())
 
 
 def test_seeds_searched_together_resume_to_the_same_bytes_and_end_as_they_do_alone(tmp_path):
