@@ -108,7 +108,7 @@ def cell_inputs(experiment: Experiment, scenario: str, victim: str, method: str,
         "version": _VERSION, "horizon": config.horizon, "lab": experiment.lab_config.model_dump(mode="json"),
         "object": config.object.model_dump(mode="json"),
         "attack": {key: value for key, value in searched.items() if key not in {*other, "seeds"}},
-        "graph": load_launch(experiment.launch_file).resolved, "nodes": list(config.deploy.nodes),
+        "launch_file": config.deploy.launch_file, "nodes": list(config.deploy.nodes),
         "stages": {stage: record.digest if record else None for stage, record in records.items()},
     }  # fmt: skip
 

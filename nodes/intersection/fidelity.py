@@ -1,0 +1,97 @@
+"""Real and learned pictures of the junction, without and with an attack: what the fidelity gate and the prediction of transfer look at.
+
+Real pictures are the deployment scene's, with the opaque objects composed by depth, from where the car was on its drive past the plain
+objects. No drive with the attack is looked at.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from advnerf_core.attack.adjoint import AttackProblem
+from advnerf_core.driving.metrics import Horizon
+from advnerf_core.driving.policy import load_policy
+from advnerf_core.geometry import Array
+from advnerf_core.scene.dataset import load_transforms
+from advnerf_core.scene.fidelity import Pictures
+from hardware.twin.intersection.scene import Intersection
+from nodes.intersection import capture
+from nodes.intersection.attack import Cell, Condition, attack_problem, load_theta
+from nodes.intersection.context import Experiment
+from nodes.intersection.deployed import DressedScene, drive_deployed
+from nodes.intersection.objects import placed_objects, surrogate_of
+from nodes.intersection.pictures import as_uint8
+from nodes.intersection.policy import victim_file
+
+Rgb = NDArray[np.uint8]
+
+
+def policy_of(experiment: Experiment, victim: str, scenario: str) -> tuple[Any, tuple[float, ...]]:
+    """The victim and the exit that it is told."""
+    return load_policy(victim_file(experiment, victim)).policy, experiment.goal(scenario)
+
+
+def held_out(experiment: Experiment, scenario: str) -> Pictures:
+    """The driving camera's views that nothing was learned from, about all drives, without objects."""
+    del scenario
+    views = load_transforms(experiment.stage_folder("capture") / capture.HELD_OUT, require_all=True).load()
+    surrogate = surrogate_of(experiment, [])
+    learned = [as_uint8(surrogate.render(pose[None], None).images[0]) for pose in views.T_world_from_camera]
+    return Pictures("held-out views", np.stack([experiment.view.image(rgb) for rgb in views.rgb]), np.stack(learned))
+
+
+def driven(
+    experiment: Experiment, scenario: str, victim: str, seed: int, folder: Path, bag: Path | None = None
+) -> Pictures:
+    """What the camera sees on the deployed drive past the plain objects; the scene is asked for it, there is no bag."""
+    del seed, folder, bag
+    return _along_the_drive(experiment, scenario, victim, None, "drive past the plain objects")
+
+
+def attacked(experiment: Experiment, scenario: str, victim: str, method: str, seed: int, folder: Path) -> Pictures:
+    """The same places with the colours of a finished search."""
+    theta = load_theta(folder, Cell(scenario, victim, cast("Condition", method), seed))
+    return _along_the_drive(experiment, scenario, victim, theta, "the same drive, attacked")
+
+
+def loop(
+    experiment: Experiment, scenario: str, victim: str, method: str, seed: int, folder: Path
+) -> tuple[AttackProblem, Callable[[torch.Tensor, bool], torch.Tensor], torch.Tensor, Horizon]:
+    """What a prediction drives: the problem, pictures with or without the attack, the deployed starts ``[S, n]`` and the horizon."""
+    theta = load_theta(folder, Cell(scenario, victim, cast("Condition", method), seed))
+    surrogate = surrogate_of(experiment, placed_objects(experiment))
+    plain = surrogate.plain_theta()
+    problem = attack_problem(experiment, surrogate, load_policy(victim_file(experiment, victim)), scenario, seed)
+
+    def images(states: torch.Tensor, with_attack: bool) -> torch.Tensor:
+        return surrogate.sense(states, theta if with_attack else plain).images
+
+    return problem, images, problem.start_states, experiment.limits
+
+
+def _along_the_drive(
+    experiment: Experiment, scenario: str, victim: str, theta: torch.Tensor | None, of: str
+) -> Pictures:
+    objects = placed_objects(experiment)
+    policy, goal = policy_of(experiment, victim, scenario)
+    with Intersection(experiment.world) as scene:
+        dressed = DressedScene(scene, experiment.view, objects)
+        start: Array = np.array(experiment.references[scenario].start_pose)
+        drive = drive_deployed(
+            dressed, policy, goal, start, experiment.paths[scenario], experiment.limits, experiment.world.car.speed_mps,
+            dressed.plain_theta(),
+        )  # fmt: skip
+        states = drive.states[:-1]
+        real = dressed.policy_images(dressed.prepare(states), dressed.plain_theta() if theta is None else theta)
+    surrogate = surrogate_of(experiment, objects)
+    shown = surrogate.plain_theta() if theta is None else theta
+    learned = [
+        as_uint8(image) for state in states for image in surrogate.sense(torch.from_numpy(state)[None], shown).images
+    ]
+    return Pictures(of, real, np.stack(learned))
