@@ -32,6 +32,7 @@ from advnerf_core.files import write_atomically
 from nodes.attacking.memory import measured_mib
 from nodes.attacking.prepare import Prepared, prepare, sensor_of
 from nodes.attacking.request import AttackRequest
+from nodes.runtime.errors import ConfigError
 from nodes.runtime.stages import Report
 
 # Smooth parts agree to 1e-7 in float64; a kink of |CTE| or a clipped pixel within a step costs some of that.
@@ -84,11 +85,17 @@ def check(request: AttackRequest, directions: int, memory: bool, report: Report)
 
     Raises:
         BlackBoxError: The policy has no gradient.
+        ConfigError: Shapes are attacked, whose gradient is random.
     """
     prepared = prepare(request)
     if not prepared.problem.differentiable:
         raise BlackBoxError(
             f"{request.policy} has no gradient that could be checked; search with random, cem or evolution"
+        )
+    if request.shape is not None:
+        raise ConfigError(
+            "the gradient of shapes is a Monte Carlo estimate, which this check would call wrong; 'python -m benchmarks.mesh_render' "
+            "compares it with finite differences"
         )
     theta = prepared.surrogate.initial_theta(torch.Generator().manual_seed(prepared.seed))
     report(0.05, "time of a gradient")

@@ -8,11 +8,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from advnerf_core.fields.coloured import ColouredObject
 from advnerf_core.fields.summed_levels import with_summed_levels
 from advnerf_core.fields.voxel_grid import VoxelGridObject, cube_face_object, face_corners_in_object
 from advnerf_core.geometry import Array
 from advnerf_core.objects.model import load_object
 from calibration.schema import TargetCalibration, load_calibration
+from nodes.attacking.meshes import mesh_field, mesh_name
 from nodes.attacking.request import ObjectRequest
 from nodes.runtime.errors import ConfigError
 
@@ -44,7 +46,7 @@ class PlacedObject:
     """
 
     name: str
-    field: VoxelGridObject
+    field: ColouredObject
     face: Face | None
     sha256: str
 
@@ -54,10 +56,14 @@ def place(wanted: ObjectRequest) -> PlacedObject:
 
     Raises:
         ObjectFileError: An object file that cannot be read.
+        MeshError: A mesh that cannot be read.
         ConfigError: A face of an object file: it has none that could be displayed.
     """
     if wanted.kind == "file":
         return _from_file(wanted)
+    if wanted.mesh is not None:
+        mesh = mesh_field(wanted.mesh, wanted.pose, wanted.scale)
+        return PlacedObject(mesh_name(wanted.mesh), mesh, None, mesh.sha256)
     field = cube_face_object(
         wanted.size_m, wanted.resolution, wanted.plain_rgb, wanted.pose, one_sided=wanted.kind == "face",
         depth_m=wanted.size_m if wanted.kind == "cube" else 0.01,

@@ -26,6 +26,7 @@ from advnerf_core.attack.poses import (
     random_poses,
 )
 from advnerf_core.attack.search import SearchResult
+from advnerf_core.fields.voxel_grid import VoxelGridObject
 from advnerf_core.files import write_atomically
 from advnerf_core.render.soft_pose import placement_of
 from nodes.attacking.objects import object_sha256
@@ -98,7 +99,9 @@ def prepare_poses(request: AttackRequest, seed: int | None = None) -> PreparedPo
     prepared = prepare(request, seed)
     bounds = [PoseBounds(each.x_m, each.y_m, each.yaw_rad, each.scale) for each in asked.bounds]
     lane = KeepOut((prepared.problem.path,), asked.keep_out_m)
-    space = PoseSpace([each.field for each in prepared.objects], bounds, lane)
+    space = PoseSpace(
+        [each.field for each in prepared.objects if isinstance(each.field, VoxelGridObject)], bounds, lane
+    )
     sensor = PlacedSensor(prepared.surrogate, space, asked.colours, edge_width=asked.edge_width)
     if asked.attack is not None:
         _, colours = placements_and_colours(asked.attack, sensor)

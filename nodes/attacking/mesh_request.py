@@ -1,0 +1,43 @@
+"""What a request for an attack says about meshes: the mesh of an object, and the key ``shape``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+AboveZero = Annotated[float, Field(gt=0)]
+NotNegative = Annotated[float, Field(ge=0)]
+Samples = Annotated[int, Field(ge=1, le=256)]
+Unit = Annotated[float, Field(ge=0, le=1)]
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class MeshRequest(_Section):
+    """A mesh: a file, or one that is made."""
+
+    file: Path | None = Field(default=None, description="GLB, OBJ, PLY, STL.")
+    generate: Literal["hydrant", "car", "ball"] | None = Field(default=None, description="Instead of a file.")
+    up: Literal["z", "y"] = Field(default="z", description="Which axis of the file points up.")
+    height_m: AboveZero | None = Field(default=None, description="Scale to this height [m]; a ball's diameter.")
+    texels: Annotated[int, Field(ge=2, le=512)] = Field(default=32, description="Texels along its longest side.")
+    rgb: tuple[Unit, Unit, Unit] = Field(default=(0.75, 0.1, 0.08), description="Colour of a ball.")
+
+    @model_validator(mode="after")
+    def _one(self) -> MeshRequest:
+        if (self.file is None) == (self.generate is None):
+            raise ValueError("expected exactly one of file and generate")
+        return self
+
+
+class ShapeRequest(_Section):
+    """Shapes are attacked instead of colours, of all objects, which must be meshes."""
+
+    bound_m: AboveZero = Field(default=0.2, description="No vertex moves farther [m].")
+    smoothness: NotNegative = Field(default=19.0, description="Lambda of the large-steps preconditioner; 0: none.")
+    samples: Samples = Field(default=4, description="Rays a pixel for the gradient inside the silhouettes.")
+    boundary_samples: Samples = Field(default=1, description="Points a pixel for that of the silhouettes.")
