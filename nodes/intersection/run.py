@@ -87,7 +87,7 @@ def stages_of(experiment: Experiment) -> list[Stage]:
         stage("capture", capture, {"world": seen, "capture": part("capture"), **measured}, ()),
         stage("scene", scene, {"scene": part("scene")}, ("capture",)),
         stage("object", objects, {"object": part("object"), "kinds": kinds}, ()),
-        stage("policy", policy, {"world": world, "policy": part("policy"), **measured}, ("capture", "scene", "object")),
+        stage("policy", policy, {"world": world, "policy": part("policy"), "sigma": config.attack.random_sigma, **measured}, ("capture", "scene", "object")),
         stage("attack", attack, {"world": world, "attack": part("attack"), **measured}, ("scene", "object", "policy")),
         stage("deploy", deploy, {"world": world, **measured}, ("object", "policy", "attack")),
         stage("report", report, {"attack": part("attack"), **measured}, ("capture", "scene", "policy", "attack", "deploy")),

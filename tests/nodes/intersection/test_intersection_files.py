@@ -1,0 +1,96 @@
+"""The experiment file, its stages, and which change redoes what."""
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from nodes.cli import main
+from nodes.experiment.run import kind_of
+from nodes.intersection.context import Experiment
+from nodes.intersection.run import load_experiment, stages_of
+from nodes.runtime.errors import ConfigError
+
+LAUNCH = Path(__file__).parents[3] / "launch" / "intersection.experiment.yaml"
+
+
+def load(folder: Path, *overrides: str) -> Experiment:
+    return load_experiment(LAUNCH, "full", list(overrides), folder)
+
+
+def test_paths_are_those_of_the_world_and_goals_are_exits(tmp_path: Path) -> None:
+    experiment = load(tmp_path)
+    for name, reference in experiment.references.items():
+        along = np.arange(0.0, reference.length_m, 1.7)
+        poses = np.array([reference.pose_at(float(s)) for s in along])
+        np.testing.assert_allclose(experiment.paths[name].pose_at(along)[:, :2], poses[:, :2], atol=1e-9)
+    goals = np.array([experiment.goal(name) for name in ("straight", "right", "left")])
+    np.testing.assert_array_equal(goals, np.eye(3))  # exits: east, south, west
+
+
+def test_starts_are_drawn_about_the_nominal_one(tmp_path: Path) -> None:
+    experiment = load(tmp_path, "attack.starts=400", "attack.start_sigma=0.2")
+    starts = experiment.start_states("left", 1).numpy()
+    np.testing.assert_array_equal(starts[0], experiment.references["left"].start_pose)
+    np.testing.assert_allclose(starts[1:].std(axis=0), [0.2, 0.2, 0.05], rtol=0.15)
+    assert not np.array_equal(starts, experiment.start_states("left", 2).numpy())
+    np.testing.assert_array_equal(starts, experiment.start_states("left", 1).numpy())
+
+
+@pytest.mark.parametrize(
+    ("override", "redone"),
+    [
+        ("scene.steps=3", {"scene"}),
+        ("object.fit_steps=3", {"object"}),
+        ("world.objects=[]", {"object", "policy", "attack", "deploy"}),
+        ("world.car.turn_rate_lag_s=0.2", {"policy", "attack", "deploy"}),
+        ("world.road.lane_width_m=3.4", {"capture", "policy", "attack", "deploy"}),
+        ("attack.evaluations=3", {"attack", "report"}),
+    ],
+)
+def test_a_change_redoes_only_what_reads_it(tmp_path: Path, override: str, redone: set[str]) -> None:
+    # What a stage reads of the stages before it is the matter of tests/nodes/runtime/test_stages.py.
+    before = {stage.name: stage.settings for stage in stages_of(load(tmp_path))}
+    after = {stage.name: stage.settings for stage in stages_of(load(tmp_path, override))}
+    assert {name for name in before if before[name] != after[name]} == redone
+
+
+def test_kind_chooses_the_experiment(tmp_path: Path) -> None:
+    assert kind_of(LAUNCH) == "intersection"
+    assert kind_of(LAUNCH.parent / "room.experiment.yaml") == "room"
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"kind": "moon"}, "expected kind room or intersection"),
+        ({"scenarios": ["backwards"]}, "straight"),
+        ({"world": {"road": {"lane_width_m": 9.0}}}, "lane_width_m"),
+        ({"polcy": {}}, "polcy"),
+    ],
+)
+def test_bad_files_are_one_clear_error(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    tiny_file: Callable[..., Path],
+    changes: dict[str, object],
+    said: str,
+) -> None:
+    file = tiny_file(**changes)
+    words = ["experiment", str(file), "--setting", "tiny", "--run-folder", str(tmp_path / "run")]
+    monkeypatch.setattr(sys, "argv", ["advnerf", *words])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    told = capsys.readouterr()
+    assert ended.value.code == 2
+    assert said in told.out + told.err
+    assert "Traceback" not in told.out + told.err
+    assert not (tmp_path / "run").exists()
+
+
+def test_unknown_setting_names_the_known_ones(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="known are demo, full"):
+        load_experiment(LAUNCH, "huge", [], tmp_path)
