@@ -19,6 +19,7 @@ from advnerf_core.attack.search import SearchResult, draw_start_states
 from advnerf_core.driving.actuated import ActuatedAckermann
 from advnerf_core.driving.dynamics import Ackermann, Dynamics
 from advnerf_core.driving.policy import LoadedPolicy
+from advnerf_core.mesh.shape import ShapeSensor
 from advnerf_core.mesh.surface import TexturedMesh
 from advnerf_core.policies.load import load_any_policy
 from advnerf_core.scene.field import load_scene
@@ -26,7 +27,6 @@ from advnerf_core.scene.render_field import FieldRenderer
 from advnerf_core.scene.surrogate import Surrogate, split_theta
 from calibration.display_colour import DisplayCalibration
 from calibration.schema import CameraCalibration, RoomCalibration, VehicleCalibration, load_calibration
-from advnerf_core.mesh.shape import ShapeSensor
 from nodes.attacking.meshes import found_meshes, shape_sensor, shaped_objects
 from nodes.attacking.objects import PlacedObject, place
 from nodes.attacking.request import AttackRequest

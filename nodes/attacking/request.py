@@ -80,7 +80,9 @@ class ObjectRequest(_Section):
         if (self.kind == "mesh") != (self.mesh is not None):
             raise ValueError("expected the key mesh exactly with kind 'mesh'")
         if self.kind == "mesh" and (self.free == "face" or self.target is not None):
-            raise ValueError("expected neither free: face nor a target with a mesh: it has no face that could be displayed")
+            raise ValueError(
+                "expected neither free: face nor a target with a mesh: it has no face that could be displayed"
+            )
         place = (self.x_m, self.y_m, self.z_m)
         if self.T_world_from_object is None and None in place:
             raise ValueError("expected either T_world_from_object or x_m, y_m and z_m (and yaw_rad)")
@@ -217,12 +219,16 @@ class AttackRequest(_Section):
             raise ValueError(f"poses: expected bounds of {len(self.objects)} object(s), got {len(self.poses.bounds)}")
         meshes = [wanted.kind == "mesh" for wanted in self.objects]
         if self.poses is not None and any(meshes):
-            raise ValueError("poses: expected objects made of voxels, got a mesh; 'advnerf object build' makes voxels of it")
+            raise ValueError(
+                "poses: expected objects made of voxels, got a mesh; 'advnerf object build' makes voxels of it"
+            )
         if self.shape is not None:
             if not all(meshes):
                 raise ValueError("shape: expected objects of kind 'mesh' only")
             if self.search.method not in ("gradient", "random") or self.search.together or self.robustness.smoothness:
-                raise ValueError("shape: expected method gradient or random, no search.together and no smoothness of colours")
+                raise ValueError(
+                    "shape: expected method gradient or random, no search.together and no smoothness of colours"
+                )
         count = len(self.starts.poses) or self.starts.count
         if len(self.goals) not in (0, 1, count):
             raise ValueError(f"expected no goal, one, or {count} (one per start), got {len(self.goals)}")
