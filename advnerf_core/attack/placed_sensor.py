@@ -1,8 +1,8 @@
 """The sensor of a pose attack: a surrogate whose objects stand where theta says, with exact derivatives and bounded memory.
 
 ``theta`` is one vector: coordinates of the placements in the unit box of a `PoseSpace`, four for each object, then the objects' colours if
-they are free too. The objects have soft edges (``fields/soft_edges``) so that the picture changes smoothly as they move; what is found is
-judged, and deployed, with their true edges (`sharp`). What a render keeps for its vector-Jacobian product are the covered pixels.
+they are free too. The objects have soft edges (``fields/soft_edges``) so that the picture changes smoothly as they move; searches take
+gradients of these pictures, and drive past the true edges (`sharp`), as a deployment does. What a render keeps for its vector-Jacobian product are the covered pixels.
 """
 
 from __future__ import annotations

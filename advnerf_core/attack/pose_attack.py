@@ -29,8 +29,8 @@ class FoundPoses:
         placements: ``(x_m, y_m, yaw_rad, scale)`` of each object, ``[K, 4]``.
         colours: Of the surrogate's ``theta_shape``; its plain or given ones where they were not searched for.
         objects: The objects at these placements, with their true edges.
-        totals: Total CTE of each start that the surrogate predicts for them; not one of the search's evaluations.
-        search: The search: its best evaluation, made with soft edges, and its history.
+        totals: Total CTE of each start that the surrogate predicts for them.
+        search: The search: its best evaluation and its history.
     """
 
     placements: Tensor

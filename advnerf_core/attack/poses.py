@@ -2,8 +2,8 @@
 
 The total cross-track error is rough over poses: a gradient step from one pose ends in the next dent. So several poses are drawn within
 the bounds, each is refined by a few gradient steps, and the best of all evaluations is kept (Abeysirigoonawardena et al. 2023: 5 poses,
-10 steps, best of 50). Random poses, and colours, at as many evaluations are the baseline. Both see objects with soft edges; what
-they find is judged with true edges (`judge`), which is what a deployment shows.
+10 steps, best of 50). Random poses, and colours, at as many evaluations are the baseline. Both drive past objects with their true edges, as a
+deployment shows them; the gradient is that of the same frames, from the same states, with soft edges (`PlacedSensor`).
 """
 
 from __future__ import annotations
@@ -18,7 +18,16 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from advnerf_core.attack.adjoint import AttackProblem, Totals, adjoint_gradient, evaluate
+from advnerf_core.attack.adjoint import (
+    AdjointResult,
+    AttackProblem,
+    BlackBoxError,
+    RenderCache,
+    Totals,
+    evaluate,
+    gradient_pass,
+    roll_out,
+)
 from advnerf_core.attack.placed_sensor import PlacedSensor
 from advnerf_core.attack.placement import KeepOut, PoseBounds, PoseBoundsError, PoseSpace, placed
 from advnerf_core.attack.search import (
@@ -84,12 +93,13 @@ def multi_start(
 
     Raises:
         PoseBoundsError: The bounds leave no place beside the lane.
+        BlackBoxError: The policy has no gradient.
         SearchDivergedError: A loss or gradient is not finite.
         SearchStateError: The state file cannot be used.
     """
     budget = budget or MultiStart()
     sensor = _sensor(problem)
-    fingerprint = _fingerprint(problem, "poses", seed=seed, steps=budget.steps, hash=settings_hash,
+    fingerprint = _fingerprint(problem, "multi-start", seed=seed, steps=budget.steps, hash=settings_hash,
                                rates=[budget.pose_rate, budget.colour_rate])  # fmt: skip
     generator = torch.Generator().manual_seed(seed)
     state = begin(state_path, fingerprint, lambda: {"generator": generator.get_state()})
@@ -100,7 +110,7 @@ def multi_start(
         if number % budget.steps == 0:
             climb = _Climb.fresh(sensor, budget, generator)
         theta = climb.theta
-        result = adjoint_gradient(problem.at_draw(number), theta)
+        result = _gradient(problem.at_draw(number), theta)
         if not (math.isfinite(result.loss) and bool(torch.isfinite(result.gradient).all())):
             raise SearchDivergedError(
                 f"expected a finite loss and gradient at evaluation {number}, got loss {result.loss}; "
@@ -154,7 +164,8 @@ def random_poses(
         if sensor.free_colours:
             colours = sigma * torch.randn(sensor.fixed_colours.shape, generator=generator, dtype=torch.float64)
         theta = sensor.join(unit, colours)
-        loss_m, totals = without_gradient(problem, theta, len(state.history))
+        sharp, shown = placed_problem(problem, theta)
+        loss_m, totals = without_gradient(sharp, shown, len(state.history))
         evaluation = state.record(theta, loss_m, totals, time.perf_counter() - began)
         state.tensors = {"generator": generator.get_state()}
         _keep(state, state_path, fingerprint)
@@ -176,8 +187,19 @@ def placed_problem(problem: AttackProblem, theta: Tensor, opaque: bool | None = 
 
 
 def judge(problem: AttackProblem, theta: Tensor, opaque: bool | None = None) -> Totals:
-    """Totals of what a search found, with true edges and without disturbances; not one of its evaluations."""
+    """Totals of what a search found, without disturbances: those of its best evaluation where nothing is disturbed."""
     return evaluate(*placed_problem(problem.undisturbed(), theta, opaque))[1]
+
+
+def _gradient(problem: AttackProblem, theta: Tensor) -> AdjointResult:
+    """Loss of a drive past the true edges, and the gradient of its frames with soft ones."""
+    if not problem.differentiable:
+        raise BlackBoxError(
+            "expected a policy with a gradient, got one that declares differentiable = False; draw random poses"
+        )
+    sharp, colours = placed_problem(problem, theta)
+    rollout, memories = roll_out(sharp, colours)
+    return gradient_pass(problem, theta, rollout, RenderCache(0), memories)
 
 
 class _Climb:

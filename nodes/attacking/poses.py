@@ -165,7 +165,7 @@ def search_poses(
 
 
 def pose_attack_file(ready: PreparedPoses, result: SearchResult) -> AttackFile:
-    """The attack file: objects at the found poses; its prediction is made with true edges."""
+    """The attack file: objects at the found poses; its prediction is made without disturbances."""
     surrogate, colours = ready.sensor.sharp(result.theta)
     moved_fields = placed(ready.sensor.space.objects, ready.sensor.placements(result.theta))
     predicted_m = float(judge(ready.problem, result.theta).protocol_cte_m.mean())

@@ -119,13 +119,13 @@ def test_a_soft_body_keeps_its_outline_and_its_colours():
 def test_no_evaluation_leaves_the_bounds_or_stands_on_the_lane():
     problem = moving(1, objects=2, bounds=PoseBounds(x_m=(2.0, 3.0), y_m=(-2.6, -1.2), yaw_rad=(-np.pi, np.pi)))
     space, seen = problem.sensor.space, []
-    sense = problem.sensor.sense
+    sharp = problem.sensor.sharp
 
-    def recorded(states, theta):
+    def recorded(theta, opaque=None):
         seen.append(problem.sensor.unit(theta).clone())
-        return sense(states, theta)
+        return sharp(theta, opaque)
 
-    problem.sensor.sense = recorded
+    problem.sensor.sharp = recorded
     multi_start(problem, MultiStart(samples=3, steps=4, pose_rate=0.8))
     random_poses(problem, 6)
     assert len(seen) == 18
@@ -176,8 +176,13 @@ def test_the_searches_spend_their_evaluations_and_multi_start_starts_over():
     assert seen == list(climbed.history)
     assert [e.iteration for e in seen] == list(range(6))
     assert climbed.best.predicted_total_cte_m == max(e.predicted_total_cte_m for e in seen)
+    # What is compared, kept and promised is the drive past the true edges.
     np.testing.assert_allclose(
-        float(evaluate(problem, climbed.theta)[1].protocol_cte_m.mean()), climbed.best.predicted_total_cte_m
+        float(judge(problem, climbed.theta).protocol_cte_m.mean()), climbed.best.predicted_total_cte_m
+    )
+    guessed = random_poses(problem, 3, seed=1)
+    np.testing.assert_allclose(
+        float(judge(problem, guessed.theta).protocol_cte_m.mean()), guessed.best.predicted_total_cte_m
     )
     # The second sample does not depend on what became of the first one.
     alone = multi_start(problem, MultiStart(samples=2, steps=1), seed=1)
