@@ -48,7 +48,7 @@ class OverBackground(PSIntegrator):
     def stand_before(self, rgb: NDArray[np.float32], depth_m: NDArray[np.float32]) -> None:
         """Set what is behind ``[H, W, 3]``, and the depth ``[H, W]`` [m] beyond which it hides the mesh."""
         self._rgb = mi.Float(np.ascontiguousarray(rgb, np.float32).ravel())
-        self._depth = mi.Float(np.nan_to_num(depth_m, nan=np.inf).astype(np.float32).ravel())
+        self._depth = mi.Float(np.where(np.isnan(depth_m), np.inf, depth_m).astype(np.float32).ravel())
 
     def sample(
         self, mode: Any, scene: Any, sampler: Any, ray: Any, depth: Any, *rest: Any, active: Any = True, **more: Any
