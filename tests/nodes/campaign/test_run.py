@@ -83,6 +83,7 @@ def test_a_killed_worker_loses_its_cell_and_no_other(here):
     assert (here.cells / "straight_hardened_gradient_0" / "work").exists()  # it went on in its own folder
 
 
+@pytest.mark.slow
 def test_a_killed_campaign_takes_its_workers_along_and_goes_on(here):
     (here.folder / "hang").touch()
     process = here.start("run", str(here.file), "--jobs", "1")
@@ -99,6 +100,7 @@ def test_a_killed_campaign_takes_its_workers_along_and_goes_on(here):
     assert set(states(here).values()) == {"done"}
 
 
+@pytest.mark.slow
 def test_failed_cells_say_why_and_are_retried_when_asked(here):
     here.write("seeds: [0, 1]\nmethods: [none, cem]\nvictims: [hardened]\n")
     (here.folder / "fail").touch()
@@ -118,6 +120,7 @@ def test_failed_cells_say_why_and_are_retried_when_asked(here):
     assert set(states(here).values()) == {"done"}
 
 
+@pytest.mark.slow
 def test_live_cells_run_alone_after_all_others(here):
     module = here.folder / "toy_cells.py"
     (here.folder / "toy_live.py").write_text(module.read_text() + "\nLIVE = True\nsearch_cell = lambda *a: None\n")
@@ -158,6 +161,7 @@ def test_a_ray_cluster_of_several_workers_runs_the_cells(here):
         cluster.shutdown()
 
 
+@pytest.mark.slow
 def test_no_cluster_is_one_clear_error(here):
     code, _, err = here.call("run", str(here.file), "--backend", "ray", "--address", "127.0.0.1:1")
     assert code == 2
