@@ -1,4 +1,4 @@
-"""How good predictions of transfer were: predicted against measured ratios of every attack that was deployed after it was predicted."""
+"""How good predictions of transfer were: predicted against measured ratios of attacks. No prediction has seen a drive with its attack."""
 
 # ruff: noqa: RUF001 (typography for readers: multiplication signs and dashes)
 
@@ -102,7 +102,7 @@ def prediction_table(pairs: Sequence[Predicted]) -> Table:
         for pair in pairs
     )  # fmt: skip
     columns = ("attack", "expected ×", "80 % of draws", "measured ×", "expected [m]", "measured [m]", "effect retained")
-    return Table("Transfer, predicted before it was deployed", columns, cells, (False, *[True] * 6))
+    return Table("Transfer, predicted without any drive with the attack", columns, cells, (False, *[True] * 6))
 
 
 def skill_text(pairs: Sequence[Predicted]) -> str:
