@@ -55,13 +55,13 @@ def draw_landscape(
 def draw_robustness(found: RobustnessMap) -> bytes:
     """PNG of a robustness map: total CTE, its ratio to plain colours at the same poses, and the largest |CTE|."""
     count, starts = found.total_cte_m.shape
-    figure = Figure(figsize=(4.5 + 0.9 * starts, 2.2 + 0.35 * count), layout="constrained", facecolor=LIGHT["paper"])
+    figure = Figure(figsize=(4.5 + 1.5 * starts, 2.4 + 0.35 * count), layout="constrained", facecolor=LIGHT["paper"])
     parts = {
         "total CTE [m]": found.total_cte_m, "ratio to plain colours": found.total_cte_m / found.plain_cte_m,
         "largest |CTE| [m]": found.worst_cte_m,
     }  # fmt: skip
     rows = [f"{m[0]:+.2f}, {m[1]:+.2f} m, {np.rad2deg(m[2]):+.0f}°" for m in found.moves]
-    columns = [f"{s[0]:.2f}, {s[1]:.2f}\n{np.rad2deg(s[2]):.0f}°" for s in found.starts]
+    columns = [f"{s[0]:.2f}\n{s[1]:.2f}\n{np.rad2deg(s[2]):.0f}°" for s in found.starts]
     for k, (axes, (name, values)) in enumerate(zip(figure.subplots(1, 3), parts.items(), strict=True)):
         picture = axes.imshow(np.ma.masked_invalid(values), aspect="auto", cmap=_COLOURS)
         axes.set_facecolor(LIGHT["grid"])
