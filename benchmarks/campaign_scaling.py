@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import resource
 import shutil
 import time
 from pathlib import Path
@@ -31,8 +32,8 @@ scenarios:
 """
 
 
-def measure(folder: Path, work: Path, jobs: int, threads: int, cells: int, iterations: int) -> float:
-    """Wall time of a campaign of its own [s]."""
+def measure(folder: Path, work: Path, jobs: int, threads: int, cells: int, iterations: int) -> tuple[float, float]:
+    """Wall time and processor time of a campaign of its own [s]; the second is what it costs also where others share the cores."""
     shutil.rmtree(work, ignore_errors=True)
     work.mkdir(parents=True)
     file = work / "scaling.campaign.yaml"
@@ -40,13 +41,14 @@ def measure(folder: Path, work: Path, jobs: int, threads: int, cells: int, itera
     seeds = ", ".join(str(100 + seed) for seed in range(cells))
     file.write_text(_FILE.format(seeds=seeds, experiment=experiment, folder=folder.resolve(), iterations=iterations))
     campaign = load_campaign(file, work)
-    began = time.monotonic()
+    began, before = time.monotonic(), resource.getrusage(resource.RUSAGE_CHILDREN)
     ended = run_campaign(campaign, campaign.cells, Options(jobs, threads, gate=False), print)
     seconds = time.monotonic() - began
     wrong = [end for end in ended if end.how != "done"]
     if wrong or len(ended) != cells:
         raise SystemExit(f"expected {cells} finished cells, got {wrong or len(ended)}")
-    return seconds
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return seconds, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
 
 def main() -> None:
@@ -59,20 +61,22 @@ def main() -> None:
     parser.add_argument("--dry", action="store_true", help="print only")
     arguments = parser.parse_args()
     load_before = os.getloadavg()[0]
-    seconds = {
+    measured = {
         (jobs, threads): measure(
             arguments.run_folder, arguments.work, jobs, threads, arguments.cells, arguments.iterations
         )
         for jobs, threads in ((1, 1), (1, 2), (2, 1))
     }
-    for (jobs, threads), wall_s in seconds.items():
+    for (jobs, threads), (wall_s, cpu_s) in measured.items():
+        rate = 3600 * arguments.cells / wall_s
         print(
-            f"{jobs} workers x {threads} threads: {wall_s:.1f} s, {3600 * arguments.cells / wall_s:.0f} cells an hour"
+            f"{jobs} workers x {threads} threads: {wall_s:.1f} s, {rate:.0f} cells an hour, {cpu_s:.1f} s of processor time"
         )
+    seconds = {key: wall_s for key, (wall_s, _) in measured.items()}
     gain = seconds[1, 1] / seconds[2, 1]
     note = (
         f"{arguments.cells} gradient attacks of {arguments.iterations} iterations on one start, one thread each: {seconds[1, 1]:.0f} s with 1 "
-        f"worker, {seconds[2, 1]:.0f} s with 2; 1 worker with 2 threads {seconds[1, 2]:.0f} s; load before {load_before:.1f}"
+        f"worker, {seconds[2, 1]:.0f} s with 2; 1 worker with 2 threads {seconds[1, 2]:.0f} s; {measured[1, 1][1] / arguments.cells:.1f} s of a core per cell; load before {load_before:.1f}"
     )
     print(f"gain {gain:.2f}; {note}")
     if not arguments.dry:
