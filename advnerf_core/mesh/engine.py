@@ -36,14 +36,17 @@ class Engine:
     dr: Any
 
 
-def engine() -> Engine:
+def engine(in_order: bool = False) -> Engine:
     """Mitsuba, ready for use.
+
+    Args:
+        in_order: On one thread, for sums that shall have the same bits each time; else on all that may be used.
 
     Raises:
         MeshEngineError: The package or LLVM is missing; says which, and what to do.
     """
     loaded = _load()
-    threads = _threads()
+    threads = 1 if in_order else _threads()
     if loaded.dr.thread_count() != threads:
         loaded.dr.set_thread_count(threads)
     return loaded

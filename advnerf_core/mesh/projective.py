@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from advnerf_core.geometry import Array, Pinhole
 from advnerf_core.mesh.engine import engine
-from advnerf_core.mesh.ray_cast import mitsuba_mesh
+from advnerf_core.mesh.ray_cast import floats, mitsuba_mesh
 
 mi, dr = engine().mi, engine().dr
 PSIntegrator: Any = import_module("mitsuba.python.ad.integrators.common").PSIntegrator
@@ -42,13 +42,13 @@ class OverBackground(PSIntegrator):
     def show(self, corner_texels: Array, texture: NDArray[np.float32]) -> None:
         """Set texture ``[H, W, 3]`` and where the faces' corners lie in it ``[F, 3, 2]``."""
         uv = np.asarray(corner_texels, np.float32) / np.array(texture.shape[1::-1], np.float32)
-        self._corners = [mi.Float(np.ascontiguousarray(uv[:, k].ravel())) for k in range(3)]
+        self._corners = [floats(mi, uv[:, k]) for k in range(3)]
         self._texture = mi.Texture2f(mi.TensorXf(np.asarray(texture, np.float32)), wrap_mode=dr.WrapMode.Clamp)
 
     def stand_before(self, rgb: NDArray[np.float32], depth_m: NDArray[np.float32]) -> None:
         """Set what is behind ``[H, W, 3]``, and the depth ``[H, W]`` [m] beyond which it hides the mesh."""
-        self._rgb = mi.Float(np.ascontiguousarray(rgb, np.float32).ravel())
-        self._depth = mi.Float(np.where(np.isnan(depth_m), np.inf, depth_m).astype(np.float32).ravel())
+        self._rgb = floats(mi, rgb)
+        self._depth = floats(mi, np.where(np.isnan(depth_m), np.inf, depth_m))
 
     def sample(
         self, mode: Any, scene: Any, sampler: Any, ray: Any, depth: Any, *rest: Any, active: Any = True, **more: Any
@@ -111,7 +111,7 @@ class ProjectiveRenderer:
         self._integrator = mi.load_dict({"type": _NAME, "sppc": samples, "sppp": boundary_samples, "sppi": 0})
         self._integrator.look_through(pinhole)
         self._integrator.show(corner_texels, texture)
-        mesh = mitsuba_mesh(np.random.default_rng(0).random((vertex_count, 3)), faces)
+        mesh = mitsuba_mesh(mi, np.random.default_rng(0).random((vertex_count, 3)), faces)
         self._scene = mi.load_dict({"type": "scene", "mesh": mesh, "sensor": _sensor(pinhole)})
         self._parameters = mi.traverse(self._scene)
         self._parameters.keep([_VERTICES])
@@ -134,11 +134,12 @@ class ProjectiveRenderer:
             rgb: What is behind ``[H, W, 3]`` in 0..1.
             depth_m: Planar depth beyond which the mesh is hidden ``[H, W]`` [m]; NaN hides nothing.
             grad_image: ``[H, W, 3]``.
-            seed: Of the samples; the same seed gives the same estimate.
+            seed: Of the samples; the same seed gives the same estimate, to the bit.
         """
+        engine(in_order=True)  # many samples add to one vertex
         positions = self._place(vertices, rgb, depth_m, attached=True)
         self._parameters.update()
-        slopes = mi.TensorXf(np.ascontiguousarray(grad_image, np.float32))
+        slopes = mi.TensorXf(floats(mi, grad_image), grad_image.shape)
         self._integrator.render_backward(self._scene, None, slopes, seed=_seed(seed))
         gradient = np.array(dr.grad(positions), np.float64).reshape(-1, 3)
         return np.asarray(gradient * self._square)
@@ -147,7 +148,7 @@ class ProjectiveRenderer:
         self, vertices: Array, rgb: NDArray[np.float32], depth_m: NDArray[np.float32], attached: bool = False
     ) -> Any:
         self._integrator.stand_before(rgb, depth_m)
-        positions = mi.Float((np.asarray(vertices) * self._square).astype(np.float32).ravel())
+        positions = floats(mi, vertices * self._square)
         if attached:
             dr.enable_grad(positions)
         self._parameters[_VERTICES] = positions
