@@ -52,6 +52,7 @@ class ScenarioConfig(_Section):
     seeds: tuple[int, ...] | None = Field(default=None, description="Instead of the campaign's.")
     victims: tuple[Victim, ...] | None = Field(default=None, description="Instead of the campaign's.")
     methods: tuple[Method, ...] | None = Field(default=None, description="Instead of the campaign's.")
+    gate: GateLimits | None = Field(default=None, description="Instead of the campaign's.")
 
 
 class CampaignConfig(_Section):

@@ -185,7 +185,7 @@ def _past_the_gate(campaign: Campaign, cells: Sequence[Cell], options: Options, 
             _experiment(campaign, cell),
             _inside(scenario, cell),
             cell.victim,
-            campaign.config.gate,
+            scenario.gate or campaign.config.gate,
             file,
         )
         verdicts[key] = found is None or found.passed or not options.gate

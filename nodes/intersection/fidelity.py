@@ -22,7 +22,7 @@ from advnerf_core.scene.dataset import load_transforms
 from advnerf_core.scene.fidelity import Pictures
 from hardware.twin.intersection.scene import Intersection
 from nodes.intersection import capture
-from nodes.intersection.attack import Cell, Condition, attack_problem, load_theta
+from nodes.intersection.attack import Cell, Condition, attack_path, attack_problem, load_theta
 from nodes.intersection.context import Experiment
 from nodes.intersection.deployed import DressedScene, drive_deployed
 from nodes.intersection.objects import placed_objects, surrogate_of
@@ -56,7 +56,7 @@ def driven(
 
 def attacked(experiment: Experiment, scenario: str, victim: str, method: str, seed: int, folder: Path) -> Pictures:
     """The same places with the colours of a finished search."""
-    theta = load_theta(folder, Cell(scenario, victim, cast("Condition", method), seed))
+    theta = _theta(experiment, scenario, victim, method, seed, folder)
     return _along_the_drive(experiment, scenario, victim, theta, "the same drive, attacked")
 
 
@@ -64,7 +64,7 @@ def loop(
     experiment: Experiment, scenario: str, victim: str, method: str, seed: int, folder: Path
 ) -> tuple[AttackProblem, Callable[[torch.Tensor, bool], torch.Tensor], torch.Tensor, Horizon]:
     """What a prediction drives: the problem, pictures with or without the attack, the deployed starts ``[S, n]`` and the horizon."""
-    theta = load_theta(folder, Cell(scenario, victim, cast("Condition", method), seed))
+    theta = _theta(experiment, scenario, victim, method, seed, folder)
     surrogate = surrogate_of(experiment, placed_objects(experiment))
     plain = surrogate.plain_theta()
     problem = attack_problem(experiment, surrogate, load_policy(victim_file(experiment, victim)), scenario, seed)
@@ -73,6 +73,13 @@ def loop(
         return surrogate.sense(states, theta if with_attack else plain).images
 
     return problem, images, problem.start_states, experiment.limits
+
+
+def _theta(experiment: Experiment, scenario: str, victim: str, method: str, seed: int, folder: Path) -> torch.Tensor:
+    """Colours of a finished search: the cell's own, or the experiment's where the cell was taken from there."""
+    cell = Cell(scenario, victim, cast("Condition", method), seed)
+    own = attack_path(folder, cell).exists()
+    return load_theta(folder if own else experiment.stage_folder("attack"), cell)
 
 
 def _along_the_drive(
