@@ -142,7 +142,12 @@ class _Recipe:
             path = self._expert_of(plan).path
             steer = steer_with(policy, torch.tensor([plan.goal]) if plan.goal else None)
             starts = recovery_states(
-                path, plan.drives, rng, config.drive_lateral_m, config.drive_heading_rad, plan.driven_m
+                path,
+                plan.drives,
+                rng,
+                config.drive_lateral_m,
+                config.drive_heading_rad,
+                plan.drives_from_m or plan.driven_m,
             )
             parts = []
             # Two at a time at least, so that both plain and textured drives occur.

@@ -31,6 +31,9 @@ FILE_FORMAT = "advnerf-policy-1"
 # (channels, kernel, stride) of each convolution, Bojarski et al. figure 4.
 CONVOLUTIONS = ((24, 5, 2), (36, 5, 2), (48, 5, 2), (64, 3, 1), (64, 3, 1))
 FLAT_FEATURES = 64 * 1 * 18
+# A few goal inputs beside a thousand features start with so much larger weights, or a policy learns every view before it learns
+# to be told where to go: only the views ahead of a junction need the goal.
+GOAL_GAIN = 12.0
 
 
 class Policy(Protocol):
@@ -81,6 +84,9 @@ class PilotNet(nn.Module):
         for fan_in, fan_out in pairwise(widths):
             linear += [nn.Linear(fan_in, fan_out), nn.ELU()]
         self.head = nn.Sequential(*linear, nn.Linear(widths[-1], 1))
+        if goal_size:
+            with torch.no_grad():  # no file and no policy without a goal is touched by this
+                self.head[0].weight[:, FLAT_FEATURES:] *= GOAL_GAIN
 
     def forward(self, images: Tensor, goals: Tensor | None = None) -> Tensor:
         """Steering ``[B]`` [rad], left positive, within ``+-max_steering_rad``.

@@ -26,6 +26,7 @@ class SourcePlan:
         goal: What the policy is told in these frames, for example a one-hot exit; as long in all plans.
         expert: Their teacher, about whose path poses are drawn; None for the recipe's own.
         driven_m: Poses are drawn so far along an open path [m]; None for all of it.
+        drives_from_m: Drives start so far along the path at most [m], so that they pass what is to be learned; None for all of it.
     """
 
     source: FrameSource
@@ -35,6 +36,7 @@ class SourcePlan:
     goal: tuple[float, ...] = ()
     expert: Expert | None = None
     driven_m: float | None = None
+    drives_from_m: float | None = None
 
     def settings(self) -> dict[str, Any]:
         """As plain data; what only goal-conditioned recipes have is named only where it is given."""
@@ -46,7 +48,7 @@ class SourcePlan:
         }
         special = {
             "goal": list(self.goal), "expert": None if self.expert is None else self.expert.to_dict(),
-            "driven_m": self.driven_m,
+            "driven_m": self.driven_m, "drives_from_m": self.drives_from_m,
         }  # fmt: skip
         return values | {name: value for name, value in special.items() if value}
 

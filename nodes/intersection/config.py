@@ -60,18 +60,22 @@ class PolicyConfig(_Section):
         default=0.1, description="What the expert looks ahead by: half a tick and part of the deployed car's lag [s]."
     )
     driven_m: PositiveNumber = Field(default=44.0, description="Frames are taken so far along each path [m].")
+    drives_from_m: PositiveNumber = Field(
+        default=12.0,
+        description="DAgger drives start so far along each path at most, so that they pass the junction [m].",
+    )
     deployed_stills: Count = Field(default=320, description="Poses about each path in the deployment scene.")
     surrogate_stills: Count = Field(default=240, description="The same in the surrogate.")
     deployed_drives: Count = Field(
-        default=2, description="Drives on each path in the deployment scene, per DAgger round."
+        default=3, description="Drives on each path in the deployment scene, per DAgger round."
     )
-    surrogate_drives: Count = Field(default=2, description="The same in the surrogate.")
+    surrogate_drives: Count = Field(default=3, description="The same in the surrogate.")
     drive_steps: Positive = Field(default=60, description="Control ticks of such a drive.")
-    dagger_rounds: Count = Field(default=1, description="Rounds of DAgger.")
+    dagger_rounds: Count = Field(default=2, description="Rounds of DAgger.")
     first_steps: Positive = Field(default=800, description="Optimiser steps of behaviour cloning.")
-    round_steps: Positive = Field(default=400, description="Optimiser steps after each round.")
+    round_steps: Positive = Field(default=300, description="Optimiser steps after each round.")
     naive_steps: Count = Field(
-        default=600, description="Optimiser steps of the victim that never sees a random texture; 0: none."
+        default=800, description="Optimiser steps of the victim that never sees a random texture; 0: none."
     )
     hidden: tuple[int, int, int] = Field(default=(200, 100, 20), description="Widths of the policy's linear layers.")
     seed: int = 0

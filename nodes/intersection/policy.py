@@ -99,7 +99,7 @@ def plans(experiment: Experiment, scene: Intersection, sample: Sample | None = N
     for name in experiment.config.scenarios:
         common: dict[str, Any] = {
             "drive_steps": config.drive_steps, "goal": experiment.goal(name), "expert": experiment.expert(name),
-            "driven_m": config.driven_m,
+            "driven_m": config.driven_m, "drives_from_m": config.drives_from_m,
         }  # fmt: skip
         domains = (
             ("deployed", seen_in_scene, config.deployed_stills, config.deployed_drives),
