@@ -44,6 +44,7 @@ ERROR_EXIT, FAILURE_EXIT = 2, 1
 # Which extra brings what a base installation, such as the car's, does not have.
 _EXTRA_OF = dict.fromkeys(("torch", "numba", "scipy", "matplotlib", "jinja2", "av"), "core") | {
     "mujoco": "twin", "pycolmap": "sfm", "trimesh": "mesh", "viser": "view", "onnxruntime": "onnx", "onnx": "onnx",
+    "mitsuba": "mesh", "drjit": "mesh", "joblib": "cluster", "ray": "cluster", "carla": "carla",
 }  # fmt: skip
 
 app = typer.Typer(
