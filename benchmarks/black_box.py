@@ -27,6 +27,7 @@ import torch
 from advnerf_core.attack.adjoint import AttackProblem, BlackBoxError, adjoint_gradient, evaluate
 from advnerf_core.attack.artifact import load_attack
 from advnerf_core.attack.baselines import random_search
+from advnerf_core.attack.distil import Distillation
 from advnerf_core.attack.guided import BlackBoxSearch, black_box_attack
 from advnerf_core.attack.optimise import gradient_attack
 from advnerf_core.attack.population import CrossEntropy, Evolution, population_search
@@ -88,7 +89,8 @@ class Search:
         def told(evaluation: Evaluation) -> None:
             k = evaluation.iteration
             calls = (first_calls if k else 0) + k * step_calls + self._per_evaluation
-            self.curve = [*self.curve[:k], [calls, evaluation.predicted_total_cte_m, evaluation.seconds]]
+            after_next = first_calls + (k + 2) * step_calls
+            self.curve = [*self.curve[:k], [calls, evaluation.predicted_total_cte_m, evaluation.seconds, after_next]]
             write_atomically(self._curve_path, json.dumps(self.curve))
             if time.monotonic() > end_s:
                 raise OutOfTimeError
@@ -97,11 +99,11 @@ class Search:
 
     def best_m(self, calls: float) -> float | None:
         """Best total CTE when so many calls had been made; None before the first, or if the search has not come so far."""
-        totals = [total for made, total, _ in self.curve if made <= calls]
+        totals = [total for made, total, *_ in self.curve if made <= calls]
         return max(totals) if totals else None
 
 
-def runner(name: str, problem: AttackProblem, calls: int) -> tuple[int, int, Callable[..., Any]]:
+def runner(name: str, problem: AttackProblem, calls: int, lessons: Distillation) -> tuple[int, int, Callable[..., Any]]:
     """First calls, calls of a step, and the search of a method within a budget of calls."""
     each = calls_per_evaluation(problem)
     evaluations = calls // each
@@ -110,7 +112,9 @@ def runner(name: str, problem: AttackProblem, calls: int) -> tuple[int, int, Cal
     if name in ("cem", "evolution"):
         strategy = CrossEntropy() if name == "cem" else Evolution()
         return 0, each, lambda **kept: population_search(problem, strategy, evaluations, 20, 8, **kept)
-    search = BlackBoxSearch("guided") if name == "guided" else BlackBoxSearch("distilled", probes=1)
+    search = BlackBoxSearch("guided", distillation=lessons)
+    if name == "distilled":
+        search = BlackBoxSearch("distilled", probes=1, distillation=lessons)
     return (
         search.first_calls(), search.step_calls(problem), lambda **kept: black_box_attack(problem, search, calls, **kept)
     )  # fmt: skip
@@ -125,7 +129,7 @@ def white_box(problem: AttackProblem, out: Path, end_s: float) -> tuple[float, f
     surrogate = problem.sensor
     assert isinstance(surrogate, Surrogate)
     _, totals = evaluate(problem, surrogate.plain_theta())
-    return float(totals.protocol_cte_m.mean()), max(total for _, total, _ in search.curve)
+    return float(totals.protocol_cte_m.mean()), max(total for _, total, *_ in search.curve)
 
 
 def victim_of(folder: Path, out: Path) -> Any:
@@ -141,8 +145,8 @@ def shares(searches: list[Search], white_calls: int, none_m: float, white_m: flo
     """Share of the white box's effect by method and multiple of its calls, as far as each search has come."""
     table: dict[str, dict[str, float]] = {}
     for search in searches:
-        done = search.curve[-1][0] / white_calls if search.curve else 0.0
-        marks = [mark for mark in MARKS if mark <= done * 1.02]
+        # A budget is used up when the next step, which is whole or not at all, would exceed it.
+        marks = [mark for mark in MARKS if search.curve and mark * white_calls < search.curve[-1][3]]
         best = {str(mark): search.best_m(mark * white_calls) for mark in marks}
         table[search.name] = {mark: (m - none_m) / (white_m - none_m) for mark, m in best.items() if m is not None}
     return table
@@ -200,10 +204,10 @@ def main() -> None:
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS))
     parser.add_argument("--minutes", type=float, default=9.0, help="of this piece; call again to go on")
     parser.add_argument("--record", action="store_true", help="record the rows although not all methods are through")
-    parser.add_argument("--trial", action="store_true", help="small: 8 ticks, twice the calls, another folder, no rows")
+    parser.add_argument("--trial", action="store_true", help="small: 4 ticks, equal calls, another folder, no rows")
     options = parser.parse_args()
     if options.trial:
-        options.steps, options.multiple, options.out = 8, 2.0, options.out.with_name(options.out.name + "_trial")
+        options.steps, options.multiple, options.out = 4, 1.0, options.out.with_name(options.out.name + "_trial")
     options.out.mkdir(parents=True, exist_ok=True)
     finished, numbers = _piece(options)
     table = numbers["shares"]
@@ -225,11 +229,12 @@ def _piece(options: argparse.Namespace) -> tuple[bool, dict[str, Any]]:
     except OutOfTimeError:
         raise SystemExit("not finished: call again to go on") from None
     searches = [Search(name, options.out, calls_per_evaluation(problem)) for name in METHODS]
+    lessons = Distillation(warm_pairs=24) if options.trial else Distillation()
     finished = True
     for search in searches:
         if search.name not in options.methods:
             continue
-        first, step, go = runner(search.name, problem, round(options.multiple * white_calls))
+        first, step, go = runner(search.name, problem, round(options.multiple * white_calls), lessons)
         try:
             go(state_path=search.state_path, on_evaluation=search.listen(first, step, end_s))
         except OutOfTimeError:
