@@ -14,7 +14,7 @@ from advnerf_core.driving.frames import FrameStore
 from advnerf_core.driving.imitation import ImitationConfig, SourcePlan, recovery_states, train_policy
 from advnerf_core.driving.path import Arc, Line
 from advnerf_core.driving.path import Path as Track
-from advnerf_core.driving.policy import load_policy
+from advnerf_core.driving.policy import PilotNet, load_policy
 from advnerf_core.driving.policy_view import PolicyView
 from advnerf_core.driving.sources import RenderedSource
 from advnerf_core.geometry import Pinhole
@@ -91,14 +91,27 @@ def test_each_goal_is_taught_by_its_own_expert(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(600)
 def test_one_policy_learns_both_turns(tmp_path: Path) -> None:
-    learning = replace(CONFIG, first_steps=250, dagger_rounds=0, batch_size=32)
-    policy = load_policy(train_policy(learning, plans(256), LEFT, VIEW, tmp_path).path).policy
+    learning = replace(CONFIG, first_steps=200, dagger_rounds=0, batch_size=32, hidden=(100, 50, 10))
+    policy = load_policy(train_policy(learning, plans(128), LEFT, VIEW, tmp_path).path).policy
     image = prepare(np.array([[7.0, 0.0, 0.0]]))(None)
     with torch.no_grad():
         left, right = (float(policy(image, torch.tensor([goal]))[0]) for goal in ((1.0, 0.0), (0.0, 1.0)))
     assert left > 0.2
     assert right < -0.2
+
+
+def test_a_goal_weighs_something_from_the_start() -> None:
+    torch.manual_seed(0)
+    told, image = PilotNet(2, 1.2), prepare(np.array([[7.0, 0.0, 0.0]]))(None)
+    with torch.no_grad():
+        hidden = [
+            told.head[0](torch.cat([told.features(image * 2.0 - 1.0), torch.tensor([g])], 1))
+            for g in ((1.0, 0.0), (0.0, 1.0))
+        ]
+    # The features alone spread the hidden units by about 0.3; the goal must be as loud.
+    assert (hidden[0] - hidden[1]).std() > 0.15
 
 
 def test_goals_of_different_lengths_are_refused(tmp_path: Path) -> None:
