@@ -86,7 +86,7 @@ class PilotNet(nn.Module):
         self.head = nn.Sequential(*linear, nn.Linear(widths[-1], 1))
         if goal_size:
             with torch.no_grad():  # no file and no policy without a goal is touched by this
-                self.head[0].weight[:, FLAT_FEATURES:] *= GOAL_GAIN
+                next(self.head.parameters())[:, FLAT_FEATURES:] *= GOAL_GAIN
 
     def forward(self, images: Tensor, goals: Tensor | None = None) -> Tensor:
         """Steering ``[B]`` [rad], left positive, within ``+-max_steering_rad``.
