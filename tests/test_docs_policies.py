@@ -47,6 +47,7 @@ def test_the_adapter_is_as_short_as_promised_and_loads(folder):
     assert (loaded.view.width, loaded.view.height) == (160, 80)
 
 
+@pytest.mark.slow
 def test_the_commands_of_the_page_check_export_and_describe_it(folder):
     pytest.importorskip("mujoco")
     pytest.importorskip("onnx")

@@ -145,6 +145,7 @@ class _Silent:
         pass
 
 
+@pytest.mark.slow
 def test_a_cancel_is_answered_at_once_and_the_same_request_goes_on(bench, tmp_path):
     text = request_text(load_request(tiny_request(tmp_path, evaluations=400)))
     bench.request(text)

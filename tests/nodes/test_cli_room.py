@@ -43,6 +43,7 @@ def write_trace(folder, topic, poses):
     return folder
 
 
+@pytest.mark.slow
 def test_path_and_fence_make_a_room_file_that_the_stack_reads(tmp_path):
     rng = np.random.default_rng(0)
     poses = SQUARE.pose_at(np.arange(0.0, 1.05 * SQUARE.length_m, 0.02))

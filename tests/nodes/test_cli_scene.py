@@ -74,6 +74,7 @@ def trained(pictures, tmp_path_factory):
     return train(pictures, tmp_path_factory.mktemp("scene"), 12)
 
 
+@pytest.mark.slow
 def test_figures_are_of_the_held_out_images(trained):
     figures = json.loads((trained / "held_out.json").read_text())
     assert [row["image"] for row in figures["images"]] == ["00.png", "08.png", "16.png"]
@@ -126,6 +127,7 @@ def test_a_killed_training_goes_on_and_ends_the_same(trained, pictures, tmp_path
     assert ours == theirs
 
 
+@pytest.mark.slow
 def test_eval_and_render(command, trained, pictures, tmp_path):
     code, output, _ = command("eval", trained / "scene.safetensors", pictures)
     assert code == 0
@@ -194,6 +196,7 @@ def view(trained, pictures, tmp_path):
     shown.close()
 
 
+@pytest.mark.slow
 def test_the_viewer_serves_a_page_and_draws_objects_into_the_scene(view, trained, pictures):
     with urllib.request.urlopen(f"http://127.0.0.1:{view.port}") as page:
         assert b"<html" in page.read().lower()

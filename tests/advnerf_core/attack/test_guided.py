@@ -197,6 +197,7 @@ def test_a_search_stopped_anywhere_resumes_to_the_bit(tmp_path, search, options)
         black_box_attack(problem, replace(search, probe_sigma=0.2), calls, seed=1, state_path=path)
 
 
+@pytest.mark.slow
 def test_what_is_kept_of_rendered_frames_changes_nothing():
     problem = toy_problem(2, 4, torch.float32)
 

@@ -112,7 +112,10 @@ def test_a_black_box_can_be_searched_but_not_differentiated(problem):
     closed = dataclasses.replace(problem, policy=BlackBox())
     result = population_search(closed, Evolution(), 6, population=4, cells=2)
     assert len(result.history) == 6
-    with pytest.raises(BlackBoxError, match="differentiable = False; search with the methods random, cem or evolution"):
+    with pytest.raises(
+        BlackBoxError,
+        match="differentiable = False; search with the methods guided, distilled, evolution, cem or random",
+    ):
         adjoint_gradient(closed, result.theta)
 
 

@@ -54,6 +54,7 @@ def test_a_search_together_ends_where_searches_alone_do(problems):
     assert not torch.equal(results[0].theta, results[1].theta)
 
 
+@pytest.mark.slow
 def test_stopped_and_resumed_it_gives_the_same_bits(problems, tmp_path):
     whole = gradient_attacks(problems, SEEDS, 4, state_path=tmp_path / "whole")
 

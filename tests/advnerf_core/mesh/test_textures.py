@@ -33,6 +33,7 @@ def psnr_db(a, b):
     return -10.0 * np.log10(np.mean(np.square(a - b)))
 
 
+@pytest.mark.slow
 def test_coverage_is_that_of_the_rasteriser_and_colours_come_near():
     for mesh, least_db in ((hydrant(), 28.0), (small_car(), 25.0)):
         poses, lens = dome(mesh.box, 3), viewing_lens(96)
@@ -155,6 +156,7 @@ def test_bad_meshes_are_refused():
 
 
 @pytest.mark.parametrize("name", ["fire_hydrant", "hatchback_red", "suv"])
+@pytest.mark.slow
 def test_meshes_of_others_are_unwrapped(name):
     file = SHARED / f"{name}.glb"
     if not file.exists():

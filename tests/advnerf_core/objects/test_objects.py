@@ -52,6 +52,7 @@ def test_resolutions_out_of_range(resolution):
         voxelise(ball(), resolution)
 
 
+@pytest.mark.slow
 def test_fitting_brings_the_picture_nearer_to_the_mesh():
     mesh = hydrant()
     before = build_from_mesh(mesh, "hydrant", resolution=24, steps=0)
@@ -62,6 +63,7 @@ def test_fitting_brings_the_picture_nearer_to_the_mesh():
     np.testing.assert_allclose(after.size_m, mesh.size_m, atol=3 * after.grids.voxel)
 
 
+@pytest.mark.slow
 def test_an_object_is_carved_out_of_its_pictures():
     views = mesh_views(ball(), 20, 64)
     hull = visual_hull(views, 24)

@@ -146,6 +146,7 @@ def check_opacity(trained: TrainedScene) -> None:
     torch.testing.assert_close(difference, (1.0 - alpha)[..., None].expand_as(rgb), atol=1e-5, rtol=0)
 
 
+@pytest.mark.slow
 def test_opacity_comes_out_as_in_its_closed_form(trained: TrainedScene) -> None:
     check_opacity(trained)
 

@@ -35,7 +35,10 @@ def test_a_pose_from_position_and_heading_looks_where_it_says():
     [
         (["horizn=3"], r"--set horizn=3: unknown key horizn; valid keys here: .*horizon"),
         (["search.metod=random"], r"unknown key search.metod; valid keys here: cache_mib"),
-        (["search.method=annealing"], r"search.method: input should be 'gradient', 'random', 'cem', 'evolution', 'distilled' or 'guided'"),
+        (
+            ["search.method=annealing"],
+            r"search.method: input should be 'gradient', 'random', 'cem', 'evolution', 'distilled' or 'guided'",
+        ),
         (["search.evaluations=0"], r"search.evaluations: .* greater than or equal to 1"),
         (["objects=[]"], "objects: .* at least 1 item"),
         (["objects=[{kind: face}]"], r"objects.0: expected either T_world_from_object or x_m, y_m and z_m"),

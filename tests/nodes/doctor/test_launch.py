@@ -86,6 +86,7 @@ def car():
     tracker.close()
 
 
+@pytest.mark.slow
 def test_the_car_is_asked_for_what_its_launch_file_wants(car, tmp_path, monkeypatch):
     monkeypatch.setattr(launch.mocap, "LISTEN_S", 0.3)
     vesc, vicon_port = car
