@@ -20,6 +20,7 @@ import yaml
 from mcap.writer import CompressionType, Writer
 
 from advnerf_core.files import write_atomically
+from nodes.runtime.bag_index_spool import SpooledIndexes
 from nodes.runtime.bag_journal import Entry, Journal
 from nodes.runtime.errors import BagError
 from nodes.runtime.messages import ROS_DISTRO, type_definition, type_hash
@@ -154,6 +155,9 @@ class BagWriter:
             self._hold_reserve()
             self._stream = _WriteThrough(self.path)
             self._writer = Writer(self._stream, chunk_size=CHUNK_BYTES, compression=CompressionType.NONE)  # type: ignore[arg-type]
+            # The library has no setting for where it keeps these; a kilobyte for every picture would be 100 MB an hour.
+            self._indexes = SpooledIndexes(self.folder)
+            self._writer._Writer__chunk_indices = self._indexes  # type: ignore[attr-defined]
             self._writer.start(profile=PROFILE, library=LIBRARY)
             if metadata:
                 self._writer.add_metadata("advnerf", dict(metadata))
@@ -261,6 +265,7 @@ class BagWriter:
         self._stop_sync.set()
         self._sync_thread.join()
         self._stream.close()
+        self._indexes.close()
         self._journal.close()
         (self.folder / _RESERVE_NAME).unlink(missing_ok=True)
 
