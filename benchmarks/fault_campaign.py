@@ -26,6 +26,7 @@ from advnerf_core.files import write_atomically
 from advnerf_core.geometry import planar_pose
 from benchmarks.fault_stops import CONFIGURED, LAUNCH_FILE, NODES, BrokenPromise
 from benchmarks.operator import LiveOperator
+from benchmarks.processes import end
 from benchmarks.results import REPOSITORY, record_row
 from hardware.twin.vesc_emulator import read_wire_log
 from nodes.runtime.messages import encode, pose_message
@@ -133,13 +134,7 @@ class Graph:
         """End everything."""
         self.operator.bus.close()
         for process in (self.supervisor, self.twin):
-            if process.poll() is None:
-                process.send_signal(signal.SIGINT)
-                try:
-                    process.wait(20.0)
-                except subprocess.TimeoutExpired:
-                    process.kill()
-                    process.wait()
+            end(process)
         self.log.close()
 
 

@@ -21,6 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from benchmarks.operator import LiveOperator
+from benchmarks.processes import end
 from benchmarks.results import REPOSITORY, record_row
 from hardware.twin.vesc_firmware import WireEvent
 
@@ -80,21 +81,12 @@ def live_graph(controller: dict[str, float]) -> Iterator[tuple[LiveOperator, sub
         finally:
             operator.bus.close()
             for process in (supervisor, twin):
-                _end(process)
+                end(process)
 
 
 def _start(module: str, *arguments: str) -> subprocess.Popen[bytes]:
     command = [sys.executable, "-m", module, *arguments]
     return subprocess.Popen(command, cwd=REPOSITORY, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-
-
-def _end(process: subprocess.Popen[bytes]) -> None:
-    process.send_signal(signal.SIGINT)
-    try:
-        process.wait(20.0)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()
 
 
 def stop_after(victim: str, number: signal.Signals, controller: dict[str, float]) -> Stop:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import os
-import signal
 import subprocess
 import sys
 import time
@@ -18,6 +17,7 @@ from typing import Any
 from benchmarks.fault_stops import CONFIGURED, BrokenPromise
 from benchmarks.network import ADDRESSES, Cable
 from benchmarks.operator import LiveOperator
+from benchmarks.processes import end
 from benchmarks.results import REPOSITORY
 from hardware.twin.vesc_emulator import read_wire_log
 from nodes.runtime.bus import Bus
@@ -220,13 +220,7 @@ class HostPair:
         if self.person is not None:
             self.person.close()
         for process in reversed(self._processes):
-            if process.poll() is None:
-                process.send_signal(signal.SIGINT)
-                try:
-                    process.wait(20.0)
-                except subprocess.TimeoutExpired:
-                    process.kill()
-                    process.wait()
+            end(process)
         self.log.close()
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -24,7 +25,7 @@ from hardware.cameras.zed_exposure import ZedExposure, exposure_lines
 Positive = Annotated[int, Field(gt=0)]
 
 
-class _Source(BaseModel):
+class _Source(BaseModel, ABC):
     """What all sources have.
 
     Attributes:
@@ -37,9 +38,9 @@ class _Source(BaseModel):
     stall_s: float = Field(default=1.0, gt=0.0)
     repeats: int = Field(default=0, ge=0)
 
+    @abstractmethod
     def camera(self) -> Camera:
         """The device."""
-        raise NotImplementedError
 
     def steady(self) -> SteadyCamera:
         """The device, kept going."""

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from advnerf_core.files import write_atomically
 from advnerf_core.scene.errors import DatasetError
 
 Rgb = NDArray[np.uint8]
@@ -18,6 +19,15 @@ Grey = NDArray[np.uint8]
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 OPAQUE = 255
 _JPEG, _PNG = b"\xff\xd8", b"\x89PNG\r\n\x1a\n"
+
+
+def write_image(path: Path, rgb: Rgb) -> None:
+    """Write ``[H, W, 3]``, whole or not at all: photographs (``.jpg``) as JPEG of quality 95, anything else without loss."""
+    options = [cv2.IMWRITE_JPEG_QUALITY, 95] if path.suffix == ".jpg" else []
+    encoded, data = cv2.imencode(path.suffix, cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), options)
+    if not encoded:
+        raise ValueError(f"expected an image that can be written as {path.suffix}, got shape {rgb.shape}")
+    write_atomically(path, data.tobytes())
 
 
 def read_image(path: Path) -> tuple[Rgb, Grey | None]:
