@@ -9,12 +9,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from advnerf_core.files import write_atomically
 from advnerf_core.geometry import Array, planar_pose
+from advnerf_core.scene.image_files import write_image
 from advnerf_core.scene.transforms_write import write_transforms
 from hardware.carla_scene.config import CarlaConfig
 from hardware.carla_scene.photos import held_out_states, photo_poses
@@ -75,7 +75,7 @@ def capture(
             for index, file in enumerate(names):
                 there = (folder / name / file).exists()
                 if not there:
-                    _write_image(folder / name / file, see(index))
+                    write_image(folder / name / file, see(index))
                 counts[there] += 1
                 report((before + index + 1) / total, f"{name} {index + 1}/{count}")
             return names
@@ -106,8 +106,3 @@ def _claim(folder: Path, config: CarlaConfig, request: CaptureRequest, drives: d
 def _list(folder: Path, names: Sequence[str], poses: Sequence[Array], pinhole: Any) -> None:
     if names:
         write_transforms(folder / "transforms.json", names, np.stack(poses), pinhole)
-
-
-def _write_image(path: Path, rgb: NDArray[np.uint8]) -> None:
-    options = [cv2.IMWRITE_JPEG_QUALITY, 95] if path.suffix == ".jpg" else []
-    write_atomically(path, cv2.imencode(path.suffix, cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), options)[1].tobytes())

@@ -23,9 +23,9 @@ from advnerf_core.driving.policy import LoadedPolicy, load_policy
 from advnerf_core.files import write_atomically
 from advnerf_core.scene.surrogate import Surrogate
 from nodes.experiment.context import Experiment
+from nodes.experiment.learned_scene import load_background, scene_sha256
 from nodes.experiment.objects import attacked_object, surrogate_of
 from nodes.experiment.policy import HARDENED, NAIVE, victim_file
-from nodes.experiment.scene import load_background, scene_sha256
 from nodes.experiment.screen import shown
 from nodes.runtime.stages import Report, hash_of
 

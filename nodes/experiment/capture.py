@@ -5,23 +5,23 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from advnerf_core.files import write_atomically
 from advnerf_core.geometry import Array, planar_pose
 from advnerf_core.scene.dataset import write_transforms
+from advnerf_core.scene.image_files import write_image
 from calibration.by_construction import write_twin_calibrations
 from calibration.schema import save_calibration
 from hardware.twin.lab import Lab
 from hardware.twin.phone import car_mounted_poses, walk_around_poses
 from nodes.experiment.config import CaptureConfig
 from nodes.experiment.context import CALIBRATION, DISPLAY, Experiment
+from nodes.experiment.learned_scene import HELD_OUT
 from nodes.experiment.screen import measure_display, plain_picture
 from nodes.runtime.stages import Report
 
-PHONE, COLOUR_PAIRS, HELD_OUT = "phone", "colour_pairs", "held_out"
+PHONE, COLOUR_PAIRS = "phone", "colour_pairs"
 
 
 def run(experiment: Experiment, folder: Path, report: Report) -> None:
@@ -47,7 +47,7 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
             names = []
             for index in range(len(poses)):
                 names.append(f"images/{index:04d}.{'jpg' if name == PHONE else 'png'}")
-                _write_image(folder / name / names[-1], take(index))
+                write_image(folder / name / names[-1], take(index))
                 report((done + index + 1) / total, f"{name} {index + 1}/{len(poses)}")
             pinhole = lab_config.phone.pinhole if name == PHONE else lab_config.camera.pinhole
             write_transforms(folder / name / "transforms.json", names, poses, pinhole)
@@ -78,12 +78,3 @@ def driving_states(experiment: Experiment, count: int, rng: np.random.Generator)
 def _held_out_indices(capture: CaptureConfig) -> set[int]:
     total = capture.colour_pairs + capture.held_out
     return {int(i) for i in np.linspace(0, total - 1, capture.held_out).round()}
-
-
-def _write_image(path: Path, rgb: NDArray[np.uint8]) -> None:
-    # A phone stores JPEG; the comparison frames stay lossless.
-    options = [cv2.IMWRITE_JPEG_QUALITY, 95] if path.suffix == ".jpg" else []
-    encoded, data = cv2.imencode(path.suffix, cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), options)
-    if not encoded:
-        raise ValueError(f"expected an image that can be written as {path.suffix}, got shape {rgb.shape}")
-    write_atomically(path, data.tobytes())

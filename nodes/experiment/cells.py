@@ -23,9 +23,9 @@ from nodes import evaluation
 from nodes.experiment import attack, deploy
 from nodes.experiment.context import CONTROL_PERIOD_S, Experiment
 from nodes.experiment.finished import changed_settings, has_same_attacks, is_finished
+from nodes.experiment.learned_scene import load_background
 from nodes.experiment.objects import attacked_object, surrogate_of
 from nodes.experiment.run import load_experiment, run_experiment
-from nodes.experiment.scene import load_background
 from nodes.runtime.errors import ConfigError, RuntimeFault
 from nodes.runtime.stages import Report, hash_of, read_record
 from nodes.trials.campaign import COUNTED_STOPS

@@ -21,6 +21,7 @@ from calibration.schema import (
 )
 from hardware.twin.config import LabConfig, PanelConfig
 from nodes.experiment.config import ExperimentConfig
+from nodes.experiment.run_folder import RunFolder
 
 CONTROL_PERIOD_S = 0.1
 CALIBRATION = "calibration"
@@ -28,29 +29,13 @@ DISPLAY = "display"
 
 
 @dataclass(frozen=True)
-class Experiment:
-    """One resolved experiment.
-
-    Attributes:
-        config: The resolved configuration.
-        file: The experiment file.
-        folder: The run folder.
-        setting: Name of the setting, e.g. ``demo``.
-    """
-
-    config: ExperimentConfig
-    file: FilePath
-    folder: FilePath
-    setting: str
+class Experiment(RunFolder[ExperimentConfig]):
+    """One resolved experiment."""
 
     @cached_property
     def lab_config(self) -> LabConfig:
         """The simulated lab with the experiment's changes."""
         return LabConfig.model_validate(self.config.lab)
-
-    def stage_folder(self, stage: str) -> FilePath:
-        """Where a stage writes."""
-        return self.folder / stage
 
     @property
     def launch_file(self) -> FilePath:

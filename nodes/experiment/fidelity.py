@@ -25,9 +25,10 @@ from advnerf_core.scene.fidelity import Pictures
 from nodes.experiment import attack, capture
 from nodes.experiment.cells import attack_file, drive_without_attack_of
 from nodes.experiment.context import CONTROL_PERIOD_S, Experiment
-from nodes.experiment.objects import as_uint8, attacked_object, surrogate_of
+from nodes.experiment.images import as_uint8
+from nodes.experiment.learned_scene import load_background
+from nodes.experiment.objects import attacked_object, surrogate_of
 from nodes.experiment.policy import victim_file
-from nodes.experiment.scene import load_background
 from nodes.experiment.screen import shown
 from nodes.pose_buffer import PoseBuffer
 from nodes.runtime.bag_read import read_messages

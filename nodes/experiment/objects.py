@@ -7,17 +7,17 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from advnerf_core.fields.voxel_grid import VoxelGridObject, cube_face_object
 from advnerf_core.files import write_atomically
 from advnerf_core.geometry import Array, Pinhole, make_transform, planar_pose
+from advnerf_core.scene.image_files import write_image
 from advnerf_core.scene.surrogate import BackgroundRenderer, Surrogate
 from nodes.experiment.context import Experiment
-from nodes.experiment.scene import load_background
+from nodes.experiment.images import as_uint8
+from nodes.experiment.learned_scene import load_background
 from nodes.runtime.stages import Report
 
 # The deployed face lies this far in front of the board or monitor that carries it, so that it is never inside it.
@@ -66,15 +66,7 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
     }
     write_atomically(folder / "object.json", json.dumps(description, indent=1) + "\n")
     for name, image in _previews(experiment, field).items():
-        encoded, data = cv2.imencode(".png", image[..., ::-1])
-        if not encoded:
-            raise ValueError(f"expected preview {name} as an image that PNG can hold, got {image.shape}")
-        write_atomically(folder / f"{name}.png", data.tobytes())
-
-
-def as_uint8(image: torch.Tensor) -> NDArray[np.uint8]:
-    """Image ``[3, H, W]`` in 0..1 as uint8 ``[H, W, 3]``."""
-    return np.ascontiguousarray((image.clamp(0, 1) * 255).round().byte().permute(1, 2, 0).numpy())
+        write_image(folder / f"{name}.png", image)
 
 
 def _previews(experiment: Experiment, field: VoxelGridObject) -> dict[str, Any]:

@@ -23,8 +23,8 @@ from advnerf_core.scene.dataset import load_image, load_transforms
 from hardware.twin.lab import Lab
 from nodes.experiment import capture
 from nodes.experiment.context import CONTROL_PERIOD_S, Experiment
+from nodes.experiment.learned_scene import load_background
 from nodes.experiment.objects import attacked_object, last_result_kept, surrogate_of
-from nodes.experiment.scene import load_background
 from nodes.experiment.screen import face_picture, plain_picture, shown
 from nodes.runtime.stages import Report
 

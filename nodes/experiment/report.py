@@ -28,7 +28,8 @@ from nodes.experiment import memory
 from nodes.experiment.attack import METHODS, attack_path, searches, sensor_of, start_states
 from nodes.experiment.context import CONTROL_PERIOD_S, Experiment
 from nodes.experiment.deploy import LiveRun, live_runs
-from nodes.experiment.objects import as_uint8, attacked_object, surrogate_of
+from nodes.experiment.images import as_uint8
+from nodes.experiment.objects import attacked_object, surrogate_of
 from nodes.experiment.policy import HARDENED
 from nodes.runtime.stages import Report, read_record
 

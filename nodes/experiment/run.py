@@ -2,29 +2,25 @@
 
 from __future__ import annotations
 
-import json
-import platform
-import sys
-import time
 from collections.abc import Sequence
-from importlib.metadata import version
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel
 from rich.console import Console
 
-from advnerf_core.files import write_atomically
 from hardware.twin.config import LabConfig
 from nodes.experiment import attack, capture, deploy, objects, policy, report, scene
 from nodes.experiment.config import ExperimentConfig
 from nodes.experiment.context import Experiment
+from nodes.experiment.run_folder import run_to_end
 from nodes.runtime.config import Document, apply_overrides, read_yaml, validate
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.launch_file import load_launch
-from nodes.runtime.progress import ProgressDisplay
-from nodes.runtime.stages import Report, Stage, StageRecord, check_until, run_stages
+from nodes.runtime.stages import Report, Stage, StageRecord
 
+_LIBRARIES = ("torch", "numpy", "numba", "opencv-contrib-python-headless", "mujoco", "pyzmq", "rosbags", "mcap")
 STAGES = ("capture", "scene", "policy", "object", "attack", "deploy", "report")
 
 
@@ -71,18 +67,8 @@ def run_experiment(
     experiment: Experiment, until: str | None = None, console: Console | None = None
 ) -> dict[str, StageRecord]:
     """Run the stages that are not there yet, and print the result of a finished experiment."""
-    console = console or Console()
-    began = time.monotonic()
-    stages = stages_of(experiment)
-    check_until(stages, until)
-    experiment.folder.mkdir(parents=True, exist_ok=True)
-    _write_manifest(experiment)
-    with ProgressDisplay(console) as display:
-        records = run_stages(stages, experiment.folder, display, until)
-    if "report" in records:
-        report.print_summary(experiment, console)
-    console.print(f"{experiment.config.name} ({experiment.setting}): {time.monotonic() - began:.0f} s", highlight=False)
-    return records
+    summarise = partial(report.print_summary, experiment)
+    return run_to_end(experiment, stages_of(experiment), _LIBRARIES, summarise, until, console)
 
 
 def stages_of(experiment: Experiment) -> list[Stage]:
@@ -128,17 +114,3 @@ def _lay_over(document: Document, values: dict[str, Any], origin: tuple[str, ...
         else:
             target[name] = value
             document.places[(*key, name)] = document.place((*origin, *key, name))
-
-
-def _write_manifest(experiment: Experiment) -> None:
-    libraries = ("torch", "numpy", "numba", "opencv-contrib-python-headless", "mujoco", "pyzmq", "rosbags", "mcap")
-    manifest = {
-        "experiment": experiment.config.name,
-        "setting": experiment.setting,
-        "file": str(experiment.file),
-        "command": " ".join(["advnerf", *sys.argv[1:]]),
-        "config": experiment.config.model_dump(mode="json"),
-        "versions": {"advnerf": version("advnerf"), "python": platform.python_version()}
-        | {name: version(name) for name in libraries},
-    }
-    write_atomically(experiment.folder / "manifest.json", json.dumps(manifest, indent=1) + "\n")

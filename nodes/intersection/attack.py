@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -23,11 +24,11 @@ from advnerf_core.driving.metrics import drive_metrics
 from advnerf_core.driving.policy import LoadedPolicy, load_policy
 from advnerf_core.files import write_atomically
 from advnerf_core.scene.surrogate import Surrogate, split_theta
+from nodes.experiment.learned_scene import scene_sha256
 from nodes.intersection.config import Method
 from nodes.intersection.context import Experiment
 from nodes.intersection.objects import object_file, placed_objects, surrogate_of
 from nodes.intersection.policy import HARDENED, victim_file, victims
-from nodes.intersection.scene import scene_sha256
 from nodes.runtime.stages import Report, hash_of
 
 Condition = Literal["none", "random", "cem", "gradient"]
@@ -190,8 +191,6 @@ def _victim(path: Path) -> LoadedPolicy:
 
 @lru_cache(maxsize=8)
 def _file_hash(path: Path, changed_ns: int) -> str:
-    import hashlib
-
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 

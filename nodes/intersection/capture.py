@@ -5,20 +5,20 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from advnerf_core.driving.imitation import recovery_states
-from advnerf_core.files import write_atomically
 from advnerf_core.geometry import Array, Pinhole, planar_pose
 from advnerf_core.scene.dataset import write_transforms
+from advnerf_core.scene.image_files import write_image
 from hardware.twin.intersection.photos import photo_poses
 from hardware.twin.intersection.scene import Intersection
+from nodes.experiment.learned_scene import HELD_OUT
 from nodes.intersection.context import Experiment
 from nodes.runtime.stages import Report
 
-PHOTOS, HELD_OUT = "photos", "held_out"
+PHOTOS = "photos"
 # Held-out views lie as far from a path as a fooled car drives [m], and as turned [rad].
 _LATERAL_M, _HEADING_RAD = 1.0, 0.2
 
@@ -65,12 +65,3 @@ def held_out_states(experiment: Experiment, rng: np.random.Generator) -> Array:
         share = len(range(index, count, len(names)))
         parts.append(recovery_states(experiment.paths[name], share, rng, _LATERAL_M, _HEADING_RAD, driven_m))
     return np.concatenate(parts)
-
-
-def write_image(path: Path, rgb: NDArray[np.uint8]) -> None:
-    """Write one image; photographs as JPEG, what is compared without loss."""
-    options = [cv2.IMWRITE_JPEG_QUALITY, 95] if path.suffix == ".jpg" else []
-    encoded, data = cv2.imencode(path.suffix, cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), options)
-    if not encoded:
-        raise ValueError(f"expected an image that can be written as {path.suffix}, got shape {rgb.shape}")
-    write_atomically(path, data.tobytes())

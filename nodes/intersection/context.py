@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path as FilePath
 
 import numpy as np
 import torch
@@ -17,33 +16,18 @@ from advnerf_core.driving.policy_view import PolicyView
 from advnerf_core.geometry import Array, Pinhole
 from hardware.twin.intersection.config import IntersectionConfig
 from hardware.twin.intersection.paths import ReferencePath
+from nodes.experiment.run_folder import RunFolder
 from nodes.intersection.config import IntersectionExperimentConfig
 
 
 @dataclass(frozen=True)
-class Experiment:
-    """One resolved experiment.
-
-    Attributes:
-        config: The resolved configuration.
-        file: The experiment file.
-        folder: The run folder.
-        setting: Name of the setting, e.g. ``demo``.
-    """
-
-    config: IntersectionExperimentConfig
-    file: FilePath
-    folder: FilePath
-    setting: str
+class Experiment(RunFolder[IntersectionExperimentConfig]):
+    """One resolved experiment."""
 
     @cached_property
     def world(self) -> IntersectionConfig:
         """The simulated intersection with the experiment's changes."""
         return IntersectionConfig.model_validate(self.config.world)
-
-    def stage_folder(self, stage: str) -> FilePath:
-        """Where a stage writes."""
-        return self.folder / stage
 
     @cached_property
     def references(self) -> dict[str, ReferencePath]:

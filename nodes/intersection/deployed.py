@@ -24,7 +24,7 @@ from advnerf_core.fields.coloured import ColouredObject
 from advnerf_core.geometry import Array, Pinhole, planar_poses
 from advnerf_core.scene.surrogate import Frames, Surrogate
 from hardware.deployment_scene import DeploymentScene, Depth, Rgb
-from nodes.intersection.pictures import as_uint8
+from nodes.experiment.images import as_uint8
 
 # At a camera's own resolution one ray per pixel is what a rasteriser takes; the policy's resize averages three of them.
 _SUPERSAMPLE = 1

@@ -21,12 +21,12 @@ from advnerf_core.geometry import Array
 from advnerf_core.scene.dataset import load_transforms
 from advnerf_core.scene.fidelity import Pictures
 from hardware.twin.intersection.scene import Intersection
+from nodes.experiment.images import as_uint8
 from nodes.intersection import capture
 from nodes.intersection.attack import Cell, Condition, attack_path, attack_problem, load_theta
 from nodes.intersection.context import Experiment
 from nodes.intersection.deployed import DressedScene, drive_deployed
 from nodes.intersection.objects import placed_objects, surrogate_of
-from nodes.intersection.pictures import as_uint8
 from nodes.intersection.policy import victim_file
 
 Rgb = NDArray[np.uint8]

@@ -16,8 +16,8 @@ from advnerf_core.objects.mesh import stand
 from advnerf_core.objects.model import ObjectModel, load_object, save_object
 from advnerf_core.scene.surrogate import BackgroundRenderer, Surrogate
 from hardware.twin.intersection.config import ObjectKind
+from nodes.experiment.learned_scene import load_background
 from nodes.intersection.context import Experiment
-from nodes.intersection.scene import load_background
 from nodes.runtime.stages import Report
 
 GENERATOR_OF: dict[ObjectKind, str] = {"small_car": "car", "hydrant": "hydrant"}

@@ -17,14 +17,14 @@ from advnerf_core.driving.sources import RenderedSource, Show
 from advnerf_core.files import write_atomically
 from advnerf_core.geometry import planar_pose
 from advnerf_core.scene.dataset import load_image, load_transforms
+from advnerf_core.scene.image_files import write_image
 from hardware.twin.intersection.scene import Intersection
+from nodes.experiment.images import as_uint8
+from nodes.experiment.learned_scene import load_background
 from nodes.intersection import capture
-from nodes.intersection.capture import write_image
 from nodes.intersection.context import Experiment
 from nodes.intersection.deployed import DressedScene
 from nodes.intersection.objects import describe, placed_objects, random_theta, surrogate_of
-from nodes.intersection.pictures import as_uint8
-from nodes.intersection.scene import load_background
 from nodes.runtime.stages import Report
 
 HARDENED, NAIVE = "hardened", "naive"

@@ -19,14 +19,14 @@ from advnerf_core.report.clips import ClipTrack, write_clip
 from advnerf_core.report.tables import Table, spread
 from advnerf_core.scene.surrogate import Surrogate
 from hardware.twin.intersection.scene import Intersection
+from nodes.experiment.images import as_uint8
+from nodes.experiment.learned_scene import load_background
 from nodes.intersection import page
 from nodes.intersection.attack import Cell, cells, load_theta
 from nodes.intersection.context import Experiment
 from nodes.intersection.deployed import DressedScene
 from nodes.intersection.objects import placed_objects
-from nodes.intersection.pictures import as_uint8
 from nodes.intersection.policy import HARDENED
-from nodes.intersection.scene import load_background
 from nodes.runtime.stages import Report
 
 DOMAINS = ("surrogate", "deployed")

@@ -56,29 +56,28 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
     wanted = experiment.config.retrain
     assert wanted is not None, "the stage runs only where the experiment asks for it"
     surrogate = surrogate_of(experiment, placed_objects(experiment))
-    rounds, victim, kept = [], victim_file(experiment, HARDENED), _old_frames(experiment)
+    file, rounds, kept = victim_file(experiment, HARDENED), [], _old_frames(experiment)
+    victim = load_policy(file)
     thetas: list[torch.Tensor] = []
     with Intersection(experiment.world) as scene:
         dressed = DressedScene(scene, experiment.view, placed_objects(experiment))
-        first = _first_attacks(experiment, surrogate, dressed)
+        first = _first_attacks(experiment, surrogate, dressed, victim)
         for number in range(wanted.rounds + 1):
             here = folder / f"round{number}"
             told = _part(report, number / (wanted.rounds + 1), 1.0 / (wanted.rounds + 1), f"round {number}")
             found = first if number == 0 else _attack_again(experiment, surrogate, dressed, victim, here, told)
-            rounds.append({"victim": load_policy(victim).sha256, **found.ratios})
+            rounds.append({"victim": victim.sha256, **found.ratios})
             if number == wanted.rounds or not _pays(found, wanted.pays_ratio):
                 break
             thetas += list(found.thetas.values())
-            new = _collect(experiment, scene, load_policy(victim), thetas, here, told)
+            new = _collect(experiment, scene, victim, thetas, here, told)
             settings = RetrainConfig(steps=wanted.steps, new_share=wanted.new_share, seed=wanted.seed + number)
-            done = fine_tune(
-                load_policy(victim), kept, new, settings, here / "policy.safetensors",
-                _stepping(told, wanted.steps),
-            )  # fmt: skip
-            victim, kept = done.path, [*kept, *new]
+            file = here / "policy.safetensors"
+            fine_tune(victim, kept, new, settings, file, _stepping(told, wanted.steps))
+            victim, kept = load_policy(file), [*kept, *new]
         summary = {
             "rounds": rounds, "old_attacks": _under_old_attacks(experiment, dressed, folder / "round0", first),
-            "pays_ratio": wanted.pays_ratio, "final_policy": str(victim), "settings_hash": hash_of(wanted.model_dump(mode="json")),
+            "pays_ratio": wanted.pays_ratio, "final_policy": str(file), "settings_hash": hash_of(wanted.model_dump(mode="json")),
         }  # fmt: skip
     write_atomically(folder / "retrain.json", json.dumps(summary, indent=1) + "\n")
     retrain_plot.draw(folder / "curve.png", rounds, wanted.pays_ratio)
@@ -120,24 +119,24 @@ def _old_frames(experiment: Experiment) -> list[Frames]:
     return [store.load(name) for name in store.names()]
 
 
-def _first_attacks(experiment: Experiment, surrogate: Surrogate, dressed: DressedScene) -> Found:
+def _first_attacks(experiment: Experiment, surrogate: Surrogate, dressed: DressedScene, victim: LoadedPolicy) -> Found:
     """What the attack stage found for its first seed."""
     folder, seed = experiment.stage_folder("attack"), experiment.config.attack.seeds[0]
     thetas: dict[str, torch.Tensor] = {
         name: load_theta(folder, Cell(name, HARDENED, "gradient", seed)) for name in experiment.config.scenarios
     }
-    return _judged(experiment, surrogate, dressed, load_policy(victim_file(experiment, HARDENED)), thetas)
+    return _judged(experiment, surrogate, dressed, victim, thetas)
 
 
 def _attack_again(
-    experiment: Experiment, surrogate: Surrogate, dressed: DressedScene, victim: Path, folder: Path,
+    experiment: Experiment, surrogate: Surrogate, dressed: DressedScene, victim: LoadedPolicy, folder: Path,
     report: Callable[[float, str], None],
 ) -> Found:  # fmt: skip
     """The gradient attack of the first seed on a retrained victim, as long as the attack on the first one."""
-    attack, policy = experiment.config.attack, load_policy(victim)
+    attack = experiment.config.attack
     thetas: dict[str, torch.Tensor] = {}
     for index, scenario in enumerate(experiment.config.scenarios):
-        problem = attack_problem(experiment, surrogate, policy, scenario, attack.seeds[0])
+        problem = attack_problem(experiment, surrogate, victim, scenario, attack.seeds[0])
 
         def told(evaluation: Any, index: int = index, scenario: str = scenario) -> None:
             done = (index + (evaluation.iteration + 1) / attack.evaluations) / len(experiment.config.scenarios)
@@ -146,10 +145,10 @@ def _attack_again(
         result = gradient_attack(
             problem, attack.evaluations, attack.learning_rate, seed=attack.seeds[0],
             state_path=folder / f"{scenario}.state.safetensors", on_evaluation=told,
-            settings_hash=hash_of({"victim": policy.sha256, "scenario": scenario}),
+            settings_hash=hash_of({"victim": victim.sha256, "scenario": scenario}),
         )  # fmt: skip
         thetas[scenario] = result.theta
-    return _judged(experiment, surrogate, dressed, policy, thetas)
+    return _judged(experiment, surrogate, dressed, victim, thetas)
 
 
 def _judged(

@@ -16,11 +16,11 @@ from advnerf_core.scene.field import SceneField, SceneFieldConfig, save_scene
 from hardware.deployment_scene import DeploymentScene
 from hardware.twin.intersection.car import DubinsCar
 from hardware.twin.intersection.config import DubinsConfig, IntersectionConfig
+from nodes.experiment.learned_scene import scene_file
 from nodes.intersection.context import Experiment
 from nodes.intersection.objects import build, object_file
 from nodes.intersection.policy import HARDENED, NAIVE, victim_file
 from nodes.intersection.run import load_experiment
-from nodes.intersection.scene import scene_file
 
 LAUNCH = Path(__file__).parents[3] / "launch" / "intersection.experiment.yaml"
 TINY: dict[str, Any] = {

@@ -1,0 +1,86 @@
+"""A resolved experiment of any kind in its run folder: its manifest, and its stages run to the end."""
+
+from __future__ import annotations
+
+import json
+import platform
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+from rich.console import Console
+
+from advnerf_core.files import write_atomically
+from nodes.runtime.progress import ProgressDisplay
+from nodes.runtime.stages import Stage, StageRecord, check_until, run_stages
+
+Config = TypeVar("Config")
+
+
+@dataclass(frozen=True)
+class RunFolder(Generic[Config]):
+    """One resolved experiment.
+
+    Attributes:
+        config: The resolved configuration.
+        file: The experiment file.
+        folder: The run folder.
+        setting: Name of the setting, e.g. ``demo``.
+    """
+
+    config: Config
+    file: Path
+    folder: Path
+    setting: str
+
+    def stage_folder(self, stage: str) -> Path:
+        """Where a stage writes."""
+        return self.folder / stage
+
+
+def run_to_end(
+    experiment: RunFolder[Any],
+    stages: Sequence[Stage],
+    libraries: Sequence[str],
+    summarise: Callable[[Console], None],
+    until: str | None = None,
+    console: Console | None = None,
+) -> dict[str, StageRecord]:
+    """Run the stages that are not there yet, and say what a finished experiment found.
+
+    Args:
+        experiment: The experiment.
+        stages: Its stages in order.
+        libraries: Whose versions the manifest names.
+        summarise: Prints the result; called if the stage ``report`` was reached.
+        until: Last stage to run; None for all.
+        console: Where to print.
+    """
+    console = console or Console()
+    began = time.monotonic()
+    check_until(stages, until)
+    experiment.folder.mkdir(parents=True, exist_ok=True)
+    _write_manifest(experiment, libraries)
+    with ProgressDisplay(console) as display:
+        records = run_stages(stages, experiment.folder, display, until)
+    if "report" in records:
+        summarise(console)
+    console.print(f"{experiment.config.name} ({experiment.setting}): {time.monotonic() - began:.0f} s", highlight=False)
+    return records
+
+
+def _write_manifest(experiment: RunFolder[Any], libraries: Sequence[str]) -> None:
+    manifest = {
+        "experiment": experiment.config.name,
+        "setting": experiment.setting,
+        "file": str(experiment.file),
+        "command": " ".join(["advnerf", *sys.argv[1:]]),
+        "config": experiment.config.model_dump(mode="json"),
+        "versions": {"advnerf": version("advnerf"), "python": platform.python_version()}
+        | {name: version(name) for name in libraries},
+    }
+    write_atomically(experiment.folder / "manifest.json", json.dumps(manifest, indent=1) + "\n")
