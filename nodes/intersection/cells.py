@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import platform
-from contextlib import AbstractContextManager, nullcontext
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ from hardware.twin.intersection.scene import Intersection
 from nodes.intersection.attack import Cell, Condition, cells, frozen_hashes, load_theta, surrogate_part
 from nodes.intersection.context import Experiment
 from nodes.intersection.deployed import DressedScene, drive_deployed
+from nodes.intersection.films import film_cell
 from nodes.intersection.objects import placed_objects, surrogate_of
 from nodes.intersection.policy import victim_file, victims
 from nodes.runtime.errors import RuntimeFault
@@ -57,22 +57,29 @@ def run_cell(
     surrogate = surrogate_of(experiment, placed_objects(experiment))
     for each in dict.fromkeys((cell.clean, cell)):
         surrogate_part(experiment, surrogate, each, folder, report)
-    result = folder / f"{cell.name}.cell.json"
-    # A scene is opened only if there is something to drive.
-    opened: AbstractContextManager[Any] = nullcontext() if result.exists() else Intersection(experiment.world)
-    with opened as scene:
-        dressed = None if scene is None else DressedScene(scene, experiment.view, placed_objects(experiment))
-        return deployed_part(experiment, dressed, cell, folder, folder)
+    result, clip = folder / f"{cell.name}.cell.json", next(folder.glob("clip.*"), None)
+    if result.exists() and clip is not None:
+        found: dict[str, Any] = json.loads(result.read_text())
+        return _with_clip(found, clip)
+    with Intersection(experiment.world) as scene:
+        dressed = DressedScene(scene, experiment.view, placed_objects(experiment))
+        data = deployed_part(experiment, dressed, cell, folder, folder)
+        return _with_clip(data, film_cell(experiment, dressed, cell, folder))
+
+
+def _with_clip(data: dict[str, Any], clip: Path) -> dict[str, Any]:
+    """The cell with the name of its film, relative to the folder of all cells."""
+    return {**data, "extra": {**data["extra"], "clip": f"{clip.parent.name}/{clip.name}"}}
 
 
 def deployed_part(
-    experiment: Experiment, dressed: DressedScene | None, cell: Cell, searched: Path, folder: Path
+    experiment: Experiment, dressed: DressedScene, cell: Cell, searched: Path, folder: Path
 ) -> dict[str, Any]:
     """Drive a searched cell and its clean drive in the deployment scene; writes ``<cell>.cell.json`` and ``<cell>.drives.json``.
 
     Args:
         experiment: The experiment.
-        dressed: The scene with its objects; may be None if the result is there.
+        dressed: The scene with its objects.
         cell: Which.
         searched: Where the surrogate's part is.
         folder: Where the result goes.
@@ -85,7 +92,6 @@ def deployed_part(
     if result.exists():
         found: dict[str, Any] = json.loads(result.read_text())
         return found
-    assert dressed is not None
     learned, clean = (json.loads((searched / f"{each.name}.json").read_text()) for each in (cell, cell.clean))
     driven = _drives(experiment, dressed, cell, searched, folder)
     undisturbed = _drives(experiment, dressed, cell.clean, searched, folder)

@@ -18,9 +18,11 @@ from advnerf_core.report.clips import data_uri, image_uri
 from advnerf_core.report.palette import DARK, LIGHT, LINE_STYLES, css_variables
 from advnerf_core.report.plots import new_axes, svg
 from advnerf_core.report.tables import Table
-from nodes.intersection import report
+from advnerf_core.report.transfer_page import METHOD_NAMES
+from nodes.intersection import films
 from nodes.intersection.attack import Cell, cells
 from nodes.intersection.context import Experiment
+from nodes.intersection.policy import HARDENED
 from nodes.runtime.stages import read_record
 
 COLOURS = {"none": LIGHT["none"], "random": LIGHT["random"], "cem": "#7a3f98", "gradient": LIGHT["gradient"]}
@@ -71,7 +73,7 @@ def write(
 def opening(experiment: Experiment) -> str:
     """What was done, in one paragraph."""
     attack, things = experiment.config.attack, experiment.world.objects
-    methods = ", ".join(report.METHOD_NAMES[name] for name in attack.methods)
+    methods = ", ".join(METHOD_NAMES[name] for name in attack.methods)
     kinds = {kind: sum(thing.kind == kind for thing in things) for kind in ("small_car", "hydrant")}
     return (
         f"One goal-conditioned policy drives {', '.join(experiment.config.scenarios)}. The colours of {kinds['small_car']} cars and "
@@ -94,16 +96,16 @@ def _drive(experiment: Experiment, name: str, clip: Path, seen: Mapping[str, NDA
         Markup("<figure>{}<figcaption>{}</figcaption></figure>").format(Markup(svg(trajectories(experiment, name), text)), text),
         Markup('<video controls loop muted src="{}"></video>').format(data_uri(clip)),
     ]  # fmt: skip
-    return [*parts, *(_picture(image, f"Objects seen: {report.METHOD_NAMES[key]}") for key, image in seen.items())]
+    return [*parts, *(_picture(image, f"Objects seen: {METHOD_NAMES[key]}") for key, image in seen.items())]
 
 
 def trajectories(experiment: Experiment, name: str) -> Figure:
     """All drives of the hardened victim on one path, from above."""
     path = experiment.paths[name]
     line = path.pose_at(np.linspace(0.0, path.length_m, 300))[:, :2]
-    found = [cell for cell in cells(experiment) if cell.scenario == name and cell.victim == report.HARDENED]
-    drives = [(cell, domain, states) for cell in found for domain in report.DOMAINS
-              for states in report.drives_of(experiment, domain, cell)]  # fmt: skip
+    found = [cell for cell in cells(experiment) if cell.scenario == name and cell.victim == HARDENED]
+    drives = [(cell, domain, states) for cell in found for domain in films.DOMAINS
+              for states in films.drives_of(experiment, domain, cell)]  # fmt: skip
     every = np.concatenate([states[:, :2] for _, _, states in drives])
     low, high = every.min(axis=0) - _MARGIN_M, every.max(axis=0) + _MARGIN_M
     with new_axes(6.4, float(np.clip(5.6 * (high - low)[1] / (high - low)[0], 2.2, 6.0)) + 0.9) as ax:
@@ -119,7 +121,7 @@ def trajectories(experiment: Experiment, name: str) -> Figure:
 
 
 def _label(cell: Cell, domain: str) -> str:
-    return f"{report.METHOD_NAMES[cell.method]}, {domain}"
+    return f"{METHOD_NAMES[cell.method]}, {domain}"
 
 
 def _ground(ax: Any, experiment: Experiment) -> None:

@@ -14,14 +14,10 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from advnerf_core.files import write_atomically
-from advnerf_core.geometry import planar_poses
-from advnerf_core.report.clips import ClipTrack, write_clip
 from advnerf_core.report.tables import Table, spread
-from advnerf_core.scene.surrogate import Surrogate
+from advnerf_core.report.transfer_page import METHOD_NAMES
 from hardware.twin.intersection.scene import Intersection
-from nodes.experiment.images import as_uint8
-from nodes.experiment.learned_scene import load_background
-from nodes.intersection import page
+from nodes.intersection import films, page
 from nodes.intersection.attack import Cell, cells, load_theta
 from nodes.intersection.context import Experiment
 from nodes.intersection.deployed import DressedScene
@@ -29,8 +25,6 @@ from nodes.intersection.objects import placed_objects
 from nodes.intersection.policy import HARDENED
 from nodes.runtime.stages import Report
 
-DOMAINS = ("surrogate", "deployed")
-METHOD_NAMES = {"none": "no attack", "random": "best random", "cem": "cross-entropy", "gradient": "gradient"}
 # Where along a drive its objects are shown [m]: most of them are in view, some close.
 _SEEN_AT_M = (9.0, 14.0)
 
@@ -75,7 +69,7 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
         overview = scene.overview()
         for index, name in enumerate(experiment.config.scenarios):
             report(0.1 + 0.8 * index / len(experiment.config.scenarios), f"filming {name}")
-            clips.append(film(experiment, dressed, name, folder))
+            clips.append(films.film_scenario(experiment, dressed, name, folder))
         seen: dict[str, dict[str, NDArray[np.uint8]]] = {
             name: textures_seen(experiment, dressed, name) for name in experiment.config.scenarios
         }
@@ -100,7 +94,7 @@ def rows_of(experiment: Experiment) -> list[Row]:
     drives: dict[tuple[str, str, str, str], list[tuple[float, float, bool]]] = {}
     for cell in cells(experiment):
         data = read_cell(experiment, cell)
-        for domain in DOMAINS:
+        for domain in films.DOMAINS:
             part = data[domain]
             kept = drives.setdefault((cell.victim, cell.scenario, domain, cell.method), [])
             kept += zip(part["total_cte_m"], part["none_total_cte_m"], part["off_track"], strict=True)
@@ -117,7 +111,7 @@ def rows_of(experiment: Experiment) -> list[Row]:
 def _order(experiment: Experiment, key: tuple[str, str, str, str]) -> tuple[bool, int, int, int]:
     victim, scenario, domain, method = key
     return (
-        victim != HARDENED, experiment.config.scenarios.index(scenario), DOMAINS.index(domain),
+        victim != HARDENED, experiment.config.scenarios.index(scenario), films.DOMAINS.index(domain),
         list(METHOD_NAMES).index(method),
     )  # fmt: skip
 
@@ -151,44 +145,6 @@ def write_results(experiment: Experiment, rows: Sequence[Row], folder: Path) -> 
         numbers = f"{len(row.total_cte_m)},{np.mean(row.total_cte_m):.4f},{std:.4f},{row.ratio:.4f},{row.off_track}"
         lines.append(f"{row.victim},{row.scenario},{row.domain},{row.method},{numbers}")
     write_atomically(folder / "results.csv", "\n".join(lines) + "\n")
-
-
-def strongest(experiment: Experiment) -> str:
-    """The method that films show: the gradient if it was searched."""
-    methods = experiment.config.attack.methods
-    return "gradient" if "gradient" in methods else methods[-1]
-
-
-def film(experiment: Experiment, dressed: DressedScene, scenario: str, folder: Path) -> Path:
-    """The attacked drive in the surrogate, and the deployed ones past plain and attacked objects, side by side; first seed and start."""
-    seed, method = experiment.config.attack.seeds[0], strongest(experiment)
-    attacked = Cell(scenario, HARDENED, method, seed)  # type: ignore[arg-type]
-    theta = load_theta(experiment.stage_folder("attack"), attacked)
-    whole = Surrogate(load_background(experiment), experiment.camera, experiment.mount, placed_objects(experiment))
-    learned = drives_of(experiment, "surrogate", attacked)[0]
-    frames = [as_uint8(whole.render(pose[None], theta).images[0]) for pose in planar_poses(learned) @ experiment.mount]
-    tracks = [_track(experiment, scenario, "learned scene, attacked", method, frames, learned)]
-    for cell, colours in ((attacked.clean, dressed.plain_theta()), (attacked, theta)):
-        states = drives_of(experiment, "deployed", cell)[0]
-        views = [dressed.camera_image(state, colours) for state in states]
-        title = "deployed, no attack" if cell.method == "none" else "deployed, attacked"
-        tracks.append(_track(experiment, scenario, title, cell.method, views, states))
-    return write_clip(folder / f"{scenario}.mp4", tracks, 1.0 / experiment.config.dt_s, experiment.world.off_track_m)
-
-
-def _track(
-    experiment: Experiment, scenario: str, title: str, method: str, frames: list[NDArray[np.uint8]], states: Any
-) -> ClipTrack:
-    cte_m = experiment.paths[scenario].project(np.asarray(states)[:, :2]).cte_m
-    condition = "gradient" if method == "cem" else method
-    return ClipTrack(title, condition, frames, cte_m)  # type: ignore[arg-type]
-
-
-def drives_of(experiment: Experiment, domain: str, cell: Cell) -> list[Any]:
-    """States ``[T + 1, 3]`` of a cell's drives in one domain."""
-    stage, suffix = ("attack", "json") if domain == "surrogate" else ("deploy", "drives.json")
-    data = json.loads((experiment.stage_folder(stage) / f"{cell.name}.{suffix}").read_text())
-    return [np.array(states)[:, :3] for states in data["states"]]
 
 
 def textures_seen(experiment: Experiment, dressed: DressedScene, scenario: str) -> dict[str, NDArray[np.uint8]]:

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import av
 import numpy as np
 import pytest
 import torch
@@ -18,6 +19,7 @@ from nodes.intersection.cells import CellError, deployed_part, run_cell
 from nodes.intersection.context import Experiment
 from nodes.intersection.deploy import FrozenChangedError, check_frozen
 from nodes.intersection.deployed import DressedScene
+from nodes.intersection.films import film_cell
 from nodes.intersection.objects import placed_objects, surrogate_of
 from nodes.intersection.policy import NAIVE, victim_file
 
@@ -97,8 +99,21 @@ def test_cell_has_both_domains_over_their_own_clean_drive(fresh: Experiment, wal
     cte_m = fresh.paths["right"].project(driven[1:, :2]).cte_m
     assert cell["deployed"]["total_cte_m"] == pytest.approx([np.abs(cte_m).sum()])
     assert (out / f"{GRADIENT.clean.name}.drives.json").exists()
-    # Once there, neither scene nor search is needed.
-    assert deployed_part(fresh, None, GRADIENT, folder, out) == cell
+    # Once there, it is not driven again: here it would end where it starts.
+    blocking = replace(wall, blocked_beyond_m=-1e3)
+    assert deployed_part(fresh, DressedScene(blocking, fresh.view, objects), GRADIENT, folder, out) == cell
+
+
+def test_a_cell_is_filmed_frame_by_frame(fresh: Experiment, wall: Any) -> None:
+    folder, objects = fresh.stage_folder("attack"), placed_objects(fresh)
+    surrogate, dressed = surrogate_of(fresh, objects), DressedScene(wall, fresh.view, objects)
+    for cell in (GRADIENT.clean, GRADIENT):
+        surrogate_part(fresh, surrogate, cell, folder, silent)
+    deployed_part(fresh, dressed, GRADIENT, folder, folder)
+    with av.open(str(film_cell(fresh, dressed, GRADIENT, folder))) as film:
+        frames = [frame.to_ndarray(format="rgb24") for frame in film.decode(video=0)]
+    assert len(frames) >= fresh.config.horizon
+    assert frames[0].std() > 5  # something is to be seen
 
 
 def test_unknown_cells_are_refused(trained: Experiment, tmp_path: Path) -> None:

@@ -1,0 +1,74 @@
+"""Films of drives from the driver's seat: one per drive of an experiment's report, and one per cell of a campaign."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from advnerf_core.geometry import Array, planar_poses
+from advnerf_core.report.clips import ClipTrack, write_clip
+from advnerf_core.report.transfer_page import METHOD_NAMES
+from advnerf_core.scene.surrogate import Surrogate
+from nodes.experiment.images import as_uint8
+from nodes.experiment.learned_scene import load_background
+from nodes.intersection.attack import Cell, load_theta
+from nodes.intersection.context import Experiment
+from nodes.intersection.deployed import DressedScene
+from nodes.intersection.objects import placed_objects
+from nodes.intersection.policy import HARDENED
+
+DOMAINS = ("surrogate", "deployed")
+
+
+def strongest(experiment: Experiment) -> str:
+    """The method that films show: the gradient if it was searched."""
+    methods = experiment.config.attack.methods
+    return "gradient" if "gradient" in methods else methods[-1]
+
+
+def film_scenario(experiment: Experiment, dressed: DressedScene, scenario: str, folder: Path) -> Path:
+    """The attacked drive in the surrogate, and the deployed ones past plain and attacked objects, side by side; first seed and start."""
+    seed, method = experiment.config.attack.seeds[0], strongest(experiment)
+    attacked = Cell(scenario, HARDENED, method, seed)  # type: ignore[arg-type]
+    theta = load_theta(experiment.stage_folder("attack"), attacked)
+    whole = Surrogate(load_background(experiment), experiment.camera, experiment.mount, placed_objects(experiment))
+    learned = drives_of(experiment, "surrogate", attacked)[0]
+    frames = [as_uint8(whole.render(pose[None], theta).images[0]) for pose in planar_poses(learned) @ experiment.mount]
+    tracks = [_track(experiment, scenario, "learned scene, attacked", method, frames, learned)]
+    for cell, colours in ((attacked.clean, dressed.plain_theta()), (attacked, theta)):
+        states = drives_of(experiment, "deployed", cell)[0]
+        views = [dressed.camera_image(state, colours) for state in states]
+        title = "deployed, no attack" if cell.method == "none" else "deployed, attacked"
+        tracks.append(_track(experiment, scenario, title, cell.method, views, states))
+    return write_clip(folder / f"{scenario}.mp4", tracks, 1.0 / experiment.config.dt_s, experiment.world.off_track_m)
+
+
+def film_cell(experiment: Experiment, dressed: DressedScene, cell: Cell, folder: Path) -> Path:
+    """The deployed drive of one cell, from its first start; its files are in ``folder``, and ``clip.mp4`` will be."""
+    states = _states(folder / f"{cell.name}.drives.json")[0]
+    colours = dressed.plain_theta() if cell.method == "none" else load_theta(folder, cell)
+    title = f"{METHOD_NAMES[cell.method]}, {cell.victim}, seed {cell.seed}"
+    views = [dressed.camera_image(state, colours) for state in states]
+    track = _track(experiment, cell.scenario, title, cell.method, views, states)
+    return write_clip(folder / "clip.mp4", [track], 1.0 / experiment.config.dt_s, experiment.world.off_track_m)
+
+
+def _track(
+    experiment: Experiment, scenario: str, title: str, method: str, frames: list[NDArray[np.uint8]], states: Array
+) -> ClipTrack:
+    cte_m = experiment.paths[scenario].project(np.asarray(states)[:, :2]).cte_m
+    condition = "gradient" if method == "cem" else method
+    return ClipTrack(title, condition, frames, cte_m)  # type: ignore[arg-type]
+
+
+def drives_of(experiment: Experiment, domain: str, cell: Cell) -> list[Array]:
+    """States ``[T + 1, 3]`` of a cell's drives in one domain."""
+    stage, suffix = ("attack", "json") if domain == "surrogate" else ("deploy", "drives.json")
+    return _states(experiment.stage_folder(stage) / f"{cell.name}.{suffix}")
+
+
+def _states(file: Path) -> list[Array]:
+    return [np.array(states)[:, :3] for states in json.loads(file.read_text())["states"]]
