@@ -3,6 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 export MUJOCO_GL ?= egl
+DEFAULT_TESTS := not slow and not gpu and not hardware and not data
 
 .PHONY: help setup demo experiment test test-slow check bench campaign fmt clean
 
@@ -28,7 +29,9 @@ experiment: setup  ## The full experiment, 3 seeds (up to 2 hours on 2 cores); w
 	@$(BIN)/python -m benchmarks.experiment_rows runs/full
 
 test: setup  ## The default tests (under 6 minutes)
-	@$(BIN)/pytest -q
+	@# What computes runs on all cores; then what measures time or starts nodes has the machine for itself.
+	@OMP_NUM_THREADS=1 $(BIN)/pytest -q -n auto --maxprocesses 4 --dist worksteal -m '$(DEFAULT_TESTS) and not live'
+	@$(BIN)/pytest -q -m '$(DEFAULT_TESTS) and live'
 
 test-slow: setup  ## The tests that take minutes, the default ones excluded
 	@$(BIN)/pytest -q -m 'slow' --timeout 1200

@@ -1,4 +1,4 @@
-"""What all tests share: a process of its own for tests that spoil the one they run in."""
+"""What all tests share: which of them need the machine for themselves, and a process of its own for those that spoil theirs."""
 
 from __future__ import annotations
 
@@ -8,7 +8,27 @@ import sys
 
 import pytest
 
+# Where tests start processes, open sockets and terminals, or hold code to a clock; what lies below _COMPUTING only computes.
+_LIVE = (
+    "tests/nodes",
+    "tests/hardware",
+    "tests/replay",
+    "tests/benchmarks",
+    "tests/docker",
+    "tests/test_docs_policies.py",
+)
+_COMPUTING = (
+    "tests/nodes/attacking", "tests/nodes/experiment", "tests/nodes/intersection", "tests/nodes/policy_data",
+    "tests/hardware/carla_scene", "tests/hardware/twin/intersection",
+)  # fmt: skip
 _INSIDE = "ADVNERF_TEST_IN_ITS_OWN_PROCESS"
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark by folder what must not share its cores."""
+    for item in items:
+        if item.nodeid.startswith(_LIVE) and not item.nodeid.startswith(_COMPUTING):
+            item.add_marker(pytest.mark.live)
 
 
 def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:

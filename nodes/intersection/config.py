@@ -124,6 +124,10 @@ class RetrainConfig(_Section):
         description="Pairs of the victim's drives on each path, per domain: past plain objects and past a found texture.",
     )
     drive_steps: Positive = Field(default=60, description="Control ticks of such a drive.")
+    placements: Count = Field(
+        default=0,
+        description="Random places of all objects in random colours that the victim also learns from; see poses.py.",
+    )
     steps: Positive = Field(default=500, description="Optimiser steps of the fine-tuning.")
     new_share: Annotated[float, Field(gt=0, lt=1)] = Field(
         default=0.4, description="Share of new frames in the training."

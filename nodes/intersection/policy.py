@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from advnerf_core.driving.imitation import ImitationConfig, SourcePlan, train_po
 from advnerf_core.driving.path import Array
 from advnerf_core.driving.policy import images_to_tensor, load_policy
 from advnerf_core.driving.sources import RenderedSource, Show
+from advnerf_core.fields.voxel_grid import VoxelGridObject
 from advnerf_core.files import write_atomically
 from advnerf_core.geometry import planar_pose
 from advnerf_core.scene.dataset import load_image, load_transforms
@@ -70,16 +71,21 @@ def victim_file(experiment: Experiment, victim: str) -> Path:
     return experiment.stage_folder("policy") / FILES[victim]
 
 
-def plans(experiment: Experiment, scene: Intersection, sample: Sample | None = None) -> list[SourcePlan]:
+def plans(
+    experiment: Experiment, scene: Intersection, sample: Sample | None = None,
+    objects: Sequence[VoxelGridObject] | None = None, ending: str = "",
+) -> list[SourcePlan]:  # fmt: skip
     """For each drive its frames from the deployment scene and from the surrogate, with its goal and its teacher.
 
     Args:
         experiment: The experiment.
         scene: The deployment scene.
         sample: Draws the colours of all objects ``[K, 3]``; None draws random ones.
+        objects: The objects where they are to stand; None has them where the world does.
+        ending: Of the sources' names, which tell their frames apart.
     """
     config, background = experiment.config.policy, load_background(experiment)
-    objects = placed_objects(experiment)
+    objects = placed_objects(experiment) if objects is None else objects
     dressed = DressedScene(scene, experiment.view, objects)
     surrogate = surrogate_of(experiment, objects, background)
     sigma, shape = experiment.config.attack.random_sigma, surrogate.theta_shape
@@ -106,7 +112,7 @@ def plans(experiment: Experiment, scene: Intersection, sample: Sample | None = N
             ("surrogate", seen_in_surrogate, config.surrogate_stills, config.surrogate_drives),
         )
         for domain, prepare, stills, drives in domains:
-            source = RenderedSource(f"{domain}-{name}", prepare, experiment.dynamics, sample or any_colours)
+            source = RenderedSource(f"{domain}-{name}{ending}", prepare, experiment.dynamics, sample or any_colours)
             found.append(SourcePlan(source, stills, drives, **common))
     return found
 

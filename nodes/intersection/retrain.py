@@ -33,6 +33,7 @@ from nodes.intersection.context import Experiment
 from nodes.intersection.deployed import DressedScene, drive_deployed
 from nodes.intersection.objects import placed_objects, surrogate_of
 from nodes.intersection.policy import HARDENED, plans, victim_file
+from nodes.intersection.poses import random_placements
 from nodes.runtime.stages import Report, hash_of
 
 _NEAR_M, _TURNED_RAD, _GIVE_UP_M = 1.0, 0.15, 3.0
@@ -184,14 +185,21 @@ def _collect(
     experiment: Experiment, scene: Intersection, victim: LoadedPolicy, thetas: Sequence[torch.Tensor], folder: Path,
     report: Callable[[float, str], None],
 ) -> list[Frames]:  # fmt: skip
-    """Frames of both domains with the found objects: stills about the paths, and drives of the victim, labelled by the teacher."""
+    """Frames of both domains with the found objects: stills about the paths, and drives of the victim, labelled by the teacher.
+
+    Where it is asked for also stills with all objects in random colours at random places.
+    """
     wanted, store = experiment.config.retrain, FrameStore(folder / "frames")
     assert wanted is not None
     chosen = plans(experiment, scene, lambda rng: thetas[int(rng.integers(len(thetas)))])
-    for number, plan in enumerate(chosen):
+    amounts = [(wanted.stills, wanted.drives)] * len(chosen)
+    for number, objects in enumerate(random_placements(experiment, wanted.placements, seed=wanted.seed + len(thetas))):
+        moved = plans(experiment, scene, None, objects, f"-moved{number}")
+        chosen, amounts = [*chosen, *moved], [*amounts, *[(-(-wanted.stills // wanted.placements), 0)] * len(moved)]
+    for number, (plan, (stills, drives)) in enumerate(zip(chosen, amounts, strict=True)):
         if plan.source.name not in store.names():
             rng = np.random.default_rng([wanted.seed, len(thetas), number])
-            store.append(plan.source.name, _frames(plan, victim, wanted.stills, wanted.drives, wanted.drive_steps, rng))
+            store.append(plan.source.name, _frames(plan, victim, stills, drives, wanted.drive_steps, rng))
         report(0.4 + 0.3 * (number + 1) / len(chosen), f"collecting: {plan.source.name}")
     return [store.load(plan.source.name) for plan in chosen]
 

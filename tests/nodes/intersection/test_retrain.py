@@ -18,7 +18,7 @@ from nodes.intersection.config import RetrainConfig
 from nodes.intersection.context import Experiment
 from nodes.intersection.policy import HARDENED, victim_file
 
-SMALL = RetrainConfig(rounds=1, pays_ratio=1e-6, stills=2, drives=1, drive_steps=2, steps=2)
+SMALL = RetrainConfig(rounds=1, pays_ratio=1e-6, stills=2, drives=1, drive_steps=2, placements=1, steps=2)
 
 
 def silent(fraction: float, text: str = "") -> None:
@@ -66,10 +66,13 @@ def test_a_round_of_retraining_and_the_attack_on_it(attacked: Experiment) -> Non
         row = found["old_attacks"][name]
         assert row["ratio"] == pytest.approx(row["retrained_attacked_m"] / row["original_undisturbed_m"])
         assert found["rounds"][0]["surrogate"][name] > 0.0
-    # what it learned from: both domains, all drives, the colours that were found and no others
+    # what it learned from: both domains, all drives, the colours that were found, and random ones where the objects were moved
     store = FrameStore(folder / "round0" / "frames")
     assert sorted(store.names()) == sorted(
-        f"{domain}-{name}" for domain in ("deployed", "surrogate") for name in attacked.config.scenarios
+        f"{domain}-{name}{moved}"
+        for domain in ("deployed", "surrogate")
+        for name in attacked.config.scenarios
+        for moved in ("", "-moved0")
     )
     picture = cv2.imread(str(folder / "curve.png"))
     assert picture is not None

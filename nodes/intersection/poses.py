@@ -1,0 +1,186 @@
+"""Pose attacks at the junction: cars and hydrants are moved beside the lanes, and coloured, until the policy leaves its lane.
+
+The paper's last colour experiment: a victim that was retrained on colour attacks and on objects at random places (stage retrain with
+``retrain.placements``) is attacked in places and colours together, five placements refined by ten gradient steps each, the best of fifty;
+as many random places and colours are the baseline.
+"""
+
+from __future__ import annotations
+
+import json
+import platform
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from advnerf_core.attack.adjoint import AttackProblem, evaluate
+from advnerf_core.attack.placement import KeepOut, PoseBounds, PoseSpace, placed
+from advnerf_core.attack.pose_attack import FoundPoses, pose_attack
+from advnerf_core.attack.poses import MultiStart
+from advnerf_core.attack.search import Evaluation
+from advnerf_core.driving.metrics import drive_metrics
+from advnerf_core.driving.policy import LoadedPolicy
+from advnerf_core.fields.voxel_grid import VoxelGridObject
+from advnerf_core.files import write_atomically
+from hardware.deployment_scene import DeploymentScene
+from hardware.twin.intersection.config import PlacedObject
+from nodes.experiment.learned_scene import scene_sha256
+from nodes.intersection.attack import attack_problem
+from nodes.intersection.context import Experiment
+from nodes.intersection.deployed import DressedScene, drive_deployed
+from nodes.intersection.objects import placed_objects, surrogate_of
+from nodes.runtime.stages import Report, hash_of
+
+PoseMethod = Literal["none", "random", "gradient"]
+
+
+@dataclass(frozen=True)
+class PoseSettings:
+    """How far the objects may be moved from where they were placed by hand, and how long is searched.
+
+    Attributes:
+        move_m: An object's x and y may change by this [m].
+        turn_rad: A car's heading may change by this [rad]; a hydrant may turn all the way round.
+        samples: Placements that are drawn.
+        steps: Evaluations of each.
+        colour_rate: Adam's step of the colours before squashing.
+    """
+
+    move_m: float = 1.5
+    turn_rad: float = 0.6
+    samples: int = 5
+    steps: int = 10
+    colour_rate: float = 0.5
+
+
+def bounds_of(things: Sequence[PlacedObject], settings: PoseSettings) -> list[PoseBounds]:
+    """Where each object may stand: about its place in the world's configuration, at its size."""
+    found = []
+    for thing in things:
+        turn_rad = np.pi if thing.kind == "hydrant" else settings.turn_rad
+        x, y, yaw = (
+            (at - reach, at + reach)
+            for at, reach in ((thing.x_m, settings.move_m), (thing.y_m, settings.move_m), (thing.yaw_rad, turn_rad))
+        )
+        found.append(PoseBounds(x_m=x, y_m=y, yaw_rad=yaw))
+    return found
+
+
+def lanes_of(experiment: Experiment) -> KeepOut:
+    """The lanes of all drives: no object may stand in one."""
+    return KeepOut(tuple(experiment.paths.values()), experiment.world.off_track_m)
+
+
+def random_placements(
+    experiment: Experiment, count: int, seed: int, settings: PoseSettings | None = None
+) -> list[tuple[VoxelGridObject, ...]]:
+    """The objects at random allowed places, ``count`` times."""
+    if not count:
+        return []
+    objects = placed_objects(experiment)
+    bounds = bounds_of(experiment.world.objects, settings or PoseSettings())
+    space, generator = PoseSpace(objects, bounds, lanes_of(experiment)), torch.Generator().manual_seed(seed)
+    return [placed(objects, space.placements(space.draw(generator))) for _ in range(count)]
+
+
+def pose_cell(
+    experiment: Experiment, victim: LoadedPolicy, scenario: str, method: PoseMethod, seed: int, folder: Path, report: Report,
+    scene: DeploymentScene, settings: PoseSettings | None = None,
+) -> dict[str, Any]:  # fmt: skip
+    """Search for places and colours in the learned scene, drive in both domains, and keep the result in ``folder``.
+
+    Args:
+        experiment: Its scene and objects must be there.
+        victim: Who is attacked.
+        scenario: Drive: straight, right or left.
+        method: ``none`` leaves the objects plain where they stand; ``random`` and ``gradient`` search at equal evaluations.
+        seed: Of the search and its starts.
+        folder: Where the search state and the result are kept.
+        report: Told the finished fraction.
+        scene: Where it is deployed.
+        settings: Bounds and budget.
+
+    Returns:
+        The cell as JSON data, as `cells.run_cell` gives it; ``extra.placements`` has x [m], y [m], yaw [rad] and scale of each
+        object, ``extra.colours`` their colours before squashing.
+    """
+    settings = settings or PoseSettings()
+    frozen = hash_of({"scene": scene_sha256(experiment), "victim": victim.sha256, "settings": asdict(settings)})
+    result = folder / f"poses_{scenario}_{method}_{seed}.cell.json"
+    if result.exists() and (kept := json.loads(result.read_text()))["settings_hash"] == frozen:
+        return dict(kept)
+    surrogate = surrogate_of(experiment, placed_objects(experiment))
+    problem = attack_problem(experiment, surrogate, victim, scenario, seed)
+    objects, colours = placed_objects(experiment), surrogate.plain_theta()
+    clean = _driven(experiment, problem, scene, objects, colours, scenario)
+    attacked, extra = clean, {}
+    if method != "none":
+        found = _search(
+            experiment, problem, method, seed, settings, result.with_suffix(".state.safetensors"), frozen, report
+        )
+        attacked = _driven(experiment, problem, scene, found.objects, found.colours, scenario)
+        extra = _told(found)
+    data = {
+        "scenario": scenario, "victim": victim.sha256, "method": method, "seed": seed, "attack_id": None, "settings_hash": frozen,
+        "machine": platform.processor() or platform.machine(),
+        "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        **{domain: {**attacked[domain], "none_total_cte_m": clean[domain]["total_cte_m"]} for domain in clean},
+        "extra": extra,
+    }  # fmt: skip
+    write_atomically(result, json.dumps(data, indent=1) + "\n")
+    return data
+
+
+def _search(
+    experiment: Experiment, problem: AttackProblem, method: Literal["random", "gradient"], seed: int, settings: PoseSettings,
+    state: Path, settings_hash: str, report: Report,
+) -> FoundPoses:  # fmt: skip
+    best = [0.0]
+    budget = MultiStart(settings.samples, settings.steps, colour_rate=settings.colour_rate)
+
+    def told(evaluation: Evaluation) -> None:
+        best[0], done = max(best[0], evaluation.predicted_total_cte_m), evaluation.iteration + 1
+        now = f"total CTE {evaluation.predicted_total_cte_m:.1f} m, best {best[0]:.1f} m"
+        report(done / budget.evaluations, f"{method} {done}/{budget.evaluations}, {now}")
+
+    return pose_attack(
+        problem, bounds_of(experiment.world.objects, settings), lanes_of(experiment), method, budget, seed,
+        sigma=experiment.config.attack.random_sigma, state_path=state, on_evaluation=told, settings_hash=settings_hash,
+    )  # fmt: skip
+
+
+def _driven(
+    experiment: Experiment, problem: AttackProblem, scene: DeploymentScene, objects: Sequence[VoxelGridObject], colours: Tensor,
+    scenario: str,
+) -> dict[str, dict[str, Any]]:  # fmt: skip
+    """Drives from all starts of a problem past objects, in the learned scene and where they are deployed."""
+    there = replace(problem, sensor=surrogate_of(experiment, objects))
+    rollout, _ = evaluate(there, colours)
+    learned = [drive_metrics(problem.path, d, experiment.limits) for d in rollout.states.transpose(0, 1).numpy()]
+    dressed = DressedScene(scene, experiment.view, objects)
+    deployed = [
+        drive_deployed(
+            dressed, problem.policy, experiment.goal(scenario), np.asarray(start), experiment.paths[scenario], experiment.limits,
+            experiment.world.car.speed_mps, colours,
+        ).metrics
+        for start in problem.start_states.numpy()
+    ]  # fmt: skip
+    return {
+        domain: {"total_cte_m": [s.total_cte_m for s in scores], "off_track": [s.off_track for s in scores]}
+        for domain, scores in (("surrogate", learned), ("deployed", deployed))
+    }
+
+
+def _told(found: FoundPoses) -> dict[str, Any]:
+    history = found.search.history
+    return {
+        "placements": found.placements.tolist(), "colours": found.colours.tolist(), "evaluations": len(history),
+        "curve_total_cte_m": [evaluation.predicted_total_cte_m for evaluation in history],
+        "seconds": round(sum(evaluation.seconds for evaluation in history), 1),
+    }  # fmt: skip
