@@ -95,9 +95,11 @@ class AttackConfig(_Section):
     """The adversary, and what it may spend: all methods evaluate equally often."""
 
     methods: tuple[Method, ...] = Field(default=("random", "cem", "gradient"), min_length=1)
-    starts: Positive = Field(default=1, description="Start poses optimised together; the first is the nominal one.")
+    starts: Positive = Field(
+        default=1, description="Start poses optimised together; the first of seed 0 is the nominal one."
+    )
     start_sigma: Annotated[float, Field(ge=0)] = Field(
-        default=0.1, description="Spread of the other starts [m and rad]; headings a quarter of it."
+        default=0.1, description="Spread of all other starts [m and rad]; headings a quarter of it."
     )
     evaluations: Positive = Field(default=50, description="Closed-loop evaluations of each search.")
     learning_rate: PositiveNumber = 0.1
