@@ -194,7 +194,7 @@ def _run_experiment(
     from nodes.experiment.run import kind_of
 
     folder = folder or Path("runs") / setting
-    if kind_of(file) == "intersection":
+    if kind_of(file) in ("intersection", "carla"):
         from nodes.intersection import run as intersection
 
         intersection.run_experiment(intersection.load_experiment(file, setting, overrides or [], folder), until)

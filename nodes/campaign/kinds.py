@@ -29,6 +29,7 @@ KINDS = {
     "room": "nodes.experiment.cells",
     "room_search": "nodes.experiment.search_cells",
     "intersection": "nodes.intersection.cells",
+    "carla": "nodes.intersection.carla_cells",
 }
 RunCell = Callable[[Any, str, str, str, int, Path, Report], dict[str, Any]]
 # The stages that a cell needs of its experiment; what comes after is the cell itself.

@@ -12,8 +12,6 @@ from advnerf_core.driving.imitation import recovery_states
 from advnerf_core.geometry import Array, Pinhole, planar_pose
 from advnerf_core.scene.dataset import write_transforms
 from advnerf_core.scene.image_files import write_image
-from hardware.twin.intersection.photos import photo_poses
-from hardware.twin.intersection.scene import Intersection
 from nodes.experiment.learned_scene import HELD_OUT
 from nodes.intersection.context import Experiment
 from nodes.runtime.stages import Report
@@ -27,10 +25,10 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
     """Write two posed image sets: ``photos`` (learned from) and ``held_out`` (driving camera, without objects)."""
     config = experiment.config.capture
     rng = np.random.default_rng(config.seed)
-    poses = photo_poses(experiment.world, config.photos, rng)
-    states = held_out_states(experiment, rng)
-    total = len(poses) + len(states)
-    with Intersection(experiment.world) as scene:
+    with experiment.site.open() as scene:
+        poses = experiment.site.photo_poses(config.photos, rng)
+        states = held_out_states(experiment, rng)
+        total = len(poses) + len(states)
 
         def keep(
             name: str, taken: Sequence[Array], pinhole: Pinhole, see: Callable[[int], NDArray[np.uint8]], done: int
@@ -38,7 +36,8 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
             files = []
             for index in range(len(taken)):
                 files.append(f"images/{index:04d}.{'jpg' if name == PHOTOS else 'png'}")
-                write_image(folder / name / files[-1], see(index))
+                if not (folder / name / files[-1]).exists():
+                    write_image(folder / name / files[-1], see(index))
                 report((done + index + 1) / total, f"{name} {index + 1}/{len(taken)}")
             write_transforms(folder / name / "transforms.json", files, taken, pinhole)
 

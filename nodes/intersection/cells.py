@@ -12,7 +12,6 @@ import numpy as np
 
 from advnerf_core.driving.policy import load_policy
 from advnerf_core.files import write_atomically
-from hardware.twin.intersection.scene import Intersection
 from nodes.intersection.attack import Cell, Condition, cells, frozen_hashes, load_theta, surrogate_part
 from nodes.intersection.context import Experiment
 from nodes.intersection.deployed import DressedScene, drive_deployed
@@ -61,7 +60,7 @@ def run_cell(
     if result.exists() and clip is not None:
         found: dict[str, Any] = json.loads(result.read_text())
         return _with_clip(found, clip)
-    with Intersection(experiment.world) as scene:
+    with experiment.site.open() as scene:
         dressed = DressedScene(scene, experiment.view, placed_objects(experiment))
         data = deployed_part(experiment, dressed, cell, folder, folder)
         return _with_clip(data, film_cell(experiment, dressed, cell, folder))

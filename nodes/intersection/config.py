@@ -140,7 +140,7 @@ class RetrainConfig(_Section):
 class IntersectionExperimentConfig(_Section):
     """One experiment, resolved: the file's values, one of its settings over them, then the command line."""
 
-    kind: Literal["intersection"]
+    kind: Literal["intersection", "carla"] = Field(description="The simulated junction, or one of a CARLA map.")
     name: str = Field(min_length=1)
     scenarios: tuple[PathName, ...] = Field(default=("straight", "right", "left"), min_length=1)
     horizon: Positive = Field(default=60, description="Control ticks of every drive (T).")
@@ -148,7 +148,9 @@ class IntersectionExperimentConfig(_Section):
     held_cap_m: PositiveNumber = Field(
         default=6.0, description="Largest |CTE| that a stopped car is charged per tick [m]."
     )
-    world: dict[str, Any] = Field(default_factory=dict, description="Changes to the simulated intersection.")
+    world: dict[str, Any] = Field(
+        default_factory=dict, description="Changes to IntersectionConfig, or to CarlaConfig of hardware/carla_scene."
+    )
     capture: CaptureConfig = CaptureConfig()
     scene: SceneConfig = SceneConfig()
     policy: PolicyConfig = PolicyConfig()

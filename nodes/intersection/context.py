@@ -14,10 +14,12 @@ from advnerf_core.driving.metrics import Horizon
 from advnerf_core.driving.path import Arc, Line, Path
 from advnerf_core.driving.policy_view import PolicyView
 from advnerf_core.geometry import Array, Pinhole
+from hardware.carla_scene.config import CarlaConfig
 from hardware.twin.intersection.config import IntersectionConfig
 from hardware.twin.intersection.paths import ReferencePath
 from nodes.experiment.run_folder import RunFolder
 from nodes.intersection.config import IntersectionExperimentConfig
+from nodes.intersection.site import CarlaSite, Site, TwinSite, World
 
 
 @dataclass(frozen=True)
@@ -25,14 +27,21 @@ class Experiment(RunFolder[IntersectionExperimentConfig]):
     """One resolved experiment."""
 
     @cached_property
-    def world(self) -> IntersectionConfig:
-        """The simulated intersection with the experiment's changes."""
-        return IntersectionConfig.model_validate(self.config.world)
+    def site(self) -> Site:
+        """Where it is captured and deployed, with the experiment's changes."""
+        if self.config.kind == "carla":
+            return CarlaSite(CarlaConfig.model_validate(self.config.world), self.stage_folder("capture"))
+        return TwinSite(IntersectionConfig.model_validate(self.config.world))
+
+    @property
+    def world(self) -> World:
+        """The site's configuration: cameras, car, objects."""
+        return self.site.world
 
     @cached_property
     def references(self) -> dict[str, ReferencePath]:
         """The drives of the experiment by scenario."""
-        known = self.world.paths()
+        known = self.site.references
         return {name: known[name] for name in self.config.scenarios}
 
     @cached_property
@@ -77,7 +86,7 @@ class Experiment(RunFolder[IntersectionExperimentConfig]):
     @property
     def limits(self) -> Horizon:
         """Over how many ticks a drive is measured, and what counts as off the track."""
-        return Horizon(self.config.horizon, self.config.dt_s, self.world.off_track_m, self.config.held_cap_m)
+        return Horizon(self.config.horizon, self.config.dt_s, self.site.off_track_m, self.config.held_cap_m)
 
     def start_states(self, scenario: str, seed: int) -> torch.Tensor:
         """Start poses ``[B, 3]`` float64 of one attack, drawn about the nominal one; the first of seed 0 is the nominal one itself.

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from hardware.twin.intersection.scene import Intersection
 from nodes.intersection.attack import cells, frozen_hashes
 from nodes.intersection.cells import deployed_part
 from nodes.intersection.context import Experiment
@@ -23,7 +22,7 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
     """Drive what is not driven yet; one ``.cell.json`` per entry of the transfer table."""
     check_frozen(experiment)
     searched, plan = experiment.stage_folder("attack"), cells(experiment)
-    with Intersection(experiment.world) as scene:
+    with experiment.site.open() as scene:
         dressed = DressedScene(scene, experiment.view, placed_objects(experiment))
         for index, cell in enumerate(plan):
             report(index / len(plan), f"{cell.scenario} {cell.victim} {cell.method} seed {cell.seed}")

@@ -20,7 +20,6 @@ from advnerf_core.driving.policy import load_policy
 from advnerf_core.geometry import Array
 from advnerf_core.scene.dataset import load_transforms
 from advnerf_core.scene.fidelity import Pictures
-from hardware.twin.intersection.scene import Intersection
 from nodes.experiment.images import as_uint8
 from nodes.intersection import capture
 from nodes.intersection.attack import Cell, Condition, attack_path, attack_problem, load_theta
@@ -87,7 +86,7 @@ def _along_the_drive(
 ) -> Pictures:
     objects = placed_objects(experiment)
     policy, goal = policy_of(experiment, victim, scenario)
-    with Intersection(experiment.world) as scene:
+    with experiment.site.open() as scene:
         dressed = DressedScene(scene, experiment.view, objects)
         start: Array = np.array(experiment.references[scenario].start_pose)
         drive = drive_deployed(

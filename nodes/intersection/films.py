@@ -43,7 +43,7 @@ def film_scenario(experiment: Experiment, dressed: DressedScene, scenario: str, 
         views = [dressed.camera_image(state, colours) for state in states]
         title = "deployed, no attack" if cell.method == "none" else "deployed, attacked"
         tracks.append(_track(experiment, scenario, title, cell.method, views, states))
-    return write_clip(folder / f"{scenario}.mp4", tracks, 1.0 / experiment.config.dt_s, experiment.world.off_track_m)
+    return write_clip(folder / f"{scenario}.mp4", tracks, 1.0 / experiment.config.dt_s, experiment.site.off_track_m)
 
 
 def film_cell(experiment: Experiment, dressed: DressedScene, cell: Cell, folder: Path) -> Path:
@@ -53,7 +53,7 @@ def film_cell(experiment: Experiment, dressed: DressedScene, cell: Cell, folder:
     title = f"{METHOD_NAMES[cell.method]}, {cell.victim}, seed {cell.seed}"
     views = [dressed.camera_image(state, colours) for state in states]
     track = _track(experiment, cell.scenario, title, cell.method, views, states)
-    return write_clip(folder / "clip.mp4", [track], 1.0 / experiment.config.dt_s, experiment.world.off_track_m)
+    return write_clip(folder / "clip.mp4", [track], 1.0 / experiment.config.dt_s, experiment.site.off_track_m)
 
 
 def _track(

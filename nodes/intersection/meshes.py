@@ -32,7 +32,6 @@ from advnerf_core.objects.generators import GENERATORS
 from advnerf_core.objects.mesh import SurfaceMesh, stand
 from advnerf_core.scene.surrogate import Surrogate, split_theta
 from hardware.deployment_scene import DeploymentScene
-from hardware.twin.intersection.scene import Intersection
 from nodes.attacking.frames import DeployedFrames
 from nodes.intersection.attack import attack_problem
 from nodes.intersection.cells import CellError
@@ -114,7 +113,7 @@ def mesh_cell(
         kept: dict[str, Any] = json.loads(result.read_text())
         return kept
     if scene is None:
-        with Intersection(experiment.world) as opened:
+        with experiment.site.open() as opened:
             return _cell(experiment, scenario, victim, method, seed, result, report, settings, opened)
     return _cell(experiment, scenario, victim, method, seed, result, report, settings, scene)
 

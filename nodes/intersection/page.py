@@ -74,12 +74,13 @@ def opening(experiment: Experiment) -> str:
     """What was done, in one paragraph."""
     attack, things = experiment.config.attack, experiment.world.objects
     methods = ", ".join(METHOD_NAMES[name] for name in attack.methods)
+    where = "junction of the CARLA map" if experiment.config.kind == "carla" else "simulated junction"
     kinds = {kind: sum(thing.kind == kind for thing in things) for kind in ("small_car", "hydrant")}
     return (
         f"One goal-conditioned policy drives {', '.join(experiment.config.scenarios)}. The colours of {kinds['small_car']} cars and "
         f"{kinds['hydrant']} hydrants are searched together in the learned scene ({methods}; {attack.evaluations} evaluations each, "
         f"{len(attack.seeds)} seed(s), {attack.starts} start(s), T = {experiment.config.horizon}), then the opaque objects are put into the "
-        "simulated junction by depth. Total CTE is the sum of |CTE| over the drive; ratios are to the same start past the plain "
+        f"{where} by depth. Total CTE is the sum of |CTE| over the drive; ratios are to the same start past the plain "
         "objects in the same domain."
     )
 
@@ -129,10 +130,12 @@ def _ground(ax: Any, experiment: Experiment) -> None:
     from matplotlib.patches import Polygon
 
     ax.grid(False)
-    side = np.linspace(-experiment.world.road.half_m, experiment.world.road.half_m, 481)
-    x, y = np.meshgrid(side, side)
-    asphalt = np.vectorize(experiment.world.on_road)(x, y).astype(float)
-    ax.contour(x, y, asphalt, levels=[0.5], colors=LIGHT["muted"], linewidths=1.0, zorder=0.5)
+    if (edge := experiment.site.road_edge) is not None:
+        half_m, on_road = edge
+        side = np.linspace(-half_m, half_m, 481)
+        x, y = np.meshgrid(side, side)
+        asphalt = np.vectorize(on_road)(x, y).astype(float)
+        ax.contour(x, y, asphalt, levels=[0.5], colors=LIGHT["muted"], linewidths=1.0, zorder=0.5)
     for thing in experiment.world.objects:
         ax.add_patch(Polygon(thing.corners_m(), closed=True, fc=LIGHT["grid"], ec=LIGHT["ink"], lw=1.0, zorder=1.5))
 

@@ -19,7 +19,7 @@ from advnerf_core.files import write_atomically
 from advnerf_core.geometry import planar_pose
 from advnerf_core.scene.dataset import load_image, load_transforms
 from advnerf_core.scene.image_files import write_image
-from hardware.twin.intersection.scene import Intersection
+from hardware.deployment_scene import DeploymentScene
 from nodes.experiment.images import as_uint8
 from nodes.experiment.learned_scene import load_background
 from nodes.intersection import capture
@@ -47,7 +47,7 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
         give_up_m=_GIVE_UP_M, max_steering_rad=experiment.world.car.max_turn_rate_radps,
     )  # fmt: skip
     write_placement(experiment, folder)
-    with Intersection(experiment.world) as scene:
+    with experiment.site.open() as scene:
         trained = train_policy(
             settings, plans(experiment, scene), experiment.expert(experiment.config.scenarios[0]), experiment.view,
             folder, lambda part, text: report(0.98 * part, text),
@@ -72,7 +72,7 @@ def victim_file(experiment: Experiment, victim: str) -> Path:
 
 
 def plans(
-    experiment: Experiment, scene: Intersection, sample: Sample | None = None,
+    experiment: Experiment, scene: DeploymentScene, sample: Sample | None = None,
     objects: Sequence[VoxelGridObject] | None = None, ending: str = "",
 ) -> list[SourcePlan]:  # fmt: skip
     """For each drive its frames from the deployment scene and from the surrogate, with its goal and its teacher.

@@ -74,7 +74,7 @@ def bounds_of(things: Sequence[PlacedObject], settings: PoseSettings) -> list[Po
 
 def lanes_of(experiment: Experiment) -> KeepOut:
     """The lanes of all drives: no object may stand in one."""
-    return KeepOut(tuple(experiment.paths.values()), experiment.world.off_track_m)
+    return KeepOut(tuple(experiment.paths.values()), experiment.site.off_track_m)
 
 
 def random_placements(

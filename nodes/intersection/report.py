@@ -16,7 +16,6 @@ from rich.console import Console
 from advnerf_core.files import write_atomically
 from advnerf_core.report.tables import Table, spread
 from advnerf_core.report.transfer_page import METHOD_NAMES
-from hardware.twin.intersection.scene import Intersection
 from nodes.intersection import films, page
 from nodes.intersection.attack import Cell, cells, load_theta
 from nodes.intersection.context import Experiment
@@ -64,9 +63,9 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
     table = transfer_table(rows)
     write_results(experiment, rows, folder)
     clips = []
-    with Intersection(experiment.world) as scene:
+    with experiment.site.open() as scene:
         dressed = DressedScene(scene, experiment.view, placed_objects(experiment))
-        overview = scene.overview()
+        overview = experiment.site.overview(scene)
         for index, name in enumerate(experiment.config.scenarios):
             report(0.1 + 0.8 * index / len(experiment.config.scenarios), f"filming {name}")
             clips.append(films.film_scenario(experiment, dressed, name, folder))

@@ -26,7 +26,7 @@ from advnerf_core.driving.retrain import RetrainConfig, fine_tune
 from advnerf_core.driving.sources import Seen, steer_with
 from advnerf_core.files import write_atomically
 from advnerf_core.scene.surrogate import Surrogate
-from hardware.twin.intersection.scene import Intersection
+from hardware.deployment_scene import DeploymentScene
 from nodes.intersection import retrain_plot
 from nodes.intersection.attack import Cell, attack_problem, load_theta
 from nodes.intersection.context import Experiment
@@ -60,7 +60,7 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
     file, rounds, kept = victim_file(experiment, HARDENED), [], _old_frames(experiment)
     victim = load_policy(file)
     thetas: list[torch.Tensor] = []
-    with Intersection(experiment.world) as scene:
+    with experiment.site.open() as scene:
         dressed = DressedScene(scene, experiment.view, placed_objects(experiment))
         first = _first_attacks(experiment, surrogate, dressed, victim)
         for number in range(wanted.rounds + 1):
@@ -182,7 +182,7 @@ def _total_cte_m(
 
 
 def _collect(
-    experiment: Experiment, scene: Intersection, victim: LoadedPolicy, thetas: Sequence[torch.Tensor], folder: Path,
+    experiment: Experiment, scene: DeploymentScene, victim: LoadedPolicy, thetas: Sequence[torch.Tensor], folder: Path,
     report: Callable[[float, str], None],
 ) -> list[Frames]:  # fmt: skip
     """Frames of both domains with the found objects: stills about the paths, and drives of the victim, labelled by the teacher.

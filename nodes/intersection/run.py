@@ -10,6 +10,7 @@ from typing import Any
 
 from rich.console import Console
 
+from hardware.carla_scene.config import CarlaConfig
 from hardware.twin.intersection.config import IntersectionConfig
 from nodes.experiment.run import read_setting
 from nodes.experiment.run_folder import run_to_end
@@ -26,7 +27,7 @@ def load_experiment(file: Path, setting: str, overrides: Sequence[str], folder: 
     """Resolve an experiment file.
 
     Args:
-        file: A ``*.experiment.yaml`` file with ``kind: intersection``.
+        file: A ``*.experiment.yaml`` file with ``kind: intersection`` or ``kind: carla``.
         setting: Which of its settings to lay over its values.
         overrides: ``section.key=value`` texts, applied last.
         folder: The run folder.
@@ -36,7 +37,7 @@ def load_experiment(file: Path, setting: str, overrides: Sequence[str], folder: 
     """
     document = read_setting(file, setting, overrides)
     config = validate(IntersectionExperimentConfig, document)
-    validate(IntersectionConfig, document.part(("world",)))
+    validate(CarlaConfig if config.kind == "carla" else IntersectionConfig, document.part(("world",)))
     return Experiment(config, file.resolve(), folder.resolve(), setting)
 
 
@@ -50,7 +51,7 @@ def run_experiment(
 
 def stages_of(experiment: Experiment) -> list[Stage]:
     """The stages with the part of the configuration that each depends on; moving an object keeps capture, scene and object files."""
-    config, world = experiment.config, experiment.world.model_dump(mode="json")
+    config, world = experiment.config, experiment.site.settings
     measured = {
         "horizon": config.horizon,
         "dt_s": config.dt_s,

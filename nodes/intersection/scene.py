@@ -42,9 +42,7 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
 
 
 def field_config(experiment: Experiment) -> SceneFieldConfig:
-    """A field in a box around the world, its painted sky included: nothing lies outside."""
-    wanted, road = experiment.config.scene, experiment.world.road
-    half = road.half_m + wanted.margin_m
+    """A field in the box that the site is learned in."""
+    wanted = experiment.config.scene
     grid = HashGridConfig(levels=wanted.levels, features=4, log2_entries=wanted.log2_entries, finest=wanted.finest)
-    low, high = (-half, -half, -wanted.margin_m), (half, half, road.sky_m + wanted.margin_m)
-    return SceneFieldConfig(low, high, grid)
+    return experiment.site.field_config(grid, wanted.margin_m)

@@ -31,7 +31,7 @@ def test_objects_move_about_their_places_and_off_the_lanes(trained: Experiment) 
             offset_m = there.T_world_from_object[:2, 3] - [thing.x_m, thing.y_m]
             assert np.abs(offset_m).max() <= PoseSettings().move_m + 1e-9
             place = (*there.T_world_from_object[:2, 3], yaw_of(there.T_world_from_object), there.scale)
-            assert lanes_of(trained).distance_m(place, footprint(there)) >= trained.world.off_track_m
+            assert lanes_of(trained).distance_m(place, footprint(there)) >= trained.site.off_track_m
     places = np.array([[each.T_world_from_object[:3, 3] for each in objects] for objects in moved])
     assert np.ptp(places[..., :2], axis=0).min() > 0.0
     assert np.ptp(places[..., 2], axis=0).max() == 0.0  # they stay on the ground

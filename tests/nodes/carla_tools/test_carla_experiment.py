@@ -1,0 +1,85 @@
+"""The whole experiment of kind carla, every stage of it in its smallest size, against the scripted server."""
+
+import json
+
+import numpy as np
+import pytest
+import yaml
+
+from advnerf_core.report.clips import read_clip
+from advnerf_core.scene.dataset import load_transforms
+from nodes.campaign.kinds import load_kind, settings_hash
+from nodes.intersection.run import load_experiment, run_experiment
+from nodes.runtime.errors import ConfigError
+
+TINY = {
+    "capture": {"photos": 6, "held_out": 3},
+    "scene": {"steps": 4, "log2_entries": 10, "finest": 32, "occupancy": 16},
+    "object": {"car_resolution": 12, "hydrant_resolution": 10, "fit_steps": 0},
+    "policy": {
+        "deployed_stills": 2, "surrogate_stills": 2, "deployed_drives": 1, "surrogate_drives": 1, "drive_steps": 2, "dagger_rounds": 1,
+        "first_steps": 2, "round_steps": 2, "naive_steps": 0, "hidden": [16, 8, 4],
+    },
+    "attack": {"evaluations": 1, "seeds": [0], "methods": ["gradient"], "time_batch": 2},
+}  # fmt: skip
+OBJECTS = [
+    {"name": "car", "kind": "small_car", "x_m": -4.5, "y_m": 5.0},
+    {"name": "hydrant", "kind": "hydrant", "x_m": -5.75, "y_m": -5.75},
+]
+
+
+@pytest.fixture
+def file(tmp_path, settings):
+    """An experiment file with one drive of three ticks."""
+    camera = {**settings["camera"], "width": 336, "height": 188}  # the policy's view is cut from it
+    world = {**settings, "camera": camera, "objects": OBJECTS}
+    data = {"kind": "carla", "name": "tiny", "horizon": 3, "scenarios": ["right"], "world": world}
+    file = tmp_path / "tiny.experiment.yaml"
+    file.write_text(yaml.safe_dump({**data, "settings": {"tiny": TINY}}))
+    return file
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_every_stage_runs_against_a_server_and_leaves_it_as_it_was(as_carla, file, tmp_path):
+    run = tmp_path / "run"
+    experiment = load_experiment(file, "tiny", [], run)
+    with pytest.raises(ConfigError, match="run that stage first"):
+        _ = experiment.references
+    run_experiment(experiment)
+    drives = json.loads((run / "capture" / "drives.json").read_text())
+    assert drives["lane_width_m"] == pytest.approx(2 * experiment.site.off_track_m)
+    assert len(load_transforms(run / "capture" / "photos", require_all=True).frames) == 6
+    cell = json.loads((run / "deploy" / "right_hardened_gradient_0.cell.json").read_text())
+    driven = np.array(json.loads((run / "deploy" / "right_hardened_gradient_0.drives.json").read_text())["states"][0])
+    cte_m = experiment.paths["right"].project(driven[1:, :2]).cte_m
+    assert cell["deployed"]["total_cte_m"] == pytest.approx([np.abs(cte_m).sum()])
+    assert len(read_clip(run / "report" / "right.mp4")) == 4  # three ticks and the start
+    assert "junction of the CARLA map" in (run / "report" / "report.html").read_text()
+    assert not as_carla.world.get_settings().synchronous_mode
+    assert as_carla.world.actors == []
+
+
+def test_another_junction_than_the_captured_one_is_refused(as_carla, file, tmp_path):
+    experiment = load_experiment(file, "tiny", [], tmp_path / "run")
+    experiment.site.open().close()
+    kept = tmp_path / "run" / "capture" / "drives.json"
+    data = json.loads(kept.read_text())
+    kept.write_text(json.dumps({**data, "lane_width_m": 4.25}))
+    with pytest.raises(ConfigError, match="another run folder"):
+        experiment.site.open()
+    assert as_carla.world.actors == []
+    assert not as_carla.world.get_settings().synchronous_mode
+
+
+def test_the_servers_address_changes_no_cell_and_its_junction_does(as_carla, file, tmp_path):
+    kind = load_kind("carla")
+    assert kind.live
+    assert kind.search_cell is not None
+
+    def of(*changes):
+        experiment = kind.load(file, "tiny", list(changes), tmp_path / "run")
+        return settings_hash(kind, experiment, "right", "hardened", "gradient", 0)
+
+    assert of() == of("world.server.port=3000") == of("attack.seeds=[0,7]")
+    assert of() != of("world.junction.beyond_m=31")
