@@ -1,6 +1,6 @@
 """Question: does retraining on found attacks cure the policy, and for how long? ``python -m benchmarks.retraining RUN_FOLDER``.
 
-Reads what ``advnerf experiment launch/intersection.experiment.yaml --setting full --set retrain.rounds=2`` wrote (stage retrain); computes nothing anew.
+Reads what ``advnerf experiment launch/intersection.experiment.yaml --setting retrain`` wrote; computes nothing anew.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ from typing import Any
 
 from benchmarks.results import record_row
 
-_COMMAND = "advnerf experiment launch/intersection.experiment.yaml --setting full --run-folder {} --set retrain.rounds={} --set retrain.placements={}"
 _TARGET = 1.1
 
 
@@ -40,8 +39,7 @@ def main() -> None:
     parser.add_argument("folder", type=Path, help="run folder of the intersection's experiment")
     parser.add_argument("--dry", action="store_true", help="print only")
     options = parser.parse_args()
-    wanted = json.loads((options.folder / "manifest.json").read_text())["config"]["retrain"]
-    command = _COMMAND.format(options.folder, wanted["rounds"], wanted["placements"])
+    command = json.loads((options.folder / "manifest.json").read_text())["command"]
     for line, value, unit, target, met, note in rows_of(
         json.loads((options.folder / "retrain" / "retrain.json").read_text())
     ):
