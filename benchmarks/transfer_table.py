@@ -6,15 +6,18 @@ It computes nothing anew: the cells in ``docs/results/<campaign>`` are what ``ad
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 
+from advnerf_core.report.cells import CellResult
 from advnerf_core.report.transfer import DOMAINS, TableRow, TransferTable
 from advnerf_core.report.transfer_page import METHOD_NAMES
 from advnerf_core.report.transfer_targets import VICTIM, TableTarget, table_targets
 from benchmarks.results import record_row
+from nodes.campaign.config import load_campaign
 from nodes.campaign.table import published_table
 
-FOLDER = Path("docs/results/paper")
+FOLDER, CAMPAIGN = Path("docs/results/paper"), Path("launch/paper.campaign.yaml")
 
 
 def line_of(row: TableRow) -> str:
@@ -23,12 +26,16 @@ def line_of(row: TableRow) -> str:
     return "#5 " + ", ".join(filter(None, [*parts, "" if row.victim == VICTIM else f"{row.victim} victim"]))
 
 
-def note_of(row: TableRow) -> str:
+def note_of(row: TableRow, cells: Sequence[CellResult] = ()) -> str:
     """What readers must know of a row."""
     spread = "" if row.std_m is None else f" +- {row.std_m:.2f}"
     parts = [
         f"seeds {', '.join(map(str, row.seeds))}: total CTE {row.mean_m or 0.0:.2f}{spread} m, off-track {row.off_track} of {row.drives}"
     ]
+    if row.missing:
+        parts.append(f"seeds {', '.join(map(str, row.missing))} are missing")
+    machines = sorted({cell.machine for cell in cells})
+    parts.append(f"run on {', '.join(machines)}")
     if row.ratio_interval is not None:
         parts.append(f"95 % {row.ratio_interval.low:.2f} to {row.ratio_interval.high:.2f}")
     if row.transfer is not None and row.method != "none":
@@ -56,10 +63,11 @@ def main() -> None:
     """Record the rows of the published table, and its other targets."""
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("--folder", type=Path, default=FOLDER)
+    parser.add_argument("--campaign", type=Path, default=CAMPAIGN, help="which lines and seeds there should be")
     parser.add_argument("--command", default="advnerf campaign run launch/paper.campaign.yaml")
     parser.add_argument("--dry", action="store_true", help="print only")
     arguments = parser.parse_args()
-    table = published_table(arguments.folder)
+    table = published_table(arguments.folder, load_campaign(arguments.campaign))
 
     def record(line: str, value: float, unit: str, target: str, met: bool | None, note: str) -> None:
         print(f"{line}: {value:.3g} {unit} (target {target or '-'}): {met}")
@@ -69,7 +77,7 @@ def main() -> None:
     for row, target in rows_of(table):
         record(
             line_of(row), row.ratio or 0.0, "x no attack", f"{target.target} x" if target else "",
-            target.met if target else None, note_of(row),
+            target.met if target else None, note_of(row, table.cells_of(row)),
         )  # fmt: skip
     for target in table_targets(table):
         if target.what != "ratio to no attack" and target.value is not None:

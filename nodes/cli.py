@@ -35,6 +35,7 @@ from nodes import (
     cli_trial,
 )
 from nodes.runtime.terminal import Overrides, RunDir, print_table, say_error, table
+from nodes.runtime.termination import ends_in_order
 
 if TYPE_CHECKING:
     from nodes.runtime.launch import Launch
@@ -197,11 +198,13 @@ def _run_experiment(
     if kind_of(file) in ("intersection", "carla"):
         from nodes.intersection import run as intersection
 
-        intersection.run_experiment(intersection.load_experiment(file, setting, overrides or [], folder), until)
+        with ends_in_order():
+            intersection.run_experiment(intersection.load_experiment(file, setting, overrides or [], folder), until)
         return
     from nodes.experiment.run import load_experiment, run_experiment
 
-    run_experiment(load_experiment(file, setting, overrides or [], folder), until)
+    with ends_in_order():
+        run_experiment(load_experiment(file, setting, overrides or [], folder), until)
 
 
 def _add_stage(name: str, what: str) -> None:

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
-import signal
-import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from nodes.runtime.terminal import Overrides, print_table, table
+from nodes.runtime.termination import ends_in_order
 
 if TYPE_CHECKING:
     from hardware.carla_scene.config import CarlaConfig
@@ -43,7 +40,7 @@ def carla_check(
     from nodes.carla_tools.check import check_server
 
     rows, failed = table("check", "state", "found"), False
-    with _ends_in_order():
+    with ends_in_order():
         checks = check_server(_config(config, overrides, host, port), pictures=pictures)
     for check in checks:
         colour = {"ok": "green", "warning": "yellow", "failure": "red"}[check.state]
@@ -101,7 +98,7 @@ def carla_capture(
     from nodes.runtime.progress import ProgressDisplay
 
     request = CaptureRequest(photos, held_out, seed)
-    with _ends_in_order(), ProgressDisplay() as display:
+    with ends_in_order(), ProgressDisplay() as display:
         taken, there = capture(_config(config, overrides, host, port), request, output, display.start("capture"))
     print(f"{taken} pictures taken, {there} were there: {output}")
 
@@ -128,7 +125,7 @@ def carla_drive(
 
     wanted = _config(config, overrides, host, port)
     dt_s = wanted.render.fixed_delta_s
-    with _ends_in_order(), CarlaScene(wanted) as scene:
+    with ends_in_order(), CarlaScene(wanted) as scene:
         reference = scene.paths[path]
         expert = turn_rate_expert(as_path(reference), wanted.car.speed_mps, dt_s, wanted.car.max_turn_rate_radps)
         drive = drive_expert(scene, expert, reference.start_pose, max(round(seconds / dt_s), 1), dt_s)
@@ -155,16 +152,6 @@ def carla_release(host: Host = None, port: Port = None) -> None:
 
     freed = release(_config(None, None, host, port).server)
     print("the world ticks by itself again" if freed else "nothing to do: the world ticks by itself")
-
-
-@contextlib.contextmanager
-def _ends_in_order() -> Iterator[None]:
-    """Asked to end (SIGTERM), end as after Ctrl-C, so that the server's world is put back first."""
-    before = signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 def _config(file: Path | None, overrides: list[str] | None, host: str | None, port: int | None) -> CarlaConfig:

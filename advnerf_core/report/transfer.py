@@ -121,6 +121,11 @@ class TransferTable:
         key = (scenario, placement, victim, method, domain)
         return next((r for r in self.rows if (r.scenario, r.placement, r.victim, r.method, r.domain) == key), None)
 
+    def cells_of(self, row: TableRow) -> list[CellResult]:
+        """The cells that a line sums up."""
+        key = (row.scenario, row.placement, row.victim, row.method)
+        return [cell for cell in self.cells.values() if _key(cell) == key]
+
 
 def make_table(wanted: Sequence[Wanted], cells: Iterable[CellResult], name: str = "") -> TransferTable:
     """Sum the cells up.

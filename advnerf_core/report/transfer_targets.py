@@ -28,8 +28,8 @@ class TableTarget:
         domain: Where.
         what: What is measured.
         target: What must be reached, in words.
-        value: What was measured; None where it was not, or not for every seed.
-        met: Whether it was; None where it is not known.
+        value: What was measured of the seeds that are there; None where nothing was.
+        met: Whether it was; None where it is not known, as seeds are missing.
         seeds: Of how many seeds.
         short_by: How much is lacking, as a share of the target; 0 where it is met.
     """
@@ -48,7 +48,7 @@ class TableTarget:
     def verdict(self) -> str:
         """In words."""
         if self.met is None:
-            return "not measured"
+            return "not measured" if self.value is None else f"{self.seeds} seed(s) so far"
         return "met" if self.met else f"missed by {100 * self.short_by:.0f} %"
 
     def record(self) -> dict[str, Any]:
@@ -90,10 +90,14 @@ def _value(row: TableRow | None, of: Callable[[TableRow], float | None]) -> floa
     return of(row) if row is not None and row.seeds else None
 
 
+def _unfinished(row: TableRow | None) -> bool:
+    return row is not None and bool(row.missing)
+
+
 def _at_least(scenario: str, method: str, domain: Domain, row: TableRow | None, limit: float) -> TableTarget:
     value = _value(row, lambda r: r.ratio)
-    met = None if value is None else value >= limit
-    short = 0.0 if value is None or met else 1.0 - value / limit
+    met = None if value is None or _unfinished(row) else value >= limit
+    short = 1.0 - value / limit if value is not None and met is False else 0.0
     seeds = len(row.seeds) if row else 0
     return TableTarget(scenario, method, domain, "ratio to no attack", f">= {limit:g}", value, met, seeds, short)
 
@@ -102,9 +106,9 @@ def _limit(
     scenario: str, method: str, what: str, limit: float, row: TableRow | None, of: Callable[[TableRow], float | None]
 ) -> TableTarget:
     value = _value(row, of)
-    met = None if value is None else value <= limit
+    met = None if value is None or _unfinished(row) else value <= limit
     # Of a limit of zero any excess counts by its own size.
-    short = 0.0 if value is None or met else (value - limit) / (limit or 1.0)
+    short = (value - limit) / (limit or 1.0) if value is not None and met is False else 0.0
     seeds = len(row.seeds) if row else 0
     return TableTarget(scenario, method, "deployed", what, f"<= {limit:g}", value, met, seeds, short)
 
@@ -115,8 +119,8 @@ def _relative_spread(row: TableRow) -> float | None:
 
 def _left_often(scenario: str, row: TableRow | None) -> TableTarget:
     value = _value(row, lambda r: r.off_track / r.drives)
-    met = None if value is None else value >= _LEFT_SHARE
-    short = 0.0 if value is None or met else 1.0 - value / _LEFT_SHARE
+    met = None if value is None or _unfinished(row) else value >= _LEFT_SHARE
+    short = 1.0 - value / _LEFT_SHARE if value is not None and met is False else 0.0
     seeds = len(row.seeds) if row else 0
     return TableTarget(
         scenario, "gradient", "deployed", "share of drives off the track", ">= 4 of 5", value, met, seeds, short

@@ -9,8 +9,8 @@ from pathlib import Path
 from markupsafe import Markup
 
 from advnerf_core.files import write_atomically
-from advnerf_core.report.cells import CellResult, read_cells
-from advnerf_core.report.transfer import TransferTable, Wanted, make_table, wanted_of
+from advnerf_core.report.cells import read_cells
+from advnerf_core.report.transfer import TransferTable, Wanted, make_table
 from advnerf_core.report.transfer_page import as_csv, as_json, as_markdown, gather_clips, render_transfer_page
 from nodes.campaign.config import Campaign
 from nodes.campaign.store import CellStatus, store_of
@@ -29,23 +29,15 @@ def wanted_rows(campaign: Campaign) -> list[Wanted]:
     return [Wanted(*key, tuple(seeds[key])) for key in order]
 
 
-def campaign_table(campaign: Campaign, found: Sequence[CellStatus] | None = None) -> TransferTable:
+def campaign_table(campaign: Campaign, found: Sequence[CellStatus]) -> TransferTable:
     """The table of the cells that are there.
 
     Args:
         campaign: The campaign.
-        found: Where its cells are; only results of the settings as they are now are taken. None takes what lies in its folder.
+        found: Where its cells are; only results of the settings as they are now are taken.
     """
-    if found is None:
-        cells = [cell for cell in _lying(campaign) if cell is not None]
-    else:
-        cells = [each.result for each in found if each.result is not None and each.state == "done"]
+    cells = [each.result for each in found if each.result is not None and each.state == "done"]
     return make_table(wanted_rows(campaign), cells, campaign.config.name)
-
-
-def _lying(campaign: Campaign) -> list[CellResult | None]:
-    store = store_of(campaign)
-    return [store.result(cell.name) for cell in campaign.cells]
 
 
 def write_table(
@@ -72,7 +64,9 @@ def write_table(
 
 
 def publish(campaign: Campaign, found: Sequence[CellStatus], folder: Path) -> tuple[list[str], list[str]]:
-    """Copy finished cells to where they are kept with the code; cells there that the campaign no longer has stay.
+    """Copy finished cells to where they are kept with the code, and remove those there that other settings have made.
+
+    What lies there of cells that are not begun here stays: they may have been run elsewhere.
 
     Args:
         campaign: The campaign.
@@ -84,10 +78,12 @@ def publish(campaign: Campaign, found: Sequence[CellStatus], folder: Path) -> tu
     """
     changed, same = [], []
     for each in found:
+        target = folder / campaign.config.name / f"{each.cell.name}.json"
+        if each.state == "changed":
+            target.unlink(missing_ok=True)
         if each.state != "done":
             continue
         text = store_of(campaign).result_file(each.cell.name).read_text(encoding="utf-8")
-        target = folder / campaign.config.name / f"{each.cell.name}.json"
         if target.exists() and target.read_text(encoding="utf-8") == text:
             same.append(each.cell.name)
             continue
@@ -96,8 +92,12 @@ def publish(campaign: Campaign, found: Sequence[CellStatus], folder: Path) -> tu
     return changed, same
 
 
-def published_table(folder: Path) -> TransferTable:
-    """The table of published cells.
+def published_table(folder: Path, campaign: Campaign) -> TransferTable:
+    """The table of published cells, with all lines and seeds that the campaign asks for.
+
+    Args:
+        folder: Of the published cells.
+        campaign: Whose they are.
 
     Raises:
         ConfigError: There are none.
@@ -105,4 +105,4 @@ def published_table(folder: Path) -> TransferTable:
     cells = read_cells(folder)
     if not cells:
         raise ConfigError(f"expected published cells in {folder}, got none; run advnerf campaign publish")
-    return make_table(wanted_of(cells), cells, folder.name)
+    return make_table(wanted_rows(campaign), cells, campaign.config.name)

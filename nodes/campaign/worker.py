@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import os
-import platform
 import signal
 import subprocess
 import sys
@@ -20,16 +19,21 @@ from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TextIO
 
 from nodes.campaign.kinds import Kind, load_kind, settings_hash
 from nodes.campaign.store import LOG, Store
 from nodes.runtime.errors import RuntimeFault
 from nodes.runtime.locks import HeldError, hold
+from nodes.runtime.machine import machine_name
+from nodes.runtime.termination import ends_in_order
 
 Phase = Literal["search", "whole"]
 _DONE, _FAILED, _ELSEWHERE = 0, 1, 3
 _PROGRESS_PERIOD_S = 5.0
+_LOOKED_AT_S = 1.0
+# Longer than CarlaScene waits for a server that is gone.
+_ENDING_S = 20.0
 _LIVE_LOCK = "advnerf-live.lock"
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 
@@ -109,8 +113,13 @@ def run_in_process(job: Job) -> Ended:
     try:
         _, errors = process.communicate(json.dumps(asdict(job)).encode())
     except BaseException:
-        process.kill()
-        process.wait()
+        # Asked first: a cell may have a world to put back, as a CARLA server's.
+        process.terminate()
+        try:
+            process.wait(_ENDING_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
         raise
     code, seconds = process.returncode, time.monotonic() - began
     said = (errors.decode("utf-8", "replace").strip().splitlines() or [""])[-1]
@@ -131,37 +140,60 @@ def run_in_process(job: Job) -> Ended:
 
 def main() -> None:
     """Run the job on stdin."""
-    _die_with(int(sys.argv[1]))
+    with ends_in_order():
+        _die_with(int(sys.argv[1]))
+        _run_job()
+
+
+def _run_job() -> None:
     job = Job(**{**(data := json.loads(sys.stdin.read())), "overrides": tuple(data["overrides"])})
     store = Store(Path(job.campaign_folder))
     store.lock_file(job.name).parent.mkdir(parents=True, exist_ok=True)
-    try:
-        lock = hold(store.lock_file(job.name))
-    except HeldError as held:
-        print(f"{job.name} is being run by process {held.owner}", file=sys.stderr)
-        raise SystemExit(_ELSEWHERE) from None
-    with lock:
+    with take_cell(store, job.name):
+        kind, experiment = _checked(job, store)
         work = store.begin(job.name, job.settings_hash)
         with open(work / LOG, "a", encoding="utf-8", buffering=1) as log:
             os.dup2(log.fileno(), 1)
             try:
-                _run(job, store, work)
+                _run(job, store, work, kind, experiment)
             except Exception as error:
                 traceback.print_exc(file=log)
                 store.keep_error(job.name, job.settings_hash, f"{type(error).__name__}: {' '.join(str(error).split())}")
                 raise SystemExit(_FAILED) from None
 
 
-def _run(job: Job, store: Store, work: Path) -> None:
+def take_cell(store: Store, name: str) -> TextIO:
+    """The cell for this process alone. Who only looks at its state holds it for an instant, which is waited for."""
+    end_s = time.monotonic() + _LOOKED_AT_S
+    while True:
+        try:
+            return hold(store.lock_file(name))
+        except HeldError as held:
+            if time.monotonic() > end_s:
+                print(f"{name} is being run by process {held.owner}", file=sys.stderr)
+                raise SystemExit(_ELSEWHERE) from None
+            time.sleep(0.05)
+
+
+def _checked(job: Job, store: Store) -> tuple[Kind, Any]:
+    """The kind and the experiment as they are now, before anything of the cell is touched."""
+    try:
+        kind = load_kind(job.kind)
+        _use_threads(job.threads)
+        experiment = kind.load(Path(job.experiment), job.setting, job.overrides, Path(job.run_folder))
+        if settings_hash(kind, experiment, job.scenario, job.victim, job.method, job.seed) != job.settings_hash:
+            raise ChangedError(
+                f"{job.name}: its settings or inputs changed after the campaign was started; run the campaign again"
+            )
+    except Exception as error:
+        store.keep_error(job.name, job.settings_hash, f"{type(error).__name__}: {' '.join(str(error).split())}")
+        raise SystemExit(_FAILED) from None
+    return kind, experiment
+
+
+def _run(job: Job, store: Store, work: Path, kind: Kind, experiment: Any) -> None:
     began = time.monotonic()
-    kind = load_kind(job.kind)
-    _use_threads(job.threads)
-    experiment = kind.load(Path(job.experiment), job.setting, job.overrides, Path(job.run_folder))
     arguments = (experiment, job.scenario, job.victim, job.method, job.seed)
-    if settings_hash(kind, *arguments) != job.settings_hash:
-        raise ChangedError(
-            f"{job.name}: its settings or inputs changed after the campaign was started; run the campaign again"
-        )
     report = _log_progress()
     if job.phase == "search":
         if kind.search_cell is not None:
@@ -175,7 +207,7 @@ def _run(job: Job, store: Store, work: Path) -> None:
     found = taken
     ours = {
         "scenario": job.shown_scenario, "placement": job.placement, "victim": job.victim, "method": job.method, "seed": job.seed,
-        "settings_hash": job.settings_hash, "machine": found.get("machine") or _machine(),
+        "settings_hash": job.settings_hash, "machine": found.get("machine") or machine_name(),
         "date": found.get("date") or datetime.now(timezone.utc).isoformat(timespec="seconds"),
     }  # fmt: skip
     seconds = found.get("seconds") or _add_seconds(work, time.monotonic() - began)
@@ -234,16 +266,6 @@ def _die_with(parent: int) -> None:
         ctypes.CDLL(None, use_errno=True).prctl(1, signal.SIGTERM)
         if os.getppid() != parent:
             raise SystemExit(_FAILED)
-
-
-def _machine() -> str:
-    model = platform.machine()
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-        model = next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), model)
-    except OSError:
-        pass
-    return f"{model}, {len(os.sched_getaffinity(0))} cores, Python {platform.python_version()}"
 
 
 if __name__ == "__main__":

@@ -153,6 +153,10 @@ def _run_or_reuse(stage: Stage, folder: Path, records: Mapping[str, StageRecord]
         return old
     resumed = old is not None and old.key == key
     if not resumed and folder.exists():
+        if not (folder / _RECORD).exists() and any(folder.iterdir()):
+            raise StageError(
+                f"expected {folder} to be a stage's folder, got files that no stage wrote; move them, or name another run folder"
+            )
         shutil.rmtree(folder)
     earlier_s = old.seconds if resumed and old is not None else 0.0
     return _run(stage, folder, key, earlier_s, display)

@@ -81,6 +81,12 @@ def test_a_cell_without_deployment_counts_in_the_surrogate_only():
 
 def test_targets_are_met_missed_or_not_measured(table):
     found = {(t.method, t.domain): t for t in table_targets(table)}
+    # A seed of each is missing: a value, and no verdict.
+    assert {t.met for t in found.values()} == {None}
+    assert found["gradient", "surrogate"].value == 4.0
+    assert found["gradient", "surrogate"].verdict == "2 seed(s) so far"
+    whole = make_table(wanted_of(table.cells.values()), table.cells.values())
+    found = {(t.method, t.domain): t for t in table_targets(whole)}
     assert found["gradient", "surrogate"].met
     assert found["gradient", "deployed"].met
     random = found["random", "deployed"]

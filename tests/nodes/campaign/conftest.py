@@ -36,9 +36,13 @@ def run_cell(experiment, scenario, victim, method, seed, folder, report):
     if (folder.parent.parent / "fail").exists() and method == "cem":
         raise RuntimeError("the search came to nothing")
     done = folder / "half"
-    while (folder.parent.parent / "hang").exists() and method == "gradient" and not done.exists():
-        (folder / "pid").write_text(str(os.getpid()))
-        time.sleep(0.02)
+    try:
+        while (folder.parent.parent / "hang").exists() and method == "gradient" and not done.exists():
+            (folder / "pid").write_text(str(os.getpid()))
+            time.sleep(0.02)
+    except BaseException:
+        _note(folder, f"closed {name}")
+        raise
     _note(folder, f"end {name}")
     factor = {"none": 1.0, "random": 1.1, "cem": 2.0, "gradient": 3.0}[method]
     none = experiment.data["base"] + seed

@@ -1,4 +1,5 @@
 import json
+import shutil
 
 import pytest
 
@@ -109,9 +110,18 @@ def test_a_table_and_published_cells_from_finished_cells(bench, monkeypatch, tmp
     assert {path.name for path in page.parent.iterdir()} == {"index.html", "table.csv", "table.json", "table.md"}
     assert publish(campaign, found, tmp_path / "kept") == ([plan[0].cell.name], [])
     assert publish(campaign, found, tmp_path / "kept") == ([], [plan[0].cell.name])
-    assert published_table(tmp_path / "kept" / "toy").find("straight", "hardened", "none", "deployed").ratio == 3.0
+    row = published_table(tmp_path / "kept" / "toy", campaign).find("straight", "hardened", "none", "deployed")
+    assert row.ratio == 3.0
+    assert set(row.seeds) | set(row.missing) == set(campaign.config.seeds)
     with pytest.raises(ConfigError, match="advnerf campaign publish"):
-        published_table(tmp_path / "nowhere")
+        published_table(tmp_path / "nowhere", campaign)
+    # A cell that other settings have made does not stay beside those of these; one that was never begun here does.
+    changed = next(each for each in found if each.state == "changed").cell.name
+    for name in (changed, found[-1].cell.name):
+        shutil.copy(bench.cells / f"{plan[0].cell.name}.json", tmp_path / "kept" / "toy" / f"{name}.json")
+    publish(campaign, found, tmp_path / "kept")
+    assert not (tmp_path / "kept" / "toy" / f"{changed}.json").exists()
+    assert (tmp_path / "kept" / "toy" / f"{found[-1].cell.name}.json").exists()
     (bench.cells / f"{plan[0].cell.name}.json").write_text("{")
     assert sorted(each.state for each in statuses(campaign, campaign.cells)) == [
         "changed",

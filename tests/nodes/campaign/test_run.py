@@ -5,12 +5,16 @@ import json
 import os
 import signal
 import sys
+import threading
 import time
 
 import pytest
 
 from nodes.campaign.config import load_campaign
 from nodes.campaign.run import Options, run_campaign, statuses
+from nodes.campaign.store import Store
+from nodes.campaign.worker import take_cell
+from nodes.runtime.locks import hold
 
 
 @pytest.fixture
@@ -183,3 +187,30 @@ def wait_for(condition, timeout_s=60.0):
     while not condition():
         assert time.monotonic() < until
         time.sleep(0.02)
+
+
+def test_a_worker_that_is_asked_to_end_closes_what_is_open(here):
+    """As a CARLA world must be put back: the cell's ``finally`` is run."""
+    (here.folder / "hang").touch()
+    here.write("seeds: [0]\nmethods: [gradient]\nvictims: [hardened]\n")
+    process = here.start("run", str(here.file), "--jobs", "1")
+    pid = here.cells / "straight_hardened_gradient_0" / "pid"
+    wait_for(lambda: pid.exists() and pid.read_text())
+    worker = int(pid.read_text())
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=60)
+    wait_for(lambda: not is_alive(worker))
+    assert any(line.startswith("closed straight_hardened_gradient_0") for line in here.calls)
+
+
+def test_who_only_looks_at_a_cell_does_not_keep_its_worker_away(tmp_path, capsys):
+    store = Store(tmp_path)
+    lock = store.lock_file("straight_hardened_none_0")
+    lock.parent.mkdir(parents=True)
+    looking = hold(lock)
+    threading.Timer(0.3, looking.close).start()
+    take_cell(store, "straight_hardened_none_0").close()
+    working = hold(lock)
+    with working, pytest.raises(SystemExit):
+        take_cell(store, "straight_hardened_none_0")
+    assert f"is being run by process {os.getpid()}" in capsys.readouterr().err

@@ -100,3 +100,12 @@ def test_the_digest_sees_names_and_contents(tmp_path):
     renamed = digest_of(tmp_path)
     write_atomically(tmp_path / "b", "2")
     assert len({before, renamed, digest_of(tmp_path)}) == 3
+
+
+def test_files_that_no_stage_wrote_are_not_wiped(tmp_path):
+    (tmp_path / "first").mkdir()
+    mine = tmp_path / "first" / "photograph.jpg"
+    mine.write_bytes(b"an hour's work")
+    with pytest.raises(StageError, match="no stage wrote"):
+        run_and_note(tmp_path, job())
+    assert mine.read_bytes() == b"an hour's work"
