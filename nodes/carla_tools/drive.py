@@ -11,7 +11,7 @@ from advnerf_core.driving.path import Path
 from advnerf_core.geometry import Array
 from hardware.deployment_scene import DeploymentScene
 
-# As the intersection's experiment has it: how firmly the expert returns to the path, and how far it looks ahead.
+# How firmly the expert returns to the lane, a little more than the teacher of the experiment, and how far it looks ahead.
 _STIFFNESS_1PM, _DELAY_S = 0.25, 0.1
 
 

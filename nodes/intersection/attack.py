@@ -70,8 +70,6 @@ def cells(experiment: Experiment) -> list[Cell]:
 def frozen_hashes(experiment: Experiment) -> dict[str, str]:
     """What is fixed before the first attack: scene, victims, objects and their places, starts and seeds."""
     policies = {f"policy_{name}": load_policy(victim_file(experiment, name)).sha256 for name in victims(experiment)}
-    places = [thing.model_dump(mode="json") for thing in experiment.world.objects]
-    geometry = [hash_of(_geometry(experiment, thing.kind)) for thing in experiment.world.objects]
     starts = {
         f"{scenario} {seed}": experiment.start_states(scenario, seed).tolist()
         for scenario in experiment.config.scenarios
@@ -80,10 +78,18 @@ def frozen_hashes(experiment: Experiment) -> dict[str, str]:
     return {
         "scene": scene_sha256(experiment),
         **policies,
-        "objects": hash_of(geometry),
-        "placement": hash_of(places),
+        **frozen_objects(experiment),
         "starts_and_seeds": hash_of(starts),
         "config": hash_of(experiment.config.model_dump(mode="json")),
+    }
+
+
+def frozen_objects(experiment: Experiment) -> dict[str, str]:
+    """Hashes of the objects, and of where they were placed by hand."""
+    things = experiment.world.objects
+    return {
+        "objects": hash_of([hash_of(_geometry(experiment, thing.kind)) for thing in things]),
+        "placement": hash_of([thing.model_dump(mode="json") for thing in things]),
     }
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import platform
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ from nodes.intersection.films import film_cell
 from nodes.intersection.objects import placed_objects, surrogate_of
 from nodes.intersection.policy import victim_file, victims
 from nodes.runtime.errors import RuntimeFault
+from nodes.runtime.machine import machine_name
 from nodes.runtime.stages import Report, hash_of
 
 PREPARED_AT = "policy"  # the last stage that a cell needs of its experiment
@@ -97,7 +97,7 @@ def deployed_part(
     data = {
         "scenario": cell.scenario, "victim": cell.victim, "method": cell.method, "seed": cell.seed,
         "attack_id": learned["attack_id"], "settings_hash": hash_of(frozen_hashes(experiment)),
-        "seconds": round(learned["seconds"], 1), "machine": platform.processor() or platform.machine(),
+        "seconds": round(learned["seconds"], 1), "machine": machine_name(),
         "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
         "surrogate": {
             "total_cte_m": learned["total_cte_m"], "off_track": learned["off_track"], "none_total_cte_m": clean["total_cte_m"],

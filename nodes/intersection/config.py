@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from hardware.twin.intersection.paths import PathName
 
@@ -139,6 +139,14 @@ class RetrainConfig(_Section):
 
 class IntersectionExperimentConfig(_Section):
     """One experiment, resolved: the file's values, one of its settings over them, then the command line."""
+
+    @model_validator(mode="after")
+    def _retraining_needs_the_gradient(self) -> IntersectionExperimentConfig:
+        if self.retrain is not None and "gradient" not in self.attack.methods:
+            raise ValueError(
+                f"expected gradient among attack.methods, as retrain learns from what it finds, got {', '.join(self.attack.methods)}"
+            )
+        return self
 
     kind: Literal["intersection", "carla"] = Field(description="The simulated junction, or one of a CARLA map.")
     name: str = Field(min_length=1)

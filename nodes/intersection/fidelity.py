@@ -27,6 +27,7 @@ from nodes.intersection.context import Experiment
 from nodes.intersection.deployed import DressedScene, drive_deployed
 from nodes.intersection.objects import placed_objects, surrogate_of
 from nodes.intersection.policy import victim_file
+from nodes.runtime.errors import RuntimeFault
 
 Rgb = NDArray[np.uint8]
 
@@ -49,14 +50,16 @@ def driven(
     experiment: Experiment, scenario: str, victim: str, seed: int, folder: Path, bag: Path | None = None
 ) -> Pictures:
     """What the camera sees on the deployed drive past the plain objects; the scene is asked for it, there is no bag."""
-    del seed, folder, bag
-    return _along_the_drive(experiment, scenario, victim, None, "drive past the plain objects")
+    del folder
+    if bag is not None:
+        raise RuntimeFault("expected no bag for a junction, whose drives are asked of the scene; leave --bag out")
+    return _along_the_drive(experiment, scenario, victim, seed, None, "drive past the plain objects")
 
 
 def attacked(experiment: Experiment, scenario: str, victim: str, method: str, seed: int, folder: Path) -> Pictures:
     """The same places with the colours of a finished search."""
     theta = _theta(experiment, scenario, victim, method, seed, folder)
-    return _along_the_drive(experiment, scenario, victim, theta, "the same drive, attacked")
+    return _along_the_drive(experiment, scenario, victim, seed, theta, "the same drive, attacked")
 
 
 def loop(
@@ -82,13 +85,13 @@ def _theta(experiment: Experiment, scenario: str, victim: str, method: str, seed
 
 
 def _along_the_drive(
-    experiment: Experiment, scenario: str, victim: str, theta: torch.Tensor | None, of: str
+    experiment: Experiment, scenario: str, victim: str, seed: int, theta: torch.Tensor | None, of: str
 ) -> Pictures:
     objects = placed_objects(experiment)
     policy, goal = policy_of(experiment, victim, scenario)
     with experiment.site.open() as scene:
         dressed = DressedScene(scene, experiment.view, objects)
-        start: Array = np.array(experiment.references[scenario].start_pose)
+        start: Array = experiment.start_states(scenario, seed)[0].numpy()
         drive = drive_deployed(
             dressed, policy, goal, start, experiment.paths[scenario], experiment.limits, experiment.world.car.speed_mps,
             dressed.plain_theta(),

@@ -7,7 +7,6 @@ attack, by the scene's own car, composed by depth. One call is one entry of the 
 from __future__ import annotations
 
 import json
-import platform
 from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime, timezone
 from pathlib import Path
@@ -39,6 +38,7 @@ from nodes.intersection.context import Experiment
 from nodes.intersection.deployed import DressedScene, drive_deployed
 from nodes.intersection.objects import GENERATOR_OF
 from nodes.intersection.policy import victim_file, victims
+from nodes.runtime.machine import machine_name
 from nodes.runtime.stages import Report, hash_of
 
 Target = Literal["texture", "shape"]
@@ -109,32 +109,45 @@ def mesh_cell(
         if value not in choices:
             raise CellError(f"expected a {what} of {', '.join(choices)}, got {value!r}")
     result = folder / f"mesh_{settings.target}_{scenario}_{victim}_{method}_{seed}.cell.json"
-    if result.exists():
-        kept: dict[str, Any] = json.loads(result.read_text())
-        return kept
+    fields = mesh_objects(experiment, settings)
+    frozen = _frozen(experiment, scenario, victim, seed, settings, fields)
+    if result.exists() and (kept := json.loads(result.read_text()))["settings_hash"] == frozen:
+        return dict(kept)
     if scene is None:
         with experiment.site.open() as opened:
-            return _cell(experiment, scenario, victim, method, seed, result, report, settings, opened)
-    return _cell(experiment, scenario, victim, method, seed, result, report, settings, scene)
+            return _cell(experiment, scenario, victim, method, seed, result, report, settings, fields, frozen, opened)
+    return _cell(experiment, scenario, victim, method, seed, result, report, settings, fields, frozen, scene)
+
+
+def _frozen(
+    experiment: Experiment, scenario: str, victim: str, seed: int, settings: MeshSettings, fields: list[MeshField]
+) -> str:
+    """Hash of what a cell depends on."""
+    attack = experiment.config.attack.model_dump(
+        mode="json", exclude={"seeds", "methods", "starts", "start_sigma", "cem_population"}
+    )
+    return hash_of({
+        "objects": [each.sha256 for each in fields], "policy": load_policy(victim_file(experiment, victim)).sha256, "attack": attack,
+        "starts": experiment.start_states(scenario, seed).tolist(), "limits": asdict(experiment.limits),
+        "site": experiment.site.settings, "scenario": scenario, **_plain(settings),
+    })  # fmt: skip
 
 
 def _cell(
     experiment: Experiment, scenario: str, victim: str, method: MeshMethod, seed: int, result: Path, report: Report,
-    settings: MeshSettings, scene: DeploymentScene,
+    settings: MeshSettings, fields: list[MeshField], frozen: str, scene: DeploymentScene,
 ) -> dict[str, Any]:  # fmt: skip
     policy = load_policy(victim_file(experiment, victim))
-    fields = mesh_objects(experiment, settings)
     view = DeployedFrames(scene, experiment.view)
     surrogate = Surrogate(view, experiment.view.pinhole, experiment.mount, fields, depth_tolerance_m=0.0)
     problem = attack_problem(experiment, surrogate, policy, scenario, seed)
     if settings.target == "shape":
         problem = replace(problem, sensor=ShapeSensor(surrogate, settings.limits))
-    frozen = hash_of({"objects": [each.sha256 for each in fields], "policy": policy.sha256, **_plain(settings)})
     plain = surrogate.plain_theta() if settings.target == "texture" else torch.zeros(problem.sensor.theta_shape)
     theta = plain
     history: tuple[Evaluation, ...] = ()
     if method != "none":
-        found = _search(experiment, problem, method, seed, settings, result, report, hash_of([frozen, scenario]))
+        found = _search(experiment, problem, method, seed, settings, result, report, frozen)
         theta, history = found.theta, found.history
         _keep_meshes(experiment, problem, fields, theta, result)
     clean, attacked = ({"surrogate": _ideal(experiment, problem, each)} for each in (plain, theta))
@@ -143,7 +156,7 @@ def _cell(
     data = {
         "scenario": scenario, "victim": victim, "method": method, "seed": seed, "attack_id": None, "settings_hash": frozen,
         "seconds": round(sum(evaluation.seconds for evaluation in history), 1),
-        "machine": platform.processor() or platform.machine(),
+        "machine": machine_name(),
         "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
         **{name: {**attacked[name], "none_total_cte_m": clean[name]["total_cte_m"]} for name in ("surrogate", "deployed")},
         "extra": {

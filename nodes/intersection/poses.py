@@ -8,7 +8,6 @@ as many random places and colours are the baseline.
 from __future__ import annotations
 
 import json
-import platform
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from datetime import datetime, timezone
@@ -16,12 +15,11 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from advnerf_core.attack.adjoint import AttackProblem, evaluate
-from advnerf_core.attack.placement import KeepOut, PoseBounds, PoseSpace, placed
-from advnerf_core.attack.pose_attack import FoundPoses, pose_attack
+from advnerf_core.attack.placement import KeepOut, PoseBounds
+from advnerf_core.attack.pose_attack import FoundPoses, pose_attack, randomly_placed
 from advnerf_core.attack.poses import MultiStart
 from advnerf_core.attack.search import Evaluation
 from advnerf_core.driving.metrics import drive_metrics
@@ -31,10 +29,11 @@ from advnerf_core.files import write_atomically
 from hardware.deployment_scene import DeploymentScene
 from hardware.twin.intersection.config import PlacedObject
 from nodes.experiment.learned_scene import scene_sha256
-from nodes.intersection.attack import attack_problem
-from nodes.intersection.context import Experiment
+from nodes.intersection.attack import attack_problem, frozen_objects
+from nodes.intersection.context import Experiment, as_path
 from nodes.intersection.deployed import DressedScene, drive_deployed
 from nodes.intersection.objects import placed_objects, surrogate_of
+from nodes.runtime.machine import machine_name
 from nodes.runtime.stages import Report, hash_of
 
 PoseMethod = Literal["none", "random", "gradient"]
@@ -73,8 +72,8 @@ def bounds_of(things: Sequence[PlacedObject], settings: PoseSettings) -> list[Po
 
 
 def lanes_of(experiment: Experiment) -> KeepOut:
-    """The lanes of all drives: no object may stand in one."""
-    return KeepOut(tuple(experiment.paths.values()), experiment.site.off_track_m)
+    """All lanes: no object may stand in one, also where nobody drives, as it stands at the height of the pavement."""
+    return KeepOut(tuple(as_path(lane) for lane in experiment.site.lanes), experiment.site.off_track_m)
 
 
 def random_placements(
@@ -83,10 +82,10 @@ def random_placements(
     """The objects at random allowed places, ``count`` times."""
     if not count:
         return []
-    objects = placed_objects(experiment)
     bounds = bounds_of(experiment.world.objects, settings or PoseSettings())
-    space, generator = PoseSpace(objects, bounds, lanes_of(experiment)), torch.Generator().manual_seed(seed)
-    return [placed(objects, space.placements(space.draw(generator))) for _ in range(count)]
+    surrogate = surrogate_of(experiment, placed_objects(experiment))
+    scenes = randomly_placed(surrogate, bounds, lanes_of(experiment), count, seed)
+    return [tuple(each for each in scene.objects if isinstance(each, VoxelGridObject)) for scene in scenes]
 
 
 def pose_cell(
@@ -111,7 +110,7 @@ def pose_cell(
         object, ``extra.colours`` their colours before squashing.
     """
     settings = settings or PoseSettings()
-    frozen = hash_of({"scene": scene_sha256(experiment), "victim": victim.sha256, "settings": asdict(settings)})
+    frozen = _frozen(experiment, victim, scenario, seed, settings)
     result = folder / f"poses_{scenario}_{method}_{seed}.cell.json"
     if result.exists() and (kept := json.loads(result.read_text()))["settings_hash"] == frozen:
         return dict(kept)
@@ -119,22 +118,31 @@ def pose_cell(
     problem = attack_problem(experiment, surrogate, victim, scenario, seed)
     objects, colours = placed_objects(experiment), surrogate.plain_theta()
     clean = _driven(experiment, problem, scene, objects, colours, scenario)
-    attacked, extra = clean, {}
+    attacked, extra, state = clean, {}, result.with_suffix(".state.safetensors")
     if method != "none":
-        found = _search(
-            experiment, problem, method, seed, settings, result.with_suffix(".state.safetensors"), frozen, report
-        )
+        found = _search(experiment, problem, method, seed, settings, state, frozen, report)
         attacked = _driven(experiment, problem, scene, found.objects, found.colours, scenario)
         extra = _told(found)
     data = {
         "scenario": scenario, "victim": victim.sha256, "method": method, "seed": seed, "attack_id": None, "settings_hash": frozen,
-        "machine": platform.processor() or platform.machine(),
+        "machine": machine_name(),
         "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
         **{domain: {**attacked[domain], "none_total_cte_m": clean[domain]["total_cte_m"]} for domain in clean},
         "extra": extra,
     }  # fmt: skip
     write_atomically(result, json.dumps(data, indent=1) + "\n")
+    state.unlink(missing_ok=True)
     return data
+
+
+def _frozen(experiment: Experiment, victim: LoadedPolicy, scenario: str, seed: int, settings: PoseSettings) -> str:
+    """Hash of what a cell depends on."""
+    attack = experiment.config.attack
+    return hash_of({
+        **frozen_objects(experiment), "scene": scene_sha256(experiment), "victim": victim.sha256, "settings": asdict(settings),
+        "starts": experiment.start_states(scenario, seed).tolist(), "sigma": attack.random_sigma,
+        "limits": asdict(experiment.limits), "site": experiment.site.settings,
+    })  # fmt: skip
 
 
 def _search(

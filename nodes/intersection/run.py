@@ -18,8 +18,10 @@ from nodes.intersection import attack, capture, deploy, objects, policy, report,
 from nodes.intersection.config import IntersectionExperimentConfig
 from nodes.intersection.context import Experiment
 from nodes.runtime.config import validate
+from nodes.runtime.errors import ConfigError
 from nodes.runtime.stages import Report, Stage, StageRecord
 
+_WHOLE = 1e-6
 _LIBRARIES = ("torch", "numpy", "numba", "opencv-contrib-python-headless", "mujoco")
 
 
@@ -37,8 +39,31 @@ def load_experiment(file: Path, setting: str, overrides: Sequence[str], folder: 
     """
     document = read_setting(file, setting, overrides)
     config = validate(IntersectionExperimentConfig, document)
-    validate(CarlaConfig if config.kind == "carla" else IntersectionConfig, document.part(("world",)))
+    if config.kind == "carla":
+        tick_s = validate(CarlaConfig, document.part(("world",))).render.fixed_delta_s
+        if abs(config.dt_s / tick_s - max(round(config.dt_s / tick_s), 1)) > _WHOLE:
+            raise ConfigError(
+                f"{file}: expected dt_s to be whole ticks of world.render.fixed_delta_s = {tick_s:g} s, got {config.dt_s:g} s"
+            )
+    else:
+        validate(IntersectionConfig, document.part(("world",)))
     return Experiment(config, file.resolve(), folder.resolve(), setting)
+
+
+def experiment_of(folder: Path) -> Experiment:
+    """The experiment that a run folder was made by, with the changes of its command line.
+
+    Raises:
+        ConfigError: The folder has no manifest, or one of another kind of experiment.
+    """
+    try:
+        manifest = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))
+        config = IntersectionExperimentConfig.model_validate(manifest["config"])
+        return Experiment(config, Path(manifest["file"]), folder.resolve(), manifest["setting"])
+    except (OSError, ValueError, KeyError) as error:
+        raise ConfigError(
+            f"expected the run folder of an experiment of kind intersection or carla, got {folder}: {error}"
+        ) from error
 
 
 def run_experiment(

@@ -50,6 +50,11 @@ class Site(Protocol):
         ...
 
     @property
+    def lanes(self) -> tuple[ReferencePath, ...]:
+        """Middles of the lanes in which nothing may stand: at least the drives'."""
+        ...
+
+    @property
     def off_track_m(self) -> float:
         """Cross-track error beyond which the car has left its lane [m]."""
         ...
@@ -95,6 +100,11 @@ class TwinSite:
     def references(self) -> dict[PathName, ReferencePath]:
         """The drives that follow from the roads' measures."""
         return self.world.paths()
+
+    @property
+    def lanes(self) -> tuple[ReferencePath, ...]:
+        """All lanes: a lane's width about them is the whole asphalt."""
+        return self.world.lanes()
 
     @property
     def off_track_m(self) -> float:
@@ -165,6 +175,11 @@ class CarlaSite:
     def references(self) -> dict[PathName, ReferencePath]:
         """The lanes of the map."""
         return self.drives.paths
+
+    @property
+    def lanes(self) -> tuple[ReferencePath, ...]:
+        """The drives; what else is asphalt the map does not say."""
+        return tuple(self.drives.paths.values())
 
     @property
     def off_track_m(self) -> float:

@@ -217,6 +217,11 @@ class IntersectionConfig(_Frozen):
             return False
         return math.hypot(abs(x_m) - width - radius, y_m + width + radius) > radius
 
+    def lanes(self) -> tuple[ReferencePath, ...]:
+        """Middles of all lanes: the drives', and those that nobody drives here, in which nothing may stand either."""
+        driven = self.paths()
+        return (*driven.values(), driven["straight"].mirrored("x"), driven["right"].mirrored("y"))
+
     def paths(self) -> dict[PathName, ReferencePath]:
         """The drives "straight", "right" and "left"."""
         return junction_paths(

@@ -59,6 +59,15 @@ class ReferencePath:
                 break
         return x, y, math.remainder(yaw, 2.0 * math.pi)
 
+    def mirrored(self, across: Literal["x", "y"]) -> ReferencePath:
+        """The same drive seen in a mirror along the x or the y axis of the world: what was on the left of the axis is on its right."""
+        x, y, yaw = self.start_pose
+        start = (x, -y, -yaw) if across == "x" else (-x, y, math.pi - yaw)
+        turned: tuple[Segment, ...] = tuple(
+            piece if piece[0] == "line" else (piece[0], piece[1], -piece[2]) for piece in self.segments
+        )
+        return ReferencePath(self.name, self.exit, start, turned)
+
 
 def segment_length_m(segment: Segment) -> float:
     """Length of one piece of a path [m]."""

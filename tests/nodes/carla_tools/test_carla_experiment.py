@@ -83,3 +83,9 @@ def test_the_servers_address_changes_no_cell_and_its_junction_does(as_carla, fil
 
     assert of() == of("world.server.port=3000") == of("attack.seeds=[0,7]")
     assert of() != of("world.junction.beyond_m=31")
+
+
+def test_ticks_that_the_server_cannot_make_are_refused_before_anything_is_run(file, tmp_path):
+    with pytest.raises(ConfigError, match=r"whole ticks of world\.render\.fixed_delta_s = 0\.1 s, got 0\.25 s"):
+        load_experiment(file, "tiny", ["dt_s=0.25"], tmp_path / "run")
+    load_experiment(file, "tiny", ["dt_s=0.25", "world.render.fixed_delta_s=0.05"], tmp_path / "run")

@@ -1,5 +1,6 @@
 """The experiment file, its stages, and which change redoes what."""
 
+import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -10,7 +11,7 @@ import pytest
 from nodes.cli import main
 from nodes.experiment.run import kind_of
 from nodes.intersection.context import Experiment
-from nodes.intersection.run import load_experiment, stages_of
+from nodes.intersection.run import experiment_of, load_experiment, stages_of
 from nodes.runtime.errors import ConfigError
 
 LAUNCH = Path(__file__).parents[3] / "launch" / "intersection.experiment.yaml"
@@ -97,3 +98,20 @@ def test_bad_files_are_one_clear_error(
 def test_unknown_setting_names_the_known_ones(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="known are demo, full"):
         load_experiment(LAUNCH, "huge", [], tmp_path)
+
+
+def test_retraining_without_the_gradient_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"gradient among attack\.methods"):
+        load(tmp_path, "retrain.rounds=1", "attack.methods=[random]")
+
+
+def test_a_run_folder_gives_back_the_experiment_that_made_it(tmp_path: Path) -> None:
+    made = load(tmp_path, "horizon=17", "world.car.speed_mps=5")
+    made.folder.mkdir(parents=True, exist_ok=True)
+    manifest = {"file": str(made.file), "setting": made.setting, "config": made.config.model_dump(mode="json")}
+    (made.folder / "manifest.json").write_text(json.dumps(manifest))
+    again = experiment_of(made.folder)
+    assert again.config == made.config
+    assert again.world.car.speed_mps == 5.0
+    with pytest.raises(ConfigError, match="expected the run folder"):
+        experiment_of(tmp_path / "nowhere")

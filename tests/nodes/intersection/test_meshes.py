@@ -1,5 +1,7 @@
 """Attacks on meshes at the junction, over the frames of a scene in closed form."""
 
+import shutil
+
 import cv2
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from advnerf_core.mesh.shape import ShapeLimits
 from nodes.attacking.frames import DeployedFrames
 from nodes.intersection.cells import CellError
 from nodes.intersection.meshes import MeshSettings, mesh_cell, mesh_objects
+from nodes.intersection.policy import victim_file
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -65,6 +68,14 @@ def test_no_attack_is_one_everywhere_and_wrong_names_are_told(trained, wall, tmp
     cell = mesh_cell(trained, "right", "naive", "none", 0, tmp_path, quiet, MeshSettings(texels=8), wall)
     for where in ("surrogate", "deployed"):
         assert cell[where]["total_cte_m"] == cell[where]["none_total_cte_m"]
+    # Another victim under the same name: what is there is not taken for its result.
+    weights = victim_file(trained, "naive").read_bytes()
+    try:
+        shutil.copy(victim_file(trained, "hardened"), victim_file(trained, "naive"))
+        anew = mesh_cell(trained, "right", "naive", "none", 0, tmp_path, quiet, MeshSettings(texels=8), wall)
+    finally:
+        victim_file(trained, "naive").write_bytes(weights)
+    assert anew["settings_hash"] != cell["settings_hash"]
     with pytest.raises(CellError, match="scenario of straight, right, left"):
         mesh_cell(trained, "up", "naive", "none", 0, tmp_path, quiet)
     with pytest.raises(CellError, match="method of none, random, gradient"):

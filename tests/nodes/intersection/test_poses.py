@@ -10,7 +10,8 @@ import pytest
 
 from advnerf_core.attack.placement import footprint
 from advnerf_core.driving.policy import load_policy
-from advnerf_core.geometry import yaw_of
+from advnerf_core.geometry import rotation_z, yaw_of
+from hardware.twin.intersection.config import IntersectionConfig
 from nodes.intersection.context import Experiment
 from nodes.intersection.policy import HARDENED, victim_file
 from nodes.intersection.poses import PoseSettings, bounds_of, lanes_of, pose_cell, random_placements
@@ -24,12 +25,19 @@ def silent(fraction: float, text: str = "") -> None:
 
 def test_objects_move_about_their_places_and_off_the_lanes(trained: Experiment) -> None:
     things = trained.world.objects
-    moved = random_placements(trained, 4, seed=3)
-    assert len(moved) == 4
+    moved = random_placements(trained, 12, seed=3)
+    assert len(moved) == 12
     for objects in moved:
         for thing, there in zip(things, objects, strict=True):
             offset_m = there.T_world_from_object[:2, 3] - [thing.x_m, thing.y_m]
             assert np.abs(offset_m).max() <= PoseSettings().move_m + 1e-9
+            low, high = (there.scale * corner for corner in footprint(there))
+            corners = np.array([[x, y] for x in (low[0], high[0]) for y in (low[1], high[1])])
+            yaw_rad = yaw_of(there.T_world_from_object)
+            corners = corners @ rotation_z(yaw_rad)[:2, :2].T + there.T_world_from_object[:2, 3]
+            assert not any(
+                IntersectionConfig().on_road(*corner) for corner in corners
+            )  # they stand on pavements, so high
             place = (*there.T_world_from_object[:2, 3], yaw_of(there.T_world_from_object), there.scale)
             assert lanes_of(trained).distance_m(place, footprint(there)) >= trained.site.off_track_m
     places = np.array([[each.T_world_from_object[:3, 3] for each in objects] for objects in moved])
@@ -65,3 +73,7 @@ def test_a_cell_is_searched_once_and_says_where_things_stand(
     kept = {file: file.stat().st_mtime_ns for file in tmp_path.glob("*.cell.json")}
     assert pose_cell(short, victim, "right", method, 0, tmp_path, silent, wall, SMALL) == json.loads(json.dumps(cell))
     assert {file: file.stat().st_mtime_ns for file in tmp_path.glob("*.cell.json")} == kept
+    longer = replace(short, config=short.config.model_copy(update={"horizon": 5}))
+    anew = pose_cell(longer, victim, "right", method, 0, tmp_path, silent, wall, SMALL)
+    assert anew["settings_hash"] != cell["settings_hash"]
+    assert anew["deployed"] != cell["deployed"]

@@ -35,6 +35,25 @@ def test_straight_runs_in_the_middle_of_the_eastbound_lane():
     np.testing.assert_allclose(yaw, 0.0)
 
 
+def test_the_lanes_cover_the_asphalt_of_the_junction_and_no_pavement():
+    """Within half a lane of the lanes' middles lies all that is driven through, crossing and rounded corners included."""
+    along = np.arange(0.0, 48.0, 0.05)
+    middles = np.concatenate([[lane.pose_at(float(s))[:2] for s in along] for lane in CONFIG.lanes()])
+    points = np.random.default_rng(0).uniform(-16.0, 16.0, (4000, 2))
+    near_m = np.array([np.hypot(*(middles - point).T).min() for point in points])
+    on_road = np.array([CONFIG.on_road(*point) for point in points])
+    assert near_m[~on_road].min() > CONFIG.off_track_m - 0.01
+    # What lies farther from all of them is the middle of the crossing, far from any pavement.
+    assert np.abs(points[on_road & (near_m > CONFIG.off_track_m + 0.01)]).max(initial=0.0) < 8.0
+
+
+def test_a_mirrored_drive_is_the_drive_in_the_mirror():
+    for name, reference in PATHS.items():
+        for across, signs in (("x", (1.0, -1.0)), ("y", (-1.0, 1.0))):
+            there = np.array([reference.mirrored(across).pose_at(float(s))[:2] for s in ALONG_M])
+            np.testing.assert_allclose(there, poses(name)[:, :2] * signs, atol=1e-9)
+
+
 @pytest.mark.parametrize(
     ("name", "start", "centre", "radius", "turn", "end_yaw", "end_axis", "end_at"),
     [
