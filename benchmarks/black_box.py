@@ -14,6 +14,7 @@ piece ends after ``--minutes``, and the next call goes on. Rows are recorded whe
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import time
 from collections.abc import Callable
@@ -141,6 +142,14 @@ def victim_of(folder: Path, out: Path) -> Any:
     return CountedPolicy(load_any_policy(path).policy)
 
 
+def about(folder: Path, steps: int) -> str:
+    """Short hash of the victim, the scene, the attacked face and the ticks: another one has a folder of its own."""
+    attack = load_attack(folder / "attack" / "hardened_gradient_0.attack.safetensors")
+    policy = load_policy(folder / "policy" / "policy.safetensors")
+    told = [policy.sha256, attack.scene_sha256, attack.T_world_from_object.tolist(), list(attack.size_m), steps]
+    return hashlib.sha256(json.dumps(told).encode()).hexdigest()[:8]
+
+
 def shares(searches: list[Search], white_calls: int, none_m: float, white_m: float) -> dict[str, dict[str, float]]:
     """Share of the white box's effect by method and multiple of its calls, as far as each search has come."""
     table: dict[str, dict[str, float]] = {}
@@ -208,7 +217,9 @@ def main() -> None:
     options = parser.parse_args()
     if options.trial:
         options.steps, options.multiple, options.out = 4, 1.0, options.out.with_name(options.out.name + "_trial")
+    options.out = options.out / about(options.run_folder, options.steps)
     options.out.mkdir(parents=True, exist_ok=True)
+    print(f"in {options.out}")
     finished, numbers = _piece(options)
     table = numbers["shares"]
     for name, row in table.items():

@@ -8,7 +8,7 @@ the plain objects in the same scene, means over seeds and starts.
 from __future__ import annotations
 
 import argparse
-import json
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +17,9 @@ import numpy as np
 from advnerf_core.mesh.shape import ShapeLimits
 from benchmarks.results import record_row
 from nodes.intersection.meshes import MeshMethod, MeshSettings, Target, mesh_cell
-from nodes.intersection.run import load_experiment
+from nodes.intersection.run import experiment_of
 
+_SEEDS = 3  # fewer are told, and judged by nobody
 TARGETS = {
     ("texture", "straight"): 1.41,
     ("texture", "right"): 1.31,
@@ -27,11 +28,11 @@ TARGETS = {
 }
 
 
-def ratio(cells: list[dict[str, Any]], where: str) -> tuple[float, float, float]:
+def ratio(cells: list[dict[str, Any]], where: str) -> tuple[float, float | None, float]:
     """Mean total CTE over that past plain objects, the spread of it over the cells, and what it is divided by [m]."""
     each = [float(np.mean(cell[where]["total_cte_m"])) for cell in cells]
     base = float(np.mean([np.mean(cell[where]["none_total_cte_m"]) for cell in cells]))
-    return float(np.mean(each)) / base, float(np.std(each)) / base, base
+    return float(np.mean(each)) / base, float(np.std(each, ddof=1)) / base if len(each) > 1 else None, base
 
 
 def main() -> None:
@@ -48,12 +49,13 @@ def main() -> None:
     parser.add_argument("--ball", type=float, help="shapes: balls of this radius instead of cars and hydrants [m]")
     parser.add_argument("--trial", action="store_true", help="print, but record nothing")
     options = parser.parse_args()
-    manifest = json.loads((options.folder / "manifest.json").read_text())
-    experiment = load_experiment(Path(manifest["file"]), manifest["setting"], [], options.folder)
+    experiment = experiment_of(options.folder)
     target: Target = options.target
     settings = MeshSettings(target, options.texels, options.ball, limits=ShapeLimits(bound_m=options.bound))
     scenarios = options.scenarios or (list(experiment.config.scenarios) if target == "texture" else ["straight"])
-    command = f"python -m benchmarks.mesh_attack {options.folder} --target {target} --seeds {' '.join(map(str, options.seeds))}"
+    command = "python -m benchmarks.mesh_attack " + " ".join(sys.argv[1:])
+    objects = "" if options.ball is None else f", balls of {options.ball:g} m"
+    of_victim = "" if options.victim == "hardened" else f", {options.victim} victim"
     folder = options.folder / "meshes" / f"{target}_{options.texels}_{options.bound}_{options.ball}"
     for scenario in scenarios:
         for method in options.methods:
@@ -63,15 +65,16 @@ def main() -> None:
                 for seed in options.seeds
             ]  # fmt: skip
             ideal, deployed = ratio(cells, "surrogate"), ratio(cells, "deployed")
+            spread = "one seed" if deployed[1] is None else f"std {deployed[1]:.2f} over {len(cells)} seeds"
             note = (
-                f"{deployed[1]:.2f} std over {len(cells)} seed(s), divided by {deployed[2]:.1f} m; ideal car over the same frames "
+                f"{spread}, divided by {deployed[2]:.1f} m; ideal car over the same frames "
                 f"{ideal[0]:.2f} x of {ideal[2]:.1f} m; {options.victim} victim"
             )
             print(f"\n{target} {scenario} {method}: deployed {deployed[0]:.2f} x; {note}")
-            wanted = TARGETS.get((target, scenario)) if method == "gradient" else None
+            wanted = TARGETS.get((target, scenario)) if method == "gradient" and options.victim == "hardened" else None
             if not options.trial:
-                record_row(f"#5 meshes: {target}, {scenario}, {method}, deployed", deployed[0], "x", f">= {wanted} x" if wanted else "printed",
-                           None if wanted is None else deployed[0] >= wanted, command, note)  # fmt: skip
+                record_row(f"#5 meshes: {target}{objects}, {scenario}, {method}{of_victim}, deployed", deployed[0], "x", f">= {wanted} x" if wanted else "printed",
+                           None if wanted is None or len(cells) < _SEEDS else deployed[0] >= wanted, command, note)  # fmt: skip
 
 
 if __name__ == "__main__":
