@@ -45,6 +45,17 @@ def note_of(row: TableRow, cells: Sequence[CellResult] = ()) -> str:
     return "; ".join(parts)
 
 
+def why_missed(target: TableTarget | None, row: TableRow, none: TableRow | None, cells: Sequence[CellResult]) -> str:
+    """By how much a ratio misses its target, and what that is on the road; empty where it does not."""
+    if target is None or target.met is not False or none is None or row.mean_m is None or none.mean_m is None:
+        return ""
+    text = f"; {target.verdict}"
+    if (ticks := cells[0].extra.get("horizon") if cells else None) is not None:
+        off_mm, clean_mm = (1000 * each / ticks for each in (row.mean_m, none.mean_m))
+        text += f": {off_mm:.0f} mm off the path on average, {clean_mm:.0f} mm without attack; a base this small makes ratios of millimetres"
+    return text
+
+
 def rows_of(table: TransferTable) -> list[tuple[TableRow, TableTarget | None]]:
     """Rows with drives, none left out as it is 1 by definition, with the target on their ratio where there is one."""
     targets = {(t.scenario, t.method, t.domain): t for t in table_targets(table) if t.what == "ratio to no attack"}
@@ -77,7 +88,8 @@ def main() -> None:
     for row, target in rows_of(table):
         record(
             line_of(row), row.ratio or 0.0, "x no attack", f"{target.target} x" if target else "",
-            target.met if target else None, note_of(row, table.cells_of(row)),
+            target.met if target else None, note_of(row, cells := table.cells_of(row))
+            + why_missed(target, row, table.find(row.scenario, row.victim, "none", row.domain, row.placement), cells),
         )  # fmt: skip
     for target in table_targets(table):
         if target.what != "ratio to no attack" and target.value is not None:

@@ -59,6 +59,19 @@ def test_a_row_of_the_table_has_its_machines_and_waits_for_its_seeds():
     assert [target.met for _, target in transfer_table.rows_of(whole)] == [True, True]
 
 
+def test_a_miss_says_by_how_much_and_what_that_is_on_the_road():
+    extra = {"extra": {"horizon": 60}}
+    cells = [CellResult.model_validate({**cell(seed, "random", 3.0), **extra}) for seed in (0, 1)]
+    cells += [CellResult.model_validate({**cell(seed, "none", 2.0), **extra}) for seed in (0, 1)]
+    table = make_table([Wanted("right", "", "hardened", method, (0, 1)) for method in ("none", "random")], cells)
+    rows = dict((row.domain, (row, target)) for row, target in transfer_table.rows_of(table))
+    row, target = rows["deployed"]
+    none = table.find("right", "hardened", "none", "deployed")
+    why = transfer_table.why_missed(target, row, none, table.cells_of(row))
+    assert "missed by 25 %: 50 mm off the path on average, 33 mm without attack" in why
+    assert transfer_table.why_missed(None, row, none, []) == ""
+
+
 def test_shares_of_the_white_box_are_of_what_it_adds(tmp_path):
     search = Search("guided", tmp_path, 10)
     search.curve = [[100, 3.0, 1.0, 300], [200, 6.0, 1.0, 1200]]
