@@ -18,8 +18,10 @@ _LIVE = (
     "tests/test_docs_policies.py",
 )
 _COMPUTING = (
-    "tests/nodes/attacking", "tests/nodes/experiment", "tests/nodes/intersection", "tests/nodes/policy_data",
-    "tests/hardware/carla_scene", "tests/hardware/twin/intersection",
+    "tests/nodes/attacking", "tests/nodes/carla_tools", "tests/nodes/experiment", "tests/nodes/intersection",
+    "tests/nodes/policy_data", "tests/nodes/scene_import", "tests/nodes/test_calibration_drive.py",
+    "tests/nodes/test_cli_calibrate.py", "tests/nodes/test_cli_object.py", "tests/nodes/test_cli_scene.py",
+    "tests/nodes/test_scene_training.py", "tests/hardware/carla_scene", "tests/hardware/twin", "tests/benchmarks",
 )  # fmt: skip
 _INSIDE = "ADVNERF_TEST_IN_ITS_OWN_PROCESS"
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
+import threading
 
 import numpy as np
 
@@ -64,6 +65,9 @@ class NodeLoop:
         self._clock = clock
         self._stop_read, self._stop_write = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
         self._stopping = False
+        # A loop that ends by itself closes its pipe while another thread may be about to write to it; a signal handler may come
+        # in between, in the same thread, so the lock can be taken twice.
+        self._ending = threading.RLock()
         self._refusals: dict[str, str] = {}
         start_ns = clock.now().mono_ns
         self._status_schedule = Schedule(STATUS_RATE_HZ, start_ns)
@@ -83,11 +87,12 @@ class NodeLoop:
 
     def stop(self) -> None:
         """End `run` soon (any thread or signal handler)."""
-        if self._stopping:
-            return
-        self._stopping = True
-        with contextlib.suppress(BlockingIOError):  # the pipe is full, so the loop is awake already
-            os.write(self._stop_write, b"s")
+        with self._ending:
+            if self._stopping:
+                return
+            self._stopping = True
+            with contextlib.suppress(BlockingIOError):  # the pipe is full, so the loop is awake already
+                os.write(self._stop_write, b"s")
 
     def run(self) -> None:
         """Work until `stop`; raises what the node raises."""
@@ -103,9 +108,10 @@ class NodeLoop:
 
     def close(self) -> None:
         """Give the loop's own file descriptors back, after the bus is closed; `stop` does nothing from then on."""
-        self._stopping = True
-        os.close(self._stop_read)
-        os.close(self._stop_write)
+        with self._ending:
+            self._stopping = True
+            os.close(self._stop_read)
+            os.close(self._stop_write)
 
     def publish_status(self, now: Now, state: str, text: str) -> None:
         """Send a sign of life with everything countable."""
