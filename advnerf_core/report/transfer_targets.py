@@ -90,14 +90,18 @@ def _value(row: TableRow | None, of: Callable[[TableRow], float | None]) -> floa
     return of(row) if row is not None and row.seeds else None
 
 
-def _unfinished(row: TableRow | None) -> bool:
-    return row is not None and bool(row.missing)
+def _verdict(row: TableRow | None, value: float | None, limit: float, at_least: bool) -> tuple[bool | None, float]:
+    """Whether a limit is kept, None while seeds are missing, and what is lacking as a share of it."""
+    if row is None or row.missing or value is None:
+        return None, 0.0
+    lacking = limit - value if at_least else value - limit
+    # Of a limit of zero any excess counts by its own size.
+    return lacking <= 0.0, max(lacking, 0.0) / (limit or 1.0)
 
 
 def _at_least(scenario: str, method: str, domain: Domain, row: TableRow | None, limit: float) -> TableTarget:
     value = _value(row, lambda r: r.ratio)
-    met = None if value is None or _unfinished(row) else value >= limit
-    short = 1.0 - value / limit if value is not None and met is False else 0.0
+    met, short = _verdict(row, value, limit, at_least=True)
     seeds = len(row.seeds) if row else 0
     return TableTarget(scenario, method, domain, "ratio to no attack", f">= {limit:g}", value, met, seeds, short)
 
@@ -106,9 +110,7 @@ def _limit(
     scenario: str, method: str, what: str, limit: float, row: TableRow | None, of: Callable[[TableRow], float | None]
 ) -> TableTarget:
     value = _value(row, of)
-    met = None if value is None or _unfinished(row) else value <= limit
-    # Of a limit of zero any excess counts by its own size.
-    short = (value - limit) / (limit or 1.0) if value is not None and met is False else 0.0
+    met, short = _verdict(row, value, limit, at_least=False)
     seeds = len(row.seeds) if row else 0
     return TableTarget(scenario, method, "deployed", what, f"<= {limit:g}", value, met, seeds, short)
 
@@ -119,8 +121,7 @@ def _relative_spread(row: TableRow) -> float | None:
 
 def _left_often(scenario: str, row: TableRow | None) -> TableTarget:
     value = _value(row, lambda r: r.off_track / r.drives)
-    met = None if value is None or _unfinished(row) else value >= _LEFT_SHARE
-    short = 1.0 - value / _LEFT_SHARE if value is not None and met is False else 0.0
+    met, short = _verdict(row, value, _LEFT_SHARE, at_least=True)
     seeds = len(row.seeds) if row else 0
     return TableTarget(
         scenario, "gradient", "deployed", "share of drives off the track", ">= 4 of 5", value, met, seeds, short
