@@ -10,6 +10,8 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from hardware.twin.config import CameraConfig
 from hardware.twin.intersection.config import DubinsConfig, PhotoConfig, PlacedObject
 
+_WHOLE_TICK_S = 1e-6
+
 
 class _Frozen(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -86,6 +88,19 @@ class RenderConfig(_Frozen):
         "lens_flare_intensity": "0.0",
         "bloom_intensity": "0.0",
     }
+
+    def whole_ticks(self, duration_s: float) -> int:
+        """Ticks that a duration takes.
+
+        Raises:
+            ValueError: It is not a whole number of ticks.
+        """
+        ticks = round(duration_s / self.fixed_delta_s) if math.isfinite(duration_s) else -1
+        if ticks < 0 or abs(ticks * self.fixed_delta_s - duration_s) > _WHOLE_TICK_S:
+            raise ValueError(
+                f"expected a duration of whole ticks of render.fixed_delta_s = {self.fixed_delta_s:g} s, got {duration_s:g} s"
+            )
+        return ticks
 
 
 class BodyConfig(_Frozen):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import math
 import weakref
 from collections.abc import Iterator
 from types import TracebackType
@@ -33,7 +32,6 @@ Depth = NDArray[np.float32]
 _log = logging.getLogger(__name__)
 _CLOSING_TIMEOUT_S = 5.0
 _ATTEMPTS = 3  # ticks until a picture of the wanted pose must have come
-_WHOLE_TICK_S = 1e-6
 
 
 class CarlaScene:
@@ -138,12 +136,7 @@ class CarlaScene:
             CarlaError: The server did not answer.
         """
         self._require_open()
-        delta = self.config.render.fixed_delta_s
-        ticks = round(duration_s / delta) if math.isfinite(duration_s) else -1
-        if ticks < 0 or abs(ticks * delta - duration_s) > _WHOLE_TICK_S:
-            raise ValueError(
-                f"expected a duration of whole ticks of render.fixed_delta_s = {delta:g} s, got {duration_s:g} s"
-            )
+        delta, ticks = self.config.render.fixed_delta_s, self.config.render.whole_ticks(duration_s)
         with server_answers("moving the car"):
             for _ in range(ticks):
                 before = self._driving_pose()

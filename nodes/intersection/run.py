@@ -21,7 +21,6 @@ from nodes.runtime.config import validate
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.stages import Report, Stage, StageRecord
 
-_WHOLE = 1e-6
 _LIBRARIES = ("torch", "numpy", "numba", "opencv-contrib-python-headless", "mujoco")
 
 
@@ -40,11 +39,13 @@ def load_experiment(file: Path, setting: str, overrides: Sequence[str], folder: 
     document = read_setting(file, setting, overrides)
     config = validate(IntersectionExperimentConfig, document)
     if config.kind == "carla":
-        tick_s = validate(CarlaConfig, document.part(("world",))).render.fixed_delta_s
-        if abs(config.dt_s / tick_s - max(round(config.dt_s / tick_s), 1)) > _WHOLE:
+        render = validate(CarlaConfig, document.part(("world",))).render
+        try:
+            render.whole_ticks(config.dt_s)
+        except ValueError as error:
             raise ConfigError(
-                f"{file}: expected dt_s to be whole ticks of world.render.fixed_delta_s = {tick_s:g} s, got {config.dt_s:g} s"
-            )
+                f"{file}: expected dt_s to be whole ticks of world.render.fixed_delta_s = {render.fixed_delta_s:g} s, got {config.dt_s:g} s"
+            ) from error
     else:
         validate(IntersectionConfig, document.part(("world",)))
     return Experiment(config, file.resolve(), folder.resolve(), setting)
