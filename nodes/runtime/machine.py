@@ -7,13 +7,16 @@ import platform
 from pathlib import Path
 
 
-def machine_name() -> str:
-    """Processor, cores at hand and Python, e.g. ``AMD EPYC, 2 cores, Python 3.11.2``."""
-    model = platform.machine()
+def processor_name() -> str:
+    """The processor's name, or its architecture where the system does not tell the name."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-        model = next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), model)
     except OSError:
-        pass
+        return platform.processor() or platform.machine()
+    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.machine())
+
+
+def machine_name() -> str:
+    """Processor, cores at hand and Python, e.g. ``AMD EPYC, 2 cores, Python 3.11.2``."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return f"{model}, {cores} cores, Python {platform.python_version()}"
+    return f"{processor_name()}, {cores} cores, Python {platform.python_version()}"
