@@ -14,19 +14,19 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from advnerf_core.attack.adjoint import AttackProblem, evaluate
+from advnerf_core.attack.adjoint import AttackProblem
 from advnerf_core.attack.artifact import AttackedObject, AttackFile, load_attack, save_attack
 from advnerf_core.attack.baselines import random_search
 from advnerf_core.attack.optimise import gradient_attack
 from advnerf_core.attack.population import CrossEntropy, population_search
-from advnerf_core.attack.search import Evaluation, SearchResult
-from advnerf_core.driving.metrics import drive_metrics
+from advnerf_core.attack.search import SearchResult
 from advnerf_core.driving.policy import LoadedPolicy, load_policy
 from advnerf_core.files import write_atomically
 from advnerf_core.scene.surrogate import Surrogate, split_theta
 from nodes.experiment.learned_scene import scene_sha256
 from nodes.intersection.config import Method
 from nodes.intersection.context import Experiment
+from nodes.intersection.drives import learned_drives, progress_of, totals
 from nodes.intersection.objects import object_file, placed_objects, surrogate_of
 from nodes.intersection.policy import HARDENED, victim_file, victims
 from nodes.runtime.stages import Report, hash_of
@@ -124,12 +124,9 @@ def surrogate_part(
         theta, seconds = result.theta, sum(evaluation.seconds for evaluation in result.history)
         curve = [evaluation.predicted_total_cte_m for evaluation in result.history]
         attack_id = save_attack(attack_path(folder, cell), _attack_file(experiment, surrogate, policy, cell, result))
-    rollout, _ = evaluate(problem, theta)
-    drives = rollout.states.transpose(0, 1).numpy()
-    scores = [drive_metrics(problem.path, states, experiment.limits) for states in drives]
+    states, scores = learned_drives(experiment, problem, theta)
     data = {
-        "attack_id": attack_id, "states": drives.tolist(), "total_cte_m": [score.total_cte_m for score in scores],
-        "off_track": [score.off_track for score in scores], "mean_cte_m": [score.mean_cte_m for score in scores],
+        "attack_id": attack_id, "states": states.tolist(), **totals(scores), "mean_cte_m": [score.mean_cte_m for score in scores],
         "curve_total_cte_m": curve, "seconds": seconds,
     }  # fmt: skip
     write_atomically(kept, json.dumps(data) + "\n")
@@ -163,18 +160,12 @@ def load_theta(folder: Path, cell: Cell) -> torch.Tensor:
 def _search(
     experiment: Experiment, problem: AttackProblem, cell: Cell, folder: Path, report: Callable[..., None]
 ) -> SearchResult:
-    attack, best = experiment.config.attack, [0.0]
-
-    def told(evaluation: Evaluation) -> None:
-        best[0], done = max(best[0], evaluation.predicted_total_cte_m), evaluation.iteration + 1
-        now = f"total CTE {evaluation.predicted_total_cte_m:.1f} m, best {best[0]:.1f} m"
-        report(done / attack.evaluations, f"{done}/{attack.evaluations}, {now}")
-
+    attack = experiment.config.attack
     frozen = {
         key: value for key, value in frozen_hashes(experiment).items() if key not in ("config", "starts_and_seeds")
     }
     common: dict[str, Any] = {
-        "seed": cell.seed, "state_path": _state_path(folder, cell), "on_evaluation": told,
+        "seed": cell.seed, "state_path": _state_path(folder, cell), "on_evaluation": progress_of(report, attack.evaluations),
         "settings_hash": hash_of({**frozen, "victim": cell.victim, "scenario": cell.scenario}),
     }  # fmt: skip
     method: Method | Literal["none"] = cell.method

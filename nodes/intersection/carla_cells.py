@@ -2,27 +2,14 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 from nodes.campaign.kinds import stage_digests
-from nodes.intersection.attack import Cell, Condition, surrogate_part
 from nodes.intersection.cells import PREPARED_AT, run_cell
+from nodes.intersection.cells import search as search_cell
 from nodes.intersection.context import Experiment
-from nodes.intersection.objects import placed_objects, surrogate_of
-from nodes.runtime.stages import Report
 
 LIVE = True
-
-
-def search_cell(
-    experiment: Experiment, scenario: str, victim: str, method: Condition, seed: int, folder: Path, report: Report
-) -> None:
-    """The part of `run_cell` that needs no server."""
-    cell = Cell(scenario, victim, method, seed)
-    surrogate = surrogate_of(experiment, placed_objects(experiment))
-    for each in dict.fromkeys((cell.clean, cell)):
-        surrogate_part(experiment, surrogate, each, folder, report)
 
 
 def cell_inputs(experiment: Experiment, scenario: str, victim: str, method: str, seed: int) -> dict[str, Any]:

@@ -7,13 +7,12 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from advnerf_core.driving.policy import load_policy
 from advnerf_core.files import write_atomically
 from nodes.intersection.attack import Cell, Condition, cells, frozen_hashes, load_theta, surrogate_part
 from nodes.intersection.context import Experiment
-from nodes.intersection.deployed import DressedScene, drive_deployed
+from nodes.intersection.deployed import DressedScene
+from nodes.intersection.drives import deployed_drives, totals
 from nodes.intersection.films import film_cell
 from nodes.intersection.objects import placed_objects, surrogate_of
 from nodes.intersection.policy import victim_file, victims
@@ -48,14 +47,7 @@ def run_cell(
     Raises:
         CellError: No such drive, victim or method.
     """
-    known = (experiment.config.scenarios, victims(experiment), ("none", "random", "cem", "gradient"))
-    for what, value, choices in zip(("scenario", "victim", "method"), (scenario, victim, method), known, strict=True):
-        if value not in choices:
-            raise CellError(f"expected a {what} of {', '.join(choices)}, got {value!r}")
-    cell = Cell(scenario, victim, method, seed)
-    surrogate = surrogate_of(experiment, placed_objects(experiment))
-    for each in dict.fromkeys((cell.clean, cell)):
-        surrogate_part(experiment, surrogate, each, folder, report)
+    cell = search(experiment, scenario, victim, method, seed, folder, report)
     result, clip = folder / f"{cell.name}.cell.json", next(folder.glob("clip.*"), None)
     if result.exists() and clip is not None:
         found: dict[str, Any] = json.loads(result.read_text())
@@ -64,6 +56,25 @@ def run_cell(
         dressed = DressedScene(scene, experiment.view, placed_objects(experiment))
         data = deployed_part(experiment, dressed, cell, folder, folder)
         return _with_clip(data, film_cell(experiment, dressed, cell, folder))
+
+
+def search(
+    experiment: Experiment, scenario: str, victim: str, method: Condition, seed: int, folder: Path, report: Report
+) -> Cell:
+    """The part of `run_cell` that needs no deployment scene: search and drive in the surrogate.
+
+    Raises:
+        CellError: No such drive, victim or method.
+    """
+    known = (experiment.config.scenarios, victims(experiment), ("none", "random", "cem", "gradient"))
+    for what, value, choices in zip(("scenario", "victim", "method"), (scenario, victim, method), known, strict=True):
+        if value not in choices:
+            raise CellError(f"expected a {what} of {', '.join(choices)}, got {value!r}")
+    cell = Cell(scenario, victim, method, seed)
+    surrogate = surrogate_of(experiment, placed_objects(experiment))
+    for each in dict.fromkeys((cell.clean, cell)):
+        surrogate_part(experiment, surrogate, each, folder, report)
+    return cell
 
 
 def _with_clip(data: dict[str, Any], clip: Path) -> dict[str, Any]:
@@ -120,18 +131,12 @@ def _drives(experiment: Experiment, dressed: DressedScene, cell: Cell, searched:
         return found
     policy = load_policy(victim_file(experiment, cell.victim)).policy
     theta = dressed.plain_theta() if cell.method == "none" else load_theta(searched, cell)
-    drives = [
-        drive_deployed(
-            dressed, policy, experiment.goal(cell.scenario), np.asarray(start), experiment.paths[cell.scenario],
-            experiment.limits, experiment.world.car.speed_mps, theta,
-        )
-        for start in experiment.start_states(cell.scenario, cell.seed).numpy()
-    ]  # fmt: skip
+    starts = experiment.start_states(cell.scenario, cell.seed)
+    drives = deployed_drives(experiment, dressed, policy, cell.scenario, starts, theta)
     data = {
         "states": [drive.states.tolist() for drive in drives], "controls": [drive.controls.tolist() for drive in drives],
-        "total_cte_m": [drive.metrics.total_cte_m for drive in drives],
-        "mean_cte_m": [drive.metrics.mean_cte_m for drive in drives],
-        "off_track": [drive.metrics.off_track for drive in drives], "blocked_tick": [drive.blocked_tick for drive in drives],
+        **totals([drive.metrics for drive in drives]), "mean_cte_m": [drive.metrics.mean_cte_m for drive in drives],
+        "blocked_tick": [drive.blocked_tick for drive in drives],
     }  # fmt: skip
     write_atomically(kept, json.dumps(data) + "\n")
     return data

@@ -17,14 +17,14 @@ from numpy.typing import NDArray
 from advnerf_core.attack.adjoint import AttackProblem
 from advnerf_core.driving.metrics import Horizon
 from advnerf_core.driving.policy import load_policy
-from advnerf_core.geometry import Array
 from advnerf_core.scene.dataset import load_transforms
 from advnerf_core.scene.fidelity import Pictures
 from nodes.experiment.images import as_uint8
 from nodes.intersection import capture
 from nodes.intersection.attack import Cell, Condition, attack_path, attack_problem, load_theta
 from nodes.intersection.context import Experiment
-from nodes.intersection.deployed import DressedScene, drive_deployed
+from nodes.intersection.deployed import DressedScene
+from nodes.intersection.drives import deployed_drives
 from nodes.intersection.objects import placed_objects, surrogate_of
 from nodes.intersection.policy import victim_file
 from nodes.runtime.errors import RuntimeFault
@@ -88,14 +88,11 @@ def _along_the_drive(
     experiment: Experiment, scenario: str, victim: str, seed: int, theta: torch.Tensor | None, of: str
 ) -> Pictures:
     objects = placed_objects(experiment)
-    policy, goal = policy_of(experiment, victim, scenario)
+    policy, _ = policy_of(experiment, victim, scenario)
     with experiment.site.open() as scene:
         dressed = DressedScene(scene, experiment.view, objects)
-        start: Array = experiment.start_states(scenario, seed)[0].numpy()
-        drive = drive_deployed(
-            dressed, policy, goal, start, experiment.paths[scenario], experiment.limits, experiment.world.car.speed_mps,
-            dressed.plain_theta(),
-        )  # fmt: skip
+        start = experiment.start_states(scenario, seed)[:1]
+        (drive,) = deployed_drives(experiment, dressed, policy, scenario, start, dressed.plain_theta())
         states = drive.states[:-1]
         real = dressed.policy_images(dressed.prepare(states), dressed.plain_theta() if theta is None else theta)
     surrogate = surrogate_of(experiment, objects)

@@ -12,15 +12,13 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from advnerf_core.attack.adjoint import AttackProblem, evaluate
+from advnerf_core.attack.adjoint import AttackProblem
 from advnerf_core.attack.baselines import random_search
 from advnerf_core.attack.optimise import gradient_attack
 from advnerf_core.attack.search import Evaluation, SearchResult
-from advnerf_core.driving.metrics import drive_metrics
 from advnerf_core.driving.policy import Policy, load_policy
 from advnerf_core.files import write_atomically
 from advnerf_core.mesh.field import MeshField
@@ -35,7 +33,8 @@ from nodes.attacking.frames import DeployedFrames
 from nodes.intersection.attack import attack_problem
 from nodes.intersection.cells import CellError
 from nodes.intersection.context import Experiment
-from nodes.intersection.deployed import DressedScene, drive_deployed
+from nodes.intersection.deployed import DressedScene
+from nodes.intersection.drives import deployed_drives, learned_drives, progress_of, totals
 from nodes.intersection.objects import GENERATOR_OF
 from nodes.intersection.policy import victim_file, victims
 from nodes.runtime.machine import machine_name
@@ -150,7 +149,7 @@ def _cell(
         found = _search(experiment, problem, method, seed, settings, result, report, frozen)
         theta, history = found.theta, found.history
         _keep_meshes(experiment, problem, fields, theta, result)
-    clean, attacked = ({"surrogate": _ideal(experiment, problem, each)} for each in (plain, theta))
+    clean, attacked = ({"surrogate": totals(learned_drives(experiment, problem, each)[1])} for each in (plain, theta))
     for drives, each in ((clean, plain), (attacked, theta)):
         drives["deployed"] = _deployed(experiment, scene, problem, fields, each, scenario, policy.policy)
     data = {
@@ -173,15 +172,9 @@ def _search(
     experiment: Experiment, problem: AttackProblem, method: MeshMethod, seed: int, settings: MeshSettings, result: Path,
     report: Report, settings_hash: str,
 ) -> SearchResult:  # fmt: skip
-    attack, best = experiment.config.attack, [0.0]
-
-    def told(evaluation: Evaluation) -> None:
-        best[0], done = max(best[0], evaluation.predicted_total_cte_m), evaluation.iteration + 1
-        now = f"total CTE {evaluation.predicted_total_cte_m:.1f} m, best {best[0]:.1f} m"
-        report(done / attack.evaluations, f"{done}/{attack.evaluations}, {now}")
-
+    attack = experiment.config.attack
     common: dict[str, Any] = {
-        "seed": seed, "state_path": _beside(result, ".state.safetensors"), "on_evaluation": told,
+        "seed": seed, "state_path": _beside(result, ".state.safetensors"), "on_evaluation": progress_of(report, attack.evaluations),
         "settings_hash": settings_hash,
     }  # fmt: skip
     sensor = problem.sensor
@@ -206,12 +199,6 @@ def _keep_meshes(
         write_glb(_beside(result, f".{thing.name}.glb"), mesh)
 
 
-def _ideal(experiment: Experiment, problem: AttackProblem, theta: Tensor) -> dict[str, Any]:
-    rollout, _ = evaluate(problem, theta)
-    scores = [drive_metrics(problem.path, d, experiment.limits) for d in rollout.states.transpose(0, 1).numpy()]
-    return {"total_cte_m": [s.total_cte_m for s in scores], "off_track": [s.off_track for s in scores]}
-
-
 def _deployed(
     experiment: Experiment, scene: DeploymentScene, problem: AttackProblem, fields: list[MeshField], theta: Tensor,
     scenario: str, policy: Policy,
@@ -220,14 +207,8 @@ def _deployed(
     if isinstance(problem.sensor, ShapeSensor):
         fields, theta = problem.sensor.shaped(theta), problem.sensor.colours
     dressed = DressedScene(scene, experiment.view, fields)
-    drives = [
-        drive_deployed(
-            dressed, policy, experiment.goal(scenario), np.asarray(start), experiment.paths[scenario], experiment.limits,
-            experiment.world.car.speed_mps, theta,
-        )
-        for start in problem.start_states.numpy()
-    ]  # fmt: skip
-    return {"total_cte_m": [d.metrics.total_cte_m for d in drives], "off_track": [d.metrics.off_track for d in drives]}
+    drives = deployed_drives(experiment, dressed, policy, scenario, problem.start_states, theta)
+    return totals([drive.metrics for drive in drives])
 
 
 def _plain(settings: MeshSettings) -> dict[str, Any]:

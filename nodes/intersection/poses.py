@@ -17,21 +17,21 @@ from typing import Any, Literal
 import numpy as np
 from torch import Tensor
 
-from advnerf_core.attack.adjoint import AttackProblem, evaluate
+from advnerf_core.attack.adjoint import AttackProblem
 from advnerf_core.attack.placement import KeepOut, PoseBounds
 from advnerf_core.attack.pose_attack import FoundPoses, pose_attack, randomly_placed
 from advnerf_core.attack.poses import MultiStart
-from advnerf_core.attack.search import Evaluation
-from advnerf_core.driving.metrics import drive_metrics
 from advnerf_core.driving.policy import LoadedPolicy
 from advnerf_core.fields.voxel_grid import VoxelGridObject
 from advnerf_core.files import write_atomically
+from advnerf_core.scene.surrogate import Surrogate
 from hardware.deployment_scene import DeploymentScene
 from hardware.twin.intersection.config import PlacedObject
 from nodes.experiment.learned_scene import scene_sha256
 from nodes.intersection.attack import attack_problem, frozen_objects
 from nodes.intersection.context import Experiment, as_path
-from nodes.intersection.deployed import DressedScene, drive_deployed
+from nodes.intersection.deployed import DressedScene
+from nodes.intersection.drives import deployed_drives, learned_drives, progress_of, totals
 from nodes.intersection.objects import placed_objects, surrogate_of
 from nodes.runtime.machine import machine_name
 from nodes.runtime.stages import Report, hash_of
@@ -114,14 +114,16 @@ def pose_cell(
     result = folder / f"poses_{scenario}_{method}_{seed}.cell.json"
     if result.exists() and (kept := json.loads(result.read_text()))["settings_hash"] == frozen:
         return dict(kept)
-    surrogate = surrogate_of(experiment, placed_objects(experiment))
+    objects = placed_objects(experiment)
+    surrogate = surrogate_of(experiment, objects)
     problem = attack_problem(experiment, surrogate, victim, scenario, seed)
-    objects, colours = placed_objects(experiment), surrogate.plain_theta()
-    clean = _driven(experiment, problem, scene, objects, colours, scenario)
+    clean = _driven(experiment, problem, scene, surrogate, objects, surrogate.plain_theta(), scenario)
     attacked, extra, state = clean, {}, result.with_suffix(".state.safetensors")
     if method != "none":
         found = _search(experiment, problem, method, seed, settings, state, frozen, report)
-        attacked = _driven(experiment, problem, scene, found.objects, found.colours, scenario)
+        attacked = _driven(
+            experiment, problem, scene, surrogate.with_objects(found.objects), found.objects, found.colours, scenario
+        )
         extra = _told(found)
     data = {
         "scenario": scenario, "victim": victim.sha256, "method": method, "seed": seed, "attack_id": None, "settings_hash": frozen,
@@ -149,40 +151,23 @@ def _search(
     experiment: Experiment, problem: AttackProblem, method: Literal["random", "gradient"], seed: int, settings: PoseSettings,
     state: Path, settings_hash: str, report: Report,
 ) -> FoundPoses:  # fmt: skip
-    best = [0.0]
     budget = MultiStart(settings.samples, settings.steps, colour_rate=settings.colour_rate)
-
-    def told(evaluation: Evaluation) -> None:
-        best[0], done = max(best[0], evaluation.predicted_total_cte_m), evaluation.iteration + 1
-        now = f"total CTE {evaluation.predicted_total_cte_m:.1f} m, best {best[0]:.1f} m"
-        report(done / budget.evaluations, f"{method} {done}/{budget.evaluations}, {now}")
-
     return pose_attack(
         problem, bounds_of(experiment.world.objects, settings), lanes_of(experiment), method, budget, seed,
-        sigma=experiment.config.attack.random_sigma, state_path=state, on_evaluation=told, settings_hash=settings_hash,
+        sigma=experiment.config.attack.random_sigma, state_path=state, settings_hash=settings_hash,
+        on_evaluation=progress_of(report, budget.evaluations, f"{method} "),
     )  # fmt: skip
 
 
 def _driven(
-    experiment: Experiment, problem: AttackProblem, scene: DeploymentScene, objects: Sequence[VoxelGridObject], colours: Tensor,
-    scenario: str,
+    experiment: Experiment, problem: AttackProblem, scene: DeploymentScene, surrogate: Surrogate,
+    objects: Sequence[VoxelGridObject], colours: Tensor, scenario: str,
 ) -> dict[str, dict[str, Any]]:  # fmt: skip
     """Drives from all starts of a problem past objects, in the learned scene and where they are deployed."""
-    there = replace(problem, sensor=surrogate_of(experiment, objects))
-    rollout, _ = evaluate(there, colours)
-    learned = [drive_metrics(problem.path, d, experiment.limits) for d in rollout.states.transpose(0, 1).numpy()]
+    _, learned = learned_drives(experiment, replace(problem, sensor=surrogate), colours)
     dressed = DressedScene(scene, experiment.view, objects)
-    deployed = [
-        drive_deployed(
-            dressed, problem.policy, experiment.goal(scenario), np.asarray(start), experiment.paths[scenario], experiment.limits,
-            experiment.world.car.speed_mps, colours,
-        ).metrics
-        for start in problem.start_states.numpy()
-    ]  # fmt: skip
-    return {
-        domain: {"total_cte_m": [s.total_cte_m for s in scores], "off_track": [s.off_track for s in scores]}
-        for domain, scores in (("surrogate", learned), ("deployed", deployed))
-    }
+    deployed = deployed_drives(experiment, dressed, problem.policy, scenario, problem.start_states, colours)
+    return {"surrogate": totals(learned), "deployed": totals([drive.metrics for drive in deployed])}
 
 
 def _told(found: FoundPoses) -> dict[str, Any]:

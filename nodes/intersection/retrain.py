@@ -7,6 +7,7 @@ against an adversary that answers it. Every search, collection, training and dri
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,7 +31,8 @@ from hardware.deployment_scene import DeploymentScene
 from nodes.intersection import retrain_plot
 from nodes.intersection.attack import Cell, attack_problem, load_theta
 from nodes.intersection.context import Experiment
-from nodes.intersection.deployed import DressedScene, drive_deployed
+from nodes.intersection.deployed import DressedScene
+from nodes.intersection.drives import deployed_drives
 from nodes.intersection.objects import placed_objects, surrogate_of
 from nodes.intersection.policy import HARDENED, plans, victim_file
 from nodes.intersection.poses import random_placements
@@ -175,13 +177,7 @@ def _total_cte_m(
 ) -> float:  # fmt: skip
     """Total CTE [m] of deployed drives, the mean over starts ``[B, 3]``; plain objects for None."""
     shown = dressed.plain_theta() if theta is None else theta
-    drives = [
-        drive_deployed(
-            dressed, policy.policy, experiment.goal(scenario), start, experiment.paths[scenario], experiment.limits,
-            experiment.world.car.speed_mps, shown,
-        )
-        for start in starts.numpy()
-    ]  # fmt: skip
+    drives = deployed_drives(experiment, dressed, policy.policy, scenario, starts, shown)
     return float(np.mean([drive.metrics.total_cte_m for drive in drives]))
 
 
@@ -195,19 +191,18 @@ def _collect(
     """
     wanted, store = experiment.config.retrain, FrameStore(folder / "frames")
     assert wanted is not None
-    chosen = plans(experiment, scene, lambda rng: thetas[int(rng.integers(len(thetas)))])
-    amounts = [(wanted.stills, wanted.drives)] * len(chosen)
-    for number, objects in enumerate(
-        random_placements(experiment, wanted.placements, seed=_PLACES_SEED + wanted.seed + len(thetas))
-    ):
+    found = plans(experiment, scene, lambda rng: thetas[int(rng.integers(len(thetas)))])
+    chosen = [(plan, wanted.stills, wanted.drives) for plan in found]
+    places = random_placements(experiment, wanted.placements, seed=_PLACES_SEED + wanted.seed + len(thetas))
+    for number, objects in enumerate(places):
         moved = plans(experiment, scene, None, objects, f"-moved{number}")
-        chosen, amounts = [*chosen, *moved], [*amounts, *[(-(-wanted.stills // wanted.placements), 0)] * len(moved)]
-    for number, (plan, (stills, drives)) in enumerate(zip(chosen, amounts, strict=True)):
+        chosen += [(plan, math.ceil(wanted.stills / len(places)), 0) for plan in moved]
+    for number, (plan, stills, drives) in enumerate(chosen):
         if plan.source.name not in store.names():
             rng = np.random.default_rng([wanted.seed, len(thetas), number])
             store.append(plan.source.name, _frames(plan, victim, stills, drives, wanted.drive_steps, rng))
         report(0.4 + 0.3 * (number + 1) / len(chosen), f"collecting: {plan.source.name}")
-    return [store.load(plan.source.name) for plan in chosen]
+    return [store.load(plan.source.name) for plan, _, _ in chosen]
 
 
 def _frames(
