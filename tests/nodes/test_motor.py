@@ -1,0 +1,170 @@
+"""The motor node in this process, on an emulated controller behind a pty."""
+
+import os
+import pty
+import time
+import tty
+from pathlib import Path
+
+import pytest
+
+from calibration.schema import VehicleCalibration, load_calibration
+from hardware.twin.config import CarConfig
+from hardware.twin.vehicle import TwinVehicle
+from hardware.twin.vesc_emulator import VescEmulator
+from hardware.twin.vesc_firmware import VescEmulatorConfig
+from hardware.vesc import Vesc
+from nodes.motor import MotorConfig, MotorNode
+from nodes.runtime.clock import SystemClock
+from nodes.runtime.messages import (
+    drive_message,
+    ns_from_stamp,
+)
+from nodes.runtime.node import MessageInfo, NodeContext
+
+TWIN = Path(__file__).parents[2] / "calibration" / "twin"
+CLOCK = SystemClock()
+
+
+def context(tmp_path):
+    return NodeContext("node", tmp_path, CLOCK)
+
+
+class Drives:
+    """A motor node on an emulator, and the safety node's commands to it."""
+
+    def __init__(self, tmp_path, **vesc):
+        self.emulator = VescEmulator(VescEmulatorConfig(**vesc), TwinVehicle(CarConfig()), tmp_path / "vesc")
+        self.config = MotorConfig(port=str(tmp_path / "vesc"), calibration=TWIN / "vehicle.yaml")
+        self.node = MotorNode.build(self.config, context(tmp_path))
+
+    def send(self, speed, steering, stamp_ns=12_345):
+        now = CLOCK.now()
+        return self.node.handle(
+            "/safety/drive",
+            drive_message(speed, steering, stamp_ns),
+            MessageInfo(now.mono_ns, now.mono_ns, instance_id=1),
+            now,
+        )
+
+    def run(self, duration_s):
+        outs, deadline = [], time.monotonic() + duration_s
+        while time.monotonic() < deadline:
+            outs += self.node.tick(CLOCK.now())
+            time.sleep(0.02)
+        return outs
+
+    def names(self):
+        return [e.name for e in self.emulator.events() if e.name not in ("GET_VALUES", "FW_VERSION", "GET_APPCONF")]
+
+
+@pytest.fixture
+def drives(tmp_path):
+    drives = Drives(tmp_path)
+    yield drives
+    drives.node.close()
+    drives.emulator.close()
+
+
+def test_motor_connects_stops_and_waits_for_the_safety_node(drives):
+    assert drives.node.status()[0] == "starting"
+    outs = drives.run(0.3)
+    assert {name for name in drives.names()} == {"SET_CURRENT_BRAKE"}
+    assert drives.node.status() == ("starting", "latched: waiting for the safety node")
+    sent = [o.message for o in outs if o.topic == "/motor/sent"]
+    assert sent[-1].braking
+    assert sent[-1].peer == "TWIN firmware 5.02"
+    states = [o.message for o in outs if o.topic == "/motor/state"]
+    assert states[-1].input_voltage_v == pytest.approx(15.2)
+    drives.send(0.0, 0.0)
+    state, text = drives.node.status()
+    assert state == "ready"
+    assert text == "TWIN firmware 5.02, own time-out 1000 ms with 0 A"
+
+
+def test_motor_obeys_and_reports_the_origin(drives):
+    drives.run(0.1)
+    drives.send(0.0, 0.0)
+    (out,) = drives.send(0.3, 0.1, stamp_ns=777)
+    message = out.message
+    assert ns_from_stamp(message.header.stamp) == 777
+    assert not message.braking
+    assert message.speed_mps == pytest.approx(0.3, abs=1e-3)
+    assert abs(int(message.serial_write_mono_ns) - time.monotonic_ns()) < 1e9
+    time.sleep(0.05)
+    assert drives.names()[-2:] == ["SET_SERVO_POS", "SET_RPM"]
+    assert drives.node.status()[0] == "active"
+
+
+def test_motor_reaches_the_commanded_speed_between_commands_but_does_not_repeat_itself(drives):
+    drives.run(0.1)
+    drives.send(0.0, 0.0)
+    drives.send(0.8, 0.0)
+    drives.run(0.1)
+    drives.send(0.8, 0.0)
+    drives.run(0.15)
+    rpm = [e.value for e in drives.emulator.events() if e.name == "SET_RPM"]
+    assert rpm == sorted(rpm)
+    assert rpm[-1] == 3691.0
+    drives.send(0.8, 0.0)
+    count = len(drives.names())
+    assert [o for o in drives.run(0.12) if o.topic == "/motor/sent"] == []
+    assert len(drives.names()) - count <= 2  # what was still on its way
+
+
+def test_motor_without_commands_brakes_then_lets_go(drives):
+    drives.run(0.1)
+    drives.send(0.0, 0.0)
+    drives.send(0.5, 0.0)
+    drives.run(1.6)
+    names = drives.names()
+    after = names[len(names) - 1 - names[::-1].index("SET_RPM") + 1 :]
+    assert after[0] == "SET_CURRENT_BRAKE"
+    assert after[-1] == "SET_CURRENT"
+    assert drives.node.status()[0] == "fault"
+    assert "latched: no fresh command" in drives.node.status()[1]
+
+
+def test_motor_that_loses_its_controller_reports_it_and_comes_back_stopped(drives, tmp_path):
+    drives.run(0.1)
+    drives.send(0.0, 0.0)
+    drives.send(0.5, 0.0)
+    drives.emulator.close()
+    drives.run(0.1)
+    assert drives.node.status()[0] == "fault"
+    assert drives.send(0.5, 0.0) == []
+    drives.emulator = VescEmulator(VescEmulatorConfig(), TwinVehicle(CarConfig()), tmp_path / "vesc")
+    drives.run(0.8)
+    assert drives.send(0.5, 0.0) == []
+    assert set(drives.names()) == {"SET_CURRENT_BRAKE"}
+    drives.send(0.0, 0.0)
+    assert drives.send(0.5, 0.0) != []
+
+
+def test_motor_on_a_controller_that_is_silent(tmp_path):
+    master, slave = pty.openpty()
+    tty.setraw(slave)
+    config = MotorConfig(port=os.ttyname(slave), calibration=TWIN / "vehicle.yaml")
+    node = MotorNode.build(config, context(tmp_path))
+    (out,) = node.tick(CLOCK.now())
+    assert (out.topic, out.message.status[0].level) == ("/diagnostics", 2)
+    assert node.status()[0] == "starting"
+    assert "is this a VESC" in node.status()[1]
+    node.close()
+    os.close(master)
+    os.close(slave)
+
+
+def test_motor_brakes_when_it_is_told_to_end(drives):
+    drives.run(0.1)
+    drives.send(0.0, 0.0)
+    drives.send(0.5, 0.0)
+    drives.node.close()
+    time.sleep(0.05)
+    assert drives.names()[-2:] == ["SET_CURRENT_BRAKE", "SET_CURRENT"]
+
+
+def test_vehicle_file_reaches_the_driver(tmp_path):
+    car = load_calibration(VehicleCalibration, TWIN / "vehicle.yaml")
+    vesc = Vesc("/dev/null", car.vehicle_gains, car.drive_limits)
+    assert vesc.gains.erpm(0.8) == pytest.approx(3691.2)
