@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from advnerf_core.files import write_atomically
-from advnerf_core.geometry import Array, planar_pose
-from advnerf_core.scene.image_files import write_image
-from advnerf_core.scene.transforms_write import write_transforms
+from advnerf_core.geometry import planar_pose
+from advnerf_core.scene.posed_images import write_posed_images
 from hardware.carla_scene.config import CarlaConfig
 from hardware.carla_scene.photos import held_out_states, photo_poses
 from hardware.carla_scene.scene import CarlaScene
@@ -68,25 +66,19 @@ def capture(
         poses = photo_poses(scene.drives, config, request.photos, rng)
         states = held_out_states(scene.drives, request.held_out, rng)
         write_atomically(folder / DRIVES, json.dumps(drives, indent=1) + "\n")
-        total, counts = len(poses) + len(states), [0, 0]
+        total = len(poses) + len(states)
 
-        def keep(name: str, count: int, see: Callable[[int], NDArray[np.uint8]], before: int) -> list[str]:
-            names = [f"images/{index:05d}.{'jpg' if name == PHOTOS else 'png'}" for index in range(count)]
-            for index, file in enumerate(names):
-                there = (folder / name / file).exists()
-                if not there:
-                    write_image(folder / name / file, see(index))
-                counts[there] += 1
-                report((before + index + 1) / total, f"{name} {index + 1}/{count}")
-            return names
+        def told(name: str, before: int) -> Callable[[int], None]:
+            return lambda count: report((before + count) / total, f"{name} {before + count} of {total}")
 
-        names = keep(PHOTOS, len(poses), lambda i: scene.photograph(poses[i]), 0)
-        _list(folder / PHOTOS, names, poses, scene.photo_pinhole)
-        names = keep(HELD_OUT, len(states), lambda i: scene.observe_at(*states[i], depth=False)[0], len(poses))
-        _list(
-            folder / HELD_OUT, names, [planar_pose(*s) @ scene.T_car_from_camera for s in states], scene.camera_pinhole
-        )
-    return counts[0], counts[1]
+        taken = write_posed_images(
+            folder / PHOTOS, poses, scene.photo_pinhole, lambda i: scene.photograph(poses[i]), "jpg", keep=True, told=told(PHOTOS, 0)
+        )  # fmt: skip
+        taken += write_posed_images(
+            folder / HELD_OUT, [planar_pose(*s) @ scene.T_car_from_camera for s in states], scene.camera_pinhole,
+            lambda i: scene.observe_at(*states[i], depth=False)[0], "png", keep=True, told=told(HELD_OUT, len(poses)),
+        )  # fmt: skip
+    return taken, total - taken
 
 
 def _claim(folder: Path, config: CarlaConfig, request: CaptureRequest, drives: dict[str, Any]) -> None:
@@ -101,8 +93,3 @@ def _claim(folder: Path, config: CarlaConfig, request: CaptureRequest, drives: d
     if folder.exists() and any(folder.iterdir()):
         raise ConfigError(f"{folder} is not empty and holds no capture: name another folder")
     write_atomically(file, json.dumps({"sha256": digest, **json.loads(text)}, indent=1) + "\n")
-
-
-def _list(folder: Path, names: Sequence[str], poses: Sequence[Array], pinhole: Any) -> None:
-    if names:
-        write_transforms(folder / "transforms.json", names, np.stack(poses), pinhole)

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from advnerf_core.geometry import Array, planar_pose
-from advnerf_core.scene.dataset import write_transforms
-from advnerf_core.scene.image_files import write_image
+from advnerf_core.scene.posed_images import write_posed_images
 from calibration.by_construction import write_twin_calibrations
 from calibration.schema import save_calibration
 from hardware.twin.lab import Lab
@@ -44,13 +43,11 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
             lab.set_monitor_image(plain_picture(experiment))
 
         def photograph(name: str, poses: list[Array], take: Callable[[int], NDArray[np.uint8]], done: int) -> None:
-            names = []
-            for index in range(len(poses)):
-                names.append(f"images/{index:04d}.{'jpg' if name == PHONE else 'png'}")
-                write_image(folder / name / names[-1], take(index))
-                report((done + index + 1) / total, f"{name} {index + 1}/{len(poses)}")
-            pinhole = lab_config.phone.pinhole if name == PHONE else lab_config.camera.pinhole
-            write_transforms(folder / name / "transforms.json", names, poses, pinhole)
+            phone = name == PHONE
+            write_posed_images(
+                folder / name, poses, (lab_config.phone if phone else lab_config.camera).pinhole, take, "jpg" if phone else "png",
+                told=lambda count: report((done + count) / total, f"{name} {count}/{len(poses)}"),
+            )  # fmt: skip
 
         photograph(PHONE, phone_poses, lambda i: lab.photograph(phone_poses[i]), 0)
         # Interleaved, so that both sets cover the whole track.

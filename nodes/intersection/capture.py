@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from advnerf_core.driving.imitation import recovery_states
-from advnerf_core.geometry import Array, Pinhole, planar_pose
-from advnerf_core.scene.dataset import write_transforms
-from advnerf_core.scene.image_files import write_image
+from advnerf_core.geometry import Array, planar_pose
+from advnerf_core.scene.posed_images import write_posed_images
 from nodes.experiment.learned_scene import HELD_OUT
 from nodes.intersection.context import Experiment
 from nodes.runtime.stages import Report
@@ -30,29 +29,20 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
         states = held_out_states(experiment, rng)
         total = len(poses) + len(states)
 
-        def keep(
-            name: str, taken: Sequence[Array], pinhole: Pinhole, see: Callable[[int], NDArray[np.uint8]], done: int
-        ) -> None:
-            files = []
-            for index in range(len(taken)):
-                files.append(f"images/{index:04d}.{'jpg' if name == PHOTOS else 'png'}")
-                if not (folder / name / files[-1]).exists():
-                    write_image(folder / name / files[-1], see(index))
-                report((done + index + 1) / total, f"{name} {index + 1}/{len(taken)}")
-            write_transforms(folder / name / "transforms.json", files, taken, pinhole)
+        def told(name: str, before: int) -> Callable[[int], None]:
+            return lambda count: report((before + count) / total, f"{name} {before + count} of {total}")
 
         def observed(index: int) -> NDArray[np.uint8]:
             x, y, yaw = map(float, states[index])
             return scene.observe_at(x, y, yaw, depth=False)[0]
 
-        keep(PHOTOS, poses, scene.photo_pinhole, lambda index: scene.photograph(poses[index]), 0)
-        keep(
-            HELD_OUT,
-            [planar_pose(*state) @ experiment.mount for state in states],
-            experiment.camera,
-            observed,
-            len(poses),
-        )
+        write_posed_images(
+            folder / PHOTOS, poses, scene.photo_pinhole, lambda index: scene.photograph(poses[index]), "jpg", keep=True, told=told(PHOTOS, 0)
+        )  # fmt: skip
+        write_posed_images(
+            folder / HELD_OUT, [planar_pose(*state) @ experiment.mount for state in states], experiment.camera, observed, "png",
+            keep=True, told=told(HELD_OUT, len(poses)),
+        )  # fmt: skip
 
 
 def held_out_states(experiment: Experiment, rng: np.random.Generator) -> Array:
