@@ -56,6 +56,18 @@ def why_missed(target: TableTarget | None, row: TableRow, none: TableRow | None,
     return text
 
 
+def how_far(cells: Sequence[CellResult]) -> str:
+    """How far off live drives came, beside the distance that counts, and how many ended at an obstacle; empty for other cells."""
+    far = [cell.extra for cell in cells if "max_abs_cte_m" in cell.extra]
+    if not far:
+        return ""
+    text = f"; at most {max(each['max_abs_cte_m'] for each in far):.2f} m off the path, off-track is beyond {far[0]['off_track_m']:.2f} m"
+    ran = [each["stands_from_s"] for each in far if each["stands_from_s"] is not None]
+    return text + (
+        f"; ran into an obstacle in {len(ran)} of {len(far)}, after {min(ran):.1f} to {max(ran):.1f} s" if ran else ""
+    )
+
+
 def rows_of(table: TransferTable) -> list[tuple[TableRow, TableTarget | None]]:
     """Rows with drives, none left out as it is 1 by definition, with the target on their ratio where there is one."""
     targets = {(t.scenario, t.method, t.domain): t for t in table_targets(table) if t.what == "ratio to no attack"}
@@ -94,7 +106,10 @@ def main() -> None:
     for target in table_targets(table):
         if target.what != "ratio to no attack" and target.value is not None:
             line = f"#5 {target.scenario}, {METHOD_NAMES[target.method]}, {target.domain}: {target.what}"
-            record(line, target.value, "", target.target, target.met, f"{target.seeds} seeds")
+            row_of_target = table.find(target.scenario, VICTIM, target.method, target.domain)
+            cells = table.cells_of(row_of_target) if row_of_target else []
+            note = f"{target.seeds} seeds" + (how_far(cells) if "off the track" in target.what else "")
+            record(line, target.value, "", target.target, target.met, note)
 
 
 if __name__ == "__main__":

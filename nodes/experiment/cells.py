@@ -17,7 +17,7 @@ from typing import Any, Literal, cast
 import numpy as np
 
 from advnerf_core.attack.artifact import AttackFile, load_attack
-from advnerf_core.driving.metrics import Horizon
+from advnerf_core.driving.metrics import Horizon, first_still_tick
 from advnerf_core.report.clips import ClipTrack, write_clip
 from nodes import evaluation
 from nodes.experiment import attack, deploy
@@ -75,7 +75,7 @@ class _Cell:
         if self.searched_in(condition) != self.folder and (taken / f"{self.live(condition).name}.json").exists():
             return taken
         if condition != "none":
-            return self.folder
+            return self.folder / "live"  # a search and a live drive of one cell leave files of one name
         inputs = hash_of(cell_inputs(self.experiment, "", self.victim, "none", self.seed))
         return self.folder.parent / "shared" / f"{self.experiment.config.name}_{self.live('none').name}_{inputs[:12]}"
 
@@ -160,6 +160,7 @@ def run_cell(
     extra: dict[str, Any] = {
         "clip": _clip(cell, driven, where), "stopped_early": driven["outcome"]["stopped_early"],
         "missed_frames": driven["missed"], "mean_abs_cte_m": driven["mean_abs_cte_m"], "time_to_leave_s": driven["time_to_leave_s"],
+        "horizon": experiment.config.horizon, "max_abs_cte_m": driven["max_abs_cte_m"], "off_track_m": experiment.room.off_track_m, "stands_from_s": stands_from_s(driven),
     }  # fmt: skip
     result = {**found, "deployed": deployed, "extra": extra}
     if where == experiment.stage_folder("deploy"):
@@ -167,6 +168,14 @@ def run_cell(
         result["date"] = datetime.fromtimestamp(driven_at, timezone.utc).isoformat(timespec="seconds")
         extra["taken_from"] = experiment.folder.name
     return result
+
+
+def stands_from_s(driven: dict[str, Any]) -> float | None:
+    """From when on the car stood although nobody had stopped it: it has run into something. None if it drove to the end [s]."""
+    if driven["outcome"]["stopped_early"]:
+        return None
+    still = first_still_tick(driven["states"])
+    return None if still is None else still * CONTROL_PERIOD_S
 
 
 def _cell(experiment: Experiment, scenario: str, victim: str, method: str, seed: int, folder: Path) -> _Cell:

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from advnerf_core.report.results import read_results
+from nodes.experiment.cells import run_cell
 from nodes.experiment.run import load_experiment, run_experiment
 
 LAUNCH = Path(__file__).parents[3] / "launch"
@@ -38,3 +39,25 @@ def test_from_photographs_to_report_and_nothing_twice(tmp_path, file):
     again = run_experiment(load_experiment(experiment, "demo", SMALL, tmp_path))
     assert {name: record.digest for name, record in again.items()} == {n: r.digest for n, r in first.items()}
     assert (tmp_path / "report" / "report.html").stat().st_mtime_ns == kept
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_a_cell_of_another_seed_is_searched_and_driven_live_once(tmp_path):
+    os.environ.setdefault("MUJOCO_GL", "egl")
+    experiment = load_experiment(LAUNCH / "monitor.experiment.yaml", "demo", SMALL, tmp_path / "run")
+    run_experiment(experiment, until="object")
+    asked = (
+        experiment,
+        "monitor",
+        "hardened",
+        "gradient",
+        1,
+        tmp_path / "cells" / "one",
+        lambda fraction, text="": None,
+    )
+    cell = run_cell(*asked)
+    assert len(cell["deployed"]["total_cte_m"]) == len(cell["deployed"]["none_total_cte_m"]) == 1
+    live = json.loads((tmp_path / "cells" / "one" / "live" / "hardened_gradient_1.json").read_text())
+    assert live["attack_ids"] == [cell["attack_id"]]
+    assert run_cell(*asked)["deployed"] == cell["deployed"]

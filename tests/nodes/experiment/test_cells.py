@@ -1,0 +1,31 @@
+"""Cells of the room in a campaign: where their parts lie, and what a live drive says of its end."""
+
+from pathlib import Path
+
+import pytest
+
+from nodes.experiment.cells import _cell, stands_from_s
+from nodes.experiment.run import load_experiment
+
+LAUNCH = Path(__file__).parents[3] / "launch"
+
+
+def driven(states, stopped_early=""):
+    return {"outcome": {"stopped_early": stopped_early}, "states": states}
+
+
+@pytest.mark.parametrize("method", ["none", "random", "gradient"])
+def test_search_and_live_drive_of_a_cell_leave_different_files(tmp_path, method):
+    experiment = load_experiment(LAUNCH / "monitor.experiment.yaml", "full", [], tmp_path / "run")
+    cell = _cell(experiment, "monitor", "hardened", method, 1, tmp_path / "cell")
+    name = f"hardened_{method}_1.json"
+    assert cell.live(method).name + ".json" == name
+    assert cell.searched_in(method) / name != cell.driven_in(method) / name
+
+
+def test_a_car_that_runs_into_something_stands_from_then_on():
+    free = [[0.08 * tick, 0.0, 0.0] for tick in range(20)]
+    against_it = free + [[1.52 + 0.001 * (tick % 2), 0.0, 0.0] for tick in range(10)]  # motion capture's noise
+    assert stands_from_s(driven(free)) is None
+    assert stands_from_s(driven(against_it)) == pytest.approx(1.9)
+    assert stands_from_s(driven(against_it, "outside of the fence")) is None
