@@ -58,7 +58,7 @@ def test_a_stopped_run_goes_on_to_the_same_bytes(tmp_path, method):
         run_attack(load_request(file), tmp_path / "whole", ProgressDisplay())
 
 
-@pytest.mark.parametrize("method", ["distilled", "guided"])
+@pytest.mark.parametrize("method", [pytest.param("distilled", marks=pytest.mark.slow), "guided"])
 def test_an_onnx_policy_is_attacked_by_questions_within_the_budget_and_resumes_to_the_same_bytes(tmp_path, method):
     file = tiny_request(tmp_path)
     loaded = load_policy(tmp_path / "policy.safetensors")
@@ -85,6 +85,7 @@ def test_an_onnx_policy_is_attacked_by_questions_within_the_budget_and_resumes_t
         run_attack(load_request(file, [*changes, "search.method=gradient"]), tmp_path / "blind", ProgressDisplay())
 
 
+@pytest.mark.slow  # tests/advnerf_core/attack/test_together.py has the search itself
 def test_seeds_searched_together_resume_to_the_same_bytes_and_end_as_they_do_alone(tmp_path):
     file = tiny_request(tmp_path)
     request = load_request(file, ["search.seeds=[0, 1]", "search.together=true"])
