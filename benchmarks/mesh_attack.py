@@ -54,6 +54,7 @@ def main() -> None:
     settings = MeshSettings(target, options.texels, options.ball, limits=ShapeLimits(bound_m=options.bound))
     scenarios = options.scenarios or (list(experiment.config.scenarios) if target == "texture" else ["straight"])
     command = "python -m benchmarks.mesh_attack " + " ".join(sys.argv[1:])
+    target_name = target if target == "texture" else f"shape within {options.bound:g} m"
     objects = "" if options.ball is None else f", balls of {options.ball:g} m"
     of_victim = "" if options.victim == "hardened" else f", {options.victim} victim"
     folder = options.folder / "meshes" / f"{target}_{options.texels}_{options.bound}_{options.ball}"
@@ -73,7 +74,7 @@ def main() -> None:
             print(f"\n{target} {scenario} {method}: deployed {deployed[0]:.2f} x; {note}")
             wanted = TARGETS.get((target, scenario)) if method == "gradient" and options.victim == "hardened" else None
             if not options.trial:
-                record_row(f"#5 meshes: {target}{objects}, {scenario}, {method}{of_victim}, deployed", deployed[0], "x", f">= {wanted} x" if wanted else "printed",
+                record_row(f"#5 meshes: {target_name}{objects}, {scenario}, {method}{of_victim}, deployed", deployed[0], "x", f">= {wanted} x" if wanted else "printed",
                            None if wanted is None or len(cells) < _SEEDS else deployed[0] >= wanted, command, note)  # fmt: skip
 
 
