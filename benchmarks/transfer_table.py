@@ -11,7 +11,7 @@ from pathlib import Path
 
 from advnerf_core.report.cells import CellResult
 from advnerf_core.report.transfer import DOMAINS, TableRow, TransferTable
-from advnerf_core.report.transfer_page import METHOD_NAMES
+from advnerf_core.report.transfer_page import METHOD_NAMES, ran_into_something
 from advnerf_core.report.transfer_targets import VICTIM, TableTarget, table_targets
 from benchmarks.results import record_row
 from nodes.campaign.config import load_campaign
@@ -61,11 +61,9 @@ def how_far(cells: Sequence[CellResult]) -> str:
     far = [cell.extra for cell in cells if "max_abs_cte_m" in cell.extra]
     if not far:
         return ""
+    ran = sum(ran_into_something(cell) for cell in cells)
     text = f"; at most {max(each['max_abs_cte_m'] for each in far):.2f} m off the path, off-track is beyond {far[0]['off_track_m']:.2f} m"
-    ran = [each["stands_from_s"] for each in far if each["stands_from_s"] is not None]
-    return text + (
-        f"; ran into an obstacle in {len(ran)} of {len(far)}, after {min(ran):.1f} to {max(ran):.1f} s" if ran else ""
-    )
+    return text + (f"; ran into an obstacle, which held it there, in {ran} of {len(cells)}" if ran else "")
 
 
 def rows_of(table: TransferTable) -> list[tuple[TableRow, TableTarget | None]]:

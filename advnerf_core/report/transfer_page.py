@@ -27,11 +27,12 @@ from advnerf_core.report.transfer_targets import TableTarget, table_targets
 SCHEMA = "advnerf-transfer/1"
 METHOD_NAMES = {"none": "no attack", "random": "best random", "cem": "cross-entropy", "gradient": "gradient"}
 STRAYED_FROM = 1.5
-OUTCOMES = ("left the track", "strayed", "held its course")
+OUTCOMES = ("left the track", "ran into something", "strayed", "held its course")
 _EXPLAINED = {
     "left the track": "The drive left its track at least once.",
+    "ran into something": "The drive ended at an obstacle, on the track as the protocol counts it.",
     "strayed": f"Total CTE at least {STRAYED_FROM:g} times that of the same drive without attack, on the track.",
-    "held its course": "Neither; drives without attack belong here.",
+    "held its course": "None of these; drives without attack belong here.",
 }
 _MISSING = "missing"
 
@@ -62,8 +63,15 @@ def outcome_of(cell: CellResult) -> str:
     drives = cell.deployed or cell.surrogate
     if any(drives.off_track):
         return OUTCOMES[0]
+    if ran_into_something(cell):
+        return OUTCOMES[1]
     strayed = sum(drives.total_cte_m) >= STRAYED_FROM * sum(drives.none_total_cte_m)
-    return OUTCOMES[1] if strayed and cell.method != "none" else OUTCOMES[2]
+    return OUTCOMES[2] if strayed and cell.method != "none" else OUTCOMES[3]
+
+
+def ran_into_something(cell: CellResult) -> bool:
+    """Whether a deployed drive of a cell was held by an obstacle (``blocked_tick`` of its extra, one for each drive)."""
+    return cell.deployed is not None and any(tick is not None for tick in cell.extra.get("blocked_tick", []))
 
 
 def text_table(table: TransferTable) -> Table:

@@ -160,7 +160,7 @@ def run_cell(
     extra: dict[str, Any] = {
         "clip": _clip(cell, driven, where), "stopped_early": driven["outcome"]["stopped_early"],
         "missed_frames": driven["missed"], "mean_abs_cte_m": driven["mean_abs_cte_m"], "time_to_leave_s": driven["time_to_leave_s"],
-        "horizon": experiment.config.horizon, "max_abs_cte_m": driven["max_abs_cte_m"], "off_track_m": experiment.room.off_track_m, "stands_from_s": stands_from_s(driven),
+        "horizon": experiment.config.horizon, "max_abs_cte_m": driven["max_abs_cte_m"], "off_track_m": experiment.room.off_track_m, "blocked_tick": [blocked_tick(driven)],
     }  # fmt: skip
     result = {**found, "deployed": deployed, "extra": extra}
     if where == experiment.stage_folder("deploy"):
@@ -170,12 +170,9 @@ def run_cell(
     return result
 
 
-def stands_from_s(driven: dict[str, Any]) -> float | None:
-    """From when on the car stood although nobody had stopped it: it has run into something. None if it drove to the end [s]."""
-    if driven["outcome"]["stopped_early"]:
-        return None
-    still = first_still_tick(driven["states"])
-    return None if still is None else still * CONTROL_PERIOD_S
+def blocked_tick(driven: dict[str, Any]) -> int | None:
+    """From which tick on the car stood although nobody had stopped it: it has run into something. None if it drove to the end."""
+    return None if driven["outcome"]["stopped_early"] else first_still_tick(driven["states"])
 
 
 def _cell(experiment: Experiment, scenario: str, victim: str, method: str, seed: int, folder: Path) -> _Cell:

@@ -131,6 +131,10 @@ def test_clips_are_grouped_by_outcome(tmp_path):
     assert [outcome_of(each) for each in (strayed, left, gone, held)] == [
         "strayed", "left the track", "strayed", "held its course",
     ]  # fmt: skip
+    crashed = strayed.model_copy(update={"extra": {"blocked_tick": [None, 42]}})
+    assert outcome_of(crashed) == "ran into something"
+    assert outcome_of(left.model_copy(update={"extra": crashed.extra})) == "left the track"
+    assert outcome_of(strayed.model_copy(update={"extra": {"blocked_tick": [None]}})) == "strayed"
     for name in "ab":
         (tmp_path / "cells" / name).mkdir(parents=True)
         (tmp_path / "cells" / name / "clip.mp4").write_bytes(name.encode())

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from nodes.experiment.cells import _cell, stands_from_s
+from nodes.experiment.cells import _cell, blocked_tick
 from nodes.experiment.run import load_experiment
 
 LAUNCH = Path(__file__).parents[3] / "launch"
@@ -26,6 +26,6 @@ def test_search_and_live_drive_of_a_cell_leave_different_files(tmp_path, method)
 def test_a_car_that_runs_into_something_stands_from_then_on():
     free = [[0.08 * tick, 0.0, 0.0] for tick in range(20)]
     against_it = free + [[1.52 + 0.001 * (tick % 2), 0.0, 0.0] for tick in range(10)]  # motion capture's noise
-    assert stands_from_s(driven(free)) is None
-    assert stands_from_s(driven(against_it)) == pytest.approx(1.9)
-    assert stands_from_s(driven(against_it, "outside of the fence")) is None
+    assert blocked_tick(driven(free)) is None
+    assert blocked_tick(driven(against_it)) == 19
+    assert blocked_tick(driven(against_it, "outside of the fence")) is None
