@@ -28,7 +28,7 @@ experiment: setup  ## The full experiment, 3 seeds (up to 2 hours on 2 cores); w
 	@$(BIN)/advnerf experiment launch/room.experiment.yaml --setting full --run-folder runs/full
 	@$(BIN)/python -m benchmarks.experiment_rows runs/full
 
-test: setup  ## The default tests (about 8 minutes on 2 cores)
+test: setup  ## The default tests (about 6 minutes on 2 cores)
 	@# What computes runs on all cores; then what measures time or starts nodes has the machine for itself.
 	@OMP_NUM_THREADS=1 $(BIN)/pytest -q -n auto --maxprocesses 4 --dist worksteal -m '$(DEFAULT_TESTS) and not live'
 	@$(BIN)/pytest -q -m '$(DEFAULT_TESTS) and live'

@@ -18,10 +18,10 @@ _LIVE = (
     "tests/test_docs_policies.py",
 )
 _COMPUTING = (
-    "tests/nodes/attacking", "tests/nodes/campaign", "tests/nodes/carla_tools", "tests/nodes/doctor/test_devices.py",
+    "tests/nodes/attacking", "tests/nodes/campaign", "tests/nodes/carla_tools", "tests/nodes/doctor/test_devices.py", "tests/nodes/doctor/test_launch.py",
     "tests/nodes/experiment", "tests/nodes/intersection", "tests/nodes/policy_data", "tests/nodes/runtime/test_bag",
     "tests/nodes/runtime/test_replay_attack.py", "tests/nodes/runtime/test_security.py", "tests/nodes/scene_import",
-    "tests/nodes/test_attack_handover.py", "tests/nodes/test_calibration_drive.py", "tests/nodes/test_cli",
+    "tests/nodes/test_attack.py", "tests/nodes/test_attack_handover.py", "tests/nodes/test_calibration_drive.py", "tests/nodes/test_cli",
     "tests/nodes/test_counterfactual.py", "tests/nodes/test_policy_reference.py", "tests/nodes/test_scene_training.py",
     "tests/nodes/test_trials.py", "tests/hardware/cameras/test_conformance.py", "tests/hardware/carla_scene",
     "tests/hardware/twin", "tests/benchmarks",

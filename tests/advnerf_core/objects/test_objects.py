@@ -26,7 +26,7 @@ def ball(radius=0.5, hole=False):
 
 @pytest.mark.parametrize("hole", [False, True])
 def test_a_ray_loses_half_its_light_at_the_surface_and_all_of_it_inside(hole):
-    grids = voxelise(ball(hole=hole), 48)
+    grids = voxelise(ball(hole=hole), 32)
     axis = grids.box_min[2] + grids.voxel * (np.arange(grids.density.shape[2]) + 0.5)
     middle = grids.density.shape[0] // 2
     line = np.interp(np.linspace(axis[-1], axis[0], 4000), axis, grids.density[middle, middle])
