@@ -33,7 +33,8 @@ from nodes.attacking.objects import object_sha256
 from nodes.attacking.pose_request import PosesRequest
 from nodes.attacking.prepare import Prepared, prepare
 from nodes.attacking.request import AttackRequest
-from nodes.attacking.search import attack_file, keep_request, telling
+from nodes.attacking.search import attack_file, keep_request
+from nodes.attacking.telling import telling
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.stages import Display, hash_of
 

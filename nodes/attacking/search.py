@@ -22,6 +22,7 @@ from advnerf_core.mesh.shape import ShapeSensor
 from nodes.attacking.meshes import write_meshes
 from nodes.attacking.prepare import Prepared, prepare
 from nodes.attacking.request import AttackRequest, load_request, request_text
+from nodes.attacking.telling import telling
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.stages import Display
 
@@ -199,19 +200,6 @@ def _keep(prepared: Prepared, result: SearchResult, folder: Path) -> None:
         "seconds": [e.seconds for e in result.history],
     }  # fmt: skip
     write_atomically(folder / f"seed_{prepared.seed}.json", json.dumps(curve, indent=1) + "\n")
-
-
-def telling(evaluations: int, report: Callable[[float, str], None]) -> OnEvaluation:
-    """Evaluations as progress: the fraction done, and in words the last and the best total."""
-    best = [0.0]
-
-    def told(evaluation: Evaluation) -> None:
-        total_m = evaluation.predicted_total_cte_m
-        best[0] = max(best[0], total_m)
-        done = evaluation.iteration + 1
-        report(done / evaluations, f"{done}/{evaluations}, total CTE {total_m:.1f} m, best {best[0]:.1f} m")
-
-    return told
 
 
 def _both(first: OnEvaluation, second: OnEvaluation | None) -> OnEvaluation:

@@ -18,10 +18,11 @@ from advnerf_core.attack.baselines import random_search
 from advnerf_core.attack.displayed import DisplayedSensor
 from advnerf_core.attack.optimise import gradient_attack
 from advnerf_core.attack.population import CrossEntropy, population_search
-from advnerf_core.attack.search import Evaluation, SearchResult, draw_start_states
+from advnerf_core.attack.search import SearchResult, draw_start_states
 from advnerf_core.driving.policy import LoadedPolicy, load_policy
 from advnerf_core.files import write_atomically
 from advnerf_core.scene.surrogate import Surrogate
+from nodes.attacking.telling import telling
 from nodes.experiment.context import Experiment
 from nodes.experiment.learned_scene import load_background, scene_sha256
 from nodes.experiment.objects import attacked_object, surrogate_of
@@ -148,17 +149,8 @@ def run_search(
     policy = load_policy(victim_file(experiment, search.victim))
     problem = attack_problem(experiment, surrogate, policy, search.seed)
     wanted = attack.iterations if search.method == "gradient" else attack.random_evaluations
-    best = [0.0]
-
-    def told(evaluation: Evaluation) -> None:
-        best[0] = max(best[0], evaluation.predicted_total_cte_m)
-        done = evaluation.iteration + 1
-        progress(
-            done / wanted, f"{done}/{wanted}, total CTE {evaluation.predicted_total_cte_m:.1f} m, best {best[0]:.1f} m"
-        )
-
     common: dict[str, Any] = {
-        "seed": search.seed, "state_path": folder / f"{search.name}.state.safetensors", "on_evaluation": told,
+        "seed": search.seed, "state_path": folder / f"{search.name}.state.safetensors", "on_evaluation": telling(wanted, progress),
         "settings_hash": hash_of(frozen_hashes(experiment)),
     }  # fmt: skip
     if search.method == "gradient":

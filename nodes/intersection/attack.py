@@ -23,10 +23,11 @@ from advnerf_core.attack.search import SearchResult
 from advnerf_core.driving.policy import LoadedPolicy, load_policy
 from advnerf_core.files import write_atomically
 from advnerf_core.scene.surrogate import Surrogate, split_theta
+from nodes.attacking.telling import telling
 from nodes.experiment.learned_scene import scene_sha256
 from nodes.intersection.config import Method
 from nodes.intersection.context import Experiment
-from nodes.intersection.drives import learned_drives, progress_of, totals
+from nodes.intersection.drives import learned_drives, totals
 from nodes.intersection.objects import object_file, placed_objects, surrogate_of
 from nodes.intersection.policy import HARDENED, victim_file, victims
 from nodes.runtime.stages import Report, hash_of
@@ -165,7 +166,7 @@ def _search(
         key: value for key, value in frozen_hashes(experiment).items() if key not in ("config", "starts_and_seeds")
     }
     common: dict[str, Any] = {
-        "seed": cell.seed, "state_path": _state_path(folder, cell), "on_evaluation": progress_of(report, attack.evaluations),
+        "seed": cell.seed, "state_path": _state_path(folder, cell), "on_evaluation": telling(attack.evaluations, report),
         "settings_hash": hash_of({**frozen, "victim": cell.victim, "scenario": cell.scenario}),
     }  # fmt: skip
     method: Method | Literal["none"] = cell.method

@@ -1,4 +1,4 @@
-"""Drives past objects, in the learned scene and where they are deployed, and what is told while they are searched."""
+"""Drives past objects, in the learned scene and where they are deployed."""
 
 from __future__ import annotations
 
@@ -9,13 +9,11 @@ import numpy as np
 from torch import Tensor
 
 from advnerf_core.attack.adjoint import AttackProblem, evaluate
-from advnerf_core.attack.search import Evaluation, OnEvaluation
 from advnerf_core.driving.metrics import DriveMetrics, drive_metrics
 from advnerf_core.driving.policy import Policy
 from advnerf_core.geometry import Array
 from nodes.intersection.context import Experiment
 from nodes.intersection.deployed import DeployedDrive, DressedScene, drive_deployed
-from nodes.runtime.stages import Report
 
 
 def learned_drives(experiment: Experiment, problem: AttackProblem, theta: Tensor) -> tuple[Array, list[DriveMetrics]]:
@@ -44,16 +42,3 @@ def totals(scores: Sequence[DriveMetrics]) -> dict[str, Any]:
         "total_cte_m": [score.total_cte_m for score in scores],
         "off_track": [score.off_track for score in scores],
     }
-
-
-def progress_of(report: Report, evaluations: int, of: str = "") -> OnEvaluation:
-    """What a search calls after every evaluation: it tells how far it is and the best total CTE so far."""
-    best_m = 0.0
-
-    def told(evaluation: Evaluation) -> None:
-        nonlocal best_m
-        best_m, done = max(best_m, evaluation.predicted_total_cte_m), evaluation.iteration + 1
-        now = f"total CTE {evaluation.predicted_total_cte_m:.1f} m, best {best_m:.1f} m"
-        report(done / evaluations, f"{of}{done}/{evaluations}, {now}")
-
-    return told

@@ -30,11 +30,12 @@ from advnerf_core.objects.mesh import SurfaceMesh, stand
 from advnerf_core.scene.surrogate import Surrogate, split_theta
 from hardware.deployment_scene import DeploymentScene
 from nodes.attacking.frames import DeployedFrames
+from nodes.attacking.telling import telling
 from nodes.intersection.attack import attack_problem
 from nodes.intersection.cells import CellError
 from nodes.intersection.context import Experiment
 from nodes.intersection.deployed import DressedScene
-from nodes.intersection.drives import deployed_drives, learned_drives, progress_of, totals
+from nodes.intersection.drives import deployed_drives, learned_drives, totals
 from nodes.intersection.objects import GENERATOR_OF
 from nodes.intersection.policy import victim_file, victims
 from nodes.runtime.machine import machine_name
@@ -174,7 +175,7 @@ def _search(
 ) -> SearchResult:  # fmt: skip
     attack = experiment.config.attack
     common: dict[str, Any] = {
-        "seed": seed, "state_path": _beside(result, ".state.safetensors"), "on_evaluation": progress_of(report, attack.evaluations),
+        "seed": seed, "state_path": _beside(result, ".state.safetensors"), "on_evaluation": telling(attack.evaluations, report),
         "settings_hash": settings_hash,
     }  # fmt: skip
     sensor = problem.sensor

@@ -27,11 +27,12 @@ from advnerf_core.files import write_atomically
 from advnerf_core.scene.surrogate import Surrogate
 from hardware.deployment_scene import DeploymentScene
 from hardware.twin.intersection.config import PlacedObject
+from nodes.attacking.telling import telling
 from nodes.experiment.learned_scene import scene_sha256
 from nodes.intersection.attack import attack_problem, frozen_objects
 from nodes.intersection.context import Experiment, as_path
 from nodes.intersection.deployed import DressedScene
-from nodes.intersection.drives import deployed_drives, learned_drives, progress_of, totals
+from nodes.intersection.drives import deployed_drives, learned_drives, totals
 from nodes.intersection.objects import placed_objects, surrogate_of
 from nodes.runtime.machine import machine_name
 from nodes.runtime.stages import Report, hash_of
@@ -155,7 +156,7 @@ def _search(
     return pose_attack(
         problem, bounds_of(experiment.world.objects, settings), lanes_of(experiment), method, budget, seed,
         sigma=experiment.config.attack.random_sigma, state_path=state, settings_hash=settings_hash,
-        on_evaluation=progress_of(report, budget.evaluations, f"{method} "),
+        on_evaluation=telling(budget.evaluations, report, f"{method} "),
     )  # fmt: skip
 
 
