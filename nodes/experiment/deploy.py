@@ -92,11 +92,6 @@ def drive_live(experiment: Experiment, live: LiveRun, folder: Path, attack: Path
     outcome = run_trial(
         experiment.launch_file, _overrides(experiment, live, attack), run_dir, plan, deploy.ready_timeout_s
     )
-    if not outcome.start_real_ns:
-        raise RuntimeFault(
-            f"expected {live.name} to drive, but the stack stopped before the car had moved: {outcome.stopped_early}; "
-            "cure that, and start again: what is finished is kept"
-        )
     bag = run_dir / "bag"
     states = trajectory(bag, outcome.start_real_ns, horizon)
     stopped_s = (outcome.end_real_ns - outcome.start_real_ns) / NS_PER_S if outcome.stopped_early else None

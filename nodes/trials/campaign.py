@@ -129,8 +129,6 @@ def _attempt(series: Series, run: Run, ready_timeout_s: float, guide: Callable[[
     trial = TrialPlan(plan.start_pose, plan.ticks * TICK_S + _TAIL_S, series.nodes, by_hand=True)
     overrides = [*plan.overrides, f"params.attack={run.attack}"]
     outcome = run_trial(Path(plan.launch), overrides, run_dir, trial, ready_timeout_s, guide, plan.host)
-    if not outcome.start_real_ns:
-        raise CampaignError(f"run {run.name}: stopped before the car moved ({outcome.stopped_early}); start it again")
     # From the bag alone, as `advnerf evaluate` does: the same numbers, to the last digit.
     found = measure_drives(run_dir / "bag", series.room, plan.ticks)[-1]
     wanted = [run.attack_id] if run.attack_id else []
