@@ -17,7 +17,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
-from nodes.runtime.machine import processor_name
+from nodes.runtime.machine import memory_gib, processor_name
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 LEDGER = REPOSITORY / "docs" / "results.json"
@@ -26,8 +26,7 @@ PAGE = REPOSITORY / "docs" / "results.md"
 
 def machine_description() -> str:
     """The machine in words: processor, cores usable, memory, accelerator if torch sees one."""
-    memory_gib = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
-    return f"{processor_name()}, {len(os.sched_getaffinity(0))} cores, {memory_gib:.0f} GiB, Python {platform.python_version()}"
+    return f"{processor_name()}, {len(os.sched_getaffinity(0))} cores, {memory_gib():.0f} GiB, Python {platform.python_version()}"
 
 
 def record_row(

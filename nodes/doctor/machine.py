@@ -19,11 +19,12 @@ from nodes.doctor.check import ABSENT, FAILURE, OK, WARNING, Finding
 from nodes.runtime.bus import Bus
 from nodes.runtime.errors import BusError, SecurityError
 from nodes.runtime.launch import active_launches
+from nodes.runtime.machine import memory_gib
 from nodes.runtime.paths import user_folder
 from nodes.runtime.security import DRIVE, KeyFolder, default_folder
 from nodes.safety import SafetyConfig
 
-_MEMORY_WARNING_BYTES = 4 * 2**30
+_MEMORY_WARNING_GIB = 4
 # Of the age limits, which are about 0.2 s, nothing is lost to a clock that is off by less.
 CLOCK_ERROR_S = 0.005
 _UNSYNCHRONISED = 0x0040
@@ -92,10 +93,10 @@ def _release(text: str) -> tuple[int, ...]:
 
 def machine() -> list[Finding]:
     """Cores and memory."""
-    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    text = f"{os.cpu_count()} cores, {memory / 2**30:.0f} GiB memory"
-    if memory < _MEMORY_WARNING_BYTES:
-        do = f"train and attack elsewhere: that wants {_MEMORY_WARNING_BYTES // 2**30} GiB"
+    memory = memory_gib()
+    text = f"{os.cpu_count()} cores, {memory:.0f} GiB memory"
+    if memory < _MEMORY_WARNING_GIB:
+        do = f"train and attack elsewhere: that wants {_MEMORY_WARNING_GIB} GiB"
         return [Finding("machine", WARNING, text, do)]
     return [Finding("machine", OK, text)]
 

@@ -31,7 +31,7 @@ from nodes.experiment.deploy import LiveRun, live_runs
 from nodes.experiment.images import as_uint8
 from nodes.experiment.objects import attacked_object, surrogate_of
 from nodes.experiment.policy import HARDENED
-from nodes.runtime.machine import processor_name
+from nodes.runtime.machine import memory_gib, processor_name
 from nodes.runtime.stages import Report, read_record
 
 SHOWN_VIEWS = 6
@@ -198,9 +198,8 @@ def _timings(experiment: Experiment) -> Iterator[rd.StageTiming]:
 def _manifest(experiment: Experiment) -> rd.Manifest:
     manifest = json.loads((experiment.folder / "manifest.json").read_text())
     frozen = json.loads((experiment.stage_folder("attack") / "frozen.json").read_text())
-    memory_gib = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
     machine = {
-        "processor": processor_name(), "cores": str(len(os.sched_getaffinity(0))), "memory": f"{memory_gib:.0f} GiB",
+        "processor": processor_name(), "cores": str(len(os.sched_getaffinity(0))), "memory": f"{memory_gib():.0f} GiB",
         "system": platform.platform(),
     }  # fmt: skip
     # The wall time from a clean clone is not known here: benchmarks/newcomer measures it.

@@ -16,6 +16,11 @@ def processor_name() -> str:
     return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.machine())
 
 
+def memory_gib() -> float:
+    """Memory of the machine [GiB]."""
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
+
+
 def machine_name() -> str:
     """Processor, cores at hand and Python, e.g. ``AMD EPYC, 2 cores, Python 3.11.2``."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
