@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,7 @@ from hardware.carla_scene.config import CarlaConfig
 from hardware.carla_scene.photos import held_out_states, photo_poses
 from hardware.carla_scene.scene import CarlaScene
 from nodes.runtime.errors import ConfigError
-from nodes.runtime.stages import Report
+from nodes.runtime.stages import Report, counted
 
 PHOTOS, HELD_OUT, DRIVES, REQUEST = "photos", "held_out", "drives.json", "request.json"
 
@@ -68,15 +67,12 @@ def capture(
         write_atomically(folder / DRIVES, json.dumps(drives, indent=1) + "\n")
         total = len(poses) + len(states)
 
-        def told(name: str, before: int) -> Callable[[int], None]:
-            return lambda count: report((before + count) / total, f"{name} {before + count} of {total}")
-
         taken = write_posed_images(
-            folder / PHOTOS, poses, scene.photo_pinhole, lambda i: scene.photograph(poses[i]), "jpg", keep=True, told=told(PHOTOS, 0)
+            folder / PHOTOS, poses, scene.photo_pinhole, lambda i: scene.photograph(poses[i]), "jpg", keep=True, told=counted(report, PHOTOS, len(poses), 0, total)
         )  # fmt: skip
         taken += write_posed_images(
             folder / HELD_OUT, [planar_pose(*s) @ scene.T_car_from_camera for s in states], scene.camera_pinhole,
-            lambda i: scene.observe_at(*states[i], depth=False)[0], "png", keep=True, told=told(HELD_OUT, len(poses)),
+            lambda i: scene.observe_at(*states[i], depth=False)[0], "png", keep=True, told=counted(report, HELD_OUT, len(states), len(poses), total),
         )  # fmt: skip
     return taken, total - taken
 

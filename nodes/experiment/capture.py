@@ -18,7 +18,7 @@ from nodes.experiment.config import CaptureConfig
 from nodes.experiment.context import CALIBRATION, DISPLAY, Experiment
 from nodes.experiment.learned_scene import HELD_OUT
 from nodes.experiment.screen import measure_display, plain_picture
-from nodes.runtime.stages import Report
+from nodes.runtime.stages import Report, counted
 
 PHONE, COLOUR_PAIRS = "phone", "colour_pairs"
 
@@ -46,7 +46,7 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
             phone = name == PHONE
             write_posed_images(
                 folder / name, poses, (lab_config.phone if phone else lab_config.camera).pinhole, take, "jpg" if phone else "png",
-                told=lambda count: report((done + count) / total, f"{name} {count}/{len(poses)}"),
+                told=counted(report, name, len(poses), done, total),
             )  # fmt: skip
 
         photograph(PHONE, phone_poses, lambda i: lab.photograph(phone_poses[i]), 0)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +12,7 @@ from advnerf_core.geometry import Array, planar_pose
 from advnerf_core.scene.posed_images import write_posed_images
 from nodes.experiment.learned_scene import HELD_OUT
 from nodes.intersection.context import Experiment
-from nodes.runtime.stages import Report
+from nodes.runtime.stages import Report, counted
 
 PHOTOS = "photos"
 # Held-out views lie as far from a path as a fooled car drives [m], and as turned [rad].
@@ -29,19 +28,16 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
         states = held_out_states(experiment, rng)
         total = len(poses) + len(states)
 
-        def told(name: str, before: int) -> Callable[[int], None]:
-            return lambda count: report((before + count) / total, f"{name} {before + count} of {total}")
-
         def observed(index: int) -> NDArray[np.uint8]:
             x, y, yaw = map(float, states[index])
             return scene.observe_at(x, y, yaw, depth=False)[0]
 
         write_posed_images(
-            folder / PHOTOS, poses, scene.photo_pinhole, lambda index: scene.photograph(poses[index]), "jpg", keep=True, told=told(PHOTOS, 0)
+            folder / PHOTOS, poses, scene.photo_pinhole, lambda index: scene.photograph(poses[index]), "jpg", keep=True, told=counted(report, PHOTOS, len(poses), 0, total)
         )  # fmt: skip
         write_posed_images(
             folder / HELD_OUT, [planar_pose(*state) @ experiment.mount for state in states], experiment.camera, observed, "png",
-            keep=True, told=told(HELD_OUT, len(poses)),
+            keep=True, told=counted(report, HELD_OUT, len(states), len(poses), total),
         )  # fmt: skip
 
 

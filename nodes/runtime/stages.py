@@ -34,6 +34,19 @@ class Report(Protocol):
         """Called with the finished fraction (0..1) and what is being done."""
 
 
+def counted(report: Report, what: str, count: int, before: int, total: int) -> Callable[[int], None]:
+    """Progress of one part of a stage, for a loop that tells how many of its ``count`` items are done.
+
+    Args:
+        report: Of the stage.
+        what: The part.
+        count: Its items.
+        before: Items of the stage before it.
+        total: Items of the whole stage.
+    """
+    return lambda done: report((before + done) / total, f"{what} {done}/{count}")
+
+
 class Display(Protocol):
     """Shows a person how far the stages are."""
 
