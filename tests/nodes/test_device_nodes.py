@@ -16,21 +16,11 @@ from hardware.vicon_codec import encode_blocks, object_pose
 from nodes.camera import CameraConfig, CameraNode
 from nodes.runtime.clock import SystemClock
 from nodes.runtime.errors import RuntimeFault
-from nodes.runtime.messages import (
-    image_array,
-    ns_from_stamp,
-    pinhole_from_camera_info,
-    pose_matrix,
-)
-from nodes.runtime.node import NodeContext
+from nodes.runtime.messages import image_array, ns_from_stamp, pinhole_from_camera_info, pose_matrix
 from nodes.vicon import ViconNode, ViconNodeConfig
 
 TWIN = Path(__file__).parents[2] / "calibration" / "twin"
 CLOCK = SystemClock()
-
-
-def context(tmp_path):
-    return NodeContext("node", tmp_path, CLOCK)
 
 
 def take(node, timeout_s=2.0):
@@ -53,11 +43,11 @@ def frame(sequence=0, age_s=0.0, shape=(188, 336, 3)):
 
 
 @pytest.fixture
-def camera(tmp_path):
+def camera(tmp_path, node_context):
     config = CameraConfig.model_validate(
         {"source": {"kind": "socket", "path": tmp_path / "frames"}, "calibration": TWIN / "camera.yaml"}
     )
-    node = CameraNode.build(config, context(tmp_path))
+    node = CameraNode.build(config, node_context)
     yield node
     node.close()
     node.inbox.close()
@@ -121,20 +111,20 @@ def test_camera_subtracts_the_measured_latency(tmp_path):
     node.inbox.close()
 
 
-def test_camera_without_calibration(tmp_path):
+def test_camera_without_calibration(tmp_path, node_context):
     config = CameraConfig.model_validate(
         {"source": {"kind": "folder", "folder": tmp_path}, "calibration": tmp_path / "no.yaml"}
     )
     with pytest.raises(CalibrationError, match="no such calibration"):
-        CameraNode.build(config, context(tmp_path))
+        CameraNode.build(config, node_context)
 
 
 # VICON
 
 
 @pytest.fixture
-def vicon(tmp_path):
-    node = ViconNode.build(ViconNodeConfig(port=0, subjects=("car", "board")), context(tmp_path))
+def vicon(node_context):
+    node = ViconNode.build(ViconNodeConfig(port=0, subjects=("car", "board")), node_context)
     yield node
     node.close()
     node.inbox.close()

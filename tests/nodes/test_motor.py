@@ -16,27 +16,20 @@ from hardware.twin.vesc_firmware import VescEmulatorConfig
 from hardware.vesc import Vesc
 from nodes.motor import MotorConfig, MotorNode
 from nodes.runtime.clock import SystemClock
-from nodes.runtime.messages import (
-    drive_message,
-    ns_from_stamp,
-)
-from nodes.runtime.node import MessageInfo, NodeContext
+from nodes.runtime.messages import drive_message, ns_from_stamp
+from nodes.runtime.node import MessageInfo
 
 TWIN = Path(__file__).parents[2] / "calibration" / "twin"
 CLOCK = SystemClock()
 
 
-def context(tmp_path):
-    return NodeContext("node", tmp_path, CLOCK)
-
-
 class Drives:
     """A motor node on an emulator, and the safety node's commands to it."""
 
-    def __init__(self, tmp_path, **vesc):
-        self.emulator = VescEmulator(VescEmulatorConfig(**vesc), TwinVehicle(CarConfig()), tmp_path / "vesc")
+    def __init__(self, tmp_path, node_context):
+        self.emulator = VescEmulator(VescEmulatorConfig(), TwinVehicle(CarConfig()), tmp_path / "vesc")
         self.config = MotorConfig(port=str(tmp_path / "vesc"), calibration=TWIN / "vehicle.yaml")
-        self.node = MotorNode.build(self.config, context(tmp_path))
+        self.node = MotorNode.build(self.config, node_context)
 
     def send(self, speed, steering, stamp_ns=12_345):
         now = CLOCK.now()
@@ -59,8 +52,8 @@ class Drives:
 
 
 @pytest.fixture
-def drives(tmp_path):
-    drives = Drives(tmp_path)
+def drives(tmp_path, node_context):
+    drives = Drives(tmp_path, node_context)
     yield drives
     drives.node.close()
     drives.emulator.close()
@@ -141,11 +134,11 @@ def test_motor_that_loses_its_controller_reports_it_and_comes_back_stopped(drive
     assert drives.send(0.5, 0.0) != []
 
 
-def test_motor_on_a_controller_that_is_silent(tmp_path):
+def test_motor_on_a_controller_that_is_silent(node_context):
     master, slave = pty.openpty()
     tty.setraw(slave)
     config = MotorConfig(port=os.ttyname(slave), calibration=TWIN / "vehicle.yaml")
-    node = MotorNode.build(config, context(tmp_path))
+    node = MotorNode.build(config, node_context)
     (out,) = node.tick(CLOCK.now())
     assert (out.topic, out.message.status[0].level) == ("/diagnostics", 2)
     assert node.status()[0] == "starting"
@@ -164,7 +157,7 @@ def test_motor_brakes_when_it_is_told_to_end(drives):
     assert drives.names()[-2:] == ["SET_CURRENT_BRAKE", "SET_CURRENT"]
 
 
-def test_vehicle_file_reaches_the_driver(tmp_path):
+def test_vehicle_file_reaches_the_driver():
     car = load_calibration(VehicleCalibration, TWIN / "vehicle.yaml")
     vesc = Vesc("/dev/null", car.vehicle_gains, car.drive_limits)
     assert vesc.gains.erpm(0.8) == pytest.approx(3691.2)

@@ -7,22 +7,12 @@ import numpy as np
 import pytest
 
 from nodes.arming import ArmingLimits
-from nodes.runtime.clock import Now, SystemClock
-from nodes.runtime.messages import (
-    drive_message,
-    header,
-    ns_from_stamp,
-    types,
-)
-from nodes.runtime.node import MessageInfo, NodeContext
+from nodes.runtime.clock import Now
+from nodes.runtime.messages import drive_message, header, ns_from_stamp, types
+from nodes.runtime.node import MessageInfo
 from nodes.safety import SafetyConfig, SafetyNode
 
 TWIN = Path(__file__).parents[2] / "calibration" / "twin"
-CLOCK = SystemClock()
-
-
-def context(tmp_path):
-    return NodeContext("node", tmp_path, CLOCK)
 
 
 class Guard:
@@ -125,7 +115,7 @@ def test_safety_does_not_let_a_program_arm_a_real_car():
     assert "a real car is armed by source 'operator' only" in state.reason
 
 
-def test_safety_reads_its_fence_from_the_room_file(tmp_path):
-    node = SafetyNode.build(SafetyConfig(room=TWIN / "room.yaml", nodes=("camera",)), context(tmp_path))
+def test_safety_reads_its_fence_from_the_room_file(node_context):
+    node = SafetyNode.build(SafetyConfig(room=TWIN / "room.yaml", nodes=("camera",)), node_context)
     assert "/status/camera" in node.subscriptions
     assert "/status/policy" not in node.subscriptions
