@@ -27,12 +27,12 @@ from advnerf_core.report.transfer_targets import TableTarget, table_targets
 SCHEMA = "advnerf-transfer/1"
 METHOD_NAMES = {"none": "no attack", "random": "best random", "cem": "cross-entropy", "gradient": "gradient"}
 STRAYED_FROM = 1.5
-OUTCOMES = ("left the track", "ran into something", "strayed", "held its course")
+OUTCOMES = (LEFT, RAN_INTO, STRAYED, HELD) = ("left the track", "ran into something", "strayed", "held its course")
 _EXPLAINED = {
-    "left the track": "The drive left its track at least once.",
-    "ran into something": "The drive ended at an obstacle, on the track as the protocol counts it.",
-    "strayed": f"Total CTE at least {STRAYED_FROM:g} times that of the same drive without attack, on the track.",
-    "held its course": "None of these; drives without attack belong here.",
+    LEFT: "The drive left its track at least once.",
+    RAN_INTO: "The drive ended at an obstacle, on the track as the protocol counts it.",
+    STRAYED: f"Total CTE at least {STRAYED_FROM:g} times that of the same drive without attack, on the track.",
+    HELD: "None of these; drives without attack belong here.",
 }
 _MISSING = "missing"
 
@@ -62,11 +62,11 @@ def outcome_of(cell: CellResult) -> str:
     """How the deployed drives of a cell ended; those in the surrogate where it was not deployed."""
     drives = cell.deployed or cell.surrogate
     if any(drives.off_track):
-        return OUTCOMES[0]
+        return LEFT
     if ran_into_something(cell):
-        return OUTCOMES[1]
+        return RAN_INTO
     strayed = sum(drives.total_cte_m) >= STRAYED_FROM * sum(drives.none_total_cte_m)
-    return OUTCOMES[2] if strayed and cell.method != "none" else OUTCOMES[3]
+    return STRAYED if strayed and cell.method != "none" else HELD
 
 
 def ran_into_something(cell: CellResult) -> bool:
