@@ -16,6 +16,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -46,7 +47,6 @@ from benchmarks.results import record_row
 from calibration.schema import RoomCalibration, load_calibration
 
 LINE = "#5 black box"
-COMMAND = "python -m benchmarks.black_box runs/full"
 METHODS = ("distilled", "guided", "evolution", "cem", "random")
 MARKS = (1, 2, 5, 10, 20, 50)
 TARGET_SHARE, TARGET_MULTIPLE = 0.6, 50
@@ -185,6 +185,7 @@ def draw(searches: list[Search], white_calls: int, none_m: float, white_m: float
 
 def record(table: dict[str, dict[str, float]], none_m: float, white_m: float, white_calls: int, steps: int) -> None:
     """Rows of the ledger."""
+    command = "python -m benchmarks.black_box " + " ".join(sys.argv[1:])
     base = f"{white_calls} calls = {ITERATIONS} iterations x {STARTS} starts x {steps} ticks; none {none_m:.2f} m, white box {white_m:.2f} m"
     for name, row in table.items():
         if not row:
@@ -199,7 +200,7 @@ def record(table: dict[str, dict[str, float]], none_m: float, white_m: float, wh
         if int(last) < TARGET_MULTIPLE:
             note += f"; the search was ended at {last} x"
         record_row(
-            f"{LINE}, {name}", 100 * row[last], f"% of the white-box effect at {last} x", target, met, COMMAND, note
+            f"{LINE}, {name}", 100 * row[last], f"% of the white-box effect at {last} x", target, met, command, note
         )
 
 
