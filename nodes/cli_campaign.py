@@ -73,6 +73,10 @@ def run(
     gate: Annotated[
         bool, typer.Option("--gate/--no-gate", help="Leave out scenarios whose surrogate the fidelity gate refuses.")
     ] = True,
+    search_only: Annotated[
+        bool,
+        typer.Option("--search-only", help="Search and deploy nothing yet, so that transfer can be predicted first."),
+    ] = False,
     overrides: Overrides = None,
 ) -> None:
     """Run the cells that are not there yet; each is kept when it is finished, so that a run may be stopped at any time."""
@@ -83,7 +87,7 @@ def run(
     if backend not in ("local", "ray"):
         raise ConfigError(f"expected --backend local or ray, got {backend!r}")
     campaign, cells = _load(file, folder, overrides, only)
-    options = Options(jobs or 0, threads or 0, backend, address, retry, gate)  # type: ignore[arg-type]
+    options = Options(jobs or 0, threads or 0, backend, address, retry, gate, search_only)  # type: ignore[arg-type]
     ended = run_campaign(campaign, cells, options, lambda text: print(text, flush=True))
     wrong = [end for end in ended if end.how != "done"]
     for end in wrong:
@@ -136,7 +140,7 @@ def table_command(
     campaign, cells = _load(file, folder, overrides, only)
     found = statuses(campaign, cells)
     full = campaign_table(campaign, found)
-    pairs = predicted(campaign, found)
+    pairs = predicted(campaign.folder, full.cells)
     sections = [("Predicted and measured transfer", prediction_section(pairs))] if pairs else []
     target = output or campaign.folder / "table"
     page = write_table(full, campaign.folder / "cells", target, sections)

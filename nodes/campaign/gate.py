@@ -1,7 +1,7 @@
 """The fidelity gate of an experiment, and predictions of how its attacks transfer, for any kind of scenario.
 
-The package of a kind has a module ``fidelity`` with ``policy_of``, ``held_out``, ``driven``, ``attacked`` and ``loop``; a kind without one has
-no gate. See `nodes/experiment/fidelity.py`.
+The package of a kind has a module ``fidelity`` with ``policy_of``, ``held_out``, ``driven``, ``lacks``, ``attacked`` and ``loop``; a kind without
+one has no gate. See `nodes/experiment/fidelity.py`.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ def cached_verdict(
 
 def predict_cell(
     kind: Kind, experiment: Any, scenario: str, victim: str, method: str, seed: int, folder: Path, draws: int = 6
-) -> TransferPrediction:
+) -> tuple[TransferPrediction, Agreement]:
     """Predict the deployed drives of a cell whose search is finished, from pictures and the surrogate alone.
 
     Args:
@@ -80,6 +80,9 @@ def predict_cell(
         seed: Of the search.
         folder: The cell's folder.
         draws: Drives per prediction.
+
+    Returns:
+        The prediction, and how alike real and learned pictures are along the deployed drive without attack.
     """
     module = kind.fidelity
     if module is None:
@@ -91,4 +94,4 @@ def predict_cell(
     with_attack = agreement_on(policy, goal, module.attacked(experiment, scenario, victim, method, seed, folder))
     effect = Effect(with_attack.learned - without.learned, with_attack.real - without.real)
     problem, images, starts, horizon = module.loop(experiment, scenario, victim, method, seed, folder)
-    return predict_transfer(problem, images, without, effect, starts, horizon, draws, seed)
+    return predict_transfer(problem, images, without, effect, starts, horizon, draws, seed), without

@@ -11,20 +11,23 @@ from pathlib import Path
 from typing import Any
 
 from advnerf_core.files import write_atomically
-from advnerf_core.report.cells import NONE
+from advnerf_core.report.cells import NONE, CellResult
 from advnerf_core.report.transfer_prediction import Predicted
 from nodes.campaign.config import Campaign, Cell
 from nodes.campaign.gate import predict_cell
 from nodes.campaign.kinds import load_kind
 from nodes.campaign.run import plan_cells
-from nodes.campaign.store import CellStatus, store_of
+from nodes.campaign.store import store_of
+
+# Only these have work of the settings as they are; whether the search is among it, the kind says.
+_MAY_BE_SEARCHED = ("done", "begun", "failed")
 
 
 def predict_campaign(campaign: Campaign, cells: Sequence[Cell], say: Callable[[str], None], draws: int = 6) -> int:
     """Predict every attacked cell that has been searched and is not predicted yet; returns how many were.
 
-    A prediction needs the finished search, which is there with the finished cell, and the drive without attack. It reads no drive with
-    the attack, so it is the same before and after that drive.
+    A prediction needs the finished search (``campaign run --search-only`` makes no more than that) and the drive without attack. It reads
+    no drive with the attack, so it is the same before and after that drive.
     """
     store, made = store_of(campaign), 0
     experiments: dict[tuple[str, str], Any] = {}
@@ -33,43 +36,50 @@ def predict_campaign(campaign: Campaign, cells: Sequence[Cell], say: Callable[[s
             continue
         planned = plan_cells(campaign, [cell], experiments)[0]
         kind = load_kind(planned.job.kind)
-        if store.status(cell, planned.job.settings_hash).state != "done" or kind.fidelity is None:
+        if kind.fidelity is None or store.status(cell, planned.job.settings_hash).state not in _MAY_BE_SEARCHED:
             continue
-        file = _file(campaign, cell)
+        file = prediction_file(campaign.folder, cell.name)
         if _kept(file, planned.job.settings_hash) is not None:
             continue
         experiment = experiments[cell.scenario, cell.placement]
-        found = predict_cell(
-            kind, experiment, planned.job.scenario, cell.victim, cell.method, cell.seed, store.work(cell.name), draws
-        )
-        record = {"settings_hash": planned.job.settings_hash, **found.record()}
+        which = (experiment, planned.job.scenario, cell.victim, cell.method, cell.seed, store.work(cell.name))
+        if lacking := kind.fidelity.lacks(*which):
+            say(f"{cell.name}: not predicted, as it lacks {lacking}")
+            continue
+        found, clean = predict_cell(kind, *which, draws)
+        record = {"settings_hash": planned.job.settings_hash, **found.record(), "clean_drive": clean.summary()}
         write_atomically(file, json.dumps(record, indent=1) + "\n")
         say(f"{cell.name}: {found.ratio:.2f} × no attack expected, {100 * found.retained:.0f} % of the effect survives")
         made += 1
     return made
 
 
-def predicted(campaign: Campaign, found: Sequence[CellStatus]) -> list[Predicted]:
-    """Predictions of finished cells, each with what was measured."""
+def predicted(folder: Path, results: Sequence[CellResult]) -> list[Predicted]:
+    """Predictions of finished cells, each with what was measured.
+
+    Args:
+        folder: Of the campaign, or of what was published of it.
+        results: Its finished cells.
+    """
     pairs = []
-    for each in found:
-        if each.state != "done" or each.result is None or each.result.deployed is None or each.cell.method == NONE:
+    for cell in results:
+        if cell.deployed is None or cell.method == NONE:
             continue
-        kept = _kept(_file(campaign, each.cell), each.result.settings_hash)
+        kept = _kept(prediction_file(folder, cell.name), cell.settings_hash)
         if kept is None:
             continue
-        drives = each.result.deployed
-        none_m = sum(drives.none_total_cte_m)
-        measured = sum(drives.total_cte_m) / none_m if none_m > 0.0 else math.nan
+        none_m = sum(cell.deployed.none_total_cte_m)
+        measured = sum(cell.deployed.total_cte_m) / none_m if none_m > 0.0 else math.nan
         pairs.append(Predicted(
-            each.cell.name, each.cell.method, kept["ratio"], kept["ratio_low"], kept["ratio_high"], measured, kept["retained"],
-            kept["total_cte_m"], drives.mean_m,
+            cell.name, cell.method, kept["ratio"], kept["ratio_low"], kept["ratio_high"], measured, kept["retained"],
+            kept["total_cte_m"], cell.deployed.mean_m,
         ))  # fmt: skip
     return [pair for pair in pairs if math.isfinite(pair.measured)]
 
 
-def _file(campaign: Campaign, cell: Cell) -> Path:
-    return campaign.folder / "predictions" / f"{cell.name}.json"
+def prediction_file(folder: Path, name: str) -> Path:
+    """Where the prediction of a cell is kept, in the folder of a campaign or of what was published of it."""
+    return folder / "predictions" / f"{name}.json"
 
 
 def _kept(file: Path, settings_hash: str) -> dict[str, Any] | None:

@@ -34,6 +34,7 @@ class Options:
         address: Of a running Ray cluster; empty takes the one in RAY_ADDRESS, or starts one here.
         retry: Also run cells that failed before.
         gate: Whether scenarios whose surrogate the fidelity gate refuses are left out; else it is only told.
+        search_only: Search, and deploy nothing: for predictions before the drives, or to choose what is worth one.
     """
 
     jobs: int = 0
@@ -42,6 +43,7 @@ class Options:
     address: str = ""
     retry: bool = False
     gate: bool = True
+    search_only: bool = False
 
 
 @dataclass(frozen=True)
@@ -128,9 +130,16 @@ def run_campaign(campaign: Campaign, cells: Sequence[Cell], options: Options, sa
         say("nothing to do: every cell is there")
         return []
     jobs, threads = _shares(options)
-    say(f"{len(wanted)} of {len(cells)} cells to run, {jobs} at a time, {threads} threads each")
-    beside = [replace(each.job, threads=threads) for each in wanted if not each.live]
-    beside += [replace(each.job, threads=threads, phase="search") for each in wanted if each.live and each.searches]
+    what = "search" if options.search_only else "run"
+    say(f"{len(wanted)} of {len(cells)} cells to {what}, {jobs} at a time, {threads} threads each")
+    searches = [
+        replace(each.job, threads=threads, phase="search")
+        for each in wanted
+        if each.searches and (each.live or options.search_only)
+    ]
+    if options.search_only:
+        return _run_beside(searches, jobs, options, say)
+    beside = [replace(each.job, threads=threads) for each in wanted if not each.live] + searches
     ended = _run_beside(beside, jobs, options, say)
     lost = {end.name for end in ended if end.how != "done"}
     searched = {job.name for job in beside if job.phase == "search"}

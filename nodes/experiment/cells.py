@@ -257,6 +257,12 @@ def _clip(cell: _Cell, driven: dict[str, Any], where: Path) -> str | None:
     return f"{cell.folder.name}/{path.name}"
 
 
+def is_searched(experiment: Experiment, victim: str, method: str, seed: int, folder: Path) -> bool:
+    """Whether the search of a cell is finished, here or in the experiment's run folder."""
+    cell = _cell(experiment, "", victim, method, seed, folder)
+    return (cell.searched_in(method) / f"{cell.search.name}.json").exists()
+
+
 def attack_file(experiment: Experiment, victim: str, method: str, seed: int, folder: Path) -> AttackFile:
     """The attack file of a cell whose search is finished."""
     cell = _cell(experiment, "", victim, method, seed, folder)

@@ -23,7 +23,7 @@ from advnerf_core.geometry import Array, invert_transform, planar_poses, yaw_of
 from advnerf_core.scene.dataset import load_transforms
 from advnerf_core.scene.fidelity import Pictures
 from nodes.experiment import attack, capture
-from nodes.experiment.cells import attack_file, drive_without_attack_of
+from nodes.experiment.cells import CellFault, attack_file, drive_without_attack_of, is_searched
 from nodes.experiment.context import CONTROL_PERIOD_S, Experiment
 from nodes.experiment.images import as_uint8
 from nodes.experiment.learned_scene import load_background
@@ -76,6 +76,18 @@ def driven(
     frames, states = frames[::step], states[::step]
     learned = _learned(surrogate_of(experiment, []), planar_poses(states) @ experiment.camera.mount, None)
     return Pictures("driven bag", np.stack([experiment.view.image(rgb) for rgb in frames]), learned)
+
+
+def lacks(experiment: Experiment, scenario: str, victim: str, method: str, seed: int, folder: Path) -> str:
+    """What a prediction still needs, in words; empty if all is there."""
+    del scenario
+    if not is_searched(experiment, victim, method, seed, folder):
+        return "its search"
+    try:
+        drive_without_attack_of(experiment, victim, seed, folder)
+    except CellFault:
+        return "the live drive without attack: run the cell of method none first"
+    return ""
 
 
 def attacked(experiment: Experiment, scenario: str, victim: str, method: str, seed: int, folder: Path) -> Pictures:

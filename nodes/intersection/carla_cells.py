@@ -5,8 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from nodes.campaign.kinds import stage_digests
-from nodes.intersection.cells import PREPARED_AT, run_cell
-from nodes.intersection.cells import search as search_cell
+from nodes.intersection.cells import PREPARED_AT, run_cell, search_cell
 from nodes.intersection.context import Experiment
 
 LIVE = True

@@ -47,7 +47,7 @@ def run_cell(
     Raises:
         CellError: No such drive, victim or method.
     """
-    cell = search(experiment, scenario, victim, method, seed, folder, report)
+    cell = search_cell(experiment, scenario, victim, method, seed, folder, report)
     result, clip = folder / f"{cell.name}.cell.json", next(folder.glob("clip.*"), None)
     if result.exists() and clip is not None:
         found: dict[str, Any] = json.loads(result.read_text())
@@ -58,7 +58,7 @@ def run_cell(
         return _with_clip(data, film_cell(experiment, dressed, cell, folder))
 
 
-def search(
+def search_cell(
     experiment: Experiment, scenario: str, victim: str, method: Condition, seed: int, folder: Path, report: Report
 ) -> Cell:
     """The part of `run_cell` that needs no deployment scene: search and drive in the surrogate.

@@ -56,6 +56,12 @@ def driven(
     return _along_the_drive(experiment, scenario, victim, seed, None, "drive past the plain objects")
 
 
+def lacks(experiment: Experiment, scenario: str, victim: str, method: str, seed: int, folder: Path) -> str:
+    """What a prediction still needs, in words; empty if all is there."""
+    found = _searched_in(experiment, _cell(scenario, victim, method, seed), folder)
+    return "" if found is not None else "its search"
+
+
 def attacked(experiment: Experiment, scenario: str, victim: str, method: str, seed: int, folder: Path) -> Pictures:
     """The same places with the colours of a finished search."""
     theta = _theta(experiment, scenario, victim, method, seed, folder)
@@ -77,11 +83,18 @@ def loop(
     return problem, images, problem.start_states, experiment.limits
 
 
+def _cell(scenario: str, victim: str, method: str, seed: int) -> Cell:
+    return Cell(scenario, victim, cast("Condition", method), seed)
+
+
+def _searched_in(experiment: Experiment, cell: Cell, folder: Path) -> Path | None:
+    """Where the attack file of a finished search is: the cell's own folder, or the experiment's where the cell was taken from there."""
+    return next((at for at in (folder, experiment.stage_folder("attack")) if attack_path(at, cell).exists()), None)
+
+
 def _theta(experiment: Experiment, scenario: str, victim: str, method: str, seed: int, folder: Path) -> torch.Tensor:
-    """Colours of a finished search: the cell's own, or the experiment's where the cell was taken from there."""
-    cell = Cell(scenario, victim, cast("Condition", method), seed)
-    own = attack_path(folder, cell).exists()
-    return load_theta(folder if own else experiment.stage_folder("attack"), cell)
+    cell = _cell(scenario, victim, method, seed)
+    return load_theta(_searched_in(experiment, cell, folder) or folder, cell)
 
 
 def _along_the_drive(

@@ -1,0 +1,126 @@
+"""The fidelity gate of campaigns, and predictions, on pictures whose steering is known: a policy that reads it off a pixel."""
+
+import json
+
+import pytest
+import torch
+from typer.testing import CliRunner
+
+from advnerf_core.driving.dynamics import Dubins
+from advnerf_core.driving.metrics import Horizon, drive_metrics
+from advnerf_core.driving.path import Line, Path
+from advnerf_core.driving.rollout import drive
+from advnerf_core.scene.gate_limits import GateLimits
+from nodes.campaign.config import load_campaign
+from nodes.campaign.gate import GateError, judge_scene
+from nodes.campaign.kinds import load_kind
+from nodes.campaign.predictions import predict_campaign, predicted
+from nodes.campaign.run import Options, run_campaign, statuses
+from nodes.cli import app
+
+HEAD = "seeds: [0]\nmethods: [gradient, none]\nvictims: [hardened]\n"
+
+
+def run(bench, **options):
+    campaign, said = load_campaign(bench.file), []
+    return run_campaign(campaign, campaign.cells, Options(jobs=2, **options), said.append), said
+
+
+def times_judged(bench):
+    return len((bench.folder / "run" / "looked.txt").read_text().splitlines())
+
+
+def test_a_surrogate_that_the_policy_reads_wrongly_has_its_cells_left_out(gated):
+    (gated.folder / "toy.experiment.yaml").write_text("base: 2.0\nwrong: 0.2\n")
+    gated.write(HEAD)
+    ended, said = run(gated)
+    assert ended == []
+    assert gated.calls == []
+    reasons = [line for line in said if line.startswith("fidelity gate, straight_hardened")]
+    assert any("PSNR 13.98 dB" in line for line in reasons)  # a fifth of the range everywhere: 20 log10(5)
+    assert any("mean steering difference 0.2000" in line and "--no-gate" in line for line in reasons)
+    ended, said = run(gated, gate=False)
+    assert {end.how for end in ended} == {"done"}
+    assert any("mean steering difference 0.2000" in line for line in said)
+    assert times_judged(gated) == 1  # kept
+
+
+def test_a_verdict_is_made_again_only_for_other_limits(gated):
+    assert {end.how for end in run(gated)[0]} == {"done"}
+    verdict = json.loads((gated.folder / "gate" / "straight_hardened.json").read_text())
+    assert verdict["passed"]
+    assert verdict["numbers"]["views"] == 16
+    assert verdict["numbers"]["steering"] == 0.0
+    run(gated)
+    assert times_judged(gated) == 1
+    gated.write("gate: {views: 17}\n" + HEAD)
+    _, said = run(gated)
+    assert times_judged(gated) == 2
+    assert any("16 pictures, at least 17 needed" in line for line in said)
+    (gated.folder / "gate" / "straight_hardened.json").write_text("half of it")
+    run(gated)
+    assert times_judged(gated) == 3
+
+
+def test_transfer_is_predicted_from_the_search_before_any_drive(gated):
+    gated.write(HEAD)
+    campaign = load_campaign(gated.file)
+    said = []
+    assert predict_campaign(campaign, campaign.cells, said.append) == 0
+    ended, _ = run(gated, search_only=True)
+    assert {end.how for end in ended} == {"done"}
+    assert {line.split()[0] for line in gated.calls} == {"search"}
+    assert [each.state for each in statuses(campaign, campaign.cells)] == ["begun", "begun"]
+    assert predict_campaign(campaign, campaign.cells, said.append) == 1  # nothing is predicted of no attack
+    assert predict_campaign(campaign, campaign.cells, said.append) == 0
+    kept = json.loads((gated.folder / "predictions" / "straight_hardened_gradient_0.json").read_text())
+    assert kept["retained"] == pytest.approx(0.5, abs=0.02)
+    assert kept["total_cte_m"] == pytest.approx(driven(0.1), rel=0.03)  # half of the attack's 0.2 rad/s
+    assert kept["clean_drive"]["steering"] == 0.0
+    assert predicted(campaign.folder, []) == []
+    run(gated)
+    found = [each.result for each in statuses(campaign, campaign.cells) if each.result is not None]
+    (pair,) = predicted(campaign.folder, found)
+    assert (pair.name, pair.measured) == ("straight_hardened_gradient_0", 3.0)
+    assert pair.ratio == pytest.approx(kept["ratio"])
+
+
+def driven(turn_radps):
+    """Total CTE of the drive that the toy's policy makes of pictures with this much added [m]."""
+
+    class Reads:
+        stateless = True
+
+        def __call__(self, images, goals=None):
+            return images[:, 0, 0, 0]
+
+    def images(states):
+        return (-0.5 * states[:, 1] - states[:, 2] + turn_radps)[:, None, None, None]
+
+    rollout = drive(Reads(), images, Dubins(1.0, 0.1), torch.tensor([[0.0, 0.3, 0.0]], dtype=torch.float64), 20)
+    path = Path.from_segments((0.0, 0.0, 0.0), [Line(50.0)], closed=False)
+    return drive_metrics(path, rollout.states[:, 0].numpy(), Horizon(20, 0.1, 0.4)).total_cte_m
+
+
+@pytest.mark.parametrize(("wrong", "code"), [(0.0, 0), (0.2, 1)])
+def test_the_gate_is_a_command_of_its_own_with_an_exit_code(gated, wrong, code):
+    (gated.folder / "toy.experiment.yaml").write_text(f"base: 2.0\nwrong: {wrong}\n")
+    (gated.folder / "run").mkdir()
+    arguments = (
+        str(gated.folder / "toy.experiment.yaml"),
+        "--kind",
+        "toyland.cells",
+        "--run-folder",
+        str(gated.folder / "run"),
+    )
+    found = CliRunner().invoke(app, ["scene", "gate", *arguments, "--bag", str(gated.file), "--json"])
+    assert found.exit_code == code
+    verdicts = json.loads(found.stdout)
+    assert [verdicts[of]["passed"] for of in ("held-out views", "driven bag")] == [code == 0, True]
+    assert verdicts["held-out views"]["numbers"]["steering"] == pytest.approx(wrong, abs=0.002)
+
+
+def test_a_kind_without_pictures_has_no_gate(bench, monkeypatch):
+    monkeypatch.syspath_prepend(str(bench.folder))
+    with pytest.raises(GateError, match="expected a module fidelity beside the cells of kind toy_cells"):
+        judge_scene(load_kind("toy_cells"), None, "straight", "hardened", GateLimits())
