@@ -7,6 +7,9 @@ from pathlib import Path
 import pytest
 
 from advnerf_core.report.results import read_results
+from nodes.campaign.gate import predict_cell
+from nodes.campaign.kinds import load_kind
+from nodes.experiment import fidelity
 from nodes.experiment.cells import run_cell
 from nodes.experiment.run import load_experiment, run_experiment
 
@@ -61,3 +64,10 @@ def test_a_cell_of_another_seed_is_searched_and_driven_live_once(tmp_path):
     live = json.loads((tmp_path / "cells" / "one" / "live" / "hardened_gradient_1.json").read_text())
     assert live["attack_ids"] == [cell["attack_id"]]
     assert run_cell(*asked)["deployed"] == cell["deployed"]
+    # What a prediction needs is there: the search, and the bag of the drive without attack.
+    which = (experiment, "monitor", "hardened", "gradient")
+    assert fidelity.lacks(*which, 2, tmp_path / "cells" / "one") == "its search"
+    assert fidelity.lacks(*which, 1, tmp_path / "cells" / "one") == ""
+    found, clean = predict_cell(load_kind("room"), *which, 1, tmp_path / "cells" / "one", draws=2)
+    assert found.ratio > 0.0
+    assert clean.summary()["views"] >= 10
