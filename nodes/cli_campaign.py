@@ -140,7 +140,7 @@ def table_command(
     campaign, cells = _load(file, folder, overrides, only)
     found = statuses(campaign, cells)
     full = campaign_table(campaign, found)
-    pairs = predicted(campaign.folder, full.cells)
+    pairs = predicted(campaign.folder, list(full.cells.values()))
     sections = [("Predicted and measured transfer", prediction_section(pairs))] if pairs else []
     target = output or campaign.folder / "table"
     page = write_table(full, campaign.folder / "cells", target, sections)

@@ -13,9 +13,15 @@ AT_LEAST: dict[str, tuple[float, float]] = {
     "straight": (2.5, 2.0), "right": (3.5, 2.5), "left": (3.5, 2.5), "green_screen": (4.0, 5.2), "monitor": (4.0, 3.5),
 }  # fmt: skip
 RANDOM_AT_MOST = 1.2
+# Deployed gradient attacks of the other campaigns: meshes by their textures and shapes; places and colours must beat random ones.
+MESHES_AT_LEAST = {
+    "straight_texture": 1.41, "right_texture": 1.31, "left_texture": 2.35,
+    "straight_shape_1m": 10.0, "straight_shape_05m": 10.0, "straight_balls_05m": 10.0,
+}  # fmt: skip
+PLACES = ("straight_places", "right_places", "left_places")
 LIVE = ("green_screen", "monitor")
 _SPREAD, _LEFT_SHARE = 0.25, 0.8
-VICTIM = "hardened"
+VICTIM, RETRAINED = "hardened", "retrained"
 
 
 @dataclass(frozen=True)
@@ -32,6 +38,7 @@ class TableTarget:
         met: Whether it was; None where it is not known, as seeds are missing.
         seeds: Of how many seeds.
         short_by: How much is lacking, as a share of the target; 0 where it is met.
+        victim: Whose line is held against it.
     """
 
     scenario: str
@@ -43,6 +50,7 @@ class TableTarget:
     met: bool | None
     seeds: int
     short_by: float = 0.0
+    victim: str = VICTIM
 
     @property
     def verdict(self) -> str:
@@ -83,7 +91,12 @@ def table_targets(table: TransferTable, victim: str = VICTIM) -> list[TableTarge
             found.append(
                 _limit(scenario, "random", "drives off the track", 0.0, random, lambda row: float(row.off_track))
             )
-    return found
+    meshes = [(name, limit) for name, limit in MESHES_AT_LEAST.items() if name in present]
+    found += [
+        _at_least(name, "gradient", "deployed", table.find(name, victim, "gradient", "deployed"), limit)
+        for name, limit in meshes
+    ]
+    return found + [_beats_random(table, name) for name in PLACES if name in present]
 
 
 def _value(row: TableRow | None, of: Callable[[TableRow], float | None]) -> float | None:
@@ -104,6 +117,21 @@ def _at_least(scenario: str, method: str, domain: Domain, row: TableRow | None, 
     met, short = _verdict(row, value, limit, at_least=True)
     seeds = len(row.seeds) if row else 0
     return TableTarget(scenario, method, domain, "ratio to no attack", f">= {limit:g}", value, met, seeds, short)
+
+
+def _beats_random(table: TransferTable, scenario: str) -> TableTarget:
+    """The gradient's ratio above that of as many random places and colours, on the retrained victim."""
+    row, random = (table.find(scenario, RETRAINED, method, "deployed") for method in ("gradient", "random"))
+    value, limit = (_value(each, lambda r: r.ratio) for each in (row, random))
+    met, short = (
+        (None, 0.0) if limit is None or random is None or random.missing else _verdict(row, value, limit, at_least=True)
+    )
+    met = met if value != limit else False  # as good as random is not better
+    target = "> random" if limit is None else f"> {limit:.2f} (random)"
+    seeds = len(row.seeds) if row else 0
+    return TableTarget(
+        scenario, "gradient", "deployed", "ratio to no attack", target, value, met, seeds, short, RETRAINED
+    )
 
 
 def _limit(

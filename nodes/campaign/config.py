@@ -14,11 +14,11 @@ from nodes.runtime.config import load_config
 from nodes.runtime.errors import ConfigError
 
 Method = Literal["none", "random", "cem", "gradient"]
-Victim = Literal["hardened", "naive"]
-# Names become file names, whose parts are separated by "_" and "."; a scenario may hold "_" as its victim is one of two words.
+Victim = Literal["hardened", "naive", "retrained"]
+# Names become file names, whose parts are separated by "_" and "."; a scenario may hold "_" as its victim is one of three words.
 Name = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_-]*$")]
 METHODS: tuple[Method, ...] = ("none", "random", "cem", "gradient")
-VICTIMS: tuple[Victim, ...] = ("hardened", "naive")
+VICTIMS: tuple[Victim, ...] = ("hardened", "naive")  # of a file that names none
 
 
 class _Section(BaseModel):
@@ -39,7 +39,7 @@ class ScenarioConfig(_Section):
 
     kind: str = Field(
         default="room", min_length=1,
-        description="room, intersection, or a Python module that runs cells (see nodes/campaign/kinds.py).",
+        description="room, room_search, intersection, intersection_poses, intersection_meshes, carla, or a Python module that runs cells (see nodes/campaign/kinds.py).",
     )  # fmt: skip
     experiment: Path = Field(description="Experiment file; relative to the campaign file.")
     setting: str = Field(default="full", description="Which of its settings.")

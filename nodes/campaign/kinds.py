@@ -7,7 +7,10 @@ A module of cells has one function that it must have, and may have others::
     def load_experiment(file, setting, overrides, folder) -> experiment
     def prepare(experiment, report) -> None                                               # what all its cells need
     def cell_inputs(experiment, scenario, victim, method, seed) -> dict                   # what the result depends on, JSON
-    LIVE = True    # run_cell drives a live graph: such cells run alone, after all that may run beside others
+    LIVE = True        # run_cell drives a live graph: such cells run alone, after all that may run beside others
+    FIDELITY = None    # there is no learned scene, and so no gate, though the package has a module fidelity
+    PREDICTS = False   # the gate holds, but nothing predicts these attacks
+    TAKEN_FROM = "deploy"    # stage of the experiment in whose folder such cells may be finished already
 
 What it lacks comes from the package it is in (``run.load_experiment``, ``run.run_experiment``), as the experiments of this project have it.
 """
@@ -29,6 +32,8 @@ KINDS = {
     "room": "nodes.experiment.cells",
     "room_search": "nodes.experiment.search_cells",
     "intersection": "nodes.intersection.cells",
+    "intersection_poses": "nodes.intersection.pose_cells",
+    "intersection_meshes": "nodes.intersection.mesh_cells",
     "carla": "nodes.intersection.carla_cells",
 }
 RunCell = Callable[[Any, str, str, str, int, Path, Report], dict[str, Any]]
@@ -55,6 +60,11 @@ class Kind:
         return bool(getattr(self.module, "LIVE", False))
 
     @property
+    def predicts(self) -> bool:
+        """Whether transfer can be predicted from pictures."""
+        return self.fidelity is not None and bool(getattr(self.module, "PREDICTS", True))
+
+    @property
     def run_cell(self) -> RunCell:
         """Runs one cell to its end; goes on where an earlier run of it was stopped."""
         found: RunCell = self.module.run_cell
@@ -68,8 +78,13 @@ class Kind:
 
     def finished(self, experiment: Any, scenario: str, victim: str, method: str, seed: int) -> dict[str, Any] | None:
         """The cell as the experiment itself has run it, with these settings; None where it has not, or where the kind keeps none."""
-        file = experiment.folder / "deploy" / f"{scenario}_{victim}_{method}_{seed}.cell.json"
-        if not file.exists() or not is_current(self._run_module().stages_of(experiment), experiment.folder, "deploy"):
+        stage = getattr(self.module, "TAKEN_FROM", "")
+        file = experiment.folder / stage / f"{scenario}_{victim}_{method}_{seed}.cell.json"
+        if (
+            not stage
+            or not file.exists()
+            or not is_current(self._run_module().stages_of(experiment), experiment.folder, stage)
+        ):
             return None
         data: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
         return data
@@ -77,6 +92,8 @@ class Kind:
     @property
     def fidelity(self) -> Any:
         """The module with the pictures of the fidelity gate, beside the module of cells; None where there is none."""
+        if hasattr(self.module, "FIDELITY"):
+            return self.module.FIDELITY
         package = getattr(self.module, "__package__", "")
         name = f"{package}.fidelity"
         return importlib.import_module(name) if package and find_spec(name) is not None else None

@@ -36,7 +36,7 @@ def predict_campaign(campaign: Campaign, cells: Sequence[Cell], say: Callable[[s
             continue
         planned = plan_cells(campaign, [cell], experiments)[0]
         kind = load_kind(planned.job.kind)
-        if kind.fidelity is None or store.status(cell, planned.job.settings_hash).state not in _MAY_BE_SEARCHED:
+        if not kind.predicts or store.status(cell, planned.job.settings_hash).state not in _MAY_BE_SEARCHED:
             continue
         file = prediction_file(campaign.folder, cell.name)
         if _kept(file, planned.job.settings_hash) is not None:

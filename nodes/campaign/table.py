@@ -13,6 +13,7 @@ from advnerf_core.report.cells import read_cells
 from advnerf_core.report.transfer import TransferTable, Wanted, make_table
 from advnerf_core.report.transfer_page import as_csv, as_json, as_markdown, gather_clips, render_transfer_page
 from nodes.campaign.config import Campaign
+from nodes.campaign.run import gate_key
 from nodes.campaign.store import CellStatus, store_of
 from nodes.runtime.errors import ConfigError
 
@@ -66,6 +67,8 @@ def write_table(
 def publish(campaign: Campaign, found: Sequence[CellStatus], folder: Path) -> tuple[list[str], list[str]]:
     """Copy finished cells to where they are kept with the code, and remove those there that other settings have made.
 
+    The fidelity gate's verdicts and the predictions of these cells go along.
+
     What lies there of cells that are not begun here stays: they may have been run elsewhere.
 
     Args:
@@ -89,6 +92,11 @@ def publish(campaign: Campaign, found: Sequence[CellStatus], folder: Path) -> tu
             continue
         write_atomically(target, text)
         changed.append(each.cell.name)
+    kept = {f"predictions/{name}.json" for name in (*changed, *same)}
+    kept |= {f"gate/{gate_key(each.cell)}.json" for each in found if each.state == "done"}
+    for name in sorted(kept):
+        if (campaign.folder / name).exists():
+            write_atomically(folder / campaign.config.name / name, (campaign.folder / name).read_text(encoding="utf-8"))
     return changed, same
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from nodes.campaign.kinds import stage_digests
-from nodes.intersection.cells import PREPARED_AT, run_cell, search_cell
+from nodes.intersection.cells import PREPARED_AT, TAKEN_FROM, run_cell, search_cell
 from nodes.intersection.context import Experiment
 
 LIVE = True
@@ -17,4 +17,4 @@ def cell_inputs(experiment: Experiment, scenario: str, victim: str, method: str,
     return {"config": config, "world": experiment.site.settings, "stages": stage_digests(experiment.folder)}
 
 
-__all__ = ["LIVE", "PREPARED_AT", "cell_inputs", "run_cell", "search_cell"]
+__all__ = ["LIVE", "PREPARED_AT", "TAKEN_FROM", "cell_inputs", "run_cell", "search_cell"]

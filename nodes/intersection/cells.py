@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from nodes.runtime.machine import machine_name
 from nodes.runtime.stages import Report, hash_of
 
 PREPARED_AT = "policy"  # the last stage that a cell needs of its experiment
+TAKEN_FROM = "deploy"
 
 
 class CellError(RuntimeFault):
@@ -66,15 +68,26 @@ def search_cell(
     Raises:
         CellError: No such drive, victim or method.
     """
-    known = (experiment.config.scenarios, victims(experiment), ("none", "random", "cem", "gradient"))
-    for what, value, choices in zip(("scenario", "victim", "method"), (scenario, victim, method), known, strict=True):
-        if value not in choices:
-            raise CellError(f"expected a {what} of {', '.join(choices)}, got {value!r}")
+    require_known(experiment, scenario, victims(experiment), victim, ("none", "random", "cem", "gradient"), method)
     cell = Cell(scenario, victim, method, seed)
     surrogate = surrogate_of(experiment, placed_objects(experiment))
     for each in dict.fromkeys((cell.clean, cell)):
         surrogate_part(experiment, surrogate, each, folder, report)
     return cell
+
+
+def require_known(
+    experiment: Experiment, scenario: str, victims: Sequence[str], victim: str, methods: Sequence[str], method: str
+) -> None:
+    """Refuse a cell that there cannot be.
+
+    Raises:
+        CellError: No such drive, victim or method.
+    """
+    known = (experiment.config.scenarios, victims, methods)
+    for what, value, choices in zip(("scenario", "victim", "method"), (scenario, victim, method), known, strict=True):
+        if value not in choices:
+            raise CellError(f"expected a {what} of {', '.join(choices)}, got {value!r}")
 
 
 def _with_clip(data: dict[str, Any], clip: Path) -> dict[str, Any]:
@@ -142,4 +155,4 @@ def _drives(experiment: Experiment, dressed: DressedScene, cell: Cell, searched:
     return data
 
 
-__all__ = ["Cell", "CellError", "cells", "deployed_part", "run_cell"]
+__all__ = ["Cell", "CellError", "cells", "deployed_part", "require_known", "run_cell", "search_cell"]

@@ -32,17 +32,19 @@ from hardware.deployment_scene import DeploymentScene
 from nodes.attacking.frames import DeployedFrames
 from nodes.attacking.telling import telling
 from nodes.intersection.attack import attack_problem
-from nodes.intersection.cells import CellError
+from nodes.intersection.cells import require_known
 from nodes.intersection.context import Experiment
 from nodes.intersection.deployed import DressedScene
 from nodes.intersection.drives import deployed_drives, learned_drives, totals
 from nodes.intersection.objects import GENERATOR_OF
-from nodes.intersection.policy import victim_file, victims
+from nodes.intersection.policy import attackable, victim_file
 from nodes.runtime.machine import machine_name
 from nodes.runtime.stages import Report, hash_of
 
 Target = Literal["texture", "shape"]
 MeshMethod = Literal["none", "random", "gradient"]
+METHODS: tuple[MeshMethod, ...] = ("none", "random", "gradient")
+_HASHES: dict[str, list[str]] = {}
 
 
 @dataclass(frozen=True)
@@ -88,7 +90,7 @@ def mesh_cell(
     Args:
         experiment: Its policies must be there (``advnerf experiment FILE --until policy``).
         scenario: Drive: straight, right or left.
-        victim: hardened or naive.
+        victim: hardened or naive, or retrained where the experiment retrains.
         method: none, random or gradient.
         seed: Of the search and its starts.
         folder: Where the search state, the found meshes (GLB) and the results are kept.
@@ -104,13 +106,10 @@ def mesh_cell(
         MeshEngineError: Mitsuba or LLVM is missing.
     """
     settings = settings or MeshSettings()
-    known = (experiment.config.scenarios, victims(experiment), ("none", "random", "gradient"))
-    for what, value, choices in zip(("scenario", "victim", "method"), (scenario, victim, method), known, strict=True):
-        if value not in choices:
-            raise CellError(f"expected a {what} of {', '.join(choices)}, got {value!r}")
+    require_known(experiment, scenario, attackable(experiment), victim, METHODS, method)
     result = folder / f"mesh_{settings.target}_{scenario}_{victim}_{method}_{seed}.cell.json"
     fields = mesh_objects(experiment, settings)
-    frozen = _frozen(experiment, scenario, victim, seed, settings, fields)
+    frozen = mesh_hash(experiment, scenario, victim, seed, settings)
     if result.exists() and (kept := json.loads(result.read_text()))["settings_hash"] == frozen:
         return dict(kept)
     if scene is None:
@@ -119,18 +118,23 @@ def mesh_cell(
     return _cell(experiment, scenario, victim, method, seed, result, report, settings, fields, frozen, scene)
 
 
-def _frozen(
-    experiment: Experiment, scenario: str, victim: str, seed: int, settings: MeshSettings, fields: list[MeshField]
-) -> str:
-    """Hash of what a cell depends on."""
+def mesh_hash(experiment: Experiment, scenario: str, victim: str, seed: int, settings: MeshSettings) -> str:
+    """Hash of what a cell depends on, whatever its method."""
     attack = experiment.config.attack.model_dump(
         mode="json", exclude={"seeds", "methods", "starts", "start_sigma", "cem_population"}
     )
     return hash_of({
-        "objects": [each.sha256 for each in fields], "policy": load_policy(victim_file(experiment, victim)).sha256, "attack": attack,
+        "objects": _objects_sha256(experiment, settings), "policy": load_policy(victim_file(experiment, victim)).sha256, "attack": attack,
         "starts": experiment.start_states(scenario, seed).tolist(), "limits": asdict(experiment.limits),
         "site": experiment.site.settings, "scenario": scenario, **_plain(settings),
     })  # fmt: skip
+
+
+def _objects_sha256(experiment: Experiment, settings: MeshSettings) -> list[str]:
+    key = hash_of([_plain(settings), [thing.model_dump(mode="json") for thing in experiment.world.objects]])
+    if key not in _HASHES:  # unwrapping meshes takes seconds, and a campaign asks for every cell
+        _HASHES[key] = [each.sha256 for each in mesh_objects(experiment, settings)]
+    return _HASHES[key]
 
 
 def _cell(

@@ -28,7 +28,7 @@ from nodes.intersection.deployed import DressedScene
 from nodes.intersection.objects import describe, placed_objects, random_theta, surrogate_of
 from nodes.runtime.stages import Report
 
-HARDENED, NAIVE = "hardened", "naive"
+HARDENED, NAIVE, RETRAINED = "hardened", "naive", "retrained"
 VICTIMS = (HARDENED, NAIVE)
 FILES = {HARDENED: "policy.safetensors", NAIVE: "naive.safetensors"}
 # Poses that the policy learns from: as far from the path [m], and as turned [rad], as a recovery may have to begin.
@@ -66,8 +66,15 @@ def victims(experiment: Experiment) -> tuple[str, ...]:
     return VICTIMS if experiment.config.policy.naive_steps else (HARDENED,)
 
 
+def attackable(experiment: Experiment) -> tuple[str, ...]:
+    """The policies that there are to attack: also the retrained one, where the experiment retrains."""
+    return (*victims(experiment), *([] if experiment.config.retrain is None else [RETRAINED]))
+
+
 def victim_file(experiment: Experiment, victim: str) -> Path:
-    """Policy file of a victim."""
+    """Policy file of a victim; the retrained one is that of the first round, as in the paper."""
+    if victim == RETRAINED:
+        return experiment.stage_folder("retrain") / "round0" / "policy.safetensors"
     return experiment.stage_folder("policy") / FILES[victim]
 
 

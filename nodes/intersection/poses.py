@@ -50,6 +50,7 @@ class PoseSettings:
         samples: Placements that are drawn.
         steps: Evaluations of each.
         colour_rate: Adam's step of the colours before squashing.
+        colours: Whether colours are searched for too; else the objects are moved in their plain ones.
     """
 
     move_m: float = 1.5
@@ -57,6 +58,7 @@ class PoseSettings:
     samples: int = 5
     steps: int = 10
     colour_rate: float = 0.5
+    colours: bool = True
 
 
 def bounds_of(things: Sequence[PlacedObject], settings: PoseSettings) -> list[PoseBounds]:
@@ -111,7 +113,7 @@ def pose_cell(
         object, ``extra.colours`` their colours before squashing.
     """
     settings = settings or PoseSettings()
-    frozen = _frozen(experiment, victim, scenario, seed, settings)
+    frozen = pose_hash(experiment, victim, scenario, seed, settings)
     result = folder / f"poses_{scenario}_{method}_{seed}.cell.json"
     if result.exists() and (kept := json.loads(result.read_text()))["settings_hash"] == frozen:
         return dict(kept)
@@ -138,8 +140,8 @@ def pose_cell(
     return data
 
 
-def _frozen(experiment: Experiment, victim: LoadedPolicy, scenario: str, seed: int, settings: PoseSettings) -> str:
-    """Hash of what a cell depends on."""
+def pose_hash(experiment: Experiment, victim: LoadedPolicy, scenario: str, seed: int, settings: PoseSettings) -> str:
+    """Hash of what a cell depends on, whatever its method."""
     attack = experiment.config.attack
     return hash_of({
         **frozen_objects(experiment), "scene": scene_sha256(experiment), "victim": victim.sha256, "settings": asdict(settings),
@@ -155,7 +157,7 @@ def _search(
     budget = MultiStart(settings.samples, settings.steps, colour_rate=settings.colour_rate)
     return pose_attack(
         problem, bounds_of(experiment.world.objects, settings), lanes_of(experiment), method, budget, seed,
-        sigma=experiment.config.attack.random_sigma, state_path=state, settings_hash=settings_hash,
+        settings.colours, sigma=experiment.config.attack.random_sigma, state_path=state, settings_hash=settings_hash,
         on_evaluation=telling(budget.evaluations, report, f"{method} "),
     )  # fmt: skip
 

@@ -87,11 +87,6 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
     retrain_plot.draw(folder / "curve.png", rounds, wanted.pays_ratio)
 
 
-def retrained_file(experiment: Experiment) -> Path:
-    """The policy after the first round of retraining, which is the paper's retrained policy."""
-    return experiment.stage_folder("retrain") / "round0" / "policy.safetensors"
-
-
 def unseen_start(experiment: Experiment, scenario: str) -> torch.Tensor:
     """A start ``[1, 3]`` that no attack and no training drive began at: a metre back, a third of a metre to the left."""
     x_m, y_m, yaw_rad = experiment.references[scenario].start_pose

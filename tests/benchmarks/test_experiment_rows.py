@@ -1,10 +1,12 @@
 """What the benchmarks of the junction make of finished cells: the figures by hand, and no verdict on too few seeds."""
 
+import json
+
 import pytest
 
 from advnerf_core.report.cells import CellResult
 from advnerf_core.report.transfer import Wanted, make_table
-from benchmarks import black_box, mesh_attack, pose_attacks, retraining, transfer_table
+from benchmarks import black_box, retraining, transfer_table
 from benchmarks.black_box import Search
 
 
@@ -31,19 +33,6 @@ def test_a_retrained_policy_is_held_against_the_original_undisturbed():
     assert rows["#5 attack -> retrain -> attack, round 0, right, deployed"] == (4.0, None)
 
 
-def test_ratios_of_meshes_are_of_means_and_have_no_spread_over_one_seed():
-    value, spread, base_m = mesh_attack.ratio([cell(0, "gradient", 6.0), cell(1, "gradient", 10.0)], "deployed")
-    assert (value, base_m) == (4.0, 2.0)
-    assert spread == pytest.approx(8.0**0.5 / 2.0)
-    assert mesh_attack.ratio([cell(0, "gradient", 6.0)], "deployed")[1] is None
-
-
-def test_totals_of_places_are_told_seed_by_seed():
-    cells = [cell(0, "random", 3.0), cell(1, "random", 5.0)]
-    assert pose_attacks.total_m(cells, "deployed") == 4.0
-    assert pose_attacks.spread_of(cells) == "2 seed(s): 3.0 m, 5.0 m"
-
-
 def test_a_row_of_the_table_has_its_machines_and_waits_for_its_seeds():
     cells = [CellResult.model_validate(cell(seed, "gradient", 9.0)) for seed in (0, 1)]
     table = make_table([Wanted("right", "", "hardened", "gradient", (0, 1, 2))], cells)
@@ -66,10 +55,9 @@ def test_a_miss_says_by_how_much_and_what_that_is_on_the_road():
     table = make_table([Wanted("right", "", "hardened", method, (0, 1)) for method in ("none", "random")], cells)
     rows = dict((row.domain, (row, target)) for row, target in transfer_table.rows_of(table))
     row, target = rows["deployed"]
-    none = table.find("right", "hardened", "none", "deployed")
-    why = transfer_table.why_missed(target, row, none, table.cells_of(row))
+    why = transfer_table.why_missed(target, row, table.cells_of(row))
     assert "missed by 25 %: 50 mm off the path on average, 33 mm without attack" in why
-    assert transfer_table.why_missed(None, row, none, []) == ""
+    assert transfer_table.why_missed(None, row, []) == ""
 
 
 def test_shares_of_the_white_box_are_of_what_it_adds(tmp_path):
@@ -79,3 +67,57 @@ def test_shares_of_the_white_box_are_of_what_it_adds(tmp_path):
     assert table["guided"]["1"] == pytest.approx(0.125)
     assert table["guided"]["10"] == pytest.approx(0.5)
     assert "50" not in table["guided"]  # it has not come so far
+
+
+def test_a_missed_target_says_by_how_much_and_what_it_points_to():
+    cells = [
+        CellResult.model_validate({**cell(seed, "gradient", 6.0), "scenario": "straight_shape_1m"}) for seed in (0, 1)
+    ]
+    table = make_table([Wanted("straight_shape_1m", "", "hardened", "gradient", (0, 1))], cells)
+    ((row, target),) = [pair for pair in transfer_table.rows_of(table) if pair[0].domain == "deployed"]
+    assert transfer_table.base_m(cells, "deployed") == 2.0
+    text = transfer_table.why_missed(target, row, cells)
+    assert text.startswith("; missed by 70 %; tried: ")
+    assert "points to" in text
+
+
+def test_places_must_beat_random_ones_on_the_retrained_victim():
+    def places(method, deployed_m):
+        data = {**cell(0, method, deployed_m), "scenario": "left_places", "victim": "retrained"}
+        return CellResult.model_validate(data)
+
+    wanted = [Wanted("left_places", "", "retrained", method, (0,)) for method in ("random", "gradient")]
+    for gradient_m, met in ((6.0, True), (4.0, False), (3.0, False)):
+        table = make_table(wanted, [places("random", 4.0), places("gradient", gradient_m)])
+        found = {(row.method, row.domain): target for row, target in transfer_table.rows_of(table)}
+        assert found["random", "deployed"] is found["gradient", "surrogate"] is None
+        assert (found["gradient", "deployed"].target, found["gradient", "deployed"].met) == ("> 2.00 (random)", met)
+    alone = make_table(wanted, [places("gradient", 9.0)])
+    assert [target.met for row, target in transfer_table.rows_of(alone) if row.domain == "deployed"] == [None]
+
+
+def test_rows_of_gate_and_predictions_come_from_what_was_published(tmp_path):
+    (tmp_path / "gate").mkdir()
+    numbers = {"views": 12, "psnr_db": 27.5, "ssim": 0.9, "steering": 0.1, "steering_worst": 0.2, "correlation": 0.99}
+    verdict = {"key": "k", "passed": False, "reasons": ["steering too far off"], "numbers": numbers}
+    (tmp_path / "gate" / "right_hardened.json").write_text(json.dumps(verdict))
+    ((line, value, unit, _, met, note, _),) = transfer_table.gate_rows(tmp_path)
+    assert (line, value, unit, met) == ("#5 fidelity gate, right_hardened, held-out views", 27.5, "dB PSNR", False)
+    assert "steering too far off" in note
+    deployed = CellResult.model_validate(cell(0, "gradient", 6.0))
+    assert transfer_table.skill_rows(tmp_path, [deployed], "file") == []
+    (tmp_path / "predictions").mkdir()
+    expected = {
+        "settings_hash": "h",
+        "ratio": 1.5,
+        "ratio_low": 1.0,
+        "ratio_high": 2.0,
+        "retained": 0.8,
+        "total_cte_m": 3.0,
+        "clean_drive": numbers,
+    }
+    (tmp_path / "predictions" / "right_hardened_gradient_0.json").write_text(json.dumps(expected))
+    ((_, factor, _, _, _, note, command),) = transfer_table.skill_rows(tmp_path, [deployed], "file")
+    assert factor == pytest.approx(2.0)  # 1.5 expected, 3 measured
+    assert "1 of 1 rightly said to work" in note
+    assert command == "advnerf campaign predict file"

@@ -16,7 +16,7 @@ from nodes.intersection import attack, retrain
 from nodes.intersection.attack import Cell
 from nodes.intersection.config import RetrainConfig
 from nodes.intersection.context import Experiment
-from nodes.intersection.policy import HARDENED, victim_file
+from nodes.intersection.policy import HARDENED, RETRAINED, victim_file
 
 SMALL = RetrainConfig(rounds=1, pays_ratio=1e-6, stills=2, drives=1, drive_steps=2, placements=1, steps=2)
 
@@ -59,7 +59,7 @@ def test_a_round_of_retraining_and_the_attack_on_it(attacked: Experiment) -> Non
     found = json.loads((folder / "retrain.json").read_text())
     assert len(found["rounds"]) == 2  # the original, and the one that was retrained
     assert found["rounds"][0]["victim"] == load_policy(victim_file(attacked, HARDENED)).sha256
-    retrained = load_policy(retrain.retrained_file(attacked))
+    retrained = load_policy(victim_file(attacked, RETRAINED))
     assert found["rounds"][1]["victim"] == retrained.sha256
     assert retrained.metadata["fine_tuned_from"] == found["rounds"][0]["victim"]
     for name in attacked.config.scenarios:
@@ -79,10 +79,10 @@ def test_a_round_of_retraining_and_the_attack_on_it(attacked: Experiment) -> Non
     assert picture.std() > 10.0
     # once more: everything is there, nothing is collected, trained or searched again
     times = {file: file.stat().st_mtime_ns for file in folder.rglob("*.npy")}
-    before = load_policy(retrain.retrained_file(attacked)).sha256
+    before = load_policy(victim_file(attacked, RETRAINED)).sha256
     retrain.run(attacked, folder, silent)
     assert {file: file.stat().st_mtime_ns for file in folder.rglob("*.npy")} == times
-    assert load_policy(retrain.retrained_file(attacked)).sha256 == before
+    assert load_policy(victim_file(attacked, RETRAINED)).sha256 == before
 
 
 @pytest.mark.slow
@@ -95,7 +95,7 @@ def test_an_attack_that_does_not_pay_ends_it(attacked: Experiment) -> None:
     found = json.loads((folder / "retrain.json").read_text())
     assert len(found["rounds"]) == 1
     assert found["old_attacks"] == {}
-    assert not retrain.retrained_file(attacked).exists()
+    assert not victim_file(attacked, RETRAINED).exists()
     seed = attacked.config.attack.seeds[0]
     file = attack.attack_path(attacked.stage_folder("attack"), Cell("left", HARDENED, "gradient", seed))
     assert load_attack(file).objects

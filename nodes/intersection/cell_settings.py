@@ -1,0 +1,60 @@
+"""What one kind of cell is told beyond its experiment: ``set: [poses.move_m=1.0]`` of a campaign's scenario."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import fields, is_dataclass
+from typing import Any, TypeVar, get_type_hints
+
+from pydantic import TypeAdapter, ValidationError
+
+from nodes.runtime.config import Document, apply_overrides
+from nodes.runtime.errors import ConfigError
+
+S = TypeVar("S")
+
+
+def split_settings(kind: type[S], section: str, overrides: Sequence[str]) -> tuple[S, list[str]]:
+    """The settings of a kind of cell, and the texts that are left for its experiment.
+
+    Args:
+        kind: A dataclass; its defaults stand where nothing is said.
+        section: What comes before the dot in the texts that are meant.
+        overrides: ``key.of.it=value`` texts.
+
+    Raises:
+        ConfigError: No such setting, or not such a value.
+    """
+    own = [text for text in overrides if text.partition("=")[0].partition(".")[0].strip() == section]
+    document = Document({}, "the changes of the scenario")
+    apply_overrides(document, own)
+    data = document.data.get(section) or {}
+    _refuse_unknown(kind, data, document, (section,))
+    try:
+        settings = TypeAdapter(kind).validate_python(data)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        key = (section, *first["loc"])
+        raise ConfigError(
+            f"{document.place(key)}: {'.'.join(map(str, key))}: {_lower(first['msg'])}, got {first['input']!r:.80}"
+        ) from None
+    return settings, [text for text in overrides if text not in own]
+
+
+def _refuse_unknown(kind: Any, data: Any, document: Document, key: tuple[str, ...]) -> None:
+    """Dataclasses take what they do not know in silence."""
+    name = ".".join(key)
+    if not isinstance(data, dict):
+        raise ConfigError(f"{document.place(key)}: expected keys below {name}, got {data!r:.80}")
+    hints = get_type_hints(kind)
+    for known, value in data.items():
+        if known not in hints:
+            names = ", ".join(f"{name}.{each.name}" for each in fields(kind))
+            raise ConfigError(f"{document.place((*key, known))}: unknown key {name}.{known}; valid keys here: {names}")
+        if is_dataclass(hints[known]):
+            _refuse_unknown(hints[known], value, document, (*key, known))
+
+
+def _lower(text: Any) -> str:
+    said = str(text).removeprefix("Value error, ")
+    return said[:1].lower() + said[1:]

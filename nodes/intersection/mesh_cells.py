@@ -1,0 +1,56 @@
+"""Cells of a campaign whose objects are meshes: kind ``intersection_meshes``, see `nodes/intersection/meshes.py`.
+
+A scenario's ``set`` may change `MeshSettings` (``meshes.target=shape``, ``meshes.limits.bound_m=1.0``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from nodes.campaign.kinds import stage_digests
+from nodes.intersection import run
+from nodes.intersection.cell_settings import split_settings
+from nodes.intersection.cells import require_known
+from nodes.intersection.context import Experiment
+from nodes.intersection.meshes import METHODS, MeshMethod, MeshSettings, mesh_cell, mesh_hash
+from nodes.intersection.policy import attackable, victim_file
+from nodes.runtime.stages import Report
+
+FIDELITY = None  # the frames are the deployment scene's own: there is no learned scene to judge
+PREPARED_AT = "policy"
+
+
+@dataclass(frozen=True)
+class MeshExperiment(Experiment):
+    """The experiment, and what is attacked of its meshes.
+
+    Attributes:
+        meshes: Textures or shapes, and how far they may go.
+    """
+
+    meshes: MeshSettings = field(default_factory=MeshSettings)
+
+
+def load_experiment(file: Path, setting: str, overrides: Sequence[str], folder: Path) -> MeshExperiment:
+    """Read the experiment, and the scenario's changes ``meshes.*``."""
+    meshes, others = split_settings(MeshSettings, "meshes", overrides)
+    base = run.load_experiment(file, setting, others, folder)
+    return MeshExperiment(base.config, base.file, base.folder, base.setting, meshes)
+
+
+def cell_inputs(experiment: MeshExperiment, scenario: str, victim: str, method: str, seed: int) -> dict[str, Any]:
+    """What a cell depends on; not known before there is a victim."""
+    require_known(experiment, scenario, attackable(experiment), victim, METHODS, method)
+    if not victim_file(experiment, victim).exists():
+        return {"stages": stage_digests(experiment.folder), "victim": None}
+    return {"everything": mesh_hash(experiment, scenario, victim, seed, experiment.meshes)}
+
+
+def run_cell(
+    experiment: MeshExperiment, scenario: str, victim: str, method: MeshMethod, seed: int, folder: Path, report: Report
+) -> dict[str, Any]:
+    """Search over the deployment scene's frames, drive there; see `mesh_cell`."""
+    return mesh_cell(experiment, scenario, victim, method, seed, folder, report, experiment.meshes)

@@ -1,0 +1,68 @@
+"""Cells of a campaign in which the objects are moved as well: kind ``intersection_poses``, see `nodes/intersection/poses.py`.
+
+A scenario's ``set`` may change `PoseSettings` (``poses.colours=false`` moves the objects in their plain colours). The victim ``retrained`` is
+the policy after the first round of the experiment's stage retrain.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from advnerf_core.driving.policy import load_policy
+from nodes.campaign.kinds import stage_digests
+from nodes.intersection import run
+from nodes.intersection.cell_settings import split_settings
+from nodes.intersection.cells import require_known
+from nodes.intersection.context import Experiment
+from nodes.intersection.policy import attackable, victim_file
+from nodes.intersection.poses import PoseMethod, PoseSettings, pose_cell, pose_hash
+from nodes.runtime.stages import Report
+
+METHODS: tuple[PoseMethod, ...] = ("none", "random", "gradient")
+PREDICTS = False  # what a prediction composes into real pictures stands where it was placed by hand
+
+
+@dataclass(frozen=True)
+class PoseExperiment(Experiment):
+    """The experiment, and how far its objects may be moved.
+
+    Attributes:
+        poses: Bounds and budget.
+    """
+
+    poses: PoseSettings = field(default_factory=PoseSettings)
+
+
+def load_experiment(file: Path, setting: str, overrides: Sequence[str], folder: Path) -> PoseExperiment:
+    """Read the experiment, and the scenario's changes ``poses.*``."""
+    poses, others = split_settings(PoseSettings, "poses", overrides)
+    base = run.load_experiment(file, setting, others, folder)
+    return PoseExperiment(base.config, base.file, base.folder, base.setting, poses)
+
+
+def prepare(experiment: PoseExperiment, report: Report) -> None:
+    """Make scene, objects and victims."""
+    del report  # the stages show their own progress
+    run.run_experiment(experiment, until="policy" if experiment.config.retrain is None else "retrain")
+
+
+def cell_inputs(experiment: PoseExperiment, scenario: str, victim: str, method: str, seed: int) -> dict[str, Any]:
+    """What a cell depends on; not known before there are scene, objects and victim."""
+    require_known(experiment, scenario, attackable(experiment), victim, METHODS, method)
+    file = victim_file(experiment, victim)
+    if not file.exists():
+        return {"stages": stage_digests(experiment.folder), "victim": None}
+    return {"everything": pose_hash(experiment, load_policy(file), scenario, seed, experiment.poses)}
+
+
+def run_cell(
+    experiment: PoseExperiment, scenario: str, victim: str, method: PoseMethod, seed: int, folder: Path, report: Report
+) -> dict[str, Any]:
+    """Search for places (and colours), drive in both domains; see `pose_cell`."""
+    require_known(experiment, scenario, attackable(experiment), victim, METHODS, method)
+    policy = load_policy(victim_file(experiment, victim))
+    with experiment.site.open() as scene:
+        return pose_cell(experiment, policy, scenario, method, seed, folder, report, scene, experiment.poses)

@@ -1,0 +1,133 @@
+"""Places and meshes as kinds of a campaign's cells: their settings, what they depend on, and which victims there are."""
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from nodes.campaign.kinds import load_kind, settings_hash
+from nodes.intersection import mesh_cells, pose_cells
+from nodes.intersection.cells import CellError
+from nodes.intersection.context import Experiment
+from nodes.intersection.mesh_cells import MeshExperiment
+from nodes.intersection.pose_cells import PoseExperiment
+from nodes.intersection.poses import PoseSettings
+from nodes.runtime.errors import ConfigError
+
+PLACES = ("right", "hardened", "random", 0)
+
+
+def silent(fraction: float, text: str = "") -> None:
+    """Takes progress."""
+
+
+def posed(trained: Experiment, **settings: Any) -> PoseExperiment:
+    config = trained.config.model_copy(update={"horizon": 2})
+    poses = PoseSettings(samples=1, steps=1, **settings)
+    return PoseExperiment(config, trained.file, trained.folder, trained.setting, poses)
+
+
+def test_settings_of_cells_are_told_apart_from_those_of_the_experiment(
+    tiny_file: Callable[..., Path], tmp_path: Path
+) -> None:
+    changes = ["poses.move_m=0.5", "horizon=7", "poses.colours=false"]
+    found = pose_cells.load_experiment(tiny_file(), "tiny", changes, tmp_path)
+    assert found.poses == PoseSettings(move_m=0.5, colours=False)
+    assert found.config.horizon == 7
+    meshes = mesh_cells.load_experiment(
+        tiny_file(), "tiny", ["meshes.target=shape", "meshes.limits.bound_m=0.7", "meshes.ball_m=0.6"], tmp_path
+    )
+    assert (meshes.meshes.target, meshes.meshes.limits.bound_m, meshes.meshes.ball_m) == ("shape", 0.7, 0.6)
+    assert mesh_cells.load_experiment(tiny_file(), "tiny", [], tmp_path).meshes.limits.bound_m == 0.4
+
+
+@pytest.mark.parametrize(
+    ("module", "change", "says"),
+    [
+        (
+            pose_cells,
+            "poses.moves_m=1",
+            "unknown key poses.moves_m; valid keys here: poses.move_m, poses.turn_rad",
+        ),
+        (pose_cells, "poses.samples=many", "--set poses.samples=many: poses.samples: input should be a valid integer"),
+        (mesh_cells, "meshes.target=colour", "meshes.target: input should be 'texture' or 'shape'"),
+        (mesh_cells, "meshes.limits.bound_m=0", "expected a bound above zero"),
+        (
+            mesh_cells,
+            "meshes.limits.bound=1",
+            "unknown key meshes.limits.bound; valid keys here: meshes.limits.bound_m",
+        ),
+        (mesh_cells, "meshes=shape", "expected keys below meshes, got 'shape'"),
+        (mesh_cells, "poses.move_m=1", "unknown key poses"),
+    ],
+)
+def test_a_wrong_setting_is_one_clear_error(
+    tiny_file: Callable[..., Path], tmp_path: Path, module: Any, change: str, says: str
+) -> None:
+    with pytest.raises(ConfigError) as error:
+        module.load_experiment(tiny_file(), "tiny", [change], tmp_path)
+    assert says in str(error.value)
+
+
+def test_a_cell_depends_on_what_is_searched_and_on_its_victim(trained: Experiment, tmp_path: Path) -> None:
+    kind, experiment = load_kind("intersection_poses"), posed(trained)
+    same = settings_hash(kind, experiment, *PLACES)
+    assert settings_hash(kind, posed(trained), *PLACES) == same
+    others = [
+        settings_hash(kind, posed(trained, move_m=0.2), *PLACES),
+        settings_hash(kind, posed(trained, colours=False), *PLACES),
+        settings_hash(kind, experiment, "right", "naive", "random", 0),
+        settings_hash(kind, experiment, "right", "hardened", "random", 1),
+        settings_hash(load_kind("intersection_meshes"), meshed(trained), "right", "hardened", "random", 0),
+    ]
+    assert len({same, *others}) == 6
+    for wrong in (
+        ("up", "hardened", "random", 0),
+        ("right", "retrained", "random", 0),
+        ("right", "hardened", "cem", 0),
+    ):
+        with pytest.raises(CellError, match="expected a"):
+            settings_hash(kind, experiment, *wrong)
+
+
+def meshed(trained: Experiment) -> MeshExperiment:
+    return MeshExperiment(trained.config, trained.file, trained.folder, trained.setting)
+
+
+def test_a_cell_of_places_alone_keeps_the_plain_colours(trained: Experiment, tmp_path: Path) -> None:
+    """The simulated junction itself; the colour cell of the same name in the run folder is not taken for it."""
+    folder = shutil.copytree(trained.folder, tmp_path / "run")
+    experiment = replace(posed(trained, colours=False), folder=folder)
+    (folder / "deploy" / "right_hardened_random_0.cell.json").write_text("{}")
+    kind = load_kind("intersection_poses")
+    assert kind.finished(experiment, *PLACES) is None
+    cell = kind.run_cell(experiment, *PLACES, tmp_path, silent)
+    plain = pose_cells.run_cell(experiment, "right", "hardened", "none", 0, tmp_path, silent)
+    assert plain["deployed"]["total_cte_m"] == cell["deployed"]["none_total_cte_m"]
+    coloured = pose_cells.run_cell(replace(experiment, poses=posed(trained).poses), *PLACES, tmp_path / "other", silent)
+    assert coloured["extra"]["placements"] == cell["extra"]["placements"]  # the same places are drawn
+    assert coloured["extra"]["colours"] != cell["extra"]["colours"]
+    assert kind.predicts is False
+    assert kind.fidelity is not None
+    assert load_kind("intersection_meshes").fidelity is None
+
+
+def test_the_retrained_victim_is_that_of_the_first_round(trained: Experiment, tmp_path: Path) -> None:
+    from nodes.intersection.config import RetrainConfig
+
+    folder = shutil.copytree(trained.folder, tmp_path / "run")
+    config = trained.config.model_copy(update={"horizon": 2, "retrain": RetrainConfig()})
+    experiment = PoseExperiment(config, trained.file, folder, "tiny", PoseSettings(samples=1, steps=1))
+    kind, asked = load_kind("intersection_poses"), ("left", "retrained", "none", 0)
+    unknown = settings_hash(kind, experiment, *asked)  # it is not trained yet
+    (folder / "retrain" / "round0").mkdir(parents=True)
+    shutil.copy(folder / "policy" / "naive.safetensors", folder / "retrain" / "round0" / "policy.safetensors")
+    assert settings_hash(kind, experiment, *asked) != unknown
+    cell = kind.run_cell(experiment, *asked, tmp_path, silent)
+    assert cell == kind.run_cell(experiment, *asked, tmp_path, silent)
+    naive = kind.run_cell(experiment, "left", "naive", "none", 0, tmp_path, silent)
+    assert json.dumps(naive["deployed"]) == json.dumps(cell["deployed"])  # the very same weights
