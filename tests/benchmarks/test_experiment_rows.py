@@ -44,6 +44,8 @@ def test_a_row_of_the_table_has_its_machines_and_waits_for_its_seeds():
     note = transfer_table.note_of(rows[0][0], table.cells_of(rows[0][0]))
     assert "seeds 2 are missing" in note
     assert "machine 0, machine 1" in note
+    assert "total CTE 9.00 +- 0.00 m of 2.00 m" in note
+    assert "by seed 4.50, 4.50 x" in note
     whole = make_table([Wanted("right", "", "hardened", "gradient", (0, 1))], cells)
     assert [target.met for _, target in transfer_table.rows_of(whole)] == [True, True]
 
