@@ -70,7 +70,7 @@ class PolicyConfig(_Section):
         default=3, description="Drives on each path in the deployment scene, per DAgger round."
     )
     surrogate_drives: Count = Field(default=3, description="The same in the surrogate.")
-    drive_steps: Positive = Field(default=60, description="Control ticks of such a drive.")
+    drive_steps: Positive = Field(default=60, description="Control ticks of such a drive; finer ticks need more.")
     dagger_rounds: Count = Field(default=2, description="Rounds of DAgger.")
     first_steps: Positive = Field(default=800, description="Optimiser steps of behaviour cloning.")
     round_steps: Positive = Field(default=300, description="Optimiser steps after each round.")
@@ -125,7 +125,7 @@ class RetrainConfig(_Section):
         default=2,
         description="Pairs of the victim's drives on each path, per domain: past plain objects and past a found texture.",
     )
-    drive_steps: Positive = Field(default=60, description="Control ticks of such a drive.")
+    drive_steps: Positive = Field(default=60, description="Control ticks of such a drive; finer ticks need more.")
     placements: Count = Field(
         default=0,
         description="Random places of all objects in random colours that the victim also learns from; see poses.py.",
@@ -148,11 +148,30 @@ class IntersectionExperimentConfig(_Section):
             )
         return self
 
+    @model_validator(mode="after")
+    def _training_drives_last(self) -> IntersectionExperimentConfig:
+        """Fine ticks with the default number of them would train on drives that end before the junction."""
+        policy, asked = self.policy, {}
+        if policy.dagger_rounds and (policy.deployed_drives or policy.surrogate_drives):
+            asked["policy.drive_steps"] = policy.drive_steps
+        if self.retrain is not None:
+            asked["retrain.drive_steps"] = self.retrain.drive_steps
+        for key, ticks in asked.items():
+            if 2 * ticks < self.horizon:
+                raise ValueError(
+                    f"expected {key} to be at least half of horizon = {self.horizon} ticks, so that what is learned from passes the "
+                    f"junction too, got {ticks} ticks of dt_s = {self.dt_s:g} s, {ticks * self.dt_s:g} s; set {key}={self.horizon}"
+                )
+        return self
+
     kind: Literal["intersection", "carla"] = Field(description="The simulated junction, or one of a CARLA map.")
     name: str = Field(min_length=1)
     scenarios: tuple[PathName, ...] = Field(default=("straight", "right", "left"), min_length=1)
     horizon: Positive = Field(default=60, description="Control ticks of every drive (T).")
-    dt_s: PositiveNumber = Field(default=0.1, description="Control tick [s]; the paper's CARLA runs have finer ones.")
+    dt_s: PositiveNumber = Field(
+        default=0.1,
+        description="Control tick [s]; the paper's CARLA runs have finer ones: docs/intersection_experiment.md.",
+    )
     held_cap_m: PositiveNumber = Field(
         default=6.0, description="Largest |CTE| that a stopped car is charged per tick [m]."
     )

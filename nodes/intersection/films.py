@@ -21,6 +21,7 @@ from nodes.intersection.objects import placed_objects
 from nodes.intersection.policy import HARDENED
 
 DOMAINS = ("surrogate", "deployed")
+_FRAME_S = 0.1  # of films: finer ticks are not all filmed
 
 
 def strongest(experiment: Experiment) -> str:
@@ -35,25 +36,33 @@ def film_scenario(experiment: Experiment, dressed: DressedScene, scenario: str, 
     attacked = Cell(scenario, HARDENED, method, seed)  # type: ignore[arg-type]
     theta = load_theta(experiment.stage_folder("attack"), attacked)
     whole = Surrogate(load_background(experiment), experiment.camera, experiment.mount, placed_objects(experiment))
-    learned = drives_of(experiment, "surrogate", attacked)[0]
+    every, rate_hz = filmed(experiment.config.dt_s)
+    learned = drives_of(experiment, "surrogate", attacked)[0][::every]
     frames = [as_uint8(whole.render(pose[None], theta).images[0]) for pose in planar_poses(learned) @ experiment.mount]
     tracks = [_track(experiment, scenario, "learned scene, attacked", method, frames, learned)]
     for cell, colours in ((attacked.clean, dressed.plain_theta()), (attacked, theta)):
-        states = drives_of(experiment, "deployed", cell)[0]
+        states = drives_of(experiment, "deployed", cell)[0][::every]
         views = [dressed.camera_image(state, colours) for state in states]
         title = "deployed, no attack" if cell.method == "none" else "deployed, attacked"
         tracks.append(_track(experiment, scenario, title, cell.method, views, states))
-    return write_clip(folder / f"{scenario}.mp4", tracks, 1.0 / experiment.config.dt_s, experiment.site.off_track_m)
+    return write_clip(folder / f"{scenario}.mp4", tracks, rate_hz, experiment.site.off_track_m)
 
 
 def film_cell(experiment: Experiment, dressed: DressedScene, cell: Cell, folder: Path) -> Path:
     """The deployed drive of one cell, from its first start; its files are in ``folder``, and ``clip.mp4`` will be."""
-    states = _states(folder / f"{cell.name}.drives.json")[0]
+    every, rate_hz = filmed(experiment.config.dt_s)
+    states = _states(folder / f"{cell.name}.drives.json")[0][::every]
     colours = dressed.plain_theta() if cell.method == "none" else load_theta(folder, cell)
     title = f"{METHOD_NAMES[cell.method]}, {cell.victim}, seed {cell.seed}"
     views = [dressed.camera_image(state, colours) for state in states]
     track = _track(experiment, cell.scenario, title, cell.method, views, states)
-    return write_clip(folder / "clip.mp4", [track], 1.0 / experiment.config.dt_s, experiment.site.off_track_m)
+    return write_clip(folder / "clip.mp4", [track], rate_hz, experiment.site.off_track_m)
+
+
+def filmed(dt_s: float) -> tuple[int, float]:
+    """Every how many ticks a frame is taken, and the film's frames per second, so that it runs in real time."""
+    every = max(1, round(_FRAME_S / dt_s))
+    return every, 1.0 / (every * dt_s)
 
 
 def _track(

@@ -79,8 +79,8 @@ def opening(experiment: Experiment) -> str:
     return (
         f"One goal-conditioned policy drives {', '.join(experiment.config.scenarios)}. The colours of {kinds['small_car']} cars and "
         f"{kinds['hydrant']} hydrants are searched together in the learned scene ({methods}; {attack.evaluations} evaluations each, "
-        f"{len(attack.seeds)} seed(s), {attack.starts} start(s), T = {experiment.config.horizon}), then the opaque objects are put into the "
-        f"{where} by depth. Total CTE is the sum of |CTE| over the drive; ratios are to the same start past the plain "
+        f"{len(attack.seeds)} seed(s), {attack.starts} start(s), T = {experiment.config.horizon} ticks of {experiment.config.dt_s:g} s), then the opaque objects are put into the "
+        f"{where} by depth. Total CTE is the sum of |CTE| over the drive's ticks; ratios are to the same start past the plain "
         "objects in the same domain."
     )
 

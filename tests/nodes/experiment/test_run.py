@@ -29,6 +29,7 @@ def test_settings_lie_over_the_file_and_the_command_line_over_both(tmp_path):
     [
         (["attack.iteration=3"], r"unknown key attack\.iteration; valid keys here: .*iterations"),
         (["attack.horizon=0"], r"attack\.horizon.*greater than or equal to 1"),
+        (["attack.display_model=sometimes"], r"attack\.display_model.*valid boolean"),
         (["lab.camera.widht=3"], r"unknown key camera\.widht"),
         (["attack"], "expected KEY=VALUE"),
     ],

@@ -4,17 +4,33 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
-from calibration.by_construction import write_twin_calibrations
-from calibration.schema import save_calibration
+from advnerf_core.attack.displayed import DisplayedSensor
+from advnerf_core.display import DisplayModel
+from advnerf_core.geometry import invert_transform, planar_pose, transform_points
+from calibration.by_construction import LAB_DATE, METHOD, write_twin_calibrations
+from calibration.display_colour import DisplayCalibration
+from calibration.schema import CalibrationError, save_calibration
 from hardware.twin.config import MonitorOpticsConfig
 from hardware.twin.lab import Lab
 from hardware.twin.world import MONITOR_PIXELS
 from nodes.experiment import screen
+from nodes.experiment.attack import sensor_of
 from nodes.experiment.context import CALIBRATION
+from nodes.experiment.objects import attacked_object, surrogate_of
 from nodes.experiment.run import load_experiment
 
 LAUNCH = Path(__file__).parents[3] / "launch"
+# A dim and reddish monitor in a lit room.
+SEEN_AS = DisplayModel(
+    np.tile(np.linspace(0.0, 1.0, 17) ** 2.2, (3, 1)),
+    np.array([[0.7, 0.1, 0.0], [0.05, 0.5, 0.05], [0.0, 0.1, 0.3]]),
+    np.array([0.02, 0.02, 0.03]),
+    response=2.2,
+    falloff=1.4,
+)
+SHOWN = np.array([0.8, 0.3, 0.6])
 
 
 @pytest.fixture
@@ -53,6 +69,54 @@ def test_the_mean_viewing_angle_is_that_of_the_drive(experiment):
         cosines.append(away @ [np.cos(monitor.yaw_rad), np.sin(monitor.yaw_rad), 0.0] / np.linalg.norm(away))
     cosine = screen.mean_cos_angle(experiment)
     assert min(cosines) - 0.05 < cosine < max(cosines)
+
+
+def grey_room(poses, pinhole):
+    """A learned scene in which there is nothing but grey, 9 m away."""
+    size = (len(poses), pinhole.height, pinhole.width)
+    return torch.full((*size, 3), 0.5), torch.full(size, 9.0)
+
+
+def seen_on_the_face(sensor, experiment):
+    """Colour ``[3]`` of the face's middle from a car 1.1 m before it, when all of it shows one colour."""
+    face, mount = experiment.panel.T_world_from_face, experiment.camera.mount
+    x_m, y_m, _ = (face @ [1.1, 0.0, 0.0, 1.0])[:3]
+    heading_rad = np.arctan2(*(face[:2, 3] - [x_m, y_m])[::-1])
+    state = torch.tensor([[x_m, y_m, heading_rad]], dtype=torch.float64)
+    theta = torch.logit(torch.tensor(SHOWN, dtype=torch.float32)).expand(sensor.theta_shape)
+    camera = planar_pose(x_m, y_m, heading_rad) @ mount
+    column, row = experiment.view.pinhole.project(transform_points(invert_transform(camera), face[:3, 3]))
+    return sensor.sense(state, theta).images[0, :, int(row), int(column)].numpy()
+
+
+@pytest.mark.parametrize(
+    ("file", "display_model", "seen"),
+    [("monitor", True, "the display"), ("monitor", False, "as shown"), ("room", True, "as shown")],
+)
+def test_an_attack_looks_through_the_display_model_where_a_monitor_shows_it_and_it_is_on(
+    tmp_path, file, display_model, seen
+):
+    override = f"attack.display_model={str(display_model).lower()}"
+    asked = load_experiment(LAUNCH / f"{file}.experiment.yaml", "demo", [override], tmp_path)
+    write_twin_calibrations(asked.lab_config, tmp_path / "capture" / CALIBRATION)
+    surrogate = surrogate_of(asked, [attacked_object(asked)], grey_room)
+    save_calibration(
+        DisplayCalibration(date=LAB_DATE, method=METHOD, model=SEEN_AS.to_dict()), asked.calibration_file("display")
+    )
+    sensor = sensor_of(asked, surrogate)
+    colour = seen_on_the_face(sensor, asked)
+    # The law in numpy, which the sensor's torch knows nothing of.
+    displayed = SEEN_AS.forward(SHOWN, screen.mean_cos_angle(asked))
+    assert np.abs(displayed - SHOWN).max() > 0.2
+    assert colour == pytest.approx(displayed if seen == "the display" else SHOWN, abs=1e-4)
+    assert isinstance(sensor, DisplayedSensor) is (seen == "the display")
+    assert (sensor is surrogate) is (seen == "as shown")
+
+
+def test_a_display_model_that_was_never_measured_is_one_clear_error(experiment):
+    surrogate = surrogate_of(experiment, [attacked_object(experiment)], grey_room)
+    with pytest.raises(CalibrationError, match=r"display\.yaml"):
+        sensor_of(experiment, surrogate)
 
 
 @pytest.mark.slow

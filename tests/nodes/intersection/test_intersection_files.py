@@ -105,6 +105,18 @@ def test_retraining_without_the_gradient_is_refused(tmp_path: Path) -> None:
         load(tmp_path, "retrain.rounds=1", "attack.methods=[random]")
 
 
+def test_training_drives_that_end_before_the_junction_are_refused(tmp_path: Path) -> None:
+    fine = ("dt_s=0.01", "horizon=600")
+    said = r"policy\.drive_steps to be at least half of horizon = 600 ticks.* got 60 ticks of dt_s = 0\.01 s, 0\.6 s; set policy\.drive_steps=600"
+    with pytest.raises(ConfigError, match=said):
+        load(tmp_path, *fine)
+    assert load(tmp_path, *fine, "policy.drive_steps=600").limits.ticks == 600
+    assert load(tmp_path, *fine, "policy.dagger_rounds=0").limits.dt_s == 0.01  # it drives in no training
+    with pytest.raises(ConfigError, match=r"retrain\.drive_steps.* got 60 ticks"):
+        load(tmp_path, *fine, "policy.drive_steps=600", "retrain.rounds=1")
+    assert load(tmp_path, *fine, "policy.drive_steps=600", "retrain.drive_steps=600").config.retrain is not None
+
+
 def test_a_run_folder_gives_back_the_experiment_that_made_it(tmp_path: Path) -> None:
     made = load(tmp_path, "horizon=17", "world.car.speed_mps=5")
     made.folder.mkdir(parents=True, exist_ok=True)

@@ -1,0 +1,173 @@
+"""Counterfactual steering as it is recorded: the green screen's graph on the twin, one process per node, one drive past an attack."""
+
+import socket
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from advnerf_core.attack.artifact import AttackFile, save_attack
+from advnerf_core.driving.policy import PilotNet, images_to_tensor, load_policy, save_policy
+from advnerf_core.driving.policy_view import PolicyView
+from advnerf_core.geometry import Pinhole
+from calibration.schema import CameraCalibration, RoomCalibration, TargetCalibration, load_calibration
+from nodes.evaluation import counterfactual
+from nodes.runtime.bag_read import read_messages
+from nodes.runtime.messages import decode, image_array, ns_from_stamp
+from nodes.runtime.topics import topic as topic_row
+from nodes.trial import TrialOutcome, TrialPlan
+from nodes.trial_runner import run_trial
+
+ROOT = Path(__file__).parents[2]
+TWIN = ROOT / "calibration" / "twin"
+NODES = ("twin", "camera", "vicon", "compositor", "policy", "counterfactual", "safety", "motor", "recorder")
+CLEAN, ATTACKED, LABEL = "/camera/image_raw", "/compositor/image", "/compositor/attack"
+SAID, COMMAND, STATUS = "/policy/counterfactual", "/policy/drive", "/status/counterfactual"
+SECONDS = 3.0
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """What one drive left.
+
+    Attributes:
+        bag: Its bag.
+        outcome: When it began and ended.
+        attack_id: What was shown.
+        policy: Who drove.
+    """
+
+    bag: Path
+    outcome: TrialOutcome
+    attack_id: str
+    policy: Path
+
+    def messages(self, topic: str) -> dict[int, Any]:
+        """What was said on a topic, by the stamp of the image that it is about [ns]; nothing is said twice."""
+        decoded = [decode(topic_row(topic).type, message.cdr) for message in read_messages(self.bag, [topic])]
+        by_stamp = {ns_from_stamp(message.header.stamp): message for message in decoded}
+        assert len(by_stamp) == len(decoded)
+        return by_stamp
+
+    def driving(self, stamp_ns: int) -> bool:
+        """Whether an image was taken while the car drove."""
+        return self.outcome.start_real_ns <= stamp_ns < self.outcome.end_real_ns
+
+
+def untrained(folder: Path) -> Path:
+    """A policy that goes gently to the left, and whose steering depends on what it sees by about a degree."""
+    torch.manual_seed(0)
+    network, camera = PilotNet(), load_calibration(CameraCalibration, TWIN / "camera.yaml")
+    with torch.no_grad():
+        for parameter in network.parameters():
+            parameter.mul_(1.5)  # as it is, it answers everything with nearly the same
+    save_policy(folder / "policy.safetensors", network, PolicyView(camera.pinhole, distortion=camera.distortion), {})
+    return folder / "policy.safetensors"
+
+
+def red_board(folder: Path) -> AttackFile:
+    """The attack: all of the board is red."""
+    target = load_calibration(TargetCalibration, TWIN / "board.yaml")
+    attack = AttackFile(
+        method="random", theta=np.zeros((4, 4, 3), np.float32), texture=np.full((64, 64, 3), (250, 0, 0), np.uint8),
+        size_m=(1.0, 1.0), T_world_from_object=np.eye(4), subject="board", corners_in_subject=target.corners,
+        camera=Pinhole(200, 66, 103.6, 103.4, 100, 32), scene_sha256="", policy_sha256="", config_sha256="", seed=0,
+        predicted_total_cte_m=None, software_version="0",
+    )  # fmt: skip
+    save_attack(folder / "red.attack.safetensors", attack)
+    return attack
+
+
+def free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
+    folder = tmp_path_factory.mktemp("counterfactual")
+    policy, attack = untrained(folder), red_board(folder)
+    overrides = [
+        "params.counterfactual=true", f"params.calibration={TWIN}", f"params.policy={policy}", "policy.speed_mps=0.5",
+        f"params.attack={folder / 'red.attack.safetensors'}", f"params.vicon_port={free_port()}",
+    ]  # fmt: skip
+    start = load_calibration(RoomCalibration, TWIN / "room.yaml").start_pose
+    plan = TrialPlan(start, SECONDS, NODES)
+    outcome = run_trial(ROOT / "launch" / "green_screen.launch.yaml", overrides, folder / "run", plan, 120.0)
+    # A computer that is too busy to answer in time stops the car, as it should; such a drive proves nothing here.
+    assert outcome.stopped_early == ""
+    return Recorded(folder / "run" / "bag", outcome, attack.attack_id, policy)
+
+
+def steering(policy: Path, images: list[Any]) -> list[float]:
+    """What the network itself makes of recorded images [rad]."""
+    loaded = load_policy(policy)
+    with torch.no_grad():
+        views = [images_to_tensor(loaded.view.image(image_array(image))) for image in images]
+        return [float(loaded.policy(view)[0]) for view in views]
+
+
+def test_every_command_of_the_drive_has_its_comparison_or_is_counted(recorded: Recorded) -> None:
+    said, commands = recorded.messages(SAID), recorded.messages(COMMAND)
+    driven = {stamp for stamp in commands if recorded.driving(stamp)}
+    assert len(driven) >= 0.8 * 10 * SECONDS
+    *_, last = (decode(topic_row(STATUS).type, message.cdr) for message in read_messages(recorded.bag, [STATUS]))
+    counted = dict(zip(last.counter_names, last.counter_values, strict=True))
+    left_out = sum(
+        count for name, count in counted.items() if name.startswith(("dropped", "lost", "without_partner", "inbox"))
+    )
+    assert len(driven - said.keys()) <= left_out
+    assert len(driven & said.keys()) >= 10
+    assert said.keys() <= recorded.messages(ATTACKED).keys()
+
+
+def test_both_steerings_are_the_networks_own_on_the_recorded_images(recorded: Recorded) -> None:
+    said, clean, attacked = (recorded.messages(topic) for topic in (SAID, CLEAN, ATTACKED))
+    for of, images in (("clean_rad", clean), ("attacked_rad", attacked)):
+        expected = steering(recorded.policy, [images[stamp] for stamp in said])
+        assert [getattr(word, of) for word in said.values()] == pytest.approx(expected, abs=1e-5)
+    assert {word.policy_sha256 for word in said.values()} == {load_policy(recorded.policy).sha256}
+
+
+def test_the_attack_adds_something_while_it_is_drawn_and_nothing_else_ever(recorded: Recorded) -> None:
+    said, labels = recorded.messages(SAID), recorded.messages(LABEL)
+    clean, attacked = recorded.messages(CLEAN), recorded.messages(ATTACKED)
+    drawn = [stamp for stamp, word in said.items() if word.drawn]
+    plain = [stamp for stamp, word in said.items() if not word.drawn]
+    assert min(len(drawn), len(plain)) >= 5
+    assert all(said[stamp].drawn is bool(labels[stamp].drawn) for stamp in said)
+    for stamp, word in said.items():
+        assert word.delta_rad == word.attacked_rad - word.clean_rad
+        assert np.array_equal(image_array(clean[stamp]), image_array(attacked[stamp])) is not word.drawn
+    assert all(said[stamp].delta_rad == said[stamp].changed == 0.0 for stamp in plain)
+    # A red board changes the steering by a degree or so, once to the left and once to the right, and some of what the policy sees.
+    assert all(said[stamp].delta_rad != 0.0 for stamp in drawn)
+    assert np.abs([said[stamp].delta_rad for stamp in drawn]).mean() > 0.005
+    assert all(0.02 < said[stamp].changed < 0.5 and said[stamp].attack_id == recorded.attack_id for stamp in drawn)
+    # Before the car is armed and after it is disarmed the interlock leaves the images alone.
+    before = [stamp for stamp in plain if stamp < recorded.outcome.start_real_ns]
+    assert before
+    assert not [stamp for stamp in drawn if stamp > recorded.outcome.end_real_ns + 10**9]
+    found = counterfactual(recorded.bag, recorded.outcome.start_real_ns, recorded.outcome.end_real_ns)
+    assert found is not None
+    assert found.frames_drawn == sum(recorded.driving(stamp) for stamp in drawn)
+
+
+def test_the_car_drives_by_the_attacked_image(recorded: Recorded) -> None:
+    said, attacked = recorded.messages(SAID), recorded.messages(ATTACKED)
+    commands = {stamp: m.drive.steering_angle for stamp, m in recorded.messages(COMMAND).items() if stamp in attacked}
+    assert len(commands) >= 10
+    expected = steering(recorded.policy, [attacked[stamp] for stamp in commands])
+    assert list(commands.values()) == pytest.approx(expected, abs=1e-5)
+    both = [stamp for stamp in commands if stamp in said and said[stamp].drawn]
+    driven, by_attacked, by_clean = np.array(
+        [(commands[stamp], said[stamp].attacked_rad, said[stamp].clean_rad) for stamp in both]
+    ).T
+    assert driven == pytest.approx(by_attacked, abs=1e-6)
+    assert np.abs(driven - by_clean).mean() > 0.005
