@@ -20,7 +20,7 @@ def rows_of(summary: dict[str, Any]) -> list[tuple[str, float, str, str, bool | 
     rows: list[tuple[str, float, str, str, bool | None, str]] = []
     for name, drive in summary["old_attacks"].items():
         note = (
-            f"from a start that nothing has seen, deployed: original undisturbed {drive['original_undisturbed_m']:.2f} m, attacked "
+            f"one seed, one start that nothing has seen, deployed: original undisturbed {drive['original_undisturbed_m']:.2f} m, attacked "
             f"{drive['original_attacked_m']:.2f} m; retrained undisturbed {drive['retrained_undisturbed_m']:.2f} m, attacked {drive['retrained_attacked_m']:.2f} m"
         )
         line = f"#5 retrained under the old attack, {name}, over the original undisturbed"
@@ -29,6 +29,8 @@ def rows_of(summary: dict[str, Any]) -> list[tuple[str, float, str, str, bool | 
         for name in each["surrogate"]:
             line = f"#5 attack -> retrain -> attack, round {number}, {name}, deployed"
             note = f"in the learned scene {each['surrogate'][name]:.2f} x; victim {each['victim'][:12]}, gradient, one seed"
+            if number == len(summary["rounds"]) - 1 and max(each["surrogate"].values()) >= summary["pays_ratio"]:
+                note += f"; the number of rounds ended the loop: an attack pays from {summary['pays_ratio']:g} x in the learned scene"
             rows.append((line, each["deployed"][name], "x no attack", "", None, note))
     return rows
 
