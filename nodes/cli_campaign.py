@@ -176,6 +176,23 @@ def predict(
 
 
 @app.command()
+def maps(
+    file: File,
+    folder: Folder = None,
+    only: Only = "",
+    number: Annotated[int, typer.Option("--object", min=0, help="Which object is moved.")] = 0,
+    overrides: Overrides = None,
+) -> None:
+    """Draw the loss landscape and the robustness map (starts x moves of an object) of finished cells that have placed objects."""
+    os.environ.setdefault("MUJOCO_GL", "egl")
+    from nodes.campaign.maps import map_cells
+
+    campaign, cells = _load(file, folder, overrides, only)
+    for picture in map_cells(campaign, cells, number):
+        print(picture)
+
+
+@app.command()
 def publish(
     file: File,
     folder: Folder = None,

@@ -4,6 +4,7 @@ A module of cells has one function that it must have, and may have others::
 
     def run_cell(experiment, scenario, victim, method, seed, folder, report) -> dict      # a cell, see report/cells.py
     def search_cell(experiment, scenario, victim, method, seed, folder, report) -> None   # its part that may run beside others
+    def draw_maps(experiment, scenario, victim, seed, extra, number, folder, report) -> list[Path]   # pictures about what a finished cell found
     def load_experiment(file, setting, overrides, folder) -> experiment
     def prepare(experiment, report) -> None                                               # what all its cells need
     def cell_inputs(experiment, scenario, victim, method, seed) -> dict                   # what the result depends on, JSON

@@ -13,7 +13,7 @@ from typing import Any
 
 from advnerf_core.driving.policy import load_policy
 from nodes.campaign.kinds import stage_digests
-from nodes.intersection import run
+from nodes.intersection import pose_maps, run
 from nodes.intersection.cell_settings import split_settings
 from nodes.intersection.cells import require_known
 from nodes.intersection.context import Experiment
@@ -56,6 +56,14 @@ def cell_inputs(experiment: PoseExperiment, scenario: str, victim: str, method: 
     if not file.exists():
         return {"stages": stage_digests(experiment.folder), "victim": None}
     return {"everything": pose_hash(experiment, load_policy(file), scenario, seed, experiment.poses)}
+
+
+def draw_maps(
+    experiment: PoseExperiment, scenario: str, victim: str, seed: int, found: dict[str, Any], number: int, folder: Path, report: Report
+) -> list[Path]:  # fmt: skip
+    """Loss landscape and robustness map of a finished cell; see `nodes/intersection/pose_maps.py`."""
+    policy = load_policy(victim_file(experiment, victim))
+    return pose_maps.draw_maps(experiment, policy, scenario, seed, found, number, folder, report, experiment.poses)
 
 
 def run_cell(

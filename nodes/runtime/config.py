@@ -168,7 +168,9 @@ def _explain(model: type[BaseModel], document: Document, error: ValidationError)
         what = f"{name} is missing"
     else:
         message = str(first["msg"]).removeprefix("Value error, ")
-        what = f"{name}: {message[:1].lower()}{message[1:]}, got {first['input']!r:.80}"
+        message = message[:1].lower() + message[1:]
+        # A check of several keys together says itself what it got; all of a file would not help.
+        what = f"{name}: {message}, got {first['input']!r:.80}" if key else message
     more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
     return f"{document.place(key)}: {what}{more}"
 

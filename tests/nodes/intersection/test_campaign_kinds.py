@@ -7,14 +7,20 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
 import pytest
 
+from advnerf_core.driving.policy import load_policy
 from nodes.campaign.kinds import load_kind, settings_hash
 from nodes.intersection import mesh_cells, pose_cells
 from nodes.intersection.cells import CellError
+from nodes.intersection.config import RetrainConfig
 from nodes.intersection.context import Experiment
 from nodes.intersection.mesh_cells import MeshExperiment
+from nodes.intersection.policy import victim_file
 from nodes.intersection.pose_cells import PoseExperiment
+from nodes.intersection.pose_maps import PoseMapSettings, draw_maps
 from nodes.intersection.poses import PoseSettings
 from nodes.runtime.errors import ConfigError
 
@@ -34,10 +40,10 @@ def posed(trained: Experiment, **settings: Any) -> PoseExperiment:
 def test_settings_of_cells_are_told_apart_from_those_of_the_experiment(
     tiny_file: Callable[..., Path], tmp_path: Path
 ) -> None:
-    changes = ["poses.move_m=0.5", "horizon=7", "poses.colours=false"]
+    changes = ["poses.move_m=0.5", "horizon=4", "poses.colours=false"]
     found = pose_cells.load_experiment(tiny_file(), "tiny", changes, tmp_path)
     assert found.poses == PoseSettings(move_m=0.5, colours=False)
-    assert found.config.horizon == 7
+    assert found.config.horizon == 4
     meshes = mesh_cells.load_experiment(
         tiny_file(), "tiny", ["meshes.target=shape", "meshes.limits.bound_m=0.7", "meshes.ball_m=0.6"], tmp_path
     )
@@ -117,8 +123,6 @@ def test_a_cell_of_places_alone_keeps_the_plain_colours(trained: Experiment, tmp
 
 
 def test_the_retrained_victim_is_that_of_the_first_round(trained: Experiment, tmp_path: Path) -> None:
-    from nodes.intersection.config import RetrainConfig
-
     folder = shutil.copytree(trained.folder, tmp_path / "run")
     config = trained.config.model_copy(update={"horizon": 2, "retrain": RetrainConfig()})
     experiment = PoseExperiment(config, trained.file, folder, "tiny", PoseSettings(samples=1, steps=1))
@@ -131,3 +135,24 @@ def test_the_retrained_victim_is_that_of_the_first_round(trained: Experiment, tm
     assert cell == kind.run_cell(experiment, *asked, tmp_path, silent)
     naive = kind.run_cell(experiment, "left", "naive", "none", 0, tmp_path, silent)
     assert json.dumps(naive["deployed"]) == json.dumps(cell["deployed"])  # the very same weights
+
+
+def test_maps_are_of_what_the_cell_found(trained: Experiment, tmp_path: Path) -> None:
+    experiment = posed(trained)
+    cell = pose_cells.run_cell(experiment, *PLACES, tmp_path, silent)
+    victim = load_policy(victim_file(trained, "hardened"))
+    asked = (experiment, victim, "right", 0, cell["extra"])
+    small = PoseMapSettings(points=(2, 2), sideways_m=(0.0, 0.3), object_moves_m=((0.0, 0.0), (0.0, 0.2)))
+    pictures = draw_maps(*asked, 1, tmp_path, silent, experiment.poses, small)
+    assert [cv2.imread(str(picture)) is not None for picture in pictures] == [True, True]
+    rows = json.loads((tmp_path / f"robustness_{trained.world.objects[1].name}.json").read_text())["cells"]
+    # The first start past objects that nobody has moved is the cell's own drive.
+    assert rows["0"][0][0] == pytest.approx(np.mean(cell["surrogate"]["total_cte_m"]), rel=1e-6)
+    assert len(rows) == 2
+    kept = pictures[0].with_suffix(".json").stat().st_mtime_ns
+    draw_maps(*asked, 1, tmp_path, silent, experiment.poses, small)
+    assert pictures[0].with_suffix(".json").stat().st_mtime_ns == kept
+    with pytest.raises(CellError, match="expected an object of 0 to 4, got 5"):
+        draw_maps(*asked, 5, tmp_path, silent, experiment.poses, small)
+    with pytest.raises(CellError, match="placed the objects"):
+        draw_maps(experiment, victim, "right", 0, {}, 1, tmp_path, silent, experiment.poses, small)
