@@ -90,7 +90,7 @@ def drive_live(experiment: Experiment, live: LiveRun, folder: Path, attack: Path
     plan = TrialPlan(experiment.room.start_pose, horizon.ticks * horizon.dt_s + 0.2, deploy.nodes)
     run_dir = folder / live.name
     outcome = run_trial(
-        experiment.launch_file, _overrides(experiment, live, attack), run_dir, plan, deploy.ready_timeout_s
+        experiment.launch_file, live_overrides(experiment, live, attack), run_dir, plan, deploy.ready_timeout_s
     )
     bag = run_dir / "bag"
     states = trajectory(bag, outcome.start_real_ns, horizon)
@@ -123,7 +123,7 @@ def live_horizon(experiment: Experiment, live: LiveRun) -> Horizon:
     return Horizon(ticks, CONTROL_PERIOD_S, experiment.room.off_track_m)
 
 
-def _overrides(experiment: Experiment, live: LiveRun, attack: Path | None) -> list[str]:
+def live_overrides(experiment: Experiment, live: LiveRun, attack: Path | None) -> list[str]:
     policy = victim_file(experiment, live.victim)
     calibration = experiment.calibration_file("camera").parent
     overrides = [
