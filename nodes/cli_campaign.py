@@ -79,7 +79,7 @@ def run(
     ] = False,
     overrides: Overrides = None,
 ) -> None:
-    """Run the cells that are not there yet; each is kept when it is finished, so that a run may be stopped at any time."""
+    """Run the cells that are not there yet, and print the table; each is kept when it is finished, so that a run may be stopped at any time."""
     os.environ.setdefault("MUJOCO_GL", "egl")
     from nodes.campaign.run import Options, run_campaign
     from nodes.runtime.errors import ConfigError
@@ -90,6 +90,8 @@ def run(
     options = Options(jobs or 0, threads or 0, backend, address, retry, gate, search_only)  # type: ignore[arg-type]
     ended = run_campaign(campaign, cells, options, lambda text: print(text, flush=True))
     wrong = [end for end in ended if end.how != "done"]
+    if not search_only:
+        _show_table(campaign, cells, None)
     for end in wrong:
         say_error(f"{end.name}: {end.text}")
     if wrong:
@@ -127,6 +129,10 @@ def table_command(
     overrides: Overrides = None,
 ) -> None:
     """Print the transfer table and the targets, and write them as JSON, CSV, Markdown and a page with the clips by outcome."""
+    _show_table(*_load(file, folder, overrides, only), output)
+
+
+def _show_table(campaign: Campaign, cells: list[Cell], output: Path | None) -> None:
     from rich.console import Console
 
     from advnerf_core.files import write_atomically
@@ -137,7 +143,6 @@ def table_command(
     from nodes.campaign.run import statuses
     from nodes.campaign.table import campaign_table, write_table
 
-    campaign, cells = _load(file, folder, overrides, only)
     found = statuses(campaign, cells)
     full = campaign_table(campaign, found)
     pairs = predicted(campaign.folder, list(full.cells.values()))

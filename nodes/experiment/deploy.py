@@ -124,6 +124,7 @@ def live_horizon(experiment: Experiment, live: LiveRun) -> Horizon:
 
 
 def live_overrides(experiment: Experiment, live: LiveRun, attack: Path | None) -> list[str]:
+    """What the launch file is told for a run: its calibration and room, its victim, its attack."""
     policy = victim_file(experiment, live.victim)
     calibration = experiment.calibration_file("camera").parent
     overrides = [
