@@ -87,6 +87,9 @@ def pose_attack(
     fields = [each for each in surrogate.objects if isinstance(each, VoxelGridObject)]
     if len(fields) < len(surrogate.objects):
         raise ValueError("expected objects made of voxels, got a mesh: only voxels are differentiable in their pose")
+    # A gradient is of the frames that were driven past: the scene in them is not rendered a second time.
+    one_evaluation = problem.steps * len(problem.start_states) * surrogate.background_frame_bytes
+    surrogate = surrogate.remembering(min(one_evaluation, problem.cache_bytes))
     sensor = PlacedSensor(surrogate, PoseSpace(fields, bounds, keep_out), free_colours, colours)
     moving = replace(problem, sensor=sensor)
     if method == "gradient":

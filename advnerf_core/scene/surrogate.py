@@ -25,6 +25,7 @@ from advnerf_core.geometry import Array, Pinhole, planar_poses
 from advnerf_core.render.cast_object import ObjectCast, cast_objects, made_opaque
 from advnerf_core.render.composite import composite, sparse_shares
 from advnerf_core.render.soft_pose import render_soft
+from advnerf_core.scene.remembered import RememberedBackground
 
 BackgroundRenderer = Callable[[Array, Pinhole], Sequence[Any]]
 """``(T_world_from_camera [B, 4, 4], pinhole) -> (rgb [B, H, W, 3] in 0..1, planar depth [B, H, W] in metres, ...)``."""
@@ -170,6 +171,17 @@ class Surrogate:
     def camera_poses(self, states: Tensor) -> Array:
         """``T_world_from_camera [B, 4, 4]`` at car states ``[B, n]``, detached."""
         return planar_poses(states.detach().cpu().numpy()) @ self.T_car_from_camera
+
+    @property
+    def background_frame_bytes(self) -> int:
+        """What one kept frame takes: colours and depth in float32."""
+        return 4 * 4 * self.camera.height * self.camera.width
+
+    def remembering(self, budget_bytes: int) -> Surrogate:
+        """The same surrogate, which keeps as many of the last background frames as fit into a budget of memory."""
+        found = copy.copy(self)
+        found._background = RememberedBackground(self._background, budget_bytes)
+        return found
 
     @torch.no_grad()
     def prepare(self, T_world_from_camera: ArrayLike) -> Frames:

@@ -291,6 +291,28 @@ def test_one_call_finds_poses_and_gives_what_a_deployment_shows():
         pose_attack(problem, space.bounds, space.keep_out, "cem")
 
 
+def test_the_scene_of_a_drive_is_rendered_once_for_its_gradient_too():
+    placed_one = moving(2)
+    surrogate, space = placed_one.sensor.surrogate, placed_one.sensor.space
+    rendered = []
+
+    def counted(poses, pinhole):
+        rendered.extend(poses)
+        return background(poses, pinhole)
+
+    background, surrogate._background = surrogate._background, counted
+    found = {}
+    for cache_bytes in (0, 2**20):
+        rendered.clear()
+        problem = dataclasses.replace(placed_one, sensor=surrogate, cache_bytes=cache_bytes)
+        result = pose_attack(problem, space.bounds, space.keep_out, budget=MultiStart(1, 2), seed=7)
+        found[cache_bytes] = (result.search.theta, len(rendered))
+    frames = problem.steps * len(problem.start_states)
+    # Two evaluations with gradients and the last one without; what is kept are those of one drive.
+    assert found[0][1] - found[2**20][1] >= 2 * (frames - len(problem.start_states))
+    assert torch.equal(found[0][0], found[2**20][0])
+
+
 def test_surrogates_for_retraining_have_their_objects_at_allowed_places():
     sensor = moving(1, objects=2).sensor
     made = randomly_placed(sensor.surrogate, sensor.space.bounds, sensor.space.keep_out, 3, seed=1)
