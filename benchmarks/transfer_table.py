@@ -62,6 +62,8 @@ def note_of(row: TableRow, cells: Sequence[CellResult] = ()) -> str:
     ]
     if len(cells) > 1:
         parts.append("by seed " + ", ".join(f"{each:.2f}" for each in ratios_of(cells, row.domain)) + " x")
+    if len(cells) > 1 and len({cell.surrogate.none_total_cte_m for cell in cells}) == 1:
+        parts.append("all seeds have the same start, so they differ by the search's noise and live timing alone")
     if row.missing:
         parts.append(f"seeds {', '.join(map(str, row.missing))} are missing")
     machines = sorted({cell.machine for cell in cells})

@@ -49,6 +49,9 @@ def test_a_row_of_the_table_has_its_machines_and_waits_for_its_seeds():
     assert "machine 0, machine 1" in note
     assert "total CTE 9.00 +- 0.00 m of 2.00 m" in note
     assert "by seed 4.50, 4.50 x" in note
+    assert "the same start" in note
+    other = [cells[0], CellResult.model_validate(cell(1, "gradient", 9.0, none_m=3.0))]
+    assert "the same start" not in transfer_table.note_of(rows[0][0], other)
     whole = make_table([Wanted("right", "", "hardened", "gradient", (0, 1))], cells)
     assert [target.met for _, target in transfer_table.rows_of(whole)] == [True, True]
 
