@@ -127,7 +127,7 @@ def _beats_random(table: TransferTable, scenario: str) -> TableTarget:
         (None, 0.0) if limit is None or random is None or random.missing else _verdict(row, value, limit, at_least=True)
     )
     met = met if value != limit else False  # as good as random is not better
-    target = "> random" if limit is None else f"> {limit:.2f} (random)"
+    target = "> random" if limit is None else f"> random {limit:.2f}"
     seeds = len(row.seeds) if row else 0
     return TableTarget(
         scenario, "gradient", "deployed", "ratio to no attack", target, value, met, seeds, short, RETRAINED
