@@ -13,8 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
+from advnerf_core.attack.artifact import load_attack
 from benchmarks.results import record_row
-from nodes.evaluation import Counterfactual, Timing, counterfactual, timing
+from nodes.evaluation import Counterfactual, Timing, attack_ids, counterfactual, timing
 from nodes.experiment.attack import Search, attack_path
 from nodes.experiment.context import CONTROL_PERIOD_S, Experiment
 from nodes.experiment.deploy import LiveRun, live_horizon, live_overrides
@@ -22,6 +23,7 @@ from nodes.experiment.run import load_experiment
 from nodes.runtime.clock import NS_PER_S
 from nodes.trial import TrialPlan
 from nodes.trial_runner import run_trial
+from nodes.trials.campaign import COUNTED_STOPS
 
 LIVE = LiveRun("hardened", "gradient", 0)
 
@@ -36,6 +38,10 @@ def drive(experiment: Experiment, folder: Path, compare: bool) -> tuple[Timing, 
     horizon = live_horizon(experiment, LIVE)
     plan = TrialPlan(experiment.room.start_pose, horizon.ticks * horizon.dt_s + 0.2, tuple(nodes))
     outcome = run_trial(experiment.launch_file, overrides, folder, plan, experiment.config.deploy.ready_timeout_s)
+    if outcome.stopped_early and not any(word in outcome.stopped_early for word in COUNTED_STOPS):
+        raise SystemExit(f"the stack stopped the drive: {outcome.stopped_early}; run it again on idle cores")
+    if (shown := attack_ids(folder / "bag")) != {load_attack(attack).attack_id}:
+        raise SystemExit(f"expected {load_attack(attack).attack_id} in the frames of {folder}, got {sorted(shown)}")
     last_frame_ns = outcome.end_real_ns - round(CONTROL_PERIOD_S * NS_PER_S)
     times = timing(folder / "bag", outcome.start_real_ns, last_frame_ns)
     return times, counterfactual(folder / "bag", outcome.start_real_ns, last_frame_ns)

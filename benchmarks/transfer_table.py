@@ -21,6 +21,7 @@ from advnerf_core.report.transfer_targets import VICTIM, TableTarget, table_targ
 from benchmarks.results import record_row
 from nodes.campaign.config import load_campaign
 from nodes.campaign.predictions import predicted, prediction_file
+from nodes.campaign.run import gate_key
 from nodes.campaign.table import PUBLISHED, published_table
 
 CAMPAIGN = Path("launch/paper.campaign.yaml")
@@ -46,9 +47,11 @@ MISSED: dict[tuple[str, str], str] = {
 }  # fmt: skip
 
 
-def line_of(row: TableRow) -> str:
+def line_of(row: TableRow, cells: Sequence[CellResult] = ()) -> str:
     """What a row of the ledger is called, e.g. ``#5 straight, gradient, surrogate``."""
-    parts = [row.scenario, row.placement, METHOD_NAMES.get(row.method, row.method), row.domain]
+    own_frames = row.domain == "surrogate" and any(cell.extra.get("frames") == "deployment" for cell in cells)
+    where = "ideal car over the same frames" if own_frames else row.domain
+    parts = [row.scenario, row.placement, METHOD_NAMES.get(row.method, row.method), where]
     return "#5 " + ", ".join(filter(None, [*parts, "" if row.victim == VICTIM else f"{row.victim} victim"]))
 
 
@@ -130,10 +133,10 @@ def rows_of(table: TransferTable) -> list[tuple[TableRow, TableTarget | None]]:
     ]
 
 
-def gate_rows(folder: Path) -> list[tuple[str, float, str, str, bool, str, str]]:
-    """How alike the learned scene is, for every scenario and victim that the gate has judged, on held-out views."""
+def gate_rows(folder: Path, judged: set[str]) -> list[tuple[str, float, str, str, bool, str, str]]:
+    """How alike the learned scene is, for every scenario and victim of the campaign that the gate has judged, on held-out views."""
     rows = []
-    for file in sorted((folder / "gate").glob("*.json")):
+    for file in sorted(file for file in (folder / "gate").glob("*.json") if file.stem in judged):
         verdict = json.loads(file.read_text(encoding="utf-8"))
         n = verdict["numbers"]
         note = (
@@ -204,7 +207,7 @@ def main() -> None:
 
     for row, target in rows_of(table):
         record(
-            line_of(row), row.ratio or 0.0, "x no attack", f"{target.target} x" if target else "",
+            line_of(row, table.cells_of(row)), row.ratio or 0.0, "x no attack", f"{target.target} x" if target else "",
             target.met if target else None, note_of(row, cells := table.cells_of(row))
             + why_missed(target, row, cells),
         )  # fmt: skip
@@ -216,7 +219,10 @@ def main() -> None:
             note = f"{target.seeds} seeds" + (how_far(cells) if "off the track" in target.what else "")
             note += why_missed(target, row_of_target, cells) if row_of_target else ""
             record(line, target.value, "", target.target, target.met, note)
-    for told in [*gate_rows(folder), *skill_rows(folder, list(table.cells.values()), str(arguments.campaign))]:
+    for told in [
+        *gate_rows(folder, {gate_key(cell) for cell in campaign.cells}),
+        *skill_rows(folder, list(table.cells.values()), str(arguments.campaign)),
+    ]:
         record(*told)
 
 

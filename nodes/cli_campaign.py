@@ -91,7 +91,7 @@ def run(
     ended = run_campaign(campaign, cells, options, lambda text: print(text, flush=True))
     wrong = [end for end in ended if end.how != "done"]
     if not search_only:
-        _show_table(campaign, cells, None)
+        _show_table(campaign, campaign.cells, None)
     for end in wrong:
         say_error(f"{end.name}: {end.text}")
     if wrong:

@@ -16,6 +16,7 @@ from advnerf_core.attack.placement import KeepOut, PoseBounds, PoseSpace, placed
 from advnerf_core.attack.poses import MultiStart, judge, multi_start, random_poses
 from advnerf_core.attack.search import OnEvaluation, SearchResult
 from advnerf_core.fields.voxel_grid import VoxelGridObject
+from advnerf_core.scene.remembered import frame_bytes
 from advnerf_core.scene.surrogate import Surrogate
 
 Method = Literal["gradient", "random"]
@@ -88,7 +89,7 @@ def pose_attack(
     if len(fields) < len(surrogate.objects):
         raise ValueError("expected objects made of voxels, got a mesh: only voxels are differentiable in their pose")
     # A gradient is of the frames that were driven past: the scene in them is not rendered a second time.
-    one_evaluation = problem.steps * len(problem.start_states) * surrogate.background_frame_bytes
+    one_evaluation = problem.steps * len(problem.start_states) * frame_bytes(surrogate.camera)
     surrogate = surrogate.remembering(min(one_evaluation, problem.cache_bytes))
     sensor = PlacedSensor(surrogate, PoseSpace(fields, bounds, keep_out), free_colours, colours)
     moving = replace(problem, sensor=sensor)

@@ -53,7 +53,7 @@ class CellResult(BaseModel):
 
     Attributes:
         scenario: straight, right, left, green_screen, monitor or another.
-        victim: ``hardened`` or ``naive``.
+        victim: ``hardened``, ``naive`` or ``retrained``.
         method: ``none``, ``random``, ``cem`` or ``gradient``.
         seed: Seed of starts and search.
         placement: Name of the placement; empty for the scenario's own.
@@ -62,7 +62,7 @@ class CellResult(BaseModel):
         seconds: Time it took [s].
         machine: Where.
         date: When, ISO.
-        surrogate: Drives in the learned scene.
+        surrogate: Drives in the learned scene; of an attack over the deployment scene's own frames (meshes) those of the ideal car there.
         deployed: Drives where it is deployed; None as long as they were not driven.
         extra: Anything else, such as the file of a clip.
     """

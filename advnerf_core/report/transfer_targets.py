@@ -126,7 +126,8 @@ def _beats_random(table: TransferTable, scenario: str) -> TableTarget:
     met, short = (
         (None, 0.0) if limit is None or random is None or random.missing else _verdict(row, value, limit, at_least=True)
     )
-    met = met if value != limit else False  # as good as random is not better
+    if met and value == limit:  # as good as random is not better
+        met = False
     target = "> random" if limit is None else f"> random {limit:.2f}"
     seeds = len(row.seeds) if row else 0
     return TableTarget(

@@ -14,6 +14,11 @@ from torch import Tensor
 from advnerf_core.geometry import Pinhole
 
 
+def frame_bytes(pinhole: Pinhole) -> int:
+    """What one kept frame takes: colours and depth in float32."""
+    return 4 * 4 * pinhole.height * pinhole.width
+
+
 class RememberedBackground:
     """A background renderer that keeps the frames it gave last, each by its pose to the bit.
 

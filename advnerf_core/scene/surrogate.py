@@ -172,11 +172,6 @@ class Surrogate:
         """``T_world_from_camera [B, 4, 4]`` at car states ``[B, n]``, detached."""
         return planar_poses(states.detach().cpu().numpy()) @ self.T_car_from_camera
 
-    @property
-    def background_frame_bytes(self) -> int:
-        """What one kept frame takes: colours and depth in float32."""
-        return 4 * 4 * self.camera.height * self.camera.width
-
     def remembering(self, budget_bytes: int) -> Surrogate:
         """The same surrogate, which keeps as many of the last background frames as fit into a budget of memory."""
         found = copy.copy(self)

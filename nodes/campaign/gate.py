@@ -6,6 +6,7 @@ one has no gate. See `nodes/experiment/fidelity.py`.
 
 from __future__ import annotations
 
+import hashlib
 import json
 from pathlib import Path
 from typing import Any
@@ -54,7 +55,10 @@ def cached_verdict(
     """The verdict on held-out views, judged again only if scene, policy or limits changed; None where the kind has no gate."""
     if kind.fidelity is None:
         return None
-    key = hash_of([stage_digests(experiment.folder), limits.model_dump(mode="json"), scenario, victim])
+    policy, _ = kind.fidelity.policy_of(experiment, victim, scenario)
+    key = hash_of(
+        [stage_digests(experiment.folder), _weights_sha256(policy), limits.model_dump(mode="json"), scenario, victim]
+    )
     try:
         kept = json.loads(file.read_text(encoding="utf-8"))
         if kept["key"] == key:
@@ -64,6 +68,14 @@ def cached_verdict(
     verdict = judge_scene(kind, experiment, scenario, victim, limits)[0][1]
     write_atomically(file, json.dumps({"key": key, **verdict.record()}, indent=1) + "\n")
     return verdict
+
+
+def _weights_sha256(policy: Any) -> str:
+    """Hash of a network's weights; a retrained one is of no stage that all cells need."""
+    digest = hashlib.sha256()
+    for name, weight in sorted(getattr(policy, "state_dict", dict)().items()):
+        digest.update(name.encode() + weight.detach().cpu().numpy().tobytes())
+    return digest.hexdigest()
 
 
 def predict_cell(

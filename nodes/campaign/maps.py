@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from advnerf_core.report.cells import NONE
 from nodes.campaign.config import Campaign, Cell
 from nodes.campaign.kinds import load_kind
 from nodes.campaign.run import plan_cells
@@ -31,7 +32,7 @@ def map_cells(campaign: Campaign, cells: Sequence[Cell], number: int) -> list[Pa
         (planned,) = plan_cells(campaign, [cell], experiments)
         draw = getattr(load_kind(planned.job.kind).module, "draw_maps", None)
         status = store.status(cell, planned.job.settings_hash)
-        if draw is None or status.state != "done" or status.result is None or "placements" not in status.result.extra:
+        if draw is None or cell.method == NONE or status.state != "done" or status.result is None:
             continue
         experiment = experiments[cell.scenario, cell.placement]
         with ProgressDisplay() as display:

@@ -19,8 +19,7 @@ from nodes.campaign.kinds import load_kind
 from nodes.campaign.run import plan_cells
 from nodes.campaign.store import store_of
 
-# Only these have work of the settings as they are; whether the search is among it, the kind says.
-_MAY_BE_SEARCHED = ("done", "begun", "failed")
+_KEYS = {"ratio", "ratio_low", "ratio_high", "retained", "total_cte_m", "clean_drive"}
 
 
 def predict_campaign(campaign: Campaign, cells: Sequence[Cell], say: Callable[[str], None], draws: int = 6) -> int:
@@ -36,10 +35,11 @@ def predict_campaign(campaign: Campaign, cells: Sequence[Cell], say: Callable[[s
             continue
         planned = plan_cells(campaign, [cell], experiments)[0]
         kind = load_kind(planned.job.kind)
-        if not kind.predicts or store.status(cell, planned.job.settings_hash).state not in _MAY_BE_SEARCHED:
+        # Work of other settings may hold a search too, of another attack.
+        if not kind.predicts or not store.has_begun(cell.name, planned.job.settings_hash):
             continue
         file = prediction_file(campaign.folder, cell.name)
-        if _kept(file, planned.job.settings_hash) is not None:
+        if kept_prediction(file, planned.job.settings_hash) is not None:
             continue
         experiment = experiments[cell.scenario, cell.placement]
         which = (experiment, planned.job.scenario, cell.victim, cell.method, cell.seed, store.work(cell.name))
@@ -65,7 +65,7 @@ def predicted(folder: Path, results: Sequence[CellResult]) -> list[Predicted]:
     for cell in results:
         if cell.deployed is None or cell.method == NONE:
             continue
-        kept = _kept(prediction_file(folder, cell.name), cell.settings_hash)
+        kept = kept_prediction(prediction_file(folder, cell.name), cell.settings_hash)
         if kept is None:
             continue
         none_m = sum(cell.deployed.none_total_cte_m)
@@ -82,9 +82,10 @@ def prediction_file(folder: Path, name: str) -> Path:
     return folder / "predictions" / f"{name}.json"
 
 
-def _kept(file: Path, settings_hash: str) -> dict[str, Any] | None:
+def kept_prediction(file: Path, settings_hash: str) -> dict[str, Any] | None:
+    """A prediction that was made of a cell with these settings; None where there is none."""
     try:
         kept: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
-    return kept if kept.get("settings_hash") == settings_hash else None
+    return kept if kept.get("settings_hash") == settings_hash and kept.keys() >= _KEYS else None

@@ -130,16 +130,11 @@ def run_campaign(campaign: Campaign, cells: Sequence[Cell], options: Options, sa
         say("nothing to do: every cell is there")
         return []
     jobs, threads = _shares(options)
-    what = "search" if options.search_only else "run"
-    say(f"{len(wanted)} of {len(cells)} cells to {what}, {jobs} at a time, {threads} threads each")
-    searches = [
-        replace(each.job, threads=threads, phase="search")
-        for each in wanted
-        if each.searches and (each.live or options.search_only)
-    ]
     if options.search_only:
-        return _run_beside(searches, jobs, options, say)
-    beside = [replace(each.job, threads=threads) for each in wanted if not each.live] + searches
+        return _search(wanted, jobs, threads, options, say)
+    say(f"{len(wanted)} of {len(cells)} cells to run, {jobs} at a time, {threads} threads each")
+    beside = [replace(each.job, threads=threads) for each in wanted if not each.live]
+    beside += [replace(each.job, threads=threads, phase="search") for each in wanted if each.live and each.searches]
     ended = _run_beside(beside, jobs, options, say)
     lost = {end.name for end in ended if end.how != "done"}
     searched = {job.name for job in beside if job.phase == "search"}
@@ -149,6 +144,20 @@ def run_campaign(campaign: Campaign, cells: Sequence[Cell], options: Options, sa
         if each.live and each.cell.name not in lost:
             ended.append(_tell(run_in_process(replace(each.job, threads=_cores())), say))
     return ended
+
+
+def _search(wanted: Sequence[Planned], jobs: int, threads: int, options: Options, say: Say) -> list[Ended]:
+    """Only the searches of cells; what has none apart from its drives waits."""
+    found = [replace(each.job, threads=threads, phase="search") for each in wanted if each.searches]
+    kinds = sorted({each.job.kind for each in wanted if not each.searches})
+    if not found:
+        raise ConfigError(
+            f"expected cells whose search can be run alone, got kinds {', '.join(kinds)}; run them without --search-only"
+        )
+    for kind in kinds:
+        say(f"cells of kind {kind} search and drive in one and are left out")
+    say(f"{len(found)} cells to search, {jobs} at a time, {threads} threads each")
+    return _run_beside(found, jobs, options, say)
 
 
 def _inside(scenario: ScenarioConfig, cell: Cell) -> str:
@@ -164,16 +173,17 @@ def _experiment(campaign: Campaign, cell: Cell) -> Any:
 
 
 def _prepare(campaign: Campaign, cells: Sequence[Cell], say: Say) -> None:
-    done: set[Path] = set()
+    done: set[tuple[Path, str]] = set()
     # All files are read before anything is made, so that a mistake in the last does not cost the hours of the first.
     experiments = {(cell.scenario, cell.placement): (cell, _experiment(campaign, cell)) for cell in cells}
     for cell, experiment in experiments.values():
         folder = campaign.run_folder(cell)
-        if folder in done:
+        kind = campaign.scenario(cell).kind  # kinds need different stages of one experiment
+        if (folder, kind) in done:
             continue
-        done.add(folder)
+        done.add((folder, kind))
         say(f"{cell.scenario}{'.' * bool(cell.placement)}{cell.placement}: {folder}")
-        load_kind(campaign.scenario(cell).kind).prepare(experiment, _PrintedReport(say))
+        load_kind(kind).prepare(experiment, _PrintedReport(say))
 
 
 def _past_the_gate(campaign: Campaign, cells: Sequence[Cell], options: Options, say: Say) -> list[Cell]:

@@ -83,11 +83,15 @@ class Store:
     def begin(self, name: str, settings_hash: str) -> Path:
         """The cell's folder, empty unless work on the same settings was begun there."""
         work = self.work(name)
-        if self._begun_with(name) != settings_hash:
+        if not self.has_begun(name, settings_hash):
             shutil.rmtree(work, ignore_errors=True)
         (work / _ERROR).unlink(missing_ok=True)
         write_atomically(work / _KEY, settings_hash + "\n")
         return work
+
+    def has_begun(self, name: str, settings_hash: str) -> bool:
+        """Whether what is in the cell's folder is of these settings."""
+        return self._begun_with(name) == settings_hash
 
     def status(self, cell: Cell, settings_hash: str | None) -> CellStatus:
         """Where a cell is.
@@ -108,7 +112,7 @@ class Store:
             return CellStatus(cell, "done" if same else "changed", "" if same else "of other settings", result)
         if settings_hash is not None and (error := self.error(name, settings_hash)):
             return CellStatus(cell, "failed", error)
-        begun = settings_hash is not None and self._begun_with(name) == settings_hash
+        begun = settings_hash is not None and self.has_begun(name, settings_hash)
         return CellStatus(cell, "begun" if begun else "missing", self._last_line(name) if begun else "")
 
     def _begun_with(self, name: str) -> str:

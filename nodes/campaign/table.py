@@ -13,6 +13,7 @@ from advnerf_core.report.cells import read_cells
 from advnerf_core.report.transfer import TransferTable, Wanted, make_table
 from advnerf_core.report.transfer_page import as_csv, as_json, as_markdown, gather_clips, render_transfer_page
 from nodes.campaign.config import Campaign
+from nodes.campaign.predictions import kept_prediction, prediction_file
 from nodes.campaign.run import gate_key
 from nodes.campaign.store import CellStatus, store_of
 from nodes.runtime.errors import ConfigError
@@ -82,8 +83,10 @@ def publish(campaign: Campaign, found: Sequence[CellStatus], folder: Path) -> tu
     changed, same = [], []
     for each in found:
         target = folder / campaign.config.name / f"{each.cell.name}.json"
+        prediction = prediction_file(folder / campaign.config.name, each.cell.name)
         if each.state == "changed":
             target.unlink(missing_ok=True)
+            prediction.unlink(missing_ok=True)
         if each.state != "done":
             continue
         text = store_of(campaign).result_file(each.cell.name).read_text(encoding="utf-8")
@@ -92,12 +95,19 @@ def publish(campaign: Campaign, found: Sequence[CellStatus], folder: Path) -> tu
             continue
         write_atomically(target, text)
         changed.append(each.cell.name)
-    kept = {f"predictions/{name}.json" for name in (*changed, *same)}
-    kept |= {f"gate/{gate_key(each.cell)}.json" for each in found if each.state == "done"}
-    for name in sorted(kept):
-        if (campaign.folder / name).exists():
-            write_atomically(folder / campaign.config.name / name, (campaign.folder / name).read_text(encoding="utf-8"))
+    _publish_beside(campaign, [each for each in found if each.state == "done"], folder / campaign.config.name)
     return changed, same
+
+
+def _publish_beside(campaign: Campaign, done: Sequence[CellStatus], folder: Path) -> None:
+    for each in done:
+        assert each.result is not None, "a finished cell has a result"
+        kept = kept_prediction(prediction_file(campaign.folder, each.cell.name), each.result.settings_hash)
+        if kept is not None:
+            write_atomically(prediction_file(folder, each.cell.name), json.dumps(kept, indent=1) + "\n")
+    for name in sorted({f"{gate_key(each.cell)}.json" for each in done}):
+        if (verdict := campaign.folder / "gate" / name).exists():
+            write_atomically(folder / "gate" / name, verdict.read_text(encoding="utf-8"))
 
 
 def published_table(folder: Path, campaign: Campaign) -> TransferTable:

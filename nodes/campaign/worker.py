@@ -196,7 +196,7 @@ def _run(job: Job, store: Store, work: Path, kind: Kind, experiment: Any) -> Non
     arguments = (experiment, job.scenario, job.victim, job.method, job.seed)
     report = _log_progress()
     if job.phase == "search":
-        if kind.search_cell is not None:
+        if kind.search_cell is not None and kind.finished(*arguments) is None:
             kind.search_cell(*arguments, work, report)
         _add_seconds(work, time.monotonic() - began)
         return

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields, is_dataclass
+from dataclasses import asdict, fields, is_dataclass
 from typing import Any, TypeVar, get_type_hints
 
 from pydantic import TypeAdapter, ValidationError
@@ -25,13 +25,13 @@ def split_settings(kind: type[S], section: str, overrides: Sequence[str]) -> tup
     Raises:
         ConfigError: No such setting, or not such a value.
     """
-    own = [text for text in overrides if text.partition("=")[0].partition(".")[0].strip() == section]
+    own = [text for text in overrides if text.partition("=")[0].partition(".")[0] == section]
     document = Document({}, "the changes of the scenario")
     apply_overrides(document, own)
-    data = document.data.get(section) or {}
+    data = document.data.get(section, {})
     _refuse_unknown(kind, data, document, (section,))
     try:
-        settings = TypeAdapter(kind).validate_python(data)
+        settings = TypeAdapter(kind).validate_python(_over(asdict(kind()), data))  # type: ignore[call-overload]
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         key = (section, *first["loc"])
@@ -39,6 +39,12 @@ def split_settings(kind: type[S], section: str, overrides: Sequence[str]) -> tup
             f"{document.place(key)}: {'.'.join(map(str, key))}: {_lower(first['msg'])}, got {first['input']!r:.80}"
         ) from None
     return settings, [text for text in overrides if text not in own]
+
+
+def _over(defaults: dict[str, Any], data: dict[str, Any]) -> dict[str, Any]:
+    """Values over defaults, section by section: a default of the whole may differ from that of its section."""
+    inner = {key: _over(defaults[key], value) for key, value in data.items() if isinstance(defaults.get(key), dict)}
+    return {**defaults, **data, **inner}
 
 
 def _refuse_unknown(kind: Any, data: Any, document: Document, key: tuple[str, ...]) -> None:

@@ -27,7 +27,9 @@ from nodes.intersection.deployed import DressedScene
 from nodes.intersection.drives import deployed_drives
 from nodes.intersection.objects import placed_objects, surrogate_of
 from nodes.intersection.policy import victim_file
+from nodes.intersection.run import stages_of
 from nodes.runtime.errors import RuntimeFault
+from nodes.runtime.stages import is_current
 
 Rgb = NDArray[np.uint8]
 
@@ -89,7 +91,10 @@ def _cell(scenario: str, victim: str, method: str, seed: int) -> Cell:
 
 def _searched_in(experiment: Experiment, cell: Cell, folder: Path) -> Path | None:
     """Where the attack file of a finished search is: the cell's own folder, or the experiment's where the cell was taken from there."""
-    return next((at for at in (folder, experiment.stage_folder("attack")) if attack_path(at, cell).exists()), None)
+    places = [folder]
+    if is_current(stages_of(experiment), experiment.folder, "attack"):
+        places.append(experiment.stage_folder("attack"))
+    return next((at for at in places if attack_path(at, cell).exists()), None)
 
 
 def _theta(experiment: Experiment, scenario: str, victim: str, method: str, seed: int, folder: Path) -> torch.Tensor:

@@ -20,7 +20,7 @@ from nodes.intersection.policy import attackable, victim_file
 from nodes.runtime.stages import Report
 
 FIDELITY = None  # the frames are the deployment scene's own: there is no learned scene to judge
-PREPARED_AT = "policy"
+prepare = run.prepare_victims
 
 
 @dataclass(frozen=True)

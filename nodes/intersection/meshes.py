@@ -12,6 +12,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -66,6 +67,11 @@ class MeshSettings:
     ball_rgb: tuple[float, float, float] = (0.75, 0.1, 0.08)
     limits: ShapeLimits = field(default_factory=lambda: ShapeLimits(bound_m=0.4))
     learning_rate: float | None = None
+
+    def __post_init__(self) -> None:
+        sizes = [each for each in (self.ball_m, self.learning_rate) if each is not None]
+        if self.texels < 1 or not all(np.isfinite(each) and each > 0.0 for each in sizes):
+            raise ValueError(f"expected at least one texel, and a radius and a rate above zero, got {self}")
 
 
 def mesh_objects(experiment: Experiment, settings: MeshSettings) -> list[MeshField]:

@@ -22,6 +22,7 @@ from nodes.intersection.poses import PoseMethod, PoseSettings, pose_cell, pose_h
 from nodes.runtime.stages import Report
 
 METHODS: tuple[PoseMethod, ...] = ("none", "random", "gradient")
+prepare = run.prepare_victims
 PREDICTS = False  # what a prediction composes into real pictures stands where it was placed by hand
 
 
@@ -41,12 +42,6 @@ def load_experiment(file: Path, setting: str, overrides: Sequence[str], folder: 
     poses, others = split_settings(PoseSettings, "poses", overrides)
     base = run.load_experiment(file, setting, others, folder)
     return PoseExperiment(base.config, base.file, base.folder, base.setting, poses)
-
-
-def prepare(experiment: PoseExperiment, report: Report) -> None:
-    """Make scene, objects and victims."""
-    del report  # the stages show their own progress
-    run.run_experiment(experiment, until="policy" if experiment.config.retrain is None else "retrain")
 
 
 def cell_inputs(experiment: PoseExperiment, scenario: str, victim: str, method: str, seed: int) -> dict[str, Any]:

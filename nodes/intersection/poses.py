@@ -60,6 +60,18 @@ class PoseSettings:
     colour_rate: float = 0.5
     colours: bool = True
 
+    def __post_init__(self) -> None:
+        reach = (self.move_m, self.turn_rad)
+        if (
+            not all(np.isfinite(each) and each >= 0.0 for each in reach)
+            or self.samples < 1
+            or self.steps < 1
+            or not self.colour_rate > 0.0
+        ):
+            raise ValueError(
+                f"expected moves and turns of at least zero, and at least one sample and step at a rate above zero, got {self}"
+            )
+
 
 def bounds_of(things: Sequence[PlacedObject], settings: PoseSettings) -> list[PoseBounds]:
     """Where each object may stand: about its place in the world's configuration, at its size."""

@@ -75,6 +75,12 @@ def run_experiment(
     return run_to_end(experiment, stages_of(experiment), _LIBRARIES, summarise, until, console)
 
 
+def prepare_victims(experiment: Experiment, report: Report) -> None:
+    """Make scene, objects and policies, also the retrained one where the experiment retrains."""
+    del report  # the stages show their own progress
+    run_experiment(experiment, until="policy" if experiment.config.retrain is None else "retrain")
+
+
 def stages_of(experiment: Experiment) -> list[Stage]:
     """The stages with the part of the configuration that each depends on; moving an object keeps capture, scene and object files."""
     config, world = experiment.config, experiment.site.settings

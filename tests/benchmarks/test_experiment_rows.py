@@ -6,6 +6,7 @@ import pytest
 
 from advnerf_core.report.cells import CellResult
 from advnerf_core.report.transfer import Wanted, make_table
+from advnerf_core.report.transfer_targets import table_targets
 from benchmarks import black_box, retraining, transfer_table
 from benchmarks.black_box import Search
 
@@ -100,6 +101,7 @@ def test_places_must_beat_random_ones_on_the_retrained_victim():
         found = {(row.method, row.domain): target for row, target in transfer_table.rows_of(table)}
         assert found["random", "deployed"] is found["gradient", "surrogate"] is None
         assert (found["gradient", "deployed"].target, found["gradient", "deployed"].met) == ("> random 2.00", met)
+    assert [target.met for target in table_targets(make_table(wanted, []))] == [None]
     alone = make_table(wanted, [places("gradient", 9.0)])
     assert [target.met for row, target in transfer_table.rows_of(alone) if row.domain == "deployed"] == [None]
 
@@ -109,7 +111,8 @@ def test_rows_of_gate_and_predictions_come_from_what_was_published(tmp_path):
     numbers = {"views": 12, "psnr_db": 27.5, "ssim": 0.9, "steering": 0.1, "steering_worst": 0.2, "correlation": 0.99}
     verdict = {"key": "k", "passed": False, "reasons": ["steering too far off"], "numbers": numbers}
     (tmp_path / "gate" / "right_hardened.json").write_text(json.dumps(verdict))
-    ((line, value, unit, _, met, note, _),) = transfer_table.gate_rows(tmp_path)
+    ((line, value, unit, _, met, note, _),) = transfer_table.gate_rows(tmp_path, {"right_hardened"})
+    assert transfer_table.gate_rows(tmp_path, {"left_hardened"}) == []
     assert (line, value, unit, met) == ("#5 fidelity gate, right_hardened, held-out views", 27.5, "dB PSNR", False)
     assert "steering too far off" in note
     deployed = CellResult.model_validate(cell(0, "gradient", 6.0))

@@ -99,10 +99,12 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
     ]  # fmt: skip
     start = load_calibration(RoomCalibration, TWIN / "room.yaml").start_pose
     plan = TrialPlan(start, SECONDS, NODES)
-    outcome = run_trial(ROOT / "launch" / "green_screen.launch.yaml", overrides, folder / "run", plan, 120.0)
-    # A computer that is too busy to answer in time stops the car, as it should; such a drive proves nothing here.
-    assert outcome.stopped_early == ""
-    return Recorded(folder / "run" / "bag", outcome, attack.attack_id, policy)
+    for attempt in ("first", "second"):
+        outcome = run_trial(ROOT / "launch" / "green_screen.launch.yaml", overrides, folder / attempt, plan, 120.0)
+        # A computer that is too busy to answer in time stops the car, as it should; such a drive proves nothing here.
+        if outcome.stopped_early == "":
+            return Recorded(folder / attempt / "bag", outcome, attack.attack_id, policy)
+    pytest.fail(f"the stack stopped two drives: {outcome.stopped_early}; run this on idle cores")
 
 
 def steering(policy: Path, images: list[Any]) -> list[float]:

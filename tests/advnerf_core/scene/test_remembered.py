@@ -6,10 +6,11 @@ import numpy as np
 import torch
 
 from advnerf_core.geometry import Pinhole
-from advnerf_core.scene.remembered import RememberedBackground
+from advnerf_core.scene.remembered import RememberedBackground, frame_bytes
 
 LENS, OTHER = Pinhole(4, 3, 4.0, 4.0, 2.0, 1.5), Pinhole(4, 3, 5.0, 5.0, 2.0, 1.5)
 FRAME_BYTES = 4 * 3 * (3 + 1) * 4
+assert frame_bytes(LENS) == FRAME_BYTES
 
 
 class Scene:

@@ -17,6 +17,7 @@ from nodes.campaign.kinds import load_kind
 from nodes.campaign.predictions import predict_campaign, predicted
 from nodes.campaign.run import Options, run_campaign, statuses
 from nodes.cli import app
+from nodes.runtime.errors import ConfigError
 
 HEAD = "seeds: [0]\nmethods: [gradient, none]\nvictims: [hardened]\n"
 
@@ -83,6 +84,23 @@ def test_transfer_is_predicted_from_the_search_before_any_drive(gated):
     (pair,) = predicted(campaign.folder, found)
     assert (pair.name, pair.measured) == ("straight_hardened_gradient_0", 3.0)
     assert pair.ratio == pytest.approx(kept["ratio"])
+
+
+def test_searches_are_not_run_alone_where_there_are_none_apart(bench, monkeypatch):
+    monkeypatch.syspath_prepend(str(bench.folder))
+    with pytest.raises(ConfigError, match="got kinds toy_cells; run them without --search-only"):
+        run(bench, search_only=True)
+
+
+def test_a_search_of_other_settings_is_not_predicted_from(gated):
+    gated.write(HEAD)
+    run(gated)
+    (gated.folder / "toy.experiment.yaml").write_text("base: 5.0\n")
+    campaign, said = load_campaign(gated.file), []
+    assert predict_campaign(campaign, campaign.cells, said.append) == 0
+    run(gated, search_only=True)  # its old result is still there
+    assert {each.state for each in statuses(campaign, campaign.cells)} == {"changed"}
+    assert predict_campaign(campaign, campaign.cells, said.append) == 1
 
 
 def driven(turn_radps):

@@ -49,6 +49,8 @@ def test_settings_of_cells_are_told_apart_from_those_of_the_experiment(
     )
     assert (meshes.meshes.target, meshes.meshes.limits.bound_m, meshes.meshes.ball_m) == ("shape", 0.7, 0.6)
     assert mesh_cells.load_experiment(tiny_file(), "tiny", [], tmp_path).meshes.limits.bound_m == 0.4
+    smoother = mesh_cells.load_experiment(tiny_file(), "tiny", ["meshes.limits.smoothness=10"], tmp_path).meshes
+    assert (smoother.limits.smoothness, smoother.limits.bound_m) == (10.0, 0.4)  # the rest stays as it was
 
 
 @pytest.mark.parametrize(
@@ -67,6 +69,11 @@ def test_settings_of_cells_are_told_apart_from_those_of_the_experiment(
             "meshes.limits.bound=1",
             "unknown key meshes.limits.bound; valid keys here: meshes.limits.bound_m",
         ),
+        (pose_cells, "poses.samples=0", "at least one sample and step"),
+        (pose_cells, "poses.move_m=.nan", "moves and turns of at least zero"),
+        (pose_cells, "poses=0", "expected keys below poses, got 0"),
+        (pose_cells, "poses .move_m=1", "unknown key poses"),
+        (mesh_cells, "meshes.ball_m=0", "a radius and a rate above zero"),
         (mesh_cells, "meshes=shape", "expected keys below meshes, got 'shape'"),
         (mesh_cells, "poses.move_m=1", "unknown key poses"),
     ],
