@@ -1,0 +1,78 @@
+"""What the documentation names is there: files, benchmarks, commands and their options."""
+
+import json
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+import typer
+
+from nodes.cli import app
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+_FILE = re.compile(
+    r"`((?:nodes|advnerf_core|hardware|calibration|launch|benchmarks|tests|docs)/[\w/.\-]+?\.(?:py|yaml|md|json|sh))`"
+)
+_NOT_OURS = ("my_", "ours")
+
+
+@pytest.fixture(scope="module")
+def command():
+    return typer.main.get_command(app)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_links_and_files_of_a_page_are_there(page):
+    text = page.read_text()
+    links = [target for target in re.findall(r"\]\(([^)#\s]+)(?:#[^)]*)?\)", text) if "://" not in target]
+    missing = [target for target in links if not (page.parent / target).exists()]
+    named = [name for name in _FILE.findall(text) if not any(part.startswith(_NOT_OURS) for part in Path(name).parts)]
+    missing += [name for name in named if not (ROOT / name).exists()]
+    missing += [
+        name
+        for name in re.findall(r"python -m (benchmarks\.\w+)", text)
+        if not (ROOT / f"{name.replace('.', '/')}.py").exists()
+    ]
+    assert missing == []
+
+
+def test_rows_name_benchmarks_that_are_there():
+    rows = json.loads((ROOT / "docs" / "results.json").read_text())
+    names = {name for row in rows for name in re.findall(r"benchmarks\.(\w+)", row["command"])}
+    assert names
+    assert [name for name in sorted(names) if not (ROOT / "benchmarks" / f"{name}.py").exists()] == []
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_commands_of_a_page_and_their_options_exist(page, command):
+    wrong = [line for line in commands_of(page.read_text()) if not is_a_command(command, line)]
+    assert wrong == []
+
+
+def commands_of(text):
+    """Lines of code blocks that call the command, continuation lines joined, comments cut off."""
+    joined = text.replace("\\\n", " ")
+    return [match.strip() for match in re.findall(r"^    (advnerf [^#\n|]*)", joined, flags=re.MULTILINE)]
+
+
+def is_a_command(command, line):
+    words = [word for word in shlex.split(line)[1:] if word not in ("...", "&")]
+    here = command
+    for word in words:
+        if not hasattr(here, "commands"):
+            break
+        if word not in here.commands:
+            return word.startswith("-") or "|" in word  # an option of the group, or alternatives such as a|b
+        here = here.commands[word]
+    known = {name for parameter in here.params for name in (*parameter.opts, *parameter.secondary_opts)} | {"--help"}
+    asked = {word.partition("=")[0] for word in words if word.startswith("--")}
+    return asked <= known
+
+
+def test_what_is_no_command_is_noticed(command):
+    assert is_a_command(command, "advnerf campaign run FILE --jobs 2")
+    assert not is_a_command(command, "advnerf campaign ran FILE")
+    assert not is_a_command(command, "advnerf campaign run FILE --jobbs 2")
+    assert commands_of("text\n\n    advnerf arm   # drives\n") == ["advnerf arm"]
