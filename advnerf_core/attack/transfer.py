@@ -73,7 +73,7 @@ class TransferPrediction:
 
 def predict_transfer(
     problem: AttackProblem, images: Scene, clean: Agreement, effect: Effect, starts: Tensor, horizon: Horizon,
-    draws: int = 6, seed: int = 0,
+    draws: int = 6, seed: int = 0, none_m: tuple[float, ...] | None = None,
 ) -> TransferPrediction:  # fmt: skip
     """Predict deployed drives with and without an attack.
 
@@ -86,6 +86,8 @@ def predict_transfer(
         horizon: Over which a drive is measured.
         draws: Drives of each kind.
         seed: Of what is drawn.
+        none_m: The draws without attack, where a prediction with the same clean views, starts, draws and seed made them; they do not
+            depend on the attack.
 
     Returns:
         The prediction.
@@ -97,8 +99,8 @@ def predict_transfer(
     residual = _blocks(effect.residual, horizon.ticks, draws, rng)
     starts = starts[torch.arange(draws) % len(starts)].contiguous()
     goals = None if problem.goals is None else problem.goals[:1].expand(draws, -1)
-    totals = {}
-    for attacked in (True, False):
+    totals = {} if none_m is None else {False: none_m}
+    for attacked in (True, False) if none_m is None else (True,):
         share = effect.retained if attacked else 0.0
         noise = torch.from_numpy(residual - disagreement if attacked else -disagreement)
         policy = _AsDeployed(problem.policy, images, share, noise, attacked)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,19 @@ from nodes.campaign.kinds import Kind, stage_digests
 from nodes.policy_data.evaluate import predict
 from nodes.runtime.errors import RuntimeFault
 from nodes.runtime.stages import hash_of
+
+
+@dataclass(frozen=True)
+class CleanDrive:
+    """What predictions of all attacks on one drive share.
+
+    Attributes:
+        agreement: How alike real and learned pictures are along the deployed drive without attack.
+        none_m: Total CTE of each draw without attack [m].
+    """
+
+    agreement: Agreement
+    none_m: tuple[float, ...]
 
 
 class GateError(RuntimeFault):
@@ -79,8 +93,9 @@ def _weights_sha256(policy: Any) -> str:
 
 
 def predict_cell(
-    kind: Kind, experiment: Any, scenario: str, victim: str, method: str, seed: int, folder: Path, draws: int = 6
-) -> tuple[TransferPrediction, Agreement]:
+    kind: Kind, experiment: Any, scenario: str, victim: str, method: str, seed: int, folder: Path, draws: int = 6,
+    clean: CleanDrive | None = None,
+) -> tuple[TransferPrediction, CleanDrive]:  # fmt: skip
     """Predict the deployed drives of a cell whose search is finished, from pictures and the surrogate alone.
 
     Args:
@@ -92,9 +107,10 @@ def predict_cell(
         seed: Of the search.
         folder: The cell's folder.
         draws: Drives per prediction.
+        clean: What an earlier prediction of the same scenario, victim, seed and draws returned of the drive without attack.
 
     Returns:
-        The prediction, and how alike real and learned pictures are along the deployed drive without attack.
+        The prediction, and what it says of the drive without attack.
     """
     module = kind.fidelity
     if module is None:
@@ -102,8 +118,14 @@ def predict_cell(
             f"expected a module fidelity beside the cells of kind {kind.name}, got none; it has no predictions"
         )
     policy, goal = module.policy_of(experiment, victim, scenario)
-    without = agreement_on(policy, goal, module.driven(experiment, scenario, victim, seed, folder))
+    without = (
+        clean.agreement
+        if clean
+        else agreement_on(policy, goal, module.driven(experiment, scenario, victim, seed, folder))
+    )
     with_attack = agreement_on(policy, goal, module.attacked(experiment, scenario, victim, method, seed, folder))
     effect = Effect(with_attack.learned - without.learned, with_attack.real - without.real)
     problem, images, starts, horizon = module.loop(experiment, scenario, victim, method, seed, folder)
-    return predict_transfer(problem, images, without, effect, starts, horizon, draws, seed), without
+    none_m = clean.none_m if clean else None
+    found = predict_transfer(problem, images, without, effect, starts, horizon, draws, seed, none_m)
+    return found, CleanDrive(without, found.none_m)

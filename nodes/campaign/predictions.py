@@ -14,7 +14,7 @@ from advnerf_core.files import write_atomically
 from advnerf_core.report.cells import NONE, CellResult
 from advnerf_core.report.transfer_prediction import Predicted
 from nodes.campaign.config import Campaign, Cell
-from nodes.campaign.gate import predict_cell
+from nodes.campaign.gate import CleanDrive, predict_cell
 from nodes.campaign.kinds import load_kind
 from nodes.campaign.run import plan_cells
 from nodes.campaign.store import store_of
@@ -30,6 +30,7 @@ def predict_campaign(campaign: Campaign, cells: Sequence[Cell], say: Callable[[s
     """
     store, made = store_of(campaign), 0
     experiments: dict[tuple[str, str], Any] = {}
+    clean: dict[tuple[str, str, str, int], CleanDrive] = {}
     for cell in cells:
         if cell.method == NONE:
             continue
@@ -46,8 +47,10 @@ def predict_campaign(campaign: Campaign, cells: Sequence[Cell], say: Callable[[s
         if lacking := kind.fidelity.lacks(*which):
             say(f"{cell.name}: not predicted, as it lacks {lacking}")
             continue
-        found, clean = predict_cell(kind, *which, draws)
-        record = {"settings_hash": planned.job.settings_hash, **found.record(), "clean_drive": clean.summary()}
+        drive = (cell.scenario, cell.placement, cell.victim, cell.seed)
+        found, clean[drive] = predict_cell(kind, *which, draws, clean.get(drive))
+        summary = clean[drive].agreement.summary()
+        record = {"settings_hash": planned.job.settings_hash, **found.record(), "clean_drive": summary}
         write_atomically(file, json.dumps(record, indent=1) + "\n")
         say(f"{cell.name}: {found.ratio:.2f} × no attack expected, {100 * found.retained:.0f} % of the effect survives")
         made += 1

@@ -70,4 +70,4 @@ def test_a_cell_of_another_seed_is_searched_and_driven_live_once(tmp_path):
     assert fidelity.lacks(*which, 1, tmp_path / "cells" / "one") == ""
     found, clean = predict_cell(load_kind("room"), *which, 1, tmp_path / "cells" / "one", draws=2)
     assert found.ratio > 0.0
-    assert clean.summary()["views"] >= 10
+    assert clean.agreement.summary()["views"] >= 10
