@@ -43,6 +43,7 @@ def test_every_texture_gets_its_own_gradient(problems, time_batch, cache_bytes):
         torch.testing.assert_close(result.totals.protocol_cte_m[rows], alone.totals.protocol_cte_m, rtol=1e-9, atol=0.0)
 
 
+@pytest.mark.slow
 def test_a_search_together_ends_where_searches_alone_do(problems):
     smooth = [dataclasses.replace(p, regulariser=Smoothness(p.sensor.objects, 0.05)) for p in problems]
     results = gradient_attacks(smooth, SEEDS, 3)

@@ -52,6 +52,7 @@ def asked(folder, *objects, rest=""):
     return file
 
 
+@pytest.mark.slow
 def test_textures_of_a_mesh_are_searched_resumed_and_exported(tmp_path):
     face = "{x_m: 1.4, y_m: -1.5, z_m: 0.4, yaw_rad: 3.1, resolution: 8}"
     request = load_request(asked(tmp_path, HYDRANT, face))

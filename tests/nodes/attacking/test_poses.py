@@ -70,6 +70,7 @@ def test_commands_search_map_and_find_their_work_again(tmp_path, monkeypatch, ca
     assert "belongs to a map with other settings" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_killed_run_ends_in_the_same_bytes_and_seeds_differ(tmp_path):
     request = load_request(request_file(tmp_path), ["search.seeds=[0, 3]", "horizon=1", "poses.steps=1"])
     whole = run_poses(request, tmp_path / "whole", ProgressDisplay())

@@ -39,7 +39,18 @@ def stop_at_one(evaluation):
         raise StoppedError
 
 
-@pytest.mark.parametrize("method", ["gradient", "random", "cem", "evolution"])
+_SLOW = pytest.mark.slow  # the same loop with another search inside; tests of the searches resume them too
+
+
+@pytest.mark.parametrize(
+    "method",
+    [
+        "gradient",
+        pytest.param("random", marks=_SLOW),
+        pytest.param("cem", marks=_SLOW),
+        pytest.param("evolution", marks=_SLOW),
+    ],
+)
 def test_a_stopped_run_goes_on_to_the_same_bytes(tmp_path, method):
     file = tiny_request(tmp_path)
     changes = [f"search.method={method}", "search.population=4", "robustness.noise=0.01", "dynamics.delay_s=0.05"]
@@ -58,7 +69,7 @@ def test_a_stopped_run_goes_on_to_the_same_bytes(tmp_path, method):
         run_attack(load_request(file), tmp_path / "whole", ProgressDisplay())
 
 
-@pytest.mark.parametrize("method", [pytest.param("distilled", marks=pytest.mark.slow), "guided"])
+@pytest.mark.parametrize("method", [pytest.param("distilled", marks=_SLOW), pytest.param("guided", marks=_SLOW)])
 def test_an_onnx_policy_is_attacked_by_questions_within_the_budget_and_resumes_to_the_same_bytes(tmp_path, method):
     file = tiny_request(tmp_path)
     loaded = load_policy(tmp_path / "policy.safetensors")

@@ -159,6 +159,7 @@ def test_the_gradient_is_what_a_turn_of_a_hundredth_of_a_second_is_worth(trained
     assert float((found.gradient * along).sum()) == pytest.approx(expected, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_search_drive_and_film_in_finer_ticks(trained: Experiment, wall: Any, tmp_path: Path) -> None:
     experiment, cell = finer(trained, 10, tmp_path / "run"), Cell("straight", HARDENED, "gradient", 0)
     objects, folder = placed_objects(experiment), experiment.stage_folder("deploy")
