@@ -172,4 +172,5 @@ class DriveLimiter:
 
 
 def _toward(start: float, goal: float, step: float) -> float:
-    return start + min(max(goal - start, -step), step)
+    # Not by the difference: adding it again may miss the goal by a last bit, and a limit with it.
+    return min(start + step, goal) if goal > start else max(start - step, goal)
