@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from advnerf_core.report.cells import CellResult, Drives
-from advnerf_core.report.transfer import DOMAINS, TableRow, TransferTable
+from advnerf_core.report.transfer import DOMAINS, Domain, TableRow, TransferTable, drives_in
 from advnerf_core.report.transfer_page import METHOD_NAMES, ran_into_something
 from advnerf_core.report.transfer_prediction import skill_of, skill_text
 from advnerf_core.report.transfer_targets import VICTIM, TableTarget, table_targets
@@ -93,20 +93,18 @@ def why_missed(target: TableTarget | None, row: TableRow, cells: Sequence[CellRe
     return f"{text}; {said}" if said else text
 
 
-def drives_of(cells: Sequence[CellResult], domain: str) -> list[Drives]:
+def drives_of(cells: Sequence[CellResult], domain: Domain) -> list[Drives]:
     """The drives of each cell in a domain, where there are any, by seed."""
-    of_domain = [
-        cell.deployed if domain == "deployed" else cell.surrogate for cell in sorted(cells, key=lambda each: each.seed)
-    ]
-    return [drives for drives in of_domain if drives is not None]
+    by_seed = sorted(cells, key=lambda each: each.seed)
+    return [drives for cell in by_seed if (drives := drives_in(cell, domain)) is not None]
 
 
-def ratios_of(cells: Sequence[CellResult], domain: str) -> list[float]:
+def ratios_of(cells: Sequence[CellResult], domain: Domain) -> list[float]:
     """Ratio to no attack of each cell, by seed."""
     return [sum(drives.total_cte_m) / sum(drives.none_total_cte_m) for drives in drives_of(cells, domain)]
 
 
-def base_m(cells: Sequence[CellResult], domain: str) -> float:
+def base_m(cells: Sequence[CellResult], domain: Domain) -> float:
     """Mean total CTE of the same starts without attack [m]."""
     return float(np.mean([np.mean(drives.none_total_cte_m) for drives in drives_of(cells, domain)]))
 

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from advnerf_core.attack.adjoint import AttackProblem, evaluate
 from advnerf_core.attack.placed_sensor import PlacedSensor
-from advnerf_core.attack.placement import placed
+from advnerf_core.attack.placement import PoseSpace, placed
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.files import write_atomically
 from advnerf_core.geometry import Array
@@ -69,6 +69,25 @@ class RobustnessMap:
     total_cte_m: Array
     plain_cte_m: Array
     worst_cte_m: Array
+
+
+def places_over(space: PoseSpace, number: int, points: Sequence[int]) -> tuple[list[float], list[float]]:
+    """x [m] and y [m] of a grid over the bounds of one object; a single one where they leave no room."""
+    low, high = (space.middle + sign * space.half for sign in (-1, 1))
+    x_m, y_m = (
+        np.unique(np.linspace(float(low[number, k]), float(high[number, k]), n)).tolist() for k, n in enumerate(points)
+    )
+    return x_m, y_m
+
+
+def starts_beside(
+    nominal: Sequence[float], sideways_m: Sequence[float], turns_rad: Sequence[float] = (0.0,)
+) -> list[tuple[float, float, float]]:
+    """Starts to the left of a nominal one, each with each turn to the left: x [m], y [m], yaw [rad]."""
+    x, y, yaw = nominal
+    return [
+        (x - aside * np.sin(yaw), y + aside * np.cos(yaw), yaw + turn) for turn in turns_rad for aside in sideways_m
+    ]
 
 
 def landscape(

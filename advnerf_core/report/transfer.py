@@ -162,7 +162,7 @@ def _key(cell: CellResult | Wanted) -> tuple[str, str, str, str]:
 def _row(want: Wanted, cells: Sequence[CellResult], domain: Domain) -> TableRow:
     paper_m, paper_std_m = PAPER.get((want.scenario, domain, want.method), (None, None))
     paper_none_m, _ = PAPER.get((want.scenario, "deployed", NONE), (None, None))
-    have = [(cell, drives) for cell in cells if (drives := _drives(cell, domain)) is not None]
+    have = [(cell, drives) for cell in cells if (drives := drives_in(cell, domain)) is not None]
     seeds = tuple(cell.seed for cell, _ in have)
     empty = TableRow(
         want.scenario, want.placement, want.victim, want.method, domain, seeds, tuple(s for s in want.seeds if s not in seeds),
@@ -181,7 +181,8 @@ def _row(want: Wanted, cells: Sequence[CellResult], domain: Domain) -> TableRow:
     return TableRow(**{**{name: getattr(empty, name) for name in empty.__dataclass_fields__}, **found})
 
 
-def _drives(cell: CellResult, domain: Domain) -> Drives | None:
+def drives_in(cell: CellResult, domain: Domain) -> Drives | None:
+    """The drives of a cell in a domain; None where there are none."""
     return cell.surrogate if domain == "surrogate" else cell.deployed
 
 

@@ -33,7 +33,6 @@ class RememberedBackground:
         self._frames: OrderedDict[tuple[bytes, Pinhole], tuple[Tensor, Tensor]] = OrderedDict()
         self._lock = threading.Lock()
         self.nbytes = 0
-        self.rendered = 0
 
     def __call__(self, T_world_from_camera: ArrayLike, pinhole: Pinhole) -> tuple[Tensor, Tensor]:
         """Colours and planar depth of a batch of views; only those that are not kept are rendered."""
@@ -53,7 +52,6 @@ class RememberedBackground:
 
     def _keep(self, new: dict[tuple[bytes, Pinhole], tuple[Tensor, Tensor]]) -> None:
         with self._lock:
-            self.rendered += len(new)
             for key, frame in new.items():
                 if key not in self._frames:
                     self._frames[key] = frame

@@ -5,11 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from advnerf_core.attack.pose_maps import Landscape, RobustnessMap, landscape, robustness_map
+from advnerf_core.attack.pose_maps import (
+    Landscape,
+    RobustnessMap,
+    landscape,
+    places_over,
+    robustness_map,
+    starts_beside,
+)
 from advnerf_core.attack.pose_plots import draw_landscape, draw_robustness
 from advnerf_core.files import write_atomically
 from nodes.attacking.poses import PreparedPoses, Report, prepare_poses
@@ -25,13 +31,9 @@ def make_landscape(request: AttackRequest, folder: Path, attack: Path | None, re
     if asked.object >= len(ready.asked.bounds):
         raise ConfigError(f"poses.landscape.object: expected 0..{len(ready.asked.bounds) - 1}, got {asked.object}")
     place = ready.sensor.placements(theta)[asked.object]
-    low, high = (ready.sensor.space.middle + s * ready.sensor.space.half for s in (-1, 1))
-    axes = [
-        np.linspace(float(low[asked.object, k]), float(high[asked.object, k]), n) for k, n in enumerate(asked.points)
-    ]
-    axes = [np.unique(axis) for axis in axes]
+    x_m, y_m = places_over(ready.sensor.space, asked.object, asked.points)
     found = landscape(
-        ready.problem, theta, (axes[0].tolist(), axes[1].tolist(), asked.yaws_rad or (float(place[2]),)), asked.object,
+        ready.problem, theta, (x_m, y_m, asked.yaws_rad or (float(place[2]),)), asked.object,
         folder / "landscape.json", _telling(report), ready.settings_hash,
     )  # fmt: skip
     marked = {"here": (float(place[0]), float(place[1]))} if attack is not None else None
@@ -48,12 +50,7 @@ def make_robustness(
     asked = ready.asked.robustness
     if asked.object >= len(ready.asked.bounds):
         raise ConfigError(f"poses.robustness.object: expected 0..{len(ready.asked.bounds) - 1}, got {asked.object}")
-    x, y, yaw = ready.problem.start_states[0, :3].tolist()
-    starts = [
-        (x - aside * np.sin(yaw), y + aside * np.cos(yaw), yaw + turn)
-        for turn in asked.turn_rad
-        for aside in asked.sideways_m
-    ]
+    starts = starts_beside(ready.problem.start_states[0, :3].tolist(), asked.sideways_m, asked.turn_rad)
     moves = [(dx, dy, turn) for turn in asked.object_turns_rad for dx, dy in asked.object_moves_m]
     found = robustness_map(
         ready.problem, _theta(ready, attack), starts, moves, asked.object, folder / "robustness.json", _telling(report),

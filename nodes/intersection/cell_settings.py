@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, fields, is_dataclass
+from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
 
 from pydantic import TypeAdapter, ValidationError
 
+from nodes.campaign.kinds import stage_digests
+from nodes.intersection.context import Experiment
+from nodes.intersection.policy import victim_file
+from nodes.intersection.run import load_experiment
 from nodes.runtime.config import Document, apply_overrides
 from nodes.runtime.errors import ConfigError
 
 S = TypeVar("S")
+E = TypeVar("E")
 
 
 def split_settings(kind: type[S], section: str, overrides: Sequence[str]) -> tuple[S, list[str]]:
@@ -39,6 +45,22 @@ def split_settings(kind: type[S], section: str, overrides: Sequence[str]) -> tup
             f"{document.place(key)}: {'.'.join(map(str, key))}: {_lower(first['msg'])}, got {first['input']!r:.80}"
         ) from None
     return settings, [text for text in overrides if text not in own]
+
+
+def load_with(
+    settled: Callable[..., E], kind: type[Any], section: str, file: Path, setting: str, overrides: Sequence[str], folder: Path
+) -> E:  # fmt: skip
+    """The experiment together with the settings of its cells, as ``settled(config, file, folder, setting, settings)``."""
+    settings, others = split_settings(kind, section, overrides)
+    base = load_experiment(file, setting, others, folder)
+    return settled(base.config, base.file, base.folder, base.setting, settings)
+
+
+def inputs_of(experiment: Experiment, victim: str, digest: Callable[[], str]) -> dict[str, Any]:
+    """What a cell depends on; not known before there is a victim."""
+    if not victim_file(experiment, victim).exists():
+        return {"stages": stage_digests(experiment.folder), "victim": None}
+    return {"everything": digest()}
 
 
 def _over(defaults: dict[str, Any], data: dict[str, Any]) -> dict[str, Any]:

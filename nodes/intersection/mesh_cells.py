@@ -10,13 +10,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from nodes.campaign.kinds import stage_digests
 from nodes.intersection import run
-from nodes.intersection.cell_settings import split_settings
+from nodes.intersection.cell_settings import inputs_of, load_with
 from nodes.intersection.cells import require_known
 from nodes.intersection.context import Experiment
 from nodes.intersection.meshes import METHODS, MeshMethod, MeshSettings, mesh_cell, mesh_hash
-from nodes.intersection.policy import attackable, victim_file
+from nodes.intersection.policy import attackable
 from nodes.runtime.stages import Report
 
 FIDELITY = None  # the frames are the deployment scene's own: there is no learned scene to judge
@@ -36,17 +35,13 @@ class MeshExperiment(Experiment):
 
 def load_experiment(file: Path, setting: str, overrides: Sequence[str], folder: Path) -> MeshExperiment:
     """Read the experiment, and the scenario's changes ``meshes.*``."""
-    meshes, others = split_settings(MeshSettings, "meshes", overrides)
-    base = run.load_experiment(file, setting, others, folder)
-    return MeshExperiment(base.config, base.file, base.folder, base.setting, meshes)
+    return load_with(MeshExperiment, MeshSettings, "meshes", file, setting, overrides, folder)
 
 
 def cell_inputs(experiment: MeshExperiment, scenario: str, victim: str, method: str, seed: int) -> dict[str, Any]:
     """What a cell depends on; not known before there is a victim."""
     require_known(experiment, scenario, attackable(experiment), victim, METHODS, method)
-    if not victim_file(experiment, victim).exists():
-        return {"stages": stage_digests(experiment.folder), "victim": None}
-    return {"everything": mesh_hash(experiment, scenario, victim, seed, experiment.meshes)}
+    return inputs_of(experiment, victim, lambda: mesh_hash(experiment, scenario, victim, seed, experiment.meshes))
 
 
 def run_cell(

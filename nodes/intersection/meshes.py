@@ -114,14 +114,13 @@ def mesh_cell(
     settings = settings or MeshSettings()
     require_known(experiment, scenario, attackable(experiment), victim, METHODS, method)
     result = folder / f"mesh_{settings.target}_{scenario}_{victim}_{method}_{seed}.cell.json"
-    fields = mesh_objects(experiment, settings)
     frozen = mesh_hash(experiment, scenario, victim, seed, settings)
     if result.exists() and (kept := json.loads(result.read_text()))["settings_hash"] == frozen:
         return dict(kept)
     if scene is None:
         with experiment.site.open() as opened:
-            return _cell(experiment, scenario, victim, method, seed, result, report, settings, fields, frozen, opened)
-    return _cell(experiment, scenario, victim, method, seed, result, report, settings, fields, frozen, scene)
+            return _cell(experiment, scenario, victim, method, seed, result, report, settings, frozen, opened)
+    return _cell(experiment, scenario, victim, method, seed, result, report, settings, frozen, scene)
 
 
 def mesh_hash(experiment: Experiment, scenario: str, victim: str, seed: int, settings: MeshSettings) -> str:
@@ -145,8 +144,9 @@ def _objects_sha256(experiment: Experiment, settings: MeshSettings) -> list[str]
 
 def _cell(
     experiment: Experiment, scenario: str, victim: str, method: MeshMethod, seed: int, result: Path, report: Report,
-    settings: MeshSettings, fields: list[MeshField], frozen: str, scene: DeploymentScene,
+    settings: MeshSettings, frozen: str, scene: DeploymentScene,
 ) -> dict[str, Any]:  # fmt: skip
+    fields = mesh_objects(experiment, settings)
     policy = load_policy(victim_file(experiment, victim))
     view = DeployedFrames(scene, experiment.view)
     surrogate = Surrogate(view, experiment.view.pinhole, experiment.mount, fields, depth_tolerance_m=0.0)

@@ -12,9 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from advnerf_core.driving.policy import load_policy
-from nodes.campaign.kinds import stage_digests
 from nodes.intersection import pose_maps, run
-from nodes.intersection.cell_settings import split_settings
+from nodes.intersection.cell_settings import inputs_of, load_with
 from nodes.intersection.cells import require_known
 from nodes.intersection.context import Experiment
 from nodes.intersection.policy import attackable, victim_file
@@ -39,18 +38,17 @@ class PoseExperiment(Experiment):
 
 def load_experiment(file: Path, setting: str, overrides: Sequence[str], folder: Path) -> PoseExperiment:
     """Read the experiment, and the scenario's changes ``poses.*``."""
-    poses, others = split_settings(PoseSettings, "poses", overrides)
-    base = run.load_experiment(file, setting, others, folder)
-    return PoseExperiment(base.config, base.file, base.folder, base.setting, poses)
+    return load_with(PoseExperiment, PoseSettings, "poses", file, setting, overrides, folder)
 
 
 def cell_inputs(experiment: PoseExperiment, scenario: str, victim: str, method: str, seed: int) -> dict[str, Any]:
     """What a cell depends on; not known before there are scene, objects and victim."""
     require_known(experiment, scenario, attackable(experiment), victim, METHODS, method)
-    file = victim_file(experiment, victim)
-    if not file.exists():
-        return {"stages": stage_digests(experiment.folder), "victim": None}
-    return {"everything": pose_hash(experiment, load_policy(file), scenario, seed, experiment.poses)}
+
+    def digest() -> str:
+        return pose_hash(experiment, load_policy(victim_file(experiment, victim)), scenario, seed, experiment.poses)
+
+    return inputs_of(experiment, victim, digest)
 
 
 def draw_maps(

@@ -7,12 +7,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
 from advnerf_core.attack.placed_sensor import PlacedSensor
 from advnerf_core.attack.placement import PoseSpace
-from advnerf_core.attack.pose_maps import landscape, robustness_map
+from advnerf_core.attack.pose_maps import landscape, places_over, robustness_map, starts_beside
 from advnerf_core.attack.pose_plots import draw_landscape, draw_robustness
 from advnerf_core.attack.problem import AttackProblem
 from advnerf_core.driving.policy import LoadedPolicy
@@ -76,15 +75,11 @@ def draw_maps(
     sensor, name = problem.sensor, experiment.world.objects[number].name
     assert isinstance(sensor, PlacedSensor)
     place = sensor.placements(theta)[number]
-    low, high = (sensor.space.middle + sign * sensor.space.half for sign in (-1, 1))
-    x_m, y_m = (
-        np.linspace(float(low[number, k]), float(high[number, k]), n).tolist() for k, n in enumerate(settings.points)
-    )
+    x_m, y_m = places_over(sensor.space, number, settings.points)
     flat = landscape(
         problem, theta, (x_m, y_m, (float(place[2]),)), number, folder / f"landscape_{name}.json", _half(report, 0.0, "landscape"), digest,
     )  # fmt: skip
-    start = problem.start_states[0, :3].tolist()
-    starts = [_aside(start, aside_m) for aside_m in settings.sideways_m]
+    starts = starts_beside(problem.start_states[0, :3].tolist(), settings.sideways_m)
     moves = [(dx, dy, 0.0) for dx, dy in settings.object_moves_m]
     rough = robustness_map(
         problem, theta, starts, moves, number, folder / f"robustness_{name}.json", _half(report, 0.5, "starts x moves"), digest,
@@ -108,11 +103,6 @@ def _problem(
     theta = sensor.join(space.unit(torch.tensor(found["placements"], dtype=torch.float64)), colours)
     problem = attack_problem(experiment, surrogate, victim, scenario, seed)
     return replace(problem, sensor=sensor), theta
-
-
-def _aside(start: list[float], aside_m: float) -> tuple[float, float, float]:
-    x_m, y_m, yaw_rad = start
-    return x_m - aside_m * float(np.sin(yaw_rad)), y_m + aside_m * float(np.cos(yaw_rad)), yaw_rad
 
 
 def _half(report: Report, begin: float, what: str) -> Callable[[int, int], None]:
