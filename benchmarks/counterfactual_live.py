@@ -8,43 +8,34 @@ frames were compared, and whether the way of a command took longer for it. Needs
 from __future__ import annotations
 
 import argparse
+import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from advnerf_core.attack.artifact import load_attack
 from benchmarks.results import record_row
-from nodes.evaluation import Counterfactual, Timing, attack_ids, counterfactual, timing
 from nodes.experiment.attack import Search, attack_path
-from nodes.experiment.context import CONTROL_PERIOD_S, Experiment
-from nodes.experiment.deploy import LiveRun, live_horizon, live_overrides
+from nodes.experiment.context import Experiment
+from nodes.experiment.deploy import LiveRun, drive_live
 from nodes.experiment.run import load_experiment
-from nodes.runtime.clock import NS_PER_S
-from nodes.trial import TrialPlan
-from nodes.trial_runner import run_trial
 from nodes.trials.campaign import COUNTED_STOPS
 
 LIVE = LiveRun("hardened", "gradient", 0)
 
 
-def drive(experiment: Experiment, folder: Path, compare: bool) -> tuple[Timing, Counterfactual | None]:
-    """One live drive past the attack; what its bag says of the way of a command, and of the comparison."""
+def drive(experiment: Experiment, folder: Path, compare: bool) -> dict[str, Any]:
+    """One live drive past the attack; what was measured in its bag."""
     shutil.rmtree(folder, ignore_errors=True)
-    attack = attack_path(experiment.stage_folder("attack"), Search("hardened", "gradient", 0))
-    overrides, nodes = live_overrides(experiment, LIVE, attack), list(experiment.config.deploy.nodes)
-    if compare:
-        overrides, nodes = [*overrides, "params.counterfactual=true"], [*nodes, "counterfactual"]
-    horizon = live_horizon(experiment, LIVE)
-    plan = TrialPlan(experiment.room.start_pose, horizon.ticks * horizon.dt_s + 0.2, tuple(nodes))
-    outcome = run_trial(experiment.launch_file, overrides, folder, plan, experiment.config.deploy.ready_timeout_s)
-    if outcome.stopped_early and not any(word in outcome.stopped_early for word in COUNTED_STOPS):
-        raise SystemExit(f"the stack stopped the drive: {outcome.stopped_early}; run it again on idle cores")
-    if (shown := attack_ids(folder / "bag")) != {load_attack(attack).attack_id}:
-        raise SystemExit(f"expected {load_attack(attack).attack_id} in the frames of {folder}, got {sorted(shown)}")
-    last_frame_ns = outcome.end_real_ns - round(CONTROL_PERIOD_S * NS_PER_S)
-    times = timing(folder / "bag", outcome.start_real_ns, last_frame_ns)
-    return times, counterfactual(folder / "bag", outcome.start_real_ns, last_frame_ns)
+    folder.mkdir(parents=True)
+    attack = attack_path(experiment.stage_folder("attack"), Search(LIVE.victim, "gradient", LIVE.seed))
+    drive_live(experiment, LIVE, folder, attack, compare)
+    measured: dict[str, Any] = json.loads((folder / f"{LIVE.name}.json").read_text(encoding="utf-8"))
+    stopped = measured["outcome"]["stopped_early"]
+    if stopped and not any(word in stopped for word in COUNTED_STOPS):
+        raise SystemExit(f"the stack stopped the drive: {stopped}; run it again on idle cores")
+    return measured
 
 
 def main() -> None:
@@ -55,20 +46,21 @@ def main() -> None:
     parser.add_argument("--dry", action="store_true", help="print only")
     options = parser.parse_args()
     experiment = load_experiment(Path("launch/room.experiment.yaml"), "full", [], options.folder)
-    alone, _ = drive(experiment, options.out / "without", compare=False)
-    times, found = drive(experiment, options.out / "with", compare=True)
-    if found is None or found.mean_abs_delta_rad is None:
+    alone = drive(experiment, options.out / "without", compare=False)
+    compared = drive(experiment, options.out / "with", compare=True)
+    found = compared.get("counterfactual")
+    if found is None or found["mean_abs_delta_rad"] is None:
         raise SystemExit("expected comparisons of frames into which the attack was drawn, got none")
-    p99, p99_alone = (float(np.percentile(each.capture_to_serial_ms, 99)) for each in (times, alone))
+    p99, p99_alone = (float(np.percentile(each["capture_to_serial_ms"], 99)) for each in (compared, alone))
     rows = [
         (
-            "#5 counterfactual steering live: what the attack adds", found.mean_abs_delta_rad, "rad mean abs",
-            f"{found.frames_drawn} frames with the attack, {found.frames} compared of {times.frames} frames of the drive; to one side "
-            f"{found.mean_delta_rad:+.3f} rad, at most {found.max_abs_delta_rad:.3f} rad after {found.max_at_s:.1f} s",
+            "#5 counterfactual steering live: what the attack adds", found["mean_abs_delta_rad"], "rad mean abs",
+            f"{found['frames_drawn']} frames with the attack, {found['frames']} compared of {compared['frames']} frames of the drive; to one "
+            f"side {found['mean_delta_rad']:+.3f} rad, at most {found['max_abs_delta_rad']:.3f} rad after {found['max_at_s']:.1f} s",
         ),
         (
             "#5 counterfactual steering live: capture to serial write", p99, "ms p99",
-            f"{p99_alone:.1f} ms on the same drive without the comparison; frames missed {times.missed} and {alone.missed}",
+            f"{p99_alone:.1f} ms on the same drive without the comparison; frames missed {compared['missed']} and {alone['missed']}",
         ),
     ]  # fmt: skip
     for line, value, unit, note in rows:

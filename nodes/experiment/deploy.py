@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import socket
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,7 +13,7 @@ from advnerf_core.attack.artifact import load_attack
 from advnerf_core.driving.metrics import Horizon
 from advnerf_core.driving.policy import load_policy
 from advnerf_core.files import write_atomically
-from nodes.evaluation import attack_ids, score, timing, trajectory
+from nodes.evaluation import attack_ids, counterfactual, score, timing, trajectory
 from nodes.experiment.attack import METHODS, Search, attack_path, frozen_hashes, victims
 from nodes.experiment.context import CONTROL_PERIOD_S, Experiment
 from nodes.experiment.policy import HARDENED, NAIVE, victim_file
@@ -83,15 +83,24 @@ def _check_frozen(experiment: Experiment) -> None:
         )
 
 
-def drive_live(experiment: Experiment, live: LiveRun, folder: Path, attack: Path | None) -> None:
-    """Drive one run through the node graph, with an attack file or none; leaves its bag and a JSON of what was measured in it."""
+def drive_live(experiment: Experiment, live: LiveRun, folder: Path, attack: Path | None, compare: bool = False) -> None:
+    """Drive one run through the node graph, with an attack file or none; leaves its bag and a JSON of what was measured in it.
+
+    Args:
+        experiment: Of the room.
+        live: Which run.
+        folder: Where its folder and its JSON go.
+        attack: What the compositor or the monitor shows.
+        compare: Let the counterfactual node steer by the clean frames too, and measure what the attack added.
+    """
     deploy = experiment.config.deploy
     horizon = live_horizon(experiment, live)
-    plan = TrialPlan(experiment.room.start_pose, horizon.ticks * horizon.dt_s + 0.2, deploy.nodes)
+    nodes, overrides = tuple(deploy.nodes), live_overrides(experiment, live, attack)
+    if compare:
+        nodes, overrides = (*nodes, "counterfactual"), [*overrides, "params.counterfactual=true"]
+    plan = TrialPlan(experiment.room.start_pose, horizon.ticks * horizon.dt_s + 0.2, nodes)
     run_dir = folder / live.name
-    outcome = run_trial(
-        experiment.launch_file, live_overrides(experiment, live, attack), run_dir, plan, deploy.ready_timeout_s
-    )
+    outcome = run_trial(experiment.launch_file, overrides, run_dir, plan, deploy.ready_timeout_s)
     bag = run_dir / "bag"
     states = trajectory(bag, outcome.start_real_ns, horizon)
     stopped_s = (outcome.end_real_ns - outcome.start_real_ns) / NS_PER_S if outcome.stopped_early else None
@@ -110,6 +119,8 @@ def drive_live(experiment: Experiment, live: LiveRun, folder: Path, attack: Path
         "capture_to_serial_ms": times.capture_to_serial_ms.tolist(),
         "hops_ms": {name: values.tolist() for name, values in times.hops_ms.items()},
     }  # fmt: skip
+    if compare and (found := counterfactual(bag, outcome.start_real_ns, last_frame_ns)) is not None:
+        result["counterfactual"] = asdict(found)
     write_atomically(folder / f"{live.name}.json", json.dumps(result) + "\n")
 
 

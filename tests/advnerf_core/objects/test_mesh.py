@@ -1,5 +1,8 @@
 """Meshes from real files, their drawing against closed forms."""
 
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -101,6 +104,19 @@ def test_a_square_covers_the_pixels_that_projection_says():
     expected[5:25, 10:30] = 1.0
     np.testing.assert_array_equal(image[..., 3], expected)
     np.testing.assert_allclose(image[15, 20], [1.0, 0.5, 0.0, 1.0])
+
+
+def test_drawing_leaves_the_threads_of_others_alone():
+    """A kernel of OpenMP would set the thread count of every library of the process that shares it, torch's too."""
+    program = (
+        "import numpy as np, torch\nfrom advnerf_core.geometry import Pinhole\n"
+        "from advnerf_core.objects.generators import hydrant\nfrom advnerf_core.objects.rasterise import draw_mesh\n"
+        "pose = np.eye(4)[None]\npose[0, 2, 3] = -3.0\n"
+        "draw_mesh(hydrant(), pose, Pinhole(40, 30, 40.0, 40.0, 20.0, 15.0))\nprint(torch.get_num_threads())"
+    )
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    told = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, env=environment, check=True)
+    assert told.stdout.split() == ["1"]
 
 
 def test_the_nearer_surface_wins_and_perspective_bends_the_texture():
