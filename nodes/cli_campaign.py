@@ -91,7 +91,7 @@ def run(
     ended = run_campaign(campaign, cells, options, lambda text: print(text, flush=True))
     wrong = [end for end in ended if end.how != "done"]
     if not search_only:
-        _show_table(campaign, campaign.cells, None)
+        _show_table(campaign, campaign.cells, _page_folder(campaign))
     for end in wrong:
         say_error(f"{end.name}: {end.text}")
     if wrong:
@@ -124,12 +124,21 @@ def table_command(
     only: Only = "",
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", help="Folder of the page.", show_default="table in the campaign's folder"),
+        typer.Option(
+            "--output", "-o", help="Folder of the page.",
+            show_default="table in the campaign's folder; with --only, no page is written",
+        ),
     ] = None,
     overrides: Overrides = None,
-) -> None:
+) -> None:  # fmt: skip
     """Print the transfer table and the targets, and write them as JSON, CSV, Markdown and a page with the clips by outcome."""
-    _show_table(*_load(file, folder, overrides, only), output)
+    campaign, cells = _load(file, folder, overrides, only)
+    # A page of some cells never takes the place of the page of all.
+    _show_table(campaign, cells, output or (None if only else _page_folder(campaign)))
+
+
+def _page_folder(campaign: Campaign) -> Path:
+    return campaign.folder / "table"
 
 
 def _show_table(campaign: Campaign, cells: list[Cell], output: Path | None) -> None:
@@ -146,11 +155,14 @@ def _show_table(campaign: Campaign, cells: list[Cell], output: Path | None) -> N
     found = statuses(campaign, cells)
     full = campaign_table(campaign, found)
     pairs = predicted(campaign.folder, list(full.cells.values()))
-    sections = [("Predicted and measured transfer", prediction_section(pairs))] if pairs else []
-    target = output or campaign.folder / "table"
-    page = write_table(full, campaign.folder / "cells", target, sections)
-    if pairs:
-        write_atomically(target / "predictions.json", json.dumps([pair.record() for pair in pairs], indent=1) + "\n")
+    page = None
+    if output is not None:
+        sections = [("Predicted and measured transfer", prediction_section(pairs))] if pairs else []
+        page = write_table(full, campaign.folder / "cells", output, sections)
+        if pairs:
+            write_atomically(
+                output / "predictions.json", json.dumps([pair.record() for pair in pairs], indent=1) + "\n"
+            )
     console = Console(width=None if sys.stdout.isatty() else 200)
     console.print(text_table(full).rich())
     console.print(target_table(table_targets(full)).rich())
@@ -160,7 +172,9 @@ def _show_table(campaign: Campaign, cells: list[Cell], output: Path | None) -> N
     left_out = [each for each in found if each.state in ("changed", "unreadable")]
     for each in left_out:
         say_error(f"{each.cell.name} is left out: {each.text}")
-    print(f"{len(full.cells)} of {len(cells)} cells; page: {page}")
+    print(
+        f"{len(full.cells)} of {len(cells)} cells; " + (f"page: {page}" if page else "-o FOLDER writes a page of them")
+    )
 
 
 @app.command()

@@ -65,7 +65,7 @@ class TableTarget:
 
 
 def table_targets(table: TransferTable, victim: str = VICTIM) -> list[TableTarget]:
-    """The targets of all scenarios that the table has.
+    """The targets of all lines that the table has.
 
     Args:
         table: The table.
@@ -96,7 +96,8 @@ def table_targets(table: TransferTable, victim: str = VICTIM) -> list[TableTarge
         _at_least(name, "gradient", "deployed", table.find(name, victim, "gradient", "deployed"), limit)
         for name, limit in meshes
     ]
-    return found + [_beats_random(table, name) for name in PLACES if name in present]
+    found += [_beats_random(table, name) for name in PLACES if name in present]
+    return [each for each in found if table.find(each.scenario, each.victim, each.method, each.domain) is not None]
 
 
 def _value(row: TableRow | None, of: Callable[[TableRow], float | None]) -> float | None:

@@ -12,7 +12,7 @@ from advnerf_core.files import write_atomically
 from advnerf_core.report.cells import read_cells
 from advnerf_core.report.transfer import TransferTable, Wanted, make_table
 from advnerf_core.report.transfer_page import as_csv, as_json, as_markdown, gather_clips, render_transfer_page
-from nodes.campaign.config import Campaign
+from nodes.campaign.config import Campaign, Cell
 from nodes.campaign.predictions import kept_prediction, prediction_file
 from nodes.campaign.run import gate_key
 from nodes.campaign.store import CellStatus, store_of
@@ -21,10 +21,10 @@ from nodes.runtime.errors import ConfigError
 PUBLISHED = Path("docs/results")
 
 
-def wanted_rows(campaign: Campaign) -> list[Wanted]:
-    """The lines that a campaign asks for."""
+def wanted_rows(campaign: Campaign, cells: Sequence[Cell]) -> list[Wanted]:
+    """The lines that some cells of a campaign fill."""
     seeds: dict[tuple[str, str, str, str], list[int]] = {}
-    for cell in campaign.cells:
+    for cell in cells:
         seeds.setdefault((cell.scenario, cell.placement, cell.victim, cell.method), []).append(cell.seed)
     # By victim before method: the reader compares the methods on one victim.
     order = sorted(seeds, key=lambda key: (list(campaign.config.scenarios).index(key[0]), key[1]))
@@ -36,10 +36,10 @@ def campaign_table(campaign: Campaign, found: Sequence[CellStatus]) -> TransferT
 
     Args:
         campaign: The campaign.
-        found: Where its cells are; only results of the settings as they are now are taken.
+        found: Where the cells are that the table is of; only results of the settings as they are now are taken.
     """
     cells = [each.result for each in found if each.result is not None and each.state == "done"]
-    return make_table(wanted_rows(campaign), cells, campaign.config.name)
+    return make_table(wanted_rows(campaign, [each.cell for each in found]), cells, campaign.config.name)
 
 
 def write_table(
@@ -123,4 +123,4 @@ def published_table(folder: Path, campaign: Campaign) -> TransferTable:
     cells = read_cells(folder)
     if not cells:
         raise ConfigError(f"expected published cells in {folder}, got none; run advnerf campaign publish")
-    return make_table(wanted_rows(campaign), cells, campaign.config.name)
+    return make_table(wanted_rows(campaign, campaign.cells), cells, campaign.config.name)

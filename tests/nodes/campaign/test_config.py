@@ -2,11 +2,13 @@ import json
 import shutil
 
 import pytest
+from typer.testing import CliRunner
 
 from nodes.campaign.config import load_campaign, select
 from nodes.campaign.kinds import load_kind
 from nodes.campaign.run import statuses
 from nodes.campaign.table import campaign_table, publish, published_table, write_table
+from nodes.cli import app
 from nodes.runtime.errors import ConfigError
 
 CAMPAIGN = """name: mine
@@ -85,6 +87,25 @@ def test_an_unknown_kind_is_told_with_what_there_is():
         load_kind("moon")
     with pytest.raises(ConfigError, match="function run_cell in json"):
         load_kind("json")
+
+
+def test_a_page_of_some_cells_does_not_take_the_place_of_the_page_of_all(bench, monkeypatch, tmp_path):
+    monkeypatch.syspath_prepend(str(bench.folder))
+
+    def table(*options):
+        done = CliRunner().invoke(app, ["campaign", "table", str(bench.file), *options])
+        assert done.exit_code == 0, done.output
+        return done.output
+
+    assert "of 4 cells; page: " in table()
+    whole = (bench.cells.parent / "table" / "table.json").read_text()
+    assert {row["method"] for row in json.loads(whole)["rows"]} == {"none", "gradient"}
+    said = table("--only", "method=gradient")
+    assert said.count(" missing ") == 2  # in either domain
+    assert "0 of 2 cells; -o FOLDER writes a page of them" in said
+    assert (bench.cells.parent / "table" / "table.json").read_text() == whole
+    table("--only", "method=gradient", "-o", str(tmp_path / "some"))
+    assert {row["method"] for row in json.loads((tmp_path / "some" / "table.json").read_text())["rows"]} == {"gradient"}
 
 
 def test_a_table_and_published_cells_from_finished_cells(bench, monkeypatch, tmp_path):
