@@ -14,7 +14,7 @@ from nodes.intersection.attack import Cell, Condition, cells, frozen_hashes, loa
 from nodes.intersection.context import Experiment
 from nodes.intersection.deployed import DressedScene
 from nodes.intersection.drives import deployed_drives, totals
-from nodes.intersection.films import film_cell
+from nodes.intersection.films import film_cell, kept_film, with_film
 from nodes.intersection.objects import placed_objects, surrogate_of
 from nodes.intersection.policy import victim_file, victims
 from nodes.runtime.errors import RuntimeFault
@@ -50,14 +50,14 @@ def run_cell(
         CellError: No such drive, victim or method.
     """
     cell = search_cell(experiment, scenario, victim, method, seed, folder, report)
-    result, clip = folder / f"{cell.name}.cell.json", next(folder.glob("clip.*"), None)
-    if result.exists() and clip is not None:
+    result, film = folder / f"{cell.name}.cell.json", kept_film(folder)
+    if result.exists() and film is not None:
         found: dict[str, Any] = json.loads(result.read_text())
-        return _with_clip(found, clip)
+        return with_film(found, film)
     with experiment.site.open() as scene:
         dressed = DressedScene(scene, experiment.view, placed_objects(experiment))
         data = deployed_part(experiment, dressed, cell, folder, folder)
-        return _with_clip(data, film_cell(experiment, dressed, cell, folder))
+        return with_film(data, film_cell(experiment, dressed, cell, folder))
 
 
 def search_cell(
@@ -88,11 +88,6 @@ def require_known(
     for what, value, choices in zip(("scenario", "victim", "method"), (scenario, victim, method), known, strict=True):
         if value not in choices:
             raise CellError(f"expected a {what} of {', '.join(choices)}, got {value!r}")
-
-
-def _with_clip(data: dict[str, Any], clip: Path) -> dict[str, Any]:
-    """The cell with the name of its film, relative to the folder of all cells."""
-    return {**data, "extra": {**data["extra"], "clip": f"{clip.parent.name}/{clip.name}"}}
 
 
 def deployed_part(

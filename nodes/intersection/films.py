@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import Tensor
 
+from advnerf_core.driving.policy import Policy
 from advnerf_core.geometry import Array, planar_poses
 from advnerf_core.report.clips import ClipTrack, write_clip
 from advnerf_core.report.transfer_page import METHOD_NAMES
@@ -17,6 +20,7 @@ from nodes.experiment.learned_scene import load_background
 from nodes.intersection.attack import Cell, load_theta
 from nodes.intersection.context import Experiment
 from nodes.intersection.deployed import DressedScene
+from nodes.intersection.drives import deployed_drives
 from nodes.intersection.objects import placed_objects
 from nodes.intersection.policy import HARDENED
 
@@ -50,12 +54,36 @@ def film_scenario(experiment: Experiment, dressed: DressedScene, scenario: str, 
 
 def film_cell(experiment: Experiment, dressed: DressedScene, cell: Cell, folder: Path) -> Path:
     """The deployed drive of one cell, from its first start; its files are in ``folder``, and ``clip.mp4`` will be."""
-    every, rate_hz = filmed(experiment.config.dt_s)
-    states = _states(folder / f"{cell.name}.drives.json")[0][::every]
     colours = dressed.plain_theta() if cell.method == "none" else load_theta(folder, cell)
+    return _film(experiment, dressed, cell, _states(folder / f"{cell.name}.drives.json")[0], colours, folder)
+
+
+def film_again(
+    experiment: Experiment, dressed: DressedScene, cell: Cell, policy: Policy, colours: Tensor, folder: Path
+) -> Path:
+    """The deployed drive of a cell that keeps no states: driven once more from its first start, and filmed as ``clip.mp4``."""
+    start = experiment.start_states(cell.scenario, cell.seed)[:1]
+    (again,) = deployed_drives(experiment, dressed, policy, cell.scenario, start, colours)
+    return _film(experiment, dressed, cell, again.states, colours, folder)
+
+
+def kept_film(folder: Path) -> Path | None:
+    """The film of a cell in its folder; None where there is none yet."""
+    return next(folder.glob("clip.*"), None)
+
+
+def with_film(data: dict[str, Any], film: Path) -> dict[str, Any]:
+    """The cell with the name of its film, relative to the folder of all cells."""
+    return {**data, "extra": {**data["extra"], "clip": f"{film.parent.name}/{film.name}"}}
+
+
+def _film(
+    experiment: Experiment, dressed: DressedScene, cell: Cell, states: Array, colours: Tensor, folder: Path
+) -> Path:
+    every, rate_hz = filmed(experiment.config.dt_s)
     title = f"{METHOD_NAMES[cell.method]}, {cell.victim}, seed {cell.seed}"
-    views = [dressed.camera_image(state, colours) for state in states]
-    track = _track(experiment, cell.scenario, title, cell.method, views, states)
+    views = [dressed.camera_image(state, colours) for state in states[::every]]
+    track = _track(experiment, cell.scenario, title, cell.method, views, states[::every])
     return write_clip(folder / "clip.mp4", [track], rate_hz, experiment.site.off_track_m)
 
 

@@ -10,12 +10,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from advnerf_core.driving.policy import load_policy
 from nodes.intersection import run
+from nodes.intersection.attack import Cell
 from nodes.intersection.cell_settings import inputs_of, load_with
 from nodes.intersection.cells import require_known
 from nodes.intersection.context import Experiment
-from nodes.intersection.meshes import METHODS, MeshMethod, MeshSettings, mesh_cell, mesh_hash
-from nodes.intersection.policy import attackable
+from nodes.intersection.deployed import DressedScene
+from nodes.intersection.films import film_again, kept_film, with_film
+from nodes.intersection.meshes import METHODS, MeshMethod, MeshSettings, found_meshes, mesh_cell, mesh_hash
+from nodes.intersection.policy import attackable, victim_file
 from nodes.runtime.stages import Report
 
 FIDELITY = None  # the frames are the deployment scene's own: there is no learned scene to judge
@@ -47,5 +51,13 @@ def cell_inputs(experiment: MeshExperiment, scenario: str, victim: str, method: 
 def run_cell(
     experiment: MeshExperiment, scenario: str, victim: str, method: MeshMethod, seed: int, folder: Path, report: Report
 ) -> dict[str, Any]:
-    """Search over the deployment scene's frames, drive there; see `mesh_cell`."""
-    return mesh_cell(experiment, scenario, victim, method, seed, folder, report, experiment.meshes)
+    """Search over the deployment scene's frames, drive there; see `mesh_cell`. The film is past the objects as they were exported."""
+    data = mesh_cell(experiment, scenario, victim, method, seed, folder, report, experiment.meshes)
+    if (film := kept_film(folder)) is None:
+        fields = found_meshes(experiment, scenario, victim, method, seed, folder, experiment.meshes)
+        policy = load_policy(victim_file(experiment, victim)).policy
+        with experiment.site.open() as scene:
+            dressed = DressedScene(scene, experiment.view, fields)
+            cell = Cell(scenario, victim, method, seed)
+            film = film_again(experiment, dressed, cell, policy, dressed.plain_theta(), folder)
+    return with_film(data, film)

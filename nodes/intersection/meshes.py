@@ -23,7 +23,7 @@ from advnerf_core.attack.search import Evaluation, SearchResult
 from advnerf_core.driving.policy import Policy, load_policy
 from advnerf_core.files import write_atomically
 from advnerf_core.mesh.field import MeshField
-from advnerf_core.mesh.glb import write_glb
+from advnerf_core.mesh.glb import read_glb, write_glb
 from advnerf_core.mesh.shape import ShapeLimits, ShapeSensor
 from advnerf_core.mesh.surface import sphere, unwrapped
 from advnerf_core.objects.generators import GENERATORS
@@ -113,7 +113,7 @@ def mesh_cell(
     """
     settings = settings or MeshSettings()
     require_known(experiment, scenario, attackable(experiment), victim, METHODS, method)
-    result = folder / f"mesh_{settings.target}_{scenario}_{victim}_{method}_{seed}.cell.json"
+    result = folder / _result_name(settings, scenario, victim, method, seed)
     frozen = mesh_hash(experiment, scenario, victim, seed, settings)
     if result.exists() and (kept := json.loads(result.read_text()))["settings_hash"] == frozen:
         return dict(kept)
@@ -121,6 +121,29 @@ def mesh_cell(
         with experiment.site.open() as opened:
             return _cell(experiment, scenario, victim, method, seed, result, report, settings, frozen, opened)
     return _cell(experiment, scenario, victim, method, seed, result, report, settings, frozen, scene)
+
+
+def found_meshes(
+    experiment: Experiment,
+    scenario: str,
+    victim: str,
+    method: MeshMethod,
+    seed: int,
+    folder: Path,
+    settings: MeshSettings,
+) -> list[MeshField]:
+    """The objects of a finished cell, read from the GLB files that it has written; the plain ones without an attack."""
+    if method == "none":
+        return mesh_objects(experiment, settings)
+    result = folder / _result_name(settings, scenario, victim, method, seed)
+    return [
+        MeshField(read_glb(_beside(result, f".{thing.name}.glb")), thing.T_world_from_object, thing.scale)
+        for thing in experiment.world.objects
+    ]
+
+
+def _result_name(settings: MeshSettings, scenario: str, victim: str, method: str, seed: int) -> str:
+    return f"mesh_{settings.target}_{scenario}_{victim}_{method}_{seed}.cell.json"
 
 
 def mesh_hash(experiment: Experiment, scenario: str, victim: str, seed: int, settings: MeshSettings) -> str:

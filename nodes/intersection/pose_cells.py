@@ -13,11 +13,14 @@ from typing import Any
 
 from advnerf_core.driving.policy import load_policy
 from nodes.intersection import pose_maps, run
+from nodes.intersection.attack import Cell
 from nodes.intersection.cell_settings import inputs_of, load_with
 from nodes.intersection.cells import require_known
 from nodes.intersection.context import Experiment
+from nodes.intersection.deployed import DressedScene
+from nodes.intersection.films import film_again, kept_film, with_film
 from nodes.intersection.policy import attackable, victim_file
-from nodes.intersection.poses import PoseMethod, PoseSettings, pose_cell, pose_hash
+from nodes.intersection.poses import PoseMethod, PoseSettings, found_colours, found_objects, pose_cell, pose_hash
 from nodes.runtime.stages import Report
 
 METHODS: tuple[PoseMethod, ...] = ("none", "random", "gradient")
@@ -62,8 +65,13 @@ def draw_maps(
 def run_cell(
     experiment: PoseExperiment, scenario: str, victim: str, method: PoseMethod, seed: int, folder: Path, report: Report
 ) -> dict[str, Any]:
-    """Search for places (and colours), drive in both domains; see `pose_cell`."""
+    """Search for places (and colours), drive in both domains, film the first deployed drive; see `pose_cell`."""
     require_known(experiment, scenario, attackable(experiment), victim, METHODS, method)
     policy = load_policy(victim_file(experiment, victim))
     with experiment.site.open() as scene:
-        return pose_cell(experiment, policy, scenario, method, seed, folder, report, scene, experiment.poses)
+        data = pose_cell(experiment, policy, scenario, method, seed, folder, report, scene, experiment.poses)
+        if (film := kept_film(folder)) is None:
+            dressed = DressedScene(scene, experiment.view, found_objects(experiment, data["extra"]))
+            colours = found_colours(data["extra"], dressed)
+            film = film_again(experiment, dressed, Cell(scenario, victim, method, seed), policy.policy, colours, folder)
+    return with_film(data, film)

@@ -15,10 +15,11 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from advnerf_core.attack.adjoint import AttackProblem
-from advnerf_core.attack.placement import KeepOut, PoseBounds
+from advnerf_core.attack.placement import KeepOut, PoseBounds, placed
 from advnerf_core.attack.pose_attack import FoundPoses, pose_attack, randomly_placed
 from advnerf_core.attack.poses import MultiStart
 from advnerf_core.driving.policy import LoadedPolicy
@@ -150,6 +151,20 @@ def pose_cell(
     write_atomically(result, json.dumps(data, indent=1) + "\n")
     state.unlink(missing_ok=True)
     return data
+
+
+def found_objects(experiment: Experiment, extra: dict[str, Any]) -> Sequence[VoxelGridObject]:
+    """The objects where a finished cell has put them, of its ``extra``; where they were placed by hand without an attack."""
+    objects = placed_objects(experiment)
+    if "placements" not in extra:
+        return objects
+    return placed(objects, torch.tensor(extra["placements"], dtype=torch.float64))
+
+
+def found_colours(extra: dict[str, Any], dressed: DressedScene) -> Tensor:
+    """Their colours before squashing; plain without an attack."""
+    plain = dressed.plain_theta()
+    return torch.tensor(extra["colours"], dtype=plain.dtype) if "colours" in extra else plain
 
 
 def pose_hash(experiment: Experiment, victim: LoadedPolicy, scenario: str, seed: int, settings: PoseSettings) -> str:

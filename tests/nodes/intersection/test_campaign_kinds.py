@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from advnerf_core.driving.policy import load_policy
+from advnerf_core.report.clips import read_clip
 from nodes.campaign.kinds import load_kind, settings_hash
 from nodes.intersection import mesh_cells, pose_cells
 from nodes.intersection.cells import CellError
@@ -118,9 +119,16 @@ def test_a_cell_of_places_alone_keeps_the_plain_colours(trained: Experiment, tmp
     (folder / "deploy" / "right_hardened_random_0.cell.json").write_text("{}")
     kind = load_kind("intersection_poses")
     assert kind.finished(experiment, *PLACES) is None
-    cell = kind.run_cell(experiment, *PLACES, tmp_path, silent)
-    plain = pose_cells.run_cell(experiment, "right", "hardened", "none", 0, tmp_path, silent)
+    cell = kind.run_cell(experiment, *PLACES, tmp_path / "moved", silent)
+    plain = pose_cells.run_cell(experiment, "right", "hardened", "none", 0, tmp_path / "plain", silent)
     assert plain["deployed"]["total_cte_m"] == cell["deployed"]["none_total_cte_m"]
+    plain_film, film = (read_clip(tmp_path / each["extra"]["clip"]) for each in (plain, cell))
+    assert len(plain_film) == len(film) == experiment.config.horizon + 1
+    assert not np.array_equal(plain_film[0], film[0])
+    # A cell that was finished without a film is filmed when it is asked for again, and not searched.
+    (tmp_path / "moved" / "clip.mp4").unlink()
+    assert kind.run_cell(experiment, *PLACES, tmp_path / "moved", silent) == cell
+    np.testing.assert_array_equal(read_clip(tmp_path / "moved" / "clip.mp4"), film)
     coloured = pose_cells.run_cell(replace(experiment, poses=posed(trained).poses), *PLACES, tmp_path / "other", silent)
     assert coloured["extra"]["placements"] == cell["extra"]["placements"]  # the same places are drawn
     assert coloured["extra"]["colours"] != cell["extra"]["colours"]

@@ -11,8 +11,11 @@ from advnerf_core.geometry import planar_pose
 from advnerf_core.mesh.engine import MeshEngineError, engine
 from advnerf_core.mesh.glb import read_glb
 from advnerf_core.mesh.shape import ShapeLimits
+from advnerf_core.report.clips import read_clip
 from nodes.attacking.frames import DeployedFrames
+from nodes.intersection import mesh_cells
 from nodes.intersection.cells import CellError
+from nodes.intersection.mesh_cells import MeshExperiment
 from nodes.intersection.meshes import MeshSettings, mesh_cell, mesh_objects
 from nodes.intersection.policy import victim_file
 
@@ -62,6 +65,14 @@ def test_a_cell_of_a_mesh_is_searched_driven_kept_and_not_done_again(target, tra
     assert not list(tmp_path.glob("*.state.safetensors"))
     torch.manual_seed(1)
     assert mesh_cell(trained, "straight", "hardened", "gradient", 0, tmp_path, quiet, settings, None) == cell
+    # A campaign's cell takes what is there, and films a drive past the exported objects.
+    settings_of = MeshExperiment(trained.config, trained.file, trained.folder, trained.setting, settings)
+    filmed = mesh_cells.run_cell(settings_of, "straight", "hardened", "gradient", 0, tmp_path, quiet)
+    assert filmed == {**cell, "extra": {**cell["extra"], "clip": f"{tmp_path.name}/clip.mp4"}}
+    film = read_clip(tmp_path / "clip.mp4")
+    assert len(film) == trained.config.horizon + 1
+    again = mesh_cells.run_cell(settings_of, "straight", "hardened", "none", 0, tmp_path / "plain", quiet)
+    assert not np.array_equal(read_clip(tmp_path / again["extra"]["clip"])[0], film[0])
 
 
 def test_no_attack_is_one_everywhere_and_wrong_names_are_told(trained, wall, tmp_path):
