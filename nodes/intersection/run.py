@@ -51,22 +51,6 @@ def load_experiment(file: Path, setting: str, overrides: Sequence[str], folder: 
     return Experiment(config, file.resolve(), folder.resolve(), setting)
 
 
-def experiment_of(folder: Path) -> Experiment:
-    """The experiment that a run folder was made by, with the changes of its command line.
-
-    Raises:
-        ConfigError: The folder has no manifest, or one of another kind of experiment.
-    """
-    try:
-        manifest = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))
-        config = IntersectionExperimentConfig.model_validate(manifest["config"])
-        return Experiment(config, Path(manifest["file"]), folder.resolve(), manifest["setting"])
-    except (OSError, ValueError, KeyError) as error:
-        raise ConfigError(
-            f"expected the run folder of an experiment of kind intersection or carla, got {folder}: {error}"
-        ) from error
-
-
 def run_experiment(
     experiment: Experiment, until: str | None = None, console: Console | None = None
 ) -> dict[str, StageRecord]:
@@ -91,6 +75,9 @@ def stages_of(experiment: Experiment) -> list[Stage]:
         "scenarios": config.scenarios,
     }
     seen = {key: value for key, value in world.items() if key not in ("objects", "car")}
+    # Held-out views lie along what is driven. Only another speed than the usual one is named: captures of before stay what they are.
+    speed_mps, car = experiment.world.car.speed_mps, type(experiment.world.car)
+    other_speed = {} if speed_mps == car.model_fields["speed_mps"].default else {"speed_mps": speed_mps}
     kinds = sorted({thing.kind for thing in experiment.world.objects})
 
     def stage(name: str, module: Any, settings: dict[str, Any], after: Sequence[str]) -> Stage:
@@ -103,7 +90,7 @@ def stages_of(experiment: Experiment) -> list[Stage]:
         return getattr(config, name).model_dump(mode="json")
 
     stages = [
-        stage("capture", capture, {"world": seen, "capture": part("capture"), **measured}, ()),
+        stage("capture", capture, {"world": seen, "capture": part("capture"), **measured, **other_speed}, ()),
         stage("scene", scene, {"scene": part("scene")}, ("capture",)),
         stage("object", objects, {"object": part("object"), "kinds": kinds}, ()),
         stage("policy", policy, {"world": world, "policy": part("policy"), "sigma": config.attack.random_sigma, **measured}, ("capture", "scene", "object")),

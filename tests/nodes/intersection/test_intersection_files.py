@@ -1,6 +1,5 @@
 """The experiment file, its stages, and which change redoes what."""
 
-import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -11,7 +10,7 @@ import pytest
 from nodes.cli import main
 from nodes.experiment.run import kind_of
 from nodes.intersection.context import Experiment
-from nodes.intersection.run import experiment_of, load_experiment, stages_of
+from nodes.intersection.run import load_experiment, stages_of
 from nodes.runtime.errors import ConfigError
 
 LAUNCH = Path(__file__).parents[3] / "launch" / "intersection.experiment.yaml"
@@ -50,6 +49,7 @@ def test_starts_are_drawn_about_the_nominal_one(tmp_path: Path) -> None:
         ("object.fit_steps=3", {"object"}),
         ("world.objects=[]", {"object", "policy", "attack", "deploy"}),
         ("world.car.turn_rate_lag_s=0.2", {"policy", "attack", "deploy"}),
+        ("world.car.speed_mps=5", {"capture", "policy", "attack", "deploy"}),
         ("world.road.lane_width_m=3.4", {"capture", "policy", "attack", "deploy"}),
         ("attack.evaluations=3", {"attack", "report"}),
     ],
@@ -115,15 +115,3 @@ def test_training_drives_that_end_before_the_junction_are_refused(tmp_path: Path
     with pytest.raises(ConfigError, match=r"retrain\.drive_steps.* got 60 ticks"):
         load(tmp_path, *fine, "policy.drive_steps=600", "retrain.rounds=1")
     assert load(tmp_path, *fine, "policy.drive_steps=600", "retrain.drive_steps=600").config.retrain is not None
-
-
-def test_a_run_folder_gives_back_the_experiment_that_made_it(tmp_path: Path) -> None:
-    made = load(tmp_path, "horizon=17", "world.car.speed_mps=5")
-    made.folder.mkdir(parents=True, exist_ok=True)
-    manifest = {"file": str(made.file), "setting": made.setting, "config": made.config.model_dump(mode="json")}
-    (made.folder / "manifest.json").write_text(json.dumps(manifest))
-    again = experiment_of(made.folder)
-    assert again.config == made.config
-    assert again.world.car.speed_mps == 5.0
-    with pytest.raises(ConfigError, match="expected the run folder"):
-        experiment_of(tmp_path / "nowhere")
