@@ -8,7 +8,8 @@ In the learned scene of an experiment's run folder, against its hardened victim 
 
 The effect is what the best texture so far adds to the total CTE of the plain board, and is given as a share of the white box's. Every
 method gets up to ``--multiple`` times the white box's calls, piece by piece: searches keep their state under the output folder, a
-piece ends after ``--minutes``, and the next call goes on. Rows are recorded when all methods are through (``--record`` before).
+piece ends after ``--minutes``, and the next call goes on. The rows of the methods asked for are recorded when they are through
+(``--record`` before).
 """
 
 from __future__ import annotations
@@ -213,7 +214,7 @@ def main() -> None:
     parser.add_argument("--multiple", type=float, default=50.0, help="calls of each method, in those of the white box")
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS))
     parser.add_argument("--minutes", type=float, default=9.0, help="of this piece; call again to go on")
-    parser.add_argument("--record", action="store_true", help="record the rows although not all methods are through")
+    parser.add_argument("--record", action="store_true", help="record the rows although not all of them are through")
     parser.add_argument("--trial", action="store_true", help="small: 4 ticks, equal calls, another folder, no rows")
     options = parser.parse_args()
     if options.trial:
@@ -226,6 +227,7 @@ def main() -> None:
     for name, row in table.items():
         print(name, {mark: f"{100 * share:.0f} %" for mark, share in row.items()})
     if not options.trial and (finished or options.record):
+        table = {name: table[name] for name in options.methods}
         record(table, numbers["none_m"], numbers["white_m"], numbers["white_calls"], options.steps)
     print("finished" if finished else "not finished: call again to go on")
 
