@@ -77,7 +77,8 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
             new = _collect(experiment, scene, victim, thetas, here, told)
             settings = RetrainConfig(steps=wanted.steps, new_share=wanted.new_share, seed=wanted.seed + number)
             file = here / "policy.safetensors"
-            fine_tune(victim, kept, new, settings, file, _stepping(told, wanted.steps))
+            if not file.exists():
+                fine_tune(victim, kept, new, settings, file, _stepping(told, wanted.steps))
             victim, kept = load_policy(file), [*kept, *new]
         summary = {
             "rounds": rounds, "old_attacks": _under_old_attacks(experiment, dressed, folder / "round0", first),

@@ -66,7 +66,10 @@ def prepare_victims(experiment: Experiment, report: Report) -> None:
 
 
 def stages_of(experiment: Experiment) -> list[Stage]:
-    """The stages with the part of the configuration that each depends on; moving an object keeps capture, scene and object files."""
+    """The stages with the part of the configuration that each depends on; moving an object keeps capture, scene and object files.
+
+    More rounds of retraining go on from those that are there.
+    """
     config, world = experiment.config, experiment.site.settings
     measured = {
         "horizon": config.horizon,
@@ -80,11 +83,14 @@ def stages_of(experiment: Experiment) -> list[Stage]:
     other_speed = {} if speed_mps == car.model_fields["speed_mps"].default else {"speed_mps": speed_mps}
     kinds = sorted({thing.kind for thing in experiment.world.objects})
 
-    def stage(name: str, module: Any, settings: dict[str, Any], after: Sequence[str]) -> Stage:
+    def stage(
+        name: str, module: Any, settings: dict[str, Any], after: Sequence[str], parts: Sequence[dict[str, Any]] = ()
+    ) -> Stage:
         def work(folder: Path, told: Report) -> None:
             module.run(experiment, folder, told)
 
-        return Stage(name, work, json.loads(json.dumps(settings)), after)
+        settings, *smaller = json.loads(json.dumps([settings, *parts]))
+        return Stage(name, work, settings, after, goes_on_from=smaller)
 
     def part(name: str) -> Any:
         return getattr(config, name).model_dump(mode="json")
@@ -100,5 +106,9 @@ def stages_of(experiment: Experiment) -> list[Stage]:
     ]  # fmt: skip
     if config.retrain is not None:
         settings = {"world": world, "retrain": part("retrain"), "attack": part("attack"), **measured}
-        stages.append(stage("retrain", retrain, settings, ("scene", "object", "policy", "attack")))
+        fewer = [
+            {**settings, "retrain": {**settings["retrain"], "rounds": rounds}}
+            for rounds in range(1, config.retrain.rounds)
+        ]
+        stages.append(stage("retrain", retrain, settings, ("scene", "object", "policy", "attack"), fewer))
     return stages

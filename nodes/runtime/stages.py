@@ -13,7 +13,7 @@ import json
 import shutil
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -67,6 +67,7 @@ class Stage:
         settings: The part of the configuration that the result depends on (JSON types).
         after: Stages whose outputs this one reads.
         version: Raised when the meaning of the stage's output changes.
+        goes_on_from: Other settings whose result is a part of this one, as fewer rounds are: their folder is gone on from, not wiped.
     """
 
     name: str
@@ -74,6 +75,7 @@ class Stage:
     settings: Mapping[str, Any]
     after: Sequence[str] = ()
     version: int = 1
+    goes_on_from: Sequence[Mapping[str, Any]] = ()
 
 
 @dataclass(frozen=True)
@@ -164,7 +166,8 @@ def _run_or_reuse(stage: Stage, folder: Path, records: Mapping[str, StageRecord]
     if old is not None and old.key == key and old.digest is not None:
         display.finish(stage.name, old.seconds, cached=True)
         return old
-    resumed = old is not None and old.key == key
+    parts = [_key_of(replace(stage, settings=settings), records) for settings in stage.goes_on_from]
+    resumed = old is not None and old.key in (key, *parts)
     if not resumed and folder.exists():
         if not (folder / _RECORD).exists() and any(folder.iterdir()):
             raise StageError(

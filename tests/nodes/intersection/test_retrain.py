@@ -83,6 +83,15 @@ def test_a_round_of_retraining_and_the_attack_on_it(attacked: Experiment) -> Non
     retrain.run(attacked, folder, silent)
     assert {file: file.stat().st_mtime_ns for file in folder.rglob("*.npy")} == times
     assert load_policy(victim_file(attacked, RETRAINED)).sha256 == before
+    # one more round goes on from the one that is there
+    twice = SMALL.model_copy(update={"rounds": SMALL.rounds + 1, "pays_ratio": 1e-6})
+    more = replace(attacked, config=attacked.config.model_copy(update={"retrain": twice}))
+    retrain.run(more, folder, silent)
+    grown = json.loads((folder / "retrain.json").read_text())
+    assert grown["rounds"][:2] == found["rounds"]
+    assert len(grown["rounds"]) == 3
+    assert grown["old_attacks"] == found["old_attacks"]
+    assert times.items() <= {file: file.stat().st_mtime_ns for file in folder.rglob("*.npy")}.items()
 
 
 @pytest.mark.slow

@@ -68,6 +68,31 @@ def test_an_interrupted_stage_finds_its_own_partial_work(tmp_path):
     assert seen == [False, True]
 
 
+def test_more_of_the_same_goes_on_from_what_is_there(tmp_path):
+    def growing(rounds, seed=0):
+        def work(folder, report):
+            for number in range(rounds):
+                if not (file := folder / f"round{number}").exists():
+                    file.write_text(f"made when {rounds} were asked for")
+
+        of = [{"rounds": fewer, "seed": seed} for fewer in range(1, rounds)]
+        return [Stage("loop", work, {"rounds": rounds, "seed": seed}, goes_on_from=of)]
+
+    def rounds():
+        return [file.read_text()[10:11] for file in sorted((tmp_path / "loop").glob("round*"))]
+
+    run_and_note(tmp_path, growing(2))
+    assert run_and_note(tmp_path, growing(3)) == ["loop"]
+    assert rounds() == ["2", "2", "3"]
+    assert run_and_note(tmp_path, growing(3)) == []
+    assert run_and_note(tmp_path, growing(2)) == [
+        "loop"
+    ]  # fewer are made anew: what is left of more would be taken for them
+    assert rounds() == ["2", "2"]
+    run_and_note(tmp_path, growing(3, seed=1))
+    assert rounds() == ["3", "3", "3"]
+
+
 def test_partial_work_of_other_settings_is_not_used(tmp_path):
     def fail(folder, report):
         (folder / "partial").write_text("half")
