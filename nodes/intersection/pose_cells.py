@@ -74,4 +74,5 @@ def run_cell(
             dressed = DressedScene(scene, experiment.view, found_objects(experiment, data["extra"]))
             colours = found_colours(data["extra"], dressed)
             film = film_again(experiment, dressed, Cell(scenario, victim, method, seed), policy.policy, colours, folder)
-    return with_film(data, film)
+    # As of all cells, the time of the search: none without one.
+    return with_film({**data, "seconds": data["extra"].get("seconds", 0.0)}, film)
