@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ from nodes.intersection.config import IntersectionExperimentConfig
 from nodes.intersection.context import Experiment
 from nodes.runtime.config import validate
 from nodes.runtime.errors import ConfigError
-from nodes.runtime.stages import Report, Stage, StageRecord
+from nodes.runtime.stages import Report, Stage, StageRecord, begun_with
 
 _LIBRARIES = ("torch", "numpy", "numba", "opencv-contrib-python-headless", "mujoco")
 
@@ -60,9 +61,19 @@ def run_experiment(
 
 
 def prepare_victims(experiment: Experiment, report: Report) -> None:
-    """Make scene, objects and policies, also the retrained one where the experiment retrains."""
+    """Make scene, objects and policies, also the retrained one where the experiment retrains: one round of it, if there is none yet."""
     del report  # the stages show their own progress
-    run_experiment(experiment, until="policy" if experiment.config.retrain is None else "retrain")
+    wanted = experiment.config.retrain
+    if wanted is None:
+        run_experiment(experiment, until="policy")
+        return
+    begun = begun_with(stages_of(experiment), experiment.folder, "retrain")
+    if begun is not None and policy.victim_file(experiment, policy.RETRAINED).exists():
+        return
+    # Its victim is that of the first round: the others are left to the experiment itself, which goes on from here.
+    rounds = 1 if begun is None else begun["retrain"]["rounds"]
+    config = experiment.config.model_copy(update={"retrain": wanted.model_copy(update={"rounds": rounds})})
+    run_experiment(replace(experiment, config=config), until="retrain")
 
 
 def stages_of(experiment: Experiment) -> list[Stage]:

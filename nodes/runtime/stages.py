@@ -131,6 +131,10 @@ def read_record(folder: Path) -> StageRecord | None:
 
 def is_current(stages: Sequence[Stage], folder: Path, name: str) -> bool:
     """Whether a stage and all that it builds on are finished, and are what would be run now."""
+    return name in _current(stages, folder)
+
+
+def _current(stages: Sequence[Stage], folder: Path) -> dict[str, StageRecord]:
     records: dict[str, StageRecord] = {}
     for stage in stages:
         record = read_record(folder / stage.name)
@@ -138,7 +142,18 @@ def is_current(stages: Sequence[Stage], folder: Path, name: str) -> bool:
             continue
         if record.key == _key_of(stage, records):
             records[stage.name] = record
-    return name in records
+    return records
+
+
+def begun_with(stages: Sequence[Stage], folder: Path, name: str) -> Mapping[str, Any] | None:
+    """The settings that a stage's folder was begun with, if running the stage now would go on from there; None if it would not."""
+    records = _current(stages, folder)
+    stage = next(each for each in stages if each.name == name)
+    record = read_record(folder / name)
+    if record is None or any(earlier not in records for earlier in stage.after):
+        return None
+    known = (stage.settings, *stage.goes_on_from)
+    return next((each for each in known if record.key == _key_of(replace(stage, settings=each), records)), None)
 
 
 def hash_of(value: Any) -> str:

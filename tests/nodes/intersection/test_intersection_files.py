@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,9 +10,11 @@ import pytest
 
 from nodes.cli import main
 from nodes.experiment.run import kind_of
+from nodes.intersection import run
 from nodes.intersection.context import Experiment
 from nodes.intersection.run import load_experiment, stages_of
 from nodes.runtime.errors import ConfigError
+from nodes.runtime.stages import Report, run_stages
 
 LAUNCH = Path(__file__).parents[3] / "launch" / "intersection.experiment.yaml"
 
@@ -115,3 +118,45 @@ def test_training_drives_that_end_before_the_junction_are_refused(tmp_path: Path
     with pytest.raises(ConfigError, match=r"retrain\.drive_steps.* got 60 ticks"):
         load(tmp_path, *fine, "policy.drive_steps=600", "retrain.rounds=1")
     assert load(tmp_path, *fine, "policy.drive_steps=600", "retrain.drive_steps=600").config.retrain is not None
+
+
+class Quiet:
+    """Takes what stages tell."""
+
+    def start(self, stage: str) -> Callable[[float, str], None]:
+        return lambda fraction, text="": None
+
+    def finish(self, stage: str, seconds: float, cached: bool) -> None:
+        pass
+
+
+def test_cells_of_the_retrained_victim_wait_for_one_round_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The stages write next to nothing here: what is asked for is decided by their records."""
+    experiment = load(tmp_path, "retrain.rounds=6")
+    asked: list[tuple[int, str]] = []
+
+    def work(folder: Path, report: Report) -> None:
+        (folder / "round0").mkdir(exist_ok=True)
+        (folder / "round0" / "policy.safetensors").write_text("a victim")
+
+    def run_experiment(wanted: Experiment, until: str) -> None:
+        assert wanted.config.retrain is not None
+        asked.append((wanted.config.retrain.rounds, until))
+        run_stages([replace(stage, run=work) for stage in stages_of(wanted)], wanted.folder, Quiet())
+
+    monkeypatch.setattr(run, "run_experiment", run_experiment)
+    run.prepare_victims(experiment, lambda fraction, text="": None)
+    assert asked == [(1, "retrain")]
+    run.prepare_victims(
+        experiment, lambda fraction, text="": None
+    )  # also of a longer loop it is the first round's victim
+    assert asked == [(1, "retrain")]
+    (experiment.folder / "retrain" / "round0" / "policy.safetensors").unlink()
+    run.prepare_victims(load(tmp_path, "retrain.rounds=4"), lambda fraction, text="": None)
+    assert asked[1:] == [(1, "retrain")]
+    run.prepare_victims(load(tmp_path, "retrain.rounds=6", "retrain.stills=7"), lambda fraction, text="": None)
+    assert asked[2:] == [(1, "retrain")]
+    longer = load(tmp_path / "longer", "retrain.rounds=6")
+    run_stages([replace(stage, run=lambda folder, report: None) for stage in stages_of(longer)], longer.folder, Quiet())
+    run.prepare_victims(longer, lambda fraction, text="": None)
+    assert asked[3:] == [(6, "retrain")]  # begun, but no victim yet: nothing of it is thrown away

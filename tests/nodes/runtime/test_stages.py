@@ -1,7 +1,7 @@
 import pytest
 
 from advnerf_core.files import write_atomically
-from nodes.runtime.stages import Stage, StageError, digest_of, read_record, run_stages
+from nodes.runtime.stages import Stage, StageError, begun_with, digest_of, read_record, run_stages
 
 
 class Notes:
@@ -81,8 +81,13 @@ def test_more_of_the_same_goes_on_from_what_is_there(tmp_path):
     def rounds():
         return [file.read_text()[10:11] for file in sorted((tmp_path / "loop").glob("round*"))]
 
+    assert begun_with(growing(3), tmp_path, "loop") is None
     run_and_note(tmp_path, growing(2))
+    assert begun_with(growing(3), tmp_path, "loop") == {"rounds": 2, "seed": 0}
+    assert begun_with(growing(3, seed=1), tmp_path, "loop") is None
     assert run_and_note(tmp_path, growing(3)) == ["loop"]
+    assert begun_with(growing(3), tmp_path, "loop") == {"rounds": 3, "seed": 0}
+    assert begun_with(growing(2), tmp_path, "loop") is None
     assert rounds() == ["2", "2", "3"]
     assert run_and_note(tmp_path, growing(3)) == []
     assert run_and_note(tmp_path, growing(2)) == [
