@@ -6,6 +6,7 @@ against an adversary that answers it. Every search, collection, training and dri
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 from collections.abc import Callable, Sequence
@@ -56,7 +57,7 @@ class Found:
 
 
 def run(experiment: Experiment, folder: Path, report: Report) -> None:
-    """Write a folder per round, ``retrain.json`` with the curve and the drives under the old attacks, and ``curve.png``."""
+    """Write a folder per round, and after each ``retrain.json`` with the curve and the drives under the old attacks, and ``curve.png``."""
     wanted = experiment.config.retrain
     assert wanted is not None, "the stage runs only where the experiment asks for it"
     surrogate = surrogate_of(experiment, placed_objects(experiment))
@@ -65,12 +66,21 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
     thetas: list[torch.Tensor] = []
     with experiment.site.open() as scene:
         dressed = DressedScene(scene, experiment.view, placed_objects(experiment))
-        first = _first_attacks(experiment, surrogate, dressed, victim)
+        first, old_attacks = _first_attacks(experiment, surrogate, dressed, victim, folder / "round0"), {}
         for number in range(wanted.rounds + 1):
             here = folder / f"round{number}"
             told = _part(report, number / (wanted.rounds + 1), 1.0 / (wanted.rounds + 1), f"round {number}")
             found = first if number == 0 else _attack_again(experiment, surrogate, dressed, victim, here, told)
             rounds.append({"victim": victim.sha256, **found.ratios})
+            if number == 1:
+                old_attacks = _under_old_attacks(experiment, dressed, folder / "round0", first)
+            summary = {
+                "rounds": rounds, "old_attacks": old_attacks, "pays_ratio": wanted.pays_ratio, "final_policy": str(file),
+                "settings_hash": hash_of(wanted.model_dump(mode="json")),
+            }  # fmt: skip
+            # After every round: a loop takes hours, and may be stopped.
+            write_atomically(folder / "retrain.json", json.dumps(summary, indent=1) + "\n")
+            retrain_plot.draw(folder / "curve.png", rounds, wanted.pays_ratio)
             if number == wanted.rounds or not _pays(found, wanted.pays_ratio):
                 break
             thetas += list(found.thetas.values())
@@ -80,12 +90,6 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
             if not file.exists():
                 fine_tune(victim, kept, new, settings, file, _stepping(told, wanted.steps))
             victim, kept = load_policy(file), [*kept, *new]
-        summary = {
-            "rounds": rounds, "old_attacks": _under_old_attacks(experiment, dressed, folder / "round0", first),
-            "pays_ratio": wanted.pays_ratio, "final_policy": str(file), "settings_hash": hash_of(wanted.model_dump(mode="json")),
-        }  # fmt: skip
-    write_atomically(folder / "retrain.json", json.dumps(summary, indent=1) + "\n")
-    retrain_plot.draw(folder / "curve.png", rounds, wanted.pays_ratio)
 
 
 def unseen_start(experiment: Experiment, scenario: str) -> torch.Tensor:
@@ -119,13 +123,15 @@ def _old_frames(experiment: Experiment) -> list[Frames]:
     return [store.load(name) for name in store.names()]
 
 
-def _first_attacks(experiment: Experiment, surrogate: Surrogate, dressed: DressedScene, victim: LoadedPolicy) -> Found:
+def _first_attacks(
+    experiment: Experiment, surrogate: Surrogate, dressed: DressedScene, victim: LoadedPolicy, folder: Path
+) -> Found:
     """What the attack stage found for its first seed."""
-    folder, seed = experiment.stage_folder("attack"), experiment.config.attack.seeds[0]
+    searched, seed = experiment.stage_folder("attack"), experiment.config.attack.seeds[0]
     thetas: dict[str, torch.Tensor] = {
-        name: load_theta(folder, Cell(name, HARDENED, "gradient", seed)) for name in experiment.config.scenarios
+        name: load_theta(searched, Cell(name, HARDENED, "gradient", seed)) for name in experiment.config.scenarios
     }
-    return _judged(experiment, surrogate, dressed, victim, thetas)
+    return _judged(experiment, surrogate, dressed, victim, thetas, folder)
 
 
 def _attack_again(
@@ -148,15 +154,18 @@ def _attack_again(
             settings_hash=hash_of({"victim": victim.sha256, "scenario": scenario}),
         )  # fmt: skip
         thetas[scenario] = result.theta
-    return _judged(experiment, surrogate, dressed, victim, thetas)
+    return _judged(experiment, surrogate, dressed, victim, thetas, folder)
 
 
 def _judged(
     experiment: Experiment, surrogate: Surrogate, dressed: DressedScene, policy: LoadedPolicy,
-    thetas: dict[str, torch.Tensor],
+    thetas: dict[str, torch.Tensor], folder: Path,
 ) -> Found:  # fmt: skip
-    """Ratios to no attack of the same victim in both domains, from the attack's starts."""
-    seed = experiment.config.attack.seeds[0]
+    """Ratios to no attack of the same victim in both domains, from the attack's starts; kept in the folder of the round."""
+    seed, kept = experiment.config.attack.seeds[0], folder / "ratios.json"
+    key = [policy.sha256, *(hashlib.sha256(theta.numpy().tobytes()).hexdigest() for theta in thetas.values())]
+    if kept.exists() and (known := json.loads(kept.read_text()))["of"] == key:
+        return Found(thetas, known["ratios"])
     ratios: dict[str, dict[str, float]] = {"surrogate": {}, "deployed": {}}
     for scenario, theta in thetas.items():
         problem = attack_problem(experiment, surrogate, policy, scenario, seed)
@@ -164,6 +173,7 @@ def _judged(
         starts = experiment.start_states(scenario, seed)
         driven = [_total_cte_m(experiment, dressed, policy, scenario, starts, each) for each in (theta, None)]
         ratios["surrogate"][scenario], ratios["deployed"][scenario] = learned[0] / learned[1], driven[0] / driven[1]
+    write_atomically(kept, json.dumps({"of": key, "ratios": ratios}, indent=1) + "\n")
     return Found(thetas, ratios)
 
 
@@ -230,8 +240,6 @@ def _frames(
 def _under_old_attacks(experiment: Experiment, dressed: DressedScene, folder: Path, first: Found) -> dict[str, Any]:
     """The retrained policy past the attacks that it was trained on, from a start that nothing has seen, beside the original undisturbed."""
     original, file = load_policy(victim_file(experiment, HARDENED)), folder / "policy.safetensors"
-    if not file.exists():
-        return {}
     retrained, rows = load_policy(file), {}
     for scenario, theta in first.thetas.items():
         start = unseen_start(experiment, scenario)

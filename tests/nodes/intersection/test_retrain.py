@@ -77,6 +77,7 @@ def test_a_round_of_retraining_and_the_attack_on_it(attacked: Experiment) -> Non
     picture = cv2.imread(str(folder / "curve.png"))
     assert picture is not None
     assert picture.std() > 10.0
+    assert sorted(file.parent.name for file in folder.glob("*/ratios.json")) == ["round0", "round1"]
     # once more: everything is there, nothing is collected, trained or searched again
     times = {file: file.stat().st_mtime_ns for file in folder.rglob("*.npy")}
     before = load_policy(victim_file(attacked, RETRAINED)).sha256
