@@ -114,9 +114,7 @@ def runner(name: str, problem: AttackProblem, calls: int, lessons: Distillation)
     if name in ("cem", "evolution"):
         strategy = CrossEntropy() if name == "cem" else Evolution()
         return 0, each, lambda **kept: population_search(problem, strategy, evaluations, 20, 8, **kept)
-    search = BlackBoxSearch("guided", distillation=lessons)
-    if name == "distilled":
-        search = BlackBoxSearch("distilled", probes=1, distillation=lessons)
+    search = BlackBoxSearch.usual("distilled" if name == "distilled" else "guided", distillation=lessons)
     return (
         search.first_calls(), search.step_calls(problem), lambda **kept: black_box_attack(problem, search, calls, **kept)
     )  # fmt: skip

@@ -24,7 +24,7 @@ import math
 import time
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -46,6 +46,8 @@ from advnerf_core.attack.search import (
 from advnerf_core.attack.visited import Visited, VisitedDrive
 from advnerf_core.errors import AdvnerfError
 
+Method = Literal["distilled", "guided"]
+_USUAL: dict[Method, tuple[float, int]] = {"guided": (0.3, 3), "distilled": (0.1, 1)}
 _ADAM = (0.9, 0.999, 1e-8)
 # A probe changes no single value of theta by more than so many times its root mean square.
 _STEEPEST = 5.0
@@ -69,9 +71,9 @@ class BlackBoxSearch:
         student: Makes it.
     """
 
-    method: Literal["distilled", "guided"] = "guided"
-    learning_rate: float = 0.1
-    probes: int = 8
+    method: Method = "guided"
+    learning_rate: float = 0.3
+    probes: int = 3
     probe_sigma: float = 0.1
     cells: int = 8
     distillation: Distillation = field(default_factory=Distillation)
@@ -80,6 +82,17 @@ class BlackBoxSearch:
     def __post_init__(self) -> None:
         if self.probes < 1 or self.learning_rate <= 0.0 or self.probe_sigma <= 0.0:
             raise ValueError(f"expected probes >= 1, learning_rate > 0 and probe_sigma > 0, got {self}")
+
+    @classmethod
+    def usual(
+        cls, method: Method, learning_rate: float | None = None, probes: int | None = None, **others: Any
+    ) -> BlackBoxSearch:
+        """A method with the rate and the probes that suit it, where none are given.
+
+        A budget buys ``guided`` few steps, so each must be long, and questions are worth less than steps; see docs/black_box.md.
+        """
+        rate, pairs = _USUAL[method]
+        return cls(method, learning_rate or rate, probes or pairs, **others)
 
     def first_calls(self) -> int:
         """Policy calls of the first lesson."""

@@ -156,7 +156,8 @@ class SearchRequest(_Section):
     method: Method = "gradient"
     evaluations: Count = Field(default=50, description="Closed-loop evaluations; an iteration of the gradient is one.")
     learning_rate: AboveZero | None = Field(
-        default=None, description="Of Adam: 0.1 for gradient, distilled and guided, 0.5 for evolution, if not given."
+        default=None,
+        description="Of Adam: 0.1 for gradient and distilled, 0.3 for guided, 0.5 for evolution, if not given.",
     )
     sigma: AboveZero | None = Field(
         default=None,
@@ -167,7 +168,7 @@ class SearchRequest(_Section):
         default=8, description="Cells along an edge that cem, evolution and guided search over; 0 for the face's own."
     )
     probes: Count | None = Field(
-        default=None, description="Pairs of textures asked about after each drive: 8 for guided, 1 for distilled."
+        default=None, description="Pairs of textures asked about after each drive: 3 for guided, 1 for distilled."
     )
     warm_pairs: Count | None = Field(
         default=None, description="Pairs of the first lesson of distilled and guided; 300 if not given."

@@ -65,8 +65,9 @@ def black_box_search(request: AttackRequest) -> BlackBoxSearch | None:
     if wanted.method != "distilled" and wanted.method != "guided":
         return None
     lessons = Distillation() if wanted.warm_pairs is None else Distillation(warm_pairs=wanted.warm_pairs)
-    probes = wanted.probes or (8 if wanted.method == "guided" else 1)
-    return BlackBoxSearch(wanted.method, wanted.learning_rate or 0.1, probes, cells=wanted.cells, distillation=lessons)
+    return BlackBoxSearch.usual(
+        wanted.method, wanted.learning_rate, wanted.probes, cells=wanted.cells, distillation=lessons
+    )
 
 
 def policy_calls(prepared: Prepared) -> int:
