@@ -192,7 +192,7 @@ def record(table: dict[str, dict[str, float]], none_m: float, white_m: float, wh
         last = max(row, key=int)
         reached = [mark for mark in row if row[mark] >= TARGET_SHARE]
         curve = ", ".join(f"{mark} x: {100 * share:.0f} %" for mark, share in row.items())
-        aimed = name in ("distilled", "guided")
+        aimed = name != "random"
         target = f">= {100 * TARGET_SHARE:.0f} % at {TARGET_MULTIPLE} x the calls" if aimed else ""
         met = bool(reached) if aimed and (reached or int(last) >= TARGET_MULTIPLE) else None
         note = f"{base}; best so far at {curve}"
