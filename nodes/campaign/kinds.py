@@ -11,6 +11,7 @@ A module of cells has one function that it must have, and may have others::
     LIVE = True        # run_cell drives a live graph: such cells run alone, after all that may run beside others
     FIDELITY = None    # there is no learned scene, and so no gate, though the package has a module fidelity
     PREDICTS = False   # the gate holds, but nothing predicts these attacks
+    UNPUBLISHED = ("colours",)   # names in a cell's extra that stay in the campaign's folder: megabytes
     TAKEN_FROM = "deploy"    # stage of the experiment in whose folder such cells may be finished already
 
 What it lacks comes from the package it is in (``run.load_experiment``, ``run.run_experiment``), as the experiments of this project have it.
@@ -59,6 +60,11 @@ class Kind:
     def live(self) -> bool:
         """Whether `run_cell` drives a live graph and so runs alone."""
         return bool(getattr(self.module, "LIVE", False))
+
+    @property
+    def unpublished(self) -> tuple[str, ...]:
+        """Names in a cell's ``extra`` that stay in the campaign's folder."""
+        return tuple(getattr(self.module, "UNPUBLISHED", ()))
 
     @property
     def predicts(self) -> bool:

@@ -13,6 +13,7 @@ from advnerf_core.report.cells import read_cells
 from advnerf_core.report.transfer import TransferTable, Wanted, make_table
 from advnerf_core.report.transfer_page import as_csv, as_json, as_markdown, gather_clips, render_transfer_page
 from nodes.campaign.config import Campaign, Cell
+from nodes.campaign.kinds import load_kind
 from nodes.campaign.predictions import kept_prediction, prediction_file
 from nodes.campaign.run import gate_key
 from nodes.campaign.store import CellStatus, store_of
@@ -89,7 +90,7 @@ def publish(campaign: Campaign, found: Sequence[CellStatus], folder: Path) -> tu
             prediction.unlink(missing_ok=True)
         if each.state != "done":
             continue
-        text = store_of(campaign).result_file(each.cell.name).read_text(encoding="utf-8")
+        text = _published_text(campaign, each.cell)
         if target.exists() and target.read_text(encoding="utf-8") == text:
             same.append(each.cell.name)
             continue
@@ -97,6 +98,17 @@ def publish(campaign: Campaign, found: Sequence[CellStatus], folder: Path) -> tu
         changed.append(each.cell.name)
     _publish_beside(campaign, [each for each in found if each.state == "done"], folder / campaign.config.name)
     return changed, same
+
+
+def _published_text(campaign: Campaign, cell: Cell) -> str:
+    """The cell's file, less what its kind keeps for its own maps and is megabytes long."""
+    text = store_of(campaign).result_file(cell.name).read_text(encoding="utf-8")
+    left_out = load_kind(campaign.config.scenarios[cell.scenario].kind).unpublished
+    if not left_out:
+        return text
+    data = json.loads(text)
+    extra = {name: value for name, value in data["extra"].items() if name not in left_out}
+    return json.dumps({**data, "extra": extra}, indent=1) + "\n"
 
 
 def _publish_beside(campaign: Campaign, done: Sequence[CellStatus], folder: Path) -> None:

@@ -25,6 +25,7 @@ from nodes.runtime.stages import Report
 
 METHODS: tuple[PoseMethod, ...] = ("none", "random", "gradient")
 prepare = run.prepare_victims
+UNPUBLISHED = ("colours",)  # six megabytes a cell; maps read them in the campaign's folder
 PREDICTS = False  # what a prediction composes into real pictures stands where it was placed by hand
 
 

@@ -134,6 +134,15 @@ def test_a_table_and_published_cells_from_finished_cells(bench, monkeypatch, tmp
     assert {path.name for path in page.parent.iterdir()} == {"index.html", "table.csv", "table.json", "table.md"}
     assert publish(campaign, found, tmp_path / "kept") == ([plan[0].cell.name], [])
     assert publish(campaign, found, tmp_path / "kept") == ([], [plan[0].cell.name])
+    kept = tmp_path / "kept" / "toy" / f"{plan[0].cell.name}.json"
+    whole = bench.cells / kept.name
+    assert kept.read_text() == whole.read_text()
+    whole.write_text(json.dumps({**json.loads(whole.read_text()), "extra": {"short": 1, "colours": [0.5] * 9}}))
+    monkeypatch.setattr(load_kind(plan[0].job.kind).module, "UNPUBLISHED", ("colours",), raising=False)
+    found = statuses(campaign, campaign.cells)
+    assert publish(campaign, found, tmp_path / "kept") == ([plan[0].cell.name], [])
+    assert json.loads(kept.read_text())["extra"] == {"short": 1}
+    assert publish(campaign, found, tmp_path / "kept") == ([], [plan[0].cell.name])
     row = published_table(tmp_path / "kept" / "toy", campaign).find("straight", "hardened", "none", "deployed")
     assert row.ratio == 3.0
     assert set(row.seeds) | set(row.missing) == set(campaign.config.seeds)
