@@ -21,8 +21,8 @@ from advnerf_core.report.transfer_targets import VICTIM, TableTarget, table_targ
 from benchmarks.results import record_row
 from nodes.campaign.config import load_campaign
 from nodes.campaign.predictions import predicted, prediction_file
+from nodes.campaign.published import PUBLISHED, published_table
 from nodes.campaign.run import gate_key
-from nodes.campaign.table import PUBLISHED, published_table
 
 CAMPAIGN = Path("launch/paper.campaign.yaml")
 # Of targets that are missed: what was tried, and what it points to.
@@ -71,6 +71,8 @@ def note_of(row: TableRow, cells: Sequence[CellResult] = ()) -> str:
         parts.append(f"seeds {', '.join(map(str, row.missing))} are missing")
     machines = sorted({cell.machine for cell in cells})
     parts.append(f"run on {', '.join(machines)}")
+    if (builds := builds_of(cells)) > 1:
+        parts.append(f"seeds are of {builds} builds of scene and policies")
     if row.ratio_interval is not None:
         parts.append(f"95 % {row.ratio_interval.low:.2f} to {row.ratio_interval.high:.2f}")
     if row.transfer is not None and row.method != "none":
@@ -78,6 +80,11 @@ def note_of(row: TableRow, cells: Sequence[CellResult] = ()) -> str:
     if row.paper_ratio is not None:
         parts.append(f"paper {row.paper_ratio:.2f} x its deployed drive without attack")
     return "; ".join(parts)
+
+
+def builds_of(cells: Sequence[CellResult]) -> int:
+    """How many scenes and policies, made anew from the same settings, some cells are of; those that do not say are taken for one."""
+    return len({tuple(sorted(cell.stages.items())) for cell in cells})
 
 
 def why_missed(target: TableTarget | None, row: TableRow, cells: Sequence[CellResult]) -> str:

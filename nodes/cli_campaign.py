@@ -220,8 +220,8 @@ def publish(
     overrides: Overrides = None,
 ) -> None:
     """Copy the finished cells to where they are kept with the code."""
+    from nodes.campaign.published import publish as copy_cells
     from nodes.campaign.run import statuses
-    from nodes.campaign.table import publish as copy_cells
 
     campaign, cells = _load(file, folder, overrides, only)
     changed, same = copy_cells(campaign, statuses(campaign, cells), to)
@@ -229,4 +229,28 @@ def publish(
         print(f"{to / campaign.config.name / name}.json")
     print(
         f"{len(changed)} cells written, {len(same)} were there, {len(cells) - len(changed) - len(same)} are not finished"
+    )
+
+
+@app.command()
+def restore(
+    file: File,
+    folder: Folder = None,
+    only: Only = "",
+    source: Annotated[
+        Path, typer.Option("--from", help="Has a folder with the campaign's name, as publish makes it.")
+    ] = Path("docs/results"),
+    overrides: Overrides = None,
+) -> None:
+    """Take published cells back into a campaign's folder that was lost: those of these settings, scenes and policies. Nothing is run."""
+    os.environ.setdefault("MUJOCO_GL", "egl")
+    from nodes.campaign.published import restore as take_back
+
+    campaign, cells = _load(file, folder, overrides, only)
+    found = take_back(campaign, cells, source)
+    for name in found.taken:
+        print(campaign.folder / "cells" / f"{name}.json")
+    print(
+        f"{len(found.taken)} cells taken back, {len(found.there)} were there, {len(found.other)} were made with other settings, scenes or "
+        f"policies, {len(found.incomplete)} are kept without what their maps and films need, {len(found.missing)} are not published"
     )

@@ -59,6 +59,7 @@ class CellResult(BaseModel):
         placement: Name of the placement; empty for the scenario's own.
         attack_id: Id of the attack file; None for none.
         settings_hash: Hash of everything that the result depends on.
+        stages: Digests of what capture, scene, object and policy stages had written; empty in cells from before they were kept.
         seconds: Time it took [s].
         machine: Where.
         date: When, ISO.
@@ -76,6 +77,7 @@ class CellResult(BaseModel):
     placement: str = ""
     attack_id: str | None = None
     settings_hash: str
+    stages: dict[str, str] = Field(default_factory=dict)
     seconds: Annotated[float, Field(ge=0.0)]
     machine: str
     date: str

@@ -21,7 +21,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any, Literal, TextIO
 
-from nodes.campaign.kinds import Kind, load_kind, settings_hash
+from nodes.campaign.kinds import Kind, load_kind, settings_hash, stage_digests
 from nodes.campaign.store import LOG, Store
 from nodes.runtime.errors import RuntimeFault
 from nodes.runtime.locks import HeldError, hold
@@ -207,7 +207,7 @@ def _run(job: Job, store: Store, work: Path, kind: Kind, experiment: Any) -> Non
     found = taken
     ours = {
         "scenario": job.shown_scenario, "placement": job.placement, "victim": job.victim, "method": job.method, "seed": job.seed,
-        "settings_hash": job.settings_hash, "machine": found.get("machine") or machine_name(),
+        "settings_hash": job.settings_hash, "stages": stage_digests(Path(job.run_folder)), "machine": found.get("machine") or machine_name(),
         "date": found.get("date") or datetime.now(timezone.utc).isoformat(timespec="seconds"),
     }  # fmt: skip
     seconds = found.get("seconds") or _add_seconds(work, time.monotonic() - began)

@@ -53,6 +53,9 @@ def test_a_row_of_the_table_has_its_machines_and_waits_for_its_seeds():
     assert "the same start" in note
     other = [cells[0], CellResult.model_validate(cell(1, "gradient", 9.0, none_m=3.0))]
     assert "the same start" not in transfer_table.note_of(rows[0][0], other)
+    assert "builds" not in note
+    anew = [cells[0], cells[1].model_copy(update={"stages": {"scene": "s1"}})]
+    assert "seeds are of 2 builds of scene and policies" in transfer_table.note_of(rows[0][0], anew)
     whole = make_table([Wanted("right", "", "hardened", "gradient", (0, 1))], cells)
     assert [target.met for _, target in transfer_table.rows_of(whole)] == [True, True]
 

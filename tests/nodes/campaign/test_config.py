@@ -1,13 +1,10 @@
 import json
-import shutil
 
 import pytest
 from typer.testing import CliRunner
 
 from nodes.campaign.config import load_campaign, select
 from nodes.campaign.kinds import load_kind
-from nodes.campaign.run import statuses
-from nodes.campaign.table import campaign_table, publish, published_table, write_table
 from nodes.cli import app
 from nodes.runtime.errors import ConfigError
 
@@ -106,59 +103,3 @@ def test_a_page_of_some_cells_does_not_take_the_place_of_the_page_of_all(bench, 
     assert (bench.cells.parent / "table" / "table.json").read_text() == whole
     table("--only", "method=gradient", "-o", str(tmp_path / "some"))
     assert {row["method"] for row in json.loads((tmp_path / "some" / "table.json").read_text())["rows"]} == {"gradient"}
-
-
-def test_a_table_and_published_cells_from_finished_cells(bench, monkeypatch, tmp_path):
-    """Without running: results are put where workers put them; one of other settings is not taken."""
-    monkeypatch.syspath_prepend(str(bench.folder))
-    campaign = load_campaign(bench.file)
-    found = statuses(campaign, campaign.cells)
-    assert {each.state for each in found} == {"missing"}
-    from nodes.campaign.run import plan_cells
-
-    plan = plan_cells(campaign, campaign.cells)
-    for each, settings_hash in ((plan[0], plan[0].job.settings_hash), (plan[1], "of before")):
-        drives = {"total_cte_m": [6.0], "off_track": [True], "none_total_cte_m": [2.0]}
-        cell = each.cell
-        data = {
-            "scenario": cell.scenario, "victim": cell.victim, "method": cell.method, "seed": cell.seed, "attack_id": None,
-            "settings_hash": settings_hash, "seconds": 1.0, "machine": "m", "date": "d", "surrogate": drives, "deployed": drives,
-        }  # fmt: skip
-        bench.cells.mkdir(exist_ok=True)
-        (bench.cells / f"{cell.name}.json").write_text(json.dumps(data))
-    found = statuses(campaign, campaign.cells)
-    assert sorted(each.state for each in found) == ["changed", "done", "missing", "missing"]
-    table = campaign_table(campaign, found)
-    assert list(table.cells) == [plan[0].cell.name]
-    page = write_table(table, bench.cells, tmp_path / "page")
-    assert {path.name for path in page.parent.iterdir()} == {"index.html", "table.csv", "table.json", "table.md"}
-    assert publish(campaign, found, tmp_path / "kept") == ([plan[0].cell.name], [])
-    assert publish(campaign, found, tmp_path / "kept") == ([], [plan[0].cell.name])
-    kept = tmp_path / "kept" / "toy" / f"{plan[0].cell.name}.json"
-    whole = bench.cells / kept.name
-    assert kept.read_text() == whole.read_text()
-    whole.write_text(json.dumps({**json.loads(whole.read_text()), "extra": {"short": 1, "colours": [0.5] * 9}}))
-    monkeypatch.setattr(load_kind(plan[0].job.kind).module, "UNPUBLISHED", ("colours",), raising=False)
-    found = statuses(campaign, campaign.cells)
-    assert publish(campaign, found, tmp_path / "kept") == ([plan[0].cell.name], [])
-    assert json.loads(kept.read_text())["extra"] == {"short": 1}
-    assert publish(campaign, found, tmp_path / "kept") == ([], [plan[0].cell.name])
-    row = published_table(tmp_path / "kept" / "toy", campaign).find("straight", "hardened", "none", "deployed")
-    assert row.ratio == 3.0
-    assert set(row.seeds) | set(row.missing) == set(campaign.config.seeds)
-    with pytest.raises(ConfigError, match="advnerf campaign publish"):
-        published_table(tmp_path / "nowhere", campaign)
-    # A cell that other settings have made does not stay beside those of these; one that was never begun here does.
-    changed = next(each for each in found if each.state == "changed").cell.name
-    for name in (changed, found[-1].cell.name):
-        shutil.copy(bench.cells / f"{plan[0].cell.name}.json", tmp_path / "kept" / "toy" / f"{name}.json")
-    publish(campaign, found, tmp_path / "kept")
-    assert not (tmp_path / "kept" / "toy" / f"{changed}.json").exists()
-    assert (tmp_path / "kept" / "toy" / f"{found[-1].cell.name}.json").exists()
-    (bench.cells / f"{plan[0].cell.name}.json").write_text("{")
-    assert sorted(each.state for each in statuses(campaign, campaign.cells)) == [
-        "changed",
-        "missing",
-        "missing",
-        "unreadable",
-    ]

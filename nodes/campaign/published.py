@@ -1,0 +1,151 @@
+"""Cells that are kept with the code: copied there when they are finished, taken back where the campaign's own folder was lost."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from advnerf_core.files import write_atomically
+from advnerf_core.report.cells import read_cell, read_cells
+from advnerf_core.report.transfer import TransferTable, make_table
+from nodes.campaign.config import Campaign, Cell
+from nodes.campaign.kinds import load_kind
+from nodes.campaign.predictions import kept_prediction, prediction_file
+from nodes.campaign.run import gate_key, plan_cells
+from nodes.campaign.store import CellStatus, store_of
+from nodes.campaign.table import wanted_rows
+from nodes.runtime.errors import ConfigError
+
+PUBLISHED = Path("docs/results")
+
+
+@dataclass(frozen=True)
+class Restored:
+    """What became of the cells that were to be taken back, by name.
+
+    Attributes:
+        taken: Now finished in the campaign's folder.
+        there: Finished there already.
+        other: Kept with the code, but made with other settings, or with a scene or a policy that was made anew since.
+        incomplete: Kept without what its kind's maps and films need.
+        missing: Not kept.
+    """
+
+    taken: tuple[str, ...] = ()
+    there: tuple[str, ...] = ()
+    other: tuple[str, ...] = ()
+    incomplete: tuple[str, ...] = ()
+    missing: tuple[str, ...] = ()
+
+
+def publish(campaign: Campaign, found: Sequence[CellStatus], folder: Path) -> tuple[list[str], list[str]]:
+    """Copy finished cells to where they are kept with the code, and remove those there that other settings have made.
+
+    The fidelity gate's verdicts and the predictions of these cells go along.
+
+    What lies there of cells that are not begun here stays: they may have been run elsewhere.
+
+    Args:
+        campaign: The campaign.
+        found: Where its cells are.
+        folder: Gets one folder per campaign.
+
+    Returns:
+        Names of the cells that are new or changed there, and of those that were the same.
+    """
+    changed, same = [], []
+    for each in found:
+        target = folder / campaign.config.name / f"{each.cell.name}.json"
+        prediction = prediction_file(folder / campaign.config.name, each.cell.name)
+        if each.state == "changed":
+            target.unlink(missing_ok=True)
+            prediction.unlink(missing_ok=True)
+        if each.state != "done":
+            continue
+        text = _published_text(campaign, each.cell)
+        if target.exists() and target.read_text(encoding="utf-8") == text:
+            same.append(each.cell.name)
+            continue
+        write_atomically(target, text)
+        changed.append(each.cell.name)
+    _publish_beside(campaign, [each for each in found if each.state == "done"], folder / campaign.config.name)
+    return changed, same
+
+
+def _published_text(campaign: Campaign, cell: Cell) -> str:
+    """The cell's file, less what its kind keeps for its own maps and is megabytes long."""
+    text = store_of(campaign).result_file(cell.name).read_text(encoding="utf-8")
+    left_out = load_kind(campaign.config.scenarios[cell.scenario].kind).unpublished
+    if not left_out:
+        return text
+    data = json.loads(text)
+    extra = {name: value for name, value in data["extra"].items() if name not in left_out}
+    return json.dumps({**data, "extra": extra}, indent=1) + "\n"
+
+
+def _publish_beside(campaign: Campaign, done: Sequence[CellStatus], folder: Path) -> None:
+    for each in done:
+        assert each.result is not None, "a finished cell has a result"
+        kept = kept_prediction(prediction_file(campaign.folder, each.cell.name), each.result.settings_hash)
+        if kept is not None:
+            write_atomically(prediction_file(folder, each.cell.name), json.dumps(kept, indent=1) + "\n")
+    for name in sorted({f"{gate_key(each.cell)}.json" for each in done}):
+        if (verdict := campaign.folder / "gate" / name).exists():
+            write_atomically(folder / "gate" / name, verdict.read_text(encoding="utf-8"))
+
+
+def published_table(folder: Path, campaign: Campaign) -> TransferTable:
+    """The table of published cells, with all lines and seeds that the campaign asks for.
+
+    Args:
+        folder: Of the published cells.
+        campaign: Whose they are.
+
+    Raises:
+        ConfigError: There are none.
+    """
+    cells = read_cells(folder)
+    if not cells:
+        raise ConfigError(f"expected published cells in {folder}, got none; run advnerf campaign publish")
+    return make_table(wanted_rows(campaign, campaign.cells), cells, campaign.config.name)
+
+
+def restore(campaign: Campaign, cells: Sequence[Cell], folder: Path) -> Restored:
+    """Take published cells back into the campaign's folder, with their predictions; its work, films included, does not come back.
+
+    Only what would be the same if it were run: settings and the outputs of capture, scene, object and policy, by hash. These must be there.
+
+    Args:
+        campaign: The campaign.
+        cells: Which of its cells.
+        folder: Of all published campaigns.
+
+    Raises:
+        CellError: What is kept there is no cell.
+    """
+    store, kept = store_of(campaign), folder / campaign.config.name
+    experiments: dict[tuple[str, str], Any] = {}
+    became: dict[str, list[str]] = {}
+    for cell in cells:
+        (planned,) = plan_cells(campaign, [cell], experiments)
+        digest, file = planned.job.settings_hash, kept / f"{cell.name}.json"
+        if store.status(cell, digest).state in ("done", "running"):
+            how = "there"
+        elif not file.exists():
+            how = "missing"
+        elif read_cell(file).settings_hash != digest:
+            how = "other"
+        elif load_kind(planned.job.kind).unpublished:
+            how = "incomplete"
+        else:
+            how = "taken"
+            store.keep_result(cell.name, json.loads(file.read_text(encoding="utf-8")))
+            prediction = kept_prediction(prediction_file(kept, cell.name), digest)
+            if prediction is not None:
+                text = json.dumps(prediction, indent=1) + "\n"
+                write_atomically(prediction_file(campaign.folder, cell.name), text)
+        became.setdefault(how, []).append(cell.name)
+    return Restored(**{how: tuple(names) for how, names in became.items()})
