@@ -3,6 +3,8 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 export MUJOCO_GL ?= egl
+# Kept byte code, whatever the shell asks for: the second run of pytest need not rewrite the assertions of 365 files again.
+export PYTHONDONTWRITEBYTECODE :=
 DEFAULT_TESTS := not slow and not gpu and not hardware and not data
 
 .PHONY: help setup demo experiment test test-slow check bench campaign fmt clean

@@ -12,8 +12,6 @@ import pytest
 _LIVE = (
     "tests/nodes",
     "tests/hardware",
-    "tests/replay",
-    "tests/benchmarks",
     "tests/docker",
     "tests/test_docs_policies.py",
 )
@@ -22,9 +20,9 @@ _COMPUTING = (
     "tests/nodes/experiment", "tests/nodes/intersection", "tests/nodes/policy_data", "tests/nodes/runtime/test_bag",
     "tests/nodes/runtime/test_replay_attack.py", "tests/nodes/runtime/test_security.py", "tests/nodes/scene_import",
     "tests/nodes/test_attack.py", "tests/nodes/test_attack_handover.py", "tests/nodes/test_calibration_drive.py", "tests/nodes/test_cli",
-    "tests/nodes/test_counterfactual.py", "tests/nodes/test_policy_reference.py", "tests/nodes/test_scene_training.py",
+    "tests/nodes/test_counterfactual.py", "tests/nodes/test_expert.py", "tests/nodes/test_policy_reference.py", "tests/nodes/test_scene_training.py",
     "tests/nodes/test_trials.py", "tests/hardware/cameras/test_conformance.py", "tests/hardware/carla_scene",
-    "tests/hardware/twin", "tests/benchmarks",
+    "tests/hardware/twin",
 )  # fmt: skip
 _INSIDE = "ADVNERF_TEST_IN_ITS_OWN_PROCESS"
 
