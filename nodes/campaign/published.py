@@ -14,7 +14,7 @@ from advnerf_core.report.transfer import TransferTable, make_table
 from nodes.campaign.config import Campaign, Cell
 from nodes.campaign.kinds import load_kind
 from nodes.campaign.predictions import kept_prediction, prediction_file
-from nodes.campaign.run import gate_key, plan_cells
+from nodes.campaign.run import gate_key, hash_as_it_is
 from nodes.campaign.store import CellStatus, store_of
 from nodes.campaign.table import wanted_rows
 from nodes.runtime.errors import ConfigError
@@ -29,7 +29,7 @@ class Restored:
     Attributes:
         taken: Now finished in the campaign's folder.
         there: Finished there already.
-        other: Kept with the code, but made with other settings, or with a scene or a policy that was made anew since.
+        other: Kept with the code, but made with other settings, or with a scene or a policy that was made anew since or is not there.
         incomplete: Kept without what its kind's maps and films need.
         missing: Not kept.
     """
@@ -130,15 +130,14 @@ def restore(campaign: Campaign, cells: Sequence[Cell], folder: Path) -> Restored
     experiments: dict[tuple[str, str], Any] = {}
     became: dict[str, list[str]] = {}
     for cell in cells:
-        (planned,) = plan_cells(campaign, [cell], experiments)
-        digest, file = planned.job.settings_hash, kept / f"{cell.name}.json"
+        digest, file = hash_as_it_is(campaign, cell, experiments), kept / f"{cell.name}.json"
         if store.status(cell, digest).state in ("done", "running"):
             how = "there"
         elif not file.exists():
             how = "missing"
-        elif read_cell(file).settings_hash != digest:
+        elif digest is None or read_cell(file).settings_hash != digest:
             how = "other"
-        elif load_kind(planned.job.kind).unpublished:
+        elif load_kind(campaign.scenario(cell).kind).unpublished:
             how = "incomplete"
         else:
             how = "taken"

@@ -94,17 +94,28 @@ def plan_cells(
 
 def statuses(campaign: Campaign, cells: Sequence[Cell]) -> list[CellStatus]:
     """Where every cell is; one whose experiment cannot be read, as it is not made yet, is missing."""
-    store, found = store_of(campaign), []
+    store = store_of(campaign)
     experiments: dict[tuple[str, str], Any] = {}
-    for cell in cells:
-        try:
-            digest: str | None = plan_cells(campaign, [cell], experiments)[0].job.settings_hash
-        except ConfigError:
-            raise
-        except (RuntimeFault, OSError):
-            digest = None
-        found.append(store.status(cell, digest))
-    return found
+    return [store.status(cell, hash_as_it_is(campaign, cell, experiments)) for cell in cells]
+
+
+def hash_as_it_is(campaign: Campaign, cell: Cell, experiments: dict[tuple[str, str], Any]) -> str | None:
+    """Hash of everything that a cell depends on; None if it cannot be known yet, as what the cell needs is not made.
+
+    Args:
+        campaign: The campaign.
+        cell: Which of its cells.
+        experiments: As of `plan_cells`.
+
+    Raises:
+        ConfigError: Its experiment or its kind is wrong.
+    """
+    try:
+        return plan_cells(campaign, [cell], experiments)[0].job.settings_hash
+    except ConfigError:
+        raise
+    except (RuntimeFault, OSError):
+        return None
 
 
 def run_campaign(campaign: Campaign, cells: Sequence[Cell], options: Options, say: Say) -> list[Ended]:
