@@ -15,10 +15,12 @@ from typing import Any, Generic, TypeVar
 from rich.console import Console
 
 from advnerf_core.files import write_atomically
+from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import ProgressDisplay
 from nodes.runtime.stages import Stage, StageRecord, check_until, run_stages
 
 Config = TypeVar("Config")
+_MANIFEST = "manifest.json"
 
 
 @dataclass(frozen=True)
@@ -59,10 +61,14 @@ def run_to_end(
         summarise: Prints the result; called if the stage ``report`` was reached.
         until: Last stage to run; None for all.
         console: Where to print.
+
+    Raises:
+        ConfigError: The folder has the stages of another experiment, which would be replaced.
     """
     console = console or Console()
     began = time.monotonic()
     check_until(stages, until)
+    _refuse_the_folder_of_another(experiment)
     experiment.folder.mkdir(parents=True, exist_ok=True)
     _write_manifest(experiment, libraries)
     with ProgressDisplay(console) as display:
@@ -71,6 +77,20 @@ def run_to_end(
         summarise(console)
     console.print(f"{experiment.config.name} ({experiment.setting}): {time.monotonic() - began:.0f} s", highlight=False)
     return records
+
+
+def _refuse_the_folder_of_another(experiment: RunFolder[Any]) -> None:
+    """Stages with the same names and other keys would empty each other's folders: hours of work."""
+    manifest = experiment.folder / _MANIFEST
+    try:
+        there = json.loads(manifest.read_text(encoding="utf-8"))["experiment"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return
+    if there != experiment.config.name:
+        raise ConfigError(
+            f"expected a run folder of experiment {experiment.config.name!r} or a new one, got {experiment.folder} of {there!r}; name another one "
+            f"with --run-folder (in a campaign run_folder), or remove {manifest} to have its stages replaced where they differ"
+        )
 
 
 def _write_manifest(experiment: RunFolder[Any], libraries: Sequence[str]) -> None:
@@ -83,4 +103,4 @@ def _write_manifest(experiment: RunFolder[Any], libraries: Sequence[str]) -> Non
         "versions": {"advnerf": version("advnerf"), "python": platform.python_version()}
         | {name: version(name) for name in libraries},
     }
-    write_atomically(experiment.folder / "manifest.json", json.dumps(manifest, indent=1) + "\n")
+    write_atomically(experiment.folder / _MANIFEST, json.dumps(manifest, indent=1) + "\n")

@@ -128,7 +128,9 @@ def test_a_cell_of_places_alone_keeps_the_plain_colours(trained: Experiment, tmp
     # A cell that was finished without a film is filmed when it is asked for again, and not searched.
     (tmp_path / "moved" / "clip.mp4").unlink()
     assert kind.run_cell(experiment, *PLACES, tmp_path / "moved", silent) == cell
-    np.testing.assert_array_equal(read_clip(tmp_path / "moved" / "clip.mp4"), film)
+    # The same drive; x264 itself gives the same pictures other bytes in one run of ten.
+    again = read_clip(tmp_path / "moved" / "clip.mp4").astype(int)
+    assert np.abs(again - film).mean() < 2.0 < np.abs(plain_film.astype(int) - film).mean()
     coloured = pose_cells.run_cell(replace(experiment, poses=posed(trained).poses), *PLACES, tmp_path / "other", silent)
     assert coloured["extra"]["placements"] == cell["extra"]["placements"]  # the same places are drawn
     assert coloured["extra"]["colours"] != cell["extra"]["colours"]
