@@ -35,16 +35,24 @@ def rows_of(summary: dict[str, Any]) -> list[tuple[str, float, str, str, bool | 
     return rows
 
 
+def command_of(manifest: dict[str, Any], summary: dict[str, Any], folder: Path) -> str:
+    """What makes these rounds: other commands may have used the run folder since."""
+    file = Path("launch") / Path(manifest["file"]).name
+    rounds = len(summary["rounds"]) - 1
+    return (
+        f"advnerf experiment {file} --setting {manifest['setting']} --run-folder {folder} --set retrain.rounds={rounds}"
+    )
+
+
 def main() -> None:
     """Record the rows."""
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("folder", type=Path, help="run folder of the intersection's experiment")
     parser.add_argument("--dry", action="store_true", help="print only")
     options = parser.parse_args()
-    command = json.loads((options.folder / "manifest.json").read_text())["command"]
-    for line, value, unit, target, met, note in rows_of(
-        json.loads((options.folder / "retrain" / "retrain.json").read_text())
-    ):
+    summary = json.loads((options.folder / "retrain" / "retrain.json").read_text())
+    command = command_of(json.loads((options.folder / "manifest.json").read_text()), summary, options.folder)
+    for line, value, unit, target, met, note in rows_of(summary):
         print(f"{line}: {value:.2f} {unit} (target {target or '-'}): {met}")
         if not options.dry:
             record_row(line, value, unit, target, met, command, note)

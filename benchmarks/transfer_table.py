@@ -30,11 +30,11 @@ _SMALL_BASE = (
     "tried: the victim has learned from random textures; nothing was tuned after the first drive; points to the base: "
 )
 _SHAPES = (
-    "tried: bounds of 0.5 and 1 m, balls as in the paper, 50 iterations (the curves are flat after 30); points to the start poses: those of "
+    "tried: bounds of 0.5 and 1 m, balls as in the paper, 50 iterations (after 30 of them 5 to 9 % of the gain are to come); points to the start poses: those of "
     "seeds 1 and 2 are drawn and cost metres without any attack, so the ratio of seed 0, from the nominal start, is the largest"
 )
 _BALLS = (
-    "tried: as for cars and hydrants; points to the base: plain balls beside the road, which no victim has learned from, already cost "
+    "tried: as for cars and hydrants (their curves still rise at 50 iterations: 16 to 18 % of the gain came after 30); points to the base: plain balls beside the road, which no victim has learned from, already cost "
     "several times what cars and hydrants do"
 )
 MISSED: dict[tuple[str, str], str] = {

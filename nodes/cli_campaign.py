@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from nodes.runtime.terminal import Overrides, print_table, say_error, table
+from nodes.runtime.termination import ends_in_order
 
 if TYPE_CHECKING:
     from nodes.campaign.config import Campaign, Cell
@@ -88,7 +89,8 @@ def run(
         raise ConfigError(f"expected --backend local or ray, got {backend!r}")
     campaign, cells = _load(file, folder, overrides, only)
     options = Options(jobs or 0, threads or 0, backend, address, retry, gate, search_only)  # type: ignore[arg-type]
-    ended = run_campaign(campaign, cells, options, lambda text: print(text, flush=True))
+    with ends_in_order():
+        ended = run_campaign(campaign, cells, options, lambda text: print(text, flush=True))
     wrong = [end for end in ended if end.how != "done"]
     if not search_only:
         _show_table(campaign, campaign.cells, _page_folder(campaign))
@@ -190,7 +192,8 @@ def predict(
     from nodes.campaign.predictions import predict_campaign
 
     campaign, cells = _load(file, folder, overrides, only)
-    made = predict_campaign(campaign, cells, lambda text: print(text, flush=True), draws)
+    with ends_in_order():
+        made = predict_campaign(campaign, cells, lambda text: print(text, flush=True), draws)
     print(f"{made} predictions made")
 
 
@@ -217,6 +220,7 @@ def publish(
     folder: Folder = None,
     only: Only = "",
     to: Annotated[Path, typer.Option("--to", help="Gets a folder with the campaign's name.")] = Path("docs/results"),
+    prune: Annotated[bool, typer.Option("--prune", help="Remove cells there that other settings have made.")] = False,
     overrides: Overrides = None,
 ) -> None:
     """Copy the finished cells to where they are kept with the code."""
@@ -224,12 +228,14 @@ def publish(
     from nodes.campaign.run import statuses
 
     campaign, cells = _load(file, folder, overrides, only)
-    changed, same = copy_cells(campaign, statuses(campaign, cells), to)
-    for name in changed:
+    found = copy_cells(campaign, statuses(campaign, cells), to, prune)
+    for name in found.written:
         print(f"{to / campaign.config.name / name}.json")
-    print(
-        f"{len(changed)} cells written, {len(same)} were there, {len(cells) - len(changed) - len(same)} are not finished"
-    )
+    unfinished = len(cells) - len(found.written) - len(found.same)
+    print(f"{len(found.written)} cells written, {len(found.same)} were there, {unfinished} are not finished")
+    if found.stale:
+        what = "were made with other settings and " + ("are removed" if prune else "stay, until --prune removes them")
+        print(f"{len(found.stale)} of those there {what}: {', '.join(found.stale)}")
 
 
 @app.command()

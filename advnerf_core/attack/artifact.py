@@ -21,7 +21,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import load, save
 
 from advnerf_core.errors import AdvnerfError
-from advnerf_core.files import write_atomically
+from advnerf_core.files import with_sorted_header, write_atomically
 from advnerf_core.geometry import Array, Pinhole
 
 FILE_FORMAT = "advnerf-attack-1"
@@ -176,16 +176,8 @@ def face_texture(theta: ArrayLike, size_px: int = TEXTURE_PX) -> NDArray[np.uint
 def save_attack(path: str | os.PathLike[str], attack: AttackFile) -> str:
     """Write an attack file atomically and return its id."""
     header = {"format": FILE_FORMAT, "sha256": attack.sha256, "metadata": _canonical(attack._metadata())}
-    write_atomically(Path(path), _with_sorted_header(save(attack._tensors(), metadata=header)))
+    write_atomically(Path(path), with_sorted_header(save(attack._tensors(), metadata=header)))
     return attack.attack_id
-
-
-def _with_sorted_header(content: bytes) -> bytes:
-    """The same container with the keys of its header in order: the library's order changes from process to process."""
-    end = 8 + int.from_bytes(content[:8], "little")
-    header = _canonical(json.loads(content[8:end])).encode()
-    header += b" " * (-len(header) % 8)  # the tensors stay aligned
-    return len(header).to_bytes(8, "little") + header + content[end:]
 
 
 def load_attack(path: str | os.PathLike[str]) -> AttackFile:

@@ -6,7 +6,6 @@ weights, optimiser moments and the step number are all there is.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from math import cos, pi
@@ -16,12 +15,13 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import Tensor
 
 from advnerf_core.driving.augment import AugmentConfig, augment
 from advnerf_core.driving.frames import FrameSet, FrameStoreError
 from advnerf_core.driving.policy import PilotNet, images_to_tensor
+from advnerf_core.files import with_sorted_header, write_atomically
 
 EVALUATION_BATCH = 128
 
@@ -130,14 +130,9 @@ def _write(path: Path, policy: PilotNet, optimiser: torch.optim.Optimizer, step:
     for name, parameter in policy.named_parameters():
         moments = optimiser.state[parameter]
         tensors[f"first.{name}"], tensors[f"second.{name}"] = moments["exp_avg"], moments["exp_avg_sq"]
-    partial = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        contiguous = {name: value.contiguous() for name, value in tensors.items()}
-        save_file(contiguous, partial, metadata={"step": str(step), "config": repr(asdict(config))})
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
+    contiguous = {name: value.contiguous() for name, value in tensors.items()}
+    header = {"step": str(step), "config": repr(asdict(config))}
+    write_atomically(path, with_sorted_header(save(contiguous, header)))
 
 
 def _resume(path: Path, policy: PilotNet, optimiser: torch.optim.Optimizer, config: FitConfig) -> int:

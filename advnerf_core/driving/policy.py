@@ -19,11 +19,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import Tensor, nn
 
 from advnerf_core.driving.policy_view import PolicyView
 from advnerf_core.errors import AdvnerfError
+from advnerf_core.files import with_sorted_header, write_atomically
 
 IMAGE_HEIGHT, IMAGE_WIDTH = 66, 200
 FILE_FORMAT = "advnerf-policy-1"
@@ -147,7 +148,6 @@ def save_policy(path: str | os.PathLike[str], policy: PilotNet, view: PolicyView
         view: How camera images become its input.
         metadata: Anything JSON can hold: training settings, data, measured errors.
     """
-    target = Path(path)
     weights = {name: value.detach().cpu().contiguous() for name, value in policy.state_dict().items()}
     header = {
         "format": FILE_FORMAT,
@@ -156,13 +156,7 @@ def save_policy(path: str | os.PathLike[str], policy: PilotNet, view: PolicyView
         "metadata": _canonical(dict(metadata)),
     }
     digest = _digest(weights, header)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    partial = target.with_name(f".{target.name}.{os.getpid()}.tmp")
-    try:
-        save_file(weights, partial, metadata={**header, "sha256": digest})
-        os.replace(partial, target)
-    finally:
-        partial.unlink(missing_ok=True)
+    write_atomically(Path(path), with_sorted_header(save(weights, {**header, "sha256": digest})))
     return digest
 
 

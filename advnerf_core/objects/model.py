@@ -19,7 +19,7 @@ from scipy import ndimage
 
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.fields.voxel_grid import VoxelGridObject
-from advnerf_core.files import write_atomically
+from advnerf_core.files import with_sorted_header, write_atomically
 from advnerf_core.geometry import Array
 from advnerf_core.objects.voxelise import OPAQUE_PER_VOXEL, ObjectGrids
 
@@ -102,7 +102,7 @@ def save_object(path: Path, model: ObjectModel) -> None:
         "box": np.stack([grids.box_min, grids.box_max]),
     }  # fmt: skip
     metadata = {"format": FILE_FORMAT, "name": model.name, "about": json.dumps(model.about, sort_keys=True)}
-    write_atomically(path, save(tensors, metadata))
+    write_atomically(path, with_sorted_header(save(tensors, metadata)))
 
 
 def load_object(path: Path) -> ObjectModel:

@@ -23,7 +23,7 @@ from torch import Tensor, nn
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.fields.hash_grid import HashGrid, HashGridConfig
 from advnerf_core.fields.spherical_harmonics import spherical_harmonics
-from advnerf_core.files import write_atomically
+from advnerf_core.files import with_sorted_header, write_atomically
 from advnerf_core.render.contraction import contract
 from advnerf_core.render.volume_kernels import MAX_LOG_DENSITY
 
@@ -199,7 +199,7 @@ def save_scene(
         "scene_hash": content,
         "metadata": json.dumps(metadata or {}),
     }
-    write_atomically(Path(path), save_tensors(tensors, header))
+    write_atomically(Path(path), with_sorted_header(save_tensors(tensors, header)))
     return content
 
 

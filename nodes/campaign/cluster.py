@@ -65,8 +65,11 @@ def collect_on_ray(jobs: list[Job], at_a_time: int) -> list[Ended] | None:
     """Run jobs on the cluster in force, all of them before it returns; None if a machine was lost, with which what it had told goes.
 
     What was finished is in the campaign's folder all the same.
+
+    Raises:
+        ConfigError: A machine cannot run a job at all, as one without this package.
     """
-    from ray.exceptions import RayError
+    from ray.exceptions import NodeDiedError, ObjectLostError, RayActorError, RayError, WorkerCrashedError
     from ray.util.joblib import register_ray
 
     register_ray()
@@ -75,6 +78,10 @@ def collect_on_ray(jobs: list[Job], at_a_time: int) -> list[Ended] | None:
         parallel = joblib.Parallel(batch_size=1, pre_dispatch="all")
         try:
             found: list[Ended] = parallel(joblib.delayed(run_in_process)(job) for job in jobs)
-        except RayError:
+        except (RayActorError, WorkerCrashedError, NodeDiedError, ObjectLostError):
             return None
+        except RayError as error:
+            raise ConfigError(
+                f"expected every machine of the cluster to have this package and the campaign's folders, got {' '.join(str(error).split())[-500:]}"
+            ) from None
     return found

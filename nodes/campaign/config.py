@@ -34,7 +34,19 @@ class PlacementConfig(_Section):
     set: tuple[str, ...] = Field(default=(), description="key=value texts over the scenario's own.")
 
 
-class ScenarioConfig(_Section):
+class _NothingTwice(_Section):
+    """Cells are named by these: one that is named twice would be run twice under one name."""
+
+    @model_validator(mode="after")
+    def _nothing_twice(self) -> _NothingTwice:
+        for name in ("seeds", "victims", "methods"):
+            values = getattr(self, name) or ()
+            if len(set(values)) != len(values):
+                raise ValueError(f"expected every one of {name} once, got {list(values)}")
+        return self
+
+
+class ScenarioConfig(_NothingTwice):
     """One scenario: an experiment, and how it is read."""
 
     kind: str = Field(
@@ -49,13 +61,13 @@ class ScenarioConfig(_Section):
         default="", description="What the experiment calls it, where the name here is another; else the name."
     )
     placements: dict[Name, PlacementConfig] = Field(default_factory=dict, description="Other places of the objects.")
-    seeds: tuple[int, ...] | None = Field(default=None, description="Instead of the campaign's.")
-    victims: tuple[Victim, ...] | None = Field(default=None, description="Instead of the campaign's.")
-    methods: tuple[Method, ...] | None = Field(default=None, description="Instead of the campaign's.")
+    seeds: tuple[int, ...] | None = Field(default=None, min_length=1, description="Instead of the campaign's.")
+    victims: tuple[Victim, ...] | None = Field(default=None, min_length=1, description="Instead of the campaign's.")
+    methods: tuple[Method, ...] | None = Field(default=None, min_length=1, description="Instead of the campaign's.")
     gate: GateLimits | None = Field(default=None, description="Instead of the campaign's.")
 
 
-class CampaignConfig(_Section):
+class CampaignConfig(_NothingTwice):
     """A campaign file."""
 
     name: Name
@@ -65,14 +77,6 @@ class CampaignConfig(_Section):
     methods: tuple[Method, ...] = Field(default=METHODS, min_length=1)
     scenarios: dict[Name, ScenarioConfig] = Field(min_length=1)
     gate: GateLimits = GateLimits()
-
-    @model_validator(mode="after")
-    def _nothing_twice(self) -> CampaignConfig:
-        for name in ("seeds", "victims", "methods"):
-            values = getattr(self, name)
-            if len(set(values)) != len(values):
-                raise ValueError(f"expected every one of {name} once, got {list(values)}")
-        return self
 
 
 @dataclass(frozen=True)

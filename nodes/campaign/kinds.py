@@ -117,6 +117,14 @@ class Kind:
         else:
             self._run_module().run_experiment(experiment, until=getattr(self.module, "PREPARED_AT", _LAST_NEEDED))
 
+    def needed_settings(self, experiment: Any) -> dict[str, Any]:
+        """Settings of the stages that a cell needs, by name; none where the kind's package has no stages."""
+        package = getattr(self.module, "__package__", "")
+        if not package or find_spec(f"{package}.run") is None or not hasattr(self._run_module(), "stages_of"):
+            return {}
+        stages = self._run_module().stages_of(experiment)
+        return {stage.name: stage.settings for stage in stages if stage.name in _NEEDED}
+
     def inputs(self, experiment: Any, scenario: str, victim: str, method: str, seed: int) -> dict[str, Any]:
         """What a cell's result depends on."""
         if inputs := getattr(self.module, "cell_inputs", None):

@@ -37,10 +37,15 @@ def predict_campaign(campaign: Campaign, cells: Sequence[Cell], say: Callable[[s
         planned = plan_cells(campaign, [cell], experiments)[0]
         kind = load_kind(planned.job.kind)
         # Work of other settings may hold a search too, of another attack.
-        if not kind.predicts or not store.has_begun(cell.name, planned.job.settings_hash):
+        if not kind.predicts:
             continue
         file = prediction_file(campaign.folder, cell.name)
-        if kept_prediction(file, planned.job.settings_hash) is not None:
+        kept = kept_prediction(file, planned.job.settings_hash)
+        if kept is not None and kept.get("draws") == draws:
+            continue
+        if not store.has_begun(cell.name, planned.job.settings_hash):
+            if kept is not None or store.result(cell.name) is not None:
+                say(f"{cell.name}: not predicted, as its search is not in {store.work(cell.name)}")
             continue
         experiment = experiments[cell.scenario, cell.placement]
         which = (experiment, planned.job.scenario, cell.victim, cell.method, cell.seed, store.work(cell.name))

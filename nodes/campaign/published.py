@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from advnerf_core.files import write_atomically
-from advnerf_core.report.cells import read_cell, read_cells
+from advnerf_core.report.cells import CellResult, read_cell, read_cells
 from advnerf_core.report.transfer import TransferTable, make_table
 from nodes.campaign.config import Campaign, Cell
 from nodes.campaign.kinds import load_kind
@@ -20,6 +20,21 @@ from nodes.campaign.table import wanted_rows
 from nodes.runtime.errors import ConfigError
 
 PUBLISHED = Path("docs/results")
+
+
+@dataclass(frozen=True)
+class Published:
+    """What became of the cells that were published, by name.
+
+    Attributes:
+        written: New or changed there.
+        same: There already.
+        stale: There, but of other settings than those of now, as is what the campaign's own folder has.
+    """
+
+    written: tuple[str, ...]
+    same: tuple[str, ...]
+    stale: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -41,28 +56,25 @@ class Restored:
     missing: tuple[str, ...] = ()
 
 
-def publish(campaign: Campaign, found: Sequence[CellStatus], folder: Path) -> tuple[list[str], list[str]]:
-    """Copy finished cells to where they are kept with the code, and remove those there that other settings have made.
+def publish(campaign: Campaign, found: Sequence[CellStatus], folder: Path, prune: bool = False) -> Published:
+    """Copy finished cells to where they are kept with the code, with the fidelity gate's verdicts and the predictions of these cells.
 
-    The fidelity gate's verdicts and the predictions of these cells go along.
-
-    What lies there of cells that are not begun here stays: they may have been run elsewhere.
+    What lies there of cells that are not finished here stays: they may have been run elsewhere.
 
     Args:
         campaign: The campaign.
         found: Where its cells are.
         folder: Gets one folder per campaign.
-
-    Returns:
-        Names of the cells that are new or changed there, and of those that were the same.
+        prune: Remove what lies there of cells whose results here are of other settings too.
     """
-    changed, same = [], []
+    written, same, stale = [], [], []
     for each in found:
         target = folder / campaign.config.name / f"{each.cell.name}.json"
-        prediction = prediction_file(folder / campaign.config.name, each.cell.name)
-        if each.state == "changed":
-            target.unlink(missing_ok=True)
-            prediction.unlink(missing_ok=True)
+        if each.state == "changed" and _is_of(target, each.result):
+            stale.append(each.cell.name)
+            if prune:
+                target.unlink()
+                prediction_file(folder / campaign.config.name, each.cell.name).unlink(missing_ok=True)
         if each.state != "done":
             continue
         text = _published_text(campaign, each.cell)
@@ -70,9 +82,14 @@ def publish(campaign: Campaign, found: Sequence[CellStatus], folder: Path) -> tu
             same.append(each.cell.name)
             continue
         write_atomically(target, text)
-        changed.append(each.cell.name)
+        written.append(each.cell.name)
     _publish_beside(campaign, [each for each in found if each.state == "done"], folder / campaign.config.name)
-    return changed, same
+    return Published(tuple(written), tuple(same), tuple(stale))
+
+
+def _is_of(published: Path, result: CellResult | None) -> bool:
+    """Whether a published cell is that result, and not one of newer settings from elsewhere."""
+    return result is not None and published.exists() and read_cell(published).settings_hash == result.settings_hash
 
 
 def _published_text(campaign: Campaign, cell: Cell) -> str:

@@ -135,15 +135,20 @@ def run_campaign(campaign: Campaign, cells: Sequence[Cell], options: Options, sa
     """
     store = store_of(campaign)
     _prepare(campaign, cells, say)
-    cells = _past_the_gate(campaign, cells, options, say)
-    wanted = [each for each in plan_cells(campaign, cells) if _is_wanted(store, each, options, say)]
+    # Before the gate, so that a cell that there cannot be is told first.
+    plan = plan_cells(campaign, cells)
+    judged = _past_the_gate(campaign, cells, options, say)
+    wanted = [each for each in plan if each.cell in judged and _is_wanted(store, each, options, say)]
     if not wanted:
         say("nothing to do: every cell is there")
         return []
+    _require_positive(options)
     jobs, threads = _shares(options)
     if options.search_only:
         return _search(wanted, jobs, threads, options, say)
-    say(f"{len(wanted)} of {len(cells)} cells to run, {jobs} at a time, {threads} threads each")
+    say(
+        f"{len(wanted)} of {len(cells)} cells to run, {jobs or 'all the cluster has cores for'} at a time, {threads} threads each"
+    )
     beside = [replace(each.job, threads=threads) for each in wanted if not each.live]
     beside += [replace(each.job, threads=threads, phase="search") for each in wanted if each.live and each.searches]
     ended = _run_beside(beside, jobs, options, say)
@@ -167,7 +172,7 @@ def _search(wanted: Sequence[Planned], jobs: int, threads: int, options: Options
         )
     for kind in kinds:
         say(f"cells of kind {kind} search and drive in one and are left out")
-    say(f"{len(found)} cells to search, {jobs} at a time, {threads} threads each")
+    say(f"{len(found)} cells to search, {jobs or 'all the cluster has cores for'} at a time, {threads} threads each")
     return _run_beside(found, jobs, options, say)
 
 
@@ -187,6 +192,7 @@ def _prepare(campaign: Campaign, cells: Sequence[Cell], say: Say) -> None:
     done: set[tuple[Path, str]] = set()
     # All files are read before anything is made, so that a mistake in the last does not cost the hours of the first.
     experiments = {(cell.scenario, cell.placement): (cell, _experiment(campaign, cell)) for cell in cells}
+    _refuse_two_in_one_folder(campaign, cells)
     for cell, experiment in experiments.values():
         folder = campaign.run_folder(cell)
         kind = campaign.scenario(cell).kind  # kinds need different stages of one experiment
@@ -195,6 +201,22 @@ def _prepare(campaign: Campaign, cells: Sequence[Cell], say: Say) -> None:
         done.add((folder, kind))
         say(f"{cell.scenario}{'.' * bool(cell.placement)}{cell.placement}: {folder}")
         load_kind(kind).prepare(experiment, _PrintedReport(say))
+
+
+def _refuse_two_in_one_folder(campaign: Campaign, cells: Sequence[Cell]) -> None:
+    """Scenarios of one run folder must need the same scene and policies, or each would run on, or remake, those of the other."""
+    folders = {campaign.run_folder(cell) for cell in cells}
+    first: dict[Path, tuple[str, dict[str, Any]]] = {}
+    for cell in {(each.scenario, each.placement): each for each in campaign.cells}.values():
+        if (folder := campaign.run_folder(cell)) not in folders:
+            continue
+        needed = load_kind(campaign.scenario(cell).kind).needed_settings(_experiment(campaign, cell))
+        name, others = first.setdefault(folder, (cell.scenario, needed))
+        if wrong := [stage for stage in needed.keys() & others.keys() if needed[stage] != others[stage]]:
+            raise ConfigError(
+                f"{campaign.file}: expected scenarios {name} and {cell.scenario} to have the same settings of stage {', '.join(sorted(wrong))}, as "
+                f"both are in {folder}, got different ones; give one of them a run_folder of its own"
+            )
 
 
 def _past_the_gate(campaign: Campaign, cells: Sequence[Cell], options: Options, say: Say) -> list[Cell]:
@@ -270,8 +292,9 @@ def _collect(jobs: list[Job], say: Say) -> list[Ended]:
 def _run_on_ray(jobs: list[Job], at_a_time: int, options: Options, say: Say) -> list[Ended]:
     from nodes.campaign.cluster import collect_on_ray, ray_session
 
-    with ray_session(options.address, at_a_time) as cores:
+    with ray_session(options.address, at_a_time or _cores()) as cores:
         say(f"Ray cluster with {cores} cores; advnerf campaign status tells how far it is")
+        at_a_time = at_a_time or max(1, cores // (options.threads or 1))
         ended: list[Ended] = []
         left = jobs
         for _ in range(_ROUNDS):
@@ -301,8 +324,14 @@ def _cores() -> int:
     return len(os.sched_getaffinity(0))
 
 
-def _shares(options: Options) -> tuple[int, int]:
+def _require_positive(options: Options) -> None:
     if options.jobs < 0 or options.threads < 0:
         raise ConfigError(f"expected --jobs and --threads of at least 1, got {options.jobs} and {options.threads}")
+
+
+def _shares(options: Options) -> tuple[int, int]:
+    """Cells at a time, 0 for as many as a cluster has cores for, which only the cluster can tell; and threads of each."""
+    if options.backend == "ray":
+        return options.jobs, options.threads or 1
     jobs = options.jobs or (_cores() // options.threads if options.threads else _cores()) or 1
-    return jobs, options.threads or (max(1, _cores() // jobs) if options.backend == "local" else 1)
+    return jobs, options.threads or max(1, _cores() // jobs)

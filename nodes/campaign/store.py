@@ -107,11 +107,12 @@ class Store:
             result = self.result(name)
         except CellError as broken:
             return CellStatus(cell, "unreadable", str(broken))
-        if result is not None:
-            same = settings_hash is not None and result.settings_hash == settings_hash
-            return CellStatus(cell, "done" if same else "changed", "" if same else "of other settings", result)
+        if result is not None and settings_hash is not None and result.settings_hash == settings_hash:
+            return CellStatus(cell, "done", "", result)
         if settings_hash is not None and (error := self.error(name, settings_hash)):
-            return CellStatus(cell, "failed", error)
+            return CellStatus(cell, "failed", error, result)
+        if result is not None:
+            return CellStatus(cell, "changed", "of other settings", result)
         begun = settings_hash is not None and self.has_begun(name, settings_hash)
         return CellStatus(cell, "begun" if begun else "missing", self._last_line(name) if begun else "")
 

@@ -21,6 +21,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any, Literal, TextIO
 
+from advnerf_core.files import write_atomically
 from nodes.campaign.kinds import Kind, load_kind, settings_hash, stage_digests
 from nodes.campaign.store import LOG, Store
 from nodes.runtime.errors import RuntimeFault
@@ -29,7 +30,7 @@ from nodes.runtime.machine import machine_name
 from nodes.runtime.termination import ends_in_order
 
 Phase = Literal["search", "whole"]
-_DONE, _FAILED, _ELSEWHERE = 0, 1, 3
+_DONE, _FAILED, _ELSEWHERE, _ASKED_TO_END = 0, 1, 3, 128 + signal.SIGTERM
 _PROGRESS_PERIOD_S = 5.0
 _LOOKED_AT_S = 1.0
 # Longer than CarlaScene waits for a server that is gone.
@@ -127,9 +128,10 @@ def run_in_process(job: Job) -> Ended:
         return Ended(job.name, "done", "", seconds)
     if code == _ELSEWHERE:
         return Ended(job.name, "elsewhere", said, seconds)
-    if code < 0:
-        text = f"killed by {signal.Signals(-code).name}; it goes on when the campaign is run again"
-        return Ended(job.name, "lost", text, seconds)
+    # One that was asked to end closed what it had open, and says so by the shell's exit code.
+    if code < 0 or code == _ASKED_TO_END:
+        by = signal.Signals(-code) if code < 0 else signal.SIGTERM
+        return Ended(job.name, "lost", f"killed by {by.name}; it goes on when the campaign is run again", seconds)
     error = store.error(job.name, job.settings_hash)
     if error:
         return Ended(job.name, "failed", error, seconds)
@@ -210,7 +212,8 @@ def _run(job: Job, store: Store, work: Path, kind: Kind, experiment: Any) -> Non
         "settings_hash": job.settings_hash, "stages": stage_digests(Path(job.run_folder)), "machine": found.get("machine") or machine_name(),
         "date": found.get("date") or datetime.now(timezone.utc).isoformat(timespec="seconds"),
     }  # fmt: skip
-    seconds = found.get("seconds") or _add_seconds(work, time.monotonic() - began)
+    spent = _add_seconds(work, time.monotonic() - began)
+    seconds = found["seconds"] if found.get("seconds") is not None else spent
     store.keep_result(job.name, {**found, **ours, "seconds": round(float(seconds), 1)})
 
 
@@ -234,7 +237,7 @@ def _add_seconds(work: Path, seconds: float) -> float:
     """Computing time of a cell over all the times it was run and stopped properly [s]."""
     file = work / "seconds"
     total = seconds + (float(file.read_text()) if file.exists() else 0.0)
-    file.write_text(f"{total:.3f}\n")
+    write_atomically(file, f"{total:.3f}\n")
     return total
 
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
 from advnerf_core.driving.policy import load_policy
 from advnerf_core.files import write_atomically
+from nodes.campaign.kinds import stage_digests
 from nodes.intersection.attack import Cell, Condition, cells, frozen_hashes, load_theta, surrogate_part
 from nodes.intersection.context import Experiment
 from nodes.intersection.deployed import DressedScene
@@ -23,10 +24,31 @@ from nodes.runtime.stages import Report, hash_of
 
 PREPARED_AT = "policy"  # the last stage that a cell needs of its experiment
 TAKEN_FROM = "deploy"
+METHODS: tuple[Condition, ...] = ("none", "random", "cem", "gradient")
+# What a cell does not depend on: which others there are, how much memory may be used, and what is told of the world elsewhere.
+_FREE: Mapping[str, bool | set[str]] = {
+    "name": True,
+    "scenarios": True,
+    "retrain": True,
+    "world": True,
+    "attack": {"seeds", "methods", "cache_mib"},
+}
 
 
 class CellError(RuntimeFault):
     """A cell was asked for that this experiment does not have."""
+
+
+def cell_inputs(experiment: Experiment, scenario: str, victim: str, method: str, seed: int) -> dict[str, Any]:
+    """What a cell depends on: the resolved world (of a server, not its address), settings, and what the stages before it wrote.
+
+    Raises:
+        CellError: No such drive, victim or method.
+    """
+    del seed
+    require_known(experiment, scenario, victims(experiment), victim, METHODS, method)
+    config = experiment.config.model_dump(mode="json", exclude=_FREE)
+    return {"config": config, "world": experiment.site.settings, "stages": stage_digests(experiment.folder)}
 
 
 def run_cell(
@@ -68,7 +90,7 @@ def search_cell(
     Raises:
         CellError: No such drive, victim or method.
     """
-    require_known(experiment, scenario, victims(experiment), victim, ("none", "random", "cem", "gradient"), method)
+    require_known(experiment, scenario, victims(experiment), victim, METHODS, method)
     cell = Cell(scenario, victim, method, seed)
     surrogate = surrogate_of(experiment, placed_objects(experiment))
     for each in dict.fromkeys((cell.clean, cell)):
@@ -125,7 +147,10 @@ def deployed_part(
             "total_cte_m": driven["total_cte_m"], "off_track": driven["off_track"],
             "none_total_cte_m": undisturbed["total_cte_m"],
         },
-        "extra": {"evaluations": len(learned["curve_total_cte_m"]), "horizon": experiment.config.horizon},
+        "extra": {
+            "evaluations": len(learned["curve_total_cte_m"]), "horizon": experiment.config.horizon,
+            "blocked_tick": driven["blocked_tick"],
+        },
     }  # fmt: skip
     write_atomically(result, json.dumps(data, indent=1) + "\n")
     return data
@@ -150,4 +175,4 @@ def _drives(experiment: Experiment, dressed: DressedScene, cell: Cell, searched:
     return data
 
 
-__all__ = ["Cell", "CellError", "cells", "deployed_part", "require_known", "run_cell", "search_cell"]
+__all__ = ["Cell", "CellError", "cell_inputs", "cells", "deployed_part", "require_known", "run_cell", "search_cell"]

@@ -185,7 +185,7 @@ def _cell(
         _keep_meshes(experiment, problem, fields, theta, result)
     clean, attacked = ({"surrogate": totals(learned_drives(experiment, problem, each)[1])} for each in (plain, theta))
     for drives, each in ((clean, plain), (attacked, theta)):
-        drives["deployed"] = _deployed(experiment, scene, problem, fields, each, scenario, policy.policy)
+        drives["deployed"], blocked = _deployed(experiment, scene, problem, fields, each, scenario, policy.policy)
     data = {
         "scenario": scenario, "victim": victim, "method": method, "seed": seed, "attack_id": None, "settings_hash": frozen,
         "seconds": round(sum(evaluation.seconds for evaluation in history), 1),
@@ -194,7 +194,7 @@ def _cell(
         **{name: {**attacked[name], "none_total_cte_m": clean[name]["total_cte_m"]} for name in ("surrogate", "deployed")},
         "extra": {
             "mesh": _plain(settings), "frames": "deployment", "evaluations": len(history),
-            "curve_total_cte_m": [evaluation.predicted_total_cte_m for evaluation in history],
+            "curve_total_cte_m": [evaluation.predicted_total_cte_m for evaluation in history], "blocked_tick": blocked,
         },
     }  # fmt: skip
     write_atomically(result, json.dumps(data, indent=1) + "\n")
@@ -236,13 +236,13 @@ def _keep_meshes(
 def _deployed(
     experiment: Experiment, scene: DeploymentScene, problem: AttackProblem, fields: list[MeshField], theta: Tensor,
     scenario: str, policy: Policy,
-) -> dict[str, Any]:  # fmt: skip
-    """Drives of the scene's own car from all starts, past opaque objects in the camera's own pixels."""
+) -> tuple[dict[str, Any], list[int | None]]:  # fmt: skip
+    """Drives of the scene's own car from all starts, past opaque objects in the camera's own pixels, and where they ran into something."""
     if isinstance(problem.sensor, ShapeSensor):
         fields, theta = problem.sensor.shaped(theta), problem.sensor.colours
     dressed = DressedScene(scene, experiment.view, fields)
     drives = deployed_drives(experiment, dressed, policy, scenario, problem.start_states, theta)
-    return totals([drive.metrics for drive in drives])
+    return totals([drive.metrics for drive in drives]), [drive.blocked_tick for drive in drives]
 
 
 def _plain(settings: MeshSettings) -> dict[str, Any]:

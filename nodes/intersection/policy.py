@@ -56,7 +56,7 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
     summary = {
         "sha256": trained.sha256, "naive_sha256": trained.naive_sha256, "frames": trained.frames,
         "validation_mae_radps": trained.validation_mae_rad, "naive_validation_mae_radps": trained.naive_validation_mae_rad,
-        "seconds": trained.seconds, "on_held_out_views": agreement(experiment),
+        "on_held_out_views": agreement(experiment),
     }  # fmt: skip
     write_atomically(folder / "policy.json", json.dumps(summary, indent=1) + "\n")
 

@@ -133,11 +133,11 @@ def pose_cell(
     objects = placed_objects(experiment)
     surrogate = surrogate_of(experiment, objects)
     problem = attack_problem(experiment, surrogate, victim, scenario, seed)
-    clean = _driven(experiment, problem, scene, surrogate, objects, surrogate.plain_theta(), scenario)
+    clean, blocked = _driven(experiment, problem, scene, surrogate, objects, surrogate.plain_theta(), scenario)
     attacked, extra, state = clean, {}, result.with_suffix(".state.safetensors")
     if method != "none":
         found = _search(experiment, problem, method, seed, settings, state, frozen, report)
-        attacked = _driven(
+        attacked, blocked = _driven(
             experiment, problem, scene, surrogate.with_objects(found.objects), found.objects, found.colours, scenario
         )
         extra = _told(found)
@@ -146,7 +146,7 @@ def pose_cell(
         "machine": machine_name(),
         "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
         **{domain: {**attacked[domain], "none_total_cte_m": clean[domain]["total_cte_m"]} for domain in clean},
-        "extra": extra,
+        "extra": {**extra, "blocked_tick": blocked},
     }  # fmt: skip
     write_atomically(result, json.dumps(data, indent=1) + "\n")
     state.unlink(missing_ok=True)
@@ -192,12 +192,13 @@ def _search(
 def _driven(
     experiment: Experiment, problem: AttackProblem, scene: DeploymentScene, surrogate: Surrogate,
     objects: Sequence[VoxelGridObject], colours: Tensor, scenario: str,
-) -> dict[str, dict[str, Any]]:  # fmt: skip
-    """Drives from all starts of a problem past objects, in the learned scene and where they are deployed."""
+) -> tuple[dict[str, dict[str, Any]], list[int | None]]:  # fmt: skip
+    """Drives from all starts of a problem past objects, in the learned scene and where they are deployed, and where these ran into something."""
     _, learned = learned_drives(experiment, replace(problem, sensor=surrogate), colours)
     dressed = DressedScene(scene, experiment.view, objects)
     deployed = deployed_drives(experiment, dressed, problem.policy, scenario, problem.start_states, colours)
-    return {"surrogate": totals(learned), "deployed": totals([drive.metrics for drive in deployed])}
+    both = {"surrogate": totals(learned), "deployed": totals([drive.metrics for drive in deployed])}
+    return both, [drive.blocked_tick for drive in deployed]
 
 
 def _told(found: FoundPoses) -> dict[str, Any]:

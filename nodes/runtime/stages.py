@@ -12,13 +12,15 @@ import hashlib
 import json
 import shutil
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.files import write_atomically
+from nodes.runtime.locks import HeldError, hold
 
 _RECORD = "stage.json"
 
@@ -177,10 +179,41 @@ def _run_or_reuse(stage: Stage, folder: Path, records: Mapping[str, StageRecord]
     if missing:
         raise StageError(f"stage '{stage.name}' needs {', '.join(missing)} to run before it")
     key = _key_of(stage, records)
-    old = read_record(folder)
-    if old is not None and old.key == key and old.digest is not None:
-        display.finish(stage.name, old.seconds, cached=True)
+    if (old := _finished(folder, key, display)) is not None:
         return old
+    with _alone(folder):
+        # Whoever held it may have made just this.
+        if (old := _finished(folder, key, display)) is not None:
+            return old
+        return _go_on_or_begin(stage, folder, key, records, display)
+
+
+def _finished(folder: Path, key: str, display: Display) -> StageRecord | None:
+    record = read_record(folder)
+    if record is None or record.key != key or record.digest is None:
+        return None
+    display.finish(folder.name, record.seconds, cached=True)
+    return record
+
+
+@contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    """Two processes in one stage's folder would write each other's files."""
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        lock = hold(folder.parent / f".{folder.name}.lock")
+    except HeldError as held:
+        raise StageError(
+            f"expected {folder} for this process alone, but process {held.owner} is at work there; wait for it, or name another run folder"
+        ) from None
+    with lock:
+        yield
+
+
+def _go_on_or_begin(
+    stage: Stage, folder: Path, key: str, records: Mapping[str, StageRecord], display: Display
+) -> StageRecord:
+    old = read_record(folder)
     parts = [_key_of(replace(stage, settings=settings), records) for settings in stage.goes_on_from]
     resumed = old is not None and old.key in (key, *parts)
     if not resumed and folder.exists():

@@ -1,13 +1,16 @@
 import json
+from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
 
 from nodes.campaign.config import load_campaign, select
 from nodes.campaign.kinds import load_kind
+from nodes.campaign.run import _refuse_two_in_one_folder
 from nodes.cli import app
 from nodes.runtime.errors import ConfigError
 
+ROOT = Path(__file__).parents[3]
 CAMPAIGN = """name: mine
 seeds: [0, 1]
 scenarios:
@@ -66,6 +69,8 @@ def test_cells_are_selected_by_what_they_are(file):
         ("placements:\n      near: {run", "placements:\n      near: {rum", r":10: unknown key .*near.rum_folder"),
         ("[none, gradient]", "[none, gradiant]", r":7: scenarios.straight.methods.1: .*'gradient'.*got 'gradiant'"),
         ("seeds: [0, 1]", "seeds: [0, 0]", "every one of seeds once"),
+        ("seeds: [7]", "seeds: [7, 7]", "every one of seeds once"),
+        ("methods: [none, gradient]", "methods: []", r":7: scenarios.straight.methods: .*at least 1 item"),
         ("one.experiment", "two.experiment", "expected the experiment file of scenario straight at .*two.experiment"),
         ("  left:", "  Left!:", "Left!"),
     ],
@@ -84,6 +89,32 @@ def test_an_unknown_kind_is_told_with_what_there_is():
         load_kind("moon")
     with pytest.raises(ConfigError, match="function run_cell in json"):
         load_kind("json")
+
+
+TWICE = """name: twice
+seeds: [0]
+scenarios:
+  straight: {{kind: intersection, experiment: {file}, run_folder: {folder}}}
+  other: {{kind: intersection, as_scenario: straight, experiment: {file}, run_folder: {folder}, set: [{change}]}}
+"""
+
+
+def test_two_scenarios_in_one_run_folder_need_the_same_scene_and_policies(tmp_path):
+    """Or one would run on the policy of the other, under a hash that says otherwise."""
+    file, folder = ROOT / "launch" / "intersection.experiment.yaml", tmp_path / "run"
+    campaign = tmp_path / "twice.campaign.yaml"
+    campaign.write_text(TWICE.format(file=file, folder=folder, change="policy.seed=1"))
+    loaded = load_campaign(campaign, tmp_path)
+    with pytest.raises(
+        ConfigError,
+        match=r"straight and other to have the same settings of stage policy, as both are in .*run_folder of its own",
+    ):
+        _refuse_two_in_one_folder(loaded, select(loaded.cells, "scenario=other"))
+    assert not folder.exists()
+    campaign.write_text(TWICE.format(file=file, folder=folder, change="attack.evaluations=7"))
+    _refuse_two_in_one_folder(load_campaign(campaign, tmp_path), load_campaign(campaign, tmp_path).cells)
+    for shipped in sorted((ROOT / "launch").glob("*.campaign.yaml")):
+        _refuse_two_in_one_folder(load_campaign(shipped, tmp_path), load_campaign(shipped, tmp_path).cells)
 
 
 def test_a_page_of_some_cells_does_not_take_the_place_of_the_page_of_all(bench, monkeypatch, tmp_path):

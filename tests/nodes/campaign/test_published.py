@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 from nodes.campaign.config import load_campaign, select
 from nodes.campaign.kinds import load_kind
 from nodes.campaign.predictions import prediction_file
-from nodes.campaign.published import publish, published_table, restore
+from nodes.campaign.published import Published, publish, published_table, restore
 from nodes.campaign.run import Options, plan_cells, run_campaign, statuses
 from nodes.campaign.table import campaign_table, write_table
 from nodes.cli import app
@@ -60,29 +60,35 @@ def test_a_table_and_published_cells_from_finished_cells(here, monkeypatch, tmp_
     assert list(table.cells) == [plan[0].cell.name]
     page = write_table(table, bench.cells, tmp_path / "page")
     assert {path.name for path in page.parent.iterdir()} == {"index.html", "table.csv", "table.json", "table.md"}
-    assert publish(campaign, found, tmp_path / "kept") == ([plan[0].cell.name], [])
-    assert publish(campaign, found, tmp_path / "kept") == ([], [plan[0].cell.name])
+    assert publish(campaign, found, tmp_path / "kept") == Published((plan[0].cell.name,), (), ())
+    assert publish(campaign, found, tmp_path / "kept") == Published((), (plan[0].cell.name,), ())
     kept = tmp_path / "kept" / "toy" / f"{plan[0].cell.name}.json"
     whole = bench.cells / kept.name
     assert kept.read_text() == whole.read_text()
     whole.write_text(json.dumps({**json.loads(whole.read_text()), "extra": {"short": 1, "colours": [0.5] * 9}}))
     monkeypatch.setattr(load_kind(plan[0].job.kind).module, "UNPUBLISHED", ("colours",), raising=False)
     found = statuses(campaign, campaign.cells)
-    assert publish(campaign, found, tmp_path / "kept") == ([plan[0].cell.name], [])
+    assert publish(campaign, found, tmp_path / "kept") == Published((plan[0].cell.name,), (), ())
     assert json.loads(kept.read_text())["extra"] == {"short": 1}
-    assert publish(campaign, found, tmp_path / "kept") == ([], [plan[0].cell.name])
+    assert publish(campaign, found, tmp_path / "kept") == Published((), (plan[0].cell.name,), ())
     row = published_table(tmp_path / "kept" / "toy", campaign).find("straight", "hardened", "none", "deployed")
     assert row.ratio == 3.0
     assert set(row.seeds) | set(row.missing) == set(campaign.config.seeds)
     with pytest.raises(ConfigError, match="advnerf campaign publish"):
         published_table(tmp_path / "nowhere", campaign)
-    # A cell that other settings have made does not stay beside those of these; one that was never begun here does.
-    changed = next(each for each in found if each.state == "changed").cell.name
-    for name in (changed, found[-1].cell.name):
-        shutil.copy(bench.cells / f"{plan[0].cell.name}.json", tmp_path / "kept" / "toy" / f"{name}.json")
-    publish(campaign, found, tmp_path / "kept")
-    assert not (tmp_path / "kept" / "toy" / f"{changed}.json").exists()
-    assert (tmp_path / "kept" / "toy" / f"{found[-1].cell.name}.json").exists()
+    # A cell that other settings have made goes when it is asked for, unless it is not the one that is here; one that was never begun here stays.
+    changed, missing = next(each for each in found if each.state == "changed").cell.name, found[-1].cell.name
+    there = tmp_path / "kept" / "toy" / f"{changed}.json"
+    shutil.copy(bench.cells / f"{changed}.json", there)
+    shutil.copy(bench.cells / f"{plan[0].cell.name}.json", there.with_name(f"{missing}.json"))
+    assert publish(campaign, found, tmp_path / "kept").stale == (changed,)
+    assert there.exists()
+    assert publish(campaign, found, tmp_path / "kept", prune=True).stale == (changed,)
+    assert not there.exists()
+    put(plan[1], there.parent, "of elsewhere")
+    assert publish(campaign, found, tmp_path / "kept", prune=True).stale == ()
+    assert there.exists()
+    assert there.with_name(f"{missing}.json").exists()
     (bench.cells / f"{plan[0].cell.name}.json").write_text("{")
     assert sorted(each.state for each in statuses(campaign, campaign.cells)) == [
         "changed",

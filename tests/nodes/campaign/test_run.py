@@ -11,7 +11,7 @@ import time
 import pytest
 
 from nodes.campaign.config import load_campaign
-from nodes.campaign.run import Options, run_campaign, statuses
+from nodes.campaign.run import Options, _shares, run_campaign, statuses
 from nodes.campaign.store import Store
 from nodes.campaign.worker import take_cell
 from nodes.runtime.locks import hold
@@ -41,7 +41,8 @@ def test_a_campaign_runs_once_and_only_what_changed_again(here):
     ended, _ = run(here)
     assert {end.how for end in ended} == {"done"}
     assert len(ended) == 4
-    assert all(line.endswith(" 1") for line in here.calls if line.startswith("begin"))  # threads: two cores, two jobs
+    threads = max(1, len(os.sched_getaffinity(0)) // 2)  # of two jobs at a time
+    assert all(line.endswith(f" {threads}") for line in here.calls if line.startswith("begin"))
     assert set(states(here).values()) == {"done"}
     before = {path.name: path.stat().st_mtime_ns for path in here.cells.glob("*.json")}
 
@@ -152,9 +153,7 @@ def test_a_ray_cluster_of_several_workers_runs_the_cells(here):
         for _ in range(2):
             cluster.add_node(num_cpus=1)
         cluster.wait_for_nodes()
-        code, out, err = here.call(
-            "run", str(here.file), "--backend", "ray", "--address", cluster.address, "--jobs", "2"
-        )
+        code, out, err = here.call("run", str(here.file), "--backend", "ray", "--address", cluster.address)
         assert code == 0, err
         assert "Ray cluster with 2 cores" in out
         assert set(states(here).values()) == {"done"}
@@ -187,6 +186,42 @@ def wait_for(condition, timeout_s=60.0):
     while not condition():
         assert time.monotonic() < until
         time.sleep(0.02)
+
+
+def test_a_worker_that_is_asked_to_end_has_not_failed(here):
+    """As by a daemon that frees memory: it goes on when the campaign is run again, without being asked to try again."""
+    (here.folder / "hang").touch()
+    here.write("seeds: [0]\nmethods: [gradient]\nvictims: [hardened]\n")
+    process = here.start("run", str(here.file), "--jobs", "1")
+    pid = here.cells / "straight_hardened_gradient_0" / "pid"
+    wait_for(lambda: pid.exists() and pid.read_text())
+    os.kill(int(pid.read_text()), signal.SIGTERM)
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 1
+    assert "straight_hardened_gradient_0: lost" in out
+    assert "killed by SIGTERM" in err
+    assert states(here) == {"straight_hardened_gradient_0": "begun"}
+
+
+def test_a_cell_that_fails_anew_is_failed_whatever_it_found_before(here):
+    here.write("seeds: [0]\nmethods: [cem]\nvictims: [hardened]\n")
+    assert [end.how for end in run(here)[0]] == ["done"]
+    (here.folder / "toy.experiment.yaml").write_text("base: 5.0\n")
+    (here.folder / "fail").touch()
+    assert [end.how for end in run(here)[0]] == ["failed"]
+    assert states(here) == {"straight_hardened_cem_0": "failed"}
+    assert run(here)[0] == []
+    (here.folder / "toy.experiment.yaml").write_text("base: 2.0\n")
+    assert states(here) == {"straight_hardened_cem_0": "done"}
+
+
+def test_a_cluster_is_filled_unless_it_is_said_how_many():
+    """How many cores it has only the cluster knows; here they are counted at once."""
+    assert _shares(Options(backend="ray")) == (0, 1)
+    assert _shares(Options(backend="ray", jobs=3, threads=2)) == (3, 2)
+    cores = len(os.sched_getaffinity(0))
+    assert _shares(Options()) == (cores, 1)
+    assert _shares(Options(jobs=1)) == (1, cores)
 
 
 def test_a_worker_that_is_asked_to_end_closes_what_is_open(here):

@@ -99,9 +99,14 @@ def test_cell_has_both_domains_over_their_own_clean_drive(fresh: Experiment, wal
     cte_m = fresh.paths["right"].project(driven[1:, :2]).cte_m
     assert cell["deployed"]["total_cte_m"] == pytest.approx([np.abs(cte_m).sum()])
     assert (out / f"{GRADIENT.clean.name}.drives.json").exists()
+    assert cell["extra"]["blocked_tick"] == [None]
     # Once there, it is not driven again: here it would end where it starts.
     blocking = replace(wall, blocked_beyond_m=-1e3)
     assert deployed_part(fresh, DressedScene(blocking, fresh.view, objects), GRADIENT, folder, out) == cell
+    (out / f"{GRADIENT.name}.cell.json").unlink()
+    (out / f"{GRADIENT.name}.drives.json").unlink()
+    held = deployed_part(fresh, DressedScene(blocking, fresh.view, objects), GRADIENT, folder, out)
+    assert held["extra"]["blocked_tick"] == [1]
 
 
 def test_a_cell_is_filmed_frame_by_frame(fresh: Experiment, wall: Any) -> None:

@@ -108,6 +108,24 @@ def test_a_cell_depends_on_what_is_searched_and_on_its_victim(trained: Experimen
             settings_hash(kind, experiment, *wrong)
 
 
+def test_a_cell_of_colours_depends_on_the_world_and_not_on_what_else_is_searched(
+    trained: Experiment, tmp_path: Path
+) -> None:
+    kind = load_kind("intersection")
+
+    def digest(*changes: str, victim: str = "hardened") -> str:
+        experiment = kind.load(trained.file, "tiny", list(changes), trained.folder)
+        return settings_hash(kind, experiment, "right", victim, "random", 0)
+
+    same = digest()
+    for free in ("name=mine", "attack.methods=[random]", "attack.seeds=[0,1,2]", "attack.cache_mib=64", "retrain={}"):
+        assert digest(free) == same
+    needed = ("world.car.turn_rate_lag_s=0.2", "attack.evaluations=9", "held_cap_m=5", "policy.seed=1")
+    assert len({same, digest(victim="naive"), *(digest(change) for change in needed)}) == 6
+    with pytest.raises(CellError, match="expected a victim of hardened, got 'naive'"):
+        digest("policy.naive_steps=0", victim="naive")
+
+
 def meshed(trained: Experiment) -> MeshExperiment:
     return MeshExperiment(trained.config, trained.file, trained.folder, trained.setting)
 

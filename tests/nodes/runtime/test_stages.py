@@ -1,6 +1,9 @@
+import os
+
 import pytest
 
 from advnerf_core.files import write_atomically
+from nodes.runtime.locks import hold
 from nodes.runtime.stages import Stage, StageError, begun_with, digest_of, read_record, run_stages
 
 
@@ -130,6 +133,19 @@ def test_the_digest_sees_names_and_contents(tmp_path):
     renamed = digest_of(tmp_path)
     write_atomically(tmp_path / "b", "2")
     assert len({before, renamed, digest_of(tmp_path)}) == 3
+
+
+def test_two_processes_do_not_make_one_stage(tmp_path):
+    """Whoever comes second is told who is at work, and what is finished already is read all the same."""
+    run_and_note(tmp_path, job(), until="first")
+    lock = hold(tmp_path / ".second.lock")
+    with (
+        lock,
+        pytest.raises(StageError, match=rf"second for this process alone, but process {os.getpid()} is at work there"),
+    ):
+        run_and_note(tmp_path, job())
+    assert not (tmp_path / "second").exists()
+    assert run_and_note(tmp_path, job()) == ["second", "other"]
 
 
 def test_files_that_no_stage_wrote_are_not_wiped(tmp_path):
