@@ -17,6 +17,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
+from advnerf_core.files import write_atomically
 from nodes.runtime.machine import memory_gib, processor_name
 
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -68,10 +69,8 @@ def record_row(
     with _locked(ledger):
         rows = [r for r in read_rows(ledger) if r["line"] != line]
         rows.append(row)
-        _write_atomically(
-            ledger, json.dumps(sorted(rows, key=lambda r: r["line"]), indent=1, ensure_ascii=False) + "\n"
-        )
-        _write_atomically(page, render_page(read_rows(ledger)))
+        write_atomically(ledger, json.dumps(sorted(rows, key=lambda r: r["line"]), indent=1, ensure_ascii=False) + "\n")
+        write_atomically(page, render_page(read_rows(ledger)))
 
 
 def read_rows(ledger: Path = LEDGER) -> list[dict[str, Any]]:
@@ -118,16 +117,10 @@ def _locked(ledger: Path) -> Iterator[None]:
         os.close(descriptor)
 
 
-def _write_atomically(path: Path, text: str) -> None:
-    temporary = path.with_suffix(path.suffix + ".part")
-    temporary.write_text(text)
-    temporary.replace(path)
-
-
 def main() -> None:
     """Render the page from the ledger."""
     argparse.ArgumentParser(description=main.__doc__).parse_args()
-    _write_atomically(PAGE, render_page(read_rows()))
+    write_atomically(PAGE, render_page(read_rows()))
     print(f"wrote {PAGE} ({len(read_rows())} rows)")
 
 

@@ -147,14 +147,6 @@ def make_table(wanted: Sequence[Wanted], cells: Iterable[CellResult], name: str 
     return TransferTable(tuple(rows), used, name)
 
 
-def wanted_of(cells: Iterable[CellResult]) -> list[Wanted]:
-    """The lines that cells make where nobody says what else there should be."""
-    seeds: dict[tuple[str, str, str, str], set[int]] = {}
-    for cell in cells:
-        seeds.setdefault(_key(cell), set()).add(cell.seed)
-    return [Wanted(*key, tuple(sorted(found))) for key, found in seeds.items()]
-
-
 def _key(cell: CellResult | Wanted) -> tuple[str, str, str, str]:
     return cell.scenario, cell.placement, cell.victim, cell.method
 

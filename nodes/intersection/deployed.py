@@ -36,7 +36,8 @@ class DressedScene:
     Args:
         scene: The scene without objects.
         view: What the policy sees of its camera.
-        objects: The objects, opaque; none for the empty scene.
+        objects: The objects, opaque; none for the empty scene. As in the learned scene, only what is nearer than they are by
+            `Surrogate.depth_tolerance_m` hides them: 0.15 m, so that where they touch the ground they do not flicker.
     """
 
     def __init__(self, scene: DeploymentScene, view: PolicyView, objects: Sequence[ColouredObject]) -> None:

@@ -61,7 +61,10 @@ def run_experiment(
 
 
 def prepare_victims(experiment: Experiment, report: Report) -> None:
-    """Make scene, objects and policies, also the retrained one where the experiment retrains: one round of it, if there is none yet."""
+    """Make scene, objects and policies, also the retrained one where the experiment retrains.
+
+    One round of it, if none is begun; rounds that were begun are gone on with, as many as were asked for then.
+    """
     del report  # the stages show their own progress
     wanted = experiment.config.retrain
     if wanted is None:

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from advnerf_core.report.cells import CellError, CellResult, read_cell
-from advnerf_core.report.transfer import Wanted, make_table, wanted_of
+from advnerf_core.report.transfer import Wanted, make_table
 from advnerf_core.report.transfer_page import (
     as_csv,
     as_json,
@@ -17,6 +17,14 @@ from advnerf_core.report.transfer_page import (
 )
 from advnerf_core.report.transfer_prediction import Predicted, prediction_section, skill_of
 from advnerf_core.report.transfer_targets import table_targets
+
+
+def wanted_of(cells):
+    """The lines that cells make where nobody says what else there should be."""
+    seeds = {}
+    for each in cells:
+        seeds.setdefault((each.scenario, each.placement, each.victim, each.method), set()).add(each.seed)
+    return [Wanted(*key, tuple(sorted(found))) for key, found in seeds.items()]
 
 
 def cell(scenario, method, seed, surrogate, deployed, clip=None, victim="hardened"):
