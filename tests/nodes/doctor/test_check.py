@@ -46,6 +46,8 @@ def test_a_hung_check_costs_its_deadline_and_the_others_are_told_in_order():
 def library(tmp_path, monkeypatch):
     """Puts a Python package of the given name and text before all others, for child processes."""
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    # Byte code is told from its source by second and size, and a text of a test takes the place of another within one second.
+    monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "1")
     return lambda name, text: (tmp_path / f"{name}.py").write_text(text)
 
 
