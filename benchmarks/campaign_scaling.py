@@ -36,7 +36,7 @@ def measure(folder: Path, work: Path, jobs: int, threads: int, cells: int, itera
     """Wall time and processor time of a campaign of its own [s]; the second is what it costs also where others share the cores."""
     # The gate's verdict stays: it is judged once, before anything is timed.
     shutil.rmtree(work / "cells", ignore_errors=True)
-    work.mkdir(parents=True)
+    work.mkdir(parents=True, exist_ok=True)
     file = work / "scaling.campaign.yaml"
     experiment = Path("launch/room.experiment.yaml").resolve()
     seeds = ", ".join(str(100 + seed) for seed in range(cells))

@@ -146,9 +146,7 @@ def run_campaign(campaign: Campaign, cells: Sequence[Cell], options: Options, sa
     jobs, threads = _shares(options)
     if options.search_only:
         return _search(wanted, jobs, threads, options, say)
-    say(
-        f"{len(wanted)} of {len(cells)} cells to run, {jobs or 'all the cluster has cores for'} at a time, {threads} threads each"
-    )
+    say(f"{len(wanted)} of {len(cells)} cells to run, {_at_a_time(jobs, threads)}")
     beside = [replace(each.job, threads=threads) for each in wanted if not each.live]
     beside += [replace(each.job, threads=threads, phase="search") for each in wanted if each.live and each.searches]
     ended = _run_beside(beside, jobs, options, say)
@@ -172,8 +170,12 @@ def _search(wanted: Sequence[Planned], jobs: int, threads: int, options: Options
         )
     for kind in kinds:
         say(f"cells of kind {kind} search and drive in one and are left out")
-    say(f"{len(found)} cells to search, {jobs or 'all the cluster has cores for'} at a time, {threads} threads each")
+    say(f"{len(found)} cells to search, {_at_a_time(jobs, threads)}")
     return _run_beside(found, jobs, options, say)
+
+
+def _at_a_time(jobs: int, threads: int) -> str:
+    return f"{jobs or 'all the cluster has cores for'} at a time, {threads} threads each"
 
 
 def _inside(scenario: ScenarioConfig, cell: Cell) -> str:

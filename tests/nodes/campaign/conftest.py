@@ -136,6 +136,15 @@ def bench(tmp_path):
     return Bench(tmp_path)
 
 
+@pytest.fixture
+def here(bench, monkeypatch):
+    """The bench, with its module of cells importable in this process too, as the command line has it."""
+    monkeypatch.syspath_prepend(str(bench.folder))
+    monkeypatch.setenv("PYTHONPATH", bench.environment["PYTHONPATH"])
+    yield bench
+    sys.modules.pop("toy_cells", None)
+
+
 class Bench:
     def __init__(self, folder):
         self.folder = folder

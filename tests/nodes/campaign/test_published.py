@@ -2,7 +2,6 @@
 
 import json
 import shutil
-import sys
 
 import pytest
 from typer.testing import CliRunner
@@ -15,15 +14,6 @@ from nodes.campaign.run import Options, plan_cells, run_campaign, statuses
 from nodes.campaign.table import campaign_table, write_table
 from nodes.cli import app
 from nodes.runtime.errors import ConfigError
-
-
-@pytest.fixture
-def here(bench, monkeypatch):
-    """The bench, with its module of cells importable in this process too, as the command line has it."""
-    monkeypatch.syspath_prepend(str(bench.folder))
-    monkeypatch.setenv("PYTHONPATH", bench.environment["PYTHONPATH"])
-    yield bench
-    sys.modules.pop("toy_cells", None)
 
 
 def put(plan, folder, settings_hash=None):

@@ -4,7 +4,6 @@ import contextlib
 import json
 import os
 import signal
-import sys
 import threading
 import time
 
@@ -15,15 +14,6 @@ from nodes.campaign.run import Options, _shares, run_campaign, statuses
 from nodes.campaign.store import Store
 from nodes.campaign.worker import take_cell
 from nodes.runtime.locks import hold
-
-
-@pytest.fixture
-def here(bench, monkeypatch):
-    """The bench, with its module importable in this process too, as the command line has it."""
-    monkeypatch.syspath_prepend(str(bench.folder))
-    monkeypatch.setenv("PYTHONPATH", bench.environment["PYTHONPATH"])
-    yield bench
-    sys.modules.pop("toy_cells", None)
 
 
 def run(bench, jobs=2, **options):
@@ -66,13 +56,9 @@ def test_a_campaign_runs_once_and_only_what_changed_again(here):
 
 
 def test_a_killed_worker_loses_its_cell_and_no_other(here):
-    (here.folder / "hang").touch()
-    process = here.start("run", str(here.file), "--jobs", "2")
-    victim = here.cells / "straight_hardened_gradient_0" / "pid"
-    other = here.cells / "straight_hardened_gradient_1" / "pid"
-    wait_for(lambda: victim.exists() and victim.read_text())
-    os.kill(int(victim.read_text()), signal.SIGKILL)
-    wait_for(lambda: other.exists() and other.read_text())
+    process, worker = start_hanging(here, jobs=2)
+    os.kill(worker, signal.SIGKILL)
+    pid_of(here, "straight_hardened_gradient_1")
     assert states(here)["straight_hardened_gradient_1"] == "running"
     (here.folder / "hang").unlink()
     out, err = process.communicate(timeout=60)
@@ -90,13 +76,9 @@ def test_a_killed_worker_loses_its_cell_and_no_other(here):
 
 @pytest.mark.slow
 def test_a_killed_campaign_takes_its_workers_along_and_goes_on(here):
-    (here.folder / "hang").touch()
-    process = here.start("run", str(here.file), "--jobs", "1")
-    pid_file = here.cells / "straight_hardened_gradient_0" / "pid"
-    wait_for(lambda: pid_file.exists() and pid_file.read_text())
+    process, worker = start_hanging(here)
     process.kill()
     process.communicate()
-    worker = int(pid_file.read_text())
     wait_for(lambda: not is_alive(worker))
     done = set(here.cells.glob("*.json"))
     (here.folder / "hang").unlink()
@@ -173,6 +155,19 @@ def test_no_cluster_is_one_clear_error(here):
     assert here.calls == []
 
 
+def start_hanging(bench, jobs=1):
+    """The campaign's process, and the pid of the worker that hangs in the gradient cell of seed 0."""
+    (bench.folder / "hang").touch()
+    process = bench.start("run", str(bench.file), "--jobs", str(jobs))
+    return process, pid_of(bench, "straight_hardened_gradient_0")
+
+
+def pid_of(bench, name):
+    file = bench.cells / name / "pid"
+    wait_for(lambda: file.exists() and file.read_text())
+    return int(file.read_text())
+
+
 def is_alive(pid):
     with contextlib.suppress(ProcessLookupError):
         os.kill(pid, 0)
@@ -190,12 +185,9 @@ def wait_for(condition, timeout_s=60.0):
 
 def test_a_worker_that_is_asked_to_end_has_not_failed(here):
     """As by a daemon that frees memory: it goes on when the campaign is run again, without being asked to try again."""
-    (here.folder / "hang").touch()
     here.write("seeds: [0]\nmethods: [gradient]\nvictims: [hardened]\n")
-    process = here.start("run", str(here.file), "--jobs", "1")
-    pid = here.cells / "straight_hardened_gradient_0" / "pid"
-    wait_for(lambda: pid.exists() and pid.read_text())
-    os.kill(int(pid.read_text()), signal.SIGTERM)
+    process, worker = start_hanging(here)
+    os.kill(worker, signal.SIGTERM)
     out, err = process.communicate(timeout=60)
     assert process.returncode == 1
     assert "straight_hardened_gradient_0: lost" in out
@@ -226,12 +218,8 @@ def test_a_cluster_is_filled_unless_it_is_said_how_many():
 
 def test_a_worker_that_is_asked_to_end_closes_what_is_open(here):
     """As a CARLA world must be put back: the cell's ``finally`` is run."""
-    (here.folder / "hang").touch()
     here.write("seeds: [0]\nmethods: [gradient]\nvictims: [hardened]\n")
-    process = here.start("run", str(here.file), "--jobs", "1")
-    pid = here.cells / "straight_hardened_gradient_0" / "pid"
-    wait_for(lambda: pid.exists() and pid.read_text())
-    worker = int(pid.read_text())
+    process, worker = start_hanging(here)
     process.terminate()  # its worker is told by the kernel
     process.communicate(timeout=60)
     wait_for(lambda: not is_alive(worker))
