@@ -7,16 +7,20 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 from pathlib import Path
 from typing import Any
 
-from benchmarks.results import record_row
+from advnerf_core.files import write_atomically
+from benchmarks.results import REPOSITORY, record_row
+from nodes.intersection.context import Experiment
+from nodes.intersection.run import load_experiment
 
 _TARGET = 1.1
 
 
-def rows_of(summary: dict[str, Any]) -> list[tuple[str, float, str, str, bool | None, str]]:
-    """Rows of the ledger: the retrained policy under the old attacks, and what attacks on each round's policy are worth."""
+def rows_of(summary: dict[str, Any], allowed: int) -> list[tuple[str, float, str, str, bool | None, str]]:
+    """Rows of the ledger: the retrained policy under the old attacks, and what attacks on each round's policy are worth; ``allowed`` rounds may be run."""
     rows: list[tuple[str, float, str, str, bool | None, str]] = []
     for name, drive in summary["old_attacks"].items():
         note = (
@@ -30,32 +34,45 @@ def rows_of(summary: dict[str, Any]) -> list[tuple[str, float, str, str, bool | 
             line = f"#5 attack -> retrain -> attack, round {number}, {name}, deployed"
             note = f"in the learned scene {each['surrogate'][name]:.2f} x; victim {each['victim'][:12]}, gradient, one seed"
             if number == len(summary["rounds"]) - 1 and max(each["surrogate"].values()) >= summary["pays_ratio"]:
-                note += f"; the number of rounds ended the loop: an attack pays from {summary['pays_ratio']:g} x in the learned scene"
+                ended = (
+                    "the number of rounds ended the loop"
+                    if number >= allowed
+                    else f"the loop was stopped before its {allowed} rounds were over"
+                )
+                note += f"; {ended}: an attack pays from {summary['pays_ratio']:g} x in the learned scene"
             rows.append((line, each["deployed"][name], "x no attack", "", None, note))
     return rows
 
 
-def command_of(manifest: dict[str, Any], summary: dict[str, Any], folder: Path) -> str:
-    """What makes these rounds: other commands may have used the run folder since."""
-    file = Path("launch") / Path(manifest["file"]).name
-    rounds = len(summary["rounds"]) - 1
-    return (
-        f"advnerf experiment {file} --setting {manifest['setting']} --run-folder {folder} --set retrain.rounds={rounds}"
-    )
+def command_of(experiment: Experiment) -> str:
+    """What makes these rounds: the manifest's command may be of something else that has used the run folder since."""
+    file = experiment.file.relative_to(REPOSITORY)
+    folder = os.path.relpath(experiment.folder, REPOSITORY)
+    return f"advnerf experiment {file} --setting {experiment.setting} --run-folder {folder}"
+
+
+def publish(found: Path, docs: Path) -> None:
+    """The rounds and their curve into the documentation."""
+    write_atomically(docs / "results" / "retrain" / "retrain.json", (found / "retrain.json").read_text())
+    write_atomically(docs / "retraining.png", (found / "curve.png").read_bytes())
 
 
 def main() -> None:
-    """Record the rows."""
+    """Record the rows, and put rounds and curve into docs/."""
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("folder", type=Path, help="run folder of the intersection's experiment")
     parser.add_argument("--dry", action="store_true", help="print only")
     options = parser.parse_args()
-    summary = json.loads((options.folder / "retrain" / "retrain.json").read_text())
-    command = command_of(json.loads((options.folder / "manifest.json").read_text()), summary, options.folder)
-    for line, value, unit, target, met, note in rows_of(summary):
+    experiment = load_experiment(REPOSITORY / "launch" / "intersection.experiment.yaml", "retrain", [], options.folder)
+    found = experiment.stage_folder("retrain")
+    summary = json.loads((found / "retrain.json").read_text())
+    allowed = experiment.config.retrain.rounds if experiment.config.retrain else 0
+    for line, value, unit, target, met, note in rows_of(summary, allowed):
         print(f"{line}: {value:.2f} {unit} (target {target or '-'}): {met}")
         if not options.dry:
-            record_row(line, value, unit, target, met, command, note)
+            record_row(line, value, unit, target, met, command_of(experiment), note)
+    if not options.dry:
+        publish(found, REPOSITORY / "docs")
 
 
 if __name__ == "__main__":

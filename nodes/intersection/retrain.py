@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -75,7 +76,8 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
             if number == 1:
                 old_attacks = _under_old_attacks(experiment, dressed, folder / "round0", first)
             summary = {
-                "rounds": rounds, "old_attacks": old_attacks, "pays_ratio": wanted.pays_ratio, "final_policy": str(file),
+                "rounds": rounds, "old_attacks": old_attacks, "pays_ratio": wanted.pays_ratio,
+                "final_policy": os.path.relpath(file, experiment.folder),
                 "settings_hash": hash_of(wanted.model_dump(mode="json")),
             }  # fmt: skip
             # After every round: a loop takes hours, and may be stopped.

@@ -29,12 +29,15 @@ def test_a_retrained_policy_is_held_against_the_original_undisturbed():
     rounds = [{"victim": "a" * 64, "surrogate": {"right": 5.0}, "deployed": {"right": 4.0}}]
     old = {"right": {**drive, "ratio": 1.1}, "left": {**drive, "ratio": 1.11}}
     summary = {"old_attacks": old, "rounds": rounds, "pays_ratio": 1.5}
-    rows = {line: (value, met) for line, value, _, _, met, _ in retraining.rows_of(summary)}
+    rows = {line: (value, met) for line, value, _, _, met, _ in retraining.rows_of(summary, 0)}
     assert rows["#5 retrained under the old attack, right, over the original undisturbed"] == (1.1, True)
     assert rows["#5 retrained under the old attack, left, over the original undisturbed"] == (1.11, False)
     assert rows["#5 attack -> retrain -> attack, round 0, right, deployed"] == (4.0, None)
-    assert "the number of rounds ended the loop" in retraining.rows_of(summary)[-1][-1]
-    assert "ended" not in retraining.rows_of({**summary, "pays_ratio": 5.1})[-1][-1]
+    assert "the number of rounds ended the loop" in retraining.rows_of(summary, 0)[-1][-1]
+    assert "stopped before its 6 rounds were over" in retraining.rows_of(summary, 6)[-1][-1]
+    cured = retraining.rows_of({**summary, "pays_ratio": 5.1}, 6)[-1][-1]
+    assert "ended" not in cured
+    assert "stopped" not in cured
 
 
 def test_a_row_of_the_table_has_its_machines_and_waits_for_its_seeds():

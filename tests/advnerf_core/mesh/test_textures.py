@@ -18,7 +18,7 @@ from advnerf_core.scene.surrogate import Surrogate
 
 from .conftest import PINHOLE, POSE
 
-SHARED = Path("/work/shared/data/models")
+SHARED = Path(__file__).parents[4] / "shared" / "data" / "models"
 
 
 def drawn(field, poses, pinhole, supersample=3):

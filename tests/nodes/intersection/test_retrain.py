@@ -61,6 +61,7 @@ def test_a_round_of_retraining_and_the_attack_on_it(attacked: Experiment) -> Non
     assert found["rounds"][0]["victim"] == load_policy(victim_file(attacked, HARDENED)).sha256
     retrained = load_policy(victim_file(attacked, RETRAINED))
     assert found["rounds"][1]["victim"] == retrained.sha256
+    assert found["final_policy"] == "retrain/round0/policy.safetensors"  # in the run folder, wherever that is
     assert retrained.metadata["fine_tuned_from"] == found["rounds"][0]["victim"]
     for name in attacked.config.scenarios:
         row = found["old_attacks"][name]
