@@ -15,6 +15,7 @@ from nodes.runtime.terminal import Overrides, print_table, say_error, table
 from nodes.runtime.termination import ends_in_order
 
 if TYPE_CHECKING:
+    from advnerf_core.report.transfer import TransferTable
     from nodes.campaign.config import Campaign, Cell
 
 app = typer.Typer(
@@ -128,13 +129,23 @@ def table_command(
         Path | None,
         typer.Option(
             "--output", "-o", help="Folder of the page.",
-            show_default="table in the campaign's folder; with --only, no page is written",
+            show_default="table in the campaign's folder; with --only or --from, no page is written",
+        ),
+    ] = None,
+    source: Annotated[
+        Path | None,
+        typer.Option(
+            "--from", help="Show the cells that were published there, e.g. in docs/results, wherever they were run.",
+            show_default="the campaign's own cells",
         ),
     ] = None,
     overrides: Overrides = None,
 ) -> None:  # fmt: skip
     """Print the transfer table and the targets, and write them as JSON, CSV, Markdown and a page with the clips by outcome."""
     campaign, cells = _load(file, folder, overrides, only)
+    if source is not None:
+        _show_published(campaign, cells, output, source / campaign.config.name)
+        return
     # A page of some cells never takes the place of the page of all.
     _show_table(campaign, cells, output or (None if only else _page_folder(campaign)))
 
@@ -144,6 +155,28 @@ def _page_folder(campaign: Campaign) -> Path:
 
 
 def _show_table(campaign: Campaign, cells: list[Cell], output: Path | None) -> None:
+    from nodes.campaign.run import statuses
+    from nodes.campaign.table import campaign_table
+
+    found = statuses(campaign, cells)
+    full = campaign_table(campaign, found)
+    page = _write_and_print(full, campaign.folder, campaign.folder / "cells", output)
+    left_out = [each for each in found if each.state in ("changed", "unreadable")]
+    for each in left_out:
+        say_error(f"{each.cell.name} is left out: {each.text}")
+    _say_where(full, cells, page)
+
+
+def _show_published(campaign: Campaign, cells: list[Cell], output: Path | None, folder: Path) -> None:
+    from nodes.campaign.published import published_table
+
+    full = published_table(folder, campaign, cells)
+    # Films are not published; those of the campaign's own cells may be of other drives.
+    _say_where(full, cells, _write_and_print(full, folder, folder, output))
+
+
+def _write_and_print(full: TransferTable, folder: Path, clips_folder: Path, output: Path | None) -> Path | None:
+    """Table, targets and the predictions in ``folder`` to the terminal, and the page into ``output`` if it is asked for."""
     from rich.console import Console
 
     from advnerf_core.files import write_atomically
@@ -151,16 +184,13 @@ def _show_table(campaign: Campaign, cells: list[Cell], output: Path | None) -> N
     from advnerf_core.report.transfer_prediction import prediction_section, prediction_table, skill_text
     from advnerf_core.report.transfer_targets import table_targets
     from nodes.campaign.predictions import predicted
-    from nodes.campaign.run import statuses
-    from nodes.campaign.table import campaign_table, write_table
+    from nodes.campaign.table import write_table
 
-    found = statuses(campaign, cells)
-    full = campaign_table(campaign, found)
-    pairs = predicted(campaign.folder, list(full.cells.values()))
+    pairs = predicted(folder, list(full.cells.values()))
     page = None
     if output is not None:
         sections = [("Predicted and measured transfer", prediction_section(pairs))] if pairs else []
-        page = write_table(full, campaign.folder / "cells", output, sections)
+        page = write_table(full, clips_folder, output, sections)
         if pairs:
             write_atomically(
                 output / "predictions.json", json.dumps([pair.record() for pair in pairs], indent=1) + "\n"
@@ -171,9 +201,10 @@ def _show_table(campaign: Campaign, cells: list[Cell], output: Path | None) -> N
     if pairs:
         console.print(prediction_table(pairs).rich())
         print(skill_text(pairs))
-    left_out = [each for each in found if each.state in ("changed", "unreadable")]
-    for each in left_out:
-        say_error(f"{each.cell.name} is left out: {each.text}")
+    return page
+
+
+def _say_where(full: TransferTable, cells: list[Cell], page: Path | None) -> None:
     print(
         f"{len(full.cells)} of {len(cells)} cells; " + (f"page: {page}" if page else "-o FOLDER writes a page of them")
     )

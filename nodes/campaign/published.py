@@ -114,20 +114,21 @@ def _publish_beside(campaign: Campaign, done: Sequence[CellStatus], folder: Path
             write_atomically(folder / "gate" / name, verdict.read_text(encoding="utf-8"))
 
 
-def published_table(folder: Path, campaign: Campaign) -> TransferTable:
-    """The table of published cells, with all lines and seeds that the campaign asks for.
+def published_table(folder: Path, campaign: Campaign, cells: Sequence[Cell] | None = None) -> TransferTable:
+    """The table of published cells, with all lines and seeds that are asked for.
 
     Args:
         folder: Of the published cells.
         campaign: Whose they are.
+        cells: Which of them the table is of; None for all of the campaign.
 
     Raises:
         ConfigError: There are none.
     """
-    cells = read_cells(folder)
-    if not cells:
+    found = read_cells(folder)
+    if not found:
         raise ConfigError(f"expected published cells in {folder}, got none; run advnerf campaign publish")
-    return make_table(wanted_rows(campaign, campaign.cells), cells, campaign.config.name)
+    return make_table(wanted_rows(campaign, campaign.cells if cells is None else cells), found, campaign.config.name)
 
 
 def restore(campaign: Campaign, cells: Sequence[Cell], folder: Path) -> Restored:

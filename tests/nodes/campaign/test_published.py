@@ -1,5 +1,6 @@
 """Cells that are kept with the code: what goes there, what stays there, and what comes back."""
 
+import csv
 import json
 import shutil
 
@@ -103,6 +104,14 @@ def test_a_lost_folder_comes_back_from_what_was_published(here, tmp_path):
     assert json.loads(before)["stages"] == {"capture": "c1", "policy": "p1"}
     assert "2 cells written" in campaign_command("publish", here.file, "--to", kept, *only)
     shutil.rmtree(here.cells)
+    said = campaign_command("table", here.file, "--from", kept, *only)
+    assert "2 of 2 cells; -o FOLDER writes a page of them" in said
+    said = campaign_command("table", here.file, "--from", kept, "-o", tmp_path / "page")
+    assert f"2 of 4 cells; page: {tmp_path / 'page' / 'index.html'}" in said.replace("\n", "")
+    rows = list(csv.DictReader((tmp_path / "page" / "table.csv").open()))
+    (attacked,) = [row for row in rows if (row["method"], row["domain"]) == ("gradient", "deployed")]
+    assert float(attacked["ratio"]) == 3.0
+    assert not (here.folder / "table").exists()  # that of the campaign's own cells
     (kept / "toy" / second.name).unlink()
 
     said = campaign_command("restore", here.file, "--from", kept, *only)
