@@ -39,6 +39,8 @@ def record_row(
     command: str,
     note: str = "",
     *,
+    machine: str = "",
+    date: str = "",
     ledger: Path = LEDGER,
     page: Path = PAGE,
 ) -> None:
@@ -52,6 +54,8 @@ def record_row(
         met: Whether the target was met; None where the line has no target.
         command: The command that measured it, runnable from the project root.
         note: The reason for a miss, or what the reader must know.
+        machine: Where it was measured; this machine if it is not said.
+        date: When, ISO; today if it is not said.
         ledger: Where the ledger is kept.
         page: Where the page is written.
     """
@@ -63,8 +67,8 @@ def record_row(
         "met": met,
         "command": command,
         "note": note,
-        "machine": machine_description(),
-        "date": datetime.now(timezone.utc).date().isoformat(),
+        "machine": machine or machine_description(),
+        "date": date or datetime.now(timezone.utc).date().isoformat(),
     }
     with _locked(ledger):
         rows = [r for r in read_rows(ledger) if r["line"] != line]
@@ -84,8 +88,9 @@ def read_rows(ledger: Path = LEDGER) -> list[dict[str, Any]]:
 def render_page(rows: list[dict[str, Any]]) -> str:
     """The ledger as a Markdown page."""
     head = (
-        "# Measured results\n\nMade from `docs/results.json` by `python -m benchmarks.results`; every row was written by the "
-        "command beside it.\n\n| line | value | target | met | command | machine, date | note |\n|---|---|---|---|---|---|---|\n"
+        "# Measured results\n\nMade from `docs/results.json` by `python -m benchmarks.results`; every row was measured by the "
+        "command beside it, on that machine and day; rows of campaigns are gathered from its cells by `python -m benchmarks.transfer_table`, those of "
+        "retraining by `python -m benchmarks.retraining`.\n\n| line | value | target | met | command | machine, date | note |\n|---|---|---|---|---|---|---|\n"
     )
     return head + "".join(_render_row(row) for row in rows)
 

@@ -171,11 +171,13 @@ class PoseSpace:
         offset = placements.double() - self.middle
         offset[:, 2] = torch.where(self._turns, torch.remainder(offset[:, 2] + np.pi, 2 * np.pi) - np.pi, offset[:, 2])
         unit = torch.where(self.half > 0.0, offset / self.half.clamp_min(1e-300), torch.zeros_like(offset))
-        if bool((offset.abs() > self.half + 1e-9).any()) or not self.allows(unit):
+        # A search ends on its bounds, from where division leads one bit beyond.
+        within = unit.clamp(-1.0, 1.0)
+        if bool((offset.abs() > self.half + 1e-9).any()) or not self.allows(within):
             raise PoseBoundsError(
                 f"expected placements within the bounds and clear of the lane, got {placements.tolist()}"
             )
-        return unit.clamp(-1.0, 1.0)
+        return within
 
     def allows(self, unit: Tensor) -> bool:
         """Whether coordinates lie in the unit box, and all objects stand clear of the lane."""

@@ -49,7 +49,7 @@ class Drives(BaseModel):
 
 
 class CellResult(BaseModel):
-    """What a finished cell found.
+    """What a finished cell found. The drives of both domains begin at the same starts in the same order; one domain may have only the first of them.
 
     Attributes:
         scenario: straight, right, left, green_screen, monitor or another.

@@ -1,8 +1,8 @@
 """The transfer table: every scenario, victim and method, in the surrogate and deployed, from the cells of a campaign.
 
 Total CTE is averaged over the drives of a seed, then over seeds; its spread is that over seeds. A ratio to no attack is of sums, each drive
-against the drive from the same start in the same domain. The transfer ratio is the deployed ratio over the surrogate's, of the seeds that
-have both. Intervals resample whole seeds. What was not run is missing, and says so.
+against the drive from the same start in the same domain. The transfer ratio is the deployed ratio over the surrogate's, of the seeds and
+the starts that have both. Intervals resample whole seeds. What was not run is missing, and says so.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class TableRow:
         std_m: Its sample standard deviation over seeds [m]; None of one seed.
         ratio: Ratio to no attack in the same domain.
         ratio_interval: Its bootstrap interval over seeds.
-        transfer: Deployed ratio over surrogate ratio; on deployed rows only.
+        transfer: Deployed ratio over surrogate ratio, from the same starts; on deployed rows only.
         transfer_interval: Its interval.
         off_track: Drives that left the track.
         paper_m: The paper's mean.
@@ -178,17 +178,17 @@ def drives_in(cell: CellResult, domain: Domain) -> Drives | None:
     return cell.surrogate if domain == "surrogate" else cell.deployed
 
 
-def _sums(drives: Sequence[Drives]) -> tuple[list[float], list[float]]:
-    """Attacked and unattacked sum of each seed."""
-    return [sum(d.total_cte_m) for d in drives], [sum(d.none_total_cte_m) for d in drives]
+def _sums(drives: Sequence[Drives], starts: Sequence[int | None] | None = None) -> tuple[list[float], list[float]]:
+    """Attacked and unattacked sum of each seed, over its first ``starts`` drives or all."""
+    some = list(zip(drives, starts or [None] * len(drives), strict=True))
+    return [sum(d.total_cte_m[:n]) for d, n in some], [sum(d.none_total_cte_m[:n]) for d, n in some]
 
 
 def _transfer(cells: Sequence[CellResult]) -> tuple[float | None, Interval | None]:
-    both = [cell for cell in cells if cell.deployed is not None]
-    deployed, surrogate = (
-        _sums([cell.deployed for cell in both if cell.deployed]),
-        _sums([cell.surrogate for cell in both]),
-    )
+    both = [(cell.surrogate, cell.deployed) for cell in cells if cell.deployed is not None]
+    # A live drive begins at the first of the starts that a search may have had: the others are no part of the comparison.
+    starts = [min(len(here.total_cte_m), len(there.total_cte_m)) for here, there in both]
+    deployed, surrogate = _sums([there for _, there in both], starts), _sums([here for here, _ in both], starts)
     there, here = ratio_of_sums(*deployed), ratio_of_sums(*surrogate)
     if not there or not here:
         return None, None

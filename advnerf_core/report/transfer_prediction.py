@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -36,6 +36,8 @@ class Predicted:
         retained: Share of the effect on single views that survives in real pictures.
         total_m: Expected total CTE [m].
         measured_m: Deployed total CTE, mean over its drives [m].
+        surrogate: Ratio to no attack of the drives in the surrogate from the same starts: what one would expect without predicting.
+        surrogate_m: Their total CTE, mean over drives [m].
     """
 
     name: str
@@ -47,6 +49,13 @@ class Predicted:
     retained: float
     total_m: float
     measured_m: float
+    surrogate: float
+    surrogate_m: float
+
+    @property
+    def unpredicted(self) -> Predicted:
+        """The same attack with what the surrogate says in place of the prediction, to hold the prediction against."""
+        return replace(self, ratio=self.surrogate, total_m=self.surrogate_m)
 
     def record(self) -> dict[str, Any]:
         """JSON-ready values."""
@@ -110,10 +119,16 @@ def skill_text(pairs: Sequence[Predicted]) -> str:
     skill = skill_of(pairs)
     if skill.factor is None or skill.factor_total is None:
         return "No attack was both predicted and deployed."
-    rank = "" if skill.rank_correlation is None else f", rank correlation {skill.rank_correlation:.2f}"
+    plain = skill_of([pair.unpredicted for pair in pairs])
+    rank, plain_rank = (
+        "" if each.rank_correlation is None else f", rank correlation {each.rank_correlation:.2f}"
+        for each in (skill, plain)
+    )
     return (
         f"{skill.count} attacks predicted and deployed: the ratio is off by a factor of {skill.factor:.2f} in the median, the total CTE by "
-        f"{skill.factor_total:.2f}{rank}; {skill.right} of {skill.count} rightly said to work (at least {WORKS_FROM:g} × no attack) or not."
+        f"{skill.factor_total:.2f}{rank}; {skill.right} of {skill.count} rightly said to work (at least {WORKS_FROM:g} × no attack) or not. "
+        f"The drives in the learned scene taken for the prediction would be off by {plain.factor:.2f} and {plain.factor_total:.2f}{plain_rank}, "
+        f"{plain.right} of {plain.count} right."
     )
 
 

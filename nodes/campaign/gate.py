@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -70,16 +71,42 @@ def cached_verdict(
     if kind.fidelity is None:
         return None
     policy, _ = kind.fidelity.policy_of(experiment, victim, scenario)
-    key = hash_of(
-        [stage_digests(experiment.folder), _weights_sha256(policy), limits.model_dump(mode="json"), scenario, victim]
-    )
+    key = _key(experiment, policy, limits, scenario, victim)
+    return _kept_or(file, key, lambda: judge_scene(kind, experiment, scenario, victim, limits)[0][1])
+
+
+def cached_drive_verdict(
+    kind: Kind, experiment: Any, scenario: str, victim: str, seed: int, folder: Path, limits: GateLimits, file: Path
+) -> Verdict | None:
+    """The same on the pictures of a deployed drive without attack, where ``folder`` is that of its cell.
+
+    Raises:
+        RuntimeFault: There is no such drive yet.
+    """
+    module = kind.fidelity
+    if module is None:
+        return None
+    policy, goal = module.policy_of(experiment, victim, scenario)
+
+    def judged() -> Verdict:
+        pictures = module.driven(experiment, scenario, victim, seed, folder)
+        return judge(agreement_on(policy, goal, pictures), limits, pictures.of)
+
+    return _kept_or(file, _key(experiment, policy, limits, scenario, victim, "drive", seed), judged)
+
+
+def _key(experiment: Any, policy: Any, limits: GateLimits, *which: Any) -> str:
+    return hash_of([stage_digests(experiment.folder), _weights_sha256(policy), limits.model_dump(mode="json"), *which])
+
+
+def _kept_or(file: Path, key: str, judged: Callable[[], Verdict]) -> Verdict:
     try:
         kept = json.loads(file.read_text(encoding="utf-8"))
         if kept["key"] == key:
             return Verdict(kept["passed"], tuple(kept["reasons"]), kept["numbers"])
     except (OSError, ValueError, KeyError, TypeError):
         pass  # an unreadable verdict is judged again
-    verdict = judge_scene(kind, experiment, scenario, victim, limits)[0][1]
+    verdict = judged()
     write_atomically(file, json.dumps({"key": key, **verdict.record()}, indent=1) + "\n")
     return verdict
 

@@ -78,11 +78,15 @@ def predicted(folder: Path, results: Sequence[CellResult]) -> list[Predicted]:
             continue
         none_m = sum(cell.deployed.none_total_cte_m)
         measured = sum(cell.deployed.total_cte_m) / none_m if none_m > 0.0 else math.nan
+        starts = min(len(cell.surrogate.total_cte_m), len(cell.deployed.total_cte_m))
+        learned, learned_none = (
+            sum(each[:starts]) for each in (cell.surrogate.total_cte_m, cell.surrogate.none_total_cte_m)
+        )
         pairs.append(Predicted(
             cell.name, cell.method, kept["ratio"], kept["ratio_low"], kept["ratio_high"], measured, kept["retained"],
-            kept["total_cte_m"], cell.deployed.mean_m,
+            kept["total_cte_m"], cell.deployed.mean_m, learned / learned_none if learned_none > 0.0 else math.nan, learned / starts,
         ))  # fmt: skip
-    return [pair for pair in pairs if math.isfinite(pair.measured)]
+    return [pair for pair in pairs if math.isfinite(pair.measured) and math.isfinite(pair.surrogate)]
 
 
 def prediction_file(folder: Path, name: str) -> Path:

@@ -14,7 +14,7 @@ from advnerf_core.report.transfer import TransferTable, make_table
 from nodes.campaign.config import Campaign, Cell
 from nodes.campaign.kinds import load_kind
 from nodes.campaign.predictions import kept_prediction, prediction_file
-from nodes.campaign.run import gate_key, hash_as_it_is
+from nodes.campaign.run import gate_file, gate_key, hash_as_it_is
 from nodes.campaign.store import CellStatus, store_of
 from nodes.campaign.table import wanted_rows
 from nodes.runtime.errors import ConfigError
@@ -109,9 +109,10 @@ def _publish_beside(campaign: Campaign, done: Sequence[CellStatus], folder: Path
         kept = kept_prediction(prediction_file(campaign.folder, each.cell.name), each.result.settings_hash)
         if kept is not None:
             write_atomically(prediction_file(folder, each.cell.name), json.dumps(kept, indent=1) + "\n")
-    for name in sorted({f"{gate_key(each.cell)}.json" for each in done}):
-        if (verdict := campaign.folder / "gate" / name).exists():
-            write_atomically(folder / "gate" / name, verdict.read_text(encoding="utf-8"))
+    for key in sorted({gate_key(each.cell) for each in done}):
+        for drive in (False, True):
+            if (verdict := gate_file(campaign.folder, key, drive)).exists():
+                write_atomically(gate_file(folder, key, drive), verdict.read_text(encoding="utf-8"))
 
 
 def published_table(folder: Path, campaign: Campaign, cells: Sequence[Cell] | None = None) -> TransferTable:

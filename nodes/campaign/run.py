@@ -10,6 +10,7 @@ from typing import Any, Literal
 
 import joblib
 
+from advnerf_core.report.cells import NONE, CellResult
 from nodes.campaign.config import Campaign, Cell, ScenarioConfig
 from nodes.campaign.kinds import load_kind, settings_hash
 from nodes.campaign.store import CellStatus, Store, store_of
@@ -157,6 +158,8 @@ def run_campaign(campaign: Campaign, cells: Sequence[Cell], options: Options, sa
     for each in wanted:
         if each.live and each.cell.name not in lost:
             ended.append(_tell(run_in_process(replace(each.job, threads=_cores())), say))
+    # Their drives without attack are there now.
+    _past_the_gate(campaign, [each.cell for each in wanted if each.live], options, say)
     return ended
 
 
@@ -223,33 +226,44 @@ def _refuse_two_in_one_folder(campaign: Campaign, cells: Sequence[Cell]) -> None
 
 def _past_the_gate(campaign: Campaign, cells: Sequence[Cell], options: Options, say: Say) -> list[Cell]:
     """The cells whose surrogate is good enough; judged once per scenario and victim, and kept."""
-    verdicts: dict[str, bool] = {}
+    passed: dict[str, bool] = {}
     for cell in cells:
-        key, scenario = gate_key(cell), campaign.scenario(cell)
-        if key in verdicts:
-            continue
-        verdicts[key] = True
-        if load_kind(scenario.kind).fidelity is None:
-            continue
-        from nodes.campaign.gate import cached_verdict  # loads torch
-
-        file = campaign.folder / "gate" / f"{key}.json"
-        found = cached_verdict(
-            load_kind(scenario.kind),
-            _experiment(campaign, cell),
-            _inside(scenario, cell),
-            cell.victim,
-            scenario.gate or campaign.config.gate,
-            file,
-        )
-        verdicts[key] = found is None or found.passed or not options.gate
-        for reason in found.reasons if found is not None else ():
-            left_out = "" if verdicts[key] else "; its cells are left out (--no-gate runs them all the same)"
-            say(f"fidelity gate, {key}: {reason}{left_out}")
-    return [cell for cell in cells if verdicts[gate_key(cell)]]
+        if (key := gate_key(cell)) not in passed:
+            passed[key] = _judge(campaign, cell, options, say)
+    return [cell for cell in cells if passed[gate_key(cell)]]
 
 
-def gate_key(cell: Cell) -> str:
+def _judge(campaign: Campaign, cell: Cell, options: Options, say: Say) -> bool:
+    """Whether the cells of this one's scenario and victim may be run: by held-out views, and by a drive without attack where there is one."""
+    scenario = campaign.scenario(cell)
+    kind, key = load_kind(scenario.kind), gate_key(cell)
+    if kind.fidelity is None:
+        return True
+    from nodes.campaign.gate import cached_drive_verdict, cached_verdict  # loads torch
+
+    limits = scenario.gate or campaign.config.gate
+    which = (kind, _experiment(campaign, cell), _inside(scenario, cell), cell.victim)
+    found = [cached_verdict(*which, limits, gate_file(campaign.folder, key))]
+    first = min(each.seed for each in campaign.cells if gate_key(each) == key)
+    without = replace(cell, method=NONE, seed=first)
+    try:
+        folder = store_of(campaign).work(without.name)
+        found.append(cached_drive_verdict(*which, first, folder, limits, gate_file(campaign.folder, key, drive=True)))
+    except RuntimeFault as fault:
+        say(f"fidelity gate, {key}: only held-out views are judged, as there is no drive without attack yet: {fault}")
+    may = not options.gate or all(verdict is None or verdict.passed for verdict in found)
+    for reason in [reason for verdict in found if verdict is not None for reason in verdict.reasons]:
+        left_out = "" if may else "; its cells are left out (--no-gate runs them all the same)"
+        say(f"fidelity gate, {key}: {reason}{left_out}")
+    return may
+
+
+def gate_file(folder: Path, key: str, drive: bool = False) -> Path:
+    """Where a campaign, or what is published of it, keeps the verdict on held-out views, or on a drive without attack."""
+    return folder / "gate" / f"{key}{'.drive' * drive}.json"
+
+
+def gate_key(cell: Cell | CellResult) -> str:
     """Name of what the fidelity gate judges for a cell."""
     return f"{cell.scenario}{'.' * bool(cell.placement)}{cell.placement}_{cell.victim}"
 

@@ -21,14 +21,14 @@ from advnerf_core.driving.metrics import Horizon, first_still_tick
 from advnerf_core.report.clips import ClipTrack, write_clip
 from nodes import evaluation
 from nodes.experiment import attack, deploy
+from nodes.experiment.config import AttackConfig
 from nodes.experiment.context import CONTROL_PERIOD_S, Experiment
-from nodes.experiment.finished import changed_settings, has_same_attacks, is_finished
+from nodes.experiment.finished import changed_settings, has_same_attacks, has_same_graph, is_finished
 from nodes.experiment.learned_scene import load_background
 from nodes.experiment.objects import attacked_object, surrogate_of
 from nodes.experiment.run import load_experiment, run_experiment
 from nodes.runtime.errors import ConfigError, RuntimeFault
 from nodes.runtime.stages import Report, hash_of, read_record
-from nodes.trials.campaign import COUNTED_STOPS
 
 __all__ = ["LIVE", "cell_inputs", "load_experiment", "prepare", "run_cell", "search_cell"]
 
@@ -72,12 +72,27 @@ class _Cell:
     def driven_in(self, condition: str) -> Path:
         """Folder of a live drive; the drive without attack belongs to all methods."""
         taken = self.experiment.stage_folder("deploy")
-        if self.searched_in(condition) != self.folder and (taken / f"{self.live(condition).name}.json").exists():
+        if self.searched_in(condition) != self.folder and self._is_driven_in(taken, condition):
             return taken
         if condition != "none":
             return self.folder / "live"  # a search and a live drive of one cell leave files of one name
         inputs = hash_of(cell_inputs(self.experiment, "", self.victim, "none", self.seed))
         return self.folder.parent / "shared" / f"{self.experiment.config.name}_{self.live('none').name}_{inputs[:12]}"
+
+    def _is_driven_in(self, folder: Path, condition: str) -> bool:
+        """Whether the run folder has this very drive: through this graph, past this attack, ended by no fault."""
+        if not has_same_graph(self.experiment):
+            return False
+        try:
+            driven = json.loads((folder / f"{self.live(condition).name}.json").read_text())
+        except FileNotFoundError:
+            return False
+        shown = (
+            []
+            if condition == "none"
+            else [load_attack(attack.attack_path(self.searched_in(condition), self.search)).attack_id]
+        )
+        return driven["attack_ids"] == shown and deploy.counts(driven)
 
 
 def prepare(experiment: Experiment, report: Report) -> None:
@@ -101,7 +116,10 @@ def cell_inputs(experiment: Experiment, scenario: str, victim: str, method: str,
     del scenario, seed
     _require_victim(experiment, victim)
     config = experiment.config
-    searched = config.attack.model_dump(mode="json")
+    searched = {
+        **config.attack.model_dump(mode="json"),
+        "cache_mib": AttackConfig().cache_mib,
+    }  # which changes no result
     other = {key for keys in _SPENT_BY.values() for key in keys} - set(_SPENT_BY[method])
     records = {stage: read_record(experiment.stage_folder(stage)) for stage in _NEEDED}
     return {
@@ -231,12 +249,10 @@ def _drive(cell: _Cell, condition: str) -> dict[str, Any]:
         shown = None if condition == "none" else attack.attack_path(cell.searched_in(condition), cell.search)
         deploy.drive_live(cell.experiment, live, folder, shown)
     driven: dict[str, Any] = json.loads(file.read_text())
-    stopped = driven["outcome"]["stopped_early"]
-    if stopped and not any(word in stopped for word in COUNTED_STOPS):
-        if folder != cell.experiment.stage_folder("deploy"):
-            file.unlink()
+    if not deploy.counts(driven):
+        file.unlink()
         raise CellFault(
-            f"the stack stopped the live drive {live.name}: {stopped}; cure that, and run the campaign with --retry"
+            f"the stack stopped the live drive {live.name}: {driven['outcome']['stopped_early']}; cure that, and run the campaign with --retry"
         )
     return driven
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import shutil
 import socket
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,6 +24,7 @@ from nodes.runtime.errors import RuntimeFault
 from nodes.runtime.stages import Report
 from nodes.trial import TrialPlan
 from nodes.trial_runner import run_trial
+from nodes.trials.campaign import COUNTED_STOPS
 
 Condition = Literal["none", "random", "cem", "gradient", "empty", "laps"]
 # The absent board or monitor of the empty scene stands outside the room, out of every camera's sight.
@@ -32,6 +35,11 @@ class FrozenChangedError(RuntimeFault):
     """Something that was fixed before the first attack is no longer what it was."""
 
 
+class DriveFault(RuntimeFault):
+    """A live drive was ended again and again by a fault of the stack, so that it measures nothing."""
+
+
+_ATTEMPTS = 3
 # What every victim meets, in this order.
 _CONDITIONS: tuple[Condition, ...] = ("none", *METHODS)
 
@@ -69,9 +77,33 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
     for index, live in enumerate(plan):
         report(index / len(plan), f"{live.victim} {live.condition} seed {live.seed}")
         if not (folder / f"{live.name}.json").exists():
-            shutil.rmtree(folder / live.name, ignore_errors=True)
             attack = _attack_file(experiment, live) if live.condition in METHODS else None
-            drive_live(experiment, live, folder, attack)
+            _drive_until_it_counts(experiment, live, folder, attack, partial(report, index / len(plan)))
+
+
+def counts(driven: dict[str, Any]) -> bool:
+    """Whether a drive measures the policy: it went on to the end, or was stopped as a drive is on purpose, and not by a fault of the stack."""
+    stopped = driven["outcome"]["stopped_early"]
+    return not stopped or any(word in stopped for word in COUNTED_STOPS)
+
+
+def _drive_until_it_counts(
+    experiment: Experiment, live: LiveRun, folder: Path, attack: Path | None, tell: Callable[[str], None]
+) -> None:
+    file = folder / f"{live.name}.json"
+    for attempt in range(1, _ATTEMPTS + 1):
+        shutil.rmtree(folder / live.name, ignore_errors=True)  # of a drive that was broken off
+        drive_live(experiment, live, folder, attack)
+        driven = json.loads(file.read_text())
+        if counts(driven):
+            return
+        stopped = driven["outcome"]["stopped_early"]
+        file.unlink()
+        tell(f"{live.name} does not count, the stack stopped it: {stopped} (attempt {attempt} of {_ATTEMPTS})")
+    raise DriveFault(
+        f"the stack stopped the live drive {live.name} {_ATTEMPTS} times, at last: {stopped}; cure that (advnerf doctor, another load on this machine), "
+        "and give the command again, which goes on here"
+    )
 
 
 def _check_frozen(experiment: Experiment) -> None:

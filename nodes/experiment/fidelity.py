@@ -72,8 +72,6 @@ def driven(
     """
     del scenario
     frames, states = _posed_frames(bag or drive_without_attack_of(experiment, victim, seed, folder))
-    step = -(-len(frames) // _MOST_FRAMES)  # neighbouring frames of a long drive say no more
-    frames, states = frames[::step], states[::step]
     learned = _learned(surrogate_of(experiment, []), planar_poses(states) @ experiment.camera.mount, None)
     return Pictures("driven bag", np.stack([experiment.view.image(rgb) for rgb in frames]), learned)
 
@@ -138,7 +136,7 @@ def _learned(sensor: Any, poses: Array, theta: torch.Tensor | None) -> Rgb:
 
 
 def _posed_frames(bag: Path) -> tuple[list[Rgb], Array]:
-    """Frames that were captured while the car was armed, and the car's states ``[N, 3]`` at their stamps."""
+    """Frames that were captured while the car was armed, of a long drive an even choice, and the car's states ``[N, 3]`` at their stamps."""
     poses, armed = PoseBuffer(keep_s=1e6), []
     for message in read_messages(bag, [_CAR, _SAFETY]):
         decoded = decode(topic_row(message.topic).type, message.cdr)
@@ -157,4 +155,5 @@ def _posed_frames(bag: Path) -> tuple[list[Rgb], Array]:
             states.append((pose.T[0, 3], pose.T[1, 3], yaw_of(pose.T)))
     if not frames:
         raise BagError(f"expected images on {_IMAGE} with poses on {_CAR} while the car was armed in {bag}, got none")
-    return frames, np.array(states)
+    step = -(-len(frames) // _MOST_FRAMES)  # neighbouring frames of a long drive say no more
+    return frames[::step], np.array(states)[::step]

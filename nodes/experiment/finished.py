@@ -1,63 +1,98 @@
-"""Whether a finished run folder was made with the settings of an experiment, so that its results may be taken."""
+"""Whether a finished run folder was made with the settings of an experiment, so that its results may be taken.
+
+Every stage's record says with which settings it was made; the manifest says only what was asked for last.
+"""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from hardware.twin.config import LabConfig
 from nodes.experiment import attack
-from nodes.experiment.config import ExperimentConfig
 from nodes.experiment.context import Experiment
-from nodes.runtime.errors import ConfigError
-from nodes.runtime.stages import read_record
+from nodes.experiment.run import stages_of
+from nodes.runtime.stages import Stage, fits_what_is_there, is_current, read_record
 
 # What does not change a result: which other seeds there are, and how much memory may be used.
 _FREE = ("seeds", "cache_mib")
+_MADE = ("capture", "scene", "policy", "object")
 
 
 def has_same_attacks(experiment: Experiment) -> bool:
     """Whether the run folder's attacks are finished, and are those of these settings on the scene and policies that are there now."""
     folder = experiment.stage_folder("attack")
-    if not is_finished(folder):
+    settings = _settings_of(folder)
+    if not is_finished(folder) or settings is None:
         return False
     then, now = json.loads((folder / "frozen.json").read_text()), attack.frozen_hashes(experiment)
     # Starts depend on the seed alone; which seeds the folder had, and hence this hash, does not matter here.
     if any(then.get(name) != now[name] for name in now if name not in ("config", "starts_and_seeds")):
         return False
-    old, new = _manifest_config(experiment), experiment.config
-    return old.horizon == new.horizon and all(
-        getattr(new.attack, name) == value for name, value in old.attack.model_dump().items() if name not in _FREE
-    )
+    changed = _changed(experiment.config.attack, settings, "attack")
+    return settings["horizon"] == experiment.config.horizon and set(changed) <= {f"attack.{name}" for name in _FREE}
 
 
-def _manifest_config(experiment: Experiment) -> ExperimentConfig:
-    try:
-        manifest = json.loads((experiment.folder / "manifest.json").read_text())
-        return ExperimentConfig.model_validate(manifest["config"])
-    except (OSError, ValueError, KeyError, ValidationError) as error:
-        first = str(error).splitlines()[0]
-        raise ConfigError(
-            f"expected {experiment.folder}/manifest.json to say with which settings the folder was made, got: {first}; name another run_folder"
-        ) from None
+def has_same_graph(experiment: Experiment) -> bool:
+    """Whether the run folder's live drives went through the node graph of this experiment."""
+    settings = _settings_of(experiment.stage_folder("deploy"))
+    if settings is None:
+        return False
+    now = _stage(experiment, "deploy").settings
+    old, new = (each[type(experiment.config.deploy).__name__] for each in (settings, now))
+    same = all(old.get(name) == new[name] for name in ("launch_file", "nodes"))
+    return same and settings["graph"] == json.loads(json.dumps(now["graph"]))
 
 
 def changed_settings(experiment: Experiment) -> list[str]:
     """What the run folder was made with that the experiment says otherwise; values that are new have their defaults."""
-    old, new = _manifest_config(experiment), experiment.config
-    changed = [
-        f"{section}.{name}"
-        for section in ("capture", "scene", "policy", "object")
-        for name, value in getattr(old, section).model_dump().items()
-        if getattr(getattr(new, section), name) != value
-    ]
-    lab = LabConfig.model_validate(old.lab).model_dump()
-    return changed + [f"lab.{name}" for name, value in experiment.lab_config.model_dump().items() if lab[name] != value]
+    stages, found = stages_of(experiment), []
+    for name in _MADE:
+        settings = _settings_of(experiment.stage_folder(name))
+        if settings is None:  # of before settings were kept: the key says whether they are the same, not which differ
+            found += [] if is_current(stages, experiment.folder, name) else [name]
+            continue
+        if not fits_what_is_there(_stage(experiment, name), experiment.folder):
+            found.append(f"{name} (it was made before what it builds on)")
+        found += _changed_lab(experiment, settings["lab"])
+        for section in ("capture", "scene", "policy", "object"):
+            if type(values := getattr(experiment.config, section)).__name__ in settings:
+                found += _changed(values, settings, section)
+    return list(dict.fromkeys(found))
 
 
 def is_finished(folder: Path) -> bool:
     """Whether a stage's folder holds a finished result."""
     record = read_record(folder)
     return record is not None and record.digest is not None
+
+
+def _stage(experiment: Experiment, name: str) -> Stage:
+    return next(stage for stage in stages_of(experiment) if stage.name == name)
+
+
+def _settings_of(folder: Path) -> Mapping[str, Any] | None:
+    record = read_record(folder)
+    return None if record is None else record.settings
+
+
+def _changed(now: BaseModel, settings: Mapping[str, Any], section: str) -> list[str]:
+    """Names of values of a section that a stage was made with otherwise."""
+    try:
+        then = type(now).model_validate(settings[type(now).__name__])
+    except (KeyError, ValidationError):
+        return [section]
+    return [f"{section}.{name}" for name, value in then if getattr(now, name) != value]
+
+
+def _changed_lab(experiment: Experiment, settings: Any) -> list[str]:
+    try:
+        then = LabConfig.model_validate(settings)
+    except ValidationError:
+        return ["lab"]
+    now = experiment.lab_config
+    return [f"lab.{name}" for name, value in then if getattr(now, name) != value]

@@ -53,6 +53,11 @@ def load_with(
     """The experiment together with the settings of its cells, as ``settled(config, file, folder, setting, settings)``."""
     settings, others = split_settings(kind, section, overrides)
     base = load_experiment(file, setting, others, folder)
+    if base.config.kind == "carla":
+        raise ConfigError(
+            f"{file}: expected an experiment of kind intersection for cells of places or meshes, got carla: they run beside one another, and a CARLA "
+            "server steps one world at a time; use kind: carla in the campaign for colours"
+        )
     return settled(base.config, base.file, base.folder, base.setting, settings)
 
 

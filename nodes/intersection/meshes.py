@@ -150,7 +150,7 @@ def mesh_hash(experiment: Experiment, scenario: str, victim: str, seed: int, set
     """Hash of what a cell depends on, whatever its method."""
     attack = experiment.config.attack.model_dump(
         mode="json", exclude={"seeds", "methods", "starts", "start_sigma", "cem_population"}
-    )
+    ) | {"cache_mib": type(experiment.config.attack)().cache_mib}  # how much memory may be used changes no result
     return hash_of({
         "objects": _objects_sha256(experiment, settings), "policy": load_policy(victim_file(experiment, victim)).sha256, "attack": attack,
         "starts": experiment.start_states(scenario, seed).tolist(), "limits": asdict(experiment.limits),

@@ -77,6 +77,11 @@ def prepare_victims(experiment: Experiment, report: Report) -> None:
     rounds = 1 if begun is None else begun["retrain"]["rounds"]
     config = experiment.config.model_copy(update={"retrain": wanted.model_copy(update={"rounds": rounds})})
     run_experiment(replace(experiment, config=config), until="retrain")
+    if not policy.victim_file(experiment, policy.RETRAINED).exists():
+        raise ConfigError(
+            f"expected a retrained policy in {experiment.stage_folder('retrain')}, got none: no attack reaches retrain.pays_ratio = "
+            f"{wanted.pays_ratio:g} (see retrain.json there), so nothing was retrained; lower it, or leave the victim retrained out of the campaign"
+        )
 
 
 def stages_of(experiment: Experiment) -> list[Stage]:

@@ -82,11 +82,15 @@ class Stage:
 
 @dataclass(frozen=True)
 class StageRecord:
-    """What is remembered of a stage: its key, and once finished the digest of its files and the seconds it took."""
+    """What is remembered of a stage: its key, once finished the digest of its files and the seconds it took, and its settings.
+
+    The settings are part of the key already; apart from it they say what a folder was made with. None in records from before they were kept.
+    """
 
     key: str
     digest: str | None
     seconds: float
+    settings: Mapping[str, Any] | None = None
 
 
 def run_stages(
@@ -125,7 +129,7 @@ def read_record(folder: Path) -> StageRecord | None:
     """The record in a stage's folder; None if there is none that can be read."""
     try:
         fields = json.loads((folder / _RECORD).read_text())
-        return StageRecord(str(fields["key"]), fields["digest"], float(fields["seconds"]))
+        return StageRecord(str(fields["key"]), fields["digest"], float(fields["seconds"]), fields.get("settings"))
     except (FileNotFoundError, ValueError, KeyError, TypeError):
         # An unreadable record means unknown contents: the stage is run again from nothing.
         return None
@@ -145,6 +149,16 @@ def _current(stages: Sequence[Stage], folder: Path) -> dict[str, StageRecord]:
         if record.key == _key_of(stage, records):
             records[stage.name] = record
     return records
+
+
+def fits_what_is_there(stage: Stage, folder: Path) -> bool:
+    """Whether a stage's finished result, whatever its settings, was made from what the stages before it hold now."""
+    record = read_record(folder / stage.name)
+    before = {name: read_record(folder / name) for name in stage.after}
+    known = {name: each for name, each in before.items() if each is not None}
+    if record is None or record.digest is None or record.settings is None or len(known) != len(before):
+        return False
+    return record.key == _key_of(replace(stage, settings=record.settings), known)
 
 
 def begun_with(stages: Sequence[Stage], folder: Path, name: str) -> Mapping[str, Any] | None:
@@ -233,20 +247,26 @@ def _key_of(stage: Stage, records: Mapping[str, StageRecord]) -> str:
 
 def _run(stage: Stage, folder: Path, key: str, earlier_s: float, display: Display) -> StageRecord:
     folder.mkdir(parents=True, exist_ok=True)
-    _write_record(folder, StageRecord(key, None, earlier_s))
+    settings = json.loads(json.dumps(stage.settings))
+    _write_record(folder, StageRecord(key, None, earlier_s, settings))
     report = display.start(stage.name)
     begin = time.monotonic()
     try:
         stage.run(folder, report)
     except BaseException:
-        _write_record(folder, StageRecord(key, None, earlier_s + time.monotonic() - begin))
+        _write_record(folder, StageRecord(key, None, earlier_s + time.monotonic() - begin, settings))
         raise
-    record = StageRecord(key, digest_of(folder), earlier_s + time.monotonic() - begin)
+    record = StageRecord(key, digest_of(folder), earlier_s + time.monotonic() - begin, settings)
     _write_record(folder, record)
     display.finish(stage.name, record.seconds, cached=False)
     return record
 
 
 def _write_record(folder: Path, record: StageRecord) -> None:
-    text = json.dumps({"key": record.key, "digest": record.digest, "seconds": round(record.seconds, 3)}, indent=1)
-    write_atomically(folder / _RECORD, text + "\n")
+    known = {
+        "key": record.key,
+        "digest": record.digest,
+        "seconds": round(record.seconds, 3),
+        "settings": record.settings,
+    }
+    write_atomically(folder / _RECORD, json.dumps(known, indent=1) + "\n")

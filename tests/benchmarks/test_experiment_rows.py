@@ -50,7 +50,7 @@ def test_a_row_of_the_table_has_its_machines_and_waits_for_its_seeds():
     ]
     note = transfer_table.note_of(rows[0][0], table.cells_of(rows[0][0]))
     assert "seeds 2 are missing" in note
-    assert "machine 0, machine 1" in note
+    assert transfer_table.measured_where(cells) == {"machine": "machine 0; machine 1", "date": "2026-11-21"}
     assert "total CTE 9.00 +- 0.00 m of 2.00 m" in note
     assert "by seed 4.50, 4.50 x" in note
     assert "the same start" in note
@@ -117,8 +117,14 @@ def test_rows_of_gate_and_predictions_come_from_what_was_published(tmp_path):
     numbers = {"views": 12, "psnr_db": 27.5, "ssim": 0.9, "steering": 0.1, "steering_worst": 0.2, "correlation": 0.99}
     verdict = {"key": "k", "passed": False, "reasons": ["steering too far off"], "numbers": numbers}
     (tmp_path / "gate" / "right_hardened.json").write_text(json.dumps(verdict))
-    ((line, value, unit, _, met, note, _),) = transfer_table.gate_rows(tmp_path, {"right_hardened"})
-    assert transfer_table.gate_rows(tmp_path, {"left_hardened"}) == []
+    (tmp_path / "gate" / "right_hardened.drive.json").write_text(json.dumps({**verdict, "passed": True, "reasons": []}))
+    (_, (line, value, unit, _, met, note)), (key, drive) = transfer_table.gate_rows(tmp_path, ["right_hardened"])
+    assert transfer_table.gate_rows(tmp_path, ["left_hardened"]) == []
+    assert (key, drive[0], drive[4]) == (
+        "right_hardened",
+        "#5 fidelity gate, right_hardened, drive without attack",
+        True,
+    )
     assert (line, value, unit, met) == ("#5 fidelity gate, right_hardened, held-out views", 27.5, "dB PSNR", False)
     assert "steering too far off" in note
     deployed = CellResult.model_validate(cell(0, "gradient", 6.0))

@@ -63,6 +63,15 @@ def test_an_early_stop_holds_the_last_error(tmp_path):
     np.testing.assert_allclose(held[5:], np.repeat(held[5:6], 36, axis=0))
 
 
+def test_a_stop_is_at_its_tick_whatever_division_makes_of_it():
+    """43 x 0.1 s over 0.1 s is a little less than 43."""
+    horizon, drifting = Horizon(200, 0.1), np.array([[0.0, -2.0 + 0.01 * k, 0.0] for k in range(201)])
+    for tick in range(1, 200):
+        metrics, held = score(drifting, TRACK, horizon, stopped_after_s=tick * 0.1)
+        assert held[-1, 1] == drifting[tick, 1]
+        assert metrics.max_cte_m == pytest.approx(0.01 * tick)
+
+
 def test_latency_is_from_capture_to_serial_write_and_braking_is_a_missed_frame(tmp_path):
     times = timing(write_drive(tmp_path, lost_frame=4), START_NS, START_NS + 10 * TICK_NS)
     np.testing.assert_allclose(times.capture_to_serial_ms, 23.0)

@@ -320,3 +320,19 @@ def test_surrogates_for_retraining_have_their_objects_at_allowed_places():
     assert len(torch.unique(places, dim=0)) == 3
     for placements in places:
         sensor.space.unit(placements)  # refuses what is not allowed
+
+
+def test_a_placement_on_its_bound_comes_back_from_where_rounding_put_it():
+    """Searches end on bounds; (highest - middle) / half is one bit above 1 for some of them."""
+    beyond = 0
+    for k in range(200):
+        x_m, move_m = 2.0 + 0.0137 * k, 0.9 + 0.011 * k
+        space = PoseSpace([box(x_m, 0.0)], [PoseBounds(x_m=(x_m - move_m, x_m + move_m))], None)
+        for sign in (-1.0, 1.0):
+            unit = torch.tensor([[sign, 0.0, 0.0, 0.0]], dtype=torch.float64)
+            placed = space.placements(unit)
+            beyond += bool(((placed - space.middle)[0, 0] / space.half[0, 0]).abs() > 1.0)
+            back = space.unit(placed)
+            assert back.abs().max() <= 1.0
+            torch.testing.assert_close(back, unit, rtol=0.0, atol=1e-12)
+    assert beyond > 0

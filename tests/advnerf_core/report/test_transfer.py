@@ -62,9 +62,10 @@ def test_the_lines_by_hand(table):
     assert (row.ratio_interval.low, row.ratio_interval.high) == (3.5, 5.0)
     deployed = table.find("straight", "hardened", "gradient", "deployed")
     assert deployed.ratio == 4.0
-    assert deployed.transfer == 1.0
-    # Seed 0 alone: 3 over 5; seed 1 alone: 5 over 3.5.
-    assert (deployed.transfer_interval.low, deployed.transfer_interval.high) == pytest.approx((0.6, 5.0 / 3.5))
+    # Deployed from the first start only, so from that one in the surrogate: 16 over 4, and 21 over 6.
+    assert deployed.transfer == pytest.approx(4.0 / 3.5)
+    # Seed 0 alone: 3 over 4.5; seed 1 alone: 5 over 3.
+    assert (deployed.transfer_interval.low, deployed.transfer_interval.high) == pytest.approx((3.0 / 4.5, 5.0 / 3.0))
     assert (deployed.paper_m, deployed.paper_std_m) == (1702, 160)
     assert deployed.paper_ratio == pytest.approx(1702 / 1166)
     assert "elsewhere" not in {row.scenario for row in table.rows}
@@ -178,14 +179,20 @@ def test_a_bad_cell_is_one_clear_error(tmp_path, damage, says):
 
 def test_the_skill_of_predictions_by_hand():
     pairs = [
-        Predicted("a", "gradient", 8.0, 7.0, 9.0, 4.0, 1.0, 8.0, 4.0),
-        Predicted("b", "random", 1.0, 0.9, 1.1, 1.0, 1.0, 2.0, 2.0),
-        Predicted("c", "cem", 3.0, 2.0, 4.0, 1.2, 1.0, 3.0, 3.0),
+        Predicted("a", "gradient", 8.0, 7.0, 9.0, 4.0, 1.0, 8.0, 4.0, 12.0, 12.0),
+        Predicted("b", "random", 1.0, 0.9, 1.1, 1.0, 1.0, 2.0, 2.0, 1.6, 2.0),
+        Predicted("c", "cem", 3.0, 2.0, 4.0, 1.2, 1.0, 3.0, 3.0, 1.2, 3.0),
     ]
     skill = skill_of(pairs)
     assert (skill.count, skill.right) == (3, 2)
     assert skill.factor == pytest.approx(2.0)  # factors 2, 1, 2.5
     assert skill.factor_total == pytest.approx(1.0)
     assert skill.rank_correlation == pytest.approx(1.0)
+    # What the search's own drives in the surrogate say: factors 3, 1.6, 1; ranks 3, 2, 1 of 3, 1, 2.
+    plain = skill_of([pair.unpredicted for pair in pairs])
+    assert plain.factor == pytest.approx(1.6)
+    assert plain.rank_correlation == pytest.approx(0.5)
+    assert plain.right == 2
     assert "2 of 3 rightly said" in prediction_section(pairs)
+    assert "would be off by 1.60 and 1.00, rank correlation 0.50, 2 of 3 right" in prediction_section(pairs)
     assert "No attack was both" in prediction_section([])

@@ -60,6 +60,7 @@ from advnerf_core.driving.dynamics import Dubins
 from advnerf_core.driving.metrics import Horizon
 from advnerf_core.driving.path import Line, Path
 from advnerf_core.scene.fidelity import Pictures
+from nodes.runtime.errors import RuntimeFault
 
 # Real pictures keep half of what the attack does on learned ones.
 TURN, KEPT = 0.2, 0.5
@@ -90,7 +91,10 @@ def held_out(experiment, scenario):
     return _pictures("held-out views", real, real + experiment.data.get("wrong", 0.0))
 
 def driven(experiment, scenario, victim, seed, folder, bag=None):
-    return _pictures("driven bag", real := np.full(16, 0.5), real)
+    if experiment.data.get("late") and not folder.with_suffix(".json").exists():
+        raise RuntimeFault("expected a live drive, got none")
+    real = np.full(16, 0.5)
+    return _pictures("driven bag", real, real + experiment.data.get("wrong_drive", 0.0))
 
 def lacks(experiment, scenario, victim, method, seed, folder):
     return "" if (folder / "searched").exists() else "its search"

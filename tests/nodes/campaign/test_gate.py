@@ -63,6 +63,24 @@ def test_a_verdict_is_made_again_only_for_other_limits(gated):
     assert times_judged(gated) == 3
 
 
+def test_a_drive_without_attack_is_judged_too_as_soon_as_there_is_one(gated):
+    gated.write(HEAD)
+    (gated.folder / "toy.experiment.yaml").write_text("base: 2.0\nlate: 1.0\nwrong_drive: 0.2\n")
+    ended, said = run(gated)
+    assert {end.how for end in ended} == {"done"}
+    assert any("only held-out views are judged" in line and "expected a live drive, got none" in line for line in said)
+    verdict = gated.folder / "gate" / "straight_hardened.drive.json"
+    assert not verdict.exists()
+    gated.write(HEAD.replace("[0]", "[0, 1]"))
+    ended, said = run(gated)
+    assert ended == []
+    assert any(
+        "driven bag: mean steering difference 0.1961" in line and "--no-gate" in line for line in said
+    )  # 128 and 178 of 255
+    assert json.loads(verdict.read_text())["passed"] is False
+    assert len(run(gated, gate=False)[0]) == 2
+
+
 def test_transfer_is_predicted_from_the_search_before_any_drive(gated):
     gated.write(HEAD)
     campaign = load_campaign(gated.file)

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from nodes.experiment.cells import _cell, blocked_tick
+from nodes.experiment.cells import _cell, blocked_tick, cell_inputs
 from nodes.experiment.run import load_experiment
 
 LAUNCH = Path(__file__).parents[3] / "launch"
@@ -21,6 +21,15 @@ def test_search_and_live_drive_of_a_cell_leave_different_files(tmp_path, method)
     name = f"hardened_{method}_1.json"
     assert cell.live(method).name + ".json" == name
     assert cell.searched_in(method) / name != cell.driven_in(method) / name
+
+
+def test_memory_for_the_cache_is_no_part_of_what_a_cell_depends_on(tmp_path):
+    def inputs(*overrides):
+        experiment = load_experiment(LAUNCH / "room.experiment.yaml", "full", overrides, tmp_path)
+        return cell_inputs(experiment, "", "hardened", "gradient", 0)
+
+    assert inputs("attack.cache_mib=64") == inputs()
+    assert inputs("attack.starts=2") != inputs()
 
 
 def test_a_car_that_runs_into_something_stands_from_then_on():

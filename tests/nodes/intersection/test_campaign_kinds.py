@@ -14,7 +14,7 @@ import pytest
 from advnerf_core.driving.policy import load_policy
 from advnerf_core.report.clips import ClipTrack, read_clip
 from nodes.campaign.kinds import load_kind, settings_hash
-from nodes.intersection import films, mesh_cells, pose_cells
+from nodes.intersection import films, mesh_cells, pose_cells, run
 from nodes.intersection.cells import CellError
 from nodes.intersection.config import RetrainConfig
 from nodes.intersection.context import Experiment
@@ -52,6 +52,20 @@ def test_settings_of_cells_are_told_apart_from_those_of_the_experiment(
     assert mesh_cells.load_experiment(tiny_file(), "tiny", [], tmp_path).meshes.limits.bound_m == 0.4
     smoother = mesh_cells.load_experiment(tiny_file(), "tiny", ["meshes.limits.smoothness=10"], tmp_path).meshes
     assert (smoother.limits.smoothness, smoother.limits.bound_m) == (10.0, 0.4)  # the rest stays as it was
+
+
+def test_places_and_meshes_are_not_attacked_on_a_carla_server(tmp_path: Path) -> None:
+    file = Path(__file__).parents[3] / "launch" / "carla.experiment.yaml"
+    for module in (pose_cells, mesh_cells):
+        with pytest.raises(ConfigError, match="steps one world at a time"):
+            module.load_experiment(file, "full", [], tmp_path)
+
+
+def test_a_defence_that_nothing_asks_for_is_told(trained: Experiment, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = trained.config.model_copy(update={"retrain": RetrainConfig(pays_ratio=9.0)})
+    monkeypatch.setattr(run, "run_experiment", lambda *arguments, **options: {})  # ends as no attack pays
+    with pytest.raises(ConfigError, match=r"no attack reaches retrain.pays_ratio = 9 .*nothing was retrained"):
+        run.prepare_victims(replace(trained, config=config), silent)
 
 
 @pytest.mark.parametrize(
@@ -99,6 +113,10 @@ def test_a_cell_depends_on_what_is_searched_and_on_its_victim(trained: Experimen
         settings_hash(load_kind("intersection_meshes"), meshed(trained), "right", "hardened", "random", 0),
     ]
     assert len({same, *others}) == 6
+    less = trained.config.model_copy(update={"attack": trained.config.attack.model_copy(update={"cache_mib": 64.0})})
+    for cells in (posed, meshed):
+        asked = (kind if cells is posed else load_kind("intersection_meshes"), cells(trained), *PLACES)
+        assert settings_hash(asked[0], cells(replace(trained, config=less)), *PLACES) == settings_hash(*asked)
     for wrong in (
         ("up", "hardened", "random", 0),
         ("right", "retrained", "random", 0),
