@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
 
 from advnerf_core.geometry import Array, Pinhole, camera_mount, make_transform, rotation_z
 
@@ -269,6 +270,14 @@ class LabConfig(_Frozen):
     car: CarConfig = CarConfig()
     shadows: bool = True
     supersampling: int = Field(default=2, ge=1, le=4)
+
+    @field_validator("board", "monitor", mode="before")
+    @classmethod
+    def _the_rest_as_it_is(cls, value: Any, info: ValidationInfo) -> Any:
+        """A panel that is moved keeps what was not said: ``--set lab.board.x_m=2.8``."""
+        if not isinstance(value, dict):
+            return value
+        return {**cls.model_fields[info.field_name or ""].default.model_dump(), **value}
 
     @property
     def start_pose(self) -> tuple[float, float, float]:

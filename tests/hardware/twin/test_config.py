@@ -63,3 +63,11 @@ def test_wrong_keys_and_values_are_errors():
 def test_config_survives_a_round_trip():
     config = LabConfig(camera=CameraConfig(width=366))
     assert LabConfig.model_validate_json(config.model_dump_json()) == config
+
+
+def test_a_panel_that_is_moved_keeps_what_was_not_said():
+    lab = LabConfig.model_validate({"board": {"x_m": 2.8}, "monitor": {"yaw_rad": 1.0}})
+    assert lab.board == LabConfig().board.model_copy(update={"x_m": 2.8})
+    assert lab.monitor == LabConfig().monitor.model_copy(update={"yaw_rad": 1.0})
+    with pytest.raises(ValidationError, match="x_mm"):
+        LabConfig.model_validate({"board": {"x_mm": 2.8}})
