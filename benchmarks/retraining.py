@@ -13,6 +13,7 @@ from typing import Any
 
 from advnerf_core.files import write_atomically
 from benchmarks.results import REPOSITORY, record_row
+from nodes.intersection import retrain_plot
 from nodes.intersection.context import Experiment
 from nodes.intersection.run import load_experiment
 
@@ -54,7 +55,8 @@ def command_of(experiment: Experiment) -> str:
 def publish(found: Path, docs: Path) -> None:
     """The rounds and their curve into the documentation."""
     write_atomically(docs / "results" / "retrain" / "retrain.json", (found / "retrain.json").read_text())
-    write_atomically(docs / "retraining.png", (found / "curve.png").read_bytes())
+    summary = json.loads((found / "retrain.json").read_text())
+    retrain_plot.draw(docs / "retraining.png", summary["rounds"], summary["pays_ratio"])
 
 
 def main() -> None:

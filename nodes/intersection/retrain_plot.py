@@ -40,7 +40,8 @@ def curve(rounds: Sequence[dict[str, Any]], pays_ratio: float) -> Figure:
             axes.plot(range(len(values)), values, style, marker="o", ms=4, color=_COLOURS.get(scenario), label=label)
     axes.axhline(pays_ratio, color="0.4", lw=0.8, ls=":", label=f"pays from {pays_ratio:g}")
     axes.axhline(1.0, color="0.8", lw=0.8)
-    axes.set_xticks(range(len(rounds)), ["original", *(f"retrained {k}x" for k in range(1, len(rounds)))])
+    axes.set_xticks(range(len(rounds)), ["original", *map(str, range(1, len(rounds)))])
+    axes.set_xlabel("times retrained")
     axes.set_ylabel("total CTE, attacked / not attacked")
     # From a hundred down to one: on a linear axis the end of the loop cannot be seen.
     axes.set_yscale("log")

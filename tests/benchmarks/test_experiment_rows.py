@@ -40,6 +40,16 @@ def test_a_retrained_policy_is_held_against_the_original_undisturbed():
     assert "stopped" not in cured
 
 
+def test_rounds_and_their_curve_are_published_as_they_were_found(tmp_path):
+    rounds = [{"victim": "a" * 64, "surrogate": {"right": 5.0}, "deployed": {"right": 4.0}}]
+    (tmp_path / "found").mkdir()
+    (tmp_path / "found" / "retrain.json").write_text(json.dumps({"rounds": rounds, "pays_ratio": 1.5}))
+    retraining.publish(tmp_path / "found", tmp_path / "docs")
+    kept = tmp_path / "docs" / "results" / "retrain" / "retrain.json"
+    assert json.loads(kept.read_text())["rounds"] == rounds
+    assert (tmp_path / "docs" / "retraining.png").read_bytes().startswith(b"\x89PNG")
+
+
 def test_a_row_of_the_table_has_its_machines_and_waits_for_its_seeds():
     cells = [CellResult.model_validate(cell(seed, "gradient", 9.0)) for seed in (0, 1)]
     table = make_table([Wanted("right", "", "hardened", "gradient", (0, 1, 2))], cells)
