@@ -76,3 +76,9 @@ def test_what_is_no_command_is_noticed(command):
     assert not is_a_command(command, "advnerf campaign ran FILE")
     assert not is_a_command(command, "advnerf campaign run FILE --jobbs 2")
     assert commands_of("text\n\n    advnerf arm   # drives\n") == ["advnerf arm"]
+
+
+def test_results_hold_no_path_of_the_machine_they_were_made_on():
+    files = [ROOT / "docs" / "results.json", *sorted((ROOT / "docs" / "results").rglob("*.json"))]
+    assert len(files) > 100
+    assert [str(file) for file in files if re.search(r'"/\w+/', file.read_text())] == []
