@@ -141,7 +141,8 @@ def run_campaign(campaign: Campaign, cells: Sequence[Cell], options: Options, sa
     judged = _past_the_gate(campaign, cells, options, say)
     wanted = [each for each in plan if each.cell in judged and _is_wanted(store, each, options, say)]
     if not wanted:
-        say("nothing to do: every cell is there")
+        there = sum(store.status(each.cell, each.job.settings_hash).state == "done" for each in plan)
+        say(f"nothing to do: {'every cell is' if there == len(plan) else f'{there} of {len(plan)} cells are'} there")
         return []
     _require_positive(options)
     jobs, threads = _shares(options)

@@ -38,6 +38,7 @@ def test_a_surrogate_that_the_policy_reads_wrongly_has_its_cells_left_out(gated)
     assert ended == []
     assert gated.calls == []
     reasons = [line for line in said if line.startswith("fidelity gate, straight_hardened")]
+    assert said[-1] == "nothing to do: 0 of 2 cells are there"
     assert any("PSNR 13.98 dB" in line for line in reasons)  # a fifth of the range everywhere: 20 log10(5)
     assert any("mean steering difference 0.2000" in line and "--no-gate" in line for line in reasons)
     ended, said = run(gated, gate=False)
