@@ -35,6 +35,10 @@ class TrialError(RuntimeFault):
     """A trial could not be carried out."""
 
 
+class NotStartedError(TrialError):
+    """The stack stopped a trial before the car had moved, as when a command came too late: worth another attempt."""
+
+
 class Phase(Enum):
     """Where a trial is."""
 

@@ -13,7 +13,7 @@ from nodes.runtime.clock import SystemClock
 from nodes.runtime.errors import LaunchError, NodeFinished
 from nodes.runtime.launch import Launch
 from nodes.runtime.loop import NodeLoop
-from nodes.trial import TrialError, TrialNode, TrialOutcome, TrialPlan
+from nodes.trial import NotStartedError, TrialNode, TrialOutcome, TrialPlan
 
 OPERATOR = "operator"
 
@@ -40,7 +40,7 @@ def run_trial(
 
     Raises:
         LaunchError: A node died or never became ready.
-        TrialError: The trial could not be carried out, or the stack stopped it before the car had moved.
+        TrialError: The trial could not be carried out; `NotStartedError` if the stack stopped it before the car had moved.
     """
     with Launch(launch_file, overrides, run_dir, host=host) as launch:
         launch.wait_ready(ready_timeout_s)
@@ -49,7 +49,7 @@ def run_trial(
     if launch.failure:
         raise LaunchError(launch.failure)
     if not node.outcome.start_real_ns:
-        raise TrialError(
+        raise NotStartedError(
             f"expected a drive in {run_dir}, but the stack stopped before the car had moved: {node.outcome.stopped_early}; cure that, "
             "and start again: what is finished is kept"
         )

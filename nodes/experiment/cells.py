@@ -7,10 +7,10 @@ the cross-entropy method, the naive victim's other seeds) is computed here, by t
 from __future__ import annotations
 
 import json
-import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -41,7 +41,7 @@ _TITLES = {"none": "no attack", "random": "best random", "cem": "cross-entropy",
 
 
 class CellFault(RuntimeFault):
-    """A live drive of a cell was ended by a fault of the stack, so that it measures nothing."""
+    """The live drive that cells are compared with is not there."""
 
 
 @dataclass(frozen=True)
@@ -164,13 +164,14 @@ def run_cell(
     """The whole cell; see `advnerf_core.report.cells`. Goes on where it was stopped.
 
     Raises:
-        CellFault: The stack stopped the live drive by a fault of its own.
+        DriveFault: The stack stopped the live drive again and again by a fault of its own.
     """
     found = searched_part(experiment, scenario, victim, method, seed, folder, report)
     cell = _cell(experiment, scenario, victim, method, seed, folder)
     report(0.9, "driving live")
-    none = _drive(cell, "none")
-    driven = none if method == "none" else _drive(cell, method)
+    tell = partial(report, 0.9)
+    none = _drive(cell, "none", tell)
+    driven = none if method == "none" else _drive(cell, method, tell)
     deployed = {
         "total_cte_m": [driven["total_cte_m"]], "off_track": [driven["off_track"]], "none_total_cte_m": [none["total_cte_m"]],
     }  # fmt: skip
@@ -240,20 +241,14 @@ def _off_track(experiment: Experiment, drives: Sequence[Any]) -> list[bool]:
     return found
 
 
-def _drive(cell: _Cell, condition: str) -> dict[str, Any]:
+def _drive(cell: _Cell, condition: str, tell: Callable[[str], None]) -> dict[str, Any]:
     """A live drive; driven if it is not there."""
     folder, live = cell.driven_in(condition), cell.live(condition)
     file = folder / f"{live.name}.json"
     if not file.exists():
-        shutil.rmtree(folder / live.name, ignore_errors=True)  # of a drive that was broken off
         shown = None if condition == "none" else attack.attack_path(cell.searched_in(condition), cell.search)
-        deploy.drive_live(cell.experiment, live, folder, shown)
+        deploy.drive_until_it_counts(cell.experiment, live, folder, shown, tell)
     driven: dict[str, Any] = json.loads(file.read_text())
-    if not deploy.counts(driven):
-        file.unlink()
-        raise CellFault(
-            f"the stack stopped the live drive {live.name}: {driven['outcome']['stopped_early']}; cure that, and run the campaign with --retry"
-        )
     return driven
 
 

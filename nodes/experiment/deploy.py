@@ -22,7 +22,7 @@ from nodes.experiment.policy import HARDENED, NAIVE, victim_file
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import RuntimeFault
 from nodes.runtime.stages import Report
-from nodes.trial import TrialPlan
+from nodes.trial import NotStartedError, TrialPlan
 from nodes.trial_runner import run_trial
 from nodes.trials.campaign import COUNTED_STOPS
 
@@ -78,7 +78,7 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
         report(index / len(plan), f"{live.victim} {live.condition} seed {live.seed}")
         if not (folder / f"{live.name}.json").exists():
             attack = _attack_file(experiment, live) if live.condition in METHODS else None
-            _drive_until_it_counts(experiment, live, folder, attack, partial(report, index / len(plan)))
+            drive_until_it_counts(experiment, live, folder, attack, partial(report, index / len(plan)))
 
 
 def counts(driven: dict[str, Any]) -> bool:
@@ -87,18 +87,25 @@ def counts(driven: dict[str, Any]) -> bool:
     return not stopped or any(word in stopped for word in COUNTED_STOPS)
 
 
-def _drive_until_it_counts(
+def drive_until_it_counts(
     experiment: Experiment, live: LiveRun, folder: Path, attack: Path | None, tell: Callable[[str], None]
 ) -> None:
-    file = folder / f"{live.name}.json"
+    """Drive one run, again if a fault of the stack ended it or kept it from beginning: a busy machine is late now and then.
+
+    Args:
+        experiment: Of the room.
+        live: Which run.
+        folder: Where its folder and its JSON go.
+        attack: What is shown.
+        tell: Told of drives that do not count.
+
+    Raises:
+        DriveFault: None of a few attempts counts; no JSON is left.
+    """
     for attempt in range(1, _ATTEMPTS + 1):
         shutil.rmtree(folder / live.name, ignore_errors=True)  # of a drive that was broken off
-        drive_live(experiment, live, folder, attack)
-        driven = json.loads(file.read_text())
-        if counts(driven):
+        if not (stopped := _fault_of(experiment, live, folder, attack)):
             return
-        stopped = driven["outcome"]["stopped_early"]
-        file.unlink()
         tell(f"{live.name} does not count, the stack stopped it: {stopped} (attempt {attempt} of {_ATTEMPTS})")
     raise DriveFault(
         f"the stack stopped the live drive {live.name} {_ATTEMPTS} times, at last: {stopped}; cure that (advnerf doctor, another load on this machine), "
@@ -154,6 +161,20 @@ def drive_live(experiment: Experiment, live: LiveRun, folder: Path, attack: Path
     if compare and (found := counterfactual(bag, outcome.start_real_ns, last_frame_ns)) is not None:
         result["counterfactual"] = asdict(found)
     write_atomically(folder / f"{live.name}.json", json.dumps(result) + "\n")
+
+
+def _fault_of(experiment: Experiment, live: LiveRun, folder: Path, attack: Path | None) -> str:
+    """Drive once; empty, or the fault of the stack for which the drive does not count."""
+    file = folder / f"{live.name}.json"
+    try:
+        drive_live(experiment, live, folder, attack)
+    except NotStartedError as error:
+        return str(error)
+    driven = json.loads(file.read_text())
+    if counts(driven):
+        return ""
+    file.unlink()
+    return str(driven["outcome"]["stopped_early"])
 
 
 def live_horizon(experiment: Experiment, live: LiveRun) -> Horizon:

@@ -20,7 +20,7 @@ from calibration.schema import RoomCalibration, load_calibration
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.launch_file import Plan, load_launch
 from nodes.runtime.launch_hosts import ALL_HOSTS, operator_of
-from nodes.trial import TrialPlan
+from nodes.trial import NotStartedError, TrialPlan
 from nodes.trial_runner import run_trial
 from nodes.trials.bags import measure_drives
 from nodes.trials.plan import NONE, CampaignError, Run, TrialsPlan, finished, keep_plan, make_runs, sha256_of
@@ -114,11 +114,15 @@ def drive_series(
 def drive_run(series: Series, run: Run, ready_timeout_s: float, guide: Callable[[str], None]) -> dict[str, Any]:
     """Drive one run and write its result; a run that a fault of the stack ended is driven again, a few times."""
     for attempt in range(1, _ATTEMPTS + 1):
-        result = _attempt(series, run, ready_timeout_s, guide)
-        stopped = result["stopped_early"]
-        if not stopped or any(word in stopped for word in COUNTED_STOPS):
-            write_atomically(series.folder / f"{run.name}.json", json.dumps(result) + "\n")
-            return result
+        try:
+            result = _attempt(series, run, ready_timeout_s, guide)
+            stopped = result["stopped_early"]
+        except NotStartedError as error:
+            stopped = str(error)
+        else:
+            if not stopped or any(word in stopped for word in COUNTED_STOPS):
+                write_atomically(series.folder / f"{run.name}.json", json.dumps(result) + "\n")
+                return result
         guide(f"this run does not count, the stack stopped it: {stopped} (attempt {attempt} of {_ATTEMPTS})")
     raise CampaignError(f"run {run.name} was stopped {_ATTEMPTS} times by the stack itself: {stopped}; cure that first")
 

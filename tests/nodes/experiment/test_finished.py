@@ -14,6 +14,7 @@ from nodes.experiment.finished import changed_settings, has_same_attacks, has_sa
 from nodes.experiment.run import load_experiment, stages_of
 from nodes.experiment.run_folder import run_to_end
 from nodes.runtime.errors import ConfigError
+from nodes.trial import NotStartedError
 
 LAUNCH = Path(__file__).parents[3] / "launch"
 
@@ -122,20 +123,23 @@ def test_a_live_drive_is_taken_of_the_same_graph_the_same_attack_and_no_fault(tm
 
 def test_a_drive_that_the_stack_stopped_is_driven_again_and_never_kept(tmp_path, monkeypatch):
     experiment, run = room(tmp_path), deploy.LiveRun("hardened", "gradient", 0)
-    stops, told = ["no fresh pose", "no fresh image", ""], []
+    stops, told = ["no fresh pose", "never began", ""], []
 
     def drive(experiment, live, folder, attack):
+        if stops[0] == "never began":
+            raise NotStartedError(stops.pop(0))
         (folder / live.name).mkdir()  # which must be gone before it is driven again
         (folder / f"{live.name}.json").write_text(driven([], stops.pop(0)))
 
     monkeypatch.setattr(deploy, "drive_live", drive)
-    deploy._drive_until_it_counts(experiment, run, tmp_path, None, told.append)
+    deploy.drive_until_it_counts(experiment, run, tmp_path, None, told.append)
     assert len(told) == 2
     assert "no fresh pose (attempt 1 of 3)" in told[0]
+    assert "never began (attempt 2 of 3)" in told[1]
     assert json.loads((tmp_path / f"{run.name}.json").read_text())["outcome"]["stopped_early"] == ""
     stops[:] = ["no fresh pose"] * 3
     with pytest.raises(
         deploy.DriveFault, match="stopped the live drive hardened_gradient_0 3 times, at last: no fresh"
     ):
-        deploy._drive_until_it_counts(experiment, run, tmp_path, None, told.append)
+        deploy.drive_until_it_counts(experiment, run, tmp_path, None, told.append)
     assert not (tmp_path / f"{run.name}.json").exists()
