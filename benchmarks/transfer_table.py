@@ -69,6 +69,8 @@ def note_of(row: TableRow, cells: Sequence[CellResult] = ()) -> str:
         parts.append("by seed " + ", ".join(f"{each:.2f}" for each in ratios_of(cells, row.domain)) + " x")
     if len(cells) > 1 and len({cell.surrogate.none_total_cte_m for cell in cells}) == 1:
         parts.append("all seeds have the same start, so they differ by the search's noise and live timing alone")
+    elif len(cells) > 1 and row.domain == "deployed" and starts_differ(cells):
+        parts.append("searched from several starts, driven from the first, which all seeds share")
     if row.missing:
         parts.append(f"seeds {', '.join(map(str, row.missing))} are missing")
     parts.append(build_text(cells))

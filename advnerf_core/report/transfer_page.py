@@ -35,6 +35,12 @@ _EXPLAINED = {
     HELD: "None of these; drives without attack belong here.",
 }
 _MISSING = "missing"
+LEGEND = (
+    "Total CTE [m]: mean over seeds ± standard deviation over seeds. × no attack: ratio of sums to the same starts without attack in the same domain. "
+    "Transfer: deployed ratio over surrogate ratio, from the same starts. 95 %: percentile bootstrap over seeds; of three seeds that is their range. "
+    "Seeds, and victims, may be of several builds of scene and policies: each cell's JSON has their digests, as far as they were kept. "
+    "Paper: its totals have units of their own per scenario, and its ratios are all to its deployed drive without attack."
+)
 
 
 @dataclass(frozen=True)
@@ -165,7 +171,16 @@ def _field(value: Any) -> Any:
 
 def as_markdown(table: TransferTable) -> str:
     """Lines and targets as a Markdown page."""
-    parts = [f"# {table.name or 'Transfer table'}", "", *_markdown_rows(text_table(table)), "", "## Targets", ""]
+    parts = [
+        f"# {table.name or 'Transfer table'}",
+        "",
+        LEGEND,
+        "",
+        *_markdown_rows(text_table(table)),
+        "",
+        "## Targets",
+        "",
+    ]
     return "\n".join([*parts, *_markdown_rows(target_table(table_targets(table))), ""])
 
 
@@ -221,7 +236,7 @@ def render_transfer_page(
     template = environment.from_string(resources.joinpath("transfer.html").read_text(encoding="utf-8"))
     groups = [(name, _EXPLAINED[name], [clip for clip in clips if clip.outcome == name]) for name in OUTCOMES]
     return template.render(
-        name=table.name or "Transfer table",
+        name=table.name or "Transfer table", legend=LEGEND,
         style=Markup(resources.joinpath("page.css").read_text(encoding="utf-8")),
         light=Markup(css_variables(LIGHT)), dark=Markup(css_variables(DARK)),
         table=text_table(table).html(), targets=target_table(table_targets(table)).html(),

@@ -75,6 +75,7 @@ def test_what_was_not_run_is_missing_and_never_a_number(table):
     row = table.find("straight", "hardened", "none", "deployed")
     assert (row.mean_m, row.ratio, row.std_m, row.transfer, row.missing) == (None, None, None, None, (0, 1, 2))
     assert "missing" in as_markdown(table)
+    assert "from the same starts" in as_markdown(table)
     line = next(r for r in csv.DictReader(io.StringIO(as_csv(table))) if r["method"] == "none")
     assert line["mean_m"] == line["ratio"] == ""
     assert line["missing"] == "0 1 2"
