@@ -7,6 +7,9 @@ import sys
 from pathlib import Path
 
 _KIB_PER_MIB = 1024.0
+# For the environment of a process whose peak is measured. glibc raises its threshold for returning freed blocks as it goes, and what then counts
+# as resident depends on the order of frees, by some 10 to 30 MiB from run to run. With fixed thresholds resident memory is what the process holds.
+RETURNS_WHAT_IS_FREED = {"MALLOC_MMAP_THRESHOLD_": "65536", "MALLOC_TRIM_THRESHOLD_": "65536"}
 
 
 def restart_peak() -> float:

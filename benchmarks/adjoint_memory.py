@@ -24,7 +24,7 @@ from torch.utils.checkpoint import checkpoint
 
 from advnerf_core.attack.adjoint import AttackProblem, adjoint_gradient, evaluate
 from advnerf_core.files import write_atomically
-from advnerf_core.memory import peak_mib, restart_peak
+from advnerf_core.memory import RETURNS_WHAT_IS_FREED, peak_mib, restart_peak
 from benchmarks.attack_toy import toy_problem
 from benchmarks.results import REPOSITORY, record_row
 
@@ -121,14 +121,9 @@ def measure(horizons: list[int], repeats: int = 3) -> list[dict[str, Any]]:
     return rows
 
 
-# glibc raises its threshold for returning freed blocks as it goes, and what then counts as resident depends on the order of frees, by
-# some 10 MiB from run to run. With fixed thresholds, for all ways alike, resident memory is what the process holds.
-_ALLOCATOR = {"MALLOC_MMAP_THRESHOLD_": "65536", "MALLOC_TRIM_THRESHOLD_": "65536"}
-
-
 def _in_fresh_process(method: str, steps: int, *options: str) -> dict[str, float]:
     command = [sys.executable, "-m", "benchmarks.adjoint_memory", "--child", method, "--horizons", str(steps), *options]
-    environment = {**os.environ, **_ALLOCATOR}
+    environment = {**os.environ, **RETURNS_WHAT_IS_FREED}
     done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True, cwd=REPOSITORY, env=environment)
     measured: dict[str, float] = json.loads(done.stdout.splitlines()[-1])
     return measured

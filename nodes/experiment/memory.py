@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -16,7 +17,7 @@ import torch
 from advnerf_core.attack.adjoint import adjoint_gradient, evaluate
 from advnerf_core.driving.policy import load_policy
 from advnerf_core.files import write_atomically
-from advnerf_core.memory import peak_mib, restart_peak
+from advnerf_core.memory import RETURNS_WHAT_IS_FREED, peak_mib, restart_peak
 from advnerf_core.report.data import MemoryRow
 from nodes.experiment.attack import attack_problem
 from nodes.experiment.config import ExperimentConfig
@@ -36,7 +37,8 @@ def measure(experiment: Experiment, folder: Path, report: Report) -> tuple[Memor
         report(index / len(HORIZONS), f"memory of the adjoint at T = {ticks}")
         if str(ticks) not in rows:
             command = [sys.executable, "-m", "nodes.experiment.memory", str(experiment.folder), str(ticks)]
-            done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
+            environment = {**os.environ, **RETURNS_WHAT_IS_FREED}
+            done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True, env=environment)
             rows[str(ticks)] = float(done.stdout.split()[-1])
             write_atomically(kept, json.dumps(rows) + "\n")
     return tuple(MemoryRow(int(ticks), mib) for ticks, mib in rows.items())
