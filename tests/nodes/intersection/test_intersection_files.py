@@ -1,5 +1,6 @@
 """The experiment file, its stages, and which change redoes what."""
 
+import shutil
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -151,12 +152,18 @@ def test_cells_of_the_retrained_victim_wait_for_one_round_only(tmp_path: Path, m
         experiment, lambda fraction, text="": None
     )  # also of a longer loop it is the first round's victim
     assert asked == [(1, "retrain")]
-    (experiment.folder / "retrain" / "round0" / "policy.safetensors").unlink()
+    shutil.rmtree(experiment.folder / "retrain")
     run.prepare_victims(load(tmp_path, "retrain.rounds=4"), lambda fraction, text="": None)
     assert asked[1:] == [(1, "retrain")]
     run.prepare_victims(load(tmp_path, "retrain.rounds=6", "retrain.stills=7"), lambda fraction, text="": None)
     assert asked[2:] == [(1, "retrain")]
     longer = load(tmp_path / "longer", "retrain.rounds=6")
-    run_stages([replace(stage, run=lambda folder, report: None) for stage in stages_of(longer)], longer.folder, Quiet())
+
+    def stopped(folder: Path, report: Report) -> None:
+        if folder.name == "retrain":
+            raise InterruptedError
+
+    with pytest.raises(InterruptedError):
+        run_stages([replace(stage, run=stopped) for stage in stages_of(longer)], longer.folder, Quiet())
     run.prepare_victims(longer, lambda fraction, text="": None)
     assert asked[3:] == [(6, "retrain")]  # begun, but no victim yet: nothing of it is thrown away
