@@ -54,8 +54,9 @@ def command_of(experiment: Experiment) -> str:
 
 def publish(found: Path, docs: Path) -> None:
     """The rounds and their curve into the documentation."""
-    write_atomically(docs / "results" / "retrain" / "retrain.json", (found / "retrain.json").read_text())
-    summary = json.loads((found / "retrain.json").read_text())
+    text = (found / "retrain.json").read_text()
+    summary = json.loads(text)
+    write_atomically(docs / "results" / "retrain" / "retrain.json", text)
     retrain_plot.draw(docs / "retraining.png", summary["rounds"], summary["pays_ratio"])
 
 

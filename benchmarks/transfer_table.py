@@ -88,9 +88,7 @@ def note_of(row: TableRow, cells: Sequence[CellResult] = ()) -> str:
 
 def starts_differ(cells: Sequence[CellResult]) -> bool:
     """Whether a cell was searched from more starts than it was deployed from."""
-    return any(
-        cell.deployed is not None and len(cell.deployed.total_cte_m) < len(cell.surrogate.total_cte_m) for cell in cells
-    )
+    return any(cell.deployed is not None and cell.shared_starts < len(cell.surrogate.total_cte_m) for cell in cells)
 
 
 def build_text(cells: Sequence[CellResult]) -> str:
@@ -249,8 +247,9 @@ def main() -> None:
             record(line, target.value, "", target.target, target.met, note, cells=cells)
     for key, told in gate_rows(folder, sorted({gate_key(cell) for cell in campaign.cells})):
         record(*told, cells=[cell for cell in table.cells.values() if gate_key(cell) == key])
-    for skill in skill_rows(folder, list(table.cells.values()), str(arguments.campaign)):
-        record(*skill)
+    foretold = [cell for cell in table.cells.values() if prediction_file(folder, cell.name).exists()]
+    for skill in skill_rows(folder, foretold, str(arguments.campaign)):
+        record(*skill, cells=foretold)
 
 
 if __name__ == "__main__":

@@ -35,6 +35,15 @@ class TrialError(RuntimeFault):
     """A trial could not be carried out."""
 
 
+# A stop that belongs to the drive: the car left the floor it has, or a person ended it. Any other is a fault of the stack.
+_COUNTED_STOPS = ("fence", "disarmed by", "released")
+
+
+def counts(stopped_early: str) -> bool:
+    """Whether a drive that was stopped so measures the policy; an empty text is a drive that went on to its end."""
+    return not stopped_early or any(word in stopped_early for word in _COUNTED_STOPS)
+
+
 class NotStartedError(TrialError):
     """The stack stopped a trial before the car had moved, as when a command came too late: worth another attempt."""
 

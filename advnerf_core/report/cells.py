@@ -90,6 +90,11 @@ class CellResult(BaseModel):
         """Name of the cell and of its file."""
         return cell_name(self.scenario, self.victim, self.method, self.seed, self.placement)
 
+    @property
+    def shared_starts(self) -> int:
+        """From how many starts, the first ones, there are drives in both domains; 0 as long as it is not deployed."""
+        return min(len(self.surrogate.total_cte_m), len(self.deployed.total_cte_m)) if self.deployed else 0
+
 
 def cell_name(scenario: str, victim: str, method: str, seed: int, placement: str = "") -> str:
     """Name of a cell, e.g. ``straight_hardened_gradient_0`` or ``straight.near_hardened_gradient_0``."""

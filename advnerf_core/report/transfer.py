@@ -163,7 +163,7 @@ def _row(want: Wanted, cells: Sequence[CellResult], domain: Domain) -> TableRow:
     if not have:
         return empty
     mean_m, std_m = mean_and_std([drives.mean_m for _, drives in have])
-    sums, none_sums = _sums([drives for _, drives in have])
+    sums, none_sums = _sums([(drives, None) for _, drives in have])
     transfer, its_interval = _transfer(cells) if domain == "deployed" else (None, None)
     found = {
         "drives": sum(len(drives.total_cte_m) for _, drives in have), "mean_m": mean_m, "std_m": std_m,
@@ -178,17 +178,15 @@ def drives_in(cell: CellResult, domain: Domain) -> Drives | None:
     return cell.surrogate if domain == "surrogate" else cell.deployed
 
 
-def _sums(drives: Sequence[Drives], starts: Sequence[int | None] | None = None) -> tuple[list[float], list[float]]:
-    """Attacked and unattacked sum of each seed, over its first ``starts`` drives or all."""
-    some = list(zip(drives, starts or [None] * len(drives), strict=True))
-    return [sum(d.total_cte_m[:n]) for d, n in some], [sum(d.none_total_cte_m[:n]) for d, n in some]
+def _sums(drives: Sequence[tuple[Drives, int | None]]) -> tuple[list[float], list[float]]:
+    """Attacked and unattacked sum of each seed, over so many of its drives, the first ones; None for all."""
+    return [sum(d.total_cte_m[:n]) for d, n in drives], [sum(d.none_total_cte_m[:n]) for d, n in drives]
 
 
 def _transfer(cells: Sequence[CellResult]) -> tuple[float | None, Interval | None]:
-    both = [(cell.surrogate, cell.deployed) for cell in cells if cell.deployed is not None]
     # A live drive begins at the first of the starts that a search may have had: the others are no part of the comparison.
-    starts = [min(len(here.total_cte_m), len(there.total_cte_m)) for here, there in both]
-    deployed, surrogate = _sums([there for _, there in both], starts), _sums([here for here, _ in both], starts)
+    both = [(cell.surrogate, cell.deployed, cell.shared_starts) for cell in cells if cell.deployed is not None]
+    surrogate, deployed = _sums([(here, n) for here, _, n in both]), _sums([(there, n) for _, there, n in both])
     there, here = ratio_of_sums(*deployed), ratio_of_sums(*surrogate)
     if not there or not here:
         return None, None

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -65,20 +64,19 @@ def judge_scene(
 
 
 def cached_verdict(
-    kind: Kind, experiment: Any, scenario: str, victim: str, limits: GateLimits, file: Path
-) -> Verdict | None:
-    """The verdict on held-out views, judged again only if scene, policy or limits changed; None where the kind has no gate."""
-    if kind.fidelity is None:
-        return None
-    policy, _ = kind.fidelity.policy_of(experiment, victim, scenario)
-    key = _key(experiment, policy, limits, scenario, victim)
-    return _kept_or(file, key, lambda: judge_scene(kind, experiment, scenario, victim, limits)[0][1])
+    kind: Kind, experiment: Any, scenario: str, victim: str, limits: GateLimits, file: Path,
+    drive: tuple[int, Path] | None = None,
+) -> Verdict | None:  # fmt: skip
+    """The verdict on held-out views, or on a drive; judged again only if scene, policy or limits changed; None where the kind has no gate.
 
-
-def cached_drive_verdict(
-    kind: Kind, experiment: Any, scenario: str, victim: str, seed: int, folder: Path, limits: GateLimits, file: Path
-) -> Verdict | None:
-    """The same on the pictures of a deployed drive without attack, where ``folder`` is that of its cell.
+    Args:
+        kind: Kind of the scenario.
+        experiment: Its experiment.
+        scenario: What the experiment calls it.
+        victim: Which policy.
+        limits: What must be reached.
+        file: Where the verdict is kept.
+        drive: Of a deployed drive without attack its seed and the folder of its cell.
 
     Raises:
         RuntimeFault: There is no such drive yet.
@@ -87,26 +85,16 @@ def cached_drive_verdict(
     if module is None:
         return None
     policy, goal = module.policy_of(experiment, victim, scenario)
-
-    def judged() -> Verdict:
-        pictures = module.driven(experiment, scenario, victim, seed, folder)
-        return judge(agreement_on(policy, goal, pictures), limits, pictures.of)
-
-    return _kept_or(file, _key(experiment, policy, limits, scenario, victim, "drive", seed), judged)
-
-
-def _key(experiment: Any, policy: Any, limits: GateLimits, *which: Any) -> str:
-    return hash_of([stage_digests(experiment.folder), _weights_sha256(policy), limits.model_dump(mode="json"), *which])
-
-
-def _kept_or(file: Path, key: str, judged: Callable[[], Verdict]) -> Verdict:
+    which = [scenario, victim, *(["drive", drive[0]] if drive else [])]
+    key = hash_of([stage_digests(experiment.folder), _weights_sha256(policy), limits.model_dump(mode="json"), *which])
     try:
         kept = json.loads(file.read_text(encoding="utf-8"))
         if kept["key"] == key:
             return Verdict(kept["passed"], tuple(kept["reasons"]), kept["numbers"])
     except (OSError, ValueError, KeyError, TypeError):
         pass  # an unreadable verdict is judged again
-    verdict = judged()
+    pictures = module.driven(experiment, scenario, victim, *drive) if drive else module.held_out(experiment, scenario)
+    verdict = judge(agreement_on(policy, goal, pictures), limits, pictures.of)
     write_atomically(file, json.dumps({"key": key, **verdict.record()}, indent=1) + "\n")
     return verdict
 

@@ -78,7 +78,7 @@ def predicted(folder: Path, results: Sequence[CellResult]) -> list[Predicted]:
             continue
         none_m = sum(cell.deployed.none_total_cte_m)
         measured = sum(cell.deployed.total_cte_m) / none_m if none_m > 0.0 else math.nan
-        starts = min(len(cell.surrogate.total_cte_m), len(cell.deployed.total_cte_m))
+        starts = cell.shared_starts
         learned, learned_none = (
             sum(each[:starts]) for each in (cell.surrogate.total_cte_m, cell.surrogate.none_total_cte_m)
         )

@@ -240,7 +240,7 @@ def _judge(campaign: Campaign, cell: Cell, options: Options, say: Say) -> bool:
     kind, key = load_kind(scenario.kind), gate_key(cell)
     if kind.fidelity is None:
         return True
-    from nodes.campaign.gate import cached_drive_verdict, cached_verdict  # loads torch
+    from nodes.campaign.gate import cached_verdict  # loads torch
 
     limits = scenario.gate or campaign.config.gate
     which = (kind, _experiment(campaign, cell), _inside(scenario, cell), cell.victim)
@@ -248,8 +248,8 @@ def _judge(campaign: Campaign, cell: Cell, options: Options, say: Say) -> bool:
     first = min(each.seed for each in campaign.cells if gate_key(each) == key)
     without = replace(cell, method=NONE, seed=first)
     try:
-        folder = store_of(campaign).work(without.name)
-        found.append(cached_drive_verdict(*which, first, folder, limits, gate_file(campaign.folder, key, drive=True)))
+        drive = first, store_of(campaign).work(without.name)
+        found.append(cached_verdict(*which, limits, gate_file(campaign.folder, key, drive=True), drive))
     except RuntimeFault as fault:
         say(f"fidelity gate, {key}: only held-out views are judged, as there is no drive without attack yet: {fault}")
     may = not options.gate or all(verdict is None or verdict.passed for verdict in found)

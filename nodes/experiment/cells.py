@@ -29,6 +29,7 @@ from nodes.experiment.objects import attacked_object, surrogate_of
 from nodes.experiment.run import load_experiment, run_experiment
 from nodes.runtime.errors import ConfigError, RuntimeFault
 from nodes.runtime.stages import Report, hash_of, read_record
+from nodes.trial import counts
 
 __all__ = ["LIVE", "cell_inputs", "load_experiment", "prepare", "run_cell", "search_cell"]
 
@@ -54,6 +55,7 @@ class _Cell:
     seed: int
     folder: Path
     taken: bool
+    same_graph: bool
 
     @property
     def search(self) -> attack.Search:
@@ -81,18 +83,16 @@ class _Cell:
 
     def _is_driven_in(self, folder: Path, condition: str) -> bool:
         """Whether the run folder has this very drive: through this graph, past this attack, ended by no fault."""
-        if not has_same_graph(self.experiment):
+        if not self.same_graph:
             return False
         try:
             driven = json.loads((folder / f"{self.live(condition).name}.json").read_text())
         except FileNotFoundError:
             return False
-        shown = (
-            []
-            if condition == "none"
-            else [load_attack(attack.attack_path(self.searched_in(condition), self.search)).attack_id]
-        )
-        return driven["attack_ids"] == shown and deploy.counts(driven)
+        shown = []
+        if condition != "none":
+            shown = [load_attack(attack.attack_path(self.searched_in(condition), self.search)).attack_id]
+        return driven["attack_ids"] == shown and counts(driven["outcome"]["stopped_early"])
 
 
 def prepare(experiment: Experiment, report: Report) -> None:
@@ -116,10 +116,8 @@ def cell_inputs(experiment: Experiment, scenario: str, victim: str, method: str,
     del scenario, seed
     _require_victim(experiment, victim)
     config = experiment.config
-    searched = {
-        **config.attack.model_dump(mode="json"),
-        "cache_mib": AttackConfig().cache_mib,
-    }  # which changes no result
+    # How much memory may be used changes no result.
+    searched = config.attack.model_dump(mode="json") | {"cache_mib": AttackConfig().cache_mib}
     other = {key for keys in _SPENT_BY.values() for key in keys} - set(_SPENT_BY[method])
     records = {stage: read_record(experiment.stage_folder(stage)) for stage in _NEEDED}
     return {
@@ -201,7 +199,8 @@ def _cell(experiment: Experiment, scenario: str, victim: str, method: str, seed:
         update={"attack": experiment.config.attack.model_copy(update={"seeds": (seed,)})}
     )
     own = replace(experiment, config=config)
-    return _Cell(own, victim, method, seed, folder, has_same_attacks(own))
+    taken = has_same_attacks(own)
+    return _Cell(own, victim, method, seed, folder, taken, taken and has_same_graph(own))
 
 
 def _require_victim(experiment: Experiment, victim: str) -> None:

@@ -22,9 +22,8 @@ from nodes.experiment.policy import HARDENED, NAIVE, victim_file
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import RuntimeFault
 from nodes.runtime.stages import Report
-from nodes.trial import NotStartedError, TrialPlan
+from nodes.trial import NotStartedError, TrialPlan, counts
 from nodes.trial_runner import run_trial
-from nodes.trials.campaign import COUNTED_STOPS
 
 Condition = Literal["none", "random", "cem", "gradient", "empty", "laps"]
 # The absent board or monitor of the empty scene stands outside the room, out of every camera's sight.
@@ -79,12 +78,6 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
         if not (folder / f"{live.name}.json").exists():
             attack = _attack_file(experiment, live) if live.condition in METHODS else None
             drive_until_it_counts(experiment, live, folder, attack, partial(report, index / len(plan)))
-
-
-def counts(driven: dict[str, Any]) -> bool:
-    """Whether a drive measures the policy: it went on to the end, or was stopped as a drive is on purpose, and not by a fault of the stack."""
-    stopped = driven["outcome"]["stopped_early"]
-    return not stopped or any(word in stopped for word in COUNTED_STOPS)
 
 
 def drive_until_it_counts(
@@ -170,11 +163,11 @@ def _fault_of(experiment: Experiment, live: LiveRun, folder: Path, attack: Path 
         drive_live(experiment, live, folder, attack)
     except NotStartedError as error:
         return str(error)
-    driven = json.loads(file.read_text())
-    if counts(driven):
+    stopped: str = json.loads(file.read_text())["outcome"]["stopped_early"]
+    if counts(stopped):
         return ""
     file.unlink()
-    return str(driven["outcome"]["stopped_early"])
+    return stopped
 
 
 def live_horizon(experiment: Experiment, live: LiveRun) -> Horizon:

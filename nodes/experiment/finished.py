@@ -12,11 +12,10 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-from hardware.twin.config import LabConfig
 from nodes.experiment import attack
 from nodes.experiment.context import Experiment
 from nodes.experiment.run import stages_of
-from nodes.runtime.stages import Stage, fits_what_is_there, is_current, read_record
+from nodes.runtime.stages import fits_what_is_there, is_current, read_record
 
 # What does not change a result: which other seeds there are, and how much memory may be used.
 _FREE = ("seeds", "cache_mib")
@@ -33,7 +32,8 @@ def has_same_attacks(experiment: Experiment) -> bool:
     # Starts depend on the seed alone; which seeds the folder had, and hence this hash, does not matter here.
     if any(then.get(name) != now[name] for name in now if name not in ("config", "starts_and_seeds")):
         return False
-    changed = _changed(experiment.config.attack, settings, "attack")
+    now_attack = experiment.config.attack
+    changed = _changed(now_attack, settings.get(type(now_attack).__name__), "attack")
     return settings["horizon"] == experiment.config.horizon and set(changed) <= {f"attack.{name}" for name in _FREE}
 
 
@@ -42,7 +42,7 @@ def has_same_graph(experiment: Experiment) -> bool:
     settings = _settings_of(experiment.stage_folder("deploy"))
     if settings is None:
         return False
-    now = _stage(experiment, "deploy").settings
+    now = next(stage.settings for stage in stages_of(experiment) if stage.name == "deploy")
     old, new = (each[type(experiment.config.deploy).__name__] for each in (settings, now))
     same = all(old.get(name) == new[name] for name in ("launch_file", "nodes"))
     return same and settings["graph"] == json.loads(json.dumps(now["graph"]))
@@ -51,17 +51,20 @@ def has_same_graph(experiment: Experiment) -> bool:
 def changed_settings(experiment: Experiment) -> list[str]:
     """What the run folder was made with that the experiment says otherwise; values that are new have their defaults."""
     stages, found = stages_of(experiment), []
-    for name in _MADE:
-        settings = _settings_of(experiment.stage_folder(name))
-        if settings is None:  # of before settings were kept: the key says whether they are the same, not which differ
-            found += [] if is_current(stages, experiment.folder, name) else [name]
+    for stage in stages:
+        if stage.name not in _MADE:
             continue
-        if not fits_what_is_there(_stage(experiment, name), experiment.folder):
-            found.append(f"{name} (it was made before what it builds on)")
-        found += _changed_lab(experiment, settings["lab"])
-        for section in ("capture", "scene", "policy", "object"):
-            if type(values := getattr(experiment.config, section)).__name__ in settings:
-                found += _changed(values, settings, section)
+        settings = _settings_of(experiment.stage_folder(stage.name))
+        if settings is None:  # of before settings were kept: the key says whether they are the same, not which differ
+            found += [] if is_current(stages, experiment.folder, stage.name) else [stage.name]
+            continue
+        if not fits_what_is_there(stage, experiment.folder):
+            found.append(f"{stage.name} (it was made before what it builds on)")
+        found += _changed(experiment.lab_config, settings["lab"], "lab")
+        for section in _MADE:
+            values = getattr(experiment.config, section)
+            if type(values).__name__ in settings:
+                found += _changed(values, settings[type(values).__name__], section)
     return list(dict.fromkeys(found))
 
 
@@ -71,28 +74,15 @@ def is_finished(folder: Path) -> bool:
     return record is not None and record.digest is not None
 
 
-def _stage(experiment: Experiment, name: str) -> Stage:
-    return next(stage for stage in stages_of(experiment) if stage.name == name)
-
-
 def _settings_of(folder: Path) -> Mapping[str, Any] | None:
     record = read_record(folder)
     return None if record is None else record.settings
 
 
-def _changed(now: BaseModel, settings: Mapping[str, Any], section: str) -> list[str]:
+def _changed(now: BaseModel, settings: Any, section: str) -> list[str]:
     """Names of values of a section that a stage was made with otherwise."""
     try:
-        then = type(now).model_validate(settings[type(now).__name__])
-    except (KeyError, ValidationError):
+        then = type(now).model_validate(settings)
+    except ValidationError:
         return [section]
     return [f"{section}.{name}" for name, value in then if getattr(now, name) != value]
-
-
-def _changed_lab(experiment: Experiment, settings: Any) -> list[str]:
-    try:
-        then = LabConfig.model_validate(settings)
-    except ValidationError:
-        return ["lab"]
-    now = experiment.lab_config
-    return [f"lab.{name}" for name, value in then if getattr(now, name) != value]

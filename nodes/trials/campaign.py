@@ -20,7 +20,7 @@ from calibration.schema import RoomCalibration, load_calibration
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.launch_file import Plan, load_launch
 from nodes.runtime.launch_hosts import ALL_HOSTS, operator_of
-from nodes.trial import NotStartedError, TrialPlan
+from nodes.trial import NotStartedError, TrialPlan, counts
 from nodes.trial_runner import run_trial
 from nodes.trials.bags import measure_drives
 from nodes.trials.plan import NONE, CampaignError, Run, TrialsPlan, finished, keep_plan, make_runs, sha256_of
@@ -28,8 +28,6 @@ from nodes.trials.plan import NONE, CampaignError, Run, TrialsPlan, finished, ke
 TICK_S = 0.1
 # After the last tick the car drives on for a moment, so that the poses reach over it.
 _TAIL_S = 0.2
-# A stop that belongs to the drive: the car left the floor it has, or a person ended it. Any other is a fault of the stack.
-COUNTED_STOPS = ("fence", "disarmed by", "released")
 _ATTEMPTS = 3
 _NOT_WATCHED = ("recorder", "viewer")
 
@@ -120,7 +118,7 @@ def drive_run(series: Series, run: Run, ready_timeout_s: float, guide: Callable[
         except NotStartedError as error:
             stopped = str(error)
         else:
-            if not stopped or any(word in stopped for word in COUNTED_STOPS):
+            if counts(stopped):
                 write_atomically(series.folder / f"{run.name}.json", json.dumps(result) + "\n")
                 return result
         guide(f"this run does not count, the stack stopped it: {stopped} (attempt {attempt} of {_ATTEMPTS})")
