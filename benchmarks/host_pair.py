@@ -167,7 +167,7 @@ class HostPair:
         self.log = (folder / "hosts.log").open("ab")
         self._processes: list[subprocess.Popen[bytes]] = []
         self.person: Person | None = None
-        keys = _exchange_keys(folder)
+        keys = exchange_keys(folder)
         config = self.car / "twin.yaml"
         config.write_text(json.dumps({"vesc": CONFIGURED, "vicon": {"port": _VICON_PORT}}), encoding="utf-8")
         try:
@@ -224,7 +224,7 @@ class HostPair:
         self.log.close()
 
 
-def _exchange_keys(folder: Path) -> dict[str, Path]:
+def exchange_keys(folder: Path) -> dict[str, Path]:
     """A key folder for each host, as docs/two_hosts.md says."""
     folders = {name: KeyFolder(folder / f"{name}_keys") for name in (ROBOT, WORKSTATION)}
     public = {name: keys.new(name) for name, keys in folders.items()}

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from advnerf_core.errors import AdvnerfError
 
-class HardwareError(RuntimeError):
+
+class HardwareError(AdvnerfError, RuntimeError):
     """A device did something other than asked; the message says what was expected, what came, and what to do."""
 
 

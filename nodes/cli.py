@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from advnerf_core.errors import AdvnerfError
 from nodes import (
     cli_attack,
     cli_attack_node,
@@ -258,7 +259,7 @@ def _send_arm(wanted: bool, run_dir: Path | None, reason: str) -> None:
 
 def _is_for_people(error: Exception) -> bool:
     """Whether the message of an exception was written for whoever typed the command."""
-    return isinstance(error, OSError) or type(error).__module__.partition(".")[0] in OUR_PACKAGES
+    return isinstance(error, AdvnerfError | OSError)
 
 
 def main() -> None:

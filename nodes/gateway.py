@@ -36,7 +36,7 @@ class GatewayConfig(BaseModel):
         connect: Address of the host that listens; the other end.
         watch_port: TCP port by which the listener speaks.
         drive_port: TCP port by which it hears.
-        keys: Key folder; none only on a loopback address.
+        keys: Key folder; none only on a loopback address, and then the link carries nothing to the end that listens.
         key: Name of this host's own key.
         peer_key: Name of the listener's key; only at the end that connects.
         exports: Topics of this host that the other may hear.
@@ -69,7 +69,7 @@ class GatewayConfig(BaseModel):
         """Both doors of the link."""
         return LinkConfig(
             self.listen or self.connect or "", self.listen is not None, self.watch_port, self.drive_port,
-            None if self.keys is None else KeyFolder(self.keys), self.key, self.peer_key, self.imports, bool(self.exports),
+            None if self.keys is None else KeyFolder(self.keys), self.key, self.peer_key, self.imports, self.exports,
         )  # fmt: skip
 
 
@@ -92,6 +92,7 @@ class GatewayNode(Node):
         self._prefixes = {name: type_hash_prefix(topic_row(name).type) for name in config.exports}
         self._sent = self._taken = 0
         self._offset: Offset | None = None
+        self._watched_only = config.listen is not None and config.keys is None
         self._link = Link(config.link(), self.inbox)
 
     @classmethod
@@ -126,6 +127,8 @@ class GatewayNode(Node):
     def status(self) -> tuple[str, str]:
         """Ready while the other host is not heard; the nodes that need it say so themselves."""
         heard_ns = self._link.heard_mono_ns
+        if heard_ns is None and self._watched_only:
+            return ACTIVE, f"{self._sent} messages sent; without keys the other host can only watch"
         if heard_ns is None:
             return READY, "the other host has not been heard yet"
         silence_s = (time.monotonic_ns() - heard_ns) / NS_PER_S

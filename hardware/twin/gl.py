@@ -6,13 +6,15 @@ import importlib
 import os
 from typing import Any
 
+from hardware.errors import HardwareError
+
 EGL_HELP = (
     "the simulated lab renders off-screen with EGL and could not start it. On Debian or Ubuntu: "
     "`sudo apt-get install libegl1 libgl1-mesa-dri libegl-mesa0 libopengl0`; leave MUJOCO_GL unset or set MUJOCO_GL=egl"
 )
 
 
-class TwinUnavailable(RuntimeError):
+class TwinUnavailable(HardwareError):
     """The simulated lab cannot run on this machine as it is set up; the message says what to install."""
 
 

@@ -105,7 +105,7 @@ class LaunchFile(_Strict):
         include: Launch files, relative to this one, on which this one builds.
         hosts: The two computers of the launch; none means that all runs on one.
         operator: Host from which people arm and ask; none means the one without an address.
-        keys: Key folder of each host; may be left out only on a loopback address.
+        keys: Key folder of each host; may be left out only on a loopback address, and then the other host can only watch.
     """
 
     name: str

@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from nodes.runtime.config import Document
 from nodes.runtime.errors import ConfigError
-from nodes.runtime.topics import TOPICS, status_topic
+from nodes.runtime.topics import STATUS_PREFIX, TOPICS, status_topic
 
 if TYPE_CHECKING:
     from nodes.runtime.launch_file import LaunchFile
@@ -26,8 +26,6 @@ _HOST_COUNT = 2
 _TOGETHER = ("safety", "motor")
 _SAFETY_MODULE = "nodes.safety"
 _COMMANDS = ("/policy/drive", "/expert/drive")
-# What the gateway calls whoever comes without a key.
-_NO_KEY = "loopback"
 
 
 class HostEntry(BaseModel):
@@ -66,6 +64,8 @@ def choose_host(document: Document, launch: LaunchFile, host: str | None) -> Non
     if host is None or host == ALL_HOSTS:
         return
     exports, imports = routes(launch, host)
+    if launch.keys is None:
+        exports, imports = _watching_only(document, launch, host, exports, imports)
     document.data["nodes"] = {
         name: entry for name, entry in document.data["nodes"].items() if launch.nodes[name].host == host
     }
@@ -79,10 +79,26 @@ def choose_host(document: Document, launch: LaunchFile, host: str | None) -> Non
 def _require_clock(document: Document, launch: LaunchFile, host: str) -> None:
     """Commands come from the other host: their age is known only as well as its clock is, so nobody arms before that."""
     other = next(name for name in launch.hosts if name != host)
-    peer = _NO_KEY if launch.keys is None else launch.hosts[other].key or other
+    peer = launch.hosts[other].key or other
     for name, node in document.data["nodes"].items():
         if launch.nodes.get(name) is not None and launch.nodes[name].module == _SAFETY_MODULE:
             node["config"] = {"clock_peers": [peer], **(node.get("config") or {})}
+
+
+def _watching_only(
+    document: Document, launch: LaunchFile, host: str, exports: list[str], imports: list[str]
+) -> tuple[list[str], list[str]]:
+    """Routes of a launch without keys: nothing goes to the host that listens. Statuses are dropped, all else is refused."""
+    listens = host == _listener(launch)
+    towards = imports if listens else exports
+    if commands := [topic for topic in towards if not topic.startswith(STATUS_PREFIX)]:
+        raise ConfigError(
+            f"{document.place(('hosts',))}: without keys the hosts can only watch each other, but {_listener(launch)} would take "
+            f"{', '.join(commands[:4])}{' and more' if len(commands) > 4 else ''} from the other: any local process could drive the "
+            f"car. Give --set keys=FOLDER (advnerf keys new), put what commands on {_listener(launch)} (people too: operator: "
+            f"{_listener(launch)}), or run everything on one computer with --host all"
+        )
+    return (exports, []) if listens else ([], imports)
 
 
 def routes(launch: LaunchFile, host: str) -> tuple[list[str], list[str]]:

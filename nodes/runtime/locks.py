@@ -7,8 +7,10 @@ import os
 from pathlib import Path
 from typing import TextIO
 
+from nodes.runtime.errors import RuntimeFault
 
-class HeldError(OSError):
+
+class HeldError(RuntimeFault, OSError):
     """Another process holds the lock.
 
     Attributes:

@@ -15,6 +15,7 @@ from typing import TypeVar
 
 from pydantic import BaseModel
 
+from advnerf_core.errors import AdvnerfError
 from nodes.runtime.bus import Bus
 from nodes.runtime.clock import Clock, SystemClock
 from nodes.runtime.config import load_node_config
@@ -191,8 +192,4 @@ def run_node_main(config_type: type[C], build: Callable[[C, NodeContext], Node])
 def _one_line(error: BaseException) -> str:
     text = " ".join(str(error).split()) or "no message"
     # Our own exceptions and those of the system say what happened; of others the type is half of the message.
-    return (
-        text
-        if type(error).__module__.startswith(("nodes.", "hardware.", "advnerf_core.", "calibration."))
-        else f"{type(error).__name__}: {text}"
-    )
+    return text if isinstance(error, AdvnerfError) else f"{type(error).__name__}: {text}"

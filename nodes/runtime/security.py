@@ -11,6 +11,7 @@ import ipaddress
 import os
 import re
 import stat
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,6 +22,9 @@ from nodes.runtime.errors import SecurityError
 
 WATCH, DRIVE = "watch", "drive"
 RIGHTS = (WATCH, DRIVE)
+_MAKE_KEYS = (
+    "Make keys with advnerf keys new, allow the other host with advnerf keys allow, and name the folder under keys"
+)
 _NAME = re.compile(r"[a-z][a-z0-9_-]{0,31}")
 _KEY = re.compile(r"[0-9a-zA-Z.\-:+=^!/*?&<>()\[\]{}@%$#]{40}")
 
@@ -160,12 +164,31 @@ def is_loopback(address: str) -> bool:
         return address == "localhost"
 
 
-def require_keys(address: str, keys: KeyFolder | None) -> None:
-    """Refuse an address that others can reach where no keys are in use."""
-    if keys is None and not is_loopback(address):
+def require_keys(address: str, keys: KeyFolder | None, commands: Sequence[str] = ()) -> None:
+    """Without keys, refuse an address that other computers can reach, and refuse to carry anything but watching.
+
+    Any process of this computer can connect to a TCP port of the loopback, whoever its user is. Commands therefore need keys
+    there too; without them a person arms through the bus's own sockets, which only the same user can open.
+
+    Args:
+        address: Where the link listens, or connects to.
+        keys: The key folder, if there is one.
+        commands: Topics that would go by the drive door, towards the host that listens.
+
+    Raises:
+        SecurityError: Keys are needed and there are none.
+    """
+    if keys is not None:
+        return
+    if not is_loopback(address):
         raise SecurityError(
-            f"{address} can be reached from other computers, and no keys are given: anybody could drive the car. Make keys with "
-            "advnerf keys new, allow the other host with advnerf keys allow, and name the folder under keys; or use 127.0.0.1"
+            f"{address} can be reached from other computers, and no keys are given: anybody could connect. {_MAKE_KEYS}; or use 127.0.0.1"
+        )
+    if commands:
+        shown = ", ".join(sorted(commands)[:4]) + (f" and {len(commands) - 4} more" if len(commands) > 4 else "")
+        raise SecurityError(
+            f"without keys a link carries watching only, but this one would carry {shown} to the host that listens: any process on "
+            f"{address} could drive the car. {_MAKE_KEYS}; or run everything on one computer with --host all"
         )
 
 

@@ -1,7 +1,7 @@
 """The link between two hosts: CURVE over TCP, two doors - one to watch, one to drive - and nothing decoded unchecked.
 
 One host listens, the other connects. What the listener says leaves by the watch door; what the other says enters by the drive
-door, and only keys on that door's list get that far. The sockets live in one thread; messages come out of an `Inbox`.
+door, and only keys on that door's list get that far; without keys there is no drive door. The sockets live in one thread; messages come out of an `Inbox`.
 """
 
 from __future__ import annotations
@@ -70,8 +70,7 @@ class Link:
     """
 
     def __init__(self, config: LinkConfig, inbox: Inbox[Inbound | Offset]) -> None:
-        if config.listens:
-            require_keys(config.address, config.keys)
+        require_keys(config.address, config.keys, config.commands)
         self._config, self._inbox = config, inbox
         self.heard_mono_ns: int | None = None
         self._outbox: deque[list[bytes]] = deque(maxlen=_OUTBOX)
@@ -121,7 +120,7 @@ class Link:
             self._keeper = Doorkeeper(self._context, self._config.keys, self._log)
             self._poller.register(self._keeper.socket, zmq.POLLIN)
         self._doors.open(WATCH)
-        if self._config.listens or self._config.sends:
+        if self._config.drives:
             self._doors.open(DRIVE)
 
     def _close_all(self) -> None:
@@ -140,8 +139,9 @@ class Link:
                     self._keeper.judge()
                 for event in self._doors.handshakes(ready):
                     self._note(event)
-                if self._doors.inward in ready:
-                    self._hear(self._doors.inward)
+                inward = self._doors.inward
+                if inward is not None and inward in ready:
+                    self._hear(inward)
                 now = time.monotonic()
                 if self._config.listens and now - pinged >= _PING_S:
                     pinged = now
@@ -215,7 +215,9 @@ class Link:
             newest = Exchange(asked_ns, received_ns, answered_ns, heard_ns)
             if not 0.0 <= newest.round_trip_s < 60.0:
                 raise MessageError(f"a clock exchange with a round trip of {newest.round_trip_s:g} s")
-            peer = _user(parts[1])
+            peer = str(
+                parts[1].get("User-Id")
+            )  # the doorkeeper's name for the key; the drive door is never open without keys
             best = self._offsets.setdefault(peer, OffsetFilter()).add(newest)
             self._inbox.put(Offset(peer, best, newest))
         else:
@@ -250,7 +252,8 @@ class Link:
         elif event.ended:
             self._log.say(f"the {event.right} door: a connection ended")
         elif not event.refusal:
-            self._log.say(f"the {event.right} door: a connection with a good key began")
+            how = "without a key" if self._config.keys is None else "with a good key"
+            self._log.say(f"the {event.right} door: a connection {how} began")
 
 
 def on_our_clock(meta: Meta, real_ns: int, mono_ns: int) -> Meta:
@@ -261,11 +264,3 @@ def on_our_clock(meta: Meta, real_ns: int, mono_ns: int) -> Meta:
     """
     age_ns = min(max(0, real_ns - meta.publish_real_ns), mono_ns, 3600 * NS_PER_S)
     return Meta(mono_ns - age_ns, meta.publish_real_ns, meta.sequence, meta.type_prefix, meta.instance_id)
-
-
-def _user(frame: zmq.Frame) -> str:
-    """Name of the key a frame came with; the listener's own words where there are no keys."""
-    try:
-        return str(frame.get("User-Id"))
-    except zmq.ZMQError:
-        return "loopback"

@@ -37,11 +37,11 @@ class LinkConfig:
         listens: Which end this is.
         watch_port: TCP port of what the listener says.
         drive_port: TCP port of what the listener hears.
-        keys: Key folder; none only on a loopback address.
+        keys: Key folder; none only on a loopback address, and to watch.
         own: Name of our own key.
         peer: Name of the listener's key, at the end that connects.
         imports: Topics taken from the other end; anything else is refused.
-        sends: Whether to use the drive door at the end that connects; false for one that only watches.
+        exports: Topics given to the other end.
     """
 
     address: str
@@ -52,7 +52,17 @@ class LinkConfig:
     own: str
     peer: str
     imports: tuple[str, ...]
-    sends: bool = True
+    exports: tuple[str, ...] = ()
+
+    @property
+    def commands(self) -> tuple[str, ...]:
+        """Topics that go by the drive door: towards the end that listens."""
+        return self.imports if self.listens else self.exports
+
+    @property
+    def drives(self) -> bool:
+        """Whether the drive door is used: by a listener that has keys, and by an end that has something to say there."""
+        return self.keys is not None and (self.listens or bool(self.exports))
 
 
 @dataclass(frozen=True)
@@ -88,9 +98,9 @@ class Doors:
         self._in, self._out = (DRIVE, WATCH) if config.listens else (WATCH, DRIVE)
 
     @property
-    def inward(self) -> zmq.Socket[Any]:
-        """The door through which messages come in."""
-        return self._sockets[self._in]
+    def inward(self) -> zmq.Socket[Any] | None:
+        """The door through which messages come in; none at a listener without keys."""
+        return self._sockets.get(self._in)
 
     @property
     def outward(self) -> zmq.Socket[Any] | None:
@@ -138,6 +148,8 @@ class Doors:
 
     def follow(self, wanted: frozenset[str]) -> None:
         """Take these topics and no others from the other end."""
+        if self.inward is None:
+            return
         for topic in wanted - self._subscribed:
             self.inward.subscribe(topic.encode())
         for topic in self._subscribed - wanted:

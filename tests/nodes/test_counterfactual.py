@@ -254,7 +254,8 @@ def test_evaluate_says_what_the_attack_added(replayed, tmp_path, policy):
 
 def test_it_is_an_option_of_the_green_screen_and_refused_before_a_monitor():
     def names(file, *overrides, host=None):
-        return set(load_launch(ROOT / "launch" / f"{file}.launch.yaml", overrides, host=host).nodes)
+        keys = ("keys=keys",) if host else ()
+        return set(load_launch(ROOT / "launch" / f"{file}.launch.yaml", (*keys, *overrides), host=host).nodes)
 
     for file, host in (("green_screen", None), ("workstation", None), ("two_hosts", "workstation")):
         assert names(file, "params.counterfactual=true", host=host) - names(file, host=host) == {"counterfactual"}

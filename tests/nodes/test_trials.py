@@ -11,6 +11,7 @@ import pytest
 from advnerf_core.attack.artifact import AttackFile, face_texture, save_attack
 from advnerf_core.driving.path import Path as DrivingPath
 from advnerf_core.geometry import Pinhole, planar_pose
+from benchmarks.host_pair import exchange_keys
 from nodes.runtime.bag import BagWriter
 from nodes.runtime.errors import BagError, ConfigError
 from nodes.runtime.launch import Launch
@@ -112,7 +113,7 @@ def test_a_launch_file_that_cannot_be_measured_is_refused(tmp_path):
 
 
 def two_hosts(tmp_path, host, *overrides):
-    settings = [f"params.calibration={ROOT / 'calibration' / 'twin'}", *overrides]
+    settings = [f"params.calibration={ROOT / 'calibration' / 'twin'}", "keys=keys", *overrides]
     return prepare_series(ROOT / "launch" / "two_hosts.launch.yaml", settings, tmp_path / "t", {}, 2, 0, 60, None, host)
 
 
@@ -239,6 +240,7 @@ def test_a_series_on_the_twin_counts_what_its_bags_say_and_goes_on(tmp_path):
 def test_trials_from_the_workstation_drive_the_car_of_the_other_host(tmp_path):
     file, vicon = ROOT / "launch" / "two_hosts.launch.yaml", free_ports(1, socket.SOCK_DGRAM)[0]
     watch, drive = free_ports(2)
+    keys = {host: f"keys={folder}" for host, folder in exchange_keys(tmp_path).items()}
     shared = [
         f"params.calibration={ROOT / 'calibration' / 'twin'}", "params.image_topic=/camera/image_raw",
         f"params.vicon_port={vicon}", "policy.module=benchmarks.straight_policy", "policy.speed_mps=0.6",
@@ -248,8 +250,10 @@ def test_trials_from_the_workstation_drive_the_car_of_the_other_host(tmp_path):
         "twin.if=true", "camera.source={kind: socket, path: '${socket_dir}/frames'}", "motor.port=${run_dir}/vesc",
     ]  # fmt: skip
     ready = ["safety.nodes=[camera, vicon, policy, motor]"]
-    with Launch(file, [*shared, *car, *ready], tmp_path / "car", host="robot"):
-        series = prepare_series(file, shared, tmp_path / "trials", {}, 2, 0, 15, None, "workstation")
+    with Launch(file, [*shared, *car, *ready, keys["robot"]], tmp_path / "car", host="robot"):
+        series = prepare_series(
+            file, [*shared, keys["workstation"]], tmp_path / "trials", {}, 2, 0, 15, None, "workstation"
+        )
         drive_series(series, 90.0, lambda run: None, print)
     results = list(series.results.values())
     assert [result["condition"] for result in results] == ["none", "none"]

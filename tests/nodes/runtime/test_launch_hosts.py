@@ -60,7 +60,6 @@ def test_all_runs_everything_here_without_a_gateway(launch_file):
     [
         (("", ""), ["workstation"]),
         (("workstation: {}", "workstation: {key: desk}"), ["desk"]),
-        (("keys: ~/keys", ""), ["loopback"]),
         (("nodes.safety, host: robot", "nodes.safety, host: robot, config: {clock_peers: []}"), []),
         # Nothing that moves the car comes from there: it may drive without the workstation.
         (("nodes.policy, host: workstation", "nodes.policy, host: robot"), None),
@@ -101,3 +100,40 @@ def test_host_of_a_file_without_hosts(launch_file):
     assert "gateway" not in load_launch(launch_file(plain)).nodes
     with pytest.raises(ConfigError, match="knows no hosts"):
         load_launch(launch_file(plain), host="robot")
+
+
+WATCHED = """
+name: pair
+operator: robot
+hosts:
+  robot: {address: 127.0.0.1}
+  desk: {}
+nodes:
+  camera: {module: nodes.camera, host: robot}
+  policy: {module: nodes.policy, host: robot}
+  safety: {module: nodes.safety, host: robot}
+  motor: {module: nodes.motor, host: robot}
+  viewer: {module: nodes.viewer, host: desk}
+"""
+
+
+def test_without_keys_the_other_host_can_only_watch(launch_file):
+    file = launch_file(WATCHED)
+    robot, desk = gateway(file, "robot")[1], gateway(file, "desk")[1]
+    assert robot["imports"] == desk["exports"] == []
+    assert {"/camera/image_raw", "/safety/state", "/arm"} <= set(robot["exports"]) == set(desk["imports"])
+    with_keys = gateway(launch_file(WATCHED + "keys: k\n"), "robot")[1]
+    assert with_keys["imports"] == ["/status/viewer"]
+
+
+@pytest.mark.parametrize("host", ["robot", "desk"])
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (("operator: robot\n", ""), "without keys .* robot would take /arm"),
+        (("nodes.policy, host: robot", "nodes.policy, host: desk"), "robot would take /policy/drive"),
+    ],
+)
+def test_without_keys_nobody_commands_from_the_other_host(launch_file, change, words, host):
+    with pytest.raises(ConfigError, match=words):
+        load_launch(launch_file(WATCHED.replace(*change)), host=host)

@@ -1,3 +1,4 @@
+import errno
 import socket
 import stat
 import time
@@ -164,7 +165,7 @@ def test_rights_are_separate_and_can_be_taken_back(tmp_path):
 def test_an_address_for_all_without_keys_is_refused(tmp_path):
     for address in ("0.0.0.0", "192.168.1.20", "::", "robot.local"):
         config = GatewayConfig(listen=address, watch_port=5590, drive_port=5591)
-        with pytest.raises(SecurityError, match="anybody could drive the car"):
+        with pytest.raises(SecurityError, match="anybody could connect"):
             GatewayNode(config, lambda topic: 0)
     with pytest.raises(ValueError, match="either listen or connect"):
         GatewayConfig(listen="127.0.0.1", connect="127.0.0.1")
@@ -293,16 +294,26 @@ def test_malformed_and_oversized_messages_of_an_allowed_key_are_refused(lab, cap
 
 
 @pytest.mark.parametrize("listens", [True, False])
-def test_something_follows_every_message_soon_so_that_tcp_notices_a_loss(listens):
+def test_something_follows_every_message_soon_so_that_tcp_notices_a_loss(listens, tmp_path):
     watch_port, drive_port = free_ports(2)
     context = zmq.Context()
     other = context.socket(zmq.SUB)
     other.subscribe(b"_pulse")
+    keys = KeyFolder(tmp_path / "keys")
+    public = keys.new("robot").encode()
+    keys.allow("robot", DRIVE)
+    # One key pair serves both ends.
+    secret = keys.secret("robot").encode()
+    other.curve_publickey, other.curve_secretkey = public, secret
+    if listens:
+        other.curve_serverkey = public
+    else:
+        other.curve_server = True
     if listens:
         other.connect(f"tcp://127.0.0.1:{watch_port}")
     else:
         other.bind(f"tcp://127.0.0.1:{drive_port}")
-    config = LinkConfig("127.0.0.1", listens, watch_port, drive_port, None, "robot", "robot", ())
+    config = LinkConfig("127.0.0.1", listens, watch_port, drive_port, keys, "robot", "robot", (), ("/policy/drive",))
     inbox = Inbox(10)
     link = Link(config, inbox)
     try:
@@ -318,6 +329,38 @@ def test_something_follows_every_message_soon_so_that_tcp_notices_a_loss(listens
         inbox.close()
         other.close(linger=0)
         context.term()
+
+
+def test_without_keys_a_link_carries_nothing_towards_the_end_that_listens():
+    watch_port, drive_port = free_ports(2)
+    ports = {"watch_port": watch_port, "drive_port": drive_port}
+    for config in (
+        GatewayConfig(listen="127.0.0.1", imports=("/policy/drive", "/arm"), **ports),
+        GatewayConfig(connect="127.0.0.1", exports=("/arm",), **ports),
+    ):
+        with pytest.raises(
+            SecurityError, match=r"without keys a link carries watching only, .*/arm.* could drive the car"
+        ):
+            GatewayNode(config, lambda topic: 1)
+
+
+def test_without_keys_others_watch_and_no_door_leads_in(lab, capfd):
+    robot = lab.host("robot", listen="127.0.0.1", exports=("/vicon/car",), keys=None)
+    watcher = lab.workstation(exports=(), keys=None)
+    robot.eyes.publisher("/vicon/car")
+    pose = encode(types.PoseStamped(header=header(0), pose=IDENTITY))
+    got = lab.run(
+        5.0, lambda got: any(r.topic == "/vicon/car" for _, r in got), lambda: robot.eyes.publish("/vicon/car", pose)
+    )
+    assert any(host is watcher and r.topic == "/vicon/car" for host, r in got)
+    with socket.socket() as stranger:
+        assert stranger.connect_ex(("127.0.0.1", lab.ports[DRIVE])) == errno.ECONNREFUSED
+    state, text = robot.node.status()
+    assert state == "active"
+    assert "can only watch" in text
+    said = capfd.readouterr().err
+    assert "a connection without a key began" in said
+    assert "good key" not in said
 
 
 def connections(ports):
