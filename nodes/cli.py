@@ -165,10 +165,12 @@ def _print_plan(plan: Any) -> None:
 
 
 def _say_problems(plan: Any) -> None:
+    from nodes.doctor.launch import policy_problems
     from nodes.runtime.launch_check import check_nodes
 
-    problems = check_nodes(plan)
-    for problem in problems.values():
+    # A policy is loaded only when its node accepts the configuration that names it.
+    problems = list(check_nodes(plan).values()) or policy_problems(plan)
+    for problem in problems:
         say_error(problem)
     if problems:
         raise typer.Exit(ERROR_EXIT)

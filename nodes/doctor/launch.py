@@ -35,7 +35,7 @@ from nodes.viewer import ViewerConfig
 
 _CHILD_DEADLINE_S = CHILD_S + 5.0
 _NODES_S = 90.0
-_TWIN = "nodes.twin"
+_TWIN, _POLICY = "nodes.twin", "nodes.policy"
 # What the launch makes itself does not exist before it runs.
 _OF_THE_RUN = ("<run_dir>", "<socket_dir>")
 _POLICY_SLOW_MS = 60.0
@@ -79,6 +79,28 @@ def checks_of(plan: Plan, folder: Path) -> list[Check]:
     if "recorder" in plan.documents:
         checks.append(Check("disk", partial(_disk, plan, folder)))
     return checks
+
+
+def policy_problems(plan: Plan) -> list[str]:
+    """What is wrong with the policies of a launch file: no such file, another image size than the camera's, another goal.
+
+    Each policy is loaded in a process of its own; nodes and devices are left alone.
+    """
+    problems = []
+    for name, entry in plan.nodes.items():
+        if entry.module != _POLICY:
+            continue
+        asked = _Asked(plan, name)
+        if (missing := _missing_policy(asked.config(PolicyConfig))) is not None:
+            problems.append(f"{name}: {missing} does not exist; --set params.policy=FILE names another")
+            continue
+        _, unfit = _try_policy(asked.config(PolicyConfig), _image_size(plan))
+        problems += [f"{name}: {finding.found}; {finding.do}" for finding in unfit]
+    return problems
+
+
+def _missing_policy(config: PolicyConfig) -> str | None:
+    return None if is_factory(config.policy) or Path(config.policy).exists() else str(config.policy)
 
 
 def _nodes(plan: Plan) -> list[Finding]:
@@ -151,30 +173,49 @@ def _safety(asked: _Asked) -> list[Check]:
 
 def _policy(asked: _Asked) -> list[Check]:
     config = asked.config(PolicyConfig)
-    if not is_factory(config.policy) and not Path(config.policy).exists():
+    if _missing_policy(config) is not None:
         return []  # said under "files"
-    size = next(
-        (
-            (found.width, found.height)
-            for entry in asked.plan.documents.values()
-            for key in ("calibration", "camera")
-            if (found := _camera_file(entry.data.get(key))) is not None
-        ),
-        None,
-    )
-    return [Check("policy", partial(_try_policy, config, size), _CHILD_DEADLINE_S)]
+    return [Check("policy", partial(_policy_findings, config, _image_size(asked.plan)), _CHILD_DEADLINE_S)]
+
+
+def _image_size(plan: Plan) -> tuple[int, int] | None:
+    """Width and height of the launch's camera [px], from the first calibration that a node names."""
+    for entry in plan.documents.values():
+        for key in ("calibration", "camera"):
+            if (found := _camera_file(entry.data.get(key))) is not None:
+                return found.width, found.height
+    return None
 
 
 def _camera_file(value: Any) -> CameraCalibration | None:
     return _calibration(Path(value)) if isinstance(value, str) and value.endswith(".yaml") else None
 
 
-def _try_policy(config: PolicyConfig, size: tuple[int, int] | None) -> list[Finding]:
+def _policy_findings(config: PolicyConfig, size: tuple[int, int] | None) -> list[Finding]:
+    data, rows = _try_policy(config, size)
+    if data is None:
+        return rows
+    if data["ms"] > _POLICY_SLOW_MS:
+        rows.append(
+            Finding("policy", FAILURE, f"{data['ms']:.0f} ms for one image", "another computer, or an ONNX policy")
+        )
+    return [Finding("policy", OK, f"{config.policy}, {data['sha256'][:12]}, {data['ms']:.1f} ms for one image"), *rows]
+
+
+def _try_policy(config: PolicyConfig, size: tuple[int, int] | None) -> tuple[dict[str, Any] | None, list[Finding]]:
+    """Load a policy in a process of its own.
+
+    Args:
+        config: Of the policy node.
+        size: Width and height of the camera's images [px], if known.
+
+    Returns:
+        What the policy says of itself (None if it cannot be loaded), and a finding for each thing that does not fit.
+    """
     answer = in_child("policy", config.policy, config.sha256)
     if answer.data is None:
-        return [
-            Finding("policy", FAILURE, answer.trouble.partition(": ")[2] or answer.trouble, "params.policy names it")
-        ]
+        trouble = answer.trouble.partition(": ")[2] or answer.trouble
+        return None, [Finding("policy", FAILURE, trouble, "params.policy names it")]
     data, rows = answer.data, []
     if size is not None and tuple(data["size"]) != size:
         text = f"trained for {data['size'][0]} x {data['size'][1]}, the camera is calibrated for {size[0]} x {size[1]}"
@@ -182,11 +223,7 @@ def _try_policy(config: PolicyConfig, size: tuple[int, int] | None) -> list[Find
     if data["goal_size"] != len(config.goal):
         text = f"wants a goal of {data['goal_size']} numbers, got {len(config.goal)}"
         rows.append(Finding("policy", FAILURE, text, "set policy.goal"))
-    if data["ms"] > _POLICY_SLOW_MS:
-        rows.append(
-            Finding("policy", FAILURE, f"{data['ms']:.0f} ms for one image", "another computer, or an ONNX policy")
-        )
-    return [Finding("policy", OK, f"{config.policy}, {data['sha256'][:12]}, {data['ms']:.1f} ms for one image"), *rows]
+    return data, rows
 
 
 def _twin(asked: _Asked) -> list[Check]:

@@ -98,7 +98,7 @@ class LaunchFile(_Strict):
 
     Attributes:
         name: Name of the launch.
-        params: Values to use elsewhere as ``${name}``. Two always exist: ``${run_dir}``, and ``${socket_dir}``, a folder
+        params: Values to use elsewhere, in other parameters too, as ``${name}``. Two always exist: ``${run_dir}``, and ``${socket_dir}``, a folder
             whose path is short enough for Unix sockets however long that of the run folder is.
         nodes: The nodes, in the order in which they are started.
         record: Add a recorder of everything; true for the defaults.
@@ -147,7 +147,7 @@ def load_launch(
 
     Args:
         file: A ``*.launch.yaml`` file.
-        overrides: ``node.key=value`` for a node's configuration, ``params.name=value``, ``record=true``,
+        overrides: ``node.key=value`` for a node's configuration (``node.config.key`` where the key is also one of `NodeEntry`), ``params.name=value``, ``record=true``,
             ``hosts.name.key=value``, or ``keys=folder``.
         run_dir: What ``${run_dir}`` stands for.
         host: Which of the file's hosts this computer is, or ``all``; None where the file has none.
@@ -218,27 +218,48 @@ def _apply_override(document: Document, override: str) -> None:
         if "." not in name or not separator:
             raise ConfigError(f"--set {override}: expected NODE.KEY=VALUE")
         rest = name.split(".", 1)[1]
-        # `if` and the others beside `config` are about the process; everything else is the node's own configuration.
-        reserved = {f.alias or key for key, f in NodeEntry.model_fields.items()} - {"config"}
-        prefix = (head,) if rest.split(".")[0] in reserved else (head, "config")
+        prefix = (head,) if _is_about_the_process(rest, value, document, override) else (head, "config")
         apply_overrides(document, [f"{'.'.join((*prefix, rest))}={value}"], ("nodes",))
         document.places[("nodes", *prefix, *rest.split("."))] = f"--set {override}"
     else:
         raise ConfigError(f"--set {override}: no node called {head!r}; known are {', '.join(nodes)}, and params")
 
 
-def _substitute(value: Any, params: dict[str, Any], document: Document, key: tuple[str | int, ...]) -> Any:
+def _is_about_the_process(key: str, value: str, document: Document, override: str) -> bool:
+    """Whether a key of ``--set NODE.KEY`` is one of `NodeEntry`, such as ``if`` or ``config.rate_hz``, not of the node itself."""
+    if key.split(".")[0] not in {field.alias or name for name, field in NodeEntry.model_fields.items()}:
+        return False
+    hosts = document.data.get("hosts") or {}
+    if key != "host":
+        return True
+    # Some nodes have a key of this name, too: the address they listen on.
+    if hosts and value.strip() not in hosts:
+        node = override.split(".")[0].strip()
+        raise ConfigError(
+            f"--set {override}: expected the host that runs {node}, one of {', '.join(hosts)}, got {value.strip()}; "
+            f"the node's own key is {node}.config.host"
+        )
+    return bool(hosts)
+
+
+def _substitute(
+    value: Any, params: dict[str, Any], document: Document, key: tuple[str | int, ...], above: tuple[str, ...] = ()
+) -> Any:
+    """Put in the values of parameters, which may name others. ``above`` are the parameters that are being put in."""
     if isinstance(value, dict):
-        return {name: _substitute(item, params, document, (*key, name)) for name, item in value.items()}
+        return {name: _substitute(item, params, document, (*key, name), above) for name, item in value.items()}
     if isinstance(value, list):
-        return [_substitute(item, params, document, (*key, index)) for index, item in enumerate(value)]
+        return [_substitute(item, params, document, (*key, index), above) for index, item in enumerate(value)]
     if not isinstance(value, str):
         return value
 
     def lookup(name: str) -> Any:
         if name not in params:
             raise ConfigError(f"{document.place(key)}: unknown parameter ${{{name}}}; known are {', '.join(params)}")
-        return params[name]
+        if name in above:
+            circle = " -> ".join((*above, name))
+            raise ConfigError(f"{document.place(key)}: parameter {name} is made of itself: {circle}")
+        return _substitute(params[name], params, document, ("params", name), (*above, name))
 
     if whole := _REFERENCE.fullmatch(value):
         return lookup(whole[1])

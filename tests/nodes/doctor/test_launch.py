@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import typer
 import yaml
 
 from hardware.twin.config import CarConfig
@@ -217,15 +218,33 @@ def test_libraries_of_this_computer_answer(tmp_path):
     assert graphics.llvm()[0].state in (OK, ABSENT, WARNING)
 
 
-@pytest.mark.slow  # a policy in a process of its own, and every node
-def test_a_policy_is_loaded_and_timed(tmp_path):
+def saved_policy(file, width, height):
     from advnerf_core.driving.policy import PilotNet, save_policy
     from advnerf_core.driving.policy_view import PolicyView
     from advnerf_core.geometry import Pinhole
 
-    view = PolicyView(Pinhole(336, 188, 174.0, 174.0, 168.0, 94.0))
-    save_policy(tmp_path / "policy.safetensors", PilotNet(), view, {})
-    plan = plan_of("green_screen", f"params.policy={tmp_path / 'policy.safetensors'}")
+    save_policy(file, PilotNet(), PolicyView(Pinhole(width, height, 174.0, 174.0, width / 2, height / 2)), {})
+    return file
+
+
+def test_launch_check_says_which_policy_does_not_fit_the_camera(tmp_path, monkeypatch, capsys):
+    file = tmp_path / "policy.safetensors"
+    missing = plan_of("green_screen", f"params.policy={file}")
+    assert launch.policy_problems(missing) == [f"policy: {file} does not exist; --set params.policy=FILE names another"]
+    saved_policy(file, 400, 224)
+    (problem,) = launch.policy_problems(plan_of("green_screen", f"params.policy={file}"))
+    assert problem.startswith("policy: trained for 400 x 224, the camera is calibrated for 336 x 188; train for this")
+    monkeypatch.setattr("nodes.runtime.launch_check.check_nodes", lambda plan: {})
+    with pytest.raises(typer.Exit):
+        cli._say_problems(missing)
+    assert "trained for 400 x 224" in capsys.readouterr().err
+
+
+@pytest.mark.slow  # a policy in a process of its own, and every node
+def test_a_policy_is_loaded_and_timed(tmp_path):
+    file = saved_policy(tmp_path / "policy.safetensors", 336, 188)
+    plan = plan_of("green_screen", f"params.policy={file}")
+    assert launch.policy_problems(plan) == []
     rows = findings(plan, tmp_path, ("EGL", "VICON"))
     assert states(rows, "nodes") == [OK]
     assert states(rows, "policy")[0] == OK

@@ -221,6 +221,20 @@ def test_parameters_conditions_and_overrides(probe, tmp_path):
     assert list(load_launch(file, ["params.with_b=true"]).nodes) == ["a", "b"]
 
 
+def test_parameters_may_name_folders_of_the_run_and_other_parameters(probe, tmp_path):
+    file = tmp_path / "p.launch.yaml"
+    text = LAUNCH_TEXT.replace("in ${run_dir}", "${port}")
+    file.write_text(text.replace("  with_b: false", "  with_b: false\n  port: ${dev}/vesc\n  dev: ${run_dir}/dev"))
+    assert load_launch(file, (), "/run/x").documents["a"].data["then"] == "/run/x/dev/vesc"
+    set_ = load_launch(file, ["params.port=${run_dir}/other"], "/run/x")
+    assert set_.documents["a"].data["then"] == "/run/x/other"
+    assert set_.resolved["params"]["port"] == "/run/x/other"
+    with pytest.raises(
+        ConfigError, match=r"parameter (dev|port) is made of itself: (dev -> port -> dev|port -> dev -> port)"
+    ):
+        load_launch(file, ["params.dev=${port}/x"])
+
+
 def test_include_is_a_base_that_can_be_changed(probe, tmp_path):
     (tmp_path / "p.launch.yaml").write_text(LAUNCH_TEXT)
     file = tmp_path / "q.launch.yaml"

@@ -102,6 +102,19 @@ def test_host_of_a_file_without_hosts(launch_file):
         load_launch(launch_file(plain), host="robot")
 
 
+def test_set_reaches_a_nodes_own_key_host(launch_file):
+    plain = launch_file("name: plain\nnodes: {vicon: {module: nodes.vicon}}\n")
+    assert load_launch(plain, ["vicon.host=0.0.0.0"]).documents["vicon"].data["host"] == "0.0.0.0"
+    pair = launch_file()
+    plan = load_launch(pair, ["vicon.config.host=0.0.0.0"], host="robot")
+    assert plan.documents["vicon"].data["host"] == "0.0.0.0"
+    assert "vicon" in load_launch(pair, ["vicon.host=workstation"], host="workstation").nodes
+    with pytest.raises(
+        ConfigError, match=r"one of robot, workstation, got 0\.0\.0\.0; .* own key is vicon\.config\.host"
+    ):
+        load_launch(pair, ["vicon.host=0.0.0.0"], host="robot")
+
+
 WATCHED = """
 name: pair
 operator: robot
