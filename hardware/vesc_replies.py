@@ -36,10 +36,17 @@ LAYOUTS = {"A": _A, "B": _B, "C": _C, "D": _D, "E": _E, "F": _F, "G": _G}
 _FORMATS = {name: ">B" + "".join(code for _, code, _ in layout) for name, layout in LAYOUTS.items()}
 _GENERATION_OF_LENGTH = {struct.calcsize(text): name for name, text in _FORMATS.items()}
 
+# mc_fault_code in the firmware's datatypes.h, all 34 values at the head of its repository in 2026; older firmware has fewer.
 FAULT_NAMES = {
     0: "none", 1: "over voltage", 2: "under voltage", 3: "gate driver", 4: "over current", 5: "FETs too hot", 6: "motor too hot",
     7: "gate driver over voltage", 8: "gate driver under voltage", 9: "processor under voltage", 10: "booted by its watchdog",
-    11: "encoder",
+    11: "encoder SPI", 12: "encoder sine/cosine amplitude too small", 13: "encoder sine/cosine amplitude too large",
+    14: "flash corrupted", 15: "offset of current sensor 1 too high", 16: "offset of current sensor 2 too high",
+    17: "offset of current sensor 3 too high", 18: "phase currents unbalanced", 19: "brake hardware",
+    20: "resolver loss of tracking", 21: "resolver degradation of signal", 22: "resolver loss of signal",
+    23: "application configuration in flash corrupted", 24: "motor configuration in flash corrupted", 25: "encoder without magnet",
+    26: "encoder magnet too strong", 27: "phase filter", 28: "encoder", 29: "low-voltage output", 30: "encoder slipped",
+    31: "over speed", 32: "under speed", 33: "over the absolute speed limit",
 }  # fmt: skip
 
 

@@ -5,12 +5,13 @@ import shutil
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
 
 import pytest
 
 from benchmarks import host_pair, two_hosts
 from benchmarks.fault_stops import BrokenPromise
-from benchmarks.network import available
+from benchmarks.network import Cable, available
 from hardware.twin.vesc_firmware import WireEvent
 
 MS = 1_000_000
@@ -67,6 +68,18 @@ def test_what_is_finished_is_not_run_again(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not available() or not two_hosts.POLICY.exists(), reason="needs root, TUN devices and a policy")
+@pytest.mark.skipif(not available(), reason="needs root, TUN devices and iproute2")
 def test_a_stalled_link_stops_the_car():
-    assert two_hosts.measure("stall", two_hosts.POLICY)["met"]
+    circle = ("policy.module=benchmarks.straight_policy", "policy.speed_mps=0.8", "policy.steering_rad=0.2")
+    result = two_hosts.measure("stall", two_hosts.POLICY, circle)
+    assert result["met"], result
+
+
+def test_ten_short_drives_under_loss_are_no_drive(monkeypatch):
+    """Every stop was in time, but the car covered 5 of 32 m."""
+    stops = [{"brake_ms": 230.0, "why": "no command of the policy for 0.22 s"}] * 10
+    monkeypatch.setattr(two_hosts, "_drive", lambda pair, duration_s: (4.7, stops))
+    pair = SimpleNamespace(cable=Cable())
+    assert not two_hosts.CONDITIONS["loss_untuned"](pair)["met"]
+    monkeypatch.setattr(two_hosts, "_drive", lambda pair, duration_s: (30.7, stops[:1]))
+    assert two_hosts.CONDITIONS["loss_untuned"](pair)["met"]

@@ -6,6 +6,7 @@ import pytest
 
 from hardware.errors import ProtocolError
 from hardware.vesc_replies import (
+    FAULT_NAMES,
     LAYOUTS,
     FirmwareVersion,
     Values,
@@ -65,9 +66,16 @@ def test_other_lengths_are_refused(length):
 
 
 def test_unknown_fault_is_a_fault():
-    values = decode_values(put(73, OFFSETS["F"], 0, 0, 0, 33))
-    assert values.fault == 33
-    assert values.fault_name == "code 33"
+    values = decode_values(put(73, OFFSETS["F"], 0, 0, 0, 34))
+    assert values.fault == 34
+    assert values.fault_name == "code 34"
+
+
+def test_every_fault_of_the_firmware_has_a_name():
+    assert sorted(FAULT_NAMES) == list(range(34))
+    assert len(set(FAULT_NAMES.values())) == 34
+    names = {19: "brake hardware", 22: "resolver loss of signal", 27: "phase filter", 30: "encoder slipped"}
+    assert {code: decode_values(put(73, OFFSETS["F"], 0, 0, 0, code)).fault_name for code in names} == names
 
 
 def test_short_version_reply():

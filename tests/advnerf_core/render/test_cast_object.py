@@ -128,7 +128,9 @@ def test_weights_sum_to_alpha_and_edges_are_antialiased():
     np.testing.assert_allclose(np.asarray(cast.weights.sum(axis=1)).ravel(), cast.alpha, atol=1e-6)
     assert cast.weights.dtype == np.float32
     assert ((cast.alpha > 0.05) & (cast.alpha < 0.95)).any()
-    assert cast.nbytes > 0
+    # int64 pixels, float64 alpha and depth; CSR of float32 with int32 indices.
+    covered, weights = len(cast.pixels), cast.weights.nnz
+    assert cast.nbytes == covered * (8 + 8 + 8) + weights * (4 + 4) + (covered + 1) * 4
 
 
 def test_an_object_out_of_view_gives_an_empty_cast():
