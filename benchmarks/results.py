@@ -11,6 +11,7 @@ import fcntl
 import json
 import os
 import platform
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import datetime, timezone
@@ -23,6 +24,9 @@ from nodes.runtime.machine import memory_gib, processor_name
 REPOSITORY = Path(__file__).resolve().parents[1]
 LEDGER = REPOSITORY / "docs" / "results.json"
 PAGE = REPOSITORY / "docs" / "results.md"
+
+# An absolute path, but not the second half of a relative one, of a fraction or of a unit.
+MACHINE_PATH = re.compile(r"(?<![\w.~$}<)/])/(?:tmp|var|home|root|work|opt|mnt|media|Users)/\S*")
 
 
 def machine_description() -> str:
@@ -59,6 +63,10 @@ def record_row(
         ledger: Where the ledger is kept.
         page: Where the page is written.
     """
+    if found := MACHINE_PATH.search(f"{line} {value} {target} {command} {note}"):
+        raise ValueError(
+            f"expected a row without paths of this machine, got {found[0]!r} in {line!r}; name files relative to the project"
+        )
     row = {
         "line": line,
         "value": value,

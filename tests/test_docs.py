@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import typer
 
+from benchmarks.results import MACHINE_PATH, record_row
 from nodes.cli import app
 
 ROOT = Path(__file__).parents[1]
@@ -82,3 +83,27 @@ def test_results_hold_no_path_of_the_machine_they_were_made_on():
     files = [ROOT / "docs" / "results.json", *sorted((ROOT / "docs" / "results").rglob("*.json"))]
     assert len(files) > 100
     assert [str(file) for file in files if re.search(r'"/\w+/', file.read_text())] == []
+    texts = (ROOT / "docs" / "results.json").read_text(), (ROOT / "docs" / "results.md").read_text()
+    assert [found for text in texts if (found := MACHINE_PATH.search(text))] == []
+
+
+@pytest.mark.parametrize(
+    ("text", "path"),
+    [
+        ("31 minutes, samples in /tmp/advnerf-v1gdx9lg; worst: recorder", "/tmp/advnerf-v1gdx9lg;"),
+        ("git clone . /tmp/clone", "/tmp/clone"),
+        ("kept in (/home/ada/runs)", "/home/ada/runs)"),
+        ("python -m benchmarks.objects runs/full", None),
+        ("drives/home and 3/4 of ../tmp/x, ~/work/x", None),
+    ],
+)
+def test_paths_of_a_machine_are_noticed_anywhere_in_a_row(tmp_path, text, path):
+    found = MACHINE_PATH.search(text)
+    assert (found and found[0]) == path
+    ledger = {"ledger": tmp_path / "r.json", "page": tmp_path / "r.md"}
+    if path is None:
+        record_row("#0 a", 1, "m", "", None, text, **ledger)
+        return
+    with pytest.raises(ValueError, match="without paths of this machine"):
+        record_row("#0 a", 1, "m", "", None, "command", text, **ledger)
+    assert not ledger["ledger"].exists()
