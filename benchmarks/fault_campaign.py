@@ -1,7 +1,8 @@
 """Does the car stop, whatever happens? ``python -m benchmarks.fault_campaign`` (200 faults, about 40 minutes, real time; resumes).
 
 Random faults at random moments while the green-screen graph drives the simulated car at 0.8 m/s: every node killed and stopped, the
-supervisor killed, the camera frozen, VICON lost in each of its forms, serial garbage, an unplugged controller, a policy that
+supervisor killed, the camera frozen, VICON lost in each of its forms, measured in two places,
+a car that is held fast, serial garbage, an unplugged controller, a policy that
 floods the bus or sends what is no number. Nodes that die are started again, so that what must not happen can happen: a successor,
 or a node that wakes up, moving the car. What counts is what the motor controller reads at its end of the wire. Every finished
 fault is a file in ``runs/fault_campaign``; a campaign that was interrupted goes on with the next one.
@@ -38,12 +39,15 @@ FAULTS = (
     *(f"kill {name}" for name in (*VICTIMS, "supervisor")),
     *(f"hang {name}" for name in VICTIMS),
     *("camera silent", "camera repeated", "vicon missing", "vicon zeros", "vicon nan", "vicon frozen"),
+    *("vicon two_senders", "vicon jump", "car jammed"),
     *("wire garbage", "wire bad_crc", "wire silent", "usb unplug", "policy flood", "policy nan"),
 )
 START = (-1.1, -2.0, 0.0)
 SEED, COUNT, LIMIT_MS = 20261121, 200, 350.0
 STOP_S, AFTER_S = 1.6, 1.2
 VICON_PORT = 51087
+# What is seen only in what does not happen: the car must be at rest for a second before it counts as stalled.
+SLOW_LIMITS_MS = {"car jammed": 1400.0}
 _STOPS = ("SET_CURRENT_BRAKE", "TIMEOUT")
 _RULE = "{max_restarts: 1000, delay_s: 0.2, max_delay_s: 0.2}"
 _RESPAWNING = (
@@ -204,8 +208,8 @@ def run(folder: Path, count: int) -> list[dict[str, Any]]:
     try:
         for number, (fault, drive_s) in enumerate(plan(count)):
             file = folder / f"{number:03d}.json"
-            if file.exists():
-                continue
+            if file.exists() and json.loads(file.read_text())["fault"] == fault:
+                continue  # done; a file of another plan is not
             if graph is None:
                 graph = Graph(Path(tempfile.mkdtemp(prefix="advnerf-")))
             try:
@@ -230,7 +234,8 @@ def report(results: list[dict[str, Any]], record: bool) -> None:
     """Print the worst, and write the rows."""
     broken = [r for r in results if "broken" in r]
     good = [r for r in results if "broken" not in r]
-    slowest, longest = max(good, key=lambda r: r["stop_ms"]), max(good, key=lambda r: r["distance_m"])
+    longest = max(good, key=lambda r: r["distance_m"])
+    slowest = max((r for r in good if r["fault"] not in SLOW_LIMITS_MS), key=lambda r: r["stop_ms"])
     print(f"stopped in {len(good)} of {len(results)}; slowest {slowest}; longest {longest}; broken: {broken}")
     if not record:
         return
@@ -240,8 +245,14 @@ def report(results: list[dict[str, Any]], record: bool) -> None:
     )  # fmt: skip
     record_row(
         "#4 fault campaign: worst time from fault to brake at the controller", round(slowest["stop_ms"]), "ms", f"<= {LIMIT_MS:g} ms",
-        slowest["stop_ms"] <= LIMIT_MS, COMMAND, f"{slowest['fault']}, by {slowest['by']}",
+        slowest["stop_ms"] <= LIMIT_MS, COMMAND, f"{slowest['fault']}, by {slowest['by']}; without {', '.join(SLOW_LIMITS_MS)}",
     )  # fmt: skip
+    for fault, limit_ms in SLOW_LIMITS_MS.items():
+        if times := [r["stop_ms"] for r in good if r["fault"] == fault]:
+            record_row(
+                f"#4 fault campaign: worst time from '{fault}' to brake at the controller", round(max(times)), "ms", f"<= {limit_ms:g} ms",
+                max(times) <= limit_ms, COMMAND, f"of {len(times)}; a stall is a second without motion",
+            )  # fmt: skip
     record_row(
         "#4 fault campaign: worst stopping distance at 0.8 m/s", round(longest["distance_m"], 2), "m", "-", None, COMMAND,
         f"{longest['fault']}, by {longest['by']}",

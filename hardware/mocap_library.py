@@ -51,7 +51,7 @@ class LibraryConfig:
 
 
 class LibraryReceiver:
-    """The same seam as `hardware.vicon.ViconReceiver`: `read`, `counts`, `close`."""
+    """The same seam as `hardware.vicon.ViconReceiver`: `read`, `counts`, `fault`, `close`."""
 
     def __init__(self, config: LibraryConfig) -> None:
         self.config = config
@@ -74,6 +74,11 @@ class LibraryReceiver:
     def source(self) -> str:
         """Where poses come from, for a person."""
         return f"{self.config.system} at {self.config.hostname}"
+
+    def fault(self, mono_ns: int) -> str:
+        """Always empty: the library talks to one system, and numbers its frames itself."""
+        del mono_ns
+        return ""
 
     def read(self, timeout_s: float) -> list[SubjectPose]:
         """Trusted poses of the frames that have come, oldest first; empty if none came within ``timeout_s``."""

@@ -2,7 +2,8 @@
 
 The stream has no time stamp and no documented sign of occlusion. Poses are therefore stamped on receipt (by the kernel where it
 can) and taken as lost in every form seen in the field: object missing, exact zeros, not a number, or the same bits over and over,
-which a real, noisy measurement never gives.
+which a real, noisy measurement never gives. A subject that two senders measure, or whose frame numbers go back and forth, is a
+fault: its poses are withheld until only one of them is heard.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from dataclasses import dataclass, field
 from advnerf_core.geometry import Array
 from hardware.errors import DeviceBusy, ProtocolError
 from hardware.vicon_codec import decode_block
+from hardware.vicon_senders import Address, SenderWatch
 
 DEFAULT_PORT = 51001
 _SO_TIMESTAMPNS = 35  # Linux: real time of arrival as ancillary data; Python has no name for it
@@ -28,6 +30,10 @@ _MOST_DATAGRAMS = 200  # per read: a flood must not keep the reader in there
 # Frames that arrive this much late are reordered datagrams; anything further back is a restarted Tracker.
 _REORDER_WINDOW_FRAMES = 50
 _RESTART_SILENCE_S = 0.1
+# Strangers may send to the port too: so many of them are told apart.
+_MOST_STREAMS = 16
+_NO_SENDER: Address = ("", 0)
+_NUMBERS = struct.Struct("<6d")
 
 
 @dataclass(frozen=True)
@@ -79,6 +85,7 @@ class ViconCounts:
     late: int = 0
     missed_frames: int = 0
     restarts: int = 0
+    disputed: int = 0
     lost: dict[str, int] = field(default_factory=dict)
 
 
@@ -89,25 +96,37 @@ class _Subject:
     repeats: int = 0
 
 
+@dataclass
+class _Stream:
+    frame_number: int
+    mono_ns: int
+
+
 class SubjectTracker:
-    """Decides which measurements are new and real. Pure: time comes as an argument."""
+    """Decides which measurements are new, real, and of one system. Pure: time comes as an argument."""
 
     def __init__(self, config: ViconConfig) -> None:
         self.config = config
         self.counts = ViconCounts(lost=dict.fromkeys(config.subjects, 0))
+        self.senders = SenderWatch(config.subjects)
         self._subjects = {name: _Subject() for name in config.subjects}
-        self._frame_number: int | None = None
-        self._frame_mono_ns = 0
+        self._streams: dict[Address, _Stream] = {}
 
-    def update(self, datagram: bytes, stamp_real_ns: int, mono_ns: int) -> list[SubjectPose]:
-        """Poses of one datagram that are fresh and not lost."""
+    def update(
+        self, datagram: bytes, stamp_real_ns: int, mono_ns: int, sender: Address = _NO_SENDER
+    ) -> list[SubjectPose]:
+        """Poses of one datagram that are fresh, not lost, and of subjects that only this sender measures."""
         self.counts.datagrams += 1
         try:
             block = decode_block(datagram)
         except ProtocolError:
             self.counts.refused += 1
             return []
-        if not self._accept_frame(block.frame_number, mono_ns):
+        new = self._accept_frame(block.frame_number, mono_ns, sender)
+        for item in block.objects:
+            numbers = _NUMBERS.pack(*item.translation_mm, *item.rotation_rad)
+            self.senders.measured(item.name, sender, block.frame_number, numbers, mono_ns)
+        if not new:
             self.counts.late += 1
             return []
         stamp = stamp_real_ns - round(self.config.latency_s * 1e9)
@@ -116,19 +135,29 @@ class SubjectTracker:
             for item in block.objects
             if self.is_real(block.frame_number, item.name, (*item.translation_mm, *item.rotation_rad))
         ]
-        return [SubjectPose(item.name, item.T_world_from_subject, block.frame_number, stamp, mono_ns) for item in seen]
+        trusted = [item for item in seen if not self.senders.fault(item.name, mono_ns)]
+        self.counts.disputed += len(seen) - len(trusted)
+        return [
+            SubjectPose(item.name, item.T_world_from_subject, block.frame_number, stamp, mono_ns) for item in trusted
+        ]
 
-    def _accept_frame(self, frame_number: int, mono_ns: int) -> bool:
-        last, silence_s = self._frame_number, (mono_ns - self._frame_mono_ns) / 1e9
-        step = 0 if last is None else (frame_number - last + 2**31) % 2**32 - 2**31  # over the wrap of u32
+    def _accept_frame(self, frame_number: int, mono_ns: int, sender: Address) -> bool:
+        # The oldest go first: a sender that is heard moves to the end.
+        stream = self._streams.pop(sender, None) or _Stream(frame_number, mono_ns)
+        self._streams[sender] = stream
+        while len(self._streams) > _MOST_STREAMS:
+            del self._streams[next(iter(self._streams))]
+        last, silence_s = stream.frame_number, (mono_ns - stream.mono_ns) / 1e9
+        step = (frame_number - last + 2**31) % 2**32 - 2**31  # over the wrap of u32
         if -_REORDER_WINDOW_FRAMES <= step < 0 and silence_s < _RESTART_SILENCE_S:
             return False
         if step < 0 or step > 10 * _REORDER_WINDOW_FRAMES:
             self.counts.restarts += 1
             self._subjects = {name: _Subject() for name in self._subjects}
+            self.senders.leapt(sender, last, frame_number, silence_s, mono_ns)
         else:
             self.counts.missed_frames += max(0, step - 1)
-        self._frame_number, self._frame_mono_ns = frame_number, mono_ns
+        stream.frame_number, stream.mono_ns = frame_number, mono_ns
         return True
 
     def is_real(self, frame_number: int, name: str, numbers: tuple[float, ...]) -> bool:
@@ -168,6 +197,10 @@ class ViconReceiver:
         """Where poses come from, for a person."""
         return f"UDP port {self.port}"
 
+    def fault(self, mono_ns: int) -> str:
+        """Which subjects are not to be trusted now, and why; empty if all are. Any thread."""
+        return self._tracker.senders.faults(mono_ns)
+
     def read(self, timeout_s: float) -> list[SubjectPose]:
         """Trusted poses of all datagrams that have come, oldest first; empty if none came within ``timeout_s``."""
         if not select.select([self._socket], [], [], timeout_s)[0]:
@@ -179,7 +212,7 @@ class ViconReceiver:
             except BlockingIOError:
                 break
             if self.config.source in (None, address[0]):
-                poses += self._tracker.update(data, *_arrival(ancillary))
+                poses += self._tracker.update(data, *_arrival(ancillary), address)
         return poses
 
     def close(self) -> None:

@@ -6,7 +6,9 @@ Pure: time and messages come as arguments.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Protocol
 
 from nodes.arming_gates import ClockGate, HandGate, edge_distance_m, inside
 from nodes.runtime.clock import NS_PER_S
@@ -50,6 +52,14 @@ class ArmingLimits:
     arm_age_s: float = 1.0
 
 
+class Gate(Protocol):
+    """A check that stands on its own."""
+
+    def problem(self, mono_ns: int) -> str:
+        """Why the car may not move; empty if it may."""
+        ...
+
+
 @dataclass
 class _Source:
     """Something that must keep coming."""
@@ -89,12 +99,14 @@ class Arming:
         peer: What the motor controller says it is.
         hand: Who holds the button.
         clocks: Clocks of other hosts.
+        gates: Further checks, in this order, after all others but the fence.
         driver: Whose commands pass; the next one in line may not stand in for it when it falls silent.
     """
 
     limits: ArmingLimits
     hand: HandGate = field(default_factory=HandGate)
     clocks: ClockGate = field(default_factory=ClockGate)
+    gates: Sequence[Gate] = ()
     armed: bool = False
     reason: str = "nobody has armed"
     source: str = ""
@@ -234,7 +246,7 @@ class Arming:
                 return f"{what} from the process that was armed with: it was restarted"
             if (age_s := source.age_s(mono_ns)) > limit_s:
                 return f"{what} yet" if math.isinf(age_s) else f"{what} for {age_s:.2f} s"
-        return self._fence_problem()
+        return next(filter(None, (gate.problem(mono_ns) for gate in self.gates)), "") or self._fence_problem()
 
     def drive_age_s(self, mono_ns: int) -> float:
         """Age of the newest command [s]."""

@@ -8,16 +8,18 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from calibration.schema import RoomCalibration, load_calibration
+from calibration.schema import RoomCalibration, VehicleCalibration, load_calibration
 from nodes.arming import Arming, ArmingLimits
 from nodes.arming_gates import ClockGate, HandGate, inside, require_simple
+from nodes.pose_check import MotionBounds, PoseCheck, PoseGate
 from nodes.runtime.clock import NS_PER_S
-from nodes.runtime.errors import ConfigError
-from nodes.runtime.messages import drive_message, header, ns_from_stamp, types
+from nodes.runtime.errors import ConfigError, MessageError
+from nodes.runtime.messages import drive_message, header, ns_from_stamp, pose_matrix, types
 from nodes.runtime.node import ACTIVE, READY, MessageInfo, Node, NodeContext, Now, Out, run_node_main
 from nodes.runtime.topics import STATUS_PREFIX, status_topic
+from nodes.stall_check import StallGate, StallLimits
 
 _TICK_RATE_HZ = 50.0
 _STOP_PERIOD_S = 0.04
@@ -29,6 +31,7 @@ class SafetyConfig(BaseModel):
 
     Attributes:
         room: Room calibration file: the fence.
+        vehicle: Vehicle calibration file: what motion of the car is possible.
         nodes: Nodes whose status must be fresh and good.
         drivers: Who may command, first the one that goes before the others: expert, policy.
         teleop: ``hold``: the car moves only while somebody holds a button (see the teleop node); ``none``: once armed.
@@ -44,11 +47,26 @@ class SafetyConfig(BaseModel):
         pose_age_limit_s: Oldest pose of the car [s].
         status_age_limit_s: Oldest status of a node [s].
         held_up_limit_s: A pause of this process after which it disarms [s].
+        motion_margin: A motion this many times faster than the limits of the vehicle calibration disarms. 1.25: gains are a few
+            per cent off, a speed controller overshoots, and no car is ever a quarter faster than it is told.
+        pose_noise_m: What noise may add to the way between two poses [m]. 5 mm is seven standard deviations of the difference of
+            two positions with 0.5 mm each: no false stop in years at 100 Hz.
+        pose_noise_rad: The same for the turn [rad]: seven standard deviations with 1 mrad each.
+        stall_command_mps: A car that is commanded slower than this is not watched for a stall [m/s]. A VESC stands below 0.2 m/s
+            (its smallest speed in closed loop), and starts roughly just above it.
+        stall_speed_mps: A car slower than this does not move [m/s]: a third of the slowest command that is watched, ten times the
+            noise of the measurement.
+        stall_time_s: A car that is commanded to move and does not is stalled after this time [s]. A standing start needs 0.1 s
+            for the command's way, 0.1 s for the slope of the speed (3.5 m/s^2 up to 0.3 m/s), 0.15 s for the motor's lag and
+            up to 0.5 s where a motor without sensors finds its rotor.
+        stall_sources: What measures the motion: motion capture, the motor controller's rpm; either at rest is a stall. On a
+            stand, where the wheels turn and the car does not move, only ``erpm``.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     room: Path
+    vehicle: Path
     nodes: tuple[str, ...] = ("camera", "vicon", "compositor", "policy", "motor")
     drivers: tuple[Literal["expert", "policy"], ...] = Field(default=("policy",), min_length=1)
     teleop: Literal["none", "hold"] = "none"
@@ -64,6 +82,34 @@ class SafetyConfig(BaseModel):
     pose_age_limit_s: float = Field(default=0.2, gt=0.0, le=0.25)
     status_age_limit_s: float = Field(default=1.0, gt=0.2)
     held_up_limit_s: float = Field(default=0.2, gt=0.04, le=0.25)
+    motion_margin: float = Field(default=1.25, ge=1.0, le=3.0)
+    pose_noise_m: float = Field(default=0.005, gt=0.0, le=0.05)
+    pose_noise_rad: float = Field(default=0.01, gt=0.0, le=0.1)
+    stall_command_mps: float = Field(default=0.3, gt=0.0)
+    stall_speed_mps: float = Field(default=0.1, gt=0.0)
+    stall_time_s: float = Field(default=1.0, ge=0.3, le=10.0)
+    stall_sources: tuple[Literal["mocap", "erpm"], ...] = Field(default=("mocap", "erpm"), min_length=1)
+
+    @model_validator(mode="after")
+    def _stall_is_slower_than_its_command(self) -> SafetyConfig:
+        if self.stall_speed_mps >= self.stall_command_mps:
+            raise ValueError(
+                f"expected stall_speed_mps below stall_command_mps, got {self.stall_speed_mps} and {self.stall_command_mps}:"
+                " every drive would be a stall"
+            )
+        return self
+
+    def poses(self, car: VehicleCalibration) -> PoseGate:
+        """The check of the car's poses."""
+        bounds = MotionBounds.of_car(
+            car.drive_limits, car.wheelbase_m, self.motion_margin, self.pose_noise_m, self.pose_noise_rad
+        )
+        return PoseGate(PoseCheck(bounds))
+
+    def stall(self) -> StallGate:
+        """The check for a car that does not move."""
+        limits = StallLimits(self.stall_command_mps, self.stall_speed_mps, self.stall_time_s, self.stall_sources)
+        return StallGate(limits)
 
     def limits(self, room: RoomCalibration) -> ArmingLimits:
         """Numbers for the state machine; a fence that would never let the car drive is refused."""
@@ -80,20 +126,33 @@ class SafetyConfig(BaseModel):
 
 
 class SafetyNode(Node):
-    """Connects the arming state machine with the bus."""
+    """Connects the arming state machine with the bus.
+
+    Args:
+        limits: Numbers of the checks.
+        poses: The check of the car's poses.
+        stall: The check for a car that does not move.
+        hand: Who holds the button.
+        clocks: Clocks of other hosts.
+    """
 
     publications = ("/safety/drive", "/safety/state")
     tick_rate_hz = _TICK_RATE_HZ
 
-    def __init__(self, limits: ArmingLimits, hand: HandGate | None = None, clocks: ClockGate | None = None) -> None:
-        self._arming = Arming(limits, hand or HandGate(), clocks or ClockGate())
+    def __init__(
+        self, limits: ArmingLimits, poses: PoseGate, stall: StallGate, hand: HandGate | None = None,
+        clocks: ClockGate | None = None,
+    ) -> None:  # fmt: skip
+        self._arming = Arming(limits, hand or HandGate(), clocks or ClockGate(), (poses, stall))
+        self._poses, self._stall = poses, stall
         self._topic_of = {f"/{driver}/drive": driver for driver in limits.drivers}
         self._stopped_ns = 0
         self._stated_ns = 0
         self._stated_armed: bool | None = None
         self._stops = 0
         self.subscriptions = (
-            "/arm", "/teleop/state", "/clock/offset", "/camera/camera_info", "/vicon/car", "/motor/sent", *self._topic_of,
+            "/arm", "/teleop/state", "/clock/offset", "/camera/camera_info", "/vicon/car", "/motor/sent", "/motor/state",
+            *self._topic_of,
             *map(status_topic, limits.nodes),
         )  # fmt: skip
 
@@ -103,7 +162,9 @@ class SafetyNode(Node):
         del context  # it needs no clock of its own
         hand = HandGate(config.teleop == "hold", config.teleop_age_limit_s)
         clocks = ClockGate(config.clock_offset_limit_s, config.clock_error_limit_s, config.clock_peers)
-        return cls(config.limits(load_calibration(RoomCalibration, config.room)), hand, clocks)
+        limits = config.limits(load_calibration(RoomCalibration, config.room))
+        poses = config.poses(load_calibration(VehicleCalibration, config.vehicle))
+        return cls(limits, poses, config.stall(), hand, clocks)
 
     def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
         """Note what came; pass a command on if it may pass."""
@@ -119,9 +180,11 @@ class SafetyNode(Node):
         elif topic == "/camera/camera_info":
             arming.heard_camera(info)
         elif topic == "/vicon/car":
-            arming.heard_car(float(message.pose.position.x), float(message.pose.position.y), info)
+            self._see_car(message, info, now)
         elif topic == "/motor/sent":
             arming.peer = str(message.peer)
+        elif topic == "/motor/state":
+            self._stall.motor(float(message.speed_mps), now.mono_ns)
         elif topic.startswith(STATUS_PREFIX):
             arming.heard_status(topic.removeprefix(STATUS_PREFIX), str(message.state), str(message.text), info)
         arming.check(now.mono_ns)
@@ -144,22 +207,34 @@ class SafetyNode(Node):
 
     def counters(self) -> dict[str, float]:
         """How often it had to stop the car."""
-        return {"disarmed": self._stops}
+        return {"disarmed": self._stops, "impossible_poses": self._poses.count}
+
+    def _see_car(self, message: Any, info: MessageInfo, now: Now) -> None:
+        x_m, y_m = float(message.pose.position.x), float(message.pose.position.y)
+        self._arming.heard_car(x_m, y_m, info)
+        self._stall.pose(x_m, y_m, now.mono_ns)
+        try:
+            self._poses.heard(ns_from_stamp(message.header.stamp), pose_matrix(message), info)
+        except MessageError as error:
+            self._poses.refuse(str(error), info)
 
     def _hand(self, message: Any, info: MessageInfo, now: Now) -> list[Out]:
         speed, steering = float(message.speed_mps), float(message.steering_rad)
         passes = self._arming.heard_hand(
             str(message.mode), bool(message.estop), speed, steering, info, now.mono_ns
         )  # fmt: skip
-        drive = [Out("/safety/drive", drive_message(speed, steering, now.real_ns))] if passes else []
-        return self._news(now) + drive
+        return self._news(now) + ([self._go(speed, steering, now.real_ns, now)] if passes else [])
 
     def _pass_on(self, driver: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
         drive, capture_ns = message.drive, ns_from_stamp(message.header.stamp)
         speed, steering = float(drive.speed), float(drive.steering_angle)
         if self._arming.heard_drive(speed, steering, capture_ns, info, now.mono_ns, now.real_ns, driver):
-            return [Out("/safety/drive", drive_message(speed, steering, capture_ns))]
+            return [self._go(speed, steering, capture_ns, now)]
         return self._news(now)
+
+    def _go(self, speed_mps: float, steering_rad: float, stamp_ns: int, now: Now) -> Out:
+        self._stall.commanded(speed_mps, now.mono_ns)
+        return Out("/safety/drive", drive_message(speed_mps, steering_rad, stamp_ns))
 
     def _obey(self, message: Any, info: MessageInfo, now: Now) -> None:
         if message.arm:
@@ -178,6 +253,7 @@ class SafetyNode(Node):
 
     def _stop(self, now: Now) -> Out:
         self._stopped_ns = now.mono_ns
+        self._stall.stopped()
         return Out("/safety/drive", drive_message(0.0, 0.0, now.real_ns))
 
     def _state(self, now: Now) -> Out:

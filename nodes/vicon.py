@@ -84,6 +84,7 @@ class ViconNode(Node):
         self._seen_ns: dict[str, int] = {}
         self._now_ns = time.monotonic_ns
         self._stale = 0
+        self._read_fault = ""
 
     @classmethod
     def build(cls, config: ViconNodeConfig, context: NodeContext) -> ViconNode:
@@ -115,8 +116,10 @@ class ViconNode(Node):
         return outs
 
     def status(self) -> tuple[str, str]:
-        """Fault while the first subject is not seen."""
+        """Fault while the first subject is not seen, or any of them has two senders."""
         now_ns, first = self._now_ns(), self._config.subjects[0]
+        if fault := self._receiver.fault(now_ns):
+            return FAULT, fault
         lost = [name for name in self._config.subjects if self._silence_s(name, now_ns) > self._config.silence_s]
         text = f"not seen: {', '.join(lost)}" if lost else ""
         if first not in self._seen_ns:
@@ -131,7 +134,7 @@ class ViconNode(Node):
         counts = self._receiver.counts
         totals: dict[str, float] = {
             "datagrams": counts.datagrams, "refused": counts.refused, "late": counts.late, "stale": self._stale,
-            "frames_missed": counts.missed_frames, "restarts": counts.restarts,
+            "frames_missed": counts.missed_frames, "restarts": counts.restarts, "disputed": counts.disputed,
         }  # fmt: skip
         return totals | {f"lost {name}": float(count) for name, count in counts.lost.items()}
 
@@ -141,7 +144,10 @@ class ViconNode(Node):
         self._receiver.close()
 
     def _read(self) -> list[SubjectPose] | None:
-        return self._receiver.read(_READ_TIMEOUT_S) or None
+        poses = self._receiver.read(_READ_TIMEOUT_S)
+        before, self._read_fault = self._read_fault, self._receiver.fault(time.monotonic_ns())
+        # A fault withholds the poses: the node must wake up to say so.
+        return poses if poses or self._read_fault != before else None
 
     def _silence_s(self, name: str, now_ns: int) -> float:
         return (now_ns - self._seen_ns.get(name, 0)) / NS_PER_S

@@ -32,6 +32,7 @@ from hardware.twin.vicon_emulator import ViconEmulator, ViconEmulatorConfig
 # A stall longer than this (a suspended laptop) is not driven through blindly.
 _LONGEST_STEP_S = 0.5
 _HISTORY_S = 2.0
+_HELD_UP_S = 0.2
 CAMERA_FAULTS = ("silent", "repeated")
 
 
@@ -255,7 +256,8 @@ class LiveLab:
             lab.set_monitor_image(shown)
 
     def _subject_poses(self, mono_ns: int) -> dict[str, Array]:
-        state = self._history.at(mono_ns, wait_s=0.01) or self.state
+        # Physics that is held up makes poses late, never wrong: an old state with a new stamp would be a car that leaps afterwards.
+        state = self._history.at(mono_ns, wait_s=_HELD_UP_S) or self.state
         return {
             "car": np.asarray(state.T_world_from_car),
             "board": self.config.lab.board.T_world_from_face,

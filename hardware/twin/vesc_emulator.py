@@ -116,6 +116,11 @@ class VescEmulator:
             self.vehicle.reset(x_m, y_m, yaw_rad)
             self._note([WireEvent(time.monotonic_ns(), "PLACED")])
 
+    def jam(self, how: str | None) -> None:
+        """Hold the car where it is, as `TwinVehicle.jam` does; None lets it go."""
+        with self._lock:
+            self.vehicle.jam(how)
+
     def disturb(self, fault: str | None) -> None:
         """Let replies reach the computer with a fault of `WIRE_FAULTS`; None heals the wire."""
         require_wire_fault(fault)

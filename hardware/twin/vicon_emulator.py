@@ -20,6 +20,7 @@ from hardware.twin.pacing import Pacer
 from hardware.vicon_codec import ObjectPose, encode_blocks, object_pose
 
 OCCLUSION_FORMS = ("missing", "zeros", "nan", "frozen")
+_NOWHERE_ELSE = np.eye(4)
 
 
 class ViconEmulatorConfig(BaseModel):
@@ -65,6 +66,7 @@ class ViconFrames:
         self._network = np.random.default_rng([config.seed, 1])
         self._held_back: list[bytes] = []
         self._occluded: dict[str, str] = {}
+        self._displaced: dict[str, Array] = {}
         self._last: dict[str, ObjectPose] = {}
 
     def occlude(self, name: str, form: str | None) -> None:
@@ -76,11 +78,18 @@ class ViconFrames:
         else:
             raise ValueError(f"expected a form of occlusion of {', '.join(OCCLUSION_FORMS)}, got {form!r}")
 
+    def displace(self, name: str, T_there_from_true: Array | None) -> None:
+        """Measure a subject elsewhere, moved by a transform ``[4, 4]`` in the world; None measures the truth again."""
+        if T_there_from_true is None:
+            self._displaced.pop(name, None)
+        else:
+            self._displaced[name] = np.array(T_there_from_true, dtype=np.float64)
+
     def next(self, T_world_from_subject: Mapping[str, Array]) -> list[bytes]:
         """Datagrams of the next frame for true poses ``[4, 4]`` [m]."""
         objects = []
         for name, T in T_world_from_subject.items():
-            if (item := self._seen(name, T)) is not None:
+            if (item := self._seen(name, self._displaced.get(name, _NOWHERE_ELSE) @ T)) is not None:
                 self._last[name] = item
                 objects.append(item)
         if self.config.shuffle:
@@ -148,6 +157,11 @@ class ViconEmulator:
         """Hide a subject in one of `OCCLUSION_FORMS`, or show it again with None."""
         with self._lock:
             self._frames.occlude(name, form)
+
+    def displace(self, name: str, T_there_from_true: Array | None) -> None:
+        """Measure a subject elsewhere, moved by a transform ``[4, 4]`` in the world; None measures the truth again."""
+        with self._lock:
+            self._frames.displace(name, T_there_from_true)
 
     def restart(self) -> None:
         """Begin to count frames from 0, as Tracker does when it is started again."""

@@ -69,6 +69,7 @@ class NodeLoop:
         # in between, in the same thread, so the lock can be taken twice.
         self._ending = threading.RLock()
         self._refusals: dict[str, str] = {}
+        self._stated = ""
         start_ns = clock.now().mono_ns
         self._status_schedule = Schedule(STATUS_RATE_HZ, start_ns)
         self._tick_schedule = Schedule(node.tick_rate_hz, start_ns) if node.tick_rate_hz else None
@@ -103,8 +104,10 @@ class NodeLoop:
             now = self._clock.now()
             if self._tick_schedule is not None and self._tick_schedule.due(now.mono_ns):
                 self._publish(self._node.tick(now))
-            if self._status_schedule.due(now.mono_ns):
-                self.publish_status(now, *self._node.status())
+            state, text = self._node.status()
+            # A change of state is said at once: the safety node waits for it, and its reason is better than a silence.
+            if self._status_schedule.due(now.mono_ns) or state != self._stated:
+                self.publish_status(now, state, text)
 
     def close(self) -> None:
         """Give the loop's own file descriptors back, after the bus is closed; `stop` does nothing from then on."""
@@ -115,6 +118,7 @@ class NodeLoop:
 
     def publish_status(self, now: Now, state: str, text: str) -> None:
         """Send a sign of life with everything countable."""
+        self._stated = state
         counters = self._counters()
         publications = list(self._node.publications)
         status = types.NodeStatus(

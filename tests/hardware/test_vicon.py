@@ -144,11 +144,11 @@ def test_wrap_of_the_frame_number():
     assert (feed.tracker.counts.restarts, feed.tracker.counts.missed_frames) == (0, 0)
 
 
-@pytest.mark.parametrize(("before", "after_s"), [(100_000, 0.01), (20, 2.0)])
-def test_restart_of_tracker(before, after_s):
+@pytest.mark.parametrize("before", [100_000, 20])
+def test_restart_of_tracker(before):
     feed = Feed()
     feed(at(before))
-    assert len(feed(at(1, x=2.0), after_s=after_s)) == 1
+    assert len(feed(at(1, x=2.0), after_s=2.0)) == 1
     assert feed.tracker.counts.restarts == 1
 
 
@@ -229,8 +229,8 @@ def test_an_occluded_subject_is_lost_and_the_other_is_not(form):
         for datagram in emulator.next(
             {"car": planar_pose(0.01 * frame, 1.0, 0.0), "board": planar_pose(3.0, 1.0, 0.0)}
         ):
-            # A restart takes Tracker longer than the network takes to overtake itself.
-            seen += [(frame, p.name) for p in feed(datagram, after_s=0.01 if frame != 50 else 0.5)]
+            # A restart takes Tracker seconds.
+            seen += [(frame, p.name) for p in feed(datagram, after_s=0.01 if frame != 50 else 2.0)]
     assert [f for f, name in seen if name == "board"] == list(range(60))
     hidden = [f for f in range(60) if (f, "car") not in seen]
     assert hidden == list(range(24 if form == "frozen" else 20, 40))

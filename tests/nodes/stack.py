@@ -47,7 +47,7 @@ class Stack(LiveOperator):
             "vicon": {"port": port, "subjects": ["car", "board"]},
             "compositor": {"camera": str(CALIBRATION / "camera.yaml"), "target": str(CALIBRATION / "board.yaml")},
             "policy": {"speed_mps": 0.8},
-            "safety": {"room": str(CALIBRATION / "room.yaml")},
+            "safety": {"room": str(CALIBRATION / "room.yaml"), "vehicle": str(CALIBRATION / "vehicle.yaml")},
             "motor": {"port": str(run_dir / "vesc"), "calibration": str(CALIBRATION / "vehicle.yaml")},
         }
 

@@ -1,5 +1,6 @@
 """The camera and the VICON node in this process, each against its real protocol: frame socket, UDP."""
 
+import re
 import socket
 import time
 from pathlib import Path
@@ -130,16 +131,21 @@ def vicon(node_context):
     node.inbox.close()
 
 
-def send_pose(node, frame_number, name, T):
+@pytest.fixture
+def tracker():
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-        for datagram in encode_blocks(frame_number, [object_pose(name, T)]):
-            sender.sendto(datagram, ("127.0.0.1", node.port))
+        yield sender
 
 
-def test_vicon_one_topic_for_each_subject(vicon):
+def send_pose(sender, node, frame_number, name, T):
+    for datagram in encode_blocks(frame_number, [object_pose(name, T)]):
+        sender.sendto(datagram, ("127.0.0.1", node.port))
+
+
+def test_vicon_one_topic_for_each_subject(vicon, tracker):
     assert vicon.publications == ("/vicon/car", "/vicon/board")
     assert vicon.status() == ("starting", f"no datagrams on UDP port {vicon.port}")
-    send_pose(vicon, 1, "car", planar_pose(0.5, -0.2, 0.7))
+    send_pose(tracker, vicon, 1, "car", planar_pose(0.5, -0.2, 0.7))
     (out,) = take(vicon)
     assert out.topic == "/vicon/car"
     np.testing.assert_allclose(pose_matrix(out.message), planar_pose(0.5, -0.2, 0.7), atol=1e-9)
@@ -147,13 +153,28 @@ def test_vicon_one_topic_for_each_subject(vicon):
     assert vicon.status() == ("active", "not seen: board")
 
 
-def test_vicon_that_loses_the_car_reports_a_fault(vicon):
-    send_pose(vicon, 1, "car", planar_pose(0.5, -0.2, 0.7))
+def test_vicon_that_loses_the_car_reports_a_fault(vicon, tracker):
+    send_pose(tracker, vicon, 1, "car", planar_pose(0.5, -0.2, 0.7))
     take(vicon)
-    send_pose(vicon, 2, "car", np.full((4, 4), np.nan))
+    send_pose(tracker, vicon, 2, "car", np.full((4, 4), np.nan))
     assert take(vicon, 0.6) == []
     assert vicon.status()[0] == "fault"
     assert vicon.counters()["lost car"] == 1
+
+
+def test_vicon_with_two_senders_is_a_fault_that_withholds_the_poses(vicon, tracker):
+    send_pose(tracker, vicon, 1, "car", planar_pose(0.5, -0.2, 0.7))
+    assert len(take(vicon)) == 1
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as another:
+        send_pose(another, vicon, 2, "car", planar_pose(2.5, -0.2, 0.7))
+    deadline = time.monotonic() + 2.0
+    while not (items := vicon.inbox.take()) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert items == [[]]  # no pose, and yet the loop wakes up to say so
+    state, text = vicon.status()
+    assert state == "fault"
+    assert re.fullmatch(r"two senders of subject car: 127\.0\.0\.1:\d+ and 127\.0\.0\.1:\d+", text)
+    assert vicon.counters()["disputed"] == 1
 
 
 def test_vicon_subjects_need_topics():

@@ -1,14 +1,18 @@
 """The safety node in this process: when it says stop, and what it passes on."""
 
 import math
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
+from advnerf_core.geometry import planar_pose
+from calibration.schema import VehicleCalibration, load_calibration
 from nodes.arming import ArmingLimits
 from nodes.runtime.clock import Now
-from nodes.runtime.messages import drive_message, header, ns_from_stamp, types
+from nodes.runtime.messages import drive_message, header, ns_from_stamp, pose_message, types
 from nodes.runtime.node import MessageInfo
 from nodes.safety import SafetyConfig, SafetyNode
 
@@ -20,7 +24,9 @@ class Guard:
 
     def __init__(self):
         limits = ArmingLimits(nodes=("camera", "motor"), fence_m=((-1, -1), (1, -1), (1, 1), (-1, 1)))
-        self.node = SafetyNode(limits)
+        config = SafetyConfig(room=TWIN / "room.yaml", vehicle=TWIN / "vehicle.yaml")
+        car = load_calibration(VehicleCalibration, config.vehicle)
+        self.node = SafetyNode(limits, config.poses(car), config.stall())
         self.ms = 1000
 
     @property
@@ -32,7 +38,7 @@ class Guard:
             topic, message, MessageInfo(self.now.mono_ns, self.now.mono_ns, instance_id=1), self.now
         )
 
-    def everything(self, peer="TWIN"):
+    def everything(self, peer="TWIN", speed=0.8):
         stamp = self.now.real_ns
         for name in ("camera", "motor"):
             status = types.NodeStatus(
@@ -51,11 +57,11 @@ class Guard:
             roi=types.RegionOfInterest(x_offset=0, y_offset=0, height=0, width=0, do_rectify=False),
         )  # fmt: skip
         self.say("/camera/camera_info", info)
-        pose = types.Pose(
-            position=types.Point(x=0.1, y=0.2, z=0.0), orientation=types.Quaternion(x=0.0, y=0.0, z=0.0, w=1.0)
-        )
-        self.say("/vicon/car", types.PoseStamped(header=header(stamp), pose=pose))
-        return self.say("/policy/drive", drive_message(0.8, 0.1, stamp))
+        self.see_car()
+        return self.say("/policy/drive", drive_message(speed, 0.1, stamp))
+
+    def see_car(self, x=0.1, y=0.2, yaw=0.0):
+        return self.say("/vicon/car", pose_message(planar_pose(x, y, yaw), self.now.real_ns))
 
     def arm(self, arm=True):
         self.ms += 1
@@ -116,6 +122,130 @@ def test_safety_does_not_let_a_program_arm_a_real_car():
 
 
 def test_safety_reads_its_fence_from_the_room_file(node_context):
-    node = SafetyNode.build(SafetyConfig(room=TWIN / "room.yaml", nodes=("camera",)), node_context)
+    config = SafetyConfig(room=TWIN / "room.yaml", vehicle=TWIN / "vehicle.yaml", nodes=("camera",))
+    node = SafetyNode.build(config, node_context)
     assert "/status/camera" in node.subscriptions
     assert "/status/policy" not in node.subscriptions
+
+
+# Poses and stalls.
+
+
+class Drive(Guard):
+    """A guard whose world goes on by itself: a car that does what it is told, measured at 100 Hz."""
+
+    def __init__(self):
+        super().__init__()
+        self.x, self.speed, self.wheels = -0.5, 0.0, 0.0
+        self.offset = (0.0, 0.0, 0.0)
+
+    def run(self, seconds, command=0.5):
+        for step in range(round(100 * seconds)):
+            self.ms += 10
+            self.x += 0.01 * self.speed
+            self.see_car(self.x + self.offset[0], self.offset[1], self.offset[2])
+            if step % 4 == 0:
+                self.say("/motor/state", self.telemetry())
+            if step % 2 == 0:
+                self.everything_but_the_car(command)
+                self.node.tick(self.now)
+        return self
+
+    def telemetry(self):
+        return types.VescState(
+            header=header(self.now.real_ns), speed_mps=self.wheels, erpm=0.0, duty=0.0, input_voltage_v=15.0, motor_current_a=0.0,
+            input_current_a=0.0, mosfet_temperature_c=30.0, fault=0, fault_text="",
+        )  # fmt: skip
+
+    def everything_but_the_car(self, command):
+        self.see_car = lambda *pose: None
+        try:
+            self.everything(speed=command)
+        finally:
+            del self.see_car
+
+    @property
+    def reason(self):
+        state, text = self.node.status()
+        return "" if state == "active" else text
+
+
+@pytest.fixture
+def drive():
+    drive = Drive().run(0.6, command=0.0)
+    drive.arm()
+    drive.run(0.3, command=0.0)
+    assert drive.reason == ""
+    return drive
+
+
+@pytest.mark.parametrize(
+    ("offset", "words"),
+    [
+        ((0.05, 0.0, 0.0), r"jumped 0.05\d m forward in 0.010 s; the car can move 0.02\d m"),
+        ((-0.3, 0.0, 0.0), r"jumped 0.30\d m backward"),
+        ((0.0, 0.05, 0.0), r"jumped 0.050 m sideways"),
+        ((0.0, 0.0, 0.3), r"turned by 0.30 rad"),
+    ],
+)
+def test_a_pose_that_no_car_can_reach_disarms_and_is_named(drive, offset, words):
+    drive.offset = offset
+    drive.run(0.01)
+    assert re.search(words, drive.reason), drive.reason
+    drive.run(1.0, command=0.0)
+    drive.arm()
+    assert drive.reason == ""  # where it is measured now, it stays
+
+
+def test_a_car_that_is_carried_can_be_armed_once_it_rests(drive):
+    drive.arm(False)
+    for step in range(20):
+        drive.offset = (0.02 * step, 0.03 * step, 0.1 * step)
+        drive.run(0.01)
+    drive.arm()
+    assert "turned by" in drive.reason
+    drive.run(0.6)
+    drive.arm()
+    assert drive.reason == ""
+
+
+def test_a_message_that_is_no_pose_disarms(drive):
+    message = pose_message(planar_pose(drive.x, 0.0, 0.0), drive.now.real_ns)
+    message.pose.orientation = types.Quaternion(x=0.0, y=0.0, z=0.0, w=0.0)
+    drive.say("/vicon/car", message)
+    assert "pose without an orientation" in drive.reason
+
+
+@pytest.mark.parametrize(
+    ("speed", "wheels", "words"),
+    [
+        (0.0, 0.0, "the car does not move"),
+        (0.0, 0.5, "the wheels spin but the car does not move"),
+        (0.5, 0.0, "the motor does not turn although the car moves"),
+    ],
+)
+def test_a_stall_disarms_and_says_what_stands(drive, speed, wheels, words):
+    drive.speed = drive.wheels = 0.5
+    assert drive.run(0.5).reason == ""
+    drive.speed, drive.wheels = speed, wheels
+    assert drive.run(0.9).reason == ""
+    drive.run(0.4)
+    assert "stalled: commanded 0.50 m/s" in drive.reason
+    assert words in drive.reason
+    drive.speed = drive.wheels = 0.0
+    drive.run(0.6, command=0.0)
+    drive.arm()
+    assert drive.reason == ""
+
+
+def test_a_standing_start_and_slow_commands_are_no_stall(drive):
+    assert drive.run(0.9).reason == ""  # it does not move yet
+    drive.speed = drive.wheels = 0.5
+    assert drive.run(1.5).reason == ""
+    drive.speed = drive.wheels = 0.0
+    assert drive.run(5.0, command=0.25).reason == ""
+
+
+def test_a_stall_must_be_slower_than_its_command():
+    with pytest.raises(ValidationError, match="every drive would be a stall"):
+        SafetyConfig(room=TWIN / "room.yaml", vehicle=TWIN / "vehicle.yaml", stall_speed_mps=0.3)

@@ -166,9 +166,8 @@ def test_the_command_prints_one_line_per_finding_and_tells_by_its_exit_code(tmp_
     file = tmp_path / "small.launch.yaml"
     room = yaml.safe_load((TWIN / "room.yaml").read_text())
     (tmp_path / "room.yaml").write_text(yaml.safe_dump(room))
-    file.write_text(
-        f"name: small\nnodes:\n  safety: {{module: nodes.safety, config: {{room: {tmp_path / 'room.yaml'}}}}}\n"
-    )
+    config = f"{{room: {tmp_path / 'room.yaml'}, vehicle: {TWIN / 'vehicle.yaml'}}}"
+    file.write_text(f"name: small\nnodes:\n  safety: {{module: nodes.safety, config: {config}}}\n")
     code, output, _ = run(monkeypatch, capsys, file)
     lines = output.splitlines()
     assert code == 0

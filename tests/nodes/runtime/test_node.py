@@ -147,6 +147,25 @@ def test_node_answers_messages_ticks_and_tells_its_status(tmp_path):
     assert node.writeable is False
 
 
+class Breakable(Echo):
+    """In fault when the test says so."""
+
+    broken = False
+
+    def status(self):
+        return ("fault", "broken") if self.broken else ("active", "")
+
+
+def test_a_change_of_state_is_told_at_once(tmp_path):
+    node = Breakable()
+    with Bus(tmp_path) as bus, Running(node, tmp_path):
+        bus.subscribe("/status/echo")
+        before = wait_for(bus, "/status/echo", 10)
+        node.broken = True
+        told = wait_for(bus, "/status/echo", accept=lambda m: m.state == "fault")
+    assert told.info.publish_mono_ns - before.info.publish_mono_ns < 190_000_000  # 200 ms would have been its turn
+
+
 class FromThread(Node):
     """Publishes what a driver thread brings."""
 

@@ -39,7 +39,8 @@ def test_delay_of_a_topic_is_split_at_publication(tmp_path):
 @pytest.mark.slow
 def test_top_shows_process_memory_rate_and_restarts(tmp_path):
     command = [sys.executable, "-m", "nodes.safety", "--run-dir", str(tmp_path), "--name", "safety"]
-    command += ["--set", f"room={os.path.abspath('calibration/twin/room.yaml')}"]
+    for name in ("room", "vehicle"):
+        command += ["--set", f"{name}={os.path.abspath(f'calibration/twin/{name}.yaml')}"]
     process = subprocess.Popen(command)
     try:
         with NodeWatch(tmp_path) as watch:

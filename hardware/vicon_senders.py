@@ -1,0 +1,99 @@
+"""Notices when the measurements of a subject cannot come from one motion capture system that runs through.
+
+Tracker's object stream names no system. Two computers that send the same subject, or two streams behind one address, make the
+subject jump between two places. Nobody can tell which of them is right, so neither is trusted while both are heard.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+Address = tuple[str, int]
+
+# Two senders within this time are two senders; a Tracker that is started again, with a new port, takes longer [s].
+HOLD_S = 1.0
+# Of so many frames the measurements are kept: as many as a datagram may be late.
+_REMEMBERED_FRAMES = 64
+_MOST_SENDERS = 8
+
+
+@dataclass
+class _Subject:
+    senders: dict[Address, int] = field(default_factory=dict)  # last heard [monotonic ns]
+    sender: Address | None = None
+    frames: dict[int, bytes] = field(default_factory=dict)
+
+
+class SenderWatch:
+    """Remembers who sent what. Pure: time comes as an argument.
+
+    Args:
+        subjects: Names to watch.
+        hold_s: A fault lasts until this long after it was last seen [s].
+    """
+
+    def __init__(self, subjects: tuple[str, ...], hold_s: float = HOLD_S) -> None:
+        self._hold_ns = round(hold_s * 1e9)
+        self._subjects = {name: _Subject() for name in subjects}
+        # Replaced and never changed: another thread reads it.
+        self._faults: dict[str, tuple[str, int]] = {}
+
+    def measured(self, name: str, sender: Address, frame_number: int, numbers: bytes, mono_ns: int) -> None:
+        """A datagram brought a measurement of a subject, new or late; ``numbers`` as they came."""
+        subject = self._subjects.get(name)
+        if subject is None:
+            return
+        if sender != subject.sender:
+            subject.sender = sender
+            subject.frames.clear()
+        subject.senders[sender] = mono_ns
+        self._look_for_others(name, subject, mono_ns)
+        known = subject.frames.setdefault(frame_number, numbers)
+        if known != numbers:
+            self._blame(
+                name, f"two different measurements of subject {name} in frame {frame_number} of {_text(sender)}: do two streams"
+                " come by this address?", mono_ns,
+            )  # fmt: skip
+        while len(subject.frames) > _REMEMBERED_FRAMES:
+            del subject.frames[next(iter(subject.frames))]
+
+    def leapt(self, sender: Address, last: int, frame_number: int, silence_s: float, mono_ns: int) -> None:
+        """The frame numbers of a sender begin somewhere else; after a silence that is a Tracker that was started again."""
+        for name, subject in self._subjects.items():
+            if subject.sender != sender:
+                continue
+            subject.frames.clear()
+            if silence_s < self._hold_ns / 1e9:
+                self._blame(
+                    name, f"the frame numbers of {_text(sender)}, which sends subject {name}, went from {last} to {frame_number}"
+                    f" within {silence_s:.2f} s", mono_ns,
+                )  # fmt: skip
+
+    def fault(self, name: str, mono_ns: int) -> str:
+        """Why a subject is not to be trusted; empty if it is."""
+        text, since_ns = self._faults.get(name, ("", 0))
+        return text if text and mono_ns - since_ns < self._hold_ns else ""
+
+    def faults(self, mono_ns: int) -> str:
+        """All of them in one line; empty if there is none. Any thread."""
+        texts = [text for text, since_ns in self._faults.values() if mono_ns - since_ns < self._hold_ns]
+        return "; ".join(texts)
+
+    def _look_for_others(self, name: str, subject: _Subject, mono_ns: int) -> None:
+        silent = [s for s, heard_ns in subject.senders.items() if mono_ns - heard_ns >= self._hold_ns]
+        for sender in silent:
+            del subject.senders[sender]
+        while len(subject.senders) > _MOST_SENDERS:
+            del subject.senders[next(iter(subject.senders))]
+        if len(subject.senders) > 1:
+            count = {2: "two"}.get(len(subject.senders), str(len(subject.senders)))
+            self._blame(
+                name, f"{count} senders of subject {name}: {' and '.join(map(_text, subject.senders))}", mono_ns
+            )
+
+    def _blame(self, name: str, text: str, mono_ns: int) -> None:
+        self._faults = {**self._faults, name: (text, mono_ns)}
+
+
+def _text(sender: Address) -> str:
+    return f"{sender[0]}:{sender[1]}"

@@ -1,0 +1,32 @@
+"""The real graph on the simulated lab: a second Tracker, a pose that jumps, a car that is held; the brake on the wire, and why."""
+
+import pytest
+
+from benchmarks.fault_campaign import LIMIT_MS, SLOW_LIMITS_MS, Graph, suffer
+
+_SETTINGS = ("record=false", "policy.module=benchmarks.straight_policy")
+
+
+@pytest.fixture(scope="module")
+def graph(tmp_path_factory):
+    graph = Graph(tmp_path_factory.mktemp("run"), _SETTINGS)
+    try:
+        yield graph
+    finally:
+        graph.close()
+
+
+@pytest.mark.parametrize(
+    ("fault", "reason"),
+    [
+        ("vicon two_senders", "two senders of subject car: 127.0.0.1:"),
+        ("car jammed", "the car does not move"),
+        pytest.param("vicon jump", "sideways", marks=pytest.mark.slow),
+        pytest.param("car spinning", "the wheels spin but the car does not move", marks=pytest.mark.slow),
+    ],
+)
+def test_the_car_is_stopped_and_told_why(graph, fault, reason):
+    result = suffer(graph, fault, 1.0)
+    assert result["by"] == "SET_CURRENT_BRAKE"
+    assert result["stop_ms"] <= (SLOW_LIMITS_MS["car jammed"] if fault.startswith("car") else LIMIT_MS)
+    assert reason in graph.operator.seen["/safety/state"].reason
