@@ -107,7 +107,8 @@ def policy_info(policy: Spec) -> None:
             rows.add_row(name, str(value).replace("[", r"\["))
     view = contract.view
     rows.add_row("image", f"{view.width} x {view.height}")
-    crop = f"rows {view.crop_top_px} to {view.crop_top_px + view.crop_height_px - 1}"
+    kept_rows, kept_columns = view.window
+    crop = f"rows {kept_rows.start} to {kept_rows.stop - 1}, columns {kept_columns.start} to {kept_columns.stop - 1}"
     rows.add_row("view", f"{crop} of {view.camera.width} x {view.camera.height}")
     rows.add_row("sha256", sha256)
     print_table(rows)

@@ -23,6 +23,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from advnerf_core.attack.artifact import BLACK_BOX_METHODS_TEXT
 from advnerf_core.attack.problem import AttackProblem, RecurrentPolicy, SearchDivergedError, Sensor, Totals
 from advnerf_core.driving.dynamics import Dynamics
 from advnerf_core.driving.metrics import Horizon, drive_metrics
@@ -148,7 +149,7 @@ def adjoint_gradient(problem: AttackProblem, theta: Tensor) -> AdjointResult:
     if not problem.differentiable:
         raise BlackBoxError(
             "expected a policy with a gradient, got one that declares differentiable = False; search with the methods "
-            "guided, distilled, evolution, cem or random instead"
+            f"{BLACK_BOX_METHODS_TEXT} instead"
         )
     theta = theta.detach()
     cache = RenderCache(problem.cache_bytes)

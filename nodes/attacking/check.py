@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from advnerf_core.attack.adjoint import AdjointResult, AttackProblem, BlackBoxError, adjoint_gradient
+from advnerf_core.attack.artifact import BLACK_BOX_METHODS_TEXT
 from advnerf_core.attack.health import (
     TickHealth,
     TimeSplit,
@@ -90,7 +91,7 @@ def check(request: AttackRequest, directions: int, memory: bool, report: Report)
     prepared = prepare(request)
     if not prepared.problem.differentiable:
         raise BlackBoxError(
-            f"{request.policy} has no gradient that could be checked; search with random, cem or evolution"
+            f"{request.policy} has no gradient that could be checked; search with {BLACK_BOX_METHODS_TEXT}"
         )
     if request.shape is not None:
         raise ConfigError(

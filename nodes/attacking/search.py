@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from advnerf_core.attack.adjoint import BlackBoxError, evaluate
-from advnerf_core.attack.artifact import AttackFile, save_attack
+from advnerf_core.attack.artifact import BLACK_BOX_METHODS_TEXT, AttackFile, save_attack
 from advnerf_core.attack.baselines import random_search
 from advnerf_core.attack.distil import Distillation
 from advnerf_core.attack.guided import BlackBoxSearch, black_box_attack
@@ -36,9 +36,7 @@ def search(
     """Search as the request asks; what ``on_evaluation`` raises ends it, and a state file then goes on from there."""
     wanted, problem = prepared.request.search, prepared.problem
     if wanted.method == "gradient" and not problem.differentiable:
-        raise BlackBoxError(
-            f"{prepared.request.policy} has no gradient: use the method guided, distilled, evolution, cem or random"
-        )
+        raise BlackBoxError(f"{prepared.request.policy} has no gradient: use the method {BLACK_BOX_METHODS_TEXT}")
     common: dict[str, Any] = {
         "seed": prepared.seed, "state_path": state_path, "on_evaluation": on_evaluation,
         "settings_hash": prepared.settings_hash,
