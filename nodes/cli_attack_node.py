@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -63,10 +64,18 @@ def attack_cancel(
 def _in_words(progress: Any) -> str:
     what = " ".join(filter(None, (progress.state, progress.text)))
     if progress.state == "done":
-        return f"done: attack {progress.attack_id}, best total CTE {progress.best_total_cte_m:.2f} m ({progress.text})"
+        return f"done: attack {progress.attack_id}, best total CTE {progress.best_total_cte_m:.2f} m{_beside(progress)} ({progress.text})"
     if progress.evaluation:
         return (
             f"{what} seed {progress.seed}: {progress.evaluation}/{progress.evaluations}, total CTE "
-            f"{progress.total_cte_m:.2f} m, best {progress.best_total_cte_m:.2f} m"
+            f"{progress.total_cte_m:.2f} m, best {progress.best_total_cte_m:.2f} m{_beside(progress)}"
         )
     return what
+
+
+def _beside(progress: Any) -> str:
+    """The drive without an attack; empty before it is known."""
+    if math.isnan(progress.clean_total_cte_m):
+        return ""
+    none = "" if progress.clean_drives else ": NO DRIVE, so the total of an attack proves nothing"
+    return f", without attack {progress.clean_total_cte_m:.2f} m{none}"

@@ -12,6 +12,7 @@ from torch import Tensor
 from advnerf_core.attack.robustness import Disturbances, PosedSensor
 from advnerf_core.driving.cross_track import cross_track
 from advnerf_core.driving.dynamics import Dynamics
+from advnerf_core.driving.metrics import LAB_OFF_TRACK_M
 from advnerf_core.driving.path import Path
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.scene.surrogate import Rendered
@@ -67,6 +68,7 @@ class AttackProblem:
         fence_m: Half side of the square |x|, |y| beyond which the car is stopped in deployment [m]; None if there is no fence.
             It shapes the reported total only: the loss goes on driving, as its gradient would else be zero.
         held_cap_m: Cap of the |CTE| that a stopped car is charged per tick in the reported total [m].
+        off_track_m: |CTE| beyond which the car is off the track [m]; it says whether the drive without an attack is one.
         disturbances: Random disturbances of what is seen; None changes nothing.
         draw: Which draw of the disturbances; searches count their evaluations here.
         regulariser: Added to the loss, for example `Smoothness`; None adds nothing.
@@ -83,6 +85,7 @@ class AttackProblem:
     cache_bytes: int = 256 * 2**20
     fence_m: float | None = None
     held_cap_m: float = 1.5
+    off_track_m: float = LAB_OFF_TRACK_M
     disturbances: Disturbances | None = None
     draw: int = 0
     regulariser: Regulariser | None = None

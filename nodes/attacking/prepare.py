@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass, replace
+from functools import cached_property
 from importlib.metadata import version
 from typing import Any
 
@@ -13,10 +14,12 @@ from torch import Tensor
 
 from advnerf_core.attack.adjoint import AttackProblem
 from advnerf_core.attack.artifact import AttackedObject, AttackFile, face_texture
+from advnerf_core.attack.clean import clean_drive
 from advnerf_core.attack.displayed import DisplayedSensor
 from advnerf_core.attack.robustness import Disturbances, Smoothness
 from advnerf_core.attack.search import SearchResult, draw_start_states
 from advnerf_core.driving.actuated import ActuatedAckermann
+from advnerf_core.driving.clean_drive import CleanDrive
 from advnerf_core.driving.dynamics import Ackermann, Dynamics
 from advnerf_core.driving.policy import LoadedPolicy
 from advnerf_core.mesh.shape import ShapeSensor
@@ -70,7 +73,21 @@ class Prepared:
         problem = replace(self.problem, start_states=starts, disturbances=disturbances(self.request, seed))
         return replace(self, problem=problem, seed=seed)
 
-    def make_attack_file(self, result: SearchResult, predicted_total_cte_m: float | None = None) -> AttackFile:
+    @property
+    def plain_theta(self) -> Tensor:
+        """Parameters of the objects as they are without an attack."""
+        if isinstance(self.problem.sensor, ShapeSensor):
+            return torch.zeros(self.problem.sensor.theta_shape)
+        return self.surrogate.plain_theta()
+
+    @cached_property
+    def clean_drive(self) -> CleanDrive:
+        """The victim's drive past the plain objects, from the same starts in the same scene."""
+        return clean_drive(self.problem, self.plain_theta)
+
+    def make_attack_file(
+        self, result: SearchResult, predicted_total_cte_m: float | None = None, clean: CleanDrive | None = None
+    ) -> AttackFile:
         """The attack file of a search's result; the prediction is the best evaluation's own unless another is given."""
         predicted = result.best.predicted_total_cte_m if predicted_total_cte_m is None else predicted_total_cte_m
         extra = {
@@ -83,6 +100,7 @@ class Prepared:
             method=self.request.search.method, **self._face(result.theta), camera=self.surrogate.camera,
             scene_sha256=self.hashes["scene"], policy_sha256=self.hashes["policy"], config_sha256=self.hashes["config"],
             seed=self.seed, predicted_total_cte_m=predicted, software_version=version("advnerf"), extra=extra,
+            clean_drive=clean or self.clean_drive,
         )  # fmt: skip
 
     def attacked_objects(self, theta: Tensor) -> tuple[AttackedObject, ...]:
@@ -218,6 +236,7 @@ def _problem(
         loaded.policy, sensor_of(request, surrogate), dynamics, room.reference_path, starts, request.horizon,
         goals=_goals(request, loaded, len(starts)), time_batch=search.time_batch,
         cache_bytes=int(search.cache_mib * 2**20), fence_m=float(np.abs(np.array(room.fence_m)).min()),
+        off_track_m=room.off_track_m,
         disturbances=disturbances(request, seed),
         regulariser=Smoothness(surrogate.objects, smoothness) if smoothness else None,
     )  # fmt: skip

@@ -56,7 +56,8 @@ class Speaker:
         self._prepared, self._evaluations = prepared, planned_evaluations(prepared)
         self.say(
             "progress", state="searching", seed=prepared.seed, evaluation=done, evaluations=self._evaluations, text="",
-            total_cte_m=self._best_m or 0.0,
+            total_cte_m=self._best_m or 0.0, clean_total_cte_m=prepared.clean_drive.mean_total_cte_m,
+            clean_drives=prepared.clean_drive.drives,
         )  # fmt: skip
 
     def told(self, evaluation: Evaluation) -> None:
