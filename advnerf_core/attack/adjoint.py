@@ -32,8 +32,20 @@ from advnerf_core.errors import AdvnerfError
 from advnerf_core.scene.surrogate import Rendered
 
 __all__ = [
-    "AdjointResult", "AttackProblem", "BlackBoxError", "RecurrentPolicy", "RenderCache", "Sensor", "Totals", "adjoint_gradient", "adjoint_states",
-    "evaluate", "gradient_pass", "roll_out",
+    "AdjointResult",
+    "AttackProblem",
+    "BlackBoxError",
+    "RecurrentPolicy",
+    "RenderCache",
+    "Sensor",
+    "Totals",
+    "adjoint_gradient",
+    "adjoint_states",
+    "drive_scores",
+    "evaluate",
+    "gradient_pass",
+    "horizon_of",
+    "roll_out",
 ]  # fmt: skip
 
 

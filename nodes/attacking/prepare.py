@@ -33,10 +33,9 @@ from calibration.schema import CameraCalibration, RoomCalibration, VehicleCalibr
 from nodes.attacking.meshes import found_meshes, shape_sensor, shaped_objects
 from nodes.attacking.objects import PlacedObject, place
 from nodes.attacking.request import AttackRequest
+from nodes.policy_camera import require_camera
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.stages import hash_of
-
-_MOUNT_TOLERANCE_PX = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,7 +145,7 @@ def prepare(request: AttackRequest, seed: int | None = None) -> Prepared:
     loaded = load_any_policy(str(request.policy))
     camera = load_calibration(CameraCalibration, request.calibration_file("camera"))
     room = load_calibration(RoomCalibration, request.calibration_file("room"))
-    _check_view(request, loaded, camera)
+    require_camera(loaded.view, camera, str(request.policy), request.calibration_file("camera"))
     objects = tuple(place(wanted) for wanted in request.objects)
     surrogate = Surrogate(
         FieldRenderer.from_file(request.scene), loaded.view.pinhole, camera.mount,
@@ -271,13 +270,3 @@ def _goals(request: AttackRequest, loaded: LoadedPolicy, starts: int) -> Tensor 
         return None
     goals = torch.tensor(request.goals, dtype=torch.float32)
     return goals.repeat_interleave(starts // len(goals), dim=0)
-
-
-def _check_view(request: AttackRequest, loaded: LoadedPolicy, camera: CameraCalibration) -> None:
-    trained, mounted = loaded.view.camera, camera.pinhole
-    same_size = (trained.width, trained.height) == (mounted.width, mounted.height)
-    if not same_size or np.abs(trained.matrix - mounted.matrix).max() > _MOUNT_TOLERANCE_PX:
-        raise ConfigError(
-            f"{request.calibration_file('camera')}: expected the camera that the policy {request.policy} was trained with, "
-            f"{trained}, got {mounted}; use its calibration, or train the policy again"
-        )
