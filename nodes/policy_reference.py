@@ -18,7 +18,7 @@ from advnerf_core.driving.policy import images_to_tensor
 from advnerf_core.driving.policy_view import PolicyView
 from advnerf_core.geometry import invert_transform, yaw_of
 from advnerf_core.policies.adapter import AdaptedPolicy
-from advnerf_core.policies.conformance import FAILURE, OK, WARNING, Finding
+from advnerf_core.policies.conformance import FAILURE, OK, WARNING, Finding, Verdict
 from advnerf_core.scene.dataset import load_image, load_transforms
 from calibration.schema import CameraCalibration, RoomCalibration, VehicleCalibration, load_calibration
 from nodes.policy_camera import require_camera
@@ -209,7 +209,7 @@ def judged_by_drives(
     size = policy.contract.goal_size
     clean = reference.drives(policy, goal if goal is not None else (0.0,) * size)
     text = clean.warning or f"drives without attack: {clean.in_words.removeprefix('drive without attack: ')}"
-    verdict = OK if clean.drives else FAILURE if reference.asked else WARNING
+    verdict: Verdict = OK if clean.drives else FAILURE if reference.asked else WARNING
     return [*findings, Finding("drive", verdict, text)]
 
 

@@ -155,10 +155,10 @@ def _at_step(step: float, along: float, beside: Sequence[float], dimensions: int
     count, rest = len(beside), dimensions - 1
     size = float(np.square(beside).sum())
     # All dimensions beside the gradient were differenced, or a share of them that is known in distribution.
-    shares = (1.0, 1.0, 1.0)
+    shares = [1.0, 1.0, 1.0]
     if count < rest:
         tail = (1.0 - CONFIDENCE) / 2.0
-        shares = (count / rest, *(float(beta.ppf(p, count / 2.0, (rest - count) / 2.0)) for p in (tail, 1.0 - tail)))
+        shares = [count / rest, *(float(beta.ppf(p, count / 2.0, (rest - count) / 2.0)) for p in (tail, 1.0 - tail))]
     ends = [_ratio(along, size / share) for share in shares]
     return CosineAtStep(step, ends[0], min(ends), max(ends), along, tuple(beside))
 

@@ -99,4 +99,7 @@ class CleanDrive:
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> CleanDrive:
         """Rebuild it from `to_dict`."""
-        return cls(**{name: tuple(value) if isinstance(value, list) else value for name, value in data.items()})
+        values: dict[str, Any] = {
+            key: tuple(value) if isinstance(value, list) else value for key, value in data.items()
+        }
+        return cls(**values)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from advnerf_core.driving.policy import images_to_tensor
 from advnerf_core.policies.adapter import AdaptedPolicy
-from advnerf_core.policies.contract import PolicyContract
+from advnerf_core.policies.contract import ColourSpace, PolicyContract
 
 Array = NDArray[np.float64]
 
@@ -128,7 +128,7 @@ def _input_changes(contract: PolicyContract) -> Iterator[Hypothesis]:
     yield from ranges
     for base in [Hypothesis((), (), contract), *ranges]:
         # A network of one channel takes no other space, nor the other way round.
-        spaces = () if contract.channels == 1 else ("RGB", "BGR", "YUV")
+        spaces: tuple[ColourSpace, ...] = () if contract.channels == 1 else ("RGB", "BGR", "YUV")
         for other in spaces:
             if other != contract.colour_space:
                 yield Hypothesis(

@@ -17,7 +17,7 @@ def in_one_line(attack: AttackFile) -> str:
 
 def print_attacks(files: Sequence[Path]) -> None:
     """A line for each attack file, and the warning if the policy does not drive without an attack."""
-    warnings = []
+    warnings: list[str] = []
     for file in files:
         attack = load_attack(file)
         print(f"{file}: {in_one_line(attack)}")
