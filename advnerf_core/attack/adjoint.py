@@ -19,33 +19,26 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from advnerf_core.attack.artifact import BLACK_BOX_METHODS_TEXT
-from advnerf_core.attack.problem import AttackProblem, RecurrentPolicy, SearchDivergedError, Sensor, Totals
+from advnerf_core.attack.problem import (
+    AttackProblem,
+    RecurrentPolicy,
+    SearchDivergedError,
+    Sensor,
+    Totals,
+    drive_scores,
+)
 from advnerf_core.driving.dynamics import Dynamics
-from advnerf_core.driving.metrics import DriveMetrics, Horizon, drive_metrics
 from advnerf_core.driving.rollout import Rollout, drive
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.scene.surrogate import Rendered
 
 __all__ = [
-    "AdjointResult",
-    "AttackProblem",
-    "BlackBoxError",
-    "RecurrentPolicy",
-    "RenderCache",
-    "Sensor",
-    "Totals",
-    "adjoint_gradient",
-    "adjoint_states",
-    "drive_scores",
-    "evaluate",
-    "gradient_pass",
-    "horizon_of",
-    "roll_out",
+    "AdjointResult", "AttackProblem", "BlackBoxError", "RecurrentPolicy", "RenderCache", "Sensor", "Totals", "adjoint_gradient", "adjoint_states",
+    "evaluate", "gradient_pass", "roll_out",
 ]  # fmt: skip
 
 
@@ -143,23 +136,6 @@ def _totals(problem: AttackProblem, states: Tensor) -> Totals:
     total = -problem.cost(states[1:]).detach().sum(0)
     protocol = [score.total_cte_m for score in drive_scores(problem, states)]
     return Totals(total, torch.tensor(protocol, dtype=total.dtype))
-
-
-def horizon_of(problem: AttackProblem) -> Horizon:
-    """What the protocol sums over in a problem's drives."""
-    return Horizon(problem.steps, problem.dynamics.dt_s, problem.off_track_m, problem.held_cap_m)
-
-
-def drive_scores(problem: AttackProblem, states: Tensor) -> list[DriveMetrics]:
-    """The protocol's metrics of each drive of states ``[T + 1, B, n]``; the car stops at the fence."""
-    scores, horizon = [], horizon_of(problem)
-    for drive_states in states.detach().cpu().numpy().swapaxes(0, 1):
-        stopped = None
-        if problem.fence_m is not None:
-            outside = np.flatnonzero((np.abs(drive_states[:, :2]) > problem.fence_m).any(axis=1))
-            stopped = int(outside[0]) if outside.size else None
-        scores.append(drive_metrics(problem.path, drive_states, horizon, stopped))
-    return scores
 
 
 def adjoint_gradient(problem: AttackProblem, theta: Tensor) -> AdjointResult:

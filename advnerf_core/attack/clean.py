@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from advnerf_core.attack.adjoint import drive_scores, evaluate, horizon_of
-from advnerf_core.attack.problem import AttackProblem
+from advnerf_core.attack.adjoint import evaluate
+from advnerf_core.attack.problem import AttackProblem, drive_scores, horizon_of
 from advnerf_core.driving.clean_drive import CleanDrive
 
 

@@ -135,7 +135,8 @@ def work(folder: Path, stream: BinaryIO) -> None:
 
 def main() -> int:
     """Run the worker; what a person can put right is one line on standard error."""
-    stream = os.fdopen(os.dup(1), "wb")
+    # Never closed: the node takes the end of this pipe for the end of the process, whose shutdown takes seconds on a busy machine.
+    stream = os.fdopen(os.dup(1), "wb", closefd=False)
     os.dup2(2, 1)
     try:
         work(Path(sys.argv[1]), stream)
