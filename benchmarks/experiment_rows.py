@@ -12,6 +12,7 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
+from advnerf_core.driving.metrics import drives
 from advnerf_core.report.data import ReportData
 from advnerf_core.report.results import read_results
 from advnerf_core.report.tables import TransferRow, find_row, transfer_rows
@@ -73,7 +74,7 @@ def record_transfer(data: ReportData, record: Record) -> None:
 
 def record_live(data: ReportData, record: Record) -> None:
     if data.laps is not None:
-        met = not data.laps.off_track and data.laps.mean_abs_cte_m <= 0.08
+        met = drives(data.laps.mean_abs_cte_m, data.laps.off_track, data.settings.off_track_m)
         record(
             "#2 policy, no attack, laps live", data.laps.mean_abs_cte_m, "m mean |CTE|", "<= 0.08 m, never off-track", met,
             f"{data.laps.laps} laps, off-track: {data.laps.off_track}, worst {np.abs(data.laps.cte_m).max():.3f} m",

@@ -23,7 +23,7 @@ CAMPAIGN = (
     "one_hop", "frame_age", "car_nodes", "launch_times", "calibrations", "lockstep_replay", "strangers", "two_hosts", "bag_kill",
     "fuzz", "pose_jumps", "stalls", "policy_from_bags", "fault_campaign", "thirty_minutes",
 )  # fmt: skip
-OF_A_RUN = ("gradient_pass", "objects", "phone_to_car")
+OF_A_RUN = ("gradient_pass", "objects", "phone_to_car", "closed_loop_cosine")
 
 
 def commands(run_folder: Path, quick: bool) -> list[str]:

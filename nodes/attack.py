@@ -201,6 +201,9 @@ class AttackNode(Node):
             attack = load_attack(current["file"])
             best = attack.predicted_total_cte_m or 0.0
             self._progress |= {"attack_id": attack.attack_id, "best_total_cte_m": best}
+            if attack.clean_drive is not None:
+                clean = attack.clean_drive
+                self._progress |= {"clean_total_cte_m": clean.mean_total_cte_m, "clean_drives": clean.drives}
             self._begin_sending(Path(current["file"]), Now(0, 0))
 
     def _tell(self, now: Now) -> Out:
@@ -242,7 +245,7 @@ class Sender:
 def _fresh(state: str, text: str) -> dict[str, Any]:
     return {
         "state": state, "text": text, "seed": 0, "evaluation": 0, "evaluations": 0, "loss_m": math.nan, "total_cte_m": 0.0,
-        "best_total_cte_m": 0.0, "seconds": 0.0, "attack_id": "",
+        "best_total_cte_m": 0.0, "clean_total_cte_m": math.nan, "clean_drives": False, "seconds": 0.0, "attack_id": "",
     }  # fmt: skip
 
 

@@ -40,6 +40,7 @@ def attack_resume(folder: Annotated[Path, typer.Argument(help="Folder of 'advner
 
 
 def _run(folder: Path, request: object) -> None:
+    from nodes.attacking.printed import print_attacks
     from nodes.attacking.request import AttackRequest
     from nodes.attacking.search import run_attack
     from nodes.runtime.errors import ConfigError
@@ -54,16 +55,7 @@ def _run(folder: Path, request: object) -> None:
         raise ConfigError(f"{folder} is in use by process {error.owner}: wait for it, or stop it") from None
     with lock, ProgressDisplay() as display:
         files = run_attack(request, folder, display)
-    for file in files:
-        print(f"{file}: {_in_one_line(file)}")
-
-
-def _in_one_line(file: Path) -> str:
-    from advnerf_core.attack.artifact import load_attack
-
-    attack = load_attack(file)
-    total = "unknown" if attack.predicted_total_cte_m is None else f"{attack.predicted_total_cte_m:.1f} m"
-    return f"attack {attack.attack_id}, {attack.method}, predicted total CTE {total}"
+    print_attacks(files)
 
 
 @app.command("show")
@@ -81,11 +73,13 @@ def attack_show(
     from advnerf_core.files import write_atomically
 
     attack = load_attack(file)
-    total = attack.predicted_total_cte_m
+    total, clean = attack.predicted_total_cte_m, attack.clean_drive
     rows = table("what", "value")
     for name, value in {
         "attack id": attack.attack_id, "method": attack.method, "seed": attack.seed,
         "predicted total CTE": "unknown" if total is None else f"{total:.2f} m",
+        "drive without attack": "not driven" if clean is None else clean.in_words.removeprefix("drive without attack: "),
+        **({} if clean is None else {"of each start": ", ".join(f"{value:.2f} m" for value in clean.total_cte_m)}),
         "face": f"{attack.size_m[0]:.3f} x {attack.size_m[1]:.3f} m on {attack.subject}" if attack.has_face else "none",
         "theta": " x ".join(map(str, attack.theta.shape)),
         "position": ", ".join(f"{v:.3f}" for v in attack.T_world_from_object[:3, 3]) + " m",
@@ -96,6 +90,8 @@ def attack_show(
     }.items():  # fmt: skip
         rows.add_row(name, str(value))
     print_table(rows)
+    if clean is not None and clean.warning:
+        print(clean.warning)
     if attack.has_face:
         path = texture or file.with_name(
             file.name.removesuffix(".safetensors").removesuffix(".attack") + ".texture.png"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -41,7 +42,7 @@ def attack_request(
         key = (progress.state, progress.seed, progress.evaluation)
         if key not in seen:
             seen.add(key)
-            print(_in_words(progress), flush=True)
+            print(in_words(progress), flush=True)
 
     last = ask_for_attack(find_run_dir(run_dir), request, name, tell, follow)
     if last.state in ("failed", "refused", "cancelled"):
@@ -57,16 +58,25 @@ def attack_cancel(
     from nodes.attacking.client import cancel_attack
     from nodes.runtime.watching import find_run_dir
 
-    print(_in_words(cancel_attack(find_run_dir(run_dir), request_id, reason)))
+    print(in_words(cancel_attack(find_run_dir(run_dir), request_id, reason)))
 
 
-def _in_words(progress: Any) -> str:
+def in_words(progress: Any) -> str:
+    """A line about an ``AttackProgress``; its totals stand beside that without an attack."""
     what = " ".join(filter(None, (progress.state, progress.text)))
     if progress.state == "done":
-        return f"done: attack {progress.attack_id}, best total CTE {progress.best_total_cte_m:.2f} m ({progress.text})"
+        return f"done: attack {progress.attack_id}, best total CTE {progress.best_total_cte_m:.2f} m{_beside(progress)} ({progress.text})"
     if progress.evaluation:
         return (
             f"{what} seed {progress.seed}: {progress.evaluation}/{progress.evaluations}, total CTE "
-            f"{progress.total_cte_m:.2f} m, best {progress.best_total_cte_m:.2f} m"
+            f"{progress.total_cte_m:.2f} m, best {progress.best_total_cte_m:.2f} m{_beside(progress)}"
         )
     return what
+
+
+def _beside(progress: Any) -> str:
+    """The drive without an attack; empty before it is known."""
+    if math.isnan(progress.clean_total_cte_m):
+        return ""
+    none = "" if progress.clean_drives else ": NO DRIVE, so the total of an attack proves nothing"
+    return f", without attack {progress.clean_total_cte_m:.2f} m{none}"

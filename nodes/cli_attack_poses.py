@@ -26,6 +26,7 @@ def attack_poses(file: RequestFile, output: Output = None, overrides: Overrides 
     """Search for where objects should stand, alone or with their colours; the same command goes on after a kill."""
     from advnerf_core.attack.artifact import load_attack
     from nodes.attacking.poses import run_poses
+    from nodes.attacking.printed import print_attacks
     from nodes.attacking.request import load_request
     from nodes.runtime.progress import ProgressDisplay
 
@@ -40,7 +41,7 @@ def attack_poses(file: RequestFile, output: Output = None, overrides: Overrides 
             total = f"{attack.predicted_total_cte_m:.1f}" if k == 0 else ""
             rows.add_row(attack.attack_id if k == 0 else "", str(k), *(f"{v:.3f}" for v in place), total)
     print_table(rows)
-    print("\n".join(str(each) for each in files))
+    print_attacks(files)
 
 
 def attack_landscape(

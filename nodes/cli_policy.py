@@ -30,7 +30,17 @@ _FAILURE_EXIT = 1
 def policy_check(
     policy: Spec,
     run_folder: Annotated[
-        Path | None, typer.Option("--run-folder", help="Frames and labels of an experiment's policy stage.")
+        Path | None,
+        typer.Option(
+            "--run-folder", help="An experiment: the camera frames of its capture, and drives in its learned scene."
+        ),
+    ] = None,
+    scene: Annotated[
+        Path | None, typer.Option("--scene", help="Views of a learned scene and drives in it; with --calibration.")
+    ] = None,
+    calibration: Annotated[
+        Path | None,
+        typer.Option("--calibration", help="Folder with camera.yaml, room.yaml and vehicle.yaml of the scene."),
     ] = None,
     bag: Annotated[Path | None, typer.Option("--bag", help="Frames and poses of a driven bag.")] = None,
     room: Annotated[
@@ -38,14 +48,20 @@ def policy_check(
     ] = Path("calibration/twin/room.yaml"),
     goal: Annotated[list[float] | None, typer.Option("--goal", help="One number of the goal vector; repeat.")] = None,
 ) -> None:
-    """Say what is wrong with a policy's adapter; the expert's frames come from the simulated lab if none are given."""
+    """Say what is wrong with a policy's adapter, and whether it drives; in the simulated lab if no place is given.
+
+    Exit code 1 if the adapter is wrong, or if the policy does not drive in the place that was given.
+    """
     from advnerf_core.policies.conformance import FAILURE, check_policy
     from advnerf_core.policies.load import load_adapted
+    from nodes.policy_reference import judged_by_drives
 
     adapted, sha256 = load_adapted(policy)
-    reference = _reference(adapted.contract.view, run_folder, bag, room)
+    reference = _reference(adapted.contract.view, run_folder, bag, room, scene, calibration)
     print(f"{policy} ({sha256[:12]}) on {reference.source}")
-    findings = check_policy(adapted, reference.images, reference.steering_rad, tuple(goal) if goal else None)
+    told = tuple(goal) if goal else None
+    findings = check_policy(adapted, reference.images, reference.steering_rad, told)
+    findings = judged_by_drives(adapted, reference, findings, told)
     rows = table("check", "state", "found")
     for finding in findings:
         rows.add_row(
@@ -56,12 +72,23 @@ def policy_check(
         raise typer.Exit(_FAILURE_EXIT)
 
 
-def _reference(view: PolicyView, run_folder: Path | None, bag: Path | None, room: Path) -> Reference:
-    from nodes.policy_reference import from_bag, from_run, from_twin
+def _reference(
+    view: PolicyView,
+    run_folder: Path | None,
+    bag: Path | None,
+    room: Path,
+    scene: Path | None,
+    calibration: Path | None,
+) -> Reference:
+    from nodes.policy_reference import from_bag, from_run, from_scene, from_twin
     from nodes.runtime.errors import ConfigError
 
-    if run_folder is not None and bag is not None:
-        raise ConfigError("expected --run-folder or --bag, got both")
+    if sum(each is not None for each in (run_folder, bag, scene)) > 1:
+        raise ConfigError("expected one of --run-folder, --bag and --scene, got several")
+    if (scene is None) != (calibration is None):
+        raise ConfigError("expected --scene and --calibration together, got one of them")
+    if scene is not None and calibration is not None:
+        return from_scene(scene, calibration, view)
     if run_folder is not None:
         return from_run(run_folder, view)
     return from_bag(bag, room, view) if bag is not None else from_twin(view)
@@ -107,7 +134,8 @@ def policy_info(policy: Spec) -> None:
             rows.add_row(name, str(value).replace("[", r"\["))
     view = contract.view
     rows.add_row("image", f"{view.width} x {view.height}")
-    crop = f"rows {view.crop_top_px} to {view.crop_top_px + view.crop_height_px - 1}"
+    kept_rows, kept_columns = view.window
+    crop = f"rows {kept_rows.start} to {kept_rows.stop - 1}, columns {kept_columns.start} to {kept_columns.stop - 1}"
     rows.add_row("view", f"{crop} of {view.camera.width} x {view.camera.height}")
     rows.add_row("sha256", sha256)
     print_table(rows)

@@ -19,13 +19,19 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from advnerf_core.attack.problem import AttackProblem, RecurrentPolicy, SearchDivergedError, Sensor, Totals
+from advnerf_core.attack.artifact import BLACK_BOX_METHODS_TEXT
+from advnerf_core.attack.problem import (
+    AttackProblem,
+    RecurrentPolicy,
+    SearchDivergedError,
+    Sensor,
+    Totals,
+    drive_scores,
+)
 from advnerf_core.driving.dynamics import Dynamics
-from advnerf_core.driving.metrics import Horizon, drive_metrics
 from advnerf_core.driving.rollout import Rollout, drive
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.scene.surrogate import Rendered
@@ -128,14 +134,7 @@ def evaluate(problem: AttackProblem, theta: Tensor) -> tuple[Rollout, Totals]:
 
 def _totals(problem: AttackProblem, states: Tensor) -> Totals:
     total = -problem.cost(states[1:]).detach().sum(0)
-    horizon = Horizon(problem.steps, problem.dynamics.dt_s, held_cap_m=problem.held_cap_m)
-    protocol = []
-    for drive_states in states.detach().cpu().numpy().swapaxes(0, 1):
-        stopped = None
-        if problem.fence_m is not None:
-            outside = np.flatnonzero((np.abs(drive_states[:, :2]) > problem.fence_m).any(axis=1))
-            stopped = int(outside[0]) if outside.size else None
-        protocol.append(drive_metrics(problem.path, drive_states, horizon, stopped).total_cte_m)
+    protocol = [score.total_cte_m for score in drive_scores(problem, states)]
     return Totals(total, torch.tensor(protocol, dtype=total.dtype))
 
 
@@ -148,7 +147,7 @@ def adjoint_gradient(problem: AttackProblem, theta: Tensor) -> AdjointResult:
     if not problem.differentiable:
         raise BlackBoxError(
             "expected a policy with a gradient, got one that declares differentiable = False; search with the methods "
-            "guided, distilled, evolution, cem or random instead"
+            f"{BLACK_BOX_METHODS_TEXT} instead"
         )
     theta = theta.detach()
     cache = RenderCache(problem.cache_bytes)

@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import load, save
 
+from advnerf_core.driving.clean_drive import CleanDrive
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.files import with_sorted_header, write_atomically
 from advnerf_core.geometry import Array, Pinhole
@@ -28,6 +29,9 @@ FILE_FORMAT = "advnerf-attack-1"
 TEXTURE_PX = 512
 
 Method = Literal["none", "random", "gradient", "cem", "evolution", "distilled", "guided"]
+# Those that need no gradient of the policy, the strongest first.
+BLACK_BOX_METHODS: tuple[Method, ...] = ("guided", "distilled", "evolution", "cem", "random")
+BLACK_BOX_METHODS_TEXT = f"{', '.join(BLACK_BOX_METHODS[:-1])} or {BLACK_BOX_METHODS[-1]}"
 
 
 class AttackFileError(AdvnerfError, ValueError):
@@ -80,6 +84,7 @@ class AttackFile:
         seed: Seed of the attack.
         predicted_total_cte_m: Total CTE the surrogate predicts, averaged over starts [m]; None if it was not computed.
         software_version: Version of advnerf that wrote the file.
+        clean_drive: The victim's drive without an attack, from the same starts in the same scene; None if it was not driven.
         extra: Anything else worth keeping, as plain data.
         objects: All objects with their colours, where there is more to them than the one face.
     """
@@ -98,6 +103,7 @@ class AttackFile:
     seed: int
     predicted_total_cte_m: float | None
     software_version: str
+    clean_drive: CleanDrive | None = None
     extra: dict[str, Any] = field(default_factory=dict)
     objects: tuple[AttackedObject, ...] = ()
 
@@ -138,7 +144,8 @@ class AttackFile:
         return {"theta": np.ascontiguousarray(self.theta), "texture": np.ascontiguousarray(self.texture), **others}
 
     def _metadata(self) -> dict[str, Any]:
-        # Left out when there are none: a file with one face keeps the hash that it always had.
+        # Left out when there are none: a file with one face, or without a drive, keeps its hash.
+        clean = {"clean_drive": self.clean_drive.to_dict()} if self.clean_drive is not None else {}
         objects = {"objects": [_object_metadata(each) for each in self.objects]} if self.objects else {}
         return {
             "method": self.method,
@@ -154,6 +161,7 @@ class AttackFile:
             "predicted_total_cte_m": self.predicted_total_cte_m,
             "software_version": self.software_version,
             "extra": self.extra,
+            **clean,
             **objects,
         }
 
@@ -232,6 +240,8 @@ def _from_parts(metadata: dict[str, Any], tensors: dict[str, NDArray[Any]]) -> A
     values["size_m"] = tuple(values["size_m"])
     values["T_world_from_object"] = np.array(values["T_world_from_object"])
     values["corners_in_subject"] = np.array(values["corners_in_subject"])
+    if "clean_drive" in values:
+        values["clean_drive"] = CleanDrive.from_dict(values["clean_drive"])
     values["objects"] = tuple(
         AttackedObject(
             each["name"],

@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from advnerf_core.attack.closed_loop import ClosedLoopCosine
 from advnerf_core.attack.health import TickHealth, TimeSplit
 from advnerf_core.report.palette import LIGHT
 
@@ -17,7 +18,7 @@ from advnerf_core.report.palette import LIGHT
 def draw_health(
     adjoint: Sequence[float],
     frozen: Sequence[float],
-    closed: Sequence[float],
+    closed: ClosedLoopCosine,
     ticks: TickHealth,
     memory_mib: Mapping[int, float],
     split: TimeSplit,
@@ -27,7 +28,7 @@ def draw_health(
     Args:
         adjoint: Derivatives along random directions by the adjoint.
         frozen: The same by finite differences with frozen poses.
-        closed: The same in the true closed loop.
+        closed: The cosine to the true closed loop, over the steps of the finite differences.
         ticks: Over time.
         memory_mib: Peak above idle by horizon; may be empty.
         split: Where the time goes.
@@ -35,7 +36,7 @@ def draw_health(
     figure = Figure(figsize=(11.0, 6.0), layout="constrained", facecolor=LIGHT["paper"])
     axes = figure.subplots(2, 3).ravel()
     _derivatives(axes[0], "frozen poses: adjoint is exact here", adjoint, frozen)
-    _derivatives(axes[1], "true closed loop (information)", adjoint, closed)
+    _cosines(axes[1], closed)
     axes[2].set_title("adjoint states")
     axes[2].semilogy(np.maximum(ticks.lambda_position, 1e-12), color=LIGHT["none"], label="position")
     axes[2].semilogy(np.maximum(ticks.lambda_yaw_m, 1e-12), color=LIGHT["gradient"], label="yaw [m/rad]")
@@ -64,6 +65,17 @@ def _derivatives(axes: Axes, title: str, adjoint: Sequence[float], other: Sequen
     axes.plot([-reach, reach], [-reach, reach], color=LIGHT["grid"])
     axes.plot(adjoint, other, "o", color=LIGHT["gradient"])
     axes.set(title=title, xlabel="by the adjoint", ylabel="by finite differences")
+
+
+def _cosines(axes: Axes, closed: ClosedLoopCosine) -> None:
+    """The cosine at each step with its interval; the steps that agree are filled."""
+    axes.axhline(0.0, color=LIGHT["grid"])
+    for at in closed.at_steps:
+        agrees = closed.plateau is not None and at.step in closed.plateau
+        axes.plot([at.step, at.step], [at.low, at.high], color=LIGHT["gradient"])
+        axes.plot(at.step, at.cosine, "o", color=LIGHT["gradient"], fillstyle="full" if agrees else "none")
+    axes.set(xscale="log", ylim=(-1.05, 1.05), xlabel="step in theta", ylabel="cosine")
+    axes.set_title("true closed loop (information)" if closed.plateau else "true closed loop: cannot be told")
 
 
 def _times(axes: Axes, split: TimeSplit) -> None:

@@ -6,12 +6,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from advnerf_core.attack.robustness import Disturbances, PosedSensor
 from advnerf_core.driving.cross_track import cross_track
 from advnerf_core.driving.dynamics import Dynamics
+from advnerf_core.driving.metrics import LAB_OFF_TRACK_M, DriveMetrics, Horizon, drive_metrics
 from advnerf_core.driving.path import Path
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.scene.surrogate import Rendered
@@ -67,6 +69,7 @@ class AttackProblem:
         fence_m: Half side of the square |x|, |y| beyond which the car is stopped in deployment [m]; None if there is no fence.
             It shapes the reported total only: the loss goes on driving, as its gradient would else be zero.
         held_cap_m: Cap of the |CTE| that a stopped car is charged per tick in the reported total [m].
+        off_track_m: |CTE| beyond which the car is off the track [m]; it says whether the drive without an attack is one.
         disturbances: Random disturbances of what is seen; None changes nothing.
         draw: Which draw of the disturbances; searches count their evaluations here.
         regulariser: Added to the loss, for example `Smoothness`; None adds nothing.
@@ -83,6 +86,7 @@ class AttackProblem:
     cache_bytes: int = 256 * 2**20
     fence_m: float | None = None
     held_cap_m: float = 1.5
+    off_track_m: float = LAB_OFF_TRACK_M
     disturbances: Disturbances | None = None
     draw: int = 0
     regulariser: Regulariser | None = None
@@ -153,3 +157,20 @@ class Totals:
 
     total_cte_m: Tensor
     protocol_cte_m: Tensor
+
+
+def horizon_of(problem: AttackProblem) -> Horizon:
+    """What the protocol sums over in a problem's drives."""
+    return Horizon(problem.steps, problem.dynamics.dt_s, problem.off_track_m, problem.held_cap_m)
+
+
+def drive_scores(problem: AttackProblem, states: Tensor) -> list[DriveMetrics]:
+    """The protocol's metrics of each drive of states ``[T + 1, B, n]``; the car stops at the fence."""
+    scores, horizon = [], horizon_of(problem)
+    for drive_states in states.detach().cpu().numpy().swapaxes(0, 1):
+        stopped = None
+        if problem.fence_m is not None:
+            outside = np.flatnonzero((np.abs(drive_states[:, :2]) > problem.fence_m).any(axis=1))
+            stopped = int(outside[0]) if outside.size else None
+        scores.append(drive_metrics(problem.path, drive_states, horizon, stopped))
+    return scores

@@ -13,6 +13,27 @@ from numpy.typing import ArrayLike, NDArray
 
 from advnerf_core.driving.path import Array, Path
 
+# The protocol's rule of what drives without an attack, in metres: the car never leaves the track, and its mean |CTE| is at most
+# this share of the off-track limit: 0.08 m in the lab, where the limit is 0.4 m.
+MEAN_CTE_SHARE = 0.2
+LAB_OFF_TRACK_M = 0.4
+
+
+def mean_cte_limit_m(off_track_m: float = LAB_OFF_TRACK_M) -> float:
+    """Largest mean |CTE| of a policy that drives [m]."""
+    return MEAN_CTE_SHARE * off_track_m
+
+
+def drives(mean_cte_m: float, off_track: bool, off_track_m: float = LAB_OFF_TRACK_M) -> bool:
+    """Whether a policy drives: it never left the track, and stayed near its path in the mean.
+
+    Args:
+        mean_cte_m: Mean |CTE| over all drives [m].
+        off_track: Whether any drive left the track.
+        off_track_m: |CTE| beyond which the car is off the track [m].
+    """
+    return not off_track and mean_cte_m <= mean_cte_limit_m(off_track_m)
+
 
 @dataclass(frozen=True)
 class Horizon:
@@ -27,7 +48,7 @@ class Horizon:
 
     ticks: int = 60
     dt_s: float = 0.1
-    off_track_m: float = 0.4
+    off_track_m: float = LAB_OFF_TRACK_M
     held_cap_m: float = 1.5
 
     def __post_init__(self) -> None:

@@ -27,6 +27,8 @@ class PolicyView:
         camera: Intrinsics of the (undistorted) camera image.
         crop_top_px: First row that is kept.
         crop_height_px: Number of rows that are kept.
+        crop_left_px: First column that is kept.
+        crop_width_px: Number of columns that are kept; None keeps all to the right edge.
         width: Width of the policy's image [px].
         height: Height of the policy's image [px].
         distortion: OpenCV distortion coefficients of the camera; empty for a camera without distortion.
@@ -38,17 +40,32 @@ class PolicyView:
     width: int = 200
     height: int = 66
     distortion: tuple[float, ...] = ()
+    crop_left_px: int = 0
+    crop_width_px: int | None = None
 
     def __post_init__(self) -> None:
         _ = self.pinhole  # fails here if the crop leaves the image
         if len(self.distortion) not in (0, 4, 5, 8):
             raise ValueError(f"expected 0, 4, 5 or 8 distortion coefficients, got {len(self.distortion)}")
 
+    @property
+    def window(self) -> tuple[slice, slice]:
+        """Rows and columns of the camera image that are kept: ``image[view.window]``."""
+        width = self.camera.width - self.crop_left_px if self.crop_width_px is None else self.crop_width_px
+        rows = slice(self.crop_top_px, self.crop_top_px + self.crop_height_px)
+        return rows, slice(self.crop_left_px, self.crop_left_px + width)
+
+    @cached_property
+    def window_pinhole(self) -> Pinhole:
+        """Intrinsics of the part of the camera image that is kept, before it is resized."""
+        rows, columns = self.window
+        width, height = columns.stop - columns.start, rows.stop - rows.start
+        return self.camera.cropped(columns.start, rows.start, width, height)
+
     @cached_property
     def pinhole(self) -> Pinhole:
         """Intrinsics of the policy's image."""
-        window = self.camera.cropped(0, self.crop_top_px, self.camera.width, self.crop_height_px)
-        return window.resized(self.width, self.height)
+        return self.window_pinhole.resized(self.width, self.height)
 
     def image(self, rgb: Image) -> Image:
         """Policy image ``[height, width, 3]`` uint8 of a camera image ``[camera.height, camera.width, 3]`` uint8 RGB."""
@@ -57,8 +74,7 @@ class PolicyView:
             raise ValueError(f"expected a uint8 image of shape {list(expected)}, got {rgb.dtype} {list(rgb.shape)}")
         if self._undistortion is not None:
             rgb = np.asarray(cv2.remap(rgb, *self._undistortion, interpolation=cv2.INTER_LINEAR), dtype=np.uint8)
-        window = rgb[self.crop_top_px : self.crop_top_px + self.crop_height_px]
-        resized = cv2.resize(window, (self.width, self.height), interpolation=cv2.INTER_AREA)
+        resized = cv2.resize(rgb[self.window], (self.width, self.height), interpolation=cv2.INTER_AREA)
         return np.asarray(resized, dtype=np.uint8)
 
     def to_dict(self) -> dict[str, Any]:

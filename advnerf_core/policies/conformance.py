@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from advnerf_core.attack.artifact import BLACK_BOX_METHODS
 from advnerf_core.driving.policy import images_to_tensor
 from advnerf_core.policies.adapter import AdaptedPolicy
 from advnerf_core.policies.contract import PolicyContractError
@@ -27,6 +28,8 @@ LARGEST_STEERING_RAD = 1.2
 _EQUAL_SHARE = 1e-3
 _CONSTANT_RAD = 1e-6
 _PROBES = 4
+# These ask about single images, which do not tell the steering of a policy with memory.
+_OF_ONE_IMAGE = ("guided", "distilled")
 _MODES = (nn.modules.dropout._DropoutNd, nn.modules.batchnorm._BatchNorm)
 
 
@@ -138,6 +141,8 @@ def _remedy(examined: _Examined, batch: Tensor) -> str:
         (f"set layout = {'NHWC' if contract.layout == 'NCHW' else 'NCHW'!r}", other),
         ("exchange width and height of the view", given.transpose(-1, -2)),
     ]
+    if contract.colour_space != "GRAY" and contract.layout == "NCHW":
+        attempts.append(("set colour_space = 'GRAY'", given[:, :1]))
     for height, width in ((66, 200), (160, 320), (120, 160), (224, 224), (128, 128), (64, 64), (480, 640)):
         if contract.layout == "NCHW" and (height, width) != contract.size:
             attempts.append((f"set width = {width} and height = {height} in the view", _resized(given, height, width)))
@@ -217,7 +222,10 @@ def _independent(examined: _Examined, images: NDArray[np.uint8]) -> Finding:
 def _gradient(examined: _Examined, images: NDArray[np.uint8]) -> Finding:
     declared = examined.policy.differentiable
     if not declared:
-        return Finding("gradient", OK, "declared a black box: searched without a gradient (random, cem, evolution)")
+        methods = ", ".join(
+            each for each in BLACK_BOX_METHODS if examined.policy.stateless or each not in _OF_ONE_IMAGE
+        )
+        return Finding("gradient", OK, f"declared a black box: attacked without a gradient ({methods})")
     batch = images_to_tensor(images[:_PROBES]).contiguous().requires_grad_()
     with torch.enable_grad():
         steering = examined(batch)

@@ -19,15 +19,22 @@ import yaml
 from advnerf_core.driving.policy_view import PolicyView
 from advnerf_core.errors import AdvnerfError
 
-ColourOrder = Literal["RGB", "BGR"]
-Unit = Literal["rad", "deg"]
+ColourSpace = Literal["RGB", "BGR", "YUV", "GRAY"]
+Unit = Literal["rad", "deg", "normalised", "1/m"]
 Side = Literal["left", "right"]
 Layout = Literal["NCHW", "NHWC"]
 _CHOICES: dict[str, tuple[str, ...]] = {
-    "colour_order": get_args(ColourOrder), "output_unit": get_args(Unit), "positive": get_args(Side),
+    "colour_space": get_args(ColourSpace), "output_unit": get_args(Unit), "positive": get_args(Side),
     "layout": get_args(Layout),
 }  # fmt: skip
 RAD_PER_DEG = pi / 180.0
+# Full-range YUV of BT.601 with U and V about one half, and grey, both as OpenCV's COLOR_RGB2YUV and COLOR_RGB2GRAY.
+_LUMA = (0.299, 0.587, 0.114)
+_RGB_IN_YUV = (
+    (0.299, -0.492 * 0.299, 0.877 * 0.701),
+    (0.587, -0.492 * 0.587, -0.877 * 0.587),
+    (0.114, 0.492 * 0.886, -0.877 * 0.114),
+)
 
 
 class PolicyContractError(AdvnerfError, ValueError):
@@ -38,16 +45,21 @@ class PolicyContractError(AdvnerfError, ValueError):
 class PolicyContract:
     """The declaration of a policy.
 
-    The network is given ``(value_max * image - mean) / std`` with the image's values in 0..1.
+    The network is given ``(value_max * image - mean) / std``, with the values of the image in ``colour_space`` in 0..1.
 
     Attributes:
         view: What the policy sees of the camera image, and its input size (``view.height``, ``view.width``).
-        colour_order: Order of the network's input channels.
+        colour_space: The network's input channels: ``RGB``, ``BGR``, ``YUV`` (full range, as 8-bit OpenCV makes it: U and V
+            about one half and clipped to 0..1) or ``GRAY`` (one channel).
         value_max: White in the network's input before ``mean`` and ``std``: 1 or 255.
-        mean: Subtracted from each channel, in the network's channel order and in units of ``value_max``.
-        std: Divides each channel.
+        mean: Subtracted from each channel, in the network's channel order and in units of ``value_max``; one number is for all.
+        std: Divides each channel; one number is for all.
         layout: ``NCHW``, or ``NHWC`` for channels last.
-        output_unit: Unit of the network's output.
+        output_unit: Unit of the network's output: the angle of the front wheels in ``rad`` or ``deg``, the same
+            ``normalised`` by ``full_steering_rad``, or the inverse turning radius of the rear axle in ``1/m``.
+        full_steering_rad: Angle of the front wheels at a normalised output of 1 [rad]; with ``normalised`` only.
+        wheelbase_m: Wheelbase that turns an inverse radius into an angle, ``atan(wheelbase / radius)`` [m]; with ``1/m`` only.
+        steering_ratio: Turn of the steering wheel over that of the front wheels, for an output that is the steering wheel's.
         positive: To which side a positive output steers.
         stateless: Whether the output depends on the present image and goal only.
         differentiable: Whether gradients reach the image; a black box declares False.
@@ -55,27 +67,60 @@ class PolicyContract:
     """
 
     view: PolicyView
-    colour_order: ColourOrder = "RGB"
+    colour_space: ColourSpace = "RGB"
     value_max: float = 1.0
-    mean: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    std: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    mean: tuple[float, ...] = (0.0,)
+    std: tuple[float, ...] = (1.0,)
     layout: Layout = "NCHW"
     output_unit: Unit = "rad"
     positive: Side = "left"
     stateless: bool = True
     differentiable: bool = True
     goal_size: int = 0
+    full_steering_rad: float | None = None
+    wheelbase_m: float | None = None
+    steering_ratio: float = 1.0
 
     def __post_init__(self) -> None:
         for name, choices in _CHOICES.items():
             if getattr(self, name) not in choices:
                 raise PolicyContractError(f"{name}: expected {' or '.join(choices)}, got {getattr(self, name)!r}")
+        self._check_input()
+        self._check_output()
+        if not isinstance(self.goal_size, int) or self.goal_size < 0:
+            raise PolicyContractError(f"expected a goal size >= 0, got {self.goal_size!r}")
+
+    def _check_input(self) -> None:
+        for name in ("mean", "std"):
+            if len(getattr(self, name)) not in (1, self.channels):
+                raise PolicyContractError(
+                    f"{name}: expected 1 number or {self.channels} (one for each channel of {self.colour_space}), "
+                    f"got {len(getattr(self, name))}"
+                )
         numbers = np.array([self.value_max, *self.mean, *self.std], dtype=np.float64)
-        whole = isinstance(self.goal_size, int) and self.goal_size >= 0
-        if numbers.shape != (7,) or not np.isfinite(numbers).all() or not whole:
-            raise PolicyContractError(f"expected 3 means, 3 deviations and a goal size >= 0, all finite, got {self}")
-        if min(self.value_max, *self.std) <= 0.0:
-            raise PolicyContractError(f"expected value_max and std > 0, got {self.value_max} and {self.std}")
+        if not np.isfinite(numbers).all() or min(self.value_max, *self.std) <= 0.0:
+            raise PolicyContractError(
+                f"expected finite means, and value_max and std > 0, got {self.mean}, {self.value_max} and {self.std}"
+            )
+
+    def _check_output(self) -> None:
+        if not (np.isfinite(self.steering_ratio) and self.steering_ratio > 0.0):
+            raise PolicyContractError(f"steering_ratio: expected a number > 0, got {self.steering_ratio}")
+        for name, unit in (("full_steering_rad", "normalised"), ("wheelbase_m", "1/m")):
+            value = getattr(self, name)
+            if self.output_unit != unit and value is not None:
+                raise PolicyContractError(f"{name}: expected it with output_unit = {unit!r} only; remove it")
+            if self.output_unit == unit and not (value is not None and np.isfinite(value) and value > 0.0):
+                raise PolicyContractError(f"{name}: expected a number > 0 with output_unit = {unit!r}, got {value}")
+        if self.output_unit in ("normalised", "1/m") and self.steering_ratio != 1.0:
+            raise PolicyContractError(
+                f"steering_ratio: expected it with output_unit = 'rad' or 'deg' only, got {self.output_unit!r}"
+            )
+
+    @property
+    def channels(self) -> int:
+        """Channels of the network's input."""
+        return 1 if self.colour_space == "GRAY" else 3
 
     @property
     def size(self) -> tuple[int, int]:
@@ -89,17 +134,27 @@ class PolicyContract:
             raise PolicyContractError(
                 f"expected images {expected}, got {list(images.shape)}; use the policy's own view"
             )
-        if self.colour_order == "BGR":
-            images = images[:, [2, 1, 0]]
+        images = self._in_colour_space(images)
         if self.value_max != 1.0:
             images = images * self.value_max
         if any(self.mean):
             images = images - _channels(images, self.mean)
-        if self.std != (1.0, 1.0, 1.0):
+        if any(value != 1.0 for value in self.std):
             images = images / _channels(images, self.std)
         if self.layout == "NHWC":
             images = images.permute(0, 2, 3, 1) if hasattr(images, "permute") else images.transpose(0, 2, 3, 1)
         return images
+
+    def _in_colour_space(self, images: Any) -> Any:
+        if self.colour_space == "RGB":
+            return images
+        if self.colour_space == "BGR":
+            return images[:, [2, 1, 0]]
+        if self.colour_space == "GRAY":
+            return _LUMA[0] * images[:, 0:1] + _LUMA[1] * images[:, 1:2] + _LUMA[2] * images[:, 2:3]
+        # One colour at a time, each copied into three channels: the same code for numpy and torch.
+        parts = [images[:, [k] * 3] * _channels(images, weights) for k, weights in enumerate(_RGB_IN_YUV)]
+        return (parts[0] + parts[1] + parts[2] + _channels(images, (0.0, 0.5, 0.5))).clip(0.0, 1.0)
 
     def to_steering_rad(self, raw: Any, batch: int) -> Any:
         """Steering ``[B]`` [rad], left positive, of the network's output ``[B]`` or ``[B, 1]`` (numpy or torch)."""
@@ -111,7 +166,12 @@ class PolicyContract:
                 f"expected the network's output to be [B] or [B, 1] steering angles, got {list(shape) or type(raw).__name__} "
                 f"for B = {batch}; return the column that steers"
             )
-        scale = (RAD_PER_DEG if self.output_unit == "deg" else 1.0) * (1.0 if self.positive == "left" else -1.0)
+        side = 1.0 if self.positive == "left" else -1.0
+        if self.output_unit == "1/m":
+            bend = raw * (side * float(self.wheelbase_m or 0.0))
+            return bend.atan() if hasattr(bend, "atan") else np.arctan(bend)
+        unit = {"rad": 1.0, "deg": RAD_PER_DEG, "normalised": self.full_steering_rad or 0.0}[self.output_unit]
+        scale = side * unit / self.steering_ratio
         return raw if scale == 1.0 else raw * scale
 
     def to_dict(self) -> dict[str, Any]:
@@ -135,7 +195,8 @@ class PolicyContract:
             values = {**data, "view": PolicyView.from_dict(data["view"])}
             for name in ("mean", "std"):
                 if name in values:
-                    values[name] = tuple(float(value) for value in values[name])
+                    given = values[name]
+                    values[name] = tuple(float(v) for v in ([given] if isinstance(given, int | float) else given))
             return cls(**values)
         except (TypeError, ValueError) as error:
             raise PolicyContractError(f"{source}: {error}") from error
@@ -163,5 +224,5 @@ def declaration_beside(path: Path, embedded: str | None) -> PolicyContract:
 
 def _channels(images: Any, values: tuple[float, ...]) -> Any:
     if hasattr(images, "new_tensor"):
-        return images.new_tensor(values).view(1, 3, 1, 1)
-    return np.asarray(values, dtype=images.dtype).reshape(1, 3, 1, 1)
+        return images.new_tensor(values).view(1, -1, 1, 1)
+    return np.asarray(values, dtype=images.dtype).reshape(1, -1, 1, 1)

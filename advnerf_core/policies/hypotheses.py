@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from advnerf_core.driving.policy import images_to_tensor
 from advnerf_core.policies.adapter import AdaptedPolicy
-from advnerf_core.policies.contract import PolicyContract
+from advnerf_core.policies.contract import ColourSpace, PolicyContract
 
 Array = NDArray[np.float64]
 
@@ -27,6 +27,7 @@ USEFUL_ERROR = 0.8
 # ... and if that is no accident of the frames: the mean of the paired differences, in its standard errors.
 BELIEVED_DEVIATIONS = 3.0
 _BATCH = 32
+_UNIT_WORDS = {"deg": "degrees", "rad": "radians", "normalised": "normalised angles", "1/m": "inverse radii"}
 _IMAGENET = ((0.485, 0.456, 0.406), (0.229, 0.224, 0.225))
 
 
@@ -126,17 +127,19 @@ def _input_changes(contract: PolicyContract) -> Iterator[Hypothesis]:
     ranges = list(_range_changes(contract))
     yield from ranges
     for base in [Hypothesis((), (), contract), *ranges]:
-        other = "BGR" if contract.colour_order == "RGB" else "RGB"
-        swapped = replace(base.contract, colour_order=other)  # type: ignore[arg-type]
-        yield Hypothesis(
-            (*base.found, f"takes {other} for {contract.colour_order}"),
-            (*base.advice, f"set colour_order = {other!r}"),
-            swapped,
-        )
+        # A network of one channel takes no other space, nor the other way round.
+        spaces: tuple[ColourSpace, ...] = () if contract.channels == 1 else ("RGB", "BGR", "YUV")
+        for other in spaces:
+            if other != contract.colour_space:
+                yield Hypothesis(
+                    (*base.found, f"takes {other} for {contract.colour_space}"),
+                    (*base.advice, f"set colour_space = {other!r}"),
+                    replace(base.contract, colour_space=other),
+                )
 
 
 def _range_changes(contract: PolicyContract) -> Iterator[Hypothesis]:
-    plain = not any(contract.mean) and contract.std == (1.0, 1.0, 1.0)
+    plain = not any(contract.mean) and all(value == 1.0 for value in contract.std)
     other = 255.0 if contract.value_max == 1.0 else 1.0
     if plain:
         yield Hypothesis(
@@ -144,34 +147,39 @@ def _range_changes(contract: PolicyContract) -> Iterator[Hypothesis]:
             (f"set value_max = {other:g}",),
             replace(contract, value_max=other),
         )
-        yield Hypothesis(
-            ("expects ImageNet's normalisation, but is given plain values",),
-            (f"set value_max = 1, mean = {_IMAGENET[0]} and std = {_IMAGENET[1]}",),
-            replace(contract, value_max=1.0, mean=_IMAGENET[0], std=_IMAGENET[1]),
-        )
+        if contract.channels == 3:
+            yield Hypothesis(
+                ("expects ImageNet's normalisation, but is given plain values",),
+                (f"set value_max = 1, mean = {_IMAGENET[0]} and std = {_IMAGENET[1]}",),
+                replace(contract, value_max=1.0, mean=_IMAGENET[0], std=_IMAGENET[1]),
+            )
         yield Hypothesis(
             ("expects values of -1..1, but is given others",),
-            ("set value_max = 1, mean = (0.5, 0.5, 0.5) and std = (0.5, 0.5, 0.5)",),
-            replace(contract, value_max=1.0, mean=(0.5, 0.5, 0.5), std=(0.5, 0.5, 0.5)),
+            ("set value_max = 1, mean = (0.5,) and std = (0.5,)",),
+            replace(contract, value_max=1.0, mean=(0.5,), std=(0.5,)),
         )
         return
     for value_max in (1.0, 255.0):
         yield Hypothesis(
             (f"expects plain values of 0..{value_max:g}, but is given normalised ones",),
             (f"leave mean and std out and set value_max = {value_max:g}",),
-            replace(contract, value_max=value_max, mean=(0.0, 0.0, 0.0), std=(1.0, 1.0, 1.0)),
+            replace(contract, value_max=value_max, mean=(0.0,), std=(1.0,)),
         )
 
 
 def _output_changes(contract: PolicyContract) -> Iterator[Hypothesis]:
-    unit = "deg" if contract.output_unit == "rad" else "rad"
     side = "right" if contract.positive == "left" else "left"
-    words = {"deg": "degrees", "rad": "radians"}
-    of_unit = (f"steers in {words[unit]} for {words[contract.output_unit]}", f"set output_unit = {unit!r}")
     of_side = (f"steers positive to the {side}, not to the {contract.positive}", f"set positive = {side!r}")
-    in_unit = replace(contract, output_unit=unit)  # type: ignore[arg-type]
-    yield Hypothesis((of_unit[0],), (of_unit[1],), in_unit)
-    for found, base in (((), contract), ((of_unit,), in_unit)):
-        turned = replace(base, positive=side)  # type: ignore[arg-type]
+    units = [unit for unit in ("deg", "rad") if unit != contract.output_unit]
+    bases: list[tuple[tuple[tuple[str, str], ...], PolicyContract]] = [((), contract)]
+    for unit in units:
+        words = f"steers in {_UNIT_WORDS[unit]} for {_UNIT_WORDS[contract.output_unit]}"
+        # Without what belongs to the declared unit only.
+        other = replace(contract, output_unit=unit, full_steering_rad=None, wheelbase_m=None)  # type: ignore[arg-type]
+        bases.append((((words, f"set output_unit = {unit!r}"),), other))
+    for found, base in bases:
+        if found:
+            yield Hypothesis((found[0][0],), (found[0][1],), base)
         both = (*found, of_side)
+        turned = replace(base, positive=side)  # type: ignore[arg-type]
         yield Hypothesis(tuple(each[0] for each in both), tuple(each[1] for each in both), turned)

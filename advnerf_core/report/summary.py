@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from advnerf_core.driving.metrics import drives, mean_cte_limit_m
 from advnerf_core.report.data import Condition, Domain, ReportData
 from advnerf_core.report.tables import TransferRow, find_row, number, transfer_rows
 from advnerf_core.report.targets import Target, evaluate_targets
@@ -89,14 +90,14 @@ def _what_was_done(data: ReportData) -> str:
 
 def _what_it_did(data: ReportData) -> str:
     rows = transfer_rows(data)
-    surrogate, deployed = _effect(rows, "surrogate"), _effect(rows, "deployed")
+    surrogate, deployed = (_effect(rows, domain, data.settings.off_track_m) for domain in ("surrogate", "deployed"))
     return (
         f"In the surrogate the total cross-track error (total CTE, the summed distance from the tape) {surrogate}. "
         f"On the live drive it {deployed}."
     )
 
 
-def _effect(rows: Sequence[TransferRow], domain: Domain) -> str:
+def _effect(rows: Sequence[TransferRow], domain: Domain, off_track_m: float) -> str:
     clean, attacked, random = (find_row(rows, domain, c) for c in _COMPARED)
     if clean is None or attacked is None:
         return "was not measured in this run"
@@ -106,7 +107,17 @@ def _effect(rows: Sequence[TransferRow], domain: Domain) -> str:
     )
     if random is not None:
         text += f"; with the best random texture it was {number(random.ratio)} ×, and the car left in {random.off_track} of {random.runs}"
-    return text
+    return text + _warning(clean, off_track_m)
+
+
+def _warning(clean: TransferRow, off_track_m: float) -> str:
+    """What must be said of a victim that does not drive without an attack; empty if it drives."""
+    if drives(clean.mean_abs_cte_m, clean.off_track > 0, off_track_m):
+        return ""
+    return (
+        f"; but WITHOUT AN ATTACK THE POLICY DOES NOT DRIVE here (mean |CTE| {clean.mean_abs_cte_m:.3f} m, expected "
+        f"<= {mean_cte_limit_m(off_track_m):g} m; off the track in {clean.off_track} of {clean.runs}), so this ratio proves nothing"
+    )
 
 
 def verdict(targets: Sequence[Target]) -> str:

@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from advnerf_core.driving.metrics import drives, mean_cte_limit_m
 from advnerf_core.report.data import Domain, ReportData
 from advnerf_core.report.tables import Table, TransferRow, find_row, number, transfer_rows
 
@@ -130,12 +131,14 @@ def _random_target(rows: Sequence[TransferRow], domain: Domain, paper: str) -> T
 
 def _drive_targets(data: ReportData) -> tuple[Target, ...]:
     laps, latency = data.laps, data.latency
-    what, target = "policy without attack, 3 laps live", "mean |CTE| ≤ 0.08 m, never off-track"
+    off_track_m = data.settings.off_track_m
+    what = "policy without attack, 3 laps live"
+    target = f"mean |CTE| ≤ {mean_cte_limit_m(off_track_m):g} m, never off-track"
     if laps is None:
         drive = Target(what, target, _NOT_MEASURED, None)
     else:
         left = "left the track" if laps.off_track else "never off-track"
-        met = laps.laps >= 3 and laps.mean_abs_cte_m <= 0.08 and not laps.off_track
+        met = laps.laps >= 3 and drives(laps.mean_abs_cte_m, laps.off_track, off_track_m)
         drive = Target(what, target, f"{laps.mean_abs_cte_m:.3f} m, {left}, {laps.laps} laps", met)
     what, target = "capture to serial write, live", "p99 ≤ one camera period, no tick missed"
     if latency is None:

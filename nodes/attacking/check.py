@@ -13,12 +13,13 @@ import torch
 from torch import Tensor, nn
 
 from advnerf_core.attack.adjoint import AdjointResult, AttackProblem, BlackBoxError, adjoint_gradient
+from advnerf_core.attack.artifact import BLACK_BOX_METHODS_TEXT
+from advnerf_core.attack.closed_loop import ClosedLoopCosine, closed_loop_cosine
 from advnerf_core.attack.health import (
     TickHealth,
     TimeSplit,
     central_slopes,
     closed_loss,
-    cosine,
     frozen_loss,
     random_directions,
     relative_error,
@@ -28,6 +29,7 @@ from advnerf_core.attack.health import (
     with_remembered_frames,
 )
 from advnerf_core.attack.health_plot import draw_health
+from advnerf_core.driving.clean_drive import CleanDrive
 from advnerf_core.files import write_atomically
 from nodes.attacking.memory import measured_mib
 from nodes.attacking.prepare import Prepared, prepare, sensor_of
@@ -38,7 +40,8 @@ from nodes.runtime.stages import Report
 # Smooth parts agree to 1e-7 in float64; a kink of |CTE| or a clipped pixel within a step costs some of that.
 EXACT, FLOAT32_EXACT = 1e-4, 1e-2
 MEMORY_GROWTH, MUCH = 1.1, 0.5
-_STEP, _CLOSED_STEP = 1e-3, 1e-2  # in theta, along unit directions
+_STEP = 1e-3  # in theta, along unit directions
+_CLOSED_DIRECTIONS = 4  # each costs twelve drives of the closed loop
 
 
 @dataclass(frozen=True)
@@ -48,11 +51,11 @@ class Check:
     Attributes:
         frozen_error: Relative error of the gradient against finite differences with frozen poses, float64.
         float32_error: Relative difference of the gradient as the attack computes it to the one in float64.
-        closed_cosine: Cosine of derivatives along random directions to the true closed loop; information only.
+        clean: The drive without an attack.
+        closed: The cosine to the true closed loop, over steps of the finite differences; information only.
         gradient_norm: Norm of the gradient.
         adjoint: Derivatives along the directions, by the adjoint.
         frozen: By finite differences with frozen poses.
-        closed: By finite differences of the true closed loop.
         ticks: Adjoints, saturation and visibility over time.
         split: Where the time goes.
         memory_mib: Peak above idle by horizon, nothing kept; empty if it was not measured.
@@ -60,11 +63,11 @@ class Check:
 
     frozen_error: float
     float32_error: float
-    closed_cosine: float
     gradient_norm: float
     adjoint: tuple[float, ...]
     frozen: tuple[float, ...]
-    closed: tuple[float, ...]
+    clean: CleanDrive
+    closed: ClosedLoopCosine
     ticks: TickHealth
     split: TimeSplit
     memory_mib: dict[int, float]
@@ -90,7 +93,7 @@ def check(request: AttackRequest, directions: int, memory: bool, report: Report)
     prepared = prepare(request)
     if not prepared.problem.differentiable:
         raise BlackBoxError(
-            f"{request.policy} has no gradient that could be checked; search with random, cem or evolution"
+            f"{request.policy} has no gradient that could be checked; search with {BLACK_BOX_METHODS_TEXT}"
         )
     if request.shape is not None:
         raise ConfigError(
@@ -105,12 +108,14 @@ def check(request: AttackRequest, directions: int, memory: bool, report: Report)
     exact = in_double(prepared)
     along = random_directions(theta.double(), directions, prepared.seed)
     reference, frozen = _frozen_slopes(exact, theta.double(), along)
-    report(0.3, "finite differences of the closed loop")
-    closed = central_slopes(partial(closed_loss, exact), theta.double(), along, _CLOSED_STEP)
+    closed = closed_loop_cosine(
+        partial(closed_loss, exact), theta.double(), reference.gradient, min(directions, _CLOSED_DIRECTIONS), seed=prepared.seed,
+        told=lambda done: report(0.3 + 0.4 * done, "finite differences of the closed loop"),
+    )  # fmt: skip
     adjoint = slopes_of(reference.gradient, along)
     return Check(
         relative_error(adjoint, frozen), _difference(result.gradient.double(), reference.gradient),
-        cosine(adjoint, closed), float(reference.gradient.norm()), tuple(adjoint), tuple(frozen), tuple(closed),
+        float(reference.gradient.norm()), tuple(adjoint), tuple(frozen), prepared.clean_drive, closed,
         ticks, split, _memory(request, report) if memory else {},
     )  # fmt: skip
 
@@ -140,7 +145,7 @@ def _memory(request: AttackRequest, report: Report) -> dict[int, float]:
     # Below two time batches the batch itself is not full yet.
     found, shortest = {}, max(request.horizon, 2 * request.search.time_batch)
     for index, ticks in enumerate((shortest, 2 * shortest, 4 * shortest)):
-        report(0.5 + index / 6, f"memory at T = {ticks}")
+        report(0.7 + index / 10, f"memory at T = {ticks}")
         found[ticks] = measured_mib(request, ticks)
     return found
 
@@ -157,14 +162,12 @@ def _on_the_gradient(found: Check) -> list[str]:
         lines.append("  is the policy smooth, in eval mode, and free of randomness? is its declared stateless true?")
     if found.float32_error > FLOAT32_EXACT:
         lines.append(f"float32 NOT ENOUGH: {found.float32_error:.1e} from float64 (expected <= {FLOAT32_EXACT:.0e})")
-    lines.append(
-        f"cosine to the true closed loop {found.closed_cosine:+.2f} (information; the method does not claim it)"
-    )
+    lines.append(f"{found.closed.in_words} (information; the method does not claim it)")
     return lines
 
 
 def _on_the_drive(found: Check) -> list[str]:
-    ticks, lines = found.ticks, []
+    ticks, lines = found.ticks, found.clean.lines
     saturated = sum(ticks.saturated) / len(ticks.saturated)
     lines.append(f"steering saturated in {saturated:.0%} of the frames" + _because(
         saturated > MUCH, "they give no gradient: is the policy too sharp, or the start too far off?"
@@ -200,7 +203,13 @@ def _because(bad: bool, why: str) -> str:
 
 def write_check(found: Check, folder: Path) -> tuple[Path, Path]:
     """Write ``check.json`` and ``check.png``."""
-    data = {**asdict(found), "sound": found.sound, "verdict": found.verdict}
+    data = {
+        **asdict(found),
+        "closed": found.closed.to_dict(),
+        "clean": found.clean.to_dict(),
+        "sound": found.sound,
+        "verdict": found.verdict,
+    }
     data["gradient_pass_ms_per_frame"] = 1e3 * found.split.gradient_pass_s / found.split.frames
     table, picture = folder / "check.json", folder / "check.png"
     write_atomically(table, json.dumps(data, indent=1) + "\n")

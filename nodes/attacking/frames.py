@@ -31,10 +31,9 @@ class DeployedFrames:
         if pinhole != self.view.pinhole:
             raise ValueError(f"expected the camera of the policy's view, {self.view.pinhole}, got {pinhole}")
         size = (self.view.width, self.view.height)
-        rows = slice(self.view.crop_top_px, self.view.crop_top_px + self.view.crop_height_px)
         rgb, depth_m = [], []
         for pose in poses @ self._T_camera_from_car:
             image, depth = self.scene.observe_at(float(pose[0, 3]), float(pose[1, 3]), yaw_of(pose))
             rgb.append(self.view.image(image))
-            depth_m.append(cv2.resize(depth[rows], size, interpolation=cv2.INTER_NEAREST_EXACT))
+            depth_m.append(cv2.resize(depth[self.view.window], size, interpolation=cv2.INTER_NEAREST_EXACT))
         return np.stack(rgb).astype(np.float32) / np.float32(255.0), np.stack(depth_m).astype(np.float32)

@@ -155,7 +155,7 @@ def search_poses(
 ) -> SearchResult:
     """Search as the request asks: multi-start for the method gradient, random poses at as many evaluations for random."""
     problem, asked, seed = ready.problem, ready.asked, ready.prepared.seed
-    told = telling(asked.evaluations, report)
+    told = telling(asked.evaluations, report, clean=ready.prepared.clean_drive)
     if ready.prepared.request.search.method == "random":
         sigma = ready.prepared.request.search.sigma or 5.0
         return random_poses(problem, asked.evaluations, sigma, seed, state_path, told, ready.settings_hash)
@@ -175,7 +175,8 @@ def pose_attack_file(ready: PreparedPoses, result: SearchResult) -> AttackFile:
         for each, moved in zip(ready.prepared.objects, moved_fields, strict=True)
     )
     prepared = replace(ready.prepared, surrogate=surrogate, objects=objects)
-    file = prepared.make_attack_file(replace(result, theta=colours), predicted_m)
+    # Without an attack the objects stand where the request has them, in their plain colours.
+    file = prepared.make_attack_file(replace(result, theta=colours), predicted_m, ready.prepared.clean_drive)
     extra = {
         **file.extra, "placements": ready.sensor.placements(result.theta).tolist(), "colours_free": ready.asked.colours,
         "keep_out_m": ready.asked.keep_out_m, "searched_total_cte_m": result.best.predicted_total_cte_m,
@@ -209,15 +210,14 @@ def _keep(ready: PreparedPoses, result: SearchResult, file: Path) -> None:
     sharp, colours = placed_problem(ready.problem.undisturbed(), result.theta)
     before = replace(sharp, sensor=ready.sensor.surrogate)
     plain = ready.sensor.surrogate.plain_theta()
-    none = evaluate(before, plain)
-    drives = {ready.prepared.request.search.method: evaluate(sharp, colours)[0], "none": none[0]}
+    drives = {ready.prepared.request.search.method: evaluate(sharp, colours)[0], "none": evaluate(before, plain)[0]}
     tracks = {name: rollout.states[:, 0, :2].numpy() for name, rollout in drives.items()}
     picture = draw_placements(ready.sensor.space, ready.sensor.placements(result.theta), [ready.problem.path], tracks)
     write_atomically(file.with_name(f"seed_{ready.prepared.seed}.poses.png"), picture)
     attack = pose_attack_file(ready, result)
     curve = {
         "attack_id": attack.attack_id, "method": attack.method, "seed": attack.seed, "best_evaluation": result.best.iteration,
-        "predicted_total_cte_m": attack.predicted_total_cte_m, "nominal_plain_total_cte_m": float(none[1].protocol_cte_m.mean()),
+        "predicted_total_cte_m": attack.predicted_total_cte_m, "clean_drive": ready.prepared.clean_drive.to_dict(),
         "placements": attack.extra["placements"], "searched_total_cte_m": [e.predicted_total_cte_m for e in result.history],
         "seconds": [e.seconds for e in result.history],
     }  # fmt: skip

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass, replace
+from functools import cached_property
 from importlib.metadata import version
 from typing import Any
 
@@ -13,10 +14,12 @@ from torch import Tensor
 
 from advnerf_core.attack.adjoint import AttackProblem
 from advnerf_core.attack.artifact import AttackedObject, AttackFile, face_texture
+from advnerf_core.attack.clean import clean_drive
 from advnerf_core.attack.displayed import DisplayedSensor
 from advnerf_core.attack.robustness import Disturbances, Smoothness
 from advnerf_core.attack.search import SearchResult, draw_start_states
 from advnerf_core.driving.actuated import ActuatedAckermann
+from advnerf_core.driving.clean_drive import CleanDrive
 from advnerf_core.driving.dynamics import Ackermann, Dynamics
 from advnerf_core.driving.policy import LoadedPolicy
 from advnerf_core.mesh.shape import ShapeSensor
@@ -30,10 +33,9 @@ from calibration.schema import CameraCalibration, RoomCalibration, VehicleCalibr
 from nodes.attacking.meshes import found_meshes, shape_sensor, shaped_objects
 from nodes.attacking.objects import PlacedObject, place
 from nodes.attacking.request import AttackRequest
+from nodes.policy_camera import require_camera
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.stages import hash_of
-
-_MOUNT_TOLERANCE_PX = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +72,21 @@ class Prepared:
         problem = replace(self.problem, start_states=starts, disturbances=disturbances(self.request, seed))
         return replace(self, problem=problem, seed=seed)
 
-    def make_attack_file(self, result: SearchResult, predicted_total_cte_m: float | None = None) -> AttackFile:
+    @property
+    def plain_theta(self) -> Tensor:
+        """Parameters of the objects as they are without an attack."""
+        if isinstance(self.problem.sensor, ShapeSensor):
+            return torch.zeros(self.problem.sensor.theta_shape)
+        return self.surrogate.plain_theta()
+
+    @cached_property
+    def clean_drive(self) -> CleanDrive:
+        """The victim's drive past the plain objects, from the same starts in the same scene."""
+        return clean_drive(self.problem, self.plain_theta)
+
+    def make_attack_file(
+        self, result: SearchResult, predicted_total_cte_m: float | None = None, clean: CleanDrive | None = None
+    ) -> AttackFile:
         """The attack file of a search's result; the prediction is the best evaluation's own unless another is given."""
         predicted = result.best.predicted_total_cte_m if predicted_total_cte_m is None else predicted_total_cte_m
         extra = {
@@ -83,6 +99,7 @@ class Prepared:
             method=self.request.search.method, **self._face(result.theta), camera=self.surrogate.camera,
             scene_sha256=self.hashes["scene"], policy_sha256=self.hashes["policy"], config_sha256=self.hashes["config"],
             seed=self.seed, predicted_total_cte_m=predicted, software_version=version("advnerf"), extra=extra,
+            clean_drive=clean or self.clean_drive,
         )  # fmt: skip
 
     def attacked_objects(self, theta: Tensor) -> tuple[AttackedObject, ...]:
@@ -128,7 +145,7 @@ def prepare(request: AttackRequest, seed: int | None = None) -> Prepared:
     loaded = load_any_policy(str(request.policy))
     camera = load_calibration(CameraCalibration, request.calibration_file("camera"))
     room = load_calibration(RoomCalibration, request.calibration_file("room"))
-    _check_view(request, loaded, camera)
+    require_camera(loaded.view, camera, str(request.policy), request.calibration_file("camera"))
     objects = tuple(place(wanted) for wanted in request.objects)
     surrogate = Surrogate(
         FieldRenderer.from_file(request.scene), loaded.view.pinhole, camera.mount,
@@ -218,6 +235,7 @@ def _problem(
         loaded.policy, sensor_of(request, surrogate), dynamics, room.reference_path, starts, request.horizon,
         goals=_goals(request, loaded, len(starts)), time_batch=search.time_batch,
         cache_bytes=int(search.cache_mib * 2**20), fence_m=float(np.abs(np.array(room.fence_m)).min()),
+        off_track_m=room.off_track_m,
         disturbances=disturbances(request, seed),
         regulariser=Smoothness(surrogate.objects, smoothness) if smoothness else None,
     )  # fmt: skip
@@ -252,13 +270,3 @@ def _goals(request: AttackRequest, loaded: LoadedPolicy, starts: int) -> Tensor 
         return None
     goals = torch.tensor(request.goals, dtype=torch.float32)
     return goals.repeat_interleave(starts // len(goals), dim=0)
-
-
-def _check_view(request: AttackRequest, loaded: LoadedPolicy, camera: CameraCalibration) -> None:
-    trained, mounted = loaded.view.camera, camera.pinhole
-    same_size = (trained.width, trained.height) == (mounted.width, mounted.height)
-    if not same_size or np.abs(trained.matrix - mounted.matrix).max() > _MOUNT_TOLERANCE_PX:
-        raise ConfigError(
-            f"{request.calibration_file('camera')}: expected the camera that the policy {request.policy} was trained with, "
-            f"{trained}, got {mounted}; use its calibration, or train the policy again"
-        )

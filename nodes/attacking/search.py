@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from advnerf_core.attack.adjoint import BlackBoxError, evaluate
-from advnerf_core.attack.artifact import AttackFile, save_attack
+from advnerf_core.attack.artifact import BLACK_BOX_METHODS_TEXT, AttackFile, save_attack
 from advnerf_core.attack.baselines import random_search
 from advnerf_core.attack.distil import Distillation
 from advnerf_core.attack.guided import BlackBoxSearch, black_box_attack
@@ -36,9 +36,7 @@ def search(
     """Search as the request asks; what ``on_evaluation`` raises ends it, and a state file then goes on from there."""
     wanted, problem = prepared.request.search, prepared.problem
     if wanted.method == "gradient" and not problem.differentiable:
-        raise BlackBoxError(
-            f"{prepared.request.policy} has no gradient: use the method guided, distilled, evolution, cem or random"
-        )
+        raise BlackBoxError(f"{prepared.request.policy} has no gradient: use the method {BLACK_BOX_METHODS_TEXT}")
     common: dict[str, Any] = {
         "seed": prepared.seed, "state_path": state_path, "on_evaluation": on_evaluation,
         "settings_hash": prepared.settings_hash,
@@ -155,7 +153,9 @@ def kept_request(folder: Path) -> AttackRequest:
 def _run_seed(prepared: Prepared, folder: Path, display: Display, on_evaluation: OnEvaluation | None) -> None:
     name, state_path = f"seed_{prepared.seed}", folder / f"seed_{prepared.seed}.state.safetensors"
     report = display.start(name)
-    result = search(prepared, state_path, _both(telling(planned_evaluations(prepared), report), on_evaluation))
+    report(0.0, "drive without attack")
+    told = telling(planned_evaluations(prepared), report, clean=prepared.clean_drive)
+    result = search(prepared, state_path, _both(told, on_evaluation))
     _keep(prepared, result, folder)
     state_path.unlink(missing_ok=True)
     display.finish(name, sum(e.seconds for e in result.history), cached=False)
@@ -176,7 +176,12 @@ def _run_together(
     each = [prepared, *(prepared.with_seed(seed) for seed in seeds[1:])]
     if on_prepared is not None:
         on_prepared(prepared)
-    told = [_both(telling(request.search.evaluations, display.start(f"seed_{seed}")), on_evaluation) for seed in seeds]
+    told = [
+        _both(
+            telling(request.search.evaluations, display.start(f"seed_{one.seed}"), clean=one.clean_drive), on_evaluation
+        )
+        for one in each
+    ]
     results = gradient_attacks(
         [one.problem for one in each], seeds, request.search.evaluations, request.search.learning_rate or 0.1,
         state_path, lambda k, evaluation: told[k](evaluation), prepared.settings_hash,
@@ -198,7 +203,7 @@ def _keep(prepared: Prepared, result: SearchResult, folder: Path) -> None:
         "attack_id": attack_id, "method": prepared.request.search.method, "seed": prepared.seed,
         "best_evaluation": result.best.iteration, "loss_m": [e.loss_m for e in result.history],
         "predicted_total_cte_m": [e.predicted_total_cte_m for e in result.history],
-        "seconds": [e.seconds for e in result.history],
+        "seconds": [e.seconds for e in result.history], "clean_drive": prepared.clean_drive.to_dict(),
     }  # fmt: skip
     write_atomically(folder / f"seed_{prepared.seed}.json", json.dumps(curve, indent=1) + "\n")
 

@@ -56,7 +56,8 @@ class Speaker:
         self._prepared, self._evaluations = prepared, planned_evaluations(prepared)
         self.say(
             "progress", state="searching", seed=prepared.seed, evaluation=done, evaluations=self._evaluations, text="",
-            total_cte_m=self._best_m or 0.0,
+            total_cte_m=self._best_m or 0.0, clean_total_cte_m=prepared.clean_drive.mean_total_cte_m,
+            clean_drives=prepared.clean_drive.drives,
         )  # fmt: skip
 
     def told(self, evaluation: Evaluation) -> None:
@@ -134,7 +135,8 @@ def work(folder: Path, stream: BinaryIO) -> None:
 
 def main() -> int:
     """Run the worker; what a person can put right is one line on standard error."""
-    stream = os.fdopen(os.dup(1), "wb")
+    # Never closed: the node takes the end of this pipe for the end of the process, whose shutdown takes seconds on a busy machine.
+    stream = os.fdopen(os.dup(1), "wb", closefd=False)
     os.dup2(2, 1)
     try:
         work(Path(sys.argv[1]), stream)

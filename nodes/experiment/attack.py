@@ -15,10 +15,12 @@ import torch
 from advnerf_core.attack.adjoint import AttackProblem, evaluate
 from advnerf_core.attack.artifact import AttackFile, face_texture, save_attack
 from advnerf_core.attack.baselines import random_search
+from advnerf_core.attack.clean import clean_drive
 from advnerf_core.attack.displayed import DisplayedSensor
 from advnerf_core.attack.optimise import gradient_attack
 from advnerf_core.attack.population import CrossEntropy, population_search
 from advnerf_core.attack.search import SearchResult, draw_start_states
+from advnerf_core.driving.clean_drive import CleanDrive
 from advnerf_core.driving.policy import LoadedPolicy, load_policy
 from advnerf_core.files import write_atomically
 from advnerf_core.scene.surrogate import Surrogate
@@ -120,6 +122,7 @@ def attack_problem(
     return AttackProblem(
         policy.policy, surrogate, experiment.dynamics, experiment.path, start_states(experiment, seed), attack.horizon,
         time_batch=attack.time_batch, cache_bytes=int(attack.cache_mib * 2**20), fence_m=float(fence),
+        off_track_m=experiment.room.off_track_m,
     )  # fmt: skip
 
 
@@ -159,10 +162,12 @@ def run_search(
         result = population_search(problem, CrossEntropy(), attack.random_evaluations, **common)
     else:
         result = random_search(problem, attack.random_evaluations, attack.random_sigma, **common)
-    attack_id = save_attack(attack_path(folder, search), _attack_file(experiment, policy, search, result))
+    clean = clean_drive(problem, plain_theta(surrogate))
+    attack_id = save_attack(attack_path(folder, search), _attack_file(experiment, policy, search, result, clean))
     rollout, totals = evaluate(measured(experiment, problem), result.theta)
     drives = {
         "attack_id": attack_id,
+        "clean_drive": clean.to_dict(),
         "states": rollout.states.transpose(0, 1).tolist(),
         "total_cte_m": totals.protocol_cte_m.tolist(),
         "curve_total_cte_m": [evaluation.predicted_total_cte_m for evaluation in result.history],
@@ -177,7 +182,16 @@ def attack_path(folder: Path, search: Search) -> Path:
     return folder / f"{search.name}.attack.safetensors"
 
 
-def _attack_file(experiment: Experiment, policy: LoadedPolicy, search: Search, result: SearchResult) -> AttackFile:
+def plain_theta(sensor: Surrogate | DisplayedSensor) -> torch.Tensor:
+    """The object's own colours, whatever is between them and the camera."""
+    behind = sensor.sensor if isinstance(sensor, DisplayedSensor) else sensor
+    assert isinstance(behind, Surrogate)
+    return behind.plain_theta()
+
+
+def _attack_file(
+    experiment: Experiment, policy: LoadedPolicy, search: Search, result: SearchResult, clean: CleanDrive
+) -> AttackFile:
     theta = result.theta.numpy().astype(np.float32)
     return AttackFile(
         method=search.method, theta=theta, texture=face_texture(theta), size_m=(experiment.face_m, experiment.face_m),
@@ -186,5 +200,5 @@ def _attack_file(experiment: Experiment, policy: LoadedPolicy, search: Search, r
         camera=experiment.view.pinhole, scene_sha256=scene_sha256(experiment), policy_sha256=policy.sha256,
         config_sha256=hash_of(experiment.config.model_dump(mode="json")), seed=search.seed,
         predicted_total_cte_m=result.best.predicted_total_cte_m, software_version=version("advnerf"),
-        extra={"victim": search.victim, "horizon": experiment.config.attack.horizon},
+        extra={"victim": search.victim, "horizon": experiment.config.attack.horizon}, clean_drive=clean,
     )  # fmt: skip

@@ -17,9 +17,11 @@ import torch
 from advnerf_core.attack.adjoint import AttackProblem
 from advnerf_core.attack.artifact import AttackedObject, AttackFile, load_attack, save_attack
 from advnerf_core.attack.baselines import random_search
+from advnerf_core.attack.clean import clean_drive
 from advnerf_core.attack.optimise import gradient_attack
 from advnerf_core.attack.population import CrossEntropy, population_search
 from advnerf_core.attack.search import SearchResult
+from advnerf_core.driving.clean_drive import CleanDrive
 from advnerf_core.driving.policy import LoadedPolicy, load_policy
 from advnerf_core.files import write_atomically
 from advnerf_core.scene.surrogate import Surrogate, split_theta
@@ -124,7 +126,10 @@ def surrogate_part(
         result = _search(experiment, problem, cell, folder, report)
         theta, seconds = result.theta, sum(evaluation.seconds for evaluation in result.history)
         curve = [evaluation.predicted_total_cte_m for evaluation in result.history]
-        attack_id = save_attack(attack_path(folder, cell), _attack_file(experiment, surrogate, policy, cell, result))
+        clean = clean_drive(problem, surrogate.plain_theta())
+        attack_id = save_attack(
+            attack_path(folder, cell), _attack_file(experiment, surrogate, policy, cell, result, clean)
+        )
     states, scores = learned_drives(experiment, problem, theta)
     data = {
         "attack_id": attack_id, "states": states.tolist(), **totals(scores), "mean_cte_m": [score.mean_cte_m for score in scores],
@@ -144,6 +149,7 @@ def attack_problem(
     return AttackProblem(
         policy.policy, surrogate, experiment.dynamics, experiment.paths[scenario], starts, experiment.config.horizon, goals,
         time_batch=attack.time_batch, cache_bytes=int(attack.cache_mib * 2**20), held_cap_m=experiment.config.held_cap_m,
+        off_track_m=experiment.site.off_track_m,
     )  # fmt: skip
 
 
@@ -198,7 +204,12 @@ def _geometry(experiment: Experiment, kind: str) -> str:
 
 
 def _attack_file(
-    experiment: Experiment, surrogate: Surrogate, policy: LoadedPolicy, cell: Cell, result: SearchResult
+    experiment: Experiment,
+    surrogate: Surrogate,
+    policy: LoadedPolicy,
+    cell: Cell,
+    result: SearchResult,
+    clean: CleanDrive,
 ) -> AttackFile:
     parts = split_theta(surrogate.objects, result.theta)
     objects = tuple(
@@ -214,5 +225,5 @@ def _attack_file(
         scene_sha256=scene_sha256(experiment), policy_sha256=policy.sha256,
         config_sha256=hash_of(experiment.config.model_dump(mode="json")), seed=cell.seed,
         predicted_total_cte_m=result.best.predicted_total_cte_m, software_version=version("advnerf"),
-        extra={"victim": cell.victim, "scenario": cell.scenario, "horizon": experiment.config.horizon}, objects=objects,
+        extra={"victim": cell.victim, "scenario": cell.scenario, "horizon": experiment.config.horizon}, objects=objects, clean_drive=clean,
     )  # fmt: skip

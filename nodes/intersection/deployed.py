@@ -42,9 +42,8 @@ class DressedScene:
 
     def __init__(self, scene: DeploymentScene, view: PolicyView, objects: Sequence[ColouredObject]) -> None:
         self.scene, self.view = scene, view
-        window = view.camera.cropped(0, view.crop_top_px, view.camera.width, view.crop_height_px)
         self._window = Surrogate(
-            self._observed, window, scene.T_car_from_camera, objects, supersample=_SUPERSAMPLE, opaque=True
+            self._observed, view.window_pinhole, scene.T_car_from_camera, objects, supersample=_SUPERSAMPLE, opaque=True
         )
         self._whole = Surrogate(
             self._observed, view.camera, scene.T_car_from_camera, objects, supersample=_SUPERSAMPLE, opaque=True
@@ -71,10 +70,10 @@ class DressedScene:
     def seen_now(self, theta: Tensor | None) -> NDArray[np.uint8]:
         """Policy image ``[66, 200, 3]`` of the car where it is now."""
         rgb, depth_m = self.scene.observe()
-        rows = slice(self.view.crop_top_px, self.view.crop_top_px + self.view.crop_height_px)
+        window = self.view.window
         state = self.scene.state
         pose = planar_poses(np.array([[state.x_m, state.y_m, state.yaw_rad]])) @ self.scene.T_car_from_camera
-        image = self._window.overlay(rgb[rows][None] / np.float32(255.0), depth_m[rows][None], pose, theta)
+        image = self._window.overlay(rgb[window][None] / np.float32(255.0), depth_m[window][None], pose, theta)
         return self._resized(as_uint8(image[0]))
 
     def camera_image(self, state: Array, theta: Tensor | None) -> NDArray[np.uint8]:
@@ -87,16 +86,17 @@ class DressedScene:
         return np.asarray(resized, dtype=np.uint8)
 
     def _observed(self, poses: Array, pinhole: Pinhole) -> tuple[Tensor, Tensor]:
-        """The scene as a background renderer: the rows of the camera image that the pinhole keeps."""
+        """The scene as a background renderer: the part of the camera image that the pinhole keeps."""
         T_camera_from_car = np.linalg.inv(self.scene.T_car_from_camera)
-        first = round(self.view.camera.cy - pinhole.cy)
+        top, left = round(self.view.camera.cy - pinhole.cy), round(self.view.camera.cx - pinhole.cx)
+        kept = slice(top, top + pinhole.height), slice(left, left + pinhole.width)
         rgb: list[Rgb] = []
         depth_m: list[Depth] = []
         for pose in poses @ T_camera_from_car:
             yaw = float(np.arctan2(pose[1, 0], pose[0, 0]))
             image, depth = self.scene.observe_at(float(pose[0, 3]), float(pose[1, 3]), yaw)
-            rgb.append(image[first : first + pinhole.height])
-            depth_m.append(depth[first : first + pinhole.height])
+            rgb.append(image[kept])
+            depth_m.append(depth[kept])
         return torch.from_numpy(np.stack(rgb)) / 255.0, torch.from_numpy(np.stack(depth_m))
 
 

@@ -17,6 +17,7 @@ from nodes.attack import AttackConfig, AttackNode, Sender
 from nodes.attacking import job, search
 from nodes.attacking.client import ask_for_attack, cancel_attack, new_request_id
 from nodes.attacking.request import load_request, request_text
+from nodes.cli_attack_node import in_words
 from nodes.runtime.bus import Bus
 from nodes.runtime.clock import ManualClock, Now, SystemClock
 from nodes.runtime.errors import LaunchError
@@ -132,6 +133,9 @@ def test_a_request_ends_in_the_attack_file_that_the_command_would_have_written(b
         files += [file] if file else []
     attack = attack_from_bytes(files[0].content, "a")
     assert attack.attack_id == last.attack_id
+    assert last.clean_total_cte_m == pytest.approx(attack.clean_drive.mean_total_cte_m)
+    assert last.clean_drives == attack.clean_drive.drives
+    assert f", without attack {last.clean_total_cte_m:.2f} m" in in_words(last)
     assert image_array(bench.of("/attack/texture")[-1]).shape == (256, 256, 3)
     assert image_array(bench.of("/attack/preview")[-1]).shape == (132, 400, 3)
     assert bench.node.status()[0] == "ready"

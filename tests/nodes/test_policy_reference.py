@@ -1,19 +1,33 @@
+import os
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from advnerf_core.driving.expert import Expert
-from advnerf_core.driving.frames import Frames, FrameStore
+from advnerf_core.driving.path import Arc
+from advnerf_core.driving.path import Path as ReferencePath
 from advnerf_core.driving.policy_view import PolicyView
+from advnerf_core.fields.hash_grid import HashGridConfig
 from advnerf_core.geometry import Pinhole, planar_pose
-from calibration.schema import CameraCalibration, RoomCalibration, load_calibration
-from nodes.policy_reference import from_bag, from_run, from_twin
+from advnerf_core.policies.adapter import adapt
+from advnerf_core.policies.conformance import FAILURE, OK, WARNING, Finding
+from advnerf_core.policies.contract import PolicyContract
+from advnerf_core.scene.field import SceneField, SceneFieldConfig, save_scene
+from advnerf_core.scene.posed_images import write_posed_images
+from calibration.schema import CameraCalibration, RoomCalibration, load_calibration, save_calibration
+from nodes.policy_reference import from_bag, from_run, from_scene, from_twin, judged_by_drives
 from nodes.runtime.bag import BagWriter
 from nodes.runtime.errors import BagError, ConfigError
 from nodes.runtime.messages import encode, image_message, pose_message
 
-TWIN = Path(__file__).parents[2] / "calibration" / "twin"
+ROOT = Path(__file__).parents[2]
+TWIN = ROOT / "calibration" / "twin"
 ROOM = TWIN / "room.yaml"
 VIEW = PolicyView(load_calibration(CameraCalibration, TWIN / "camera.yaml").pinhole)
 T0, MS = 1_800_000_000_000_000_000, 1_000_000
@@ -52,21 +66,115 @@ def test_a_bag_that_is_of_no_use_is_one_error(tmp_path):
         from_bag(write_bag(tmp_path / "small", moving, (40, 60)), ROOM, VIEW)
 
 
-def test_frames_of_a_run_folder_are_the_plain_ones(tmp_path):
-    rng = np.random.default_rng(0)
-    textured = np.arange(12) % 2 == 1
-    frames = Frames(
-        rng.integers(0, 255, (12, 66, 200, 3)).astype(np.uint8), np.zeros((12, 3)),
-        np.arange(12, dtype=np.float32) / 100, np.zeros((12, 0), np.float32), textured,
-    )  # fmt: skip
-    FrameStore(tmp_path / "policy" / "frames").append("stills-lab", frames)
-    reference = from_run(tmp_path, VIEW)
-    np.testing.assert_allclose(reference.steering_rad, np.arange(0, 12, 2) / 100, atol=1e-7)
-    np.testing.assert_array_equal(reference.images, frames.images[::2])
-    with pytest.raises(ConfigError, match="expected frames of 100 x 66"):
-        from_run(tmp_path, PolicyView(VIEW.camera, width=100))
-    with pytest.raises(ConfigError, match="found none"):
+def about(path):
+    """Car states round a path, turned from it to both sides."""
+    states = path.pose_at(np.linspace(0.0, path.length_m, 12))
+    states[:, 2] += 0.05 * (-1.0) ** np.arange(12)
+    return states
+
+
+def run_folder(folder, steer_path=None):
+    """What the capture stage of an experiment leaves, in an empty learned scene; every frame has a ramp from top to bottom."""
+    calibration = folder / "capture" / "calibration"
+    calibration.mkdir(parents=True)
+    for name in ("camera", "room", "vehicle"):
+        shutil.copy(TWIN / f"{name}.yaml", calibration)
+    camera = load_calibration(CameraCalibration, TWIN / "camera.yaml")
+    room = load_calibration(RoomCalibration, TWIN / "room.yaml")
+    if steer_path is not None:
+        room = room.model_copy(update={"path": steer_path.to_dict()})
+        save_calibration(room, calibration / "room.yaml")
+    states = about(room.reference_path)
+    ramp = np.repeat(np.arange(188, dtype=np.uint8)[:, None, None], 336, 1).repeat(3, 2)
+    poses = [planar_pose(*state) @ camera.mount for state in states]
+    write_posed_images(folder / "capture" / "held_out", poses, camera.pinhole, lambda i: ramp + np.uint8(i), "png")
+    grid = HashGridConfig(levels=2, features=2, log2_entries=8, coarsest=4, finest=8)
+    scene = SceneField(SceneFieldConfig((-4.0, -4.0, 0.0), (4.0, 4.0, 2.5), grid=grid, hidden=16))
+    (folder / "scene").mkdir()
+    save_scene(folder / "scene" / "scene.safetensors", scene, np.zeros((4, 4, 4), bool), {})
+    return folder
+
+
+def test_a_run_folder_is_seen_through_the_policys_own_crop(tmp_path):
+    folder = run_folder(tmp_path / "run")
+    usual, high = from_run(folder, VIEW), from_run(folder, replace(VIEW, crop_top_px=0))
+    assert usual.images.shape == high.images.shape == (12, 66, 200, 3)
+    np.testing.assert_allclose(usual.images[0, 0, :, 0], 24, atol=1)
+    np.testing.assert_allclose(high.images[0, 0, :, 0], 0, atol=1)
+    narrow = from_run(folder, replace(VIEW, crop_left_px=100, crop_width_px=100, width=100))
+    assert narrow.images.shape == (12, 66, 100, 3)
+    room = load_calibration(RoomCalibration, ROOM)
+    wanted = Expert(room.reference_path).steer_states(about(room.reference_path))
+    np.testing.assert_allclose(usual.steering_rad, wanted, atol=1e-6)
+    with pytest.raises(ConfigError, match="expected the camera that the policy"):
+        from_run(folder, replace(VIEW, camera=replace(VIEW.camera, fx=200.0)))
+    with pytest.raises(ConfigError, match="expected the run folder of an experiment"):
         from_run(tmp_path / "nothing", VIEW)
+
+
+class Circling(torch.nn.Module):
+    """Steers by one angle whatever it sees, and a little by the light."""
+
+    def __init__(self, steering_rad):
+        super().__init__()
+        self.steering_rad = steering_rad
+
+    def forward(self, images):
+        return self.steering_rad + 1e-3 * images.mean(dim=(1, 2, 3))
+
+
+def circling(steering_rad):
+    return adapt(Circling(steering_rad).eval(), PolicyContract(VIEW))
+
+
+def test_a_policy_is_driven_round_the_path_in_the_scene(tmp_path):
+    circle = ReferencePath.from_segments((0.0, -2.0, 0.0), [Arc(2.0, np.pi / 2)] * 4)
+    reference = from_run(run_folder(tmp_path / "run", circle), VIEW)
+    on_it = circling(float(np.arctan(0.25 / 2.0)))
+    clean = reference.drives(on_it, ())
+    assert len(clean.total_cte_m) == 4
+    assert clean.ticks * 4 * 0.08 == pytest.approx(circle.length_m, abs=0.4)
+    assert clean.drives, clean.lines
+    straight = reference.drives(circling(0.0), ())
+    assert not straight.drives
+    assert all(straight.off_track)
+    right = [Finding("mode", OK, ""), Finding("expert", WARNING, "far off")]
+    assert judged_by_drives(on_it, reference, right)[-1].verdict == OK
+    failed = judged_by_drives(circling(0.0), reference, right)[-1]
+    assert (failed.name, failed.verdict) == ("drive", FAILURE)
+    assert "does not drive here" in failed.text
+    assert judged_by_drives(circling(0.0), replace(reference, asked=False), right)[-1].verdict == WARNING
+    bag = replace(reference, drives=None)
+    assert [f.verdict for f in judged_by_drives(on_it, bag, right)] == [OK, FAILURE]
+    wrong = [Finding("mode", FAILURE, "")]
+    assert judged_by_drives(on_it, reference, wrong) == wrong
+
+
+def test_a_scene_gives_views_of_the_policys_own_size_and_drives(tmp_path):
+    folder = run_folder(tmp_path / "run", ReferencePath.from_segments((0.0, -2.0, 0.0), [Arc(2.0, np.pi / 2)] * 4))
+    calibration = folder / "capture" / "calibration"
+    reference = from_scene(folder / "scene" / "scene.safetensors", calibration, replace(VIEW, width=100), count=6)
+    assert reference.images.shape == (6, 66, 100, 3)
+    assert np.ptp(reference.steering_rad) > 0.1
+    assert reference.asked
+    assert not reference.drives(circling(-0.1), ()).drives
+
+
+def test_the_command_fails_for_a_policy_that_does_not_drive_where_it_was_asked_to(tmp_path):
+    circle = ReferencePath.from_segments((0.0, -2.0, 0.0), [Arc(2.0, np.pi / 2)] * 4)
+    folder = run_folder(tmp_path / "run", circle)
+    for name, steering_rad in (("good", 0.1244), ("bad", -0.1)):
+        source = (
+            f"from test_policy_reference import circling\n\n\ndef factory():\n    return circling({steering_rad})\n"
+        )
+        (tmp_path / f"{name}.py").write_text(source)
+    for name, place, code in (("bad", ["--run-folder", str(folder)], 1), ("good", ["--run-folder", str(folder)], 0)):
+        done = subprocess.run(
+            [sys.executable, "-m", "nodes.cli", "policy", "check", f"{name}:factory", *place], cwd=tmp_path, text=True,
+            capture_output=True, env={**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{Path(__file__).parent}", "COLUMNS": "300"},
+        )  # fmt: skip
+        assert done.returncode == code, done.stdout + done.stderr
+        assert ("NO DRIVE" in done.stdout) == (code == 1)
 
 
 def test_the_twin_gives_left_and_right(monkeypatch):

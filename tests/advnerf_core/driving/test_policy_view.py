@@ -57,3 +57,15 @@ def test_round_trip_and_errors() -> None:
         PolicyView(CAMERA, crop_top_px=100)
     with pytest.raises(ValueError, match=r"PolicyView\.to_dict"):
         PolicyView.from_dict({"camera": {}})
+
+
+def test_columns_outside_the_crop_are_not_seen() -> None:
+    view = PolicyView(CAMERA, crop_left_px=20, crop_width_px=300)
+    image = np.full((188, 336, 3), 255, np.uint8)
+    image[24:135, 20:320] = 7
+    assert (view.image(image) == 7).all()
+    points = np.array([[0.3, 0.1, 1.0], [-0.5, 0.2, 2.0]])
+    scale = np.array([200 / 300, 66 / 111])
+    np.testing.assert_allclose(view.pinhole.project(points), (CAMERA.project(points) - [20, 24]) * scale)
+    with pytest.raises(ValueError, match="crop inside"):
+        PolicyView(CAMERA, crop_left_px=100, crop_width_px=300)

@@ -74,7 +74,7 @@ def swapped(x):
 @pytest.mark.parametrize(
     ("before", "after", "advice", "contract"),
     [
-        (swapped, lambda y: y, "takes BGR for RGB: set colour_order = 'BGR'", {}),
+        (swapped, lambda y: y, "takes BGR for RGB: set colour_space = 'BGR'", {}),
         (lambda x: x / 255, lambda y: y, "expects values of 0..255, but is given 0..1: set value_max = 255", {}),
         (lambda x: x, lambda y: y, "expects values of 0..1, but is given 0..255: set value_max = 1", {"value_max": 255.0}),
         (lambda x: x, lambda y: y * 180 / np.pi, "steers in degrees for radians: set output_unit = 'deg'", {}),
@@ -92,7 +92,7 @@ def test_a_lie_is_recognised_and_named(before, after, advice, contract):
 
 def test_the_declaration_that_is_advised_makes_it_right():
     network = around(lambda x: swapped(x) / 255, lambda y: -y * 180 / np.pi)
-    truth = replace(DECLARED, colour_order="BGR", value_max=255.0, output_unit="deg", positive="right")
+    truth = replace(DECLARED, colour_space="BGR", value_max=255.0, output_unit="deg", positive="right")
     assert findings(network, truth)["expert"].verdict == OK
     assert findings(network)["expert"].verdict == FAILURE
 
@@ -201,3 +201,21 @@ def test_no_gradient(before, after, sentence):
 def test_a_constant_output():
     found = findings(around(after=lambda y: 0 * y + 0.1))
     assert "steers 0.1000 rad whatever it sees" in found["range"].text
+
+
+def test_a_black_box_is_told_every_method_that_can_attack_it():
+    found = findings(around(), replace(DECLARED, differentiable=False))
+    assert "guided, distilled, evolution, cem, random" in found["gradient"].text
+
+
+def test_a_network_of_yuv_that_is_declared_rgb_is_recognised():
+    back = torch.tensor(
+        [[1.0, 0.0, 1.0 / 0.877], [1.0, -0.114 / 0.587 / 0.492, -0.299 / 0.587 / 0.877], [1.0, 1.0 / 0.492, 0.0]]
+    )
+
+    def from_yuv(x):
+        return torch.einsum("kc,bchw->bkhw", back, x - torch.tensor([0.0, 0.5, 0.5]).view(1, 3, 1, 1))
+
+    found = findings(around(from_yuv))
+    assert "takes YUV for RGB: set colour_space = 'YUV'" in found["expert"].text
+    assert findings(around(from_yuv), replace(DECLARED, colour_space="YUV"))["expert"].verdict == OK

@@ -79,11 +79,11 @@ def test_numpy_and_torch_convert_alike():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"colour_order": "GBR"}, "colour_order: expected RGB or BGR, got 'GBR'"),
-        ({"output_unit": "degrees"}, "output_unit: expected rad or deg"),
+        ({"colour_space": "GBR"}, "colour_space: expected RGB or BGR or YUV or GRAY, got 'GBR'"),
+        ({"output_unit": "degrees"}, "output_unit: expected rad or deg or normalised or 1/m"),
         ({"std": (1.0, 0.0, 1.0)}, "std > 0"),
         ({"goal_size": -1}, "goal size >= 0"),
-        ({"colour": "RGB"}, "unknown key colour; valid keys: view, colour_order"),
+        ({"colour": "RGB"}, "unknown key colour; valid keys: view, colour_space"),
         ({"view": {"width": 3}}, "expected a policy view"),
     ],
 )
@@ -293,3 +293,100 @@ def test_the_attack_knows_a_black_box(tmp_path):
     problem = AttackProblem(load_any_policy(file).policy, None, Dynamics(), None, torch.zeros(1, 3), 2)
     with pytest.raises(BlackBoxError, match="declares differentiable = False"):
         adjoint_gradient(problem, torch.zeros(2, 2, 3))
+
+
+def udacity(**changes):
+    """The public behavioural-cloning PilotNet: cropped, YUV in -1..1, a share of 25 degrees, positive to the right."""
+    view = replace(VIEW, crop_top_px=60, crop_height_px=103, crop_left_px=16, crop_width_px=300)
+    declared = {"colour_space": "YUV", "value_max": 255.0, "mean": (127.5,), "std": (127.5,), "layout": "NHWC"}
+    return PolicyContract(
+        view, **{**declared, "output_unit": "normalised", "full_steering_rad": 0.436, "positive": "right", **changes}
+    )
+
+
+class YuvPilot(nn.Module):
+    """PilotNet behind the layout of channels last; its input is YUV and its output a share of the full angle."""
+
+    def __init__(self):
+        super().__init__()
+        self.inner = net()
+
+    def forward(self, given):
+        return self.inner(0.5 * given.permute(0, 3, 1, 2) + 0.5)[:, None] / 0.3
+
+
+def test_yuv_and_grey_are_what_opencv_makes_of_an_8_bit_picture():
+    import cv2
+
+    rgb = np.random.default_rng(3).integers(0, 256, (66, 200, 3)).astype(np.uint8)
+    planes = np.moveaxis(rgb, -1, 0)[None].astype(np.float32) / np.float32(255.0)
+    yuv = PolicyContract(VIEW, "YUV", 255.0).to_network(planes)[0]
+    # 8-bit OpenCV rounds the luma before it takes the differences.
+    assert np.abs(np.moveaxis(yuv, 0, -1) - cv2.cvtColor(rgb, cv2.COLOR_RGB2YUV)).max() < 1.6
+    grey = PolicyContract(VIEW, "GRAY", 255.0).to_network(planes)
+    assert grey.shape == (1, 1, 66, 200)
+    assert np.abs(grey[0, 0] - cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)).max() < 0.6
+    saturated = PolicyContract(VIEW, "YUV").to_network(
+        np.array([[[[1.0]], [[0.0]], [[0.0]]]]).repeat(66, 2).repeat(200, 3)
+    )
+    assert saturated.max() == 1.0  # V of pure red lies beyond what 8 bits hold
+
+
+@pytest.mark.parametrize("space", ["YUV", "GRAY", "BGR"])
+def test_the_gradient_through_a_colour_space_agrees_with_finite_differences(space):
+    contract = PolicyContract(SMALL, space, 255.0, (127.5,), (127.5,))
+    weights = torch.randn(contract.channels, *contract.size, generator=torch.Generator().manual_seed(2)).double()
+    policy = adapt(lambda given: 0.1 * torch.tanh(1e-2 * (weights * given.sin()).sum((1, 2, 3))), contract)
+    # Away from full saturation, where V is clipped.
+    x = (0.2 + 0.6 * images(1, contract).double()).requires_grad_()
+    (gradient,) = torch.autograd.grad(policy(x).sum(), x)
+    direction = torch.randn(x.shape, generator=torch.Generator().manual_seed(4)).double()
+    with torch.no_grad():
+        numeric = (policy(x + 1e-6 * direction) - policy(x - 1e-6 * direction)) / 2e-6
+    assert float((gradient * direction).sum()) == pytest.approx(float(numeric), rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"output_unit": "1/m", "full_steering_rad": None, "wheelbase_m": 0.25},
+        {"output_unit": "deg", "full_steering_rad": None, "steering_ratio": 15.0, "colour_space": "BGR"},
+    ],
+)
+def test_a_public_pilotnet_steers_alike_live_in_onnx_and_in_an_attack(tmp_path, changes):
+    contract = udacity(**changes)
+    policy = adapt(YuvPilot().eval(), contract)
+    assert PolicyContract.from_dict(contract.to_dict()) == contract
+    file = tmp_path / "policy.onnx"
+    export_onnx(policy.network, contract, file)
+    frame = np.random.default_rng(0).integers(0, 256, (188, 336, 3)).astype(np.uint8)
+    driver = load_driver(file)
+    seen = driver.view.image(frame)
+    planes = torch.from_numpy(seen).permute(2, 0, 1)[None] / 255.0
+    expected = float(policy(planes)[0])
+    assert abs(expected) > 1e-4
+    assert driver.steer(seen, ()) == pytest.approx(expected, abs=1e-5)
+    raw = float(policy.network(contract.to_network(planes))[0])
+    angles = {"normalised": 0.436 * raw, "1/m": np.arctan(0.25 * raw), "deg": np.deg2rad(raw) / 15.0}
+    assert expected == pytest.approx(-angles[contract.output_unit], abs=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"full_steering_rad": None}, "full_steering_rad: expected a number > 0 with output_unit = 'normalised'"),
+        ({"output_unit": "1/m", "full_steering_rad": None}, "wheelbase_m: expected a number > 0"),
+        ({"output_unit": "rad"}, "full_steering_rad: expected it with output_unit = 'normalised' only"),
+        ({"steering_ratio": 15.0}, "steering_ratio: expected it with output_unit = 'rad' or 'deg' only"),
+        ({"colour_space": "GRAY", "mean": (1.0, 2.0, 3.0)}, "mean: expected 1 number or 1"),
+    ],
+)
+def test_a_declaration_that_contradicts_itself_is_one_error(changes, message):
+    with pytest.raises(PolicyContractError, match=message):
+        udacity(**changes)
+
+
+def test_a_mean_for_all_channels_may_be_a_single_number_in_a_file():
+    data = {"view": VIEW.to_dict(), "mean": 127.5, "std": 127.5, "value_max": 255}
+    assert PolicyContract.from_dict(data).mean == (127.5,)

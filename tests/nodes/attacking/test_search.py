@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from advnerf_core.attack.adjoint import BlackBoxError
+from advnerf_core.attack.adjoint import BlackBoxError, evaluate
 from advnerf_core.attack.artifact import load_attack
 from advnerf_core.attack.guided import BudgetError
 from advnerf_core.display import DisplayModel
@@ -168,3 +168,51 @@ def test_an_object_out_of_sight_has_no_gradient_and_the_check_says_so(tmp_path):
     found = check(load_request(tiny_request(tmp_path), away), 2, False, lambda fraction, text="": None)
     assert not found.sound
     assert found.verdict[0].startswith("NO GRADIENT")
+
+
+def command(monkeypatch, *words):
+    monkeypatch.setattr(sys, "argv", ["advnerf", "attack", *map(str, words)])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    return ended.value.code
+
+
+def test_every_result_stands_beside_the_drive_without_attack(tmp_path, monkeypatch, capsys):
+    file = tiny_request(tmp_path, evaluations=2)
+    starts = "starts.poses=[[0.0, -1.65, 0.5], [0.0, -2.3, -0.4]]"  # they head away from the path
+    changes = ["--set", starts]
+    assert command(monkeypatch, "run", file, "-o", tmp_path / "out", *changes) == 0
+    printed = capsys.readouterr().out
+    attack = load_attack(tmp_path / "out" / "seed_0.attack.safetensors")
+    prepared = prepare(load_request(file, [starts]))
+    _, totals = evaluate(prepared.problem, prepared.surrogate.plain_theta())
+    clean = attack.clean_drive
+    assert clean.total_cte_m == pytest.approx(totals.protocol_cte_m.tolist(), rel=1e-6)
+    assert len(clean.total_cte_m) == 2
+    assert not clean.drives
+    beside = f"without attack {clean.mean_total_cte_m:.2f} m (NO DRIVE)"
+    assert beside in printed
+    assert "NO DRIVE: without an attack this policy does not drive here" in printed
+    assert json.loads((tmp_path / "out" / "seed_0.json").read_text())["clean_drive"] == clean.to_dict()
+    assert command(monkeypatch, "resume", tmp_path / "out") == 0
+    assert beside in capsys.readouterr().out
+    assert command(monkeypatch, "show", tmp_path / "out" / "seed_0.attack.safetensors") == 0
+    shown = capsys.readouterr().out
+    assert "drive without attack" in shown
+    assert "NO DRIVE" in shown
+    assert command(monkeypatch, "check", file, "-o", tmp_path / "out", "--directions", 2, "--no-memory", *changes) in (
+        0,
+        1,
+    )
+    checked = capsys.readouterr().out
+    assert f"drive without attack: total CTE {clean.mean_total_cte_m:.2f} m over 3 ticks" in checked
+    assert "NO DRIVE" in checked
+    assert json.loads((tmp_path / "out" / "check.json").read_text())["clean"] == clean.to_dict()
+
+
+def test_a_policy_that_drives_gets_no_warning(tmp_path, monkeypatch, capsys):
+    file = tiny_request(tmp_path, evaluations=1)  # three ticks on the straight: no network can leave it
+    assert command(monkeypatch, "run", file, "-o", tmp_path / "out") == 0
+    printed = capsys.readouterr().out
+    assert ", without attack 0." in printed
+    assert "NO DRIVE" not in printed

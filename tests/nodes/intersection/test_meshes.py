@@ -39,8 +39,7 @@ def test_deployed_frames_are_what_the_policy_sees_with_depth(trained, wall):
     image, depth = wall.observe_at(-24.0, -1.75, 0.1)
     np.testing.assert_array_equal(np.round(255 * rgb[0]).astype(np.uint8), trained.view.image(image))
     # Depth is that of a ray of the policy's own camera, up to the pixels of the finer image.
-    rows = slice(trained.view.crop_top_px, trained.view.crop_top_px + trained.view.crop_height_px)
-    mean = cv2.resize(depth[rows], (200, 66), interpolation=cv2.INTER_AREA)
+    mean = cv2.resize(depth[trained.view.window], (200, 66), interpolation=cv2.INTER_AREA)
     flat = np.abs(depth_m[0] / mean - 1.0) < 0.05
     assert flat.mean() > 0.9
     with pytest.raises(ValueError, match="policy's view"):

@@ -48,7 +48,7 @@ def sample(typename, stamp_ns):
         "advnerf_msgs/msg/AttackCancel": lambda: types.AttackCancel(header=h, request_id="", reason="enough"),
         "advnerf_msgs/msg/AttackProgress": lambda: types.AttackProgress(
             header=h, request_id="a", state="searching", text="", seed=0, evaluation=1, evaluations=2, loss_m=-1.0,
-            total_cte_m=1.0, best_total_cte_m=1.0, seconds=0.1, attack_id="",
+            total_cte_m=1.0, best_total_cte_m=1.0, clean_total_cte_m=0.5, clean_drives=True, seconds=0.1, attack_id="",
         ),
         "advnerf_msgs/msg/FileChunk": lambda: types.FileChunk(
             header=h, name="a", sha256="ab", size_bytes=3, index=0, count=1, data=np.arange(3, dtype=np.uint8)

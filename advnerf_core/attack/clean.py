@@ -1,0 +1,20 @@
+"""Drives of the victim without an attack: plain object, same starts, same scene."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from advnerf_core.attack.adjoint import evaluate
+from advnerf_core.attack.problem import AttackProblem, drive_scores, horizon_of
+from advnerf_core.driving.clean_drive import CleanDrive
+
+
+def clean_drive(problem: AttackProblem, plain_theta: Tensor) -> CleanDrive:
+    """Drive without disturbances and without an attack.
+
+    Args:
+        problem: The problem that is attacked.
+        plain_theta: Parameters of the objects without an attack.
+    """
+    rollout, _ = evaluate(problem.undisturbed(), plain_theta)
+    return CleanDrive.of(drive_scores(problem, rollout.states), horizon_of(problem))

@@ -1,0 +1,105 @@
+"""The drive of a policy without an attack, which every result of an attack is read against. No torch here: attack files hold it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from advnerf_core.driving.metrics import DriveMetrics, Horizon, drives, mean_cte_limit_m
+
+
+@dataclass(frozen=True)
+class CleanDrive:
+    """How a policy drives where an attack is searched for, without the attack: one entry for each start pose.
+
+    Attributes:
+        total_cte_m: Total CTE of each drive [m].
+        mean_cte_m: Mean |CTE| of each [m].
+        max_cte_m: Largest |CTE| of each [m].
+        off_track: Whether each left the track.
+        ticks: Control ticks of a drive.
+        off_track_m: |CTE| beyond which the car is off the track [m].
+    """
+
+    total_cte_m: tuple[float, ...]
+    mean_cte_m: tuple[float, ...]
+    max_cte_m: tuple[float, ...]
+    off_track: tuple[bool, ...]
+    ticks: int
+    off_track_m: float
+
+    def __post_init__(self) -> None:
+        lists = (self.total_cte_m, self.mean_cte_m, self.max_cte_m, self.off_track)
+        if not self.total_cte_m or len({len(each) for each in lists}) != 1:
+            raise ValueError(f"expected one number of each kind for every start, got {[len(each) for each in lists]}")
+        if not np.isfinite([*self.total_cte_m, *self.mean_cte_m, *self.max_cte_m]).all():
+            raise ValueError("expected finite cross-track errors of the drive without an attack, got some that are not")
+
+    @classmethod
+    def of(cls, metrics: Sequence[DriveMetrics], horizon: Horizon) -> CleanDrive:
+        """From the metrics of each drive and what they were taken over."""
+        return cls(
+            tuple(each.total_cte_m for each in metrics), tuple(each.mean_cte_m for each in metrics),
+            tuple(each.max_cte_m for each in metrics), tuple(bool(each.off_track) for each in metrics),
+            horizon.ticks, horizon.off_track_m,
+        )  # fmt: skip
+
+    @property
+    def mean_total_cte_m(self) -> float:
+        """Total CTE, averaged over the starts [m]: what an attack's total is compared with."""
+        return float(np.mean(self.total_cte_m))
+
+    @property
+    def drives(self) -> bool:
+        """Whether the policy drives at all: the rule of `advnerf_core.driving.metrics.drives` over all starts."""
+        return drives(float(np.mean(self.mean_cte_m)), any(self.off_track), self.off_track_m)
+
+    @property
+    def short(self) -> str:
+        """The total in a few words."""
+        return f"without attack {self.mean_total_cte_m:.2f} m" + ("" if self.drives else " (NO DRIVE)")
+
+    @property
+    def in_words(self) -> str:
+        """The drive in one sentence."""
+        return (
+            f"drive without attack: total CTE {self.mean_total_cte_m:.2f} m over {self.ticks} ticks, mean |CTE| "
+            f"{np.mean(self.mean_cte_m):.3f} m, at most {max(self.max_cte_m):.2f} m"
+        )
+
+    @property
+    def warning(self) -> str:
+        """Why this is no drive and what to do; empty if it is one."""
+        if self.drives:
+            return ""
+        left = sum(self.off_track)
+        reasons = [
+            f"it leaves the track (|CTE| > {self.off_track_m:g} m) from {left} of {len(self.off_track)} starts"
+        ] * bool(left)
+        mean_m, limit_m = float(np.mean(self.mean_cte_m)), mean_cte_limit_m(self.off_track_m)
+        if mean_m > limit_m:
+            reasons.append(f"its mean |CTE| is {mean_m:.3f} m, expected <= {limit_m:g} m")
+        return (
+            f"NO DRIVE: without an attack this policy does not drive here: {' and '.join(reasons)}. The total of an attack on it "
+            "proves nothing; check its declaration, scene and starts, or train it for this place"
+        )
+
+    @property
+    def lines(self) -> list[str]:
+        """What is printed beside a result: the drive, and the warning if it is none."""
+        return [self.in_words, *([self.warning] if self.warning else [])]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data from which `from_dict` makes the same."""
+        return {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(self).items()}
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> CleanDrive:
+        """Rebuild it from `to_dict`."""
+        values: dict[str, Any] = {
+            key: tuple(value) if isinstance(value, list) else value for key, value in data.items()
+        }
+        return cls(**values)

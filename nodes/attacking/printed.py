@@ -1,0 +1,27 @@
+"""The results of a search as the commands print them: each total beside that of the drive without an attack."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from advnerf_core.attack.artifact import AttackFile, load_attack
+
+
+def in_one_line(attack: AttackFile) -> str:
+    """What was found, and what the policy does without it."""
+    total = "unknown" if attack.predicted_total_cte_m is None else f"{attack.predicted_total_cte_m:.1f} m"
+    clean = "without attack not driven" if attack.clean_drive is None else attack.clean_drive.short
+    return f"attack {attack.attack_id}, {attack.method}, predicted total CTE {total}, {clean}"
+
+
+def print_attacks(files: Sequence[Path]) -> None:
+    """A line for each attack file, and the warning if the policy does not drive without an attack."""
+    warnings: list[str] = []
+    for file in files:
+        attack = load_attack(file)
+        print(f"{file}: {in_one_line(attack)}")
+        if attack.clean_drive is not None and attack.clean_drive.warning not in ("", *warnings):
+            warnings.append(attack.clean_drive.warning)
+    for warning in warnings:
+        print(warning)

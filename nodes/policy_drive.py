@@ -1,0 +1,67 @@
+"""Does a policy drive? Closed-loop drives round a path, in a learned scene or in the simulated lab, without an attack."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from advnerf_core.attack.clean import clean_drive
+from advnerf_core.attack.problem import AttackProblem
+from advnerf_core.driving.clean_drive import CleanDrive
+from advnerf_core.driving.dynamics import Ackermann
+from advnerf_core.scene.surrogate import Rendered
+from calibration.schema import RoomCalibration, VehicleCalibration
+
+# Together the drives go once round a path of this many parts; each begins on the path.
+_STARTS = 4
+_SPEED_MPS, _PERIOD_S = 0.8, 0.1
+
+See = Callable[[Tensor], Tensor]
+"""Policy images ``[B, 3, H, W]`` RGB in 0..1 from car states ``[B, 3]``."""
+
+
+class _Seen:
+    """A sensor without objects, as a drive needs it."""
+
+    theta_shape = (0, 3)
+
+    def __init__(self, see: See) -> None:
+        self._see = see
+
+    def initial_theta(self, generator: torch.Generator) -> Tensor:
+        del generator
+        return torch.zeros(self.theta_shape)
+
+    def sense(self, states: Tensor, theta: Tensor) -> Rendered:
+        del theta
+        images = self._see(states)
+        return Rendered(images, lambda grad: torch.zeros(self.theta_shape), images.nbytes)
+
+
+def drive_round(
+    policy: Any, see: See, room: RoomCalibration, vehicle: VehicleCalibration, goal: tuple[float, ...] = ()
+) -> CleanDrive:
+    """Drive once round the room's path, in parts that begin on it.
+
+    Args:
+        policy: A policy in eval mode.
+        see: What it sees.
+        room: Path, fence and off-track limit.
+        vehicle: The car.
+        goal: Goal vector of a policy that has goals.
+    """
+    path, count = room.reference_path, _STARTS
+    starts = torch.from_numpy(path.pose_at(np.arange(count) / count * path.length_m))
+    limits = (vehicle.limits.steering_min_rad, vehicle.limits.steering_max_rad)
+    goals = torch.tensor([goal] * count, dtype=torch.float32) if goal else None
+    problem = AttackProblem(
+        policy, _Seen(see), Ackermann(vehicle.wheelbase_m, _SPEED_MPS, _PERIOD_S, limits), path, starts,
+        math.ceil(path.length_m / count / (_SPEED_MPS * _PERIOD_S)), goals,
+        fence_m=float(np.abs(np.array(room.fence_m)).min()), off_track_m=room.off_track_m,
+    )  # fmt: skip
+    return clean_drive(problem, torch.zeros(_Seen.theta_shape))
