@@ -15,7 +15,8 @@ from calibration.schema import RoomCalibration, load_calibration
 from nodes.pose_buffer import PoseBuffer
 from nodes.runtime.bag_read import read_messages
 from nodes.runtime.errors import BagError, ConfigError
-from nodes.runtime.messages import decode, image_array, pose_matrix, stamp_ns
+from nodes.runtime.messages import decode, pose_matrix, stamp_ns
+from nodes.runtime.pictures import rgb_image
 from nodes.runtime.topics import topic as topic_row
 
 _IMAGES, _CAR = "/camera/image_raw", "/vicon/car"
@@ -74,7 +75,7 @@ def from_bag(bag: Path, room: Path, view: PolicyView, count: int = 96) -> Refere
         if found is None:
             continue
         T = found.T
-        images.append(_seen(view, image_array(image), str(bag)))
+        images.append(_seen(view, rgb_image(image, f"{_IMAGES} in {bag}"), str(bag)))
         steering.append(float(expert.steer(T[0, 3], T[1, 3], np.arctan2(T[1, 0], T[0, 0]))))
     if len(images) < 4 or np.ptp(steering) == 0.0:
         raise BagError(

@@ -23,7 +23,8 @@ from calibration.schema import CalibrationError
 from calibration.vehicle import Drive
 from nodes.runtime.bag_read import read_info, read_messages
 from nodes.runtime.errors import BagError
-from nodes.runtime.messages import decode, image_array, pose_matrix, stamp_ns
+from nodes.runtime.messages import decode, pose_matrix, stamp_ns
+from nodes.runtime.pictures import rgb_image
 from nodes.runtime.topics import topic as topic_row
 
 Rgb = NDArray[np.uint8]
@@ -66,10 +67,7 @@ def read_poses(bag: Path, topic: str) -> PoseSeries:
 def read_frames(bag: Path) -> Iterator[tuple[int, Rgb]]:
     """Stamp [ns] and picture ``[H, W, 3]`` RGB of every frame."""
     for message in _decoded(bag, IMAGES):
-        image = image_array(message)
-        if image.ndim == 2:
-            image = np.repeat(image[..., None], 3, axis=-1)
-        yield stamp_ns(message), image[..., ::-1] if message.encoding == "bgr8" else image
+        yield stamp_ns(message), rgb_image(message, f"{IMAGES} in {bag}")
 
 
 def read_pictures(source: Path) -> Iterator[tuple[str, Rgb]]:

@@ -26,7 +26,8 @@ from nodes.pose_buffer import PoseBuffer
 from nodes.runtime.bag_read import read_info, read_messages
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import BagError, ConfigError
-from nodes.runtime.messages import decode, image_array, ns_from_stamp, pose_matrix
+from nodes.runtime.messages import decode, ns_from_stamp, pose_matrix
+from nodes.runtime.pictures import rgb_image
 from nodes.runtime.topics import topic as topic_row
 
 Labels = Literal["expert", "recorded"]
@@ -108,7 +109,7 @@ def frames_of_bag(
         if why:
             counts[why] += 1
             continue
-        rgb = image_array(image)
+        rgb = rgb_image(image, f"{found[0]} in {bag}")
         _require_size(rgb, view, str(bag))
         images.append(view.image(rgb))
         states.append(state)

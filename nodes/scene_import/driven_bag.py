@@ -20,7 +20,8 @@ from calibration.schema import CalibrationError, CameraCalibration, load_calibra
 from nodes.pose_buffer import PoseBuffer
 from nodes.runtime.bag_read import read_attachment, read_info, read_messages
 from nodes.runtime.errors import BagError
-from nodes.runtime.messages import decode, image_array, pose_matrix, stamp_ns
+from nodes.runtime.messages import decode, pose_matrix, stamp_ns
+from nodes.runtime.pictures import rgb_image
 from nodes.runtime.stages import Report
 from nodes.runtime.topics import topic as topic_row
 from nodes.scene_import.errors import ImportRecordingError
@@ -168,15 +169,13 @@ def _write_frames(
 
 
 def _rgb(message: Any, camera: CameraCalibration, bag: Path) -> Rgb:
-    image = image_array(message)
+    image = rgb_image(message, f"{IMAGE_TOPIC} in {bag}")
     if image.shape[:2] != (camera.height, camera.width):
         raise ImportRecordingError(
             f"expected frames of {camera.width} x {camera.height}, as calibrated, got {image.shape[1]} x {image.shape[0]} in {bag}; "
             "give the calibration of this camera with --calibration"
         )
-    if image.ndim == 2:
-        return np.repeat(image[..., None], 3, axis=-1)
-    return image[..., ::-1] if message.encoding == "bgr8" else image
+    return image
 
 
 def _write_png(file: Path, rgb: Rgb) -> None:
