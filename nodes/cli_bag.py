@@ -27,8 +27,9 @@ def bag_info(
 
     info = read_info(bag)
     start = datetime.fromtimestamp(info.start_ns / 1e9).isoformat(" ", "milliseconds")
+    files = f" in {len(info.parts)} files" if len(info.parts) > 1 else ""
     print(
-        f"{info.path}: {info.size_bytes / 1e6:.1f} MB, {info.messages} messages in {info.duration_s:.2f} s from {start}"
+        f"{info.path}: {info.size_bytes / 1e6:.1f} MB{files}, {info.messages} messages in {info.duration_s:.2f} s from {start}"
     )
     for key, value in info.metadata.items():
         print(f"{key}: {value}")

@@ -160,7 +160,7 @@ def _parts(
     parts = []
     for bag in bags:
         cut = partial(frames_of_bag, bag, view, expert, labels, image_topic)
-        parts.append(Part(str(bag), (read_info(bag).path,), {"labels": labels, "images": image_topic}, cut))
+        parts.append(Part(str(bag), read_info(bag).parts, {"labels": labels, "images": image_topic}, cut))
     for log in logs:
         options = {"columns": columns, "scale": scale}
         parts.append(Part(str(log), (log,), options, partial(_own_view, frames_of_log, log, view, columns, scale)))

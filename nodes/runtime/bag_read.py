@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 
 from mcap.reader import make_reader
@@ -14,7 +14,9 @@ from mcap.summary import Summary
 from advnerf_core.files import write_atomically
 from nodes.runtime.bag_chunks import messages_in_order
 from nodes.runtime.bag_file import open_bag
-from nodes.runtime.bag_repair import mcap_file, read_summary, type_of
+from nodes.runtime.bag_merge import Source, merge_by_time
+from nodes.runtime.bag_parts import bag_parts
+from nodes.runtime.bag_repair import read_summary, type_of
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import BagError, TopicError
 from nodes.runtime.messages import type_hash
@@ -40,9 +42,21 @@ class TopicInfo:
 
 @dataclass(frozen=True)
 class BagInfo:
-    """What a bag holds; times are log times [ns since 1970]."""
+    """What a bag holds; times are log times [ns since 1970].
+
+    Attributes:
+        path: Its file, or its folder if it was split.
+        parts: Its files in order.
+        size_bytes: Size of all files.
+        start_ns: Time of the first message.
+        end_ns: Time of the last message.
+        topics: Its topics by name.
+        attachments: Names of the files that ride along, in whichever part.
+        metadata: Facts that the recorder noted: versions, git hash.
+    """
 
     path: Path
+    parts: tuple[Path, ...]
     size_bytes: int
     start_ns: int
     end_ns: int
@@ -72,40 +86,59 @@ class BagMessage:
     sequence: int
 
 
+@dataclass(frozen=True)
+class _Part:
+    """What one file says about itself, without the index of its chunks."""
+
+    path: Path
+    size_bytes: int
+    start_ns: int
+    end_ns: int
+    messages: int
+    topics: tuple[TopicInfo, ...]
+    hashes: dict[str, str]
+    attachments: tuple[str, ...]
+    metadata: dict[str, str]
+
+
 def read_info(bag: Path) -> BagInfo:
-    """Summary of a bag."""
-    path, summary, statistics = _whole_file(bag)
-    with open_bag(path) as file:
-        records = {record.name: dict(record.metadata) for record in make_reader(file).iter_metadata()}
-    ends = records.get("advnerf_end")
-    topics = tuple(
-        TopicInfo(
-            channel.topic, type_of(summary, channel), statistics.channel_message_counts.get(channel.id, 0),
-            None if ends is None else _count(ends.get(f"lost {channel.topic}", "0")),
-        )
-        for channel in sorted(summary.channels.values(), key=lambda channel: channel.topic)
-    )  # fmt: skip
+    """Summary of a bag, over all its parts."""
+    parts = _parts(bag)
+    filled = [part for part in parts if part.messages]
+    topics: dict[str, TopicInfo] = {}
+    for topic in (topic for part in parts for topic in part.topics):
+        topics[topic.name] = _sum(topics[topic.name], topic) if topic.name in topics else topic
     return BagInfo(
-        path, path.stat().st_size, statistics.message_start_time, statistics.message_end_time, topics,
-        tuple(index.name for index in summary.attachment_indexes), records.get("advnerf", {}),
+        parts[0].path if len(parts) == 1 else parts[0].path.parent, tuple(part.path for part in parts),
+        sum(part.size_bytes for part in parts), min((part.start_ns for part in filled), default=0),
+        max((part.end_ns for part in filled), default=0), tuple(topics[name] for name in sorted(topics)),
+        tuple(dict.fromkeys(name for part in parts for name in part.attachments)),
+        next((part.metadata for part in parts if part.metadata), {}),
     )  # fmt: skip
 
 
 def read_attachment(bag: Path, name: str) -> bytes:
-    """Content of an attached file."""
-    with open_bag(_whole_file(bag)[0]) as file:
-        names = []
-        for attachment in make_reader(file).iter_attachments():
-            if attachment.name == name:
-                return bytes(attachment.data)
-            names.append(attachment.name)
+    """Content of an attached file, from whichever part has it."""
+    parts = _parts(bag)
+    for part in parts:
+        if name not in part.attachments:
+            continue
+        with open_bag(part.path) as file:
+            for attachment in make_reader(file).iter_attachments():
+                if attachment.name == name:
+                    return bytes(attachment.data)
+    names = [name for part in parts for name in part.attachments]
     raise BagError(f"{bag} has no attachment {name!r}; it has {', '.join(names) or 'none'}")
 
 
 def read_attachments(bag: Path) -> dict[str, bytes]:
     """Content of all attached files by name; of two with one name the later."""
-    with open_bag(_whole_file(bag)[0]) as file:
-        return {attachment.name: bytes(attachment.data) for attachment in make_reader(file).iter_attachments()}
+    contents: dict[str, bytes] = {}
+    for part in _parts(bag):
+        if part.attachments:
+            with open_bag(part.path) as file:
+                contents |= {found.name: bytes(found.data) for found in make_reader(file).iter_attachments()}
+    return contents
 
 
 def extract_attachments(bag: Path, folder: Path, names: Sequence[str] = ()) -> list[Path]:
@@ -154,14 +187,23 @@ def read_messages(bag: Path, topics: Sequence[str] | None = None, start_offset_s
         raise BagError(
             f"expected a start offset between 0 and {info.duration_s:.1f} s, the length of {path}, got {start_offset_s}"
         )
-    _, summary, statistics = _whole_file(bag)
-    names = {
-        channel.id: channel.topic for channel in summary.channels.values() if not topics or channel.topic in topics
-    }
+    wanted = frozenset(topics or known)
+    sources = [
+        Source(part.start_ns, partial(_messages_of, bag, part.path, wanted, start_ns))
+        for part in _parts(bag)
+        if part.messages and part.end_ns >= start_ns and not wanted.isdisjoint(topic.name for topic in part.topics)
+    ]
+    yield from merge_by_time(sources, lambda message: message.log_ns)
+
+
+def _messages_of(bag: Path, path: Path, topics: frozenset[str], start_ns: int) -> Iterator[BagMessage]:
+    """Messages of one file in order of their log time."""
+    summary, statistics = _whole_file(bag, path)
+    names = {channel.id: channel.topic for channel in summary.channels.values() if channel.topic in topics}
     with open_bag(path) as file:
         if statistics.message_count and not summary.chunk_indexes:  # written by others, without chunks
             for _, channel, message in make_reader(file).iter_messages(
-                topics, starting_at=start_ns, log_time_order=True
+                list(topics), starting_at=start_ns, log_time_order=True
             ):
                 yield BagMessage(channel.topic, message.data, message.log_time, message.publish_time, message.sequence)
             return
@@ -171,35 +213,74 @@ def read_messages(bag: Path, topics: Sequence[str] | None = None, start_offset_s
 
 def require_our_types(bag: Path, topics: Sequence[str]) -> None:
     """Refuse a bag whose topics have other types than ours: receivers would refuse every message."""
-    path, summary, _ = _whole_file(bag)
-    for channel in summary.channels.values():
-        if channel.topic not in topics:
-            continue
-        typename = type_of(summary, channel)
-        try:
-            ours = topic_row(channel.topic).type
-        except TopicError as error:
-            raise BagError(f"{path}: cannot play {channel.topic}: {error}") from None
-        found = channel.metadata.get("topic_type_hash", "")
-        if typename != ours or found not in ("", type_hash(ours)):
-            raise BagError(
-                f"{path}: {channel.topic} is {typename} {found}, but here it is {ours} {type_hash(ours)}; leave it out with --topics"
-            )
+    for part in _parts(bag):
+        for topic in part.topics:
+            if topic.name not in topics:
+                continue
+            try:
+                ours = topic_row(topic.name).type
+            except TopicError as error:
+                raise BagError(f"{part.path}: cannot play {topic.name}: {error}") from None
+            found = part.hashes[topic.name]
+            if topic.type != ours or found not in ("", type_hash(ours)):
+                raise BagError(
+                    f"{part.path}: {topic.name} is {topic.type} {found}, but here it is {ours} {type_hash(ours)}; "
+                    "leave it out with --topics"
+                )
 
 
 def _count(text: str) -> int | None:
     return int(text) if text.isascii() and text.isdigit() else None
 
 
-def _whole_file(bag: Path) -> tuple[Path, Summary, Statistics]:
-    path = mcap_file(bag)
+def _sum(one: TopicInfo, other: TopicInfo) -> TopicInfo:
+    lost = None if one.lost is None or other.lost is None else one.lost + other.lost
+    return TopicInfo(one.name, one.type or other.type, one.count + other.count, lost)
+
+
+def _parts(bag: Path) -> list[_Part]:
+    found = []
+    for path in bag_parts(bag):
+        state = path.stat()
+        if (part := _part_of(path, state.st_mtime_ns, state.st_size)) is None:
+            raise _unfinished(bag, path)
+        found.append(part)
+    return found
+
+
+@lru_cache(maxsize=1024)
+def _part_of(path: Path, mtime_ns: int, size_bytes: int) -> _Part | None:
+    if (found := _summary_of(path, mtime_ns, size_bytes)) is None:
+        return None
+    summary, statistics = found
+    with open_bag(path) as file:
+        records = {record.name: dict(record.metadata) for record in make_reader(file).iter_metadata()}
+    ends = records.get("advnerf_end")
+    topics: dict[str, TopicInfo] = {}
+    for channel in summary.channels.values():
+        lost = None if ends is None else _count(ends.get(f"lost {channel.topic}", "0"))
+        count = statistics.channel_message_counts.get(channel.id, 0)
+        topic = TopicInfo(channel.topic, type_of(summary, channel), count, lost)
+        topics[channel.topic] = _sum(topics[channel.topic], topic) if channel.topic in topics else topic
+    return _Part(
+        path, size_bytes, statistics.message_start_time, statistics.message_end_time, statistics.message_count,
+        tuple(topics.values()),
+        {channel.topic: channel.metadata.get("topic_type_hash", "") for channel in summary.channels.values()},
+        tuple(index.name for index in summary.attachment_indexes), records.get("advnerf", {}),
+    )  # fmt: skip
+
+
+def _whole_file(bag: Path, path: Path) -> tuple[Summary, Statistics]:
     state = path.stat()
-    found = _summary_of(path, state.st_mtime_ns, state.st_size)
-    if found is None:
-        raise BagError(
-            f"{path} is unfinished: its recorder was killed or is still at work; make it whole with: advnerf bag repair {bag}"
-        )
-    return path, *found
+    if (found := _summary_of(path, state.st_mtime_ns, state.st_size)) is None:
+        raise _unfinished(bag, path)
+    return found
+
+
+def _unfinished(bag: Path, path: Path) -> BagError:
+    return BagError(
+        f"{path} is unfinished: its recorder was killed or is still at work; make it whole with: advnerf bag repair {bag}"
+    )
 
 
 @lru_cache(maxsize=4)

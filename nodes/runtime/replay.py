@@ -46,7 +46,7 @@ class Replay:
 
     def __init__(self, bag: Path, choice: Choice, whole: bool = False) -> None:
         self.info = read_info(bag)
-        self._bag, self._whole = bag, whole
+        self.bag, self._whole = bag, whole
         self._folder = tempfile.TemporaryDirectory(prefix="advnerf-replay-")
         self._clock = BagClock(self.info.start_ns)
         self._nodes: dict[str, Node] = {}
@@ -90,7 +90,7 @@ class Replay:
         """Every message that was made, and with ``whole`` also those that were kept, in order."""
         topics = None if self._whole else self._heard
         heard = frozenset(self._heard)
-        for message in read_messages(self._bag, topics):
+        for message in read_messages(self.bag, topics):
             if message.topic in self.made_topics:
                 continue
             yield from (Replayed(made, True) for made in self._lockstep.advance_to(message.log_ns))
@@ -115,7 +115,7 @@ def write_replay(replay: Replay, folder: Path) -> None:
     Everything that rides along in the old bag does so in the new one; the same replay gives the same bytes.
     """
     metadata = {**replay.info.metadata, "replayed": ", ".join(sorted(replay.names))}
-    attachments = read_attachments(replay.info.path)
+    attachments = read_attachments(replay.bag)
     with BagWriter(folder, attachments, metadata, attached_ns=replay.info.start_ns) as writer:
         for entry in replay:
             message = entry.message
