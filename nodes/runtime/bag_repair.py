@@ -34,7 +34,9 @@ from mcap.writer import MCAP0_MAGIC
 from advnerf_core.files import write_atomically
 from nodes.runtime.bag import METADATA_FILE, Contents, rosbag2_metadata
 from nodes.runtime.bag_file import NONSENSE, BoundedFile
+from nodes.runtime.bag_formats import require_mcap
 from nodes.runtime.bag_journal import journal_of, read_journal
+from nodes.runtime.bag_parts import bag_parts
 from nodes.runtime.bag_scan import RECORD_HEAD, Scan, note_chunk, redo_last_index, scan_file
 from nodes.runtime.errors import BagError
 from nodes.runtime.messages import type_definition, type_hash
@@ -64,6 +66,9 @@ def mcap_file(bag: Path) -> Path:
     if bag.is_file():
         return bag
     files = sorted(bag.glob("*.mcap")) if bag.is_dir() else []
+    if not files:
+        for part in bag_parts(bag):
+            require_mcap(part, "repaired")
     if len(files) != 1:
         raise BagError(f"{bag}: expected a bag folder with one .mcap file, got {len(files)}")
     return files[0]
@@ -88,6 +93,7 @@ def type_of(summary: Summary, channel: Channel) -> str:
 def repair(bag: Path) -> Repaired:
     """Make a bag whole in place; one that is whole already stays as it is."""
     path = mcap_file(bag)
+    require_mcap(path, "repaired")
     if (found := read_summary(path)) is not None:
         _complete_folder(path, _contents_of(*found))
         return Repaired(path, found[1].message_count, was_whole=True)
