@@ -7,16 +7,16 @@ from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
 
-from mcap.reader import make_reader
-from mcap.records import Statistics
+from mcap.records import Channel, Statistics
 from mcap.summary import Summary
 
 from advnerf_core.files import write_atomically
-from nodes.runtime.bag_chunks import messages_in_order
+from nodes.runtime.bag_check import diagnose
+from nodes.runtime.bag_chunks import messages_in_order, read_attachment_at, read_metadata_at
 from nodes.runtime.bag_file import open_bag
 from nodes.runtime.bag_merge import Source, merge_by_time
 from nodes.runtime.bag_parts import bag_parts
-from nodes.runtime.bag_repair import read_summary, type_of
+from nodes.runtime.bag_whole import FileSummary, read_summary
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import BagError, TopicError
 from nodes.runtime.messages import type_hash
@@ -53,6 +53,8 @@ class BagInfo:
         topics: Its topics by name.
         attachments: Names of the files that ride along, in whichever part.
         metadata: Facts that the recorder noted: versions, git hash.
+        unchecked: Why its messages may have changed without a sign of it; empty where checksums cover them. Every figure made from
+            such a bag says so.
     """
 
     path: Path
@@ -63,6 +65,7 @@ class BagInfo:
     topics: tuple[TopicInfo, ...]
     attachments: tuple[str, ...]
     metadata: dict[str, str]
+    unchecked: str = ""
 
     @property
     def duration_s(self) -> float:
@@ -99,6 +102,7 @@ class _Part:
     hashes: dict[str, str]
     attachments: tuple[str, ...]
     metadata: dict[str, str]
+    unchecked: str
 
 
 def read_info(bag: Path) -> BagInfo:
@@ -114,6 +118,7 @@ def read_info(bag: Path) -> BagInfo:
         max((part.end_ns for part in filled), default=0), tuple(topics[name] for name in sorted(topics)),
         tuple(dict.fromkeys(name for part in parts for name in part.attachments)),
         next((part.metadata for part in parts if part.metadata), {}),
+        next((part.unchecked for part in parts if part.unchecked), ""),
     )  # fmt: skip
 
 
@@ -121,12 +126,8 @@ def read_attachment(bag: Path, name: str) -> bytes:
     """Content of an attached file, from whichever part has it."""
     parts = _parts(bag)
     for part in parts:
-        if name not in part.attachments:
-            continue
-        with open_bag(part.path) as file:
-            for attachment in make_reader(file).iter_attachments():
-                if attachment.name == name:
-                    return bytes(attachment.data)
+        if name in part.attachments:
+            return _attachments(part.path, [name])[name]
     names = [name for part in parts for name in part.attachments]
     raise BagError(f"{bag} has no attachment {name!r}; it has {', '.join(names) or 'none'}")
 
@@ -135,10 +136,15 @@ def read_attachments(bag: Path) -> dict[str, bytes]:
     """Content of all attached files by name; of two with one name the later."""
     contents: dict[str, bytes] = {}
     for part in _parts(bag):
-        if part.attachments:
-            with open_bag(part.path) as file:
-                contents |= {found.name: bytes(found.data) for found in make_reader(file).iter_attachments()}
+        contents |= _attachments(part.path, part.attachments)
     return contents
+
+
+def _attachments(path: Path, names: Sequence[str]) -> dict[str, bytes]:
+    summary, _ = _whole_file(path)
+    with open_bag(path) as file:
+        found = [read_attachment_at(file, index) for index in summary.attachment_indexes if index.name in names]
+    return {attachment.name: bytes(attachment.data) for attachment in found}
 
 
 def extract_attachments(bag: Path, folder: Path, names: Sequence[str] = ()) -> list[Path]:
@@ -189,24 +195,18 @@ def read_messages(bag: Path, topics: Sequence[str] | None = None, start_offset_s
         )
     wanted = frozenset(topics or known)
     sources = [
-        Source(part.start_ns, partial(_messages_of, bag, part.path, wanted, start_ns))
+        Source(part.start_ns, partial(_messages_of, part.path, wanted, start_ns))
         for part in _parts(bag)
         if part.messages and part.end_ns >= start_ns and not wanted.isdisjoint(topic.name for topic in part.topics)
     ]
     yield from merge_by_time(sources, lambda message: message.log_ns)
 
 
-def _messages_of(bag: Path, path: Path, topics: frozenset[str], start_ns: int) -> Iterator[BagMessage]:
+def _messages_of(path: Path, topics: frozenset[str], start_ns: int) -> Iterator[BagMessage]:
     """Messages of one file in order of their log time."""
-    summary, statistics = _whole_file(bag, path)
+    summary, _ = _whole_file(path)
     names = {channel.id: channel.topic for channel in summary.channels.values() if channel.topic in topics}
     with open_bag(path) as file:
-        if statistics.message_count and not summary.chunk_indexes:  # written by others, without chunks
-            for _, channel, message in make_reader(file).iter_messages(
-                list(topics), starting_at=start_ns, log_time_order=True
-            ):
-                yield BagMessage(channel.topic, message.data, message.log_time, message.publish_time, message.sequence)
-            return
         for raw in messages_in_order(file, summary, names, start_ns):
             yield BagMessage(names[raw.channel_id], raw.data, raw.log_ns, raw.publish_ns, raw.sequence)
 
@@ -229,6 +229,12 @@ def require_our_types(bag: Path, topics: Sequence[str]) -> None:
                 )
 
 
+def type_of(summary: Summary, channel: Channel) -> str:
+    """Type of a channel's messages; empty if the file does not say."""
+    schema = summary.schemas.get(channel.schema_id)
+    return schema.name if schema is not None else ""
+
+
 def _count(text: str) -> int | None:
     return int(text) if text.isascii() and text.isdigit() else None
 
@@ -243,7 +249,7 @@ def _parts(bag: Path) -> list[_Part]:
     for path in bag_parts(bag):
         state = path.stat()
         if (part := _part_of(path, state.st_mtime_ns, state.st_size)) is None:
-            raise _unfinished(bag, path)
+            raise _unfinished(path)
         found.append(part)
     return found
 
@@ -254,7 +260,8 @@ def _part_of(path: Path, mtime_ns: int, size_bytes: int) -> _Part | None:
         return None
     summary, statistics = found
     with open_bag(path) as file:
-        records = {record.name: dict(record.metadata) for record in make_reader(file).iter_metadata()}
+        notes = [read_metadata_at(file, index) for index in summary.metadata_indexes]
+    records = {record.name: dict(record.metadata) for record in notes}
     ends = records.get("advnerf_end")
     topics: dict[str, TopicInfo] = {}
     for channel in summary.channels.values():
@@ -267,24 +274,25 @@ def _part_of(path: Path, mtime_ns: int, size_bytes: int) -> _Part | None:
         tuple(topics.values()),
         {channel.topic: channel.metadata.get("topic_type_hash", "") for channel in summary.channels.values()},
         tuple(index.name for index in summary.attachment_indexes), records.get("advnerf", {}),
+        summary.unchecked,
     )  # fmt: skip
 
 
-def _whole_file(bag: Path, path: Path) -> tuple[Summary, Statistics]:
+def _whole_file(path: Path) -> tuple[FileSummary, Statistics]:
     state = path.stat()
     if (found := _summary_of(path, state.st_mtime_ns, state.st_size)) is None:
-        raise _unfinished(bag, path)
+        raise _unfinished(path)
     return found
 
 
-def _unfinished(bag: Path, path: Path) -> BagError:
-    return BagError(
-        f"{path} is unfinished: its recorder was killed or is still at work; make it whole with: advnerf bag repair {bag}"
-    )
+def _unfinished(path: Path) -> BagError:
+    """What to say of a file without an end; what is advised depends on what is in it."""
+    lines = diagnose(path).lines
+    return BagError(f"{path} is unfinished: its recorder was killed; {'; '.join(lines[-2:])}")
 
 
 @lru_cache(maxsize=4)
-def _summary_of(path: Path, mtime_ns: int, size_bytes: int) -> tuple[Summary, Statistics] | None:
+def _summary_of(path: Path, mtime_ns: int, size_bytes: int) -> tuple[FileSummary, Statistics] | None:
     """Summary of a file in a certain state; one with an hour of chunks takes a second to read."""
     del mtime_ns, size_bytes  # they are the state
     return read_summary(path)
