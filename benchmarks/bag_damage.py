@@ -195,7 +195,7 @@ class Numbers:
 
 def messages_of(path: Path) -> list[Message]:
     """Messages as our reader gives them."""
-    return [(m.topic, m.log_ns, m.publish_ns, m.sequence, m.cdr) for m in read_messages(path)]
+    return [(m.topic, m.log_ns, m.publish_ns, m.sequence, m.cdr) for m in read_messages(path, as_recorded=True)]
 
 
 def make_bags(folder: Path) -> dict[str, bytes]:

@@ -22,7 +22,9 @@ from mcap.records import Channel, Chunk, ChunkIndex, Message, MessageIndex, Sche
 from advnerf_core.files import write_atomically
 from nodes.runtime.bag import METADATA_FILE, rosbag2_metadata
 from nodes.runtime.bag_assemble import Layout, assemble, contents_of
+from nodes.runtime.bag_formats import require_mcap
 from nodes.runtime.bag_journal import Entry, journal_of, read_journal
+from nodes.runtime.bag_parts import bag_parts
 from nodes.runtime.bag_scan import Loss, Piece, Scan, scan_file
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import BagError
@@ -76,6 +78,9 @@ def mcap_file(bag: Path) -> Path:
     if bag.is_file():
         return bag
     files = sorted(bag.glob("*.mcap")) if bag.is_dir() else []
+    if not files:
+        for part in bag_parts(bag):
+            require_mcap(part, "repaired")
     if len(files) != 1:
         raise BagError(f"{bag}: expected a bag folder with one .mcap file, got {len(files)}")
     return files[0]
@@ -94,6 +99,7 @@ def repair(bag: Path, force: bool = False, keep_original: bool = True, in_place:
         BagError: It is no MCAP file, is being written, or would lose too much; then it is as it was.
     """
     path = mcap_file(bag).resolve()
+    require_mcap(path, "repaired")
     try:
         before = path.stat()
         # A recorder at work would go on writing to the old file.

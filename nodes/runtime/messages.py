@@ -114,6 +114,18 @@ def decode(typename: str, data: bytes | memoryview) -> Any:
         raise MessageError(f"expected CDR bytes of {typename}, got {len(data)} bytes that are not: {error}") from error
 
 
+def fields_of(typename: str) -> list[tuple[str, Any]] | None:
+    """Names and kinds of the fields of a type, as ``rosbags`` describes them; None for a type that is not known."""
+    found = _STORE.fielddefs.get(typename)
+    return None if found is None else list(found[1])
+
+
+def message_class(typename: str) -> Any:
+    """Class of the messages of a type."""
+    _require_type(typename)
+    return _STORE.types[typename]
+
+
 def stamp_from_ns(stamp_ns: int) -> Any:
     """``builtin_interfaces/Time`` of a real time [ns]."""
     return types.Time(sec=int(stamp_ns) // NS_PER_S, nanosec=int(stamp_ns) % NS_PER_S)

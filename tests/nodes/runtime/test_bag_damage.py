@@ -404,3 +404,10 @@ def test_a_bag_of_a_stranger_that_was_repaired_says_nothing_of_losses(bags, writ
     path = write(bags["no chunks"][:-2000])
     repair(path)
     assert {topic.lost for topic in read_info(path).topics} == {None}
+
+
+def test_what_is_read_from_a_bag_without_checksums_is_said_to_be_unchecked(bags, write, capsys):
+    for name, said in (("no chunks", True), ("no checksums", True), ("chunks", False), ("all data", False)):
+        path = write(bags[name], name)
+        next(read_messages(path))
+        assert ("unchecked" in capsys.readouterr().err) is said

@@ -214,7 +214,7 @@ def test_repair_wherever_the_file_was_cut(tmp_path):
 @pytest.mark.parametrize("content", [b"", b"not a bag at all"])
 def test_what_is_no_bag_is_refused(tmp_path, content):
     (tmp_path / "x.mcap").write_bytes(content)
-    with pytest.raises(BagError, match="expected an MCAP file"):
+    with pytest.raises(BagError, match="expected a bag: MCAP"):
         repair(tmp_path / "x.mcap")
     with pytest.raises(BagError, match="expected a bag folder"):
         read_info(tmp_path / "nothing")
