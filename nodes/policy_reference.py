@@ -82,7 +82,8 @@ def from_bag(bag: Path, room: Path, view: PolicyView, count: int = 96) -> Refere
         raise BagError(
             f"expected at least 4 frames with poses and varying steering in {bag}, got {len(images)}; drive further"
         )
-    return Reference(np.stack(images), np.array(steering), f"{len(images)} frames of {bag}")
+    unchecked = ", unchecked" if read_info(bag).unchecked else ""
+    return Reference(np.stack(images), np.array(steering), f"{len(images)} frames of {bag}{unchecked}")
 
 
 def from_run(folder: Path, view: PolicyView, count: int = 180) -> Reference:

@@ -249,7 +249,7 @@ class BagWriter:
         if self._open:
             self._let_go()
         try:
-            saved = f"{repair(self.folder).messages} messages up to then are readable in it"
+            saved = f"{repair(self.folder, in_place=True).messages} messages up to then are readable in it"
         except (BagError, OSError) as second:
             saved = (
                 f"and it could not be finished ({second}); free some space and run: advnerf bag repair {self.folder}"

@@ -60,6 +60,7 @@ class DrivenFrames:
         calibration: The camera.
         recorded: Frames in the bag.
         without_pose: Frames that were left out because motion capture had a gap.
+        unchecked: Why the bag may be damaged without a sign of it; empty where checksums cover it.
     """
 
     files: tuple[Path, ...]
@@ -68,6 +69,7 @@ class DrivenFrames:
     calibration: CameraCalibration
     recorded: int
     without_pose: int
+    unchecked: str = ""
 
 
 def take_frames(
@@ -102,7 +104,7 @@ def take_frames(
     rows = [wanted[index] for index in sorted(wanted)]
     return DrivenFrames(
         tuple(files), tuple(stamp for _, stamp, _ in rows), np.stack([T for _, _, T in rows]), camera, len(stamps),
-        len(stamps) - len(placed),
+        len(stamps) - len(placed), read_info(bag).unchecked,
     )  # fmt: skip
 
 
