@@ -108,7 +108,8 @@ def _plain(bag: Path, choice: Choice, output: Path | None) -> None:
                 pass
         _say(run, time.perf_counter() - start)
     if output is not None:
-        print(f"wrote {output}")
+        left_out = f", without {', '.join(run.left_out)}: not in the topic table" if run.left_out else ""
+        print(f"wrote {output}{left_out}")
 
 
 def _against(

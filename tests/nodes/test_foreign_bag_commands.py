@@ -17,9 +17,12 @@ from nodes import cli
 from nodes.calibrating.bags import read_pictures, read_poses
 from nodes.policy_data.frames import frames_of_bag
 from nodes.policy_reference import from_bag
+from nodes.runtime.bag_read import read_info
 from nodes.runtime.bus import Bus
 from nodes.runtime.errors import MessageError
 from nodes.runtime.messages import pose_matrix, stamp_ns
+from nodes.runtime.replay import Replay
+from nodes.runtime.replay_nodes import Choice
 
 sys.path.insert(0, str(Path(__file__).parent / "runtime"))
 from foreign_samples import COMPRESSED, COUNT, START_NS, STEP_NS, WRITERS, rgb_at, state_at
@@ -102,6 +105,39 @@ def test_a_foreign_bag_is_described(tmp_path, writer):
     assert TRANSFORM in shown.output
     taken = advnerf("bag", "extract", bag, "-o", tmp_path / "out")
     assert (taken.exit_code, taken.output) == (0, "")
+
+
+REPLAYED = f"""\
+name: foreign
+nodes:
+  compositor:
+    module: nodes.compositor
+    config: {{camera: {CAMERA}, target: {TWIN / "board.yaml"}}}
+"""
+
+
+def test_one_drive_in_four_formats_replays_to_the_same_bytes(tmp_path):
+    (tmp_path / "foreign.launch.yaml").write_text(REPLAYED)
+    choice = Choice(("compositor",), launch=tmp_path / "foreign.launch.yaml")
+    digests = set()
+    for writer, write in WRITERS.items():
+        with Replay(write(tmp_path / writer, encoding="bgr8", pose_type=TRANSFORM), choice) as replay:
+            made = [entry for entry in replay if entry.made and not entry.message.topic.startswith("/status/")]
+        assert len(made) == 2 * COUNT
+        digests.add(replay.summary.digest)
+    assert len(digests) == 1
+
+
+def test_a_whole_replay_of_a_foreign_bag_says_what_it_leaves_out(tmp_path):
+    (tmp_path / "foreign.launch.yaml").write_text(REPLAYED)
+    bag = WRITERS["rosbags-sqlite3"](tmp_path / "drive", pose_type=TRANSFORM)
+    arguments = ("--nodes", "compositor", "--launch", tmp_path / "foreign.launch.yaml", "-o", tmp_path / "again")
+    done = advnerf("replay", bag, *arguments)
+    assert done.exit_code == 0, done.output
+    assert "without /chatter: not in the topic table" in " ".join(done.output.split())
+    kept = {topic.name: (topic.type, topic.count) for topic in read_info(tmp_path / "again").topics}
+    assert kept["/vicon/car"] == ("geometry_msgs/msg/PoseStamped", COUNT)
+    assert "/chatter" not in kept
 
 
 def player(bag, run_dir, *arguments):
