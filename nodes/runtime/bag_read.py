@@ -277,7 +277,7 @@ def _converters(part: _Part, topics: frozenset[str], types: Mapping[str, str]) -
 def type_of(summary: Summary, channel: Channel) -> str:
     """Type of a channel's messages; empty if the file does not say."""
     schema = summary.schemas.get(channel.schema_id)
-    return schema.name if schema is not None else ""
+    return full_type_name(schema.name) if schema is not None else ""
 
 
 def _count(text: str) -> int | None:
@@ -340,7 +340,7 @@ def _stored_part(path: Path, form: Format, size_bytes: int) -> _Part:
 def _recorded(summary: Summary, channel: Channel) -> RecordedTopic:
     schema = summary.schemas.get(channel.schema_id)
     return RecordedTopic(
-        channel.topic, full_type_name(type_of(summary, channel)), channel.metadata.get("topic_type_hash", ""),
+        channel.topic, type_of(summary, channel), channel.metadata.get("topic_type_hash", ""),
         "" if schema is None else schema.data.decode("utf-8", "replace"), "" if schema is None else schema.encoding,
         channel.message_encoding,
     )  # fmt: skip

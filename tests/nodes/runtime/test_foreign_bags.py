@@ -201,6 +201,49 @@ string frame_id
         np.testing.assert_array_equal(got.d, np.arange(5.0))
 
 
+ROS1_TRANSFORM = b"""# This expresses a transform from coordinate frame header.frame_id
+Header header
+string child_frame_id # the frame id of the child frame
+Transform transform
+
+================================================================================
+MSG: std_msgs/Header
+# Standard metadata for higher-level stamped data types.
+uint32 seq
+#Two-integer timestamp that is expressed as:
+time stamp
+string frame_id
+
+================================================================================
+MSG: geometry_msgs/Transform
+Vector3 translation
+Quaternion rotation
+
+================================================================================
+MSG: geometry_msgs/Vector3
+float64 x
+float64 y
+float64 z
+================================================================================
+MSG: geometry_msgs/Quaternion
+float64 x
+float64 y
+float64 z
+float64 w
+"""
+
+
+def test_a_bag_of_ros_1_that_was_converted_to_mcap_is_read(tmp_path):
+    """``mcap convert`` keeps the bytes, the short names and the definitions of ROS 1."""
+    raw = struct.pack("<IIII5sI3s7d", 7, 11, 12, 5, b"world", 3, b"car", 1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0)
+    path = tmp_path / "a.mcap"
+    add_topic(path, "/vicon/car", "geometry_msgs/TransformStamped", ROS1_TRANSFORM, "ros1msg", raw, "ros1")
+    assert [t.type for t in read_info(path).topics] == ["geometry_msgs/msg/TransformStamped"]
+    (got,) = (decode(POSES[0], m.cdr) for m in read_messages(path, ["/vicon/car"]))
+    assert (stamp_ns(got), got.header.frame_id) == (11_000_000_012, "world")
+    np.testing.assert_array_equal(pose_matrix(got)[:3, 3], [1.0, 2.0, 3.0])
+
+
 def test_a_definition_in_idl_is_followed(tmp_path):
     text = """================================================================================
 IDL: geometry_msgs/msg/PoseStamped
