@@ -1,6 +1,7 @@
 """Bags that others wrote: by the mcap library, by rosbags in MCAP, SQLite and ROS 1, and the samples of rosbag2 itself."""
 
 import bz2
+import contextlib
 import gzip
 import sqlite3
 import struct
@@ -39,6 +40,7 @@ from nodes.runtime.bag_read import read_attachments, read_info, read_messages
 from nodes.runtime.bag_repair import repair
 from nodes.runtime.bag_stamps import read_delays
 from nodes.runtime.errors import BagError, MessageError
+from nodes.runtime.message_definitions import as_our_message, parse_definition
 from nodes.runtime.messages import (
     decode,
     encode,
@@ -461,3 +463,26 @@ def test_our_own_bytes_are_not_touched(tmp_path):
     path = add_topic(tmp_path / "a.mcap", "/camera/image_raw", IMAGE, type_definition(IMAGE).encode(), "ros2msg", cdr)
     assert [m.cdr for m in read_messages(path)] == [cdr]
     assert types.Image is type(decode(IMAGE, cdr))
+
+
+def test_damaged_definitions_and_messages_are_a_message_or_one_error():
+    """Definitions come from strangers: nothing in them may end in another exception, or ask for more memory than there are bytes."""
+    rng = np.random.default_rng(5)
+    samples = [
+        (POSES[0], encode(pose_message(np.eye(4), 5))),
+        (IMAGE, encode(image_message(rgb_at(0, 8, 6), 5, "camera"))),
+    ]
+    good = 0
+    for k in range(300):
+        typename, cdr = samples[k % 2]
+        text, data = bytearray(type_definition(typename).encode()), bytearray(cdr)
+        for _ in range(k % 3):
+            text[rng.integers(0, len(text))] = rng.choice(list(b"[]<=1 9\n/aZ#"))
+        for _ in range(k // 3 % 3):
+            data[rng.integers(4, min(len(data), 120))] = rng.integers(0, 256)
+        with contextlib.suppress(MessageError):
+            definition = parse_definition(typename, text.decode(), "ros2msg")
+            if not definition.missing(typename):
+                encode(as_our_message(definition.read(bytes(data)), typename))
+                good += 1
+    assert 50 < good < 300
