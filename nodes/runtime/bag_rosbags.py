@@ -29,7 +29,7 @@ class StoredTopic(NamedTuple):
 
     number: int
     recorded: RecordedTopic
-    count: int
+    messages: int
 
 
 class Stored(NamedTuple):
@@ -57,7 +57,7 @@ def read_stored(path: Path, form: Format) -> Stored:
     """
     with _opened(path, form) as reader:
         topics = tuple(_topic(connection, form) for connection in reader.connections)
-        count = sum(topic.count for topic in topics)
+        count = sum(topic.messages for topic in topics)
         if not count:
             return Stored(0, 0, 0, topics)
         return Stored(reader.start_time, reader.end_time - 1, count, topics)
