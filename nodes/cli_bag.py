@@ -77,6 +77,16 @@ def bag_record(
         Path, typer.Option("--output", "-o", help="New folder for the bag.", show_default="bag-<time>")
     ] = Path(""),
     topics: Topics = None,
+    max_bag_duration_s: Annotated[
+        float | None,
+        typer.Option(
+            "--max-bag-duration", metavar="S", min=0.1, help="New file after so many seconds.", show_default="600"
+        ),
+    ] = None,
+    max_bag_size_mb: Annotated[
+        float | None,
+        typer.Option("--max-bag-size", metavar="MIB", min=0.1, help="New file after so many MiB.", show_default="256"),
+    ] = None,
     run_dir: RunDir = None,
 ) -> None:
     """Record what a running launch says, until Ctrl-C."""
@@ -87,7 +97,9 @@ def bag_record(
     folder = output if output.name else Path(f"bag-{time.strftime('%Y%m%d-%H%M%S')}")
     run = find_run_dir(run_dir)
     statuses = [] if topics else node_names(run)
-    config = RecorderConfig(output=folder.resolve(), topics=topics, statuses_of=statuses)
+    limits = {"max_bag_duration_s": max_bag_duration_s, "max_bag_size_mb": max_bag_size_mb}
+    given = {key: value for key, value in limits.items() if value is not None}
+    config = RecorderConfig(output=folder.resolve(), topics=topics, statuses_of=statuses, **given)
     print(f"recording to {folder}, Ctrl-C ends it", flush=True)
     raise typer.Exit(run_node(lambda context: RecorderNode.build(config, context), "bag_record", run))
 
@@ -182,10 +194,10 @@ def bag_control(
 @app.command("repair")
 def bag_repair(bag: Annotated[Path, typer.Argument(help="Bag folder or .mcap file.", exists=True)]) -> None:
     """Make the bag of a killed recorder whole, in place."""
-    from nodes.runtime.bag_repair import repair
+    from nodes.runtime.bag_repair_parts import repair_bag
 
-    result = repair(bag)
-    if result.was_whole:
-        print(f"{result.path} is whole: {result.messages} messages")
-    else:
-        print(f"{result.path}: kept {result.messages} messages, cut off {result.cut_bytes} bytes")
+    for result in repair_bag(bag):
+        if result.was_whole:
+            print(f"{result.path} is whole: {result.messages} messages")
+        else:
+            print(f"{result.path}: kept {result.messages} messages, cut off {result.cut_bytes} bytes")

@@ -32,9 +32,10 @@ from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC
 
 from advnerf_core.files import write_atomically
-from nodes.runtime.bag import METADATA_FILE, Contents, rosbag2_metadata
 from nodes.runtime.bag_file import NONSENSE, BoundedFile
 from nodes.runtime.bag_journal import journal_of, read_journal
+from nodes.runtime.bag_metadata import Contents, rosbag2_metadata
+from nodes.runtime.bag_parts import METADATA_FILE
 from nodes.runtime.bag_scan import RECORD_HEAD, Scan, note_chunk, redo_last_index, scan_file
 from nodes.runtime.errors import BagError
 from nodes.runtime.messages import type_definition, type_hash

@@ -28,8 +28,8 @@ from mcap.records import (
 from mcap.stream_reader import breakup_chunk
 from mcap.writer import MCAP0_MAGIC
 
-from nodes.runtime.bag import Contents
 from nodes.runtime.bag_file import NONSENSE
+from nodes.runtime.bag_metadata import Contents
 from nodes.runtime.errors import BagError
 
 RECORD_HEAD = struct.Struct("<BQ")

@@ -194,7 +194,7 @@ def test_launch_check_asks_the_nodes_about_their_configuration(folder):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["bag", "info", "{folder}"], "expected a bag folder with one .mcap file, got 0"),
+        (["bag", "info", "{folder}"], "expected a bag folder with a .mcap file, got 0"),
         (
             ["topic", "echo", "/nothing", "--run-dir", "{folder}"],
             "unknown topic '/nothing'; known are /camera/image_raw",
