@@ -141,8 +141,8 @@ def test_bag_is_recorded_described_played_and_repaired(running, folder, command)
     assert "/status/sender" in rows
     played = ("bag", "play", bag, "--rate", 20, "--no-wait", "--run-dir", folder / "other")
     assert command(*played)[0] == 0
-    whole = (bag / "recorded.mcap").read_bytes()
-    (bag / "recorded.mcap").write_bytes(whole[:-100])
+    whole = (bag / "recorded_0.mcap").read_bytes()
+    (bag / "recorded_0.mcap").write_bytes(whole[:-100])
     assert command("bag", "info", bag)[0] == 2
     code, output, _ = command("bag", "repair", bag)
     assert (code, "kept" in output) == (0, True)
