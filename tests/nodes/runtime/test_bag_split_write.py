@@ -192,7 +192,7 @@ def killed_bags(tmp_path, counts):
 
 def test_wherever_a_recorder_is_killed_around_a_split_nothing_is_lost_or_doubled(tmp_path):
     store, splits = get_typestore(Stores.ROS2_JAZZY), 0
-    counts = sorted(np.random.default_rng(15).choice(np.arange(12, 330), 20, replace=False).tolist())
+    counts = sorted(np.random.default_rng(15).choice(np.arange(12, 200), 20, replace=False).tolist())
     for bag, taken in killed_bags(tmp_path, counts):
         repaired = repair_bag(bag)
         numbers = [m.sequence for m in read_messages(bag)]
