@@ -172,4 +172,4 @@ def _say(run: Replay, wall_s: float) -> None:
         say_error(f"refused messages on {topic}: {reason}")
     speed = f", {summary.duration_s / wall_s:.0f} x real time" if wall_s > 0 else ""
     print(f"{summary.duration_s:.2f} s of recording in {wall_s:.2f} s{speed}")
-    print(f"digest {summary.digest}")
+    print(f"digest {summary.digest}" + (f" (unchecked: {run.info.unchecked})" if run.info.unchecked else ""))

@@ -150,6 +150,7 @@ def _print_report(imported: Imported) -> None:
     if "recorded_frames" in facts:
         print(
             f"{facts['taken_frames']} of {facts['recorded_frames']} frames taken, {facts['without_pose']} had no motion-capture pose"
+            + (f"; unchecked: {facts['unchecked']}" if facts.get("unchecked") else "")
         )
     if model := facts.get("structure_from_motion"):
         rows = table("camera", "images", "fl_x", "fl_y", "k1, k2, p1, p2")

@@ -15,7 +15,7 @@ import yaml
 from nodes.runtime.errors import BagError
 
 METADATA_FILE = "metadata.yaml"
-SUFFIXES = (".mcap", ".db3")
+SUFFIXES = (".mcap", ".db3", ".bag")
 _NUMBERED = re.compile(r"(?P<name>.+)_(?P<number>\d{1,9})")
 # 83 parts take 15 kB; a stranger's file may have any size.
 _MOST_METADATA_BYTES = 1 << 24
@@ -25,6 +25,11 @@ _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 def part_name(bag_name: str, number: int) -> str:
     """File name of a part, counted from 0."""
     return f"{bag_name}_{number}.mcap"
+
+
+def holds_bag(folder: Path) -> bool:
+    """Whether a folder has the files of a bag in it."""
+    return bool(_files(Path(folder)))
 
 
 def bag_parts(bag: Path) -> tuple[Path, ...]:
@@ -49,7 +54,7 @@ def bag_parts(bag: Path) -> tuple[Path, ...]:
     if listed := listed_files(bag):
         return _with_unlisted(bag, listed)
     if not files:
-        raise BagError(f"{bag}: expected a bag folder with a .mcap file, got 0")
+        raise _no_bag(bag)
     if len(files) == 1 and not _is_named_after_folder(files[0]):
         return (files[0],)
     return _by_number(bag, files)
@@ -153,6 +158,16 @@ def _by_number(folder: Path, files: list[Path]) -> tuple[Path, ...]:
         if number not in found:
             raise _missing(folder, f"{name}_{number}{files[0].suffix}", "a later one is there")
     return tuple(found[number] for number in range(max(found) + 1))
+
+
+def _no_bag(folder: Path) -> BagError:
+    """What to say of a folder without a recording, or of nothing."""
+    expected = f"expected a bag folder with {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]} files, or one such file"
+    if not folder.is_dir():
+        return BagError(f"{folder} does not exist; {expected}")
+    names = sorted(file.name + ("/" if file.is_dir() else "") for file in folder.iterdir())
+    said = ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
+    return BagError(f"{folder} is a folder without a bag: it has {said or 'no files'}; {expected}")
 
 
 def _missing(folder: Path, name: str, reason: str) -> BagError:

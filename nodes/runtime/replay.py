@@ -13,11 +13,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from nodes.runtime.bag import BagWriter
-from nodes.runtime.bag_read import BagMessage, read_attachments, read_info, read_messages, require_our_types
+from nodes.runtime.bag_read import BagMessage, read_attachments, read_info, read_messages, require_readable
 from nodes.runtime.errors import BagError
 from nodes.runtime.node import Node
 from nodes.runtime.replay_lockstep import BagClock, Lockstep, Summary
 from nodes.runtime.replay_nodes import Choice, build_nodes, close_nodes
+from nodes.runtime.topics import topic as topic_row
 
 
 @dataclass(frozen=True)
@@ -55,7 +56,7 @@ class Replay:
             self._lockstep = Lockstep(self._nodes, self._clock, self.info.start_ns)
             recorded = [topic.name for topic in self.info.topics]
             self._heard = [topic for topic in recorded if topic in self._lockstep.heard_topics - self.made_topics]
-            require_our_types(bag, self._heard)
+            require_readable(bag, {topic: topic_row(topic).type for topic in self._heard})
             if not self._heard:
                 raise BagError(
                     f"{self.info.path} has nothing for {', '.join(choice.nodes)}: they listen to "

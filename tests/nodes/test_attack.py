@@ -20,8 +20,9 @@ from nodes.attacking.request import load_request, request_text
 from nodes.runtime.bus import Bus
 from nodes.runtime.clock import ManualClock, Now, SystemClock
 from nodes.runtime.errors import LaunchError
-from nodes.runtime.messages import decode, encode, header, image_array, image_message, pose_message, type_name, types
+from nodes.runtime.messages import decode, encode, header, image_message, pose_message, type_name, types
 from nodes.runtime.node import MessageInfo, NodeContext
+from nodes.runtime.pictures import rgb_image
 from nodes.runtime.transfer import Assembler, chunk_messages
 
 REPOSITORY = Path(__file__).parents[2]
@@ -132,8 +133,8 @@ def test_a_request_ends_in_the_attack_file_that_the_command_would_have_written(b
         files += [file] if file else []
     attack = attack_from_bytes(files[0].content, "a")
     assert attack.attack_id == last.attack_id
-    assert image_array(bench.of("/attack/texture")[-1]).shape == (256, 256, 3)
-    assert image_array(bench.of("/attack/preview")[-1]).shape == (132, 400, 3)
+    assert rgb_image(bench.of("/attack/texture")[-1], "test").shape == (256, 256, 3)
+    assert rgb_image(bench.of("/attack/preview")[-1], "test").shape == (132, 400, 3)
     assert bench.node.status()[0] == "ready"
 
 

@@ -126,11 +126,12 @@ def test_killed_process_that_splits_its_bag_loses_at_most_what_came_in_its_last_
         assert len(list(reader.messages())) == sum(part.messages for part in repaired)
 
 
-def test_bag_that_exists_is_one_clear_line_and_exit_code_1(tmp_path):
+def test_bag_that_exists_is_one_clear_line_and_exit_code_2(tmp_path):
     (tmp_path / "bag").mkdir()
     (tmp_path / "bag" / "x").write_text("")
     command = [sys.executable, "-m", "nodes.recorder", "--run-dir", str(tmp_path)]
     result = subprocess.run(command, capture_output=True, text=True, timeout=20)
-    assert result.returncode == 1
+    assert result.returncode == 2
     assert result.stderr.count("\n") == 1
     assert "exists and is not empty; record to another folder" in result.stderr
+    assert "traceback" not in result.stderr
