@@ -27,7 +27,7 @@ def add_to(app: typer.Typer) -> None:
 
 
 def replay(
-    bag: Annotated[Path, typer.Argument(help="Bag folder or .mcap file.", exists=True)],
+    bag: Annotated[Path, typer.Argument(help="Bag folder, or a .mcap, .db3 or .bag file.", exists=True)],
     nodes: Annotated[
         str, typer.Option("--nodes", metavar="NAME,...", help="Nodes of the recorded launch to run again.")
     ] = "",
