@@ -121,9 +121,9 @@ def bag_record(
     folder = output if output.name else Path(f"bag-{time.strftime('%Y%m%d-%H%M%S')}")
     run = find_run_dir(run_dir)
     statuses = [] if topics else node_names(run)
+    config = RecorderConfig(output=folder.resolve(), topics=topics, statuses_of=statuses)
     limits = {"max_bag_duration_s": max_bag_duration_s, "max_bag_size_mb": max_bag_size_mb}
-    given = {key: value for key, value in limits.items() if value is not None}
-    config = RecorderConfig(output=folder.resolve(), topics=topics, statuses_of=statuses, **given)
+    config = config.model_copy(update={key: value for key, value in limits.items() if value is not None})
     print(f"recording to {folder}, Ctrl-C ends it", flush=True)
     raise typer.Exit(run_node(lambda context: RecorderNode.build(config, context), "bag_record", run))
 

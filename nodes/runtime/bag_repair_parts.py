@@ -12,6 +12,7 @@ from nodes.runtime.bag_file import open_bag
 from nodes.runtime.bag_metadata import Contents, FileEntry, rosbag2_metadata
 from nodes.runtime.bag_parts import METADATA_FILE, bag_parts, listed_files
 from nodes.runtime.bag_repair import Repaired, repair
+from nodes.runtime.errors import BagError
 
 
 def repair_bag(bag: Path, repair_file: Callable[[Path], Repaired] = repair) -> list[Repaired]:
@@ -58,6 +59,8 @@ def _contents(part: Path) -> Contents:
     """What the summary of a whole file says."""
     with open_bag(part) as file:
         summary = make_reader(file).get_summary()
+    if summary is None or summary.statistics is None:
+        raise BagError(f"{part}: expected a summary with statistics after the repair, got none; repair it again")
     statistics = summary.statistics
     contents = Contents(start_ns=statistics.message_start_time, end_ns=statistics.message_end_time)
     for channel in summary.channels.values():
