@@ -17,6 +17,7 @@ from advnerf_core.report.data import ReportData
 from advnerf_core.report.results import read_results
 from advnerf_core.report.tables import TransferRow, find_row, transfer_rows
 from benchmarks.results import record_row
+from nodes.runtime.bag_parts import bag_parts
 
 COMMAND = "make experiment"
 Record = Callable[[str, float | str, str, str, bool | None, str], None]
@@ -94,11 +95,11 @@ def record_bags(folder: Path, record: Record) -> None:
     topics: set[str] = set()
     messages = 0
     for bag in bags:
-        with (next(bag.glob("*.mcap"))).open("rb") as stream:
-            reader = make_reader(stream, decoder_factories=[DecoderFactory()])
-            counted = [
-                channel.topic for _, channel, _, decoded in reader.iter_decoded_messages() if decoded is not None
-            ]
+        counted: list[str] = []
+        for part in bag_parts(bag):
+            with part.open("rb") as stream:
+                decoded = make_reader(stream, decoder_factories=[DecoderFactory()]).iter_decoded_messages()
+                counted += [channel.topic for _, channel, _, message in decoded if message is not None]
         with AnyReader([bag]) as other:
             decoded_again = [
                 connection.topic

@@ -21,7 +21,8 @@ import zmq
 
 from benchmarks.results import record_row
 from nodes.runtime.bus import Bus
-from nodes.runtime.messages import decode, encode, image_array, image_message, pose_message, stamp_from_ns
+from nodes.runtime.messages import decode, encode, image_message, pose_message, stamp_from_ns
+from nodes.runtime.pictures import rgb_image
 from nodes.runtime.topics import topic
 
 COMMAND = "python -m benchmarks.one_hop"
@@ -62,7 +63,7 @@ def _take(bus: Bus, kind: str) -> Any:
         for received in bus.receive():
             message = received.message()
             if kind == IMAGE:
-                image_array(message)
+                rgb_image(message, IMAGE)
             return message
         if time.monotonic() > deadline:
             raise TimeoutError(f"no answer within {_TIMEOUT_S:g} s")

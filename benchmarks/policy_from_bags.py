@@ -62,7 +62,7 @@ def train(bags: list[Path], out: Path, steps: int) -> Training:
     room = load_calibration(RoomCalibration, _CALIBRATION / "room.yaml")
     view = PolicyView(camera.pinhole, distortion=camera.distortion)
     expert = Expert(room.reference_path, ExpertConfig(speed_mps=_SPEED_MPS))
-    parts = [Part(str(bag), (read_info(bag).path,), {}, partial(frames_of_bag, bag, view, expert)) for bag in bags]
+    parts = [Part(str(bag), read_info(bag).parts, {}, partial(frames_of_bag, bag, view, expert)) for bag in bags]
     return train_from_recordings(parts, view, expert, ImitationConfig(first_steps=steps), out, progress=_say)
 
 

@@ -4,35 +4,53 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from nodes.runtime.terminal import RunDir, Topics, print_table, table
+from nodes.runtime.terminal import RunDir, Topics, print_table, say_error, table
+
+if TYPE_CHECKING:
+    from nodes.runtime.bag_read import BagInfo
+    from nodes.runtime.bag_repair import Repaired
 
 app = typer.Typer(no_args_is_help=True, help="Record, look into, play and repair bags (MCAP, as rosbag2 writes them).")
 
 
 @app.command("info")
 def bag_info(
-    bag: Annotated[Path, typer.Argument(help="Bag folder or .mcap file.", exists=True)],
+    bag: Annotated[Path, typer.Argument(help="Bag folder, or a .mcap, .db3 or .bag file.", exists=True)],
     stamps: Annotated[
         bool, typer.Option("--stamps", help="Also read every message and say how late they came.")
     ] = False,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Believe the summary; do not read the bag to compare it with its checksums.")
+    ] = False,
 ) -> None:
-    """Say what is in a bag, and what was lost on the way into it."""
+    """Say what is in a bag, what was lost on the way into it, and whether it is as it was recorded."""
     from datetime import datetime
 
+    from nodes.runtime.bag_check import diagnose
+    from nodes.runtime.bag_parts import bag_parts
     from nodes.runtime.bag_read import read_info
 
+    if not quick:
+        for found in map(diagnose, bag_parts(bag)):
+            if not found.whole:
+                for line in found.lines[:-1]:
+                    print(f"{found.path}: {line}")
+                say_error(f"{found.path} is not whole; {found.lines[-1]}")
+                raise typer.Exit(1)
     info = read_info(bag)
     start = datetime.fromtimestamp(info.start_ns / 1e9).isoformat(" ", "milliseconds")
+    files = f" in {len(info.parts)} files" if len(info.parts) > 1 else ""
     print(
-        f"{info.path}: {info.size_bytes / 1e6:.1f} MB, {info.messages} messages in {info.duration_s:.2f} s from {start}"
+        f"{info.path}: {info.size_bytes / 1e6:.1f} MB{files}, {info.messages} messages in {info.duration_s:.2f} s from {start}"
     )
     for key, value in info.metadata.items():
         print(f"{key}: {value}")
     print(f"attachments: {', '.join(info.attachments) or 'none'}")
+    print(checked_line(info, quick))
     rows = table("topic", "type", "messages", "rate", "lost")
     for topic in info.topics:
         rate = f"{(topic.count - 1) / info.duration_s:.1f} Hz" if topic.count > 1 and info.duration_s > 0 else ""
@@ -40,6 +58,13 @@ def bag_info(
     print_table(rows)
     if stamps:
         _print_delays(bag)
+
+
+def checked_line(info: BagInfo, quick: bool) -> str:
+    """Whether the messages are those that were recorded, as far as can be told."""
+    if info.unchecked:
+        return f"unchecked: {info.unchecked}, so a damaged message in it cannot be told from a good one"
+    return "not compared with its checksums (--quick)" if quick else "checked: all messages agree with their checksums"
 
 
 def _print_delays(bag: Path) -> None:
@@ -59,7 +84,7 @@ def _print_delays(bag: Path) -> None:
 
 @app.command("extract")
 def bag_extract(
-    bag: Annotated[Path, typer.Argument(help="Bag folder or .mcap file.", exists=True)],
+    bag: Annotated[Path, typer.Argument(help="Bag folder, or a .mcap, .db3 or .bag file.", exists=True)],
     names: Annotated[list[str] | None, typer.Argument(help="Attachments to take out.", show_default="all")] = None,
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder to put them in.")] = Path(),
 ) -> None:
@@ -76,6 +101,16 @@ def bag_record(
         Path, typer.Option("--output", "-o", help="New folder for the bag.", show_default="bag-<time>")
     ] = Path(""),
     topics: Topics = None,
+    max_bag_duration_s: Annotated[
+        float | None,
+        typer.Option(
+            "--max-bag-duration", metavar="S", min=0.1, help="New file after so many seconds.", show_default="600"
+        ),
+    ] = None,
+    max_bag_size_mb: Annotated[
+        float | None,
+        typer.Option("--max-bag-size", metavar="MIB", min=0.1, help="New file after so many MiB.", show_default="256"),
+    ] = None,
     run_dir: RunDir = None,
 ) -> None:
     """Record what a running launch says, until Ctrl-C."""
@@ -87,13 +122,15 @@ def bag_record(
     run = find_run_dir(run_dir)
     statuses = [] if topics else node_names(run)
     config = RecorderConfig(output=folder.resolve(), topics=topics, statuses_of=statuses)
+    limits = {"max_bag_duration_s": max_bag_duration_s, "max_bag_size_mb": max_bag_size_mb}
+    config = config.model_copy(update={key: value for key, value in limits.items() if value is not None})
     print(f"recording to {folder}, Ctrl-C ends it", flush=True)
     raise typer.Exit(run_node(lambda context: RecorderNode.build(config, context), "bag_record", run))
 
 
 @app.command("play")
 def bag_play(
-    bag: Annotated[Path, typer.Argument(help="Bag folder or .mcap file.", exists=True)],
+    bag: Annotated[Path, typer.Argument(help="Bag folder, or a .mcap, .db3 or .bag file.", exists=True)],
     rate: Annotated[float, typer.Option("--rate", min=0.001, help="Speed relative to the recording.")] = 1.0,
     loop: Annotated[bool, typer.Option("--loop", help="Begin again at the end.")] = False,
     offset_s: Annotated[
@@ -179,12 +216,37 @@ def bag_control(
 
 
 @app.command("repair")
-def bag_repair(bag: Annotated[Path, typer.Argument(help="Bag folder or .mcap file.", exists=True)]) -> None:
-    """Make the bag of a killed recorder whole, in place."""
-    from nodes.runtime.bag_repair import repair
+def bag_repair(
+    bag: Annotated[Path, typer.Argument(help="Bag folder or .mcap file.", exists=True)],
+    force: Annotated[
+        bool, typer.Option("--force", help="Also if messages are lost that are not at the end of an unfinished file.")
+    ] = False,
+    discard_original: Annotated[
+        bool, typer.Option("--discard-original", help="Do not keep the file as it was, as NAME.mcap.damaged.")
+    ] = False,
+) -> None:
+    """Make the bag of a killed recorder, or a damaged one, whole; the file as it was is kept beside it."""
+    from functools import partial
 
-    result = repair(bag)
+    from nodes.runtime.bag_repair import repair
+    from nodes.runtime.bag_repair_parts import repair_bag
+
+    for result in repair_bag(bag, partial(repair, force=force, keep_original=not discard_original)):
+        _print_repair(result)
+
+
+def _print_repair(result: Repaired) -> None:
+    unchecked = f"; unchecked: {result.unchecked}" if result.unchecked else ""
     if result.was_whole:
-        print(f"{result.path} is whole: {result.messages} messages")
-    else:
-        print(f"{result.path}: kept {result.messages} messages, cut off {result.cut_bytes} bytes")
+        print(f"{result.path} is whole: {result.messages} messages{unchecked}; nothing was changed")
+        return
+    for loss in result.losses:
+        print(f"lost: {loss}")
+    for fix in result.fixes:
+        print(f"mended: {fix}")
+    rows = table("topic", "messages before", "after")
+    for topic in result.topics:
+        rows.add_row(topic.name, "?" if topic.before is None else str(topic.before), str(topic.after))
+    print_table(rows)
+    print(f"{result.path}: kept {result.messages} messages, left out {result.cut_bytes} bytes{unchecked}")
+    print("the file as it was is gone" if result.kept is None else f"the file as it was: {result.kept}")

@@ -90,6 +90,7 @@ def train(
     print_table(rows)
     print(
         f"{done.path} {done.sha256[:12]}, {1e3 * done.validation_mae_rad:.1f} mrad from the labels on held-out frames"
+        + "".join(f"; {name} unchecked: {reason}" for name, reason in done.unchecked.items())
     )
 
 
@@ -160,7 +161,8 @@ def _parts(
     parts = []
     for bag in bags:
         cut = partial(frames_of_bag, bag, view, expert, labels, image_topic)
-        parts.append(Part(str(bag), (read_info(bag).path,), {"labels": labels, "images": image_topic}, cut))
+        info = read_info(bag)
+        parts.append(Part(str(bag), info.parts, {"labels": labels, "images": image_topic}, cut, info.unchecked))
     for log in logs:
         options = {"columns": columns, "scale": scale}
         parts.append(Part(str(log), (log,), options, partial(_own_view, frames_of_log, log, view, columns, scale)))

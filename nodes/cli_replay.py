@@ -27,7 +27,7 @@ def add_to(app: typer.Typer) -> None:
 
 
 def replay(
-    bag: Annotated[Path, typer.Argument(help="Bag folder or .mcap file.", exists=True)],
+    bag: Annotated[Path, typer.Argument(help="Bag folder, or a .mcap, .db3 or .bag file.", exists=True)],
     nodes: Annotated[
         str, typer.Option("--nodes", metavar="NAME,...", help="Nodes of the recorded launch to run again.")
     ] = "",
@@ -108,7 +108,8 @@ def _plain(bag: Path, choice: Choice, output: Path | None) -> None:
                 pass
         _say(run, time.perf_counter() - start)
     if output is not None:
-        print(f"wrote {output}")
+        left_out = f", without {', '.join(run.left_out)}: not in the topic table" if run.left_out else ""
+        print(f"wrote {output}{left_out}")
 
 
 def _against(
@@ -172,4 +173,4 @@ def _say(run: Replay, wall_s: float) -> None:
         say_error(f"refused messages on {topic}: {reason}")
     speed = f", {summary.duration_s / wall_s:.0f} x real time" if wall_s > 0 else ""
     print(f"{summary.duration_s:.2f} s of recording in {wall_s:.2f} s{speed}")
-    print(f"digest {summary.digest}")
+    print(f"digest {summary.digest}" + (f" (unchecked: {run.info.unchecked})" if run.info.unchecked else ""))

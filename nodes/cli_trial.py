@@ -71,7 +71,7 @@ def trial(
 
 
 def evaluate(
-    bags: Annotated[list[Path], typer.Argument(help="Bag folders or .mcap files.", exists=True)],
+    bags: Annotated[list[Path], typer.Argument(help="Bag folders, or .mcap, .db3 or .bag files.", exists=True)],
     room: Annotated[
         Path | None, typer.Option("--room", help="Room file.", show_default="the one in the bag", exists=True)
     ] = None,
@@ -83,7 +83,7 @@ def evaluate(
 
     rows = table(
         "bag", "attack", "total CTE \\[m]", "mean \\[m]", "max \\[m]", "off track", "left after", "attack adds",
-        "stopped early",
+        "stopped early", "checksums",
     )  # fmt: skip
     for bag in bags:
         for found in evaluate_bag(bag, room, ticks):
@@ -95,6 +95,7 @@ def evaluate(
                 str(bag), " ".join(found["attack_ids"]) or "none", f"{found['total_cte_m']:.3f}",
                 f"{found['mean_abs_cte_m']:.3f}", f"{found['max_abs_cte_m']:.3f}", "yes" if found["off_track"] else "no",
                 "" if leaving is None else f"{leaving:.1f} s", _added(found.get("counterfactual")), found["stopped_early"],
+                "unchecked" if found["unchecked"] else "agree",
             )  # fmt: skip
     if not as_json:
         print_table(rows)
@@ -134,13 +135,23 @@ def _pose(text: str) -> tuple[float, float, float]:
 def _print_summary(results: list[dict[str, Any]]) -> None:
     from nodes.trials.campaign import summarise
 
-    rows = table("condition", "runs", "total CTE \\[m]", "ratio", "off track", "stopped early", "capture to serial p50")
+    rows = table(
+        "condition",
+        "runs",
+        "total CTE \\[m]",
+        "ratio",
+        "off track",
+        "stopped early",
+        "capture to serial p50",
+        "checksums",
+    )
     for row in summarise(results):
         spread = "" if row["std_m"] is None else f" +- {row['std_m']:.3f}"
         rows.add_row(
             row["condition"], str(row["runs"]), f"{row['mean_m']:.3f}{spread}",
             "" if row["ratio"] is None else f"{row['ratio']:.2f}", f"{row['off_track']} of {row['runs']}",
             str(row["stopped_early"]), "" if row["latency_p50_ms"] is None else f"{row['latency_p50_ms']:.1f} ms",
+            f"unchecked in {row['unchecked']}" if row["unchecked"] else "agree",
         )  # fmt: skip
     print_table(rows)
 

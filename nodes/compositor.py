@@ -29,9 +29,9 @@ from nodes.pose_buffer import PoseBuffer
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import ConfigError, MessageError
 from nodes.runtime.interlock import SAFETY_STATE, Interlock
-from nodes.runtime.messages import header, image_array, image_message, pose_matrix, stamp_ns, types
+from nodes.runtime.messages import header, image_message, pose_matrix, stamp_ns, types
 from nodes.runtime.node import ACTIVE, READY, MessageInfo, Node, NodeContext, Now, Out, run_node_main
-from nodes.runtime.pictures import RAW_TOPIC, raw_image
+from nodes.runtime.pictures import RAW_TOPIC, rgb8_message, rgb_image
 from nodes.runtime.transfer import Assembler, ReceivedFile
 
 _CAR, _FILE = "/vicon/car", "/attack/file"
@@ -170,7 +170,7 @@ class CompositorNode(Node):
         self._last_image_ns = now.mono_ns
         self._counts["images"] += 1
         try:
-            image = raw_image(message)
+            image = rgb8_message(message, topic)
         except MessageError as error:
             self._counts["dropped_bad"] += 1
             self._trouble = f"image dropped: {error}"
@@ -256,13 +256,13 @@ class CompositorNode(Node):
             return []
         T_camera_from_face = invert_transform(car.T @ self._showing.T_car_from_camera) @ face.T
         # The received array is read-only; the overlay draws on a copy.
-        image, drawn = self._showing.overlay.draw(image_array(waiting.message), T_camera_from_face)
+        image, drawn = self._showing.overlay.draw(rgb_image(waiting.message, self._image_topic), T_camera_from_face)
         ahead_s = max(car.extrapolated_s, face.extrapolated_s)
         self._counts["drawn"] += drawn
         self._counts["extrapolated"] += ahead_s > 0.0
         self._trouble = f"pose extrapolated by {1e3 * ahead_s:.0f} ms" if ahead_s > 0.0 else ""
-        frame, encoding = waiting.message.header.frame_id, waiting.message.encoding
-        out = waiting.message if not drawn else image_message(image, waiting.stamp_ns, frame, encoding)
+        frame = waiting.message.header.frame_id
+        out = waiting.message if not drawn else image_message(image, waiting.stamp_ns, frame)
         reason = self._trouble if drawn else "out of view"
         return [Out("/compositor/image", out), self._label(waiting.message, drawn, reason)]
 

@@ -23,9 +23,9 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 from advnerf_core.policies.load import Driver, load_driver
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import ConfigError, MessageError
-from nodes.runtime.messages import header, image_array, stamp_ns, types
+from nodes.runtime.messages import header, stamp_ns, types
 from nodes.runtime.node import ACTIVE, FAULT, READY, MessageInfo, Node, NodeContext, Now, Out, run_node_main
-from nodes.runtime.pictures import RAW_TOPIC, raw_image
+from nodes.runtime.pictures import RAW_TOPIC, rgb_image
 
 COUNTERFACTUAL_TOPIC = "/policy/counterfactual"
 _ATTACKED, _LABEL = "/compositor/image", "/compositor/attack"
@@ -135,7 +135,7 @@ class CounterfactualNode(Node):
             self._counts["dropped_late"] += 1
             return []
         try:
-            clean, attacked = (self._seen(entry[name]) for name in (self._clean_topic, _ATTACKED))
+            clean, attacked = (self._seen(name, entry[name]) for name in (self._clean_topic, _ATTACKED))
         except MessageError as error:
             self._counts["dropped_bad"] += 1
             self._trouble = str(error)
@@ -161,16 +161,15 @@ class CounterfactualNode(Node):
         """Pairs compared, and what was left out."""
         return {key: float(value) for key, value in self._counts.items()} | {"largest_delta_rad": self._largest_rad}
 
-    def _seen(self, message: Any) -> NDArray[np.uint8]:
+    def _seen(self, topic: str, message: Any) -> NDArray[np.uint8]:
         """What the policy sees of an image."""
-        image = raw_image(message)
+        rgb = rgb_image(message, topic)
         camera = self._clean.view.camera
-        if (image.encoding, int(image.width), int(image.height)) != ("rgb8", camera.width, camera.height):
+        if rgb.shape[:2] != (camera.height, camera.width):
             raise MessageError(
-                f"expected rgb8 {camera.width} x {camera.height}, got {image.encoding} {image.width} x {image.height}; name the policy "
-                "that drives"
+                f"expected images of {camera.width} x {camera.height}, got {rgb.shape[1]} x {rgb.shape[0]}; name the policy that drives"
             )
-        return self._clean.view.image(image_array(image))
+        return self._clean.view.image(rgb)
 
     def _compare(self, clean: NDArray[np.uint8], attacked: NDArray[np.uint8], label: Any, stamp: int) -> list[Out]:
         clean_rad, attacked_rad = self._clean.steer(clean, self._goal), self._attacked.steer(attacked, self._goal)

@@ -16,7 +16,8 @@ from advnerf_core.driving.path import Path as DrivingPath
 from advnerf_core.geometry import yaw_of
 from nodes.runtime.bag_read import read_info, read_messages
 from nodes.runtime.errors import BagError
-from nodes.runtime.messages import decode, image_array, ns_from_stamp, pose_matrix
+from nodes.runtime.messages import decode, ns_from_stamp, pose_matrix
+from nodes.runtime.pictures import rgb_image
 from nodes.runtime.topics import topic as topic_row
 
 # Derived messages carry the capture stamp of the image they come from, so each hop is publish time minus that stamp.
@@ -28,6 +29,7 @@ HOPS = {
 }
 # Who shows an attack says so here, with the attack's id.
 SHOWN_BY = ("/compositor/attack", "/monitor/attack")
+_SEEN = "/compositor/image"
 COUNTERFACTUAL = "/policy/counterfactual"
 _NS_PER_MS = 1e6
 
@@ -119,11 +121,11 @@ def timing(bag: Path, start_real_ns: int, end_real_ns: int) -> Timing:
 def frames(bag: Path, start_real_ns: int, count: int, period_s: float = 0.1) -> NDArray[np.uint8]:
     """What the policy saw at the control ticks, ``[count, H, W, 3]``: the newest image at each tick."""
     stamps, images = [], []
-    for message in _decoded(bag, "/compositor/image"):
+    for message in _decoded(bag, _SEEN):
         stamps.append(ns_from_stamp(message.header.stamp))
-        images.append(image_array(message).copy())
+        images.append(rgb_image(message, f"{_SEEN} in {bag}").copy())
     if not images:
-        raise BagError(f"expected images on /compositor/image in {bag}, got none")
+        raise BagError(f"expected images on {_SEEN} in {bag}, got none")
     ticks = start_real_ns + np.arange(count) * round(period_s * 1e9)
     newest = np.clip(np.searchsorted(stamps, ticks, side="right") - 1, 0, len(images) - 1)
     return np.stack([images[index] for index in newest])

@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from nodes.runtime.bag_keys import Keys
 from nodes.runtime.bag_play import PAUSE, RATE, RESUME, STEP, STOP, TOGGLE, Command, Playhead
-from nodes.runtime.bag_read import BagMessage, read_info, read_messages, require_our_types
+from nodes.runtime.bag_read import BagMessage, read_info, read_messages, require_readable
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import BagError, MessageError, NodeFinished
 from nodes.runtime.messages import stamp_from_ns, types
@@ -33,7 +33,7 @@ from nodes.runtime.node import (
     ReaderThread,
     run_node_main,
 )
-from nodes.runtime.topics import STATUS_PREFIX
+from nodes.runtime.topics import STATUS_PREFIX, type_of_topic
 from nodes.runtime.topics import topic as topic_row
 
 _CONTROL, _CLOCK = "/player/control", "/clock"
@@ -91,8 +91,11 @@ class PlayerNode(Node):
         self._subscribers = subscribers
         self._info = read_info(config.bag)
         self._topics = _choose_topics(config, [topic.name for topic in self._info.topics])
-        require_our_types(config.bag, self._topics)
         self._names = _renamed(config, self._topics)
+        unknown = [topic.name for topic in self._info.topics if type_of_topic(topic.name) is None]
+        self._left_out = [] if config.topics else [name for name in unknown if name not in self._topics]
+        self._types = {recorded: topic_row(played).type for recorded, played in self._names.items()}
+        require_readable(config.bag, self._types)
         self._played_names = tuple(self._names[topic] for topic in self._topics)
         self.publications = (*self._played_names, _CLOCK) if config.clock_hz else self._played_names
         for topic in config.wait_for or ():
@@ -109,6 +112,7 @@ class PlayerNode(Node):
         self._head: Playhead | None = None
         self._clock_due_ns = 0
         self._played, self._trouble, self._ending = 0, "", False
+        self._rewind()  # a bag without a message in the wanted part is refused here, not when a subscriber comes
         self._keys, self._reader = None, None
         if terminal is not None:
             self.inbox = Inbox[str](capacity=16)
@@ -144,7 +148,6 @@ class PlayerNode(Node):
             if self._missing():
                 return []
             self._head = Playhead(self._begin_ns, now.mono_ns, self._config.rate, self._config.paused)
-            self._rewind()
         due: list[Out] = []
         while not self._head.paused and self._next is not None and self._next.log_ns <= self._head.time_ns(now.mono_ns):
             due.append(self._take())
@@ -160,6 +163,8 @@ class PlayerNode(Node):
         if self._head is None and (missing := self._missing()):
             return READY, f"waits for subscribers of {', '.join(missing)}"
         words = [f"{self._played} messages played"]
+        if self._left_out:
+            words.append(f"not in the topic table: {', '.join(self._left_out)}")
         if self._head is not None and self._head.paused:
             words.append("paused")
         return ACTIVE, "; ".join([*words, *filter(None, [self._trouble])])
@@ -226,7 +231,7 @@ class PlayerNode(Node):
         return [] if wanted is None and len(missing) < len(self._played_names) else missing
 
     def _rewind(self) -> None:
-        self._messages = read_messages(self._config.bag, self._topics, self._config.start_offset_s)
+        self._messages = read_messages(self._config.bag, self._topics, self._config.start_offset_s, self._types)
         self._advance()
         if self._next is None:
             span = f"{self._config.start_offset_s} s"
@@ -239,10 +244,9 @@ def _renamed(config: PlayerConfig, topics: list[str]) -> dict[str, str]:
     for old, new in config.remap.items():
         if old not in topics:
             raise BagError(f"cannot play {old} as {new}: it is not played; played are {', '.join(topics)}")
-        if topic_row(new).type != topic_row(old).type:
-            raise BagError(f"cannot play {old} as {new}: it is {topic_row(old).type}, {new} is {topic_row(new).type}")
     names = {topic: config.remap.get(topic, topic) for topic in topics}
     for name in names.values():
+        topic_row(name)  # only topics of the table can be published
         if len(sources := [topic for topic, played in names.items() if played == name]) > 1:
             raise BagError(f"{' and '.join(sources)} would both be played as {name}; leave one out with --topics")
     return names
@@ -250,13 +254,17 @@ def _renamed(config: PlayerConfig, topics: list[str]) -> dict[str, str]:
 
 def _choose_topics(config: PlayerConfig, recorded: list[str]) -> list[str]:
     if config.topics is None:
-        chosen = [name for name in recorded if name not in _STAYS and not name.startswith(STATUS_PREFIX)]
+        stays = [name for name in recorded if name in _STAYS or name.startswith(STATUS_PREFIX)]
+        chosen = [name for name in recorded if name not in stays and (type_of_topic(name) or name in config.remap)]
     else:
         chosen = list(dict.fromkeys(config.topics))
         if unknown := [name for name in chosen if name not in recorded]:
             raise BagError(f"{config.bag} has no topic {', '.join(unknown)}; it has {', '.join(recorded)}")
     if not chosen:
-        raise BagError(f"{config.bag} has nothing to play; it has {', '.join(recorded) or 'no message'}")
+        raise BagError(
+            f"{config.bag} has nothing to play; it has {', '.join(recorded) or 'no message'}. Only topics of the topic table can be "
+            "played; name others with --remap OLD:=NEW"
+        )
     return chosen
 
 

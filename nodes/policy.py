@@ -18,9 +18,9 @@ from pydantic import BaseModel, ConfigDict, Field
 from advnerf_core.policies.load import Driver, load_driver
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import ConfigError, MessageError
-from nodes.runtime.messages import drive_message, image_array, stamp_ns
+from nodes.runtime.messages import drive_message, stamp_ns
 from nodes.runtime.node import ACTIVE, FAULT, READY, MessageInfo, Node, NodeContext, Now, Out, run_node_main
-from nodes.runtime.pictures import raw_image
+from nodes.runtime.pictures import rgb_image
 
 _DRIVE = "/policy/drive"
 _WARM_UP_RUNS = 5
@@ -114,18 +114,18 @@ class PolicyNode(Node):
             )
             return []
         try:
-            message = raw_image(message)
+            rgb = rgb_image(message, topic)
         except MessageError as error:
             self._drop("dropped_bad", str(error))
             return []
         camera = self._driver.view.camera
-        if (message.encoding, int(message.width), int(message.height)) != ("rgb8", camera.width, camera.height):
-            got = f"{message.encoding} {message.width} x {message.height}"
+        if rgb.shape[:2] != (camera.height, camera.width):
+            got = f"{rgb.shape[1]} x {rgb.shape[0]}"
             self._drop(
-                "dropped_bad", f"expected rgb8 {camera.width} x {camera.height}, got {got}; train for this camera"
+                "dropped_bad", f"expected images of {camera.width} x {camera.height}, got {got}; train for this camera"
             )
             return []
-        steering_rad = self._steer(image_array(message))
+        steering_rad = self._steer(rgb)
         if not np.isfinite(steering_rad):
             self._drop("dropped_bad", "the policy's output is not finite")
             return []

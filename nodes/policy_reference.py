@@ -24,12 +24,14 @@ from calibration.schema import CameraCalibration, RoomCalibration, VehicleCalibr
 from nodes.policy_camera import require_camera
 from nodes.policy_drive import See, drive_round
 from nodes.pose_buffer import PoseBuffer
-from nodes.runtime.bag_read import read_messages
+from nodes.runtime.bag_images import image_messages, image_topic
+from nodes.runtime.bag_read import read_info, read_messages
 from nodes.runtime.errors import BagError, ConfigError
-from nodes.runtime.messages import decode, image_array, pose_matrix, stamp_ns
+from nodes.runtime.messages import decode, pose_matrix, stamp_ns
+from nodes.runtime.pictures import rgb_image
 from nodes.runtime.topics import topic as topic_row
 
-_IMAGES, _CAR = "/camera/image_raw", "/vicon/car"
+_CAR = "/vicon/car"
 _LATERAL_M, _HEADING_RAD = 0.15, 0.2
 _FEWEST = 4
 
@@ -88,25 +90,26 @@ def from_bag(bag: Path, room: Path, view: PolicyView, count: int = 96) -> Refere
     for message in read_messages(bag, [_CAR]):
         pose = decode(topic_row(_CAR).type, message.cdr)
         poses.add(stamp_ns(pose), pose_matrix(pose))
-    stamps = [message.log_ns for message in read_messages(bag, [_IMAGES])]
-    wanted = set(np.linspace(0, len(stamps) - 1, min(count, len(stamps))).astype(int).tolist())
+    topic = image_topic(bag)
+    recorded = next(row.count for row in read_info(bag).topics if row.name == topic)
+    wanted = set(np.linspace(0, recorded - 1, min(count, recorded)).astype(int).tolist())
     expert = Expert(load_calibration(RoomCalibration, room).reference_path)
     images, steering = [], []
-    for number, message in enumerate(read_messages(bag, [_IMAGES])):
+    for number, image in enumerate(image_messages(bag, topic)):
         if number not in wanted:
             continue
-        image = decode(topic_row(_IMAGES).type, message.cdr)
         found = poses.at(stamp_ns(image), 0.0)
         if found is None:
             continue
         T = found.T
-        images.append(_seen(view, image_array(image), str(bag)))
+        images.append(_seen(view, rgb_image(image, f"{topic} in {bag}"), str(bag)))
         steering.append(float(expert.steer(T[0, 3], T[1, 3], np.arctan2(T[1, 0], T[0, 0]))))
     if len(images) < _FEWEST or np.ptp(steering) == 0.0:
         raise BagError(
             f"expected at least {_FEWEST} frames with poses and varying steering in {bag}, got {len(images)}; drive further"
         )
-    return Reference(np.stack(images), np.array(steering), f"{len(images)} frames of {bag}", asked=True)
+    unchecked = ", unchecked" if read_info(bag).unchecked else ""
+    return Reference(np.stack(images), np.array(steering), f"{len(images)} frames of {bag}{unchecked}", asked=True)
 
 
 def from_run(folder: Path, view: PolicyView) -> Reference:

@@ -21,9 +21,12 @@ from calibration.degeneracy import DegenerateDataError, mean_rotation
 from calibration.display_colour import mean_colour, screen_region
 from calibration.schema import CalibrationError
 from calibration.vehicle import Drive
+from nodes.runtime.bag_images import image_messages, image_topic
+from nodes.runtime.bag_parts import holds_bag
 from nodes.runtime.bag_read import read_info, read_messages
 from nodes.runtime.errors import BagError
-from nodes.runtime.messages import decode, image_array, pose_matrix, stamp_ns
+from nodes.runtime.messages import decode, pose_matrix, stamp_ns
+from nodes.runtime.pictures import rgb_image
 from nodes.runtime.topics import topic as topic_row
 
 Rgb = NDArray[np.uint8]
@@ -65,16 +68,14 @@ def read_poses(bag: Path, topic: str) -> PoseSeries:
 
 def read_frames(bag: Path) -> Iterator[tuple[int, Rgb]]:
     """Stamp [ns] and picture ``[H, W, 3]`` RGB of every frame."""
-    for message in _decoded(bag, IMAGES):
-        image = image_array(message)
-        if image.ndim == 2:
-            image = np.repeat(image[..., None], 3, axis=-1)
-        yield stamp_ns(message), image[..., ::-1] if message.encoding == "bgr8" else image
+    topic = image_topic(bag)
+    for message in image_messages(bag, topic):
+        yield stamp_ns(message), rgb_image(message, f"{topic} in {bag}")
 
 
 def read_pictures(source: Path) -> Iterator[tuple[str, Rgb]]:
     """Name and picture of every file of a folder, or of every frame of a bag."""
-    if source.is_dir() and not any(source.glob("*.mcap")):
+    if source.is_dir() and not holds_bag(source):
         files = sorted(file for file in source.iterdir() if file.suffix.lower() in PICTURES)
         if not files:
             raise CalibrationError(f"expected a bag, or a folder of pictures ({', '.join(PICTURES)}), got {source}")

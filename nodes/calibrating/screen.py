@@ -15,7 +15,8 @@ from calibration.schema import CalibrationError
 from hardware.display import Display
 from nodes.calibrating.bags import IMAGES
 from nodes.runtime.bus import Bus
-from nodes.runtime.messages import image_array, stamp_ns
+from nodes.runtime.messages import stamp_ns
+from nodes.runtime.pictures import rgb_image
 
 Rgb = NDArray[np.uint8]
 # Frames whose exposure may have begun before the flip, or that show it half-way.
@@ -70,9 +71,7 @@ def live_frames(run_dir: Path) -> Iterator[tuple[int, Rgb]]:
             for received in bus.receive():
                 heard = time.monotonic()
                 message = received.message()
-                image = image_array(message)
-                colour = image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=-1)
-                yield stamp_ns(message), colour[..., ::-1] if message.encoding == "bgr8" else colour
+                yield stamp_ns(message), rgb_image(message, IMAGES)
             if time.monotonic() - heard > _LONGEST_WAIT_S:
                 raise CalibrationError(
                     f"expected frames on {IMAGES}, heard none for {_LONGEST_WAIT_S:g} s; is the camera node running?"

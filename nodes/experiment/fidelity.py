@@ -33,7 +33,8 @@ from nodes.experiment.screen import shown
 from nodes.pose_buffer import PoseBuffer
 from nodes.runtime.bag_read import read_messages
 from nodes.runtime.errors import BagError
-from nodes.runtime.messages import decode, image_array, ns_from_stamp, pose_matrix
+from nodes.runtime.messages import decode, ns_from_stamp, pose_matrix
+from nodes.runtime.pictures import rgb_image
 from nodes.runtime.topics import topic as topic_row
 
 Rgb = NDArray[np.uint8]
@@ -151,7 +152,7 @@ def _posed_frames(bag: Path) -> tuple[list[Rgb], Array]:
         stamp_ns = ns_from_stamp(image.header.stamp)
         pose = poses.at(stamp_ns, 0.0)
         if pose is not None and armed and min(armed) <= stamp_ns <= max(armed):
-            frames.append(image_array(image).copy())
+            frames.append(rgb_image(image, f"{_IMAGE} in {bag}").copy())
             states.append((pose.T[0, 3], pose.T[1, 3], yaw_of(pose.T)))
     if not frames:
         raise BagError(f"expected images on {_IMAGE} with poses on {_CAR} while the car was armed in {bag}, got none")

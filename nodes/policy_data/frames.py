@@ -23,15 +23,17 @@ from advnerf_core.driving.frames import Frames
 from advnerf_core.driving.policy_view import PolicyView
 from advnerf_core.geometry import Pinhole, yaw_of
 from nodes.pose_buffer import PoseBuffer
+from nodes.runtime.bag_images import CAMERA_TOPICS, image_messages, image_topic
 from nodes.runtime.bag_read import read_info, read_messages
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import BagError, ConfigError
-from nodes.runtime.messages import decode, image_array, ns_from_stamp, pose_matrix
+from nodes.runtime.messages import decode, ns_from_stamp, pose_matrix
+from nodes.runtime.pictures import rgb_image
 from nodes.runtime.topics import topic as topic_row
 
 Labels = Literal["expert", "recorded"]
 _CAR, _SAFETY, _SENT, _EXPERT = "/vicon/car", "/safety/state", "/motor/sent", "/expert/state"
-_IMAGES = ("/compositor/image", "/camera/image_raw")
+_IMAGES = ("/compositor/image", *CAMERA_TOPICS)
 _JOIN_S = 0.12
 _GIVE_UP_M = 0.7
 
@@ -80,7 +82,7 @@ class _Track:
 
 
 def frames_of_bag(
-    bag: Path, view: PolicyView, expert: Expert | None, labels: Labels = "expert", image_topic: str | None = None
+    bag: Path, view: PolicyView, expert: Expert | None, labels: Labels = "expert", images_on: str | None = None
 ) -> Recording:
     """Frames of a driven bag.
 
@@ -89,26 +91,23 @@ def frames_of_bag(
         view: How camera images become policy images.
         expert: The teacher, at the policy's delay; may be None for recorded labels.
         labels: Where they come from.
-        image_topic: Where images come from; None takes the compositor's if there are any, else the camera's.
+        images_on: Topic of the images, raw or compressed; None takes the compositor's if there are any, else the camera's.
     """
     counts_of = {topic.name: topic.count for topic in read_info(bag).topics}
-    found = [topic for topic in ([image_topic] if image_topic else _IMAGES) if counts_of.get(topic)]
-    if not found:
-        raise BagError(f"expected images on {image_topic or ' or '.join(_IMAGES)} in {bag}, got none")
+    topic = image_topic(bag, [images_on] if images_on else _IMAGES)
     if labels == "expert" and (expert is None or not counts_of.get(_CAR)):
         raise BagError(f"expected poses on {_CAR} in {bag} for the expert's labels, got none; use --labels recorded")
     track = _read_track(bag, [t for t in (_CAR, _SAFETY, _SENT, _EXPERT) if counts_of.get(t)])
     counts = dict.fromkeys(("not armed", "no pose", "no command", "disturbed", "too far from the path"), 0)
     images, states, steering, recorded, stamps = [], [], [], [], []
-    for message in read_messages(bag, [found[0]]):
-        image = decode(topic_row(found[0]).type, message.cdr)
+    for image in image_messages(bag, topic):
         stamp_ns = ns_from_stamp(image.header.stamp)
         sent_rad = track.steering_rad(stamp_ns)
         state, why = _usable(track, stamp_ns, sent_rad, expert, labels)
         if why:
             counts[why] += 1
             continue
-        rgb = image_array(image)
+        rgb = rgb_image(image, f"{topic} in {bag}")
         _require_size(rgb, view, str(bag))
         images.append(view.image(rgb))
         states.append(state)

@@ -33,12 +33,14 @@ class Part:
         files: What it is made of; other sizes or times make it another recording.
         options: How it is cut and labelled.
         cut: Makes its frames.
+        unchecked: Why its messages may be damaged without a sign of it; empty where checksums cover them.
     """
 
     name: str
     files: tuple[Path, ...]
     options: dict[str, Any]
     cut: Callable[[], Recording]
+    unchecked: str = ""
 
     @property
     def digest(self) -> str:
@@ -57,6 +59,7 @@ class Training:
         validation_mae_rad: Mean absolute steering error on held-out frames [rad].
         frames: Frames of each recording, and of the surrogate.
         left_out: Images of each recording that were not used, by reason.
+        unchecked: Recordings that no checksum covers, and why.
     """
 
     path: Path
@@ -64,6 +67,7 @@ class Training:
     validation_mae_rad: float
     frames: dict[str, int]
     left_out: dict[str, dict[str, int]]
+    unchecked: dict[str, str]
 
 
 def train_from_recordings(
@@ -92,7 +96,8 @@ def train_from_recordings(
     write_atomically(out / POLICY, (work / POLICY).read_bytes())
     frames = {name: len(store.load(name)) for name in store.names()}
     named = {part.name: frames.pop(_shard(part)) for part in parts}
-    result = Training(out / POLICY, sha256, mae, {**named, **frames}, left_out)
+    unchecked = {part.name: part.unchecked for part in parts if part.unchecked}
+    result = Training(out / POLICY, sha256, mae, {**named, **frames}, left_out, unchecked)
     summary = {**asdict(result), "path": POLICY, "settings": claim}
     write_atomically(out / "policy.json", json.dumps(summary, indent=1) + "\n")
     for old in (out / "work").iterdir():

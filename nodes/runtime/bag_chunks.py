@@ -1,27 +1,33 @@
-"""The messages of an MCAP file in the order of their log time, chunk by chunk: several times as fast as the general reader."""
+"""The messages of an MCAP file in the order of their log time, chunk by chunk: several times as fast as the general reader.
+
+Every chunk is compared with its checksum before a message of it is given away.
+"""
 
 from __future__ import annotations
 
 import os
-import struct
 from collections.abc import Collection, Iterator
 from heapq import heappop, heappush
-from typing import BinaryIO, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 from mcap.opcode import Opcode
-from mcap.records import Chunk, ChunkIndex
-from mcap.stream_reader import get_chunk_data_stream
+from mcap.records import Attachment, AttachmentIndex, Channel, ChunkIndex, Metadata, MetadataIndex
 from mcap.summary import Summary
 
-from nodes.runtime.bag_file import NONSENSE
+from nodes.runtime.bag_records import (
+    MESSAGE_HEAD,
+    MOST_BYTES,
+    Damaged,
+    checked_attachment,
+    chunk_head,
+    parse,
+    record_at,
+    records_of,
+    unpack_chunk,
+)
+from nodes.runtime.bag_scan import Run
+from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import BagError
-
-_RECORD_HEAD = struct.Struct("<BQ")
-_MESSAGE_HEAD = struct.Struct("<HIQQ")
-# Before the data of a chunk: start and end time, uncompressed size, CRC; then the name of the compression, then a length.
-_CHUNK_HEAD = struct.Struct("<QQQI")
-# What a damaged or hostile file may make us ask for.
-_MOST_BYTES = 1 << 28
 
 
 class RawMessage(NamedTuple):
@@ -36,6 +42,16 @@ class RawMessage(NamedTuple):
     data: bytes
 
 
+class _Block(NamedTuple):
+    """A chunk, or messages outside of chunks, in order of the first log time."""
+
+    start_ns: int
+    offset: int
+    end_ns: int
+    channels: Collection[int]
+    source: ChunkIndex | Run
+
+
 def messages_in_order(
     file: BinaryIO, summary: Summary, channels: Collection[int], start_ns: int = 0
 ) -> Iterator[RawMessage]:
@@ -46,71 +62,115 @@ def messages_in_order(
         summary: Its summary.
         channels: Ids of the channels that are wanted.
         start_ns: First log time [ns since 1970].
+
+    Raises:
+        BagError: A chunk is damaged; the messages before it have been given away.
     """
     wanted = frozenset(channels)
     waiting: list[RawMessage] = []
-    for index in sorted(summary.chunk_indexes, key=lambda index: (index.message_start_time, index.chunk_start_offset)):
+    for block in _blocks(summary):
         # Chunks overlap in time where messages came late; what is older than all of this one can go.
-        while waiting and waiting[0].log_ns < index.message_start_time:
+        while waiting and waiting[0].log_ns < block.start_ns:
             yield heappop(waiting)
-        indexed = index.message_index_offsets
-        if index.message_end_time < start_ns or (indexed and wanted.isdisjoint(indexed)):
+        if block.end_ns < start_ns or (block.channels and wanted.isdisjoint(block.channels)):
             continue
-        for message in _messages(_chunk_data(file, index), wanted, index.chunk_start_offset):
-            if message.log_ns >= start_ns:
-                heappush(waiting, message)
+        try:
+            data = _run_data(file, block.source) if isinstance(block.source, Run) else _chunk_data(file, block.source)
+            for message in _messages(data, wanted, block.offset):
+                if message.log_ns >= start_ns:
+                    heappush(waiting, message)
+        except Damaged as error:
+            raise _damaged(file, summary, block, error) from error
     while waiting:
         yield heappop(waiting)
 
 
+def _blocks(summary: Summary) -> list[_Block]:
+    blocks = [
+        _Block(
+            index.message_start_time,
+            index.chunk_start_offset,
+            index.message_end_time,
+            index.message_index_offsets,
+            index,
+        )
+        for index in summary.chunk_indexes
+    ]
+    for run in getattr(summary, "runs", ()):
+        blocks.append(_Block(run.start_ns, run.offset, run.end_ns, run.channels, run))
+    return sorted(blocks, key=lambda block: block[:2])
+
+
+def _damaged(file: Any, summary: Summary, block: _Block, error: Damaged) -> BagError:
+    path = getattr(file, "name", "the bag")
+    first_ns = summary.statistics.message_start_time if summary.statistics is not None else block.start_ns
+    since, until = ((moment - first_ns) / NS_PER_S for moment in (block.start_ns, block.end_ns))
+    topics = [c.topic if isinstance(c := summary.channels.get(i), Channel) else f"channel {i}" for i in block.channels]
+    return BagError(
+        f"{path} is damaged: the chunk at byte {block.offset} (log times {block.start_ns} to {block.end_ns} ns, {since:.3f} to "
+        f"{until:.3f} s after the first message; {', '.join(sorted(topics)) or 'topics unknown'}): {error}; advnerf bag info {path} "
+        f"lists all damage, advnerf bag repair --force {path} keeps the rest"
+    )
+
+
 def _messages(data: bytes, wanted: frozenset[int], chunk_offset: int) -> Iterator[RawMessage]:
-    at, end = 0, len(data)
-    while at + _RECORD_HEAD.size <= end:
-        opcode, length = _RECORD_HEAD.unpack_from(data, at)
-        body = at + _RECORD_HEAD.size
-        at = body + length
-        if at > end:
-            raise BagError("a chunk of the bag ends in the middle of a record: the file is damaged")
+    for opcode, body, end in records_of(data):
         if opcode != Opcode.MESSAGE:
             continue
-        channel_id, sequence, log_ns, publish_ns = _MESSAGE_HEAD.unpack_from(data, body)
+        channel_id, sequence, log_ns, publish_ns = MESSAGE_HEAD.unpack_from(data, body)
         if channel_id in wanted:
-            payload = data[body + _MESSAGE_HEAD.size : at]
+            payload = data[body + MESSAGE_HEAD.size : end]
             yield RawMessage(log_ns, chunk_offset, body, channel_id, sequence, publish_ns, payload)
 
 
 def _chunk_data(file: BinaryIO, index: ChunkIndex) -> bytes:
-    """Records of a chunk, unpacked."""
-    size = file.seek(0, os.SEEK_END)
-    if index.chunk_start_offset + index.chunk_length > size or index.uncompressed_size > _MOST_BYTES:
-        raise BagError(
-            f"the bag's summary has a chunk of {index.chunk_length} bytes ({index.uncompressed_size} unpacked) at byte "
-            f"{index.chunk_start_offset} of {size}: it is damaged"
+    """Records of a chunk, unpacked and checked."""
+    if index.uncompressed_size > MOST_BYTES:
+        raise Damaged(
+            f"the summary says that it has {index.uncompressed_size} bytes; at most {MOST_BYTES} are unpacked"
         )
-    file.seek(index.chunk_start_offset)
-    record = file.read(index.chunk_length)
+    record = _record(file, index.chunk_start_offset, index.chunk_length, Opcode.CHUNK)
+    head = chunk_head(record, 0, len(record))
+    return unpack_chunk(head, record[head.data_at :])
+
+
+def _run_data(file: BinaryIO, run: Run) -> bytes:
+    file.seek(run.offset)
+    data = file.read(run.length)
+    if len(data) != run.length:
+        raise Damaged("the file is shorter than it was")
+    return data
+
+
+def _record(file: BinaryIO, offset: int, length: int, opcode: int) -> bytes:
+    """Body of the record that the summary has at a place."""
+    size = file.seek(0, os.SEEK_END)
+    if offset + length > size:
+        raise Damaged(f"the summary has {length} bytes of it at byte {offset} of {size}")
+    file.seek(offset)
+    record = file.read(length)
+    found, body, end = record_at(record, 0, length)
+    if found != opcode or end != length:
+        raise Damaged(f"there is no such record of {length} bytes, where the summary has it")
+    return record[body:end]
+
+
+def read_attachment_at(file: Any, index: AttachmentIndex) -> Attachment:
+    """An attachment, checked."""
     try:
-        opcode, _ = _RECORD_HEAD.unpack_from(record)
-        start, end, size, crc = _CHUNK_HEAD.unpack_from(record, _RECORD_HEAD.size)
-        at = _RECORD_HEAD.size + _CHUNK_HEAD.size
-        (name_length,) = struct.unpack_from("<I", record, at)
-        compression = record[at + 4 : at + 4 + name_length].decode()
-        at += 4 + name_length
-        (data_length,) = struct.unpack_from("<Q", record, at)
-        data = record[at + 8 : at + 8 + data_length]
-        if opcode != Opcode.CHUNK or len(data) != data_length:
-            raise BagError(
-                f"the bag has no whole chunk at byte {index.chunk_start_offset}, where its summary says so: it is damaged"
-            )
-        if not compression:
-            return data
-        if size > _MOST_BYTES:
-            raise BagError(f"a chunk of the bag wants {size} bytes; at most {_MOST_BYTES} are unpacked")
-        chunk = Chunk(
-            compression=compression, data=data, message_start_time=start, message_end_time=end, uncompressed_crc=crc,
-            uncompressed_size=size,
-        )  # fmt: skip
-        stream, length = get_chunk_data_stream(chunk)
-        return bytes(stream.read(length))
-    except NONSENSE as error:
-        raise BagError(f"the chunk at byte {index.chunk_start_offset} of the bag cannot be read: {error}") from error
+        attachment, _ = checked_attachment(_record(file, index.offset, index.length, Opcode.ATTACHMENT))
+    except Damaged as error:
+        raise BagError(
+            f"{file.name} is damaged: the attachment {index.name} at byte {index.offset}: {error}; "
+            f"advnerf bag repair --force {file.name} keeps the rest"
+        ) from error
+    return attachment
+
+
+def read_metadata_at(file: Any, index: MetadataIndex) -> Metadata:
+    """A metadata record."""
+    try:
+        found: Metadata = parse(Metadata, _record(file, index.offset, index.length, Opcode.METADATA))
+    except Damaged as error:
+        raise BagError(f"{file.name} is damaged: its metadata {index.name} at byte {index.offset}: {error}") from error
+    return found

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import mmap
 import os
 import struct
 from collections.abc import Iterator
@@ -26,6 +27,7 @@ class BoundedFile:
 
     def __init__(self, file: BinaryIO) -> None:
         self._file = file
+        self.name = str(file.name)
         self._size = os.fstat(file.fileno()).st_size
 
     def read(self, size: int = -1) -> bytes:
@@ -47,6 +49,17 @@ class BoundedFile:
     def seekable(self) -> bool:
         """Yes."""
         return True
+
+
+@contextmanager
+def mapped(path: Path) -> Iterator[Any]:
+    """Bytes of a file, without reading it all into memory; nothing may hold on to a part of them."""
+    with open(path, "rb") as file:
+        if os.fstat(file.fileno()).st_size == 0:
+            yield b""
+            return
+        with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as buffer:
+            yield buffer
 
 
 @contextmanager

@@ -2,23 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from functools import lru_cache
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache, partial
 from pathlib import Path
 
-from mcap.reader import make_reader
-from mcap.records import Statistics
+from mcap.records import Channel, Statistics
 from mcap.summary import Summary
 
 from advnerf_core.files import write_atomically
-from nodes.runtime.bag_chunks import messages_in_order
+from nodes.runtime.bag_check import diagnose
+from nodes.runtime.bag_chunks import messages_in_order, read_attachment_at, read_metadata_at
 from nodes.runtime.bag_file import open_bag
-from nodes.runtime.bag_repair import mcap_file, read_summary, type_of
+from nodes.runtime.bag_formats import Format, no_checksums, recognise
+from nodes.runtime.bag_merge import Source, merge_by_time
+from nodes.runtime.bag_parts import bag_parts
+from nodes.runtime.bag_rosbags import read_stored, stored_messages
+from nodes.runtime.bag_types import Convert, RecordedTopic, converter, unpacked
+from nodes.runtime.bag_whole import FileSummary, read_summary
 from nodes.runtime.clock import NS_PER_S
-from nodes.runtime.errors import BagError, TopicError
-from nodes.runtime.messages import type_hash
-from nodes.runtime.topics import topic as topic_row
+from nodes.runtime.errors import BagError
+from nodes.runtime.message_definitions import full_type_name
+from nodes.runtime.topics import type_of_topic
 
 
 @dataclass(frozen=True)
@@ -40,15 +46,30 @@ class TopicInfo:
 
 @dataclass(frozen=True)
 class BagInfo:
-    """What a bag holds; times are log times [ns since 1970]."""
+    """What a bag holds; times are log times [ns since 1970].
+
+    Attributes:
+        path: Its file, or its folder if it was split.
+        parts: Its files in order.
+        size_bytes: Size of all files.
+        start_ns: Time of the first message.
+        end_ns: Time of the last message.
+        topics: Its topics by name.
+        attachments: Names of the files that ride along, in whichever part.
+        metadata: Facts that the recorder noted: versions, git hash.
+        unchecked: Why its messages may have changed without a sign of it; empty where checksums cover them. Every figure made from
+            such a bag says so.
+    """
 
     path: Path
+    parts: tuple[Path, ...]
     size_bytes: int
     start_ns: int
     end_ns: int
     topics: tuple[TopicInfo, ...]
     attachments: tuple[str, ...]
     metadata: dict[str, str]
+    unchecked: str = ""
 
     @property
     def duration_s(self) -> float:
@@ -63,7 +84,7 @@ class BagInfo:
 
 @dataclass(frozen=True)
 class BagMessage:
-    """One message of a bag."""
+    """One message of a bag; the bytes on a topic of ours are CDR of our type, however the bag had them."""
 
     topic: str
     cdr: bytes
@@ -72,40 +93,64 @@ class BagMessage:
     sequence: int
 
 
+@dataclass(frozen=True)
+class _Part:
+    """What one file says about itself, without the index of its chunks; ``recorded`` has its topics by their numbers in the file."""
+
+    path: Path
+    format: Format
+    size_bytes: int
+    start_ns: int
+    end_ns: int
+    messages: int
+    topics: tuple[TopicInfo, ...]
+    recorded: Mapping[int, RecordedTopic]
+    attachments: tuple[str, ...]
+    metadata: dict[str, str]
+    unchecked: str
+
+
 def read_info(bag: Path) -> BagInfo:
-    """Summary of a bag."""
-    path, summary, statistics = _whole_file(bag)
-    with open_bag(path) as file:
-        records = {record.name: dict(record.metadata) for record in make_reader(file).iter_metadata()}
-    ends = records.get("advnerf_end")
-    topics = tuple(
-        TopicInfo(
-            channel.topic, type_of(summary, channel), statistics.channel_message_counts.get(channel.id, 0),
-            None if ends is None else _count(ends.get(f"lost {channel.topic}", "0")),
-        )
-        for channel in sorted(summary.channels.values(), key=lambda channel: channel.topic)
-    )  # fmt: skip
+    """Summary of a bag, over all its parts."""
+    parts = _parts(bag)
+    filled = [part for part in parts if part.messages]
+    topics: dict[str, TopicInfo] = {}
+    for topic in (topic for part in parts for topic in part.topics):
+        topics[topic.name] = _sum(topics[topic.name], topic) if topic.name in topics else topic
     return BagInfo(
-        path, path.stat().st_size, statistics.message_start_time, statistics.message_end_time, topics,
-        tuple(index.name for index in summary.attachment_indexes), records.get("advnerf", {}),
+        parts[0].path if len(parts) == 1 else parts[0].path.parent, tuple(part.path for part in parts),
+        sum(part.size_bytes for part in parts), min((part.start_ns for part in filled), default=0),
+        max((part.end_ns for part in filled), default=0), tuple(topics[name] for name in sorted(topics)),
+        tuple(dict.fromkeys(name for part in parts for name in part.attachments)),
+        next((part.metadata for part in parts if part.metadata), {}),
+        next((part.unchecked for part in parts if part.unchecked), ""),
     )  # fmt: skip
 
 
 def read_attachment(bag: Path, name: str) -> bytes:
-    """Content of an attached file."""
-    with open_bag(_whole_file(bag)[0]) as file:
-        names = []
-        for attachment in make_reader(file).iter_attachments():
-            if attachment.name == name:
-                return bytes(attachment.data)
-            names.append(attachment.name)
+    """Content of an attached file, from whichever part has it."""
+    parts = _parts(bag)
+    for part in parts:
+        if name in part.attachments:
+            return _attachments(part.path, [name])[name]
+    names = [name for part in parts for name in part.attachments]
     raise BagError(f"{bag} has no attachment {name!r}; it has {', '.join(names) or 'none'}")
 
 
 def read_attachments(bag: Path) -> dict[str, bytes]:
     """Content of all attached files by name; of two with one name the later."""
-    with open_bag(_whole_file(bag)[0]) as file:
-        return {attachment.name: bytes(attachment.data) for attachment in make_reader(file).iter_attachments()}
+    contents: dict[str, bytes] = {}
+    for part in _parts(bag):
+        if part.attachments:
+            contents |= _attachments(part.path, part.attachments)
+    return contents
+
+
+def _attachments(path: Path, names: Sequence[str]) -> dict[str, bytes]:
+    summary, _ = _whole_file(path)
+    with open_bag(path) as file:
+        found = [read_attachment_at(file, index) for index in summary.attachment_indexes if index.name in names]
+    return {attachment.name: bytes(attachment.data) for attachment in found}
 
 
 def extract_attachments(bag: Path, folder: Path, names: Sequence[str] = ()) -> list[Path]:
@@ -135,75 +180,193 @@ def plain_name(bag: Path, name: str) -> str:
     return name
 
 
-def read_messages(bag: Path, topics: Sequence[str] | None = None, start_offset_s: float = 0.0) -> Iterator[BagMessage]:
+def read_messages(
+    bag: Path, topics: Sequence[str] | None = None, start_offset_s: float = 0.0, types: Mapping[str, str] | None = None,
+    as_recorded: bool = False,
+) -> Iterator[BagMessage]:  # fmt: skip
     """Messages in order of their log time.
+
+    Messages on topics of ours come as our type: a bag that has another definition of it, or a type that can stand for it (see
+    `nodes.runtime.bag_types`), is converted.
 
     Args:
         bag: Bag folder or file.
         topics: Only these; every one must be in the bag.
         start_offset_s: Leave out so much of the beginning [s].
+        types: Types that are wanted, by topic; None takes those of the topic table, and leaves other topics as they are.
+        as_recorded: Convert nothing.
+
+    Raises:
+        BagError: The bag cannot be read, lacks a topic, or has a topic of a type that cannot become ours.
     """
     info = read_info(bag)
     path = info.path
+    if info.unchecked:
+        _say_unchecked(path, info.unchecked)
     known = [topic.name for topic in info.topics]
     for name in topics or ():
         if name not in known:
             raise BagError(f"{path} has no topic {name}; it has {', '.join(known)}")
-    start_ns = info.start_ns + round(start_offset_s * NS_PER_S)
+    # Without an offset nothing is left out: of a file with log times of 0, the summary does not count these as its start.
+    start_ns = info.start_ns + round(start_offset_s * NS_PER_S) if start_offset_s else 0
     if start_offset_s < 0 or start_ns > info.end_ns:
         raise BagError(
             f"expected a start offset between 0 and {info.duration_s:.1f} s, the length of {path}, got {start_offset_s}"
         )
-    _, summary, statistics = _whole_file(bag)
-    names = {
-        channel.id: channel.topic for channel in summary.channels.values() if not topics or channel.topic in topics
-    }
-    with open_bag(path) as file:
-        if statistics.message_count and not summary.chunk_indexes:  # written by others, without chunks
-            for _, channel, message in make_reader(file).iter_messages(
-                topics, starting_at=start_ns, log_time_order=True
-            ):
-                yield BagMessage(channel.topic, message.data, message.log_time, message.publish_time, message.sequence)
-            return
+    wanted = frozenset(topics or known)
+    sources = [
+        Source(part.start_ns, partial(_messages_of, part, wanted, start_ns, converters))
+        for part in _parts(bag)
+        if part.messages and part.end_ns >= start_ns and not wanted.isdisjoint(topic.name for topic in part.topics)
+        for converters in [{} if as_recorded else _converters(part, wanted, types or {})]
+    ]
+    yield from merge_by_time(sources, lambda message: message.log_ns)
+
+
+def _messages_of(
+    part: _Part, topics: frozenset[str], start_ns: int, converters: Mapping[int, Convert]
+) -> Iterator[BagMessage]:
+    """Messages of one file in order of their log time."""
+    names = {number: recorded.topic for number, recorded in part.recorded.items() if recorded.topic in topics}
+    stored = _mcap_messages if part.format is Format.MCAP else _stored_messages
+    for number, message in stored(part, names, start_ns):
+        data = unpacked(message.cdr, message.topic, str(part.path))
+        if convert := converters.get(number):
+            data = convert(data)
+        yield message if data is message.cdr else replace(message, cdr=data)
+
+
+def _mcap_messages(part: _Part, names: Mapping[int, str], start_ns: int) -> Iterator[tuple[int, BagMessage]]:
+    summary, _ = _whole_file(part.path)
+    with open_bag(part.path) as file:
         for raw in messages_in_order(file, summary, names, start_ns):
-            yield BagMessage(names[raw.channel_id], raw.data, raw.log_ns, raw.publish_ns, raw.sequence)
+            times = raw.log_ns, raw.publish_ns, raw.sequence
+            yield raw.channel_id, BagMessage(names[raw.channel_id], raw.data, *times)
 
 
-def require_our_types(bag: Path, topics: Sequence[str]) -> None:
-    """Refuse a bag whose topics have other types than ours: receivers would refuse every message."""
-    path, summary, _ = _whole_file(bag)
-    for channel in summary.channels.values():
-        if channel.topic not in topics:
-            continue
-        typename = type_of(summary, channel)
-        try:
-            ours = topic_row(channel.topic).type
-        except TopicError as error:
-            raise BagError(f"{path}: cannot play {channel.topic}: {error}") from None
-        found = channel.metadata.get("topic_type_hash", "")
-        if typename != ours or found not in ("", type_hash(ours)):
-            raise BagError(
-                f"{path}: {channel.topic} is {typename} {found}, but here it is {ours} {type_hash(ours)}; leave it out with --topics"
-            )
+def _stored_messages(part: _Part, names: Mapping[int, str], start_ns: int) -> Iterator[tuple[int, BagMessage]]:
+    """Messages of a file that is no MCAP; it has neither publish times nor sequence numbers, so they are made up."""
+    counts = dict.fromkeys(names.values(), 0)
+    for number, log_ns, data in stored_messages(part.path, part.format, names, start_ns):
+        topic = names[number]
+        yield number, BagMessage(topic, data, log_ns, log_ns, counts[topic])
+        counts[topic] += 1
+
+
+def require_readable(bag: Path, topics: Mapping[str, str]) -> None:
+    """Refuse a bag with a topic that cannot become the type that is wanted.
+
+    Args:
+        bag: Bag folder or file.
+        topics: Types that are wanted, by topic.
+    """
+    for part in _parts(bag):
+        _converters(part, frozenset(topics), topics)
+
+
+def _converters(part: _Part, topics: frozenset[str], types: Mapping[str, str]) -> dict[int, Convert]:
+    """What makes the messages of a file ours, by the number of their topic; nothing for those that are ours."""
+    found = {}
+    for number, recorded in part.recorded.items():
+        expected = types.get(recorded.topic) or type_of_topic(recorded.topic)
+        if recorded.topic in topics and expected and (convert := converter(recorded, expected, str(part.path))):
+            found[number] = convert
+    return found
+
+
+def type_of(summary: Summary, channel: Channel) -> str:
+    """Type of a channel's messages; empty if the file does not say."""
+    schema = summary.schemas.get(channel.schema_id)
+    return full_type_name(schema.name) if schema is not None else ""
 
 
 def _count(text: str) -> int | None:
     return int(text) if text.isascii() and text.isdigit() else None
 
 
-def _whole_file(bag: Path) -> tuple[Path, Summary, Statistics]:
-    path = mcap_file(bag)
+def _sum(one: TopicInfo, other: TopicInfo) -> TopicInfo:
+    lost = None if one.lost is None or other.lost is None else one.lost + other.lost
+    return TopicInfo(one.name, one.type or other.type, one.count + other.count, lost)
+
+
+def _parts(bag: Path) -> list[_Part]:
+    found = []
+    for path in bag_parts(bag):
+        state = path.stat()
+        if (part := _part_of(path, state.st_mtime_ns, state.st_size)) is None:
+            raise _unfinished(path)
+        found.append(part)
+    return found
+
+
+@lru_cache(maxsize=1024)
+def _part_of(path: Path, mtime_ns: int, size_bytes: int) -> _Part | None:
+    form = recognise(path)
+    if form is not Format.MCAP:
+        return _stored_part(path, form, size_bytes)
+    if (found := _summary_of(path, mtime_ns, size_bytes)) is None:
+        return None
+    summary, statistics = found
+    with open_bag(path) as file:
+        notes = [read_metadata_at(file, index) for index in summary.metadata_indexes]
+    records = {record.name: dict(record.metadata) for record in notes}
+    ends = records.get("advnerf_end")
+    topics: dict[str, TopicInfo] = {}
+    for channel in summary.channels.values():
+        lost = None if ends is None else _count(ends.get(f"lost {channel.topic}", "0"))
+        count = statistics.channel_message_counts.get(channel.id, 0)
+        topic = TopicInfo(channel.topic, type_of(summary, channel), count, lost)
+        topics[channel.topic] = _sum(topics[channel.topic], topic) if channel.topic in topics else topic
+    return _Part(
+        path, form, size_bytes, statistics.message_start_time, statistics.message_end_time, statistics.message_count,
+        tuple(topics.values()), {channel.id: _recorded(summary, channel) for channel in summary.channels.values()},
+        tuple(index.name for index in summary.attachment_indexes), records.get("advnerf", {}),
+        summary.unchecked,
+    )  # fmt: skip
+
+
+def _stored_part(path: Path, form: Format, size_bytes: int) -> _Part:
+    stored = read_stored(path, form)
+    topics: dict[str, TopicInfo] = {}
+    for _, recorded, count in stored.topics:
+        topic = TopicInfo(recorded.topic, recorded.type, count, None)
+        topics[topic.name] = _sum(topics[topic.name], topic) if topic.name in topics else topic
+    return _Part(
+        path, form, size_bytes, stored.start_ns, stored.end_ns, stored.messages, tuple(topics.values()),
+        {number: recorded for number, recorded, _ in stored.topics}, (), {}, no_checksums(form),
+    )  # fmt: skip
+
+
+def _recorded(summary: Summary, channel: Channel) -> RecordedTopic:
+    schema = summary.schemas.get(channel.schema_id)
+    return RecordedTopic(
+        channel.topic, type_of(summary, channel), channel.metadata.get("topic_type_hash", ""),
+        "" if schema is None else schema.data.decode("utf-8", "replace"), "" if schema is None else schema.encoding,
+        channel.message_encoding,
+    )  # fmt: skip
+
+
+def _whole_file(path: Path) -> tuple[FileSummary, Statistics]:
     state = path.stat()
-    found = _summary_of(path, state.st_mtime_ns, state.st_size)
-    if found is None:
-        raise BagError(
-            f"{path} is unfinished: its recorder was killed or is still at work; make it whole with: advnerf bag repair {bag}"
-        )
-    return path, *found
+    if (found := _summary_of(path, state.st_mtime_ns, state.st_size)) is None:
+        raise _unfinished(path)
+    return found
+
+
+@lru_cache(maxsize=1024)
+def _say_unchecked(path: Path, reason: str) -> None:
+    """Once per bag, for everybody who takes numbers from it."""
+    print(f"{path}: unchecked: {reason}, so damage to it cannot be noticed", file=sys.stderr, flush=True)
+
+
+def _unfinished(path: Path) -> BagError:
+    """What to say of a file without an end; what is advised depends on what is in it."""
+    lines = diagnose(path).lines
+    return BagError(f"{path} is unfinished: its recorder was killed; {'; '.join(lines[-2:])}")
 
 
 @lru_cache(maxsize=4)
-def _summary_of(path: Path, mtime_ns: int, size_bytes: int) -> tuple[Summary, Statistics] | None:
+def _summary_of(path: Path, mtime_ns: int, size_bytes: int) -> tuple[FileSummary, Statistics] | None:
     """Summary of a file in a certain state; one with an hour of chunks takes a second to read."""
     del mtime_ns, size_bytes  # they are the state
     return read_summary(path)

@@ -44,7 +44,7 @@ def read_delays(bag: Path) -> dict[str, Delays]:
     """Times of every topic with a message, by name; the whole bag is read for it."""
     names = {topic.name: _begins_with_stamp(topic.name, topic.type) for topic in read_info(bag).topics}
     rows: dict[str, list[tuple[int, int, int]]] = {}
-    for message in read_messages(bag):
+    for message in read_messages(bag, as_recorded=True):
         stamp_ns = _stamp_ns(message.cdr) if names[message.topic] else 0
         rows.setdefault(message.topic, []).append((stamp_ns, message.publish_ns, message.log_ns))
     return {topic: _delays(found) for topic, found in rows.items()}

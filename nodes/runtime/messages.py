@@ -26,7 +26,6 @@ ROS_DISTRO = "jazzy"
 MSG_FOLDER = Path(__file__).parent / "msg"
 # No message of ours comes near; a corrupt length field must not make a receiver ask for gigabytes.
 MAX_SEQUENCE_LENGTH = 64 * 1024 * 1024
-# Written in the byte order of x86 and ARM, the only machines we run on.
 _RGB8, _MONO8, _BGR8 = "rgb8", "mono8", "bgr8"
 _CHANNELS = {_RGB8: 3, _BGR8: 3, _MONO8: 1}
 
@@ -115,6 +114,18 @@ def decode(typename: str, data: bytes | memoryview) -> Any:
         raise MessageError(f"expected CDR bytes of {typename}, got {len(data)} bytes that are not: {error}") from error
 
 
+def fields_of(typename: str) -> list[tuple[str, Any]] | None:
+    """Names and kinds of the fields of a type, as ``rosbags`` describes them; None for a type that is not known."""
+    found = _STORE.fielddefs.get(typename)
+    return None if found is None else list(found[1])
+
+
+def message_class(typename: str) -> Any:
+    """Class of the messages of a type."""
+    _require_type(typename)
+    return _STORE.types[typename]
+
+
 def stamp_from_ns(stamp_ns: int) -> Any:
     """``builtin_interfaces/Time`` of a real time [ns]."""
     return types.Time(sec=int(stamp_ns) // NS_PER_S, nanosec=int(stamp_ns) % NS_PER_S)
@@ -148,21 +159,6 @@ def image_message(image: NDArray[np.uint8], stamp_ns: int, frame_id: str, encodi
         header=header(stamp_ns, frame_id), height=height, width=width, encoding=encoding, is_bigendian=0,
         step=width * channels, data=np.ascontiguousarray(image).reshape(-1),
     )  # fmt: skip
-
-
-def image_array(message: Any) -> NDArray[np.uint8]:
-    """Pixels ``[H, W, 3]`` (RGB or BGR as the message says) or ``[H, W]`` uint8; read-only when it came over the wire."""
-    channels = _CHANNELS.get(message.encoding)
-    if channels is None:
-        raise MessageError(f"expected an encoding of {', '.join(_CHANNELS)}, got {message.encoding!r}")
-    height, width, step = int(message.height), int(message.width), int(message.step)
-    if step < width * channels or len(message.data) != height * step:
-        raise MessageError(
-            f"expected {height} rows of {step} >= {width * channels} bytes for {width} x {height} {message.encoding}, "
-            f"got {len(message.data)} bytes"
-        )
-    rows = np.asarray(message.data, dtype=np.uint8).reshape(height, step)[:, : width * channels]
-    return rows.reshape(height, width) if channels == 1 else rows.reshape(height, width, channels)
 
 
 def pose_message(T_frame_from_body: ArrayLike, stamp_ns: int, frame_id: str = "world") -> Any:

@@ -1,6 +1,6 @@
-"""Pictures for the air: JPEG messages that keep the stamp of their picture, and one decoder for whoever receives pictures.
+"""Pictures on topics and in bags: one entrance that turns any of them into RGB, and JPEG messages that keep the stamp of their picture.
 
-Nothing here trusts a received picture: its size is read from the header of the JPEG data before they are decoded.
+Nothing here trusts a received picture: the size in the header of compressed data is checked before they are decoded.
 """
 
 from __future__ import annotations
@@ -12,14 +12,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nodes.runtime.errors import MessageError
-from nodes.runtime.messages import header, image_array, image_message, stamp_ns, type_name, types
+from nodes.runtime.image_encodings import is_bayer, rgb_of_image, rgb_of_samples
+from nodes.runtime.image_parts import IMAGE_TYPE
+from nodes.runtime.messages import header, image_message, stamp_ns, type_name, types
 
 RAW_TOPIC, COMPRESSED_TOPIC = "/camera/image_raw", "/camera/image_raw/compressed"
+COMPRESSED_TYPE = "sensor_msgs/msg/CompressedImage"
 # As ROS 2's image transport writes it: what the picture was, and what is inside the JPEG.
 _FORMAT = "rgb8; jpeg compressed bgr8"
-_COMPRESSED_TYPE = "sensor_msgs/msg/CompressedImage"
+_RGB8 = "rgb8"
 MAX_PIXELS = 16_000_000
-_START, _SCAN = b"\xff\xd8", 0xDA
+_JPEG, _PNG = b"\xff\xd8", b"\x89PNG\r\n\x1a\n"
+_SCAN = 0xDA
 # Start-of-frame markers hold the size; C4, C8 and CC among them are something else.
 _FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _BARE = frozenset({0x01, *range(0xD0, 0xD9)})
@@ -45,29 +49,90 @@ def compressed_image_message(rgb: NDArray[np.uint8], stamp_ns: int, frame_id: st
     return types.CompressedImage(header=header(stamp_ns, frame_id), format=_FORMAT, data=data.reshape(-1))
 
 
-def raw_image(message: Any) -> Any:
-    """``sensor_msgs/Image`` of a picture however it came, with its own stamp; an ``Image`` is returned as it is."""
-    if type_name(message) != _COMPRESSED_TYPE:
+def rgb_image(message: Any, source: str) -> NDArray[np.uint8]:
+    """Pixels ``[H, W, 3]`` uint8 RGB of an ``Image`` or a ``CompressedImage``; read-only where it is a view of the message.
+
+    Args:
+        message: The picture; see `nodes.runtime.image_encodings` for encodings, JPEG and PNG for compressed ones.
+        source: Where it comes from, for the error: its topic, and the bag if there is one.
+
+    Raises:
+        MessageError: It is no picture, is damaged, or has an encoding that is not supported.
+    """
+    typename = type_name(message)
+    if typename == COMPRESSED_TYPE:
+        return _decompressed(message, source)
+    if typename != IMAGE_TYPE:
+        raise MessageError(f"{source}: expected {IMAGE_TYPE} or {COMPRESSED_TYPE}, got {typename}")
+    return rgb_of_image(message, source)
+
+
+def rgb8_message(message: Any, source: str) -> Any:
+    """``sensor_msgs/Image`` in rgb8 of any picture, with its own stamp and frame; one that is so already is returned.
+
+    Args:
+        message: An ``Image`` or a ``CompressedImage``.
+        source: Where it comes from, for the error.
+    """
+    rgb = rgb_image(message, source)
+    if type_name(message) == IMAGE_TYPE and message.encoding == _RGB8:
         return message
-    return image_message(_decoded(message), stamp_ns(message), message.header.frame_id)
+    return image_message(rgb, stamp_ns(message), message.header.frame_id)
 
 
-def picture_array(message: Any) -> NDArray[np.uint8]:
-    """Pixels of an ``Image`` (see `image_array`) or of a ``CompressedImage``, then RGB ``[H, W, 3]``."""
-    return _decoded(message) if type_name(message) == _COMPRESSED_TYPE else image_array(message)
-
-
-def _decoded(message: Any) -> NDArray[np.uint8]:
+def _decompressed(message: Any, source: str) -> NDArray[np.uint8]:
     data = np.asarray(message.data, dtype=np.uint8)
-    if "jpeg" not in message.format and "jpg" not in message.format:
-        raise MessageError(f"expected a picture compressed as JPEG, got format {message.format[:40]!r}")
-    width, height = jpeg_size(data.tobytes())
+    width, height = _compressed_size(data.tobytes(), str(message.format), source)
     if width * height > MAX_PIXELS:
-        raise MessageError(f"expected a picture of at most {MAX_PIXELS} pixels, got {width} x {height}")
-    bgr = cv2.imdecode(data, cv2.IMREAD_COLOR)
-    if bgr is None or bgr.shape[:2] != (height, width):
-        raise MessageError(f"expected a JPEG of {width} x {height}, its data are damaged")
-    return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+        raise MessageError(f"{source}: expected a picture of at most {MAX_PIXELS} pixels, got {width} x {height}")
+    try:
+        # Unchanged: 16 bits stay, one channel stays, and a rotation in the file's EXIF data is not applied.
+        samples = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        samples = None
+    if samples is None or samples.shape[:2] != (height, width) or samples.dtype not in (np.uint8, np.uint16):
+        raise MessageError(f"{source}: expected a JPEG or PNG picture of {width} x {height}, its data are damaged")
+    return rgb_of_samples(samples.reshape(height, width, -1), _layout(str(message.format), samples))
+
+
+def _layout(picture_format: str, samples: NDArray[Any]) -> str:
+    """How decoded samples are laid out: OpenCV gives BGR, but image transport may have compressed something else as if it were BGR.
+
+    The format reads ``<encoding>; <codec> compressed <what was given to the codec>``. Of a colour image the last part is ``bgr8``;
+    without it, image transport takes the samples in the order of red, green, blue.
+    """
+    encoding, separator, rest = picture_format.partition(";")
+    channels = 1 if samples.ndim == 2 else samples.shape[2]
+    if channels == 1:
+        return encoding.rstrip("0123456789") if is_bayer(encoding) else "grey"
+    swapped = (
+        separator and "compressed" in rest and "compressed bgr" not in rest and encoding.startswith(("rgb", "bgr"))
+    )
+    return {(3, False): "bgr", (3, True): "rgb", (4, False): "bgra", (4, True): "rgba"}[channels, bool(swapped)]
+
+
+def _compressed_size(data: bytes, picture_format: str, source: str) -> tuple[int, int]:
+    """Width and height [px] in the header of JPEG or PNG data; nothing is decoded."""
+    try:
+        if data.startswith(_PNG):
+            return png_size(data)
+        if data.startswith(_JPEG):
+            return jpeg_size(data)
+    except MessageError as error:
+        raise MessageError(f"{source}: {error}") from None
+    raise MessageError(
+        f"{source}: cannot decompress the format {picture_format[:40]!r} ({len(data)} bytes); supported are JPEG and PNG data"
+    )
+
+
+def png_size(data: bytes) -> tuple[int, int]:
+    """Width and height [px] in the header of PNG data; nothing is decoded.
+
+    Source: PNG specification, second edition, 11.2.2: the chunk IHDR comes first.
+    """
+    if len(data) < 24 or data[12:16] != b"IHDR":
+        raise MessageError(f"expected PNG data, got {len(data)} bytes without a size in them")
+    return int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")
 
 
 def jpeg_size(data: bytes) -> tuple[int, int]:
@@ -75,7 +140,7 @@ def jpeg_size(data: bytes) -> tuple[int, int]:
 
     Source: ITU-T T.81, annex B: segments of a marker and a length, until the start of frame.
     """
-    position = 2 if data.startswith(_START) else len(data)
+    position = 2 if data.startswith(_JPEG) else len(data)
     while position + 9 <= len(data) and data[position] == 0xFF:
         marker = data[position + 1]
         if marker == 0xFF or marker in _BARE:

@@ -19,12 +19,14 @@ from advnerf_core.errors import AdvnerfError
 from nodes.runtime.bus import Bus
 from nodes.runtime.clock import Clock, SystemClock
 from nodes.runtime.config import load_node_config
-from nodes.runtime.errors import NodeFinished
+from nodes.runtime.errors import BagError, ConfigError, NodeFinished, TopicError
 from nodes.runtime.loop import NodeLoop
 from nodes.runtime.node import FAULT, STARTING, Node, NodeContext
 from nodes.runtime.topics import status_topic
 
 C = TypeVar("C", bound=BaseModel)
+# Raised while a node is built, these say what the user has to change; no traceback helps with that.
+_WRONG_REQUEST = (BagError, ConfigError, TopicError)
 
 
 class _Signals:
@@ -67,7 +69,8 @@ def run_node(
         on_loop: Called with the loop before it runs; lets a test stop it.
 
     Returns:
-        Exit code: 0 after an orderly end, 1 after a fault (one line on stderr, traceback in ``<run_dir>/logs``).
+        Exit code: 0 after an orderly end, 1 after a fault (one line on stderr, traceback in ``<run_dir>/logs``), 2 when the node
+        cannot be built as it was asked for (one line on stderr).
     """
     clock = clock or SystemClock()
     in_main_thread = threading.current_thread() is threading.main_thread()
@@ -120,6 +123,10 @@ class _Runner:
         self.loop.run()
 
     def fail(self, error: Exception) -> None:
+        if self.loop is None and isinstance(error, _WRONG_REQUEST):
+            self.exit_code = 2
+            print(f"{self._name}: {_one_line(error)}", file=sys.stderr, flush=True)
+            return
         self.exit_code = 1
         log = self._run_dir / "logs" / f"{self._name}.traceback.txt"
         line = f"{self._name}: {_one_line(error)}"

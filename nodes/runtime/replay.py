@@ -13,11 +13,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from nodes.runtime.bag import BagWriter
-from nodes.runtime.bag_read import BagMessage, read_attachments, read_info, read_messages, require_our_types
+from nodes.runtime.bag_read import BagMessage, read_attachments, read_info, read_messages, require_readable
 from nodes.runtime.errors import BagError
 from nodes.runtime.node import Node
 from nodes.runtime.replay_lockstep import BagClock, Lockstep, Summary
 from nodes.runtime.replay_nodes import Choice, build_nodes, close_nodes
+from nodes.runtime.topics import topic as topic_row
+from nodes.runtime.topics import type_of_topic
 
 
 @dataclass(frozen=True)
@@ -41,12 +43,12 @@ class Replay:
         choice: What to replay.
         whole: Also yield what is in the bag but interests no node (to write another bag).
 
-    Iterate over it once; then `summary` is complete. Use it as a context manager: leaving it closes the nodes.
+    Topics of foreign bags that are not in the topic table are left out, and listed in `left_out`. Iterate over it once; then `summary` is complete. Use it as a context manager: leaving it closes the nodes.
     """
 
     def __init__(self, bag: Path, choice: Choice, whole: bool = False) -> None:
         self.info = read_info(bag)
-        self._bag, self._whole = bag, whole
+        self.bag, self._whole = bag, whole
         self._folder = tempfile.TemporaryDirectory(prefix="advnerf-replay-")
         self._clock = BagClock(self.info.start_ns)
         self._nodes: dict[str, Node] = {}
@@ -54,8 +56,9 @@ class Replay:
             self._nodes = build_nodes(bag, choice, Path(self._folder.name), self._clock)
             self._lockstep = Lockstep(self._nodes, self._clock, self.info.start_ns)
             recorded = [topic.name for topic in self.info.topics]
+            self.left_out = [topic for topic in recorded if type_of_topic(topic) is None]
             self._heard = [topic for topic in recorded if topic in self._lockstep.heard_topics - self.made_topics]
-            require_our_types(bag, self._heard)
+            require_readable(bag, {topic: topic_row(topic).type for topic in self._heard})
             if not self._heard:
                 raise BagError(
                     f"{self.info.path} has nothing for {', '.join(choice.nodes)}: they listen to "
@@ -88,9 +91,10 @@ class Replay:
 
     def __iter__(self) -> Iterator[Replayed]:
         """Every message that was made, and with ``whole`` also those that were kept, in order."""
-        topics = None if self._whole else self._heard
+        recorded = [topic.name for topic in self.info.topics]
+        topics = [topic for topic in recorded if topic not in self.left_out] if self._whole else self._heard
         heard = frozenset(self._heard)
-        for message in read_messages(self._bag, topics):
+        for message in read_messages(self.bag, topics):
             if message.topic in self.made_topics:
                 continue
             yield from (Replayed(made, True) for made in self._lockstep.advance_to(message.log_ns))
@@ -115,7 +119,7 @@ def write_replay(replay: Replay, folder: Path) -> None:
     Everything that rides along in the old bag does so in the new one; the same replay gives the same bytes.
     """
     metadata = {**replay.info.metadata, "replayed": ", ".join(sorted(replay.names))}
-    attachments = read_attachments(replay.info.path)
+    attachments = read_attachments(replay.bag)
     with BagWriter(folder, attachments, metadata, attached_ns=replay.info.start_ns) as writer:
         for entry in replay:
             message = entry.message

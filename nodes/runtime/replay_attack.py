@@ -42,6 +42,7 @@ class RetroAttack:
         attack_id: Id of the attack.
         start_ns: Beginning of the recording [ns since 1970].
         digests: Digests of the two replays: clean, attacked.
+        unchecked: Why the recording may be damaged without a sign of it; empty where checksums cover it.
     """
 
     stamps_ns: NDArray[np.int64]
@@ -52,6 +53,7 @@ class RetroAttack:
     attack_id: str
     start_ns: int
     digests: tuple[str, str]
+    unchecked: str = ""
 
     @property
     def delta_rad(self) -> Array:
@@ -80,10 +82,14 @@ class RetroAttack:
             "clean_against_recorded_rad": None if np.isnan(far).all() else float(np.nanmean(far)),
             "digest_clean": self.digests[0],
             "digest_attacked": self.digests[1],
+            "unchecked": self.unchecked,
         }
 
     def verdict(self) -> str:
         """What would have been steered, in a sentence."""
+        return self._sentence() + (f"; unchecked: {self.unchecked}" if self.unchecked else "")
+
+    def _sentence(self) -> str:
         n = self.numbers()
         if not self.drawn.any():
             return f"the face of attack {self.attack_id} was in view in none of {n['frames']} images; nothing would have changed"
@@ -135,6 +141,7 @@ def retro_attack(bag: Path, attack: Path, choice: Choice) -> RetroAttack:
         next((name for _, name in labels.values() if name), ""),
         read_info(bag).start_ns,
         (clean_digest, digest),
+        read_info(bag).unchecked,
     )
 
 
@@ -152,6 +159,8 @@ def plot_retro_attack(result: RetroAttack, path: Path) -> None:
     above.plot(t, result.attacked_rad * _DEG, color="C3", label=f"attack {result.attack_id}")
     above.set_ylabel("steering (left +) [degrees]")
     above.legend(frameon=False)
+    if result.unchecked:
+        above.set_title("unchecked: the recording has no checksums", loc="right", fontsize="small")
     delta = result.delta_rad * _DEG
     below.axhline(0.0, color="0.8", linewidth=0.8)
     below.plot(t, delta, color="0.4")

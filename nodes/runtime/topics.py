@@ -85,6 +85,14 @@ def status_topic(node: str) -> str:
     return STATUS_PREFIX + node
 
 
+def type_of_topic(name: str) -> str | None:
+    """Type of a topic; None for one that is not ours."""
+    try:
+        return topic(name).type
+    except TopicError:
+        return None
+
+
 def topic(name: str) -> Topic:
     """Row of a topic; every node has a status topic besides the table."""
     if row := TOPICS.get(name):

@@ -208,7 +208,10 @@ def _write_car(path: Path, frames: DrivenFrames, extra: dict[str, Any]) -> None:
 
 
 def _bag_facts(frames: DrivenFrames) -> dict[str, Any]:
-    return {"recorded_frames": frames.recorded, "without_pose": frames.without_pose, "taken_frames": len(frames.files)}
+    return {
+        "recorded_frames": frames.recorded, "without_pose": frames.without_pose, "taken_frames": len(frames.files),
+        "unchecked": frames.unchecked,
+    }  # fmt: skip
 
 
 def _box_of(points: Array, poses: Array) -> dict[str, Any]:

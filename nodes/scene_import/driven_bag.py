@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,14 +17,16 @@ from advnerf_core.scene.image_files import Rgb
 from advnerf_core.scene.similarity import rotation_angles
 from calibration.schema import CalibrationError, CameraCalibration, load_calibration
 from nodes.pose_buffer import PoseBuffer
+from nodes.runtime.bag_images import image_messages, image_topic
 from nodes.runtime.bag_read import read_attachment, read_info, read_messages
 from nodes.runtime.errors import BagError
-from nodes.runtime.messages import decode, image_array, pose_matrix, stamp_ns
+from nodes.runtime.messages import decode, pose_matrix, stamp_ns
+from nodes.runtime.pictures import rgb_image
 from nodes.runtime.stages import Report
 from nodes.runtime.topics import topic as topic_row
 from nodes.scene_import.errors import ImportRecordingError
 
-IMAGE_TOPIC, CAR_TOPIC = "/camera/image_raw", "/vicon/car"
+CAR_TOPIC = "/vicon/car"
 CAR_CAMERA = "car"
 _ATTACHED_CALIBRATION = "camera.yaml"
 _WHOLE_DRIVE_S = 1e6
@@ -59,6 +60,7 @@ class DrivenFrames:
         calibration: The camera.
         recorded: Frames in the bag.
         without_pose: Frames that were left out because motion capture had a gap.
+        unchecked: Why the bag may be damaged without a sign of it; empty where checksums cover it.
     """
 
     files: tuple[Path, ...]
@@ -67,6 +69,7 @@ class DrivenFrames:
     calibration: CameraCalibration
     recorded: int
     without_pose: int
+    unchecked: str = ""
 
 
 def take_frames(
@@ -87,7 +90,8 @@ def take_frames(
     """
     camera = _camera(bag, calibration)
     poses = _car_poses(bag, config)
-    stamps = [stamp_ns(message) for _, message in _messages(bag, IMAGE_TOPIC)]
+    topic = image_topic(bag)
+    stamps = [stamp_ns(message) for message in image_messages(bag, topic)]
     placed = [(index, stamp, pose.T @ camera.mount) for index, stamp in enumerate(stamps) if (pose := poses.at(stamp))]
     if not placed:
         raise ImportRecordingError(
@@ -96,11 +100,11 @@ def take_frames(
         )
     chosen = choose_by_motion(np.stack([T for _, _, T in placed]), config)
     wanted = {placed[i][0]: placed[i] for i in chosen}
-    files = _write_frames(bag, folder, wanted, camera, report)
+    files = _write_frames(bag, topic, folder, wanted, camera, report)
     rows = [wanted[index] for index in sorted(wanted)]
     return DrivenFrames(
         tuple(files), tuple(stamp for _, stamp, _ in rows), np.stack([T for _, _, T in rows]), camera, len(stamps),
-        len(stamps) - len(placed),
+        len(stamps) - len(placed), read_info(bag).unchecked,
     )  # fmt: skip
 
 
@@ -133,50 +137,48 @@ def _camera(bag: Path, file: Path | None) -> CameraCalibration:
         raise CalibrationError(f"{_ATTACHED_CALIBRATION} in {bag}: {' '.join(str(error).split())}") from error
 
 
-def _messages(bag: Path, topic: str) -> Iterator[tuple[int, Any]]:
-    typename = topic_row(topic).type
-    for message in read_messages(bag, [topic]):
-        yield message.log_ns, decode(typename, message.cdr)
-
-
 def _car_poses(bag: Path, config: BagConfig) -> PoseBuffer:
     poses = PoseBuffer(keep_s=_WHOLE_DRIVE_S, max_gap_s=config.max_gap_s)
-    for _, message in _messages(bag, CAR_TOPIC):
-        T = pose_matrix(message)
+    for message in read_messages(bag, [CAR_TOPIC]):
+        pose = decode(topic_row(CAR_TOPIC).type, message.cdr)
+        T = pose_matrix(pose)
         if np.isfinite(T).all():
-            poses.add(stamp_ns(message), T)
+            poses.add(stamp_ns(pose), T)
     return poses
 
 
 def _write_frames(
-    bag: Path, folder: Path, wanted: dict[int, tuple[int, int, Array]], camera: CameraCalibration, report: Report
+    bag: Path,
+    topic: str,
+    folder: Path,
+    wanted: dict[int, tuple[int, int, Array]],
+    camera: CameraCalibration,
+    report: Report,
 ) -> list[Path]:
     folder.mkdir(parents=True, exist_ok=True)
-    total = next((t.count for t in read_info(bag).topics if t.name == IMAGE_TOPIC), 0)
+    total = next((t.count for t in read_info(bag).topics if t.name == topic), 0)
     files = []
-    for index, (_, message) in enumerate(_messages(bag, IMAGE_TOPIC)):
+    for index, message in enumerate(image_messages(bag, topic)):
         report(index / max(total, 1), f"frame {index + 1} of {total}")
         if index not in wanted:
             continue
         file = folder / f"{wanted[index][1]}.png"
         if not file.exists():  # whole or not there: it was written under another name first
-            _write_png(file, _rgb(message, camera, bag))
+            _write_png(file, _rgb(message, camera, f"{topic} in {bag}"))
         files.append(file)
     for stranger in set(folder.glob("*.png")) - set(files):
         stranger.unlink()
     return files
 
 
-def _rgb(message: Any, camera: CameraCalibration, bag: Path) -> Rgb:
-    image = image_array(message)
+def _rgb(message: Any, camera: CameraCalibration, source: str) -> Rgb:
+    image = rgb_image(message, source)
     if image.shape[:2] != (camera.height, camera.width):
         raise ImportRecordingError(
-            f"expected frames of {camera.width} x {camera.height}, as calibrated, got {image.shape[1]} x {image.shape[0]} in {bag}; "
+            f"expected frames of {camera.width} x {camera.height}, as calibrated, got {image.shape[1]} x {image.shape[0]} on {source}; "
             "give the calibration of this camera with --calibration"
         )
-    if image.ndim == 2:
-        return np.repeat(image[..., None], 3, axis=-1)
-    return image[..., ::-1] if message.encoding == "bgr8" else image
+    return image
 
 
 def _write_png(file: Path, rgb: Rgb) -> None:

@@ -107,14 +107,18 @@ def evaluate_bag(bag: Path, room: Path | None, ticks: int = 60) -> list[dict[str
 
 
 def measure_drives(bag: Path, room: RoomCalibration, ticks: int) -> list[dict[str, Any]]:
-    """Measure every drive of a bag against the path of a room."""
+    """Measure every drive of a bag against the path of a room.
+
+    ``unchecked`` says why the numbers may come from damaged messages without a sign of it; empty where checksums cover them.
+    """
     wanted = Horizon(ticks, off_track_m=room.off_track_m)
     results = []
     for span in find_drives(bag):
         early = (span.end_real_ns - span.start_real_ns) / NS_PER_S < wanted.ticks * wanted.dt_s
         stopped = (span.reason or "the bag ends") if early else ""
         found = measure_drive(bag, span, room.reference_path, wanted, stopped)
-        results.append({"bag": str(bag), "start_real_ns": span.start_real_ns, **found})
+        unchecked = {"unchecked": read_info(bag).unchecked}
+        results.append({"bag": str(bag), "start_real_ns": span.start_real_ns, **unchecked, **found})
     return results
 
 

@@ -140,7 +140,8 @@ def _attempt(series: Series, run: Run, ready_timeout_s: float, guide: Callable[[
 
 
 def summarise(results: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """One row per condition: runs, total CTE [m] mean and standard deviation, ratio to no attack, times off the track.
+    """One row per condition: runs, total CTE [m] mean and standard deviation, ratio to no attack, times off the track; in how many
+    runs no checksum covers what was measured.
 
     The standard deviation is that of a sample (n - 1), and None of a single run; the ratio is of the means.
     """
@@ -159,6 +160,7 @@ def summarise(results: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
             "off_track": sum(bool(each["off_track"]) for each in groups[condition]),
             "stopped_early": sum(bool(each["stopped_early"]) for each in groups[condition]),
             "latency_p50_ms": float(np.median(latencies)) if latencies else None,
+            "unchecked": sum(bool(each.get("unchecked")) for each in groups[condition]),
         })  # fmt: skip
     return rows
 

@@ -21,8 +21,9 @@ from nodes.cli_attack_node import in_words
 from nodes.runtime.bus import Bus
 from nodes.runtime.clock import ManualClock, Now, SystemClock
 from nodes.runtime.errors import LaunchError
-from nodes.runtime.messages import decode, encode, header, image_array, image_message, pose_message, type_name, types
+from nodes.runtime.messages import decode, encode, header, image_message, pose_message, type_name, types
 from nodes.runtime.node import MessageInfo, NodeContext
+from nodes.runtime.pictures import rgb_image
 from nodes.runtime.transfer import Assembler, chunk_messages
 
 REPOSITORY = Path(__file__).parents[2]
@@ -136,8 +137,8 @@ def test_a_request_ends_in_the_attack_file_that_the_command_would_have_written(b
     assert last.clean_total_cte_m == pytest.approx(attack.clean_drive.mean_total_cte_m)
     assert last.clean_drives == attack.clean_drive.drives
     assert f", without attack {last.clean_total_cte_m:.2f} m" in in_words(last)
-    assert image_array(bench.of("/attack/texture")[-1]).shape == (256, 256, 3)
-    assert image_array(bench.of("/attack/preview")[-1]).shape == (132, 400, 3)
+    assert rgb_image(bench.of("/attack/texture")[-1], "test").shape == (256, 256, 3)
+    assert rgb_image(bench.of("/attack/preview")[-1], "test").shape == (132, 400, 3)
     assert bench.node.status()[0] == "ready"
 
 

@@ -26,9 +26,9 @@ from nodes.runtime.clock import SystemClock
 from nodes.runtime.config import load_node_config
 from nodes.runtime.errors import ConfigError, RuntimeFault
 from nodes.runtime.launch_file import load_launch
-from nodes.runtime.messages import image_array, ns_from_stamp, pinhole_from_camera_info
+from nodes.runtime.messages import ns_from_stamp, pinhole_from_camera_info
 from nodes.runtime.node import NodeContext
-from nodes.runtime.pictures import picture_array
+from nodes.runtime.pictures import rgb_image
 
 TWIN = Path(__file__).parents[2] / "calibration" / "twin" / "camera.yaml"
 CLOCK = SystemClock()
@@ -77,7 +77,7 @@ def test_compressed_picture_goes_with_the_raw_one_under_the_same_stamp():
     )
     assert ns_from_stamp(small.message.header.stamp) == ns_from_stamp(raw.message.header.stamp)
     assert small.message.header.frame_id == raw.message.header.frame_id
-    assert np.abs(picture_array(small.message).astype(int) - image_array(raw.message)).max() <= 2
+    assert np.abs(rgb_image(small.message, "test").astype(int) - rgb_image(raw.message, "test")).max() <= 2
 
 
 def test_compressed_rate_is_its_own_and_nothing_is_done_for_nobody():
@@ -190,7 +190,7 @@ def test_camera_process_sends_both_kinds_of_picture_over_the_bus(tmp_path):
                 for received in bus.receive():
                     message = received.message()
                     kind = raw if received.topic == "/camera/image_raw" else small
-                    kind[ns_from_stamp(message.header.stamp)] = picture_array(message)
+                    kind[ns_from_stamp(message.header.stamp)] = rgb_image(message, "test")
             status = Path(f"/proc/{process.pid}/status").read_text()
             resident_kb = int(status.split("VmRSS:")[1].split()[0])
     finally:

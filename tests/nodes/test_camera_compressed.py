@@ -14,9 +14,9 @@ from advnerf_core.policies.torch_driver import TorchDriver
 from nodes.compositor import CompositorConfig, CompositorNode
 from nodes.policy import PolicyNode
 from nodes.runtime.clock import ManualClock
-from nodes.runtime.messages import decode, encode, image_array, image_message, stamp_ns, type_name
+from nodes.runtime.messages import decode, encode, image_message, stamp_ns, type_name
 from nodes.runtime.node import MessageInfo, NodeContext
-from nodes.runtime.pictures import COMPRESSED_TOPIC, compressed_image_message
+from nodes.runtime.pictures import COMPRESSED_TOPIC, compressed_image_message, rgb_image
 
 TWIN = Path(__file__).parents[2] / "calibration" / "twin"
 T0 = 1_700_000_000_000_000_000
@@ -52,14 +52,14 @@ def test_compositor_takes_compressed_pictures_and_gives_raw_ones(compositor):
     image, label = hand_over(compositor, compressed_image_message(picture(), T0, "camera", 95))
     assert (type_name(image.message), stamp_ns(image.message)) == ("sensor_msgs/msg/Image", T0)
     assert stamp_ns(label.message) == T0
-    assert np.abs(image_array(image.message).astype(int) - picture()).max() < 12
+    assert np.abs(rgb_image(image.message, "test").astype(int) - picture()).max() < 12
     assert encode(image.message)
 
 
 def test_compositor_drops_a_damaged_picture_and_says_so(compositor):
     assert hand_over(compositor, damaged()) == []
     assert compositor.counters()["dropped_bad"] == 1
-    assert "image dropped: expected JPEG data" in compositor.status()[1]
+    assert "image dropped: /camera/image_raw/compressed: expected JPEG data" in compositor.status()[1]
     assert len(hand_over(compositor, compressed_image_message(picture(), T0, "camera"))) == 2
     assert "dropped" not in compositor.status()[1]
 

@@ -15,8 +15,9 @@ from calibration.schema import CameraCalibration, TargetCalibration, load_calibr
 from nodes.compositor import CompositorConfig, CompositorNode, show
 from nodes.runtime.clock import ManualClock
 from nodes.runtime.errors import ConfigError
-from nodes.runtime.messages import decode, encode, image_array, image_message, pose_message, stamp_ns, type_name
+from nodes.runtime.messages import decode, encode, image_message, pose_message, stamp_ns, type_name
 from nodes.runtime.node import MessageInfo, NodeContext
+from nodes.runtime.pictures import rgb_image
 from nodes.runtime.transfer import chunk_messages
 
 CALIBRATION = Path(__file__).parents[2] / "calibration" / "twin"
@@ -93,6 +94,21 @@ def expected_image(t_s, value=90):
     return overlay.draw(np.full((188, 336, 3), value, np.uint8), T)[0]
 
 
+def test_the_face_is_drawn_in_its_own_colours_into_a_picture_in_bgr(bench):
+    for t in (0.0, 0.01, 0.02):
+        bench.poses(t)
+    rgb = np.full((188, 336, 3), (90, 60, 30), np.uint8)
+    bgr = image_message(np.ascontiguousarray(rgb[..., ::-1]), T0 + 20 * MS, "camera", "bgr8")
+    bench.send("/camera/image_raw", bgr)
+    bench.poses(0.03)
+    (image,) = bench.images()
+    T = invert_transform(car_at(0.02) @ CAMERA.mount) @ T_WORLD_FROM_BOARD
+    expected = FaceOverlay(attack().texture, TARGET.corners, CAMERA.pinhole).draw(rgb, T)[0]
+    assert image.encoding == "rgb8"
+    assert np.abs(rgb_image(image, "test").astype(int) - expected).mean() < 0.3
+    assert (expected != rgb).any()
+
+
 def test_an_image_waits_for_the_pose_after_it_and_shows_the_face_at_its_own_stamp(bench):
     for t in (0.0, 0.01, 0.02):
         bench.poses(t)
@@ -106,9 +122,9 @@ def test_an_image_waits_for_the_pose_after_it_and_shows_the_face_at_its_own_stam
     assert label.drawn
     assert label.reason == ""
     # Interpolation between poses 10 ms apart is exact to micrometres here: at most a rounding step somewhere.
-    difference = np.abs(image_array(image).astype(int) - expected_image(0.025))
+    difference = np.abs(rgb_image(image, "test").astype(int) - expected_image(0.025))
     assert difference.max() <= 1
-    assert (image_array(image) != 90).any()
+    assert (rgb_image(image, "test") != 90).any()
 
 
 def test_after_the_bounded_wait_the_pose_is_extrapolated_and_flagged(bench):
@@ -123,7 +139,7 @@ def test_after_the_bounded_wait_the_pose_is_extrapolated_and_flagged(bench):
     assert "extrapolated by 15 ms" in label.reason
     assert "extrapolated" in bench.node.status()[1]
     assert bench.node.counters()["extrapolated"] == 1
-    assert np.abs(image_array(image).astype(int) - expected_image(0.035)).mean() < 0.3
+    assert np.abs(rgb_image(image, "test").astype(int) - expected_image(0.035)).mean() < 0.3
 
 
 def test_without_poses_in_reach_the_image_is_dropped_and_counted(bench):
@@ -143,9 +159,9 @@ def test_two_images_never_wait(bench):
         bench.poses(t)
     bench.image(0.02, value=10)
     bench.image(0.03, value=20)
-    assert [image_array(i)[0, 0, 0] for i in bench.images()] == [10]
+    assert [rgb_image(i, "test")[0, 0, 0] for i in bench.images()] == [10]
     bench.poses(0.03)
-    assert [image_array(i)[0, 0, 0] for i in bench.images()] == [10, 20]
+    assert [rgb_image(i, "test")[0, 0, 0] for i in bench.images()] == [10, 20]
 
 
 def test_out_of_view_passes_the_image_unchanged_and_says_so(bench):
@@ -154,7 +170,7 @@ def test_out_of_view_passes_the_image_unchanged_and_says_so(bench):
         bench.send("/vicon/car", pose_message(planar_pose(0.0, 2.0, np.pi), T0 + round(t * 1e9)))
     bench.image(0.005)
     (image,), (label,) = bench.images(), bench.labels()
-    assert (image_array(image) == 90).all()
+    assert (rgb_image(image, "test") == 90).all()
     assert not label.drawn
     assert label.reason == "out of view"
 
@@ -163,7 +179,7 @@ def test_without_an_attack_file_images_pass_at_once():
     bench = Bench(CompositorNode(None))
     bench.image(0.0)
     (image,), (label,) = bench.images(), bench.labels()
-    assert (image_array(image) == 90).all()
+    assert (rgb_image(image, "test") == 90).all()
     assert (label.attack_id, label.drawn) == ("", False)
     assert bench.node.status()[0] == "active"
     bench.pass_time(1.5)
@@ -247,7 +263,7 @@ def test_without_an_attack_the_first_one_is_shown_when_it_comes(tmp_path):
         bench.send("/attack/file", chunk)
     drive_by(bench, 0.2)
     assert [(label.attack_id, label.drawn) for label in bench.labels()] == [("", False), (attack().attack_id, True)]
-    assert (image_array(bench.images()[1]) != 90).any()
+    assert (rgb_image(bench.images()[1], "test") != 90).any()
 
 
 def broken(case, tmp_path):

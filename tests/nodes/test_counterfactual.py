@@ -140,7 +140,7 @@ def test_what_has_no_partner_is_late_or_does_not_fit_is_left_out_and_counted(dri
     small = image_message(np.zeros((94, 168, 3), np.uint8), START_NS, "camera")
     assert give(node, (CLEAN, small), (ATTACKED, small), (LABEL, label(0))) == []
     state, text = node.status()
-    assert (state, "expected rgb8 336 x 188, got rgb8 168 x 94" in text) == ("fault", True)
+    assert (state, "expected images of 336 x 188, got 168 x 94" in text) == ("fault", True)
     assert len(give(node, *pair)) == 1
     assert node.status()[0] == "active"
     node.tick(Now(10**11, START_NS))

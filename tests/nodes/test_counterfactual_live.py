@@ -16,7 +16,8 @@ from advnerf_core.geometry import Pinhole
 from calibration.schema import CameraCalibration, RoomCalibration, TargetCalibration, load_calibration
 from nodes.evaluation import counterfactual
 from nodes.runtime.bag_read import read_messages
-from nodes.runtime.messages import decode, image_array, ns_from_stamp
+from nodes.runtime.messages import decode, ns_from_stamp
+from nodes.runtime.pictures import rgb_image
 from nodes.runtime.topics import topic as topic_row
 from nodes.trial import TrialOutcome, TrialPlan
 from nodes.trial_runner import run_trial
@@ -111,7 +112,7 @@ def steering(policy: Path, images: list[Any]) -> list[float]:
     """What the network itself makes of recorded images [rad]."""
     loaded = load_policy(policy)
     with torch.no_grad():
-        views = [images_to_tensor(loaded.view.image(image_array(image))) for image in images]
+        views = [images_to_tensor(loaded.view.image(rgb_image(image, "test"))) for image in images]
         return [float(loaded.policy(view)[0]) for view in views]
 
 
@@ -146,7 +147,7 @@ def test_the_attack_adds_something_while_it_is_drawn_and_nothing_else_ever(recor
     assert all(said[stamp].drawn is bool(labels[stamp].drawn) for stamp in said)
     for stamp, word in said.items():
         assert word.delta_rad == word.attacked_rad - word.clean_rad
-        assert np.array_equal(image_array(clean[stamp]), image_array(attacked[stamp])) is not word.drawn
+        assert np.array_equal(rgb_image(clean[stamp], "test"), rgb_image(attacked[stamp], "test")) is not word.drawn
     assert all(said[stamp].delta_rad == said[stamp].changed == 0.0 for stamp in plain)
     # A red board changes the steering by a degree or so, once to the left and once to the right, and some of what the policy sees.
     assert all(said[stamp].delta_rad != 0.0 for stamp in drawn)

@@ -17,7 +17,8 @@ from hardware.vicon_codec import encode_blocks, object_pose
 from nodes.camera import CameraConfig, CameraNode
 from nodes.runtime.clock import SystemClock
 from nodes.runtime.errors import RuntimeFault
-from nodes.runtime.messages import image_array, ns_from_stamp, pinhole_from_camera_info, pose_matrix
+from nodes.runtime.messages import ns_from_stamp, pinhole_from_camera_info, pose_matrix
+from nodes.runtime.pictures import rgb_image
 from nodes.vicon import ViconNode, ViconNodeConfig
 
 TWIN = Path(__file__).parents[2] / "calibration" / "twin"
@@ -71,7 +72,7 @@ def test_camera_publishes_frames_with_their_own_stamps(camera, tmp_path):
     assert (
         ns_from_stamp(image.message.header.stamp) == ns_from_stamp(info.message.header.stamp) == sent.stamp_realtime_ns
     )
-    np.testing.assert_array_equal(image_array(image.message), sent.rgb)
+    np.testing.assert_array_equal(rgb_image(image.message, "test"), sent.rgb)
     assert pinhole_from_camera_info(info.message).cx == 168.0
     assert camera.status() == ("active", "")
 

@@ -11,7 +11,8 @@ from calibration.panel import centre_square
 from calibration.schema import TargetCalibration, load_calibration
 from nodes.evaluation import attack_ids
 from nodes.runtime.bag_read import read_messages
-from nodes.runtime.messages import decode, image_array, ns_from_stamp
+from nodes.runtime.messages import decode, ns_from_stamp
+from nodes.runtime.pictures import rgb_image
 from nodes.trial import TrialPlan
 from nodes.trial_runner import run_trial
 
@@ -49,7 +50,7 @@ def test_the_lab_camera_sees_the_attack_while_armed_and_not_before(tmp_path):
     before, armed = [], []
     for message in read_messages(bag, ["/camera/image_raw"]):
         image = decode("sensor_msgs/msg/Image", message.cdr)
-        stamp, rgb = ns_from_stamp(image.header.stamp), image_array(image).astype(int)
+        stamp, rgb = ns_from_stamp(image.header.stamp), rgb_image(image, "test").astype(int)
         redness = (rgb[..., 0] - rgb[..., 1:].max(axis=-1) > 80).sum()
         inside = outcome.start_real_ns < stamp < outcome.end_real_ns - 2 * 10**8
         (armed if inside else before if stamp < outcome.start_real_ns - 10**9 else []).append(redness)

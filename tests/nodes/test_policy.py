@@ -73,8 +73,11 @@ def test_stale_images_are_refused(captured_ms: int, published_ms: int) -> None:
 def test_images_that_the_policy_does_not_know_are_a_fault() -> None:
     node = PolicyNode(TorchDriver(_loaded()))
     assert _send(node, image_message(_rgb(shape=(94, 168, 3)), T0, "camera")) == []
-    assert node.status() == ("fault", "expected rgb8 336 x 188, got rgb8 168 x 94; train for this camera")
-    assert _send(node, image_message(_rgb(), T0, "camera", "bgr8")) == []
+    assert node.status() == ("fault", "expected images of 336 x 188, got 168 x 94; train for this camera")
+    depth = image_message(_rgb(), T0, "camera")
+    depth.encoding = "32FC1"
+    assert _send(node, depth) == []
+    assert "cannot turn the encoding '32FC1' into RGB" in node.status()[1]
     assert _send(node, image_message(_rgb(), T0, "camera"), captured_ms=-50) == []
     assert "clocks" in node.status()[1]
     assert node.counters()["dropped_bad"] == 3
@@ -148,3 +151,10 @@ print(out.message.drive.steering_angle)
     goal = torch.tensor([[0.5, -1.0]])
     expected = float(_loaded(goal_size=2).policy(images_to_tensor(VIEW.image(_rgb())), goal)[0])
     assert float(done.stdout) == pytest.approx(expected, abs=1e-5)
+
+
+def test_a_camera_that_sends_bgr_is_steered_by_in_its_true_colours() -> None:
+    node, rgb = PolicyNode(TorchDriver(_loaded())), _rgb()
+    (straight,) = _send(node, image_message(rgb, T0, "camera"))
+    (turned,) = _send(node, image_message(np.ascontiguousarray(rgb[..., ::-1]), T0, "camera", "bgr8"))
+    assert turned.message.drive.steering_angle == straight.message.drive.steering_angle

@@ -9,7 +9,8 @@ import nodes
 from nodes.runtime.bus import Bus
 from nodes.runtime.clock import SystemClock
 from nodes.runtime.errors import SecurityError
-from nodes.runtime.messages import decode, encode, image_array, image_message, type_definition
+from nodes.runtime.messages import decode, encode, image_message, type_definition
+from nodes.runtime.pictures import rgb_image
 from nodes.runtime.topics import TOPICS
 from nodes.viewer import ViewerConfig, ViewerNode
 
@@ -55,7 +56,7 @@ def test_a_real_client_gets_the_published_bytes_and_the_schema(tmp_path):
             opcode, number, _ = struct.unpack_from("<BIQ", data)
             assert (opcode, number) == (MESSAGE_DATA, 5)
             assert data[13:] == encode(message)
-            np.testing.assert_array_equal(image_array(decode("sensor_msgs/msg/Image", data[13:])), PIXELS)
+            np.testing.assert_array_equal(rgb_image(decode("sensor_msgs/msg/Image", data[13:]), "test"), PIXELS)
             assert node.status()[0] == "active"
     finally:
         node.close()

@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from nodes.runtime.messages import drive_message, image_array, stamp_ns
+from nodes.runtime.messages import drive_message, stamp_ns
 from nodes.runtime.node import MessageInfo, Node, NodeContext, Now, Out
+from nodes.runtime.pictures import rgb_image
 
 
 class GreenConfig(BaseModel):
@@ -39,7 +40,7 @@ class GreenPolicy(Node):
 
     def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
         """Steer by an image."""
-        green = image_array(message)[..., 1].astype(np.int64)
+        green = rgb_image(message, "test")[..., 1].astype(np.int64)
         half = green.shape[1] // 2
         difference = int(green[:, half:].sum() - green[:, :half].sum()) / green.size
         drive = drive_message(self._config.speed_mps, self._config.gain_rad * difference, stamp_ns(message))

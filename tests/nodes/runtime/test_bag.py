@@ -11,14 +11,14 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
 from nodes import cli
-from nodes.runtime import bag as bag_module
+from nodes.runtime import bag_part
 from nodes.runtime.bag import BagWriter
 from nodes.runtime.bag_read import (
     extract_attachments,
     read_attachment,
     read_info,
     read_messages,
-    require_our_types,
+    require_readable,
 )
 from nodes.runtime.bag_stamps import read_delays
 from nodes.runtime.errors import BagError
@@ -26,6 +26,7 @@ from nodes.runtime.messages import (
     encode,
     header,
     pose_message,
+    type_definition,
     type_hash,
     types,
 )
@@ -103,7 +104,7 @@ def test_info_attachments_and_selection(tmp_path):
         list(read_messages(tmp_path / "bag", ["/nothing"]))
     with pytest.raises(BagError, match=r"between 0 and 0\.\d s"):
         list(read_messages(tmp_path / "bag", start_offset_s=9))
-    require_our_types(tmp_path / "bag", list(TOPICS))
+    require_readable(tmp_path / "bag", {name: row.type for name, row in TOPICS.items()})
 
 
 @pytest.mark.parametrize("compression", [CompressionType.NONE, CompressionType.ZSTD, CompressionType.LZ4, None])
@@ -188,7 +189,11 @@ def test_existing_folder_is_not_overwritten(tmp_path):
 
 
 def test_bag_with_another_version_of_a_type_is_not_played(tmp_path, monkeypatch):
-    monkeypatch.setattr(bag_module, "type_hash", lambda typename: "RIHS01_00")
+    definition = type_definition("advnerf_msgs/msg/Arm").replace("bool arm\n", "")
+    monkeypatch.setattr(bag_part, "type_hash", lambda typename: "RIHS01_00")
+    monkeypatch.setattr(bag_part, "type_definition", lambda typename: definition)
     write_all_topics(tmp_path / "bag", rounds=1).close()
-    with pytest.raises(BagError, match="leave it out with --topics"):
-        require_our_types(tmp_path / "bag", ["/arm"])
+    with pytest.raises(
+        BagError, match=r"bag\.mcap: /arm: its advnerf_msgs/msg/Arm is another than ours and has no arm"
+    ):
+        require_readable(tmp_path / "bag", {"/arm": "advnerf_msgs/msg/Arm"})

@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 import time
+import zlib
 
 import numpy as np
 import pytest
@@ -36,8 +37,13 @@ def test_a_summary_that_lies_is_an_error_and_takes_no_memory(tmp_path):
     with open(path, "rb") as file:
         chunk = make_reader(file).get_summary().chunk_indexes[0]
     index = content.rindex(chunk.chunk_start_offset.to_bytes(8, "little") + chunk.chunk_length.to_bytes(8, "little"))
+    start = int.from_bytes(content[-28:-20], "little")
     for wrong in (1 << 60, chunk.chunk_length + 10**9, 5):
         content[index + 8 : index + 16] = wrong.to_bytes(8, "little")
+        path.write_bytes(content)
+        with pytest.raises(BagError, match="the checksum of its summary"):
+            list(read_messages(path))
+        content[-12:-8] = zlib.crc32(content[start:-12]).to_bytes(4, "little")
         path.write_bytes(content)
         with pytest.raises(BagError, match=r"damaged|cannot be read"):
             list(read_messages(path))
@@ -156,7 +162,7 @@ def test_bag_of_a_killed_recorder_is_whole_after_repair(tmp_path):
     time.sleep(0.4)
     process.kill()
     flushed = int(process.communicate()[0].split()[-1])
-    with pytest.raises(BagError, match="make it whole with: advnerf bag repair"):
+    with pytest.raises(BagError, match=r"advnerf bag repair .* keeps all"):
         read_info(tmp_path / "bag")
     result = repair(tmp_path / "bag")
     assert not result.was_whole
@@ -205,23 +211,10 @@ def test_repair_wherever_the_file_was_cut(tmp_path):
             assert len(list(reader.messages())) == result.messages
 
 
-def test_damaged_chunk_ends_what_is_kept(tmp_path):
-    write_all_topics(tmp_path / "bag", rounds=40).close()
-    path = tmp_path / "bag" / "bag.mcap"
-    with open(path, "rb") as file:
-        chunk = make_reader(file).get_summary().chunk_indexes[-1]
-    content = bytearray(path.read_bytes())[:-20]
-    content[chunk.chunk_start_offset + 500] ^= 0xFF
-    path.write_bytes(content)
-    result = repair(tmp_path / "bag")
-    assert 0 < result.messages < 40 * (len(TOPICS) + 1)
-    assert len(list(read_messages(tmp_path / "bag"))) == result.messages
-
-
 @pytest.mark.parametrize("content", [b"", b"not a bag at all"])
 def test_what_is_no_bag_is_refused(tmp_path, content):
     (tmp_path / "x.mcap").write_bytes(content)
-    with pytest.raises(BagError, match="expected an MCAP file"):
+    with pytest.raises(BagError, match="expected a bag: MCAP"):
         repair(tmp_path / "x.mcap")
     with pytest.raises(BagError, match="expected a bag folder"):
         read_info(tmp_path / "nothing")
@@ -240,7 +233,7 @@ def test_full_disk_is_one_clear_error_and_the_part_before_is_readable(tmp_path, 
         return write(descriptor, data)
 
     writer = BagWriter(tmp_path / "bag")
-    stream_of["bag"] = writer._stream.descriptor
+    stream_of["bag"] = writer._part._stream.descriptor
     monkeypatch.setattr(bag_module.os, "write", limited)
     pose = sample("geometry_msgs/msg/PoseStamped", START_NS)
 

@@ -7,8 +7,9 @@ import pytest
 
 from nodes.runtime.bus import Bus
 from nodes.runtime.errors import BusError, MessageError, TopicError
-from nodes.runtime.messages import drive_message, header, image_array, image_message, pose_message, types
+from nodes.runtime.messages import drive_message, header, image_message, pose_message, types
 from nodes.runtime.messages import stamp_ns as stamp_of
+from nodes.runtime.pictures import rgb_image
 
 
 def receive_for(bus, duration_s):
@@ -44,7 +45,7 @@ def test_latest_topic_is_drained_to_the_newest_and_drops_are_counted(tmp_path):
             sender.publish("/camera/image_raw", image_message(np.full((4, 5, 3), i, np.uint8), i, "cam"))
             time.sleep(0.01)
         (got,) = receiver.receive()
-        assert image_array(got.message())[0, 0, 0] == 4
+        assert rgb_image(got.message(), "test")[0, 0, 0] == 4
         counts = receiver.counts()["/camera/image_raw"]
         assert counts.dropped + counts.lost == 4
 

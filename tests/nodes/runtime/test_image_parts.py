@@ -4,8 +4,9 @@ import pytest
 from nodes.runtime.bus import Bus
 from nodes.runtime.errors import MessageError
 from nodes.runtime.image_parts import join_image, split_image
-from nodes.runtime.messages import decode, encode, image_array, image_message
+from nodes.runtime.messages import decode, encode, image_message
 from nodes.runtime.messages import stamp_ns as stamp_of
+from nodes.runtime.pictures import rgb_image
 
 PIXELS = np.random.default_rng(1).integers(0, 256, (188, 366, 3), dtype=np.uint8)
 
@@ -20,7 +21,7 @@ def test_parts_joined_are_the_bytes_of_the_codec(frame_id):
         assert vars(back).keys() == vars(message).keys()
         assert stamp_of(back) == stamp_ns
         assert back.header.frame_id == frame_id
-        np.testing.assert_array_equal(image_array(back), PIXELS)
+        np.testing.assert_array_equal(rgb_image(back, "test"), PIXELS)
         assert not back.data.flags.writeable
 
 
@@ -47,6 +48,6 @@ def test_over_the_bus_images_are_views_and_recorders_get_the_same_bytes(tmp_path
         sender.publish("/camera/image_raw", message)
         receiver.wait(1.0)
         (got,) = receiver.receive()
-        np.testing.assert_array_equal(image_array(got.message()), PIXELS)
+        np.testing.assert_array_equal(rgb_image(got.message(), "test"), PIXELS)
         assert got.info.raw == encode(message)
         assert stamp_of(decode("sensor_msgs/msg/Image", got.info.raw)) == 42

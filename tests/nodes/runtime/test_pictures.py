@@ -9,7 +9,7 @@ import pytest
 
 from nodes.runtime.errors import MessageError
 from nodes.runtime.messages import decode, encode, image_message, ns_from_stamp
-from nodes.runtime.pictures import compressed_image_message, jpeg_size, picture_array, raw_image
+from nodes.runtime.pictures import compressed_image_message, jpeg_size, rgb8_message, rgb_image
 
 STAMP = 1_700_000_000_123_456_789
 TYPE = "sensor_msgs/msg/CompressedImage"
@@ -29,9 +29,9 @@ def test_picture_keeps_its_stamp_and_its_colours():
     got = over_the_wire(compressed_image_message(rgb, STAMP, "camera", 90))
     assert got.format == "rgb8; jpeg compressed bgr8"
     assert len(got.data) < rgb.size / 8
-    image = raw_image(got)
+    image = rgb8_message(got, "/c")
     assert (ns_from_stamp(image.header.stamp), image.header.frame_id, image.encoding) == (STAMP, "camera", "rgb8")
-    assert np.abs(picture_array(got).astype(int) - rgb).mean() < 3.0
+    assert np.abs(rgb_image(got, "/c").astype(int) - rgb).mean() < 3.0
     # Anybody's JPEG decoder gives BGR of the same picture.
     assert np.abs(cv2.imdecode(got.data, cv2.IMREAD_COLOR)[:, :, ::-1].astype(int) - rgb).mean() < 3.0
 
@@ -43,8 +43,8 @@ def test_less_quality_is_less_data():
 
 def test_a_raw_image_passes_as_it_is():
     image = image_message(picture(), STAMP, "camera")
-    assert raw_image(image) is image
-    np.testing.assert_array_equal(picture_array(image), picture())
+    assert rgb8_message(image, "/c") is image
+    np.testing.assert_array_equal(rgb_image(image, "/c"), picture())
 
 
 @pytest.mark.parametrize("size", [(8, 8), (1, 1), (336, 188), (1921, 17)])
@@ -64,21 +64,28 @@ def bomb():
     return bytes(data)
 
 
+def png_bomb():
+    data = bytearray(cv2.imencode(".png", np.zeros((8, 8, 3), np.uint8))[1].tobytes())
+    data[16:24] = struct.pack(">II", 60000, 60000)
+    return bytes(data)
+
+
 @pytest.mark.parametrize(
     ("data", "form", "message"),
     [
         (bomb(), "jpeg", "at most 16000000 pixels, got 60000 x 60000"),
-        (b"", "jpeg", "without a size"),
+        (b"", "jpeg", r"cannot decompress the format 'jpeg' \(0 bytes\)"),
         (b"\xff\xd8\xff\xe0\x00\x00" + bytes(50), "jpeg", "without a size"),
-        (b"\x89PNG" + bytes(100), "jpeg", "without a size"),
-        (bytes(100), "png", "compressed as JPEG, got format 'png'"),
+        (b"\x89PNG\r\n\x1a\n" + bytes(100), "png", "expected PNG data, got 108 bytes without a size"),
+        (png_bomb(), "png", "at most 16000000 pixels, got 60000 x 60000"),
+        (bytes(100), "png", "cannot decompress the format 'png'"),
     ],
 )
 def test_what_strangers_may_send(data, form, message):
     got = compressed_image_message(picture(8, 8), 0, "c")
     got.data, got.format = np.frombuffer(data, np.uint8), form
     with pytest.raises(MessageError, match=message):
-        picture_array(got)
+        rgb_image(got, "/c")
 
 
 def test_every_cut_and_every_flipped_byte_is_a_picture_or_one_error():
@@ -91,7 +98,7 @@ def test_every_cut_and_every_flipped_byte_is_a_picture_or_one_error():
         message = compressed_image_message(picture(8, 8), 0, "c")
         message.data = np.frombuffer(bytes(data), np.uint8)
         with contextlib.suppress(MessageError):
-            assert picture_array(message).ndim == 3
+            assert rgb_image(message, "/c").ndim == 3
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,91 @@
+"""What a file is that somebody takes for a bag, by its first bytes."""
+
+from __future__ import annotations
+
+from enum import Enum
+from pathlib import Path
+
+from nodes.runtime.errors import BagError
+
+
+class Format(Enum):
+    """Formats of bags that can be read."""
+
+    MCAP = "MCAP"
+    SQLITE = "rosbag2 in SQLite"
+    ROS1 = "ROS 1 bag"
+
+
+_MCAP, _SQLITE, _ROS1 = b"\x89MCAP", b"SQLite format 3\0", b"#ROSBAG V2.0\n"
+_EXPECTED = "expected a bag: MCAP (.mcap), rosbag2 in SQLite (.db3), or ROS 1 (.bag)"
+_CONVERT = "rosbags-convert --src {bag} --dst NEW_FOLDER --dst-storage mcap"
+# First bytes of other files, what they are, and what to do.
+_OTHERS = (
+    (b"#ROSBAG V", "a ROS 1 bag of an old version", "migrate it on a machine with ROS 1: rosbag fix {bag} NEW.bag"),
+    (b"\x28\xb5\x2f\xfd", "a file compressed with zstd", "unpack it: zstd -d {bag}; a whole rosbag2 folder: " + _CONVERT.replace("{bag}", "{folder}")),
+    (b"\x1f\x8b", "a file compressed with gzip", "unpack it: gunzip {bag}"),
+    (b"BZh", "a file compressed with bzip2", "unpack it: bunzip2 {bag}"),
+    (b"\xfd7zXZ\0", "a file compressed with xz", "unpack it: unxz {bag}"),
+    (b"\x04\x22\x4d\x18", "a file compressed with LZ4", "unpack it: lz4 -d {bag}"),
+    (b"PK\x03\x04", "a ZIP archive", "unpack it and give the bag in it"),
+    (b"\x89PNG", "a PNG picture", ""),
+    (b"\xff\xd8\xff", "a JPEG picture", ""),
+)  # fmt: skip
+
+
+def recognise(path: Path) -> Format:
+    """Format of a file.
+
+    Raises:
+        BagError: It is no bag; the line says what it is and what to do.
+    """
+    try:
+        with open(path, "rb") as file:
+            head = file.read(512)
+    except OSError as error:
+        raise BagError(f"cannot read {path}: {error.strerror}") from error
+    for magic, found in ((_MCAP, Format.MCAP), (_SQLITE, Format.SQLITE), (_ROS1, Format.ROS1)):
+        if head.startswith(magic):
+            return found
+    # A recorder that was killed at once leaves less than the first bytes of the format.
+    if head and _MCAP.startswith(head):
+        return Format.MCAP
+    kind, advice = _kind(head)
+    advice = advice.format(bag=path, folder=path.parent)
+    raise BagError(f"{path} is {kind}; {_EXPECTED}" + (f". To read it, {advice}" if advice else ""))
+
+
+def no_checksums(form: Format) -> str:
+    """Why nothing can be said about damage to a file of a format."""
+    return f"{form.value} has no checksums"
+
+
+def require_mcap(path: Path, verb: str) -> None:
+    """Refuse a bag of another format for what only works with MCAP.
+
+    Args:
+        path: The file.
+        verb: What is to be done with it, e.g. ``repaired``.
+    """
+    if (found := recognise(path)) is not Format.MCAP:
+        raise BagError(
+            f"{path} is {found.value}; only MCAP bags can be {verb}. Convert it first: {_CONVERT.format(bag=path)}"
+            + (f", or: ros2 bag convert -i {path} -o OPTIONS.yaml" if found is Format.SQLITE else "")
+        )
+
+
+def _kind(head: bytes) -> tuple[str, str]:
+    if not head:
+        return "empty (0 bytes)", ""
+    for magic, kind, advice in _OTHERS:
+        if head.startswith(magic):
+            return kind, advice
+    if not any(head):
+        return "full of zeros: its disk was full or lost power before anything was written", ""
+    return ("a text file" if _is_text(head) else f"a file of unknown format (it begins with {head[:8].hex(' ')})"), ""
+
+
+def _is_text(head: bytes) -> bool:
+    text = head.decode("utf-8", "replace")
+    # One character may be cut in two at the end.
+    return text.count("\ufffd") <= 1 and all(letter.isprintable() or letter in "\t\r\n\f" for letter in text)

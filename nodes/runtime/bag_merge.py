@@ -1,0 +1,54 @@
+"""Messages of several files as one sequence in time; a file is opened only when its time has come."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from heapq import heappop, heappush
+from typing import Generic, TypeVar
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Source(Generic[T]):
+    """Messages of one file.
+
+    Attributes:
+        start_ns: A time before which it has no message [ns since 1970].
+        open: Begins to read it; the messages come in order of time.
+    """
+
+    start_ns: int
+    open: Callable[[], Iterator[T]]
+
+
+def merge_by_time(sources: Sequence[Source[T]], time_ns: Callable[[T], int]) -> Iterator[T]:
+    """All messages in order of their time; of two with one time that of the earlier source comes first.
+
+    Args:
+        sources: The files, in the order in which they were recorded.
+        time_ns: Time of a message [ns since 1970].
+    """
+    if len(sources) == 1:
+        yield from sources[0].open()
+        return
+    closed = sorted(range(len(sources)), key=lambda number: (sources[number].start_ns, number), reverse=True)
+    # Numbers differ, so that neither messages nor iterators are compared.
+    waiting: list[tuple[int, int, T, Iterator[T]]] = []
+    while waiting or closed:
+        while closed and (not waiting or sources[closed[-1]].start_ns <= waiting[0][0]):
+            number = closed.pop()
+            _wait(waiting, number, sources[number].open(), time_ns)
+        if waiting:
+            _, number, message, rest = heappop(waiting)
+            yield message
+            _wait(waiting, number, rest, time_ns)
+
+
+def _wait(
+    waiting: list[tuple[int, int, T, Iterator[T]]], number: int, messages: Iterator[T], time_ns: Callable[[T], int]
+) -> None:
+    for message in messages:
+        heappush(waiting, (time_ns(message), number, message, messages))
+        return
