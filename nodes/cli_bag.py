@@ -12,6 +12,7 @@ from nodes.runtime.terminal import RunDir, Topics, print_table, say_error, table
 
 if TYPE_CHECKING:
     from nodes.runtime.bag_read import BagInfo
+    from nodes.runtime.bag_repair import Repaired
 
 app = typer.Typer(no_args_is_help=True, help="Record, look into, play and repair bags (MCAP, as rosbag2 writes them).")
 
@@ -100,6 +101,16 @@ def bag_record(
         Path, typer.Option("--output", "-o", help="New folder for the bag.", show_default="bag-<time>")
     ] = Path(""),
     topics: Topics = None,
+    max_bag_duration_s: Annotated[
+        float | None,
+        typer.Option(
+            "--max-bag-duration", metavar="S", min=0.1, help="New file after so many seconds.", show_default="600"
+        ),
+    ] = None,
+    max_bag_size_mb: Annotated[
+        float | None,
+        typer.Option("--max-bag-size", metavar="MIB", min=0.1, help="New file after so many MiB.", show_default="256"),
+    ] = None,
     run_dir: RunDir = None,
 ) -> None:
     """Record what a running launch says, until Ctrl-C."""
@@ -110,7 +121,9 @@ def bag_record(
     folder = output if output.name else Path(f"bag-{time.strftime('%Y%m%d-%H%M%S')}")
     run = find_run_dir(run_dir)
     statuses = [] if topics else node_names(run)
-    config = RecorderConfig(output=folder.resolve(), topics=topics, statuses_of=statuses)
+    limits = {"max_bag_duration_s": max_bag_duration_s, "max_bag_size_mb": max_bag_size_mb}
+    given = {key: value for key, value in limits.items() if value is not None}
+    config = RecorderConfig(output=folder.resolve(), topics=topics, statuses_of=statuses, **given)
     print(f"recording to {folder}, Ctrl-C ends it", flush=True)
     raise typer.Exit(run_node(lambda context: RecorderNode.build(config, context), "bag_record", run))
 
@@ -213,9 +226,13 @@ def bag_repair(
     ] = False,
 ) -> None:
     """Make the bag of a killed recorder, or a damaged one, whole; the file as it was is kept beside it."""
-    from nodes.runtime.bag_repair import repair
+    from nodes.runtime.bag_repair_parts import repair_bag
 
-    result = repair(bag, force, not discard_original)
+    for result in repair_bag(bag, force, not discard_original):
+        _print_repair(result)
+
+
+def _print_repair(result: Repaired) -> None:
     unchecked = f"; unchecked: {result.unchecked}" if result.unchecked else ""
     if result.was_whole:
         print(f"{result.path} is whole: {result.messages} messages{unchecked}; nothing was changed")

@@ -10,7 +10,7 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from nodes.runtime.bag import BagWriter
+from nodes.runtime.bag import BagWriter, SplitLimits
 from nodes.runtime.errors import BagError
 from nodes.runtime.node import MessageInfo, Node, NodeContext, Now, Out, run_node_main
 from nodes.runtime.paths import RESOLVED_NAME
@@ -30,6 +30,9 @@ class RecorderConfig(BaseModel):
         statuses_of: Nodes whose status is recorded too.
         attachments: Files that ride along: calibration, attack file.
         queue: Messages that may wait per topic while the disk is busy.
+        max_bag_duration_s: A new file is begun after so long [s]; the default keeps the index of a quiet recording small.
+        max_bag_size_mb: A new file is begun when one has so many MiB; the default is 20 s of camera and compositor images.
+            The index of a file takes about 700 bytes of memory for every image, or for every 64 KiB of small messages.
     """
 
     model_config = ConfigDict(extra="forbid")
@@ -39,6 +42,8 @@ class RecorderConfig(BaseModel):
     statuses_of: list[str] = Field(default_factory=list)
     attachments: list[Path] = Field(default_factory=list)
     queue: int = Field(default=200, ge=1)
+    max_bag_duration_s: float = Field(default=SplitLimits.duration_s, gt=0, allow_inf_nan=False)
+    max_bag_size_mb: float = Field(default=SplitLimits.size_mib, gt=0, allow_inf_nan=False)
 
 
 class RecorderNode(Node):
@@ -66,11 +71,13 @@ class RecorderNode(Node):
         topics += [topic for name in config.statuses_of if (topic := status_topic(name)) not in topics]
         attachments = _read_attachments([context.run_dir / RESOLVED_NAME], must_exist=False)
         attachments |= _read_attachments(config.attachments, must_exist=True)
-        return cls(BagWriter(context.run_dir / config.output, attachments, provenance()), topics, config.queue)
+        limits = SplitLimits(config.max_bag_duration_s, config.max_bag_size_mb)
+        writer = BagWriter(context.run_dir / config.output, attachments, provenance(), limits=limits)
+        return cls(writer, topics, config.queue)
 
     def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
         """Write one message."""
-        self._writer.write(topic, info.raw, info.receive_real_ns, info.publish_real_ns, info.sequence)
+        self._writer.write(topic, info.raw, info.receive_real_ns, info.publish_real_ns, info.sequence, info.lost)
         self._lost[topic] += info.lost
         return []
 
@@ -81,7 +88,7 @@ class RecorderNode(Node):
 
     def status(self) -> tuple[str, str]:
         """Active, with the number of messages."""
-        return "active", f"{sum(self._writer.contents.counts.values())} messages in {self._writer.folder}"
+        return "active", f"{self._writer.messages} messages in {self._writer.folder}"
 
     def counters(self) -> dict[str, float]:
         """Messages that were lost on the way."""
@@ -89,7 +96,7 @@ class RecorderNode(Node):
 
     def close(self) -> None:
         """Finish the bag."""
-        self._writer.close({f"lost {topic}": str(count) for topic, count in self._lost.items()})
+        self._writer.close()
 
 
 def provenance() -> dict[str, str]:

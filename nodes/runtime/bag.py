@@ -1,137 +1,67 @@
 """Bags: what rosbag2, Foxglove, ``mcap`` and ``rosbags`` open. The bytes of the wire go in as they are.
 
-A bag is a folder with ``<name>.mcap`` and ``metadata.yaml``. Chunks of 64 KiB are written through to the file at once and
-reach the disk once a second; the chunk that is being filled is kept in a journal beside it, so that a recorder that is killed
-loses none of the messages it had received (`nodes.runtime.bag_repair` puts them together).
+A bag is a folder with one ``.mcap`` file, or with numbered parts, and ``metadata.yaml``. Chunks of 64 KiB are written through to the
+file at once and reach the disk once a second. A journal beside the file keeps the messages of the chunk that is being filled, so
+that a killed recorder loses none that it had received (`nodes.runtime.bag_repair` puts them together).
+
+A file's index is kept in memory until the file is finished, about 700 bytes for every chunk. A recorder therefore begins a new part
+from time to time; the old one is finished by another thread.
 """
 
 from __future__ import annotations
 
 import contextlib
 import os
+import queue
 import shutil
 import threading
-import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
-import yaml
-from mcap.writer import CompressionType, Writer
-
 from advnerf_core.files import write_atomically
-from nodes.runtime.bag_index_spool import SpooledIndexes
-from nodes.runtime.bag_journal import Entry, Journal
+from nodes.runtime.bag_metadata import Contents, FileEntry, rosbag2_metadata
+from nodes.runtime.bag_part import PartWriter
+from nodes.runtime.bag_parts import METADATA_FILE, part_name
+from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import BagError
-from nodes.runtime.messages import ROS_DISTRO, type_definition, type_hash
-from nodes.runtime.topics import topic as topic_row
 
-CHUNK_BYTES = 64 * 1024
-PROFILE, LIBRARY = "ros2", "advnerf"
-METADATA_FILE = "metadata.yaml"
-# Held back so that the summary still fits when the disk is full: about a day of chunk indexes.
+# Held back so that the summaries still fit when the disk is full: those of two parts of 1 GiB take 3 MB.
 RESERVE_BYTES = 8 * 1024 * 1024
 _RESERVE_NAME = ".reserve"
 _SYNC_PERIOD_S = 1.0
+_BYTES_PER_MIB = 1 << 20
 
 
-@dataclass
-class Contents:
-    """What a bag's summary says.
+@dataclass(frozen=True)
+class SplitLimits:
+    """When a new part is begun: as soon as one of the limits is reached.
 
     Attributes:
-        types: Type name by topic.
-        hashes: RIHS01 hash by topic.
-        counts: Number of messages by topic.
-        start_ns: Log time of the first message [ns since 1970]; 0 when there is none.
-        end_ns: Log time of the last message [ns since 1970].
+        duration_s: Time between the first and the last message of a part [s].
+        size_mib: Size of a part [MiB].
     """
 
-    types: dict[str, str] = field(default_factory=dict)
-    hashes: dict[str, str] = field(default_factory=dict)
-    counts: dict[str, int] = field(default_factory=dict)
-    start_ns: int = 0
-    end_ns: int = 0
+    duration_s: float = 600.0
+    size_mib: float = 256.0
 
-    def add_topic(self, topic: str, typename: str, rihs: str) -> None:
-        """Note a topic."""
-        self.types[topic], self.hashes[topic] = typename, rihs
-        self.counts.setdefault(topic, 0)
-
-    def add_message(self, topic: str, log_ns: int) -> None:
-        """Note a message."""
-        self.start_ns = min(self.start_ns, log_ns) if sum(self.counts.values()) else log_ns
-        self.end_ns = max(self.end_ns, log_ns)
-        self.counts[topic] += 1
-
-
-def rosbag2_metadata(file_name: str, contents: Contents) -> str:
-    """Text of ``metadata.yaml``, version 9."""
-    duration = {"nanoseconds": contents.end_ns - contents.start_ns}
-    start = {"nanoseconds_since_epoch": contents.start_ns}
-    count = sum(contents.counts.values())
-    topics = [
-        {
-            "topic_metadata": {
-                "name": topic, "type": typename, "serialization_format": "cdr",
-                "offered_qos_profiles": [], "type_description_hash": contents.hashes[topic],
-            },
-            "message_count": contents.counts[topic],
-        }
-        for topic, typename in contents.types.items()
-    ]  # fmt: skip
-    information = {
-        "version": 9, "storage_identifier": "mcap", "duration": duration, "starting_time": start, "message_count": count,
-        "topics_with_message_count": topics, "compression_format": "", "compression_mode": "",
-        "relative_file_paths": [file_name],
-        "files": [{"path": file_name, "starting_time": start, "duration": duration, "message_count": count}],
-        "custom_data": None, "ros_distro": ROS_DISTRO,
-    }  # fmt: skip
-    # Without aliases: rosbag2's reader does not know them.
-    return yaml.dump({"rosbag2_bagfile_information": information}, Dumper=_PlainDumper, sort_keys=False)
-
-
-class _PlainDumper(yaml.SafeDumper):
-    def ignore_aliases(self, data: object) -> bool:
-        return True
-
-
-class _WriteThrough:
-    """The part of a file that ``mcap.Writer`` uses, without a buffer between it and the system.
-
-    A file opened with ``buffering=0`` would not do: the writer wraps it in a buffer of its own, whose end is then lost.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self.descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
-        self._position = 0
-
-    def write(self, data: bytes) -> int:
-        view = memoryview(data)
-        while view:
-            written = os.write(self.descriptor, view)
-            view = view[written:]
-            self._position += written
-        return len(data)
-
-    def tell(self) -> int:
-        return self._position
-
-    def flush(self) -> None:
-        """Nothing is held back."""
-
-    def close(self) -> None:
-        os.close(self.descriptor)
+    def reached(self, part: PartWriter, log_ns: int) -> bool:
+        """Whether a message with this log time belongs into a new part; a clock that was set back also begins one."""
+        if part.first_log_ns is None:
+            return False
+        late = abs(log_ns - part.first_log_ns) >= self.duration_s * NS_PER_S
+        return late or part.size_bytes >= self.size_mib * _BYTES_PER_MIB
 
 
 class BagWriter:
     """Writes one bag; for one thread.
 
     Args:
-        folder: New folder of the bag; its name is also that of the file in it.
-        attachments: Content of the files that ride along, by name.
-        metadata: Facts that ride along: versions, git hash.
+        folder: New folder of the bag; its name is also that of the files in it.
+        attachments: Content of the files that ride along, by name; in the first part of a split bag.
+        metadata: Facts that ride along in every part: versions, git hash.
         attached_ns: Time at which the files were attached [ns since 1970]; none means now.
+        limits: When to begin a new part; none writes a single file without a number, whose index stays in memory.
     """
 
     def __init__(
@@ -140,39 +70,31 @@ class BagWriter:
         attachments: Mapping[str, bytes] | None = None,
         metadata: Mapping[str, str] | None = None,
         attached_ns: int | None = None,
+        limits: SplitLimits | None = None,
     ) -> None:
         self.folder = Path(folder)
-        self.path = self.folder / f"{self.folder.name}.mcap"
-        self.contents = Contents()
-        self._channels: dict[str, int] = {}
-        self._schemas: dict[str, int] = {}
-        self._stop_sync = threading.Event()
+        self.messages = 0
+        self._limits, self._metadata = limits, dict(metadata or {})
+        self._total, self._files = Contents(), list[FileEntry]()
         self._open = False
         if self.folder.exists() and any(self.folder.iterdir()):
             raise BagError(f"{self.folder} exists and is not empty; record to another folder, or remove it")
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             self._hold_reserve()
-            self._stream = _WriteThrough(self.path)
-            self._writer = Writer(self._stream, chunk_size=CHUNK_BYTES, compression=CompressionType.NONE)  # type: ignore[arg-type]
-            # The library has no setting for where it keeps these; a kilobyte for every picture would be 100 MB an hour.
-            self._indexes = SpooledIndexes(self.folder)
-            self._writer._Writer__chunk_indices = self._indexes  # type: ignore[attr-defined]
-            self._writer.start(profile=PROFILE, library=LIBRARY)
-            if metadata:
-                self._writer.add_metadata("advnerf", dict(metadata))
-            stamp_ns = time.time_ns() if attached_ns is None else attached_ns
-            for name, content in (attachments or {}).items():
-                self._writer.add_attachment(stamp_ns, stamp_ns, name, "application/octet-stream", content)
-            self._journal = Journal(self.path, self._stream.tell())
+            name = f"{self.folder.name}.mcap" if limits is None else part_name(self.folder.name, 0)
+            self._part = PartWriter(self.folder / name, attachments or {}, self._metadata, attached_ns)
         except OSError as error:
             shutil.rmtree(self.folder, ignore_errors=True)
             raise BagError(
                 f"cannot record to {self.folder}: {error.strerror}; it needs {RESERVE_BYTES // 2**20} MiB of free space to begin"
             ) from error
         self._open = True
-        self._sync_thread = threading.Thread(target=self._sync, name="bag sync", daemon=True)
-        self._sync_thread.start()
+        self._full: queue.Queue[PartWriter | None] = queue.Queue()
+        self._finishing = False
+        self._failure: OSError | None = None
+        self._keeper = threading.Thread(target=self._keep, name="bag keeper", daemon=True)
+        self._keeper.start()
 
     def __enter__(self) -> BagWriter:
         return self
@@ -180,7 +102,14 @@ class BagWriter:
     def __exit__(self, *exception: object) -> None:
         self.close()
 
-    def write(self, topic: str, cdr: bytes, log_ns: int, publish_ns: int, sequence: int) -> None:
+    @property
+    def path(self) -> Path:
+        """The file that is being written."""
+        return self._part.path
+
+    def write(
+        self, topic: str, cdr: bytes, log_ns: int, publish_ns: int, sequence: int, lost: int | None = None
+    ) -> None:
         """Add a message.
 
         Args:
@@ -189,67 +118,91 @@ class BagWriter:
             log_ns: When it was received [ns since 1970].
             publish_ns: When it was published [ns since 1970].
             sequence: Number of its publisher.
+            lost: Messages of the topic that were lost before this one; none if that is not known.
         """
         try:
-            channel = self._channels.get(topic) or self._register(topic)
-            self._journal.restart(self._stream.tell())  # a definition may have filled a chunk
-            # A message that fills a chunk by itself ends it at once and needs no journal.
-            if len(cdr) <= CHUNK_BYTES:
-                self._journal.add(Entry(topic, cdr, log_ns, publish_ns, sequence))
-            self._writer.add_message(channel, log_ns, cdr, publish_ns, sequence & 0xFFFFFFFF)
-            self._journal.restart(self._stream.tell())
+            self._raise_failure()
+            # While the last part is still being finished, this one grows: waiting would hold up the bus.
+            if self._limits is not None and not self._finishing and self._limits.reached(self._part, log_ns):
+                self._split()
+            self._part.write(topic, cdr, log_ns, publish_ns, sequence, lost)
         except OSError as error:
             self._rescue(error)
-        self.contents.add_message(topic, log_ns)
+        self.messages += 1
 
     def flush(self) -> None:
         """End the present chunk, so that it reaches the disk with the next sync."""
         try:
-            self._writer.flush()
-            self._journal.restart(self._stream.tell())
+            self._raise_failure()
+            self._part.flush()
         except OSError as error:
             self._rescue(error)
 
     def close(self, metadata: Mapping[str, str] | None = None) -> None:
-        """Write what makes a bag whole: the summary and ``metadata.yaml``.
+        """Write what makes a bag whole: the summary of its last file and ``metadata.yaml``.
 
         Args:
-            metadata: Facts known only at the end: what was lost.
+            metadata: Facts known only at the end.
         """
         if not self._open:
             return
         try:
-            self._writer.flush()
-            if metadata:
-                self._writer.add_metadata("advnerf_end", dict(metadata))
-            text = rosbag2_metadata(self.path.name, self.contents)
-            self._writer.add_metadata("rosbag2", {"serialized_metadata": text})
-            self._writer.finish()
-            os.fsync(self._stream.descriptor)
+            self._stop_keeper()
+            self._raise_failure()
+            self._finish(self._part, metadata)
             self._let_go()
-            self._journal.path.unlink()
-            write_atomically(self.folder / METADATA_FILE, text)
         except OSError as error:
             self._rescue(error)
 
-    def _register(self, topic: str) -> int:
-        typename = topic_row(topic).type
-        if typename not in self._schemas:
-            definition = type_definition(typename).encode()
-            self._schemas[typename] = self._writer.register_schema(typename, "ros2msg", definition)
-        metadata = {"topic_type_hash": type_hash(typename)}
-        self._channels[topic] = self._writer.register_channel(topic, "cdr", self._schemas[typename], metadata)
-        self.contents.add_topic(topic, typename, type_hash(typename))
-        return self._channels[topic]
+    def _split(self) -> None:
+        """Go on in a new part. The old one has all its chunks in its file before the new one begins."""
+        old = self._part
+        old.flush()
+        number = len(self._files) + 1
+        self._part = PartWriter(self.folder / part_name(self.folder.name, number), {}, self._metadata)
+        self._finishing = True
+        self._full.put(old)
+
+    def _finish(self, part: PartWriter, metadata: Mapping[str, str] | None = None) -> None:
+        """Finish a part, then list it: ``metadata.yaml`` never names a file that is not whole."""
+        part.finish(metadata)
+        self._total.add(part.contents)
+        self._files.append(FileEntry.of(part.path.name, part.contents))
+        text = rosbag2_metadata(part.path.name, self._total, self._files)
+        write_atomically(self.folder / METADATA_FILE, text)
+
+    def _keep(self) -> None:
+        """What takes long: once a second, see that the file is on the disk; finish parts that are full."""
+        while True:
+            try:
+                part = self._full.get(timeout=_SYNC_PERIOD_S)
+            except queue.Empty:
+                with contextlib.suppress(OSError):  # the next write reports it
+                    self._part.sync()
+                continue
+            if part is None:
+                return
+            try:
+                self._finish(part)
+            except OSError as error:
+                part.let_go()
+                self._failure = error
+            self._finishing = False
+
+    def _raise_failure(self) -> None:
+        if self._failure is not None:
+            raise self._failure
 
     def _rescue(self, error: OSError) -> None:
-        """After a failed write: finish the file as far as it goes, in the space held back for it."""
-        from nodes.runtime.bag_repair import repair
+        """After a failed write: finish the files as far as they go, in the space held back for it."""
+        from nodes.runtime.bag_repair_parts import repair_bag
 
         if self._open:
+            self._stop_keeper()
             self._let_go()
         try:
-            saved = f"{repair(self.folder, in_place=True).messages} messages up to then are readable in it"
+            messages = sum(part.messages for part in repair_bag(self.folder, in_place=True))
+            saved = f"{messages} messages up to then are readable in it"
         except (BagError, OSError) as second:
             saved = (
                 f"and it could not be finished ({second}); free some space and run: advnerf bag repair {self.folder}"
@@ -260,16 +213,11 @@ class BagWriter:
         with open(self.folder / _RESERVE_NAME, "wb") as reserve:
             os.posix_fallocate(reserve.fileno(), 0, RESERVE_BYTES)
 
+    def _stop_keeper(self) -> None:
+        self._full.put(None)
+        self._keeper.join()
+
     def _let_go(self) -> None:
         self._open = False
-        self._stop_sync.set()
-        self._sync_thread.join()
-        self._stream.close()
-        self._indexes.close()
-        self._journal.close()
+        self._part.let_go()
         (self.folder / _RESERVE_NAME).unlink(missing_ok=True)
-
-    def _sync(self) -> None:
-        while not self._stop_sync.wait(_SYNC_PERIOD_S):
-            with contextlib.suppress(OSError):  # the next write reports it
-                os.fdatasync(self._stream.descriptor)

@@ -21,7 +21,8 @@ from mcap.records import (
     SummaryOffset,
 )
 
-from nodes.runtime.bag import LIBRARY, PROFILE, Contents, rosbag2_metadata
+from nodes.runtime.bag_metadata import Contents, rosbag2_metadata
+from nodes.runtime.bag_part import LIBRARY, PROFILE
 from nodes.runtime.bag_records import MAGIC, RECORD_HEAD
 from nodes.runtime.bag_scan import Piece, Scan
 

@@ -51,7 +51,7 @@ def bag_parts(bag: Path) -> tuple[Path, ...]:
     if bag.is_file():
         return _parts_with(bag)
     files = _files(bag)
-    if listed := _listed(bag):
+    if listed := listed_files(bag):
         return _with_unlisted(bag, listed)
     if not files:
         raise _no_bag(bag)
@@ -62,7 +62,7 @@ def bag_parts(bag: Path) -> tuple[Path, ...]:
 
 def _parts_with(file: Path) -> tuple[Path, ...]:
     """All parts of the bag that a file belongs to."""
-    if listed := _listed(file.parent):
+    if listed := listed_files(file.parent):
         parts = _with_unlisted(file.parent, listed)
         return parts if file in parts else (file,)
     if not _is_named_after_folder(file):
@@ -94,8 +94,8 @@ def _is_named_after_folder(file: Path) -> bool:
     return number >= 0 and name == file.absolute().parent.name
 
 
-def _listed(folder: Path) -> tuple[str, ...]:
-    """File names in ``metadata.yaml``; none if there is no such file."""
+def listed_files(folder: Path) -> tuple[str, ...]:
+    """File names in a folder's ``metadata.yaml`` in order; none if there is no such file."""
     path = folder / METADATA_FILE
     try:
         state = path.stat()

@@ -20,11 +20,11 @@ from mcap.data_stream import RecordBuilder
 from mcap.records import Channel, Chunk, ChunkIndex, Message, MessageIndex, Schema
 
 from advnerf_core.files import write_atomically
-from nodes.runtime.bag import METADATA_FILE, rosbag2_metadata
 from nodes.runtime.bag_assemble import Layout, assemble, contents_of
 from nodes.runtime.bag_formats import require_mcap
 from nodes.runtime.bag_journal import Entry, journal_of, read_journal
-from nodes.runtime.bag_parts import bag_parts
+from nodes.runtime.bag_metadata import rosbag2_metadata
+from nodes.runtime.bag_parts import METADATA_FILE, bag_parts
 from nodes.runtime.bag_scan import Loss, Piece, Scan, scan_file
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import BagError

@@ -85,12 +85,16 @@ class RecordEntry(_Strict):
         attachments: Files that ride along in the bag, besides the resolved launch file: calibration, attack file; an empty
             entry (a parameter without a value) is left out.
         host: Host that records; none means the one without an address, whose disk is larger.
+        max_bag_duration_s: Begin a new file after so long [s]; none leaves it to the recorder.
+        max_bag_size_mb: Begin a new file when one has so many MiB; none leaves it to the recorder.
     """
 
     output: str = "bag"
     topics: list[str] | None = None
     attachments: list[str | None] = Field(default_factory=list)
     host: str | None = None
+    max_bag_duration_s: float | None = Field(default=None, gt=0)
+    max_bag_size_mb: float | None = Field(default=None, gt=0)
 
 
 class LaunchFile(_Strict):
@@ -252,7 +256,10 @@ def _add_recorder(document: Document, launch: LaunchFile) -> None:
         raise ConfigError(f"{document.place(('nodes', RECORDER))}: this node and the key record exclude each other")
     others = [name for name, entry in launch.nodes.items() if entry.enabled]
     attachments = [file for file in record.attachments if file]
-    config = {**record.model_dump(exclude={"host"}), "attachments": attachments, "statuses_of": others}
+    limits = record.model_dump(include={"max_bag_duration_s", "max_bag_size_mb"}, exclude_none=True)
+    config = {
+        "output": record.output, "topics": record.topics, "attachments": attachments, "statuses_of": others, **limits,
+    }  # fmt: skip
     home = record.host or next((name for name, entry in launch.hosts.items() if entry.address is None), None)
     document.data["nodes"][RECORDER] = {
         "module": "nodes.recorder", "stop_last": True, "config": config, "host": home,

@@ -11,7 +11,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
 from nodes import cli
-from nodes.runtime import bag as bag_module
+from nodes.runtime import bag_part
 from nodes.runtime.bag import BagWriter
 from nodes.runtime.bag_read import (
     extract_attachments,
@@ -190,8 +190,8 @@ def test_existing_folder_is_not_overwritten(tmp_path):
 
 def test_bag_with_another_version_of_a_type_is_not_played(tmp_path, monkeypatch):
     definition = type_definition("advnerf_msgs/msg/Arm").replace("bool arm\n", "")
-    monkeypatch.setattr(bag_module, "type_hash", lambda typename: "RIHS01_00")
-    monkeypatch.setattr(bag_module, "type_definition", lambda typename: definition)
+    monkeypatch.setattr(bag_part, "type_hash", lambda typename: "RIHS01_00")
+    monkeypatch.setattr(bag_part, "type_definition", lambda typename: definition)
     write_all_topics(tmp_path / "bag", rounds=1).close()
     with pytest.raises(
         BagError, match=r"bag\.mcap: /arm: its advnerf_msgs/msg/Arm is another than ours and has no arm"

@@ -233,7 +233,7 @@ def test_full_disk_is_one_clear_error_and_the_part_before_is_readable(tmp_path, 
         return write(descriptor, data)
 
     writer = BagWriter(tmp_path / "bag")
-    stream_of["bag"] = writer._stream.descriptor
+    stream_of["bag"] = writer._part._stream.descriptor
     monkeypatch.setattr(bag_module.os, "write", limited)
     pose = sample("geometry_msgs/msg/PoseStamped", START_NS)
 
