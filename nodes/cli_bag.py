@@ -19,7 +19,7 @@ app = typer.Typer(no_args_is_help=True, help="Record, look into, play and repair
 
 @app.command("info")
 def bag_info(
-    bag: Annotated[Path, typer.Argument(help="Bag folder or .mcap file.", exists=True)],
+    bag: Annotated[Path, typer.Argument(help="Bag folder, or a .mcap, .db3 or .bag file.", exists=True)],
     stamps: Annotated[
         bool, typer.Option("--stamps", help="Also read every message and say how late they came.")
     ] = False,
@@ -84,7 +84,7 @@ def _print_delays(bag: Path) -> None:
 
 @app.command("extract")
 def bag_extract(
-    bag: Annotated[Path, typer.Argument(help="Bag folder or .mcap file.", exists=True)],
+    bag: Annotated[Path, typer.Argument(help="Bag folder, or a .mcap, .db3 or .bag file.", exists=True)],
     names: Annotated[list[str] | None, typer.Argument(help="Attachments to take out.", show_default="all")] = None,
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder to put them in.")] = Path(),
 ) -> None:
@@ -130,7 +130,7 @@ def bag_record(
 
 @app.command("play")
 def bag_play(
-    bag: Annotated[Path, typer.Argument(help="Bag folder or .mcap file.", exists=True)],
+    bag: Annotated[Path, typer.Argument(help="Bag folder, or a .mcap, .db3 or .bag file.", exists=True)],
     rate: Annotated[float, typer.Option("--rate", min=0.001, help="Speed relative to the recording.")] = 1.0,
     loop: Annotated[bool, typer.Option("--loop", help="Begin again at the end.")] = False,
     offset_s: Annotated[

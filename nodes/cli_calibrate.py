@@ -24,7 +24,9 @@ app = typer.Typer(
 cli_calibrate_display.add_to(app)
 
 Output = Annotated[Path, typer.Option("--output", "-o", help="YAML file to write; its picture goes beside it.")]
-Source = Annotated[Path | None, typer.Argument(help="Bag folder or .mcap file.", exists=True, show_default="--live")]
+Source = Annotated[
+    Path | None, typer.Argument(help="Bag folder, or a .mcap, .db3 or .bag file.", exists=True, show_default="--live")
+]
 Live = Annotated[
     float,
     typer.Option("--live", min=0.0, metavar="SECONDS", help="Record the running launch for so long, and use that."),

@@ -27,7 +27,7 @@ def add_to(app: typer.Typer) -> None:
 
 
 def replay(
-    bag: Annotated[Path, typer.Argument(help="Bag folder or .mcap file.", exists=True)],
+    bag: Annotated[Path, typer.Argument(help="Bag folder, or a .mcap, .db3 or .bag file.", exists=True)],
     nodes: Annotated[
         str, typer.Option("--nodes", metavar="NAME,...", help="Nodes of the recorded launch to run again.")
     ] = "",
@@ -108,7 +108,8 @@ def _plain(bag: Path, choice: Choice, output: Path | None) -> None:
                 pass
         _say(run, time.perf_counter() - start)
     if output is not None:
-        print(f"wrote {output}")
+        left_out = f", without {', '.join(run.left_out)}: not in the topic table" if run.left_out else ""
+        print(f"wrote {output}{left_out}")
 
 
 def _against(

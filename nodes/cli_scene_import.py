@@ -17,7 +17,7 @@ app = typer.Typer()
 
 Output = Annotated[Path, typer.Option("--output", "-o", help="Folder of the data set; a stopped run goes on there.")]
 Media = Annotated[list[Path], typer.Argument(help="Videos and folders of photographs.", exists=True)]
-Bag = Annotated[Path, typer.Argument(help="Bag folder or .mcap file of a drive.", exists=True)]
+Bag = Annotated[Path, typer.Argument(help="Bag folder, or a .mcap, .db3 or .bag file of a drive.", exists=True)]
 Most = Annotated[int, typer.Option("--most", min=3, help="At most so many images of each video, folder or bag.")]
 OneCamera = Annotated[
     bool, typer.Option("--one-camera", help="All were taken by one camera with one focal length (no zoom).")

@@ -71,7 +71,7 @@ def trial(
 
 
 def evaluate(
-    bags: Annotated[list[Path], typer.Argument(help="Bag folders or .mcap files.", exists=True)],
+    bags: Annotated[list[Path], typer.Argument(help="Bag folders, or .mcap, .db3 or .bag files.", exists=True)],
     room: Annotated[
         Path | None, typer.Option("--room", help="Room file.", show_default="the one in the bag", exists=True)
     ] = None,

@@ -92,6 +92,8 @@ class PlayerNode(Node):
         self._info = read_info(config.bag)
         self._topics = _choose_topics(config, [topic.name for topic in self._info.topics])
         self._names = _renamed(config, self._topics)
+        unknown = [topic.name for topic in self._info.topics if type_of_topic(topic.name) is None]
+        self._left_out = [] if config.topics else [name for name in unknown if name not in self._topics]
         self._types = {recorded: topic_row(played).type for recorded, played in self._names.items()}
         require_readable(config.bag, self._types)
         self._played_names = tuple(self._names[topic] for topic in self._topics)
@@ -161,6 +163,8 @@ class PlayerNode(Node):
         if self._head is None and (missing := self._missing()):
             return READY, f"waits for subscribers of {', '.join(missing)}"
         words = [f"{self._played} messages played"]
+        if self._left_out:
+            words.append(f"not in the topic table: {', '.join(self._left_out)}")
         if self._head is not None and self._head.paused:
             words.append("paused")
         return ACTIVE, "; ".join([*words, *filter(None, [self._trouble])])

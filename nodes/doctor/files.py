@@ -27,7 +27,7 @@ _COMMON: dict[str, type[Calibration]] = {
 }  # fmt: skip
 # The key that only says "calibration" means what its node is about.
 _OWN: dict[str, type[Calibration]] = {"nodes.camera": CameraCalibration, "nodes.motor": VehicleCalibration}
-_FILES = (".safetensors", ".onnx", ".pt2", ".conf", ".yaml", ".mcap")
+_FILES = (".safetensors", ".onnx", ".pt2", ".conf", ".yaml", ".mcap", ".db3", ".bag")
 
 
 def calibrations(plan: Plan) -> list[Finding]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from nodes.runtime.bag_formats import Format, no_checksums, recognise
 from nodes.runtime.bag_repair import being_written, describe, examine, refusal_of
 from nodes.runtime.errors import BagError
 
@@ -32,8 +33,10 @@ def diagnose(path: Path) -> Diagnosis:
     """Read a file from its beginning to its end, and say what is wrong with it.
 
     Raises:
-        BagError: It is no MCAP file, or is packed in a way that is not known here.
+        BagError: It is no bag, or is packed in a way that is not known here.
     """
+    if (form := recognise(path)) is not Format.MCAP:
+        return Diagnosis(path, True, no_checksums(form), ())
     if being_written(path):
         raise BagError(f"{path} is being written at this moment; stop its recorder, then it has an end")
     scan = examine(path)

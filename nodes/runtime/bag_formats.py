@@ -55,6 +55,11 @@ def recognise(path: Path) -> Format:
     raise BagError(f"{path} is {kind}; {_EXPECTED}" + (f". To read it, {advice}" if advice else ""))
 
 
+def no_checksums(form: Format) -> str:
+    """Why nothing can be said about damage to a file of a format."""
+    return f"{form.value} has no checksums"
+
+
 def require_mcap(path: Path, verb: str) -> None:
     """Refuse a bag of another format for what only works with MCAP.
 

@@ -15,7 +15,7 @@ from advnerf_core.files import write_atomically
 from nodes.runtime.bag_check import diagnose
 from nodes.runtime.bag_chunks import messages_in_order, read_attachment_at, read_metadata_at
 from nodes.runtime.bag_file import open_bag
-from nodes.runtime.bag_formats import Format, recognise
+from nodes.runtime.bag_formats import Format, no_checksums, recognise
 from nodes.runtime.bag_merge import Source, merge_by_time
 from nodes.runtime.bag_parts import bag_parts
 from nodes.runtime.bag_rosbags import read_stored, stored_messages
@@ -141,7 +141,8 @@ def read_attachments(bag: Path) -> dict[str, bytes]:
     """Content of all attached files by name; of two with one name the later."""
     contents: dict[str, bytes] = {}
     for part in _parts(bag):
-        contents |= _attachments(part.path, part.attachments)
+        if part.attachments:
+            contents |= _attachments(part.path, part.attachments)
     return contents
 
 
@@ -276,7 +277,7 @@ def _converters(part: _Part, topics: frozenset[str], types: Mapping[str, str]) -
 def type_of(summary: Summary, channel: Channel) -> str:
     """Type of a channel's messages; empty if the file does not say."""
     schema = summary.schemas.get(channel.schema_id)
-    return schema.name if schema is not None else ""
+    return full_type_name(schema.name) if schema is not None else ""
 
 
 def _count(text: str) -> int | None:
@@ -332,14 +333,14 @@ def _stored_part(path: Path, form: Format, size_bytes: int) -> _Part:
         topics[topic.name] = _sum(topics[topic.name], topic) if topic.name in topics else topic
     return _Part(
         path, form, size_bytes, stored.start_ns, stored.end_ns, stored.messages, tuple(topics.values()),
-        {number: recorded for number, recorded, _ in stored.topics}, (), {}, f"{form.value} has no checksums",
+        {number: recorded for number, recorded, _ in stored.topics}, (), {}, no_checksums(form),
     )  # fmt: skip
 
 
 def _recorded(summary: Summary, channel: Channel) -> RecordedTopic:
     schema = summary.schemas.get(channel.schema_id)
     return RecordedTopic(
-        channel.topic, full_type_name(type_of(summary, channel)), channel.metadata.get("topic_type_hash", ""),
+        channel.topic, type_of(summary, channel), channel.metadata.get("topic_type_hash", ""),
         "" if schema is None else schema.data.decode("utf-8", "replace"), "" if schema is None else schema.encoding,
         channel.message_encoding,
     )  # fmt: skip

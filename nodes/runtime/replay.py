@@ -19,6 +19,7 @@ from nodes.runtime.node import Node
 from nodes.runtime.replay_lockstep import BagClock, Lockstep, Summary
 from nodes.runtime.replay_nodes import Choice, build_nodes, close_nodes
 from nodes.runtime.topics import topic as topic_row
+from nodes.runtime.topics import type_of_topic
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,7 @@ class Replay:
         choice: What to replay.
         whole: Also yield what is in the bag but interests no node (to write another bag).
 
-    Iterate over it once; then `summary` is complete. Use it as a context manager: leaving it closes the nodes.
+    Topics of foreign bags that are not in the topic table are left out, and listed in `left_out`. Iterate over it once; then `summary` is complete. Use it as a context manager: leaving it closes the nodes.
     """
 
     def __init__(self, bag: Path, choice: Choice, whole: bool = False) -> None:
@@ -55,6 +56,7 @@ class Replay:
             self._nodes = build_nodes(bag, choice, Path(self._folder.name), self._clock)
             self._lockstep = Lockstep(self._nodes, self._clock, self.info.start_ns)
             recorded = [topic.name for topic in self.info.topics]
+            self.left_out = [topic for topic in recorded if type_of_topic(topic) is None]
             self._heard = [topic for topic in recorded if topic in self._lockstep.heard_topics - self.made_topics]
             require_readable(bag, {topic: topic_row(topic).type for topic in self._heard})
             if not self._heard:
@@ -89,7 +91,8 @@ class Replay:
 
     def __iter__(self) -> Iterator[Replayed]:
         """Every message that was made, and with ``whole`` also those that were kept, in order."""
-        topics = None if self._whole else self._heard
+        recorded = [topic.name for topic in self.info.topics]
+        topics = [topic for topic in recorded if topic not in self.left_out] if self._whole else self._heard
         heard = frozenset(self._heard)
         for message in read_messages(self.bag, topics):
             if message.topic in self.made_topics:

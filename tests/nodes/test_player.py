@@ -4,6 +4,7 @@ import time
 
 import numpy as np
 import pytest
+from mcap.writer import Writer as McapWriter
 
 from nodes.player import PlayerConfig, PlayerNode
 from nodes.runtime.bag import BagWriter
@@ -105,6 +106,22 @@ def test_a_recording_does_not_ask_for_an_attack(tmp_path):
 
 def test_requests_to_arm_are_played_only_when_asked_for(bag):
     assert PlayerNode(PlayerConfig(bag=bag, topics=["/arm"]), lambda topic: 0).publications == ("/arm",)
+
+
+def test_topics_that_nobody_here_knows_are_left_out_and_named(tmp_path):
+    path = tmp_path / "a.mcap"
+    writer = McapWriter(str(path))
+    writer.start()
+    for topic, typename in (("/chatter", "std_msgs/msg/String"), ("/vicon/car", "geometry_msgs/msg/PoseStamped")):
+        channel = writer.register_channel(topic, "cdr", writer.register_schema(typename, "ros2msg", b""))
+        cdr = encode(types.String(data="x") if topic == "/chatter" else pose_message(np.eye(4), START_NS))
+        writer.add_message(channel, START_NS, cdr, START_NS)
+    writer.finish()
+    node = PlayerNode(PlayerConfig(bag=path, wait_for=[]), lambda topic: 0)
+    assert node.publications == ("/vicon/car",)
+    out, done = play(node, ManualClock())
+    assert (len(out), done) == (1, True)
+    assert node.status() == ("active", "1 messages played; not in the topic table: /chatter")
 
 
 def test_wrong_choices_are_errors(bag, tmp_path):

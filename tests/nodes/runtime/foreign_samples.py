@@ -23,9 +23,9 @@ def rgb_at(index, height=188, width=336):
 
 
 def state_at(index):
-    """Position and quaternion (x, y, z, w) of the car."""
-    angle = 0.1 * index
-    return (0.5 * index, 1.0 - 0.1 * index, 0.02), (0.0, 0.0, float(np.sin(angle / 2)), float(np.cos(angle / 2)))
+    """Position and quaternion (x, y, z, w) of the car, near the path of the simulated lab."""
+    angle = 0.05 * index
+    return (0.2 * index - 0.5, 0.03 * index - 2.0, 0.02), (0.0, 0.0, float(np.sin(angle / 2)), float(np.cos(angle / 2)))
 
 
 class Make:
