@@ -1,5 +1,8 @@
 """What does a recorder lose that is killed? ``python -m benchmarks.bag_kill`` (about eight minutes; goes on where it was stopped).
 
+``--splits`` kills a recorder that begins a new file several times a second, instead of one that does not get that far (another
+eight minutes, a row of its own).
+
 A recorder process is sent 30 images of 366 x 188 and 50 poses a second and killed with SIGKILL at a random moment; then its bag is
 repaired and read by three readers that know nothing of ours: ``mcap`` with ``mcap-ros2-support``, ``rosbags``, and Foxglove's own
 decoder (``@mcap/core`` and ``@foxglove/rosmsg2-serialization``, in node). All must find the same messages with the same contents.
@@ -27,12 +30,14 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
 from benchmarks.results import REPOSITORY, record_row
-from nodes.runtime.bag_repair import repair
+from nodes.runtime.bag_repair_parts import repair_bag
 from nodes.runtime.bus import Bus
 from nodes.runtime.messages import image_message, pose_message
 
 COMMAND = "python -m benchmarks.bag_kill"
-FOLDER = REPOSITORY / "runs" / "bag_kill"
+FOLDER, SPLIT_FOLDER = REPOSITORY / "runs" / "bag_kill", REPOSITORY / "runs" / "bag_kill_splits"
+# Each limit is reached about every quarter of a second with the traffic below: 6.3 MB a second.
+SPLITTING = ("max_bag_size_mb=1", "max_bag_duration_s=0.25")
 IMAGE, POSE = "/camera/image_raw", "/vicon/car"
 IMAGE_HZ, POSE_HZ = 30.0, 50.0
 KILLS, MOST_LOST = 100, 2
@@ -101,15 +106,15 @@ def node_decoder(folder: Path) -> Path:
     return script
 
 
-def kill_once(seed: int, script: Path | None) -> dict[str, int]:
+def kill_once(seed: int, script: Path | None, settings: tuple[str, ...] = ()) -> dict[str, int]:
     """One recorder killed; what was sent, what was lost, and how many readers agreed."""
     rng = np.random.default_rng(seed)
     with tempfile.TemporaryDirectory(prefix="advnerf-") as folder:
-        sent, expected = _record_and_kill(Path(folder), rng)
-        repaired = repair(Path(folder) / "bag")
-        found = [_with_mcap(repaired.path), _with_rosbags(repaired.path.parent)]
+        sent, expected = _record_and_kill(Path(folder), rng, settings)
+        files = [part.path for part in repair_bag(Path(folder) / "bag")]
+        found = [_with_mcap(files), _with_rosbags(Path(folder) / "bag")]
         if script is not None:
-            found.append(_with_node(repaired.path, script))
+            found.append(_with_node(files, script))
         for other in found:
             if other != found[0]:
                 raise ReadersDisagree(f"kill {seed}: {found}")
@@ -118,14 +123,17 @@ def kill_once(seed: int, script: Path | None) -> dict[str, int]:
         lost = {topic: sent[topic] - counts[topic] for topic in counts}
         return {
             "seed": seed, "sent": sum(sent.values()), "lost_images": lost[IMAGE], "lost_poses": lost[POSE],
-            "lost": sum(lost.values()), "readers": len(found),
+            "lost": sum(lost.values()), "readers": len(found), "files": len(files),
         }  # fmt: skip
 
 
-def _record_and_kill(folder: Path, rng: np.random.Generator) -> tuple[dict[str, int], dict[str, list[float]]]:
+def _record_and_kill(
+    folder: Path, rng: np.random.Generator, settings: tuple[str, ...]
+) -> tuple[dict[str, int], dict[str, list[float]]]:
     """Send until a random moment, kill; how many were sent, and the sums that are expected of their contents."""
     command = [sys.executable, "-m", "nodes.recorder", "--run-dir", str(folder)]
     command += ["--set", f"topics=[{IMAGE}, {POSE}]"]
+    command += [part for setting in settings for part in ("--set", setting)]
     process = subprocess.Popen(command, cwd=REPOSITORY, stderr=subprocess.DEVNULL)
     sent, sums = {IMAGE: 0, POSE: 0}, {IMAGE: [0.0], POSE: [0.0]}
     try:
@@ -161,12 +169,13 @@ def _require_content(seed: int, found: Found, counts: dict[str, int], sums: dict
         raise ReadersDisagree(f"kill {seed}: the bag does not hold the first {counts} messages that were sent")
 
 
-def _with_mcap(path: Path) -> Found:
+def _with_mcap(files: list[Path]) -> Found:
     found = Found()
-    with open(path, "rb") as file:
-        reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
-        for _, channel, _, message in reader.iter_decoded_messages():
-            found.add(channel.topic, message)
+    for path in files:
+        with open(path, "rb") as file:
+            reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
+            for _, channel, _, message in reader.iter_decoded_messages():
+                found.add(channel.topic, message)
     return found
 
 
@@ -178,14 +187,22 @@ def _with_rosbags(folder: Path) -> Found:
     return found
 
 
-def _with_node(path: Path, script: Path) -> Found:
-    result = subprocess.run(["node", str(script), str(path)], capture_output=True, text=True, timeout=120, check=False)
-    if result.returncode:
-        raise ReadersDisagree(f"Foxglove's decoder cannot read {path}: {result.stderr.strip()[-500:]}")
-    return Found(**json.loads(result.stdout))
+def _with_node(files: list[Path], script: Path) -> Found:
+    total = Found()
+    for path in files:
+        result = subprocess.run(
+            ["node", str(script), str(path)], capture_output=True, text=True, timeout=120, check=False
+        )
+        if result.returncode:
+            raise ReadersDisagree(f"Foxglove's decoder cannot read {path}: {result.stderr.strip()[-500:]}")
+        found = Found(**json.loads(result.stdout))
+        for topic, count in found.counts.items():
+            total.counts[topic] = total.counts.get(topic, 0) + count
+        total.pixels, total.x = total.pixels + found.pixels, total.x + found.x
+    return total
 
 
-def measure(kills: int, folder: Path, record: bool) -> None:
+def measure(kills: int, folder: Path, splits: bool, save: bool) -> None:
     """Kill again and again; finished kills are kept in a file and not repeated."""
     folder.mkdir(parents=True, exist_ok=True)
     script = node_decoder(folder / "node") if shutil.which("npm") else None
@@ -194,21 +211,30 @@ def measure(kills: int, folder: Path, record: bool) -> None:
     done = folder / "kills.jsonl"
     rows = [json.loads(line) for line in done.read_text().splitlines()] if done.exists() else []
     for seed in range(len(rows), kills):
-        rows.append(kill_once(seed, script))
+        rows.append(kill_once(seed, script, SPLITTING if splits else ()))
         with open(done, "a", encoding="utf-8") as file:
             file.write(json.dumps(rows[-1]) + "\n")
         print(json.dumps(rows[-1]), flush=True)
+    rows = rows[:kills]
     worst, readers = max(row["lost"] for row in rows), min(row["readers"] for row in rows)
+    files = [row.get("files", 1) for row in rows]
     note = (
         f"{sum(row['sent'] for row in rows)} sent, {sum(row['lost'] for row in rows)} lost in all "
-        f"({sum(row['lost_images'] for row in rows)} images); each file read alike by {readers} readers"
-        + ("" if readers == 3 else ": Foxglove's decoder was not there")
+        f"({sum(row['lost_images'] for row in rows)} images); {min(files)} to {max(files)} files in a bag, {sum(files)} in all; "
+        f"each file read alike by {readers} readers" + ("" if readers == 3 else ": Foxglove's decoder was not there")
     )
     print(f"{kills} kills: at most {worst} lost; {note}")
-    if record:
+    if not save:
+        return
+    target = f"<= {MOST_LOST} each; all repaired files open in mcap+mcap-ros2-support, rosbags, Foxglove's npm decoder"
+    if splits:
         record_row(
-            f"#4 kill -9 of the recorder, {kills} times at 30 Hz images + 50 Hz poses", worst, "messages lost at most",
-            f"<= {MOST_LOST} each; all repaired files open in mcap+mcap-ros2-support, rosbags, Foxglove's npm decoder",
+            f"#15 kill -9 of a recorder that begins a new file every 0.25 s, {kills} times at 30 Hz images + 50 Hz poses", worst,
+            "messages lost at most", target, worst <= MOST_LOST and readers == 3 and min(files) > 1, f"{COMMAND} --splits", note,
+        )  # fmt: skip
+    else:
+        record_row(
+            f"#4 kill -9 of the recorder, {kills} times at 30 Hz images + 50 Hz poses", worst, "messages lost at most", target,
             worst <= MOST_LOST and readers == 3, COMMAND, note,
         )  # fmt: skip
 
@@ -216,13 +242,15 @@ def measure(kills: int, folder: Path, record: bool) -> None:
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--splits", action="store_true", help="kill a recorder that splits its bag all the time")
+    parser.add_argument("--count", type=int, default=KILLS, help="kills")
     parser.add_argument("--trial", action="store_true", help="three kills, nothing is recorded or kept")
     options = parser.parse_args()
     if options.trial:
         with tempfile.TemporaryDirectory(prefix="advnerf-") as folder:
-            measure(3, Path(folder), record=False)
+            measure(3, Path(folder), options.splits, save=False)
     else:
-        measure(KILLS, FOLDER, record=True)
+        measure(options.count, SPLIT_FOLDER if options.splits else FOLDER, options.splits, save=True)
 
 
 if __name__ == "__main__":

@@ -111,6 +111,6 @@ def _times(start_ns: int, end_ns: int) -> dict[str, dict[str, int]]:
     return {"duration": {"nanoseconds": end_ns - start_ns}, "starting_time": {"nanoseconds_since_epoch": start_ns}}
 
 
-class _PlainDumper(_DUMPER):  # type: ignore[misc]
+class _PlainDumper(_DUMPER):
     def ignore_aliases(self, data: object) -> bool:
         return True

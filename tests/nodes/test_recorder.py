@@ -7,10 +7,13 @@ import time
 import numpy as np
 import pytest
 from pydantic import ValidationError
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_typestore
 
 from nodes.recorder import RecorderConfig, RecorderNode, provenance
 from nodes.runtime.bag_read import read_attachment, read_info, read_messages
 from nodes.runtime.bag_repair import repair
+from nodes.runtime.bag_repair_parts import repair_bag
 from nodes.runtime.bus import Bus
 from nodes.runtime.clock import Now, SystemClock
 from nodes.runtime.errors import BagError
@@ -55,8 +58,9 @@ def test_provenance_names_the_version():
     assert provenance()["version"]
 
 
-def start_recorder(tmp_path, bus):
+def start_recorder(tmp_path, bus, *settings):
     command = [sys.executable, "-m", "nodes.recorder", "--run-dir", str(tmp_path)]
+    command += [part for setting in settings for part in ("--set", setting)]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     for topic in ("/camera/image_raw", "/vicon/car"):
         bus.publisher(topic)
@@ -101,6 +105,25 @@ def test_killed_process_loses_at_most_what_came_in_its_last_moment(tmp_path):
     assert sum(sent.values()) - repaired.messages <= 2
     counts = {t.name: t.count for t in read_info(tmp_path / "bag").topics}
     assert set(counts) == set(sent)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_killed_process_that_splits_its_bag_loses_at_most_what_came_in_its_last_moment(tmp_path, seed):
+    rng = np.random.default_rng(seed)
+    with Bus(tmp_path) as bus:
+        process = start_recorder(tmp_path, bus, "max_bag_size_mb=1", "max_bag_duration_s=0.3")
+        sent = drive(bus, 0.6 + rng.uniform(0.0, 0.4))
+        os.kill(process.pid, signal.SIGKILL)
+        process.communicate(timeout=10)
+    repaired = repair_bag(tmp_path / "bag")
+    assert len(repaired) >= 3
+    assert sum(sent.values()) - sum(part.messages for part in repaired) <= 2
+    for topic, count in sent.items():
+        numbers = [message.sequence for message in read_messages(tmp_path / "bag", [topic])]
+        assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
+        assert count - len(numbers) <= 2
+    with AnyReader([tmp_path / "bag"], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
+        assert len(list(reader.messages())) == sum(part.messages for part in repaired)
 
 
 def test_bag_that_exists_is_one_clear_line_and_exit_code_2(tmp_path):

@@ -102,7 +102,7 @@ def test_a_truncated_file_without_chunks_keeps_its_messages(bags, write):
     content = bags["no chunks"][:-2000]
     path = write(content)
     info = CliRunner().invoke(app, ["bag", "info", str(path)])
-    assert info.exit_code == 1
+    assert info.exit_code == 2
     assert f"advnerf bag repair {path} keeps all {len(reachable(content))} messages" in info.stderr
     result = repair(path)
     assert result.messages == len(reachable(content)) > 40
@@ -373,7 +373,7 @@ def test_the_command_says_what_was_before_and_after(bags, write):
     at, length = chunks_of(bags["chunks"])[2]
     path = write(flipped(bags["chunks"], at + length - 30))
     info = run(app, ["bag", "info", str(path)])
-    assert info.exit_code == 1
+    assert info.exit_code == 2
     assert "repair --force" in info.stderr
     refused = run(app, ["bag", "repair", str(path)])
     assert refused.exit_code != 0

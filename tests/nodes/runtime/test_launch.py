@@ -9,6 +9,7 @@ import psutil
 import pytest
 import yaml
 
+from nodes.recorder import RecorderConfig
 from nodes.runtime.errors import ConfigError, LaunchError
 from nodes.runtime.launch import Launch, active_launches
 from nodes.runtime.launch_file import load_launch
@@ -234,8 +235,10 @@ def test_include_is_a_base_that_can_be_changed(probe, tmp_path):
 
 def test_record_adds_a_recorder_that_stops_last(probe, tmp_path):
     file = tmp_path / "r.launch.yaml"
-    file.write_text(LAUNCH_TEXT + "record: {output: my_bag}\n")
+    file.write_text(LAUNCH_TEXT + "record: {output: my_bag, max_bag_size_mb: 64}\n")
     plan = load_launch(file)
+    recorder = RecorderConfig(**plan.documents["recorder"].data)
+    assert (str(recorder.output), recorder.max_bag_size_mb, recorder.max_bag_duration_s) == ("my_bag", 64.0, 600.0)
     assert plan.nodes["recorder"].stop_last
     assert plan.documents["recorder"].data["statuses_of"] == ["a"]
 
