@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from nodes.runtime.bag_read import BagInfo
     from nodes.runtime.bag_repair import Repaired
 
+_DAMAGED_EXIT = 2  # as for every bag that cannot be read
+
 app = typer.Typer(no_args_is_help=True, help="Record, look into, play and repair bags (MCAP, as rosbag2 writes them).")
 
 
@@ -40,7 +42,7 @@ def bag_info(
                 for line in found.lines[:-1]:
                     print(f"{found.path}: {line}")
                 say_error(f"{found.path} is not whole; {found.lines[-1]}")
-                raise typer.Exit(1)
+                raise typer.Exit(_DAMAGED_EXIT)
     info = read_info(bag)
     start = datetime.fromtimestamp(info.start_ns / 1e9).isoformat(" ", "milliseconds")
     files = f" in {len(info.parts)} files" if len(info.parts) > 1 else ""
@@ -226,12 +228,9 @@ def bag_repair(
     ] = False,
 ) -> None:
     """Make the bag of a killed recorder, or a damaged one, whole; the file as it was is kept beside it."""
-    from functools import partial
-
-    from nodes.runtime.bag_repair import repair
     from nodes.runtime.bag_repair_parts import repair_bag
 
-    for result in repair_bag(bag, partial(repair, force=force, keep_original=not discard_original)):
+    for result in repair_bag(bag, force, not discard_original):
         _print_repair(result)
 
 

@@ -17,7 +17,6 @@ import shutil
 import threading
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 from advnerf_core.files import write_atomically
@@ -196,14 +195,13 @@ class BagWriter:
 
     def _rescue(self, error: OSError) -> None:
         """After a failed write: finish the files as far as they go, in the space held back for it."""
-        from nodes.runtime.bag_repair import repair
         from nodes.runtime.bag_repair_parts import repair_bag
 
         if self._open:
             self._stop_keeper()
             self._let_go()
         try:
-            messages = sum(part.messages for part in repair_bag(self.folder, partial(repair, in_place=True)))
+            messages = sum(part.messages for part in repair_bag(self.folder, in_place=True))
             saved = f"{messages} messages up to then are readable in it"
         except (BagError, OSError) as second:
             saved = (

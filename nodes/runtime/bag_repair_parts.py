@@ -2,25 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import os
 from pathlib import Path
 
-from mcap.reader import make_reader
-
 from advnerf_core.files import write_atomically
-from nodes.runtime.bag_file import open_bag
 from nodes.runtime.bag_metadata import Contents, FileEntry, rosbag2_metadata
 from nodes.runtime.bag_parts import METADATA_FILE, bag_parts, listed_files
-from nodes.runtime.bag_repair import Repaired, repair
+from nodes.runtime.bag_repair import Repaired, kept_names, repair
+from nodes.runtime.bag_whole import read_summary
 from nodes.runtime.errors import BagError
 
 
-def repair_bag(bag: Path, repair_file: Callable[[Path], Repaired] = repair) -> list[Repaired]:
+def repair_bag(bag: Path, force: bool = False, keep_original: bool = True, in_place: bool = False) -> list[Repaired]:
     """Make every part of a bag whole.
 
     Args:
         bag: Bag folder or any of its files.
-        repair_file: Repairs one file.
+        force: See `nodes.runtime.bag_repair.repair`, as for the other two.
+        keep_original: Keep the parts, and ``metadata.yaml``, as they were.
+        in_place: Write no second files.
 
     Returns:
         What was done to each part, in order.
@@ -30,10 +30,13 @@ def repair_bag(bag: Path, repair_file: Callable[[Path], Repaired] = repair) -> l
     """
     parts = bag_parts(bag)
     folder = parts[0].parent
-    repaired = [repair_file(part) for part in parts]
+    repaired = [repair(part, force, keep_original, in_place) for part in parts]
     _remove_what_was_begun(folder)
-    if len(parts) > 1 and listed_files(folder) != tuple(part.name for part in parts):
-        _list(folder, parts)
+    names, listed = tuple(part.name for part in parts), listed_files(folder)
+    if len(parts) > 1 and listed != names:
+        _list(folder, parts, listed != () and keep_original)
+    elif listed == names and any(not part.was_whole for part in repaired):
+        _list(folder, parts, keep_original)  # its counts are those of before
     return repaired
 
 
@@ -46,22 +49,25 @@ def _remove_what_was_begun(folder: Path) -> None:
             journal.unlink()
 
 
-def _list(folder: Path, parts: tuple[Path, ...]) -> None:
+def _list(folder: Path, parts: tuple[Path, ...], keep_old: bool) -> None:
+    """Write ``metadata.yaml`` from what the parts say now."""
     total, files = Contents(), []
     for part in parts:
         contents = _contents(part)
         total.add(contents)
         files.append(FileEntry.of(part.name, contents))
-    write_atomically(folder / METADATA_FILE, rosbag2_metadata("", total, files))
+    file = folder / METADATA_FILE
+    if keep_old:
+        os.link(file, next(name for name in kept_names(file) if not os.path.lexists(name)))
+    write_atomically(file, rosbag2_metadata(parts[0].name, total, files))
 
 
 def _contents(part: Path) -> Contents:
     """What the summary of a whole file says."""
-    with open_bag(part) as file:
-        summary = make_reader(file).get_summary()
-    if summary is None or summary.statistics is None:
+    found = read_summary(part)
+    if found is None:
         raise BagError(f"{part}: expected a summary with statistics after the repair, got none; repair it again")
-    statistics = summary.statistics
+    summary, statistics = found
     contents = Contents(start_ns=statistics.message_start_time, end_ns=statistics.message_end_time)
     for channel in summary.channels.values():
         schema = summary.schemas.get(channel.schema_id)

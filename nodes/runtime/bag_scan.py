@@ -543,7 +543,8 @@ class _Scanner:
         if known is not None and known.statistics is not None and known.statistics.chunk_count and not found.runs:
             places = sorted(
                 [index.chunk_start_offset for index in known.chunk_indexes]
-                + [index.offset for index in (*known.attachment_indexes, *known.metadata_indexes)]
+                + [attachment.offset for attachment in known.attachment_indexes]
+                + [metadata.offset for metadata in known.metadata_indexes]
                 + [self._limit - DATA_END_BYTES]
             )
             after = bisect_right(places, at)

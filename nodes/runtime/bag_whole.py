@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from mcap.opcode import Opcode
-from mcap.records import ChunkIndex, Statistics
+from mcap.records import AttachmentIndex, ChunkIndex, Statistics
 from mcap.summary import Summary
 
 from nodes.runtime.bag_file import mapped
@@ -74,7 +74,8 @@ def _lists_everything(buffer: Any, ending: Ending, summary: Summary) -> bool:
     if len(summary.channels) != statistics.channel_count or len(summary.schemas) != statistics.schema_count:
         return False
     spans = [(i.chunk_start_offset, i.chunk_length + i.message_index_length) for i in summary.chunk_indexes]
-    spans += [(i.offset, i.length) for i in (*summary.attachment_indexes, *summary.metadata_indexes)]
+    spans += [(i.offset, i.length) for i in summary.attachment_indexes]
+    spans += [(i.offset, i.length) for i in summary.metadata_indexes]
     try:
         at = record_at(buffer, len(MAGIC), ending.summary_start)[2]
     except Damaged:
@@ -110,7 +111,7 @@ def summary_of(scan: Scan) -> tuple[FileSummary, Statistics]:
     for piece in scan.pieces:
         if isinstance(piece.record, ChunkIndex):
             summary.chunk_indexes.append(piece.record)
-        elif piece.record is not None and hasattr(piece.record, "media_type"):
+        elif isinstance(piece.record, AttachmentIndex):
             summary.attachment_indexes.append(piece.record)
         elif piece.record is not None:
             summary.metadata_indexes.append(piece.record)

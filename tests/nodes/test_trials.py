@@ -7,11 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from advnerf_core.attack.artifact import AttackFile, face_texture, save_attack
 from advnerf_core.driving.path import Path as DrivingPath
 from advnerf_core.geometry import Pinhole, planar_pose
 from benchmarks.host_pair import exchange_keys
+from nodes.cli import app
 from nodes.runtime.bag import BagWriter
 from nodes.runtime.errors import BagError, ConfigError
 from nodes.runtime.launch import Launch
@@ -202,6 +204,27 @@ def test_the_numbers_of_a_bag_follow_from_the_bag_alone(tmp_path):
     np.testing.assert_allclose(np.array(whole["states"])[:, 1], -1.9, atol=1e-9)
     path = DrivingPath.rounded_square(4.0, 1.1)
     np.testing.assert_allclose(whole["cte_m"], path.project(np.array(whole["states"])[:, :2]).cte_m, atol=1e-9)
+
+
+def test_numbers_of_a_bag_without_checksums_are_unchecked(tmp_path):
+    bag = write_bag(tmp_path, [(1.0, 2.2, "disarmed by trial: trial is over")])
+    (checked,) = evaluate_bag(bag, None, ticks=20)
+    assert checked["unchecked"] == ""
+    path = bag / "bag.mcap"
+    content = bytearray(path.read_bytes())
+    at = 8
+    while content[at] != 0x0F:  # DataEnd
+        if content[at] == 0x06:  # Chunk; its checksum behind two times and a size
+            content[at + 33 : at + 37] = bytes(4)
+        at += 9 + int.from_bytes(content[at + 1 : at + 9], "little")
+    path.write_bytes(content)
+    (unchecked,) = evaluate_bag(bag, None, ticks=20)
+    assert "chunks carry no checksum" in unchecked["unchecked"]
+    assert unchecked["total_cte_m"] == checked["total_cte_m"]
+    shown = CliRunner().invoke(app, ["evaluate", str(bag), "--ticks", "20"], env={"COLUMNS": "240"})
+    assert "unchecked" in shown.stdout
+    rows = summarise([{**unchecked, "condition": "none"}, {**checked, "condition": "none"}])
+    assert rows[0]["unchecked"] == 1
 
 
 def test_bags_without_a_drive_say_what_they_lack(tmp_path):

@@ -6,8 +6,11 @@ import signal
 import struct
 import subprocess
 import sys
+import time
 
+import numpy as np
 import pytest
+import yaml
 from bag_samples import START_NS, write_all_topics
 from mcap.reader import make_reader
 from typer.testing import CliRunner
@@ -24,9 +27,10 @@ from benchmarks.bag_damage import (
     reachable,
 )
 from nodes.cli import app
-from nodes.runtime.bag import BagWriter
+from nodes.runtime.bag import BagWriter, SplitLimits
 from nodes.runtime.bag_read import read_attachments, read_info, read_messages
 from nodes.runtime.bag_repair import repair
+from nodes.runtime.bag_repair_parts import repair_bag
 from nodes.runtime.errors import BagError
 from nodes.runtime.messages import encode, pose_message
 
@@ -98,7 +102,7 @@ def test_a_truncated_file_without_chunks_keeps_its_messages(bags, write):
     content = bags["no chunks"][:-2000]
     path = write(content)
     info = CliRunner().invoke(app, ["bag", "info", str(path)])
-    assert info.exit_code == 1
+    assert info.exit_code == 2
     assert f"advnerf bag repair {path} keeps all {len(reachable(content))} messages" in info.stderr
     result = repair(path)
     assert result.messages == len(reachable(content)) > 40
@@ -206,8 +210,6 @@ def test_a_length_that_is_wrong_loses_one_message_not_the_rest(bags, write):
 
 
 def pose_message_of(index):
-    import numpy as np
-
     T = np.eye(4)
     T[:2, 3] = 0.08 * index, 0.3 * np.sin(index)
     return pose_message(T, START_NS + index * 20_000_000)
@@ -371,7 +373,7 @@ def test_the_command_says_what_was_before_and_after(bags, write):
     at, length = chunks_of(bags["chunks"])[2]
     path = write(flipped(bags["chunks"], at + length - 30))
     info = run(app, ["bag", "info", str(path)])
-    assert info.exit_code == 1
+    assert info.exit_code == 2
     assert "repair --force" in info.stderr
     refused = run(app, ["bag", "repair", str(path)])
     assert refused.exit_code != 0
@@ -411,3 +413,26 @@ def test_what_is_read_from_a_bag_without_checksums_is_said_to_be_unchecked(bags,
         path = write(bags[name], name)
         next(read_messages(path))
         assert ("unchecked" in capsys.readouterr().err) is said
+
+
+def test_a_part_of_a_split_bag_is_repaired_by_itself_and_the_list_follows(tmp_path):
+    limits = SplitLimits(duration_s=0.1)
+    with BagWriter(tmp_path / "bag", limits=limits) as writer:
+        for i in range(40):
+            stamp_ns = START_NS + i * 10_000_000
+            writer.write("/vicon/car", encode(pose_message(np.eye(4), stamp_ns)), stamp_ns, stamp_ns, i)
+            time.sleep(0.005)
+    parts = read_info(tmp_path / "bag").parts
+    assert len(parts) > 1
+    content = parts[0].read_bytes()
+    at, length = chunks_of(content)[0]
+    parts[0].write_bytes(flipped(content, at + length - 20))
+    with pytest.raises(BagError, match=f"{parts[0]} is damaged: the chunk at byte {at}"):
+        list(read_messages(tmp_path / "bag"))
+    done = repair_bag(tmp_path / "bag", force=True)
+    assert [part.was_whole for part in done] == [False] + [True] * (len(parts) - 1)
+    left = len(list(read_messages(tmp_path / "bag")))
+    assert 0 < left < 40
+    listed = yaml.safe_load((tmp_path / "bag" / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
+    assert listed["message_count"] == left
+    assert "message_count: 40" in (tmp_path / "bag" / "metadata.yaml.damaged").read_text()
