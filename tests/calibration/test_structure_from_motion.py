@@ -8,56 +8,12 @@ from advnerf_core.geometry import Pinhole, look_at
 from advnerf_core.scene.image_files import image_size
 from advnerf_core.scene.lens import Lens
 from advnerf_core.scene.similarity import align_poses
+from benchmarks.painted_corner import WALL_M, WALLS, photograph, poses_of, some_camera, write_photographs
 from calibration.structure_from_motion import ReconstructionError, SfmConfig, Source, reconstruct
 
 PHONE = Pinhole(400, 300, 330.0, 330.0, 200.0, 150.0)
 CAR = Pinhole(320, 200, 210.0, 210.0, 160.0, 100.0)
 PHONE_LENS, CAR_LENS = Lens((-0.12, 0.03, 0.0, 0.0, 0.0)), Lens()
-WALL_M = 3.0
-
-
-def painting(seed):
-    """Random blocks of several sizes: corners at every scale."""
-    rng = np.random.default_rng(seed)
-    image = np.zeros((900, 900, 3), np.float32)
-    for cells, weight in ((9, 0.4), (30, 0.35), (90, 0.25)):
-        blocks = rng.uniform(0.0, 255.0, (cells, cells, 3)).astype(np.float32)
-        image += weight * cv2.resize(blocks, (900, 900), interpolation=cv2.INTER_NEAREST)
-    return cv2.GaussianBlur(image, (0, 0), 1.0)
-
-
-WALLS = [painting(seed) for seed in range(3)]
-
-
-def photograph(T_world_from_camera, pinhole, lens):
-    """Cast a ray through every pixel of the distorted image onto the planes x = 0, y = 0, z = 0."""
-    columns, rows = np.meshgrid(np.arange(pinhole.width, dtype=float), np.arange(pinhole.height, dtype=float))
-    matrix = pinhole.matrix.copy()
-    matrix[:2, 2] -= 0.5
-    pixels = np.stack([columns, rows], axis=-1).reshape(-1, 1, 2)
-    straight = cv2.undistortPoints(pixels, matrix, np.array(lens.coefficients)).reshape(-1, 2)
-    directions = np.column_stack([straight, np.ones(len(straight))]) @ T_world_from_camera[:3, :3].T
-    origin, image, nearest = T_world_from_camera[:3, 3], np.zeros((len(straight), 3)), np.full(len(straight), np.inf)
-    for axis in range(3):
-        with np.errstate(divide="ignore"):
-            distance = -origin[axis] / directions[:, axis]
-        u, v = ((origin + distance[:, None] * directions)[:, other] for other in range(3) if other != axis)
-        hit = (distance > 0) & (distance < nearest) & (u >= 0) & (u < WALL_M) & (v >= 0) & (v < WALL_M)
-        nearest[hit] = distance[hit]
-        maps = ((900 / WALL_M * each[hit]).astype(np.float32).reshape(-1, 1) for each in (u, v))
-        # In rows of one pixel; OpenCV's maps may not be longer than 32767.
-        x, y = maps
-        parts = [
-            cv2.remap(WALLS[axis], a, b, cv2.INTER_LINEAR)
-            for a, b in zip(np.array_split(x, 8), np.array_split(y, 8), strict=True)
-        ]
-        image[hit] = np.concatenate(parts).reshape(-1, 3)
-    return np.rint(image).clip(0, 255).astype(np.uint8).reshape(pinhole.height, pinhole.width, 3)
-
-
-def poses_of(count, radius, height, first, last):
-    angles = np.linspace(first, last, count)
-    return [look_at([radius * np.cos(a), radius * np.sin(a), height], [0.7, 0.7, 0.6]) for a in angles]
 
 
 @pytest.fixture(scope="module")
