@@ -42,6 +42,8 @@ def photograph(T_world_from_camera: Array, pinhole: Pinhole, lens: Lens) -> NDAr
             distance = -origin[axis] / directions[:, axis]
         u, v = ((origin + distance[:, None] * directions)[:, other] for other in range(3) if other != axis)
         hit = (distance > 0) & (distance < nearest) & (u >= 0) & (u < WALL_M) & (v >= 0) & (v < WALL_M)
+        if not hit.any():
+            continue
         nearest[hit] = distance[hit]
         maps = ((900 / WALL_M * each[hit]).astype(np.float32).reshape(-1, 1) for each in (u, v))
         # In rows of one pixel; OpenCV's maps may not be longer than 32767.

@@ -9,7 +9,7 @@ import os
 import shutil
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -133,6 +133,29 @@ def held_cameras(file: Path, sources: Sequence[Source]) -> set[int]:
     known = {name for source in sources if source.pinhole is not None for name in source.images}
     with pycolmap.Database.open(file) as database:
         return {image.camera_id for image in database.read_all_images() if image.name in known}
+
+
+def camera_names(file: Path, sources: Sequence[Source]) -> dict[int, str]:
+    """Names of COLMAP's cameras: the source's, with the image or the image size where a source has several cameras."""
+    import pycolmap
+
+    source_of = {name: source.camera_id for source in sources for name in source.images}
+    with pycolmap.Database.open(file) as database:
+        cameras = {int(camera.camera_id): camera for camera in database.read_all_cameras()}
+        images: dict[int, list[str]] = {number: [] for number in sorted(cameras)}
+        for image in database.read_all_images():
+            images[int(image.camera_id)].append(image.name)
+    of_source: dict[str, list[int]] = {}
+    for number, names in images.items():
+        of_source.setdefault(source_of[names[0]], []).append(number)
+    found: dict[int, str] = {}
+    for source, numbers in of_source.items():
+        for number in numbers:
+            camera, names = cameras[number], images[number]
+            what = PurePosixPath(names[0]).stem if len(names) == 1 else f"{camera.width}x{camera.height}"
+            name = source if len(numbers) == 1 else f"{source}/{what}"
+            found[number] = name if name not in found.values() else f"{name} (camera {number})"
+    return found
 
 
 def extract_features(

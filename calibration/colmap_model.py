@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -44,7 +44,8 @@ def put_together(root: Path, sources: Sequence[Source], work: Path, config: SfmC
     pairs = database.pairs_to_match(file, sources, config)
     database.match(file, work, pairs, config.seed, _part(report, _FEATURES_UNTIL, _MATCHES_UNTIL))
     held = database.held_cameras(file, sources)
-    model = _read_finished(work, sources)
+    cameras = database.camera_names(file, sources)
+    model = _read_finished(work, sources, cameras)
     if model is None:
         best, parts = _map(file, root, work, held, len(names), config, _part(report, _MATCHES_UNTIL, _POSES_UNTIL))
         placed = {image.name for image in best.images.values() if image.has_pose}
@@ -52,7 +53,7 @@ def put_together(root: Path, sources: Sequence[Source], work: Path, config: SfmC
         elsewhere = "it could not be placed: too little overlap with the others, or blur"
         why |= {name: elsewhere for name in names if name not in placed}
         _write_finished(work, best, parts, choices, why)
-        model = _model(best, sources, parts, choices, why)
+        model = _model(best, sources, cameras, parts, choices, why)
     _require_enough(model, names, config)
     return model
 
@@ -101,28 +102,37 @@ def _write_finished(
     folder = work / "sparse" / "chosen"
     folder.mkdir()
     reconstruction.write(folder)
-    record = {"parts": parts, "choices": {number: asdict(choice) for number, choice in choices.items()}, "why": dict(why)}
+    record = {
+        "parts": parts,
+        "choices": {number: asdict(choice) for number, choice in choices.items()},
+        "why": dict(why),
+    }
     write_atomically(work / _FINISHED, json.dumps(record, indent=1))
 
 
-def _read_finished(work: Path, sources: Sequence[Source]) -> Model | None:
+def _read_finished(work: Path, sources: Sequence[Source], cameras: Mapping[int, str]) -> Model | None:
     import pycolmap
 
     if not (work / _FINISHED).exists():
         return None
     record = json.loads((work / _FINISHED).read_text())
     choices = {int(number): Choice(**choice) for number, choice in record["choices"].items()}
-    return _model(pycolmap.Reconstruction(work / "sparse" / "chosen"), sources, record["parts"], choices, record["why"])
+    reconstruction = pycolmap.Reconstruction(work / "sparse" / "chosen")
+    return _model(reconstruction, sources, cameras, record["parts"], choices, record["why"])
 
 
 def _model(
-    reconstruction: Any, sources: Sequence[Source], parts: int, choices: Mapping[int, Choice], why: Mapping[str, str]
+    reconstruction: Any,
+    sources: Sequence[Source],
+    camera_ids: Mapping[int, str],
+    parts: int,
+    choices: Mapping[int, Choice],
+    why: Mapping[str, str],
 ) -> Model:
-    source_of = {name: source.camera_id for source in sources for name in source.images}
+    names = [name for source in sources for name in source.images]
     by_name = {image.name: image for image in reconstruction.images.values() if image.has_pose}
-    camera_ids = _camera_names(reconstruction, source_of)
     registered = []
-    for name in (name for name in source_of if name in by_name):
+    for name in (name for name in names if name in by_name):
         image = by_name[name]
         T = np.eye(4)
         T[:3] = image.cam_from_world().inverse().matrix()
@@ -138,32 +148,9 @@ def _model(
         cameras.append(
             FoundCamera(camera_ids[number], images, choice.model, choice.why, *found, choice.focal_error_percent)
         )
-    left_out = tuple(LeftOut(name, why[name]) for name in source_of if name not in by_name)
+    left_out = tuple(LeftOut(name, why[name]) for name in names if name not in by_name)
     error_px = float(reconstruction.compute_mean_reprojection_error())
     return Model(tuple(registered), left_out, _array(points), error_px, parts, tuple(cameras))
-
-
-def _camera_names(reconstruction: Any, source_of: Mapping[str, str]) -> dict[int, str]:
-    """Names of COLMAP's cameras: the source's, with the image or the image size where a source has several cameras."""
-    images: dict[int, list[str]] = {}
-    for image in reconstruction.images.values():
-        images.setdefault(int(image.camera_id), []).append(image.name)
-    of_source: dict[str, list[int]] = {}
-    for number, names in sorted(images.items()):
-        of_source.setdefault(source_of[names[0]], []).append(number)
-    return {
-        number: source if len(numbers) == 1 else _one_of_several(source, reconstruction.cameras[number], images[number], taken)
-        for source, numbers in of_source.items() for taken in [set[str]()] for number in numbers
-    }  # fmt: skip
-
-
-def _one_of_several(source: str, camera: Any, images: Collection[str], taken: set[str]) -> str:
-    what = PurePosixPath(*images).stem if len(images) == 1 else f"{camera.width}x{camera.height}"
-    name, number = f"{source}/{what}", 2
-    while name in taken:
-        name, number = f"{source}/{what} ({number})", number + 1
-    taken.add(name)
-    return name
 
 
 def _array(points: Sequence[NDArray[np.float64]]) -> Array:

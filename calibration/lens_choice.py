@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from advnerf_core.geometry import Pinhole
 from advnerf_core.scene.errors import DatasetError
@@ -278,9 +279,7 @@ def _problem(reconstruction: Any, number: int, focal_error_percent: float) -> st
     if (why := nonsense(*intrinsics(reconstruction.cameras[number]))) is not None:
         return why
     if not focal_error_percent <= MAX_FOCAL_ERROR_PERCENT:
-        return (
-            f"focal length is only known within {focal_error_percent:.3g} % (at most {MAX_FOCAL_ERROR_PERCENT:g} % wanted)"
-        )
+        return f"focal length is only known within {focal_error_percent:.3g} % (at most {MAX_FOCAL_ERROR_PERCENT:g} % wanted)"
     return None
 
 
@@ -290,6 +289,7 @@ def _take_out(reconstruction: Any, number: int, why: str) -> dict[str, str]:
     names = {image.name: int(image.frame_id) for image in images}
     for frame in names.values():
         reconstruction.deregister_frame(frame)
+    reconstruction.tear_down()  # else the covariance asks for the poses of what was taken out
     return dict.fromkeys(names, why)
 
 

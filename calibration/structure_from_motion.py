@@ -31,8 +31,6 @@ __all__ = [
     "FoundCamera", "LeftOut", "Model", "ReconstructionError", "Registered", "SfmConfig", "Source", "reconstruct",
 ]  # fmt: skip
 
-_LOG_TAIL = 300
-
 
 def reconstruct(
     root: Path, sources: Sequence[Source], work: Path, config: SfmConfig | None = None, report: Report | None = None
@@ -85,7 +83,8 @@ def _require_colmap() -> None:
 
 def _converse(process: subprocess.Popen[bytes], job: object, report: Report) -> Model | None:
     """Hand over the job and follow its progress; the model, or None if the process ended before it had one."""
-    assert process.stdin is not None and process.stdout is not None
+    assert process.stdin is not None
+    assert process.stdout is not None
     try:
         pickle.dump(job, process.stdin)
         process.stdin.flush()
@@ -103,10 +102,12 @@ def _converse(process: subprocess.Popen[bytes], job: object, report: Report) -> 
         return None
 
 
-def _ended_early(code: int, log: Path) -> ReconstructionError:
-    lines = log.read_text(errors="replace").strip()[-_LOG_TAIL:].splitlines()
-    how = f"was ended by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
+def _ended_early(code: int, log: Path) -> Exception:
+    words = log.read_text(errors="replace").strip()
+    if code >= 0:
+        return RuntimeError(f"the process that COLMAP runs in ended with exit code {code}:\n{words}")
+    last = words.splitlines()[-1] if words else "it left no message"
     return ReconstructionError(
-        f"expected COLMAP to finish, but its process {how} ({lines[-1] if lines else 'no last words'}); its log is {log}. "
-        "If memory ran out, give fewer or smaller images (--most); run the command again to go on"
+        f"expected COLMAP to finish, but its process was ended by {signal.Signals(-code).name} ({last}); its log is {log}. If memory ran "
+        "out, give fewer or smaller images (--most); run the command again to go on"
     )
