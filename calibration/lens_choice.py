@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from advnerf_core.geometry import Pinhole
 from advnerf_core.scene.errors import DatasetError
 from advnerf_core.scene.lens import Lens, straightening
+from calibration.photo_model import MIN_IMAGES, Report
 
 # Name, free parameters, and the fewest images of the camera with which the model is tried at all.
 _MODELS = (("SIMPLE_PINHOLE", 1, 1), ("SIMPLE_RADIAL", 2, 1), ("RADIAL", 3, 5), ("OPENCV", 6, 20))
@@ -37,8 +38,6 @@ _DEGREES_OF_FREEDOM = 4.0
 _ALIKE = 3.0
 _MAX_REPROJECTION_PX, _MIN_ANGLE_DEG = 4.0, 1.5
 
-Report = Callable[[float, str], None]
-
 
 @dataclass(frozen=True)
 class Choice:
@@ -47,12 +46,12 @@ class Choice:
     Attributes:
         model: COLMAP's name of the model.
         why: Why this one.
-        focal_error_percent: Standard error of the focal length [%]; 0 where it is held.
+        focal_error_percent: Standard error of the focal length [%]; None where it is held, or could not be computed.
     """
 
     model: str
     why: str
-    focal_error_percent: float
+    focal_error_percent: float | None = None
 
 
 def intrinsics(camera: Any) -> tuple[Pinhole, Lens]:
@@ -105,32 +104,32 @@ def choose_lenses(
         The choice for each camera that stays, and the reason for each image that was taken out.
     """
     images = _images_of(reconstruction)
-    known = {number: Choice("OPENCV", "known, held", 0.0) for number in images if number in held}
+    known = {number: Choice("OPENCV", "known, held") for number in images if number in held}
     unknown = [number for number in images if number not in held]
     if not unknown:
         return known, {}
     scale_px = _typical_error_px(reconstruction)
     chosen = _by_evidence(reconstruction, unknown, held, scale_px, report)
     constant, left_out = set(held), dict[str, str]()
-    while chosen:
+    while chosen and sum(map(len, _images_of(reconstruction).values())) >= MIN_IMAGES:
         report(0.8, "bundle adjustment with the chosen lenses")
         for number, choice in chosen.items():
             _set_model(reconstruction.cameras[number], choice.model)
         errors = _adjust(reconstruction, constant, scale_px, with_errors=True)
-        problems = {number: why for number in chosen if (why := _problem(reconstruction, number, errors[number]))}
+        problems = {number: why for number in chosen if (why := _problem(reconstruction, number, errors.get(number)))}
         if not problems:
-            chosen = {number: replace(choice, focal_error_percent=errors[number]) for number, choice in chosen.items()}
+            chosen = {number: replace(each, focal_error_percent=errors.get(number)) for number, each in chosen.items()}
             break
         distorted = [number for number in problems if chosen[number].model != "SIMPLE_PINHOLE"]
         for number in distorted:
-            chosen[number] = Choice("SIMPLE_PINHOLE", f"no distortion, because with it the {problems[number]}", 0.0)
+            chosen[number] = Choice("SIMPLE_PINHOLE", f"no distortion, because with it the {problems[number]}")
         if distorted:
             continue
         # One at a time: without the worst, the others may do.
-        worst = max(problems, key=lambda number: errors[number])
+        worst = max(problems, key=lambda number: errors.get(number, math.inf))
         if worst in exif_focal_px and worst not in constant:
             chosen[worst] = Choice(
-                "SIMPLE_PINHOLE", f"EXIF focal length, held, because without it the {problems[worst]}", 0.0
+                "SIMPLE_PINHOLE", f"EXIF focal length, held, because without it the {problems[worst]}"
             )
             _set_focal_length(reconstruction.cameras[worst], exif_focal_px[worst])
             constant.add(worst)
@@ -215,7 +214,7 @@ def _simplest(criteria: Mapping[str, float], images: int) -> Choice:
             gain = criteria[best] - criteria[model]
             said.append(f"{model} over {best}: evidence {gain:.0f}")
             best = model if gain > _EVIDENCE else best
-    return Choice(best or "SIMPLE_PINHOLE", f"{'; '.join(said)} ({_EVIDENCE:.0f} decides)", 0.0)
+    return Choice(best or "SIMPLE_PINHOLE", f"{'; '.join(said)} ({_EVIDENCE:.0f} decides)")
 
 
 def _set_model(camera: Any, model: str) -> None:
@@ -244,7 +243,7 @@ def _set_focal_length(camera: Any, focal_px: float) -> None:
 def _adjust(
     reconstruction: Any, constant: Collection[int], scale_px: float, with_errors: bool = False
 ) -> dict[int, float]:
-    """Bundle adjustment, principal points held; the focal lengths' standard errors [%] by camera, if wanted."""
+    """Bundle adjustment, principal points held; if wanted, standard errors of the refined focal lengths [%] by camera."""
     import pycolmap
 
     options, config = pycolmap.BundleAdjustmentOptions(), pycolmap.BundleAdjustmentConfig()
@@ -266,19 +265,18 @@ def _adjust(
         return {}
     covariance = pycolmap.estimate_ba_covariance(pycolmap.BACovarianceOptions(), reconstruction, adjuster)
     errors = {}
-    for number in images:
-        camera = reconstruction.cameras[number]
+    for camera in (reconstruction.cameras[number] for number in images if number not in constant):
         of_camera = None if covariance is None else covariance.get_other_params_cov(camera.params)
-        variance = math.inf if of_camera is None else float(of_camera[0, 0])
-        error = 100.0 * _ALIKE * scale_px * math.sqrt(max(variance, 0.0)) / float(camera.focal_length_x)
-        errors[number] = 0.0 if number in constant else error
+        if of_camera is not None:
+            error_px = _ALIKE * scale_px * math.sqrt(max(float(of_camera[0, 0]), 0.0))
+            errors[int(camera.camera_id)] = 100.0 * error_px / float(camera.focal_length_x)
     return errors
 
 
-def _problem(reconstruction: Any, number: int, focal_error_percent: float) -> str | None:
+def _problem(reconstruction: Any, number: int, focal_error_percent: float | None) -> str | None:
     if (why := nonsense(*intrinsics(reconstruction.cameras[number]))) is not None:
         return why
-    if not focal_error_percent <= MAX_FOCAL_ERROR_PERCENT:
+    if focal_error_percent is not None and focal_error_percent > MAX_FOCAL_ERROR_PERCENT:
         return f"focal length is only known within {focal_error_percent:.3g} % (at most {MAX_FOCAL_ERROR_PERCENT:g} % wanted)"
     return None
 

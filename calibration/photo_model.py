@@ -105,7 +105,7 @@ class FoundCamera:
         why: Why this model.
         pinhole: Intrinsics.
         lens: Distortion.
-        focal_error_percent: Standard error of the focal length [%]; 0 where it was known and held.
+        focal_error_percent: Standard error of the focal length [%]; None where it was held, or could not be computed.
     """
 
     camera_id: str
@@ -114,7 +114,7 @@ class FoundCamera:
     why: str
     pinhole: Pinhole
     lens: Lens
-    focal_error_percent: float
+    focal_error_percent: float | None
 
     def summary(self) -> dict[str, Any]:
         """The camera as the report of an import lists it."""
