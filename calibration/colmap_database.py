@@ -76,13 +76,13 @@ def _create(file: Path, root: Path, sources: Sequence[Source]) -> None:
     import pycolmap
 
     pycolmap.Database.open(file).close()
-    groups: dict[tuple[object, ...], tuple[Source, list[str], float | None]] = {}
+    groups: dict[tuple[object, ...], tuple[Source, tuple[int, int], float | None, list[str]]] = {}
     for source in sources:
         for name in source.images:
             size, (model, focal_px) = image_size(root / name), exif(root / name)
             key = (source.camera_id, source.pinhole, source.lens, size, model, focal_px)
-            groups.setdefault(key, (source, [], focal_px))[1].append(name)
-    for (_, _, _, size, *_), (source, names, focal_px) in groups.items():
+            groups.setdefault(key, (source, size, focal_px, []))[3].append(name)
+    for source, size, focal_px, names in groups.values():
         options = pycolmap.ImageReaderOptions()
         options.default_focal_length_factor = _GUESSED_FOCAL_LENGTH
         options.camera_model = FIRST_MODEL if source.pinhole is None else "OPENCV"

@@ -38,24 +38,31 @@ def put_together(root: Path, sources: Sequence[Source], work: Path, config: SfmC
     """Put photographs together; see `calibration.structure_from_motion.reconstruct`."""
     names = [name for source in sources for name in source.images]
     file = database.open_work(root, work, sources, asdict(config))
+    cameras = database.camera_names(file, sources)
+    model = _read_finished(work, sources, cameras)
+    if model is None:
+        model = _find_model(file, root, work, sources, cameras, config, report)
+    _require_enough(model, names, config)
+    return model
+
+
+def _find_model(
+    file: Path, root: Path, work: Path, sources: Sequence[Source], cameras: Mapping[int, str], config: SfmConfig, report: Report
+) -> Model:  # fmt: skip
+    names = [name for source in sources for name in source.images]
     database.extract_features(
         file, root, names, config.max_features, config.peak_threshold, _part(report, 0.0, _FEATURES_UNTIL)
     )
     pairs = database.pairs_to_match(file, sources, config)
     database.match(file, work, pairs, config.seed, _part(report, _FEATURES_UNTIL, _MATCHES_UNTIL))
     held = database.held_cameras(file, sources)
-    cameras = database.camera_names(file, sources)
-    model = _read_finished(work, sources, cameras)
-    if model is None:
-        best, parts = _map(file, root, work, held, len(names), config, _part(report, _MATCHES_UNTIL, _POSES_UNTIL))
-        placed = {image.name for image in best.images.values() if image.has_pose}
-        choices, why = choose_lenses(best, held, database.exif_focal_lengths(file), _part(report, _POSES_UNTIL, 1.0))
-        elsewhere = "it could not be placed: too little overlap with the others, or blur"
-        why |= {name: elsewhere for name in names if name not in placed}
-        _write_finished(work, best, parts, choices, why)
-        model = _model(best, sources, cameras, parts, choices, why)
-    _require_enough(model, names, config)
-    return model
+    best, parts = _map(file, root, work, held, len(names), config, _part(report, _MATCHES_UNTIL, _POSES_UNTIL))
+    placed = {image.name for image in best.images.values() if image.has_pose}
+    choices, why = choose_lenses(best, held, database.exif_focal_lengths(file), _part(report, _POSES_UNTIL, 1.0))
+    elsewhere = "it could not be placed: too little overlap with the others, or blur"
+    why |= {name: elsewhere for name in names if name not in placed}
+    _write_finished(work, best, parts, choices, why)
+    return _model(best, sources, cameras, parts, choices, why)
 
 
 def _part(report: Report, low: float, high: float) -> Report:

@@ -23,7 +23,7 @@ def main() -> None:
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
     if os.getppid() != int(sys.argv[1]):
         return
-    job = pickle.load(sys.stdin.buffer)
+    root, sources, work, config = pickle.load(sys.stdin.buffer)
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # what libraries print must not get between the answers
 
@@ -34,7 +34,7 @@ def main() -> None:
     from calibration.colmap_model import put_together
 
     try:
-        say("model", put_together(*job, lambda share, text: say("progress", (share, text))))
+        say("model", put_together(root, sources, work, config, lambda share, text: say("progress", (share, text))))
     except (AdvnerfError, OSError) as error:
         say("error", error)
 
