@@ -76,19 +76,19 @@ def test_a_stopped_run_goes_on_and_other_inputs_begin_anew(scene, tmp_path):
 
     work = tmp_path / "work"
     with pytest.raises(StoppedError):
-        reconstruct(root, sources, work, report=stop)
+        reconstruct(root, sources, work, FEW_FEATURES, stop)
     said = []
-    first = reconstruct(root, sources, work, report=lambda share, text: said.append(text))
+    first = reconstruct(root, sources, work, FEW_FEATURES, lambda share, text: said.append(text))
     assert not any(text.startswith("features") for text in said), "features were there already"
     said.clear()
-    again = reconstruct(root, sources, work, report=lambda share, text: said.append(text))
+    again = reconstruct(root, sources, work, FEW_FEATURES, lambda share, text: said.append(text))
     assert not any("placed" in text for text in said), "a finished model is read, not made again"
     np.testing.assert_array_equal(again.points, first.points)
     (work / "finished.json").unlink()
-    again = reconstruct(root, sources, work)
+    again = reconstruct(root, sources, work, FEW_FEATURES)
     np.testing.assert_allclose(again.poses, first.poses, atol=1e-9)
     said.clear()
-    reconstruct(root, sources, work, SfmConfig(max_features=1500), lambda share, text: said.append(text))
+    reconstruct(root, sources, work, SfmConfig(max_features=700), lambda share, text: said.append(text))
     assert any(text.startswith("features") for text in said)
 
 
