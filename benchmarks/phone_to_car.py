@@ -89,7 +89,7 @@ def make_scene(folder: Path, frames: int, steps: int) -> tuple[Path, str]:
     scene = folder / "scene.safetensors"
     save_scene(scene, trained.scene, trained.occupied, {"march": vars(trained.march), "steps": steps})
     match_colours(scene, data / "transforms_car.json", scene, 12)
-    total = model["registered"] + len(model["unregistered"])
+    total = model["registered"] + len(model["left_out"])
     return scene, (
         f"; {model['registered']} of {total} images of phone and car in one model, placed in the motion-capture world with "
         f"{1000 * placing['rms_position_m']:.1f} mm and {math.degrees(placing['rms_rotation_rad']):.2f} degrees rms"

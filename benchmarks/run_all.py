@@ -16,7 +16,8 @@ from pathlib import Path
 from benchmarks.results import REPOSITORY
 
 QUICK = (
-    "hash_encoding", "adjoint_gradient", "adjoint_memory", "fault_stops", "hydrant", "structure_from_motion", "training_step",
+    "hash_encoding", "adjoint_gradient", "adjoint_memory", "fault_stops", "hydrant", "structure_from_motion", "few_photographs",
+    "training_step",
 )  # fmt: skip
 LONG = ("attack_kill", "scene_kill", "adjoint_memory --compare", "newcomer")
 CAMPAIGN = (

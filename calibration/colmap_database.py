@@ -7,24 +7,25 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path, PurePosixPath
+from typing import Any
 
 import numpy as np
 
 from advnerf_core.files import write_atomically
-from advnerf_core.geometry import Pinhole
 from advnerf_core.scene.image_files import image_size
-from advnerf_core.scene.lens import Lens
+from calibration.lens_choice import FIRST_MODEL, FOCAL_RATIOS
+from calibration.photo_model import Report, SfmConfig, Source
 from calibration.photo_pairs import chosen_pairs, every_pair
 
-if TYPE_CHECKING:
-    from calibration.structure_from_motion import SfmConfig, Source
-
-Progress = Callable[[float, str], None]
 _FILE, _KEY = "database.db", "inputs.json"
-_IMAGES_AT_ONCE, _PAIRS_AT_ONCE, _MOST_TRIALS = 16, 400, 2000
+_MOST_TRIALS = 2000
+# Pairs are matched in calls of about this length, so that progress moves; each call builds its index of features again.
+_CALL_S, _FIRST_PAIRS, _MOST_PAIRS = 2.0, 8, 400
+# Raised when cameras or features are made in another way: work of before is then begun again.
+_VERSION = 2
 # Where the focal length is unknown: a phone's main camera and most others lie within a factor of two of this many image widths.
 _GUESSED_FOCAL_LENGTH = 0.9
 
@@ -67,33 +68,62 @@ def _key(root: Path, sources: Sequence[Source], config: Mapping[str, Any]) -> st
         digest.update(repr((source.camera_id, source.ordered, source.pinhole, source.lens)).encode())
         for name in source.images:
             digest.update(name.encode() + b"\0" + hashlib.sha256((root / name).read_bytes()).digest())
-    return json.dumps({"config": dict(config), "images": digest.hexdigest()}, sort_keys=True)
+    return json.dumps({"version": _VERSION, "config": dict(config), "images": digest.hexdigest()}, sort_keys=True)
 
 
 def _create(file: Path, root: Path, sources: Sequence[Source]) -> None:
-    """One camera for each source, and for each size of its images: a phone held upright counts as another camera."""
+    """One camera for each name, image size, and camera and focal length of the EXIF data; a phone held upright is another camera."""
     import pycolmap
 
     pycolmap.Database.open(file).close()
+    groups: dict[tuple[object, ...], tuple[Source, tuple[int, int], float | None, list[str]]] = {}
     for source in sources:
-        sizes: dict[tuple[int, int], list[str]] = {}
         for name in source.images:
-            sizes.setdefault(image_size(root / name), []).append(name)
-        for size, names in sizes.items():
-            options = pycolmap.ImageReaderOptions()
-            options.camera_model = "OPENCV"
-            if (params := _params(source, size)) is not None:
-                options.camera_params = ",".join(f"{value:.17g}" for value in params)
-            options.default_focal_length_factor = _GUESSED_FOCAL_LENGTH
-            with quiet():
-                pycolmap.import_images(file, root, pycolmap.CameraMode.SINGLE, names, options)
+            size, (model, focal_px) = image_size(root / name), exif(root / name)
+            key = (source.camera_id, source.pinhole, source.lens, size, model, focal_px)
+            groups.setdefault(key, (source, size, focal_px, []))[3].append(name)
+    for source, size, focal_px, names in groups.values():
+        options = pycolmap.ImageReaderOptions()
+        options.default_focal_length_factor = _GUESSED_FOCAL_LENGTH
+        options.camera_model = FIRST_MODEL if source.pinhole is None else "OPENCV"
+        if (params := _params(source, size, focal_px)) is not None:
+            options.camera_params = ",".join(f"{value:.17g}" for value in params)
+        with quiet():
+            pycolmap.import_images(file, root, pycolmap.CameraMode.SINGLE, names, options)
 
 
-def _params(source: Source, size: tuple[int, int]) -> list[float] | None:
-    if source.pinhole is None:
+def exif(path: Path) -> tuple[str | None, float | None]:
+    """Camera and focal length [px] that a photograph's EXIF data name; None for what they do not."""
+    import pycolmap
+
+    with path.open("rb") as stream:
+        if b"Exif\0" not in stream.read(1 << 16):
+            return None, None
+    with quiet():
+        bitmap = pycolmap.Bitmap.read(path, True)
+    if bitmap is None:
+        return None, None
+    focal_px = bitmap.exif_focal_length()
+    return bitmap.exif_camera_model(), float(focal_px) if focal_px else None
+
+
+def _params(source: Source, size: tuple[int, int], focal_px: float | None) -> list[float] | None:
+    width, height = size
+    if source.pinhole is not None:
+        p = source.pinhole.resized(width, height)
+        return [p.fx, p.fy, p.cx, p.cy, *source.lens.coefficients[:4]]
+    if focal_px is None or not FOCAL_RATIOS[0] <= focal_px / max(size) <= FOCAL_RATIOS[1]:
         return None
-    p = source.pinhole.resized(*size)
-    return [p.fx, p.fy, p.cx, p.cy, *source.lens.coefficients[:4]]
+    return [focal_px, 0.5 * width, 0.5 * height, 0.0]
+
+
+def exif_focal_lengths(file: Path) -> dict[int, float]:
+    """Focal lengths that the photographs name themselves [px], by COLMAP's number of the camera."""
+    import pycolmap
+
+    with pycolmap.Database.open(file) as database:
+        cameras = database.read_all_cameras()
+    return {int(c.camera_id): float(c.focal_length_x) for c in cameras if c.has_prior_focal_length}
 
 
 def held_cameras(file: Path, sources: Sequence[Source]) -> set[int]:
@@ -105,8 +135,31 @@ def held_cameras(file: Path, sources: Sequence[Source]) -> set[int]:
         return {image.camera_id for image in database.read_all_images() if image.name in known}
 
 
+def camera_names(file: Path, sources: Sequence[Source]) -> dict[int, str]:
+    """Names of COLMAP's cameras: the source's, with the image or the image size where a source has several cameras."""
+    import pycolmap
+
+    source_of = {name: source.camera_id for source in sources for name in source.images}
+    with pycolmap.Database.open(file) as database:
+        cameras = {int(camera.camera_id): camera for camera in database.read_all_cameras()}
+        images: dict[int, list[str]] = {number: [] for number in sorted(cameras)}
+        for image in database.read_all_images():
+            images[int(image.camera_id)].append(image.name)
+    of_source: dict[str, list[int]] = {}
+    for number, names in images.items():
+        of_source.setdefault(source_of[names[0]], []).append(number)
+    found: dict[int, str] = {}
+    for source, numbers in of_source.items():
+        for number in numbers:
+            camera, names = cameras[number], images[number]
+            what = PurePosixPath(names[0]).stem if len(names) == 1 else f"{camera.width}x{camera.height}"
+            name = source if len(numbers) == 1 else f"{source}/{what}"
+            found[number] = name if name not in found.values() else f"{name} (camera {number})"
+    return found
+
+
 def extract_features(
-    file: Path, root: Path, names: Sequence[str], max_features: int, peak_threshold: float, report: Progress
+    file: Path, root: Path, names: Sequence[str], max_features: int, peak_threshold: float, report: Report
 ) -> None:
     """Local features (SIFT) of all images that have none yet."""
     import pycolmap
@@ -117,13 +170,15 @@ def extract_features(
     with pycolmap.Database.open(file) as database:
         done = {image.name for image in database.read_all_images() if database.exists_descriptors(image.image_id)}
     todo = [name for name in names if name not in done]
-    for start in range(0, len(todo), _IMAGES_AT_ONCE):
-        report((len(names) - len(todo) + start) / len(names), f"features of {len(names)} images")
+    at_once = threads()
+    for start in range(0, len(todo), at_once):
+        ready = len(names) - len(todo) + start
+        report(ready / len(names), f"features of {ready} of {len(names)} images")
         with quiet():
             pycolmap.extract_features(
                 file,
                 root,
-                todo[start : start + _IMAGES_AT_ONCE],
+                todo[start : start + at_once],
                 extraction_options=options,
                 device=pycolmap.Device.cpu,
             )
@@ -145,7 +200,7 @@ def pairs_to_match(file: Path, sources: Sequence[Source], config: SfmConfig) -> 
     return [(names[i], names[j]) for i, j in pairs]
 
 
-def match(file: Path, work: Path, pairs: Sequence[tuple[str, str]], report: Progress) -> None:
+def match(file: Path, work: Path, pairs: Sequence[tuple[str, str]], seed: int, report: Report) -> None:
     """Match features of pairs and verify them by two-view geometry; pairs of an earlier run are left as they are."""
     import pycolmap
 
@@ -155,15 +210,15 @@ def match(file: Path, work: Path, pairs: Sequence[tuple[str, str]], report: Prog
     # Most pairs do not overlap, and proving that takes all the trials there are; a pair that needs more is not worth them.
     geometry.ransac.max_num_trials = _MOST_TRIALS
     listing.match_list_path = work / "pairs.txt"
-    for start in range(0, len(pairs), _PAIRS_AT_ONCE):
+    geometry.ransac.random_seed = seed
+    start, at_once = 0, _FIRST_PAIRS
+    while start < len(pairs):
         report(start / len(pairs), f"{start} of {len(pairs)} pairs of images matched")
-        chunk = pairs[start : start + _PAIRS_AT_ONCE]
-        write_atomically(work / "pairs.txt", "".join(f"{a} {b}\n" for a, b in chunk))
+        chunk, began_s = pairs[start : start + at_once], time.monotonic()
+        write_atomically(listing.match_list_path, "".join(f"{a} {b}\n" for a, b in chunk))
         with quiet():
             pycolmap.match_image_pairs(file, options, listing, geometry, pycolmap.Device.cpu)
-
-
-def intrinsics(camera: Any) -> tuple[Pinhole, Lens]:
-    """Our intrinsics of a COLMAP camera with the model OPENCV; both count pixel centres from +0.5."""
-    fx, fy, cx, cy, k1, k2, p1, p2 = (float(value) for value in camera.params)
-    return Pinhole(int(camera.width), int(camera.height), fx, fy, cx, cy), Lens((k1, k2, p1, p2, 0.0))
+        start += len(chunk)
+        rate = len(chunk) / max(time.monotonic() - began_s, 1e-3)
+        at_once = min(max(round(_CALL_S * rate), _FIRST_PAIRS), _MOST_PAIRS)
+    report(1.0, f"{len(pairs)} of {len(pairs)} pairs of images matched")

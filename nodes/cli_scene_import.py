@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import signal
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,7 +16,12 @@ if TYPE_CHECKING:
 
 app = typer.Typer()
 
-Output = Annotated[Path, typer.Option("--output", "-o", help="Folder of the data set; a stopped run goes on there.")]
+Output = Annotated[
+    Path,
+    typer.Option(
+        "--output", "-o", help="Folder of the data set, written when it is whole; a stopped run goes on in OUTPUT.part."
+    ),
+]
 Media = Annotated[list[Path], typer.Argument(help="Videos and folders of photographs.", exists=True)]
 Bag = Annotated[Path, typer.Argument(help="Bag folder, or a .mcap, .db3 or .bag file of a drive.", exists=True)]
 Most = Annotated[int, typer.Option("--most", min=3, help="At most so many images of each video, folder or bag.")]
@@ -62,7 +68,7 @@ def from_video(
 def from_images(
     media: Media, output: Output, most: Most = 300, one_camera: OneCamera = False, extent_m: ExtentM = 4.0, seed: Seed = 0
 ) -> None:  # fmt: skip
-    """Find poses and lenses of photographs; each folder is a camera, videos may join in."""
+    """Find poses and lenses of photographs; images of a folder share a camera unless size or EXIF data differ; videos may join in."""
     _from_media(media, output, 0.06, most, one_camera, extent_m, seed)
 
 
@@ -78,7 +84,7 @@ def from_bag(
     from nodes.scene_import.driven_bag import BagConfig
 
     config = BagConfig(step_m, math.radians(step_deg), most=most)
-    _run("from-bag", lambda report: run(bag, output, config, margin_m, report, calibration))
+    _run("from-bag", output, lambda report: run(bag, output, config, margin_m, report, calibration))
 
 
 @app.command("from-phone-and-car")
@@ -102,7 +108,7 @@ def from_phone_and_car(
     media_config = MediaConfig(KeyframeConfig(movement), most, one_camera)
     bag_config, placing = BagConfig(step_m, math.radians(step_deg), most=most), PlacingConfig(tolerance_m)
     _run(
-        "from-phone-and-car",
+        "from-phone-and-car", output,
         lambda report: run(media, bag, output, media_config, bag_config, SfmConfig(seed=seed), placing, report, calibration),
     )  # fmt: skip
 
@@ -134,14 +140,28 @@ def _from_media(
     from nodes.scene_import.media import MediaConfig
 
     config = MediaConfig(KeyframeConfig(movement), most, one_camera)
-    _run("from-media", lambda report: run(media, output, config, SfmConfig(seed=seed), extent_m, report))
+    _run("from-media", output, lambda report: run(media, output, config, SfmConfig(seed=seed), extent_m, report))
 
 
-def _run(name: str, work: Any) -> None:
+def _run(name: str, output: Path, work: Any) -> None:
     from nodes.runtime.progress import ProgressDisplay
+    from nodes.runtime.terminal import say_error
+    from nodes.runtime.termination import ends_in_order
+    from nodes.scene_import.staging import work_folder
 
-    with ProgressDisplay() as display:
-        imported: Imported = work(display.start(name))
+    code = 0
+    try:
+        with ends_in_order(), ProgressDisplay() as display:
+            imported: Imported = work(display.start(name))
+    except KeyboardInterrupt:
+        code = 128 + signal.SIGINT
+    except SystemExit as asked:
+        code = int(asked.code or 0)
+    if code:
+        kept = work_folder(output)
+        going_on = f"finished work is kept in {kept}, and the same command goes on there"
+        say_error(f"stopped; {going_on if kept.exists() else 'nothing is left behind'}")
+        raise typer.Exit(code)
     _print_report(imported)
 
 
@@ -153,17 +173,7 @@ def _print_report(imported: Imported) -> None:
             + (f"; unchecked: {facts['unchecked']}" if facts.get("unchecked") else "")
         )
     if model := facts.get("structure_from_motion"):
-        rows = table("camera", "images", "fl_x", "fl_y", "k1, k2, p1, p2")
-        for camera, found in model["cameras"].items():
-            k = ", ".join(f"{value:.4f}" for value in found["distortion"][:4])
-            rows.add_row(camera, str(found["registered"]), f"{found['fl_x']:.1f}", f"{found['fl_y']:.1f}", k)
-        print_table(rows)
-        total = model["registered"] + len(model["unregistered"])
-        print(
-            f"{model['registered']} of {total} images placed, {model['points']} points, reprojection error {model['reprojection_error_px']:.2f} px"
-        )
-        if model["unregistered"]:
-            print(f"not placed: {', '.join(model['unregistered'])}")
+        _print_model(model)
     if placing := facts.get("placing"):
         print(
             f"placed in the motion-capture world by {placing['inliers']} of {placing['cameras']} frames of the car: scale {placing['scale']:.4f}, "
@@ -171,3 +181,21 @@ def _print_report(imported: Imported) -> None:
         )
     print(f"scale: {facts['scale']}")
     print("\n".join(str(path) for path in imported.transforms))
+
+
+def _print_model(model: dict[str, Any]) -> None:
+    rows = table("camera", "images", "lens", "focal length [px]", "k1, k2, p1, p2")
+    for camera, found in model["cameras"].items():
+        focal = f"{found['fl_x']:.1f}" + (f", {found['fl_y']:.1f}" if found["fl_y"] != found["fl_x"] else "")
+        error = f" +- {found['focal_error_percent']:.1f} %" if found["focal_error_percent"] else ""
+        k = ", ".join(f"{value:.4f}" for value in found["distortion"][:4])
+        rows.add_row(camera, str(found["registered"]), found["model"], focal + error, k)
+    print_table(rows)
+    for camera, found in model["cameras"].items():
+        print(f"{camera}: {found['model']}: {found['why']}")
+    total = model["registered"] + len(model["left_out"])
+    print(
+        f"{model['registered']} of {total} images placed, {model['points']} points, reprojection error {model['reprojection_error_px']:.2f} px"
+    )
+    for image in model["left_out"]:
+        print(f"left out: {image['name']}: {image['why']}")

@@ -18,6 +18,7 @@ Grey = NDArray[np.uint8]
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 OPAQUE = 255
+_ORIENTATION_TAG = 0x0112
 _JPEG, _PNG = b"\xff\xd8", b"\x89PNG\r\n\x1a\n"
 
 
@@ -86,6 +87,30 @@ def read_bytes(path: Path) -> bytes:
     """The file's content; what stands in the way is one error."""
     with _open(path) as stream:
         return stream.read()
+
+
+def upright_exif(data: bytes) -> bytes:
+    """The EXIF segment of a JPEG file for a copy whose pixels were turned upright: the orientation in it is 1; empty without EXIF."""
+    at = 2
+    while data.startswith(_JPEG) and at + 4 <= len(data) and data[at] == 0xFF and data[at + 1] != 0xDA:
+        end = at + 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+        if data[at + 1] == 0xE1 and data[at + 4 : at + 10] == b"Exif\0\0":
+            return data[at : at + 10] + _with_orientation_1(data[at + 10 : end])
+        at = end
+    return b""
+
+
+def _with_orientation_1(tiff: bytes) -> bytes:
+    order, changed = "<" if tiff[:2] == b"II" else ">", bytearray(tiff)
+    try:
+        (directory,) = struct.unpack_from(f"{order}I", tiff, 4)
+        (entries,) = struct.unpack_from(f"{order}H", tiff, directory)
+        for at in range(directory + 2, directory + 2 + 12 * entries, 12):
+            if struct.unpack_from(f"{order}H", tiff, at)[0] == _ORIENTATION_TAG:
+                struct.pack_into(f"{order}H", changed, at + 8, 1)
+    except struct.error:
+        return tiff  # damaged: readers ignore it
+    return bytes(changed)
 
 
 def _first_scan(data: bytes) -> int | None:

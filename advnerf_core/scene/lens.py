@@ -173,6 +173,7 @@ def _cannot_be_undone(pinhole: Pinhole, lens: Lens) -> DatasetError:
     kind = "OPENCV_FISHEYE k1, k2, k3, k4" if lens.fisheye else "OPENCV k1, k2, p1, p2, k3"
     return DatasetError(
         f"expected a distortion that can be undone over the whole image, got {kind} = "
-        f"{', '.join(f'{c:.4g}' for c in lens.coefficients)} at {pinhole.width} x {pinhole.height}, fl_x {pinhole.fx:.1f}: they "
-        "fold the border over itself; calibrate again with pictures that reach the corners, or undistort the images first"
+        f"{', '.join(f'{c:.4g}' for c in lens.coefficients)} at {pinhole.width} x {pinhole.height}, fl_x {pinhole.fx:.1f}; "
+        "no camera has such a lens, so its poses are doubtful too. Remove the frames of this camera from the file, or find its poses and lens "
+        "again: `advnerf scene from-images FOLDER -o NEW_FOLDER` takes the simplest lens that fits and leaves out such cameras by name"
     )

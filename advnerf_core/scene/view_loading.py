@@ -96,7 +96,8 @@ def _straightened(
     try:
         lens = straightening(pinhole, frame.lens, keep_all)
     except DatasetError as error:
-        raise DatasetError(f"{frame.path}: {error}") from error
+        camera = f" (camera {frame.camera_id})" if frame.camera_id else ""
+        raise DatasetError(f"{frame.path}{camera}: {error}") from error
     if alpha is not None:
         rgb, alpha = _unpremultiplied(*(lens.apply(plane) for plane in _premultiplied(rgb, alpha)))
     else:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,10 +21,16 @@ from nodes.runtime.stages import Report
 from nodes.scene_import.driven_bag import CAR_CAMERA, BagConfig, DrivenFrames, take_frames
 from nodes.scene_import.errors import ImportRecordingError
 from nodes.scene_import.media import IMAGES, MediaConfig, gather
+from nodes.scene_import.staging import (
+    COLMAP,
+    REPORT_FILE,
+    TRANSFORMS,
+    TRANSFORMS_CAR,
+    TRANSFORMS_PHONE,
+    build_beside,
+)
 
-TRANSFORMS, REPORT_FILE, COLMAP = "transforms.json", "import.json", "colmap"
 _MEDIA_SHARE = 0.3
-_CLAIM = ".made_by_advnerf"
 _BOX_PERCENT, _BOX_MARGIN = 0.5, 0.05
 # Against the spread of the x axes: small, so that they decide as soon as the cameras have turned a little.
 _LEVEL_WEIGHT = 0.005
@@ -42,6 +48,10 @@ class Imported:
     transforms: tuple[Path, ...]
     report: dict[str, Any]
 
+    def moved_to(self, folder: Path) -> Imported:
+        """The same in another folder."""
+        return replace(self, transforms=tuple(folder / path.name for path in self.transforms))
+
 
 def from_media(
     media: Sequence[Path], output: Path, media_config: MediaConfig, sfm: SfmConfig, extent_m: float, report: Report
@@ -54,9 +64,17 @@ def from_media(
         media_config: Which frames.
         sfm: How they are put together.
         extent_m: Largest distance between two places the photographs were taken from [m].
-        report: Told of the progress.
+        report: Progress callback.
     """
-    _claim(output, media)
+    imported = build_beside(
+        output, media, lambda folder: _from_media(media, folder, media_config, sfm, extent_m, report)
+    )
+    return imported.moved_to(output)
+
+
+def _from_media(
+    media: Sequence[Path], output: Path, media_config: MediaConfig, sfm: SfmConfig, extent_m: float, report: Report
+) -> Imported:
     sources = gather(media, output, media_config, lambda share, text="": report(_MEDIA_SHARE * share, text))
     model = _reconstruct(output, sources, sfm, report)
     similarity = upright(model, extent_m)
@@ -79,10 +97,18 @@ def from_bag(
         output: Folder of the data set.
         config: Which frames.
         margin_m: How far the scene reaches beyond the camera's way [m].
-        report: Told of the progress.
+        report: Progress callback.
         calibration: The camera's file; None takes the bag's.
     """
-    _claim(output)
+    imported = build_beside(
+        output, (), lambda folder: _from_bag(bag, folder, config, margin_m, report, calibration), resumes=False
+    )
+    return imported.moved_to(output)
+
+
+def _from_bag(
+    bag: Path, output: Path, config: BagConfig, margin_m: float, report: Report, calibration: Path | None
+) -> Imported:
     frames = take_frames(bag, output / IMAGES / CAR_CAMERA, config, report, calibration)
     positions = frames.T_world_from_camera[:, :3, 3]
     facts = {"bag": str(bag), **_bag_facts(frames), "scale": "metric: motion capture"}
@@ -101,7 +127,17 @@ def from_phone_and_car(
     ``transforms.json`` holds all registered images with the model's poses, ``transforms_phone.json`` only the phone's (to learn a
     scene from), ``transforms_car.json`` all frames of the car with their motion-capture poses (to fit colours and to compare).
     """
-    _claim(output, media)
+    imported = build_beside(
+        output, media,
+        lambda folder: _from_phone_and_car(media, bag, folder, media_config, bag_config, sfm, placing, report, calibration),
+    )  # fmt: skip
+    return imported.moved_to(output)
+
+
+def _from_phone_and_car(
+    media: Sequence[Path], bag: Path, output: Path, media_config: MediaConfig, bag_config: BagConfig, sfm: SfmConfig,
+    placing: PlacingConfig, report: Report, calibration: Path | None,
+) -> Imported:  # fmt: skip
     frames = take_frames(
         bag, output / IMAGES / CAR_CAMERA, bag_config, lambda share, text="": report(0.1 * share, text), calibration
     )
@@ -145,21 +181,6 @@ def upright(model: Model, extent_m: float) -> Similarity:
     return Similarity(scale, make_transform(R, -scale * R @ middle))
 
 
-def _claim(output: Path, media: Sequence[Path] = ()) -> None:
-    """Images there are replaced and removed, so they must be ours: no photograph of a person is ever touched."""
-    images = output / IMAGES
-    inside = [path for path in media if path.resolve().is_relative_to(images.resolve())]
-    if inside:
-        raise ImportRecordingError(
-            f"expected media outside {images}, where the data set keeps its own copies, got {inside[0]}; give another --output"
-        )
-    if images.exists() and any(images.iterdir()) and not (images / _CLAIM).exists():
-        raise ImportRecordingError(
-            f"expected a new folder or one of an earlier import, but {images} holds other files; give another --output"
-        )
-    write_atomically(images / _CLAIM, "Images in this folder are copies; an import replaces and removes them.\n")
-
-
 def _reconstruct(output: Path, sources: Sequence[Source], sfm: SfmConfig, report: Report) -> Model:
     return reconstruct(
         output, sources, output / COLMAP, sfm, lambda share, text: report(_MEDIA_SHARE + (1.0 - _MEDIA_SHARE) * share, text)
@@ -180,7 +201,7 @@ def _write_joint(output: Path, model: Model, placed: Placed, frames: DrivenFrame
         raise ImportRecordingError(
             "expected images of the phone in one model with the car's, got none; film at the car's height along its track too"
         )
-    paths = (output / TRANSFORMS, output / "transforms_phone.json", output / "transforms_car.json")
+    paths = (output / TRANSFORMS, output / TRANSFORMS_PHONE, output / TRANSFORMS_CAR)
     _write_model(paths[0], output, model, poses, everything, extra)
     _write_model(paths[1], output, model, poses, phone, extra)
     _write_car(paths[2], frames, extra)

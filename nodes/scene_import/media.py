@@ -133,7 +133,9 @@ def _copy(file: Path, copy: Path) -> None:
         as_stored = cv2.imdecode(raw, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
         upright = cv2.imdecode(raw, cv2.IMREAD_COLOR)
         if as_stored is not None and upright is not None and not np.array_equal(as_stored, upright):
-            data = cv2.imencode(".jpg", upright, [cv2.IMWRITE_JPEG_QUALITY, video.JPEG_QUALITY])[1].tobytes()
+            turned = cv2.imencode(".jpg", upright, [cv2.IMWRITE_JPEG_QUALITY, video.JPEG_QUALITY])[1].tobytes()
+            # The camera and its focal length are in the EXIF data, and structure from motion wants them.
+            data = turned[:2] + image_files.upright_exif(data) + turned[2:]
     write_atomically(copy, data)
     now = file.stat()
     os.utime(copy, ns=(now.st_atime_ns, max(now.st_mtime_ns, copy.stat().st_mtime_ns)))

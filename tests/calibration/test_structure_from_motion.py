@@ -1,63 +1,24 @@
 """Structure from motion on photographs whose poses and lens are known: a box's inner corner with painted walls."""
 
+from pathlib import Path
+
 import cv2
 import numpy as np
+import psutil
 import pytest
+from PIL import Image
 
 from advnerf_core.geometry import Pinhole, look_at
 from advnerf_core.scene.image_files import image_size
 from advnerf_core.scene.lens import Lens
 from advnerf_core.scene.similarity import align_poses
+from benchmarks.painted_corner import WALL_M, WALLS, photograph, poses_of, some_camera, write_photographs
 from calibration.structure_from_motion import ReconstructionError, SfmConfig, Source, reconstruct
 
 PHONE = Pinhole(400, 300, 330.0, 330.0, 200.0, 150.0)
 CAR = Pinhole(320, 200, 210.0, 210.0, 160.0, 100.0)
+FEW_FEATURES = SfmConfig(max_features=1200)
 PHONE_LENS, CAR_LENS = Lens((-0.12, 0.03, 0.0, 0.0, 0.0)), Lens()
-WALL_M = 3.0
-
-
-def painting(seed):
-    """Random blocks of several sizes: corners at every scale."""
-    rng = np.random.default_rng(seed)
-    image = np.zeros((900, 900, 3), np.float32)
-    for cells, weight in ((9, 0.4), (30, 0.35), (90, 0.25)):
-        blocks = rng.uniform(0.0, 255.0, (cells, cells, 3)).astype(np.float32)
-        image += weight * cv2.resize(blocks, (900, 900), interpolation=cv2.INTER_NEAREST)
-    return cv2.GaussianBlur(image, (0, 0), 1.0)
-
-
-WALLS = [painting(seed) for seed in range(3)]
-
-
-def photograph(T_world_from_camera, pinhole, lens):
-    """Cast a ray through every pixel of the distorted image onto the planes x = 0, y = 0, z = 0."""
-    columns, rows = np.meshgrid(np.arange(pinhole.width, dtype=float), np.arange(pinhole.height, dtype=float))
-    matrix = pinhole.matrix.copy()
-    matrix[:2, 2] -= 0.5
-    pixels = np.stack([columns, rows], axis=-1).reshape(-1, 1, 2)
-    straight = cv2.undistortPoints(pixels, matrix, np.array(lens.coefficients)).reshape(-1, 2)
-    directions = np.column_stack([straight, np.ones(len(straight))]) @ T_world_from_camera[:3, :3].T
-    origin, image, nearest = T_world_from_camera[:3, 3], np.zeros((len(straight), 3)), np.full(len(straight), np.inf)
-    for axis in range(3):
-        with np.errstate(divide="ignore"):
-            distance = -origin[axis] / directions[:, axis]
-        u, v = ((origin + distance[:, None] * directions)[:, other] for other in range(3) if other != axis)
-        hit = (distance > 0) & (distance < nearest) & (u >= 0) & (u < WALL_M) & (v >= 0) & (v < WALL_M)
-        nearest[hit] = distance[hit]
-        maps = ((900 / WALL_M * each[hit]).astype(np.float32).reshape(-1, 1) for each in (u, v))
-        # In rows of one pixel; OpenCV's maps may not be longer than 32767.
-        x, y = maps
-        parts = [
-            cv2.remap(WALLS[axis], a, b, cv2.INTER_LINEAR)
-            for a, b in zip(np.array_split(x, 8), np.array_split(y, 8), strict=True)
-        ]
-        image[hit] = np.concatenate(parts).reshape(-1, 3)
-    return np.rint(image).clip(0, 255).astype(np.uint8).reshape(pinhole.height, pinhole.width, 3)
-
-
-def poses_of(count, radius, height, first, last):
-    angles = np.linspace(first, last, count)
-    return [look_at([radius * np.cos(a), radius * np.sin(a), height], [0.7, 0.7, 0.6]) for a in angles]
 
 
 @pytest.fixture(scope="module")
@@ -82,6 +43,7 @@ def scene(tmp_path_factory):
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(400)
 def test_poses_and_lens_of_two_cameras_are_found(scene):
     root, sources, truth = scene
     model = reconstruct(root, sources, root / "work")
@@ -101,6 +63,7 @@ def test_poses_and_lens_of_two_cameras_are_found(scene):
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(400)
 def test_a_stopped_run_goes_on_and_other_inputs_begin_anew(scene, tmp_path):
     root, sources, _ = scene
 
@@ -113,23 +76,24 @@ def test_a_stopped_run_goes_on_and_other_inputs_begin_anew(scene, tmp_path):
 
     work = tmp_path / "work"
     with pytest.raises(StoppedError):
-        reconstruct(root, sources, work, report=stop)
+        reconstruct(root, sources, work, FEW_FEATURES, stop)
     said = []
-    first = reconstruct(root, sources, work, report=lambda share, text: said.append(text))
+    first = reconstruct(root, sources, work, FEW_FEATURES, lambda share, text: said.append(text))
     assert not any(text.startswith("features") for text in said), "features were there already"
     said.clear()
-    again = reconstruct(root, sources, work, report=lambda share, text: said.append(text))
+    again = reconstruct(root, sources, work, FEW_FEATURES, lambda share, text: said.append(text))
     assert not any("placed" in text for text in said), "a finished model is read, not made again"
     np.testing.assert_array_equal(again.points, first.points)
     (work / "finished.json").unlink()
-    again = reconstruct(root, sources, work)
+    again = reconstruct(root, sources, work, FEW_FEATURES)
     np.testing.assert_allclose(again.poses, first.poses, atol=1e-9)
     said.clear()
-    reconstruct(root, sources, work, SfmConfig(max_features=1500), lambda share, text: said.append(text))
+    reconstruct(root, sources, work, SfmConfig(max_features=700), lambda share, text: said.append(text))
     assert any(text.startswith("features") for text in said)
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(400)
 def test_photographs_without_overlap_are_refused_with_what_to_do(tmp_path):
     rng = np.random.default_rng(0)
     for k in range(4):
@@ -137,6 +101,110 @@ def test_photographs_without_overlap_are_refused_with_what_to_do(tmp_path):
         cv2.imwrite(str(tmp_path / f"{k}.png"), cv2.resize(blocks, (400, 300), interpolation=cv2.INTER_NEAREST))
     with pytest.raises(ReconstructionError, match=r"could not put any two together; they need overlap"):
         reconstruct(tmp_path, [Source("phone", tuple(f"{k}.png" for k in range(4)))], tmp_path / "work")
+
+
+def true_focal_lengths(model, truth):
+    return np.array([image.pinhole.fx / truth[image.name][1].fx - 1.0 for image in model.images])
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(400)
+def test_ten_photographs_by_ten_cameras_have_ten_sane_lenses(tmp_path):
+    rng, poses = np.random.default_rng(1), poses_of(10, 2.6, 1.4, 0.2, 1.37)
+    truth = write_photographs(tmp_path, poses, [some_camera(rng, 460) for _ in poses])
+    said = []
+    model = reconstruct(
+        tmp_path,
+        [Source("photos", tuple(truth))],
+        tmp_path / "work",
+        report=lambda share, text: said.append((share, text)),
+    )
+    assert len(model.images) >= 8
+    assert np.abs(true_focal_lengths(model, truth)).max() < 0.05
+    assert {image.name for image in model.images} | set(model.unregistered) == set(truth)
+    listed = {camera.camera_id: camera for camera in model.cameras}
+    assert [image.camera_id for image in model.images] == list(listed), "each by its own name"
+    assert set(listed) <= {f"photos/{index:02d}" for index in range(10)}
+    assert {camera.model for camera in model.cameras} <= {"SIMPLE_PINHOLE", "SIMPLE_RADIAL"}, (
+        "one image supports no more"
+    )
+    assert all("RADIAL needs 5 images" in camera.why for camera in model.cameras)
+    assert all(0.0 < camera.focal_error_percent < 5.0 for camera in model.cameras)
+    assert set(model.summary()["cameras"]) == set(listed)
+    shares = [share for share, _ in said]
+    assert shares == sorted(shares), "progress never goes back"
+    pairs = {text for _, text in said if text.endswith("of 45 pairs of images matched")}
+    assert len(pairs) >= 4, "progress moves while pairs are matched"
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(400)
+def test_eleven_photographs_by_one_camera_give_its_focal_length(tmp_path):
+    pinhole = Pinhole(480, 320, 450.0, 450.0, 240.0, 160.0)
+    poses = poses_of(11, 2.6, 1.4, 0.2, 1.37)
+    truth = write_photographs(tmp_path, poses, [(pinhole, Lens((-0.08, 0.02, 0.0, 0.0, 0.0)))] * 11)
+    names = tuple(truth)
+    # Two folders, but one camera: they share its lens.
+    sources = [Source("camera", names[:6]), Source("camera", names[6:])]
+    model = reconstruct(tmp_path, sources, tmp_path / "work", FEW_FEATURES)
+    assert model.unregistered == ()
+    assert [(camera.camera_id, camera.images) for camera in model.cameras] == [("camera", 11)]
+    assert np.abs(true_focal_lengths(model, truth)).max() < 0.01
+    assert model.images[0].lens.coefficients[0] == pytest.approx(-0.08, abs=0.03)
+
+
+def with_exif(folder, name, focal_length_35mm):
+    """The photograph as a JPEG file whose EXIF data name a camera and its focal length."""
+    image = Image.open(folder / name)
+    exif = Image.Exif()
+    exif[0x010F], exif[0x0110] = "Maker", "Model"
+    exif.get_ifd(0x8769)[0x920A], exif.get_ifd(0x8769)[0xA405] = 5.0, focal_length_35mm
+    image.save((folder / name).with_suffix(".jpg"), quality=95, exif=exif)
+    (folder / name).unlink()
+    return str(Path(name).with_suffix(".jpg"))
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(400)
+@pytest.mark.parametrize("knows_itself", [False, True])
+def test_a_camera_whose_lens_cannot_be_told_is_left_out_by_name_or_held_at_its_exif_focal_length(
+    tmp_path, knows_itself
+):
+    """Seen square on, a wall says nothing about the focal length: a longer one from farther off gives the same picture."""
+    common = Pinhole(400, 300, 380.0, 380.0, 200.0, 150.0)
+    square_on = Pinhole(360, 360, 500.0, 500.0, 180.0, 180.0)
+    poses = [*poses_of(5, 2.6, 1.4, 0.4, 1.17), look_at([2.6, 1.1, 1.2], [0.0, 1.1, 1.2])]
+    truth = write_photographs(tmp_path, poses, [(common, Lens())] * 5 + [(square_on, Lens())])
+    names, last = list(truth), "05.png"
+    if knows_itself:
+        names[-1] = last = with_exif(
+            tmp_path, last, round(43.27 * 500.0 / np.hypot(360.0, 360.0))
+        )  # by the diagonal of the film
+    model = reconstruct(tmp_path, [Source("photos", tuple(names))], tmp_path / "work", FEW_FEATURES)
+    cameras = {camera.camera_id: camera for camera in model.cameras}
+    assert cameras["photos/400x300"].pinhole.fx == pytest.approx(380.0, rel=0.01)
+    if knows_itself:
+        assert model.left_out == ()
+        assert "EXIF focal length, held" in cameras["photos/05"].why
+        assert cameras["photos/05"].pinhole.fx == pytest.approx(500.0, rel=0.05)
+    else:
+        assert model.unregistered == (last,)
+        assert "focal length is only known within" in model.left_out[0].why
+    # What was finished says the same again.
+    again = reconstruct(tmp_path, [Source("photos", tuple(names))], tmp_path / "work", FEW_FEATURES)
+    assert (again.left_out, again.cameras) == (model.left_out, model.cameras)
+
+
+def test_a_process_of_colmap_that_is_killed_is_one_error(tmp_path):
+    poses = poses_of(3, 2.6, 1.4, 0.2, 0.4)
+    truth = write_photographs(tmp_path, poses, [(PHONE, Lens())] * 3)
+
+    def kill(share, text):
+        for child in psutil.Process().children():
+            child.kill()
+
+    with pytest.raises(ReconstructionError, match=r"was ended by SIGKILL .* run the command again to go on"):
+        reconstruct(tmp_path, [Source("photos", tuple(truth))], tmp_path / "work", report=kill)
 
 
 def test_what_cannot_begin_is_refused_at_once(tmp_path):

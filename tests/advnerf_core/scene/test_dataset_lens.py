@@ -82,6 +82,15 @@ def test_a_lens_wider_than_a_pinhole_is_cropped_to_what_one_can_hold():
     assert 0.5 * 400 / straight.pinhole.fx == pytest.approx(np.tan(np.deg2rad(70.0)), rel=0.01)
 
 
+def test_an_absurd_lens_is_refused_with_its_camera_and_advice_that_can_be_followed(tmp_path):
+    frame = {"file_path": "a.png", "transform_matrix": np.eye(4).tolist(), "camera_id": "ten/03"}
+    file = write(tmp_path, k1=-3.0, k2=-1.6e8, frames=[frame])
+    with pytest.raises(
+        DatasetError, match=r"a\.png \(camera ten/03\): .*Remove the frames of this camera .*from-images"
+    ):
+        load_transforms(file).load()
+
+
 def test_coefficients_that_fold_the_image_are_refused():
     with pytest.raises(DatasetError, match=r"distortion that can be undone.*k1, k2.*= -3, 0"):
         straightening(PINHOLE, Lens((-3.0, 0.0, 0.0, 0.0, 0.0)))

@@ -1,0 +1,176 @@
+"""COLMAP's part of structure from motion; runs in a process of its own, see `calibration.structure_from_motion`."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from advnerf_core.files import write_atomically
+from advnerf_core.geometry import Array
+from calibration import colmap_database as database
+from calibration.lens_choice import FOCAL_RATIOS, Choice, choose_lenses, intrinsics
+from calibration.photo_model import (
+    MIN_IMAGES,
+    FoundCamera,
+    LeftOut,
+    Model,
+    ReconstructionError,
+    Registered,
+    Report,
+    SfmConfig,
+    Source,
+)
+
+# Shares of the wall time, roughly: features, matches, poses, lenses.
+_FEATURES_UNTIL, _MATCHES_UNTIL, _POSES_UNTIL = 0.25, 0.65, 0.93
+_FINISHED = "finished.json"
+_SHOWN_NAMES = 5
+
+
+def put_together(root: Path, sources: Sequence[Source], work: Path, config: SfmConfig, report: Report) -> Model:
+    """Put photographs together; see `calibration.structure_from_motion.reconstruct`."""
+    names = [name for source in sources for name in source.images]
+    file = database.open_work(root, work, sources, asdict(config))
+    cameras = database.camera_names(file, sources)
+    model = _read_finished(work, sources, cameras)
+    if model is None:
+        model = _find_model(file, root, work, sources, cameras, config, report)
+    _require_enough(model, names, config)
+    return model
+
+
+def _find_model(
+    file: Path, root: Path, work: Path, sources: Sequence[Source], cameras: Mapping[int, str], config: SfmConfig, report: Report
+) -> Model:  # fmt: skip
+    names = [name for source in sources for name in source.images]
+    database.extract_features(
+        file, root, names, config.max_features, config.peak_threshold, _part(report, 0.0, _FEATURES_UNTIL)
+    )
+    pairs = database.pairs_to_match(file, sources, config)
+    database.match(file, work, pairs, config.seed, _part(report, _FEATURES_UNTIL, _MATCHES_UNTIL))
+    held = database.held_cameras(file, sources)
+    best, parts = _map(file, root, work, held, len(names), config, _part(report, _MATCHES_UNTIL, _POSES_UNTIL))
+    placed = {image.name for image in best.images.values() if image.has_pose}
+    choices, why = choose_lenses(best, held, database.exif_focal_lengths(file), _part(report, _POSES_UNTIL, 1.0))
+    elsewhere = "it could not be placed: too little overlap with the others, or blur"
+    why |= {name: elsewhere for name in names if name not in placed}
+    _write_finished(work, best, parts, choices, why)
+    return _model(best, sources, cameras, parts, choices, why)
+
+
+def _part(report: Report, low: float, high: float) -> Report:
+    return lambda share, text: report(low + (high - low) * share, text)
+
+
+def _map(
+    file: Path, root: Path, work: Path, held: set[int], total: int, config: SfmConfig, report: Report
+) -> tuple[Any, int]:
+    """The largest of the models that COLMAP finds, and how many it finds."""
+    import pycolmap
+
+    sparse, placed = work / "sparse", 0
+    options = pycolmap.IncrementalPipelineOptions()
+    options.random_seed, options.extract_colors = config.seed, False
+    options.num_threads = 1  # sums over threads in another order end in another model
+    options.constant_cameras = held
+    options.min_focal_length_ratio, options.max_focal_length_ratio = FOCAL_RATIOS
+    # Indoors walls are smooth: COLMAP's own limits, made for buildings outdoors, would leave many a photograph out.
+    options.mapper.init_min_num_inliers, options.mapper.abs_pose_min_num_inliers = 60, 15
+
+    def one_more() -> None:
+        nonlocal placed
+        placed = min(placed + 1, total)  # images of a part that is given up are counted again
+        report(placed / total, f"{placed} of {total} images placed")
+
+    shutil.rmtree(sparse, ignore_errors=True)
+    sparse.mkdir()
+    pycolmap.set_random_seed(config.seed)
+    with database.quiet():
+        found = pycolmap.incremental_mapping(file, root, sparse, options, next_image_callback=one_more)
+    if not found:
+        raise ReconstructionError(
+            f"expected {total} photographs of one scene, could not put any two together; they need overlap (every spot in three "
+            "photographs), texture, and movement of the camera between them, not only turning"
+        )
+    best = max(found, key=lambda number: (found[number].num_reg_images(), found[number].num_points3D()))
+    return found[best], len(found)
+
+
+def _write_finished(
+    work: Path, reconstruction: Any, parts: int, choices: Mapping[int, Choice], why: Mapping[str, str]
+) -> None:
+    folder = work / "sparse" / "chosen"
+    folder.mkdir()
+    reconstruction.write(folder)
+    record = {
+        "parts": parts,
+        "choices": {number: asdict(choice) for number, choice in choices.items()},
+        "why": dict(why),
+    }
+    write_atomically(work / _FINISHED, json.dumps(record, indent=1))
+
+
+def _read_finished(work: Path, sources: Sequence[Source], cameras: Mapping[int, str]) -> Model | None:
+    import pycolmap
+
+    if not (work / _FINISHED).exists():
+        return None
+    record = json.loads((work / _FINISHED).read_text())
+    choices = {int(number): Choice(**choice) for number, choice in record["choices"].items()}
+    reconstruction = pycolmap.Reconstruction(work / "sparse" / "chosen")
+    return _model(reconstruction, sources, cameras, record["parts"], choices, record["why"])
+
+
+def _model(
+    reconstruction: Any,
+    sources: Sequence[Source],
+    camera_ids: Mapping[int, str],
+    parts: int,
+    choices: Mapping[int, Choice],
+    why: Mapping[str, str],
+) -> Model:
+    names = [name for source in sources for name in source.images]
+    by_name = {image.name: image for image in reconstruction.images.values() if image.has_pose}
+    registered = []
+    for name in (name for name in names if name in by_name):
+        image = by_name[name]
+        T = np.eye(4)
+        T[:3] = image.cam_from_world().inverse().matrix()
+        pinhole, lens = intrinsics(image.camera)
+        registered.append(Registered(name, camera_ids[image.camera_id], T, pinhole, lens, image.num_points3D))
+    points = [
+        p.xyz for _, p in sorted(reconstruction.points3D.items(), key=lambda item: item[0]) if p.track.length() >= 3
+    ]
+    cameras = []
+    for number in dict.fromkeys(by_name[image.name].camera_id for image in registered):
+        choice, images = choices[number], sum(image.camera_id == camera_ids[number] for image in registered)
+        found = intrinsics(reconstruction.cameras[number])
+        cameras.append(
+            FoundCamera(camera_ids[number], images, choice.model, choice.why, *found, choice.focal_error_percent)
+        )
+    left_out = tuple(LeftOut(name, why[name]) for name in names if name not in by_name)
+    error_px = float(reconstruction.compute_mean_reprojection_error())
+    return Model(tuple(registered), left_out, _array(points), error_px, parts, tuple(cameras))
+
+
+def _array(points: Sequence[NDArray[np.float64]]) -> Array:
+    return np.array(points, np.float64).reshape(-1, 3)
+
+
+def _require_enough(model: Model, names: Sequence[str], config: SfmConfig) -> None:
+    needed = max(MIN_IMAGES, int(np.ceil(config.min_registered_share * len(names))))
+    if len(model.images) >= needed:
+        return
+    shown = "; ".join(f"{image.name}: {image.why}" for image in model.left_out[:_SHOWN_NAMES])
+    more = "; ..." if len(model.left_out) > _SHOWN_NAMES else ""
+    raise ReconstructionError(
+        f"expected at least {needed} of {len(names)} images in one model, got {len(model.images)} ({model.parts} separate parts; not in "
+        f"it: {shown}{more}); take more photographs between the parts, from places that see both, with less blur"
+    )
