@@ -29,7 +29,7 @@ from advnerf_core.attack.adjoint import adjoint_gradient
 from advnerf_core.fields.summed_levels import with_summed_levels
 from advnerf_core.fields.voxel_grid import VoxelGridObject
 from advnerf_core.geometry import make_transform, rotation_z
-from advnerf_core.objects.fit import PosedRgba
+from advnerf_core.objects.pictures import PosedRgba
 from advnerf_core.objects.generators import GENERATORS
 from advnerf_core.objects.mesh import SurfaceMesh, load_mesh, stand
 from advnerf_core.objects.model import ObjectModel
