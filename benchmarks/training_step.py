@@ -59,7 +59,7 @@ class Batch:
         pixels = rng.integers(0, images.rgb[..., 0].size, rays)
         pixel_rays(pixels, images.rgb, poses, intrinsics, self.rays, self.colours)
         self.jitter = rng.random(rays, dtype=np.float32)
-        march = trainer.config.march
+        march = trainer.march
         self.marcher = Marcher(rays * march.max_samples * 2, march, field.box_high)
         self.skipping = leap_distances(trainer.occupied(), trainer.occupancy.cells)
         everywhere = np.ones(trainer.occupancy.shape, np.bool_)
