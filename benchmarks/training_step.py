@@ -8,12 +8,12 @@ first, as in any training.
 from __future__ import annotations
 
 import argparse
-from dataclasses import replace
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
+from advnerf_core.driving.policy_view import PolicyView
 from advnerf_core.fields.hash_grid import HashGrid, encode_reference
 from advnerf_core.parallel import thread_count
 from advnerf_core.render.march import Marcher
@@ -21,6 +21,7 @@ from advnerf_core.render.occupancy import Leaps, leap_distances
 from advnerf_core.render.rays import intrinsics_row, pixel_rays, poses_in_box
 from advnerf_core.scene.dataset import ImageSet
 from advnerf_core.scene.field import SceneField, SceneFieldConfig
+from advnerf_core.scene.intervals import pixel_intervals
 from advnerf_core.scene.torch_step import TorchStep
 from advnerf_core.scene.train import TrainConfig, Trainer
 from advnerf_core.scene.train_step import CpuStep
@@ -134,7 +135,9 @@ def photograph_lab(count: int) -> tuple[ImageSet, SceneFieldConfig]:
 
 def prepare(images: ImageSet, field: SceneFieldConfig, steps: int, rays: int) -> tuple[Batch, CpuStep, TorchStep]:
     """A batch, and the two ways to take a step on it from the same state of training."""
-    trainer = Trainer(images, field, replace(TrainConfig(steps=steps), backend="numba"))
+    view = PolicyView(LabConfig().camera.pinhole).pinhole
+    config = TrainConfig(steps=steps, backend="numba", march=pixel_intervals([view], field))  # as experiments train
+    trainer = Trainer(images, field, config)
     for _ in range(steps):
         trainer.train_step()
     ours = trainer.stepper

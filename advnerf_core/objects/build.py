@@ -25,6 +25,8 @@ FIT_VIEWS, FIT_PIXELS = 60, 160
 HELD_OUT_VIEWS = 12
 # Limits of a good fit to pictures; see `advice`.
 POOR_DB, UNFINISHED_DB, GAP_DB = 20.0, 0.3, 6.0
+# Rows that are drawn at once for a comparison: a whole picture of 800 x 800 takes as much memory as the pictures of a set.
+_STRIP_ROWS = 64
 # The held-out poses lie between those of the fit.
 _HELD_OUT_PHASE = 0.37
 
@@ -179,13 +181,15 @@ class Agreement:
         """Compare an object with pictures of it."""
         squares, pixels, covered = 0.0, 0, 0
         for index, pinhole in enumerate(views.pinholes):
-            image = views.picture(index)
-            drawn = draw_object(model, views.T_object_from_camera[index], pinhole)[0]
-            error = drawn[..., :3] - drawn[..., 3:] - (image[..., :3] - image[..., 3:])
-            # Outside both silhouettes the error is zero: the sum is that of the covered pixels.
-            squares += float(np.square(error).sum())
-            pixels += error[..., 0].size
-            covered += int(((drawn[..., 3] > 0.0) | (image[..., 3] > 0.0)).sum())
+            image, pixels = views.picture(index), pixels + pinhole.width * pinhole.height
+            for top in range(0, pinhole.height, _STRIP_ROWS):
+                part = image[top : top + _STRIP_ROWS]
+                strip = pinhole.cropped(0, top, pinhole.width, len(part))
+                drawn = draw_object(model, views.T_object_from_camera[index], strip)[0]
+                error = drawn[..., :3] - drawn[..., 3:] - (part[..., :3] - part[..., 3:])
+                # Outside both silhouettes the error is zero: the sum is that of the covered pixels.
+                squares += float(np.square(error).sum())
+                covered += int(((drawn[..., 3] > 0.0) | (part[..., 3] > 0.0)).sum())
         return cls(_psnr_db(squares, 3 * pixels), _psnr_db(squares, 3 * covered))
 
 
