@@ -134,10 +134,12 @@ def compare(repeats: int, trial: bool, horizons: tuple[int, int, int] = (60, 200
     short, middle, long = horizons
     wanted = [("adjoint", short), ("adjoint", long), ("cached", short), ("cached", long)]
     wanted += [(way, middle) for way in WAYS]
-    found = {}
+    found, runs = {}, {which: list[dict[str, float]]() for which in wanted}
+    for _ in range(repeats):  # in turns, so that other load on the machine hits all
+        for way, steps in wanted:
+            runs[way, steps].append(_in_fresh_process(way, steps, "--warm", "--time-batch", str(LEAN_BATCH)))
     for way, steps in wanted:
-        runs = [_in_fresh_process(way, steps, "--warm", "--time-batch", str(LEAN_BATCH)) for _ in range(repeats)]
-        found[way, steps] = {key: median(run[key] for run in runs) for key in ("mib", "seconds")}
+        found[way, steps] = {key: median(run[key] for run in runs[way, steps]) for key in ("mib", "seconds")}
         print(
             f"{way}, T = {steps}: {found[way, steps]['mib']:.1f} MiB, {found[way, steps]['seconds']:.2f} s", flush=True
         )

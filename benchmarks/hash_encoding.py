@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import argparse
-import time
 from collections.abc import Callable
+from statistics import median
 
 import torch
 
 from advnerf_core.fields.hash_grid import HashGrid, HashGridConfig, encode_reference
 from benchmarks.results import record_row
+from benchmarks.timing import runs_in_turns
 
 POINTS = 131_072
 TARGET = 20.0
@@ -17,7 +18,7 @@ TARGET = 20.0
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--repeats", type=int, default=3, help="timed rounds; the best of each counts")
+    parser.add_argument("--repeats", type=int, default=9, help="timed runs of each, in turns; medians count")
     parser.add_argument("--dry-run", action="store_true", help="print, but do not write the ledger")
     arguments = parser.parse_args()
 
@@ -25,16 +26,22 @@ def main() -> None:
     points = torch.rand(POINTS, 3, generator=torch.Generator().manual_seed(0))
     weights = torch.randn(POINTS, grid.config.width, generator=torch.Generator().manual_seed(1))
 
-    kernel, plain = [], []
     with torch.no_grad():
         grid.table.normal_(generator=torch.Generator().manual_seed(2))
         difference = (grid(points) - encode_reference(points, grid.table, grid.levels)).abs().max().item()
-    seconds(lambda: grid(points), weights, grid)  # compiles
-    for _ in range(arguments.repeats):  # alternating, so that other load on the machine hits both
-        kernel.append(min(seconds(lambda: grid(points), weights, grid) for _ in range(5)))
-        plain.append(seconds(lambda: encode_reference(points, grid.table, grid.levels), weights, grid))
-    ratio = min(plain) / min(kernel)
-    note = f"forward + backward {1e3 * min(kernel):.0f} ms against {1e3 * min(plain):.0f} ms; values agree to {difference:.0e}"
+    runs = runs_in_turns(
+        {
+            "kernels": lambda: one_pass(lambda: grid(points), weights, grid),
+            "plain": lambda: one_pass(lambda: encode_reference(points, grid.table, grid.levels), weights, grid),
+        },
+        arguments.repeats,
+    )
+    kernels_s, plain_s = median(runs["kernels"]), median(runs["plain"])
+    ratio = plain_s / kernels_s
+    note = (
+        f"forward + backward {1e3 * kernels_s:.0f} ms against {1e3 * plain_s:.0f} ms, medians of {arguments.repeats} in turns "
+        f"(kernels {_span_ms(runs['kernels'])}, plain {_span_ms(runs['plain'])} ms); values agree to {difference:.0e}"
+    )
     print(f"{ratio:.1f} x: {note}")
     if not arguments.dry_run:
         record_row(
@@ -43,12 +50,14 @@ def main() -> None:
         )  # fmt: skip
 
 
-def seconds(encode: Callable[[], torch.Tensor], weights: torch.Tensor, grid: HashGrid) -> float:
-    """Wall time of one forward and backward pass [s]."""
+def one_pass(encode: Callable[[], torch.Tensor], weights: torch.Tensor, grid: HashGrid) -> None:
+    """One forward and backward pass."""
     grid.table.grad = None
-    began = time.perf_counter()
     encode().backward(weights)
-    return time.perf_counter() - began
+
+
+def _span_ms(seconds: list[float]) -> str:
+    return f"{1e3 * min(seconds):.0f} to {1e3 * max(seconds):.0f}"
 
 
 if __name__ == "__main__":

@@ -16,10 +16,9 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from statistics import median
 from typing import Any
 
 import numpy as np
@@ -29,10 +28,10 @@ from advnerf_core.attack.adjoint import adjoint_gradient
 from advnerf_core.fields.summed_levels import with_summed_levels
 from advnerf_core.fields.voxel_grid import VoxelGridObject
 from advnerf_core.geometry import make_transform, rotation_z
-from advnerf_core.objects.fit import PosedRgba
 from advnerf_core.objects.generators import GENERATORS
 from advnerf_core.objects.mesh import SurfaceMesh, load_mesh, stand
 from advnerf_core.objects.model import ObjectModel
+from advnerf_core.objects.pictures import PosedRgba
 from advnerf_core.objects.rasterise import draw_mesh
 from advnerf_core.objects.views import dome, viewing_lens
 from advnerf_core.objects.voxelise import voxelise
@@ -41,6 +40,7 @@ from advnerf_core.scene.render_field import FieldRenderer
 from advnerf_core.scene.surrogate import Surrogate
 from benchmarks.attack_lab import lab_problem
 from benchmarks.results import record_row
+from benchmarks.timing import seconds_in_turns
 
 LINE = "#3 objects"
 COUNTS = (1, 5, 20)
@@ -51,18 +51,6 @@ def crowd(model: ObjectModel, count: int) -> list[VoxelGridObject]:
     """So many copies before the start of the path, all in view at first, in rows of five."""
     places = [(0.6 + 0.5 * (k // 5), -2.9 + 0.45 * (k % 5)) for k in range(count)]
     return [model.placed(make_transform(rotation_z(0.7 * k), [x, y, 0.0])) for k, (x, y) in enumerate(places)]
-
-
-def seconds_in_turns(ways: Mapping[str, Callable[[], object]], repeats: int) -> dict[str, float]:
-    """Median seconds of each way, in turns, so that other load on the machine hits all; each is run once before."""
-    taken: dict[str, list[float]] = {name: [] for name in ways}
-    for turn in range(repeats + 1):
-        for name, way in ways.items():
-            began = time.perf_counter()
-            way()
-            if turn:
-                taken[name].append(time.perf_counter() - began)
-    return {name: median(parts) for name, parts in taken.items()}
 
 
 def without_leaps(field: VoxelGridObject) -> VoxelGridObject:

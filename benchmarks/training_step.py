@@ -8,14 +8,12 @@ first, as in any training.
 from __future__ import annotations
 
 import argparse
-import time
-from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
+from advnerf_core.driving.policy_view import PolicyView
 from advnerf_core.fields.hash_grid import HashGrid, encode_reference
 from advnerf_core.parallel import thread_count
 from advnerf_core.render.march import Marcher
@@ -23,10 +21,12 @@ from advnerf_core.render.occupancy import Leaps, leap_distances
 from advnerf_core.render.rays import intrinsics_row, pixel_rays, poses_in_box
 from advnerf_core.scene.dataset import ImageSet
 from advnerf_core.scene.field import SceneField, SceneFieldConfig
+from advnerf_core.scene.intervals import pixel_intervals
 from advnerf_core.scene.torch_step import TorchStep
 from advnerf_core.scene.train import TrainConfig, Trainer
 from advnerf_core.scene.train_step import CpuStep
 from benchmarks.results import record_row
+from benchmarks.timing import seconds_in_turns
 from hardware.twin.config import LabConfig
 from hardware.twin.lab import Lab
 from hardware.twin.phone import walk_around_poses
@@ -60,7 +60,7 @@ class Batch:
         pixels = rng.integers(0, images.rgb[..., 0].size, rays)
         pixel_rays(pixels, images.rgb, poses, intrinsics, self.rays, self.colours)
         self.jitter = rng.random(rays, dtype=np.float32)
-        march = trainer.config.march
+        march = trainer.march
         self.marcher = Marcher(rays * march.max_samples * 2, march, field.box_high)
         self.skipping = leap_distances(trainer.occupied(), trainer.occupancy.cells)
         everywhere = np.ones(trainer.occupancy.shape, np.bool_)
@@ -92,26 +92,29 @@ def main() -> None:
     parser.add_argument("--rays", type=int, default=1024)
     parser.add_argument("--steps", type=int, default=300, help="steps of training that fill the occupancy grid")
     parser.add_argument("--photographs", type=int, default=40)
-    parser.add_argument("--repeats", type=int, default=5, help="timed rounds; the best of each counts")
+    parser.add_argument("--repeats", type=int, default=5, help="timed runs of each way, in turns; medians count")
     parser.add_argument("--trial", action="store_true", help="print, but record nothing")
     arguments = parser.parse_args()
 
     images, field = photograph_lab(arguments.photographs)
     batch, ours, plain = prepare(images, field, arguments.steps, arguments.rays)
-    kernel_s, plain_s, spared_s, grid_s = [], [], [], []
-    few, many = batch.ours(ours), batch.plainly(plain)  # compiles, and warms the allocator
-    for _ in range(arguments.repeats):  # in turns, so that other load on the machine hits all
-        kernel_s.append(min(seconds(lambda: batch.ours(ours)) for _ in range(5)))
-        grid_s.append(seconds(lambda: batch.plainly(plain, batch.skipping)))
-        plain_s.append(seconds(lambda: batch.plainly(plain)))
-        spared_s.append(seconds(lambda: batch.plainly(plain, hidden=False)))
+    few, many = batch.ours(ours), batch.plainly(plain)
+    seconds = seconds_in_turns(
+        {
+            "ours": lambda: batch.ours(ours),
+            "plain with the grid": lambda: batch.plainly(plain, batch.skipping),
+            "plain": lambda: batch.plainly(plain),
+            "plain without hidden samples": lambda: batch.plainly(plain, hidden=False),
+        },
+        arguments.repeats,
+    )
     # The quicker of the two plain ways is what ours is held against.
-    plain_s = plain_s if min(plain_s) < min(spared_s) else spared_s
-    ratio = min(plain_s) / min(kernel_s)
+    plain_s = min(seconds["plain"], seconds["plain without hidden samples"])
+    ratio = plain_s / seconds["ours"]
     note = (
-        f"{1e3 * min(kernel_s):.0f} ms and {few / arguments.rays:.0f} samples a ray against {1e3 * min(plain_s):.0f} ms and "
-        f"{many / arguments.rays:.0f}; plain torch with the grid {1e3 * min(grid_s):.0f} ms; {thread_count()} threads, after "
-        f"{arguments.steps} steps"
+        f"{1e3 * seconds['ours']:.0f} ms and {few / arguments.rays:.0f} samples a ray against {1e3 * plain_s:.0f} ms and "
+        f"{many / arguments.rays:.0f}; plain torch with the grid {1e3 * seconds['plain with the grid']:.0f} ms; medians of "
+        f"{arguments.repeats} in turns; {thread_count()} threads, after {arguments.steps} steps"
     )
     print(f"{ratio:.1f} x: {note}")
     if not arguments.trial:
@@ -132,7 +135,9 @@ def photograph_lab(count: int) -> tuple[ImageSet, SceneFieldConfig]:
 
 def prepare(images: ImageSet, field: SceneFieldConfig, steps: int, rays: int) -> tuple[Batch, CpuStep, TorchStep]:
     """A batch, and the two ways to take a step on it from the same state of training."""
-    trainer = Trainer(images, field, replace(TrainConfig(steps=steps), backend="numba"))
+    view = PolicyView(LabConfig().camera.pinhole).pinhole
+    config = TrainConfig(steps=steps, backend="numba", march=pixel_intervals([view], field))  # as experiments train
+    trainer = Trainer(images, field, config)
     for _ in range(steps):
         trainer.train_step()
     ours = trainer.stepper
@@ -143,13 +148,6 @@ def prepare(images: ImageSet, field: SceneFieldConfig, steps: int, rays: int) ->
     scene.grid = PlainGrid(scene.grid)  # type: ignore[assignment]
     plain = TorchStep(scene, trainer.config.huber, ours.distortion, ours.opacity)
     return Batch(images, trainer, rays), ours, plain
-
-
-def seconds(work: Callable[[], int]) -> float:
-    """Wall time [s]."""
-    began = time.perf_counter()
-    work()
-    return time.perf_counter() - began
 
 
 if __name__ == "__main__":

@@ -25,6 +25,15 @@ Size = Annotated[
 Corner = Annotated[
     tuple[float, float, float] | None, typer.Option(help="Corner of the learned box, in the file's unit.")
 ]
+IntervalScale = Annotated[
+    float,
+    typer.Option(
+        "--interval-scale",
+        min=0.05,
+        max=20.0,
+        help="Sample intervals in those of the training; longer ones are quicker.",
+    ),
+]
 _HELD_OUT_EVERY = 8
 
 
@@ -65,11 +74,34 @@ def scene_train(
             "directions to degree 4), for detail and for comparisons; slower.",
         ),
     ] = "room",
+    interval_px: Annotated[
+        float | None,
+        typer.Option(
+            "--interval-px",
+            help="Sample intervals in pixels of the images; fewer are finer and slower.",
+            show_default="3.5",
+        ),
+    ] = None,
+    interval: Annotated[
+        tuple[float, float] | None,
+        typer.Option(
+            "--interval",
+            help="Shortest and longest sample interval, in the file's unit.",
+            show_default="1/1024 and 1/64 of the box",
+        ),
+    ] = None,
+    interval_growth: Annotated[
+        float | None,
+        typer.Option(
+            "--interval-growth", help="Sample interval per distance.", show_default="--interval-px by focal length"
+        ),
+    ] = None,
 ) -> None:
     """Learn a scene from posed images; ends with PSNR and SSIM on held-out ones.
 
     Images with alpha are learned with it: what they show as transparent stays so.
     """
+    from advnerf_core.scene.intervals import INTERVAL_PX
     from nodes.runtime.errors import ConfigError
     from nodes.runtime.locks import HeldError, hold
     from nodes.runtime.progress import ProgressDisplay
@@ -92,6 +124,9 @@ def scene_train(
         checkpoint_every_s,
         unbounded,
         preset,
+        INTERVAL_PX if interval_px is None else interval_px,
+        interval,
+        interval_growth,
     )
     output.mkdir(parents=True, exist_ok=True)
     try:
@@ -105,13 +140,19 @@ def scene_train(
 
 
 @app.command("eval")
-def scene_eval(scene: SceneFile, transforms: DataSet, size: Size = None, every: int = _HELD_OUT_EVERY) -> None:
+def scene_eval(
+    scene: SceneFile,
+    transforms: DataSet,
+    size: Size = None,
+    every: int = _HELD_OUT_EVERY,
+    interval_scale: IntervalScale = 1.0,
+) -> None:
     """Compare a scene with the held-out images of a data set."""
     from advnerf_core.scene.dataset import load_transforms
     from advnerf_core.scene.render_field import FieldRenderer
     from nodes.scene_training import evaluate
 
-    renderer = FieldRenderer.from_file(scene)
+    renderer = FieldRenderer.from_file(scene, interval_scale=interval_scale)
     _print_figures(evaluate(renderer, load_transforms(transforms).training_and_held_out(every)[1], size))
 
 
@@ -124,6 +165,7 @@ def scene_render(
     size: Size = None,
     held_out: Annotated[bool, typer.Option("--held-out", help="Only the held-out images' cameras.")] = False,
     every: int = _HELD_OUT_EVERY,
+    interval_scale: IntervalScale = 1.0,
 ) -> None:
     """Draw what a scene shows from the cameras of a data set: colour, depth, and a video."""
     from advnerf_core.scene.dataset import load_transforms
@@ -131,7 +173,7 @@ def scene_render(
     from nodes.runtime.progress import ProgressDisplay
     from nodes.scene_training import render
 
-    renderer = FieldRenderer.from_file(scene)
+    renderer = FieldRenderer.from_file(scene, interval_scale=interval_scale)
     listed = load_transforms(transforms)
     listed = listed.training_and_held_out(every)[1] if held_out else listed.sorted_by_name()
     with ProgressDisplay() as display:

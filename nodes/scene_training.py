@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from advnerf_core.render.march import MarchConfig
 from advnerf_core.scene.dataset import ImageSet, PosedImages, load_transforms
 from advnerf_core.scene.field import SceneFieldConfig, save_scene
 from advnerf_core.scene.image_files import OPAQUE
+from advnerf_core.scene.intervals import INTERVAL_PX, pixel_intervals
 from advnerf_core.scene.metrics import psnr, ssim
 from advnerf_core.scene.render_field import FieldRenderer
 from advnerf_core.scene.train import Progress, TrainConfig, train_scene
@@ -28,10 +29,6 @@ from nodes.runtime.stages import Report
 
 SCENE, CHECKPOINT, FIGURES = "scene.safetensors", "checkpoint.safetensors", "held_out.json"
 MM_PER_M = 1000.0
-# Sample intervals as shares of the box: a fine cell of the hash grid, and a coarse one.
-_SMALLEST_STEP, _LARGEST_STEP = 1 / 2048, 1 / 160
-# Rays that go on to the horizon need more of them; Instant-NGP's 1024 is the most it takes, too.
-_UNBOUNDED_SAMPLES = 1024
 _NO_TIME_LIMIT_STEPS = 1_000_000
 PRESETS = ("room", "instant-ngp")
 _WHITE = (1.0, 1.0, 1.0)
@@ -56,6 +53,9 @@ class TrainingRequest:
         checkpoint_every_s: A kill loses at most so much training [s].
         unbounded: Whether the scene goes on outside the box, contracted; None: if the file's ``aabb_scale`` is more than 1.
         preset: Sizes of the field: ``room``, ours, or ``instant-ngp``.
+        interval_px: Sample intervals in pixels of the training images; see `pixel_intervals`.
+        interval: Shortest and longest sample interval instead of the rule's, in the data set's unit.
+        interval_growth: Interval per distance instead of the rule's.
     """
 
     transforms: Path
@@ -71,6 +71,9 @@ class TrainingRequest:
     checkpoint_every_s: float = 30.0
     unbounded: bool | None = None
     preset: str = "room"
+    interval_px: float = INTERVAL_PX
+    interval: tuple[float, float] | None = None
+    interval_growth: float | None = None
 
     def __post_init__(self) -> None:
         """Refuse what cannot be trained."""
@@ -80,6 +83,12 @@ class TrainingRequest:
             raise ConfigError(f"expected a box with low < high, got {self.box_m}")
         if self.preset not in PRESETS:
             raise ConfigError(f"expected a preset of {', '.join(PRESETS)}, got {self.preset!r}")
+        if not self.interval_px > 0.0:
+            raise ConfigError(f"expected --interval-px above 0, got {self.interval_px}")
+        if self.interval is not None and not 0.0 < self.interval[0] <= self.interval[1]:
+            raise ConfigError(f"expected --interval as 0 < SHORTEST <= LONGEST, got {list(self.interval)}")
+        if self.interval_growth is not None and not self.interval_growth >= 0.0:
+            raise ConfigError(f"expected --interval-growth of 0 or more, got {self.interval_growth}")
 
 
 def train(request: TrainingRequest, report: Report) -> dict[str, Any]:
@@ -89,12 +98,13 @@ def train(request: TrainingRequest, report: Report) -> dict[str, Any]:
         print(f"missing, left out: {path}")
     images = training.load(request.size)
     field = scene_field(request, training, transparent=_transparent(images))
-    print(_described(request, field))
+    march = sample_intervals(request, field, images)
+    print(_described(request, field, march))
 
     def progress(at: Progress) -> None:
         report(0.95 * at.fraction, f"step {at.step}, {at.psnr_db:.1f} dB on training rays")
 
-    trained = train_scene(images, field, _train_config(request, field), request.output / CHECKPOINT, progress)
+    trained = train_scene(images, field, _train_config(request, field, march), request.output / CHECKPOINT, progress)
     metadata = {
         "march": vars(trained.march), "steps": trained.history[-1][0], "seed": request.seed, "photographs": len(images.rgb),
         "dataset": str(request.transforms),
@@ -213,12 +223,16 @@ def scene_field(request: TrainingRequest, listed: PosedImages, transparent: bool
     return SceneFieldConfig(_corner(low), _corner(high), grid, direction_bands=bands, **common)
 
 
-def _train_config(request: TrainingRequest, field: SceneFieldConfig) -> TrainConfig:
+def sample_intervals(request: TrainingRequest, field: SceneFieldConfig, images: ImageSet) -> MarchConfig:
+    """How samples are placed, in training and rendering: by the rule, where the request does not say otherwise."""
+    march = pixel_intervals(images.pinholes, field, request.near, request.interval_px)
+    if request.interval is not None:
+        march = replace(march, smallest_step_m=request.interval[0], largest_step_m=request.interval[1])
+    return march if request.interval_growth is None else replace(march, step_growth=request.interval_growth)
+
+
+def _train_config(request: TrainingRequest, field: SceneFieldConfig, march: MarchConfig) -> TrainConfig:
     is_open = request.open_scene or field.contraction
-    march = MarchConfig(
-        near_m=request.near, smallest_step_m=_SMALLEST_STEP * field.extent_m, largest_step_m=_LARGEST_STEP * field.extent_m,
-        max_samples=_UNBOUNDED_SAMPLES if field.contraction else MarchConfig.max_samples,
-    )  # fmt: skip
     return TrainConfig(
         steps=request.steps or _NO_TIME_LIMIT_STEPS, seed=request.seed, checkpoint_every_s=request.checkpoint_every_s,
         max_seconds=None if request.minutes is None else 60.0 * request.minutes, march=march,
@@ -226,7 +240,7 @@ def _train_config(request: TrainingRequest, field: SceneFieldConfig) -> TrainCon
     )  # fmt: skip
 
 
-def _described(request: TrainingRequest, field: SceneFieldConfig) -> str:
+def _described(request: TrainingRequest, field: SceneFieldConfig, march: MarchConfig) -> str:
     """What was decided for the user, and how to decide otherwise."""
     inside = "inner region" if field.contraction else "box"
     low, high = (np.round(corner, 2).tolist() for corner in (field.box_low_m, field.box_high_m))
@@ -236,7 +250,10 @@ def _described(request: TrainingRequest, field: SceneFieldConfig) -> str:
         text += f", unbounded{why}"
     if not field.learned_background:
         text += "; images have alpha: learned before random colours, transparent where they are"
-    return f"{text}; preset {request.preset}"
+    intervals = (
+        f"{march.smallest_step_m:.3g} .. {march.largest_step_m:.3g}, {march.step_growth:.3g} of the distance between"
+    )
+    return f"{text}; preset {request.preset}; sample intervals {intervals}"
 
 
 def _span(listed: PosedImages) -> str:

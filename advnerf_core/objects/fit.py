@@ -7,18 +7,18 @@ be faked by a colour.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy import ndimage
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from advnerf_core.errors import AdvnerfError
-from advnerf_core.geometry import Array, Pinhole
+from advnerf_core.objects.pictures import FitError, PosedRgba, RayBatches, crossing
 from advnerf_core.objects.voxelise import OPAQUE_PER_VOXEL, ObjectGrids
 
 _LEARNING_RATE = 0.15
@@ -26,38 +26,19 @@ _EDGE = 1e-3  # the logistic function of the density never reaches 0 or 1 at the
 _SPARSITY = 1e-3
 
 
-class FitError(AdvnerfError, ValueError):
-    """Pictures that no object can be fitted to."""
-
-
 @dataclass(frozen=True, eq=False)
-class PosedRgba:
-    """Pictures of an object with transparency.
+class Fit:
+    """What a fit ended with.
 
     Attributes:
-        images: Premultiplied ``[N, H, W, 4]`` float32 in 0..1.
-        T_object_from_camera: ``[N, 4, 4]``, OpenCV axes.
-        pinholes: Intrinsics of each.
+        grids: Density and colours.
+        steps: Optimiser steps that were taken.
+        gain_db: How much the training error fell from the last but one to the last fifth of the steps [dB].
     """
 
-    images: NDArray[np.float32]
-    T_object_from_camera: Array
-    pinholes: tuple[Pinhole, ...]
-
-    def __post_init__(self) -> None:
-        count = len(self.T_object_from_camera)
-        size = (self.pinholes[0].height, self.pinholes[0].width) if self.pinholes else (0, 0)
-        if self.images.shape != (count, *size, 4) or len(self.pinholes) != count:
-            raise FitError(
-                f"expected {count} pictures {[*size, 4]} with as many intrinsics, "
-                f"got {list(self.images.shape)} and {len(self.pinholes)}"
-            )
-        if len(self.images) < 3:
-            raise FitError(f"expected at least 3 pictures around the object, got {len(self.images)}")
-        if not (np.isfinite(self.images).all() and np.isfinite(self.T_object_from_camera).all()):
-            raise FitError("expected finite pixels and poses, got some that are not")
-        if not self.images[..., 3].any():
-            raise FitError("expected an object in the pictures, all of them are fully transparent")
+    grids: ObjectGrids
+    steps: int
+    gain_db: float
 
 
 def fit_grids(
@@ -66,37 +47,71 @@ def fit_grids(
     steps: int = 300,
     rays: int = 2048,
     seed: int = 0,
-    progress: Callable[[int, float], None] | None = None,
-) -> ObjectGrids:
+    progress: Callable[[float, str], None] | None = None,
+    max_seconds: float | None = None,
+) -> Fit:
     """Density and colours that explain the pictures.
+
+    Memory does not grow with the pictures: each step makes only its own rays.
 
     Args:
         views: The pictures.
         start: Where to begin; voxels further than two from any with density stay empty.
-        steps: Optimiser steps.
+        steps: Optimiser steps; 0 leaves the start as it is.
         rays: Rays per step.
         seed: Of the rays and backgrounds.
-        progress: Told the step and the mean squared error.
+        progress: Called after each step with the finished fraction and a text.
+        max_seconds: Stop after this much time, if sooner [s]. The learning rate falls with the finished fraction, so that a fit
+            that is stopped by time ends as smoothly as one that is stopped by steps.
+
+    Raises:
+        FitError: Too few pictures, none shows the object, or none looks at the box.
     """
+    views.refuse_useless()
+    batches = RayBatches(views, start.box_min, start.box_max, seed)
     torch_rng = torch.Generator().manual_seed(seed)
-    target, origins, directions = _rays_of(views, start)
     field = _Field(start)
     optimiser = torch.optim.Adam(field.parameters, lr=_LEARNING_RATE)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, max(steps, 1), eta_min=0.1 * _LEARNING_RATE)
-    for step in range(steps):
-        chosen = torch.randint(len(target), (rays,), generator=torch_rng)
-        background = torch.rand(rays, 3, generator=torch_rng)
-        colour, alpha = field.render(origins[chosen], directions[chosen], torch.rand(rays, 1, generator=torch_rng))
-        got = colour + (1.0 - alpha) * background
-        wanted = target[chosen, :3] + (1.0 - target[chosen, 3:]) * background
-        error = (got - wanted).square().mean()
-        optimiser.zero_grad(set_to_none=True)
-        (error + _SPARSITY * field.opacity_between()).backward()
-        optimiser.step()
-        schedule.step()
+    began, errors, fraction = time.monotonic(), list[float](), 0.0 if steps > 0 else 1.0
+    while fraction < 1.0:
+        optimiser.param_groups[0]["lr"] = _learning_rate(fraction)
+        errors.append(_step(field, optimiser, batches.draw(rays), torch_rng))
+        by_time = 0.0 if max_seconds is None else (time.monotonic() - began) / max_seconds
+        fraction = min(1.0, max(len(errors) / steps, by_time))
         if progress is not None:
-            progress(step + 1, float(error.detach()))
-    return field.grids()
+            progress(fraction, f"step {len(errors)}, {_psnr(errors[-50:]):.1f} dB on training rays")
+    return Fit(field.grids(), len(errors), _gain_db(errors))
+
+
+def _step(
+    field: _Field, optimiser: torch.optim.Optimizer, batch: tuple[Tensor, Tensor, Tensor], torch_rng: torch.Generator
+) -> float:
+    """One step on a batch of rays; returns the mean squared error before it."""
+    target, origins, directions = batch
+    count = len(target)
+    background = torch.rand(count, 3, generator=torch_rng)
+    colour, alpha = field.render(origins, directions, torch.rand(count, 1, generator=torch_rng))
+    got = colour + (1.0 - alpha) * background
+    wanted = target[:, :3] + (1.0 - target[:, 3:]) * background
+    error = (got - wanted).square().mean()
+    optimiser.zero_grad(set_to_none=True)
+    (error + _SPARSITY * field.opacity_between()).backward()
+    optimiser.step()
+    return float(error.detach())
+
+
+def _learning_rate(fraction: float) -> float:
+    """Half a cosine from the full rate to a tenth of it."""
+    return _LEARNING_RATE * (0.1 + 0.45 * (1.0 + math.cos(math.pi * fraction)))
+
+
+def _psnr(errors: Sequence[float]) -> float:
+    return -10.0 * math.log10(max(float(np.mean(errors)), 1e-12))
+
+
+def _gain_db(errors: Sequence[float]) -> float:
+    fifth = len(errors) // 5
+    return 0.0 if fifth == 0 else _psnr(errors[-fifth:]) - _psnr(errors[-2 * fifth : -fifth])
 
 
 class _Field:
@@ -127,7 +142,7 @@ class _Field:
 
     def render(self, origins: Tensor, directions: Tensor, jitter: Tensor) -> tuple[Tensor, Tensor]:
         """Premultiplied colours ``[R, 3]`` and coverage ``[R, 1]`` of rays with unit directions."""
-        near, far = _crossing(origins, directions, self._low, self._high)
+        near, far = crossing(origins, directions, self._low, self._high)
         count = int(torch.ceil((far - near).max().clamp(min=0.0) / self._step)) + 1
         t = near[:, None] + (torch.arange(count) + jitter) * self._step
         points = origins[:, None] + t[..., None] * directions[:, None]
@@ -158,30 +173,3 @@ class _Field:
                 "expected an object in the box, the pictures agree that it is empty: are box and poses right?"
             )
         return ObjectGrids(density, colours, self._start.box_min, self._start.box_max)
-
-
-def _rays_of(views: PosedRgba, grids: ObjectGrids) -> tuple[Tensor, Tensor, Tensor]:
-    """Pixels ``[P, 4]``, ray origins and unit directions ``[P, 3]`` of all rays that meet the box."""
-    low, high = (torch.tensor(corner, dtype=torch.float32) for corner in (grids.box_min, grids.box_max))
-    pixels, origins, directions = [], [], []
-    for image, T, lens in zip(views.images, views.T_object_from_camera, views.pinholes, strict=True):
-        x = (np.arange(lens.width) + 0.5 - lens.cx) / lens.fx
-        y = (np.arange(lens.height) + 0.5 - lens.cy) / lens.fy
-        rays = np.stack([*np.meshgrid(x, y), np.ones((lens.height, lens.width))], axis=-1).reshape(-1, 3)
-        rays = rays / np.linalg.norm(rays, axis=-1, keepdims=True) @ np.asarray(T)[:3, :3].T
-        direction = torch.from_numpy(rays).float()
-        origin = torch.tensor(np.asarray(T)[:3, 3], dtype=torch.float32).expand_as(direction)
-        near, far = _crossing(origin, direction, low, high)
-        meets = far > near
-        pixels.append(torch.from_numpy(image.reshape(-1, 4))[meets])
-        origins.append(origin[meets])
-        directions.append(direction[meets])
-    if not sum(len(part) for part in pixels):
-        raise FitError("expected the pictures to look at the object's box, none of them does: are box and poses right?")
-    return torch.cat(pixels), torch.cat(origins), torch.cat(directions)
-
-
-def _crossing(origins: Tensor, directions: Tensor, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
-    inverse = 1.0 / torch.where(directions.abs() < 1e-9, torch.full_like(directions, 1e-9), directions)
-    a, b = (low - origins) * inverse, (high - origins) * inverse
-    return torch.minimum(a, b).amax(-1).clamp(min=0.0), torch.maximum(a, b).amin(-1)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from advnerf_core.geometry import Array, invert_transform, transform_points
-from advnerf_core.objects.fit import FitError, PosedRgba
+from advnerf_core.objects.pictures import FitError, PosedRgba
 from advnerf_core.objects.voxelise import OPAQUE_PER_VOXEL, ObjectGrids
 
 _SEEN_THROUGH = 0.1
@@ -25,6 +25,7 @@ def visual_hull(views: PosedRgba, resolution: int = 64) -> ObjectGrids:
     Raises:
         FitError: The silhouettes have nothing in common, or the cameras do not look at one place.
     """
+    views.refuse_useless()
     centre, radius = _looked_at(views)
     coarse = _carve(views, centre - radius, 2 * radius / _COARSE, (_COARSE,) * 3)
     if not coarse.any():
@@ -39,8 +40,9 @@ def visual_hull(views: PosedRgba, resolution: int = 64) -> ObjectGrids:
     counts = np.ceil((high - low) / voxel).astype(int) + 2 * _MARGIN_VOXELS
     box_min = (low + high) / 2 - 0.5 * voxel * counts
     inside = _carve(views, box_min, voxel, tuple(counts))
-    coverage = views.images[..., 3:].sum()
-    mean = views.images[..., :3].sum(axis=(0, 1, 2)) / max(float(coverage), 1.0)
+    # Picture by picture: a sum over all at once would copy them.
+    sums = np.sum([image.sum(axis=(0, 1), dtype=np.float64) for image in views.images], axis=0)
+    mean = sums[:3] / max(sums[3], views.white)
     density = np.where(inside, _START_SHARE * OPAQUE_PER_VOXEL / voxel, 0.0).astype(np.float32)
     colours = np.broadcast_to(mean, (*counts, 3)).astype(np.float32)
     return ObjectGrids(density, colours, box_min, box_min + voxel * counts)
@@ -71,6 +73,6 @@ def _carve(views: PosedRgba, box_min: Array, voxel: float, counts: tuple[int, ..
         v = np.floor(lens.fy * seen[:, 1] / z + lens.cy)
         within = ahead & (u >= 0) & (v >= 0) & (u < lens.width) & (v < lens.height)
         alpha = image[v[within].astype(int), u[within].astype(int), 3]
-        kept[np.flatnonzero(within)[alpha < _SEEN_THROUGH]] = False
+        kept[np.flatnonzero(within)[alpha < _SEEN_THROUGH * views.white]] = False
         shown_in += within
     return np.asarray((kept & (shown_in >= 0.5 * len(views.images))).reshape(counts))

@@ -76,7 +76,7 @@ class Marcher:
     """Packs the samples of a batch of rays; keeps its memory between batches.
 
     Args:
-        capacity: Most samples in a batch. Rays that do not fit are left out.
+        capacity: Samples of a batch that fit. Rays that begin after so many are left out.
         config: How samples are placed.
         box_high: High corner of the box in box coordinates ``[3]``.
         contracted: Whether the field is contracted: rays then go on outside the box.
@@ -84,7 +84,8 @@ class Marcher:
 
     def __init__(self, capacity: int, config: MarchConfig, box_high: Array32, contracted: bool = False) -> None:
         self.config, self.box_high, self.contracted = config, box_high, contracted
-        room = max(capacity // SLOTS, config.max_samples)
+        # A ray is only begun where the longest one fits: without that reserve, many short rays would be left out.
+        room = capacity // SLOTS + config.max_samples
         self._points, self._t = np.empty((SLOTS, room, 3), np.float32), np.empty((SLOTS, room), np.float32)
         self._widths = np.empty((SLOTS, room), np.float32)
 

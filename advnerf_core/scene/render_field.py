@@ -56,12 +56,21 @@ class FieldRenderer:
         path: str | Path,
         colour_map: ColourMap | None = None,
         behind: tuple[float, float, float] = (1.0, 1.0, 1.0),
+        interval_scale: float = 1.0,
     ) -> FieldRenderer:
-        """Renderer of a scene file; the colour map in the file, if any, applies unless another is given."""
+        """Renderer of a scene file.
+
+        Args:
+            path: The file.
+            colour_map: Instead of the one in the file, if any.
+            behind: Colour behind a scene that was learned from images with alpha.
+            interval_scale: Sample intervals in those of the training, which a field looks best with. Longer ones are quicker.
+        """
         scene, occupied, metadata = load_scene(Path(path))
         march = MarchConfig(**metadata["march"]) if "march" in metadata else None
         if colour_map is None and "colour_map" in metadata:
             colour_map = ColourMap.from_dict(metadata["colour_map"])
+        march = (march or MarchConfig()).coarser(interval_scale)
         return cls(scene, occupied, march, colour_map, behind=behind)
 
     def render(self, T_world_from_camera: ArrayLike | Tensor, pinhole: Pinhole) -> tuple[Tensor, Tensor, Tensor]:

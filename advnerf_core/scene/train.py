@@ -24,6 +24,7 @@ from advnerf_core.render.occupancy import Leaps, OccupancyGrid, leap_distances, 
 from advnerf_core.render.rays import intrinsics_row, pixel_rays, poses_in_box
 from advnerf_core.scene.dataset import ImageSet
 from advnerf_core.scene.field import SceneField, SceneFieldConfig
+from advnerf_core.scene.intervals import pixel_intervals
 from advnerf_core.scene.torch_step import TorchStep
 from advnerf_core.scene.train_config import Progress, TrainConfig, TrainedScene
 from advnerf_core.scene.train_step import CpuStep, Matte, StepResult
@@ -43,6 +44,9 @@ class Trainer:
             random colour, so that nothing but the true opacity fits.
         field_config: Sizes of the field, and its box.
         config: How to train.
+
+    Attributes:
+        march: How samples are placed, in training and for rendering.
     """
 
     def __init__(self, images: ImageSet, field_config: SceneFieldConfig, config: TrainConfig | None = None) -> None:
@@ -59,8 +63,11 @@ class Trainer:
         self.history: list[tuple[int, float, float]] = []
         self._poses = poses_in_box(images.T_world_from_camera, field_config.origin_m, field_config.extent_m)
         self._intrinsics = np.stack([intrinsics_row(p) for p in images.pinholes])
+        self.march = self.config.march or pixel_intervals(
+            images.pinholes, field_config, self.config.near_m, self.config.interval_px
+        )
         capacity = int(1.25 * self.config.samples_per_step)
-        self._marcher = Marcher(capacity, self.config.march, field_config.box_high, field_config.contraction)
+        self._marcher = Marcher(capacity, self.march, field_config.box_high, field_config.contraction)
         # Pixels to learn from, where a mask or an undistortion leaves some out.
         self._usable = None if images.valid is None else np.flatnonzero(images.valid)
         if self._usable is not None and not len(self._usable):
@@ -109,8 +116,7 @@ class Trainer:
             self.occupied(), self.occupancy.box_high, self.stepper.log_density, self.config.refine_depth,
             contracted=self.scene.config.contraction,
         )  # fmt: skip
-        march = self.config.march.coarser(self.config.render_step_scale)
-        return TrainedScene(self.scene.cpu(), occupied, march, self.history)
+        return TrainedScene(self.scene.cpu(), occupied, self.march, self.history)
 
     def train_step(self) -> StepResult:
         """One batch of random pixels; all randomness follows from the seed and the step number."""
@@ -137,7 +143,7 @@ class Trainer:
     def occupied(self) -> NDArray[np.bool_]:
         """Cells where something is, now ``[X, Y, Z]``."""
         # A cell counts if its density would show in the shortest interval: 1 % opacity.
-        smallest = self.config.march.smallest_step_m / self.scene.config.extent_m
+        smallest = self.march.smallest_step_m / self.scene.config.extent_m
         return self.occupancy.occupied(0.01 / smallest)
 
     def save(self, path: Path) -> None:
@@ -222,7 +228,9 @@ class Trainer:
         progress(Progress(self.step, self.fraction, loss, psnr_db, left, recent[-1].rays, samples / max(rays, 1)))
 
     def _fingerprint(self) -> str:
-        digest = hashlib.sha256(json.dumps([self.scene.config.to_dict(), asdict(self.config)], sort_keys=True).encode())
+        # The intervals as they were chosen: they also depend on the cameras and on the rule.
+        settings = [self.scene.config.to_dict(), {**asdict(self.config), "march": asdict(self.march)}]
+        digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode())
         digest.update(str(self.images.rgb.shape).encode() + self.images.T_world_from_camera.tobytes())
         digest.update(self.images.rgb[:, ::16, ::16].tobytes())
         if self.images.alpha is not None and not self.scene.config.learned_background:

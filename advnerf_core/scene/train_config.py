@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from advnerf_core.render.march import MarchConfig
 from advnerf_core.scene.field import SceneField
+from advnerf_core.scene.intervals import INTERVAL_PX
 
 BACKENDS = ("auto", "numba", "torch")
 
@@ -29,12 +30,13 @@ class TrainConfig:
         distortion: Weight of the distortion loss, which turns fog into surfaces.
         occupancy_resolution: Cells along the longest side of the box, or of the cube that a contracted field lies in.
         occupancy_every: Steps between updates of the occupancy grid.
-        warmup_steps: Steps during which sample intervals shrink to their final size and all cells are probed.
-        march: How samples are placed.
+        warmup_steps: Steps during which sample intervals shrink to their final length and all cells are probed.
+        march: How samples are placed, in training and rendering; None: by `pixel_intervals`, of the training images.
+        near_m: Nothing nearer to a camera than this is learned [m]; not used if ``march`` is given.
+        interval_px: Sample intervals in pixels of the training images; not used if ``march`` is given.
         opacity: Weight of the rays' mean transmittance in the loss. A constant background is learned for what is left; without
             this pull it explains walls that all cameras see from one side, and is wrong from any other. Not used for images with
             alpha, which tell what is transparent.
-        render_step_scale: Sample intervals for rendering, in those of the training: a finished field is smooth along rays.
         refine_depth: Optical depth of crossing a fine cell from which rendering looks into it. Surfaces of a finished room are
             dense; where they may still be haze, as in large boxes or after short trainings, 0.005 keeps them whole.
         seed: Seed of everything random.
@@ -53,9 +55,10 @@ class TrainConfig:
     occupancy_resolution: int = 128
     occupancy_every: int = 16
     warmup_steps: int = 256
-    march: MarchConfig = field(default_factory=MarchConfig)
+    march: MarchConfig | None = None
+    near_m: float = 0.1
+    interval_px: float = INTERVAL_PX
     opacity: float = 1.5e-3
-    render_step_scale: float = 2.0
     refine_depth: float = 0.05
     seed: int = 0
     checkpoint_every_s: float = 60.0
@@ -100,7 +103,7 @@ class TrainedScene:
     Attributes:
         scene: The field.
         occupied: Cells where something is ``[X, Y, Z]``, finer than in training.
-        march: How to place samples for rendering.
+        march: How samples were placed, and are for rendering.
         history: One row per report: step, elapsed [s], PSNR [dB].
     """
 

@@ -31,6 +31,10 @@ class SceneConfig(_Section):
     margin_m: Annotated[float, Field(ge=0)] = Field(
         default=0.1, description="How far the field's box reaches beyond the walls [m]."
     )
+    interval_px: Annotated[float, Field(gt=0)] | None = Field(
+        default=None,
+        description="Sample intervals in pixels of the policy's view; none: the default of pixel_intervals.",
+    )
     seed: int = 0
 
 

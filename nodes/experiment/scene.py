@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from advnerf_core.scene.colour import fit_colour_map
 from advnerf_core.scene.dataset import ImageSet, load_transforms
 from advnerf_core.scene.field import SceneFieldConfig, save_scene
+from advnerf_core.scene.intervals import INTERVAL_PX, pixel_intervals
 from advnerf_core.scene.render_field import FieldRenderer
 from advnerf_core.scene.train import Progress, TrainConfig, train_scene
 from nodes.experiment import capture
@@ -29,10 +30,11 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
     def progress(at: Progress) -> None:
         report(_TRAINING_SHARE * at.fraction, f"step {at.step}, {at.psnr_db:.1f} dB on training rays")
 
-    trained = train_scene(
-        photographs, _field_config(experiment), TrainConfig(steps=config.steps, seed=config.seed),
-        folder / "checkpoint.safetensors", progress,
-    )  # fmt: skip
+    field = _field_config(experiment)
+    # The policy's view is coarser than the phone's: samples as fine as the phone's pixels would cost time in every tick.
+    march = pixel_intervals([experiment.view.pinhole], field, interval_px=config.interval_px or INTERVAL_PX)
+    training = TrainConfig(steps=config.steps, seed=config.seed, march=march)
+    trained = train_scene(photographs, field, training, folder / "checkpoint.safetensors", progress)
     report(_TRAINING_SHARE, "fitting the colour map")
     pairs = load_transforms(captured / capture.COLOUR_PAIRS, require_all=True).load()
     bare = FieldRenderer(trained.scene, trained.occupied, trained.march)

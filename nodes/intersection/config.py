@@ -44,6 +44,10 @@ class SceneConfig(_Section):
     margin_m: Annotated[float, Field(ge=0)] = Field(
         default=0.5, description="The box reaches so far beyond the world [m]."
     )
+    interval_px: PositiveNumber | None = Field(
+        default=None,
+        description="Sample intervals in pixels of the policy's view; none: the default of pixel_intervals.",
+    )
     seed: int = 0
 
 

@@ -5,17 +5,17 @@ from __future__ import annotations
 from pathlib import Path
 
 from advnerf_core.fields.hash_grid import HashGridConfig
-from advnerf_core.render.march import MarchConfig
 from advnerf_core.scene.dataset import load_transforms
 from advnerf_core.scene.field import SceneFieldConfig, save_scene
+from advnerf_core.scene.intervals import INTERVAL_PX, pixel_intervals
 from advnerf_core.scene.train import Progress, TrainConfig, train_scene
 from nodes.experiment.learned_scene import compare_views, scene_file
 from nodes.intersection import capture
 from nodes.intersection.context import Experiment
 from nodes.runtime.stages import Report
 
-# A junction is ten times a room: so are the first and the longest intervals between samples.
-_MARCH = MarchConfig(near_m=0.3, smallest_step_m=0.03, largest_step_m=0.8, step_growth=0.016)
+# Nothing stands nearer to the cameras.
+_NEAR_M = 0.3
 _TRAINING_SHARE = 0.97
 
 
@@ -27,12 +27,14 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
     def progress(at: Progress) -> None:
         report(_TRAINING_SHARE * at.fraction, f"step {at.step}, {at.psnr_db:.1f} dB on training rays")
 
+    field = field_config(experiment)
+    march = pixel_intervals([experiment.view.pinhole], field, _NEAR_M, config.interval_px or INTERVAL_PX)
     training = TrainConfig(
-        steps=config.steps, seed=config.seed, march=_MARCH, refine_depth=config.refine_depth,
+        steps=config.steps, seed=config.seed, march=march, refine_depth=config.refine_depth,
         occupancy_resolution=config.occupancy,
     )  # fmt: skip
     checkpoint = folder / "checkpoint.safetensors"
-    trained = train_scene(photographs, field_config(experiment), training, checkpoint, progress)
+    trained = train_scene(photographs, field, training, checkpoint, progress)
     metadata = {
         "march": vars(trained.march), "steps": config.steps, "seed": config.seed, "photographs": len(photographs.rgb),
     }  # fmt: skip

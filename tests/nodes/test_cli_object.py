@@ -41,25 +41,67 @@ def test_build_show_and_info(command, tmp_path):
     assert "0.75" in output
 
 
-def test_build_from_cut_out_pictures(command, tmp_path):
-    views = mesh_views(hydrant(), 8, 48)
+def write_pictures(folder, count, pixels=48, file="transforms.json", phase=0.0, spoilt=False):
+    """Cut-out pictures of the hydrant; spoilt ones show it green."""
+    views = mesh_views(hydrant(), count, pixels, phase)
     to_opengl = np.diag([1.0, -1.0, -1.0, 1.0])
     frames = []
     for k, (image, pose) in enumerate(zip(views.images, views.T_object_from_camera, strict=True)):
         rgb = image[..., :3] / np.maximum(image[..., 3:], 1e-6)
-        pixels = np.rint(255 * np.concatenate([rgb[..., ::-1], image[..., 3:]], axis=-1)).astype(np.uint8)
-        cv2.imwrite(str(tmp_path / f"{k}.png"), pixels)
-        frames.append({"file_path": f"{k}.png", "transform_matrix": (pose @ to_opengl).tolist()})
+        if spoilt:
+            rgb = rgb[..., [1, 0, 2]]
+        values = np.rint(255 * np.concatenate([rgb[..., ::-1], image[..., 3:]], axis=-1)).astype(np.uint8)
+        name = f"{file[:-5]}_{k}.png"
+        cv2.imwrite(str(folder / name), values)
+        frames.append({"file_path": name, "transform_matrix": (pose @ to_opengl).tolist()})
     lens = views.pinholes[0]
-    (tmp_path / "transforms.json").write_text(
-        json.dumps({"fl_x": lens.fx, "cx": lens.cx, "cy": lens.cy, "frames": frames})
-    )
+    (folder / file).write_text(json.dumps({"fl_x": lens.fx, "cx": lens.cx, "cy": lens.cy, "frames": frames}))
+    return folder
+
+
+def test_build_from_cut_out_pictures(command, tmp_path):
     path = tmp_path / "o.object.safetensors"
-    code, _, errors = command(
-        "object", "build", "--images", tmp_path / "transforms.json", "--resolution", 16, "--steps", 3, "-o", path
+    transforms = write_pictures(tmp_path, 8) / "transforms.json"
+    code, output, errors = command(
+        "object", "build", "--images", transforms, "--resolution", 16, "--steps", 3, "-o", path
     )
     assert (code, errors) == (0, "")
+    assert "8 training, 0 held-out pictures" in output
+    assert "dB on training views" in output
+    assert "held-out views" not in output
+    assert "warning: " in output  # three steps are no fit
     np.testing.assert_allclose(load_object(path).size_m, hydrant().size_m, atol=0.3)
+
+
+def test_a_data_sets_own_split_is_followed(command, tmp_path):
+    folder = tmp_path / "set"
+    folder.mkdir()
+    write_pictures(folder, 10, file="transforms_train.json")
+    write_pictures(folder, 2, file="transforms_val.json", phase=0.3, spoilt=True)
+    write_pictures(folder, 14, file="transforms_test.json", phase=0.6, spoilt=True)
+    path = tmp_path / "o.object.safetensors"
+    arguments = ("object", "build", "--images", folder, "--resolution", 16, "--steps", 40, "-o", path)
+    code, output, errors = command(*arguments)
+    assert (code, errors) == (0, "")
+    assert "10 training, 16 held-out pictures (the data set's own split)" in output
+    model = load_object(path)
+    assert model.name == "set"
+    assert model.about["pictures"] == 10
+    # Had the green pictures been learned from, the object would be less red, and they would agree better.
+    assert model.about["train_psnr_db"] > model.about["held_out_psnr_db"] + 3.0
+    assert "held-out pictures agree worse" in output
+
+
+def test_sixteen_pictures_hold_out_two_and_can_be_made_smaller(command, tmp_path):
+    path = tmp_path / "o.object.safetensors"
+    write_pictures(tmp_path, 16, pixels=64)
+    code, output, errors = command(
+        "object", "build", "--images", tmp_path, "--resolution", 16, "--minutes", 0.01, "--size", 32, 32, "-o", path
+    )
+    assert (code, errors) == (0, "")
+    assert "14 training, 2 held-out pictures" in output
+    assert load_object(path).about["steps"] < 600
+    assert "held_out_psnr_db" in load_object(path).about
 
 
 @pytest.mark.parametrize(
@@ -69,6 +111,8 @@ def test_build_from_cut_out_pictures(command, tmp_path):
         (["--generate", "tree"], "expected --generate to be one of hydrant, car; got 'tree'"),
         (["{folder}/none.glb"], "found none"),
         (["--generate", "car", "--height", "-1"], "height above zero"),
+        (["--generate", "car", "--minutes", "1"], "--minutes and --size only with --images"),
+        (["--images", "{folder}", "--minutes", "1", "--steps", "5"], "either --steps or --minutes"),
     ],
 )
 def test_mistakes_are_one_line(command, tmp_path, arguments, message):

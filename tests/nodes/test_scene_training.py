@@ -14,11 +14,13 @@ from numpy.typing import NDArray
 from advnerf_core.geometry import Array, Pinhole, look_at
 from advnerf_core.render.march import MarchConfig
 from advnerf_core.scene.dataset import load_transforms
+from advnerf_core.scene.field import load_scene, save_scene
+from advnerf_core.scene.intervals import INTERVAL_PX
 from advnerf_core.scene.render_field import FieldRenderer
 from advnerf_core.scene.train import TrainConfig, train_scene
 from nodes import cli, scene_training
 from nodes.runtime.errors import ConfigError
-from nodes.scene_training import TrainingRequest, scene_field
+from nodes.scene_training import TrainingRequest, sample_intervals, scene_field
 
 TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 CAMERA = Pinhole(40, 40, 50.0, 50.0, 20.0, 20.0)
@@ -163,3 +165,62 @@ def test_pictures_with_alpha_are_learned_with_it_end_to_end(
         assert np.abs(ours[..., 3] - real[..., 3]).mean() < 0.03
         inside = real[..., 3] == 1.0
         assert np.abs(ours[inside, :3] - real[inside, :3]).mean() < 0.06
+
+
+def test_intervals_follow_the_images_unless_the_user_says_otherwise(pictures: Path) -> None:
+    listed = load_transforms(pictures)
+    images = listed.with_frames(listed.frames[:2]).load()
+
+    def chosen(**changes: object) -> MarchConfig:
+        request = request_for(pictures, box_m=((-0.8,) * 3, (0.8,) * 3), **changes)
+        return sample_intervals(request, scene_field(request, listed, transparent=True), images)
+
+    rule = chosen()
+    assert rule == MarchConfig(0.05, 1.6 / 1024, 1.6 / 64, INTERVAL_PX / 50.0, 1024)
+    assert chosen(interval_px=0.5 * INTERVAL_PX) == dataclasses.replace(rule, step_growth=0.5 * rule.step_growth)
+    assert chosen(interval=(0.01, 0.02), near=0.3) == MarchConfig(0.3, 0.01, 0.02, rule.step_growth, 1024)
+    assert chosen(interval_growth=0.5) == dataclasses.replace(rule, step_growth=0.5)
+
+
+@pytest.mark.slow
+def test_options_of_intervals_reach_training_and_renderer(
+    pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def run(*arguments: object) -> str:
+        monkeypatch.setattr(sys, "argv", ["advnerf", "scene", *map(str, arguments)])
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+        assert not ended.value.code
+        return capsys.readouterr().out
+
+    # A thin box has few cells: after one step all of them are occupied, and each is looked into.
+    box = ("--box-low", -0.8, -0.1, -0.1, "--box-high", 0.8, 0.1, 0.1)
+    own = ("--interval", 0.02, 0.04, "--interval-growth", 0.5)
+    text = run("train", pictures, "-o", tmp_path, "--steps", 1, "--size", 16, 16, *box, *own)
+    assert "sample intervals 0.02 .. 0.04, 0.5 of the distance between" in text
+    scene = tmp_path / "scene.safetensors"
+    assert FieldRenderer.from_file(scene).march == MarchConfig(0.05, 0.02, 0.04, 0.5, 1024)
+    # After one step nothing is dense enough to be kept; haze shows intervals as well as walls do.
+    field, occupied, metadata = load_scene(scene)
+    save_scene(scene, field, np.ones_like(occupied), metadata)
+    small = (scene, pictures, "--size", 16, 16)
+    assert (
+        run("eval", *small) == run("eval", *small, "--interval-scale", 1) != run("eval", *small, "--interval-scale", 20)
+    )
+    run("render", *small, "--held-out", "-o", tmp_path / "fine")
+    run("render", *small, "--held-out", "-o", tmp_path / "coarse", "--interval-scale", 20)
+    fine, coarse = ((tmp_path / name / "0000_00.png").read_bytes() for name in ("fine", "coarse"))
+    assert fine != coarse
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"interval_px": 0.0}, "--interval-px above 0"),
+        ({"interval": (0.2, 0.1)}, "SHORTEST <= LONGEST"),
+        ({"interval_growth": -1.0}, "--interval-growth of 0 or more"),
+    ],
+)
+def test_impossible_intervals_are_refused(tmp_path: Path, changes: dict[str, object], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        request_for(tmp_path, **changes)

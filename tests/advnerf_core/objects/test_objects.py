@@ -1,15 +1,22 @@
 """Voxels, fits and files of objects."""
 
+import json
+import subprocess
+import sys
+import time
+
+import cv2
 import numpy as np
 import pytest
 import trimesh
 
-from advnerf_core.objects.build import agreement_db, build_from_images, build_from_mesh, draw_object, mesh_views
-from advnerf_core.objects.fit import FitError, PosedRgba, fit_grids
+from advnerf_core.objects.build import advice, agreement_db, build_from_images, build_from_mesh, draw_object, mesh_views
+from advnerf_core.objects.fit import fit_grids
 from advnerf_core.objects.generators import hydrant
 from advnerf_core.objects.hull import visual_hull
 from advnerf_core.objects.mesh import MeshError, SurfaceMesh, part_from_colours
 from advnerf_core.objects.model import ObjectFileError, ObjectModel, load_object, save_object
+from advnerf_core.objects.pictures import FitError, PosedRgba, RayBatches
 from advnerf_core.objects.views import look_at, viewing_lens
 from advnerf_core.objects.voxelise import OPAQUE_PER_VOXEL, voxelise
 from advnerf_core.render.cast_object import cast_object
@@ -71,8 +78,116 @@ def test_an_object_is_carved_out_of_its_pictures():
     assert (
         1.0 < volume / (4 / 3 * np.pi * 0.125) < 2.2
     )  # the hull holds the object, and a cone below, where nobody looked
-    model = build_from_images(views, "ball", resolution=24, steps=100)
+    held_out = mesh_views(ball(), 2, 64, phase=0.37)
+    model = build_from_images(views, "ball", resolution=24, steps=100, held_out=held_out)
     assert model.about["held_out_psnr_db"] > 22.0
+    assert model.about["held_out_psnr_db"] == round(agreement_db(model, held_out), 2)
+    assert model.about["held_out_object_psnr_db"] < model.about["held_out_psnr_db"]
+    assert abs(model.about["train_psnr_db"] - model.about["held_out_psnr_db"]) < 3.0
+
+
+def as_bytes(views):
+    return PosedRgba(np.rint(255 * views.images).astype(np.uint8), views.T_object_from_camera, views.pinholes)
+
+
+def test_pictures_in_bytes_give_the_same_hull_and_the_same_rays():
+    views = mesh_views(ball(), 6, 64)
+    real, rounded = (visual_hull(each, 24) for each in (views, as_bytes(views)))
+    assert ((real.density > 0) != (rounded.density > 0)).mean() < 0.01
+    np.testing.assert_allclose(real.colours, rounded.colours, atol=2 / 255)
+    box = real.box_min, real.box_max
+    for ours, theirs in zip(
+        RayBatches(views, *box, seed=3).draw(500), RayBatches(as_bytes(views), *box, seed=3).draw(500), strict=True
+    ):
+        np.testing.assert_allclose(ours, theirs, atol=0.51 / 255)
+
+
+def test_rays_of_a_batch_are_those_of_their_pixels_and_meet_the_box():
+    views = mesh_views(ball(), 6, 64)
+    coordinates = np.stack(np.meshgrid(np.arange(64), np.arange(64)), axis=-1) / 64.0
+    marked = np.zeros((6, 64, 64, 4), np.float32)
+    marked[..., :2], marked[..., 2] = coordinates, np.arange(6)[:, None, None] / 6.0
+    batches = RayBatches(
+        PosedRgba(marked, views.T_object_from_camera, views.pinholes), np.full(3, -0.2), np.full(3, 0.2)
+    )
+    pixels, origins, directions = (values.numpy() for values in batches.draw(4000))
+    assert len(pixels) == len(origins) == len(directions) == 4000
+    index = np.rint(6 * pixels[:, 2]).astype(int)
+    assert (np.bincount(index, minlength=6) > 400).all()
+    poses = np.asarray(views.T_object_from_camera)[index]
+    np.testing.assert_allclose(origins, poses[:, :3, 3], atol=1e-6)
+    seen = np.einsum("nji,nj->ni", poses[:, :3, :3], directions)
+    lens = views.pinholes[0]
+    column = lens.fx * seen[:, 0] / seen[:, 2] + lens.cx
+    np.testing.assert_allclose(column, 64 * pixels[:, 0] + 0.5, atol=1e-2)
+    middle = origins - (origins * directions).sum(axis=1, keepdims=True) * directions
+    assert np.linalg.norm(middle, axis=1).max() < 0.2 * np.sqrt(3) + 1e-6
+
+
+MEMORY_SCRIPT = """
+import resource, sys, tracemalloc
+from pathlib import Path
+from advnerf_core.objects.build import build_from_images
+from advnerf_core.objects.pictures import load_pictures
+from advnerf_core.scene.dataset import load_transforms
+listed = load_transforms(Path(sys.argv[1]))
+warm = load_pictures(listed, (64, 64))
+build_from_images(warm, "warm", resolution=16, steps=1)
+before_kib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+build_from_images(load_pictures(listed), "ball", resolution=32, steps=3)
+print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before_kib) / 1024)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(400)
+def test_a_hundred_large_pictures_fit_into_memory(tmp_path):
+    """The pictures' own bytes, and not as much again for everything else: float32 pictures with their rays took 6 GiB."""
+    count, side = 100, 800
+    views = mesh_views(ball(), count, 64)
+    frames = []
+    for k, (image, pose) in enumerate(zip(views.images, views.T_object_from_camera, strict=True)):
+        large = cv2.resize(np.rint(255 * image).astype(np.uint8), (side, side))
+        cv2.imwrite(str(tmp_path / f"{k:03d}.png"), large, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+        frames.append({"file_path": f"{k:03d}.png", "transform_matrix": (pose @ np.diag([1, -1, -1, 1.0])).tolist()})
+    content = {"fl_x": views.pinholes[0].fx * side / 64, "frames": frames}
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    done = subprocess.run(
+        [sys.executable, "-c", MEMORY_SCRIPT, str(tmp_path)], capture_output=True, text=True, timeout=300
+    )
+    assert done.returncode == 0, done.stderr
+    pictures_mib = count * side * side * 4 / 2**20
+    print(f"{float(done.stdout):.0f} MiB of {pictures_mib:.0f} MiB of pictures")
+    assert float(done.stdout) < 2 * pictures_mib
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({}, []),
+        ({"train_object_psnr_db": 18.0, "gain_db": 0.9}, ["18.0 dB", "not finished", "--steps"]),
+        ({"held_out_object_psnr_db": 17.0}, ["17.0 dB", "more pictures"]),
+        ({"train_object_psnr_db": 18.0, "held_out_object_psnr_db": 17.5}, ["17.5 dB", "--resolution"]),
+        ({"gain_db": 1.0}, ["still fell by 1.0 dB"]),
+    ],
+)
+def test_advice_names_what_is_wrong(changes, words):
+    about = {"train_object_psnr_db": 26.0, "held_out_object_psnr_db": 24.0, "gain_db": 0.1, "steps": 600, **changes}
+    text = "; ".join(advice(about))
+    assert bool(text) == bool(words)
+    for word in words:
+        assert word in text
+
+
+def test_a_fit_stops_in_time_and_says_that_it_is_not_finished():
+    views = mesh_views(ball(), 8, 48)
+    began = time.monotonic()
+    fit = fit_grids(views, visual_hull(views, 16), steps=1_000_000, rays=256, max_seconds=1.0)
+    assert time.monotonic() - began > 0.9
+    assert 5 < fit.steps < 1_000_000
+    short = build_from_images(views, "ball", resolution=16, steps=10)
+    assert short.about["steps"] == 10
+    assert any("not finished" in text for text in advice(short.about))
 
 
 def test_a_rotated_object_equals_a_rotated_camera():
@@ -145,9 +260,9 @@ def test_what_is_not_an_object_file_is_one_error(tmp_path):
 def test_pictures_that_no_object_fits(tmp_path):
     views = mesh_views(ball(), 6, 32)
     with pytest.raises(FitError, match="fully transparent"):
-        PosedRgba(np.zeros_like(views.images), views.T_object_from_camera, views.pinholes)
+        visual_hull(PosedRgba(np.zeros_like(views.images), views.T_object_from_camera, views.pinholes))
     with pytest.raises(FitError, match="at least 3"):
-        PosedRgba(views.images[:2], views.T_object_from_camera[:2], views.pinholes[:2])
+        visual_hull(views.chosen([0, 1]))
     with pytest.raises(FitError, match="finite"):
         PosedRgba(views.images * np.nan, views.T_object_from_camera, views.pinholes)
     with pytest.raises(FitError, match="same way"):

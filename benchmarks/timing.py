@@ -1,0 +1,30 @@
+"""How benchmarks compare two or more ways: one rule for every side.
+
+All ways run in one process, in turns, equally often, after one run of each that does not count. The figure of a way is the median
+of its runs. A best-of rule favours the side that is run more often; runs in turns let other load on the machine hit all sides.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from statistics import median
+
+
+def runs_in_turns(ways: Mapping[str, Callable[[], object]], repeats: int) -> dict[str, list[float]]:
+    """Seconds of ``repeats`` runs of each way, taken in turns after one run of each that does not count."""
+    if repeats < 1:
+        raise ValueError(f"expected at least one repeat, got {repeats}")
+    taken: dict[str, list[float]] = {name: [] for name in ways}
+    for turn in range(repeats + 1):
+        for name, way in ways.items():
+            began = time.perf_counter()
+            way()
+            if turn:
+                taken[name].append(time.perf_counter() - began)
+    return taken
+
+
+def seconds_in_turns(ways: Mapping[str, Callable[[], object]], repeats: int) -> dict[str, float]:
+    """Median seconds of each way; see `runs_in_turns`."""
+    return {name: median(parts) for name, parts in runs_in_turns(ways, repeats).items()}
