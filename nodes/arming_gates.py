@@ -91,6 +91,15 @@ class ClockGate:
         """Note a measurement."""
         self._heard[peer] = (offset_s, error_s, info.publish_mono_ns)
 
+    def doubt_ns(self, mono_ns: int) -> int:
+        """How wrong a time that another host gave can be at most, by the measurements of now [ns]; 0 without other hosts."""
+        fresh = [
+            abs(offset_s) + error_s
+            for offset_s, error_s, publish_ns in self._heard.values()
+            if (mono_ns - publish_ns) / NS_PER_S <= self.age_limit_s
+        ]
+        return round(max(fresh, default=0.0) * NS_PER_S)
+
     def problem(self, mono_ns: int) -> str:
         """Why the car may not move; empty if it may."""
         for peer in self.peers:

@@ -13,10 +13,12 @@ from pydantic import BaseModel, ConfigDict, Field
 from calibration.schema import RoomCalibration, load_calibration
 from nodes.arming import Arming, ArmingLimits
 from nodes.arming_gates import ClockGate, HandGate, inside, require_simple
+from nodes.arming_requests import ArmRequests
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.messages import drive_message, header, ns_from_stamp, types
 from nodes.runtime.node import ACTIVE, READY, MessageInfo, Node, NodeContext, Now, Out, run_node_main
+from nodes.runtime.requests import asked_mono_ns
 from nodes.runtime.topics import STATUS_PREFIX, status_topic
 
 _TICK_RATE_HZ = 50.0
@@ -87,6 +89,7 @@ class SafetyNode(Node):
 
     def __init__(self, limits: ArmingLimits, hand: HandGate | None = None, clocks: ClockGate | None = None) -> None:
         self._arming = Arming(limits, hand or HandGate(), clocks or ClockGate())
+        self._requests = ArmRequests(self._arming)
         self._topic_of = {f"/{driver}/drive": driver for driver in limits.drivers}
         self._stopped_ns = 0
         self._stated_ns = 0
@@ -112,10 +115,10 @@ class SafetyNode(Node):
             return self._pass_on(self._topic_of[topic], message, info, now)
         if topic == "/teleop/state":
             return self._hand(message, info, now)
+        if topic == "/arm":
+            return self._obey(message, info, now)
         if topic == "/clock/offset":
             arming.clocks.heard(str(message.peer), float(message.offset_s), float(message.error_s), info)
-        elif topic == "/arm":
-            self._obey(message, info, now)
         elif topic == "/camera/camera_info":
             arming.heard_camera(info)
         elif topic == "/vicon/car":
@@ -161,11 +164,15 @@ class SafetyNode(Node):
             return [Out("/safety/drive", drive_message(speed, steering, capture_ns))]
         return self._news(now)
 
-    def _obey(self, message: Any, info: MessageInfo, now: Now) -> None:
+    def _obey(self, message: Any, info: MessageInfo, now: Now) -> list[Out]:
+        """Do what a person asks, and answer every repeat of it."""
+        ask_id, source, asked_ns = str(message.ask_id), str(message.source), asked_mono_ns(message, info)
         if message.arm:
-            self._arming.arm(str(message.source), info, now.mono_ns)
+            self._requests.arm(ask_id, source, asked_ns, now.mono_ns)
         else:
-            self._arming.disarm(f"disarmed by {message.source}: {message.reason}", now.mono_ns)
+            self._requests.disarm(ask_id, f"disarmed by {source}: {message.reason}", asked_ns, now.mono_ns)
+        self._arming.check(now.mono_ns)
+        return self._news(now) or [self._state(now)]
 
     def _news(self, now: Now) -> list[Out]:
         """What must be said at once when the car was armed or disarmed."""
@@ -182,10 +189,11 @@ class SafetyNode(Node):
 
     def _state(self, now: Now) -> Out:
         self._stated_ns, self._stated_armed = now.mono_ns, self._arming.armed
-        arming = self._arming
+        arming, answer = self._arming, self._requests.last
         message = types.SafetyState(
             header=header(now.real_ns), armed=arming.armed, stopping=not arming.armed, reason=arming.reason,
-            source=arming.source if arming.armed else "", command_age_s=arming.drive_age_s(now.mono_ns),
+            source=arming.source if arming.armed else "", answered_id=answer.ask_id, granted=answer.granted, answer=answer.text,
+            command_age_s=arming.drive_age_s(now.mono_ns),
             pose_age_s=arming.pose_age_s(now.mono_ns),
         )  # fmt: skip
         return Out("/safety/state", message)

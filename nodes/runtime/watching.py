@@ -16,15 +16,13 @@ from nodes.runtime.bus import Bus, Received
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import LaunchError, MessageError
 from nodes.runtime.launch import active_launches
-from nodes.runtime.messages import header, stamp_ns, types
+from nodes.runtime.messages import stamp_ns
 from nodes.runtime.paths import bus_folder
 from nodes.runtime.topics import STATUS_PREFIX, TOPICS, status_topic
 from nodes.runtime.topics import topic as topic_row
 
 _STATUS_WAIT_S = 1.0
 _ECHO_ITEMS = 12
-_ANSWER_WAIT_S = 2.0
-_READING_NS = 20_000_000
 
 
 @dataclass(frozen=True)
@@ -126,33 +124,6 @@ def measure_rate(run_dir: Path, topic: str, duration_s: float) -> RateReport:
         len(times), lost, len(gaps) / sum(gaps), min(gaps), max(gaps),
         statistics.median(ages) if ages else None, max(ages) if ages else None,
     )  # fmt: skip
-
-
-def ask_to_arm(run_dir: Path, wanted: bool, reason: str) -> tuple[bool, str]:
-    """Send a request to arm or to disarm as a person, and wait for the safety node's answer.
-
-    Returns:
-        Whether the car is armed now, and by whom, or else why not.
-    """
-    with Bus(run_dir) as bus:
-        bus.publisher("/arm")
-        bus.subscribe("/safety/state")
-        bus.wait_for_subscribers(["/arm"], _ANSWER_WAIT_S)
-        request = types.Arm(header=header(time.time_ns()), arm=wanted, source="operator", reason=reason)
-        sent_ns = time.monotonic_ns()
-        bus.publish("/arm", request)
-        deadline, state = time.monotonic() + _ANSWER_WAIT_S, None
-        while (left := deadline - time.monotonic()) > 0:
-            bus.wait(left)
-            for received in bus.receive():
-                # What was said before the request was read is no answer to it.
-                if received.info.publish_mono_ns > sent_ns + _READING_NS:
-                    state = received.message()
-            if state is not None and bool(state.armed) == wanted:
-                break
-    if state is None:
-        raise LaunchError(f"the safety node did not answer within {_ANSWER_WAIT_S:g} s; is it running?")
-    return bool(state.armed), str(state.source if state.armed else state.reason)
 
 
 def describe(message: Any, indent: str = "") -> str:
