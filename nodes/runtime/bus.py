@@ -23,7 +23,7 @@ from nodes.runtime.errors import BusError, MessageError
 from nodes.runtime.image_parts import IMAGE_TYPE, PartedInfo, join_image, split_image, with_parts
 from nodes.runtime.locks import HeldError, hold
 from nodes.runtime.messages import MAX_SEQUENCE_LENGTH, decode, encode, type_hash_prefix, type_name
-from nodes.runtime.paths import socket_path
+from nodes.runtime.paths import lock_path, socket_path
 from nodes.runtime.topics import STATUS_PREFIX, Topic
 from nodes.runtime.topics import topic as topic_row
 from nodes.runtime.wire import MessageInfo, Meta, Relayed, pack_meta, unpack_parts
@@ -119,9 +119,8 @@ class Publisher:
             send(part, _NOBLOCK_MORE)
         send(cdr[-1], _NOBLOCK)
         if self._is_status:
-            os.utime(
-                self._lock.fileno()
-            )  # the time of the last sign of life, for who looks after the process has stopped
+            # The age of the last status must be known when the process hangs and cannot say it any more.
+            os.utime(self._lock.fileno())
 
     def subscribers(self) -> int:
         """How many subscribers are connected."""
@@ -347,7 +346,7 @@ def _lock_endpoint(topic: Topic, run_dir: Path) -> tuple[Path, TextIO]:
     owners = []
     for path in socket_paths(run_dir, topic):
         try:
-            return path, hold(path.with_name(path.name + ".lock"))
+            return path, hold(lock_path(path))
         except HeldError as error:
             owners.append(error.owner)
     raise BusError(

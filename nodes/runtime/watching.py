@@ -14,10 +14,11 @@ import numpy as np
 
 from nodes.runtime.bus import Bus, Received
 from nodes.runtime.clock import NS_PER_S
+from nodes.runtime.config import parse_yaml
 from nodes.runtime.errors import LaunchError, MessageError
-from nodes.runtime.launch import active_launches
+from nodes.runtime.launch import active_launches, is_running
 from nodes.runtime.messages import stamp_ns
-from nodes.runtime.paths import bus_folder
+from nodes.runtime.paths import RESOLVED_NAME, bus_folder
 from nodes.runtime.topics import STATUS_PREFIX, TOPICS, status_topic
 from nodes.runtime.topics import topic as topic_row
 
@@ -62,21 +63,33 @@ def find_run_dir(given: Path | None) -> Path:
 
 
 def node_names(run_dir: Path) -> list[str]:
-    """Names of the nodes that have, or had, a socket in a run folder."""
+    """Names of the nodes that have, or had, a socket in a run folder, and of those of its launch while it is at work."""
     prefix = status_topic("x")[:-1].strip("/").replace("/", ".")
-    names = (path.name for path in bus_folder(run_dir).iterdir() if path.suffix != ".lock")
-    return sorted(name.removeprefix(prefix + ".") for name in names if name.startswith(prefix + "."))
+    sockets = (path.name for path in bus_folder(run_dir).iterdir() if path.suffix != ".lock")
+    names = {name.removeprefix(prefix + ".") for name in sockets if name.startswith(prefix + ".")}
+    return sorted(names | set(_launched(run_dir)))
+
+
+def _launched(run_dir: Path) -> list[str]:
+    """Nodes of the launch that is at work in a run folder."""
+    try:
+        if not is_running(run_dir):
+            return []
+        resolved = parse_yaml((run_dir / RESOLVED_NAME).read_text(encoding="utf-8"), RESOLVED_NAME).data
+        return [name for name, entry in resolved["nodes"].items() if entry.get("if", True)]
+    except FileNotFoundError:
+        return []
 
 
 def node_statuses(run_dir: Path, wait_s: float = _STATUS_WAIT_S) -> dict[str, Any]:
-    """Last status of every node that reports within a moment."""
+    """Last status of every node that reports within a moment; None for a node that is silent."""
     names = node_names(run_dir)
-    statuses: dict[str, Any] = {}
+    statuses: dict[str, Any] = dict.fromkeys(names)
     with Bus(run_dir) as bus:
         for name in names:
             bus.subscribe(status_topic(name))
         deadline = time.monotonic() + wait_s
-        while len(statuses) < len(names) and (left := deadline - time.monotonic()) > 0:
+        while None in statuses.values() and (left := deadline - time.monotonic()) > 0:
             bus.wait(left)
             for received in bus.receive():
                 statuses[received.topic.removeprefix(STATUS_PREFIX)] = received.message()
@@ -86,7 +99,7 @@ def node_statuses(run_dir: Path, wait_s: float = _STATUS_WAIT_S) -> dict[str, An
 def list_topics(run_dir: Path) -> list[TopicRow]:
     """All topics of the table and all statuses, with who publishes them now and to how many."""
     publishers: dict[str, tuple[str, int]] = {}
-    statuses = node_statuses(run_dir)
+    statuses = {name: status for name, status in node_statuses(run_dir).items() if status is not None}
     for name, status in statuses.items():
         for topic, subscribers in zip(status.publications, status.subscribers, strict=True):
             publishers[topic] = (name, int(subscribers))
