@@ -6,7 +6,7 @@ Pure: time and messages come as arguments.
 from __future__ import annotations
 
 from nodes.arming import Arming
-from nodes.runtime.requests import Answer, Answers
+from nodes.runtime.requests import Answer, Answers, is_id
 
 
 class ArmRequests:
@@ -38,8 +38,8 @@ class ArmRequests:
         """
         if self._answers.repeat(ask_id):
             return
-        if not ask_id:
-            refusal = "the request has no ask_id; use advnerf arm of this version"
+        if not is_id(ask_id):
+            refusal = f"expected an ask_id of 1 to 64 characters, got {len(ask_id)}; use advnerf arm"
         elif asked_ns <= self._forgotten_ns:
             refusal = "the request is older than one that was decided and forgotten; arm again"
         else:
@@ -55,7 +55,8 @@ class ArmRequests:
         self._arming.disarm(reason, mono_ns)
 
     def _keep(self, answer: Answer, asked_ns: int) -> None:
-        self._asked_ns[answer.ask_id] = asked_ns
+        if is_id(answer.ask_id):
+            self._asked_ns[answer.ask_id] = asked_ns
         if (forgotten := self._answers.give(answer)) is not None:
             # Its id would not be known again, so that everything as old is void.
             self._forgotten_ns = max(self._forgotten_ns, self._asked_ns.pop(forgotten.ask_id))

@@ -166,7 +166,11 @@ class SafetyNode(Node):
 
     def _obey(self, message: Any, info: MessageInfo, now: Now) -> list[Out]:
         """Do what a person asks, and answer every repeat of it."""
-        ask_id, source, asked_ns = str(message.ask_id), str(message.source), asked_mono_ns(message, info)
+        ask_id, source, asked_ns = (
+            str(message.ask_id),
+            str(message.source),
+            min(asked_mono_ns(message, info), now.mono_ns),
+        )
         if message.arm:
             self._requests.arm(ask_id, source, asked_ns, now.mono_ns)
         else:

@@ -12,6 +12,7 @@ from nodes.runtime.messages import stamp_ns
 from nodes.runtime.wire import MessageInfo
 
 _REMEMBERED = 256
+_LONGEST_ID = 64
 
 
 @dataclass(frozen=True)
@@ -53,6 +54,11 @@ class Answer:
     text: str = ""
 
 
+def is_id(ask_id: str) -> bool:
+    """Whether a text can be the id of a request: 1 to 64 characters."""
+    return 0 < len(ask_id) <= _LONGEST_ID
+
+
 class Answers:
     """Remembers the answers of a node by the id of the request, so that a repeat gets the same answer and changes nothing.
 
@@ -67,7 +73,7 @@ class Answers:
 
     def repeat(self, ask_id: str) -> bool:
         """Whether this request was decided before; its answer is then the last one again. A request without id never was."""
-        known = self._answers.get(ask_id) if ask_id else None
+        known = self._answers.get(ask_id)
         if known is not None:
             self.last = known
         return known is not None
@@ -75,7 +81,7 @@ class Answers:
     def give(self, answer: Answer) -> Answer | None:
         """Keep a new answer; returns the one that was forgotten for it, if any."""
         self.last = answer
-        if not answer.ask_id:
+        if not is_id(answer.ask_id):
             return None
         self._answers[answer.ask_id] = answer
         return self._answers.popitem(last=False)[1] if len(self._answers) > self._limit else None

@@ -101,8 +101,10 @@ def test_an_id_is_decided_once_even_when_it_claims_to_be_asked_now(car):
     car.ask("stop", arm=False)
     assert car.ask("a").granted  # the answer of then
     assert not car.arming.armed
-    assert not car.ask("").granted
-    assert not car.arming.armed
+    for no_id in ("", "x" * 65):
+        assert car.ask(no_id).text == f"expected an ask_id of 1 to 64 characters, got {len(no_id)}; use advnerf arm"
+        assert not car.arming.armed
+        assert car.ask(no_id, arm=False).granted
 
 
 def test_an_old_request_is_void(car):
@@ -146,6 +148,10 @@ def test_clocks_of_two_hosts_make_a_request_older_never_younger(car):
     assert "older than the last stop" in car.ask("a").text
     car.ms += 19
     assert car.ask("b").granted
+    assert car.arming.clocks.doubt_ns(car.ms * MS) == 30 * MS
+    for offset_s in (float("nan"), float("inf"), 1e9):
+        car.arming.clocks.heard("workstation", offset_s, 0.01, info)
+        assert car.arming.clocks.doubt_ns(car.ms * MS) == 3_600_000 * MS
 
 
 @pytest.mark.parametrize(
