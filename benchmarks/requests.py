@@ -36,6 +36,8 @@ SETTINGS = (
 _TURN_BACK_X_M = 1.5
 _WIRE_S = 1.0
 _GIVE_UP_S = 10.0
+# A node says within this time that it is in fault, and the safety node that it has stopped the car.
+_STATUS_S = 1.0
 
 
 @dataclass
@@ -105,7 +107,10 @@ def _pair(graph: Graph, tally: Tally, drive_s: float) -> None:
         return
     moved = _event(graph, offset, 0, "SET_RPM")
     if moved is None:
-        (tally.lost if answer.armed and graph.operator.armed else tally.stopped).append("armed, but no command to move")
+        graph.operator.watch(_STATUS_S)
+        stopped = not graph.operator.armed or graph.operator.state_of("motor") == "fault"
+        (tally.stopped if stopped else tally.lost).append(f"armed, but no command to move: {graph.operator.describe()}")
+        ask_to_disarm(graph.folder, "benchmark", _patience(time.monotonic_ns()))
         return
     graph.operator.watch(drive_s)
     asked_ns = time.monotonic_ns()
@@ -170,9 +175,15 @@ def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("--count", type=int, default=COUNT, help="pairs of arm and disarm")
-    tally = run(parser.parse_args().count)
+    parser.add_argument("--trial", action="store_true", help="nothing is recorded")
+    options = parser.parse_args()
+    tally = run(options.count)
     print(f"lost: {tally.lost}; refused: {set(tally.refused)}; stopped: {set(tally.stopped)}")
-    report(tally)
+    print(
+        f"disarm to brake, brake to return [ms]: {np.percentile([tally.brake_ms, tally.return_ms], [50, 99, 100], axis=1)}"
+    )
+    if not options.trial:
+        report(tally)
 
 
 if __name__ == "__main__":
