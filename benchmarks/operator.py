@@ -9,8 +9,10 @@ from typing import Any
 
 from hardware.twin.vesc_emulator import read_wire_log
 from hardware.twin.vesc_firmware import WireEvent
+from nodes.runtime.arm_requests import arm_message
 from nodes.runtime.bus import Bus
-from nodes.runtime.messages import header, types
+from nodes.runtime.clock import SystemClock
+from nodes.runtime.requests import Asked
 
 _UP = ("ready", "active")
 MOTOR_EVENTS = ("SET_RPM", "SET_CURRENT_BRAKE", "SET_CURRENT", "TIMEOUT")
@@ -85,7 +87,8 @@ class LiveOperator:
 
     def say_arm(self, arm: bool = True, source: str = "trial") -> None:
         """Ask for arming or disarming, once."""
-        self.bus.publish("/arm", types.Arm(header=header(time.time_ns()), arm=arm, source=source, reason="test"))
+        now = SystemClock().now()
+        self.bus.publish("/arm", arm_message(Asked.at(now), now, arm, source, "test"))
 
     def wait_ready(self, timeout_s: float = 40.0) -> None:
         """Wait for all nodes."""

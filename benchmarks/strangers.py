@@ -88,7 +88,7 @@ def _free_ports() -> list[int]:
 def commands() -> list[list[bytes]]:
     """A command to drive and a request to arm, as they travel."""
     now_ns = time.time_ns()
-    arm = types.Arm(header=header(now_ns), arm=True, source="operator", reason="")
+    arm = types.Arm(header=header(now_ns), arm=True, source="operator", reason="", ask_id="stranger", age_ns=0)
     found = []
     for name, message in zip(_COMMANDS, (drive_message(0.8, 0.0, now_ns), arm), strict=True):
         meta = Meta(time.monotonic_ns(), now_ns, 0, type_hash_prefix(topic(name).type), 1)

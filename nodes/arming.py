@@ -115,6 +115,8 @@ class Arming:
     _estop: str = ""
     _position_m: tuple[float, float] | None = None
     _disarmed_ns: int = 0
+    _fault: str = ""
+    _fault_ns: int = 0
     _last_ns: int | None = None
     _camera: _Source = field(default_factory=_Source)
     _car: _Source = field(default_factory=_Source)
@@ -179,7 +181,7 @@ class Arming:
             self._estop = "e-stop pressed; let it go and re-arm"
             self.disarm(self._estop, mono_ns)
         elif began and self.hand.required:
-            self.arm(OPERATOR, info, mono_ns, explicit=False)
+            self.arm(OPERATOR, info.publish_mono_ns, mono_ns, explicit=False)
         if self.hand.drives and self.armed and (fault := self._command_fault(speed_mps, steering_rad)):
             self.disarm(fault, mono_ns)
         return self.check(mono_ns) and self.hand.drives
@@ -187,42 +189,48 @@ class Arming:
     def check(self, mono_ns: int) -> bool:
         """Disarm if anything is wrong; whether commands to move may pass."""
         self._check_held_up(mono_ns)
-        if self.armed and (problem := self.problem(mono_ns)):
-            self.disarm(problem, mono_ns)
+        if self.armed:
+            if problem := self.problem(mono_ns):
+                self.disarm(problem, mono_ns)
+        elif fault := self._passing_fault(mono_ns):
+            self._fault, self._fault_ns = fault, mono_ns
         return self.armed
 
-    def arm(self, source: str, info: MessageInfo, mono_ns: int, explicit: bool = True) -> None:
+    def arm(self, source: str, asked_ns: int, mono_ns: int, explicit: bool = True) -> str:
         """Somebody wants to arm. A person may; a program only if no real car can move.
 
         Args:
             source: Who.
-            info: Of the request.
+            asked_ns: When it was first asked [ns].
             mono_ns: Now [ns].
             explicit: Whether it was asked for in so many words, which clears an e-stop; a held button does not.
+
+        Returns:
+            Why the car is not armed; empty if it is.
         """
         self._check_held_up(mono_ns)
         if self.armed:
-            return
-        if (
-            info.publish_mono_ns <= self._disarmed_ns
-            or mono_ns - info.publish_mono_ns > self.limits.arm_age_s * NS_PER_S
-        ):
-            self.reason = "not armed: the request to arm is older than what happened since; arm again"
-            return
+            return ""
+        asked_ns -= self.clocks.doubt_ns(mono_ns)
+        if void := self._void(asked_ns, mono_ns):
+            return void
         for watched in self._watched():
             watched.restarted = False  # whatever happened before, this is who is armed with
         if explicit and source == OPERATOR and not self.hand.pressed_stop:
             self._estop = ""
         self.driver = self._first_fresh(mono_ns)
         if source != OPERATOR and TWIN_PEER not in self.peer.upper():
-            self.reason = (
-                f"not armed: {source!r} is not a person, and the motor's peer is {self.peer or 'unknown'}, not the twin;"
+            refusal = (
+                f"{source!r} is not a person, and the motor's peer is {self.peer or 'unknown'}, not the twin;"
                 f" a real car is armed by source {OPERATOR!r} only"
             )
-        elif problem := self.problem(mono_ns):
-            self.reason = f"not armed: {problem}"
+        elif not (refusal := self.problem(mono_ns)) and explicit and asked_ns <= self._fault_ns:
+            refusal = f"since the request there was a fault: {self._fault}; arm again"
+        if refusal:
+            self.reason = f"not armed: {refusal}"
         else:
             self.armed, self.source, self.reason = True, source, ""
+        return refusal
 
     def disarm(self, reason: str, mono_ns: int) -> None:
         """Stop, and stay stopped until somebody arms again."""
@@ -230,23 +238,38 @@ class Arming:
 
     def problem(self, mono_ns: int) -> str:
         """The first thing that is wrong, causes before effects; empty if all is well."""
-        limits = self.limits
-        if problem := self._estop or self.hand.problem(mono_ns) or self.clocks.problem(mono_ns):
+        return self._estop or self.hand.problem(mono_ns) or self._restart_problem() or self._passing_fault(mono_ns)
+
+    def _restart_problem(self) -> str:
+        """Which source is no longer the process that was armed with; the next arming takes it as it is."""
+        for name, node in self._nodes.items():
+            if node.restarted:
+                return f"node {name} was restarted"
+        for what, source, _ in self._sources():
+            if source.restarted:
+                return f"{what} from the process that was armed with: it was restarted"
+        return ""
+
+    def _passing_fault(self, mono_ns: int) -> str:
+        """The first fault that goes away without anybody arming."""
+        if problem := self.clocks.problem(mono_ns):
             return problem
         for name, node in self._nodes.items():
             if problem := self._node_problem(name, node, mono_ns):
                 return problem
-        sources = [("no pose of the car", self._car, limits.pose_age_s)]
+        for what, source, limit_s in self._sources():
+            if (age_s := source.age_s(mono_ns)) > limit_s:
+                return f"{what} yet" if math.isinf(age_s) else f"{what} for {age_s:.2f} s"
+        return next(filter(None, (gate.problem(mono_ns) for gate in self.gates)), "") or self._fence_problem()
+
+    def _sources(self) -> list[tuple[str, _Source, float]]:
+        limits = self.limits
+        sources: list[tuple[str, _Source, float]] = [("no pose of the car", self._car, limits.pose_age_s)]
         if "camera" in limits.nodes:
             sources.insert(0, ("no camera image", self._camera, limits.image_age_s))
         if not self.hand.drives:
             sources.append((f"no command of the {self.driver}", self._drivers[self.driver], limits.drive_age_s))
-        for what, source, limit_s in sources:
-            if source.restarted:
-                return f"{what} from the process that was armed with: it was restarted"
-            if (age_s := source.age_s(mono_ns)) > limit_s:
-                return f"{what} yet" if math.isinf(age_s) else f"{what} for {age_s:.2f} s"
-        return next(filter(None, (gate.problem(mono_ns) for gate in self.gates)), "") or self._fence_problem()
+        return sources
 
     def drive_age_s(self, mono_ns: int) -> float:
         """Age of the newest command [s]."""
@@ -255,6 +278,15 @@ class Arming:
     def pose_age_s(self, mono_ns: int) -> float:
         """Age of the newest pose of the car [s]."""
         return self._car.age_s(mono_ns)
+
+    def _void(self, asked_ns: int, mono_ns: int) -> str:
+        """Why a request to arm does not count any more; empty if it does."""
+        if asked_ns <= self._disarmed_ns:
+            return f"the request is older than the last stop ({self.reason}); arm again"
+        age_s, limit_s = (mono_ns - asked_ns) / NS_PER_S, self.limits.arm_age_s
+        if age_s > limit_s:
+            return f"the request is {age_s:.1f} s old, older than {limit_s:g} s; arm again"
+        return ""
 
     def _watched(self) -> list[_Source]:
         return [self._camera, self._car, *self._drivers.values(), *self._nodes.values()]
@@ -279,8 +311,6 @@ class Arming:
         return ""
 
     def _node_problem(self, name: str, node: _NodeStatus, mono_ns: int) -> str:
-        if node.restarted:
-            return f"node {name} was restarted"
         if (age_s := node.age_s(mono_ns)) > self.limits.status_age_s:
             return (
                 f"node {name} has not reported yet" if math.isinf(age_s) else f"node {name} is silent for {age_s:.1f} s"
@@ -303,7 +333,10 @@ class Arming:
         return "" if -0.05 <= age_s <= self.limits.image_age_s else f"a command from an image {age_s:.2f} s old"
 
     def _check_held_up(self, mono_ns: int) -> None:
-        pause_s = 0.0 if self._last_ns is None else (mono_ns - self._last_ns) / NS_PER_S
+        if self._last_ns is None:
+            # Stopped until now: what was asked of a safety node before this one is void.
+            self._last_ns = self._disarmed_ns = mono_ns
+        pause_s = (mono_ns - self._last_ns) / NS_PER_S
         self._last_ns = mono_ns
         if self.armed and pause_s > self.limits.held_up_s:
             # Stopped by a signal, or the computer was: what was checked before says nothing about now.

@@ -15,6 +15,7 @@ from nodes.runtime.wire import MessageInfo
 
 IDLE, HUMAN, AUTONOMY = "idle", "human", "autonomy"
 Point = tuple[float, float]
+_MOST_DOUBT_S = 3600.0
 
 
 @dataclass
@@ -90,6 +91,16 @@ class ClockGate:
     def heard(self, peer: str, offset_s: float, error_s: float, info: MessageInfo) -> None:
         """Note a measurement."""
         self._heard[peer] = (offset_s, error_s, info.publish_mono_ns)
+
+    def doubt_ns(self, mono_ns: int) -> int:
+        """How wrong a time that another host gave can be, by the newest measurements [ns]; 0 without other hosts."""
+        worst_s = 0.0
+        for offset_s, error_s, publish_ns in self._heard.values():
+            if (mono_ns - publish_ns) / NS_PER_S <= self.age_limit_s:
+                doubt_s = abs(offset_s) + error_s
+                # Not finite, or beyond every limit: nothing that was asked can be known to be young.
+                worst_s = max(worst_s, doubt_s) if doubt_s <= _MOST_DOUBT_S else _MOST_DOUBT_S
+        return round(worst_s * NS_PER_S)
 
     def problem(self, mono_ns: int) -> str:
         """Why the car may not move; empty if it may."""

@@ -25,6 +25,7 @@ from nodes.attacking.request import parse_request, request_text
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.messages import header, image_message, types
 from nodes.runtime.node import ACTIVE, READY, Inbox, MessageInfo, Node, NodeContext, Now, Out, run_node_main
+from nodes.runtime.requests import Answer, Answers
 from nodes.runtime.transfer import chunk_messages
 
 _REQUEST, _CANCEL = "/attack/request", "/attack/cancel"
@@ -76,6 +77,7 @@ class AttackNode(Node):
         self._progress: dict[str, Any] = {}
         self._told_ns = 0
         self._sender: Sender | None = None
+        self._answers = Answers()
         self._resume()
 
     @classmethod
@@ -86,15 +88,14 @@ class AttackNode(Node):
         return cls(config, folder, context.subscribers)
 
     def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
-        """Take a request or a cancel."""
-        if topic == _CANCEL:
-            return self._cancel(message, now)
-        try:
-            self._accept(message)
-        except (AdvnerfError, OSError) as error:
-            refusal = _fresh("refused", " ".join(str(error).split()))
-            return [self._message(now, str(message.request_id), refusal)]
-        return [self._tell(now)]
+        """Take a request or a cancel, once, and answer every repeat of it."""
+        ask_id = str(message.ask_id)
+        if not self._answers.repeat(ask_id):
+            self._answers.give(Answer(ask_id, *self._decide(topic, message)))
+        answer = self._answers.last
+        if answer.granted:
+            return [self._tell(now)]
+        return [self._message(now, str(message.request_id), _fresh("refused", answer.text))]
 
     def receive(self, item: Said, now: Now) -> list[Out]:
         """Take what the search says; what an earlier one said is too late."""
@@ -145,6 +146,13 @@ class AttackNode(Node):
             self._job.stop()
             self._job = None
 
+    def _decide(self, topic: str, message: Any) -> tuple[bool, str]:
+        try:
+            self._cancel(message) if topic == _CANCEL else self._accept(message)
+        except (AdvnerfError, OSError) as error:
+            return False, " ".join(str(error).split())
+        return True, ""
+
     def _accept(self, message: Any) -> None:
         request_id, text = str(message.request_id), str(message.request)
         if not _ID.fullmatch(request_id):
@@ -166,13 +174,10 @@ class AttackNode(Node):
         self._keep("running")
         self._job = Job(self._folder / request_id, self.inbox, self._config.threads)
 
-    def _cancel(self, message: Any, now: Now) -> list[Out]:
-        wanted = str(message.request_id)
-        if self._job is None or wanted not in ("", self._request_id):
-            return [self._tell(now)]
-        self._keep("cancelled")
-        self._finish("cancelled", str(message.reason))
-        return [self._tell(now)]
+    def _cancel(self, message: Any) -> None:
+        if self._job is not None and str(message.request_id) in ("", self._request_id):
+            self._keep("cancelled")
+            self._finish("cancelled", str(message.reason))
 
     def _finish(self, state: str, text: str, attack_id: str = "") -> None:
         self._progress |= {"state": state, "text": text, "attack_id": attack_id}
@@ -211,7 +216,9 @@ class AttackNode(Node):
         return self._message(now, self._request_id, self._progress or _fresh("idle", ""))
 
     def _message(self, now: Now, request_id: str, progress: dict[str, Any]) -> Out:
-        return Out(_PROGRESS, types.AttackProgress(header=header(now.real_ns), request_id=request_id, **progress))
+        return Out(_PROGRESS, types.AttackProgress(
+            header=header(now.real_ns), request_id=request_id, answered_id=self._answers.last.ask_id, **progress
+        ))  # fmt: skip
 
 
 class Sender:

@@ -239,7 +239,15 @@ def arm(
     run_dir: RunDir = None, reason: Annotated[str, typer.Option("--reason", help="Why, for the record.")] = ""
 ) -> None:
     """Ask the safety node of a running launch to let the car move."""
-    _send_arm(True, run_dir, reason)
+    from nodes.runtime.arm_requests import ask_to_arm
+    from nodes.runtime.watching import find_run_dir
+
+    answer = ask_to_arm(find_run_dir(run_dir), reason)
+    if answer.granted and answer.armed:
+        print(f"armed by {answer.text}")
+        return
+    print(f"armed, and stopped since: {answer.text}" if answer.granted else f"not armed: {answer.text}")
+    raise typer.Exit(FAILURE_EXIT)
 
 
 @app.command()
@@ -247,15 +255,25 @@ def disarm(
     run_dir: RunDir = None, reason: Annotated[str, typer.Option("--reason", help="Why, for the record.")] = ""
 ) -> None:
     """Stop the car of a running launch and keep it stopped."""
-    _send_arm(False, run_dir, reason)
+    from nodes.runtime.arm_requests import BRAKE_WAIT_S, ask_to_disarm
+    from nodes.runtime.watching import find_run_dir
 
+    def silent(waited_s: float) -> None:
+        say_error(
+            f"NOT CONFIRMED: no answer of the safety node for {waited_s:.1f} s, the car may be driving; still asking"
+            " (Ctrl-C gives up). Use the e-stop or cut the power"
+        )
 
-def _send_arm(wanted: bool, run_dir: Path | None, reason: str) -> None:
-    from nodes.runtime.watching import ask_to_arm, find_run_dir
-
-    armed, why = ask_to_arm(find_run_dir(run_dir), wanted, reason)
-    print(f"armed by {why}" if armed else f"not armed: {why}")
-    if armed != wanted:
+    answer = ask_to_disarm(find_run_dir(run_dir), reason, silent)
+    if answer.armed:
+        say_error("disarmed, but somebody has armed the car again since")
+        raise typer.Exit(FAILURE_EXIT)
+    print(f"not armed: {answer.text}")
+    if not answer.braked:
+        say_error(
+            f"NOT CONFIRMED: disarmed, but the motor node has not said within {BRAKE_WAIT_S:g} s that it brakes; look at the"
+            " car. If the motor node is down, the controller brakes after its own time-out"
+        )
         raise typer.Exit(FAILURE_EXIT)
 
 

@@ -204,17 +204,15 @@ def bag_control(
 ) -> None:
     """Tell a player that is at work to pause, go on, step, change its speed, or end."""
     from nodes.runtime.bag_play import Command
-    from nodes.runtime.bus import Bus
-    from nodes.runtime.messages import types
+    from nodes.runtime.player_requests import ask_player
     from nodes.runtime.watching import find_run_dir
 
     text = " ".join(words)
     Command.parse(text)
-    with Bus(find_run_dir(run_dir)) as bus:
-        bus.publisher("/player/control")
-        bus.wait_for_subscribers(["/player/control"], 2.0)
-        bus.publish("/player/control", types.String(data=text))
-        bus.close(farewell=True)
+    granted, answer = ask_player(find_run_dir(run_dir), text)
+    print(answer if granted else f"not done: {answer}")
+    if not granted:
+        raise typer.Exit(1)
 
 
 @app.command("repair")

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import time
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from nodes.runtime.terminal import RunDir, print_table, table
 
+if TYPE_CHECKING:
+    from nodes.runtime.bus import Bus, Received
+    from nodes.runtime.clock import Now
+    from nodes.runtime.requests import Asked
+
 app = typer.Typer(no_args_is_help=True, help="Look at the motor controller, set its time-out, check the steering.")
 Port = Annotated[str, typer.Option("--port", help="Serial device; the launch that uses it must be stopped.")]
-_CHECK_S = 75.0
+_CHECK_S, _ANSWER_S = 75.0, 3.0
 
 
 @app.command("info")
@@ -70,25 +75,16 @@ def check_steering(
 ) -> None:
     """Show the front wheels to the left and to the right; motion capture or you must see them turn."""
     from nodes.runtime.bus import Bus
-    from nodes.runtime.messages import header, types
     from nodes.runtime.watching import find_run_dir
 
     with Bus(find_run_dir(run_dir)) as bus:
-        bus.publisher("/motor/check")
-        bus.subscribe("/diagnostics")
-        bus.wait_for_subscribers(["/motor/check"], 2.0)
-
-        def say(action: str) -> None:
-            message = types.SteeringCheck(header=header(time.time_ns()), action=action, source="operator")
-            bus.publish("/motor/check", message)
-
-        say("start")
+        _ask_motor(bus, "start")
         asked, shown, began = False, "", time.monotonic()
         while time.monotonic() - began < _CHECK_S:
             bus.wait(0.2)
             for received in bus.receive():
-                row = next((row for row in received.message().status if row.name == "motor: steering"), None)
-                if row is None or time.monotonic() - began < 1.5:
+                row = _steering_row(received)
+                if row is None:
                     continue
                 if row.message != shown:
                     shown = str(row.message)
@@ -96,10 +92,36 @@ def check_steering(
                 if shown.endswith("confirm or deny") and not asked:
                     asked = True
                     turned = yes or typer.confirm("did the front wheels turn left, then right?")
-                    say("confirm" if turned else "deny")
+                    _ask_motor(bus, "confirm" if turned else "deny")
                 elif not shown.startswith("steering check:"):
                     if not shown.startswith(("steering seen", "steering confirmed")):
                         raise typer.Exit(1)
                     return
     print("the motor node gave no answer")
     raise typer.Exit(1)
+
+
+def _ask_motor(bus: Bus, action: str) -> None:
+    """Send a request about the check until the motor node has answered; a refusal ends the command."""
+    from nodes.runtime.asking import NoAnswerError, ask
+    from nodes.runtime.errors import LaunchError
+    from nodes.runtime.messages import header, types
+
+    def make(asked: Asked, now: Now) -> Any:
+        return types.SteeringCheck(header=header(asked.real_ns), action=action, source="operator", ask_id=asked.ask_id)
+
+    def read(ask_id: str, received: Received) -> dict[str, str] | None:
+        row = _steering_row(received)
+        values = {} if row is None else {str(pair.key): str(pair.value) for pair in row.values}
+        return values if values.get("answered") == ask_id else None
+
+    try:
+        answer = ask(bus, "/motor/check", make, "/diagnostics", read, every_s=0.1, patience_s=_ANSWER_S)
+    except NoAnswerError:
+        raise LaunchError(f"the motor node did not answer within {_ANSWER_S:g} s; is it running?") from None
+    if answer["granted"] != str(True):
+        raise LaunchError(f"the motor node refused to {action} the steering check: {answer['answer']}")
+
+
+def _steering_row(received: Received) -> Any:
+    return next((row for row in received.message().status if row.name == "motor: steering"), None)

@@ -23,12 +23,18 @@ def add_to(root: typer.Typer) -> None:
 
 @app.command("list")
 def node_list(run_dir: RunDir = None) -> None:
-    """List the nodes that report, with their state and what they say."""
+    """List the nodes with their state and what they say; those that do not report are silent."""
     from nodes.runtime.watching import find_run_dir, node_statuses
+    from nodes.runtime.watching_nodes import SILENT, describe_silence
 
+    run = find_run_dir(run_dir)
     rows = table("node", "state", "process", "text")
-    for name, status in sorted(node_statuses(find_run_dir(run_dir)).items()):
-        rows.add_row(name, str(status.state), str(status.pid), str(status.text))
+    for name, status in sorted(node_statuses(run).items()):
+        if status is None:
+            silence = describe_silence(run, name)
+            rows.add_row(name, SILENT, str(silence.pid or "-"), silence.text)
+        else:
+            rows.add_row(name, str(status.state), str(status.pid), str(status.text))
     print_table(rows)
 
 

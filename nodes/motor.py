@@ -124,8 +124,11 @@ class MotorNode(Node):
             self._watch.see(message, now.mono_ns)
             return []
         if topic == "/motor/check":
-            self._obey_check(str(message.action), str(message.source), now)
-            return []
+            busy = "the car drives; disarm first" if self._gate.state is GateState.DRIVING else ""
+            self._watch.obey(
+                message, busy or ("" if self._vesc.is_open else f"no controller: {self._link_error}"), now.mono_ns
+            )
+            return self._diagnostics(now, at_once=True)
         drive = message.drive
         action = self._gate.command(float(drive.speed), float(drive.steering_angle), info, now.mono_ns)
         if isinstance(action, Drive):
@@ -164,14 +167,6 @@ class MotorNode(Node):
     def close(self) -> None:
         """Brake until the car stands, let the motor go."""
         self._vesc.close()
-
-    def _obey_check(self, action: str, source: str, now: Now) -> None:
-        if self._gate.state is GateState.DRIVING or not self._vesc.is_open:
-            return
-        if action == "start":
-            self._watch.start_check(now.mono_ns)
-        elif action in ("confirm", "deny"):
-            self._watch.check.answer(action == "confirm", source, now.mono_ns)
 
     def _show_wheels(self, now: Now) -> None:
         steering_rad = self._watch.check.steering_rad(now.mono_ns)
@@ -263,8 +258,8 @@ class MotorNode(Node):
         states = [Out("/motor/state", self._state(reply, now)) for reply in replies if isinstance(reply, Values)]
         return states + [out for reply in replies for out in self._watch.hear(reply, self._vesc, now)]
 
-    def _diagnostics(self, now: Now) -> list[Out]:
-        if now.mono_ns - self._diagnosed_ns < _DIAGNOSTICS_S * NS_PER_S:
+    def _diagnostics(self, now: Now, at_once: bool = False) -> list[Out]:
+        if not at_once and now.mono_ns - self._diagnosed_ns < _DIAGNOSTICS_S * NS_PER_S:
             return []
         self._diagnosed_ns = now.mono_ns
         report = self._watch.report(self._vesc, self._link_error, self._config.battery_warning_v, now)

@@ -11,6 +11,7 @@ from hardware.odometry import POSITION_VARIANCE, YAW_VARIANCE, OdometryState
 from hardware.vesc_replies import FirmwareVersion, Values
 from hardware.vesc_settings import TimeoutSettings
 from nodes.runtime.messages import header, types
+from nodes.runtime.requests import Answer
 
 OK, WARN, ERROR, STALE = 0, 1, 2, 3
 _HOT_C = 80.0
@@ -51,6 +52,7 @@ class ControllerReport:
         steering: How the steering check stands.
         steering_good: Whether arming may rely on the steering.
         battery_warning_v: Supply voltage below which a person is warned [V].
+        answer: To the last request about the steering check.
     """
 
     values: Values | None
@@ -63,10 +65,14 @@ class ControllerReport:
     steering: str
     steering_good: bool
     battery_warning_v: float
+    answer: Answer
 
 
 def diagnostics_message(report: ControllerReport, stamp_ns: int) -> Any:
-    """``diagnostic_msgs/DiagnosticArray`` with the rows controller, battery, time-out and steering."""
+    """``diagnostic_msgs/DiagnosticArray`` with the rows controller, battery, time-out and steering.
+
+    The row on steering also carries the answer to the last request about its check: ``answered``, ``granted``, ``answer``.
+    """
     hardware = str(report.firmware) if report.firmware else "VESC"
     rows = [_controller(report), _battery(report), _timeout(report), _steering(report)]
     statuses = [
@@ -125,4 +131,8 @@ def _timeout(report: ControllerReport) -> _Row:
 
 
 def _steering(report: ControllerReport) -> _Row:
-    return "steering", OK if report.steering_good else WARN, report.steering, {}
+    answer = report.answer
+    answered = (
+        {"answered": answer.ask_id, "granted": str(answer.granted), "answer": answer.text} if answer.ask_id else {}
+    )
+    return "steering", OK if report.steering_good else WARN, report.steering, answered

@@ -14,6 +14,7 @@ from nodes.runtime.clock import NS_PER_S, Now
 from nodes.runtime.errors import MessageError
 from nodes.runtime.messages import pose_matrix
 from nodes.runtime.node import Out
+from nodes.runtime.requests import Answer, Answers
 from nodes.steering_check import CheckSettings, SteeringCheck
 
 # How often a controller is asked for its settings before it counts as one that does not tell them.
@@ -33,10 +34,12 @@ class ControllerWatch:
         check: The steering check.
         values: Last telemetry; None before the first.
         timeout: Time-out as read back; None where the controller does not tell.
+        answers: What was answered to requests about the check.
     """
 
     def __init__(self, wanted: TimeoutSettings, steering_check: str, shown: CheckSettings) -> None:
         self.check = SteeringCheck(shown)
+        self.answers = Answers()
         self.values: Values | None = None
         self.timeout: TimeoutSettings | None = None
         self._wanted = wanted
@@ -79,6 +82,27 @@ class ControllerWatch:
         """Begin to show the wheels."""
         self._checked_with = self._firmware
         self.check.start(mono_ns)
+
+    def obey(self, message: Any, refusal: str, mono_ns: int) -> None:
+        """Do what a person asks about the check, once; a repeat only gets its answer again.
+
+        Args:
+            message: A ``SteeringCheck``.
+            refusal: Why nothing can be done now; empty if it can.
+            mono_ns: Monotonic time [ns].
+        """
+        ask_id, action = str(message.ask_id), str(message.action)
+        if self.answers.repeat(ask_id):
+            return
+        if action not in ("start", "confirm", "deny"):
+            refusal = f"expected start, confirm or deny, got {action[:40]!r}"
+        elif not refusal and action != "start" and not self.check.awaits_answer(mono_ns):
+            refusal = "no steering check awaits an answer; start one"
+        if not refusal and action == "start":
+            self.start_check(mono_ns)
+        elif not refusal:
+            self.check.answer(action == "confirm", str(message.source), mono_ns)
+        self.answers.give(Answer(ask_id, not refusal, refusal or self.check.text))
 
     def see(self, message: Any, mono_ns: int) -> None:
         """The car was measured while its wheels are shown."""
@@ -124,5 +148,5 @@ class ControllerWatch:
         age_s = (now.mono_ns - vesc.last_reply_mono_ns) / NS_PER_S
         return ControllerReport(
             self.values, age_s, self._firmware, self.timeout, self._wanted, vesc.skipped_bytes, link, self.check.text,
-            self.steering_good, battery_warning_v,
+            self.steering_good, battery_warning_v, self.answers.last,
         )  # fmt: skip

@@ -4,7 +4,7 @@ The bytes and the capture stamps are those of the recording; publish times are n
 Statuses and requests (to arm, for an attack) stay in the bag unless they are asked for: a recording must not arm a car.
 
 It can be told to pause, to go on, to step message by message, to change its speed and to end: by keys where it has a terminal,
-and by texts on ``/player/control``. ``/clock`` says where in the recording it is.
+and by requests on ``/player/control``, which it answers on ``/player/state``. ``/clock`` says where in the recording it is.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from nodes.runtime.bag_play import PAUSE, RATE, RESUME, STEP, STOP, TOGGLE, Comm
 from nodes.runtime.bag_read import BagMessage, read_info, read_messages, require_readable
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import BagError, MessageError, NodeFinished
-from nodes.runtime.messages import stamp_from_ns, types
+from nodes.runtime.messages import header, stamp_from_ns, types
 from nodes.runtime.node import (
     ACTIVE,
     READY,
@@ -33,14 +33,17 @@ from nodes.runtime.node import (
     ReaderThread,
     run_node_main,
 )
+from nodes.runtime.requests import Answer, Answers
 from nodes.runtime.topics import STATUS_PREFIX, type_of_topic
 from nodes.runtime.topics import topic as topic_row
 
-_CONTROL, _CLOCK = "/player/control", "/clock"
-_STAYS = ("/arm", "/attack/request", "/attack/cancel", _CONTROL, _CLOCK)
+_CONTROL, _STATE, _CLOCK = "/player/control", "/player/state", "/clock"
+_STAYS = ("/arm", "/attack/request", "/attack/cancel", _CONTROL, _STATE, _CLOCK)
 # Messages leave at the first tick after they are due, so they are up to 2.5 ms late on average.
 _TICK_HZ = 200.0
 _FASTER = 1.25
+# Who told it to stop may not have heard the answer yet, and asks again.
+_FAREWELL_NS = NS_PER_S // 4
 
 
 class PlayerConfig(BaseModel):
@@ -97,7 +100,7 @@ class PlayerNode(Node):
         self._types = {recorded: topic_row(played).type for recorded, played in self._names.items()}
         require_readable(config.bag, self._types)
         self._played_names = tuple(self._names[topic] for topic in self._topics)
-        self.publications = (*self._played_names, _CLOCK) if config.clock_hz else self._played_names
+        self.publications = (*self._played_names, *((_CLOCK,) if config.clock_hz else ()), _STATE)
         for topic in config.wait_for or ():
             if topic not in self.publications:
                 raise BagError(
@@ -111,7 +114,9 @@ class PlayerNode(Node):
         self._next: BagMessage | None = None
         self._head: Playhead | None = None
         self._clock_due_ns = 0
-        self._played, self._trouble, self._ending = 0, "", False
+        self._played, self._trouble = 0, ""
+        self._answers = Answers()
+        self._ends_ns: int | None = None
         self._rewind()  # a bag without a message in the wanted part is refused here, not when a subscriber comes
         self._keys, self._reader = None, None
         if terminal is not None:
@@ -126,24 +131,32 @@ class PlayerNode(Node):
         return cls(config, context.subscribers)
 
     def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
-        """Do what a text on the bus says."""
-        try:
-            return self._obey(Command.parse(str(message.data)), now)
-        except MessageError as error:
-            self._trouble = str(error)
-            return []
+        """Do what a request says, once, and answer every repeat of it."""
+        outs: list[Out] = []
+        ask_id = str(message.ask_id)
+        if not self._answers.repeat(ask_id):
+            try:
+                outs = self._obey(Command.parse(str(message.command)), now)
+            except MessageError as error:
+                self._trouble = str(error)
+            self._answers.give(Answer(ask_id, not self._trouble, self._trouble or self.status()[1]))
+        return [*outs, self._state(now)]
 
     def receive(self, item: str, now: Now) -> list[Out]:
         """Do what a key says."""
         if item in ("faster", "slower"):
             rate = self._head.rate if self._head else self._config.rate
-            return self._obey(Command(RATE, rate * _FASTER if item == "faster" else rate / _FASTER), now)
-        return self._obey(Command(item), now)
+            return self._obey(
+                Command(RATE, rate * _FASTER if item == "faster" else rate / _FASTER), now, by_request=False
+            )
+        return self._obey(Command(item), now, by_request=False)
 
     def tick(self, now: Now) -> list[Out]:
         """Publish what is due."""
-        if self._ending:
-            raise NodeFinished
+        if self._ends_ns is not None:
+            if now.mono_ns >= self._ends_ns:
+                raise NodeFinished
+            return []
         if self._head is None:
             if self._missing():
                 return []
@@ -175,11 +188,13 @@ class PlayerNode(Node):
             self._reader.stop()
             self._keys.close()
 
-    def _obey(self, command: Command, now: Now) -> list[Out]:
+    def _obey(self, command: Command, now: Now, by_request: bool = True) -> list[Out]:
         self._trouble = ""
         if command.word == STOP:
-            self._ending = True
+            self._ends_ns = now.mono_ns + (_FAREWELL_NS if by_request else 0)
+            return []
         if self._head is None:
+            self._trouble = "it has not begun yet"
             return []
         if command.word in (PAUSE, RESUME, TOGGLE):
             paused = not self._head.paused if command.word == TOGGLE else command.word == PAUSE
@@ -189,6 +204,15 @@ class PlayerNode(Node):
         elif command.word == STEP:
             return self._step(int(command.number), now)
         return []
+
+    def _state(self, now: Now) -> Out:
+        answer, head = self._answers.last, self._head
+        message = types.PlayerState(
+            header=header(now.real_ns), answered_id=answer.ask_id, granted=answer.granted, answer=answer.text,
+            paused=self._config.paused if head is None else head.paused, rate=self._config.rate if head is None else head.rate,
+            playing=stamp_from_ns(0 if head is None else head.time_ns(now.mono_ns)),
+        )  # fmt: skip
+        return Out(_STATE, message)
 
     def _step(self, count: int, now: Now) -> list[Out]:
         """The next messages at once; it stands still behind them."""

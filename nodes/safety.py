@@ -13,11 +13,13 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from calibration.schema import RoomCalibration, VehicleCalibration, load_calibration
 from nodes.arming import Arming, ArmingLimits
 from nodes.arming_gates import ClockGate, HandGate, inside, require_simple
+from nodes.arming_requests import ArmRequests
 from nodes.pose_check import MotionBounds, PoseCheck, PoseGate
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import ConfigError, MessageError
 from nodes.runtime.messages import drive_message, header, ns_from_stamp, pose_matrix, types
 from nodes.runtime.node import ACTIVE, READY, MessageInfo, Node, NodeContext, Now, Out, run_node_main
+from nodes.runtime.requests import asked_mono_ns
 from nodes.runtime.topics import STATUS_PREFIX, status_topic
 from nodes.stall_check import StallGate, StallLimits
 
@@ -144,6 +146,7 @@ class SafetyNode(Node):
         clocks: ClockGate | None = None,
     ) -> None:  # fmt: skip
         self._arming = Arming(limits, hand or HandGate(), clocks or ClockGate(), (poses, stall))
+        self._requests = ArmRequests(self._arming)
         self._poses, self._stall = poses, stall
         self._topic_of = {f"/{driver}/drive": driver for driver in limits.drivers}
         self._stopped_ns = 0
@@ -173,10 +176,10 @@ class SafetyNode(Node):
             return self._pass_on(self._topic_of[topic], message, info, now)
         if topic == "/teleop/state":
             return self._hand(message, info, now)
+        if topic == "/arm":
+            return self._obey(message, info, now)
         if topic == "/clock/offset":
             arming.clocks.heard(str(message.peer), float(message.offset_s), float(message.error_s), info)
-        elif topic == "/arm":
-            self._obey(message, info, now)
         elif topic == "/camera/camera_info":
             arming.heard_camera(info)
         elif topic == "/vicon/car":
@@ -236,11 +239,19 @@ class SafetyNode(Node):
         self._stall.commanded(speed_mps, now.mono_ns)
         return Out("/safety/drive", drive_message(speed_mps, steering_rad, stamp_ns))
 
-    def _obey(self, message: Any, info: MessageInfo, now: Now) -> None:
+    def _obey(self, message: Any, info: MessageInfo, now: Now) -> list[Out]:
+        """Do what a person asks, and answer every repeat of it."""
+        ask_id, source, asked_ns = (
+            str(message.ask_id),
+            str(message.source),
+            min(asked_mono_ns(message, info), now.mono_ns),
+        )
         if message.arm:
-            self._arming.arm(str(message.source), info, now.mono_ns)
+            self._requests.arm(ask_id, source, asked_ns, now.mono_ns)
         else:
-            self._arming.disarm(f"disarmed by {message.source}: {message.reason}", now.mono_ns)
+            self._requests.disarm(ask_id, f"disarmed by {source}: {message.reason}", asked_ns, now.mono_ns)
+        self._arming.check(now.mono_ns)
+        return self._news(now) or [self._state(now)]
 
     def _news(self, now: Now) -> list[Out]:
         """What must be said at once when the car was armed or disarmed."""
@@ -258,10 +269,11 @@ class SafetyNode(Node):
 
     def _state(self, now: Now) -> Out:
         self._stated_ns, self._stated_armed = now.mono_ns, self._arming.armed
-        arming = self._arming
+        arming, answer = self._arming, self._requests.last
         message = types.SafetyState(
             header=header(now.real_ns), armed=arming.armed, stopping=not arming.armed, reason=arming.reason,
-            source=arming.source if arming.armed else "", command_age_s=arming.drive_age_s(now.mono_ns),
+            source=arming.source if arming.armed else "", answered_id=answer.ask_id, granted=answer.granted, answer=answer.text,
+            command_age_s=arming.drive_age_s(now.mono_ns),
             pose_age_s=arming.pose_age_s(now.mono_ns),
         )  # fmt: skip
         return Out("/safety/state", message)

@@ -69,6 +69,10 @@ class SteeringCheck:
         """Whether the wheels are being shown, or an answer is awaited."""
         return self._began_ns is not None
 
+    def awaits_answer(self, mono_ns: int) -> bool:
+        """Whether both sides were shown and a person may say what was seen."""
+        return self.showing and self._side(mono_ns) is None
+
     def start(self, mono_ns: int) -> None:
         """Begin to show the wheels; an earlier result is void."""
         self._began_ns, self.passed, self._last = mono_ns, False, None
@@ -116,7 +120,7 @@ class SteeringCheck:
 
     def answer(self, turned: bool, source: str, mono_ns: int) -> None:
         """A person says whether the wheels turned; counts only after both sides were shown."""
-        if not self.showing or self._side(mono_ns) is not None:
+        if not self.awaits_answer(mono_ns):
             return
         if turned:
             self._end(True, f"steering confirmed by {source}")

@@ -17,6 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from hardware.gamepad import EVENT_LAYOUT, JS_LAYOUT, Gamepad, Layout
 from hardware.hands import Hands
 from hardware.keyboard import Keyboard
+from nodes.runtime.arm_requests import OPERATOR, arm_message
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.messages import header, types
 from nodes.runtime.node import (
@@ -32,8 +33,10 @@ from nodes.runtime.node import (
     ReaderThread,
     run_node_main,
 )
+from nodes.runtime.requests import Asked
 
 _STALE_S = 0.15
+_ARM_NS = NS_PER_S
 
 
 class TeleopConfig(BaseModel):
@@ -63,6 +66,7 @@ class TeleopNode(Node):
         release: Lets the device go.
     """
 
+    subscriptions = ("/safety/state",)
     publications = ("/teleop/state", "/arm")
     tick_rate_hz = 20.0
 
@@ -73,6 +77,7 @@ class TeleopNode(Node):
         self._stops = self._rearms = 0
         self._estop = False
         self._arm_in_ticks = 0
+        self._asked: Asked | None = None
         self._mode = "idle"
         self._reader = ReaderThread(read, self.inbox, "hands")
         self._reader.start()
@@ -90,7 +95,9 @@ class TeleopNode(Node):
         return cls(config, device.read, device.close)
 
     def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
-        """It listens to nobody."""
+        """Hear whether the safety node has answered the request to re-arm."""
+        if self._asked is not None and message.answered_id == self._asked.ask_id:
+            self._asked = None
         return []
 
     def receive(self, item: Hands, now: Now) -> list[Out]:
@@ -99,18 +106,25 @@ class TeleopNode(Node):
         if item.rearms > self._rearms:
             self._estop, self._arm_in_ticks = False, 2
         if item.stops > self._stops:
-            self._estop, self._arm_in_ticks = True, 0  # of both at once, stopping counts
+            self._estop, self._arm_in_ticks, self._asked = True, 0, None  # of both at once, stopping counts
         self._stops, self._rearms = item.stops, item.rearms
         state = self._state(now)
         return [state] if (self._mode, self._estop) != before else []
 
     def tick(self, now: Now) -> list[Out]:
-        """Say it again; re-arm a moment after the e-stop was said to be over, for the two travel apart."""
+        """Say it again; re-arm a moment after the e-stop was said to be over, for the two travel apart.
+
+        The request to re-arm is repeated until the safety node has answered, or no longer acts on it.
+        """
         outs = [self._state(now)]
         if self._arm_in_ticks:
             self._arm_in_ticks -= 1
             if not self._arm_in_ticks:
-                outs.append(self._arm(now))
+                self._asked = Asked.at(now)
+        if self._asked is not None and self._asked.age_ns(now) > _ARM_NS:
+            self._asked = None
+        if self._asked is not None:
+            outs.append(Out("/arm", arm_message(self._asked, now, True, OPERATOR, "re-armed by hand")))
         return outs
 
     def status(self) -> tuple[str, str]:
@@ -138,10 +152,6 @@ class TeleopNode(Node):
             steering_rad=config.steering_rad * hands.steering if drives else 0.0, device=hands.text,
         )  # fmt: skip
         return Out("/teleop/state", message)
-
-    def _arm(self, now: Now) -> Out:
-        request = types.Arm(header=header(now.real_ns), arm=True, source="operator", reason="re-armed by hand")
-        return Out("/arm", request)
 
 
 def _layout(path: Path, axes: tuple[int, int] | None) -> Layout | None:

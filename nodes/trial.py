@@ -15,10 +15,12 @@ from typing import Any
 import numpy as np
 
 from advnerf_core.geometry import planar_pose, wrap_angle, yaw_of
+from nodes.runtime.arm_requests import arm_message
 from nodes.runtime.clock import NS_PER_S, Now
 from nodes.runtime.errors import NodeFinished, RuntimeFault
-from nodes.runtime.messages import header, ns_from_stamp, pose_matrix, pose_message, types
+from nodes.runtime.messages import ns_from_stamp, pose_matrix, pose_message
 from nodes.runtime.node import MessageInfo, Node, Out
+from nodes.runtime.requests import Asked
 from nodes.runtime.topics import status_topic
 
 TWIN_PEER = "TWIN"
@@ -108,6 +110,8 @@ class _Seen:
     spot_m: Any = None
     standing_since_ns: int | None = None
     armed: bool = False
+    answered_id: str = ""
+    granted: bool = False
     safety_reason: str = ""
     peer: str = ""
 
@@ -137,6 +141,7 @@ class TrialNode(Node):
         self._seen = _Seen()
         self._phase_began_ns: int | None = None
         self._said_ns = 0
+        self._asked: Asked | None = None
 
     def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
         """Remember what is going on; act on the car's pose at once."""
@@ -144,7 +149,7 @@ class TrialNode(Node):
         if topic == "/vicon/car":
             self._see_car(message, now)
         elif topic == "/safety/state":
-            self._seen.armed, self._seen.safety_reason = bool(message.armed), str(message.reason)
+            self._see_safety(message)
         elif topic == "/motor/sent":
             self._seen.peer = str(message.peer)
         else:
@@ -185,6 +190,11 @@ class TrialNode(Node):
             if offset_m > MOVED_M:
                 self.outcome.start_real_ns = stamp_ns
 
+    def _see_safety(self, message: Any) -> None:
+        seen = self._seen
+        seen.armed, seen.safety_reason = bool(message.armed), str(message.reason)
+        seen.answered_id, seen.granted = str(message.answered_id), bool(message.granted)
+
     def _see_status(self, message: Any) -> None:
         if message.state in ("ready", "active"):
             self._seen.ready.add(str(message.node))
@@ -222,7 +232,14 @@ class TrialNode(Node):
                 return []
             why = self._seen.safety_reason or "nobody has armed"
             return self._tell(f"on the start. ARM to drive (gamepad, or: advnerf arm). Not armed: {why}", now)
-        return self._say(self._arm_message(True, now), now)
+        if self._asked is not None and self._seen.answered_id == self._asked.ask_id:
+            if self._seen.granted:  # armed, and stopped before the trial heard of it: never armed a second time
+                self._enter(Phase.DRIVING, now)
+                return []
+            if now.mono_ns - self._asked.mono_ns < _REPEAT_S * NS_PER_S:
+                return []
+            self._asked = None  # refused; what was missing may have come
+        return [self._arm_message(True, now)]
 
     def _drive(self, now: Now) -> list[Out]:
         began_ns = self.outcome.start_real_ns
@@ -243,10 +260,11 @@ class TrialNode(Node):
         if not self._seen.armed and self._stood_s(now) > _STANDING_S:
             self._enter(Phase.DONE, now)
             return []
-        return self._say(self._arm_message(False, now), now)
+        answered = self._asked is not None and self._seen.answered_id == self._asked.ask_id
+        return [] if answered and not self._seen.armed else [self._arm_message(False, now)]
 
     def _enter(self, phase: Phase, now: Now) -> None:
-        self.phase, self._phase_began_ns, self._said_ns = phase, now.mono_ns, 0
+        self.phase, self._phase_began_ns, self._said_ns, self._asked = phase, now.mono_ns, 0, None
 
     def _phase_s(self, now: Now) -> float:
         return (now.mono_ns - (self._phase_began_ns or now.mono_ns)) / NS_PER_S
@@ -287,8 +305,10 @@ class TrialNode(Node):
         )
 
     def _arm_message(self, arm: bool, now: Now) -> Out:
+        """One more repeat of the request of this phase."""
+        self._asked = self._asked or Asked.at(now)
         reason = "trial starts" if arm else "trial is over"
-        return Out("/arm", types.Arm(header=header(now.real_ns), arm=arm, source="trial", reason=reason))
+        return Out("/arm", arm_message(self._asked, now, arm, "trial", reason))
 
     def _what_is_missing(self) -> str:
         seen = self._seen

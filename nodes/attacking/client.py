@@ -8,11 +8,14 @@ from pathlib import Path
 from typing import Any
 
 from nodes.attacking.request import AttackRequest, request_text
-from nodes.runtime.bus import Bus
+from nodes.runtime.asking import NoAnswerError, ask
+from nodes.runtime.bus import Bus, Received
+from nodes.runtime.clock import Now
 from nodes.runtime.errors import LaunchError
 from nodes.runtime.messages import header, types
+from nodes.runtime.requests import Asked
 
-_LISTENING_S = 5.0
+_REPEAT_S, _ANSWER_S = 0.2, 10.0
 _SILENCE_S = 10.0
 ENDED = ("done", "failed", "cancelled", "refused")
 
@@ -41,44 +44,59 @@ def ask_for_attack(
     Raises:
         LaunchError: No node listens, or it has fallen silent.
     """
-    message = types.AttackRequest(
-        header=header(time.time_ns()), request_id=request_id, request=request_text(request), source="operator"
-    )
+
+    def make(asked: Asked, now: Now) -> Any:
+        return types.AttackRequest(
+            header=header(asked.real_ns), request_id=request_id, request=text, source="operator", ask_id=asked.ask_id
+        )
+
+    text = request_text(request)
     with Bus(run_dir) as bus:
-        _send(bus, "/attack/request", message)
+        progress = _ask(bus, "/attack/request", make)
+        tell(progress)
+        if not follow or progress.state in ENDED:
+            return progress
         for progress in _progress(bus, request_id):
             tell(progress)
-            if not follow or progress.state in ENDED:
+            if progress.state in ENDED:
                 return progress
     raise AssertionError("unreachable: the progress ends with an error")
 
 
 def cancel_attack(run_dir: Path, request_id: str, reason: str) -> Any:
     """End the search of a request, or whichever there is; returns the node's ``AttackProgress`` after it."""
-    message = types.AttackCancel(header=header(time.time_ns()), request_id=request_id, reason=reason)
+
+    def make(asked: Asked, now: Now) -> Any:
+        return types.AttackCancel(
+            header=header(asked.real_ns), request_id=request_id, reason=reason, ask_id=asked.ask_id
+        )
+
     with Bus(run_dir) as bus:
-        _send(bus, "/attack/cancel", message)
-        for progress in _progress(bus, request_id or None):
-            return progress
-    raise AssertionError("unreachable: the progress ends with an error")
+        return _ask(bus, "/attack/cancel", make)
 
 
-def _send(bus: Bus, topic: str, message: Any) -> None:
-    bus.publisher(topic)
-    bus.subscribe("/attack/progress")
-    bus.wait_for_subscribers([topic], _LISTENING_S)
-    bus.wait(0.0)
-    bus.receive()  # what was said before is no answer
-    bus.publish(topic, message)
+def _ask(bus: Bus, topic: str, make: Callable[[Asked, Now], Any]) -> Any:
+    """Send a message until the attack node has answered it; the progress that answers."""
+
+    def read(ask_id: str, received: Received) -> Any:
+        progress = received.message()
+        return progress if progress.answered_id == ask_id else None
+
+    try:
+        return ask(bus, topic, make, "/attack/progress", read, every_s=_REPEAT_S, patience_s=_ANSWER_S)
+    except NoAnswerError:
+        raise LaunchError(
+            f"the attack node did not answer within {_ANSWER_S:g} s; is it running with the same --run-dir?"
+        ) from None
 
 
-def _progress(bus: Bus, request_id: str | None) -> Iterator[Any]:
-    asked_ns, heard_s = time.monotonic_ns(), time.monotonic()
+def _progress(bus: Bus, request_id: str) -> Iterator[Any]:
+    heard_s = time.monotonic()
     while time.monotonic() - heard_s < _SILENCE_S:
         bus.wait(0.1)
         for received in bus.receive():
             heard_s = time.monotonic()
             message = received.message()
-            if received.info.publish_mono_ns >= asked_ns and request_id in (None, message.request_id):
+            if message.request_id == request_id:
                 yield message
     raise LaunchError(f"the attack node has said nothing of this request for {_SILENCE_S:g} s; look into its log")

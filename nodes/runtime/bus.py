@@ -8,6 +8,7 @@ repeats a subscription to a restarted publisher only when its socket is used.
 
 from __future__ import annotations
 
+import os
 import secrets
 import time
 from collections.abc import Iterable, Sequence
@@ -22,8 +23,8 @@ from nodes.runtime.errors import BusError, MessageError
 from nodes.runtime.image_parts import IMAGE_TYPE, PartedInfo, join_image, split_image, with_parts
 from nodes.runtime.locks import HeldError, hold
 from nodes.runtime.messages import MAX_SEQUENCE_LENGTH, decode, encode, type_hash_prefix, type_name
-from nodes.runtime.paths import socket_path
-from nodes.runtime.topics import Topic
+from nodes.runtime.paths import lock_path, socket_path
+from nodes.runtime.topics import STATUS_PREFIX, Topic
 from nodes.runtime.topics import topic as topic_row
 from nodes.runtime.wire import MessageInfo, Meta, Relayed, pack_meta, unpack_parts
 
@@ -64,7 +65,7 @@ class Counts:
 
 
 class Publisher:
-    """Sends one topic; there can be only one per topic and run folder."""
+    """Sends one topic; there can be only so many per topic and run folder as the topic has senders, for most of them one."""
 
     def __init__(self, context: zmq.Context[Any], run_dir: Path, topic: Topic, instance_id: int, clock: Clock) -> None:
         self.topic = topic
@@ -74,8 +75,8 @@ class Publisher:
         self._name = topic.name.encode()
         self._sequence = 0
         self._subscribers = 0
-        path = socket_path(run_dir, topic.name)
-        self._lock = _lock_endpoint(path, topic.name, run_dir)
+        path, self._lock = _lock_endpoint(topic, run_dir)
+        self._is_status = topic.name.startswith(STATUS_PREFIX)
         self._socket = context.socket(zmq.XPUB)
         self._socket.linger = 0
         self._socket.sndhwm = _SEND_QUEUE
@@ -117,6 +118,9 @@ class Publisher:
         for part in cdr[:-1]:
             send(part, _NOBLOCK_MORE)
         send(cdr[-1], _NOBLOCK)
+        if self._is_status:
+            # The age of the last status must be known when the process hangs and cannot say it any more.
+            os.utime(self._lock.fileno())
 
     def subscribers(self) -> int:
         """How many subscribers are connected."""
@@ -204,7 +208,8 @@ class Bus:
         socket.setsockopt(zmq.RECONNECT_IVL, 20)
         socket.setsockopt(zmq.RECONNECT_IVL_MAX, 100)
         socket.subscribe(row.name.encode())
-        socket.connect(f"ipc://{socket_path(self._run_dir, row.name)}")
+        for path in socket_paths(self._run_dir, row):
+            socket.connect(f"ipc://{path}")
         self._poller.register(socket, zmq.POLLIN)
         self._subscriptions[topic] = _Subscription(row, socket, take_all, limit)
 
@@ -330,12 +335,21 @@ def age_s(info: MessageInfo, mono_ns: int) -> float:
     return (mono_ns - info.publish_mono_ns) / NS_PER_S
 
 
-def _lock_endpoint(path: Path, topic: str, run_dir: Path) -> TextIO:
-    """Hold a lock beside the socket: a second bind to an ipc path succeeds silently and robs the first of its readers."""
-    try:
-        return hold(path.with_name(path.name + ".lock"))
-    except HeldError as error:
-        raise BusError(
-            f"{topic} is already published in {run_dir} by process {error.owner}: another launch uses the same endpoints; "
-            "stop it, or give this one another --run-dir"
-        ) from None
+def socket_paths(run_dir: Path, topic: Topic) -> list[Path]:
+    """Paths of the Unix sockets of a topic, one for each process that may send it."""
+    first = socket_path(run_dir, topic.name)
+    return [first, *(first.with_name(f"{first.name}.{number}") for number in range(2, topic.senders + 1))]
+
+
+def _lock_endpoint(topic: Topic, run_dir: Path) -> tuple[Path, TextIO]:
+    """Hold a lock beside a socket: a second bind to an ipc path succeeds silently and robs the first of its readers."""
+    owners = []
+    for path in socket_paths(run_dir, topic):
+        try:
+            return path, hold(lock_path(path))
+        except HeldError as error:
+            owners.append(error.owner)
+    raise BusError(
+        f"{topic.name} is already published in {run_dir} by process {', '.join(owners)}: another launch uses the same endpoints; "
+        "stop it, or give this one another --run-dir"
+    )

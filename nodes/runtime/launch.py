@@ -266,7 +266,7 @@ def active_launches() -> list[dict[str, Any]]:
     for card in sorted((user_folder() / "active").glob("*.json")):
         try:
             launch = json.loads(card.read_text(encoding="utf-8"))
-            if _is_locked(Path(launch["run_dir"])):
+            if is_running(Path(launch["run_dir"])):
                 found.append(launch)
         except (OSError, ValueError, KeyError):
             continue  # it ended while we looked
@@ -292,7 +292,8 @@ def _lock_run(run_dir: Path) -> TextIO:
         ) from None
 
 
-def _is_locked(run_dir: Path) -> bool:
+def is_running(run_dir: Path) -> bool:
+    """Whether a launch is at work in a run folder."""
     with open(run_dir / "launch.lock", encoding="ascii") as lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)

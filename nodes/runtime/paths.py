@@ -59,3 +59,8 @@ def socket_path(run_dir: Path, topic: str) -> Path:
     if len(name) > _LONGEST_NAME:
         raise BusError(f"expected a topic name of at most {_LONGEST_NAME} characters, got {topic!r}")
     return bus_folder(run_dir) / name
+
+
+def lock_path(socket: Path) -> Path:
+    """Lock beside a socket. That of a status is touched at every status, so that its age is known when the node is silent."""
+    return socket.with_name(socket.name + ".lock")

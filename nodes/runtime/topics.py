@@ -22,6 +22,7 @@ class Topic:
         queue: How many messages a receiver keeps; 1 means only the newest (older ones are dropped and counted).
         max_age_s: Age since publication beyond which a receiver must not act on it [s]; None where age does not matter.
         publisher: Role that sends it.
+        senders: How many processes of a host may send it at the same time. Whoever asks for a stop must not wait for another.
     """
 
     name: str
@@ -30,6 +31,7 @@ class Topic:
     queue: int
     max_age_s: float | None
     publisher: str
+    senders: int = 1
 
     @property
     def latest(self) -> bool:
@@ -58,7 +60,7 @@ _ROWS = (
     Topic("/safety/drive", _ACKERMANN, 10.0, 1, 0.25, "safety"),
     Topic("/safety/state", "advnerf_msgs/msg/SafetyState", 10.0, 20, 0.5, "safety"),
     Topic("/clock/offset", "advnerf_msgs/msg/ClockOffset", 5.0, 20, 1.0, "gateway"),
-    Topic("/arm", "advnerf_msgs/msg/Arm", None, 20, None, "operator"),
+    Topic("/arm", "advnerf_msgs/msg/Arm", None, 20, None, "operator", senders=4),
     Topic("/twin/reset", "geometry_msgs/msg/PoseStamped", None, 5, None, "operator"),
     Topic("/attack/request", "advnerf_msgs/msg/AttackRequest", None, 5, None, "operator"),
     Topic("/attack/cancel", "advnerf_msgs/msg/AttackCancel", None, 5, None, "operator"),
@@ -72,7 +74,8 @@ _ROWS = (
     Topic("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray", 1.0, 20, None, "motor"),
     Topic("/motor/state", "advnerf_msgs/msg/VescState", 20.0, 50, 0.5, "motor"),
     Topic("/clock", "rosgraph_msgs/msg/Clock", 40.0, 1, None, "player"),
-    Topic("/player/control", "std_msgs/msg/String", None, 20, None, "operator"),
+    Topic("/player/control", "advnerf_msgs/msg/PlayerControl", None, 20, None, "operator"),
+    Topic("/player/state", "advnerf_msgs/msg/PlayerState", None, 20, None, "player"),
 )
 TOPICS: dict[str, Topic] = {row.name: row for row in _ROWS}
 _NODE_NAME = re.compile(r"[a-z][a-z0-9_]{0,23}")

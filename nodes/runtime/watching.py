@@ -14,17 +14,16 @@ import numpy as np
 
 from nodes.runtime.bus import Bus, Received
 from nodes.runtime.clock import NS_PER_S
+from nodes.runtime.config import parse_yaml
 from nodes.runtime.errors import LaunchError, MessageError
-from nodes.runtime.launch import active_launches
-from nodes.runtime.messages import header, stamp_ns, types
-from nodes.runtime.paths import bus_folder
+from nodes.runtime.launch import active_launches, is_running
+from nodes.runtime.messages import stamp_ns
+from nodes.runtime.paths import RESOLVED_NAME, bus_folder
 from nodes.runtime.topics import STATUS_PREFIX, TOPICS, status_topic
 from nodes.runtime.topics import topic as topic_row
 
 _STATUS_WAIT_S = 1.0
 _ECHO_ITEMS = 12
-_ANSWER_WAIT_S = 2.0
-_READING_NS = 20_000_000
 
 
 @dataclass(frozen=True)
@@ -64,21 +63,33 @@ def find_run_dir(given: Path | None) -> Path:
 
 
 def node_names(run_dir: Path) -> list[str]:
-    """Names of the nodes that have, or had, a socket in a run folder."""
+    """Names of the nodes that have, or had, a socket in a run folder, and of those of its launch while it is at work."""
     prefix = status_topic("x")[:-1].strip("/").replace("/", ".")
-    names = (path.name for path in bus_folder(run_dir).iterdir() if path.suffix != ".lock")
-    return sorted(name.removeprefix(prefix + ".") for name in names if name.startswith(prefix + "."))
+    sockets = (path.name for path in bus_folder(run_dir).iterdir() if path.suffix != ".lock")
+    names = {name.removeprefix(prefix + ".") for name in sockets if name.startswith(prefix + ".")}
+    return sorted(names | set(_launched(run_dir)))
+
+
+def _launched(run_dir: Path) -> list[str]:
+    """Nodes of the launch that is at work in a run folder."""
+    try:
+        if not is_running(run_dir):
+            return []
+        resolved = parse_yaml((run_dir / RESOLVED_NAME).read_text(encoding="utf-8"), RESOLVED_NAME).data
+        return [name for name, entry in resolved["nodes"].items() if entry.get("if", True)]
+    except FileNotFoundError:
+        return []
 
 
 def node_statuses(run_dir: Path, wait_s: float = _STATUS_WAIT_S) -> dict[str, Any]:
-    """Last status of every node that reports within a moment."""
+    """Last status of every node that reports within a moment; None for a node that is silent."""
     names = node_names(run_dir)
-    statuses: dict[str, Any] = {}
+    statuses: dict[str, Any] = dict.fromkeys(names)
     with Bus(run_dir) as bus:
         for name in names:
             bus.subscribe(status_topic(name))
         deadline = time.monotonic() + wait_s
-        while len(statuses) < len(names) and (left := deadline - time.monotonic()) > 0:
+        while None in statuses.values() and (left := deadline - time.monotonic()) > 0:
             bus.wait(left)
             for received in bus.receive():
                 statuses[received.topic.removeprefix(STATUS_PREFIX)] = received.message()
@@ -88,7 +99,7 @@ def node_statuses(run_dir: Path, wait_s: float = _STATUS_WAIT_S) -> dict[str, An
 def list_topics(run_dir: Path) -> list[TopicRow]:
     """All topics of the table and all statuses, with who publishes them now and to how many."""
     publishers: dict[str, tuple[str, int]] = {}
-    statuses = node_statuses(run_dir)
+    statuses = {name: status for name, status in node_statuses(run_dir).items() if status is not None}
     for name, status in statuses.items():
         for topic, subscribers in zip(status.publications, status.subscribers, strict=True):
             publishers[topic] = (name, int(subscribers))
@@ -126,33 +137,6 @@ def measure_rate(run_dir: Path, topic: str, duration_s: float) -> RateReport:
         len(times), lost, len(gaps) / sum(gaps), min(gaps), max(gaps),
         statistics.median(ages) if ages else None, max(ages) if ages else None,
     )  # fmt: skip
-
-
-def ask_to_arm(run_dir: Path, wanted: bool, reason: str) -> tuple[bool, str]:
-    """Send a request to arm or to disarm as a person, and wait for the safety node's answer.
-
-    Returns:
-        Whether the car is armed now, and by whom, or else why not.
-    """
-    with Bus(run_dir) as bus:
-        bus.publisher("/arm")
-        bus.subscribe("/safety/state")
-        bus.wait_for_subscribers(["/arm"], _ANSWER_WAIT_S)
-        request = types.Arm(header=header(time.time_ns()), arm=wanted, source="operator", reason=reason)
-        sent_ns = time.monotonic_ns()
-        bus.publish("/arm", request)
-        deadline, state = time.monotonic() + _ANSWER_WAIT_S, None
-        while (left := deadline - time.monotonic()) > 0:
-            bus.wait(left)
-            for received in bus.receive():
-                # What was said before the request was read is no answer to it.
-                if received.info.publish_mono_ns > sent_ns + _READING_NS:
-                    state = received.message()
-            if state is not None and bool(state.armed) == wanted:
-                break
-    if state is None:
-        raise LaunchError(f"the safety node did not answer within {_ANSWER_WAIT_S:g} s; is it running?")
-    return bool(state.armed), str(state.source if state.armed else state.reason)
 
 
 def describe(message: Any, indent: str = "") -> str:

@@ -14,9 +14,11 @@ from nodes.runtime.bus import Bus
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import MessageError
 from nodes.runtime.messages import stamp_ns
+from nodes.runtime.paths import lock_path, socket_path
 from nodes.runtime.topics import STATUS_PREFIX, status_topic
 from nodes.runtime.watching import listen, node_names
 
+SILENT = "silent"
 _MIB = 2**20
 _QUEUE_WORDS = ("inbox_dropped",)
 
@@ -52,7 +54,7 @@ class NodeRow:
     Attributes:
         name: Name in the launch file.
         pid: Its process; 0 for one on another host.
-        state: What it says it is.
+        state: What it says it is, or ``silent``.
         text: What it says about it.
         cpu_percent: Of one core; None for a process that is not here.
         memory_mib: Resident memory [MiB]; None for a process that is not here.
@@ -74,6 +76,49 @@ class NodeRow:
     missed: int
     restarts: int
     queue: int
+
+
+@dataclass(frozen=True)
+class Silence:
+    """A node that does not report.
+
+    Attributes:
+        pid: Its process; 0 for one that has ended, or runs on another host.
+        text: How long ago it reported, and what its process does.
+    """
+
+    pid: int
+    text: str
+
+
+def describe_silence(run_dir: Path, name: str) -> Silence:
+    """Say since when a node has not reported, from the lock that its publisher touches at every status."""
+    lock = lock_path(socket_path(run_dir, status_topic(name)))
+    try:
+        age_s = max(0.0, time.time() - lock.stat().st_mtime)
+        owner = int(lock.read_text(encoding="ascii").strip() or 0)
+    except (FileNotFoundError, ValueError):
+        return Silence(0, "has never reported")
+    process = _process_of(name, owner)
+    if process is None:
+        return Silence(0, f"last status {age_s:.1f} s ago; its process is not here any more")
+    try:
+        stopped = process.status() == psutil.STATUS_STOPPED
+    except psutil.Error:
+        stopped = False
+    return Silence(
+        owner, f"last status {age_s:.1f} s ago; its process is {'stopped by a signal' if stopped else 'alive'}"
+    )
+
+
+def _process_of(name: str, pid: int) -> psutil.Process | None:
+    """The process of a node, if it is here: a node of another host may have the number of a stranger."""
+    try:
+        process = psutil.Process(pid)
+        command = process.cmdline()
+        return process if "--name" in command and command[command.index("--name") + 1] == name else None
+    except (psutil.Error, IndexError):
+        return None
 
 
 def measure_delay(run_dir: Path, topic: str, duration_s: float) -> DelayReport:
@@ -117,7 +162,8 @@ class NodeWatch:
 
     def rows(self, duration_s: float) -> list[NodeRow]:
         """Watch for a while; what each node did in it."""
-        for name in node_names(self._run_dir):
+        names = node_names(self._run_dir)
+        for name in names:
             self._bus.subscribe(status_topic(name))
         self._first.clear()
         deadline = time.monotonic() + duration_s
@@ -126,7 +172,9 @@ class NodeWatch:
             for received in self._bus.receive():
                 name = received.topic.removeprefix(STATUS_PREFIX)
                 self._note(name, received.message())
-        return [self._row(name) for name in sorted(self._first)]
+        return [
+            self._row(name) if name in self._first else self._silent(name) for name in sorted({*names, *self._first})
+        ]
 
     def _note(self, name: str, status: Any) -> None:
         now, pid = time.monotonic(), int(status.pid)
@@ -138,32 +186,35 @@ class NodeWatch:
         self._process(name, pid)
 
     def _process(self, name: str, pid: int) -> psutil.Process | None:
-        """The process, if it is here: a node of another host may have the number of a stranger."""
         if pid not in self._processes:
-            try:
-                process = psutil.Process(pid)
-                command = process.cmdline()
-                if "--name" not in command or command[command.index("--name") + 1] != name:
-                    return None
-                process.cpu_percent()  # the first call begins the measurement
-            except (psutil.Error, IndexError):
+            process = _process_of(name, pid)
+            if process is None:
                 return None
+            process.cpu_percent()  # the first call begins the measurement
             self._processes[pid] = process
         return self._processes[pid]
+
+    def _usage(self, process: psutil.Process | None) -> tuple[float | None, float | None]:
+        """Processor [% of one core] and memory [MiB]; None for a process that is not here."""
+        try:
+            return (None, None) if process is None else (process.cpu_percent(), process.memory_info().rss / _MIB)
+        except psutil.Error:
+            return None, None
+
+    def _silent(self, name: str) -> NodeRow:
+        silence = describe_silence(self._run_dir, name)
+        cpu, memory = self._usage(self._process(name, silence.pid) if silence.pid else None)
+        restarts = self._restarts.get(name, 0)
+        return NodeRow(name, silence.pid, SILENT, silence.text, cpu, memory, 0.0, 0, 0, restarts, 0)
 
     def _row(self, name: str) -> NodeRow:
         (began, first), (ended, last) = self._first[name], self._last[name]
         before, after = _counters(first), _counters(last)
         work = sum(after[key] - before.get(key, 0.0) for key in after if key == "ticks" or key.startswith("received "))
         process = self._process(name, int(last.pid))
-        cpu = memory = None
-        if process is not None:
-            try:
-                cpu, memory = process.cpu_percent(), process.memory_info().rss / _MIB
-            except psutil.Error:
-                process = None
+        cpu, memory = self._usage(process)
         return NodeRow(
-            name, int(last.pid) if process else 0, str(last.state), str(last.text), cpu, memory,
+            name, 0 if memory is None else int(last.pid), str(last.state), str(last.text), cpu, memory,
             work / (ended - began) if ended > began else 0.0,
             int(sum(v for k, v in after.items() if k.split(" ")[0] in ("dropped", "lost", "refused") and " " in k)),
             int(after.get("ticks_missed", 0)), self._restarts.get(name, 0),

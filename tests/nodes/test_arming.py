@@ -62,7 +62,7 @@ class World:
 
     def arm(self, source="operator", age_ms=0):
         self.ms += 1
-        self.arming.arm(source, self.info("arm", age_ms), self.ms * MS)
+        self.refusal = self.arming.arm(source, (self.ms - age_ms) * MS, self.ms * MS)
         self.ms += 9
         return self.arming.armed
 
@@ -184,11 +184,16 @@ def test_being_held_up_disarms_before_anything_passes(armed):
 def test_a_request_to_arm_from_before_the_stop_is_void(armed):
     armed.ms += 3000
     assert not armed.arm(age_ms=500)
-    assert "older" in armed.arming.reason
+    assert "older than the last stop (the safety node was held up" in armed.refusal
+    assert "held up" in armed.arming.reason
 
 
 def test_an_old_request_to_arm_is_void(world):
     assert not world.arm(age_ms=1500)
+    assert world.refusal == "the request is older than the last stop (nobody has armed); arm again"
+    world.run(2000)
+    assert not world.arm(age_ms=1100)
+    assert world.refusal == "the request is 1.1 s old, older than 1 s; arm again"
 
 
 def test_disarming_is_at_once_and_latches(armed):

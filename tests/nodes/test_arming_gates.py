@@ -62,7 +62,7 @@ class World:
 
     def arm(self, source="operator"):
         self.ms += 1
-        self.arming.arm(source, self.info("arm"), self.ms * MS)
+        self.arming.arm(source, self.ms * MS, self.ms * MS)
         self.ms += 9
         return self.arming.armed
 

@@ -65,11 +65,14 @@ class Bench:
 
     def request(self, text, request_id="a"):
         return self.send(
-            "/attack/request", types.AttackRequest(header=header(0), request_id=request_id, request=text, source="")
+            "/attack/request",
+            types.AttackRequest(header=header(0), request_id=request_id, request=text, source="", ask_id=""),
         )
 
     def cancel(self, request_id=""):
-        return self.send("/attack/cancel", types.AttackCancel(header=header(0), request_id=request_id, reason="enough"))
+        return self.send(
+            "/attack/cancel", types.AttackCancel(header=header(0), request_id=request_id, reason="enough", ask_id="")
+        )
 
     def run_until(self, condition, timeout_s=40.0):
         deadline = time.monotonic() + timeout_s

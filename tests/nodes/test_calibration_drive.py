@@ -17,7 +17,7 @@ PIXEL = np.zeros((1, 1, 3), np.uint8)
 
 def state(armed, stopping=False):
     return types.SafetyState(
-        header=header(0), armed=armed, stopping=stopping, reason="", source="operator", command_age_s=0.0, pose_age_s=0.0
+        header=header(0), armed=armed, stopping=stopping, reason="", source="operator", command_age_s=0.0, pose_age_s=0.0, answered_id="", granted=False, answer=""
     )  # fmt: skip
 
 

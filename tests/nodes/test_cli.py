@@ -1,4 +1,5 @@
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -41,6 +42,7 @@ name: little
 nodes:
   sender:
     module: sender_node
+    hang_timeout_s: 30.0  # a test stops it for some seconds
     config: {rate_hz: 50}
 """
 
@@ -98,6 +100,25 @@ def test_topic_list_names_publishers(running, command):
     assert rows["/vicon/car"][1:] == ["geometry_msgs/msg/PoseStamped", "100", "Hz", "sender", "0"]
     assert rows["/arm"][-2:] == ["-", "0"]
     assert "/status/sender" in rows
+
+
+def test_a_node_that_hangs_is_listed_as_silent_with_its_age(running, command):
+    _, output, _ = command("node", "list", "--run-dir", running)
+    rows = {line.split()[0]: line.split() for line in output.splitlines()}
+    pid = int(rows["sender"][2])
+    assert rows["sender"][1] == "active"
+    os.kill(pid, signal.SIGSTOP)
+    try:
+        time.sleep(0.3)
+        code, output, _ = command("node", "list", "--run-dir", running)
+        _, top, _ = command("top", "--period", "0.5", "--count", "1", "--run-dir", running)
+    finally:
+        os.kill(pid, signal.SIGCONT)
+    silent = rf"(?m)^sender +silent +{pid} +last status (\d+\.\d) s ago; its process is stopped by a signal *$"
+    assert code == 0
+    assert 1.0 <= float(re.search(silent, output)[1]) <= 4.0
+    assert re.search(r"(?m)^sender +silent .*last status \d+\.\d s ago; its process is stopped by a signal", top)
+    assert rows["sender"] == command("node", "list", "--run-dir", running)[1].splitlines()[1].split()
 
 
 def test_topic_hz_measures_the_rate(running, command):

@@ -195,7 +195,7 @@ def drive(folder, policy):
             armed = 100 <= ms < 2400
             state = types.SafetyState(
                 header=header(START_NS + ms * MS), armed=armed, stopping=not armed, reason="", source="", command_age_s=0.0,
-                pose_age_s=0.0,
+                pose_age_s=0.0, answered_id="", granted=False, answer="",
             )  # fmt: skip
             put("/safety/state", state, ms)
             put(

@@ -41,7 +41,7 @@ class Car:
             if step % 10 == 0:
                 state = types.SafetyState(
                     header=header(0), armed=self.armed, stopping=False, reason="", source="", command_age_s=0.0,
-                    pose_age_s=0.0,
+                    pose_age_s=0.0, answered_id="", granted=False, answer="",
                 )  # fmt: skip
                 self.node.handle("/safety/state", state, info, now)
             pose = pose_message(planar_pose(self.x, self.y, self.yaw), now.real_ns)
@@ -127,6 +127,13 @@ class Hand:
         self.clock.advance(after_s)
         return self.node.tick(self.clock.now())
 
+    def answer(self, ask_id):
+        state = types.SafetyState(
+            header=header(0), armed=True, stopping=False, reason="", source="operator", command_age_s=0.0, pose_age_s=0.0,
+            answered_id=ask_id, granted=True, answer="armed",
+        )  # fmt: skip
+        self.node.handle("/safety/state", state, MessageInfo(0, 0), self.clock.now())
+
 
 @pytest.fixture
 def hand():
@@ -155,6 +162,13 @@ def test_the_estop_stays_until_re_armed_which_is_asked_for_a_moment_later(hand):
     ((_, state),) = hand.does(stops=1, rearms=1)
     assert not state.estop
     assert [t for t, _ in hand.tick() + hand.tick()] == ["/teleop/state", "/teleop/state", "/arm"]
+    (_, (_, first)), (_, (_, repeat)) = hand.tick(), hand.tick()
+    assert (first.ask_id, first.header) == (repeat.ask_id, repeat.header)
+    assert repeat.age_ns - first.age_ns == 50_000_000
+    hand.answer("of another")
+    assert [t for t, _ in hand.tick()] == ["/teleop/state", "/arm"]
+    hand.answer(first.ask_id)
+    assert [t for t, _ in hand.tick()] == ["/teleop/state"]
     hand.does(stops=2, rearms=2)  # both at once: stopping counts
     assert [t for t, _ in hand.tick() + hand.tick()] == ["/teleop/state"] * 2
     assert hand.tick()[0].message.estop

@@ -17,7 +17,7 @@ _SPEC.loader.exec_module(bench_of)
 def say(bench, armed):
     state = types.SafetyState(
         header=header(0), armed=armed, stopping=not armed, reason="" if armed else "the car is outside the fence",
-        source="", command_age_s=0.0, pose_age_s=0.0,
+        source="", command_age_s=0.0, pose_age_s=0.0, answered_id="", granted=False, answer="",
     )  # fmt: skip
     now = bench.clock.now()
     info = MessageInfo(now.mono_ns, now.mono_ns, instance_id=1)

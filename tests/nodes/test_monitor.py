@@ -65,7 +65,7 @@ class Screen:
 
     def safety(self, armed, reason=""):
         self.hear("/safety/state", types.SafetyState(
-            header=header(0), armed=armed, stopping=not armed, reason=reason, source="", command_age_s=0.0, pose_age_s=0.0,
+            header=header(0), armed=armed, stopping=not armed, reason=reason, source="", command_age_s=0.0, pose_age_s=0.0, answered_id="", granted=False, answer="",
         ))  # fmt: skip
 
     def pass_time(self, ms):

@@ -50,7 +50,7 @@ class Car:
             time.sleep(0.005)
 
     def say(self, action):
-        message = types.SteeringCheck(header=header(0), action=action, source="operator")
+        message = types.SteeringCheck(header=header(0), action=action, source="operator", ask_id="")
         self.node.handle("/motor/check", message, MessageInfo(0, 0, instance_id=1), CLOCK.now())
 
     def rows(self):
@@ -217,7 +217,7 @@ def test_the_node_turns_the_wheels_and_listens_to_the_person(make):
         car.node.handle(
             "/vicon/car", pose_message(planar_pose(0.0, 0.0, 0.0), 0), MessageInfo(0, 0, instance_id=1), now
         )
-    message = types.SteeringCheck(header=header(0), action="confirm", source="operator")
+    message = types.SteeringCheck(header=header(0), action="confirm", source="operator", ask_id="")
     car.node.handle("/motor/check", message, MessageInfo(0, 0, instance_id=1), now)
     assert "steering" not in car.node._watch.missing()
 

@@ -19,7 +19,7 @@ START_NS = 1_800_000_000_000_000_000
 @pytest.fixture
 def bag(tmp_path):
     """Two seconds: poses of the car at 50 Hz, of the board at 10 Hz, one request to arm, one status."""
-    arm = encode(types.Arm(header=header(START_NS), arm=True, source="person", reason=""))
+    arm = encode(types.Arm(header=header(START_NS), arm=True, source="person", reason="", ask_id="", age_ns=0))
     with BagWriter(tmp_path / "bag") as writer:
         writer.write("/arm", arm, START_NS, START_NS, 0)
         for i in range(100):
@@ -44,7 +44,7 @@ def play(node, clock, step_s=0.01, steps=10_000):
 
 def test_messages_come_when_they_are_due_and_then_it_is_done(bag):
     node = PlayerNode(PlayerConfig(bag=bag, wait_for=[]), lambda topic: 0)
-    assert set(node.publications) == {"/vicon/car", "/vicon/board"}
+    assert set(node.publications) == {"/vicon/car", "/vicon/board", "/player/state"}
     out, done = play(node, ManualClock(123, 456))
     assert done
     assert len(out) == 120
@@ -94,18 +94,21 @@ def test_any_subscriber_will_do_when_none_is_named(bag):
 
 def test_a_recording_does_not_ask_for_an_attack(tmp_path):
     with BagWriter(tmp_path / "bag") as writer:
-        request = encode(types.AttackRequest(header=header(START_NS), request_id="a", request="", source=""))
-        cancel = encode(types.AttackCancel(header=header(START_NS), request_id="a", reason=""))
+        request = encode(types.AttackRequest(header=header(START_NS), request_id="a", request="", source="", ask_id=""))
+        cancel = encode(types.AttackCancel(header=header(START_NS), request_id="a", reason="", ask_id=""))
         for topic, data in (("/attack/request", request), ("/attack/cancel", cancel)):
             writer.write(topic, data, START_NS, START_NS, 0)
         for k in range(2):
             pose = encode(pose_message(np.eye(4), START_NS))
             writer.write("/vicon/car", pose, START_NS + k, START_NS, k)
-    assert PlayerNode(PlayerConfig(bag=tmp_path / "bag"), lambda topic: 0).publications == ("/vicon/car",)
+    assert PlayerNode(PlayerConfig(bag=tmp_path / "bag"), lambda topic: 0).publications == (
+        "/vicon/car",
+        "/player/state",
+    )
 
 
 def test_requests_to_arm_are_played_only_when_asked_for(bag):
-    assert PlayerNode(PlayerConfig(bag=bag, topics=["/arm"]), lambda topic: 0).publications == ("/arm",)
+    assert PlayerNode(PlayerConfig(bag=bag, topics=["/arm"]), lambda topic: 0).publications == ("/arm", "/player/state")
 
 
 def test_topics_that_nobody_here_knows_are_left_out_and_named(tmp_path):

@@ -11,9 +11,11 @@ from pydantic import ValidationError
 from advnerf_core.geometry import planar_pose
 from calibration.schema import VehicleCalibration, load_calibration
 from nodes.arming import ArmingLimits
+from nodes.runtime.arm_requests import arm_message
 from nodes.runtime.clock import Now
 from nodes.runtime.messages import drive_message, header, ns_from_stamp, pose_message, types
 from nodes.runtime.node import MessageInfo
+from nodes.runtime.requests import Asked
 from nodes.safety import SafetyConfig, SafetyNode
 
 TWIN = Path(__file__).parents[2] / "calibration" / "twin"
@@ -35,7 +37,10 @@ class Guard:
 
     def say(self, topic, message):
         return self.node.handle(
-            topic, message, MessageInfo(self.now.mono_ns, self.now.mono_ns, instance_id=1), self.now
+            topic,
+            message,
+            MessageInfo(self.now.mono_ns, self.now.mono_ns, publish_real_ns=self.now.real_ns, instance_id=1),
+            self.now,
         )
 
     def everything(self, peer="TWIN", speed=0.8):
@@ -65,7 +70,7 @@ class Guard:
 
     def arm(self, arm=True):
         self.ms += 1
-        return self.say("/arm", types.Arm(header=header(0), arm=arm, source="trial", reason="test"))
+        return self.say("/arm", arm_message(Asked.at(self.now), self.now, arm, "trial", "test"))
 
 
 def drives_of(outs):
@@ -115,7 +120,7 @@ def test_safety_says_stop_in_the_same_breath_as_it_finds_a_fault():
 def test_safety_does_not_let_a_program_arm_a_real_car():
     guard = Guard()
     guard.everything(peer="60_MK5 firmware 5.02")
-    assert states_of(guard.arm()) == []
+    assert states_of(guard.arm()) == [False]
     guard.ms += 120
     (state,) = [o.message for o in guard.node.tick(guard.now) if o.topic == "/safety/state"]
     assert "a real car is armed by source 'operator' only" in state.reason

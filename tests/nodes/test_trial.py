@@ -17,7 +17,8 @@ class Stage:
     def __init__(self, peer="TWIN v1", moves=True, **plan):
         self.node = TrialNode(TrialPlan(START, 1.0, ("camera", "motor"), **plan))
         self.t_s, self.pose, self.armed, self.reason, self.sent = 0.0, np.array([0.0, 0.0, 1.0]), False, "", []
-        self.peer, self.moves, self.requests = peer, moves, 0
+        self.peer, self.moves, self.requests = peer, moves, []
+        self.answered_id, self.granted, self.grants, self.hears = "", False, True, True
 
     @property
     def now(self):
@@ -35,15 +36,17 @@ class Stage:
         self.hear("/vicon/car", pose_message(T, self.now.real_ns))
         state = types.SafetyState(
             header=header(self.now.real_ns), armed=self.armed, stopping=not self.armed, reason=self.reason, source="",
-            command_age_s=0.0, pose_age_s=0.0,
+            command_age_s=0.0, pose_age_s=0.0, answered_id=self.answered_id, granted=self.granted, answer="",
         )  # fmt: skip
         self.hear("/safety/state", state)
         for topic, message in self.node.tick(self.now):
             self.sent.append(topic)
             if topic == "/twin/reset":
                 self.pose = np.array(START)
-            else:
-                self.armed = bool(message.arm)
+            elif self.hears:
+                self.requests.append((message.ask_id, bool(message.arm)))
+                self.answered_id, self.granted = message.ask_id, not message.arm or self.grants
+                self.armed = bool(message.arm) and self.grants
 
     def nodes_are_ready(self):
         for name in ("camera", "motor"):
@@ -126,6 +129,44 @@ def test_a_failed_graph_ends_the_trial():
     stage.node = TrialNode(stage.node.plan, lambda: "required node camera died")
     with pytest.raises(TrialError, match="camera died"):
         stage.step()
+
+
+def test_a_request_is_repeated_under_one_id_until_it_is_answered():
+    stage = Stage()
+    stage.nodes_are_ready()
+    stage.run_until(Phase.ARMING)
+    stage.hears = False
+    for _ in range(10):
+        stage.step()
+    assert stage.sent.count("/arm") >= 9
+    stage.hears = True
+    stage.run_until(Phase.DONE)
+    assert [arm for _, arm in stage.requests] == [True, False]
+    assert len({ask_id for ask_id, _ in stage.requests}) == 2
+
+
+def test_a_refused_arming_is_asked_again_as_another_request():
+    stage = Stage()
+    stage.nodes_are_ready()
+    stage.grants = False
+    stage.run_until(Phase.ARMING)
+    for _ in range(41):
+        stage.step()
+    assert len(stage.requests) == len({ask_id for ask_id, _ in stage.requests}) == 4
+    stage.grants = True
+    stage.run_until(Phase.DONE)
+
+
+def test_a_car_that_was_stopped_before_the_trial_heard_of_its_arming_is_not_armed_again():
+    stage = Stage()
+    stage.nodes_are_ready()
+    stage.run_until(Phase.ARMING)
+    while not stage.requests:
+        stage.step()
+    stage.armed, stage.reason = False, "no pose of the car for 0.30 s"
+    stage.run_until(Phase.DONE)
+    assert stage.node.outcome.stopped_early == "no pose of the car for 0.30 s"
+    assert [arm for _, arm in stage.requests] == [True, False]
 
 
 class HandStage(Stage):

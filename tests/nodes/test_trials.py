@@ -171,7 +171,7 @@ def write_bag(folder, drives, offset_m=0.1, rate_hz=100):
     def state(armed, reason=""):
         stamp = START_NS + round(t * 1e9)
         put("/safety/state", types.SafetyState(
-            header=header(stamp), armed=armed, stopping=not armed, reason=reason, source="", command_age_s=0.0, pose_age_s=0.0,
+            header=header(stamp), armed=armed, stopping=not armed, reason=reason, source="", command_age_s=0.0, pose_age_s=0.0, answered_id="", granted=False, answer="",
         ))  # fmt: skip
 
     for stand_s, drive_s, reason in drives:

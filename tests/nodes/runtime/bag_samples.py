@@ -30,9 +30,9 @@ def sample(typename, stamp_ns):
         "geometry_msgs/msg/PoseStamped": lambda: pose_message(np.eye(4), stamp_ns),
         "ackermann_msgs/msg/AckermannDriveStamped": lambda: drive_message(0.8, 0.1, stamp_ns),
         "advnerf_msgs/msg/AttackStamp": lambda: types.AttackStamp(header=h, attack_id="abc", drawn=True, reason=""),
-        "advnerf_msgs/msg/Arm": lambda: types.Arm(header=h, arm=True, source="test", reason="because"),
+        "advnerf_msgs/msg/Arm": lambda: types.Arm(header=h, arm=True, source="test", reason="because", ask_id="a", age_ns=1),
         "advnerf_msgs/msg/SafetyState": lambda: types.SafetyState(
-            header=h, armed=True, stopping=False, reason="", source="test", command_age_s=0.1, pose_age_s=0.01
+            header=h, armed=True, stopping=False, reason="", source="test", command_age_s=0.1, pose_age_s=0.01, answered_id="", granted=False, answer=""
         ),
         "advnerf_msgs/msg/MotorSent": lambda: types.MotorSent(
             header=h, serial_write_mono_ns=1, serial_write_real_ns=2, speed_mps=0.8, steering_rad=0.1, erpm=3691.0,
@@ -43,12 +43,13 @@ def sample(typename, stamp_ns):
             input_current_a=0.5, mosfet_temperature_c=30.0, fault=0, fault_text="",
         ),
         "advnerf_msgs/msg/AttackRequest": lambda: types.AttackRequest(
-            header=h, request_id="a", request="horizon: 1", source=""
+            header=h, request_id="a", request="horizon: 1", source="", ask_id="x"
         ),
-        "advnerf_msgs/msg/AttackCancel": lambda: types.AttackCancel(header=h, request_id="", reason="enough"),
+        "advnerf_msgs/msg/AttackCancel": lambda: types.AttackCancel(header=h, request_id="", reason="enough", ask_id="x"),
         "advnerf_msgs/msg/AttackProgress": lambda: types.AttackProgress(
             header=h, request_id="a", state="searching", text="", seed=0, evaluation=1, evaluations=2, loss_m=-1.0,
             total_cte_m=1.0, best_total_cte_m=1.0, clean_total_cte_m=0.5, clean_drives=True, seconds=0.1, attack_id="",
+            answered_id="x",
         ),
         "advnerf_msgs/msg/FileChunk": lambda: types.FileChunk(
             header=h, name="a", sha256="ab", size_bytes=3, index=0, count=1, data=np.arange(3, dtype=np.uint8)

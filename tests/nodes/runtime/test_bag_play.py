@@ -18,7 +18,7 @@ from nodes.runtime.bag_play import Command, Playhead
 from nodes.runtime.bus import Bus
 from nodes.runtime.clock import ManualClock
 from nodes.runtime.errors import BagError, MessageError, NodeFinished
-from nodes.runtime.messages import decode, drive_message, encode, ns_from_stamp, pose_message, types
+from nodes.runtime.messages import decode, drive_message, encode, header, ns_from_stamp, pose_message, types
 
 START_NS = 1_800_000_000_000_000_000
 S = 1_000_000_000
@@ -36,13 +36,17 @@ def bag(tmp_path_factory):
     return folder
 
 
+def control(text, ask_id):
+    return types.PlayerControl(header=header(0), command=text, ask_id=ask_id)
+
+
 class Bench:
     """A player and a clock that only the test moves."""
 
     def __init__(self, bag, **config):
         config.setdefault("topics", ["/vicon/car"])
         self.node = PlayerNode(PlayerConfig(bag=bag, wait_for=[], **config), lambda topic: 1)
-        self.clock, self.done = ManualClock(7 * S, 3 * S), False
+        self.clock, self.done, self.asks = ManualClock(7 * S, 3 * S), False, 0
 
     def run(self, seconds, step_s=0.005):
         outs = []
@@ -56,7 +60,13 @@ class Bench:
         return outs
 
     def tell(self, text):
-        return self.node.handle("/player/control", types.String(data=text), None, self.clock.now())
+        self.asks += 1
+        *outs, (topic, state) = self.ask(text, f"{self.asks}")
+        assert (topic, state.answered_id) == ("/player/state", f"{self.asks}")
+        return outs
+
+    def ask(self, text, ask_id):
+        return self.node.handle("/player/control", control(text, ask_id), None, self.clock.now())
 
 
 def test_pause_holds_the_recording_and_resume_goes_on_where_it_was(bag):
@@ -82,6 +92,16 @@ def test_steps_are_exact_and_leave_it_paused(bag):
     assert len(bench.tell("step 1000")) == 85
 
 
+def test_a_repeated_request_steps_once_and_is_answered_again(bag):
+    bench = Bench(bag, paused=True)
+    bench.run(0.1)
+    first, again, other = bench.ask("step 3", "a"), bench.ask("step 3", "a"), bench.ask("step 3", "b")
+    assert [len(outs) for outs in (first, again, other)] == [4, 1, 4]
+    assert (first[-1].message.answer, first[-1].message.granted) == ("3 messages played; paused", True)
+    assert again[-1].message.answer == first[-1].message.answer
+    assert [len(bench.ask("nonsense", "c")), bench.ask("nonsense", "c")[-1].message.granted] == [1, False]
+
+
 def test_rate_changes_on_the_way(bag):
     bench = Bench(bag)
     assert len(bench.run(0.5)) == 25
@@ -93,7 +113,7 @@ def test_rate_changes_on_the_way(bag):
 
 def test_a_window_and_another_name(bag):
     bench = Bench(bag, start_offset_s=0.5, duration_s=0.3, remap={"/vicon/car": "/vicon/board"})
-    assert bench.node.publications == ("/vicon/board",)
+    assert bench.node.publications == ("/vicon/board", "/player/state")
     outs = bench.run(5.0)
     assert bench.done
     stamps = [ns_from_stamp(decode("geometry_msgs/msg/PoseStamped", out.message).header.stamp) for out in outs]
@@ -121,7 +141,15 @@ def test_stop_ends_it_even_while_it_waits(bag):
     node = PlayerNode(PlayerConfig(bag=bag), lambda topic: 0)
     clock = ManualClock()
     assert node.tick(clock.now()) == []
-    node.handle("/player/control", types.String(data="stop"), None, clock.now())
+    (pause,) = node.handle("/player/control", control("pause", "1"), None, clock.now())
+    assert (pause.message.granted, pause.message.answer) == (False, "it has not begun yet")
+    (stop,) = node.handle("/player/control", control("stop", "2"), None, clock.now())
+    assert stop.message.granted
+    clock.advance(0.2)
+    assert node.tick(clock.now()) == []  # who asked may not have heard the answer
+    (again,) = node.handle("/player/control", control("stop", "2"), None, clock.now())
+    assert (again.message.answered_id, again.message.granted) == ("2", True)
+    clock.advance(0.06)
     with pytest.raises(NodeFinished):
         node.tick(clock.now())
 
@@ -198,6 +226,11 @@ def test_command_plays_under_a_terminal_and_obeys_keys_and_bus(bag, tmp_path):
         "--run-dir",
         str(tmp_path),
     ]
+
+    def control_says(*words):
+        program = [sys.executable, "-m", "nodes.cli", "bag", "control", *words, "--run-dir", str(tmp_path)]
+        return subprocess.run(program, capture_output=True, text=True, timeout=30, check=False)
+
     with Bus(tmp_path) as bus:
         bus.subscribe("/vicon/car", queue=500)
         process = subprocess.Popen([*command, "--topics", "/vicon/car"], stdin=slave, stdout=subprocess.PIPE, text=True)
@@ -211,13 +244,16 @@ def test_command_plays_under_a_terminal_and_obeys_keys_and_bus(bag, tmp_path):
 
         try:
             assert "space: pause" in process.stdout.readline()
-            bus.publisher("/player/control")
-            bus.wait_for_subscribers(["/player/control"], 20.0)
+            with Bus(tmp_path) as recorder:
+                recorder.subscribe("/player/control")  # its only subscriber may be a recorder
+                deadline = time.monotonic() + 20.0
+                while control_says("rate 1").returncode and time.monotonic() < deadline:
+                    pass
             assert hear(1, 0.5) == []
             os.write(master, b"s")
             assert [received.info.sequence for received in hear(1)] == [0]
-            words = [sys.executable, "-m", "nodes.cli", "bag", "control"]
-            bus.publish("/player/control", types.String(data="step 3"))
+            stepped = control_says("step", "3")
+            assert (stepped.returncode, stepped.stdout) == (0, "4 messages played; paused\n")
             assert len(hear(3)) == 3
             assert hear(1, 0.3) == []
             os.write(master, b" ")
@@ -230,6 +266,9 @@ def test_command_plays_under_a_terminal_and_obeys_keys_and_bus(bag, tmp_path):
             process.stdout.close()
             os.close(master)
             os.close(slave)
-    wrong = subprocess.run([*words, "jump", "--run-dir", str(tmp_path)], capture_output=True, text=True, timeout=30)
+    wrong = control_says("jump")
     assert wrong.returncode == 2
     assert re.match(r"error: expected pause, resume", wrong.stderr)
+    absent = control_says("pause")
+    assert absent.returncode == 2
+    assert "no player answered within 3 s" in absent.stderr

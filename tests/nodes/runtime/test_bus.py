@@ -1,3 +1,4 @@
+import contextlib
 import subprocess
 import sys
 import time
@@ -10,6 +11,7 @@ from nodes.runtime.errors import BusError, MessageError, TopicError
 from nodes.runtime.messages import drive_message, header, image_message, pose_message, types
 from nodes.runtime.messages import stamp_ns as stamp_of
 from nodes.runtime.pictures import rgb_image
+from nodes.runtime.topics import topic
 
 
 def receive_for(bus, duration_s):
@@ -105,11 +107,30 @@ def test_subscribers_are_counted_up_and_down(tmp_path):
 
 def test_second_publisher_is_one_clear_error_and_the_endpoint_is_free_afterwards(tmp_path):
     with Bus(tmp_path) as first, Bus(tmp_path) as second:
-        first.publisher("/arm")
-        with pytest.raises(BusError, match=r"/arm is already published in .* by process \d+.*--run-dir"):
-            second.publisher("/arm")
+        first.publisher("/twin/reset")
+        with pytest.raises(BusError, match=r"/twin/reset is already published in .* by process \d+.*--run-dir"):
+            second.publisher("/twin/reset")
     with Bus(tmp_path) as third:
-        third.publisher("/arm")
+        third.publisher("/twin/reset")
+
+
+def test_several_may_ask_for_a_stop_at_the_same_time(tmp_path):
+    """Teleop, a trial, a gateway and a command are heard by all, also by who listened before they began."""
+    senders = topic("/arm").senders
+    with Bus(tmp_path) as receiver, contextlib.ExitStack() as stack:
+        receiver.subscribe("/arm")
+        buses = [stack.enter_context(Bus(tmp_path)) for _ in range(senders)]
+        for number, bus in enumerate(buses):
+            bus.publisher("/arm")
+            while bus.subscribers("/arm") == 0:
+                receiver.wait(0.01)
+            bus.publish(
+                "/arm", types.Arm(header=header(1), arm=False, source=f"{number}", reason="", ask_id="a", age_ns=0)
+            )
+        got = receive_for(receiver, 0.2)
+        assert [received.message().source for received in got] == [f"{number}" for number in range(senders)]
+        with Bus(tmp_path) as one_too_many, pytest.raises(BusError, match="/arm is already published"):
+            one_too_many.publisher("/arm")
 
 
 def test_restarted_publisher_has_a_new_instance_and_is_found_again(tmp_path):
@@ -121,7 +142,9 @@ def test_restarted_publisher_has_a_new_instance_and_is_found_again(tmp_path):
                 sender.publisher("/arm")
                 while sender.subscribers("/arm") == 0:
                     receiver.wait(0.01)
-                sender.publish("/arm", types.Arm(header=header(1), arm=True, source="test", reason=""))
+                sender.publish(
+                    "/arm", types.Arm(header=header(1), arm=True, source="test", reason="", ask_id="a", age_ns=0)
+                )
                 (got,) = receive_for(receiver, 0.1)
                 instances.append(got.info.instance_id)
                 assert got.info.lost == 0

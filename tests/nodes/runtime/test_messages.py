@@ -83,7 +83,7 @@ def test_camera_info_has_the_principal_point_of_ros_and_comes_back_as_ours():
 
 def test_wrong_field_is_a_message_error():
     with pytest.raises(MessageError, match="wrong type or is out of range"):
-        encode(types.Arm(header=header(0), arm=True, source=3, reason=""))
+        encode(types.Arm(header=header(0), arm=True, source=3, reason="", ask_id="a", age_ns=0))
     with pytest.raises(MessageError, match="expected a ROS 2 message, got int"):
         encode(3)
     with pytest.raises(MessageError, match="unknown message type 'a/b'"):

@@ -148,7 +148,7 @@ def test_nodes_that_answer_each_other_for_ever_are_stopped():
         def handle(self, topic, message, info, now):
             return [Out("/arm", info.raw)]
 
-    arm = types.Arm(header=pose_message(np.eye(4), 0).header, arm=False, source="", reason="")
+    arm = types.Arm(header=pose_message(np.eye(4), 0).header, arm=False, source="", reason="", ask_id="a", age_ns=0)
     with pytest.raises(BagError, match="answer each other without end on /arm"):
         lockstep(loop=Loop()).feed(BagMessage("/arm", encode(arm), START_NS, START_NS, 0))
 

@@ -192,7 +192,7 @@ def test_watch_only_key_sees_but_cannot_drive_or_arm(lab, capfd):
     robot = lab.robot()
     visitor = lab.workstation("visitor", exports=("/policy/drive", "/arm"))
     robot.eyes.publisher("/vicon/car")
-    arm = types.Arm(header=header(0), arm=True, source="operator", reason="")
+    arm = types.Arm(header=header(0), arm=True, source="operator", reason="", ask_id="a", age_ns=0)
 
     def act():
         robot.eyes.publish("/vicon/car", encode(types.PoseStamped(header=header(0), pose=IDENTITY)))

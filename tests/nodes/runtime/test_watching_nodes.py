@@ -1,4 +1,6 @@
 import os
+import re
+import signal
 import subprocess
 import sys
 import threading
@@ -45,15 +47,30 @@ def test_top_shows_process_memory_rate_and_restarts(tmp_path):
     try:
         with NodeWatch(tmp_path) as watch:
             deadline = time.monotonic() + 15.0
-            while not (rows := watch.rows(0.5)) and time.monotonic() < deadline:
+            while not ((rows := watch.rows(0.5)) and rows[0].state == "ready") and time.monotonic() < deadline:
                 pass
             (row,) = watch.rows(1.0)
             assert (row.name, row.pid, row.restarts) == ("safety", process.pid, 0)
             assert row.rate_hz == pytest.approx(50.0, rel=0.3)  # its ticks
             assert 20 < row.memory_mib < 120
-            process.terminate()
+            process.send_signal(signal.SIGSTOP)
+            time.sleep(0.5)  # what it sent before is taken by the first look
+            watch.rows(0.5)
+            (row,) = watch.rows(0.5)
+            assert (row.state, row.pid, row.rate_hz) == ("silent", process.pid, 0.0)
+            age_s = re.fullmatch(r"last status (\d+\.\d) s ago; its process is stopped by a signal", row.text)
+            assert 0.9 <= float(age_s[1]) <= 3.0
+            process.send_signal(signal.SIGCONT)
+            while watch.rows(0.5)[0].state == "silent" and time.monotonic() < deadline + 15.0:
+                pass
+            process.kill()
             process.wait()
+            watch.rows(0.5)
+            (row,) = watch.rows(0.5)
+            assert (row.state, row.pid) == ("silent", 0)
+            assert row.text.endswith("its process is not here any more")
             process = subprocess.Popen(command)
+            rows = []
             while not (rows and rows[0].restarts) and time.monotonic() < deadline + 15.0:
                 rows = watch.rows(0.5)
             assert rows[0].restarts == 1

@@ -1,0 +1,93 @@
+"""Ask a node for something: the request is repeated until the node has answered.
+
+A publisher cannot know who listens: its only subscriber may be a recorder, and the node that a request is for may join later or
+be restarted. So a request has an id, every repeat carries the same one, and the node answers with it.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+from nodes.runtime.bus import Bus, Received
+from nodes.runtime.clock import Now, SystemClock
+from nodes.runtime.errors import BusError, LaunchError, MessageError
+from nodes.runtime.requests import Asked
+
+T = TypeVar("T")
+_TELL_S = 1.0
+
+
+class NoAnswerError(LaunchError):
+    """The node that a request is for did not answer in time."""
+
+
+def ask(
+    bus: Bus,
+    topic: str,
+    make: Callable[[Asked, Now], Any],
+    answers: str,
+    read: Callable[[str, Received], T | None],
+    *,
+    every_s: float,
+    patience_s: float | None,
+    silent: Callable[[float], None] = lambda waited_s: None,
+    silent_after_s: float = 1.0,
+) -> T:
+    """Publish a request again and again until it is answered.
+
+    Args:
+        bus: A bus of the calling thread; messages of its other subscriptions that come meanwhile are passed to `read` too.
+        topic: Topic of the request.
+        make: Makes the message for one repeat from the request's identity and the time.
+        answers: Topic on which the node answers.
+        read: Returns the answer if a received message is one to this id, else None.
+        every_s: Time between two repeats [s].
+        patience_s: Time after which it gives up [s]; None asks for ever.
+        silent: Called with the time waited so far [s] while there is no answer, every second.
+        silent_after_s: When it is called first [s].
+
+    Returns:
+        What `read` returned.
+
+    Raises:
+        NoAnswerError: No answer within the patience.
+        BusError: Others publish the topic, and did so for the whole time.
+    """
+    clock = SystemClock()
+    bus.subscribe(answers)
+    asked = Asked.at(clock.now())
+    began = time.monotonic()
+    next_s, tell_s, taken = began, began + silent_after_s, None
+    while True:
+        now_s = time.monotonic()
+        if now_s >= next_s:
+            next_s = now_s + every_s
+            taken = _publish(bus, topic, make(asked, clock.now()))
+        bus.wait(max(0.0, next_s - time.monotonic()))
+        for received in bus.receive():
+            answer = _read(read, asked.ask_id, received)
+            if answer is not None:
+                return answer
+        waited_s = time.monotonic() - began
+        if patience_s is not None and waited_s > patience_s:
+            raise taken or NoAnswerError(f"no answer on {answers} to the request on {topic} within {patience_s:g} s")
+        if time.monotonic() >= tell_s:
+            tell_s = time.monotonic() + _TELL_S
+            silent(waited_s)
+
+
+def _publish(bus: Bus, topic: str, message: Any) -> BusError | None:
+    try:
+        bus.publish(topic, message)
+    except BusError as error:
+        return error  # all endpoints of the topic are taken now; one may become free
+    return None
+
+
+def _read(read: Callable[[str, Received], T | None], ask_id: str, received: Received) -> T | None:
+    try:
+        return read(ask_id, received)
+    except MessageError:
+        return None  # bytes that are no message must not end a request to stop the car

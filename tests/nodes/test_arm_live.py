@@ -1,0 +1,233 @@
+"""Requests to arm and to disarm on real sockets: a real safety process, a recorder as the only subscriber, late and restarted nodes."""
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from nodes.runtime.arm_requests import arm_message, ask_to_arm, ask_to_disarm
+from nodes.runtime.bus import Bus
+from nodes.runtime.clock import SystemClock
+from nodes.runtime.errors import LaunchError
+from nodes.runtime.messages import drive_message, header, pose_message, types
+from nodes.runtime.requests import Asked
+
+ROOM = Path(__file__).parents[2] / "calibration" / "twin" / "room.yaml"
+CLOCK = SystemClock()
+
+
+class Lab:
+    """A run folder with a car that is measured and commanded, a motor node that does what it is told, and a recorder of /arm."""
+
+    def __init__(self, folder):
+        self.folder, self.process, self.recorded = folder, None, []
+        self.well, self.motor, self._stopping = True, True, False
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def _run(self):
+        with Bus(self.folder) as bus:
+            bus.subscribe("/arm")
+            bus.subscribe("/safety/drive")
+            speed, next_s = 0.0, time.monotonic()
+            while not self._stopping:
+                bus.wait(max(0.0, next_s - time.monotonic()))
+                for received in bus.receive():
+                    if received.topic == "/arm":
+                        self.recorded.append(received.message())
+                    else:
+                        speed = float(received.message().drive.speed)
+                if time.monotonic() < next_s:
+                    continue
+                next_s += 0.02
+                now_ns = time.time_ns()
+                if self.well:
+                    bus.publish("/vicon/car", pose_message(np.eye(4), now_ns))
+                bus.publish("/policy/drive", drive_message(0.5, 0.0, now_ns))
+                if self.motor:
+                    bus.publish("/motor/sent", sent(speed, now_ns))
+
+    def start(self):
+        command = [sys.executable, "-m", "nodes.safety", "--run-dir", str(self.folder), "--name", "safety"]
+        self.process = subprocess.Popen([*command, "--set", f"room={ROOM}", "--set", "nodes=[]"])
+
+    def wait_ready(self, reason="nobody has armed"):
+        with Bus(self.folder) as bus:
+            bus.subscribe("/safety/state")
+            deadline = time.monotonic() + 20.0
+            while time.monotonic() < deadline:
+                bus.wait(0.1)
+                for received in bus.receive():
+                    state = received.message()
+                    if state.reason == reason and state.command_age_s < 0.2 and state.pose_age_s < 0.2:
+                        return
+        raise AssertionError("the safety node is not ready")
+
+    def end(self):
+        if self.process is not None:
+            self.process.kill()
+            self.process.wait()
+
+    def close(self):
+        self.end()
+        self._stopping = True
+        self._thread.join()
+
+
+def sent(speed_mps, stamp_ns):
+    return types.MotorSent(
+        header=header(stamp_ns), serial_write_mono_ns=0, serial_write_real_ns=0, speed_mps=speed_mps, steering_rad=0.0, erpm=0.0,
+        servo=0.5, brake_current_a=0.0, braking=speed_mps == 0.0, reason="", peer="TWIN",
+    )  # fmt: skip
+
+
+@pytest.fixture
+def lab(tmp_path):
+    lab = Lab(tmp_path)
+    yield lab
+    lab.close()
+
+
+def command(lab, *words):
+    program = [sys.executable, "-m", "nodes.cli", *words, "--run-dir", str(lab.folder)]
+    return subprocess.Popen(program, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def test_no_request_is_lost_with_a_recorder(lab):
+    lab.start()
+    lab.wait_ready()
+    for _ in range(15):
+        answer = ask_to_arm(lab.folder, "")
+        assert (answer.granted, answer.armed, answer.text) == (True, True, "operator")
+        answer = ask_to_disarm(lab.folder, "enough", pytest.fail)
+        assert (answer.granted, answer.armed, answer.braked) == (True, False, True)
+        assert answer.text == "disarmed by operator: enough"
+    assert lab.recorded  # whatever it heard: not waiting for the recorder is the point
+
+
+def test_a_disarm_waits_loudly_for_a_safety_node_that_joins_late(lab):
+    asking = command(lab, "disarm", "--reason", "look out")
+    first = asking.stderr.readline()
+    assert "NOT CONFIRMED: no answer of the safety node for 0.3 s" in first
+    assert lab.recorded  # a recorder hears it all the time
+    lab.start()
+    output, _ = asking.communicate(timeout=30)
+    assert (asking.returncode, output) == (0, "not armed: disarmed by operator: look out\n")
+
+
+def test_a_disarm_that_is_given_up_is_no_success(lab):
+    asking = command(lab, "disarm")
+    assert "NOT CONFIRMED" in asking.stderr.readline()
+    asking.send_signal(signal.SIGINT)
+    assert asking.wait(10) == 130
+    asking.stdout.close()
+    asking.stderr.close()
+
+
+def test_a_disarm_without_a_motor_node_says_so(lab):
+    lab.start()
+    lab.wait_ready()
+    lab.motor = False
+    asking = command(lab, "disarm")
+    output, errors = asking.communicate(timeout=30)
+    assert asking.returncode == 1
+    assert "not armed: disarmed by operator" in output
+    assert "NOT CONFIRMED: disarmed, but the motor node has not said within 0.3 s" in errors
+
+
+def test_why_it_is_not_armed(lab):
+    with pytest.raises(LaunchError, match=r"did not answer within 2 s, and the car may be armed or not"):
+        ask_to_arm(lab.folder, "")
+    lab.start()
+    lab.wait_ready()
+    lab.well = False
+    time.sleep(0.4)
+    asking = command(lab, "arm")
+    output, errors = asking.communicate(timeout=30)
+    assert (asking.returncode, errors) == (1, "")
+    assert output.startswith("not armed: no pose of the car for ")
+
+
+def test_a_hung_safety_node_answers_when_it_wakes_and_an_arm_is_void_by_then(lab):
+    lab.start()
+    lab.wait_ready()
+    os.kill(lab.process.pid, signal.SIGSTOP)
+    asking = command(lab, "disarm")
+    assert "NOT CONFIRMED" in asking.stderr.readline()
+    asked = Asked.at(CLOCK.now())
+    with sender(lab) as send:
+        send(asked)
+        time.sleep(1.1)
+        os.kill(lab.process.pid, signal.SIGCONT)
+        output, _ = asking.communicate(timeout=30)
+        assert (asking.returncode, output) == (0, "not armed: disarmed by operator: \n")
+        state = send.until_answered(asked)
+    assert not state.armed
+    assert not state.granted
+
+
+def test_a_fault_between_two_repeats_of_an_arm_leaves_the_car_disarmed(lab):
+    lab.start()
+    lab.wait_ready()
+    asked = Asked.at(CLOCK.now())
+    with sender(lab) as send:
+        assert send.until_answered(asked).armed
+        lab.well = False
+        time.sleep(0.35)
+        lab.well = True
+        time.sleep(0.1)
+        state = send.until_answered(asked)
+        assert CLOCK.now().mono_ns - asked.mono_ns < 1_000_000_000
+    assert (state.armed, state.granted) == (False, True)
+    assert state.reason.startswith("no pose of the car for ")
+
+
+def test_a_restart_between_two_repeats_of_an_arm_leaves_the_car_disarmed(lab):
+    lab.start()
+    lab.wait_ready()
+    asked = Asked.at(CLOCK.now())
+    with sender(lab) as send:
+        assert send.until_answered(asked).armed
+        lab.end()
+        lab.start()
+        lab.wait_ready()
+        state = send.until_answered(asked)
+    assert (state.armed, state.granted) == (False, False)
+    assert "older than the last stop (nobody has armed)" in state.answer
+
+
+class Sender:
+    """Repeats requests to arm, as a client of its own kind might."""
+
+    def __init__(self, bus):
+        self._bus = bus
+
+    def __call__(self, asked):
+        now = CLOCK.now()
+        self._bus.publish("/arm", arm_message(asked, now, True, "operator", ""))
+
+    def until_answered(self, asked):
+        self._bus.receive()
+        sent_ns, deadline = time.monotonic_ns(), time.monotonic() + 5.0
+        while time.monotonic() < deadline:
+            self(asked)
+            self._bus.wait(0.02)
+            for received in self._bus.receive():
+                state = received.message()
+                if state.answered_id == asked.ask_id and received.info.publish_mono_ns > sent_ns:
+                    return state
+        raise AssertionError("no answer")
+
+
+@contextlib.contextmanager
+def sender(lab):
+    with Bus(lab.folder) as bus:
+        bus.subscribe("/safety/state")
+        yield Sender(bus)
