@@ -28,9 +28,11 @@ from hardware.twin.vehicle import TwinVehicle
 from hardware.twin.vicon_emulator import ViconEmulatorConfig, ViconFrames
 from hardware.vicon import SubjectTracker, ViconConfig
 from nodes.arming import ArmingLimits
+from nodes.runtime.arm_requests import OPERATOR, arm_message
 from nodes.runtime.clock import NS_PER_S, Now
 from nodes.runtime.messages import drive_message, header, types
 from nodes.runtime.node import MessageInfo, Out
+from nodes.runtime.requests import Asked
 from nodes.safety import SafetyConfig, SafetyNode
 from nodes.vicon import ViconNode, ViconNodeConfig
 
@@ -95,8 +97,8 @@ class SimulatedDrive:
             self.step(moving=False)
             self.step(moving=False)
             if self.step_index > 20:
-                request = types.Arm(header=header(0), arm=True, source="operator", reason="benchmark")
-                self._say("/arm", request, self._now(self._mono_ns))
+                now = self._now(self._mono_ns)
+                self._say("/arm", arm_message(Asked.at(now), now, True, OPERATOR, "benchmark"), now)
             if self.armed:
                 return
         raise RuntimeError(f"expected the safety node to be armed within 20 s, it says: {self.reason}")
