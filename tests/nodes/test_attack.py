@@ -314,11 +314,11 @@ def _wait(bus, condition, timeout_s=60.0):
 
 def test_without_a_node_the_commands_say_so_whoever_else_listens(tmp_path, monkeypatch):
     monkeypatch.setattr("nodes.attacking.client._ANSWER_S", 0.3)
-    with pytest.raises(LaunchError, match="the attack node did not answer within 0.3 s"):
+    with pytest.raises(LaunchError, match=r"the attack node did not answer within 0\.3 s"):
         cancel_attack(tmp_path, "", "")
     with Bus(tmp_path) as recorder:
         recorder.subscribe("/attack/cancel")
-        with pytest.raises(LaunchError, match="the attack node did not answer within 0.3 s"):
+        with pytest.raises(LaunchError, match=r"the attack node did not answer within 0\.3 s"):
             cancel_attack(tmp_path, "", "")
 
 
