@@ -222,6 +222,25 @@ def test_the_node_turns_the_wheels_and_listens_to_the_person(make):
     assert "steering" not in car.node._watch.missing()
 
 
+def test_a_repeated_request_for_the_check_is_obeyed_once_and_answered_every_time(make):
+    car = make()
+    car.settle(lambda: "steering was not checked" in car.node.status()[1])
+
+    def ask(action, ask_id):
+        message = types.SteeringCheck(header=header(0), action=action, source="operator", ask_id=ask_id)
+        car.outs += car.node.handle("/motor/check", message, MessageInfo(0, 0, instance_id=1), CLOCK.now())
+        values = {pair.key: pair.value for pair in car.rows()["motor: steering"].values}
+        return values["answered"], values["granted"], values["answer"]
+
+    assert ask("confirm", "a") == ("a", "False", "no steering check awaits an answer; start one")
+    assert ask("start", "b")[:2] == ("b", "True")
+    began_ns = car.node._watch.check._began_ns
+    assert ask("start", "b")[:2] == ("b", "True")
+    assert car.node._watch.check._began_ns == began_ns
+    assert ask("confirm", "a") == ("a", "False", "no steering check awaits an answer; start one")
+    assert ask("jump", "c") == ("c", "False", "expected start, confirm or deny, got 'jump'")
+
+
 def test_command_line(tmp_path):
     with VescEmulator(VescEmulatorConfig(), TwinVehicle(CarConfig()), tmp_path / "vesc") as emulator:
         port = ["--port", str(tmp_path / "vesc")]
