@@ -100,8 +100,10 @@ def fox(folder: Path, data: Path, step: int, ten_cameras: bool) -> Found:
     return find(folder, truth)
 
 
-def record(line: str, target: str, limit_percent: float, fewest: int, results: Sequence[Found], trial: bool) -> None:
-    """Print a row and, unless it is a trial, write it."""
+def record(
+    line: str, target: str, limit_percent: float, fewest: int, results: Sequence[Found], trial: bool, miss: str = ""
+) -> None:
+    """Print a row and, unless it is a trial, write it; ``miss`` is the reason to give if the target is missed."""
     largest = max(result.largest_percent for result in results)
     placed, given = sum(len(result.errors_percent) for result in results), sum(result.given for result in results)
     met = all(len(r.errors_percent) >= fewest and r.largest_percent <= limit_percent for r in results)
@@ -115,6 +117,7 @@ def record(line: str, target: str, limit_percent: float, fewest: int, results: S
     )
     reasons = [reason for result in results for reason in result.left_out]
     note += f"; left out: {'; '.join(reasons)}" if reasons else ""
+    note += f"; {miss}" if miss and not met else ""
     print(f"{line}: {largest:.2f} %: {note}", flush=True)
     if not trial:
         record_row(line, largest, "% largest focal length error", target, met, COMMAND, note)
@@ -150,7 +153,8 @@ def main() -> None:
         for step, words in ((4, "all round the fox"), (1, "neighbours")):
             sets = [fox(options.folder / f"fox_eleven_{step}", options.data, step, ten_cameras=False)]
             line = f"#15 lens of eleven fox photographs, {words}"
-            record(line, "all placed, <= 1 %", ELEVEN_PERCENT, 11, sets, trial)
+            miss = "on a short arc an error of the focal length is made up for by the distances" if step == 1 else ""
+            record(line, "all placed, <= 1 %", ELEVEN_PERCENT, 11, sets, trial, miss)
     elif "fox" in options.only:
         print(f"left out: fox, whose photographs are not in {options.data}")
 
