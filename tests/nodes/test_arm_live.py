@@ -19,7 +19,7 @@ from nodes.runtime.errors import LaunchError
 from nodes.runtime.messages import drive_message, header, pose_message, types
 from nodes.runtime.requests import Asked
 
-ROOM = Path(__file__).parents[2] / "calibration" / "twin" / "room.yaml"
+TWIN = Path(__file__).parents[2] / "calibration" / "twin"
 CLOCK = SystemClock()
 
 
@@ -56,7 +56,17 @@ class Lab:
 
     def start(self):
         command = [sys.executable, "-m", "nodes.safety", "--run-dir", str(self.folder), "--name", "safety"]
-        self.process = subprocess.Popen([*command, "--set", f"room={ROOM}", "--set", "nodes=[]"])
+        self.process = subprocess.Popen(
+            [
+                *command,
+                "--set",
+                f"room={TWIN / 'room.yaml'}",
+                "--set",
+                f"vehicle={TWIN / 'vehicle.yaml'}",
+                "--set",
+                "nodes=[]",
+            ]
+        )
 
     def wait_ready(self, reason="nobody has armed"):
         with Bus(self.folder) as bus:

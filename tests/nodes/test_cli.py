@@ -186,7 +186,7 @@ def test_bag_is_recorded_described_played_and_repaired(running, folder, command)
     assert command(*played)[0] == 0
     whole = (bag / "recorded_0.mcap").read_bytes()
     (bag / "recorded_0.mcap").write_bytes(whole[:-100])
-    assert command("bag", "info", bag)[0] == 1
+    assert command("bag", "info", bag)[0] == 2
     code, output, _ = command("bag", "repair", bag)
     assert (code, "kept" in output) == (0, True)
     assert read_info(bag).messages > 50

@@ -121,7 +121,7 @@ def test_topics_that_nobody_here_knows_are_left_out_and_named(tmp_path):
         writer.add_message(channel, START_NS, cdr, START_NS)
     writer.finish()
     node = PlayerNode(PlayerConfig(bag=path, wait_for=[]), lambda topic: 0)
-    assert node.publications == ("/vicon/car",)
+    assert node.publications == ("/vicon/car", "/player/state")
     out, done = play(node, ManualClock())
     assert (len(out), done) == (1, True)
     assert node.status() == ("active", "1 messages played; not in the topic table: /chatter")

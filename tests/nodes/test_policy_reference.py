@@ -123,8 +123,8 @@ class Circling(torch.nn.Module):
         return self.steering_rad + 1e-3 * images.mean(dim=(1, 2, 3))
 
 
-def circling(steering_rad):
-    return adapt(Circling(steering_rad).eval(), PolicyContract(VIEW))
+def circling(steering_rad, view=VIEW):
+    return adapt(Circling(steering_rad).eval(), PolicyContract(view))
 
 
 def test_a_policy_is_driven_round_the_path_in_the_scene(tmp_path):
@@ -153,11 +153,12 @@ def test_a_policy_is_driven_round_the_path_in_the_scene(tmp_path):
 def test_a_scene_gives_views_of_the_policys_own_size_and_drives(tmp_path):
     folder = run_folder(tmp_path / "run", ReferencePath.from_segments((0.0, -2.0, 0.0), [Arc(2.0, np.pi / 2)] * 4))
     calibration = folder / "capture" / "calibration"
-    reference = from_scene(folder / "scene" / "scene.safetensors", calibration, replace(VIEW, width=100), count=6)
+    narrow = replace(VIEW, width=100)
+    reference = from_scene(folder / "scene" / "scene.safetensors", calibration, narrow, count=6)
     assert reference.images.shape == (6, 66, 100, 3)
     assert np.ptp(reference.steering_rad) > 0.1
     assert reference.asked
-    assert not reference.drives(circling(-0.1), ()).drives
+    assert not reference.drives(circling(-0.1, narrow), ()).drives
 
 
 def test_the_command_fails_for_a_policy_that_does_not_drive_where_it_was_asked_to(tmp_path):
