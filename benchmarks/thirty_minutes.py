@@ -26,6 +26,7 @@ import numpy as np
 
 from benchmarks.car_nodes import resident_mb
 from benchmarks.fault_campaign import VICTIMS, Graph
+from benchmarks.host_pauses import HostPauses
 from benchmarks.results import REPOSITORY, record_row
 from calibration.schema import RoomCalibration, load_calibration
 from nodes.runtime.bag_read import read_info, read_messages
@@ -84,17 +85,23 @@ def sample(graph: Graph, numbers: Numbers, began: float) -> dict[str, Any]:
 
 @dataclass
 class Stops:
-    """When the car stopped without being told to [s since the beginning], and why."""
+    """When the car stopped without being told to [s since the beginning], and why.
+
+    Attributes:
+        found: All of them.
+        by_host: How many came while the host withheld its processors (`benchmarks.host_pauses`).
+    """
 
     found: list[tuple[float, str]] = field(default_factory=list)
+    by_host: int = 0
 
     def describe(self) -> str:
         """The stops in words."""
         said = "; ".join(f"{t_s:.0f} s: {reason}" for t_s, reason in self.found[:5])
-        return f"{len(self.found)} stops" + (f" ({said})" if said else "")
+        return f"{len(self.found)} stops, {self.by_host} of them while the host paused" + (f" ({said})" if said else "")
 
 
-def live(graph: Graph, duration_s: float) -> tuple[list[dict[str, Any]], Stops]:
+def live(graph: Graph, duration_s: float, pauses: HostPauses) -> tuple[list[dict[str, Any]], Stops]:
     """Drive for so long; the samples, and the stops after which a person armed again."""
     numbers, stops, samples = Numbers(graph.folder), Stops(), []
     try:
@@ -110,7 +117,10 @@ def live(graph: Graph, duration_s: float) -> tuple[list[dict[str, Any]], Stops]:
                     graph.operator.watch(0.1)
                     numbers.look()
                     if not graph.operator.armed:
-                        stops.found.append((time.monotonic() - began, graph.operator.seen["/safety/state"].reason))
+                        now_s = time.monotonic()
+                        reason = str(graph.operator.seen["/safety/state"].reason).replace(f"{graph.folder}/", "")
+                        stops.found.append((now_s - began, reason))
+                        stops.by_host += pauses.explain(now_s)
                         print(f"stopped: {stops.found[-1]}: {graph.operator.describe()}", flush=True)
                         graph.put_back()
                         graph.operator.arm(20.0)
@@ -199,8 +209,9 @@ def record(samples: list[dict[str, Any]], stops: Stops, note: str) -> None:
     dropped = sum(
         v for s in samples[-1]["nodes"].values() for k, v in s["counters"].items() if k.startswith(("dropped", "lost"))
     )
+    unexplained = len(stops.found) - stops.by_host
     record_row(
-        "#15 half an hour live with the trained policy: unexplained stops", len(stops.found), "stops", "0", not stops.found, COMMAND, note,
+        "#15 half an hour live with the trained policy: unexplained stops", unexplained, "stops", "0", not unexplained, COMMAND, note,
     )  # fmt: skip
     said = ", ".join(f"{name} {count}" for name, count in late.items() if count) or "no node missed any"
     record_row(
@@ -244,12 +255,15 @@ def main() -> None:
     settings = (f"params.policy={json.dumps(str(options.policy.resolve()))}",)
     graph = Graph(folder, settings)
     try:
-        samples, stops = live(graph, 60.0 if options.trial else options.minutes * 60.0)
+        with HostPauses(folder) as pauses:
+            samples, stops = live(graph, 60.0 if options.trial else options.minutes * 60.0, pauses)
+            host = pauses.describe()
     finally:
         graph.close()
     digest = hashlib.sha256(options.policy.read_bytes()).hexdigest()[:12]
     note = (
-        f"{samples[-1]['t_s'] / 60:.1f} minutes, policy {digest}, {stops.describe()}, {describe_drive(folder / 'bag')}"
+        f"{samples[-1]['t_s'] / 60:.1f} minutes, policy {digest}, {stops.describe()}, {host}, "
+        f"{describe_drive(folder / 'bag')}"
     )
     print(f"{note}\nmissed ticks {missed(samples)}\ngrowth {growth(samples, 0.0 if options.trial else WARM_UP_S)}")
     print(f"unaccounted {unaccounted(samples)}")
