@@ -8,13 +8,13 @@ CPU, in a process of its own: COLMAP takes over the process's signals, and one c
 from __future__ import annotations
 
 import os
-import pickle
 import signal
 import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from calibration.colmap_messages import pack_job, unpack_answer
 from calibration.photo_model import (
     MIN_IMAGES,
     FoundCamera,
@@ -63,7 +63,7 @@ def reconstruct(
             stdout=subprocess.PIPE, stderr=stream, start_new_session=True,
         )  # fmt: skip
         try:
-            model = _converse(process, (root.absolute(), tuple(sources), work.absolute(), config), report)
+            model = _converse(process, pack_job(root.absolute(), sources, work.absolute(), config), report)
         finally:
             process.kill()
             process.communicate()
@@ -81,25 +81,23 @@ def _require_colmap() -> None:
         raise ModuleNotFoundError("No module named 'pycolmap'", name="pycolmap")
 
 
-def _converse(process: subprocess.Popen[bytes], job: object, report: Report) -> Model | None:
+def _converse(process: subprocess.Popen[bytes], job: bytes, report: Report) -> Model | None:
     """Hand over the job and follow its progress; the model, or None if the process ended before it had one."""
     assert process.stdin is not None
     assert process.stdout is not None
     try:
-        pickle.dump(job, process.stdin)
+        process.stdin.write(job)
         process.stdin.flush()
-        while True:
-            kind, value = pickle.load(process.stdout)
-            if kind == "error":
-                raise value
-            if kind == "model":
-                assert isinstance(value, Model)
-                process.wait()
-                return value
-            report(*value)
-    except (EOFError, BrokenPipeError, pickle.UnpicklingError):
-        process.wait()
-        return None
+    except BrokenPipeError:
+        pass  # it has ended; what it wrote before, if anything, says why
+    while (line := process.stdout.readline()).endswith(b"\n"):
+        answer = unpack_answer(line)
+        if isinstance(answer, Model):
+            process.wait()
+            return answer
+        report(*answer)
+    process.wait()
+    return None
 
 
 def _ended_early(code: int, log: Path) -> Exception:
