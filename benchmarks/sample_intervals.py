@@ -68,7 +68,7 @@ def fox(data: Path) -> Case:
     listed = load_transforms(data).sorted_by_name()
     training, held_out = (part.load(_FOX_SIZE) for part in listed.split(_HELD_OUT_EVERY))
     field = _field(*listed.box(), bands=3)
-    return Case(training, held_out, field, _rules(training.pinholes, field, 0.3), held_out.pinholes[0])
+    return Case(training, held_out, field, _rules(training, field, 0.3), held_out.pinholes[0])
 
 
 def standing_back(data: Path) -> Case:
@@ -91,7 +91,7 @@ def standing_back(data: Path) -> Case:
 
     field = _field(centre - 0.55 * extent_m, centre + 0.55 * extent_m, bands=3, learned_background=False)
     training = pictures(60, 0.0)
-    return Case(training, pictures(8, 0.37), field, _rules(training.pinholes, field, 0.05), lens)
+    return Case(training, pictures(8, 0.37), field, _rules(training, field, 0.05), lens)
 
 
 def room(data: Path) -> Case:
@@ -101,7 +101,10 @@ def room(data: Path) -> Case:
     held = np.arange(len(images.rgb)) % _HELD_OUT_EVERY == 0
     view = PolicyView(LabConfig().camera.pinhole).pinhole
     before = MarchConfig()
-    rules = {"pixels": (pixel_intervals([view], field),) * 2, "box": (before, before.coarser(2.0))}
+    rules = {
+        "pixels": (pixel_intervals([view], images.T_world_from_camera, field),) * 2,
+        "box": (before, before.coarser(2.0)),
+    }
     return Case(_some(images, ~held), _some(images, held), field, rules, view, is_open=False)
 
 
@@ -161,11 +164,12 @@ def _held_out_db(renderer: FieldRenderer, views: ImageSet) -> float:
     return float(np.mean(scores))
 
 
-def _rules(
-    pinholes: tuple[Pinhole, ...], field: SceneFieldConfig, near_m: float
-) -> dict[str, tuple[MarchConfig, MarchConfig]]:
+def _rules(images: ImageSet, field: SceneFieldConfig, near_m: float) -> dict[str, tuple[MarchConfig, MarchConfig]]:
     before = MarchConfig(near_m, field.extent_m / 2048, field.extent_m / 160, 0.016)
-    return {"pixels": (pixel_intervals(pinholes, field, near_m),) * 2, "box": (before, before.coarser(2.0))}
+    return {
+        "pixels": (pixel_intervals(images.pinholes, images.T_world_from_camera, field, near_m),) * 2,
+        "box": (before, before.coarser(2.0)),
+    }
 
 
 def _field(low: Array, high: Array, bands: int, learned_background: bool = True) -> SceneFieldConfig:
