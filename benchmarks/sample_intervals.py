@@ -5,8 +5,8 @@
   8 to 80 mm, as its default was.
 
 Three sets: ``fox``, photographs; ``standing_back``, pictures with alpha of the generated car by a long lens that stands back; ``room``,
-a small capture of the simulated lab, seen by the policy's view. Both rules take the same number of steps with the same number of
-samples. Views are timed in turns, by median; the ratio is printed and recorded.
+a small capture of the simulated lab, with held-out pictures as coarse as the policy's view. Both rules take the same number of steps
+with the same number of samples. Views are timed in turns, by median.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from advnerf_core.driving.policy_view import PolicyView
@@ -105,7 +106,7 @@ def room(data: Path) -> Case:
         "pixels": (pixel_intervals([view], images.T_world_from_camera, field),) * 2,
         "box": (before, before.coarser(2.0)),
     }
-    return Case(_some(images, ~held), _some(images, held), field, rules, view, is_open=False)
+    return Case(_some(images, ~held), _of_focal(_some(images, held), view.fx), field, rules, view, is_open=False)
 
 
 CASES: dict[str, Callable[[Path], Case]] = {"fox": fox, "standing_back": standing_back, "room": room}
@@ -181,6 +182,14 @@ def _field(low: Array, high: Array, bands: int, learned_background: bool = True)
 def _some(images: ImageSet, chosen: Array) -> ImageSet:
     pinholes = tuple(lens for lens, keep in zip(images.pinholes, chosen, strict=True) if keep)
     return ImageSet(images.rgb[chosen], pinholes, images.T_world_from_camera[chosen])
+
+
+def _of_focal(images: ImageSet, focal_px: float) -> ImageSet:
+    """Images made smaller by area averaging, to a focal length: as coarse as another camera's."""
+    lens = images.pinholes[0]
+    size = (round(lens.width * focal_px / lens.fx), round(lens.height * focal_px / lens.fx))
+    small = np.stack([cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in images.rgb])
+    return ImageSet(small, (lens.resized(*size),) * len(small), images.T_world_from_camera)
 
 
 def _report(name: str) -> Callable[[Progress], None]:
