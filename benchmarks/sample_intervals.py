@@ -146,6 +146,8 @@ def compare(case: Case, steps: int, repeats: int) -> tuple[dict[str, float], dic
             steps=steps, march=march, opacity=0.0 if case.is_open else TrainConfig.opacity,
             distortion=2e-3 if case.is_open else TrainConfig.distortion,
             refine_depth=0.005 if case.is_open else TrainConfig.refine_depth,
+            # In the warm-up intervals are longer: a run that ends in it would compare nothing.
+            warmup_steps=min(TrainConfig.warmup_steps, steps // 4),
         )  # fmt: skip
         trained = train_scene(case.training, case.field, config, progress=_report(name))
         renderers[name] = FieldRenderer(trained.scene, trained.occupied, march_of_views)

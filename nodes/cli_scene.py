@@ -79,7 +79,7 @@ def scene_train(
         typer.Option(
             "--interval-px",
             help="Sample intervals in pixels of the images; fewer are finer and slower.",
-            show_default="3.5; 1.5 if all cameras stand outside the box",
+            show_default="4; 1.5 if all cameras stand outside the box",
         ),
     ] = None,
     interval: Annotated[

@@ -13,7 +13,7 @@ from advnerf_core.render.march import MarchConfig
 from advnerf_core.scene.field import SceneFieldConfig
 
 # Of cameras among the content, and of cameras that all stand outside the box and look at it.
-INTERVAL_PX, INTERVAL_PX_FROM_OUTSIDE = 3.5, 1.5
+INTERVAL_PX, INTERVAL_PX_FROM_OUTSIDE = 4.0, 1.5
 # Shares of the box's longest side.
 _SHORTEST, _LONGEST = 1 / 1024, 1 / 64
 # As many as Instant-NGP takes. Occupied space is short, so that few rays come near it.
@@ -33,7 +33,7 @@ def pixel_intervals(
     the interval at ``t`` is ``interval_px * t / f``. A camera close to a wall gets short intervals, and a camera that stands back
     gets intervals as fine, relative to what it sees, as its pixels.
 
-    - Cameras in the box, as in a room: 3.5 pixels. Rays pass much that is occupied, and each surface is seen from about one side.
+    - Cameras in the box, as in a room: 4 pixels. Rays pass much that is occupied, and each surface is seen from about one side.
     - All cameras outside the box, around an object: 1.5 pixels. What is along the ray in one view is across it in another, so that
       intervals show like pixels; and rays pass little that is occupied, so that short intervals cost few rays in training.
 
