@@ -136,7 +136,9 @@ def photograph_lab(count: int) -> tuple[ImageSet, SceneFieldConfig]:
 def prepare(images: ImageSet, field: SceneFieldConfig, steps: int, rays: int) -> tuple[Batch, CpuStep, TorchStep]:
     """A batch, and the two ways to take a step on it from the same state of training."""
     view = PolicyView(LabConfig().camera.pinhole).pinhole
-    config = TrainConfig(steps=steps, backend="numba", march=pixel_intervals([view], field))  # as experiments train
+    config = TrainConfig(
+        steps=steps, backend="numba", march=pixel_intervals([view], images.T_world_from_camera, field)
+    )  # as experiments train
     trainer = Trainer(images, field, config)
     for _ in range(steps):
         trainer.train_step()

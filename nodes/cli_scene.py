@@ -79,7 +79,7 @@ def scene_train(
         typer.Option(
             "--interval-px",
             help="Sample intervals in pixels of the images; fewer are finer and slower.",
-            show_default="3.5",
+            show_default="4; 1.5 if all cameras stand outside the box",
         ),
     ] = None,
     interval: Annotated[
@@ -101,7 +101,6 @@ def scene_train(
 
     Images with alpha are learned with it: what they show as transparent stays so.
     """
-    from advnerf_core.scene.intervals import INTERVAL_PX
     from nodes.runtime.errors import ConfigError
     from nodes.runtime.locks import HeldError, hold
     from nodes.runtime.progress import ProgressDisplay
@@ -124,7 +123,7 @@ def scene_train(
         checkpoint_every_s,
         unbounded,
         preset,
-        INTERVAL_PX if interval_px is None else interval_px,
+        interval_px,
         interval,
         interval_growth,
     )

@@ -20,7 +20,7 @@ from advnerf_core.render.march import MarchConfig
 from advnerf_core.scene.dataset import ImageSet, PosedImages, load_transforms
 from advnerf_core.scene.field import SceneFieldConfig, save_scene
 from advnerf_core.scene.image_files import OPAQUE
-from advnerf_core.scene.intervals import INTERVAL_PX, pixel_intervals
+from advnerf_core.scene.intervals import pixel_intervals
 from advnerf_core.scene.metrics import psnr, ssim
 from advnerf_core.scene.render_field import FieldRenderer
 from advnerf_core.scene.train import Progress, TrainConfig, train_scene
@@ -53,7 +53,7 @@ class TrainingRequest:
         checkpoint_every_s: A kill loses at most so much training [s].
         unbounded: Whether the scene goes on outside the box, contracted; None: if the file's ``aabb_scale`` is more than 1.
         preset: Sizes of the field: ``room``, ours, or ``instant-ngp``.
-        interval_px: Sample intervals in pixels of the training images; see `pixel_intervals`.
+        interval_px: Sample intervals in pixels of the training images; None: those of the rule, see `pixel_intervals`.
         interval: Shortest and longest sample interval instead of the rule's, in the data set's unit.
         interval_growth: Interval per distance instead of the rule's.
     """
@@ -71,7 +71,7 @@ class TrainingRequest:
     checkpoint_every_s: float = 30.0
     unbounded: bool | None = None
     preset: str = "room"
-    interval_px: float = INTERVAL_PX
+    interval_px: float | None = None
     interval: tuple[float, float] | None = None
     interval_growth: float | None = None
 
@@ -83,7 +83,7 @@ class TrainingRequest:
             raise ConfigError(f"expected a box with low < high, got {self.box_m}")
         if self.preset not in PRESETS:
             raise ConfigError(f"expected a preset of {', '.join(PRESETS)}, got {self.preset!r}")
-        if not self.interval_px > 0.0:
+        if self.interval_px is not None and not self.interval_px > 0.0:
             raise ConfigError(f"expected --interval-px above 0, got {self.interval_px}")
         if self.interval is not None and not 0.0 < self.interval[0] <= self.interval[1]:
             raise ConfigError(f"expected --interval as 0 < SHORTEST <= LONGEST, got {list(self.interval)}")
@@ -225,7 +225,7 @@ def scene_field(request: TrainingRequest, listed: PosedImages, transparent: bool
 
 def sample_intervals(request: TrainingRequest, field: SceneFieldConfig, images: ImageSet) -> MarchConfig:
     """How samples are placed, in training and rendering: by the rule, where the request does not say otherwise."""
-    march = pixel_intervals(images.pinholes, field, request.near, request.interval_px)
+    march = pixel_intervals(images.pinholes, images.T_world_from_camera, field, request.near, request.interval_px)
     if request.interval is not None:
         march = replace(march, smallest_step_m=request.interval[0], largest_step_m=request.interval[1])
     return march if request.interval_growth is None else replace(march, step_growth=request.interval_growth)

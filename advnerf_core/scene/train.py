@@ -64,7 +64,7 @@ class Trainer:
         self._poses = poses_in_box(images.T_world_from_camera, field_config.origin_m, field_config.extent_m)
         self._intrinsics = np.stack([intrinsics_row(p) for p in images.pinholes])
         self.march = self.config.march or pixel_intervals(
-            images.pinholes, field_config, self.config.near_m, self.config.interval_px
+            images.pinholes, images.T_world_from_camera, field_config, self.config.near_m, self.config.interval_px
         )
         capacity = int(1.25 * self.config.samples_per_step)
         self._marcher = Marcher(capacity, self.march, field_config.box_high, field_config.contraction)

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from advnerf_core.render.march import MarchConfig
 from advnerf_core.scene.field import SceneField
-from advnerf_core.scene.intervals import INTERVAL_PX
 
 BACKENDS = ("auto", "numba", "torch")
 
@@ -33,7 +32,7 @@ class TrainConfig:
         warmup_steps: Steps during which sample intervals shrink to their final length and all cells are probed.
         march: How samples are placed, in training and rendering; None: by `pixel_intervals`, of the training images.
         near_m: Nothing nearer to a camera than this is learned [m]; not used if ``march`` is given.
-        interval_px: Sample intervals in pixels of the training images; not used if ``march`` is given.
+        interval_px: Sample intervals in pixels of the training images, instead of the rule's; not used if ``march`` is given.
         opacity: Weight of the rays' mean transmittance in the loss. A constant background is learned for what is left; without
             this pull it explains walls that all cameras see from one side, and is wrong from any other. Not used for images with
             alpha, which tell what is transparent.
@@ -57,7 +56,7 @@ class TrainConfig:
     warmup_steps: int = 256
     march: MarchConfig | None = None
     near_m: float = 0.1
-    interval_px: float = INTERVAL_PX
+    interval_px: float | None = None
     opacity: float = 1.5e-3
     refine_depth: float = 0.05
     seed: int = 0

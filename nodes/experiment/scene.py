@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from advnerf_core.scene.colour import fit_colour_map
 from advnerf_core.scene.dataset import ImageSet, load_transforms
 from advnerf_core.scene.field import SceneFieldConfig, save_scene
-from advnerf_core.scene.intervals import INTERVAL_PX, pixel_intervals
+from advnerf_core.scene.intervals import pixel_intervals
 from advnerf_core.scene.render_field import FieldRenderer
 from advnerf_core.scene.train import Progress, TrainConfig, train_scene
 from nodes.experiment import capture
@@ -32,7 +32,9 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
 
     field = _field_config(experiment)
     # The policy's view is coarser than the phone's: samples as fine as the phone's pixels would cost time in every tick.
-    march = pixel_intervals([experiment.view.pinhole], field, interval_px=config.interval_px or INTERVAL_PX)
+    march = pixel_intervals(
+        [experiment.view.pinhole], photographs.T_world_from_camera, field, interval_px=config.interval_px
+    )
     training = TrainConfig(steps=config.steps, seed=config.seed, march=march)
     trained = train_scene(photographs, field, training, folder / "checkpoint.safetensors", progress)
     report(_TRAINING_SHARE, "fitting the colour map")

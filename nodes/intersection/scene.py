@@ -7,7 +7,7 @@ from pathlib import Path
 from advnerf_core.fields.hash_grid import HashGridConfig
 from advnerf_core.scene.dataset import load_transforms
 from advnerf_core.scene.field import SceneFieldConfig, save_scene
-from advnerf_core.scene.intervals import INTERVAL_PX, pixel_intervals
+from advnerf_core.scene.intervals import pixel_intervals
 from advnerf_core.scene.train import Progress, TrainConfig, train_scene
 from nodes.experiment.learned_scene import compare_views, scene_file
 from nodes.intersection import capture
@@ -28,7 +28,9 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
         report(_TRAINING_SHARE * at.fraction, f"step {at.step}, {at.psnr_db:.1f} dB on training rays")
 
     field = field_config(experiment)
-    march = pixel_intervals([experiment.view.pinhole], field, _NEAR_M, config.interval_px or INTERVAL_PX)
+    march = pixel_intervals(
+        [experiment.view.pinhole], photographs.T_world_from_camera, field, _NEAR_M, config.interval_px
+    )
     training = TrainConfig(
         steps=config.steps, seed=config.seed, march=march, refine_depth=config.refine_depth,
         occupancy_resolution=config.occupancy,

@@ -15,7 +15,7 @@ from advnerf_core.geometry import Array, Pinhole, look_at
 from advnerf_core.render.march import MarchConfig
 from advnerf_core.scene.dataset import load_transforms
 from advnerf_core.scene.field import load_scene, save_scene
-from advnerf_core.scene.intervals import INTERVAL_PX
+from advnerf_core.scene.intervals import INTERVAL_PX_FROM_OUTSIDE
 from advnerf_core.scene.render_field import FieldRenderer
 from advnerf_core.scene.train import TrainConfig, train_scene
 from nodes import cli, scene_training
@@ -176,8 +176,10 @@ def test_intervals_follow_the_images_unless_the_user_says_otherwise(pictures: Pa
         return sample_intervals(request, scene_field(request, listed, transparent=True), images)
 
     rule = chosen()
-    assert rule == MarchConfig(0.05, 1.6 / 1024, 1.6 / 64, INTERVAL_PX / 50.0, 1024)
-    assert chosen(interval_px=0.5 * INTERVAL_PX) == dataclasses.replace(rule, step_growth=0.5 * rule.step_growth)
+    assert rule == MarchConfig(0.05, 1.6 / 1024, 1.6 / 64, INTERVAL_PX_FROM_OUTSIDE / 50.0, 1024)
+    assert chosen(interval_px=0.5 * INTERVAL_PX_FROM_OUTSIDE) == dataclasses.replace(
+        rule, step_growth=0.5 * rule.step_growth
+    )
     assert chosen(interval=(0.01, 0.02), near=0.3) == MarchConfig(0.3, 0.01, 0.02, rule.step_growth, 1024)
     assert chosen(interval_growth=0.5) == dataclasses.replace(rule, step_growth=0.5)
 

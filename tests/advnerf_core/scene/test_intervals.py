@@ -11,7 +11,7 @@ from advnerf_core.geometry import Pinhole, look_at
 from advnerf_core.render.march_kernels import step_size
 from advnerf_core.scene.dataset import ImageSet
 from advnerf_core.scene.field import SceneFieldConfig, save_scene
-from advnerf_core.scene.intervals import INTERVAL_PX, pixel_intervals
+from advnerf_core.scene.intervals import INTERVAL_PX, INTERVAL_PX_FROM_OUTSIDE, pixel_intervals
 from advnerf_core.scene.metrics import psnr
 from advnerf_core.scene.render_field import FieldRenderer
 from advnerf_core.scene.train import CheckpointError, TrainConfig, Trainer, train_scene
@@ -26,6 +26,8 @@ TRAIN = TrainConfig(
     steps=350, samples_per_step=1 << 14, max_rays=1 << 12, occupancy_resolution=64, warmup_steps=64, distortion=2e-3,
     near_m=0.05, backend="numba",
 )  # fmt: skip
+
+INSIDE, OUTSIDE = np.eye(4)[None], look_at([DISTANCE_M, 0.0, 0.0], [0.0, 0.0, 0.0])[None]
 
 
 def chequered_ball(T, fine=3):
@@ -61,34 +63,41 @@ def standing_back():
 def test_an_interval_is_a_few_pixels_at_any_distance():
     field = SceneFieldConfig((-4.0,) * 3, (4.0,) * 3)
     for focal_px, distance_m in ((500.0, 3.0), (1000.0, 6.0), (4000.0, 60.0)):
-        steps = pixel_intervals([dataclasses.replace(LENS, fx=focal_px)], field).steps()
+        steps = pixel_intervals([dataclasses.replace(LENS, fx=focal_px)], INSIDE, field).steps()
         pixel_m = distance_m / focal_px
         assert step_size(np.float32(distance_m), steps) == pytest.approx(INTERVAL_PX * pixel_m, rel=1e-5)
-    finer = pixel_intervals([LENS], field, interval_px=1.0)
-    assert finer.step_growth == pytest.approx(pixel_intervals([LENS], field).step_growth / INTERVAL_PX)
+    finer = pixel_intervals([LENS], INSIDE, field, interval_px=1.0)
+    assert finer.step_growth == pytest.approx(pixel_intervals([LENS], INSIDE, field).step_growth / INTERVAL_PX)
 
 
 def test_content_is_sampled_finely_whatever_the_pictures():
     """By distance alone, small pictures of a far object would have one interval through all of it."""
     field = SceneFieldConfig((-4.0,) * 3, (4.0,) * 3)
-    march = pixel_intervals([dataclasses.replace(LENS, fx=50.0)], field)
+    march = pixel_intervals([dataclasses.replace(LENS, fx=50.0)], INSIDE, field)
     assert step_size(np.float32(50.0), march.steps()) == pytest.approx(8.0 / 64)
     assert step_size(np.float32(1e-3), march.steps()) == pytest.approx(8.0 / 1024)
 
 
+def test_cameras_around_an_object_get_finer_intervals_than_cameras_in_a_room():
+    growth = [
+        pixel_intervals([LENS], np.concatenate(poses), FIELD).step_growth for poses in ([OUTSIDE], [OUTSIDE, INSIDE])
+    ]
+    assert growth == [INTERVAL_PX_FROM_OUTSIDE / FOCAL_PX, INTERVAL_PX / FOCAL_PX]
+
+
 def test_the_median_camera_counts():
     lenses = [dataclasses.replace(LENS, fx=f) for f in (100.0, 400.0, 9000.0)]
-    assert pixel_intervals(lenses, FIELD) == pixel_intervals([lenses[1]], FIELD)
+    assert pixel_intervals(lenses, INSIDE, FIELD) == pixel_intervals([lenses[1]], INSIDE, FIELD)
 
 
 def test_an_interval_of_no_pixels_is_refused():
     with pytest.raises(ValueError, match="interval_px > 0, got 0"):
-        pixel_intervals([LENS], FIELD, interval_px=0.0)
+        pixel_intervals([LENS], INSIDE, FIELD, interval_px=0.0)
 
 
 def test_rendering_has_the_intervals_of_the_training_unless_told_otherwise(standing_back, tmp_path):
     trainer = Trainer(standing_back[0], FIELD, dataclasses.replace(TRAIN, steps=2))
-    assert trainer.march == trainer._marcher.config == pixel_intervals([LENS], FIELD, 0.05)
+    assert trainer.march == trainer._marcher.config == pixel_intervals([LENS], OUTSIDE, FIELD, 0.05)
     with torch.no_grad():
         trained = trainer.run()
     assert trained.march == trainer.march
@@ -109,7 +118,7 @@ def test_a_checkpoint_of_other_intervals_is_refused(standing_back, tmp_path):
     config = dataclasses.replace(TRAIN, steps=1)
     path = tmp_path / "checkpoint.safetensors"
     train_scene(standing_back[0], FIELD, config, path)
-    march = pixel_intervals([LENS], FIELD, 0.05)
+    march = pixel_intervals([LENS], OUTSIDE, FIELD, 0.05)
     # The rule's intervals, given as such, are the same training.
     Trainer(standing_back[0], FIELD, dataclasses.replace(config, march=march)).restore(path)
     other_lens = dataclasses.replace(
