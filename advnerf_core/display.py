@@ -2,7 +2,7 @@
 
 ``seen = (ambient + cos(angle)^falloff  M curve(shown)) ^ (1 / response)``: each channel of the monitor has its own monotone curve (its gamma), the
 camera mixes the channels' light by ``M``, the room reflects in the glass, the panel dims to the side, and the camera answers with its own
-power. All colours are in 0..1. `advnerf_core.attack.displayed` is the same in torch, with gradients.
+power. All colours are in 0..1. `advnerf_core.attack.spaces.displayed` is the same in torch, with gradients.
 """
 
 from __future__ import annotations

@@ -18,10 +18,10 @@ from pathlib import Path
 import torch
 from safetensors.torch import save
 
-from advnerf_core.attack.baselines import random_search
-from advnerf_core.attack.optimise import gradient_attack
-from advnerf_core.attack.population import CrossEntropy, Evolution, population_search
-from advnerf_core.attack.search import SearchResult
+from advnerf_core.attack.search.baselines import random_search
+from advnerf_core.attack.search.optimise import gradient_attack
+from advnerf_core.attack.search.population import CrossEntropy, Evolution, population_search
+from advnerf_core.attack.search.search import SearchResult
 from advnerf_core.files import write_atomically
 from benchmarks.attack_toy import toy_problem
 from benchmarks.results import REPOSITORY, record_row

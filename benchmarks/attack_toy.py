@@ -15,9 +15,9 @@ from torch import Tensor
 from advnerf_core.attack.adjoint import AttackProblem
 from advnerf_core.driving.dynamics import Ackermann
 from advnerf_core.driving.path import Path
-from advnerf_core.driving.policy import PilotNet
 from advnerf_core.fields.voxel_grid import VoxelGridObject, cube_face_object
 from advnerf_core.geometry import Array, Pinhole, camera_mount, make_transform, rotation_z
+from advnerf_core.policies.pilotnet import PilotNet
 from advnerf_core.scene.surrogate import Surrogate
 
 VIEW = Pinhole(336, 188, 173.97, 173.97, 168.0, 94.0).cropped(0, 40, 336, 111).resized(200, 66)

@@ -25,9 +25,9 @@ import zstandard
 from mcap.writer import CompressionType, Writer
 
 from benchmarks.results import record_row
-from nodes.runtime.bag import BagWriter
-from nodes.runtime.bag_read import read_attachments, read_info, read_messages
-from nodes.runtime.bag_repair import repair
+from nodes.bags.reader import read_attachments, read_info, read_messages
+from nodes.bags.repair import repair
+from nodes.bags.writer import BagWriter
 from nodes.runtime.errors import BagError
 from nodes.runtime.messages import encode, pose_message, type_definition
 

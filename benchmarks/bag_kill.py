@@ -30,7 +30,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
 from benchmarks.results import REPOSITORY, record_row
-from nodes.runtime.bag_repair_parts import repair_bag
+from nodes.bags.repair_parts import repair_bag
 from nodes.runtime.bus import Bus
 from nodes.runtime.messages import image_message, pose_message
 

@@ -3,7 +3,7 @@
 In the learned scene of an experiment's run folder, against its hardened victim written as an ONNX file, on its one path. Methods:
 
 - white box: the gradient attack on the same policy in torch; its calls are iterations x starts x ticks, forward only;
-- distilled, guided: `advnerf_core.attack.guided`; everything that is asked counts;
+- distilled, guided: `advnerf_core.attack.search.guided`; everything that is asked counts;
 - evolution, cem, random: closed-loop evaluations only, starts x ticks calls each; random textures are the floor.
 
 The effect is what the best texture so far adds to the total CTE of the plain board, and is given as a share of the white box's. Every
@@ -29,19 +29,19 @@ import torch
 
 from advnerf_core.attack.adjoint import AttackProblem, BlackBoxError, adjoint_gradient, evaluate
 from advnerf_core.attack.artifact import load_attack
-from advnerf_core.attack.baselines import random_search
-from advnerf_core.attack.distil import Distillation
-from advnerf_core.attack.guided import BlackBoxSearch, black_box_attack
-from advnerf_core.attack.optimise import gradient_attack
-from advnerf_core.attack.population import CrossEntropy, Evolution, population_search
-from advnerf_core.attack.query_count import CountedPolicy, calls_per_evaluation
-from advnerf_core.attack.search import Evaluation, OnEvaluation, draw_start_states
-from advnerf_core.driving.policy import load_policy
+from advnerf_core.attack.search.baselines import random_search
+from advnerf_core.attack.search.distil import Distillation
+from advnerf_core.attack.search.guided import BlackBoxSearch, black_box_attack
+from advnerf_core.attack.search.optimise import gradient_attack
+from advnerf_core.attack.search.population import CrossEntropy, Evolution, population_search
+from advnerf_core.attack.search.query_count import CountedPolicy, calls_per_evaluation
+from advnerf_core.attack.search.search import Evaluation, OnEvaluation, draw_start_states
 from advnerf_core.fields.voxel_grid import cube_face_object
 from advnerf_core.files import write_atomically
 from advnerf_core.policies.contract import PolicyContract
 from advnerf_core.policies.load import load_any_policy
 from advnerf_core.policies.onnx_policy import export_onnx
+from advnerf_core.policies.pilotnet import load_policy
 from advnerf_core.scene.surrogate import Surrogate
 from benchmarks.attack_lab import lab_problem
 from benchmarks.results import record_row

@@ -14,8 +14,8 @@ import math
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from advnerf_core.data.similarity import rotation_angles
 from advnerf_core.geometry import Array, make_transform
-from advnerf_core.scene.similarity import rotation_angles
 from benchmarks.results import record_row
 from calibration.by_construction import twin_calibrations
 from calibration.camera_to_car import MountView, calibrate_mount
@@ -25,9 +25,9 @@ from calibration.schema import CameraCalibration
 from calibration.time_offset import fit_offset, image_turns
 from calibration.vehicle import Drive, fit_gains
 from calibration.vehicle_response import fit_response
-from hardware.twin.config import CarConfig, LabConfig, MonitorOpticsConfig
-from hardware.twin.lab import Lab
-from hardware.twin.vehicle import TwinVehicle
+from hardware.worlds.lab.config import CarConfig, LabConfig, MonitorOpticsConfig
+from hardware.worlds.lab.lab import Lab
+from hardware.worlds.lab.vehicle import TwinVehicle
 from nodes.experiment import screen
 
 COMMAND = "python -m benchmarks.calibrations"

@@ -23,9 +23,9 @@ from advnerf_core.attack.closed_loop import closed_loop_cosine
 from advnerf_core.attack.health import closed_loss
 from advnerf_core.files import write_atomically
 from benchmarks.results import REPOSITORY, record_row
-from nodes.attacking.check import in_double
-from nodes.attacking.prepare import Prepared, prepare
-from nodes.attacking.request import AttackRequest, load_request
+from nodes.experiment.request.check import in_double
+from nodes.experiment.request.prepare import Prepared, prepare
+from nodes.experiment.request.request import AttackRequest, load_request
 
 COMMAND = "python -m benchmarks.closed_loop_cosine RUN_FOLDER"
 HORIZONS = (10, 20, 40, 60)

@@ -20,7 +20,7 @@ from nodes.experiment.attack import Search, attack_path
 from nodes.experiment.context import Experiment
 from nodes.experiment.deploy import LiveRun, drive_live
 from nodes.experiment.run import load_experiment
-from nodes.trials.campaign import COUNTED_STOPS
+from nodes.lab.trials.series import COUNTED_STOPS
 
 LIVE = LiveRun("hardened", "gradient", 0)
 

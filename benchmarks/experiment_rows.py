@@ -17,7 +17,7 @@ from advnerf_core.report.data import ReportData
 from advnerf_core.report.results import read_results
 from advnerf_core.report.tables import TransferRow, find_row, transfer_rows
 from benchmarks.results import record_row
-from nodes.runtime.bag_parts import bag_parts
+from nodes.bags.parts import bag_parts
 
 COMMAND = "make experiment"
 Record = Callable[[str, float | str, str, str, bool | None, str], None]

@@ -29,7 +29,7 @@ from benchmarks.fault_stops import CONFIGURED, LAUNCH_FILE, NODES, BrokenPromise
 from benchmarks.operator import LiveOperator
 from benchmarks.processes import end
 from benchmarks.results import REPOSITORY, record_row
-from hardware.twin.vesc_emulator import read_wire_log
+from hardware.emulators.vesc_emulator import read_wire_log
 from nodes.runtime.messages import encode, pose_message
 
 COMMAND = "python -m benchmarks.fault_campaign"

@@ -23,7 +23,7 @@ from pathlib import Path
 from benchmarks.operator import LiveOperator
 from benchmarks.processes import end
 from benchmarks.results import REPOSITORY, record_row
-from hardware.twin.vesc_firmware import WireEvent
+from hardware.emulators.vesc_firmware import WireEvent
 
 COMMAND = "python -m benchmarks.fault_stops"
 LAUNCH_FILE = REPOSITORY / "launch" / "green_screen.launch.yaml"

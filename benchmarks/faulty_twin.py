@@ -12,10 +12,11 @@ import threading
 import numpy as np
 
 from advnerf_core.geometry import Array, make_transform
-from hardware.twin.live import LiveLab
-from hardware.twin.vicon_emulator import ViconEmulator
-from nodes.runtime.node import NodeContext, run_node_main
+from hardware.emulators.live import LiveLab
+from hardware.emulators.vicon_emulator import ViconEmulator
+from nodes.runtime.node import NodeContext
 from nodes.runtime.paths import bus_folder
+from nodes.runtime.process import run_node_main
 from nodes.twin import TwinConfig, TwinNode
 
 # To the side, and inside the fence of the track's straights: the pose check must stop the car, not the fence.

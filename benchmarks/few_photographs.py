@@ -17,9 +17,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from advnerf_core.data.dataset import load_transforms
+from advnerf_core.data.lens import Lens
 from advnerf_core.geometry import Pinhole
-from advnerf_core.scene.dataset import load_transforms
-from advnerf_core.scene.lens import Lens
 from benchmarks.painted_corner import poses_of, some_camera, write_photographs
 from benchmarks.results import record_row
 from benchmarks.structure_from_motion import say

@@ -13,9 +13,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from advnerf_core.data.dataset import ImageSet, load_transforms
 from advnerf_core.fields.hash_grid import HashGridConfig
 from advnerf_core.parallel import thread_count
-from advnerf_core.scene.dataset import ImageSet, load_transforms
 from advnerf_core.scene.field import SceneFieldConfig
 from advnerf_core.scene.metrics import psnr
 from advnerf_core.scene.render_field import FieldRenderer

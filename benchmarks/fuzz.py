@@ -23,14 +23,14 @@ import numpy as np
 
 from advnerf_core.errors import AdvnerfError
 from benchmarks.results import record_row
-from hardware.vesc_codec import FrameDecoder, decode_command, encode_frame
-from hardware.vesc_replies import decode_firmware_version, decode_values
-from hardware.vicon_codec import decode_block, encode_blocks, object_pose
-from nodes.runtime.bag import BagWriter
-from nodes.runtime.bag_read import read_info, read_messages
+from hardware.mocap.vicon_codec import decode_block, encode_blocks, object_pose
+from hardware.motor.vesc_codec import FrameDecoder, decode_command, encode_frame
+from hardware.motor.vesc_replies import decode_firmware_version, decode_values
+from nodes.bags.reader import read_info, read_messages
+from nodes.bags.writer import BagWriter
+from nodes.launching.launch_file import LaunchFile
 from nodes.runtime.config import parse_yaml, validate
 from nodes.runtime.image_parts import join_image, split_image
-from nodes.runtime.launch_file import LaunchFile
 from nodes.runtime.messages import decode, drive_message, encode, image_message, pose_message, type_hash_prefix
 from nodes.runtime.topics import topic
 from nodes.runtime.wire import Meta, pack_meta, unpack

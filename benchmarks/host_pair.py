@@ -19,10 +19,10 @@ from benchmarks.network import ADDRESSES, Cable
 from benchmarks.operator import LiveOperator
 from benchmarks.processes import end
 from benchmarks.results import REPOSITORY
-from hardware.twin.vesc_emulator import read_wire_log
+from hardware.emulators.vesc_emulator import read_wire_log
+from nodes.linking.keys import DRIVE, KeyFolder
 from nodes.runtime.bus import Bus
 from nodes.runtime.paths import bus_folder
-from nodes.runtime.security import DRIVE, KeyFolder
 
 LAUNCH_FILE = REPOSITORY / "launch" / "two_hosts.launch.yaml"
 NODES = ("camera", "vicon", "compositor", "policy", "safety", "motor")

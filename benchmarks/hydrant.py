@@ -10,9 +10,9 @@ import argparse
 import time
 from pathlib import Path
 
-from advnerf_core.objects.build import HELD_OUT_VIEWS, build_from_mesh
-from advnerf_core.objects.generators import hydrant
-from advnerf_core.objects.mesh import load_mesh
+from advnerf_core.objects.voxel.build import HELD_OUT_VIEWS, build_from_mesh
+from advnerf_core.objects.voxel.generators import hydrant
+from advnerf_core.objects.voxel.mesh import load_mesh
 from benchmarks.results import record_row
 
 TARGET_DB = 30.0

@@ -11,10 +11,10 @@ import numpy as np
 
 from advnerf_core.geometry import Array, planar_pose
 from calibration.by_construction import write_twin_calibrations
-from hardware.twin.config import LabConfig
-from hardware.twin.lab import Lab
-from hardware.twin.phone import track_length, track_pose
-from nodes.runtime.bag import BagWriter
+from hardware.worlds.lab.config import LabConfig
+from hardware.worlds.lab.lab import Lab
+from hardware.worlds.lab.phone import track_length, track_pose
+from nodes.bags.writer import BagWriter
 from nodes.runtime.messages import encode, image_message, pose_message
 
 START_NS = 1_800_000_000_000_000_000

@@ -24,11 +24,11 @@ from advnerf_core.attack.artifact import AttackFile, face_texture, save_attack
 from advnerf_core.geometry import make_transform, planar_pose, rotation_z
 from benchmarks.results import REPOSITORY, record_row
 from calibration.schema import CameraCalibration, TargetCalibration, load_calibration
-from nodes.runtime.bag import BagWriter
-from nodes.runtime.bag_read import read_info
+from nodes.bags.reader import read_info
+from nodes.bags.writer import BagWriter
+from nodes.replaying.nodes import Choice
+from nodes.replaying.replay import Replay
 from nodes.runtime.messages import encode, image_message, pose_message
-from nodes.runtime.replay import Replay
-from nodes.runtime.replay_nodes import Choice
 
 COMMAND = "python -m benchmarks.lockstep_replay"
 CALIBRATION = REPOSITORY / "calibration" / "twin"

@@ -12,7 +12,8 @@ from typing import Any
 
 from benchmarks.straight_policy import StraightConfig, StraightPolicy
 from nodes.runtime.messages import drive_message, ns_from_stamp
-from nodes.runtime.node import MessageInfo, NodeContext, Now, Out, run_node_main
+from nodes.runtime.node import MessageInfo, NodeContext, Now, Out
+from nodes.runtime.process import run_node_main
 
 
 class MadPolicy(StraightPolicy):

@@ -24,15 +24,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from advnerf_core.attack.optimise import gradient_attack
+from advnerf_core.attack.search.optimise import gradient_attack
 from advnerf_core.geometry import Array, Pinhole, camera_mount, make_transform, planar_pose, rotation_z
-from advnerf_core.mesh.engine import engine
-from advnerf_core.mesh.field import MeshField
-from advnerf_core.mesh.glb import read_glb, write_glb
-from advnerf_core.mesh.shape import ShapeLimits, ShapeSensor
-from advnerf_core.mesh.surface import sphere, unwrapped
-from advnerf_core.objects.generators import hydrant
-from advnerf_core.objects.mesh import stand
+from advnerf_core.objects.mesh.engine import engine
+from advnerf_core.objects.mesh.field import MeshField
+from advnerf_core.objects.mesh.glb import read_glb, write_glb
+from advnerf_core.objects.mesh.shape import ShapeLimits, ShapeSensor
+from advnerf_core.objects.mesh.surface import sphere, unwrapped
+from advnerf_core.objects.voxel.generators import hydrant
+from advnerf_core.objects.voxel.mesh import stand
 from advnerf_core.scene.surrogate import Surrogate
 from benchmarks.attack_lab import lab_problem
 from benchmarks.results import record_row

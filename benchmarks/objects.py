@@ -28,13 +28,13 @@ from advnerf_core.attack.adjoint import adjoint_gradient
 from advnerf_core.fields.summed_levels import with_summed_levels
 from advnerf_core.fields.voxel_grid import VoxelGridObject
 from advnerf_core.geometry import make_transform, rotation_z
-from advnerf_core.objects.generators import GENERATORS
-from advnerf_core.objects.mesh import SurfaceMesh, load_mesh, stand
-from advnerf_core.objects.model import ObjectModel
-from advnerf_core.objects.pictures import PosedRgba
-from advnerf_core.objects.rasterise import draw_mesh
-from advnerf_core.objects.views import dome, viewing_lens
-from advnerf_core.objects.voxelise import voxelise
+from advnerf_core.objects.voxel.generators import GENERATORS
+from advnerf_core.objects.voxel.mesh import SurfaceMesh, load_mesh, stand
+from advnerf_core.objects.voxel.model import ObjectModel
+from advnerf_core.objects.voxel.pictures import PosedRgba
+from advnerf_core.objects.voxel.rasterise import draw_mesh
+from advnerf_core.objects.voxel.views import dome, viewing_lens
+from advnerf_core.objects.voxel.voxelise import voxelise
 from advnerf_core.render.cast_object import ObjectCast, cast_object
 from advnerf_core.scene.render_field import FieldRenderer
 from advnerf_core.scene.surrogate import Surrogate

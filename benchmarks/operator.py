@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from hardware.twin.vesc_emulator import read_wire_log
-from hardware.twin.vesc_firmware import WireEvent
+from hardware.emulators.vesc_emulator import read_wire_log
+from hardware.emulators.vesc_firmware import WireEvent
 from nodes.runtime.arm_requests import arm_message
 from nodes.runtime.bus import Bus
 from nodes.runtime.clock import SystemClock

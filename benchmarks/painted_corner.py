@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from advnerf_core.data.lens import Lens
 from advnerf_core.geometry import Array, Pinhole, look_at
-from advnerf_core.scene.lens import Lens
 
 WALL_M = 3.0
 

@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from advnerf_core.driving.policy import images_to_tensor, load_policy
+from advnerf_core.data.dataset import load_image, load_transforms
+from advnerf_core.data.keyframes import KeyframeConfig
+from advnerf_core.policies.pilotnet import images_to_tensor, load_policy
 from advnerf_core.scene.colour import IDENTITY
-from advnerf_core.scene.dataset import load_image, load_transforms
 from advnerf_core.scene.field import SceneFieldConfig, save_scene
-from advnerf_core.scene.keyframes import KeyframeConfig
 from advnerf_core.scene.metrics import psnr
 from advnerf_core.scene.render_field import FieldRenderer
 from advnerf_core.scene.train import TrainConfig, train_scene
@@ -29,12 +29,12 @@ from benchmarks.results import record_row
 from benchmarks.structure_from_motion import say
 from calibration.phone_and_car import PlacingConfig
 from calibration.structure_from_motion import SfmConfig
-from hardware.twin.lab import Lab
-from hardware.twin.phone import video_poses
-from nodes.scene_import.colours import match_colours
-from nodes.scene_import.data_set import from_phone_and_car
-from nodes.scene_import.driven_bag import BagConfig
-from nodes.scene_import.media import MediaConfig
+from hardware.worlds.lab.lab import Lab
+from hardware.worlds.lab.phone import video_poses
+from nodes.lab.importing.colours import match_colours
+from nodes.lab.importing.data_set import from_phone_and_car
+from nodes.lab.importing.driven_bag import BagConfig
+from nodes.lab.importing.media import MediaConfig
 
 TARGET_RAD = 0.04
 TRAINING_SIZE = (640, 480)

@@ -16,11 +16,11 @@ from statistics import median
 
 import torch
 
-from advnerf_core.attack.placed_sensor import PlacedSensor
-from advnerf_core.attack.placement import PoseBounds, PoseSpace
+from advnerf_core.attack.spaces.placed_sensor import PlacedSensor
+from advnerf_core.attack.spaces.placement import PoseBounds, PoseSpace
 from advnerf_core.fields.voxel_grid import VoxelGridObject
-from advnerf_core.objects.build import build_from_mesh
-from advnerf_core.objects.generators import GENERATORS
+from advnerf_core.objects.voxel.build import build_from_mesh
+from advnerf_core.objects.voxel.generators import GENERATORS
 from advnerf_core.parallel import set_thread_count
 from advnerf_core.scene.surrogate import Surrogate
 from benchmarks.attack_lab import lab_problem

@@ -17,20 +17,20 @@ from functools import partial
 from pathlib import Path
 
 from advnerf_core.driving.expert import Expert, ExpertConfig
-from advnerf_core.driving.imitation import ImitationConfig
 from advnerf_core.driving.metrics import Horizon
-from advnerf_core.driving.policy_view import PolicyView
 from advnerf_core.files import write_atomically
+from advnerf_core.learning.imitation import ImitationConfig
+from advnerf_core.policies.view import PolicyView
 from benchmarks.results import record_row
 from calibration.schema import CameraCalibration, RoomCalibration, load_calibration
-from nodes.evaluation import score, trajectory
-from nodes.policy_data.frames import frames_of_bag
-from nodes.policy_data.train import Part, Training, train_from_recordings
-from nodes.runtime.bag_read import read_info
+from nodes.bags.reader import read_info
+from nodes.lab.policy_data.frames import frames_of_bag
+from nodes.lab.policy_data.train import Part, Training, train_from_recordings
+from nodes.lab.trials.evaluation import score, trajectory
+from nodes.lab.trials.trial import TrialOutcome, TrialPlan
+from nodes.lab.trials.trial_runner import run_trial
+from nodes.launching.launch import Launch
 from nodes.runtime.clock import NS_PER_S
-from nodes.runtime.launch import Launch
-from nodes.trial import TrialOutcome, TrialPlan
-from nodes.trial_runner import run_trial
 
 _ROOT = Path(__file__).parents[1]
 _LAUNCH = _ROOT / "launch" / "collect.launch.yaml"

@@ -22,12 +22,12 @@ import numpy as np
 from advnerf_core.geometry import make_transform, planar_pose
 from benchmarks.results import REPOSITORY, record_row
 from calibration.schema import VehicleCalibration, load_calibration
-from hardware.limits import DriveLimiter
-from hardware.twin.config import CarConfig
-from hardware.twin.vehicle import TwinVehicle
-from hardware.twin.vicon_emulator import ViconEmulatorConfig, ViconFrames
-from hardware.vicon import SubjectTracker, ViconConfig
-from nodes.arming import ArmingLimits
+from hardware.emulators.vicon_emulator import ViconEmulatorConfig, ViconFrames
+from hardware.mocap.vicon import SubjectTracker, ViconConfig
+from hardware.motor.limits import DriveLimiter
+from hardware.worlds.lab.config import CarConfig
+from hardware.worlds.lab.vehicle import TwinVehicle
+from nodes.control.arming import ArmingLimits
 from nodes.runtime.arm_requests import OPERATOR, arm_message
 from nodes.runtime.clock import NS_PER_S, Now
 from nodes.runtime.messages import drive_message, header, types

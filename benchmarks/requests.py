@@ -23,7 +23,7 @@ import numpy as np
 from benchmarks.fault_campaign import START, Graph
 from benchmarks.processes import end
 from benchmarks.results import REPOSITORY, record_row
-from hardware.twin.vesc_firmware import WireEvent
+from hardware.emulators.vesc_firmware import WireEvent
 from nodes.runtime.arm_requests import ask_to_arm, ask_to_disarm
 from nodes.runtime.errors import LaunchError
 

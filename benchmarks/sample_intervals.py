@@ -19,14 +19,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from advnerf_core.driving.policy_view import PolicyView
+from advnerf_core.data.dataset import ImageSet, load_transforms
 from advnerf_core.fields.hash_grid import HashGridConfig
 from advnerf_core.geometry import Array, Pinhole
-from advnerf_core.objects.generators import small_car
-from advnerf_core.objects.rasterise import draw_mesh
-from advnerf_core.objects.views import dome
+from advnerf_core.objects.voxel.generators import small_car
+from advnerf_core.objects.voxel.rasterise import draw_mesh
+from advnerf_core.objects.voxel.views import dome
+from advnerf_core.policies.view import PolicyView
 from advnerf_core.render.march import MarchConfig
-from advnerf_core.scene.dataset import ImageSet, load_transforms
 from advnerf_core.scene.field import SceneFieldConfig
 from advnerf_core.scene.intervals import pixel_intervals
 from advnerf_core.scene.metrics import psnr
@@ -35,7 +35,7 @@ from advnerf_core.scene.train import Progress, TrainConfig, train_scene
 from benchmarks.results import record_row
 from benchmarks.timing import seconds_in_turns
 from benchmarks.training_step import photograph_lab
-from hardware.twin.config import LabConfig
+from hardware.worlds.lab.config import LabConfig
 
 COMMAND = "python -m benchmarks.sample_intervals"
 _HELD_OUT_EVERY = 8

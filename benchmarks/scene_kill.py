@@ -20,9 +20,9 @@ from pathlib import Path
 
 import numpy as np
 
+from advnerf_core.data.dataset import ImageSet
 from advnerf_core.files import write_atomically
 from advnerf_core.geometry import Pinhole
-from advnerf_core.scene.dataset import ImageSet
 from advnerf_core.scene.field import SceneFieldConfig
 from advnerf_core.scene.metrics import psnr
 from advnerf_core.scene.render_field import FieldRenderer

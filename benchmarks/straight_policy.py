@@ -7,7 +7,8 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict
 
 from nodes.runtime.messages import drive_message, ns_from_stamp
-from nodes.runtime.node import MessageInfo, Node, NodeContext, Now, Out, run_node_main
+from nodes.runtime.node import MessageInfo, Node, NodeContext, Now, Out
+from nodes.runtime.process import run_node_main
 
 
 class StraightConfig(BaseModel):

@@ -22,9 +22,9 @@ from pathlib import Path
 import zmq
 
 from benchmarks.results import REPOSITORY, record_row
+from nodes.linking.keys import DRIVE, WATCH, KeyFolder
 from nodes.runtime.bus import Bus
 from nodes.runtime.messages import drive_message, encode, header, type_hash_prefix, types
-from nodes.runtime.security import DRIVE, WATCH, KeyFolder
 from nodes.runtime.topics import topic
 from nodes.runtime.wire import Meta, pack_meta
 

@@ -14,12 +14,12 @@ from pathlib import Path
 
 import numpy as np
 
-from advnerf_core.scene.similarity import align_poses
+from advnerf_core.data.similarity import align_poses
 from benchmarks.lab_recordings import lab_with_phone, photograph
 from benchmarks.results import record_row
 from calibration.structure_from_motion import SfmConfig, Source, reconstruct
-from hardware.twin.lab import Lab
-from hardware.twin.phone import video_poses
+from hardware.worlds.lab.lab import Lab
+from hardware.worlds.lab.phone import video_poses
 
 POSITION_PERCENT, ROTATION_DEG = 0.3, 0.3
 

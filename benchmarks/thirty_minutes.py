@@ -29,7 +29,7 @@ from benchmarks.fault_campaign import VICTIMS, Graph
 from benchmarks.host_pauses import HostPauses
 from benchmarks.results import REPOSITORY, record_row
 from calibration.schema import RoomCalibration, load_calibration
-from nodes.runtime.bag_read import read_info, read_messages
+from nodes.bags.reader import read_info, read_messages
 from nodes.runtime.bus import Bus
 from nodes.runtime.messages import decode, pose_matrix
 from nodes.runtime.topics import topic

@@ -13,13 +13,13 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from advnerf_core.driving.policy_view import PolicyView
+from advnerf_core.data.dataset import ImageSet
 from advnerf_core.fields.hash_grid import HashGrid, encode_reference
 from advnerf_core.parallel import thread_count
+from advnerf_core.policies.view import PolicyView
 from advnerf_core.render.march import Marcher
 from advnerf_core.render.occupancy import Leaps, leap_distances
 from advnerf_core.render.rays import intrinsics_row, pixel_rays, poses_in_box
-from advnerf_core.scene.dataset import ImageSet
 from advnerf_core.scene.field import SceneField, SceneFieldConfig
 from advnerf_core.scene.intervals import pixel_intervals
 from advnerf_core.scene.torch_step import TorchStep
@@ -27,9 +27,9 @@ from advnerf_core.scene.train import TrainConfig, Trainer
 from advnerf_core.scene.train_step import CpuStep
 from benchmarks.results import record_row
 from benchmarks.timing import seconds_in_turns
-from hardware.twin.config import LabConfig
-from hardware.twin.lab import Lab
-from hardware.twin.phone import walk_around_poses
+from hardware.worlds.lab.config import LabConfig
+from hardware.worlds.lab.lab import Lab
+from hardware.worlds.lab.phone import walk_around_poses
 
 COMMAND = "python -m benchmarks.training_step"
 TARGET = 10.0

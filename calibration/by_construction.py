@@ -22,8 +22,8 @@ from calibration.schema import (
     VehicleCalibration,
     save_calibration,
 )
-from hardware.limits import DriveLimits, VehicleGains
-from hardware.twin.config import CarConfig, LabConfig, PanelConfig
+from hardware.motor.limits import DriveLimits, VehicleGains
+from hardware.worlds.lab.config import CarConfig, LabConfig, PanelConfig
 
 METHOD = "by construction"
 # The day the default lab got its numbers; the files do not change when they are written again.

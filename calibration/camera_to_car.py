@@ -21,8 +21,8 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from advnerf_core.data.similarity import rotation_angles
 from advnerf_core.geometry import Array, invert_transform, make_transform
-from advnerf_core.scene.similarity import rotation_angles
 from calibration.charuco import Detection, board_pose
 from calibration.degeneracy import DegenerateDataError, PoorFitError, mean_rotation, require_count, rotation_spread
 from calibration.measured import LensCalibration, rows_of

@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
+from advnerf_core.data.image_files import image_size
 from advnerf_core.files import write_atomically
-from advnerf_core.scene.image_files import image_size
 from calibration.lens_choice import FIRST_MODEL, FOCAL_RATIOS
 from calibration.photo_model import Report, SfmConfig, Source
 from calibration.photo_pairs import chosen_pairs, every_pair

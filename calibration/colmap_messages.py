@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from advnerf_core.data.lens import Lens
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.geometry import Pinhole
-from advnerf_core.scene.lens import Lens
 from calibration.photo_model import FoundCamera, LeftOut, Model, ReconstructionError, Registered, SfmConfig, Source
 
 Job = tuple[Path, tuple[Source, ...], Path, SfmConfig]

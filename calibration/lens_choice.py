@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from advnerf_core.data.errors import DatasetError
+from advnerf_core.data.lens import Lens, straightening
 from advnerf_core.geometry import Pinhole
-from advnerf_core.scene.errors import DatasetError
-from advnerf_core.scene.lens import Lens, straightening
 from calibration.photo_model import MIN_IMAGES, Report
 
 # Name, free parameters, and the fewest images of the camera with which the model is tried at all.

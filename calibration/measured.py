@@ -7,9 +7,9 @@ from typing import Literal
 import numpy as np
 from pydantic import Field, field_validator
 
+from advnerf_core.data.lens import Lens
+from advnerf_core.data.similarity import Similarity
 from advnerf_core.geometry import Array, Pinhole
-from advnerf_core.scene.lens import Lens
-from advnerf_core.scene.similarity import Similarity
 from calibration.schema import Calibration, Row4, require_rigid
 
 

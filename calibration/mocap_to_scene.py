@@ -1,7 +1,7 @@
 """Where a learned scene lies in the motion-capture world, from cameras whose poses are known in both.
 
 Structure from motion leaves scale and frame open. Frames taken on the tracked car (or with a tracked phone) have poses in both worlds; the
-similarity is `advnerf_core.scene.similarity.align_poses` (Umeyama 1991 with consensus). It is judged on cameras it was not fitted to.
+similarity is `advnerf_core.data.similarity.align_poses` (Umeyama 1991 with consensus). It is judged on cameras it was not fitted to.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from advnerf_core.data.similarity import Alignment, SimilarityError, align_poses, rotation_angles
 from advnerf_core.geometry import Array
-from advnerf_core.scene.similarity import Alignment, SimilarityError, align_poses, rotation_angles
 from calibration.degeneracy import DegenerateDataError, PoorFitError, require_count
 from calibration.measured import SceneCalibration, rows_of
 

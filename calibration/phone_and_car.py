@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from advnerf_core.data.similarity import Alignment, align_poses
 from advnerf_core.geometry import Array
-from advnerf_core.scene.similarity import Alignment, align_poses
 from calibration.structure_from_motion import Model, ReconstructionError
 
 _MIN_SHARED = 6

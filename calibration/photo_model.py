@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from advnerf_core.data.lens import Lens
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.geometry import Array, Pinhole
-from advnerf_core.scene.lens import Lens
 
 Report = Callable[[float, str], None]
 MIN_IMAGES = 3

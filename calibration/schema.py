@@ -18,7 +18,7 @@ from advnerf_core.driving.path import Path as DrivingPath
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.files import write_atomically
 from advnerf_core.geometry import Array, Pinhole
-from hardware.limits import DriveLimits, VehicleGains
+from hardware.motor.limits import DriveLimits, VehicleGains
 
 Row4 = tuple[float, float, float, float]
 Point3 = tuple[float, float, float]
@@ -109,7 +109,7 @@ class CameraCalibration(Calibration):
 
 
 class GainsSection(BaseModel):
-    """See `hardware.limits.VehicleGains`."""
+    """See `hardware.motor.limits.VehicleGains`."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -122,7 +122,7 @@ class GainsSection(BaseModel):
 
 
 class LimitsSection(BaseModel):
-    """See `hardware.limits.DriveLimits`."""
+    """See `hardware.motor.limits.DriveLimits`."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 

@@ -20,11 +20,12 @@ from pydantic import BaseModel, ConfigDict, Field
 from advnerf_core.attack.artifact import load_attack
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.files import write_atomically
-from nodes.attacking.job import REQUEST, Job, Said
-from nodes.attacking.request import parse_request, request_text
+from nodes.experiment.request.job import REQUEST, Job, Said
+from nodes.experiment.request.request import parse_request, request_text
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.messages import header, image_message, types
-from nodes.runtime.node import ACTIVE, READY, Inbox, MessageInfo, Node, NodeContext, Now, Out, run_node_main
+from nodes.runtime.node import ACTIVE, READY, Inbox, MessageInfo, Node, NodeContext, Now, Out
+from nodes.runtime.process import run_node_main
 from nodes.runtime.requests import Answer, Answers
 from nodes.runtime.transfer import chunk_messages
 

@@ -16,7 +16,8 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.messages import drive_message, stamp_ns
-from nodes.runtime.node import MessageInfo, Node, NodeContext, Now, Out, run_node_main
+from nodes.runtime.node import MessageInfo, Node, NodeContext, Now, Out
+from nodes.runtime.process import run_node_main
 
 IMAGE, STATE, DRIVE = "/compositor/image", "/safety/state", "/policy/drive"
 STRAIGHT_SLOW_S, STRAIGHT_FAST_S = 1.8, 1.4

@@ -13,26 +13,15 @@ from pydantic import BaseModel, ConfigDict, Field
 from advnerf_core.geometry import Pinhole
 from calibration.schema import CameraCalibration, load_calibration
 from hardware.cameras.interface import Frame
+from hardware.cameras.sources import CameraSource
 from hardware.cameras.stamping import Decimator
 from hardware.cameras.steady import SteadyCamera
-from nodes.camera_sources import CameraSource
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import RuntimeFault
 from nodes.runtime.messages import camera_info_message, image_message
-from nodes.runtime.node import (
-    ACTIVE,
-    FAULT,
-    STARTING,
-    Inbox,
-    MessageInfo,
-    Node,
-    NodeContext,
-    Now,
-    Out,
-    ReaderThread,
-    run_node_main,
-)
+from nodes.runtime.node import ACTIVE, FAULT, STARTING, Inbox, MessageInfo, Node, NodeContext, Now, Out, ReaderThread
 from nodes.runtime.pictures import COMPRESSED_TOPIC, RAW_TOPIC, compressed_image_message
+from nodes.runtime.process import run_node_main
 
 _READ_TIMEOUT_S = 0.2
 # Of the focal length and, as a share of the picture, of its centre: no calibration moves a factory's numbers so far.
@@ -58,7 +47,7 @@ class CameraConfig(BaseModel):
     """Configuration of the camera node.
 
     Attributes:
-        source: Device: ``kind`` v4l2, zed, oak, socket, file or folder; see `nodes.camera_sources`.
+        source: Device: ``kind`` v4l2, zed, oak, socket, file or folder; see `hardware.cameras.sources`.
         calibration: Camera calibration file; frames of another size are refused.
         max_age_s: A frame older than this when it arrives is not published [s].
         silence_s: Time without a frame after which the node reports a fault [s].

@@ -14,9 +14,10 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from advnerf_core.driving.path import Path as DrivingPath
 from calibration.schema import RoomCalibration, load_calibration
+from nodes.lab.trials.trial import TrialNode, TrialPlan
 from nodes.runtime.errors import NodeFinished
-from nodes.runtime.node import MessageInfo, Node, NodeContext, Now, Out, run_node_main
-from nodes.trial import TrialNode, TrialPlan
+from nodes.runtime.node import MessageInfo, Node, NodeContext, Now, Out
+from nodes.runtime.process import run_node_main
 
 
 class Start(BaseModel):

@@ -25,13 +25,14 @@ from advnerf_core.attack.projection import FaceOverlay
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.geometry import Array, invert_transform
 from calibration.schema import CameraCalibration, TargetCalibration, load_calibration
-from nodes.pose_buffer import PoseBuffer
+from nodes.control.interlock import SAFETY_STATE, Interlock
+from nodes.control.pose_buffer import PoseBuffer
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import ConfigError, MessageError
-from nodes.runtime.interlock import SAFETY_STATE, Interlock
 from nodes.runtime.messages import header, image_message, pose_matrix, stamp_ns, types
-from nodes.runtime.node import ACTIVE, READY, MessageInfo, Node, NodeContext, Now, Out, run_node_main
+from nodes.runtime.node import ACTIVE, READY, MessageInfo, Node, NodeContext, Now, Out
 from nodes.runtime.pictures import RAW_TOPIC, rgb8_message, rgb_image
+from nodes.runtime.process import run_node_main
 from nodes.runtime.transfer import Assembler, ReceivedFile
 
 _CAR, _FILE = "/vicon/car", "/attack/file"

@@ -24,8 +24,9 @@ from advnerf_core.policies.load import Driver, load_driver
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import ConfigError, MessageError
 from nodes.runtime.messages import header, stamp_ns, types
-from nodes.runtime.node import ACTIVE, FAULT, READY, MessageInfo, Node, NodeContext, Now, Out, run_node_main
+from nodes.runtime.node import ACTIVE, FAULT, READY, MessageInfo, Node, NodeContext, Now, Out
 from nodes.runtime.pictures import RAW_TOPIC, rgb_image
+from nodes.runtime.process import run_node_main
 
 COUNTERFACTUAL_TOPIC = "/policy/counterfactual"
 _ATTACKED, _LABEL = "/compositor/image", "/compositor/attack"

@@ -23,7 +23,8 @@ from advnerf_core.geometry import wrap_angle, yaw_of
 from calibration.schema import RoomCalibration, VehicleCalibration, load_calibration
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.messages import drive_message, header, pose_matrix, stamp_ns, types
-from nodes.runtime.node import ACTIVE, READY, MessageInfo, Node, NodeContext, Now, Out, run_node_main
+from nodes.runtime.node import ACTIVE, READY, MessageInfo, Node, NodeContext, Now, Out
+from nodes.runtime.process import run_node_main
 
 _CAR, _STATE = "/vicon/car", "/safety/state"
 _SPEED_BASE_S = 0.15

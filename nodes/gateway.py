@@ -13,11 +13,12 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from nodes.linking.keys import KeyFolder
+from nodes.linking.link import Inbound, Link, LinkConfig, Offset
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.messages import header, type_hash_prefix, types
-from nodes.runtime.node import ACTIVE, READY, Inbox, MessageInfo, Node, NodeContext, Now, Out, run_node_main
-from nodes.runtime.security import KeyFolder
-from nodes.runtime.security_link import Inbound, Link, LinkConfig, Offset
+from nodes.runtime.node import ACTIVE, READY, Inbox, MessageInfo, Node, NodeContext, Now, Out
+from nodes.runtime.process import run_node_main
 from nodes.runtime.topics import topic as topic_row
 from nodes.runtime.wire import Meta
 

@@ -22,12 +22,13 @@ from advnerf_core.attack.artifact import AttackFile, attack_from_bytes, load_att
 from advnerf_core.errors import AdvnerfError
 from calibration.panel import Panel, make_panel, require_fits
 from calibration.schema import TargetCalibration, load_calibration
-from hardware.display import Display, PygameDisplay, TwinDisplay
-from hardware.edid import edid_of
 from hardware.errors import HardwareError
+from hardware.screen.display import Display, PygameDisplay, TwinDisplay
+from hardware.screen.edid import edid_of
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.messages import header, types
-from nodes.runtime.node import ACTIVE, READY, MessageInfo, Node, NodeContext, Now, Out, run_node_main
+from nodes.runtime.node import ACTIVE, READY, MessageInfo, Node, NodeContext, Now, Out
+from nodes.runtime.process import run_node_main
 from nodes.runtime.transfer import Assembler, ReceivedFile
 
 _SAFETY, _FILE = "/safety/state", "/attack/file"

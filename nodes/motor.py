@@ -19,17 +19,18 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from calibration.schema import VehicleCalibration, load_calibration
 from hardware.errors import HardwareError, ProtocolError
-from hardware.limits import Sent
-from hardware.vesc import Vesc
-from hardware.vesc_replies import Values
-from hardware.vesc_settings import TimeoutSettings
-from nodes.command_gate import Brake, CommandGate, Drive, GateSettings, GateState
-from nodes.motor_reports import diagnostics_message
-from nodes.motor_watch import ControllerWatch
+from hardware.motor.limits import Sent
+from hardware.motor.vesc import Vesc
+from hardware.motor.vesc_replies import Values
+from hardware.motor.vesc_settings import TimeoutSettings
+from nodes.control.command_gate import Brake, CommandGate, Drive, GateSettings, GateState
+from nodes.control.motor_reports import diagnostics_message
+from nodes.control.motor_watch import ControllerWatch
+from nodes.control.steering_check import CheckSettings
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.messages import header, ns_from_stamp, types
-from nodes.runtime.node import ACTIVE, FAULT, READY, STARTING, MessageInfo, Node, NodeContext, Now, Out, run_node_main
-from nodes.steering_check import CheckSettings
+from nodes.runtime.node import ACTIVE, FAULT, READY, STARTING, MessageInfo, Node, NodeContext, Now, Out
+from nodes.runtime.process import run_node_main
 
 _TICK_RATE_HZ = 50.0
 _RETRY_S = 0.5

@@ -15,24 +15,14 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from nodes.runtime.bag_keys import Keys
-from nodes.runtime.bag_play import PAUSE, RATE, RESUME, STEP, STOP, TOGGLE, Command, Playhead
-from nodes.runtime.bag_read import BagMessage, read_info, read_messages, require_readable
+from nodes.bags.keys import Keys
+from nodes.bags.play import PAUSE, RATE, RESUME, STEP, STOP, TOGGLE, Command, Playhead
+from nodes.bags.reader import BagMessage, read_info, read_messages, require_readable
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import BagError, MessageError, NodeFinished
 from nodes.runtime.messages import header, stamp_from_ns, types
-from nodes.runtime.node import (
-    ACTIVE,
-    READY,
-    Inbox,
-    MessageInfo,
-    Node,
-    NodeContext,
-    Now,
-    Out,
-    ReaderThread,
-    run_node_main,
-)
+from nodes.runtime.node import ACTIVE, READY, Inbox, MessageInfo, Node, NodeContext, Now, Out, ReaderThread
+from nodes.runtime.process import run_node_main
 from nodes.runtime.requests import Answer, Answers
 from nodes.runtime.topics import STATUS_PREFIX, type_of_topic
 from nodes.runtime.topics import topic as topic_row

@@ -19,8 +19,9 @@ from advnerf_core.policies.load import Driver, load_driver
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import ConfigError, MessageError
 from nodes.runtime.messages import drive_message, stamp_ns
-from nodes.runtime.node import ACTIVE, FAULT, READY, MessageInfo, Node, NodeContext, Now, Out, run_node_main
+from nodes.runtime.node import ACTIVE, FAULT, READY, MessageInfo, Node, NodeContext, Now, Out
 from nodes.runtime.pictures import rgb_image
+from nodes.runtime.process import run_node_main
 
 _DRIVE = "/policy/drive"
 _WARM_UP_RUNS = 5

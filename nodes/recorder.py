@@ -10,10 +10,11 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from nodes.runtime.bag import BagWriter, SplitLimits
+from nodes.bags.writer import BagWriter, SplitLimits
 from nodes.runtime.errors import BagError
-from nodes.runtime.node import MessageInfo, Node, NodeContext, Now, Out, run_node_main
+from nodes.runtime.node import MessageInfo, Node, NodeContext, Now, Out
 from nodes.runtime.paths import RESOLVED_NAME
+from nodes.runtime.process import run_node_main
 from nodes.runtime.topics import TOPICS, status_topic
 from nodes.runtime.topics import topic as topic_row
 

@@ -11,17 +11,18 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from calibration.schema import RoomCalibration, VehicleCalibration, load_calibration
-from nodes.arming import Arming, ArmingLimits
-from nodes.arming_gates import ClockGate, HandGate, inside, require_simple
-from nodes.arming_requests import ArmRequests
-from nodes.pose_check import MotionBounds, PoseCheck, PoseGate
+from nodes.control.arming import Arming, ArmingLimits
+from nodes.control.arming_gates import ClockGate, HandGate, inside, require_simple
+from nodes.control.arming_requests import ArmRequests
+from nodes.control.pose_check import MotionBounds, PoseCheck, PoseGate
+from nodes.control.stall_check import StallGate, StallLimits
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import ConfigError, MessageError
 from nodes.runtime.messages import drive_message, header, ns_from_stamp, pose_matrix, types
-from nodes.runtime.node import ACTIVE, READY, MessageInfo, Node, NodeContext, Now, Out, run_node_main
+from nodes.runtime.node import ACTIVE, READY, MessageInfo, Node, NodeContext, Now, Out
+from nodes.runtime.process import run_node_main
 from nodes.runtime.requests import asked_mono_ns
 from nodes.runtime.topics import STATUS_PREFIX, status_topic
-from nodes.stall_check import StallGate, StallLimits
 
 _TICK_RATE_HZ = 50.0
 _STOP_PERIOD_S = 0.04

@@ -14,25 +14,14 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from hardware.gamepad import EVENT_LAYOUT, JS_LAYOUT, Gamepad, Layout
-from hardware.hands import Hands
-from hardware.keyboard import Keyboard
+from hardware.operator.gamepad import EVENT_LAYOUT, JS_LAYOUT, Gamepad, Layout
+from hardware.operator.hands import Hands
+from hardware.operator.keyboard import Keyboard
 from nodes.runtime.arm_requests import OPERATOR, arm_message
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.messages import header, types
-from nodes.runtime.node import (
-    ACTIVE,
-    FAULT,
-    READY,
-    Inbox,
-    MessageInfo,
-    Node,
-    NodeContext,
-    Now,
-    Out,
-    ReaderThread,
-    run_node_main,
-)
+from nodes.runtime.node import ACTIVE, FAULT, READY, Inbox, MessageInfo, Node, NodeContext, Now, Out, ReaderThread
+from nodes.runtime.process import run_node_main
 from nodes.runtime.requests import Asked
 
 _STALE_S = 0.15

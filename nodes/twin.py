@@ -9,18 +9,19 @@ from __future__ import annotations
 from typing import Any
 
 from advnerf_core.geometry import yaw_of
+from hardware.emulators.live import LiveLab, LiveLabConfig
 from hardware.errors import HardwareError
-from hardware.twin.live import LiveLab, LiveLabConfig
 from nodes.runtime.errors import MessageError
 from nodes.runtime.messages import pose_matrix
-from nodes.runtime.node import ACTIVE, MessageInfo, Node, NodeContext, Now, Out, run_node_main
+from nodes.runtime.node import ACTIVE, MessageInfo, Node, NodeContext, Now, Out
 from nodes.runtime.paths import bus_folder
+from nodes.runtime.process import run_node_main
 
 RESET_TOPIC = "/twin/reset"
 
 
 class TwinConfig(LiveLabConfig):
-    """Configuration of the twin node: see `hardware.twin.live.LiveLabConfig`."""
+    """Configuration of the twin node: see `hardware.emulators.live.LiveLabConfig`."""
 
 
 class TwinNode(Node):

@@ -7,24 +7,13 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
-from hardware.mocap_library import LibraryConfig, LibraryReceiver
-from hardware.vicon import DEFAULT_PORT, SubjectPose, ViconConfig, ViconReceiver
+from hardware.mocap.library import LibraryConfig, LibraryReceiver
+from hardware.mocap.vicon import DEFAULT_PORT, SubjectPose, ViconConfig, ViconReceiver
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import TopicError
 from nodes.runtime.messages import pose_message
-from nodes.runtime.node import (
-    ACTIVE,
-    FAULT,
-    STARTING,
-    Inbox,
-    MessageInfo,
-    Node,
-    NodeContext,
-    Now,
-    Out,
-    ReaderThread,
-    run_node_main,
-)
+from nodes.runtime.node import ACTIVE, FAULT, STARTING, Inbox, MessageInfo, Node, NodeContext, Now, Out, ReaderThread
+from nodes.runtime.process import run_node_main
 from nodes.runtime.topics import topic
 
 _READ_TIMEOUT_S = 0.2

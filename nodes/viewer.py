@@ -10,10 +10,11 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from nodes.linking.keys import is_loopback
 from nodes.runtime.errors import BusError, SecurityError
 from nodes.runtime.messages import type_definition
-from nodes.runtime.node import ACTIVE, READY, MessageInfo, Node, NodeContext, Now, Out, run_node_main
-from nodes.runtime.security import is_loopback
+from nodes.runtime.node import ACTIVE, READY, MessageInfo, Node, NodeContext, Now, Out
+from nodes.runtime.process import run_node_main
 from nodes.runtime.topics import TOPICS, status_topic
 from nodes.runtime.topics import topic as topic_row
 

@@ -9,7 +9,7 @@ import pytest
 import typer
 
 from benchmarks.results import MACHINE_PATH, record_row
-from nodes.cli import app
+from nodes.cli.main import app
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]

@@ -8,7 +8,7 @@ import pytest
 
 from advnerf_core.errors import AdvnerfError
 from hardware.errors import HardwareError, LinkLost
-from hardware.twin.gl import TwinUnavailable
+from hardware.worlds.lab.gl import TwinUnavailable
 from nodes.runtime.errors import NodeFinished
 from nodes.runtime.process import _one_line
 

@@ -17,8 +17,8 @@ import torch
 from torch import Tensor
 
 from advnerf_core.attack.adjoint import AdjointResult, RenderCache, adjoint_gradient, evaluate, gradient_pass, roll_out
-from advnerf_core.attack.displayed import DisplayedSensor
 from advnerf_core.attack.problem import AttackProblem
+from advnerf_core.attack.spaces.displayed import DisplayedSensor
 from advnerf_core.driving.rollout import Rollout
 from advnerf_core.geometry import Array
 from advnerf_core.scene.surrogate import Frames, Rendered, Surrogate

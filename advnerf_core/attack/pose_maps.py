@@ -18,8 +18,8 @@ import torch
 from torch import Tensor
 
 from advnerf_core.attack.adjoint import AttackProblem, evaluate
-from advnerf_core.attack.placed_sensor import PlacedSensor
-from advnerf_core.attack.placement import PoseSpace, placed
+from advnerf_core.attack.spaces.placed_sensor import PlacedSensor
+from advnerf_core.attack.spaces.placement import PoseSpace, placed
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.files import write_atomically
 from advnerf_core.geometry import Array

@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 from torch import Tensor
 
-from advnerf_core.attack.placement import PoseSpace, footprint
 from advnerf_core.attack.pose_maps import Landscape, RobustnessMap
+from advnerf_core.attack.spaces.placement import PoseSpace, footprint
 from advnerf_core.driving.path import Path
 from advnerf_core.geometry import Array, rotation_z
 from advnerf_core.report.palette import LIGHT

@@ -1,6 +1,6 @@
 """What renderers and attacks need of an object whose colours are free, whatever its geometry is.
 
-``VoxelGridObject`` is one, and so is a textured mesh (``advnerf_core.mesh.field``).
+``VoxelGridObject`` is one, and so is a textured mesh (``advnerf_core.objects.mesh.field``).
 """
 
 from __future__ import annotations

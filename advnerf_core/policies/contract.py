@@ -16,8 +16,8 @@ from typing import Any, Literal, get_args
 import numpy as np
 import yaml
 
-from advnerf_core.driving.policy_view import PolicyView
 from advnerf_core.errors import AdvnerfError
+from advnerf_core.policies.view import PolicyView
 
 ColourSpace = Literal["RGB", "BGR", "YUV", "GRAY"]
 Unit = Literal["rad", "deg", "normalised", "1/m"]

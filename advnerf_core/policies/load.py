@@ -17,12 +17,12 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from advnerf_core.driving.policy_view import PolicyView
 from advnerf_core.policies.contract import PolicyContract, PolicyContractError
+from advnerf_core.policies.view import PolicyView
 
 if TYPE_CHECKING:
-    from advnerf_core.driving.policy import LoadedPolicy
     from advnerf_core.policies.adapter import AdaptedPolicy
+    from advnerf_core.policies.pilotnet import LoadedPolicy
 
 _FACTORY = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*")
 _SUFFIXES = (".safetensors", ".onnx", ".pt2")
@@ -39,7 +39,7 @@ def load_any_policy(spec: str | os.PathLike[str], expected_sha256: str | None = 
     Raises:
         AdvnerfError: It cannot be loaded, is left in training mode, or is not the one that was expected.
     """
-    from advnerf_core.driving.policy import LoadedPolicy, load_policy
+    from advnerf_core.policies.pilotnet import LoadedPolicy, load_policy
 
     suffix = "" if is_factory(spec) else Path(spec).suffix
     if suffix == ".safetensors":
@@ -71,7 +71,7 @@ def load_adapted(spec: str | os.PathLike[str]) -> tuple[AdaptedPolicy, str]:
         program, contract, sha256 = load_program(path)
         return AdaptedPolicy(program, contract), sha256
     if path.suffix == ".safetensors":
-        from advnerf_core.driving.policy import load_policy
+        from advnerf_core.policies.pilotnet import load_policy
 
         loaded = load_policy(path)
         return AdaptedPolicy(

@@ -7,7 +7,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from advnerf_core.driving.policy import LoadedPolicy, images_to_tensor
+from advnerf_core.policies.pilotnet import LoadedPolicy, images_to_tensor
 
 
 class TorchDriver:

@@ -1,4 +1,4 @@
-"""Camera whose frames come over a Unix socket: the client of `hardware.twin.frame_server`, or of any other frame server."""
+"""Camera whose frames come over a Unix socket: the client of `hardware.emulators.frame_server`, or of any other frame server."""
 
 from __future__ import annotations
 

@@ -14,23 +14,24 @@ import torch
 
 from advnerf_core.attack.adjoint import AttackProblem, evaluate
 from advnerf_core.attack.artifact import AttackFile, face_texture, save_attack
-from advnerf_core.attack.baselines import random_search
 from advnerf_core.attack.clean import clean_drive
-from advnerf_core.attack.displayed import DisplayedSensor
-from advnerf_core.attack.optimise import gradient_attack
-from advnerf_core.attack.population import CrossEntropy, population_search
-from advnerf_core.attack.search import SearchResult, draw_start_states
+from advnerf_core.attack.search.baselines import random_search
+from advnerf_core.attack.search.optimise import gradient_attack
+from advnerf_core.attack.search.population import CrossEntropy, population_search
+from advnerf_core.attack.search.search import SearchResult, draw_start_states
+from advnerf_core.attack.spaces.displayed import DisplayedSensor
 from advnerf_core.driving.clean_drive import CleanDrive
-from advnerf_core.driving.policy import LoadedPolicy, load_policy
 from advnerf_core.files import write_atomically
+from advnerf_core.policies.pilotnet import LoadedPolicy, load_policy
 from advnerf_core.scene.surrogate import Surrogate
-from nodes.attacking.telling import telling
 from nodes.experiment.context import Experiment
 from nodes.experiment.learned_scene import load_background, scene_sha256
 from nodes.experiment.objects import attacked_object, surrogate_of
 from nodes.experiment.policy import HARDENED, NAIVE, victim_file
+from nodes.experiment.request.telling import telling
 from nodes.experiment.screen import shown
-from nodes.runtime.stages import Report, hash_of
+from nodes.experiment.stages import hash_of
+from nodes.runtime.progress import Report
 
 Method = Literal["random", "cem", "gradient"]
 METHODS: tuple[Method, ...] = (

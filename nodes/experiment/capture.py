@@ -8,17 +8,17 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from advnerf_core.data.posed_images import write_posed_images
 from advnerf_core.geometry import Array, planar_pose
-from advnerf_core.scene.posed_images import write_posed_images
 from calibration.by_construction import write_twin_calibrations
 from calibration.schema import save_calibration
-from hardware.twin.lab import Lab
-from hardware.twin.phone import car_mounted_poses, walk_around_poses
+from hardware.worlds.lab.lab import Lab
+from hardware.worlds.lab.phone import car_mounted_poses, walk_around_poses
 from nodes.experiment.config import CaptureConfig
 from nodes.experiment.context import CALIBRATION, DISPLAY, Experiment
 from nodes.experiment.learned_scene import HELD_OUT
 from nodes.experiment.screen import measure_display, plain_picture
-from nodes.runtime.stages import Report, counted
+from nodes.runtime.progress import Report, counted
 
 PHONE, COLOUR_PAIRS = "phone", "colour_pairs"
 

@@ -19,7 +19,6 @@ import numpy as np
 from advnerf_core.attack.artifact import AttackFile, load_attack
 from advnerf_core.driving.metrics import Horizon, first_still_tick
 from advnerf_core.report.clips import ClipTrack, write_clip
-from nodes import evaluation
 from nodes.experiment import attack, deploy
 from nodes.experiment.config import AttackConfig
 from nodes.experiment.context import CONTROL_PERIOD_S, Experiment
@@ -27,9 +26,11 @@ from nodes.experiment.finished import changed_settings, has_same_attacks, has_sa
 from nodes.experiment.learned_scene import load_background
 from nodes.experiment.objects import attacked_object, surrogate_of
 from nodes.experiment.run import load_experiment, run_experiment
+from nodes.experiment.stages import hash_of, read_record
+from nodes.lab.trials import evaluation
+from nodes.lab.trials.trial import counts
 from nodes.runtime.errors import ConfigError, RuntimeFault
-from nodes.runtime.stages import Report, hash_of, read_record
-from nodes.trial import counts
+from nodes.runtime.progress import Report
 
 __all__ = ["LIVE", "cell_inputs", "load_experiment", "prepare", "run_cell", "search_cell"]
 

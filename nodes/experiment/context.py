@@ -9,7 +9,7 @@ from pathlib import Path as FilePath
 from advnerf_core.display import DisplayModel
 from advnerf_core.driving.dynamics import Ackermann
 from advnerf_core.driving.path import Path
-from advnerf_core.driving.policy_view import PolicyView
+from advnerf_core.policies.view import PolicyView
 from calibration.display_colour import DisplayCalibration
 from calibration.panel import centre_square
 from calibration.schema import (
@@ -19,7 +19,7 @@ from calibration.schema import (
     VehicleCalibration,
     load_calibration,
 )
-from hardware.twin.config import LabConfig, PanelConfig
+from hardware.worlds.lab.config import LabConfig, PanelConfig
 from nodes.experiment.config import ExperimentConfig
 from nodes.experiment.run_folder import RunFolder
 

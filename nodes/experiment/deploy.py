@@ -13,17 +13,17 @@ from typing import Any, Literal
 
 from advnerf_core.attack.artifact import load_attack
 from advnerf_core.driving.metrics import Horizon
-from advnerf_core.driving.policy import load_policy
 from advnerf_core.files import write_atomically
-from nodes.evaluation import attack_ids, counterfactual, score, timing, trajectory
+from advnerf_core.policies.pilotnet import load_policy
 from nodes.experiment.attack import METHODS, Search, attack_path, frozen_hashes, victims
 from nodes.experiment.context import CONTROL_PERIOD_S, Experiment
 from nodes.experiment.policy import HARDENED, NAIVE, victim_file
+from nodes.lab.trials.evaluation import attack_ids, counterfactual, score, timing, trajectory
+from nodes.lab.trials.trial import NotStartedError, TrialPlan, counts
+from nodes.lab.trials.trial_runner import run_trial
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import RuntimeFault
-from nodes.runtime.stages import Report
-from nodes.trial import NotStartedError, TrialPlan, counts
-from nodes.trial_runner import run_trial
+from nodes.runtime.progress import Report
 
 Condition = Literal["none", "random", "cem", "gradient", "empty", "laps"]
 # The absent board or monitor of the empty scene stands outside the room, out of every camera's sight.

@@ -17,11 +17,13 @@ from numpy.typing import NDArray
 from advnerf_core.attack.adjoint import AttackProblem
 from advnerf_core.attack.artifact import AttackFile, face_texture
 from advnerf_core.attack.projection import FaceOverlay
+from advnerf_core.data.dataset import load_transforms
 from advnerf_core.driving.metrics import Horizon
-from advnerf_core.driving.policy import load_policy
 from advnerf_core.geometry import Array, invert_transform, planar_poses, yaw_of
-from advnerf_core.scene.dataset import load_transforms
+from advnerf_core.policies.pilotnet import load_policy
 from advnerf_core.scene.fidelity import Pictures
+from nodes.bags.reader import read_messages
+from nodes.control.pose_buffer import PoseBuffer
 from nodes.experiment import attack, capture
 from nodes.experiment.cells import CellFault, attack_file, drive_without_attack_of, is_searched
 from nodes.experiment.context import CONTROL_PERIOD_S, Experiment
@@ -30,8 +32,6 @@ from nodes.experiment.learned_scene import load_background
 from nodes.experiment.objects import attacked_object, surrogate_of
 from nodes.experiment.policy import victim_file
 from nodes.experiment.screen import shown
-from nodes.pose_buffer import PoseBuffer
-from nodes.runtime.bag_read import read_messages
 from nodes.runtime.errors import BagError
 from nodes.runtime.messages import decode, ns_from_stamp, pose_matrix
 from nodes.runtime.pictures import rgb_image

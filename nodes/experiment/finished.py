@@ -15,7 +15,7 @@ from pydantic import BaseModel, ValidationError
 from nodes.experiment import attack
 from nodes.experiment.context import Experiment
 from nodes.experiment.run import stages_of
-from nodes.runtime.stages import fits_what_is_there, is_current, read_record
+from nodes.experiment.stages import fits_what_is_there, is_current, read_record
 
 # What does not change a result: which other seeds there are, and how much memory may be used.
 _FREE = ("seeds", "cache_mib")

@@ -8,15 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from advnerf_core.driving.policy_view import PolicyView
+from advnerf_core.data.dataset import load_transforms
+from advnerf_core.data.image_files import write_image
 from advnerf_core.files import write_atomically
-from advnerf_core.scene.dataset import load_transforms
+from advnerf_core.policies.view import PolicyView
 from advnerf_core.scene.field import load_scene
-from advnerf_core.scene.image_files import write_image
 from advnerf_core.scene.metrics import psnr, ssim
 from advnerf_core.scene.render_field import FieldRenderer
 from nodes.experiment.run_folder import RunFolder
-from nodes.runtime.stages import Report
+from nodes.runtime.progress import Report
 
 HELD_OUT = "held_out"  # the captured set that nothing learns from
 

@@ -15,16 +15,16 @@ from pathlib import Path
 import torch
 
 from advnerf_core.attack.adjoint import adjoint_gradient, evaluate
-from advnerf_core.driving.policy import load_policy
 from advnerf_core.files import write_atomically
 from advnerf_core.memory import RETURNS_WHAT_IS_FREED, peak_mib, restart_peak
+from advnerf_core.policies.pilotnet import load_policy
 from advnerf_core.report.data import MemoryRow
 from nodes.experiment.attack import attack_problem
 from nodes.experiment.config import ExperimentConfig
 from nodes.experiment.context import Experiment
 from nodes.experiment.objects import attacked_object, surrogate_of
 from nodes.experiment.policy import HARDENED, victim_file
-from nodes.runtime.stages import Report
+from nodes.runtime.progress import Report
 
 HORIZONS = (50, 200, 400)
 

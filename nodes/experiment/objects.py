@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 import torch
 
+from advnerf_core.data.image_files import write_image
 from advnerf_core.fields.voxel_grid import VoxelGridObject, cube_face_object
 from advnerf_core.files import write_atomically
 from advnerf_core.geometry import Array, Pinhole, make_transform, planar_pose
-from advnerf_core.scene.image_files import write_image
 from advnerf_core.scene.surrogate import BackgroundRenderer, Surrogate
 from nodes.experiment.context import Experiment
 from nodes.experiment.images import as_uint8
 from nodes.experiment.learned_scene import load_background
-from nodes.runtime.stages import Report
+from nodes.runtime.progress import Report
 
 # The deployed face lies this far in front of the board or monitor that carries it, so that it is never inside it.
 FACE_OFFSET_M = 0.01

@@ -11,22 +11,22 @@ from numpy.typing import NDArray
 
 from advnerf_core.attack.artifact import face_texture
 from advnerf_core.attack.projection import FaceOverlay
+from advnerf_core.data.dataset import load_image, load_transforms
 from advnerf_core.driving.expert import Expert, ExpertConfig
-from advnerf_core.driving.imitation import ImitationConfig, SourcePlan, train_policy
 from advnerf_core.driving.path import Array
-from advnerf_core.driving.policy import images_to_tensor, load_policy
-from advnerf_core.driving.sources import Overlay, RenderedSource, SceneSource, Show, Texture
 from advnerf_core.fields.voxel_grid import inverse_squash
 from advnerf_core.files import write_atomically
 from advnerf_core.geometry import invert_transform, planar_pose
-from advnerf_core.scene.dataset import load_image, load_transforms
-from hardware.twin.lab import Lab
+from advnerf_core.learning.imitation import ImitationConfig, SourcePlan, train_policy
+from advnerf_core.learning.sources import Overlay, RenderedSource, SceneSource, Show, Texture
+from advnerf_core.policies.pilotnet import images_to_tensor, load_policy
+from hardware.worlds.lab.lab import Lab
 from nodes.experiment import capture
 from nodes.experiment.context import CONTROL_PERIOD_S, Experiment
 from nodes.experiment.learned_scene import load_background
 from nodes.experiment.objects import attacked_object, last_result_kept, surrogate_of
 from nodes.experiment.screen import face_picture, plain_picture, shown
-from nodes.runtime.stages import Report
+from nodes.runtime.progress import Report
 
 HARDENED, NAIVE = "hardened", "naive"
 FILES = {HARDENED: "policy.safetensors", NAIVE: "naive.safetensors"}

@@ -23,7 +23,6 @@ from advnerf_core.report import tables, targets
 from advnerf_core.report.clips import ClipTrack, write_clip
 from advnerf_core.report.page import write_report
 from advnerf_core.report.results import read_results
-from nodes import evaluation
 from nodes.experiment import memory
 from nodes.experiment.attack import METHODS, attack_path, searches, sensor_of, start_states
 from nodes.experiment.context import CONTROL_PERIOD_S, Experiment
@@ -31,8 +30,10 @@ from nodes.experiment.deploy import LiveRun, live_runs
 from nodes.experiment.images import as_uint8
 from nodes.experiment.objects import attacked_object, surrogate_of
 from nodes.experiment.policy import HARDENED
+from nodes.experiment.stages import read_record
+from nodes.lab.trials import evaluation
 from nodes.runtime.machine import memory_gib, processor_name
-from nodes.runtime.stages import Report, read_record
+from nodes.runtime.progress import Report
 
 SHOWN_VIEWS = 6
 _PATH_POINTS = 400

@@ -10,15 +10,16 @@ from typing import Any
 from pydantic import BaseModel
 from rich.console import Console
 
-from hardware.twin.config import LabConfig
+from hardware.worlds.lab.config import LabConfig
 from nodes.experiment import attack, capture, deploy, objects, policy, report, scene
 from nodes.experiment.config import ExperimentConfig
 from nodes.experiment.context import Experiment
 from nodes.experiment.run_folder import run_to_end
+from nodes.experiment.stages import Stage, StageRecord
+from nodes.launching.launch_file import load_launch
 from nodes.runtime.config import Document, apply_overrides, read_yaml, validate
 from nodes.runtime.errors import ConfigError
-from nodes.runtime.launch_file import load_launch
-from nodes.runtime.stages import Report, Stage, StageRecord
+from nodes.runtime.progress import Report
 
 _LIBRARIES = ("torch", "numpy", "numba", "opencv-contrib-python-headless", "mujoco", "pyzmq", "rosbags", "mcap")
 STAGES = ("capture", "scene", "policy", "object", "attack", "deploy", "report")

@@ -15,9 +15,9 @@ from typing import Any, Generic, TypeVar
 from rich.console import Console
 
 from advnerf_core.files import write_atomically
+from nodes.experiment.stages import Stage, StageRecord, check_until, run_stages
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import ProgressDisplay
-from nodes.runtime.stages import Stage, StageRecord, check_until, run_stages
 
 Config = TypeVar("Config")
 _MANIFEST = "manifest.json"

@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from advnerf_core.data.dataset import ImageSet, load_transforms
 from advnerf_core.scene.colour import fit_colour_map
-from advnerf_core.scene.dataset import ImageSet, load_transforms
 from advnerf_core.scene.field import SceneFieldConfig, save_scene
 from advnerf_core.scene.intervals import pixel_intervals
 from advnerf_core.scene.render_field import FieldRenderer
@@ -17,7 +17,7 @@ from advnerf_core.scene.train import Progress, TrainConfig, train_scene
 from nodes.experiment import capture
 from nodes.experiment.context import Experiment
 from nodes.experiment.learned_scene import compare_views, scene_file
-from nodes.runtime.stages import Report
+from nodes.runtime.progress import Report
 
 _TRAINING_SHARE = 0.95
 

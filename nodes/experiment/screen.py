@@ -8,14 +8,14 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from advnerf_core.attack.displayed import DisplayedSensor
+from advnerf_core.attack.spaces.displayed import DisplayedSensor
 from advnerf_core.geometry import Array, invert_transform, planar_pose, planar_poses, transform_points
 from advnerf_core.scene.surrogate import Surrogate
 from calibration.display_colour import DisplayFit, colours_to_show, fit_display, mean_colour, screen_region
 from calibration.panel import Panel
-from hardware.twin.lab import Lab
-from hardware.twin.monitor import ScreenOptics
-from hardware.twin.world import MONITOR_PIXELS
+from hardware.worlds.lab.lab import Lab
+from hardware.worlds.lab.monitor import ScreenOptics
+from hardware.worlds.lab.world import MONITOR_PIXELS
 from nodes.experiment.context import Experiment
 
 Rgb = NDArray[np.uint8]

@@ -1,6 +1,6 @@
 """What a node is: a pure class that turns messages into messages. Sockets, signals and rates are the loop's business.
 
-The same class runs as a process (`run_node_main`), inside a test, and in lockstep replay, because everything it needs is
+The same class runs as a process (`nodes.runtime.process.run_node_main`), inside a test, and in lockstep replay, because everything it needs is
 handed to it: messages, time, and what its constructor got.
 """
 
@@ -16,7 +16,7 @@ from nodes.runtime.clock import Clock, Now
 from nodes.runtime.inbox import Inbox, ReaderThread
 from nodes.runtime.wire import MessageInfo
 
-__all__ = ["Inbox", "MessageInfo", "Node", "NodeContext", "Now", "Out", "ReaderThread", "run_node", "run_node_main"]
+__all__ = ["Inbox", "MessageInfo", "Node", "NodeContext", "Now", "Out", "ReaderThread"]
 
 STARTING, READY, ACTIVE, FAULT = "starting", "ready", "active", "fault"
 
@@ -87,17 +87,3 @@ class Node(ABC):
 
     def close(self) -> None:  # noqa: B027 - most nodes have nothing to let go
         """Make the device safe and let it go. Called once, also after an exception."""
-
-
-def run_node(*arguments: Any, **options: Any) -> int:
-    """Run a node until it is told to stop; see `nodes.runtime.process.run_node`."""
-    from nodes.runtime.process import run_node as run
-
-    return run(*arguments, **options)
-
-
-def run_node_main(config_type: Any, build: Any) -> int:
-    """Command line of a node process; see `nodes.runtime.process.run_node_main`."""
-    from nodes.runtime.process import run_node_main as run
-
-    return run(config_type, build)

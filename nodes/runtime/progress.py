@@ -3,18 +3,48 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from types import TracebackType
+from typing import Protocol
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from nodes.runtime.stages import Report
-
 LOG_PERIOD_S = 15.0
 
 
+class Report(Protocol):
+    """Told about the progress of one stage."""
+
+    def __call__(self, fraction: float, text: str = "") -> None:
+        """Called with the finished fraction (0..1) and what is being done."""
+
+
+def counted(report: Report, what: str, count: int, before: int, total: int) -> Callable[[int], None]:
+    """Progress of one part of a stage, for a loop that tells how many of its ``count`` items are done.
+
+    Args:
+        report: Of the stage.
+        what: The part.
+        count: Its items.
+        before: Items of the stage before it.
+        total: Items of the whole stage.
+    """
+    return lambda done: report((before + done) / total, f"{what} {done}/{count}")
+
+
+class Display(Protocol):
+    """Shows a person how far the stages are."""
+
+    def start(self, stage: str) -> Report:
+        """A stage begins; the returned callable takes its progress."""
+
+    def finish(self, stage: str, seconds: float, cached: bool) -> None:
+        """A stage has ended, or its earlier result is used."""
+
+
 class ProgressDisplay:
-    """Implements `nodes.runtime.stages.Display`.
+    """Implements `Display`.
 
     Args:
         console: Where to write; a log file or pipe gets lines instead of bars.

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from advnerf_core.attack.displayed import DisplayedSensor, displayed
+from advnerf_core.attack.spaces.displayed import DisplayedSensor, displayed
 from advnerf_core.display import DisplayModel, DisplayModelError
 from advnerf_core.scene.surrogate import Rendered
 

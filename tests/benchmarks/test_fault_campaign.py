@@ -7,7 +7,7 @@ import pytest
 
 from benchmarks.fault_campaign import FAULTS, judge, plan, run
 from benchmarks.fault_stops import BrokenPromise
-from hardware.twin.vesc_firmware import WireEvent
+from hardware.emulators.vesc_firmware import WireEvent
 
 
 def row(ms, name, speed, odometer):

@@ -1,12 +1,12 @@
 import numpy as np
 
+from advnerf_core.data.image_files import read_image
 from advnerf_core.geometry import planar_pose, wrap_angle
-from advnerf_core.scene.image_files import read_image
 from benchmarks.lab_recordings import FRAME_PERIOD_S, START_NS, car_state, lab_with_phone, record_drive
-from hardware.twin.config import LabConfig
-from hardware.twin.lab import Lab
-from nodes.runtime.bag_read import read_info
-from nodes.scene_import.driven_bag import BagConfig, take_frames
+from hardware.worlds.lab.config import LabConfig
+from hardware.worlds.lab.lab import Lab
+from nodes.bags.reader import read_info
+from nodes.lab.importing.driven_bag import BagConfig, take_frames
 
 
 def test_the_car_of_the_drive_goes_where_it_looks():

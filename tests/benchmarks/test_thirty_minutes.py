@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from benchmarks.thirty_minutes import NODES, Stops, describe_drive, growth, missed
-from nodes.runtime.bag import BagWriter, SplitLimits
+from nodes.bags.writer import BagWriter, SplitLimits
 from nodes.runtime.messages import encode, pose_message
 
 

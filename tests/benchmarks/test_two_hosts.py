@@ -12,7 +12,7 @@ import pytest
 from benchmarks import host_pair, two_hosts
 from benchmarks.fault_stops import BrokenPromise
 from benchmarks.network import Cable, available
-from hardware.twin.vesc_firmware import WireEvent
+from hardware.emulators.vesc_firmware import WireEvent
 
 MS = 1_000_000
 

@@ -3,8 +3,8 @@
 import numpy as np
 
 from calibration.vehicle import Drive
-from hardware.twin.config import CarConfig
-from hardware.twin.vehicle import TwinVehicle
+from hardware.worlds.lab.config import CarConfig
+from hardware.worlds.lab.vehicle import TwinVehicle
 
 POSE_PERIOD_S, COMMAND_PERIOD_S = 0.01, 0.05
 CAR = CarConfig()

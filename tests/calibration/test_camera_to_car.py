@@ -5,8 +5,8 @@ import pytest
 from boards import seen, turned
 from scipy.spatial.transform import Rotation
 
+from advnerf_core.data.similarity import rotation_angles
 from advnerf_core.geometry import camera_mount, invert_transform, make_transform, planar_pose
-from advnerf_core.scene.similarity import rotation_angles
 from calibration.camera_to_car import MountConfig, MountView, calibrate_mount
 from calibration.degeneracy import DegenerateDataError, PoorFitError
 from calibration.measured import LensCalibration

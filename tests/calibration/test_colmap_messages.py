@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
+from advnerf_core.data.lens import Lens
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.geometry import Pinhole
-from advnerf_core.scene.lens import Lens
 from calibration import colmap_messages as messages
 from calibration.photo_model import FoundCamera, LeftOut, Model, ReconstructionError, Registered, SfmConfig, Source
 

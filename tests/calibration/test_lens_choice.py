@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
+from advnerf_core.data.lens import Lens
 from advnerf_core.geometry import Pinhole
-from advnerf_core.scene.lens import Lens
 from calibration.lens_choice import nonsense
 
 
@@ -32,7 +32,7 @@ def test_lenses_that_do_not_exist_are_refused_with_the_reason(bad, words):
 
 def test_what_is_accepted_can_be_learned_from():
     """A lens that passes must never be refused later, when its images are undistorted."""
-    from advnerf_core.scene.lens import straightening
+    from advnerf_core.data.lens import straightening
 
     rng, accepted = np.random.default_rng(0), 0
     for _ in range(150):

@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from advnerf_core.data.lens import Lens
+from advnerf_core.data.similarity import Similarity, SimilarityError
 from advnerf_core.geometry import Pinhole, camera_mount, make_transform, planar_pose
-from advnerf_core.scene.lens import Lens
-from advnerf_core.scene.similarity import Similarity, SimilarityError
 from calibration.phone_and_car import PlacingConfig, place_in_mocap
 from calibration.structure_from_motion import Model, ReconstructionError, Registered
 

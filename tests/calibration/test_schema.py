@@ -18,8 +18,8 @@ from calibration.schema import (
     load_calibration,
     save_calibration,
 )
-from hardware.limits import VehicleGains
-from hardware.twin.config import CameraConfig, LabConfig
+from hardware.motor.limits import VehicleGains
+from hardware.worlds.lab.config import CameraConfig, LabConfig
 
 SHIPPED = Path(__file__).parents[2] / "calibration" / "twin"
 MODELS = {

@@ -8,10 +8,10 @@ import psutil
 import pytest
 from PIL import Image
 
+from advnerf_core.data.image_files import image_size
+from advnerf_core.data.lens import Lens
+from advnerf_core.data.similarity import align_poses
 from advnerf_core.geometry import Pinhole, look_at
-from advnerf_core.scene.image_files import image_size
-from advnerf_core.scene.lens import Lens
-from advnerf_core.scene.similarity import align_poses
 from benchmarks.painted_corner import WALL_M, WALLS, photograph, poses_of, some_camera, write_photographs
 from calibration.structure_from_motion import ReconstructionError, SfmConfig, Source, reconstruct
 

@@ -13,7 +13,7 @@ from calibration.degeneracy import DegenerateDataError, PoorFitError
 from calibration.schema import VehicleCalibration, load_calibration, save_calibration
 from calibration.vehicle import fit_gains, twist
 from calibration.vehicle_response import fit_response, follow, vehicle_calibration
-from hardware.twin.config import LabConfig
+from hardware.worlds.lab.config import LabConfig
 
 
 @pytest.fixture(scope="module")

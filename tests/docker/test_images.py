@@ -70,7 +70,7 @@ def test_images_install_what_the_project_offers(name):
 
 
 def test_compose_names_files_and_settings_that_exist():
-    from nodes.runtime.launch_file import load_launch
+    from nodes.launching.launch_file import load_launch
 
     services = yaml.safe_load((DOCKER / "compose.yaml").read_text())["services"]
     for service in services.values():

@@ -12,8 +12,8 @@ from hardware.cameras.file import FileCamera
 from hardware.cameras.frame_wire import HEAD_BYTES, decode_frame, encode_head
 from hardware.cameras.interface import Frame
 from hardware.cameras.socket import SocketCamera
+from hardware.emulators.frame_server import FrameServer
 from hardware.errors import DeviceBusy, DeviceNotFound, LinkLost, LinkTimeout, ProtocolError
-from hardware.twin.frame_server import FrameServer
 
 
 def frame(sequence, shape=(188, 336, 3)):

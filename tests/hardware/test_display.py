@@ -6,9 +6,9 @@ import sys
 import numpy as np
 import pytest
 
-from hardware.display import PygameDisplay, TwinDisplay
+from hardware.emulators.monitor_port import MonitorPort
 from hardware.errors import DeviceBusy, DeviceNotFound, LinkLost
-from hardware.twin.monitor_port import MonitorPort
+from hardware.screen.display import PygameDisplay, TwinDisplay
 
 SIZE_M = (0.5977, 0.3362)
 
@@ -52,7 +52,7 @@ def test_a_driver_that_gives_another_size_is_refused():
     script = (
         "import pygame; real = pygame.display.set_mode\n"
         "pygame.display.set_mode = lambda size, *a, **k: real((1024, 768), *a, **k)\n"
-        "from hardware.display import PygameDisplay; PygameDisplay(0, (1920, 1080))"
+        "from hardware.screen.display import PygameDisplay; PygameDisplay(0, (1920, 1080))"
     )
     environment = {**os.environ, "SDL_VIDEODRIVER": "offscreen"}
     done = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, timeout=60)
@@ -87,7 +87,7 @@ def wait_for(port):
 
 
 def test_a_second_source_is_refused_and_a_lost_twin_noticed(tmp_path, monkeypatch):
-    monkeypatch.setattr("hardware.display._TIMEOUT_S", 0.1)
+    monkeypatch.setattr("hardware.screen.display._TIMEOUT_S", 0.1)
     port = MonitorPort(tmp_path / "monitor", SIZE_M, (64, 36))
     display = TwinDisplay(tmp_path / "monitor")
     with pytest.raises(DeviceBusy, match="another picture source"):

@@ -1,7 +1,7 @@
 import pytest
 
-from hardware.edid import connected_displays, edid_of, make_edid, parse_edid
 from hardware.errors import DeviceNotFound, ProtocolError
+from hardware.screen.edid import connected_displays, edid_of, make_edid, parse_edid
 
 # Real monitors, from reports of their owners; the data sheet of the U2412M gives an active area of 518.4 x 324.0 mm.
 DELL_U2412M = bytes.fromhex(

@@ -8,8 +8,8 @@ import termios
 import pytest
 
 from hardware.errors import HardwareError
-from hardware.gamepad import Gamepad
-from hardware.keyboard import Keyboard
+from hardware.operator.gamepad import Gamepad
+from hardware.operator.keyboard import Keyboard
 
 KEY, ABS, SYN = 1, 3, 0
 

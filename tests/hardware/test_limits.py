@@ -6,7 +6,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from hardware.limits import DriveLimiter, DriveLimits, VehicleGains
+from hardware.motor.limits import DriveLimiter, DriveLimits, VehicleGains
 
 LIMITS = DriveLimits()
 

@@ -8,13 +8,13 @@ import pytest
 
 from advnerf_core.geometry import VehicleState, yaw_of
 from hardware.cameras.socket import SocketCamera
+from hardware.emulators.live import LiveLab, LiveLabConfig, PoseHistory
+from hardware.emulators.vicon_emulator import OCCLUSION_FORMS, ViconEmulatorConfig, ViconFrames
 from hardware.errors import HardwareError
-from hardware.limits import DriveLimits, VehicleGains
-from hardware.twin.lab import Lab
-from hardware.twin.live import LiveLab, LiveLabConfig, PoseHistory
-from hardware.twin.vicon_emulator import OCCLUSION_FORMS, ViconEmulatorConfig, ViconFrames
-from hardware.vesc import Vesc
-from hardware.vicon import SubjectTracker, ViconConfig, ViconReceiver
+from hardware.mocap.vicon import SubjectTracker, ViconConfig, ViconReceiver
+from hardware.motor.limits import DriveLimits, VehicleGains
+from hardware.motor.vesc import Vesc
+from hardware.worlds.lab.lab import Lab
 
 
 @pytest.fixture(scope="module")

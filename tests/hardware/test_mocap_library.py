@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hardware.errors import DeviceNotFound, HardwareError
-from hardware.mocap_library import LibraryConfig, LibraryReceiver
+from hardware.mocap.library import LibraryConfig, LibraryReceiver
 
 PLAYER = """
 import time

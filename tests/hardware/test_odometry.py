@@ -4,9 +4,9 @@ import math
 
 import pytest
 
-from hardware.odometry import LONGEST_STEP_S, Odometry
-from hardware.twin.config import CarConfig
-from hardware.twin.vehicle import TwinVehicle
+from hardware.motor.odometry import LONGEST_STEP_S, Odometry
+from hardware.worlds.lab.config import CarConfig
+from hardware.worlds.lab.vehicle import TwinVehicle
 
 
 def drive(odometry, speed, steering, duration_s, step_s):

@@ -9,16 +9,16 @@ import tty
 
 import pytest
 
+from hardware.emulators.pacing import Pacer
+from hardware.emulators.vesc_emulator import VescEmulator, read_wire_log
+from hardware.emulators.vesc_firmware import VescEmulatorConfig, VescFirmware
 from hardware.errors import DeviceBusy, DeviceNotFound, HardwareError, LinkLost, LinkTimeout
-from hardware.limits import DriveLimits, VehicleGains
-from hardware.twin.config import CarConfig
-from hardware.twin.pacing import Pacer
-from hardware.twin.vehicle import TwinVehicle
-from hardware.twin.vesc_emulator import VescEmulator, read_wire_log
-from hardware.twin.vesc_firmware import VescEmulatorConfig, VescFirmware
-from hardware.vesc import Vesc
-from hardware.vesc_codec import CommandId, encode_command
-from hardware.vesc_replies import FirmwareVersion
+from hardware.motor.limits import DriveLimits, VehicleGains
+from hardware.motor.vesc import Vesc
+from hardware.motor.vesc_codec import CommandId, encode_command
+from hardware.motor.vesc_replies import FirmwareVersion
+from hardware.worlds.lab.config import CarConfig
+from hardware.worlds.lab.vehicle import TwinVehicle
 
 
 def vehicle():

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hardware.vesc_codec import (
+from hardware.motor.vesc_codec import (
     Command,
     CommandId,
     FrameDecoder,

@@ -5,7 +5,7 @@ import struct
 import pytest
 
 from hardware.errors import ProtocolError
-from hardware.vesc_replies import (
+from hardware.motor.vesc_replies import (
     FAULT_NAMES,
     LAYOUTS,
     FirmwareVersion,

@@ -4,15 +4,15 @@ import struct
 
 import pytest
 
+from hardware.emulators.vesc_emulator import VescEmulator
+from hardware.emulators.vesc_firmware import VescEmulatorConfig
 from hardware.errors import LinkTimeout, ProtocolError
-from hardware.limits import DriveLimits, VehicleGains
-from hardware.twin.config import CarConfig
-from hardware.twin.vehicle import TwinVehicle
-from hardware.twin.vesc_emulator import VescEmulator
-from hardware.twin.vesc_firmware import VescEmulatorConfig
-from hardware.vesc import Vesc
-from hardware.vesc_replies import FirmwareVersion
-from hardware.vesc_settings import TimeoutSettings, decode_app_configuration
+from hardware.motor.limits import DriveLimits, VehicleGains
+from hardware.motor.vesc import Vesc
+from hardware.motor.vesc_replies import FirmwareVersion
+from hardware.motor.vesc_settings import TimeoutSettings, decode_app_configuration
+from hardware.worlds.lab.config import CarConfig
+from hardware.worlds.lab.vehicle import TwinVehicle
 
 # Controller id 7, 250 ms = 0x000000FA, 20 A (0x41A00000 as IEEE 754 single; 20000 mA = 0x00004E20), then other settings.
 TAIL = bytes.fromhex("00 01 f4 02 03 aa bb cc 02 03 00")

@@ -5,16 +5,16 @@ import time
 
 import pytest
 
+from hardware.emulators.vesc_emulator import VescEmulator
+from hardware.emulators.vesc_firmware import VescEmulatorConfig
+from hardware.emulators.vesc_wire import wire_chunks
 from hardware.errors import LinkLost, LinkTimeout
-from hardware.limits import DriveLimits, VehicleGains
-from hardware.twin.config import CarConfig
-from hardware.twin.vehicle import TwinVehicle
-from hardware.twin.vesc_emulator import VescEmulator
-from hardware.twin.vesc_firmware import VescEmulatorConfig
-from hardware.twin.vesc_wire import wire_chunks
-from hardware.vesc import Vesc
-from hardware.vesc_codec import FrameDecoder, encode_frame
-from hardware.vesc_replies import FirmwareVersion, Values
+from hardware.motor.limits import DriveLimits, VehicleGains
+from hardware.motor.vesc import Vesc
+from hardware.motor.vesc_codec import FrameDecoder, encode_frame
+from hardware.motor.vesc_replies import FirmwareVersion, Values
+from hardware.worlds.lab.config import CarConfig
+from hardware.worlds.lab.vehicle import TwinVehicle
 
 # Which telemetry a firmware sends, over the whole range of both.
 PAIRS = [("A", (2, 18)), ("B", (3, 33)), ("C", (3, 38)), ("D", (3, 40)), ("E", (3, 48)), ("F", (5, 2)), ("G", (6, 2))]

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from advnerf_core.geometry import make_transform, planar_pose
 from hardware.errors import DeviceBusy, ProtocolError
-from hardware.vicon import SubjectTracker, ViconConfig, ViconReceiver
-from hardware.vicon_codec import ObjectPose, decode_block, encode_blocks, object_pose
+from hardware.mocap.vicon import SubjectTracker, ViconConfig, ViconReceiver
+from hardware.mocap.vicon_codec import ObjectPose, decode_block, encode_blocks, object_pose
 
 CONFIG = ViconConfig(subjects=("car", "board"), frozen_frames=4)
 
@@ -184,7 +184,7 @@ def test_port_in_use_is_one_clear_error():
 
 
 def through_the_network(frames=2000, **network):
-    from hardware.twin.vicon_emulator import ViconEmulatorConfig, ViconFrames
+    from hardware.emulators.vicon_emulator import ViconEmulatorConfig, ViconFrames
 
     emulator = ViconFrames(ViconEmulatorConfig(noise_m=1e-4, noise_rad=1e-4, **network))
     feed = Feed(ViconConfig(subjects=("car", "a_name_of_24_characters_"), frozen_frames=5))
@@ -218,7 +218,7 @@ def test_a_bad_network_costs_poses_and_never_gives_a_wrong_or_an_old_one():
 
 @pytest.mark.parametrize("form", ["missing", "zeros", "nan", "frozen"])
 def test_an_occluded_subject_is_lost_and_the_other_is_not(form):
-    from hardware.twin.vicon_emulator import ViconEmulatorConfig, ViconFrames
+    from hardware.emulators.vicon_emulator import ViconEmulatorConfig, ViconFrames
 
     emulator, feed, seen = ViconFrames(ViconEmulatorConfig()), Feed(ViconConfig(("car", "board"), frozen_frames=5)), []
     for frame in range(60):

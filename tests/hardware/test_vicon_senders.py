@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from advnerf_core.geometry import planar_pose
-from hardware.twin.vicon_emulator import ViconEmulatorConfig, ViconFrames
-from hardware.vicon import SubjectTracker, ViconConfig, ViconReceiver
-from hardware.vicon_codec import encode_blocks, object_pose
+from hardware.emulators.vicon_emulator import ViconEmulatorConfig, ViconFrames
+from hardware.mocap.vicon import SubjectTracker, ViconConfig, ViconReceiver
+from hardware.mocap.vicon_codec import encode_blocks, object_pose
 
 A, B = ("10.0.0.5", 51001), ("10.0.0.7", 40000)
 

@@ -4,8 +4,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nodes.arming import Arming, ArmingLimits
-from nodes.arming_requests import ArmRequests
+from nodes.control.arming import Arming, ArmingLimits
+from nodes.control.arming_requests import ArmRequests
 from nodes.runtime.messages import header, types
 from nodes.runtime.requests import Answer, Answers, asked_mono_ns
 from nodes.runtime.wire import MessageInfo

@@ -6,8 +6,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from nodes.arming import Arming, ArmingLimits
-from nodes.arming_gates import ClockGate, HandGate, edge_distance_m, inside, require_simple
+from nodes.control.arming import Arming, ArmingLimits
+from nodes.control.arming_gates import ClockGate, HandGate, edge_distance_m, inside, require_simple
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.wire import MessageInfo
 

@@ -5,8 +5,8 @@ import pytest
 
 from calibration.vehicle import Drive, fit_gains
 from calibration.vehicle_response import fit_response
-from hardware.twin.config import CarConfig
-from hardware.twin.vehicle import TwinVehicle
+from hardware.worlds.lab.config import CarConfig
+from hardware.worlds.lab.vehicle import TwinVehicle
 from nodes.calibration_drive import CalibrationDrive, CalibrationDriveConfig, program
 from nodes.runtime.messages import header, image_message, ns_from_stamp, types
 from nodes.runtime.node import Now

@@ -12,20 +12,20 @@ from pydantic import TypeAdapter, ValidationError
 
 from calibration.schema import CameraCalibration, load_calibration
 from hardware.cameras.interface import Frame
+from hardware.cameras.sources import CameraSource
 from hardware.cameras.steady import SteadyCamera
-from hardware.cameras.v4l2 import V4l2Camera
-from hardware.cameras.v4l2_negotiation import Mode
-from hardware.cameras.zed import ZedCamera
-from hardware.twin.v4l2_device import VideoDevice
-from hardware.twin.v4l2_emulator import VideoPortEmulator
-from hardware.twin.zed_emulator import ZedRegisters
+from hardware.cameras.v4l2.driver import V4l2Camera
+from hardware.cameras.v4l2.negotiation import Mode
+from hardware.cameras.zed.driver import ZedCamera
+from hardware.emulators.v4l2_device import VideoDevice
+from hardware.emulators.v4l2_emulator import VideoPortEmulator
+from hardware.emulators.zed_emulator import ZedRegisters
 from nodes.camera import CameraConfig, CameraNode
-from nodes.camera_sources import CameraSource
+from nodes.launching.launch_file import load_launch
 from nodes.runtime.bus import Bus
 from nodes.runtime.clock import SystemClock
 from nodes.runtime.config import load_node_config
 from nodes.runtime.errors import ConfigError, RuntimeFault
-from nodes.runtime.launch_file import load_launch
 from nodes.runtime.messages import ns_from_stamp, pinhole_from_camera_info
 from nodes.runtime.node import NodeContext
 from nodes.runtime.pictures import rgb_image

@@ -7,10 +7,10 @@ import pytest
 import torch
 from pydantic import ValidationError
 
-from advnerf_core.driving.policy import LoadedPolicy, PilotNet
-from advnerf_core.driving.policy_view import PolicyView
 from advnerf_core.geometry import Pinhole
+from advnerf_core.policies.pilotnet import LoadedPolicy, PilotNet
 from advnerf_core.policies.torch_driver import TorchDriver
+from advnerf_core.policies.view import PolicyView
 from nodes.compositor import CompositorConfig, CompositorNode
 from nodes.policy import PolicyNode
 from nodes.runtime.clock import ManualClock

@@ -8,12 +8,12 @@ import pytest
 from typer.testing import CliRunner
 
 from calibration.schema import CameraCalibration, load_calibration
-from hardware.cameras.zed_calibration import Rectifier, load_factory_calibration
-from hardware.twin.v4l2_device import VideoDevice
-from hardware.twin.v4l2_emulator import VideoPortEmulator
-from hardware.twin.zed_emulator import ZedRegisters
-from nodes.camera_tools import CameraToolError, describe_devices, parse_source, try_source
-from nodes.cli_camera import app
+from hardware.cameras.zed.calibration import Rectifier, load_factory_calibration
+from hardware.emulators.v4l2_device import VideoDevice
+from hardware.emulators.v4l2_emulator import VideoPortEmulator
+from hardware.emulators.zed_emulator import ZedRegisters
+from nodes.cli.camera import app
+from nodes.lab.camera_tools import CameraToolError, describe_devices, parse_source, try_source
 from nodes.runtime.errors import ConfigError
 
 TWIN = Path(__file__).parents[2] / "calibration" / "twin" / "camera.yaml"

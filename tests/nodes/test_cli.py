@@ -10,17 +10,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nodes import cli
-from nodes.runtime.bag import BagWriter
-from nodes.runtime.bag_read import read_info
+from nodes.bags.reader import read_info
+from nodes.bags.writer import BagWriter
+from nodes.cli import main as cli
+from nodes.launching.watching import describe
 from nodes.runtime.messages import encode, pose_message
-from nodes.runtime.watching import describe
 
 SENDER = """
     import numpy as np
     from pydantic import BaseModel, ConfigDict
     from nodes.runtime.messages import pose_message
-    from nodes.runtime.node import Node, Out, run_node_main
+    from nodes.runtime.node import Node, Out
+    from nodes.runtime.process import run_node_main
 
     class Config(BaseModel):
         model_config = ConfigDict(extra="forbid")

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import yaml
 
+from advnerf_core.data.dataset import write_transforms
 from advnerf_core.geometry import camera_mount, make_transform, planar_pose
-from advnerf_core.scene.dataset import write_transforms
 from calibration.by_construction import twin_calibrations
 from calibration.charuco import Board, BoardDetector
 from calibration.display_colour import DisplayCalibration, colours_to_show
@@ -22,14 +22,14 @@ from calibration.schema import (
     load_calibration,
     save_calibration,
 )
-from hardware.display import PygameDisplay
-from hardware.twin.config import LabConfig
-from nodes import cli
-from nodes.calibrating.bags import StillConfig, read_shown, still_views
-from nodes.calibrating.live import record_live
-from nodes.calibrating.screen import show_and_watch
-from nodes.runtime.bag import BagWriter
-from nodes.runtime.bag_read import read_info
+from hardware.screen.display import PygameDisplay
+from hardware.worlds.lab.config import LabConfig
+from nodes.bags.reader import read_info
+from nodes.bags.writer import BagWriter
+from nodes.cli import main as cli
+from nodes.lab.wizards.bags import StillConfig, read_shown, still_views
+from nodes.lab.wizards.live import record_live
+from nodes.lab.wizards.screen import show_and_watch
 from nodes.runtime.bus import Bus
 from nodes.runtime.errors import BagError
 from nodes.runtime.messages import encode, header, image_message, pose_message, types

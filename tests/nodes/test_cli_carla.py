@@ -13,8 +13,8 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
-from hardware.carla_scene import CarlaMapError
-from nodes.cli_carla import app
+from hardware.worlds.carla import CarlaMapError
+from nodes.cli.carla import app
 from nodes.runtime.errors import ConfigError
 
 ROOT = Path(__file__).parents[2]

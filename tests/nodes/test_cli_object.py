@@ -7,10 +7,10 @@ import cv2
 import numpy as np
 import pytest
 
-from advnerf_core.objects.build import mesh_views
-from advnerf_core.objects.generators import hydrant
-from advnerf_core.objects.model import load_object
-from nodes import cli
+from advnerf_core.objects.voxel.build import mesh_views
+from advnerf_core.objects.voxel.generators import hydrant
+from advnerf_core.objects.voxel.model import load_object
+from nodes.cli import main as cli
 
 
 @pytest.fixture

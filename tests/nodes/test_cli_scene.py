@@ -13,11 +13,11 @@ import pytest
 import torch
 
 from advnerf_core.geometry import Pinhole
-from advnerf_core.objects.build import mesh_views
-from advnerf_core.objects.generators import hydrant, small_car
+from advnerf_core.objects.voxel.build import mesh_views
+from advnerf_core.objects.voxel.generators import hydrant, small_car
 from advnerf_core.scene.render_field import FieldRenderer
-from nodes import cli
-from nodes.scene_view import SceneView
+from nodes.cli import main as cli
+from nodes.lab.scene_view import SceneView
 
 TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 BOX = ("--box-low", "-2.2", "-2.2", "-0.4", "--box-high", "2.2", "2.2", "2.0")
@@ -163,8 +163,8 @@ def test_mistakes_are_one_line(command, pictures, tmp_path, arguments, message):
 
 
 def test_masks_decide_what_is_learned_from(pictures, tmp_path):
+    from advnerf_core.data.dataset import load_transforms
     from advnerf_core.errors import AdvnerfError
-    from advnerf_core.scene.dataset import load_transforms
     from advnerf_core.scene.field import SceneFieldConfig
     from advnerf_core.scene.train import TrainConfig, Trainer
 
@@ -187,8 +187,8 @@ def test_masks_decide_what_is_learned_from(pictures, tmp_path):
 
 @pytest.fixture
 def view(trained, pictures, tmp_path):
-    from advnerf_core.objects.build import build_from_mesh
-    from advnerf_core.objects.model import save_object
+    from advnerf_core.objects.voxel.build import build_from_mesh
+    from advnerf_core.objects.voxel.model import save_object
 
     save_object(tmp_path / "h.object.safetensors", build_from_mesh(hydrant(3.0), "hydrant", 16, 0))
     shown = SceneView(trained / "scene.safetensors", pictures, [tmp_path / "h.object.safetensors"], port=18080)

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from nodes.command_gate import Brake, CommandGate, Drive, GateSettings, GateState
+from nodes.control.command_gate import Brake, CommandGate, Drive, GateSettings, GateState
 from nodes.runtime.wire import MessageInfo
 
 SETTINGS = GateSettings(command_age_limit_s=0.22, brake_current_a=15.0, brake_ramp_s=0.1, brake_hold_s=1.0)

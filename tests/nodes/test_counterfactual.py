@@ -10,25 +10,25 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from advnerf_core.driving.policy import PilotNet, load_policy, save_policy
-from advnerf_core.driving.policy_view import PolicyView
 from advnerf_core.geometry import Pinhole, planar_pose
 from advnerf_core.policies.load import load_driver
-from nodes.cli import app
+from advnerf_core.policies.pilotnet import PilotNet, load_policy, save_policy
+from advnerf_core.policies.view import PolicyView
+from nodes.bags.reader import read_messages
+from nodes.bags.writer import BagWriter
+from nodes.cli.main import app
 from nodes.counterfactual import CounterfactualConfig, CounterfactualNode
-from nodes.evaluation import counterfactual
-from nodes.runtime.bag import BagWriter
-from nodes.runtime.bag_read import read_messages
+from nodes.lab.trials.evaluation import counterfactual
+from nodes.launching.launch_check import check_nodes
+from nodes.launching.launch_file import load_launch
+from nodes.replaying.nodes import Choice
+from nodes.replaying.replay import Replay, write_replay
 from nodes.runtime.clock import Now
 from nodes.runtime.config import parse_yaml, validate
 from nodes.runtime.errors import ConfigError
-from nodes.runtime.launch_check import check_nodes
-from nodes.runtime.launch_file import load_launch
 from nodes.runtime.messages import decode, encode, header, image_message, pose_message, types
 from nodes.runtime.node import MessageInfo, NodeContext
 from nodes.runtime.pictures import compressed_image_message
-from nodes.runtime.replay import Replay, write_replay
-from nodes.runtime.replay_nodes import Choice
 
 ROOT = Path(__file__).parents[2]
 TWIN = ROOT / "calibration" / "twin"

@@ -10,17 +10,17 @@ import pytest
 import torch
 
 from advnerf_core.attack.artifact import AttackFile, save_attack
-from advnerf_core.driving.policy import PilotNet, images_to_tensor, load_policy, save_policy
-from advnerf_core.driving.policy_view import PolicyView
 from advnerf_core.geometry import Pinhole
+from advnerf_core.policies.pilotnet import PilotNet, images_to_tensor, load_policy, save_policy
+from advnerf_core.policies.view import PolicyView
 from calibration.schema import CameraCalibration, RoomCalibration, TargetCalibration, load_calibration
-from nodes.evaluation import counterfactual
-from nodes.runtime.bag_read import read_messages
+from nodes.bags.reader import read_messages
+from nodes.lab.trials.evaluation import counterfactual
+from nodes.lab.trials.trial import TrialOutcome, TrialPlan
+from nodes.lab.trials.trial_runner import run_trial
 from nodes.runtime.messages import decode, ns_from_stamp
 from nodes.runtime.pictures import rgb_image
 from nodes.runtime.topics import topic as topic_row
-from nodes.trial import TrialOutcome, TrialPlan
-from nodes.trial_runner import run_trial
 
 ROOT = Path(__file__).parents[2]
 TWIN = ROOT / "calibration" / "twin"

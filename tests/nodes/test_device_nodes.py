@@ -12,8 +12,8 @@ from pydantic import ValidationError
 from advnerf_core.geometry import planar_pose
 from calibration.schema import CalibrationError, CameraCalibration, load_calibration
 from hardware.cameras.interface import Frame
-from hardware.twin.frame_server import FrameServer
-from hardware.vicon_codec import encode_blocks, object_pose
+from hardware.emulators.frame_server import FrameServer
+from hardware.mocap.vicon_codec import encode_blocks, object_pose
 from nodes.camera import CameraConfig, CameraNode
 from nodes.runtime.clock import SystemClock
 from nodes.runtime.errors import RuntimeFault

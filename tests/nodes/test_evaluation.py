@@ -4,8 +4,8 @@ import pytest
 from advnerf_core.driving.metrics import Horizon
 from advnerf_core.driving.path import Path
 from advnerf_core.geometry import planar_pose
-from nodes.evaluation import attack_ids, frames, score, timing, trajectory
-from nodes.runtime.bag import BagWriter
+from nodes.bags.writer import BagWriter
+from nodes.lab.trials.evaluation import attack_ids, frames, score, timing, trajectory
 from nodes.runtime.messages import drive_message, encode, header, image_message, pose_message, types
 
 START_NS = 1_700_000_000_000_000_000

@@ -9,7 +9,7 @@ import pytest
 from advnerf_core.driving.expert import Expert, ExpertConfig
 from advnerf_core.driving.path import Path as DrivingPath
 from advnerf_core.geometry import planar_pose
-from hardware.hands import Hands
+from hardware.operator.hands import Hands
 from nodes.collect import Start
 from nodes.expert import Disturbance, ExpertNode, ExpertNodeConfig
 from nodes.runtime.clock import ManualClock

@@ -11,18 +11,18 @@ import pytest
 from typer.testing import CliRunner
 
 from advnerf_core.driving.expert import Expert
-from advnerf_core.driving.policy_view import PolicyView
+from advnerf_core.policies.view import PolicyView
 from calibration.schema import CameraCalibration, RoomCalibration, load_calibration
-from nodes import cli
-from nodes.calibrating.bags import read_pictures, read_poses
-from nodes.policy_data.frames import frames_of_bag
-from nodes.policy_reference import from_bag
-from nodes.runtime.bag_read import read_info
+from nodes.bags.reader import read_info
+from nodes.cli import main as cli
+from nodes.lab.policy_data.frames import frames_of_bag
+from nodes.lab.policy_reference import from_bag
+from nodes.lab.wizards.bags import read_pictures, read_poses
+from nodes.replaying.nodes import Choice
+from nodes.replaying.replay import Replay
 from nodes.runtime.bus import Bus
 from nodes.runtime.errors import MessageError
 from nodes.runtime.messages import pose_matrix, stamp_ns
-from nodes.runtime.replay import Replay
-from nodes.runtime.replay_nodes import Choice
 
 sys.path.insert(0, str(Path(__file__).parent / "runtime"))
 from foreign_samples import COMPRESSED, COUNT, START_NS, STEP_NS, WRITERS, rgb_at, state_at

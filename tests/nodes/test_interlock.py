@@ -4,7 +4,7 @@ import importlib.util
 from pathlib import Path
 
 from nodes.compositor import CompositorNode, show
-from nodes.runtime.interlock import Interlock
+from nodes.control.interlock import Interlock
 from nodes.runtime.messages import decode, encode, header, types
 from nodes.runtime.wire import MessageInfo
 

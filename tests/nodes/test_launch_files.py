@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from nodes.runtime.launch_check import check_nodes
-from nodes.runtime.launch_file import load_launch
+from nodes.launching.launch_check import check_nodes
+from nodes.launching.launch_file import load_launch
 
 LAUNCH = Path(__file__).parents[2] / "launch"
 

@@ -11,8 +11,8 @@ from advnerf_core.attack.artifact import AttackFile, face_texture, save_attack
 from advnerf_core.geometry import Pinhole
 from calibration.panel import Panel, centre_square, make_panel, require_fits
 from calibration.schema import CalibrationError, TargetCalibration, load_calibration
+from hardware.emulators.monitor_port import MonitorPort
 from hardware.errors import HardwareError
-from hardware.twin.monitor_port import MonitorPort
 from nodes.monitor import MonitorConfig, MonitorNode, TwinScreenConfig
 from nodes.runtime.clock import ManualClock
 from nodes.runtime.messages import decode, encode, header, type_name, types

@@ -9,12 +9,12 @@ from advnerf_core.attack.artifact import AttackFile, save_attack
 from advnerf_core.geometry import Pinhole
 from calibration.panel import centre_square
 from calibration.schema import TargetCalibration, load_calibration
-from nodes.evaluation import attack_ids
-from nodes.runtime.bag_read import read_messages
+from nodes.bags.reader import read_messages
+from nodes.lab.trials.evaluation import attack_ids
+from nodes.lab.trials.trial import TrialPlan
+from nodes.lab.trials.trial_runner import run_trial
 from nodes.runtime.messages import decode, ns_from_stamp
 from nodes.runtime.pictures import rgb_image
-from nodes.trial import TrialPlan
-from nodes.trial_runner import run_trial
 
 ROOT = Path(__file__).parents[2]
 NODES = ("twin", "camera", "vicon", "compositor", "monitor", "policy", "safety", "motor")

@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 
 from calibration.schema import VehicleCalibration, load_calibration
-from hardware.twin.config import CarConfig
-from hardware.twin.vehicle import TwinVehicle
-from hardware.twin.vesc_emulator import VescEmulator
-from hardware.twin.vesc_firmware import VescEmulatorConfig
-from hardware.vesc import Vesc
+from hardware.emulators.vesc_emulator import VescEmulator
+from hardware.emulators.vesc_firmware import VescEmulatorConfig
+from hardware.motor.vesc import Vesc
+from hardware.worlds.lab.config import CarConfig
+from hardware.worlds.lab.vehicle import TwinVehicle
 from nodes.motor import MotorConfig, MotorNode
 from nodes.runtime.clock import SystemClock
 from nodes.runtime.messages import drive_message, ns_from_stamp

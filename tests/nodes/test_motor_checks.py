@@ -11,16 +11,16 @@ import pytest
 from typer.testing import CliRunner
 
 from advnerf_core.geometry import planar_pose
-from hardware.twin.config import CarConfig
-from hardware.twin.vehicle import TwinVehicle
-from hardware.twin.vesc_emulator import VescEmulator
-from hardware.twin.vesc_firmware import VescEmulatorConfig
-from nodes.cli import app
+from hardware.emulators.vesc_emulator import VescEmulator
+from hardware.emulators.vesc_firmware import VescEmulatorConfig
+from hardware.worlds.lab.config import CarConfig
+from hardware.worlds.lab.vehicle import TwinVehicle
+from nodes.cli.main import app
+from nodes.control.steering_check import CheckSettings, SteeringCheck
 from nodes.motor import MotorConfig, MotorNode
 from nodes.runtime.clock import Now, SystemClock
 from nodes.runtime.messages import decode, encode, header, pose_message, types
 from nodes.runtime.node import MessageInfo, NodeContext
-from nodes.steering_check import CheckSettings, SteeringCheck
 
 CLOCK = SystemClock()
 VEHICLE = Path(__file__).parents[2] / "calibration" / "twin" / "vehicle.yaml"

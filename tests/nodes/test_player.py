@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from mcap.writer import Writer as McapWriter
 
+from nodes.bags.writer import BagWriter
 from nodes.player import PlayerConfig, PlayerNode
-from nodes.runtime.bag import BagWriter
 from nodes.runtime.bus import Bus
 from nodes.runtime.clock import ManualClock
 from nodes.runtime.errors import BagError, NodeFinished

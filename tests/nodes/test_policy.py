@@ -6,7 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from advnerf_core.driving.policy import (
+from advnerf_core.geometry import Pinhole
+from advnerf_core.policies.contract import PolicyContract
+from advnerf_core.policies.onnx_policy import export_onnx
+from advnerf_core.policies.pilotnet import (
     LoadedPolicy,
     PilotNet,
     PolicyFileError,
@@ -14,11 +17,8 @@ from advnerf_core.driving.policy import (
     load_policy,
     save_policy,
 )
-from advnerf_core.driving.policy_view import PolicyView
-from advnerf_core.geometry import Pinhole
-from advnerf_core.policies.contract import PolicyContract
-from advnerf_core.policies.onnx_policy import export_onnx
 from advnerf_core.policies.torch_driver import TorchDriver
+from advnerf_core.policies.view import PolicyView
 from nodes.policy import PolicyConfig, PolicyNode
 from nodes.runtime.clock import ManualClock
 from nodes.runtime.errors import ConfigError

@@ -9,20 +9,20 @@ import numpy as np
 import pytest
 import torch
 
+from advnerf_core.data.posed_images import write_posed_images
 from advnerf_core.driving.expert import Expert
 from advnerf_core.driving.path import Arc
 from advnerf_core.driving.path import Path as ReferencePath
-from advnerf_core.driving.policy_view import PolicyView
 from advnerf_core.fields.hash_grid import HashGridConfig
 from advnerf_core.geometry import Pinhole, planar_pose
 from advnerf_core.policies.adapter import adapt
 from advnerf_core.policies.conformance import FAILURE, OK, WARNING, Finding
 from advnerf_core.policies.contract import PolicyContract
+from advnerf_core.policies.view import PolicyView
 from advnerf_core.scene.field import SceneField, SceneFieldConfig, save_scene
-from advnerf_core.scene.posed_images import write_posed_images
 from calibration.schema import CameraCalibration, RoomCalibration, load_calibration, save_calibration
-from nodes.policy_reference import from_bag, from_run, from_scene, from_twin, judged_by_drives
-from nodes.runtime.bag import BagWriter
+from nodes.bags.writer import BagWriter
+from nodes.lab.policy_reference import from_bag, from_run, from_scene, from_twin, judged_by_drives
 from nodes.runtime.errors import BagError, ConfigError
 from nodes.runtime.messages import encode, image_message, pose_message
 

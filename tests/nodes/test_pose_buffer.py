@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from advnerf_core.geometry import make_transform, rotation_x, rotation_z, yaw_of
-from nodes.pose_buffer import PoseBuffer
+from nodes.control.pose_buffer import PoseBuffer
 
 SPEED_MPS, RADIUS_M = 1.5, 1.0
 

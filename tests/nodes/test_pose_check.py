@@ -8,10 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from advnerf_core.geometry import make_transform, planar_pose, rotation_x, rotation_z
-from hardware.limits import DriveLimits
-from hardware.twin.config import CarConfig
-from hardware.twin.vehicle import TwinVehicle
-from nodes.pose_check import MotionBounds, PoseCheck, PoseGate
+from hardware.motor.limits import DriveLimits
+from hardware.worlds.lab.config import CarConfig
+from hardware.worlds.lab.vehicle import TwinVehicle
+from nodes.control.pose_check import MotionBounds, PoseCheck, PoseGate
 from nodes.runtime.wire import MessageInfo
 
 BOUNDS = MotionBounds.of_car(DriveLimits(), 0.25, 1.25, 0.005, 0.01)

@@ -10,10 +10,10 @@ from pydantic import ValidationError
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
+from nodes.bags.reader import read_attachment, read_info, read_messages
+from nodes.bags.repair import repair
+from nodes.bags.repair_parts import repair_bag
 from nodes.recorder import RecorderConfig, RecorderNode, provenance
-from nodes.runtime.bag_read import read_attachment, read_info, read_messages
-from nodes.runtime.bag_repair import repair
-from nodes.runtime.bag_repair_parts import repair_bag
 from nodes.runtime.bus import Bus
 from nodes.runtime.clock import Now, SystemClock
 from nodes.runtime.errors import BagError

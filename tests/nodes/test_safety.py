@@ -10,7 +10,7 @@ from pydantic import ValidationError
 
 from advnerf_core.geometry import planar_pose
 from calibration.schema import VehicleCalibration, load_calibration
-from nodes.arming import ArmingLimits
+from nodes.control.arming import ArmingLimits
 from nodes.runtime.arm_requests import arm_message
 from nodes.runtime.clock import Now
 from nodes.runtime.messages import drive_message, header, ns_from_stamp, pose_message, types

@@ -11,16 +11,17 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
+from advnerf_core.data.dataset import load_transforms
 from advnerf_core.geometry import Array, Pinhole, look_at
 from advnerf_core.render.march import MarchConfig
-from advnerf_core.scene.dataset import load_transforms
 from advnerf_core.scene.field import load_scene, save_scene
 from advnerf_core.scene.intervals import INTERVAL_PX_FROM_OUTSIDE
 from advnerf_core.scene.render_field import FieldRenderer
 from advnerf_core.scene.train import TrainConfig, train_scene
-from nodes import cli, scene_training
+from nodes.cli import main as cli
+from nodes.lab import scene_training
+from nodes.lab.scene_training import TrainingRequest, sample_intervals, scene_field
 from nodes.runtime.errors import ConfigError
-from nodes.scene_training import TrainingRequest, sample_intervals, scene_field
 
 TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 CAMERA = Pinhole(40, 40, 50.0, 50.0, 20.0, 20.0)

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hardware.twin.config import CarConfig
-from hardware.twin.vehicle import TwinVehicle
-from nodes.stall_check import StallGate, StallLimits
+from hardware.worlds.lab.config import CarConfig
+from hardware.worlds.lab.vehicle import TwinVehicle
+from nodes.control.stall_check import StallGate, StallLimits
 
 CAR = CarConfig()
 

@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 
 from advnerf_core.geometry import planar_pose
+from nodes.lab.trials.trial import Phase, TrialError, TrialNode, TrialPlan
 from nodes.runtime.clock import Now
 from nodes.runtime.errors import NodeFinished
 from nodes.runtime.messages import header, pose_message, types
-from nodes.trial import Phase, TrialError, TrialNode, TrialPlan
 
 REAL_NS = 1_700_000_000_000_000_000
 START = (-1.1, -2.0, 0.0)

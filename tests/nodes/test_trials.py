@@ -13,14 +13,14 @@ from advnerf_core.attack.artifact import AttackFile, face_texture, save_attack
 from advnerf_core.driving.path import Path as DrivingPath
 from advnerf_core.geometry import Pinhole, planar_pose
 from benchmarks.host_pair import exchange_keys
-from nodes.cli import app
-from nodes.runtime.bag import BagWriter
+from nodes.bags.writer import BagWriter
+from nodes.cli.main import app
+from nodes.lab.trials.bags import evaluate_bag, find_drives
+from nodes.lab.trials.plan import CampaignError, finished, make_order, williams_rows
+from nodes.lab.trials.series import drive_series, prepare_series, summarise
+from nodes.launching.launch import Launch
 from nodes.runtime.errors import BagError, ConfigError
-from nodes.runtime.launch import Launch
 from nodes.runtime.messages import encode, header, pose_message, types
-from nodes.trials.bags import evaluate_bag, find_drives
-from nodes.trials.campaign import drive_series, prepare_series, summarise
-from nodes.trials.plan import CampaignError, finished, make_order, williams_rows
 
 ROOT = Path(__file__).parents[2]
 LOOPBACK = "127.0.0.1"
@@ -239,7 +239,7 @@ def test_bags_without_a_drive_say_what_they_lack(tmp_path):
 
 @pytest.mark.slow
 def test_a_series_on_the_twin_counts_what_its_bags_say_and_goes_on(tmp_path):
-    from nodes.trials.campaign import drive_series
+    from nodes.lab.trials.series import drive_series
 
     calibration = [f"params.calibration={ROOT / 'calibration' / 'twin'}", "params.vicon_port=52871"]
     stands_in = ["policy.module=benchmarks.straight_policy", "policy.speed_mps=0.5"]

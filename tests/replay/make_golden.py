@@ -15,7 +15,7 @@ import yaml
 
 from advnerf_core.attack.artifact import AttackFile, save_attack
 from advnerf_core.geometry import Pinhole
-from nodes.runtime.bag import BagWriter
+from nodes.bags.writer import BagWriter
 from nodes.runtime.messages import encode, image_message, pose_message
 
 HERE = Path(__file__).parent
@@ -112,9 +112,9 @@ def _fill(writer: BagWriter) -> None:
 
 def make_golden(bag: Path, folder: Path) -> Path:
     """Write the golden bag of a bag; returns its path."""
-    from nodes.runtime.replay import Replay
-    from nodes.runtime.replay_golden import update_golden
-    from nodes.runtime.replay_nodes import Choice
+    from nodes.replaying.golden import update_golden
+    from nodes.replaying.nodes import Choice
+    from nodes.replaying.replay import Replay
 
     path = folder / GOLDEN_NAME
     with Replay(bag, Choice(("compositor", "policy"), {"policy": "green_policy"})) as replay:

@@ -8,7 +8,7 @@ import make_golden
 import pytest
 from mcap.reader import make_reader
 
-from nodes import cli
+from nodes.cli import main as cli
 from nodes.runtime.errors import BagError
 
 HERE = Path(__file__).parent

@@ -4,8 +4,8 @@ import dataclasses
 
 import torch
 
-from advnerf_core.attack.placed_sensor import PlacedSensor
-from advnerf_core.attack.placement import KeepOut, PoseBounds, PoseSpace
+from advnerf_core.attack.spaces.placed_sensor import PlacedSensor
+from advnerf_core.attack.spaces.placement import KeepOut, PoseBounds, PoseSpace
 from advnerf_core.driving.path import Path
 from advnerf_core.fields.voxel_grid import cube_face_object
 from advnerf_core.geometry import make_transform, rotation_z

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from advnerf_core.attack.adjoint import AttackProblem, RenderCache, adjoint_gradient, evaluate, roll_out
 from advnerf_core.driving.dynamics import AckermannServoLag, Dubins
-from advnerf_core.driving.policy import PilotNet
+from advnerf_core.policies.pilotnet import PilotNet
 from advnerf_core.scene.surrogate import Rendered
 from benchmarks.adjoint_gradient import backpropagated_gradient, finite_difference, relative_error
 from benchmarks.attack_toy import painted_room, random_policy, toy_problem

@@ -9,14 +9,14 @@ import torch
 from torch import nn
 
 from advnerf_core.attack.adjoint import AttackProblem, BlackBoxError, adjoint_gradient, evaluate
-from advnerf_core.attack.distil import Distillation, Lessons, Student
-from advnerf_core.attack.guided import BlackBoxSearch, BudgetError, black_box_attack
-from advnerf_core.attack.optimise import gradient_attack
-from advnerf_core.attack.population import Evolution, population_search
-from advnerf_core.attack.query_count import CountedPolicy, VictimError, calls_per_evaluation
 from advnerf_core.attack.robustness import Disturbances
-from advnerf_core.attack.search import SearchStateError
-from advnerf_core.attack.visited import PreparingSensor, VisitedDrive
+from advnerf_core.attack.search.distil import Distillation, Lessons, Student
+from advnerf_core.attack.search.guided import BlackBoxSearch, BudgetError, black_box_attack
+from advnerf_core.attack.search.optimise import gradient_attack
+from advnerf_core.attack.search.population import Evolution, population_search
+from advnerf_core.attack.search.query_count import CountedPolicy, VictimError, calls_per_evaluation
+from advnerf_core.attack.search.search import SearchStateError
+from advnerf_core.attack.search.visited import PreparingSensor, VisitedDrive
 from advnerf_core.driving.dynamics import Ackermann
 from advnerf_core.driving.path import Path
 from advnerf_core.scene.surrogate import Rendered
@@ -278,12 +278,12 @@ def test_lessons_keep_their_number_and_take_the_new_in():
 
 
 def test_an_onnx_policy_refuses_gradients_and_is_attacked_all_the_same(tmp_path):
-    from advnerf_core.driving.policy import PilotNet
-    from advnerf_core.driving.policy_view import PolicyView
     from advnerf_core.geometry import Pinhole
     from advnerf_core.policies.contract import PolicyContract
     from advnerf_core.policies.load import load_any_policy
     from advnerf_core.policies.onnx_policy import export_onnx
+    from advnerf_core.policies.pilotnet import PilotNet
+    from advnerf_core.policies.view import PolicyView
 
     torch.manual_seed(0)
     view = PolicyView(Pinhole(336, 188, 173.97, 173.97, 168.0, 94.0))

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from advnerf_core.attack.adjoint import BlackBoxError, adjoint_gradient
-from advnerf_core.attack.population import Coarse, CrossEntropy, Evolution, population_search, rank_utilities
-from advnerf_core.attack.search import SearchDivergedError, SearchStateError
+from advnerf_core.attack.search.population import Coarse, CrossEntropy, Evolution, population_search, rank_utilities
+from advnerf_core.attack.search.search import SearchDivergedError, SearchStateError
 from benchmarks.attack_toy import random_policy, toy_problem
 
 STRATEGIES = [CrossEntropy(), Evolution()]

@@ -11,7 +11,7 @@ import torch
 from advnerf_core.attack.adjoint import evaluate
 from advnerf_core.attack.pose_maps import PoseMapError, landscape, robustness_map
 from advnerf_core.attack.pose_plots import draw_landscape, draw_placements, draw_robustness
-from advnerf_core.attack.poses import placed
+from advnerf_core.attack.search.poses import placed
 
 sys.path.insert(0, str(Path(__file__).parent))
 from placed_toy import SQUARE, moving

@@ -10,9 +10,8 @@ from scipy.ndimage import map_coordinates
 
 from advnerf_core.attack.adjoint import adjoint_gradient, evaluate
 from advnerf_core.attack.health import central_slopes, frozen_loss, random_directions, slopes_of
-from advnerf_core.attack.placement import footprint
-from advnerf_core.attack.pose_attack import pose_attack, randomly_placed
-from advnerf_core.attack.poses import (
+from advnerf_core.attack.search.pose_attack import pose_attack, randomly_placed
+from advnerf_core.attack.search.poses import (
     KeepOut,
     MultiStart,
     PlacedSensor,
@@ -25,7 +24,8 @@ from advnerf_core.attack.poses import (
     placed_problem,
     random_poses,
 )
-from advnerf_core.attack.search import SearchStateError
+from advnerf_core.attack.search.search import SearchStateError
+from advnerf_core.attack.spaces.placement import footprint
 from advnerf_core.fields.soft_edges import with_soft_edges
 from advnerf_core.fields.voxel_grid import cube_face_object
 from advnerf_core.geometry import planar_pose

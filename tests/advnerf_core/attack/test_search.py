@@ -5,9 +5,9 @@ import pytest
 import torch
 
 from advnerf_core.attack.adjoint import adjoint_gradient, evaluate
-from advnerf_core.attack.baselines import random_search
-from advnerf_core.attack.optimise import gradient_attack
-from advnerf_core.attack.search import SearchDivergedError, SearchStateError, draw_start_states
+from advnerf_core.attack.search.baselines import random_search
+from advnerf_core.attack.search.optimise import gradient_attack
+from advnerf_core.attack.search.search import SearchDivergedError, SearchStateError, draw_start_states
 from advnerf_core.scene.surrogate import Rendered
 from benchmarks.attack_toy import toy_problem
 

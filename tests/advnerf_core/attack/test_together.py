@@ -6,10 +6,10 @@ import pytest
 import torch
 
 from advnerf_core.attack.adjoint import adjoint_gradient
-from advnerf_core.attack.optimise import gradient_attack
 from advnerf_core.attack.robustness import Smoothness
-from advnerf_core.attack.search import SearchStateError
-from advnerf_core.attack.together import gradient_attacks
+from advnerf_core.attack.search.optimise import gradient_attack
+from advnerf_core.attack.search.search import SearchStateError
+from advnerf_core.attack.search.together import gradient_attacks
 from advnerf_core.scene.many_textures import ManyTextures
 from benchmarks.attack_toy import toy_problem
 

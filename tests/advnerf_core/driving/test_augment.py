@@ -1,6 +1,6 @@
 import numpy as np
 
-from advnerf_core.driving.augment import AugmentConfig, augment
+from advnerf_core.learning.augment import AugmentConfig, augment
 
 OFF = AugmentConfig(brightness=0.0, contrast=0.0, gamma=0.0, colour=0.0, noise=0.0, blur_share=0.0, shift_px=0)
 

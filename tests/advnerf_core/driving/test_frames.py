@@ -3,7 +3,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from advnerf_core.driving.frames import Frames, FrameSet, FrameStore, FrameStoreError
+from advnerf_core.learning.frames import Frames, FrameSet, FrameStore, FrameStoreError
 
 
 def _frames(count: int, base: int = 0) -> Frames:

@@ -10,14 +10,14 @@ import torch
 
 from advnerf_core.driving.dynamics import Dubins
 from advnerf_core.driving.expert import Expert, ExpertConfig
-from advnerf_core.driving.frames import FrameStore
-from advnerf_core.driving.imitation import ImitationConfig, SourcePlan, recovery_states, train_policy
 from advnerf_core.driving.path import Arc, Line
 from advnerf_core.driving.path import Path as Track
-from advnerf_core.driving.policy import PilotNet, load_policy
-from advnerf_core.driving.policy_view import PolicyView
-from advnerf_core.driving.sources import RenderedSource
 from advnerf_core.geometry import Pinhole
+from advnerf_core.learning.frames import FrameStore
+from advnerf_core.learning.imitation import ImitationConfig, SourcePlan, recovery_states, train_policy
+from advnerf_core.learning.sources import RenderedSource
+from advnerf_core.policies.pilotnet import PilotNet, load_policy
+from advnerf_core.policies.view import PolicyView
 
 VIEW = PolicyView(Pinhole(336, 188, 173.97, 173.97, 168.0, 94.0))
 TURNING = ExpertConfig(

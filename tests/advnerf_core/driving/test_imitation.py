@@ -7,18 +7,18 @@ import numpy as np
 import pytest
 import torch
 
-from advnerf_core.driving import imitation
 from advnerf_core.driving.dynamics import Ackermann
 from advnerf_core.driving.expert import Expert
-from advnerf_core.driving.fit import FitConfig, fit, mean_absolute_error
-from advnerf_core.driving.frames import Frames, FrameSet, FrameStore, FrameStoreError
-from advnerf_core.driving.imitation import ImitationConfig, SourcePlan, recovery_states, train_policy
 from advnerf_core.driving.path import Path as Track
-from advnerf_core.driving.policy import PilotNet, load_policy
-from advnerf_core.driving.policy_view import PolicyView
 from advnerf_core.driving.rollout import drive
-from advnerf_core.driving.sources import RenderedSource, SceneSource, random_texture, steer_with
 from advnerf_core.geometry import Pinhole, VehicleState, camera_mount, planar_pose
+from advnerf_core.learning import imitation
+from advnerf_core.learning.fit import FitConfig, fit, mean_absolute_error
+from advnerf_core.learning.frames import Frames, FrameSet, FrameStore, FrameStoreError
+from advnerf_core.learning.imitation import ImitationConfig, SourcePlan, recovery_states, train_policy
+from advnerf_core.learning.sources import RenderedSource, SceneSource, random_texture, steer_with
+from advnerf_core.policies.pilotnet import PilotNet, load_policy
+from advnerf_core.policies.view import PolicyView
 
 TRACK = Track.rounded_square(4.0, 1.1)
 VIEW = PolicyView(Pinhole(336, 188, 173.97, 173.97, 168.0, 94.0))

@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from advnerf_core.driving.policy_view import PolicyView
 from advnerf_core.geometry import Pinhole
+from advnerf_core.policies.view import PolicyView
 
 CAMERA = Pinhole(336, 188, 173.97, 173.97, 168.0, 94.0)
 VIEW = PolicyView(CAMERA)

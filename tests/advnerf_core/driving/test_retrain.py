@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from advnerf_core.driving.augment import AugmentConfig
-from advnerf_core.driving.frames import Frames, FrameStoreError
-from advnerf_core.driving.policy import PilotNet, images_to_tensor, load_policy, save_policy
-from advnerf_core.driving.policy_view import PolicyView
-from advnerf_core.driving.retrain import MixedFrames, RetrainConfig, fine_tune
 from advnerf_core.geometry import Pinhole
+from advnerf_core.learning.augment import AugmentConfig
+from advnerf_core.learning.frames import Frames, FrameStoreError
+from advnerf_core.learning.retrain import MixedFrames, RetrainConfig, fine_tune
+from advnerf_core.policies.pilotnet import PilotNet, images_to_tensor, load_policy, save_policy
+from advnerf_core.policies.view import PolicyView
 
 VIEW = PolicyView(Pinhole(336, 188, 174.0, 174.0, 168.0, 94.0))
 QUIET = AugmentConfig()

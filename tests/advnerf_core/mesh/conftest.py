@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 
 from advnerf_core.geometry import Pinhole, make_transform, rotation_x, rotation_z
-from advnerf_core.mesh.engine import MeshEngineError, engine
-from advnerf_core.mesh.field import MeshField
-from advnerf_core.mesh.surface import TexturedMesh, sphere, unwrapped
+from advnerf_core.objects.mesh.engine import MeshEngineError, engine
+from advnerf_core.objects.mesh.field import MeshField
+from advnerf_core.objects.mesh.surface import TexturedMesh, sphere, unwrapped
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -8,14 +8,14 @@ import numpy as np
 import torch
 
 from advnerf_core.geometry import make_transform
-from advnerf_core.mesh.engine import engine, newest_llvm
+from advnerf_core.objects.mesh.engine import engine, newest_llvm
 from advnerf_core.scene.surrogate import Surrogate
 
 from .conftest import PINHOLE
 
 TRY = """
 import sys
-from advnerf_core.mesh.engine import MeshEngineError, engine
+from advnerf_core.objects.mesh.engine import MeshEngineError, engine
 try:
     engine()
 except MeshEngineError as error:
@@ -71,7 +71,9 @@ def test_threads_follow_the_environment(monkeypatch):
 
 
 def test_importing_our_packages_does_not_import_mitsuba():
-    done = run("import sys, advnerf_core.mesh.shape, advnerf_core.mesh.glb; sys.exit('mitsuba' in sys.modules)")
+    done = run(
+        "import sys, advnerf_core.objects.mesh.shape, advnerf_core.objects.mesh.glb; sys.exit('mitsuba' in sys.modules)"
+    )
     assert done.returncode == 0, done.stderr
 
 

@@ -7,14 +7,14 @@ import pytest
 import torch
 
 from advnerf_core.attack.adjoint import AttackProblem, adjoint_gradient
-from advnerf_core.attack.optimise import gradient_attack
+from advnerf_core.attack.search.optimise import gradient_attack
 from advnerf_core.driving.dynamics import Ackermann
 from advnerf_core.driving.path import Line, Path
 from advnerf_core.geometry import Pinhole, camera_mount, make_transform
-from advnerf_core.mesh.field import MeshField
-from advnerf_core.mesh.large_steps import LargeSteps, laplacian
-from advnerf_core.mesh.shape import ShapeLimits, ShapeSensor
-from advnerf_core.mesh.surface import sphere, unwrapped
+from advnerf_core.objects.mesh.field import MeshField
+from advnerf_core.objects.mesh.large_steps import LargeSteps, laplacian
+from advnerf_core.objects.mesh.shape import ShapeLimits, ShapeSensor
+from advnerf_core.objects.mesh.surface import sphere, unwrapped
 from advnerf_core.scene.surrogate import Surrogate
 
 from .conftest import PINHOLE, POSE, coloured_sphere

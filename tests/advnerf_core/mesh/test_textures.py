@@ -7,13 +7,13 @@ import pytest
 import torch
 
 from advnerf_core.geometry import make_transform, rotation_x, rotation_z
-from advnerf_core.mesh.field import MeshField
-from advnerf_core.mesh.glb import read_glb, write_glb
-from advnerf_core.mesh.surface import sphere, unwrapped
-from advnerf_core.objects.generators import hydrant, small_car
-from advnerf_core.objects.mesh import MeshError, SurfaceMesh, load_mesh, part_from_colours
-from advnerf_core.objects.rasterise import draw_mesh
-from advnerf_core.objects.views import dome, viewing_lens
+from advnerf_core.objects.mesh.field import MeshField
+from advnerf_core.objects.mesh.glb import read_glb, write_glb
+from advnerf_core.objects.mesh.surface import sphere, unwrapped
+from advnerf_core.objects.voxel.generators import hydrant, small_car
+from advnerf_core.objects.voxel.mesh import MeshError, SurfaceMesh, load_mesh, part_from_colours
+from advnerf_core.objects.voxel.rasterise import draw_mesh
+from advnerf_core.objects.voxel.views import dome, viewing_lens
 from advnerf_core.scene.surrogate import Surrogate
 
 from .conftest import PINHOLE, POSE

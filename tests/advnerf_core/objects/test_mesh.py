@@ -11,10 +11,10 @@ import trimesh
 from PIL import Image
 
 from advnerf_core.geometry import Pinhole
-from advnerf_core.objects.generators import GENERATORS, hydrant, small_car
-from advnerf_core.objects.mesh import MeshError, SurfaceMesh, load_mesh, part_from_colours, stand, texture_colours
-from advnerf_core.objects.rasterise import draw_mesh
-from advnerf_core.objects.views import dome, look_at, ring, viewing_lens
+from advnerf_core.objects.voxel.generators import GENERATORS, hydrant, small_car
+from advnerf_core.objects.voxel.mesh import MeshError, SurfaceMesh, load_mesh, part_from_colours, stand, texture_colours
+from advnerf_core.objects.voxel.rasterise import draw_mesh
+from advnerf_core.objects.voxel.views import dome, look_at, ring, viewing_lens
 
 MODELS = Path(__file__).parents[4] / "shared" / "data" / "models"
 
@@ -110,7 +110,7 @@ def test_drawing_leaves_the_threads_of_others_alone():
     """A kernel of OpenMP would set the thread count of every library of the process that shares it, torch's too."""
     program = (
         "import numpy as np, torch\nfrom advnerf_core.geometry import Pinhole\n"
-        "from advnerf_core.objects.generators import hydrant\nfrom advnerf_core.objects.rasterise import draw_mesh\n"
+        "from advnerf_core.objects.voxel.generators import hydrant\nfrom advnerf_core.objects.voxel.rasterise import draw_mesh\n"
         "pose = np.eye(4)[None]\npose[0, 2, 3] = -3.0\n"
         "draw_mesh(hydrant(), pose, Pinhole(40, 30, 40.0, 40.0, 20.0, 15.0))\nprint(torch.get_num_threads())"
     )

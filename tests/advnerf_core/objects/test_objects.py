@@ -10,15 +10,22 @@ import numpy as np
 import pytest
 import trimesh
 
-from advnerf_core.objects.build import advice, agreement_db, build_from_images, build_from_mesh, draw_object, mesh_views
-from advnerf_core.objects.fit import fit_grids
-from advnerf_core.objects.generators import hydrant
-from advnerf_core.objects.hull import visual_hull
-from advnerf_core.objects.mesh import MeshError, SurfaceMesh, part_from_colours
-from advnerf_core.objects.model import ObjectFileError, ObjectModel, load_object, save_object
-from advnerf_core.objects.pictures import FitError, PosedRgba, RayBatches
-from advnerf_core.objects.views import look_at, viewing_lens
-from advnerf_core.objects.voxelise import OPAQUE_PER_VOXEL, voxelise
+from advnerf_core.objects.voxel.build import (
+    advice,
+    agreement_db,
+    build_from_images,
+    build_from_mesh,
+    draw_object,
+    mesh_views,
+)
+from advnerf_core.objects.voxel.fit import fit_grids
+from advnerf_core.objects.voxel.generators import hydrant
+from advnerf_core.objects.voxel.hull import visual_hull
+from advnerf_core.objects.voxel.mesh import MeshError, SurfaceMesh, part_from_colours
+from advnerf_core.objects.voxel.model import ObjectFileError, ObjectModel, load_object, save_object
+from advnerf_core.objects.voxel.pictures import FitError, PosedRgba, RayBatches
+from advnerf_core.objects.voxel.views import look_at, viewing_lens
+from advnerf_core.objects.voxel.voxelise import OPAQUE_PER_VOXEL, voxelise
 from advnerf_core.render.cast_object import cast_object
 
 
@@ -127,9 +134,9 @@ def test_rays_of_a_batch_are_those_of_their_pixels_and_meet_the_box():
 MEMORY_SCRIPT = """
 import resource, sys, tracemalloc
 from pathlib import Path
-from advnerf_core.objects.build import build_from_images
-from advnerf_core.objects.pictures import load_pictures
-from advnerf_core.scene.dataset import load_transforms
+from advnerf_core.objects.voxel.build import build_from_images
+from advnerf_core.objects.voxel.pictures import load_pictures
+from advnerf_core.data.dataset import load_transforms
 listed = load_transforms(Path(sys.argv[1]))
 warm = load_pictures(listed, (64, 64))
 build_from_images(warm, "warm", resolution=16, steps=1)

@@ -5,11 +5,11 @@ import pytest
 import torch
 from torch import nn
 
-from advnerf_core.driving.policy_view import PolicyView
 from advnerf_core.geometry import Pinhole
 from advnerf_core.policies.adapter import adapt
 from advnerf_core.policies.conformance import FAILURE, OK, check_policy
 from advnerf_core.policies.contract import PolicyContract
+from advnerf_core.policies.view import PolicyView
 
 VIEW = PolicyView(Pinhole(336, 188, 173.97, 173.97, 168.0, 94.0), width=40, height=22)
 DECLARED = PolicyContract(VIEW)

@@ -12,14 +12,14 @@ from torch import nn
 
 from advnerf_core.attack.adjoint import BlackBoxError
 from advnerf_core.attack.problem import AttackProblem
-from advnerf_core.driving.policy import PilotNet, save_policy
-from advnerf_core.driving.policy_view import PolicyView
 from advnerf_core.geometry import Pinhole
 from advnerf_core.policies.adapter import adapt
 from advnerf_core.policies.contract import PolicyContract, PolicyContractError
 from advnerf_core.policies.exported_policy import export_program
 from advnerf_core.policies.load import load_adapted, load_any_policy, load_driver
 from advnerf_core.policies.onnx_policy import OnnxNetwork, export_onnx
+from advnerf_core.policies.pilotnet import PilotNet, save_policy
+from advnerf_core.policies.view import PolicyView
 
 VIEW = PolicyView(Pinhole(336, 188, 173.97, 173.97, 168.0, 94.0))
 SMALL = replace(VIEW, width=40, height=22)
@@ -210,8 +210,8 @@ def test_a_program_with_pickled_objects_is_refused_unread(tmp_path, member):
 
 FACTORY = """
 import torch
-from advnerf_core.driving.policy import PilotNet
-from advnerf_core.driving.policy_view import PolicyView
+from advnerf_core.policies.pilotnet import PilotNet
+from advnerf_core.policies.view import PolicyView
 from advnerf_core.geometry import Pinhole
 from advnerf_core.policies.adapter import adapt
 from advnerf_core.policies.contract import PolicyContract

@@ -7,11 +7,11 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
+from advnerf_core.data.dataset import ImageSet
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.fields.hash_grid import HashGridConfig
 from advnerf_core.geometry import Array, Pinhole, look_at
 from advnerf_core.render.march import MarchConfig, Samples
-from advnerf_core.scene.dataset import ImageSet
 from advnerf_core.scene.field import SceneField, SceneFieldConfig
 from advnerf_core.scene.render_field import FieldRenderer
 from advnerf_core.scene.torch_step import TorchStep, render_rays

@@ -5,8 +5,8 @@ import cv2
 import numpy as np
 import pytest
 
+from advnerf_core.data.dataset import DatasetError, load_transforms, write_transforms
 from advnerf_core.geometry import OPENGL_FROM_OPENCV, Pinhole, look_at
-from advnerf_core.scene.dataset import DatasetError, load_transforms, write_transforms
 
 PINHOLE = Pinhole(64, 48, 50.0, 51.0, 31.0, 25.0)
 

@@ -4,9 +4,9 @@ import cv2
 import numpy as np
 import pytest
 
+from advnerf_core.data.dataset import DatasetError, Lens, load_transforms
+from advnerf_core.data.lens import straightening
 from advnerf_core.geometry import Pinhole
-from advnerf_core.scene.dataset import DatasetError, Lens, load_transforms
-from advnerf_core.scene.lens import straightening
 
 SIZE = (160, 120)
 PINHOLE = Pinhole(*SIZE, 70.0, 72.0, 79.0, 61.0)

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
+from advnerf_core.data.dataset import ImageSet
 from advnerf_core.fields.hash_grid import HashGridConfig
 from advnerf_core.geometry import Pinhole, look_at
 from advnerf_core.render.march_kernels import step_size
-from advnerf_core.scene.dataset import ImageSet
 from advnerf_core.scene.field import SceneFieldConfig, save_scene
 from advnerf_core.scene.intervals import INTERVAL_PX, INTERVAL_PX_FROM_OUTSIDE, pixel_intervals
 from advnerf_core.scene.metrics import psnr

@@ -3,9 +3,9 @@ import cv2
 import numpy as np
 import pytest
 
-from advnerf_core.scene.dataset import DatasetError
-from advnerf_core.scene.keyframes import KeyframeConfig, KeyframeSelector, sharpness, work_image
-from advnerf_core.scene.video import keep_keyframes, read_video
+from advnerf_core.data.dataset import DatasetError
+from advnerf_core.data.keyframes import KeyframeConfig, KeyframeSelector, sharpness, work_image
+from advnerf_core.data.video import keep_keyframes, read_video
 
 WIDTH, HEIGHT = 320, 240
 RNG = np.random.default_rng(4)

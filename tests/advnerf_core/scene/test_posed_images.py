@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from advnerf_core.data.posed_images import write_posed_images
+from advnerf_core.data.transforms import load_transforms
 from advnerf_core.geometry import Pinhole, make_transform, rotation_z
-from advnerf_core.scene.posed_images import write_posed_images
-from advnerf_core.scene.transforms import load_transforms
 
 PINHOLE = Pinhole(12, 8, 10.0, 11.0, 6.0, 4.0)
 POSES = [make_transform(rotation_z(0.3 * i), [i, 0.0, 0.5]) for i in range(3)]

@@ -8,12 +8,12 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
+from advnerf_core.data.dataset import ImageSet
 from advnerf_core.fields.hash_grid import HashGridConfig
 from advnerf_core.geometry import Array, Pinhole, look_at
 from advnerf_core.render.march import MarchConfig, Marcher
 from advnerf_core.render.march_kernels import span_in_box
 from advnerf_core.render.occupancy import leap_distances
-from advnerf_core.scene.dataset import ImageSet
 from advnerf_core.scene.field import SceneField, SceneFieldConfig, SceneFileError, load_scene, save_scene
 from advnerf_core.scene.metrics import psnr
 from advnerf_core.scene.render_field import FieldRenderer

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
+from advnerf_core.data.dataset import ImageSet
 from advnerf_core.fields.hash_grid import HashGridConfig
 from advnerf_core.geometry import Pinhole, look_at
 from advnerf_core.render.march import MarchConfig, Marcher
 from advnerf_core.render.occupancy import leap_distances
-from advnerf_core.scene.dataset import ImageSet
 from advnerf_core.scene.field import SceneField, SceneFieldConfig
 from advnerf_core.scene.render_field import FieldRenderer
 from advnerf_core.scene.torch_step import TorchStep

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from advnerf_core.data.similarity import Similarity, SimilarityError, align_poses, extent, rotation_angles
 from advnerf_core.geometry import make_transform
-from advnerf_core.scene.similarity import Similarity, SimilarityError, align_poses, extent, rotation_angles
 
 TOLERANCES = (0.05, np.deg2rad(2.0))
 TRUE = Similarity(0.37, make_transform(Rotation.from_rotvec([0.4, -1.1, 2.0]).as_matrix(), [3.0, -7.0, 0.5]))

@@ -9,11 +9,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from advnerf_core.data.dataset import ImageSet
 from advnerf_core.fields.hash_grid import HashGridConfig
 from advnerf_core.geometry import Array, Pinhole, look_at
 from advnerf_core.render.march import MarchConfig, Samples
 from advnerf_core.render.occupancy import refine_occupied
-from advnerf_core.scene.dataset import ImageSet
 from advnerf_core.scene.field import SceneField, SceneFieldConfig
 from advnerf_core.scene.torch_step import TorchStep, distortion_loss, render_rays
 from advnerf_core.scene.train import TrainConfig, Trainer

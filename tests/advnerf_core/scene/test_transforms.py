@@ -5,8 +5,8 @@ import cv2
 import numpy as np
 import pytest
 
+from advnerf_core.data.dataset import DatasetError, Lens, load_transforms, write_transforms
 from advnerf_core.geometry import OPENGL_FROM_OPENCV, Pinhole, look_at
-from advnerf_core.scene.dataset import DatasetError, Lens, load_transforms, write_transforms
 
 FOX = Path("../shared/data/fox")
 WIDTH, HEIGHT = 32, 24

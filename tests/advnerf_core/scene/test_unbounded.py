@@ -10,13 +10,13 @@ import torch
 from numpy.typing import NDArray
 from safetensors import safe_open
 
+from advnerf_core.data.dataset import ImageSet
 from advnerf_core.fields.hash_grid import HashGridConfig
 from advnerf_core.geometry import Array, Pinhole, look_at
 from advnerf_core.render.contraction import contract
 from advnerf_core.render.march import MarchConfig, Marcher, Samples
 from advnerf_core.render.occupancy import leap_distances
 from advnerf_core.render.rays import poses_in_box
-from advnerf_core.scene.dataset import ImageSet
 from advnerf_core.scene.field import SceneField, SceneFieldConfig, load_scene, save_scene, scene_hash
 from advnerf_core.scene.metrics import psnr
 from advnerf_core.scene.render_field import FieldRenderer

@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from advnerf_core.scene.dataset import DatasetError, load_transforms
-from advnerf_core.scene.image_files import image_size, is_cut_off, read_image
+from advnerf_core.data.dataset import DatasetError, load_transforms
+from advnerf_core.data.image_files import image_size, is_cut_off, read_image
 
 EYE = np.eye(4).tolist()
 

@@ -10,14 +10,14 @@ from hardware.cameras.file import FileCamera
 from hardware.cameras.interface import Frame
 from hardware.cameras.oak import OakCamera, OakSettings, OakStream, find_device
 from hardware.cameras.socket import SocketCamera
-from hardware.cameras.v4l2 import V4l2Camera
-from hardware.cameras.v4l2_negotiation import Mode
+from hardware.cameras.v4l2.driver import V4l2Camera
+from hardware.cameras.v4l2.negotiation import Mode
 from hardware.cameras.video import VideoCamera
-from hardware.cameras.zed import ZedCamera
-from hardware.twin.frame_server import FrameServer
-from hardware.twin.v4l2_device import VideoDevice
-from hardware.twin.v4l2_emulator import VideoPortEmulator
-from hardware.twin.zed_emulator import ZedRegisters
+from hardware.cameras.zed.driver import ZedCamera
+from hardware.emulators.frame_server import FrameServer
+from hardware.emulators.v4l2_device import VideoDevice
+from hardware.emulators.v4l2_emulator import VideoPortEmulator
+from hardware.emulators.zed_emulator import ZedRegisters
 
 PATH = "/dev/v4l/by-id/usb-Camera-video-index0"
 SHAPE = (188, 336, 3)

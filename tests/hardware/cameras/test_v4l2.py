@@ -12,14 +12,13 @@ import cv2
 import numpy as np
 import pytest
 
-from hardware.cameras import v4l2_abi as abi
-from hardware.cameras import v4l2_controls
-from hardware.cameras.v4l2 import V4l2Camera
-from hardware.cameras.v4l2_controls import Controls
-from hardware.cameras.v4l2_negotiation import Mode
-from hardware.cameras.v4l2_port import KernelPort
-from hardware.errors import DeviceBusy, DeviceNotFound, HardwareError, LinkLost, ProtocolError
-from hardware.twin.v4l2_device import (
+from hardware.cameras.v4l2 import abi
+from hardware.cameras.v4l2 import controls as v4l2_controls
+from hardware.cameras.v4l2.controls import Controls
+from hardware.cameras.v4l2.driver import V4l2Camera
+from hardware.cameras.v4l2.negotiation import Mode
+from hardware.cameras.v4l2.port import KernelPort
+from hardware.emulators.v4l2_device import (
     AUTO_EXPOSURE,
     AUTO_WHITE_BALANCE,
     EXPOSURE,
@@ -28,7 +27,8 @@ from hardware.twin.v4l2_device import (
     WHITE_BALANCE,
     VideoDevice,
 )
-from hardware.twin.v4l2_emulator import VideoPortEmulator
+from hardware.emulators.v4l2_emulator import VideoPortEmulator
+from hardware.errors import DeviceBusy, DeviceNotFound, HardwareError, LinkLost, ProtocolError
 
 PATH = "/dev/v4l/by-id/usb-Emulated_Camera-video-index0"
 MODE = Mode(32, 16, 30.0)

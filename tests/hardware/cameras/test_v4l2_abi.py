@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from hardware.cameras import v4l2_abi as abi
+from hardware.cameras.v4l2 import abi
 
 # Printed by a C program with sizeof, offsetof and the macros themselves.
 SIZES = {

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from advnerf_core.geometry import Pinhole
-from hardware.cameras.v4l2_controls import Controls
-from hardware.cameras.zed import ZedCamera
-from hardware.cameras.zed_calibration import EyeCalibration, Rectifier, ZedCalibrationError, load_factory_calibration
-from hardware.cameras.zed_exposure import (
+from hardware.cameras.v4l2.controls import Controls
+from hardware.cameras.zed.calibration import EyeCalibration, Rectifier, ZedCalibrationError, load_factory_calibration
+from hardware.cameras.zed.driver import ZedCamera
+from hardware.cameras.zed.exposure import (
     ExtensionUnit,
     ZedExposure,
     automatic_is_on,
@@ -19,10 +19,10 @@ from hardware.cameras.zed_exposure import (
     read_exposure_lines,
     read_gain,
 )
+from hardware.emulators.v4l2_device import VideoDevice
+from hardware.emulators.v4l2_emulator import VideoPortEmulator
+from hardware.emulators.zed_emulator import ZedRegisters
 from hardware.errors import HardwareError, ProtocolError
-from hardware.twin.v4l2_device import VideoDevice
-from hardware.twin.v4l2_emulator import VideoPortEmulator
-from hardware.twin.zed_emulator import ZedRegisters
 
 PATH = "/dev/v4l/by-id/usb-Technologies__Inc._ZED-video-index0"
 

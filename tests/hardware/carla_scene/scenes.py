@@ -3,8 +3,8 @@
 import numpy as np
 
 from advnerf_core.geometry import transform_points
-from hardware.carla_scene.config import CarlaConfig
-from hardware.carla_scene.scene import CarlaScene
+from hardware.worlds.carla.config import CarlaConfig
+from hardware.worlds.carla.scene import CarlaScene
 
 
 def scene_of(library, settings, **changes):

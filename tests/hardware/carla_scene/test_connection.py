@@ -8,10 +8,10 @@ import threading
 
 import pytest
 
-from hardware.carla_scene.config import CarlaConfig, ServerConfig
-from hardware.carla_scene.connection import check_versions, connect, map_name, open_world
-from hardware.carla_scene.errors import CarlaMapError, CarlaUnreachable, CarlaVersionMismatch
-from hardware.carla_scene.scene import CarlaScene
+from hardware.worlds.carla.config import CarlaConfig, ServerConfig
+from hardware.worlds.carla.connection import check_versions, connect, map_name, open_world
+from hardware.worlds.carla.errors import CarlaMapError, CarlaUnreachable, CarlaVersionMismatch
+from hardware.worlds.carla.scene import CarlaScene
 
 
 @contextlib.contextmanager
@@ -124,10 +124,10 @@ def test_without_the_library_importing_works_and_using_says_what_to_install():
     """In a Python of its own that cannot import carla."""
     program = (
         "import sys; sys.modules['carla'] = None\n"
-        "import hardware.carla_scene\n"
-        "from hardware.carla_scene import CarlaConfig, CarlaScene\n"
+        "import hardware.worlds.carla\n"
+        "from hardware.worlds.carla import CarlaConfig, CarlaScene\n"
         "try:\n    CarlaScene()\n"
-        "except hardware.carla_scene.CarlaNotInstalled as error:\n    print(error)\n"
+        "except hardware.worlds.carla.CarlaNotInstalled as error:\n    print(error)\n"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
     assert "pip install 'advnerf[carla]'" in done.stdout, done.stderr

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from hardware.carla_scene import CarlaConfig, CarlaScene
+from hardware.worlds.carla import CarlaConfig, CarlaScene
 
 ROOT = Path(__file__).parents[3]
 PAGE = (ROOT / "docs" / "carla.md").read_text(encoding="utf-8")
@@ -29,8 +29,8 @@ def test_the_configuration_is_one():
 
 def test_the_program_runs(library, settings, monkeypatch):
     config = CarlaConfig.model_validate(settings)
-    monkeypatch.setattr("hardware.carla_scene.CarlaConfig", lambda: config)
-    monkeypatch.setattr("hardware.carla_scene.CarlaScene", lambda given: CarlaScene(given, library))
+    monkeypatch.setattr("hardware.worlds.carla.CarlaConfig", lambda: config)
+    monkeypatch.setattr("hardware.worlds.carla.CarlaScene", lambda given: CarlaScene(given, library))
     names = {}
     exec(compile(block("python"), "docs/carla.md", "exec"), names)
     assert names["depth"].shape == names["rgb"].shape[:2] == (46, 84)

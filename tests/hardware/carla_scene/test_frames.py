@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from advnerf_core.geometry import camera_mount, invert_transform, planar_pose, transform_points
-from hardware.carla_scene.frames import CarlaPose, SceneFrame
+from hardware.worlds.carla.frames import CarlaPose, SceneFrame
 
 MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
 # Every combination of signs and quadrants, and both poles.

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from advnerf_core.driving.path import Arc, Line, Path
-from hardware.carla_scene.errors import CarlaMapError
-from hardware.carla_scene.junction import find_drives, list_junctions
-from hardware.twin.intersection.paths import junction_paths
+from hardware.worlds.carla.errors import CarlaMapError
+from hardware.worlds.carla.junction import find_drives, list_junctions
+from hardware.worlds.junction.paths import junction_paths
 
 
 def drives_of(carla, junction, **settings):

@@ -5,8 +5,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from hardware.carla_scene.errors import CarlaFrameError
-from hardware.carla_scene.pixels import depth_of, rgb_of
+from hardware.worlds.carla.errors import CarlaFrameError
+from hardware.worlds.carla.pixels import depth_of, rgb_of
 
 
 def image(bgra):

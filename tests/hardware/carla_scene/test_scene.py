@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from advnerf_core.geometry import camera_mount, planar_pose, transform_points
-from hardware.deployment_scene import DeploymentScene
+from hardware.worlds.world import DeploymentScene
 from tests.hardware.carla_scene.scenes import carla_points, is_put_back, scene_of
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from advnerf_core.geometry import camera_mount, planar_pose, transform_points
-from hardware.carla_scene.errors import CarlaBusy, CarlaError, CarlaFrameError, CarlaMapError, CarlaUnreachable
+from hardware.worlds.carla.errors import CarlaBusy, CarlaError, CarlaFrameError, CarlaMapError, CarlaUnreachable
 from tests.hardware.carla_scene.scenes import carla_points, drive, is_put_back, scene_of
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from hardware.twin.config import CameraConfig, LabConfig, TrackConfig
+from hardware.worlds.lab.config import CameraConfig, LabConfig, TrackConfig
 
 
 def test_driving_camera_has_the_documented_intrinsics():

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from advnerf_core.geometry import planar_pose
-from hardware.deployment_scene import DeploymentScene
-from hardware.twin.config import CameraConfig, CarConfig, LabConfig
-from hardware.twin.lab import Lab
-from hardware.twin.phone import track_length, track_pose
+from hardware.worlds.lab.config import CameraConfig, CarConfig, LabConfig
+from hardware.worlds.lab.lab import Lab
+from hardware.worlds.lab.phone import track_length, track_pose
+from hardware.worlds.world import DeploymentScene
 
 
 @pytest.fixture(scope="module")

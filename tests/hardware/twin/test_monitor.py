@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from advnerf_core.geometry import look_at, planar_pose
-from hardware.twin.config import LabConfig, MonitorOpticsConfig
-from hardware.twin.lab import Lab
-from hardware.twin.monitor import ScreenOptics
-from hardware.twin.world import MONITOR_PIXELS
+from hardware.worlds.lab.config import LabConfig, MonitorOpticsConfig
+from hardware.worlds.lab.lab import Lab
+from hardware.worlds.lab.monitor import ScreenOptics
+from hardware.worlds.lab.world import MONITOR_PIXELS
 
 OFFICE = MonitorOpticsConfig.office()
 PANEL = LabConfig().monitor

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from advnerf_core.geometry import yaw_of
-from hardware.twin.config import LabConfig, PhoneConfig
-from hardware.twin.furniture import furnish
-from hardware.twin.phone import apply_colours, car_mounted_poses, track_length, track_pose, walk_around_poses
+from hardware.worlds.lab.config import LabConfig, PhoneConfig
+from hardware.worlds.lab.furniture import furnish
+from hardware.worlds.lab.phone import apply_colours, car_mounted_poses, track_length, track_pose, walk_around_poses
 
 CONFIG = LabConfig()
 

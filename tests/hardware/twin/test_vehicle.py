@@ -5,8 +5,8 @@ import math
 
 import pytest
 
-from hardware.twin.config import CarConfig
-from hardware.twin.vehicle import Footprint, TwinVehicle
+from hardware.worlds.lab.config import CarConfig
+from hardware.worlds.lab.vehicle import Footprint, TwinVehicle
 
 CAR = CarConfig()
 

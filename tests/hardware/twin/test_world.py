@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from advnerf_core.geometry import Pinhole, invert_transform, look_at, planar_pose, transform_points
-from hardware.twin import gl, lighting
-from hardware.twin.config import LabConfig
-from hardware.twin.furniture import Solid, furnish, obstacles
-from hardware.twin.lab import Lab
-from hardware.twin.phone import track_length, track_pose
+from hardware.worlds.lab import gl, lighting
+from hardware.worlds.lab.config import LabConfig
+from hardware.worlds.lab.furniture import Solid, furnish, obstacles
+from hardware.worlds.lab.lab import Lab
+from hardware.worlds.lab.phone import track_length, track_pose
 
 CONFIG = LabConfig()
 POSES = [(0.4, -2.0, 0.0), (1.2, -1.8, 0.15), (0.8, -2.3, 0.2)]

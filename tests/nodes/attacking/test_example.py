@@ -4,13 +4,13 @@ import pathlib
 
 import numpy as np
 
-from advnerf_core.attack.poses import KeepOut, PoseBounds, PoseSpace
+from advnerf_core.attack.search.poses import KeepOut, PoseBounds, PoseSpace
 from advnerf_core.driving.path import Path
-from advnerf_core.objects.build import build_from_mesh
-from advnerf_core.objects.generators import GENERATORS
-from hardware.twin.config import LabConfig
-from nodes.attacking.request import load_request
+from advnerf_core.objects.voxel.build import build_from_mesh
+from advnerf_core.objects.voxel.generators import GENERATORS
+from hardware.worlds.lab.config import LabConfig
 from nodes.experiment.objects import FACE_OFFSET_M
+from nodes.experiment.request.request import load_request
 
 EXAMPLE = pathlib.Path(__file__).parents[3] / "launch" / "corner.attack.yaml"
 

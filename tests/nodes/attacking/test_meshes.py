@@ -9,13 +9,13 @@ import pytest
 import torch
 
 from advnerf_core.attack.artifact import load_attack
-from advnerf_core.mesh.engine import MeshEngineError, engine
-from advnerf_core.mesh.glb import read_glb
-from nodes import cli
-from nodes.attacking.check import check
-from nodes.attacking.prepare import prepare
-from nodes.attacking.request import load_request
-from nodes.attacking.search import run_attack
+from advnerf_core.objects.mesh.engine import MeshEngineError, engine
+from advnerf_core.objects.mesh.glb import read_glb
+from nodes.cli import main as cli
+from nodes.experiment.request.check import check
+from nodes.experiment.request.prepare import prepare
+from nodes.experiment.request.request import load_request
+from nodes.experiment.request.search import run_attack
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import ProgressDisplay
 

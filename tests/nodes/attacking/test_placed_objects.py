@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from advnerf_core.objects.generators import hydrant
-from advnerf_core.objects.model import ObjectModel, save_object
-from advnerf_core.objects.voxelise import voxelise
-from nodes.attacking.objects import place
-from nodes.attacking.request import ObjectRequest
+from advnerf_core.objects.voxel.generators import hydrant
+from advnerf_core.objects.voxel.model import ObjectModel, save_object
+from advnerf_core.objects.voxel.voxelise import voxelise
+from nodes.experiment.request.objects import place
+from nodes.experiment.request.request import ObjectRequest
 
 
 @pytest.fixture(scope="module")

@@ -11,18 +11,18 @@ import torch
 
 from advnerf_core.attack.adjoint import BlackBoxError, evaluate
 from advnerf_core.attack.artifact import load_attack
-from advnerf_core.attack.guided import BudgetError
+from advnerf_core.attack.search.guided import BudgetError
 from advnerf_core.display import DisplayModel
-from advnerf_core.driving.policy import load_policy
 from advnerf_core.policies.contract import PolicyContract
 from advnerf_core.policies.onnx_policy import export_onnx
+from advnerf_core.policies.pilotnet import load_policy
 from calibration.display_colour import DisplayCalibration
 from calibration.schema import save_calibration
-from nodes import cli
-from nodes.attacking.check import check
-from nodes.attacking.prepare import prepare
-from nodes.attacking.request import load_request
-from nodes.attacking.search import attack_file, run_attack
+from nodes.cli import main as cli
+from nodes.experiment.request.check import check
+from nodes.experiment.request.prepare import prepare
+from nodes.experiment.request.request import load_request
+from nodes.experiment.request.search import attack_file, run_attack
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import ProgressDisplay
 

@@ -4,10 +4,10 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from nodes.campaign.config import load_campaign, select
-from nodes.campaign.kinds import load_kind
-from nodes.campaign.run import _refuse_two_in_one_folder
-from nodes.cli import app
+from nodes.cli.main import app
+from nodes.experiment.campaign.config import load_campaign, select
+from nodes.experiment.campaign.kinds import load_kind
+from nodes.experiment.campaign.run import _refuse_two_in_one_folder
 from nodes.runtime.errors import ConfigError
 
 ROOT = Path(__file__).parents[3]

@@ -11,12 +11,12 @@ from advnerf_core.driving.metrics import Horizon, drive_metrics
 from advnerf_core.driving.path import Line, Path
 from advnerf_core.driving.rollout import drive
 from advnerf_core.scene.gate_limits import GateLimits
-from nodes.campaign.config import load_campaign
-from nodes.campaign.gate import GateError, judge_scene
-from nodes.campaign.kinds import load_kind
-from nodes.campaign.predictions import predict_campaign, predicted
-from nodes.campaign.run import Options, run_campaign, statuses
-from nodes.cli import app
+from nodes.cli.main import app
+from nodes.experiment.campaign.config import load_campaign
+from nodes.experiment.campaign.gate import GateError, judge_scene
+from nodes.experiment.campaign.kinds import load_kind
+from nodes.experiment.campaign.predictions import predict_campaign, predicted
+from nodes.experiment.campaign.run import Options, run_campaign, statuses
 from nodes.runtime.errors import ConfigError
 
 HEAD = "seeds: [0]\nmethods: [gradient, none]\nvictims: [hardened]\n"

@@ -7,13 +7,13 @@ import shutil
 import pytest
 from typer.testing import CliRunner
 
-from nodes.campaign.config import load_campaign, select
-from nodes.campaign.kinds import load_kind
-from nodes.campaign.predictions import prediction_file
-from nodes.campaign.published import Published, publish, published_table, restore
-from nodes.campaign.run import Options, plan_cells, run_campaign, statuses
-from nodes.campaign.table import campaign_table, write_table
-from nodes.cli import app
+from nodes.cli.main import app
+from nodes.experiment.campaign.config import load_campaign, select
+from nodes.experiment.campaign.kinds import load_kind
+from nodes.experiment.campaign.predictions import prediction_file
+from nodes.experiment.campaign.published import Published, publish, published_table, restore
+from nodes.experiment.campaign.run import Options, plan_cells, run_campaign, statuses
+from nodes.experiment.campaign.table import campaign_table, write_table
 from nodes.runtime.errors import ConfigError
 
 

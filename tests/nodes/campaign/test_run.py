@@ -9,10 +9,10 @@ import time
 
 import pytest
 
-from nodes.campaign.config import load_campaign
-from nodes.campaign.run import Options, _shares, run_campaign, statuses
-from nodes.campaign.store import Store
-from nodes.campaign.worker import take_cell
+from nodes.experiment.campaign.config import load_campaign
+from nodes.experiment.campaign.run import Options, _shares, run_campaign, statuses
+from nodes.experiment.campaign.store import Store
+from nodes.experiment.campaign.worker import take_cell
 from nodes.runtime.locks import hold
 
 

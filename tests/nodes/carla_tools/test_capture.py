@@ -5,14 +5,14 @@ import json
 import numpy as np
 import pytest
 
+from advnerf_core.data.dataset import load_transforms
 from advnerf_core.geometry import transform_points
-from advnerf_core.scene.dataset import load_transforms
-from hardware.carla_scene import CarlaConfig, CarlaUnreachable
-from hardware.carla_scene.drives import Drives
-from hardware.carla_scene.errors import CarlaMapError
-from hardware.carla_scene.junction import find_drives
-from hardware.carla_scene.photos import photo_poses
-from nodes.carla_tools.capture import CaptureRequest, capture
+from hardware.worlds.carla import CarlaConfig, CarlaUnreachable
+from hardware.worlds.carla.drives import Drives
+from hardware.worlds.carla.errors import CarlaMapError
+from hardware.worlds.carla.junction import find_drives
+from hardware.worlds.carla.photos import photo_poses
+from nodes.lab.carla.capture import CaptureRequest, capture
 from nodes.runtime.errors import ConfigError
 
 REQUEST = CaptureRequest(photos=12, held_out=3, seed=4)

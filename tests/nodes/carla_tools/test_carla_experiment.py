@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import yaml
 
+from advnerf_core.data.dataset import load_transforms
 from advnerf_core.report.clips import read_clip
-from advnerf_core.scene.dataset import load_transforms
-from nodes.campaign.kinds import load_kind, settings_hash
-from nodes.intersection.run import load_experiment, run_experiment
+from nodes.experiment.campaign.kinds import load_kind, settings_hash
+from nodes.experiment.junction.run import load_experiment, run_experiment
 from nodes.runtime.errors import ConfigError
 
 TINY = {

@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from hardware.carla_scene import CarlaConfig
-from nodes.carla_tools.check import check_server
+from hardware.worlds.carla import CarlaConfig
+from nodes.lab.carla.check import check_server
 
 
 def checks_of(library, settings, pictures=None, **changes):

@@ -5,14 +5,14 @@ import pytest
 import torch
 
 from advnerf_core.driving.metrics import Horizon
-from advnerf_core.driving.policy_view import PolicyView
 from advnerf_core.fields.voxel_grid import VoxelGridObject
 from advnerf_core.geometry import make_transform
+from advnerf_core.policies.view import PolicyView
 from advnerf_core.scene.surrogate import Surrogate
-from hardware.carla_scene import CarlaConfig, CarlaScene
-from nodes.carla_tools.drive import drive_expert, turn_rate_expert
-from nodes.intersection.context import as_path
-from nodes.intersection.deployed import DressedScene, drive_deployed
+from hardware.worlds.carla import CarlaConfig, CarlaScene
+from nodes.experiment.junction.context import as_path
+from nodes.experiment.junction.deployed import DressedScene, drive_deployed
+from nodes.lab.carla.drive import drive_expert, turn_rate_expert
 
 
 @pytest.mark.parametrize("name", ["straight", "right", "left"])

@@ -8,13 +8,13 @@ from pathlib import Path
 import pytest
 
 from calibration.schema import CameraCalibration, load_calibration
-from hardware.cameras.v4l2 import V4l2Camera
-from hardware.cameras.v4l2_negotiation import Mode
-from hardware.twin.v4l2_device import VideoDevice
-from hardware.twin.v4l2_emulator import VideoPortEmulator
-from nodes.camera_sources import V4l2Source
-from nodes.doctor import cameras, graphics
-from nodes.doctor.check import ABSENT, FAILURE, OK, WARNING, Check, examine
+from hardware.cameras.sources import V4l2Source
+from hardware.cameras.v4l2.driver import V4l2Camera
+from hardware.cameras.v4l2.negotiation import Mode
+from hardware.emulators.v4l2_device import VideoDevice
+from hardware.emulators.v4l2_emulator import VideoPortEmulator
+from nodes.lab.doctor import cameras, graphics
+from nodes.lab.doctor.check import ABSENT, FAILURE, OK, WARNING, Check, examine
 
 TWIN = Path(__file__).parents[3] / "calibration" / "twin"
 

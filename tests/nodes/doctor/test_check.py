@@ -6,8 +6,8 @@ import time
 import pytest
 
 from hardware.errors import LinkLost
-from nodes.doctor import cameras, graphics
-from nodes.doctor.check import ABSENT, FAILURE, OK, WARNING, Check, Finding, examine, in_child, worst
+from nodes.lab.doctor import cameras, graphics
+from nodes.lab.doctor.check import ABSENT, FAILURE, OK, WARNING, Check, Finding, examine, in_child, worst
 
 
 def test_a_hung_check_costs_its_deadline_and_the_others_are_told_in_order():

@@ -13,16 +13,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hardware.emulators.vesc_emulator import VescEmulator
+from hardware.emulators.vesc_firmware import VescEmulatorConfig
+from hardware.emulators.vicon_emulator import ViconEmulator, ViconEmulatorConfig
 from hardware.errors import LinkLost
-from hardware.twin.config import CarConfig
-from hardware.twin.vehicle import TwinVehicle
-from hardware.twin.vesc_emulator import VescEmulator
-from hardware.twin.vesc_firmware import VescEmulatorConfig
-from hardware.twin.vicon_emulator import ViconEmulator, ViconEmulatorConfig
-from hardware.vesc_settings import TimeoutSettings
-from hardware.vicon import ViconConfig
-from nodes.doctor import mocap, motor
-from nodes.doctor.check import ABSENT, FAILURE, OK, WARNING, Check, examine
+from hardware.mocap.vicon import ViconConfig
+from hardware.motor.vesc_settings import TimeoutSettings
+from hardware.worlds.lab.config import CarConfig
+from hardware.worlds.lab.vehicle import TwinVehicle
+from nodes.lab.doctor import mocap, motor
+from nodes.lab.doctor.check import ABSENT, FAILURE, OK, WARNING, Check, examine
 
 TWIN = Path(__file__).parents[3] / "calibration" / "twin"
 GOOD = {"timeout_ms": 250.0, "timeout_brake_current_a": 20.0}

@@ -11,17 +11,17 @@ import pytest
 import typer
 import yaml
 
-from hardware.twin.config import CarConfig
-from hardware.twin.vehicle import TwinVehicle
-from hardware.twin.vesc_emulator import VescEmulator
-from hardware.twin.vesc_firmware import VescEmulatorConfig
-from hardware.twin.vicon_emulator import ViconEmulator, ViconEmulatorConfig
-from nodes import cli
-from nodes.doctor import graphics, launch, machine
-from nodes.doctor.check import ABSENT, FAILURE, OK, WARNING, examine
-from nodes.doctor.launch import checks_of, pictures_of
-from nodes.runtime.launch_file import load_launch
-from nodes.runtime.security import DRIVE, KeyFolder
+from hardware.emulators.vesc_emulator import VescEmulator
+from hardware.emulators.vesc_firmware import VescEmulatorConfig
+from hardware.emulators.vicon_emulator import ViconEmulator, ViconEmulatorConfig
+from hardware.worlds.lab.config import CarConfig
+from hardware.worlds.lab.vehicle import TwinVehicle
+from nodes.cli import main as cli
+from nodes.lab.doctor import graphics, launch, machine
+from nodes.lab.doctor.check import ABSENT, FAILURE, OK, WARNING, examine
+from nodes.lab.doctor.launch import checks_of, pictures_of
+from nodes.launching.launch_file import load_launch
+from nodes.linking.keys import DRIVE, KeyFolder
 
 ROOT = Path(__file__).parents[3]
 TWIN = ROOT / "calibration" / "twin"
@@ -147,7 +147,7 @@ def test_it_runs_where_no_large_library_is_installed():
     """As on the car; and none of them is imported into the doctor's own process where it is."""
     program = (
         "import sys\nfor name in ('torch', 'scipy', 'mujoco', 'numba', 'depthai', 'pygame', 'mitsuba', 'foxglove', 'av'): "
-        "sys.modules[name] = None\nimport nodes.cli_doctor, nodes.doctor.general, nodes.doctor.launch, nodes.doctor.probes"
+        "sys.modules[name] = None\nimport nodes.cli.doctor, nodes.lab.doctor.general, nodes.lab.doctor.launch, nodes.lab.doctor.probes"
     )
     subprocess.run([sys.executable, "-c", program], check=True, timeout=60, cwd=ROOT)
 
@@ -218,9 +218,9 @@ def test_libraries_of_this_computer_answer(tmp_path):
 
 
 def saved_policy(file, width, height):
-    from advnerf_core.driving.policy import PilotNet, save_policy
-    from advnerf_core.driving.policy_view import PolicyView
     from advnerf_core.geometry import Pinhole
+    from advnerf_core.policies.pilotnet import PilotNet, save_policy
+    from advnerf_core.policies.view import PolicyView
 
     save_policy(file, PilotNet(), PolicyView(Pinhole(width, height, 174.0, 174.0, width / 2, height / 2)), {})
     return file
@@ -233,7 +233,7 @@ def test_launch_check_says_which_policy_does_not_fit_the_camera(tmp_path, monkey
     saved_policy(file, 400, 224)
     (problem,) = launch.policy_problems(plan_of("green_screen", f"params.policy={file}"))
     assert problem.startswith("policy: trained for 400 x 224, the camera is calibrated for 336 x 188; train for this")
-    monkeypatch.setattr("nodes.runtime.launch_check.check_nodes", lambda plan: {})
+    monkeypatch.setattr("nodes.launching.launch_check.check_nodes", lambda plan: {})
     with pytest.raises(typer.Exit):
         cli._say_problems(missing)
     assert "trained for 400 x 224" in capsys.readouterr().err

@@ -4,12 +4,12 @@ from collections import namedtuple
 
 import pytest
 
-from nodes.doctor import machine, motor
-from nodes.doctor.check import ABSENT, FAILURE, OK, WARNING, Finding
-from nodes.doctor.recording import Pictures, bytes_per_s
+from nodes.lab.doctor import machine, motor
+from nodes.lab.doctor.check import ABSENT, FAILURE, OK, WARNING, Finding
+from nodes.lab.doctor.recording import Pictures, bytes_per_s
+from nodes.linking.keys import DRIVE, KeyFolder
 from nodes.runtime.bus import Bus
 from nodes.runtime.messages import header, types
-from nodes.runtime.security import DRIVE, KeyFolder
 
 
 def test_keys_are_shown_and_one_that_others_may_read_is_a_finding_with_its_cure(tmp_path):

@@ -13,8 +13,8 @@ from nodes.experiment.cells import _cell, prepare
 from nodes.experiment.finished import changed_settings, has_same_attacks, has_same_graph
 from nodes.experiment.run import load_experiment, stages_of
 from nodes.experiment.run_folder import run_to_end
+from nodes.lab.trials.trial import NotStartedError
 from nodes.runtime.errors import ConfigError
-from nodes.trial import NotStartedError
 
 LAUNCH = Path(__file__).parents[3] / "launch"
 

@@ -6,8 +6,8 @@ import pytest
 from nodes.experiment.attack import Search, searches
 from nodes.experiment.deploy import live_runs
 from nodes.experiment.run import STAGES, load_experiment, run_experiment, stages_of
+from nodes.experiment.stages import StageError
 from nodes.runtime.errors import ConfigError
-from nodes.runtime.stages import StageError
 
 ROOM = Path(__file__).parents[3] / "launch" / "room.experiment.yaml"
 

@@ -6,8 +6,8 @@ import pytest
 from rich.console import Console
 
 from nodes.experiment.run_folder import RunFolder, run_to_end
+from nodes.experiment.stages import Stage
 from nodes.runtime.errors import ConfigError
-from nodes.runtime.stages import Stage
 
 
 def run(folder, name, value=1):

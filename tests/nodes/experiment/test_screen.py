@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 import torch
 
-from advnerf_core.attack.displayed import DisplayedSensor
+from advnerf_core.attack.spaces.displayed import DisplayedSensor
 from advnerf_core.display import DisplayModel
 from advnerf_core.geometry import invert_transform, planar_pose, transform_points
 from calibration.by_construction import LAB_DATE, METHOD, write_twin_calibrations
 from calibration.display_colour import DisplayCalibration
 from calibration.schema import CalibrationError, save_calibration
-from hardware.twin.config import MonitorOpticsConfig
-from hardware.twin.lab import Lab
-from hardware.twin.world import MONITOR_PIXELS
+from hardware.worlds.lab.config import MonitorOpticsConfig
+from hardware.worlds.lab.lab import Lab
+from hardware.worlds.lab.world import MONITOR_PIXELS
 from nodes.experiment import screen
 from nodes.experiment.attack import sensor_of
 from nodes.experiment.context import CALIBRATION

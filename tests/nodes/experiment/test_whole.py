@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from advnerf_core.report.results import read_results
-from nodes.campaign.gate import predict_cell
-from nodes.campaign.kinds import load_kind
 from nodes.experiment import fidelity
+from nodes.experiment.campaign.gate import predict_cell
+from nodes.experiment.campaign.kinds import load_kind
 from nodes.experiment.cells import run_cell
 from nodes.experiment.run import load_experiment, run_experiment
 

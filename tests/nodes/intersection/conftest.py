@@ -8,19 +8,19 @@ import pytest
 import torch
 import yaml
 
-from advnerf_core.driving.policy import PilotNet, save_policy
 from advnerf_core.fields.hash_grid import HashGridConfig
 from advnerf_core.geometry import Array, Pinhole, VehicleState, planar_pose
-from advnerf_core.objects.model import save_object
+from advnerf_core.objects.voxel.model import save_object
+from advnerf_core.policies.pilotnet import PilotNet, save_policy
 from advnerf_core.scene.field import SceneField, SceneFieldConfig, save_scene
-from hardware.deployment_scene import DeploymentScene
-from hardware.twin.intersection.car import DubinsCar
-from hardware.twin.intersection.config import DubinsConfig, IntersectionConfig
+from hardware.worlds.junction.car import DubinsCar
+from hardware.worlds.junction.config import DubinsConfig, IntersectionConfig
+from hardware.worlds.world import DeploymentScene
+from nodes.experiment.junction.context import Experiment
+from nodes.experiment.junction.objects import build, object_file
+from nodes.experiment.junction.policy import HARDENED, NAIVE, victim_file
+from nodes.experiment.junction.run import load_experiment
 from nodes.experiment.learned_scene import scene_file
-from nodes.intersection.context import Experiment
-from nodes.intersection.objects import build, object_file
-from nodes.intersection.policy import HARDENED, NAIVE, victim_file
-from nodes.intersection.run import load_experiment
 
 LAUNCH = Path(__file__).parents[3] / "launch" / "intersection.experiment.yaml"
 TINY: dict[str, Any] = {

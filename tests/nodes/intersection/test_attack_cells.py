@@ -12,16 +12,16 @@ import pytest
 import torch
 
 from advnerf_core.attack.artifact import load_attack
-from advnerf_core.attack.search import SearchStateError
-from nodes.intersection import attack, report
-from nodes.intersection.attack import Cell, cells, load_theta, surrogate_part
-from nodes.intersection.cells import CellError, deployed_part, run_cell
-from nodes.intersection.context import Experiment
-from nodes.intersection.deploy import FrozenChangedError, check_frozen
-from nodes.intersection.deployed import DressedScene
-from nodes.intersection.films import film_cell
-from nodes.intersection.objects import placed_objects, surrogate_of
-from nodes.intersection.policy import NAIVE, victim_file
+from advnerf_core.attack.search.search import SearchStateError
+from nodes.experiment.junction import attack, report
+from nodes.experiment.junction.attack import Cell, cells, load_theta, surrogate_part
+from nodes.experiment.junction.cells import CellError, deployed_part, run_cell
+from nodes.experiment.junction.context import Experiment
+from nodes.experiment.junction.deploy import FrozenChangedError, check_frozen
+from nodes.experiment.junction.deployed import DressedScene
+from nodes.experiment.junction.films import film_cell
+from nodes.experiment.junction.objects import placed_objects, surrogate_of
+from nodes.experiment.junction.policy import NAIVE, victim_file
 
 GRADIENT = Cell("right", "hardened", "gradient", 0)
 

@@ -11,18 +11,18 @@ import cv2
 import numpy as np
 import pytest
 
-from advnerf_core.driving.policy import load_policy
+from advnerf_core.policies.pilotnet import load_policy
 from advnerf_core.report.clips import ClipTrack, read_clip
-from nodes.campaign.kinds import load_kind, settings_hash
-from nodes.intersection import films, mesh_cells, pose_cells, run
-from nodes.intersection.cells import CellError
-from nodes.intersection.config import RetrainConfig
-from nodes.intersection.context import Experiment
-from nodes.intersection.mesh_cells import MeshExperiment
-from nodes.intersection.policy import victim_file
-from nodes.intersection.pose_cells import PoseExperiment
-from nodes.intersection.pose_maps import PoseMapSettings, draw_maps
-from nodes.intersection.poses import PoseSettings
+from nodes.experiment.campaign.kinds import load_kind, settings_hash
+from nodes.experiment.junction import films, mesh_cells, pose_cells, run
+from nodes.experiment.junction.cells import CellError
+from nodes.experiment.junction.config import RetrainConfig
+from nodes.experiment.junction.context import Experiment
+from nodes.experiment.junction.mesh_cells import MeshExperiment
+from nodes.experiment.junction.policy import victim_file
+from nodes.experiment.junction.pose_cells import PoseExperiment
+from nodes.experiment.junction.pose_maps import PoseMapSettings, draw_maps
+from nodes.experiment.junction.poses import PoseSettings
 from nodes.runtime.errors import ConfigError
 
 PLACES = ("right", "hardened", "random", 0)

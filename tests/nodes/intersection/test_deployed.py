@@ -10,13 +10,13 @@ import torch
 from advnerf_core.driving.dynamics import Dubins
 from advnerf_core.driving.metrics import Horizon
 from advnerf_core.driving.path import Line, Path
-from advnerf_core.driving.policy_view import PolicyView
 from advnerf_core.fields.voxel_grid import VoxelGridObject
 from advnerf_core.geometry import make_transform
-from advnerf_core.objects.model import load_object
-from nodes.intersection.context import Experiment
-from nodes.intersection.deployed import DressedScene, drive_deployed
-from nodes.intersection.objects import object_file
+from advnerf_core.objects.voxel.model import load_object
+from advnerf_core.policies.view import PolicyView
+from nodes.experiment.junction.context import Experiment
+from nodes.experiment.junction.deployed import DressedScene, drive_deployed
+from nodes.experiment.junction.objects import object_file
 
 STRAIGHT = Path.from_segments((0.0, 0.0, 0.0), [Line(60.0)], closed=False)
 

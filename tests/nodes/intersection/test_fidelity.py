@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nodes.campaign.gate import predict_cell
-from nodes.campaign.kinds import load_kind
-from nodes.intersection import fidelity
-from nodes.intersection.cells import search_cell
-from nodes.intersection.context import Experiment
-from nodes.intersection.deployed import DressedScene
-from nodes.intersection.drives import deployed_drives
-from nodes.intersection.objects import placed_objects
+from nodes.experiment.campaign.gate import predict_cell
+from nodes.experiment.campaign.kinds import load_kind
+from nodes.experiment.junction import fidelity
+from nodes.experiment.junction.cells import search_cell
+from nodes.experiment.junction.context import Experiment
+from nodes.experiment.junction.deployed import DressedScene
+from nodes.experiment.junction.drives import deployed_drives
+from nodes.experiment.junction.objects import placed_objects
 
 WHICH = ("right", "hardened", "random", 0)
 

@@ -15,19 +15,19 @@ from scipy.integrate import quad
 from advnerf_core.attack.adjoint import adjoint_gradient
 from advnerf_core.driving.dynamics import Dubins
 from advnerf_core.driving.metrics import DriveMetrics, drive_metrics
-from advnerf_core.driving.policy import load_policy
 from advnerf_core.driving.rollout import drive
 from advnerf_core.geometry import Array
+from advnerf_core.policies.pilotnet import load_policy
 from advnerf_core.report.clips import read_clip
-from hardware.deployment_scene import DeploymentScene
-from nodes.intersection.attack import Cell, attack_problem, surrogate_part
-from nodes.intersection.cells import deployed_part
-from nodes.intersection.context import Experiment
-from nodes.intersection.deployed import DressedScene, SelfDriving
-from nodes.intersection.films import film_cell, filmed
-from nodes.intersection.objects import placed_objects, surrogate_of
-from nodes.intersection.policy import HARDENED, victim_file
-from nodes.intersection.run import load_experiment
+from hardware.worlds.world import DeploymentScene
+from nodes.experiment.junction.attack import Cell, attack_problem, surrogate_part
+from nodes.experiment.junction.cells import deployed_part
+from nodes.experiment.junction.context import Experiment
+from nodes.experiment.junction.deployed import DressedScene, SelfDriving
+from nodes.experiment.junction.films import film_cell, filmed
+from nodes.experiment.junction.objects import placed_objects, surrogate_of
+from nodes.experiment.junction.policy import HARDENED, victim_file
+from nodes.experiment.junction.run import load_experiment
 
 LAUNCH = Path(__file__).parents[3] / "launch" / "intersection.experiment.yaml"
 SECONDS, TICKS_S = 2.0, (0.1, 0.01)

@@ -9,13 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nodes.cli import main
+from nodes.cli.main import main
+from nodes.experiment.junction import run
+from nodes.experiment.junction.context import Experiment
+from nodes.experiment.junction.run import load_experiment, stages_of
 from nodes.experiment.run import kind_of
-from nodes.intersection import run
-from nodes.intersection.context import Experiment
-from nodes.intersection.run import load_experiment, stages_of
+from nodes.experiment.stages import run_stages
 from nodes.runtime.errors import ConfigError
-from nodes.runtime.stages import Report, run_stages
+from nodes.runtime.progress import Report
 
 LAUNCH = Path(__file__).parents[3] / "launch" / "intersection.experiment.yaml"
 

@@ -8,16 +8,16 @@ import pytest
 import torch
 
 from advnerf_core.geometry import planar_pose
-from advnerf_core.mesh.engine import MeshEngineError, engine
-from advnerf_core.mesh.glb import read_glb
-from advnerf_core.mesh.shape import ShapeLimits
+from advnerf_core.objects.mesh.engine import MeshEngineError, engine
+from advnerf_core.objects.mesh.glb import read_glb
+from advnerf_core.objects.mesh.shape import ShapeLimits
 from advnerf_core.report.clips import read_clip
-from nodes.attacking.frames import DeployedFrames
-from nodes.intersection import mesh_cells
-from nodes.intersection.cells import CellError
-from nodes.intersection.mesh_cells import MeshExperiment
-from nodes.intersection.meshes import MeshSettings, mesh_cell, mesh_objects
-from nodes.intersection.policy import victim_file
+from nodes.experiment.junction import mesh_cells
+from nodes.experiment.junction.cells import CellError
+from nodes.experiment.junction.mesh_cells import MeshExperiment
+from nodes.experiment.junction.meshes import MeshSettings, mesh_cell, mesh_objects
+from nodes.experiment.junction.policy import victim_file
+from nodes.experiment.request.frames import DeployedFrames
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from advnerf_core.attack.placement import footprint
-from advnerf_core.driving.policy import load_policy
+from advnerf_core.attack.spaces.placement import footprint
 from advnerf_core.geometry import rotation_z, yaw_of
-from hardware.twin.intersection.config import IntersectionConfig
-from nodes.intersection.context import Experiment
-from nodes.intersection.policy import HARDENED, victim_file
-from nodes.intersection.poses import PoseSettings, bounds_of, lanes_of, pose_cell, random_placements
+from advnerf_core.policies.pilotnet import load_policy
+from hardware.worlds.junction.config import IntersectionConfig
+from nodes.experiment.junction.context import Experiment
+from nodes.experiment.junction.policy import HARDENED, victim_file
+from nodes.experiment.junction.poses import PoseSettings, bounds_of, lanes_of, pose_cell, random_placements
 
 SMALL = PoseSettings(samples=1, steps=1)
 

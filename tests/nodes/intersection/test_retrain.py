@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from advnerf_core.attack.artifact import load_attack
-from advnerf_core.driving.frames import Frames, FrameStore
-from advnerf_core.driving.policy import load_policy
-from nodes.intersection import attack, retrain
-from nodes.intersection.attack import Cell
-from nodes.intersection.config import RetrainConfig
-from nodes.intersection.context import Experiment
-from nodes.intersection.policy import HARDENED, RETRAINED, victim_file
+from advnerf_core.learning.frames import Frames, FrameStore
+from advnerf_core.policies.pilotnet import load_policy
+from nodes.experiment.junction import attack, retrain
+from nodes.experiment.junction.attack import Cell
+from nodes.experiment.junction.config import RetrainConfig
+from nodes.experiment.junction.context import Experiment
+from nodes.experiment.junction.policy import HARDENED, RETRAINED, victim_file
 
 SMALL = RetrainConfig(rounds=1, pays_ratio=1e-6, stills=2, drives=1, drive_steps=2, placements=1, steps=2)
 

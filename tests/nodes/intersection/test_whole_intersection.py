@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from advnerf_core.report.clips import read_clip
-from nodes.intersection import attack, deploy, report
-from nodes.intersection.attack import cells
-from nodes.intersection.context import Experiment
+from nodes.experiment.junction import attack, deploy, report
+from nodes.experiment.junction.attack import cells
+from nodes.experiment.junction.context import Experiment
 
 
 def silent(fraction: float, text: str = "") -> None:

@@ -6,12 +6,12 @@ import pytest
 import torch
 
 from advnerf_core.driving.expert import Expert
-from advnerf_core.driving.imitation import ImitationConfig
 from advnerf_core.driving.path import Path as DrivingPath
-from advnerf_core.driving.policy import load_policy
-from nodes.policy_data.evaluate import compare, saliency
-from nodes.policy_data.frames import frames_of_log, view_for_size
-from nodes.policy_data.train import Part, train_from_recordings
+from advnerf_core.learning.imitation import ImitationConfig
+from advnerf_core.policies.pilotnet import load_policy
+from nodes.lab.policy_data.evaluate import compare, saliency
+from nodes.lab.policy_data.frames import frames_of_log, view_for_size
+from nodes.lab.policy_data.train import Part, train_from_recordings
 from nodes.runtime.errors import ConfigError
 
 EXPERT = Expert(DrivingPath.rounded_square(4.0, 1.1))

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from nodes.runtime.bag import BagWriter
+from nodes.bags.writer import BagWriter
 from nodes.runtime.messages import (
     _STORE,
     camera_info_message,

@@ -10,17 +10,17 @@ from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
-from nodes import cli
-from nodes.runtime import bag_part
-from nodes.runtime.bag import BagWriter
-from nodes.runtime.bag_read import (
+from nodes.bags import part as bag_part
+from nodes.bags.reader import (
     extract_attachments,
     read_attachment,
     read_info,
     read_messages,
     require_readable,
 )
-from nodes.runtime.bag_stamps import read_delays
+from nodes.bags.stamps import read_delays
+from nodes.bags.writer import BagWriter
+from nodes.cli import main as cli
 from nodes.runtime.errors import BagError
 from nodes.runtime.messages import (
     encode,

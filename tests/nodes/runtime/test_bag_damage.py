@@ -26,11 +26,11 @@ from benchmarks.bag_damage import (
     messages_of,
     reachable,
 )
-from nodes.cli import app
-from nodes.runtime.bag import BagWriter, SplitLimits
-from nodes.runtime.bag_read import read_attachments, read_info, read_messages
-from nodes.runtime.bag_repair import repair
-from nodes.runtime.bag_repair_parts import repair_bag
+from nodes.bags.reader import read_attachments, read_info, read_messages
+from nodes.bags.repair import repair
+from nodes.bags.repair_parts import repair_bag
+from nodes.bags.writer import BagWriter, SplitLimits
+from nodes.cli.main import app
 from nodes.runtime.errors import BagError
 from nodes.runtime.messages import encode, pose_message
 
@@ -217,7 +217,7 @@ def pose_message_of(index):
 
 def test_a_flipped_bit_in_each_pose_is_an_error_of_evaluate(tmp_path):
     """21 flips changed a total cross-track error from 8.693 to 8.232 m without a word."""
-    from nodes.evaluation import trajectory
+    from nodes.lab.trials.evaluation import trajectory
 
     write_all_topics(tmp_path / "bag", rounds=40).close()
     path = tmp_path / "bag" / "bag.mcap"
@@ -314,9 +314,7 @@ def test_a_repair_that_is_killed_leaves_the_file(step, bags, write):
 def test_a_full_disk_leaves_the_file(bags, write):
     content = bags["chunks"][:-1000]
     path = write(content)
-    code = (
-        "import sys; from nodes.runtime.bag_repair import repair; from pathlib import Path; repair(Path(sys.argv[1]))"
-    )
+    code = "import sys; from nodes.bags.repair import repair; from pathlib import Path; repair(Path(sys.argv[1]))"
 
     def limit():
         resource.setrlimit(resource.RLIMIT_FSIZE, (len(content) // 2, len(content) // 2))

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from nodes.runtime.bag_parts import bag_parts, part_name
+from nodes.bags.parts import bag_parts, part_name
 from nodes.runtime.errors import BagError
 
 

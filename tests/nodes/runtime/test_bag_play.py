@@ -11,10 +11,10 @@ import time
 import numpy as np
 import pytest
 
+from nodes.bags.keys import Keys
+from nodes.bags.play import Command, Playhead
+from nodes.bags.writer import BagWriter
 from nodes.player import PlayerConfig, PlayerNode
-from nodes.runtime.bag import BagWriter
-from nodes.runtime.bag_keys import Keys
-from nodes.runtime.bag_play import Command, Playhead
 from nodes.runtime.bus import Bus
 from nodes.runtime.clock import ManualClock
 from nodes.runtime.errors import BagError, MessageError, NodeFinished

@@ -16,16 +16,16 @@ from mcap.stream_reader import StreamReader
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
-from nodes.runtime import bag as bag_module
-from nodes.runtime.bag import BagWriter
-from nodes.runtime.bag_journal import journal_of
-from nodes.runtime.bag_read import (
+from nodes.bags import writer as bag_module
+from nodes.bags.journal import journal_of
+from nodes.bags.reader import (
     read_attachments,
     read_info,
     read_messages,
 )
-from nodes.runtime.bag_repair import repair
-from nodes.runtime.bag_stamps import read_delays
+from nodes.bags.repair import repair
+from nodes.bags.stamps import read_delays
+from nodes.bags.writer import BagWriter
 from nodes.runtime.errors import BagError
 from nodes.runtime.topics import TOPICS
 
@@ -138,7 +138,7 @@ RECORDER = """
 import sys, time
 from pathlib import Path
 sys.path.insert(0, sys.argv[2])
-from nodes.runtime.bag import BagWriter
+from nodes.bags.writer import BagWriter
 writer, pose = BagWriter(Path(sys.argv[1])), bytes(120)
 image = bytes(190_000)
 last_flush = time.monotonic()

@@ -6,8 +6,8 @@ from bag_samples import START_NS
 from rosbags.highlevel import AnyReader
 from split_samples import foreign_metadata, foreign_part
 
-from nodes.runtime.bag_merge import Source, merge_by_time
-from nodes.runtime.bag_read import extract_attachments, read_attachment, read_attachments, read_info, read_messages
+from nodes.bags.merge import Source, merge_by_time
+from nodes.bags.reader import extract_attachments, read_attachment, read_attachments, read_info, read_messages
 from nodes.runtime.errors import BagError
 
 TOPICS = ("/vicon/car", "/arm", "/policy/drive")

@@ -16,13 +16,13 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
-from nodes.runtime.bag import BagWriter, SplitLimits
-from nodes.runtime.bag_part import PartWriter
-from nodes.runtime.bag_read import read_attachments, read_info, read_messages
-from nodes.runtime.bag_repair_parts import repair_bag
+from nodes.bags.part import PartWriter
+from nodes.bags.reader import read_attachments, read_info, read_messages
+from nodes.bags.repair_parts import repair_bag
+from nodes.bags.writer import BagWriter, SplitLimits
+from nodes.replaying.nodes import Choice
+from nodes.replaying.replay import Replay, write_replay
 from nodes.runtime.errors import BagError
-from nodes.runtime.replay import Replay, write_replay
-from nodes.runtime.replay_nodes import Choice
 
 POSE, IMAGE = "geometry_msgs/msg/PoseStamped", "sensor_msgs/msg/Image"
 CORNER = Path(__file__).parents[2] / "replay" / "corner.mcap"
@@ -126,7 +126,7 @@ def test_a_part_that_cannot_be_finished_is_one_clear_error_and_everything_before
 
     writer = BagWriter(tmp_path / "drive", limits=SplitLimits(duration_s=0.5))
     with monkeypatch.context() as patch:
-        patch.setattr("nodes.runtime.bag_part.os.fsync", no_space)
+        patch.setattr("nodes.bags.part.os.fsync", no_space)
         fill(writer, 51)
         while writer._finishing:
             time.sleep(0.001)
@@ -143,7 +143,7 @@ import os, signal, sys, threading, time
 from pathlib import Path
 sys.path[:0] = sys.argv[3:5]
 from test_bag_split_write import fill
-from nodes.runtime.bag import BagWriter, SplitLimits
+from nodes.bags.writer import BagWriter, SplitLimits
 
 originals = {name: getattr(os, name) for name in ("write", "ftruncate", "rename", "replace", "unlink", "open", "fsync")}
 
@@ -217,7 +217,7 @@ STREAM = """
 import os, sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[2])
-from nodes.runtime.bag import BagWriter, SplitLimits
+from nodes.bags.writer import BagWriter, SplitLimits
 writer = BagWriter(Path(sys.argv[1]), limits=SplitLimits(size_mib=0.5))
 message, page = bytes([0, 1, 0, 0]) + bytes(200), os.sysconf("SC_PAGE_SIZE")
 for i in range(int(sys.argv[3])):

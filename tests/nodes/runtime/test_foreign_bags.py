@@ -34,13 +34,13 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from zstandard import ZstdCompressor
 
 from advnerf_core.geometry import make_transform, rotation_from_quaternion
-from nodes.evaluation import trajectory
-from nodes.runtime.bag_images import image_messages, image_topic
-from nodes.runtime.bag_read import read_attachments, read_info, read_messages
-from nodes.runtime.bag_repair import repair
-from nodes.runtime.bag_stamps import read_delays
+from nodes.bags.images import image_messages, image_topic
+from nodes.bags.message_definitions import as_our_message, parse_definition
+from nodes.bags.reader import read_attachments, read_info, read_messages
+from nodes.bags.repair import repair
+from nodes.bags.stamps import read_delays
+from nodes.lab.trials.evaluation import trajectory
 from nodes.runtime.errors import BagError, MessageError
-from nodes.runtime.message_definitions import as_our_message, parse_definition
 from nodes.runtime.messages import (
     decode,
     encode,

@@ -9,16 +9,17 @@ import psutil
 import pytest
 import yaml
 
+from nodes.launching.launch import Launch, active_launches
+from nodes.launching.launch_file import load_launch
 from nodes.recorder import RecorderConfig
 from nodes.runtime.errors import ConfigError, LaunchError
-from nodes.runtime.launch import Launch, active_launches
-from nodes.runtime.launch_file import load_launch
 
 NODE = """
     import os, signal, subprocess, sys, time
     from pydantic import BaseModel, ConfigDict
     from nodes.runtime.messages import header, types
-    from nodes.runtime.node import Node, Out, run_node_main
+    from nodes.runtime.node import Node, Out
+    from nodes.runtime.process import run_node_main
     from nodes.runtime.errors import NodeFinished
 
     class Config(BaseModel):
@@ -175,7 +176,7 @@ def test_deaf_node_and_its_own_child_are_killed_when_asked_twice(probe, tmp_path
 def test_kill_of_the_supervisor_leaves_no_process(probe, tmp_path):
     file = write(tmp_path / "a.launch.yaml", a={}, b={"config": {"then": "hang", "after_s": 0}}, c={})
     script = (
-        "import sys, time; from pathlib import Path; from nodes.runtime.launch import Launch\n"
+        "import sys, time; from pathlib import Path; from nodes.launching.launch import Launch\n"
         "launch = Launch(Path(sys.argv[1]), run_dir=Path(sys.argv[2])); launch.start()\n"
         "print(*launch.pids.values(), flush=True); time.sleep(60)"
     )

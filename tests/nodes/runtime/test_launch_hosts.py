@@ -1,7 +1,7 @@
 import pytest
 
+from nodes.launching.launch_file import load_launch
 from nodes.runtime.errors import ConfigError
-from nodes.runtime.launch_file import load_launch
 
 FILE = """
 name: pair

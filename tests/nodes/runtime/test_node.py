@@ -14,7 +14,8 @@ from nodes.runtime.errors import NodeFinished
 from nodes.runtime.loop import Schedule
 from nodes.runtime.messages import drive_message, image_message
 from nodes.runtime.messages import stamp_ns as stamp_of
-from nodes.runtime.node import Inbox, Node, Out, ReaderThread, run_node
+from nodes.runtime.node import Inbox, Node, Out, ReaderThread
+from nodes.runtime.process import run_node
 
 
 def test_schedule_stays_on_its_grid_and_skips_what_it_missed():
@@ -251,7 +252,8 @@ def test_second_node_of_a_name_ends_before_it_opens_its_device(tmp_path, capsys)
 
 NODE_SCRIPT = """
     from pydantic import BaseModel, ConfigDict
-    from nodes.runtime.node import Node, run_node_main
+    from nodes.runtime.node import Node
+    from nodes.runtime.process import run_node_main
 
     class CounterConfig(BaseModel):
         model_config = ConfigDict(extra="forbid")

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 import yaml
 
-from nodes.runtime.bag import BagWriter
-from nodes.runtime.bag_read import BagMessage, read_attachments, read_info, read_messages
+from nodes.bags.reader import BagMessage, read_attachments, read_info, read_messages
+from nodes.bags.writer import BagWriter
+from nodes.replaying.lockstep import BagClock, Lockstep
+from nodes.replaying.nodes import Choice
+from nodes.replaying.replay import Replay, write_replay
 from nodes.runtime.clock import ManualClock
 from nodes.runtime.errors import BagError, MessageError, NodeFinished
 from nodes.runtime.messages import decode, drive_message, encode, pose_message, stamp_ns, types
 from nodes.runtime.node import Node, Out
-from nodes.runtime.replay import Replay, write_replay
-from nodes.runtime.replay_lockstep import BagClock, Lockstep
-from nodes.runtime.replay_nodes import Choice
 from nodes.runtime.topics import topic as topic_row
 
 START_NS = 1_800_000_000_000_000_000

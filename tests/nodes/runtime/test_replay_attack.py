@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nodes import cli
-from nodes.runtime.bag_read import BagMessage, read_attachments, read_messages
+from nodes.bags.reader import BagMessage, read_attachments, read_messages
+from nodes.cli import main as cli
+from nodes.replaying.attack import plot_retro_attack, retro_attack
+from nodes.replaying.golden import Golden, Tolerances, compare
+from nodes.replaying.nodes import Choice
+from nodes.replaying.replay import Replay, write_replay
 from nodes.runtime.errors import BagError
 from nodes.runtime.messages import decode, drive_message, encode, pose_message, type_name
-from nodes.runtime.replay import Replay, write_replay
-from nodes.runtime.replay_attack import plot_retro_attack, retro_attack
-from nodes.runtime.replay_golden import Golden, Tolerances, compare
-from nodes.runtime.replay_nodes import Choice
 from nodes.runtime.topics import topic as topic_row
 
 START_NS = 1_800_000_000_000_000_000

@@ -9,14 +9,14 @@ import pytest
 import zmq
 
 from nodes.gateway import GatewayConfig, GatewayNode
+from nodes.linking.clock_offset import Exchange, OffsetFilter
+from nodes.linking.keys import DRIVE, WATCH, KeyFolder
+from nodes.linking.link import Link, LinkConfig, on_our_clock
 from nodes.runtime.bus import Bus
 from nodes.runtime.clock import NS_PER_S
-from nodes.runtime.clock_offset import Exchange, OffsetFilter
 from nodes.runtime.errors import SecurityError, TopicError
 from nodes.runtime.inbox import Inbox
 from nodes.runtime.messages import drive_message, encode, header, type_hash_prefix, types
-from nodes.runtime.security import DRIVE, WATCH, KeyFolder
-from nodes.runtime.security_link import Link, LinkConfig, on_our_clock
 from nodes.runtime.wire import Meta, pack_meta
 
 ACKERMANN = "ackermann_msgs/msg/AckermannDriveStamped"

@@ -3,8 +3,8 @@ import os
 import pytest
 
 from advnerf_core.files import write_atomically
+from nodes.experiment.stages import Stage, StageError, begun_with, digest_of, read_record, run_stages
 from nodes.runtime.locks import hold
-from nodes.runtime.stages import Stage, StageError, begun_with, digest_of, read_record, run_stages
 
 
 class Notes:

@@ -9,10 +9,10 @@ import time
 import numpy as np
 import pytest
 
+from nodes.launching.watching_nodes import NodeWatch, measure_delay
 from nodes.runtime.bus import Bus
 from nodes.runtime.errors import MessageError
 from nodes.runtime.messages import pose_message
-from nodes.runtime.watching_nodes import NodeWatch, measure_delay
 
 
 def test_delay_of_a_topic_is_split_at_publication(tmp_path):

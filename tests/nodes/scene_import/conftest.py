@@ -6,8 +6,8 @@ import pytest
 from advnerf_core.geometry import planar_pose
 from calibration.by_construction import twin_calibrations
 from calibration.schema import save_calibration
-from hardware.twin.config import LabConfig
-from nodes.runtime.bag import BagWriter
+from hardware.worlds.lab.config import LabConfig
+from nodes.bags.writer import BagWriter
 from nodes.runtime.messages import encode, image_message, pose_message
 
 START_NS, PERIOD_NS = 1_800_000_000_000_000_000, 100_000_000

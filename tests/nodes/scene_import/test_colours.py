@@ -4,15 +4,15 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
+from advnerf_core.data.dataset import write_transforms
 from advnerf_core.fields.hash_grid import HashGridConfig
 from advnerf_core.geometry import Pinhole, look_at
 from advnerf_core.scene.colour import IDENTITY, ColourMap
-from advnerf_core.scene.dataset import write_transforms
 from advnerf_core.scene.field import SceneField, SceneFieldConfig, load_scene, save_scene
 from advnerf_core.scene.render_field import FieldRenderer
-from nodes import cli
-from nodes.scene_import.colours import match_colours
-from nodes.scene_import.errors import ImportRecordingError
+from nodes.cli import main as cli
+from nodes.lab.importing.colours import match_colours
+from nodes.lab.importing.errors import ImportRecordingError
 
 CAMERA = Pinhole(40, 30, 30.0, 30.0, 20.0, 15.0)
 TRUE = ColourMap(((0.85, 0.1, 0.0), (0.05, 0.9, 0.0), (0.0, 0.1, 0.7)), (0.03, 0.0, 0.05), 1.2)

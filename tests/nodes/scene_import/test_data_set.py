@@ -5,17 +5,17 @@ import sys
 import numpy as np
 import pytest
 
+from advnerf_core.data.dataset import load_transforms
+from advnerf_core.data.lens import Lens
+from advnerf_core.data.similarity import Similarity, align_poses, extent
 from advnerf_core.geometry import Pinhole, look_at, make_transform, rotation_x, rotation_z
-from advnerf_core.scene.dataset import load_transforms
-from advnerf_core.scene.lens import Lens
-from advnerf_core.scene.similarity import Similarity, align_poses, extent
 from benchmarks.lab_recordings import lab_with_phone, photograph, record_drive
 from calibration.structure_from_motion import Model, Registered, SfmConfig
-from hardware.twin.lab import Lab
-from hardware.twin.phone import video_poses
-from nodes.scene_import.data_set import from_media, upright
-from nodes.scene_import.errors import ImportRecordingError
-from nodes.scene_import.media import MediaConfig
+from hardware.worlds.lab.lab import Lab
+from hardware.worlds.lab.phone import video_poses
+from nodes.lab.importing.data_set import from_media, upright
+from nodes.lab.importing.errors import ImportRecordingError
+from nodes.lab.importing.media import MediaConfig
 
 
 def walk(count=40):

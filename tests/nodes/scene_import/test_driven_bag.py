@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from advnerf_core.data.dataset import load_transforms
 from advnerf_core.geometry import camera_mount, planar_pose
-from advnerf_core.scene.dataset import load_transforms
-from hardware.twin.config import LabConfig
-from nodes import cli
-from nodes.scene_import.driven_bag import BagConfig, choose_by_motion, take_frames
-from nodes.scene_import.errors import ImportRecordingError
+from hardware.worlds.lab.config import LabConfig
+from nodes.cli import main as cli
+from nodes.lab.importing.driven_bag import BagConfig, choose_by_motion, take_frames
+from nodes.lab.importing.errors import ImportRecordingError
 
 from .conftest import START_NS, state_at
 

@@ -2,10 +2,10 @@ import cv2
 import numpy as np
 import pytest
 
-from advnerf_core.scene.dataset import DatasetError
-from advnerf_core.scene.image_files import read_image
-from nodes.scene_import.errors import ImportRecordingError
-from nodes.scene_import.media import MediaConfig, gather, photographs_in
+from advnerf_core.data.dataset import DatasetError
+from advnerf_core.data.image_files import read_image
+from nodes.lab.importing.errors import ImportRecordingError
+from nodes.lab.importing.media import MediaConfig, gather, photographs_in
 
 RNG = np.random.default_rng(0)
 

@@ -8,14 +8,14 @@ import cv2
 import psutil
 import pytest
 
+from advnerf_core.data.dataset import load_transforms
+from advnerf_core.data.lens import Lens
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.geometry import Pinhole
-from advnerf_core.scene.dataset import load_transforms
-from advnerf_core.scene.lens import Lens
 from benchmarks.painted_corner import poses_of, write_photographs
-from nodes.runtime.bag import BagWriter
-from nodes.scene_import.errors import ImportRecordingError
-from nodes.scene_import.staging import build_beside, work_folder
+from nodes.bags.writer import BagWriter
+from nodes.lab.importing.errors import ImportRecordingError
+from nodes.lab.importing.staging import build_beside, work_folder
 
 CAMERA = Pinhole(320, 240, 290.0, 290.0, 160.0, 120.0)
 
@@ -166,7 +166,7 @@ def test_a_stopped_import_ends_in_one_line_and_goes_on(tmp_path, number, code):
 def test_a_photograph_that_is_turned_upright_keeps_its_exif_data(tmp_path):
     from PIL import Image
 
-    from nodes.scene_import.media import MediaConfig, gather
+    from nodes.lab.importing.media import MediaConfig, gather
 
     image = Image.new("RGB", (64, 48), (200, 40, 40))
     exif = Image.Exif()

@@ -2,7 +2,7 @@
 
 import pytest
 
-from hardware.twin.intersection.scene import Intersection
+from hardware.worlds.junction.scene import Intersection
 
 
 @pytest.fixture(scope="session")

@@ -5,8 +5,8 @@ import math
 import pytest
 from scipy.integrate import solve_ivp
 
-from hardware.twin.intersection.car import DubinsCar
-from hardware.twin.intersection.config import DubinsConfig
+from hardware.worlds.junction.car import DubinsCar
+from hardware.worlds.junction.config import DubinsConfig
 
 
 def anywhere(x_m, y_m, yaw_rad):

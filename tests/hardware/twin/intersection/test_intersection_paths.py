@@ -8,16 +8,16 @@ import pytest
 from pydantic import ValidationError
 
 from advnerf_core.driving.path import Arc, Line, Path
-from advnerf_core.objects.generators import hydrant, small_car
-from hardware.twin.intersection.config import (
+from advnerf_core.objects.voxel.generators import hydrant, small_car
+from hardware.worlds.junction.config import (
     OBJECT_SIZES_M,
     DubinsConfig,
     IntersectionConfig,
     PlacedObject,
     RoadConfig,
 )
-from hardware.twin.intersection.ground import kerb_lines, markings
-from hardware.twin.intersection.paths import EXITS
+from hardware.worlds.junction.ground import kerb_lines, markings
+from hardware.worlds.junction.paths import EXITS
 
 CONFIG = IntersectionConfig()
 PATHS = CONFIG.paths()

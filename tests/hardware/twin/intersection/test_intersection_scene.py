@@ -5,18 +5,18 @@ import math
 import numpy as np
 import pytest
 
-from advnerf_core.driving.policy_view import PolicyView
 from advnerf_core.geometry import invert_transform, planar_pose, transform_points
-from advnerf_core.objects.generators import GENERATORS
-from advnerf_core.objects.rasterise import draw_mesh
-from hardware.deployment_scene import DeploymentScene
-from hardware.twin.intersection import pictures
-from hardware.twin.intersection.car import DubinsCar
-from hardware.twin.intersection.config import DubinsConfig, RoadConfig
-from hardware.twin.intersection.ground import PAINT_M
-from hardware.twin.intersection.photos import DRIVEN_M, photo_poses
-from hardware.twin.intersection.scene import Intersection
-from hardware.twin.intersection.town import HOUSES, TREES
+from advnerf_core.objects.voxel.generators import GENERATORS
+from advnerf_core.objects.voxel.rasterise import draw_mesh
+from advnerf_core.policies.view import PolicyView
+from hardware.worlds.junction import pictures
+from hardware.worlds.junction.car import DubinsCar
+from hardware.worlds.junction.config import DubinsConfig, RoadConfig
+from hardware.worlds.junction.ground import PAINT_M
+from hardware.worlds.junction.photos import DRIVEN_M, photo_poses
+from hardware.worlds.junction.scene import Intersection
+from hardware.worlds.junction.town import HOUSES, TREES
+from hardware.worlds.world import DeploymentScene
 
 APPROACH = (-24.0, -1.75, 0.0)
 FROM_SOUTH = (1.75, -24.0, 0.5 * math.pi)

@@ -1,0 +1,279 @@
+"""Pose attacks: where objects stand, alone or together with their colours, searched through the same adjoint.
+
+The total cross-track error is rough over poses: a gradient step from one pose ends in the next dent. So several poses are drawn within
+the bounds, each is refined by a few gradient steps, and the best of all evaluations is kept (Abeysirigoonawardena et al. 2023: 5 poses,
+10 steps, best of 50). Random poses, and colours, at as many evaluations are the baseline. Both drive past objects with their true edges, as a
+deployment shows them; the gradient is that of the same frames, from the same states, with soft edges (`PlacedSensor`).
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from advnerf_core.attack.adjoint import (
+    AdjointResult,
+    AttackProblem,
+    BlackBoxError,
+    RenderCache,
+    Totals,
+    evaluate,
+    gradient_pass,
+    roll_out,
+)
+from advnerf_core.attack.search.search import (
+    OnEvaluation,
+    SearchDivergedError,
+    SearchResult,
+    SearchState,
+    begin,
+    search_fingerprint,
+    without_gradient,
+)
+from advnerf_core.attack.spaces.placed_sensor import PlacedSensor
+from advnerf_core.attack.spaces.placement import KeepOut, PoseBounds, PoseBoundsError, PoseSpace, placed
+
+__all__ = [
+    "KeepOut", "MultiStart", "PlacedSensor", "PoseBounds", "PoseBoundsError", "PoseSpace", "judge", "multi_start", "placed", "placed_problem",
+    "random_poses",
+]  # fmt: skip
+
+
+@dataclass(frozen=True)
+class MultiStart:
+    """The budget of a multi-start search; it evaluates ``samples * steps`` drives.
+
+    Attributes:
+        samples: Poses that are drawn.
+        steps: Evaluations of each, the drawn one included.
+        pose_rate: Adam's step along a coordinate of the unit box: 0.1 is a twentieth of the bounds.
+        colour_rate: Adam's step of the colours before squashing.
+    """
+
+    samples: int = 5
+    steps: int = 10
+    pose_rate: float = 0.1
+    colour_rate: float = 0.1
+
+    def __post_init__(self) -> None:
+        """Refuse an empty budget."""
+        if self.samples < 1 or self.steps < 1 or not (self.pose_rate > 0.0 and self.colour_rate > 0.0):
+            raise ValueError(f"expected samples and steps >= 1 and rates > 0, got {self}")
+
+    @property
+    def evaluations(self) -> int:
+        """Closed-loop evaluations in all."""
+        return self.samples * self.steps
+
+
+def multi_start(
+    problem: AttackProblem,
+    budget: MultiStart | None = None,
+    seed: int = 0,
+    state_path: Path | None = None,
+    on_evaluation: OnEvaluation | None = None,
+    settings_hash: str = "",
+) -> SearchResult:
+    """Draw poses, refine each by projected gradient steps, keep the best evaluation of all.
+
+    Args:
+        problem: What is attacked; its sensor must be a `PlacedSensor`.
+        budget: Samples, steps and rates.
+        seed: Of the poses and of the colours' starting noise.
+        state_path: State file, written after every evaluation; if it exists, the search goes on from it.
+        on_evaluation: Called after every evaluation.
+        settings_hash: Hash of scene, policy and configuration; a state file of another one is refused.
+
+    Raises:
+        PoseBoundsError: The bounds leave no place beside the lane.
+        BlackBoxError: The policy has no gradient.
+        SearchDivergedError: A loss or gradient is not finite.
+        SearchStateError: The state file cannot be used.
+    """
+    budget = budget or MultiStart()
+    sensor = _sensor(problem)
+    fingerprint = _fingerprint(problem, "multi-start", seed=seed, steps=budget.steps, hash=settings_hash,
+                               rates=[budget.pose_rate, budget.colour_rate])  # fmt: skip
+    generator = torch.Generator().manual_seed(seed)
+    state = begin(state_path, fingerprint, lambda: {"generator": generator.get_state()})
+    generator.set_state(state.tensors["generator"])
+    climb = _Climb.resumed(sensor, budget, state.tensors)
+    while len(state.history) < budget.evaluations:
+        began, number = time.perf_counter(), len(state.history)
+        if number % budget.steps == 0:
+            climb = _Climb.fresh(sensor, budget, generator)
+        theta = climb.theta
+        result = _gradient(problem.at_draw(number), theta)
+        if not (math.isfinite(result.loss) and bool(torch.isfinite(result.gradient).all())):
+            raise SearchDivergedError(
+                f"expected a finite loss and gradient at evaluation {number}, got loss {result.loss}; "
+                "check the policy and the scene for NaN"
+            )
+        climb.step(result.gradient)
+        evaluation = state.record(theta, result.loss, result.totals, time.perf_counter() - began)
+        state.tensors = {"generator": generator.get_state(), **climb.tensors()}
+        _keep(state, state_path, fingerprint)
+        if on_evaluation is not None:
+            on_evaluation(evaluation)
+    return state.result()
+
+
+def random_poses(
+    problem: AttackProblem,
+    evaluations: int = 50,
+    sigma: float = 5.0,
+    seed: int = 0,
+    state_path: Path | None = None,
+    on_evaluation: OnEvaluation | None = None,
+    settings_hash: str = "",
+) -> SearchResult:
+    """The baseline: poses drawn evenly from what is allowed and, if colours are free, these from ``N(0, sigma^2)``; the best is kept.
+
+    Args:
+        problem: What is attacked; its sensor must be a `PlacedSensor`.
+        evaluations: Drives in all, those of a resumed state included; as many as a multi-start's, for a fair comparison.
+        sigma: Spread of the colours before squashing.
+        seed: Of the draws.
+        state_path: State file, written after every evaluation; if it exists, the search goes on from it.
+        on_evaluation: Called after every evaluation.
+        settings_hash: Hash of scene, policy and configuration; a state file of another one is refused.
+
+    Raises:
+        PoseBoundsError: The bounds leave no place beside the lane.
+        SearchDivergedError: A loss is not finite.
+        SearchStateError: The state file cannot be used.
+    """
+    if evaluations < 1:
+        raise ValueError(f"expected at least one evaluation, got {evaluations}")
+    sensor = _sensor(problem)
+    fingerprint = _fingerprint(problem, "random poses", seed=seed, sigma=sigma, hash=settings_hash)
+    generator = torch.Generator().manual_seed(seed)
+    state = begin(state_path, fingerprint, lambda: {"generator": generator.get_state()})
+    generator.set_state(state.tensors["generator"])
+    while len(state.history) < evaluations:
+        began = time.perf_counter()
+        unit = sensor.space.draw(generator)
+        colours = torch.zeros(0, dtype=torch.float64)
+        if sensor.free_colours:
+            colours = sigma * torch.randn(sensor.fixed_colours.shape, generator=generator, dtype=torch.float64)
+        theta = sensor.join(unit, colours)
+        sharp, shown = placed_problem(problem, theta)
+        loss_m, totals = without_gradient(sharp, shown, len(state.history))
+        evaluation = state.record(theta, loss_m, totals, time.perf_counter() - began)
+        state.tensors = {"generator": generator.get_state()}
+        _keep(state, state_path, fingerprint)
+        if on_evaluation is not None:
+            on_evaluation(evaluation)
+    return state.result()
+
+
+def placed_problem(problem: AttackProblem, theta: Tensor, opaque: bool | None = None) -> tuple[AttackProblem, Tensor]:
+    """The problem with the objects at the places of ``theta``, with true edges, and its theta: the colours.
+
+    Args:
+        problem: With a `PlacedSensor`.
+        theta: Placements and colours.
+        opaque: True composes as a deployment does that cannot blend.
+    """
+    surrogate, colours = _sensor(problem).sharp(theta, opaque)
+    return replace(problem, sensor=surrogate), colours
+
+
+def judge(problem: AttackProblem, theta: Tensor, opaque: bool | None = None) -> Totals:
+    """Totals of what a search found, without disturbances: those of its best evaluation where nothing is disturbed."""
+    return evaluate(*placed_problem(problem.undisturbed(), theta, opaque))[1]
+
+
+def _gradient(problem: AttackProblem, theta: Tensor) -> AdjointResult:
+    """Loss of a drive past the true edges, and the gradient of its frames with soft ones."""
+    if not problem.differentiable:
+        raise BlackBoxError(
+            "expected a policy with a gradient, got one that declares differentiable = False; draw random poses"
+        )
+    sharp, colours = placed_problem(problem, theta)
+    rollout, memories = roll_out(sharp, colours)
+    return gradient_pass(problem, theta, rollout, RenderCache(0), memories)
+
+
+class _Climb:
+    """One drawn pose on its way: coordinates and colours with their Adam, which has no other state."""
+
+    def __init__(self, sensor: PlacedSensor, budget: MultiStart, unit: Tensor, colours: Tensor) -> None:
+        self._sensor = sensor
+        self._parts = {"unit": unit.clone().requires_grad_(), "colours": colours.clone().requires_grad_()}
+        rates = {"unit": budget.pose_rate, "colours": budget.colour_rate}
+        self._adam = torch.optim.Adam([{"params": [part], "lr": rates[name]} for name, part in self._parts.items()])
+
+    @classmethod
+    def fresh(cls, sensor: PlacedSensor, budget: MultiStart, generator: torch.Generator) -> _Climb:
+        """A pose drawn at random, with plain colours."""
+        theta = sensor.initial_theta(generator)
+        return cls(sensor, budget, sensor.unit(theta), theta[sensor.pose_count :])
+
+    @classmethod
+    def resumed(cls, sensor: PlacedSensor, budget: MultiStart, tensors: dict[str, Tensor]) -> _Climb:
+        """Where ``tensors`` left it; of no meaning if they hold none."""
+        if "unit" not in tensors:
+            return cls(sensor, budget, torch.zeros(0, 4), torch.zeros(0))
+        climb = cls(sensor, budget, tensors["unit"], tensors["colours"])
+        for name, part in climb._parts.items():
+            moments = {
+                key.partition(".")[2]: value.clone() for key, value in tensors.items() if key.startswith(name + ".")
+            }
+            if moments:
+                climb._adam.state[part] = moments
+        return climb
+
+    @property
+    def theta(self) -> Tensor:
+        """Where it is."""
+        return self._sensor.join(self._parts["unit"].detach(), self._parts["colours"].detach())
+
+    def step(self, gradient: Tensor) -> None:
+        """One step downhill; the pose stays within what is allowed."""
+        unit, before = self._parts["unit"], self._parts["unit"].detach().clone()
+        unit.grad = self._sensor.unit(gradient)
+        self._parts["colours"].grad = gradient[self._sensor.pose_count :]
+        self._adam.step()
+        with torch.no_grad():
+            unit.copy_(self._sensor.space.project(unit.detach(), before))
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Everything it needs to go on."""
+        out: dict[str, Tensor] = {}
+        for name, part in self._parts.items():
+            out[name] = part.detach().clone()
+            moments: dict[str, Any] = self._adam.state.get(part, {})
+            out |= {f"{name}.{key}": value.clone() for key, value in moments.items()}
+        return out
+
+
+def _sensor(problem: AttackProblem) -> PlacedSensor:
+    if not isinstance(problem.sensor, PlacedSensor):
+        raise TypeError(f"expected a problem with a PlacedSensor, got one with a {type(problem.sensor).__name__}")
+    if problem.regulariser is not None:
+        raise ValueError("expected no regulariser: those of colours do not know placements")
+    return problem.sensor
+
+
+def _fingerprint(problem: AttackProblem, method: str, **settings: Any) -> str:
+    """Hash of all that a pose search depends on, except its length."""
+    sensor = _sensor(problem)
+    keep_out = sensor.space.keep_out
+    lane = None if keep_out is None else [keep_out.clearance_m, *(path.to_dict() for path in keep_out.paths)]
+    limits: Iterable[Tensor] = (sensor.space.middle, sensor.space.half)
+    return search_fingerprint(
+        problem, sensor.theta_shape, method=method, lane=lane, limits=[part.tolist() for part in limits], **settings
+    )
+
+
+def _keep(state: SearchState, path: Path | None, fingerprint: str) -> None:
+    if path is not None:
+        state.save(path, fingerprint)

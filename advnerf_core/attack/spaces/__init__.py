@@ -1,0 +1,1 @@
+"""What is searched: colours of placed objects, the picture on a display."""

@@ -1,0 +1,1 @@
+"""Posed images in and out: data sets, transforms.json, lenses, videos."""

@@ -1,0 +1,150 @@
+"""Which frames of a video to keep: sharp ones, and a new one whenever the view has moved on.
+
+Sharpness is the variance of the Laplacian (Pech-Pacheco et al. 2000) of a small grey copy. Movement is the median displacement of
+corners that optical flow (Lucas and Kanade, with pyramids) follows from the last kept frame; when too few can be followed, the view is
+another one. Among the frames since the movement came near its limit the sharpest is kept, so that a shake costs no place.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from advnerf_core.data.image_files import Grey, Rgb
+
+_WORK_WIDTH = 480
+_CORNERS, _LEAST_CORNERS = 300, 12
+_LOST_SHARE, _RETURN_PX = 0.35, 1.0
+
+
+@dataclass(frozen=True)
+class KeyframeConfig:
+    """How frames are chosen.
+
+    Attributes:
+        movement: Displacement of the picture after which a new frame is due, as a share of its width.
+        window: Share of that movement over which the sharpest frame is looked for.
+        blur_limit: A frame less sharp than this share of the usual sharpness is passed over until `max_wait_s` is over.
+        max_wait_s: At the latest after so long another frame is kept, if the view has moved at all [s].
+    """
+
+    movement: float = 0.06
+    window: float = 0.4
+    blur_limit: float = 0.35
+    max_wait_s: float = 2.0
+
+    def __post_init__(self) -> None:
+        if not (
+            0.0 < self.movement < 1.0
+            and 0.0 < self.window < 1.0
+            and 0.0 <= self.blur_limit < 1.0
+            and self.max_wait_s > 0.0
+        ):
+            raise ValueError(f"expected shares between 0 and 1 and a positive time, got {self}")
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A frame of a video.
+
+    Attributes:
+        number: Place in the video, from 0.
+        time_s: Time in the video [s].
+        rgb: ``[H, W, 3]`` uint8.
+        sharpness: Variance of the Laplacian.
+    """
+
+    number: int
+    time_s: float
+    rgb: Rgb
+    sharpness: float
+
+
+class KeyframeSelector:
+    """Takes frames one after another and says which to keep; holds at most two of them.
+
+    Args:
+        config: How to choose.
+    """
+
+    def __init__(self, config: KeyframeConfig | None = None) -> None:
+        self._config = config or KeyframeConfig()
+        self._kept: Grey | None = None
+        self._kept_s = 0.0
+        self._corners: NDArray[np.float32] = np.zeros((0, 1, 2), np.float32)
+        self._best: Candidate | None = None
+        self._usual = 0.0
+
+    def offer(self, number: int, time_s: float, rgb: Rgb) -> Candidate | None:
+        """The next frame ``[H, W, 3]`` uint8; the one to keep, if one has been settled on."""
+        grey = work_image(rgb)
+        new = Candidate(number, time_s, rgb, sharpness(grey))
+        self._usual = new.sharpness if self._usual == 0.0 else 0.95 * self._usual + 0.05 * new.sharpness
+        if self._kept is None:
+            # What comes close behind and is sharper may still take the first one's place.
+            self._best = new
+            self._remember(new)
+            return None
+        config, waited = self._config, time_s - self._kept_s
+        if new.sharpness < config.blur_limit * self._usual and waited < config.max_wait_s:
+            return None  # and corners cannot be followed into it either
+        moved = self.movement(grey)
+        late = waited >= config.max_wait_s and moved >= 0.1 * config.movement
+        if moved >= (1.0 - config.window) * config.movement or late:
+            self._best = _sharper(self._best, new)
+        return self._keep() if moved >= config.movement or late else None
+
+    def last(self) -> Candidate | None:
+        """At the end of the video: the best frame that has moved on and was not kept, if there is one."""
+        return None if self._best is None else self._keep()
+
+    def movement(self, grey: Grey) -> float:
+        """Median displacement since the last kept frame, as a share of the width; 1 when it cannot be followed."""
+        if self._kept is None or len(self._corners) < _LEAST_CORNERS:
+            # Nothing to follow on a bare wall: how different the pictures are stands in for it.
+            return 0.0 if self._kept is None else float(np.asarray(cv2.absdiff(self._kept, grey)).mean() / 255.0)
+        found, status = _follow(self._kept, grey, self._corners)
+        back, status_back = _follow(grey, self._kept, found)
+        # Flow finds something in any picture; what it finds is the same corner only if the way back ends where it began.
+        same = status & status_back & (np.linalg.norm(back - self._corners, axis=-1).reshape(-1) < _RETURN_PX)
+        if same.mean() < _LOST_SHARE:
+            return 1.0
+        shift = np.linalg.norm((found - self._corners).reshape(-1, 2)[same], axis=1)
+        return float(np.median(shift) / grey.shape[1])
+
+    def _keep(self) -> Candidate:
+        assert self._best is not None
+        kept, self._best = self._best, None
+        self._remember(kept)
+        return kept
+
+    def _remember(self, frame: Candidate) -> None:
+        grey = work_image(frame.rgb)
+        corners = cv2.goodFeaturesToTrack(grey, _CORNERS, 0.01, 6)
+        self._corners = np.zeros((0, 1, 2), np.float32) if corners is None else np.asarray(corners, np.float32)
+        self._kept, self._kept_s = grey, frame.time_s
+
+
+def work_image(rgb: Rgb) -> Grey:
+    """Small grey copy ``[h, w]`` on which frames are judged."""
+    grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+    width = min(_WORK_WIDTH, grey.shape[1])
+    size = (width, max(1, round(grey.shape[0] * width / grey.shape[1])))
+    return np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def _follow(first: Grey, second: Grey, points: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    found, status, _ = cv2.calcOpticalFlowPyrLK(first, second, points, None, winSize=(21, 21), maxLevel=4)  # type: ignore[call-overload]
+    return np.asarray(found, np.float32), np.asarray(status.reshape(-1) == 1)
+
+
+def sharpness(grey: Grey) -> float:
+    """Variance of the Laplacian of an image ``[h, w]``."""
+    return float(cv2.Laplacian(grey, cv2.CV_32F).var())
+
+
+def _sharper(best: Candidate | None, new: Candidate) -> Candidate:
+    return new if best is None or new.sharpness > best.sharpness else best

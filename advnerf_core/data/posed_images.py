@@ -1,0 +1,50 @@
+"""A folder of posed images, filled picture by picture from whatever takes them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from advnerf_core.data.image_files import write_image
+from advnerf_core.data.transforms_write import write_transforms
+from advnerf_core.geometry import Array, Pinhole
+
+
+def write_posed_images(
+    folder: Path,
+    poses: Sequence[Array],
+    pinhole: Pinhole,
+    see: Callable[[int], NDArray[np.uint8]],
+    suffix: Literal["jpg", "png"],
+    *,
+    keep: bool = False,
+    told: Callable[[int], None] = lambda count: None,
+) -> int:
+    """Write ``images/00000.<suffix>`` and so on and, when all are there, their ``transforms.json``; no poses, no files.
+
+    Args:
+        folder: Where to.
+        poses: ``T_world_from_camera [4, 4]`` of each picture, OpenCV axes.
+        pinhole: Intrinsics of all.
+        see: Takes the picture ``[h, w, 3]`` of an index.
+        suffix: ``png`` where pixels are compared, ``jpg`` where a scene is learned from them.
+        keep: Do not take pictures that are there: for a capture that goes on. The caller sees to it that they belong to these poses.
+        told: Called after each picture with how many are there.
+
+    Returns:
+        How many pictures were taken now.
+    """
+    names = [f"images/{index:05d}.{suffix}" for index in range(len(poses))]
+    taken = 0
+    for index, name in enumerate(names):
+        if not (keep and (folder / name).exists()):
+            write_image(folder / name, see(index))
+            taken += 1
+        told(index + 1)
+    if names:
+        write_transforms(folder / "transforms.json", names, np.stack(poses), pinhole)
+    return taken

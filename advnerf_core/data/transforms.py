@@ -1,0 +1,247 @@
+"""``transforms.json`` as nerfstudio, Instant-NGP and blender write it, turned into our conventions at the door.
+
+Files have OpenGL camera axes (x right, y up, z backward); everything after this module has OpenCV axes. Whatever is wrong with
+a file is one `DatasetError` that names the file, the frame and the field.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from advnerf_core.data.errors import DatasetError
+from advnerf_core.data.image_files import SUFFIXES, image_size
+from advnerf_core.data.lens import Lens
+from advnerf_core.data.views import HELD_OUT_SPLITS, NGP_OFFSET, NGP_SCALE, TRAIN, PosedImage, PosedImages
+from advnerf_core.geometry import OPENGL_FROM_OPENCV, Array, Pinhole
+
+_LENSES = {"OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"}
+_FISHEYES = {"OPENCV_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
+_SPLITS = (TRAIN, *HELD_OUT_SPLITS)
+_RIGID_TOLERANCE = 0.01
+# Single precision resolves a centimetre there; what is farther has a map's origin, not a scene's.
+_FARTHEST = 1e5
+_Values = dict[str, Any]
+
+
+class _FieldError(ValueError):
+    """A field of one frame is wrong; says which and how."""
+
+
+def load_transforms(path: str | Path, require_all: bool = False) -> PosedImages:
+    """Read a ``transforms.json``, or a folder with one or with blender's ``transforms_train.json`` and its like.
+
+    Args:
+        path: The file, or the folder that holds it.
+        require_all: Whether a listed image that is missing is an error; otherwise it is left out and listed in ``missing``.
+
+    Raises:
+        DatasetError: Unreadable file, wrong content, or images missing.
+    """
+    files = _files(Path(path))
+    sets = [_read_set(file, split, require_all) for file, split in files]
+    first = sets[0]
+    frames = tuple(frame for each in sets for frame in each.frames)
+    missing = tuple(name for each in sets for name in each.missing)
+    _refuse_far_away(files[0][0], frames)
+    return PosedImages(frames, missing, first.aabb_scale, first.scale, first.offset, first.file)
+
+
+def _files(path: Path) -> list[tuple[Path, str | None]]:
+    if not path.is_dir():
+        return [(path, next((s for s in _SPLITS if path.stem == f"transforms_{s}"), None))]
+    if not (path / "transforms.json").exists():
+        split_files = [(path / f"transforms_{split}.json", split) for split in _SPLITS]
+        if present := [(file, split) for file, split in split_files if file.exists()]:
+            return list(present)
+    return [(path / "transforms.json", None)]
+
+
+def _read_set(path: Path, split: str | None, require_all: bool) -> PosedImages:
+    content = _read_json(path)
+    listed = content.get("frames")
+    if not isinstance(listed, list) or not listed:
+        raise DatasetError(f"expected a list 'frames' in {path}, got {type(listed).__name__} without entries")
+    split_of, frames, missing = _listed_splits(path, content), [], []
+    for number, entry in enumerate(listed):
+        try:
+            name = _name_of(entry)
+            image = _image_path(path.parent, name)
+            if image is None:
+                missing.append(path.parent / name)
+                continue
+            frames.append(_frame(path.parent, image, {**content, **entry}, split or split_of.get(_normal(name))))
+        except ValueError as error:
+            label = f" ({entry['file_path']})" if isinstance(entry, dict) and "file_path" in entry else ""
+            raise DatasetError(f"{path}: frame {number}{label}: {error}") from error
+    if missing and (require_all or not frames):
+        raise DatasetError(
+            f"expected {len(listed)} images listed in {path}, {len(missing)} are missing, the first is {missing[0]}; "
+            "put the images there, or take the entries out of the file"
+        )
+    scale, offset, aabb = _ngp_box(path, content)
+    return PosedImages(tuple(frames), tuple(missing), aabb, scale, offset, path)
+
+
+def _read_json(path: Path) -> _Values:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise DatasetError(f"expected a transforms.json at {path}, got: {error.strerror}") from error
+    except ValueError as error:
+        raise DatasetError(f"expected JSON in {path}, got: {error}") from error
+    if not isinstance(content, dict):
+        raise DatasetError(f"expected a JSON object in {path}, got {type(content).__name__}")
+    return content
+
+
+def _listed_splits(path: Path, content: _Values) -> dict[str, str]:
+    """nerfstudio's lists of file names by split."""
+    splits: dict[str, str] = {}
+    for split in _SPLITS:
+        names = content.get(f"{split}_filenames", [])
+        if not isinstance(names, list):
+            raise DatasetError(f"{path}: {split}_filenames: expected a list of files, got {type(names).__name__}")
+        splits.update({_normal(str(name)): split for name in names})
+    return splits
+
+
+def _ngp_box(path: Path, content: _Values) -> tuple[float, tuple[float, float, float], float | None]:
+    try:
+        scale = _number(content, "scale", NGP_SCALE, positive=True)
+        aabb = _number(content, "aabb_scale", 1.0, positive=True) if content.get("aabb_scale") is not None else None
+        raw = content.get("offset", NGP_OFFSET)
+        x, y, z = (float(v) for v in (raw if isinstance(raw, list | tuple) else [raw] * 3))
+        if not np.isfinite([x, y, z]).all():
+            raise _FieldError(f"offset: expected three finite numbers, got {raw}")
+    except (ValueError, TypeError) as error:
+        raise DatasetError(f"{path}: {error}") from error
+    return scale, (x, y, z), aabb
+
+
+def _name_of(entry: Any) -> str:
+    if not isinstance(entry, dict):
+        raise _FieldError(f"expected an object with file_path and transform_matrix, got {type(entry).__name__}")
+    name = entry.get("file_path")
+    if not isinstance(name, str) or not name:
+        raise _FieldError(f"file_path: expected the name of an image file, got {name!r}")
+    return name.replace("\\", "/")  # written on Windows
+
+
+def _normal(name: str) -> str:
+    return Path(name.replace("\\", "/")).as_posix()
+
+
+def _image_path(folder: Path, name: str) -> Path | None:
+    # Blender's files leave the suffix out.
+    candidates: Iterable[Path] = (folder / name, *(folder / f"{name}{suffix}" for suffix in SUFFIXES))
+    return next((c for c in candidates if c.is_file()), None)
+
+
+def _frame(folder: Path, image: Path, values: _Values, split: str | None) -> PosedImage:
+    mask = values.get("mask_path")
+    mask_file = None if not mask else folder / str(mask).replace("\\", "/")
+    if mask_file is not None and not mask_file.is_file():
+        raise _FieldError(
+            f"mask_path: expected a mask at {mask_file}, it is missing; put it there or take the entry out"
+        )
+    return PosedImage(
+        image, _pinhole(image, values), _lens(values), _pose(values), mask_file, str(values.get("camera_id", "")), split
+    )
+
+
+def _pose(values: _Values) -> Array:
+    if "transform_matrix" not in values:
+        raise _FieldError("transform_matrix: expected the camera's pose, it is missing")
+    try:
+        matrix = np.array(values["transform_matrix"], np.float64)
+    except (ValueError, TypeError):
+        raise _FieldError(f"transform_matrix: expected 4 x 4 numbers, got {values['transform_matrix']!r:.80}") from None
+    if matrix.shape == (3, 4):
+        matrix = np.vstack([matrix, [0.0, 0.0, 0.0, 1.0]])
+    if matrix.shape != (4, 4):
+        raise _FieldError(f"transform_matrix: expected 4 x 4 numbers, got shape {list(matrix.shape)}")
+    if not np.isfinite(matrix).all():
+        raise _FieldError("transform_matrix: expected finite numbers, got NaN or infinity; leave this frame out")
+    if np.abs(matrix[3] - [0.0, 0.0, 0.0, 1.0]).max() > _RIGID_TOLERANCE:
+        raise _FieldError(
+            f"transform_matrix: expected the last row 0 0 0 1, got {matrix[3].tolist()}; is it transposed?"
+        )
+    u, stretch, vt = np.linalg.svd(matrix[:3, :3])
+    if np.abs(stretch - 1.0).max() > _RIGID_TOLERANCE or np.linalg.det(matrix[:3, :3]) < 0.0:
+        kind = "a mirror image" if np.linalg.det(matrix[:3, :3]) < 0.0 else "a stretch"
+        raise _FieldError(
+            f"transform_matrix: expected a rotation and a translation, got {kind} by {', '.join(f'{s:.4g}' for s in stretch)} in "
+            "its rotation part; remove the scale of the camera (or of its parent) and export again"
+        )
+    # Files in the wild carry rotations rounded to a few digits; the nearest rotation keeps rays of unit length.
+    matrix[:3, :3] = u @ vt
+    return np.asarray(matrix @ OPENGL_FROM_OPENCV, np.float64)
+
+
+def _refuse_far_away(path: Path, frames: Iterable[PosedImage]) -> None:
+    for frame in frames:
+        farthest = float(np.abs(frame.T_world_from_camera[:3, 3]).max())
+        if farthest > _FARTHEST:
+            raise DatasetError(
+                f"{path}: frame {frame.path.name}: transform_matrix: expected a camera within {_FARTHEST:.0f} m of the origin, got "
+                f"{farthest:.4g}; take a common offset off all positions (map coordinates have a far origin), or use metres"
+            )
+
+
+def _lens(values: _Values) -> Lens:
+    model = str(values.get("camera_model", "OPENCV_FISHEYE" if values.get("is_fisheye") else "OPENCV"))
+    if model not in _LENSES | _FISHEYES or values.get("is_equirectangular") or values.get("equirectangular"):
+        raise _FieldError(
+            f"camera_model: expected {', '.join(sorted(_LENSES | _FISHEYES))}, got {model}; undistort the images first"
+        )
+    fisheye = model in _FISHEYES or bool(values.get("is_fisheye"))
+    keys = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
+    strange = ("p1", "p2") if fisheye else ("k4", "k5", "k6")
+    for key in strange:
+        if _number(values, key, 0.0) != 0.0:
+            raise _FieldError(
+                f"{key}: expected only {', '.join(keys)} with camera_model {model}, got {values[key]}; undistort the images first"
+            )
+    return Lens(tuple(_number(values, key, 0.0) for key in keys), fisheye)
+
+
+def _pinhole(image: Path, values: _Values) -> Pinhole:
+    if values.get("w") is not None and values.get("h") is not None:
+        width, height = (int(_number(values, key, 0.0, positive=True)) for key in ("w", "h"))
+    else:
+        width, height = image_size(image)
+    fx, fy = _focal_length(values, "x", width), _focal_length(values, "y", height)
+    if fx is None and fy is None:
+        raise _FieldError("fl_x: expected fl_x, camera_angle_x or x_fov, none is there")
+    return Pinhole(
+        width, height, fx or fy or 0.0, fy or fx or 0.0, _number(values, "cx", 0.5 * width), _number(values, "cy", 0.5 * height)
+    )  # fmt: skip
+
+
+def _focal_length(values: _Values, axis: str, size: int) -> float | None:
+    if values.get(f"fl_{axis}") is not None:
+        return _number(values, f"fl_{axis}", 0.0, positive=True)
+    for key, unit in ((f"camera_angle_{axis}", 1.0), (f"{axis}_fov", math.pi / 180.0)):
+        if values.get(key) is not None:
+            angle = unit * _number(values, key, 0.0, positive=True)
+            if angle >= math.pi:
+                raise _FieldError(f"{key}: expected a field of view below a half turn, got {values[key]}")
+            return 0.5 * size / math.tan(0.5 * angle)
+    return None
+
+
+def _number(values: _Values, key: str, default: float, positive: bool = False) -> float:
+    raw = values.get(key)
+    try:
+        value = default if raw is None else float(raw)
+    except (TypeError, ValueError):
+        raise _FieldError(f"{key}: expected a number, got {raw!r:.60}") from None
+    if not math.isfinite(value) or (positive and value <= 0.0):
+        raise _FieldError(f"{key}: expected a {'positive' if positive else 'finite'} number, got {raw}")
+    return value

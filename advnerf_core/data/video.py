@@ -1,0 +1,134 @@
+"""Videos: frames in order, upright, with their times; and the pick of them on disk."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from advnerf_core.data.errors import DatasetError
+from advnerf_core.data.image_files import Rgb
+from advnerf_core.data.keyframes import Candidate, KeyframeConfig, KeyframeSelector
+from advnerf_core.files import write_atomically
+
+SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm")
+JPEG_QUALITY = 95
+_RECORD = "keyframes.json"
+
+
+def read_video(path: Path) -> Iterator[tuple[int, float, float, Rgb]]:
+    """Frames of a video: number, time [s], share of the video that is over (0..1), image ``[H, W, 3]`` uint8 upright.
+
+    Raises:
+        DatasetError: The file is no video, or not one frame of it can be read. A damaged end only ends the video early.
+    """
+    import av
+
+    number = 0
+    try:
+        with av.open(str(path)) as container:
+            if not container.streams.video:
+                raise DatasetError(f"expected a video, got {path} without a picture; give another file")
+            stream = container.streams.video[0]
+            stream.thread_type = "AUTO"
+            length_s = float(container.duration / av.time_base) if container.duration else 0.0
+            for frame in container.decode(stream):
+                time_s = float(frame.time) if frame.time is not None else float(number)
+                share = min(max(time_s / length_s, 0.0), 1.0) if length_s > 0.0 else 0.0
+                # Phones store the sensor's picture and say how to turn it.
+                turns = round(getattr(frame, "rotation", 0) / 90.0) % 4
+                rgb = np.ascontiguousarray(np.rot90(frame.to_ndarray(format="rgb24"), turns))
+                yield number, time_s, share, rgb
+                number += 1
+    except (av.error.FFmpegError, OSError) as error:
+        if number == 0:
+            raise DatasetError(
+                f"expected a video that can be decoded, got {path}: {getattr(error, 'strerror', None) or error}; "
+                "copy it again, or convert it to MP4 (H.264)"
+            ) from error
+    if number == 0:
+        raise DatasetError(f"expected a video with frames, got {path} without any; copy it again")
+
+
+def keep_keyframes(
+    path: Path, folder: Path, config: KeyframeConfig, most: int, report: Callable[[float, str], None]
+) -> list[Path]:
+    """Write the frames of a video worth keeping as JPEG files; what an earlier run finished is used again.
+
+    Args:
+        path: The video.
+        folder: Where the files go, named by their number in the video.
+        config: How to choose.
+        most: At most so many, evenly thinned out.
+        report: Told of the finished share and how many are kept.
+
+    Returns:
+        The files in order of time.
+    """
+    key = _key(path, config, most)
+    if (done := _finished(folder, key)) is not None:
+        return done
+    folder.mkdir(parents=True, exist_ok=True)
+    for old in folder.glob("*.jpg"):  # of another choice, or of a run that was stopped
+        old.unlink()
+    selector, kept = KeyframeSelector(config), []
+    for number, time_s, share, rgb in read_video(path):
+        if (chosen := selector.offer(number, time_s, rgb)) is not None:
+            kept.append(_write(folder, chosen))
+        report(share, f"{path.name}: {len(kept)} of {number + 1} frames kept")
+    if (chosen := selector.last()) is not None:
+        kept.append(_write(folder, chosen))
+    rows = _thinned(kept, most)
+    for row in kept:
+        if row not in rows:
+            (folder / row["file"]).unlink()
+    write_atomically(folder / _RECORD, json.dumps({"key": key, "frames": rows}, indent=1) + "\n")
+    return [folder / row["file"] for row in rows]
+
+
+def _write(folder: Path, frame: Candidate) -> dict[str, Any]:
+    name = f"{frame.number:06d}.jpg"
+    encoded, data = cv2.imencode(
+        ".jpg", np.ascontiguousarray(frame.rgb[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
+    )
+    if not encoded:
+        raise ValueError(f"expected an image that can be written as JPEG, got shape {frame.rgb.shape}")
+    write_atomically(folder / name, data.tobytes())
+    return {"file": name, "time_s": round(frame.time_s, 4), "sharpness": round(frame.sharpness, 2)}
+
+
+def _thinned(rows: list[dict[str, Any]], most: int) -> list[dict[str, Any]]:
+    if len(rows) <= most:
+        return rows
+    return [rows[i] for i in np.linspace(0, len(rows) - 1, most).round().astype(int)]
+
+
+def _key(path: Path, config: KeyframeConfig, most: int) -> str:
+    # The content of a video is too long to read twice; its size and the moment it was written stand for it.
+    try:
+        state = path.stat()
+    except OSError as error:
+        raise DatasetError(f"expected a video at {path}, got: {error.strerror}") from error
+    facts = {
+        "file": str(path.resolve()),
+        "bytes": state.st_size,
+        "time": state.st_mtime_ns,
+        "most": most,
+        **asdict(config),
+    }
+    return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
+
+
+def _finished(folder: Path, key: str) -> list[Path] | None:
+    try:
+        record = json.loads((folder / _RECORD).read_text())
+        files = [folder / row["file"] for row in record["frames"]]
+        return files if record["key"] == key and all(file.exists() for file in files) else None
+    except (OSError, ValueError, KeyError, TypeError):
+        return None

@@ -1,0 +1,207 @@
+"""Posed images: what a data set lists, and what a trainer gets after undistortion.
+
+On disk an image has a lens and possibly a mask and transparency; in memory there are ideal pinholes with pixel centres at +0.5
+and, where a set needs them, an opacity and a flag per pixel.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from advnerf_core.data.errors import DatasetError
+from advnerf_core.data.image_files import OPAQUE, Grey, Rgb
+from advnerf_core.data.lens import Lens
+from advnerf_core.data.view_loading import load_view
+from advnerf_core.geometry import Array, Pinhole
+
+# Instant-NGP maps the file's coordinates into its unit cube by 0.33 x + 0.5, unless the file says otherwise.
+NGP_SCALE, NGP_OFFSET = 0.33, (0.5, 0.5, 0.5)
+TRAIN, HELD_OUT_SPLITS = "train", ("val", "test")
+
+
+@dataclass(frozen=True, eq=False)
+class PosedImage:
+    """One photograph on disk.
+
+    Attributes:
+        path: The image file.
+        pinhole: Intrinsics for the listed size.
+        lens: Distortion.
+        T_world_from_camera: Pose ``[4, 4]``, OpenCV axes.
+        mask: File whose black pixels are to be left out; None if all count.
+        camera_id: Which camera took it.
+        split: ``train``, ``val`` or ``test`` where the data set says so.
+    """
+
+    path: Path
+    pinhole: Pinhole
+    lens: Lens
+    T_world_from_camera: Array
+    mask: Path | None = None
+    camera_id: str = ""
+    split: str | None = None
+
+    @property
+    def distortion(self) -> tuple[float, ...]:
+        """Coefficients of the lens."""
+        return self.lens.coefficients
+
+
+@dataclass(frozen=True, eq=False)
+class ImageSet:
+    """Undistorted images in memory, all of one size.
+
+    Attributes:
+        rgb: ``[N, H, W, 3]`` uint8.
+        pinholes: Intrinsics of each image.
+        T_world_from_camera: ``[N, 4, 4]``.
+        alpha: Opacity ``[N, H, W]`` uint8; None when all are opaque.
+        valid: ``[N, H, W]`` bool, pixels to learn from and to compare with; None when all are.
+        camera_ids: Which camera took each; empty when unknown.
+    """
+
+    rgb: Rgb
+    pinholes: tuple[Pinhole, ...]
+    T_world_from_camera: Array
+    alpha: Grey | None = None
+    valid: NDArray[np.bool_] | None = None
+    camera_ids: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not len(self.rgb) == len(self.pinholes) == len(self.T_world_from_camera):
+            raise ValueError(
+                f"expected as many images as pinholes and poses, got {len(self.rgb)}, {len(self.pinholes)} and "
+                f"{len(self.T_world_from_camera)}"
+            )
+        for name, plane in (("alpha", self.alpha), ("valid", self.valid)):
+            if plane is not None and plane.shape != self.rgb.shape[:3]:
+                raise ValueError(f"expected {name} of shape {self.rgb.shape[:3]}, got {plane.shape}")
+
+    def on_background(self, colour: ArrayLike) -> Rgb:
+        """The images over one colour ``[3]`` in 0..1, ``[N, H, W, 3]`` uint8."""
+        if self.alpha is None:
+            return self.rgb
+        opacity = self.alpha[..., None].astype(np.float32) / OPAQUE
+        behind = np.asarray(colour, np.float32) * np.float32(255.0)
+        return np.rint(opacity * self.rgb + (1.0 - opacity) * behind).astype(np.uint8)
+
+
+@dataclass(frozen=True, eq=False)
+class PosedImages:
+    """What a data set lists.
+
+    Attributes:
+        frames: Images that exist, in the file's order.
+        missing: Listed files that do not exist.
+        aabb_scale: Instant-NGP's box size, if the file has one.
+        scale: Instant-NGP's scale from the file's coordinates to its unit cube.
+        offset: Its offset, applied after the scale.
+        file: The file that lists them.
+    """
+
+    frames: tuple[PosedImage, ...]
+    missing: tuple[Path, ...]
+    aabb_scale: float | None
+    scale: float = NGP_SCALE
+    offset: tuple[float, float, float] = NGP_OFFSET
+    file: Path | None = None
+
+    @property
+    def splits(self) -> tuple[str, ...]:
+        """Splits that the data set itself makes, e.g. ``("train", "test")``; empty if it makes none."""
+        return tuple(dict.fromkeys(frame.split for frame in self.frames if frame.split is not None))
+
+    @property
+    def camera_ids(self) -> tuple[str, ...]:
+        """Cameras in the set, in order of appearance."""
+        return tuple(dict.fromkeys(frame.camera_id for frame in self.frames))
+
+    def with_frames(self, frames: Sequence[PosedImage]) -> PosedImages:
+        """The same data set with other frames."""
+        return replace(self, frames=tuple(frames))
+
+    def sorted_by_name(self) -> PosedImages:
+        """The same, in the order of file names."""
+        return self.with_frames(sorted(self.frames, key=lambda f: f.path.name))
+
+    def of_camera(self, camera_id: str) -> PosedImages:
+        """Only the images of one camera."""
+        if camera_id not in self.camera_ids:
+            raise DatasetError(
+                f"expected one of the cameras {', '.join(self.camera_ids)} of {self._name}, got {camera_id!r}"
+            )
+        return self.with_frames([frame for frame in self.frames if frame.camera_id == camera_id])
+
+    def of_split(self, *names: str) -> PosedImages:
+        """Only the images of some of the data set's own splits."""
+        return self.with_frames([frame for frame in self.frames if frame.split in names])
+
+    def split(self, every: int) -> tuple[PosedImages, PosedImages]:
+        """Training and held-out images: of the present order, every ``every``-th, from the first, is held out."""
+        if every < 2:
+            raise ValueError(f"expected to hold out every 2nd image or fewer, got every {every}")
+        if len(self.frames) < 2:
+            raise DatasetError(
+                f"expected at least 2 images in {self._name} to hold some of them out, got {len(self.frames)}; take more photographs"
+            )
+        held = [f for i, f in enumerate(self.frames) if i % every == 0]
+        rest = [f for i, f in enumerate(self.frames) if i % every != 0]
+        return self.with_frames(rest), self.with_frames(held)
+
+    def training_and_held_out(self, every: int = 8) -> tuple[PosedImages, PosedImages]:
+        """The data set's own split if it has one (all but ``train`` is held out), else every ``every``-th by name."""
+        training, held_out = self.of_split(TRAIN), self.of_split(*HELD_OUT_SPLITS)
+        if training.frames and held_out.frames:
+            return training, held_out
+        return self.sorted_by_name().split(every)
+
+    def load(self, size: tuple[int, int] | None = None, keep_all: bool = False) -> ImageSet:
+        """Read, undistort and resize all images.
+
+        Args:
+            size: ``(width, height)`` [px] to bring all images to by area averaging; None keeps the size on disk.
+            keep_all: Whether undistortion keeps the whole view, with ``valid`` saying where there is none; otherwise it crops.
+        """
+        if not self.frames:
+            raise DatasetError(f"expected at least one image in {self._name} to load, got none")
+        with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+            views = list(pool.map(lambda frame: load_view(frame, size, keep_all), self.frames))
+        sizes = {(view.pinhole.width, view.pinhole.height) for view in views}
+        if len(sizes) > 1:
+            raise DatasetError(
+                f"expected images of one size in {self._name}, got {sorted(sizes)}; give a size to bring them to"
+            )
+        shape = views[0].rgb.shape[:2]
+        opaque, whole = np.full(shape, OPAQUE, np.uint8), np.ones(shape, np.bool_)
+        alphas, valids = [view.alpha for view in views], [view.valid for view in views]
+        return ImageSet(
+            np.stack([view.rgb for view in views]), tuple(view.pinhole for view in views),
+            np.stack([frame.T_world_from_camera for frame in self.frames]),
+            None if all(a is None for a in alphas) else np.stack([opaque if a is None else a for a in alphas]),
+            None if all(v is None for v in valids) else np.stack([whole if v is None else v for v in valids]),
+            tuple(frame.camera_id for frame in self.frames),
+        )  # fmt: skip
+
+    def box(self) -> tuple[Array, Array]:
+        """Low and high corner of Instant-NGP's box for this file, in its world units."""
+        half = 0.5 * (self.aabb_scale or 1.0) / self.scale
+        centre = (0.5 - np.array(self.offset)) / self.scale
+        return centre - half, centre + half
+
+    def inner_box(self) -> tuple[Array, Array]:
+        """The part of Instant-NGP's box that a contracted field sees in full detail: its unit cube, larger if cameras need it."""
+        centre = (0.5 - np.array(self.offset)) / self.scale
+        places = np.stack([frame.T_world_from_camera[:3, 3] for frame in self.frames])
+        half = max(0.5 / self.scale, float(np.abs(places - centre).max()))
+        return centre - half, centre + half
+
+    @property
+    def _name(self) -> str:
+        return str(self.file) if self.file is not None else "the data set"

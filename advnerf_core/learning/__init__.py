@@ -1,0 +1,1 @@
+"""How a driving policy is trained: frames, augmentation, imitation, retraining."""

@@ -1,0 +1,161 @@
+"""Supervised training of the policy on frames: deterministic, and resumable to the bit.
+
+Everything random in step ``t`` is drawn from a generator seeded by ``(seed, t)``, so a checkpoint needs no generator state:
+weights, optimiser moments and the step number are all there is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from math import cos, pi
+from pathlib import Path
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor
+
+from advnerf_core.files import with_sorted_header, write_atomically
+from advnerf_core.learning.augment import AugmentConfig, augment
+from advnerf_core.learning.frames import FrameSet, FrameStoreError
+from advnerf_core.policies.pilotnet import PilotNet, images_to_tensor
+
+EVALUATION_BATCH = 128
+
+
+@dataclass(frozen=True)
+class FitConfig:
+    """Settings of one training.
+
+    Attributes:
+        steps: Optimiser steps.
+        batch_size: Frames per step.
+        learning_rate: Peak; linear warm-up, then a half cosine to a hundredth of it.
+        warm_up_steps: Length of the warm-up.
+        weight_decay: Of AdamW.
+        huber_rad: Errors beyond this count linearly [rad].
+        seed: Of batches and augmentation.
+        checkpoint_every: Steps between checkpoints.
+        augment: Image augmentation.
+    """
+
+    steps: int
+    batch_size: int = 64
+    learning_rate: float = 1e-3
+    warm_up_steps: int = 20
+    weight_decay: float = 1e-4
+    huber_rad: float = 0.1
+    seed: int = 0
+    checkpoint_every: int = 100
+    augment: AugmentConfig = field(default_factory=AugmentConfig)
+
+
+def fit(
+    policy: PilotNet,
+    frames: FrameSet,
+    config: FitConfig,
+    checkpoint: Path | None = None,
+    report: Callable[[int, float], None] | None = None,
+) -> None:
+    """Train ``policy`` in place on ``frames.training``.
+
+    Args:
+        policy: The network; its weights are the start unless the checkpoint holds a later step.
+        frames: Training frames.
+        config: Settings.
+        checkpoint: File to continue from and to write every ``checkpoint_every`` steps and at the end.
+        report: Told the step and the running mean square error [rad^2].
+    """
+    if len(frames.training) == 0:
+        raise FrameStoreError("expected training frames, got none: collect frames, or lower the share that is held out")
+    policy.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    optimiser = torch.optim.AdamW(
+        policy.parameters(), config.learning_rate, weight_decay=config.weight_decay, fused=True
+    )
+    done = 0 if checkpoint is None else _resume(checkpoint, policy, optimiser, config)
+    policy.train()
+    running = 0.0
+    for step in range(done, config.steps):
+        optimiser.param_groups[0]["lr"] = _learning_rate(config, step)
+        error = _train_step(policy, optimiser, frames, config, step)
+        running = error if step == done else 0.95 * running + 0.05 * error
+        finished = step + 1
+        if checkpoint is not None and (finished % config.checkpoint_every == 0 or finished == config.steps):
+            _write(checkpoint, policy, optimiser, finished, config)
+        if report is not None and (finished % 10 == 0 or finished == config.steps):
+            report(finished, running)
+    policy.eval()
+
+
+@torch.no_grad()
+def mean_absolute_error(policy: PilotNet, frames: FrameSet) -> float:
+    """Mean absolute steering error [rad] on the held-out frames (on the training frames if none are held out)."""
+    rows = frames.held_out if len(frames.held_out) else frames.training
+    total = 0.0
+    for start in range(0, len(rows), EVALUATION_BATCH):
+        images, labels, goals = frames.batch(rows[start : start + EVALUATION_BATCH])
+        output = policy(images_to_tensor(images), torch.from_numpy(goals) if policy.goal_size else None)
+        total += float((output - torch.from_numpy(labels)).abs().sum())
+    return total / len(rows)
+
+
+def _train_step(
+    policy: PilotNet, optimiser: torch.optim.Optimizer, frames: FrameSet, config: FitConfig, step: int
+) -> float:
+    rng = np.random.default_rng([config.seed, step])
+    rows = frames.training[rng.integers(0, len(frames.training), config.batch_size)]
+    images, labels, goals = frames.batch(rows)
+    inputs = torch.from_numpy(augment(images, config.augment, rng)).permute(0, 3, 1, 2)  # stays channels-last
+    target = torch.from_numpy(labels)
+    output: Tensor = policy(inputs, torch.from_numpy(goals) if policy.goal_size else None)
+    loss = F.huber_loss(output, target, delta=config.huber_rad) / config.huber_rad**2
+    optimiser.zero_grad(set_to_none=True)
+    loss.backward()
+    optimiser.step()
+    return float((output.detach() - target).square().mean())
+
+
+def _learning_rate(config: FitConfig, step: int) -> float:
+    if step < config.warm_up_steps:
+        return config.learning_rate * (step + 1) / config.warm_up_steps
+    share = (step - config.warm_up_steps) / max(1, config.steps - config.warm_up_steps)
+    return config.learning_rate * (0.01 + 0.99 * 0.5 * (1.0 + cos(pi * share)))
+
+
+def _write(path: Path, policy: PilotNet, optimiser: torch.optim.Optimizer, step: int, config: FitConfig) -> None:
+    tensors = {f"weight.{name}": value.detach() for name, value in policy.state_dict().items()}
+    for name, parameter in policy.named_parameters():
+        moments = optimiser.state[parameter]
+        tensors[f"first.{name}"], tensors[f"second.{name}"] = moments["exp_avg"], moments["exp_avg_sq"]
+    contiguous = {name: value.contiguous() for name, value in tensors.items()}
+    header = {"step": str(step), "config": repr(asdict(config))}
+    write_atomically(path, with_sorted_header(save(contiguous, header)))
+
+
+def _resume(path: Path, policy: PilotNet, optimiser: torch.optim.Optimizer, config: FitConfig) -> int:
+    """Load the checkpoint if there is one; returns the number of finished steps."""
+    if not path.is_file():
+        return 0
+    try:
+        with safe_open(path, framework="pt") as file:
+            header = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
+    except (SafetensorError, OSError) as error:
+        raise FrameStoreError(
+            f"expected a training checkpoint at {path}, got {error}; delete it to start again"
+        ) from error
+    if header.get("config") != repr(asdict(config)):
+        raise FrameStoreError(f"expected a checkpoint of the same settings at {path}; delete it to start again")
+    policy.load_state_dict({k.removeprefix("weight."): v for k, v in tensors.items() if k.startswith("weight.")})
+    policy.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    step = int(header["step"])
+    for name, parameter in policy.named_parameters():
+        optimiser.state[parameter] = {
+            "step": torch.tensor(float(step)),
+            "exp_avg": torch.empty_like(parameter).copy_(tensors[f"first.{name}"]),
+            "exp_avg_sq": torch.empty_like(parameter).copy_(tensors[f"second.{name}"]),
+        }
+    return step

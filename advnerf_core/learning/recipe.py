@@ -1,0 +1,138 @@
+"""What a training recipe is given, and what it gives: settings, sources with their goals and teachers, and where poses are drawn."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path as FilePath
+from typing import Any
+
+import numpy as np
+
+from advnerf_core.driving.expert import Expert
+from advnerf_core.driving.path import Array, Path
+from advnerf_core.learning.augment import AugmentConfig
+from advnerf_core.learning.sources import FrameSource
+
+
+@dataclass(frozen=True)
+class SourcePlan:
+    """How much is taken from one source.
+
+    Attributes:
+        source: The domain.
+        stills: States that are looked at before the first training.
+        drives: Drives in each DAgger round.
+        drive_steps: Ticks of each of these drives.
+        goal: What the policy is told in these frames, for example a one-hot exit; as long in all plans.
+        expert: Their teacher, about whose path poses are drawn; None for the recipe's own.
+        driven_m: Poses are drawn so far along an open path [m]; None for all of it.
+        drives_from_m: Drives start so far along the path at most [m], so that they pass what is to be learned; None for all of it.
+    """
+
+    source: FrameSource
+    stills: int
+    drives: int = 8
+    drive_steps: int = 40
+    goal: tuple[float, ...] = ()
+    expert: Expert | None = None
+    driven_m: float | None = None
+    drives_from_m: float | None = None
+
+    def settings(self) -> dict[str, Any]:
+        """As plain data; what only goal-conditioned recipes have is named only where it is given."""
+        values = {
+            "source": self.source.name,
+            "stills": self.stills,
+            "drives": self.drives,
+            "drive_steps": self.drive_steps,
+        }
+        special = {
+            "goal": list(self.goal), "expert": None if self.expert is None else self.expert.to_dict(),
+            "driven_m": self.driven_m, "drives_from_m": self.drives_from_m,
+        }  # fmt: skip
+        return values | {name: value for name, value in special.items() if value}
+
+
+@dataclass(frozen=True)
+class ImitationConfig:
+    """Settings of the recipe.
+
+    Attributes:
+        seed: Of poses, textures, initial weights, batches and augmentation.
+        dagger_rounds: Rounds of driving, labelling and continued training.
+        first_steps: Optimiser steps of behaviour cloning.
+        round_steps: Optimiser steps after each DAgger round.
+        naive_steps: Optimiser steps of a second policy that never sees a random texture; 0 trains none.
+        batch_size: Frames per step.
+        learning_rate: Peak learning rate; continued training starts at half of it.
+        lateral_m: Stills are up to this far from the path [m].
+        heading_rad: Stills are turned up to this much from the path's heading [rad].
+        drive_lateral_m: DAgger drives start up to this far from the path [m].
+        drive_heading_rad: And turned up to this much [rad].
+        give_up_m: A drive ends when |CTE| exceeds this [m]; frames from further away teach little.
+        max_steering_rad: Bound of the policy's output [rad].
+        hidden: Widths of the policy's linear layers.
+        augment: Image augmentation.
+        holdout_every: One block in so many is kept for validation.
+    """
+
+    seed: int = 0
+    dagger_rounds: int = 2
+    first_steps: int = 500
+    round_steps: int = 250
+    naive_steps: int = 0
+    batch_size: int = 64
+    learning_rate: float = 1e-3
+    lateral_m: float = 0.35
+    heading_rad: float = 0.45
+    drive_lateral_m: float = 0.2
+    drive_heading_rad: float = 0.25
+    give_up_m: float = 0.7
+    max_steering_rad: float = 0.30
+    hidden: tuple[int, int, int] = (100, 50, 10)
+    augment: AugmentConfig = field(default_factory=AugmentConfig)
+    holdout_every: int = 20
+
+
+@dataclass(frozen=True)
+class TrainedPolicy:
+    """What the recipe made.
+
+    Attributes:
+        path: Policy file.
+        sha256: Its hash.
+        validation_mae_rad: Mean absolute steering error on held-out frames [rad].
+        naive_path: File of the policy that never saw a random texture, if one was asked for.
+        naive_sha256: Its hash.
+        naive_validation_mae_rad: Its error on held-out plain frames [rad].
+        frames: Number of collected frames.
+        seconds: Time spent in this call on each part: collect, train [s].
+    """
+
+    path: FilePath
+    sha256: str
+    validation_mae_rad: float
+    naive_path: FilePath | None
+    naive_sha256: str | None
+    naive_validation_mae_rad: float | None
+    frames: int
+    seconds: dict[str, float]
+
+
+def recovery_states(
+    path: Path,
+    count: int,
+    rng: np.random.Generator,
+    lateral_m: float,
+    heading_rad: float,
+    driven_m: float | None = None,
+) -> Array:
+    """Poses ``[count, 3]`` about the path, or its first ``driven_m`` [m], evenly along it: half spread over the full range, half near the path."""
+    s = (np.arange(count) + rng.random(count)) / max(count, 1) * (path.length_m if driven_m is None else driven_m)
+    pose = path.pose_at(rng.permutation(s))
+    spread = np.where(np.arange(count)[:, None] % 2 == 0, 1.0, 0.35)
+    lateral, heading = (rng.uniform(-1.0, 1.0, (count, 2)) * spread * [lateral_m, heading_rad]).T
+    pose[:, 0] -= lateral * np.sin(pose[:, 2])
+    pose[:, 1] += lateral * np.cos(pose[:, 2])
+    pose[:, 2] += heading
+    return pose

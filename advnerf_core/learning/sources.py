@@ -1,0 +1,256 @@
+"""Where training frames come from: a scene that steps itself (lab, simulator) or a batch renderer (surrogate).
+
+Both give the same two things: looks at chosen states, and closed-loop drives for DAgger, each state seen with the object
+plain and, if it is in view, with random textures too. No simulator and no renderer is imported here: callables are given.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from advnerf_core.driving.dynamics import Dynamics
+from advnerf_core.driving.path import Array
+from advnerf_core.geometry import VehicleState
+from advnerf_core.policies.pilotnet import images_to_tensor
+from advnerf_core.policies.view import Image, PolicyView
+
+Steer = Callable[[Image], Array]
+"""Steering ``[B]`` [rad] for policy images ``[B, 66, 200, 3]`` uint8."""
+
+KeepDriving = Callable[[Array], NDArray[np.bool_]]
+"""Which of the states ``[B, 3]`` are still worth driving on from, ``[B]``."""
+
+Texture = NDArray[np.float32]
+"""Colours ``[n, n, 3]`` in 0..1 of the object's face, row 0 on top, column 0 left for a viewer who faces it."""
+
+Overlay = Callable[[Image, Array, Texture], Image]
+"""``(rgb [H, W, 3], state [3], texture) -> rgb`` with the texture on the object's face; the same image if out of view."""
+
+
+@dataclass(frozen=True)
+class Seen:
+    """Policy images of some states.
+
+    Attributes:
+        images: ``[M, 66, 200, 3]`` uint8.
+        states: ``[M, 3]`` where each was seen.
+        textured: ``[M]`` whether the object showed a random texture.
+    """
+
+    images: Image
+    states: Array
+    textured: NDArray[np.bool_]
+
+    @staticmethod
+    def join(parts: list[Seen]) -> Seen:
+        """All parts in one, in order."""
+        return Seen(
+            np.concatenate([part.images for part in parts]),
+            np.concatenate([part.states for part in parts]),
+            np.concatenate([part.textured for part in parts]),
+        )
+
+
+class FrameSource(Protocol):
+    """A domain that frames can be taken from."""
+
+    name: str
+    batch_size: int  # how many states, or drives, it likes to handle at once
+
+    def look(self, states: Array, rng: np.random.Generator) -> Seen:
+        """What is seen from the states ``[B, 3]``."""
+
+    def drive(
+        self, steer: Steer, starts: Array, steps: int, keep_driving: KeepDriving, rng: np.random.Generator
+    ) -> Seen:
+        """Closed-loop drives of up to ``steps`` ticks from ``starts [B, 3]``: everything seen on the way."""
+
+
+def random_texture(rng: np.random.Generator, cells: int, sigma: float = 5.0) -> Texture:
+    """Random colours as the random attack draws them: squashed normal grid values, method section 2."""
+    return (1.0 / (1.0 + np.exp(-sigma * rng.standard_normal((cells, cells, 3))))).astype(np.float32)
+
+
+class SteppedScene(Protocol):
+    """A deployment scene that moves its own car, such as the synchronous lab."""
+
+    def reset(self, x_m: float, y_m: float, yaw_rad: float) -> Any:
+        """Put the car down."""
+
+    def step(self, steering_rad: float, speed_mps: float, duration_s: float) -> VehicleState:
+        """Drive on and return the true state."""
+
+    def observe(self, depth: Literal[False]) -> tuple[Image, None]:
+        """RGB ``[H, W, 3]`` uint8 of the driving camera, without depth."""
+
+    def observe_at(self, x_m: float, y_m: float, yaw_rad: float, depth: Literal[False]) -> tuple[Image, None]:
+        """The same, as if the car stood there."""
+
+
+class SceneSource:
+    """Frames of a scene that steps itself.
+
+    Args:
+        name: Name of the shards.
+        scene: The scene, for instance the synchronous lab.
+        view: How camera images become policy images.
+        speed_mps: Commanded speed [m/s].
+        dt_s: Control tick [s].
+        overlay: Paints a texture on the object's face; None for scenes without a changing object.
+        texture_cells: The random textures have so many cells per side.
+        variants: Textured images per state in which the object is in view.
+    """
+
+    batch_size = 1
+
+    def __init__(
+        self,
+        name: str,
+        scene: SteppedScene,
+        view: PolicyView,
+        speed_mps: float,
+        dt_s: float,
+        overlay: Overlay | None = None,
+        texture_cells: int = 16,
+        variants: int = 1,
+    ) -> None:
+        self.name = name
+        self._scene, self._view, self._overlay = scene, view, overlay
+        self._speed_mps, self._dt_s = speed_mps, dt_s
+        self._cells, self._variants = texture_cells, variants
+
+    def look(self, states: Array, rng: np.random.Generator) -> Seen:
+        """What is seen from the states ``[B, 3]``."""
+        parts = []
+        for state in states:
+            x, y, yaw = map(float, state)
+            parts.append(self._seen(self._scene.observe_at(x, y, yaw, depth=False)[0], state, rng))
+        return Seen.join(parts)
+
+    def drive(
+        self, steer: Steer, starts: Array, steps: int, keep_driving: KeepDriving, rng: np.random.Generator
+    ) -> Seen:
+        """Drives, one after another; in every second one the policy sees one random texture throughout."""
+        parts = []
+        for number, start in enumerate(starts):
+            held = random_texture(rng, self._cells) if self._overlay is not None and number % 2 else None
+            self._scene.reset(*map(float, start))
+            state = np.asarray(start, dtype=np.float64)
+            for _ in range(steps):
+                parts.append(self._seen(self._scene.observe(depth=False)[0], state, rng, held))
+                steering = float(steer(parts[-1].images[-1:] if held is not None else parts[-1].images[:1])[0])
+                moved = self._scene.step(steering, self._speed_mps, self._dt_s)
+                state = np.array([moved.x_m, moved.y_m, moved.yaw_rad])
+                if not keep_driving(state[None])[0]:
+                    break
+        return Seen.join(parts)
+
+    def _seen(
+        self,
+        rgb: Image,
+        state: Array,
+        rng: np.random.Generator,
+        held: Texture | None = None,
+    ) -> Seen:
+        """The plain view first, the textured ones after it, a held texture last."""
+        images = [self._view.image(rgb)]
+        if self._overlay is not None:
+            textures = [random_texture(rng, self._cells) for _ in range(self._variants)]
+            for texture in textures if held is None else [*textures[:-1], held]:
+                painted = self._overlay(rgb, state, texture)
+                if np.array_equal(painted, rgb):  # the object is out of view
+                    break
+                images.append(self._view.image(painted))
+        return Seen(np.stack(images), np.tile(state[:3], (len(images), 1)), np.arange(len(images)) > 0)
+
+
+Show = Callable[[Any], Tensor]
+"""Images ``[B, 3, 66, 200]`` RGB 0..1 of prepared states with a texture parameter, or with None for the plain object."""
+
+
+class RenderedSource:
+    """Frames of a batch renderer, such as the surrogate.
+
+    Args:
+        name: Name of the shards.
+        prepare: Takes states ``[B, 3]``, does what does not depend on the texture (the background), returns ``Show``.
+        dynamics: Vehicle model for drives.
+        sample_texture: Draws a texture parameter for ``Show``; None for scenes without a changing object.
+        variants: Textured images per state in which the object is in view.
+        batch_size: States per call of ``prepare``, and drives side by side.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        prepare: Callable[[Array], Show],
+        dynamics: Dynamics,
+        sample_texture: Callable[[np.random.Generator], Any] | None = None,
+        variants: int = 1,
+        batch_size: int = 8,
+    ) -> None:
+        self.name, self.batch_size = name, batch_size
+        self._prepare, self._dynamics, self._sample, self._variants = prepare, dynamics, sample_texture, variants
+
+    def look(self, states: Array, rng: np.random.Generator) -> Seen:
+        """What is seen from the states ``[B, 3]``."""
+        return self._seen(states, rng, None)[0]
+
+    def drive(
+        self, steer: Steer, starts: Array, steps: int, keep_driving: KeepDriving, rng: np.random.Generator
+    ) -> Seen:
+        """Drives side by side; the odd ones see one random texture throughout."""
+        held = None if self._sample is None else self._sample(rng)
+        states = torch.zeros(len(starts), self._dynamics.state_size, dtype=torch.float64)
+        states[:, :3] = torch.from_numpy(np.asarray(starts, dtype=np.float64))
+        odd = np.arange(len(starts)) % 2 == 1
+        parts = []
+        for _ in range(steps):
+            seen, plain, painted = self._seen(states[:, :3].numpy(), rng, held)
+            parts.append(seen)
+            steering = steer(np.where(odd[:, None, None, None], painted, plain))
+            states = self._dynamics.step(states, torch.from_numpy(np.asarray(steering, dtype=np.float64)))
+            keep = keep_driving(states[:, :3].numpy())
+            states, odd = states[torch.from_numpy(keep)], odd[keep]
+            if not len(states):
+                break
+        return Seen.join(parts)
+
+    def _seen(self, states: Array, rng: np.random.Generator, held: Any) -> tuple[Seen, Image, Image]:
+        """Plain and (where they differ) textured views; and per state the plain view and that with the held texture."""
+        show = self._prepare(states)
+        plain = _as_uint8(show(None))
+        painted = plain if held is None else _as_uint8(show(held))
+        textures = [] if self._sample is None else [self._sample(rng) for _ in range(self._variants)]
+        views = [_as_uint8(show(texture)) for texture in textures]
+        images, rows, textured = [], [], []
+        for row in range(len(states)):
+            in_view = [view[row] for view in views if not np.array_equal(view[row], plain[row])]
+            images += [plain[row], *in_view]
+            rows += [row] * (1 + len(in_view))
+            textured += [False] + [True] * len(in_view)
+        return Seen(np.stack(images), states[rows].copy(), np.array(textured)), plain, painted
+
+
+def _as_uint8(images: Tensor) -> Image:
+    array = (images.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).permute(0, 2, 3, 1)
+    return np.ascontiguousarray(array.numpy())
+
+
+def steer_with(policy: Any, goals: Tensor | None = None) -> Steer:
+    """A policy as a function of uint8 images, for drives; ``goals [1, G]`` holds for all."""
+
+    def steer(images: Image) -> Array:
+        with torch.no_grad():
+            repeated = None if goals is None else goals.expand(len(images), -1)
+            steering: Tensor = policy(images_to_tensor(images), repeated)
+        return steering.double().numpy()
+
+    return steer

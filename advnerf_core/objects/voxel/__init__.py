@@ -1,0 +1,1 @@
+"""Objects as voxel grids: from meshes, cut-out photographs and generators."""

@@ -1,0 +1,202 @@
+"""From a mesh or from cut-out photographs to an object model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+
+from advnerf_core.geometry import Array, Pinhole
+from advnerf_core.objects.voxel.fit import fit_grids
+from advnerf_core.objects.voxel.hull import visual_hull
+from advnerf_core.objects.voxel.mesh import SurfaceMesh
+from advnerf_core.objects.voxel.model import ObjectModel
+from advnerf_core.objects.voxel.pictures import PosedRgba
+from advnerf_core.objects.voxel.rasterise import draw_mesh
+from advnerf_core.objects.voxel.views import dome, viewing_lens
+from advnerf_core.objects.voxel.voxelise import voxelise
+from advnerf_core.render.cast_object import cast_object
+
+Progress = Callable[[float, str], None]
+FIT_VIEWS, FIT_PIXELS = 60, 160
+HELD_OUT_VIEWS = 12
+# Limits of a good fit to pictures; see `advice`.
+POOR_DB, UNFINISHED_DB, GAP_DB = 20.0, 0.3, 6.0
+# Rows that are drawn at once for a comparison: a whole picture of 800 x 800 takes as much memory as the pictures of a set.
+_STRIP_ROWS = 64
+# The held-out poses lie between those of the fit.
+_HELD_OUT_PHASE = 0.37
+
+
+def build_from_mesh(
+    mesh: SurfaceMesh,
+    name: str,
+    resolution: int = 64,
+    steps: int = 400,
+    source: dict[str, Any] | None = None,
+    progress: Progress | None = None,
+) -> ObjectModel:
+    """Voxelise a mesh, then refine the grids on pictures drawn from it.
+
+    Args:
+        mesh: The mesh [m].
+        name: What the object is called.
+        resolution: Voxels along its longest side, 8 to 128.
+        steps: Steps of the refinement; 0 leaves the geometry as voxelised.
+        source: Where the mesh comes from, kept in the model.
+        progress: Told the finished fraction and what is being done.
+    """
+    told = progress or (lambda fraction, text: None)
+    told(0.0, "voxelising")
+    start = voxelise(mesh, resolution)
+    grids = (
+        start if steps == 0 else fit_grids(mesh_views(mesh, FIT_VIEWS, FIT_PIXELS), start, steps, progress=told).grids
+    )
+    model = ObjectModel(name, grids)
+    held_out = mesh_views(mesh, HELD_OUT_VIEWS, FIT_PIXELS, _HELD_OUT_PHASE)
+    about = {
+        "source": source or {}, "resolution": resolution, "steps": steps, "triangles": mesh.triangle_count,
+        "held_out_psnr_db": round(agreement_db(model, held_out), 2), "software_version": version("advnerf"),
+    }  # fmt: skip
+    return ObjectModel(name, model.grids, about)
+
+
+def build_from_images(
+    views: PosedRgba,
+    name: str,
+    resolution: int = 64,
+    steps: int = 600,
+    source: dict[str, Any] | None = None,
+    progress: Progress | None = None,
+    held_out: PosedRgba | None = None,
+    max_seconds: float | None = None,
+) -> ObjectModel:
+    """Carve an object out of cut-out pictures, then fit density and colours.
+
+    ``about`` gets the agreement with the pictures: ``train_psnr_db`` and ``held_out_psnr_db`` over whole pictures,
+    ``train_object_psnr_db`` and ``held_out_object_psnr_db`` over the pixels of the object, and ``gain_db``, by which the error
+    still fell at the end. Keys of held-out pictures are missing if there are none.
+
+    Args:
+        views: Pictures to learn from.
+        name: What the object is called.
+        resolution: Voxels along the longest side.
+        steps: Steps of the fit.
+        source: Where the pictures come from, kept in the model.
+        progress: Called with the finished fraction and what is being done.
+        held_out: Pictures that nothing is learned from. The agreement is taken on at most 12 of each set.
+        max_seconds: Time limit of the fit [s].
+    """
+    told = progress or (lambda fraction, text: None)
+    told(0.0, "carving")
+    fit = fit_grids(views, visual_hull(views, resolution), steps, progress=told, max_seconds=max_seconds)
+    model = ObjectModel(name, fit.grids)
+    about: dict[str, Any] = {
+        "source": source or {}, "resolution": resolution, "steps": fit.steps, "pictures": len(views.images),
+        "gain_db": round(fit.gain_db, 2), "software_version": version("advnerf"),
+    }  # fmt: skip
+    for which, pictures in (("train", views), ("held_out", held_out)):
+        if pictures is None:
+            continue
+        told(1.0, f"comparing with {which.replace('_', '-')} pictures")
+        judged = Agreement.of(model, _spread(pictures, HELD_OUT_VIEWS))
+        about[f"{which}_psnr_db"] = round(judged.psnr_db, 2)
+        about[f"{which}_object_psnr_db"] = round(judged.object_psnr_db, 2)
+    return ObjectModel(name, model.grids, about)
+
+
+def advice(about: Mapping[str, Any]) -> list[str]:
+    """Say what is wrong with an object that was fitted to pictures, and what to do; empty if it is good.
+
+    The figures are those of the object's own pixels. ``POOR_DB`` is an error of a tenth of the colour range: colours that an
+    attack changes must be known better than that. A fit is unfinished if the error fell by more than ``UNFINISHED_DB`` over the
+    last fifth of its steps, and overfitted if held-out pictures are worse by more than ``GAP_DB``, twice the error.
+    """
+    train_db, held_out_db = about["train_object_psnr_db"], about.get("held_out_object_psnr_db")
+    found = []
+    worst_db = train_db if held_out_db is None else min(train_db, held_out_db)
+    if worst_db < POOR_DB:
+        found.append(
+            f"the object agrees poorly with its pictures: {worst_db:.1f} dB over its own pixels, expected at least {POOR_DB:.0f} dB"
+        )
+    if about["gain_db"] > UNFINISHED_DB:
+        found.append(
+            f"the fit is not finished: the error still fell by {about['gain_db']:.1f} dB over the last fifth of {about['steps']} "
+            "steps; give more --steps or --minutes"
+        )
+    if held_out_db is not None and train_db - held_out_db > GAP_DB:
+        found.append(
+            f"held-out pictures agree worse than training pictures by {train_db - held_out_db:.1f} dB: take more pictures, "
+            "and check that their poses and cut-outs are exact"
+        )
+    if found and len(found) == 1 and worst_db < POOR_DB:
+        found.append("check poses and cut-outs first; then raise --resolution, and --steps with it")
+    return found
+
+
+def _spread(views: PosedRgba, most: int) -> PosedRgba:
+    """At most so many pictures, evenly spread over the set."""
+    count = len(views.images)
+    return views.chosen(np.unique(np.linspace(0, count - 1, min(most, count)).round().astype(int)))
+
+
+def mesh_views(mesh: SurfaceMesh, count: int, pixels: int, phase: float = 0.0) -> PosedRgba:
+    """Pictures of a mesh from a dome around it."""
+    poses, lens = dome(mesh.box, count, phase=phase), viewing_lens(pixels)
+    return PosedRgba(draw_mesh(mesh, poses, lens), poses, (lens,) * count)
+
+
+def draw_object(model: ObjectModel, T_object_from_camera: Array, pinhole: Pinhole, supersample: int = 2) -> Array:
+    """Premultiplied pictures ``[B, H, W, 4]`` of an object in its own colours."""
+    field = model.placed(np.eye(4))
+    assert field.plain_colours is not None
+    colours = np.concatenate([field.plain_colours, field.fixed_colours])
+    poses = np.asarray(T_object_from_camera).reshape(-1, 4, 4)
+    pictures = np.zeros((len(poses), pinhole.height * pinhole.width, 4))
+    for picture, pose in zip(pictures, poses, strict=True):
+        cast = cast_object(field, pose[None], pinhole, supersample, np.float64)
+        picture[cast.pixels, :3] = cast.weights @ colours
+        picture[cast.pixels, 3] = cast.alpha
+    return pictures.reshape(len(poses), pinhole.height, pinhole.width, 4)
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """How well an object explains pictures, both before white.
+
+    Attributes:
+        psnr_db: Over all pixels of the pictures [dB].
+        object_psnr_db: Over the pixels that the object covers, drawn or pictured [dB]. It does not depend on how much of a
+            picture is empty.
+    """
+
+    psnr_db: float
+    object_psnr_db: float
+
+    @classmethod
+    def of(cls, model: ObjectModel, views: PosedRgba) -> Agreement:
+        """Compare an object with pictures of it."""
+        squares, pixels, covered = 0.0, 0, 0
+        for index, pinhole in enumerate(views.pinholes):
+            image, pixels = views.picture(index), pixels + pinhole.width * pinhole.height
+            for top in range(0, pinhole.height, _STRIP_ROWS):
+                part = image[top : top + _STRIP_ROWS]
+                strip = pinhole.cropped(0, top, pinhole.width, len(part))
+                drawn = draw_object(model, views.T_object_from_camera[index], strip)[0]
+                error = drawn[..., :3] - drawn[..., 3:] - (part[..., :3] - part[..., 3:])
+                # Outside both silhouettes the error is zero: the sum is that of the covered pixels.
+                squares += float(np.square(error).sum())
+                covered += int(((drawn[..., 3] > 0.0) | (part[..., 3] > 0.0)).sum())
+        return cls(_psnr_db(squares, 3 * pixels), _psnr_db(squares, 3 * covered))
+
+
+def agreement_db(model: ObjectModel, views: PosedRgba) -> float:
+    """PSNR against pictures, both before white, over all their pixels [dB]."""
+    return Agreement.of(model, views).psnr_db
+
+
+def _psnr_db(squares: float, count: int) -> float:
+    return float(-10.0 * np.log10(max(squares / max(count, 1), 1e-12)))

@@ -1,0 +1,274 @@
+"""What a launch file may write under ``source`` of the camera node: one class for each kind of device. No node."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from hardware.cameras.file import FileCamera
+from hardware.cameras.interface import Camera
+from hardware.cameras.oak import OakCamera, OakSettings
+from hardware.cameras.pixels import PIXEL_FORMATS
+from hardware.cameras.socket import SocketCamera
+from hardware.cameras.steady import SteadyCamera
+from hardware.cameras.v4l2.controls import Controls
+from hardware.cameras.v4l2.driver import V4l2Camera
+from hardware.cameras.v4l2.negotiation import Mode
+from hardware.cameras.video import VideoCamera
+from hardware.cameras.zed.calibration import EYE_SIZES
+from hardware.cameras.zed.driver import ZedCamera
+from hardware.cameras.zed.exposure import ZedExposure, exposure_lines
+
+Positive = Annotated[int, Field(gt=0)]
+
+
+class _Source(BaseModel, ABC):
+    """What all sources have.
+
+    Attributes:
+        stall_s: Time without a frame after which the device is opened anew [s].
+        repeats: Identical pictures in a row that count as a stall; 0 for never.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    stall_s: float = Field(default=1.0, gt=0.0)
+    repeats: int = Field(default=0, ge=0)
+
+    @abstractmethod
+    def camera(self) -> Camera:
+        """The device."""
+
+    def steady(self) -> SteadyCamera:
+        """The device, kept going."""
+        stall_s = max(self.stall_s, 3.0 * self.period_s())
+        return SteadyCamera(self.camera(), stall_s, max(5.0, stall_s), self.repeats)
+
+    def period_s(self) -> float:
+        """Time between two frames where the configuration says it; a slow one is no stall [s]."""
+        return 0.0
+
+
+class _ControlledSource(_Source):
+    """A device with the standard controls of video devices.
+
+    Attributes:
+        white_balance_k: Colour temperature to fix [K]; None for automatic.
+        power_line_hz: Mains frequency against which the device avoids flicker [Hz].
+        controls: More controls by name, in the device's own units (``advnerf camera list`` shows them).
+    """
+
+    white_balance_k: int | None = None
+    power_line_hz: Literal[0, 50, 60] | None = None
+    controls: dict[str, int] = {}
+
+    def _controls(self, exposure_us: float | None = None, gain: int | None = None) -> Controls:
+        return Controls(exposure_us, gain, self.white_balance_k, self.power_line_hz, self.controls)
+
+
+class V4l2Source(_ControlledSource):
+    """A video device of Linux: USB webcams, v4l2loopback, vivid.
+
+    Attributes:
+        kind: ``v4l2``.
+        device: Stable path, ``/dev/v4l/by-id/...-video-index0``.
+        width: Columns that the device delivers [px].
+        height: Rows that the device delivers [px].
+        fps: Rate of the device [Hz].
+        pixel_format: Four letters.
+        rate_hz: Frames to deliver per second, chosen by their stamps [Hz]; None for all.
+        size: Width and height to scale the pictures to [px]; None keeps them.
+        exposure_us: Exposure time to fix [us]; None for automatic.
+        gain: Gain to fix, in the device's own units.
+    """
+
+    kind: Literal["v4l2"] = "v4l2"
+    device: Path
+    width: Positive
+    height: Positive
+    fps: float = Field(default=30.0, gt=0.0)
+    pixel_format: Literal[PIXEL_FORMATS] = "YUYV"  # type: ignore[valid-type]
+    rate_hz: float | None = Field(default=10.0, gt=0.0)
+    size: tuple[Positive, Positive] | None = None
+    exposure_us: float | None = None
+    gain: int | None = None
+    repeats: int = Field(default=15, ge=0)
+
+    @model_validator(mode="after")
+    def _possible(self) -> V4l2Source:
+        self.camera()  # nothing is opened; the driver says what is impossible
+        return self
+
+    def period_s(self) -> float:
+        """Time between two frames [s]."""
+        return 1.0 / self.rate_hz if self.rate_hz else 0.0
+
+    def camera(self) -> V4l2Camera:
+        """The device."""
+        mode = Mode(self.width, self.height, self.fps, self.pixel_format)
+        controls = self._controls(self.exposure_us, self.gain)
+        return V4l2Camera(self.device, mode, controls, self.rate_hz, size=self.size)
+
+
+class ZedSource(_ControlledSource):
+    """A ZED without its SDK: its left eye, rectified.
+
+    Attributes:
+        kind: ``zed``.
+        device: Stable path, ``/dev/v4l/by-id/...ZED...-video-index0``.
+        factory: Its ``SN<serial>.conf``.
+        mode: Resolution.
+        fps: Rate of the device: 15, 30, 60 or 100 [Hz].
+        rate_hz: Frames to deliver per second, chosen by their stamps [Hz]; None for all.
+        size: Width and height of the delivered pictures [px].
+        exposure_percent: Exposure to fix [% of the longest at this rate]; None for automatic.
+        gain_raw: Gain to fix, as the sensor's register holds it; ``advnerf camera list`` shows the present one.
+    """
+
+    kind: Literal["zed"] = "zed"
+    device: Path
+    factory: Path
+    mode: Literal["2K", "HD1080", "HD720", "VGA"] = "VGA"
+    fps: float = 30.0
+    rate_hz: float | None = Field(default=10.0, gt=0.0)
+    size: tuple[Positive, Positive] = (336, 188)
+    exposure_percent: float | None = None
+    gain_raw: int | None = None
+    repeats: int = Field(default=15, ge=0)
+
+    @model_validator(mode="after")
+    def _possible(self) -> ZedSource:
+        self._controls()
+        ZedExposure(self.exposure_percent, self.gain_raw)
+        exposure_lines(100.0, self.fps)
+        width, height = EYE_SIZES[self.mode]
+        if self.size[0] > width or self.size[1] > height:
+            raise ValueError(f"expected a size of at most {width} x {height} in mode {self.mode}, got {self.size}")
+        if self.rate_hz is not None and self.rate_hz > self.fps:
+            raise ValueError(f"expected rate_hz of at most fps, {self.fps:g}, got {self.rate_hz:g}")
+        return self
+
+    def period_s(self) -> float:
+        """Time between two frames [s]."""
+        return 1.0 / self.rate_hz if self.rate_hz else 0.0
+
+    def camera(self) -> ZedCamera:
+        """The device; reads its factory calibration."""
+        exposure = ZedExposure(self.exposure_percent, self.gain_raw)
+        return ZedCamera(
+            self.device, self.factory, self.mode, self.fps, self.rate_hz, self.size, exposure, self._controls()
+        )
+
+
+class OakSource(_Source):
+    """An OAK camera (depthai 3), undistorted by the device.
+
+    Attributes:
+        kind: ``oak``.
+        device: Its id, IP address or USB port; empty for the only one.
+        socket: Board socket of the camera.
+        width: Columns [px].
+        height: Rows [px].
+        fps: Frames per second [Hz].
+        undistort: Let the device take the distortion out.
+        exposure_us: Exposure time to fix [us]; None for automatic.
+        iso: Sensitivity that goes with it.
+        white_balance_k: Colour temperature to fix [K]; None for automatic.
+    """
+
+    kind: Literal["oak"] = "oak"
+    device: str = ""
+    socket: str = "CAM_A"
+    width: Positive = 336
+    height: Positive = 188
+    fps: float = Field(default=10.0, gt=0.0)
+    undistort: bool = True
+    exposure_us: int | None = None
+    iso: int | None = None
+    white_balance_k: int | None = None
+    repeats: int = Field(default=15, ge=0)
+
+    @model_validator(mode="after")
+    def _possible(self) -> OakSource:
+        self.camera()
+        return self
+
+    def period_s(self) -> float:
+        """Time between two frames [s]."""
+        return 1.0 / self.fps
+
+    def camera(self) -> OakCamera:
+        """The device."""
+        return OakCamera(OakSettings(**self.model_dump(exclude={"kind", "stall_s", "repeats"})))
+
+
+class SocketSource(_Source):
+    """Frames from a Unix socket: the twin's, or those of a camera server of your own.
+
+    Attributes:
+        kind: ``socket``.
+        path: Path of the socket; ``${socket_dir}/frames`` for the twin.
+    """
+
+    kind: Literal["socket"] = "socket"
+    path: Path
+
+    def camera(self) -> SocketCamera:
+        """The device."""
+        return SocketCamera(self.path)
+
+
+class FileSource(_Source):
+    """A recorded video.
+
+    Attributes:
+        kind: ``file``.
+        path: The video.
+        rate_hz: Frames per second; None for those of the video.
+        loop: Begin again after the last one.
+    """
+
+    kind: Literal["file"] = "file"
+    path: Path
+    rate_hz: float | None = Field(default=None, gt=0.0)
+    loop: bool = True
+
+    def period_s(self) -> float:
+        """Time between two frames [s]."""
+        return 1.0 / self.rate_hz if self.rate_hz else 0.0
+
+    def camera(self) -> VideoCamera:
+        """The device."""
+        return VideoCamera(self.path, self.rate_hz, self.loop)
+
+
+class FolderSource(_Source):
+    """Recorded pictures.
+
+    Attributes:
+        kind: ``folder``.
+        folder: Folder of numbered images.
+        rate_hz: Frames per second.
+        loop: Begin again after the last one.
+    """
+
+    kind: Literal["folder"] = "folder"
+    folder: Path
+    rate_hz: float = Field(default=10.0, gt=0.0)
+    loop: bool = True
+
+    def period_s(self) -> float:
+        """Time between two frames [s]."""
+        return 1.0 / self.rate_hz
+
+    def camera(self) -> FileCamera:
+        """The device."""
+        return FileCamera(self.folder, self.rate_hz, self.loop)
+
+
+CameraSource = Annotated[
+    V4l2Source | ZedSource | OakSource | SocketSource | FileSource | FolderSource, Field(discriminator="kind")
+]

@@ -1,0 +1,1 @@
+"""ZED stereo cameras without their SDK, through V4L2."""

@@ -1,0 +1,1 @@
+"""Devices of the simulated lab that speak the real protocols."""

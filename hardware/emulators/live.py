@@ -1,0 +1,265 @@
+"""The simulated lab in real time, behind the real protocols: a VESC on a pty, VICON packets, stamped frames on a socket.
+
+Four threads share one car: the VESC's (bytes in, bytes out), physics (200 Hz, absolute schedule; time held up is made up for,
+as real time would), VICON (100 Hz), and the camera, which owns the OpenGL context and draws the world as it was at the stamp.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections import deque
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from advnerf_core.geometry import Array, VehicleState
+from hardware.cameras.interface import Frame
+from hardware.emulators.frame_server import FrameServer
+from hardware.emulators.monitor_port import MonitorPort
+from hardware.emulators.pacing import NS_PER_S, Pacer
+from hardware.emulators.vesc_emulator import VescEmulator
+from hardware.emulators.vesc_firmware import VescEmulatorConfig
+from hardware.emulators.vicon_emulator import ViconEmulator, ViconEmulatorConfig
+from hardware.errors import HardwareError
+from hardware.worlds.lab.config import LabConfig
+from hardware.worlds.lab.furniture import vehicle_in_room
+from hardware.worlds.lab.lab import Lab
+
+# A stall longer than this (a suspended laptop) is not driven through blindly.
+_LONGEST_STEP_S = 0.5
+_HISTORY_S = 2.0
+_HELD_UP_S = 0.2
+CAMERA_FAULTS = ("silent", "repeated")
+
+
+class LiveLabConfig(BaseModel):
+    """The live twin.
+
+    Attributes:
+        lab: The world.
+        vesc: The motor controller.
+        vicon: The motion capture system.
+        physics_rate_hz: Steps of the car per second.
+        start_pose: Where the car stands at first: x [m], y [m], yaw [rad].
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    lab: LabConfig = LabConfig()
+    vesc: VescEmulatorConfig = VescEmulatorConfig()
+    vicon: ViconEmulatorConfig = ViconEmulatorConfig()
+    physics_rate_hz: float = Field(default=200.0, ge=100.0, le=1000.0)
+    start_pose: tuple[float, float, float] = (-1.1, -2.0, 0.0)
+
+
+class PoseHistory:
+    """Where the car was, by monotonic time; asked by VICON and camera for the instant they measure."""
+
+    def __init__(self, rate_hz: float) -> None:
+        self._states: deque[tuple[int, VehicleState]] = deque(maxlen=math.ceil(_HISTORY_S * rate_hz))
+        self._changed = threading.Condition()
+
+    def add(self, mono_ns: int, state: VehicleState) -> None:
+        """Note the state at an instant."""
+        with self._changed:
+            self._states.append((mono_ns, state))
+            self._changed.notify_all()
+
+    def clear(self) -> None:
+        """Forget: the car was lifted, nothing between then and now is a motion."""
+        with self._changed:
+            self._states.clear()
+
+    def at(self, mono_ns: int, wait_s: float = 0.0) -> VehicleState | None:
+        """State at an instant, interpolated; after waiting up to ``wait_s`` for it, the newest there is."""
+        with self._changed:
+            self._changed.wait_for(lambda: bool(self._states) and self._states[-1][0] >= mono_ns, wait_s)
+            if not self._states:
+                return None
+            later = self._states[-1]
+            for earlier in reversed(self._states):
+                if earlier[0] <= mono_ns:
+                    return _between(earlier, later, mono_ns)
+                later = earlier
+            return later[1]
+
+
+def _between(a: tuple[int, VehicleState], b: tuple[int, VehicleState], mono_ns: int) -> VehicleState:
+    if b[0] <= a[0] or mono_ns >= b[0]:
+        return b[1] if mono_ns >= b[0] else a[1]
+    w, p, q = (mono_ns - a[0]) / (b[0] - a[0]), a[1], b[1]
+    turn = math.remainder(q.yaw_rad - p.yaw_rad, 2.0 * math.pi)
+    return VehicleState(
+        p.x_m + w * (q.x_m - p.x_m), p.y_m + w * (q.y_m - p.y_m), p.yaw_rad + w * turn,
+        p.speed_mps + w * (q.speed_mps - p.speed_mps), p.steering_rad + w * (q.steering_rad - p.steering_rad),
+    )  # fmt: skip
+
+
+class LiveLab:
+    """The whole lab; it lives from construction to `close`.
+
+    In the run folder: ``vesc`` (link to the pty), ``vesc_wire.csv`` (what the controller read); in the socket folder: ``frames``, and ``monitor``, the plug of the monitor.
+
+    Args:
+        config: All numbers.
+        run_dir: Folder for the link and the log.
+        socket_dir: Folder for the socket, whose path may have 107 characters at most; None is the run folder.
+        ready_timeout_s: How long building the world may take [s].
+    """
+
+    def __init__(
+        self, config: LiveLabConfig, run_dir: Path, socket_dir: Path | None = None, ready_timeout_s: float = 60.0
+    ) -> None:
+        self.config = config
+        self.vesc_port = run_dir / "vesc"
+        self.frames_path = (socket_dir or run_dir) / "frames"
+        self.monitor_path = (socket_dir or run_dir) / "monitor"
+        self._stop = threading.Event()
+        self._ready = threading.Event()
+        self._failure: BaseException | None = None
+        self._camera_fault: str | None = None
+        self._history = PoseHistory(config.physics_rate_hz)
+        self._physics_pacer = Pacer(config.physics_rate_hz)
+        self._camera_pacer = Pacer(config.lab.camera.rate_hz)
+        self._threads: list[threading.Thread] = []
+        self._frames = FrameServer(self.frames_path)
+        self._monitor: MonitorPort | None = None
+        self._vesc: VescEmulator | None = None
+        self._vicon: ViconEmulator | None = None
+        try:
+            panel = config.lab.monitor
+            self._monitor = MonitorPort(self.monitor_path, (panel.width_m, panel.height_m))
+            car = vehicle_in_room(config.lab)
+            car.reset(*config.start_pose)
+            self._vesc = VescEmulator(config.vesc, car, self.vesc_port, run_dir / "vesc_wire.csv")
+            self._start(self._run_physics, "twin physics")
+            self._start(self._run_camera, "twin camera")
+            self._wait_until_ready(ready_timeout_s)
+            # Last: who sees poses may count on pictures.
+            self._vicon = ViconEmulator(config.vicon, self._subject_poses)
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def vesc(self) -> VescEmulator:
+        """The motor controller, with its wire log."""
+        assert self._vesc is not None
+        return self._vesc
+
+    @property
+    def vicon(self) -> ViconEmulator:
+        """The motion capture system, with its faults to inject."""
+        assert self._vicon is not None
+        return self._vicon
+
+    def freeze_camera(self, fault: str | None) -> None:
+        """Let the camera fall ``silent``, or hand out its last frame ``repeated`` with its old stamp; None heals it."""
+        if fault not in (None, *CAMERA_FAULTS):
+            raise ValueError(f"expected a fault of {', '.join(CAMERA_FAULTS)}, got {fault!r}")
+        self._camera_fault = fault
+
+    @property
+    def state(self) -> VehicleState:
+        """True state of the car now."""
+        return self.vesc.state
+
+    @property
+    def missed(self) -> dict[str, int]:
+        """Ticks left out because a thread was held up."""
+        missed = {"camera": self._camera_pacer.missed, "physics": self._physics_pacer.missed}
+        return missed if self._vicon is None else {**missed, "vicon": self._vicon.missed}
+
+    def check(self) -> None:
+        """Raise what a thread of the lab died of."""
+        if self._failure is not None:
+            raise self._failure
+
+    def place(self, x_m: float, y_m: float, yaw_rad: float) -> None:
+        """Lift the car to a start pose; refused while it moves or a motor command is in force."""
+        self.vesc.place(x_m, y_m, yaw_rad)
+        self._history.clear()
+
+    def close(self) -> None:
+        """Stop all threads and remove the link and the socket."""
+        self._stop.set()
+        if self._vicon is not None:
+            self._vicon.close()
+        for thread in self._threads:
+            thread.join(timeout=5.0)
+        self._frames.close()
+        if self._monitor is not None:
+            self._monitor.close()
+        if self._vesc is not None:
+            self._vesc.close()
+
+    def __enter__(self) -> LiveLab:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    def _start(self, run: object, name: str) -> None:
+        thread = threading.Thread(target=self._guard, args=(run,), name=name, daemon=True)
+        self._threads.append(thread)
+        thread.start()
+
+    def _guard(self, run: object) -> None:
+        try:
+            assert callable(run)
+            run()
+        except Exception as error:  # reported to whoever owns the lab, by check()
+            self._failure = error
+            self._stop.set()
+            self._ready.set()
+
+    def _wait_until_ready(self, timeout_s: float) -> None:
+        if not self._ready.wait(timeout_s):
+            raise HardwareError(
+                f"expected the simulated lab to draw a picture within {timeout_s:g} s, got none: is EGL hanging?"
+            )
+        self.check()
+
+    def _run_physics(self) -> None:
+        last_ns: int | None = None
+        while (tick_ns := self._physics_pacer.wait(self._stop)) is not None:
+            step_s = 1.0 / self.config.physics_rate_hz if last_ns is None else (tick_ns - last_ns) / NS_PER_S
+            self._history.add(tick_ns, self.vesc.advance(min(step_s, _LONGEST_STEP_S), tick_ns))
+            last_ns = tick_ns
+
+    def _run_camera(self) -> None:
+        with Lab(self.config.lab) as lab:
+            lab.observe(depth=False)  # the first picture pays for compiling shaders
+            self._ready.set()
+            sequence = 0
+            last: Frame | None = None
+            while (tick_ns := self._camera_pacer.wait(self._stop)) is not None:
+                real_ns = tick_ns + time.time_ns() - time.monotonic_ns()
+                state = self._history.at(tick_ns, wait_s=0.02) or self.state
+                self._light_monitor(lab)
+                rgb, _ = lab.observe_at(state.x_m, state.y_m, state.yaw_rad, depth=False)
+                frame = Frame(rgb, real_ns, tick_ns, sequence)
+                if self._camera_fault is None:
+                    self._frames.publish(last := frame)
+                    sequence += 1
+                elif self._camera_fault == "repeated" and last is not None:
+                    self._frames.publish(replace(last))  # another object: the server tells frames apart by that
+
+    def _light_monitor(self, lab: Lab) -> None:
+        assert self._monitor is not None
+        changed, shown = self._monitor.take()
+        if changed:
+            lab.set_monitor_image(shown)
+
+    def _subject_poses(self, mono_ns: int) -> dict[str, Array]:
+        # Physics that is held up makes poses late, never wrong: an old state with a new stamp would be a car that leaps afterwards.
+        state = self._history.at(mono_ns, wait_s=_HELD_UP_S) or self.state
+        return {
+            "car": np.asarray(state.T_world_from_car),
+            "board": self.config.lab.board.T_world_from_face,
+            "monitor": self.config.lab.monitor.T_world_from_face,
+        }

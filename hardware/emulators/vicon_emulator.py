@@ -1,0 +1,184 @@
+"""Motion capture of the twin: sends Vicon Tracker's object stream for poses that a function tells.
+
+It adds the noise of a real measurement, without which a standing object would be taken for a frozen one, and produces every
+known form of occlusion, loss and restart on request.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import socket
+import threading
+from collections.abc import Callable, Mapping
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from advnerf_core.geometry import Array, make_transform, rotation_x, rotation_y, rotation_z
+from hardware.emulators.pacing import Pacer
+from hardware.mocap.vicon_codec import ObjectPose, encode_blocks, object_pose
+
+OCCLUSION_FORMS = ("missing", "zeros", "nan", "frozen")
+_NOWHERE_ELSE = np.eye(4)
+
+
+class ViconEmulatorConfig(BaseModel):
+    """The twin's motion capture system.
+
+    Attributes:
+        host: Address to send to.
+        port: UDP port to send to.
+        rate_hz: Frames per second.
+        block_bytes: Size of a datagram: 256, 512 or 1024.
+        noise_m: Standard deviation of each coordinate [m].
+        noise_rad: Standard deviation of each angle [rad].
+        seed: Seed of the noise.
+        shuffle: Whether objects come in another order in every frame.
+        loss: Probability that a datagram is lost on the way.
+        duplication: Probability that it comes twice.
+        reordering: Probability that it comes only after its successor.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    host: str = "127.0.0.1"
+    port: int = Field(default=51001, ge=1, le=65535)
+    rate_hz: float = Field(default=100.0, gt=0.0, le=1000.0)
+    block_bytes: int = 1024
+    noise_m: float = Field(default=1e-4, ge=0.0)
+    noise_rad: float = Field(default=3e-4, ge=0.0)
+    seed: int = 0
+    shuffle: bool = False
+    loss: float = Field(default=0.0, ge=0.0, le=1.0)
+    duplication: float = Field(default=0.0, ge=0.0, le=1.0)
+    reordering: float = Field(default=0.0, ge=0.0, le=1.0)
+
+
+class ViconFrames:
+    """Makes the datagrams of one frame after the other. Pure, so that faults can be tested without a network."""
+
+    def __init__(self, config: ViconEmulatorConfig) -> None:
+        self.config = config
+        self.frame_number = 0
+        self._rng = np.random.default_rng(config.seed)
+        # Of its own, so that a bad network does not change the noise of the measurements.
+        self._network = np.random.default_rng([config.seed, 1])
+        self._held_back: list[bytes] = []
+        self._occluded: dict[str, str] = {}
+        self._displaced: dict[str, Array] = {}
+        self._last: dict[str, ObjectPose] = {}
+
+    def occlude(self, name: str, form: str | None) -> None:
+        """Hide a subject in one of `OCCLUSION_FORMS`, or show it again with None."""
+        if form is None:
+            self._occluded.pop(name, None)
+        elif form in OCCLUSION_FORMS:
+            self._occluded[name] = form
+        else:
+            raise ValueError(f"expected a form of occlusion of {', '.join(OCCLUSION_FORMS)}, got {form!r}")
+
+    def displace(self, name: str, T_there_from_true: Array | None) -> None:
+        """Measure a subject elsewhere, moved by a transform ``[4, 4]`` in the world; None measures the truth again."""
+        if T_there_from_true is None:
+            self._displaced.pop(name, None)
+        else:
+            self._displaced[name] = np.array(T_there_from_true, dtype=np.float64)
+
+    def next(self, T_world_from_subject: Mapping[str, Array]) -> list[bytes]:
+        """Datagrams of the next frame for true poses ``[4, 4]`` [m]."""
+        objects = []
+        for name, T in T_world_from_subject.items():
+            if (item := self._seen(name, self._displaced.get(name, _NOWHERE_ELSE) @ T)) is not None:
+                self._last[name] = item
+                objects.append(item)
+        if self.config.shuffle:
+            objects = [objects[i] for i in self._network.permutation(len(objects))]
+        datagrams = encode_blocks(self.frame_number, objects, self.config.block_bytes)
+        self.frame_number = (self.frame_number + 1) % 2**32
+        return self._transmit(datagrams)
+
+    def _transmit(self, datagrams: list[bytes]) -> list[bytes]:
+        config, late, sent = self.config, self._held_back, []
+        self._held_back = []
+        for datagram in datagrams:
+            lost, twice, held = self._network.random(3) < (config.loss, config.duplication, config.reordering)
+            if held and not lost:
+                self._held_back.append(datagram)
+            elif not lost:
+                sent += [datagram] * (1 + int(twice))
+        return sent + late
+
+    def _seen(self, name: str, T: Array) -> ObjectPose | None:
+        form = self._occluded.get(name)
+        if form == "missing":
+            return None
+        if form == "zeros":
+            return ObjectPose(name, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+        if form == "nan":
+            return ObjectPose(name, (math.nan,) * 3, (math.nan,) * 3)
+        if form == "frozen" and name in self._last:
+            return self._last[name]
+        rx, ry, rz = self._rng.normal(0.0, self.config.noise_rad, 3) if self.config.noise_rad else np.zeros(3)
+        noise = make_transform(
+            rotation_z(rz) @ rotation_y(ry) @ rotation_x(rx), self._rng.normal(0.0, 1.0, 3) * self.config.noise_m
+        )
+        noisy = T @ make_transform(noise[:3, :3], np.zeros(3))
+        noisy[:3, 3] += noise[:3, 3]
+        return object_pose(name, noisy)
+
+
+class ViconEmulator:
+    """Sends frames from a thread of its own.
+
+    Args:
+        config: Rate, address and noise.
+        poses: Called from the sending thread for the true poses at a monotonic time [ns].
+    """
+
+    def __init__(self, config: ViconEmulatorConfig, poses: Callable[[int], Mapping[str, Array]]) -> None:
+        self.config = config
+        self._frames = ViconFrames(config)
+        self._poses = poses
+        self._lock = threading.Lock()
+        self._stop = threading.Event()
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+        self._pacer = Pacer(config.rate_hz)
+        self._thread = threading.Thread(target=self._run, name="vicon emulator", daemon=True)
+        self._thread.start()
+
+    @property
+    def missed(self) -> int:
+        """Frames left out because the thread was held up."""
+        return self._pacer.missed
+
+    def occlude(self, name: str, form: str | None) -> None:
+        """Hide a subject in one of `OCCLUSION_FORMS`, or show it again with None."""
+        with self._lock:
+            self._frames.occlude(name, form)
+
+    def displace(self, name: str, T_there_from_true: Array | None) -> None:
+        """Measure a subject elsewhere, moved by a transform ``[4, 4]`` in the world; None measures the truth again."""
+        with self._lock:
+            self._frames.displace(name, T_there_from_true)
+
+    def restart(self) -> None:
+        """Begin to count frames from 0, as Tracker does when it is started again."""
+        with self._lock:
+            self._frames.frame_number = 0
+
+    def close(self) -> None:
+        """Stop sending."""
+        self._stop.set()
+        self._thread.join(timeout=2.0)
+        self._socket.close()
+
+    def _run(self) -> None:
+        while (tick_ns := self._pacer.wait(self._stop)) is not None:
+            poses = self._poses(tick_ns)
+            with self._lock:
+                datagrams = self._frames.next(poses)
+            for datagram in datagrams:
+                with contextlib.suppress(ConnectionRefusedError):  # nobody listens yet; UDP does not care
+                    self._socket.sendto(datagram, (self.config.host, self.config.port))

@@ -1,0 +1,1 @@
+"""The VESC motor controller: bytes, settings, limits, odometry."""

@@ -1,0 +1,79 @@
+"""A terminal's keyboard as a hand. Terminals send no key-up: a key is held while it repeats.
+
+So a tap never moves the car: holding begins with the second repeat in a row and ends when the next one is late. The hand drives
+with w (straight), a and d (left, right) and s (backwards); o lets the software drive; space is the e-stop, r re-arms.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import termios
+import tty
+from collections.abc import Callable
+from typing import Any
+
+from hardware.errors import HardwareError
+from hardware.operator.hands import Hands
+
+_DRIVE = {"w": (1.0, 0.0), "a": (1.0, 1.0), "d": (1.0, -1.0), "s": (-1.0, 0.0)}
+_AUTONOMY, _STOP, _REARM = "o", " ", "r"
+HELP = "hold w a d s: drive, hold o: let the software drive, space: e-stop, r: re-arm, Ctrl-C: end"
+
+
+class Keyboard:
+    """The terminal on a file descriptor, in raw mode while it is open.
+
+    Args:
+        fd: A terminal.
+        mono_ns: Monotonic clock [ns].
+        late_s: A repeat that comes later than this after the one before is no repeat [s].
+    """
+
+    def __init__(self, fd: int, mono_ns: Callable[[], int], late_s: float = 0.15) -> None:
+        if not os.isatty(fd):
+            raise HardwareError("expected a terminal to read keys from, got none; run it in one, or use a gamepad")
+        self._fd, self._mono_ns, self._late_ns = fd, mono_ns, round(late_s * 1e9)
+        self._before: list[Any] | None = termios.tcgetattr(fd)
+        tty.setcbreak(fd, termios.TCSANOW)
+        self._key, self._repeats, self._key_ns = "", 0, 0
+        self._stops = self._rearms = 0
+        self._lost = False
+
+    def read(self, timeout_s: float = 0.05) -> Hands:
+        """Wait for keys, at most so long [s], and say what is held."""
+        with contextlib.suppress(InterruptedError):
+            if select.select([self._fd], [], [], timeout_s)[0] and not self._lost:
+                self._take()
+        now_ns = self._mono_ns()
+        held = self._key if self._repeats >= 2 and now_ns - self._key_ns <= self._late_ns else ""
+        throttle, steering = _DRIVE.get(held, (0.0, 0.0))
+        return Hands(
+            held in _DRIVE, held == _AUTONOMY, throttle, steering, self._stops, self._rearms, not self._lost,
+            "the terminal is gone" if self._lost else "keyboard",
+        )  # fmt: skip
+
+    def close(self) -> None:
+        """Give the terminal back as it was."""
+        if self._before is not None:
+            with contextlib.suppress(termios.error):
+                termios.tcsetattr(self._fd, termios.TCSANOW, self._before)
+        self._before = None
+
+    def _take(self) -> None:
+        try:
+            keys = os.read(self._fd, 256).decode("ascii", "replace").lower()
+        except OSError:
+            keys = ""
+        self._lost = not keys
+        now_ns = self._mono_ns()
+        for key in keys:
+            self._stops += key == _STOP
+            self._rearms += key == _REARM
+        if not keys:
+            return
+        # What came at once after a pause says that keys were pressed, not that one is held: it counts as one.
+        key = keys[-1]
+        again = key == self._key and now_ns - self._key_ns <= self._late_ns
+        self._key, self._repeats, self._key_ns = key, self._repeats + 1 if again else 0, now_ns

@@ -1,0 +1,1 @@
+"""Screens that show an attack in the room."""

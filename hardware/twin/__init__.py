@@ -1,1 +1,0 @@
-"""The simulated lab: a MuJoCo world and protocol-exact device emulators."""

@@ -1,0 +1,1 @@
+"""Places that are driven: the lab, the junction, CARLA."""

@@ -1,0 +1,153 @@
+"""Every number of CARLA as a deployment scene: the server, the junction, the cameras, the car, and where objects stand."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from hardware.worlds.junction.config import DubinsConfig, PhotoConfig, PlacedObject
+from hardware.worlds.lab.config import CameraConfig
+
+_WHOLE_TICK_S = 1e-6
+
+
+class _Frozen(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class ServerConfig(_Frozen):
+    """Where the server is, and how long it may take.
+
+    Attributes:
+        host: Computer of the server.
+        port: Its first port; the second one, for images, is the next number unless the server was told otherwise.
+        timeout_s: For connecting, for a call, and for a tick [s].
+        load_timeout_s: For loading a map [s].
+        frame_timeout_s: From a tick's end to the arrival of its pictures [s].
+        town: The map; None takes the one that is loaded.
+        load_town: Load the map if another one is loaded; it removes whatever else is in the world.
+        take_over: Go on where the world is synchronous already: another client drives it, or one was killed.
+        allow_traffic: Go on where there are other vehicles or walkers, which would be in the pictures.
+    """
+
+    host: str = "127.0.0.1"
+    port: int = Field(default=2000, ge=1, le=65534)
+    timeout_s: float = Field(default=20.0, gt=0.0)
+    load_timeout_s: float = Field(default=180.0, gt=0.0)
+    frame_timeout_s: float = Field(default=5.0, gt=0.0)
+    town: str | None = "Town02"
+    load_town: bool = True
+    take_over: bool = False
+    allow_traffic: bool = False
+
+
+class JunctionConfig(_Frozen):
+    """Which junction, and how much road around it.
+
+    Attributes:
+        id: OpenDRIVE id; None takes the map's first junction of three roads that is flat and has roads long enough.
+        choice: Which of its sets of drives.
+        approach_m: The drives start so far before the junction's middle [m].
+        beyond_m: Length of the road after the junction that belongs to the reference paths [m].
+        max_height_range_m: The drives' points may differ so much in height [m]; the car moves in a plane.
+        reach_m: The world ends at plus and minus this in x and y of the scene's frame [m].
+    """
+
+    id: int | None = None
+    choice: int = Field(default=0, ge=0)
+    approach_m: float = Field(default=24.0, gt=0.0)
+    beyond_m: float = Field(default=40.0, gt=0.0)
+    max_height_range_m: float = Field(default=0.15, ge=0.0)
+    reach_m: float = Field(default=60.0, gt=0.0)
+
+
+class RenderConfig(_Frozen):
+    """How the server draws.
+
+    Attributes:
+        fixed_delta_s: Simulated time of one tick [s]; CARLA's physics wants no more than 0.1.
+        weather: Name of a preset of ``carla.WeatherParameters``, its wind stilled; None leaves the weather alone.
+        freeze_lights: Stop the traffic lights while the scene is open.
+        settle_ticks: Extra ticks after a camera has jumped: exposure, anti-aliasing over time and texture streaming catch up.
+        exposure: ``fixed`` pins both bounds of the automatic exposure to one value, so that a place has one colour; ``automatic``
+            leaves it alone.
+        exposure_bright: That value; None takes the server's upper bound, where daylight is.
+        camera_attributes: Attributes of ``sensor.camera.rgb``; names that the server does not have are an error.
+    """
+
+    fixed_delta_s: float = Field(default=0.1, gt=0.0, le=0.1)
+    weather: str | None = "ClearNoon"
+    freeze_lights: bool = True
+    settle_ticks: int = Field(default=5, ge=0, le=100)
+    exposure: Literal["fixed", "automatic"] = "fixed"
+    exposure_bright: float | None = Field(default=None, gt=0.0)
+    camera_attributes: dict[str, str] = {
+        "motion_blur_intensity": "0.0",
+        "lens_flare_intensity": "0.0",
+        "bloom_intensity": "0.0",
+    }
+
+    def whole_ticks(self, duration_s: float) -> int:
+        """Ticks that a duration takes.
+
+        Raises:
+            ValueError: It is not a whole number of ticks.
+        """
+        ticks = round(duration_s / self.fixed_delta_s) if math.isfinite(duration_s) else -1
+        if ticks < 0 or abs(ticks * self.fixed_delta_s - duration_s) > _WHOLE_TICK_S:
+            raise ValueError(
+                f"expected a duration of whole ticks of render.fixed_delta_s = {self.fixed_delta_s:g} s, got {duration_s:g} s"
+            )
+        return ticks
+
+
+class BodyConfig(_Frozen):
+    """The car that is seen in CARLA. It has no physics: it is put where the Dubins car of the experiment is.
+
+    Attributes:
+        blueprint: Which vehicle; None for no body, only cameras.
+        origin_ahead_m: The blueprint's origin, the middle of the body, ahead of the reference point that moves along the heading
+            [m]; about half the wheelbase, so that the reference point is the rear axle.
+        half_length_m: From the origin to the front bumper [m].
+        half_width_m: Half of the width [m].
+        solid: Labels of ``carla.CityObjectLabel`` that stop the car; empty lets it pass through everything.
+    """
+
+    blueprint: str | None = "vehicle.lincoln.mkz_2020"
+    origin_ahead_m: float = 1.4
+    half_length_m: float = Field(default=2.45, gt=0.0)
+    half_width_m: float = Field(default=0.9, gt=0.0)
+    solid: tuple[str, ...] = ("Buildings", "Walls", "Fences", "Poles", "GuardRail", "TrafficLight", "TrafficSigns")
+
+
+class CarlaConfig(_Frozen):
+    """CARLA as a deployment scene.
+
+    Attributes:
+        server: Server and map.
+        junction: Where in the map.
+        render: How it is drawn.
+        body: The body of the car.
+        camera: Driving camera, relative to the car's reference point. The default sits over the bonnet, which it does not see.
+        photo: Camera of the posed images.
+        car: How the car moves.
+        objects: Where the objects of the attack stand, in the scene's frame; composed by depth, not part of CARLA's world.
+    """
+
+    server: ServerConfig = ServerConfig()
+    junction: JunctionConfig = JunctionConfig()
+    render: RenderConfig = RenderConfig()
+    body: BodyConfig = BodyConfig()
+    camera: CameraConfig = CameraConfig(x_m=3.2, z_m=1.6, pitch_down_rad=math.radians(8.0))
+    photo: PhotoConfig = PhotoConfig()
+    car: DubinsConfig = DubinsConfig()
+    objects: tuple[PlacedObject, ...] = ()
+
+    @model_validator(mode="after")
+    def _objects_have_names_of_their_own(self) -> CarlaConfig:
+        names = [thing.name for thing in self.objects]
+        if len(set(names)) != len(names):
+            raise ValueError(f"expected objects of different names, got {names}")
+        return self

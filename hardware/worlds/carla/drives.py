@@ -1,0 +1,77 @@
+"""The drives through a junction of a CARLA map: where they are, and as plain data for where no server is at hand."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from hardware.worlds.carla.errors import CarlaMapError
+from hardware.worlds.carla.frames import SceneFrame
+from hardware.worlds.junction.paths import ExitName, PathName, ReferencePath
+
+# The names of the simulated intersection, whose frame this is.
+EXIT_OF: dict[PathName, ExitName] = {"straight": "east", "right": "south", "left": "west"}
+
+
+@dataclass(frozen=True)
+class Drives:
+    """The three drives, in the scene's own frame: x along the straight drive, origin in the junction's middle on the ground.
+
+    The frame and the names are those of the simulated intersection: straight leaves to the east, right to the south; left comes
+    from the south and leaves to the west.
+
+    Attributes:
+        junction_id: OpenDRIVE id of the junction.
+        frame: Where the scene's frame is in CARLA's world.
+        paths: Straight, right and left.
+        lane_width_m: Width of the narrowest lane driven on [m].
+        height_range_m: Highest minus lowest point of all three drives [m].
+        right_hand: Whether traffic keeps to the right.
+    """
+
+    junction_id: int
+    frame: SceneFrame
+    paths: dict[PathName, ReferencePath]
+    lane_width_m: float
+    height_range_m: float
+    right_hand: bool
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data (JSON types) from which :meth:`from_dict` makes the same drives, where no server is at hand."""
+        T = self.frame.T_mirrored_from_world
+        return {
+            "junction_id": self.junction_id,
+            "frame": {"x_m": T[0, 3], "y_m": T[1, 3], "z_m": T[2, 3], "yaw_rad": self.frame.yaw_rad},
+            "paths": {
+                name: {"start_pose": path.start_pose, "segments": path.segments} for name, path in self.paths.items()
+            },
+            "lane_width_m": self.lane_width_m,
+            "height_range_m": self.height_range_m,
+            "right_hand": self.right_hand,
+        }
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Drives:
+        """Rebuild drives from :meth:`to_dict`.
+
+        Raises:
+            CarlaMapError: The data is something else.
+        """
+        try:
+            paths = {
+                name: ReferencePath(
+                    name,
+                    EXIT_OF[name],
+                    (x, y, yaw),
+                    tuple(tuple(piece) for piece in path["segments"]),
+                )
+                for name, path in data["paths"].items()
+                for x, y, yaw in [map(float, path["start_pose"])]
+            }
+            rest = {name: data[name] for name in ("junction_id", "lane_width_m", "height_range_m", "right_hand")}
+            return cls(frame=SceneFrame(**data["frame"]), paths=paths, **rest)
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise CarlaMapError(
+                f"expected drives as written by Drives.to_dict, got something else: {error!r}"
+            ) from error

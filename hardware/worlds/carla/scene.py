@@ -1,0 +1,283 @@
+"""CARLA, synchronous: observe, decide, step. The car's time passes only in ``step``."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import weakref
+from collections.abc import Iterator
+from types import TracebackType
+from typing import Any, Literal, overload
+
+import numpy as np
+from numpy.typing import NDArray
+
+from advnerf_core.geometry import Array, Pinhole, VehicleState, planar_pose
+from hardware.worlds.carla.body import CarlaCar
+from hardware.worlds.carla.camera import DEPTH, RGB, Camera
+from hardware.worlds.carla.config import CarlaConfig
+from hardware.worlds.carla.connection import check_nobody_else, connect, open_world
+from hardware.worlds.carla.drives import Drives
+from hardware.worlds.carla.errors import CarlaError, CarlaFrameError
+from hardware.worlds.carla.frames import CarlaPose
+from hardware.worlds.carla.junction import find_drives
+from hardware.worlds.carla.library import load_carla, server_answers
+from hardware.worlds.carla.pixels import depth_of, rgb_of
+from hardware.worlds.carla.synchronous import TickedWorld, set_scenery
+from hardware.worlds.carla.undo import Undo
+from hardware.worlds.junction.paths import PathName, ReferencePath
+
+Rgb = NDArray[np.uint8]
+Depth = NDArray[np.float32]
+_log = logging.getLogger(__name__)
+_CLOSING_TIMEOUT_S = 5.0
+_ATTEMPTS = 3  # ticks until a picture of the wanted pose must have come
+
+
+class CarlaScene:
+    """A junction of a CARLA map with a Dubins car in it; a `hardware.worlds.world.DeploymentScene`.
+
+    The world belongs to the scene while it is open: synchronous, weather and traffic lights fixed, the server draws only when asked.
+    Closing puts all of it back, also after an error, or when the program ends without closing.
+
+    ``step`` moves the car and ticks; pictures are those of the last tick. A picture from elsewhere (``observe`` after ``reset``,
+    ``observe_at``, ``photograph``) takes ticks of its own, in which the car stands. A picture counts only if its frame number is the
+    tick's and its pose is the one asked for; where the server leaves a frame out, or moves the camera a tick late, another tick
+    follows, up to three.
+
+    Args:
+        config: All numbers of the scene.
+        library: The ``carla`` module; None imports it.
+
+    Raises:
+        CarlaError: One of `hardware.worlds.carla.errors`, for what is missing or wrong.
+
+    Attributes:
+        camera_pinhole: Intrinsics of the driving camera.
+        photo_pinhole: Intrinsics of the camera of ``photograph``.
+        T_car_from_camera: Where the driving camera sits on the car ``[4, 4]``.
+        drives: Junction, frame and lanes, as the map has them.
+        repeated_frames: How often a picture did not come, or came from elsewhere, and another tick followed.
+    """
+
+    def __init__(self, config: CarlaConfig | None = None, library: Any = None) -> None:
+        self.config = CarlaConfig() if config is None else config
+        self.camera_pinhole: Pinhole = self.config.camera.pinhole
+        self.photo_pinhole: Pinhole = self.config.photo.pinhole
+        self.T_car_from_camera: Array = self.config.camera.T_car_from_camera
+        self.repeated_frames = 0
+        self._closed = False
+        self._changed = True  # whether something stands elsewhere since the last tick
+        self._library = load_carla() if library is None else library
+        self._cameras: dict[str, Camera] = {}
+        self._undo = Undo()
+        self._client: Any = None
+        # Also where nobody closes the scene: a world left synchronous stands still for everybody.
+        self._at_exit = weakref.finalize(self, self._undo.run)
+        try:
+            with server_answers("opening the scene"):
+                self._open()
+        except BaseException:
+            self._put_back()
+            raise
+
+    def _open(self) -> None:
+        config, library = self.config, self._library
+        self._client = connect(config.server, library)
+        self._world = open_world(self._client, config.server)
+        check_nobody_else(self._world, config.server)
+        self.drives: Drives = drives_in(self._world.get_map(), library, config)
+        self._ticked = TickedWorld(self._world, config.render.fixed_delta_s, config.server.timeout_s, self._undo)
+        set_scenery(self._world, library, config.render, self._undo)
+        self._car = CarlaCar(self._world, library, self.drives.frame, config, self._undo)
+
+    @property
+    def paths(self) -> dict[PathName, ReferencePath]:
+        """The reference paths straight, right and left."""
+        return self.drives.paths
+
+    @property
+    def off_track_m(self) -> float:
+        """Cross-track error beyond which the car has left its lane [m]."""
+        return 0.5 * self.drives.lane_width_m
+
+    @property
+    def state(self) -> VehicleState:
+        """True state of the car."""
+        return self._car.state
+
+    @property
+    def turn_rate_radps(self) -> float:
+        """True turn rate of the car [rad/s], which lags behind its command."""
+        return self._car.turn_rate_radps
+
+    @property
+    def blocked(self) -> bool:
+        """Whether the car stands against something solid or at the end of the world."""
+        return self._car.blocked
+
+    def reset(self, x_m: float, y_m: float, yaw_rad: float) -> VehicleState:
+        """Put the car down at rest, turning nowhere."""
+        self._require_open()
+        self._changed = True
+        with server_answers("putting the car down"):
+            return self._car.reset(x_m, y_m, yaw_rad)
+
+    def step(self, turn_rate_radps: float, speed_mps: float, duration_s: float) -> VehicleState:
+        """Hold one command for a while.
+
+        Args:
+            turn_rate_radps: Commanded turn rate, left positive [rad/s]; clipped to the car's bound.
+            speed_mps: Speed, reached at once [m/s].
+            duration_s: Time to the next observation, a whole number of ticks [s].
+
+        Raises:
+            ValueError: The duration is not a whole number of ticks, or a value is not finite.
+            CarlaError: The server did not answer.
+        """
+        self._require_open()
+        delta, ticks = self.config.render.fixed_delta_s, self.config.render.whole_ticks(duration_s)
+        with server_answers("moving the car"):
+            for _ in range(ticks):
+                before = self._driving_pose()
+                self._car.advance(turn_rate_radps, speed_mps, delta)
+                after = self._driving_pose()
+                for name in (RGB, DEPTH):
+                    if name in self._cameras:
+                        self._cameras[name].aim(after, jump=self._cameras[name].pose != before)
+                self._tick()
+        return self.state
+
+    @overload
+    def observe(self, depth: Literal[True] = True) -> tuple[Rgb, Depth]: ...
+    @overload
+    def observe(self, depth: Literal[False]) -> tuple[Rgb, None]: ...
+    def observe(self, depth: bool = True) -> tuple[Rgb, Depth | None]:
+        """What the driving camera sees: colours ``[H, W, 3]`` and planar depth ``[H, W]`` [m], or None if not wanted.
+
+        Raises:
+            CarlaFrameError: The pictures did not come in time.
+            CarlaUnreachable: The server did not answer.
+        """
+        return self._see(self.state.T_world_from_car, depth)
+
+    @overload
+    def observe_at(self, x_m: float, y_m: float, yaw_rad: float, depth: Literal[True] = True) -> tuple[Rgb, Depth]: ...
+    @overload
+    def observe_at(self, x_m: float, y_m: float, yaw_rad: float, depth: Literal[False]) -> tuple[Rgb, None]: ...
+    def observe_at(self, x_m: float, y_m: float, yaw_rad: float, depth: bool = True) -> tuple[Rgb, Depth | None]:
+        """What the driving camera would see from another pose of the car; the car stays where it is, and out of sight."""
+        with server_answers("looking from elsewhere"), self._without_car():
+            return self._see(planar_pose(x_m, y_m, yaw_rad), depth)
+
+    def photograph(self, T_world_from_camera: Array) -> Rgb:
+        """A photograph ``[H, W, 3]`` with ``photo_pinhole``, without the car, in the driving camera's colours."""
+        p = self.photo_pinhole
+        with server_answers("taking a photograph"), self._without_car():
+            (image,) = self._pictures({"photo": (RGB, p)}, T_world_from_camera)
+            return rgb_of(image, p.width, p.height)
+
+    def close(self) -> None:
+        """Remove cameras and car and put the world back; safe to call twice.
+
+        Raises:
+            CarlaError: Something could not be put back; the message says what.
+        """
+        failed = self._put_back()
+        if failed:
+            raise CarlaError(
+                f"could not put CARLA's world back: {'; '.join(failed)}. If the server still runs, `advnerf carla release` frees it"
+            )
+
+    def __enter__(self) -> CarlaScene:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if kind is None:
+            self.close()
+            return
+        # The error under way is the one to be seen; what could not be put back, often for the same reason, is only noted.
+        for what in self._put_back():
+            _log.warning("could not put back %s", what)
+
+    def _put_back(self) -> list[str]:
+        self._closed = True
+        self._cameras.clear()
+        self._at_exit.detach()
+        if self._client is not None:
+            # A server that is gone is not waited for again and again.
+            self._client.set_timeout(min(_CLOSING_TIMEOUT_S, self.config.server.timeout_s))
+        return self._undo.run()
+
+    def _require_open(self) -> None:
+        if self._closed:
+            raise CarlaError(
+                "expected an open scene, this one is closed: its world is not ours any more; make another one"
+            )
+
+    def _tick(self) -> None:
+        self._ticked.tick()
+        self._changed = False
+
+    @contextlib.contextmanager
+    def _without_car(self) -> Iterator[None]:
+        if not self._car.hide():
+            yield
+            return
+        self._changed = True
+        try:
+            yield
+        finally:
+            self._car.show()
+            self._changed = True
+
+    def _driving_pose(self) -> CarlaPose:
+        return self.drives.frame.camera_pose(self.state.T_world_from_car @ self.T_car_from_camera)
+
+    def _see(self, T_world_from_car: Array, depth: bool) -> tuple[Rgb, Depth | None]:
+        p = self.camera_pinhole
+        wanted = {RGB: (RGB, p)} | ({DEPTH: (DEPTH, p)} if depth else {})
+        with server_answers("taking a picture"):
+            images = self._pictures(wanted, T_world_from_car @ self.T_car_from_camera)
+        return rgb_of(images[0], p.width, p.height), depth_of(images[1], p.width, p.height) if depth else None
+
+    def _pictures(self, wanted: dict[str, tuple[str, Pinhole]], T_world_from_camera: Array) -> list[Any]:
+        """Raw pictures of one tick from one pose, by several cameras (made when they are first wanted)."""
+        self._require_open()
+        pose = self.drives.frame.camera_pose(T_world_from_camera)
+        for name, (kind, pinhole) in wanted.items():
+            if name not in self._cameras:
+                parts = (self._world, self._library, kind, pinhole, pose, self.config.render, self._undo)
+                self._cameras[name] = Camera(*parts)
+            elif self._cameras[name].pose != pose:
+                self._cameras[name].aim(pose, jump=True)
+        cameras = [self._cameras[name] for name in wanted]
+        if not all(camera.settled for camera in cameras):
+            for _ in range(self.config.render.settle_ticks + 1):
+                self._tick()
+            for camera in cameras:
+                camera.settled = True
+        elif self._changed:
+            self._tick()
+        for _ in range(_ATTEMPTS - 1):
+            try:
+                return [self._picture(camera) for camera in cameras]
+            except CarlaFrameError:
+                self.repeated_frames += 1
+                self._tick()
+        return [self._picture(camera) for camera in cameras]
+
+    def _picture(self, camera: Camera) -> Any:
+        return camera.picture(self._ticked.frame, self.config.server.frame_timeout_s)
+
+
+def drives_in(carla_map: Any, library: Any, config: CarlaConfig) -> Drives:
+    """The drives of the configured junction, on ground that is flat enough for a car that moves in a plane.
+
+    Raises:
+        CarlaMapError: The junction is not there, its roads are too short, or they are not flat.
+    """
+    j = config.junction
+    return find_drives(carla_map, library, j.id, j.choice, j.approach_m, j.beyond_m, j.max_height_range_m)

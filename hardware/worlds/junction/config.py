@@ -1,0 +1,229 @@
+"""Every number of the simulated intersection: roads, cameras, the car's true behaviour, and where the objects stand."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from advnerf_core.geometry import Array, Pinhole, make_transform, rotation_z
+from hardware.worlds.junction.paths import PathName, ReferencePath, junction_paths
+from hardware.worlds.lab.config import CameraConfig
+
+ObjectKind = Literal["small_car", "hydrant"]
+# Length and width [m] at scale 1 of the objects that ``advnerf object build --generate`` makes.
+OBJECT_SIZES_M: dict[ObjectKind, tuple[float, float]] = {"small_car": (3.64, 1.7), "hydrant": (0.48, 0.48)}
+
+
+class _Frozen(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class RoadConfig(_Frozen):
+    """A main road along x with a side road to the south (negative y), two lanes each; the origin is the junction's middle.
+
+    Attributes:
+        lane_width_m: Width of a lane [m]; vehicles keep to the right.
+        corner_radius_m: Radius of the kerb at the two corners [m].
+        kerb_height_m: Height of kerb and pavement above the asphalt [m].
+        pavement_width_m: From the asphalt to the front gardens, kerb stone included [m].
+        half_m: The world ends at plus and minus this in x and y [m].
+        sky_m: Height of the painted sky's ceiling [m].
+        seed: Seed of the procedural textures.
+    """
+
+    lane_width_m: float = Field(default=3.5, ge=2.5, le=5.0)
+    corner_radius_m: float = Field(default=6.0, ge=2.0, le=12.0)
+    kerb_height_m: float = Field(default=0.12, ge=0.02, le=0.3)
+    pavement_width_m: float = Field(default=3.0, ge=1.0, le=4.0)
+    half_m: float = Field(default=60.0, ge=50.0, le=100.0)
+    sky_m: float = Field(default=36.0, ge=20.0)
+    seed: int = Field(default=11, ge=0)
+
+
+class PhotoConfig(_Frozen):
+    """The camera that photographs the scene for learning: same colours as the driving camera, wider and larger.
+
+    Attributes:
+        width: Image width [px].
+        height: Image height [px].
+        horizontal_fov_deg: Horizontal field of view [deg]; fixes fx = fy.
+    """
+
+    width: int = Field(default=640, gt=0)
+    height: int = Field(default=360, gt=0)
+    horizontal_fov_deg: float = Field(default=90.0, gt=0.0, lt=170.0)
+
+    @property
+    def pinhole(self) -> Pinhole:
+        """Intrinsics with a centred principal point and square pixels."""
+        focal_px = 0.5 * self.width / math.tan(0.5 * math.radians(self.horizontal_fov_deg))
+        return Pinhole(self.width, self.height, focal_px, focal_px, 0.5 * self.width, 0.5 * self.height)
+
+
+class DubinsConfig(_Frozen):
+    """The car: what the experiment asks of it, and how it really behaves.
+
+    Attributes:
+        speed_mps: Speed of the experiments [m/s].
+        max_turn_rate_radps: Commands are clipped to plus and minus this [rad/s].
+        turn_rate_lag_s: Time constant with which the turn rate follows its command [s]; 0 for none.
+        turn_rate_gain: True turn rate over the commanded one; 1 for a car without error.
+        body_length_m: Length of the body [m].
+        body_width_m: Width of the body [m].
+        body_ahead_m: Middle of the body ahead of the reference point, which moves along the heading [m].
+    """
+
+    speed_mps: float = Field(default=6.0, gt=0.0)
+    max_turn_rate_radps: float = Field(default=1.2, gt=0.0)
+    turn_rate_lag_s: float = Field(default=0.12, ge=0.0)
+    turn_rate_gain: float = Field(default=1.02, gt=0.0)
+    body_length_m: float = Field(default=3.6, gt=0.0)
+    body_width_m: float = Field(default=1.6, gt=0.0)
+    body_ahead_m: float = 1.2
+
+    @classmethod
+    def ideal(cls) -> DubinsConfig:
+        """The car that the surrogate believes in: no lag, no gain error."""
+        return cls(turn_rate_lag_s=0.0, turn_rate_gain=1.0)
+
+
+class PlacedObject(_Frozen):
+    """Where an object of the attack stands. It is not part of the simulated world: the deployment composes it by depth.
+
+    Attributes:
+        name: Unique name.
+        kind: What it is.
+        x_m: Middle of its foot [m].
+        y_m: Middle of its foot [m].
+        z_m: Height it stands on [m]: the kerb's on a pavement.
+        yaw_rad: Heading of its front [rad].
+        scale: Size relative to the object as it was built.
+    """
+
+    name: str = Field(min_length=1)
+    kind: ObjectKind
+    x_m: float
+    y_m: float
+    z_m: float = 0.12
+    yaw_rad: float = 0.0
+    scale: float = Field(default=1.0, gt=0.0, le=2.0)
+
+    @property
+    def T_world_from_object(self) -> Array:
+        """Pose ``[4, 4]`` of its foot, x to its front, z up; the scale is not part of it."""
+        return make_transform(rotation_z(self.yaw_rad), [self.x_m, self.y_m, self.z_m])
+
+    def corners_m(self) -> list[tuple[float, float]]:
+        """The four corners [m] of the ground it covers."""
+        length, width = (0.5 * self.scale * size for size in OBJECT_SIZES_M[self.kind])
+        c, s = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
+        signs = ((1, 1), (-1, 1), (-1, -1), (1, -1))
+        ends = [(a * length, b * width) for a, b in signs]
+        return [(self.x_m + c * u - s * v, self.y_m + s * u + c * v) for u, v in ends]
+
+
+class IntersectionConfig(_Frozen):
+    """The whole simulated intersection; the defaults are the scene of the experiments.
+
+    Attributes:
+        road: Roads, pavements and the world's size.
+        camera: Driving camera, mounted relative to the car's reference point.
+        photo: Camera of the posed images that a surrogate is learned from.
+        car: Vehicle.
+        objects: Where the objects of the attack stand.
+        approach_m: How far from the junction's middle the drives start [m].
+        left_radius_m: Radius of the left turn [m]; the right turn is concentric with the kerb.
+        beyond_m: Length of the road after a turn that belongs to the reference path [m].
+        supersampling: Images are drawn this many times larger per axis and averaged.
+    """
+
+    road: RoadConfig = RoadConfig()
+    camera: CameraConfig = CameraConfig(x_m=1.2, z_m=1.5, pitch_down_rad=math.radians(8.0))
+    photo: PhotoConfig = PhotoConfig()
+    car: DubinsConfig = DubinsConfig()
+    # Cars on the pavements of the far side and of the near corner, hydrants at the kerb beside the three exits: each drive
+    # sees some of them close and most of them from afar.
+    objects: tuple[PlacedObject, ...] = (
+        PlacedObject(name="car_north", kind="small_car", x_m=-4.5, y_m=4.65, yaw_rad=math.pi, scale=1.2),
+        PlacedObject(name="car_corner", kind="small_car", x_m=5.47, y_m=-7.62, yaw_rad=math.radians(65.0), scale=1.2),
+        PlacedObject(
+            name="hydrant_corner", kind="hydrant", x_m=-5.75, y_m=-5.75, yaw_rad=math.radians(45.0), scale=1.6
+        ),
+        PlacedObject(name="hydrant_south", kind="hydrant", x_m=-3.95, y_m=-14.0, scale=1.6),
+        PlacedObject(name="hydrant_east", kind="hydrant", x_m=11.0, y_m=-3.95, yaw_rad=math.radians(90.0), scale=1.6),
+    )
+    approach_m: float = Field(default=24.0, gt=0.0)
+    left_radius_m: float = Field(default=8.75, gt=0.0)
+    beyond_m: float = Field(default=30.0, gt=0.0)
+    supersampling: int = Field(default=2, ge=1, le=4)
+
+    @model_validator(mode="after")
+    def _corners_have_a_pavement(self) -> IntersectionConfig:
+        road = self.road
+        if road.pavement_width_m >= road.corner_radius_m:
+            raise ValueError(
+                f"expected a pavement narrower than the corners' radius of {road.corner_radius_m} m, got {road.pavement_width_m} m"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _drivable(self) -> IntersectionConfig:
+        half_lane, radius = 0.5 * self.road.lane_width_m, max(self.right_radius_m, self.left_radius_m)
+        if not half_lane + radius < self.approach_m <= self.road.half_m - 10.0:
+            raise ValueError(
+                f"expected half a lane + the radius of the turns = {half_lane + radius} m < approach_m <= half_m - 10 = "
+                f"{self.road.half_m - 10.0} m, got {self.approach_m} m"
+            )
+        tightest = self.car.speed_mps / self.car.max_turn_rate_radps
+        if min(self.right_radius_m, self.left_radius_m) < tightest:
+            raise ValueError(
+                f"expected turns the car can follow, of at least speed / turn rate = {tightest:.2f} m, got a right turn of "
+                f"{self.right_radius_m} m and a left turn of {self.left_radius_m} m"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _objects_beside_the_roads(self) -> IntersectionConfig:
+        names = [thing.name for thing in self.objects]
+        if len(set(names)) != len(names):
+            raise ValueError(f"expected objects of different names, got {names}")
+        for thing in self.objects:
+            inside = [corner for corner in thing.corners_m() if self.on_road(*corner)]
+            if inside:
+                x, y = inside[0]
+                raise ValueError(
+                    f"expected objects beside the roads, but {thing.name} reaches into a lane at ({x:.2f}, {y:.2f}); move it"
+                )
+        return self
+
+    @property
+    def right_radius_m(self) -> float:
+        """Radius of the right turn along the middle of the lane [m]: concentric with the kerb."""
+        return self.road.corner_radius_m + 0.5 * self.road.lane_width_m
+
+    @property
+    def off_track_m(self) -> float:
+        """Cross-track error beyond which the car has left its lane [m]."""
+        return 0.5 * self.road.lane_width_m
+
+    def on_road(self, x_m: float, y_m: float) -> bool:
+        """Whether a point lies on the asphalt, rounded corners included."""
+        width, radius = self.road.lane_width_m, self.road.corner_radius_m
+        if abs(y_m) < width or (y_m < 0.0 and abs(x_m) < width):
+            return True
+        if y_m > 0.0 or abs(x_m) > width + radius or y_m < -width - radius:
+            return False
+        return math.hypot(abs(x_m) - width - radius, y_m + width + radius) > radius
+
+    def lanes(self) -> tuple[ReferencePath, ...]:
+        """Middles of all lanes: the drives', and those that nobody drives here, in which nothing may stand either."""
+        driven = self.paths()
+        return (*driven.values(), driven["straight"].mirrored("x"), driven["right"].mirrored("y"))
+
+    def paths(self) -> dict[PathName, ReferencePath]:
+        """The drives "straight", "right" and "left"."""
+        return junction_paths(
+            self.road.lane_width_m, self.right_radius_m, self.left_radius_m, self.approach_m, self.beyond_m
+        )

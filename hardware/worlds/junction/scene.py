@@ -1,0 +1,148 @@
+"""The simulated intersection, synchronous: observe, decide, step, as fast as it goes. Time passes only in ``step``."""
+
+from __future__ import annotations
+
+from types import TracebackType
+from typing import Literal, overload
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from advnerf_core.geometry import Array, Pinhole, VehicleState, invert_transform, look_at, planar_pose, transform_points
+from hardware.worlds.junction.car import DubinsCar
+from hardware.worlds.junction.config import IntersectionConfig
+from hardware.worlds.junction.town import obstacles
+from hardware.worlds.junction.world import build_model
+from hardware.worlds.lab.renderer import Renderer
+from hardware.worlds.lab.vehicle import Footprint
+
+Rgb = NDArray[np.uint8]
+Depth = NDArray[np.float32]
+RANGE_M = (0.1, 250.0)  # from the near plane to past the farthest corner of the sky
+PATH_RGB = {"straight": (40, 110, 230), "right": (235, 140, 20), "left": (200, 40, 170)}
+
+
+class Intersection:
+    """A junction of three roads with a Dubins car in it; a `hardware.worlds.world.DeploymentScene`.
+
+    The same configuration and the same calls give the same bytes on one machine. It owns an OpenGL context: use it in the
+    thread that made it, and close it or use it as a context manager.
+
+    Args:
+        config: All numbers of the scene.
+
+    Raises:
+        TwinUnavailable: MuJoCo or EGL is missing; the message names the packages.
+    """
+
+    def __init__(self, config: IntersectionConfig | None = None) -> None:
+        self.config = IntersectionConfig() if config is None else config
+        self.camera_pinhole: Pinhole = self.config.camera.pinhole
+        self.photo_pinhole: Pinhole = self.config.photo.pinhole
+        self.T_car_from_camera: Array = self.config.camera.T_car_from_camera
+        self._obstacles = obstacles(self.config)
+        self._car = DubinsCar(self.config.car, self.fits)
+        self._renderer = Renderer(build_model(self.config), self.config.supersampling, range_m=RANGE_M)
+
+    def reset(self, x_m: float, y_m: float, yaw_rad: float) -> VehicleState:
+        """Put the car down at rest, turning nowhere."""
+        return self._car.reset(x_m, y_m, yaw_rad)
+
+    def step(self, turn_rate_radps: float, speed_mps: float, duration_s: float) -> VehicleState:
+        """Hold one command for a while.
+
+        Args:
+            turn_rate_radps: Commanded turn rate, left positive [rad/s]; clipped to the car's bound.
+            speed_mps: Speed, reached at once [m/s].
+            duration_s: Time to the next observation [s].
+        """
+        return self._car.advance(turn_rate_radps, speed_mps, duration_s)
+
+    @property
+    def state(self) -> VehicleState:
+        """True state of the car."""
+        return self._car.state
+
+    @property
+    def turn_rate_radps(self) -> float:
+        """True turn rate of the car [rad/s], which lags behind its command."""
+        return self._car.turn_rate_radps
+
+    @property
+    def blocked(self) -> bool:
+        """Whether the car stands against a house, a trunk or a post, or at the end of the world."""
+        return self._car.blocked
+
+    def fits(self, x_m: float, y_m: float, yaw_rad: float) -> bool:
+        """Whether the car's body is clear of everything solid at a pose of its reference point."""
+        car = self.config.car
+        x, y = x_m + car.body_ahead_m * np.cos(yaw_rad), y_m + car.body_ahead_m * np.sin(yaw_rad)
+        body = Footprint(float(x), float(y), 0.5 * car.body_length_m, 0.5 * car.body_width_m, yaw_rad)
+        if any(max(map(abs, corner)) > self.config.road.half_m for corner in body.corners()):
+            return False
+        return not any(body.overlaps(obstacle) for obstacle in self._obstacles)
+
+    @overload
+    def observe(self, depth: Literal[True] = True) -> tuple[Rgb, Depth]: ...
+    @overload
+    def observe(self, depth: Literal[False]) -> tuple[Rgb, None]: ...
+    def observe(self, depth: bool = True) -> tuple[Rgb, Depth | None]:
+        """What the driving camera sees now.
+
+        Args:
+            depth: Whether depth is wanted too.
+
+        Returns:
+            Colour image ``[H, W, 3]`` uint8 and planar depth ``[H, W]`` float32 [m], or None.
+        """
+        return self._see(self.state.T_world_from_car, depth)
+
+    @overload
+    def observe_at(self, x_m: float, y_m: float, yaw_rad: float, depth: Literal[True] = True) -> tuple[Rgb, Depth]: ...
+    @overload
+    def observe_at(self, x_m: float, y_m: float, yaw_rad: float, depth: Literal[False]) -> tuple[Rgb, None]: ...
+    def observe_at(self, x_m: float, y_m: float, yaw_rad: float, depth: bool = True) -> tuple[Rgb, Depth | None]:
+        """What the driving camera would see from another pose of the car; the car stays where it is."""
+        return self._see(planar_pose(x_m, y_m, yaw_rad), depth)
+
+    def photograph(self, T_world_from_camera: Array) -> Rgb:
+        """A photograph ``[H, W, 3]`` uint8 with ``photo_pinhole``, in the driving camera's colours."""
+        return self._renderer.render_rgb(T_world_from_camera, self.photo_pinhole)
+
+    def overview(self, width: int = 960, height: int = 720) -> Rgb:
+        """Picture of the junction from above the south, with the paths and the objects' places drawn in, for reports."""
+        focal = 1.0 * width
+        pinhole = Pinhole(width, height, focal, focal, 0.5 * width, 0.5 * height)
+        T = look_at([0.0, -46.0, 62.0], [0.0, -7.0, 0.0])
+        picture = self._renderer.render_rgb(T, pinhole)  # the sky is seen from inside only
+        for name, path in self.config.paths().items():
+            along = np.arange(0.0, self.config.car.speed_mps * 6.0, 0.25)
+            points = np.array([[*path.pose_at(float(s))[:2], 0.05] for s in along])
+            _draw(picture, pinhole.project(transform_points(invert_transform(T), points)), PATH_RGB[name], False)
+        for thing in self.config.objects:
+            corners = np.array([[x, y, thing.z_m] for x, y in thing.corners_m()])
+            _draw(picture, pinhole.project(transform_points(invert_transform(T), corners)), (240, 30, 30), True)
+        return picture
+
+    def close(self) -> None:
+        """Free the OpenGL context; safe to call twice."""
+        self._renderer.close()
+
+    def __enter__(self) -> Intersection:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _see(self, T_world_from_car: Array, depth: bool) -> tuple[Rgb, Depth | None]:
+        T = T_world_from_car @ self.T_car_from_camera
+        rgb = self._renderer.render_rgb(T, self.camera_pinhole)
+        return rgb, self._renderer.render_depth(T, self.camera_pinhole) if depth else None
+
+
+def _draw(picture: Rgb, pixels: Array, rgb: tuple[int, int, int], closed: bool) -> None:
+    line = np.rint(pixels * 16.0).astype(np.int32)[:, None]
+    cv2.polylines(picture, [line], closed, rgb, thickness=2, lineType=cv2.LINE_AA, shift=4)

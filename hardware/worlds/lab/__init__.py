@@ -1,0 +1,1 @@
+"""The simulated lab: a furnished room, a car, cameras and a monitor in MuJoCo."""

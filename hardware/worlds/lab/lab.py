@@ -1,0 +1,210 @@
+"""The simulated lab, synchronous: observe, decide, step, as fast as it goes. Lab time passes only in ``step``."""
+
+from __future__ import annotations
+
+from types import TracebackType
+from typing import Literal, overload
+
+import numpy as np
+from numpy.typing import NDArray
+
+from advnerf_core.geometry import Array, Pinhole, VehicleState, look_at, planar_pose
+from hardware.worlds.lab import textures
+from hardware.worlds.lab.config import LabConfig, MonitorOpticsConfig
+from hardware.worlds.lab.furniture import vehicle_in_room
+from hardware.worlds.lab.monitor import ScreenOptics
+from hardware.worlds.lab.phone import apply_colours
+from hardware.worlds.lab.renderer import Renderer
+from hardware.worlds.lab.world import CAR_GROUP, CEILING_GROUP, MONITOR_PIXELS, build_model
+
+Rgb = NDArray[np.uint8]
+Depth = NDArray[np.float32]
+
+
+class Lab:
+    """A room with a car in it.
+
+    The same configuration and the same calls give the same bytes on one machine. A ``Lab`` owns an OpenGL context: use
+    it in the thread that made it, and close it or use it as a context manager.
+
+    Args:
+        config: All numbers of the lab.
+
+    Raises:
+        TwinUnavailable: MuJoCo or EGL is missing; the message names the packages.
+    """
+
+    def __init__(self, config: LabConfig | None = None) -> None:
+        self.config = LabConfig() if config is None else config
+        self.camera_pinhole: Pinhole = self.config.camera.pinhole
+        self.phone_pinhole: Pinhole = self.config.phone.pinhole
+        self.photo_pinhole: Pinhole = self.phone_pinhole
+        self.T_car_from_camera: Array = self.config.camera.T_car_from_camera
+        self._vehicle = vehicle_in_room(self.config)
+        self._pending: list[tuple[float, float, float]] = []  # due time [s], servo, erpm
+        self._time_s = 0.0
+        self._renderer = Renderer(build_model(self.config), self.config.supersampling, hidden_groups=(CAR_GROUP,))
+        # None where colours are seen as they are shown: nothing to compute from frame to frame.
+        self._optics: ScreenOptics | None = None
+        if self.config.monitor_optics != MonitorOpticsConfig():
+            self._optics = ScreenOptics(self.config.monitor_optics, self.config.monitor, MONITOR_PIXELS)
+        self._screen_seen_from: Array | None = None
+        if self._optics is not None:
+            self.set_monitor_image(None)
+
+    def reset(self, x_m: float, y_m: float, yaw_rad: float, speed_mps: float = 0.0) -> VehicleState:
+        """Put the car down, forget commands under way and start lab time at 0; a speed, if given, is held."""
+        self._vehicle.reset(x_m, y_m, yaw_rad, speed_mps)
+        if speed_mps != 0.0:
+            self._vehicle.command(erpm=self._vehicle.erpm)
+        self._pending.clear()
+        self._time_s = 0.0
+        return self.state
+
+    def step(self, steering_rad: float, speed_mps: float, duration_s: float) -> VehicleState:
+        """Send one command and let time pass.
+
+        The command goes the way of the real driver's: nominal gains, servo clipped to its limits, speeds below the motor
+        controller's minimum become a drag stop; and it reaches the actuators ``car.command_delay_s`` after this call.
+
+        Args:
+            steering_rad: Commanded wheel angle, left positive [rad].
+            speed_mps: Commanded speed [m/s].
+            duration_s: Time to the next observation [s].
+        """
+        if not np.isfinite([steering_rad, speed_mps, duration_s]).all() or duration_s < 0.0:
+            raise ValueError(
+                f"expected a finite command and duration >= 0, got {steering_rad}, {speed_mps}, {duration_s}"
+            )
+        car = self.config.car
+        due = self._time_s + car.command_delay_s
+        self._pending.append((due, car.servo_from_steering(steering_rad), car.erpm_from_speed(speed_mps)))
+        end = self._time_s + duration_s
+        while self._pending and self._pending[0][0] <= end:
+            due, servo, erpm = self._pending.pop(0)
+            self._vehicle.advance(max(due - self._time_s, 0.0))
+            self._time_s = due
+            self._actuate(servo, erpm)
+        self._vehicle.advance(max(end - self._time_s, 0.0))
+        self._time_s = end
+        return self.state
+
+    def _actuate(self, servo: float, erpm: float) -> None:
+        if abs(erpm) < self.config.car.min_erpm:
+            self._vehicle.command(servo=servo, duty=0.0)
+        else:
+            self._vehicle.command(servo=servo, erpm=erpm)
+
+    @property
+    def state(self) -> VehicleState:
+        """True state of the car."""
+        return self._vehicle.state
+
+    @property
+    def time_s(self) -> float:
+        """Lab time since the last reset [s]."""
+        return self._time_s
+
+    @property
+    def blocked(self) -> bool:
+        """Whether the car stands against a wall or an obstacle."""
+        return self._vehicle.blocked
+
+    @overload
+    def observe(self, depth: Literal[True] = True) -> tuple[Rgb, Depth]: ...
+    @overload
+    def observe(self, depth: Literal[False]) -> tuple[Rgb, None]: ...
+    def observe(self, depth: bool = True) -> tuple[Rgb, Depth | None]:
+        """What the driving camera sees now.
+
+        Args:
+            depth: Whether depth is wanted too; it costs about half as much again.
+
+        Returns:
+            Colour image ``[H, W, 3]`` uint8 and planar depth ``[H, W]`` float32 [m], or None.
+        """
+        return self._see(planar_pose(*self._pose()), depth)
+
+    @overload
+    def observe_at(self, x_m: float, y_m: float, yaw_rad: float, depth: Literal[True] = True) -> tuple[Rgb, Depth]: ...
+    @overload
+    def observe_at(self, x_m: float, y_m: float, yaw_rad: float, depth: Literal[False]) -> tuple[Rgb, None]: ...
+    def observe_at(self, x_m: float, y_m: float, yaw_rad: float, depth: bool = True) -> tuple[Rgb, Depth | None]:
+        """What the driving camera would see from another pose of the car; the car stays where it is."""
+        return self._see(planar_pose(x_m, y_m, yaw_rad), depth)
+
+    def observe_held(self, T_world_from_car: Array) -> Rgb:
+        """What the driving camera sees ``[H, W, 3]`` while a person holds the car at any pose ``[4, 4]``, tilted too."""
+        return self._see(T_world_from_car, depth=False)[0]
+
+    def photograph(self, T_world_from_camera: Array) -> Rgb:
+        """Take a phone photo ``[H, W, 3]`` uint8 with ``phone_pinhole`` and the phone's own colours."""
+        self._light_screen(T_world_from_camera)
+        rgb = self._renderer.render_rgb(T_world_from_camera, self.phone_pinhole)
+        return apply_colours(rgb, self.config.phone)
+
+    def overview(self, width: int = 960, height: int = 720) -> Rgb:
+        """Picture of the whole room and the car from above the south wall, without the ceiling, for reports."""
+        focal = 1.04 * width
+        pinhole = Pinhole(width, height, focal, focal, 0.5 * width, 0.5 * height)
+        side = self.config.room.side_m
+        self._renderer.place("car", planar_pose(*self._pose()), hidden_groups=(CEILING_GROUP,))
+        try:
+            return self._renderer.render_rgb(look_at([0.0, -1.12 * side, 1.12 * side], [0.0, -0.3, 0.0]), pinhole)
+        finally:
+            self._renderer.place("car", np.eye(4), hidden_groups=(CAR_GROUP,))
+
+    def subject_poses(self) -> dict[str, Array]:
+        """What motion capture sees: ``T_world_from_subject`` ``[4, 4]`` of "car", "board" and "monitor"."""
+        return {
+            "car": planar_pose(*self._pose()),
+            "board": self.config.board.T_world_from_face,
+            "monitor": self.config.monitor.T_world_from_face,
+        }
+
+    def set_board_image(self, rgb: Rgb | None) -> None:
+        """Show a picture ``[h, w, 3]`` on the board's face (row 0 on top); None makes it plain again."""
+        plain = np.full((2, 2, 3), self.config.board.rgb, dtype=np.float32)
+        self._renderer.set_texture("board", textures.to_uint8(plain) if rgb is None else rgb)
+
+    def set_monitor_image(self, rgb: Rgb | None) -> None:
+        """Show a picture ``[h, w, 3]`` on the whole monitor (row 0 on top); None shows the idle screen again."""
+        shown = textures.to_uint8(textures.screen_image(256, 144)) if rgb is None else rgb
+        if self._optics is None:
+            self._renderer.set_texture("monitor", shown)
+            return
+        self._optics.show(shown)
+        self._screen_seen_from = None
+
+    def close(self) -> None:
+        """Free the OpenGL context; safe to call twice."""
+        self._renderer.close()
+
+    def __enter__(self) -> Lab:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _pose(self) -> tuple[float, float, float]:
+        state = self._vehicle.state
+        return state.x_m, state.y_m, state.yaw_rad
+
+    def _see(self, T_world_from_car: Array, depth: bool) -> tuple[Rgb, Depth | None]:
+        T = T_world_from_car @ self.T_car_from_camera
+        self._light_screen(T)
+        rgb = self._renderer.render_rgb(T, self.camera_pinhole)
+        return rgb, self._renderer.render_depth(T, self.camera_pinhole) if depth else None
+
+    def _light_screen(self, T_world_from_camera: Array) -> None:
+        """Give the monitor the colours that are seen from where the camera is."""
+        if self._optics is None:
+            return
+        place = T_world_from_camera[:3, 3]
+        before = self._screen_seen_from
+        if before is not None and (not self._optics.depends_on_place or np.array_equal(before, place)):
+            return
+        self._renderer.set_texture("monitor", self._optics.seen_from(place))
+        self._screen_seen_from = np.array(place)

@@ -1,0 +1,115 @@
+"""Bags that are no MCAP, read through ``rosbags``: the SQLite files of rosbag2, and bags of ROS 1."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from rosbags import rosbag1, rosbag2
+from rosbags.interfaces import MessageDefinitionFormat
+
+from nodes.bags.formats import Format
+from nodes.bags.message_definitions import IDL, MSG, full_type_name
+from nodes.bags.stored_types import CDR, ROS1, RecordedTopic
+from nodes.runtime.errors import BagError
+
+# What the readers raise at a damaged file.
+_NONSENSE = (
+    rosbag1.ReaderError, rosbag2.ReaderError, struct.error, ValueError, KeyError, IndexError, TypeError, AssertionError,
+    OverflowError, EOFError, MemoryError, RuntimeError, OSError,
+)  # fmt: skip
+_LANGUAGES = {MessageDefinitionFormat.MSG: MSG, MessageDefinitionFormat.IDL: IDL}
+
+
+class StoredTopic(NamedTuple):
+    """One topic of one writer: its number in the file, what the file says about it, and how many messages it has."""
+
+    number: int
+    recorded: RecordedTopic
+    messages: int
+
+
+class Stored(NamedTuple):
+    """What a file holds; times in nanoseconds since 1970, 0 for a file without messages."""
+
+    start_ns: int
+    end_ns: int
+    messages: int
+    topics: tuple[StoredTopic, ...]
+
+
+class StoredMessage(NamedTuple):
+    """One message, with the number of its topic."""
+
+    number: int
+    log_ns: int
+    data: bytes
+
+
+def read_stored(path: Path, form: Format) -> Stored:
+    """What a file holds.
+
+    Raises:
+        BagError: The file is damaged, or its recorder left a part of it in another file.
+    """
+    with _opened(path, form) as reader:
+        topics = tuple(_topic(connection, form) for connection in reader.connections)
+        count = sum(topic.messages for topic in topics)
+        if not count:
+            return Stored(0, 0, 0, topics)
+        return Stored(reader.start_time, reader.end_time - 1, count, topics)
+
+
+def stored_messages(path: Path, form: Format, numbers: Collection[int], start_ns: int) -> Iterator[StoredMessage]:
+    """Messages in order of their log time.
+
+    Args:
+        path: The file.
+        form: Its format.
+        numbers: Numbers of the topics that are wanted.
+        start_ns: First log time [ns since 1970].
+    """
+    with _opened(path, form) as reader:
+        wanted = [connection for connection in reader.connections if connection.id in numbers]
+        if wanted:  # an empty list means all of them
+            for connection, log_ns, data in reader.messages(wanted, start=start_ns):
+                yield StoredMessage(connection.id, log_ns, bytes(data))
+
+
+def _topic(connection: Any, form: Format) -> StoredTopic:
+    language = _LANGUAGES.get(connection.msgdef.format, "")
+    serialization = ROS1 if form is Format.ROS1 else connection.ext.serialization_format or CDR
+    recorded = RecordedTopic(
+        connection.topic, full_type_name(connection.msgtype), "" if form is Format.ROS1 else connection.digest,
+        connection.msgdef.data if language else "", language or MSG, serialization,
+    )  # fmt: skip
+    return StoredTopic(connection.id, recorded, connection.msgcount)
+
+
+@contextmanager
+def _opened(path: Path, form: Format) -> Iterator[Any]:
+    rest = path.with_name(f"{path.name}-wal")
+    if form is Format.SQLITE and rest.exists() and rest.stat().st_size:
+        raise BagError(
+            f"{path} is unfinished: its recorder was killed or is still at work, and the newest messages are in {rest.name}; "
+            f"put them in with: sqlite3 {path} 'PRAGMA wal_checkpoint(TRUNCATE)'"
+        )
+    try:
+        with _reader(path, form) as reader:
+            yield reader
+    except BagError:
+        raise
+    except _NONSENSE as error:
+        said = " ".join(str(error).split())
+        raise BagError(f"{path} is {form.value}, and cannot be read: {type(error).__name__} {said:.160}") from error
+
+
+def _reader(path: Path, form: Format) -> Any:
+    if form is Format.ROS1:
+        return rosbag1.Reader(path)
+    if path.suffix != ".db3":
+        raise BagError(f"{path} is {form.value}; rename it to {path.stem}.db3 to read it")
+    return rosbag2.Reader(path)

@@ -1,0 +1,41 @@
+"""The camera's pictures in a bag, whether they were recorded raw or compressed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from nodes.bags.reader import read_info, read_messages
+from nodes.runtime.errors import BagError
+from nodes.runtime.image_parts import IMAGE_TYPE
+from nodes.runtime.messages import decode
+from nodes.runtime.pictures import COMPRESSED_TOPIC, RAW_TOPIC
+
+CAMERA_TOPICS = (RAW_TOPIC, COMPRESSED_TOPIC)
+
+
+def image_topic(bag: Path, candidates: Sequence[str] = CAMERA_TOPICS) -> str:
+    """The first of some topics that has messages.
+
+    Raises:
+        BagError: None has.
+    """
+    topics = {topic.name: topic for topic in read_info(bag).topics if topic.count}
+    for name in candidates:
+        if name in topics:
+            return name
+    raise BagError(
+        f"expected images on {' or '.join(candidates)} in {bag}, got none; it has {', '.join(topics) or 'no message'}"
+    )
+
+
+def image_messages(bag: Path, topic: str) -> Iterator[Any]:
+    """Every picture of a topic as ``sensor_msgs/Image``, in order of log time; a topic with compressed pictures is decoded.
+
+    Args:
+        bag: Bag folder or file.
+        topic: Any topic with images, also one that is not in the topic table.
+    """
+    for message in read_messages(bag, [topic], types={topic: IMAGE_TYPE}):
+        yield decode(IMAGE_TYPE, message.cdr)

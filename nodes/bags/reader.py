@@ -1,0 +1,372 @@
+"""Look into bags and take messages out of them."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache, partial
+from pathlib import Path
+
+from mcap.records import Channel, Statistics
+from mcap.summary import Summary
+
+from advnerf_core.files import write_atomically
+from nodes.bags.check import diagnose
+from nodes.bags.chunks import messages_in_order, read_attachment_at, read_metadata_at
+from nodes.bags.file import open_bag
+from nodes.bags.foreign import read_stored, stored_messages
+from nodes.bags.formats import Format, no_checksums, recognise
+from nodes.bags.merge import Source, merge_by_time
+from nodes.bags.message_definitions import full_type_name
+from nodes.bags.parts import bag_parts
+from nodes.bags.stored_types import Convert, RecordedTopic, converter, unpacked
+from nodes.bags.whole import FileSummary, read_summary
+from nodes.runtime.clock import NS_PER_S
+from nodes.runtime.errors import BagError
+from nodes.runtime.topics import type_of_topic
+
+
+@dataclass(frozen=True)
+class TopicInfo:
+    """One topic of a bag.
+
+    Attributes:
+        name: Topic.
+        type: ROS 2 type.
+        count: Messages.
+        lost: Messages that were published but did not reach the recorder; None when the recorder did not say.
+    """
+
+    name: str
+    type: str
+    count: int
+    lost: int | None
+
+
+@dataclass(frozen=True)
+class BagInfo:
+    """What a bag holds; times are log times [ns since 1970].
+
+    Attributes:
+        path: Its file, or its folder if it was split.
+        parts: Its files in order.
+        size_bytes: Size of all files.
+        start_ns: Time of the first message.
+        end_ns: Time of the last message.
+        topics: Its topics by name.
+        attachments: Names of the files that ride along, in whichever part.
+        metadata: Facts that the recorder noted: versions, git hash.
+        unchecked: Why its messages may have changed without a sign of it; empty where checksums cover them. Every figure made from
+            such a bag says so.
+    """
+
+    path: Path
+    parts: tuple[Path, ...]
+    size_bytes: int
+    start_ns: int
+    end_ns: int
+    topics: tuple[TopicInfo, ...]
+    attachments: tuple[str, ...]
+    metadata: dict[str, str]
+    unchecked: str = ""
+
+    @property
+    def duration_s(self) -> float:
+        """Time from the first to the last message [s]."""
+        return (self.end_ns - self.start_ns) / NS_PER_S
+
+    @property
+    def messages(self) -> int:
+        """Number of messages."""
+        return sum(topic.count for topic in self.topics)
+
+
+@dataclass(frozen=True)
+class BagMessage:
+    """One message of a bag; the bytes on a topic of ours are CDR of our type, however the bag had them."""
+
+    topic: str
+    cdr: bytes
+    log_ns: int
+    publish_ns: int
+    sequence: int
+
+
+@dataclass(frozen=True)
+class _Part:
+    """What one file says about itself, without the index of its chunks; ``recorded`` has its topics by their numbers in the file."""
+
+    path: Path
+    format: Format
+    size_bytes: int
+    start_ns: int
+    end_ns: int
+    messages: int
+    topics: tuple[TopicInfo, ...]
+    recorded: Mapping[int, RecordedTopic]
+    attachments: tuple[str, ...]
+    metadata: dict[str, str]
+    unchecked: str
+
+
+def read_info(bag: Path) -> BagInfo:
+    """Summary of a bag, over all its parts."""
+    parts = _parts(bag)
+    filled = [part for part in parts if part.messages]
+    topics: dict[str, TopicInfo] = {}
+    for topic in (topic for part in parts for topic in part.topics):
+        topics[topic.name] = _sum(topics[topic.name], topic) if topic.name in topics else topic
+    return BagInfo(
+        parts[0].path if len(parts) == 1 else parts[0].path.parent, tuple(part.path for part in parts),
+        sum(part.size_bytes for part in parts), min((part.start_ns for part in filled), default=0),
+        max((part.end_ns for part in filled), default=0), tuple(topics[name] for name in sorted(topics)),
+        tuple(dict.fromkeys(name for part in parts for name in part.attachments)),
+        next((part.metadata for part in parts if part.metadata), {}),
+        next((part.unchecked for part in parts if part.unchecked), ""),
+    )  # fmt: skip
+
+
+def read_attachment(bag: Path, name: str) -> bytes:
+    """Content of an attached file, from whichever part has it."""
+    parts = _parts(bag)
+    for part in parts:
+        if name in part.attachments:
+            return _attachments(part.path, [name])[name]
+    names = [name for part in parts for name in part.attachments]
+    raise BagError(f"{bag} has no attachment {name!r}; it has {', '.join(names) or 'none'}")
+
+
+def read_attachments(bag: Path) -> dict[str, bytes]:
+    """Content of all attached files by name; of two with one name the later."""
+    contents: dict[str, bytes] = {}
+    for part in _parts(bag):
+        if part.attachments:
+            contents |= _attachments(part.path, part.attachments)
+    return contents
+
+
+def _attachments(path: Path, names: Sequence[str]) -> dict[str, bytes]:
+    summary, _ = _whole_file(path)
+    with open_bag(path) as file:
+        found = [read_attachment_at(file, index) for index in summary.attachment_indexes if index.name in names]
+    return {attachment.name: bytes(attachment.data) for attachment in found}
+
+
+def extract_attachments(bag: Path, folder: Path, names: Sequence[str] = ()) -> list[Path]:
+    """Write attached files into a folder.
+
+    Args:
+        bag: Bag folder or file.
+        folder: Where they go; made if it is missing. A file that is there already is an error, never overwritten.
+        names: Only these; none means all.
+    """
+    contents = read_attachments(bag)
+    if unknown := [name for name in names if name not in contents]:
+        raise BagError(f"{bag} has no attachment {', '.join(unknown)}; it has {', '.join(contents) or 'none'}")
+    targets = {name: Path(folder) / plain_name(bag, name) for name in names or contents}
+    for target in targets.values():
+        if target.exists():
+            raise BagError(f"{target} exists; remove it or choose another folder with --output")
+    for name, target in targets.items():
+        write_atomically(target, contents[name])
+    return list(targets.values())
+
+
+def plain_name(bag: Path, name: str) -> str:
+    """The name of an attachment, if it is that of a file and nothing else: a stranger's bag must not write where it likes."""
+    if name in ("", ".", "..") or Path(name).name != name or "\0" in name:
+        raise BagError(f"{bag}: the attachment {name!r} has no plain file name; it is not written anywhere")
+    return name
+
+
+def read_messages(
+    bag: Path, topics: Sequence[str] | None = None, start_offset_s: float = 0.0, types: Mapping[str, str] | None = None,
+    as_recorded: bool = False,
+) -> Iterator[BagMessage]:  # fmt: skip
+    """Messages in order of their log time.
+
+    Messages on topics of ours come as our type: a bag that has another definition of it, or a type that can stand for it (see
+    `nodes.bags.stored_types`), is converted.
+
+    Args:
+        bag: Bag folder or file.
+        topics: Only these; every one must be in the bag.
+        start_offset_s: Leave out so much of the beginning [s].
+        types: Types that are wanted, by topic; None takes those of the topic table, and leaves other topics as they are.
+        as_recorded: Convert nothing.
+
+    Raises:
+        BagError: The bag cannot be read, lacks a topic, or has a topic of a type that cannot become ours.
+    """
+    info = read_info(bag)
+    path = info.path
+    if info.unchecked:
+        _say_unchecked(path, info.unchecked)
+    known = [topic.name for topic in info.topics]
+    for name in topics or ():
+        if name not in known:
+            raise BagError(f"{path} has no topic {name}; it has {', '.join(known)}")
+    # Without an offset nothing is left out: of a file with log times of 0, the summary does not count these as its start.
+    start_ns = info.start_ns + round(start_offset_s * NS_PER_S) if start_offset_s else 0
+    if start_offset_s < 0 or start_ns > info.end_ns:
+        raise BagError(
+            f"expected a start offset between 0 and {info.duration_s:.1f} s, the length of {path}, got {start_offset_s}"
+        )
+    wanted = frozenset(topics or known)
+    sources = [
+        Source(part.start_ns, partial(_messages_of, part, wanted, start_ns, converters))
+        for part in _parts(bag)
+        if part.messages and part.end_ns >= start_ns and not wanted.isdisjoint(topic.name for topic in part.topics)
+        for converters in [{} if as_recorded else _converters(part, wanted, types or {})]
+    ]
+    yield from merge_by_time(sources, lambda message: message.log_ns)
+
+
+def _messages_of(
+    part: _Part, topics: frozenset[str], start_ns: int, converters: Mapping[int, Convert]
+) -> Iterator[BagMessage]:
+    """Messages of one file in order of their log time."""
+    names = {number: recorded.topic for number, recorded in part.recorded.items() if recorded.topic in topics}
+    stored = _mcap_messages if part.format is Format.MCAP else _stored_messages
+    for number, message in stored(part, names, start_ns):
+        data = unpacked(message.cdr, message.topic, str(part.path))
+        if convert := converters.get(number):
+            data = convert(data)
+        yield message if data is message.cdr else replace(message, cdr=data)
+
+
+def _mcap_messages(part: _Part, names: Mapping[int, str], start_ns: int) -> Iterator[tuple[int, BagMessage]]:
+    summary, _ = _whole_file(part.path)
+    with open_bag(part.path) as file:
+        for raw in messages_in_order(file, summary, names, start_ns):
+            times = raw.log_ns, raw.publish_ns, raw.sequence
+            yield raw.channel_id, BagMessage(names[raw.channel_id], raw.data, *times)
+
+
+def _stored_messages(part: _Part, names: Mapping[int, str], start_ns: int) -> Iterator[tuple[int, BagMessage]]:
+    """Messages of a file that is no MCAP; it has neither publish times nor sequence numbers, so they are made up."""
+    counts = dict.fromkeys(names.values(), 0)
+    for number, log_ns, data in stored_messages(part.path, part.format, names, start_ns):
+        topic = names[number]
+        yield number, BagMessage(topic, data, log_ns, log_ns, counts[topic])
+        counts[topic] += 1
+
+
+def require_readable(bag: Path, topics: Mapping[str, str]) -> None:
+    """Refuse a bag with a topic that cannot become the type that is wanted.
+
+    Args:
+        bag: Bag folder or file.
+        topics: Types that are wanted, by topic.
+    """
+    for part in _parts(bag):
+        _converters(part, frozenset(topics), topics)
+
+
+def _converters(part: _Part, topics: frozenset[str], types: Mapping[str, str]) -> dict[int, Convert]:
+    """What makes the messages of a file ours, by the number of their topic; nothing for those that are ours."""
+    found = {}
+    for number, recorded in part.recorded.items():
+        expected = types.get(recorded.topic) or type_of_topic(recorded.topic)
+        if recorded.topic in topics and expected and (convert := converter(recorded, expected, str(part.path))):
+            found[number] = convert
+    return found
+
+
+def type_of(summary: Summary, channel: Channel) -> str:
+    """Type of a channel's messages; empty if the file does not say."""
+    schema = summary.schemas.get(channel.schema_id)
+    return full_type_name(schema.name) if schema is not None else ""
+
+
+def _count(text: str) -> int | None:
+    return int(text) if text.isascii() and text.isdigit() else None
+
+
+def _sum(one: TopicInfo, other: TopicInfo) -> TopicInfo:
+    lost = None if one.lost is None or other.lost is None else one.lost + other.lost
+    return TopicInfo(one.name, one.type or other.type, one.count + other.count, lost)
+
+
+def _parts(bag: Path) -> list[_Part]:
+    found = []
+    for path in bag_parts(bag):
+        state = path.stat()
+        if (part := _part_of(path, state.st_mtime_ns, state.st_size)) is None:
+            raise _unfinished(path)
+        found.append(part)
+    return found
+
+
+@lru_cache(maxsize=1024)
+def _part_of(path: Path, mtime_ns: int, size_bytes: int) -> _Part | None:
+    form = recognise(path)
+    if form is not Format.MCAP:
+        return _stored_part(path, form, size_bytes)
+    if (found := _summary_of(path, mtime_ns, size_bytes)) is None:
+        return None
+    summary, statistics = found
+    with open_bag(path) as file:
+        notes = [read_metadata_at(file, index) for index in summary.metadata_indexes]
+    records = {record.name: dict(record.metadata) for record in notes}
+    ends = records.get("advnerf_end")
+    topics: dict[str, TopicInfo] = {}
+    for channel in summary.channels.values():
+        lost = None if ends is None else _count(ends.get(f"lost {channel.topic}", "0"))
+        count = statistics.channel_message_counts.get(channel.id, 0)
+        topic = TopicInfo(channel.topic, type_of(summary, channel), count, lost)
+        topics[channel.topic] = _sum(topics[channel.topic], topic) if channel.topic in topics else topic
+    return _Part(
+        path, form, size_bytes, statistics.message_start_time, statistics.message_end_time, statistics.message_count,
+        tuple(topics.values()), {channel.id: _recorded(summary, channel) for channel in summary.channels.values()},
+        tuple(index.name for index in summary.attachment_indexes), records.get("advnerf", {}),
+        summary.unchecked,
+    )  # fmt: skip
+
+
+def _stored_part(path: Path, form: Format, size_bytes: int) -> _Part:
+    stored = read_stored(path, form)
+    topics: dict[str, TopicInfo] = {}
+    for _, recorded, count in stored.topics:
+        topic = TopicInfo(recorded.topic, recorded.type, count, None)
+        topics[topic.name] = _sum(topics[topic.name], topic) if topic.name in topics else topic
+    return _Part(
+        path, form, size_bytes, stored.start_ns, stored.end_ns, stored.messages, tuple(topics.values()),
+        {number: recorded for number, recorded, _ in stored.topics}, (), {}, no_checksums(form),
+    )  # fmt: skip
+
+
+def _recorded(summary: Summary, channel: Channel) -> RecordedTopic:
+    schema = summary.schemas.get(channel.schema_id)
+    return RecordedTopic(
+        channel.topic, type_of(summary, channel), channel.metadata.get("topic_type_hash", ""),
+        "" if schema is None else schema.data.decode("utf-8", "replace"), "" if schema is None else schema.encoding,
+        channel.message_encoding,
+    )  # fmt: skip
+
+
+def _whole_file(path: Path) -> tuple[FileSummary, Statistics]:
+    state = path.stat()
+    if (found := _summary_of(path, state.st_mtime_ns, state.st_size)) is None:
+        raise _unfinished(path)
+    return found
+
+
+@lru_cache(maxsize=1024)
+def _say_unchecked(path: Path, reason: str) -> None:
+    """Once per bag, for everybody who takes numbers from it."""
+    print(f"{path}: unchecked: {reason}, so damage to it cannot be noticed", file=sys.stderr, flush=True)
+
+
+def _unfinished(path: Path) -> BagError:
+    """What to say of a file without an end; what is advised depends on what is in it."""
+    lines = diagnose(path).lines
+    return BagError(f"{path} is unfinished: its recorder was killed; {'; '.join(lines[-2:])}")
+
+
+@lru_cache(maxsize=4)
+def _summary_of(path: Path, mtime_ns: int, size_bytes: int) -> tuple[FileSummary, Statistics] | None:
+    """Summary of a file in a certain state; one with an hour of chunks takes a second to read."""
+    del mtime_ns, size_bytes  # they are the state
+    return read_summary(path)

@@ -1,0 +1,173 @@
+"""Records of an MCAP file as bytes: their lengths, their contents, their checksums."""
+
+from __future__ import annotations
+
+import io
+import struct
+import zlib
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.records import Attachment
+
+from nodes.bags.file import NONSENSE
+from nodes.runtime.errors import BagError
+
+MAGIC = b"\x89MCAP0\r\n"
+RECORD_HEAD = struct.Struct("<BQ")
+MESSAGE_HEAD = struct.Struct("<HIQQ")
+# Opcode and length, then the offsets of summary and summary offsets, then the checksum; behind it the magic.
+FOOTER_BYTES = RECORD_HEAD.size + 20
+DATA_END_BYTES = RECORD_HEAD.size + 4
+# Before the data of a chunk: start and end time, uncompressed size, CRC; then the name of the compression, then a length.
+_CHUNK_HEAD = struct.Struct("<QQQI")
+CHUNK_HEAD_BYTES = _CHUNK_HEAD.size + 4 + 8
+# What a damaged or hostile file may make us ask for.
+MOST_BYTES = 1 << 28
+_LONGEST_NAME = 64
+
+
+class Damaged(ValueError):
+    """Bytes contradict themselves; the text says how and fits behind "it is damaged: "."""
+
+
+class ChunkHead(NamedTuple):
+    """What stands before the records of a chunk; no checksum covers it.
+
+    Attributes:
+        start_ns: Log time of its first message [ns since 1970].
+        end_ns: Log time of its last message [ns since 1970].
+        size: Bytes of its records, unpacked.
+        crc: Checksum of its records, unpacked; 0 means none.
+        compression: Name of the compression; empty for none.
+        data_at: Where its data begin, in the bytes that were parsed.
+        data_length: Bytes of its data.
+    """
+
+    start_ns: int
+    end_ns: int
+    size: int
+    crc: int
+    compression: str
+    data_at: int
+    data_length: int
+
+
+def record_at(buffer: Any, at: int, limit: int) -> tuple[int, int, int]:
+    """Opcode, beginning and end of the body of the record at a place; it must end before ``limit``."""
+    if at + RECORD_HEAD.size > limit:
+        raise Damaged("a record ends in its first nine bytes")
+    opcode, length = RECORD_HEAD.unpack_from(buffer, at)
+    body = at + RECORD_HEAD.size
+    if opcode == 0:
+        raise Damaged("there is no record")
+    if length > limit - body:
+        raise Damaged(f"a record says that it has {length} bytes, {limit - body} are left")
+    return opcode, body, body + length
+
+
+def chunk_head(buffer: Any, body: int, length: int | None) -> ChunkHead:
+    """Head of a chunk record; the length of its data must agree with that of the record.
+
+    Args:
+        buffer: At least the head.
+        body: Where the record's body begins.
+        length: Length that the record gives for its body; None where that cannot be trusted.
+    """
+    try:
+        start_ns, end_ns, size, crc = _CHUNK_HEAD.unpack_from(buffer, body)
+        at = body + _CHUNK_HEAD.size
+        (name_length,) = struct.unpack_from("<I", buffer, at)
+        if name_length > _LONGEST_NAME:
+            raise Damaged(f"the name of its compression says that it has {name_length} bytes")
+        compression = bytes(buffer[at + 4 : at + 4 + name_length]).decode()
+        at += 4 + name_length
+        (data_length,) = struct.unpack_from("<Q", buffer, at)
+    except (struct.error, UnicodeDecodeError) as error:
+        raise Damaged("its head makes no sense") from error
+    if length is not None and data_length != length - CHUNK_HEAD_BYTES - name_length:
+        raise Damaged(f"its two lengths do not agree: {length} bytes for the record, {data_length} for the data in it")
+    return ChunkHead(start_ns, end_ns, size, crc, compression, at + 8, data_length)
+
+
+def unpack_chunk(head: ChunkHead, data: bytes) -> bytes:
+    """Records of a chunk, unpacked and checked.
+
+    Raises:
+        Damaged: They cannot be unpacked, or the checksum is that of other bytes.
+        BagError: The compression is unknown here, which is no damage.
+    """
+    records = data if not head.compression else _unpacked(head.compression, data)
+    if head.crc:
+        if (found := zlib.crc32(records)) != head.crc:
+            raise Damaged(f"its checksum is {head.crc:08x}, that of its content {found:08x}")
+    elif len(records) != head.size:
+        raise Damaged(f"it says that it has {head.size} bytes, it has {len(records)}")
+    return records
+
+
+def _unpacked(compression: str, data: bytes) -> bytes:
+    try:
+        if compression == "lz4":
+            import lz4.frame
+
+            found = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=MOST_BYTES + 1)
+        elif compression == "zstd":
+            import zstandard
+
+            with zstandard.ZstdDecompressor().stream_reader(data) as stream:
+                found = stream.read(MOST_BYTES + 1)
+        else:
+            raise BagError(f"the compression {compression!r:.80} is not known here; known are lz4, zstd and none")
+    except ImportError as error:
+        raise BagError(f"the bag is packed with {compression}: pip install {error.name}") from error
+    except NONSENSE as error:
+        raise Damaged(f"its content cannot be unpacked ({error!s:.80})") from error
+    if len(found) > MOST_BYTES:
+        raise Damaged(f"unpacked it has more than {MOST_BYTES} bytes")
+    return bytes(found)
+
+
+def records_of(data: bytes) -> Iterator[tuple[int, int, int]]:
+    """Opcode, beginning and end of the body of every record in a chunk."""
+    at, limit = 0, len(data)
+    while at < limit:
+        opcode, body, end = record_at(data, at, limit)
+        if opcode == Opcode.MESSAGE and end - body < MESSAGE_HEAD.size:
+            raise Damaged(f"a message in it has {end - body} bytes, fewer than its own head")
+        yield opcode, body, end
+        at = end
+
+
+def parse(kind: Any, body: bytes) -> Any:
+    """A record of the library's own kind (schema, channel, metadata, ...), if its body is exactly that."""
+    stream = ReadDataStream(io.BytesIO(body))
+    try:
+        record = kind.read(stream)
+    except NONSENSE as error:
+        raise Damaged(f"a {kind.__name__.lower()} makes no sense") from error
+    if stream.count != len(body):
+        raise Damaged(f"a {kind.__name__.lower()} has {len(body)} bytes, its content {stream.count}")
+    return record
+
+
+def checked_attachment(body: bytes) -> tuple[Attachment, bool]:
+    """An attachment, and whether it carries a checksum."""
+    record = parse(Attachment, body)
+    crc = int.from_bytes(body[-4:], "little")
+    if crc and (found := zlib.crc32(memoryview(body)[:-4])) != crc:
+        raise Damaged(f"the checksum of the attachment {record.name} is {crc:08x}, that of its content {found:08x}")
+    return record, bool(crc)
+
+
+def index_entries(body: bytes) -> tuple[int, list[tuple[int, int]]]:
+    """Channel, and log time and place of each message, of a message index."""
+    if len(body) < 6:
+        raise Damaged("a message index ends in its head")
+    channel_id, length = struct.unpack_from("<HI", body)
+    if length != len(body) - 6 or length % 16:
+        raise Damaged("a message index makes no sense")
+    numbers = struct.unpack_from(f"<{length // 8}Q", body, 6)
+    return channel_id, list(zip(numbers[::2], numbers[1::2], strict=True))

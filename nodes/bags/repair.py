@@ -1,0 +1,364 @@
+"""Make an unfinished or damaged bag whole: keep everything that can be read, write the end that is missing.
+
+The new file is written beside the old one, checked, and only then takes its name; the old one stays under another. A repair that
+would lose more than the damaged end of an unfinished file is refused unless it is asked for.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import shutil
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from mcap.data_stream import RecordBuilder
+from mcap.records import Channel, Chunk, ChunkIndex, Message, MessageIndex, Schema
+
+from advnerf_core.files import write_atomically
+from nodes.bags.assemble import Layout, assemble, contents_of
+from nodes.bags.damage import describe
+from nodes.bags.formats import require_mcap
+from nodes.bags.journal import RESERVE_BYTES, RESERVE_NAME, Entry, journal_of, read_journal
+from nodes.bags.metadata import rosbag2_metadata
+from nodes.bags.parts import METADATA_FILE, bag_parts
+from nodes.bags.scan import Piece, Scan, scan_file
+from nodes.runtime.errors import BagError
+from nodes.runtime.messages import type_definition, type_hash
+from nodes.runtime.topics import topic as topic_row
+
+KEPT_SUFFIX = ".damaged"
+_BLOCK_BYTES = 1 << 24
+
+
+@dataclass(frozen=True)
+class TopicRepair:
+    """Messages of a topic before and after a repair; before is None where the file does not say."""
+
+    name: str
+    before: int | None
+    after: int
+
+
+@dataclass(frozen=True)
+class Repaired:
+    """What a repair did.
+
+    Attributes:
+        path: The file.
+        messages: Messages in it.
+        cut_bytes: Bytes that could not be kept.
+        was_whole: There was nothing to do.
+        kept: Where the file is as it was before; None where it was removed, or nothing was done.
+        topics: What became of the messages.
+        losses: What was lost, in words.
+        fixes: What was mended without a loss, in words.
+        unchecked: Why messages may have changed without a sign of it; empty where checksums cover them.
+    """
+
+    path: Path
+    messages: int
+    cut_bytes: int = 0
+    was_whole: bool = False
+    kept: Path | None = None
+    topics: tuple[TopicRepair, ...] = ()
+    losses: tuple[str, ...] = ()
+    fixes: tuple[str, ...] = ()
+    unchecked: str = ""
+
+
+def mcap_file(bag: Path) -> Path:
+    """The ``.mcap`` file of a bag given as its folder or as the file itself."""
+    bag = Path(bag)
+    if bag.is_file():
+        return bag
+    files = sorted(bag.glob("*.mcap")) if bag.is_dir() else []
+    if not files:
+        for part in bag_parts(bag):
+            require_mcap(part, "repaired")
+    if len(files) != 1:
+        raise BagError(f"{bag}: expected a bag folder with one .mcap file, got {len(files)}")
+    return files[0]
+
+
+def repair(bag: Path, force: bool = False, keep_original: bool = True, in_place: bool = False) -> Repaired:
+    """Make a file whole; one that is whole already stays as it is.
+
+    Args:
+        bag: The file, or a bag folder with one.
+        force: Also if messages are lost that are not at the damaged end of an unfinished file.
+        keep_original: Keep the old file, as ``NAME.mcap.damaged``.
+        in_place: Write no second file; only for an unfinished one whose beginning stays as it is. For a recorder on a full disk.
+
+    Raises:
+        BagError: It is no MCAP file, is being written, or would lose too much; then it is as it was.
+    """
+    path = mcap_file(bag).resolve()
+    require_mcap(path, "repaired")
+    try:
+        before = path.stat()
+        # A recorder at work would go on writing to the old file.
+        if not in_place and being_written(path):
+            raise BagError(f"{path} is being written at this moment; stop its recorder first")
+        scan = examine(path)
+        if scan.whole:
+            _complete_folder(path, scan, None)
+            return Repaired(path, scan.messages, was_whole=True, unchecked=scan.unchecked)
+        known = _messages_before(scan)
+        losses = tuple(describe(scan, loss) for loss in scan.losses)
+        if not force and (refusal := refusal_of(scan)):
+            raise BagError(f"{path} is not repaired, because {refusal}. {_ADVICE}")
+        cut = sum(loss.length for loss in scan.losses)
+        layout = assemble(scan, path.name, {"cut_bytes": str(cut), "lost": "; ".join(losses)[:10_000]})
+        kept = None
+        if in_place:
+            _extend(path, layout)
+        else:
+            kept = _swap(path, layout, scan, before, keep_original)
+    except OSError as error:
+        raise BagError(f"cannot repair {path}: {error.strerror}; it is as it was") from error
+    _complete_folder(path, scan, kept)
+    topics = tuple(
+        TopicRepair(name, known.get(name), after) for name, after in sorted(contents_of(scan).counts.items())
+    )
+    gone = tuple(
+        TopicRepair(name, count, 0) for name, count in sorted(known.items()) if name not in {t.name for t in topics}
+    )
+    return Repaired(path, scan.messages, cut, False, kept, topics + gone, losses, tuple(scan.fixes), scan.unchecked)
+
+
+def examine(path: Path) -> Scan:
+    """What a file holds, with the messages that its recorder had not yet written into it."""
+    scan = scan_file(path)
+    _add_journal(scan, path)
+    return scan
+
+
+_ADVICE = "With --force it keeps the rest, and the file as it is now beside it"
+
+
+def refusal_of(scan: Scan) -> str:
+    """Why a repair must be asked for twice; empty if it loses no more than the end of an unfinished file."""
+    more = scan.loses_more_than_the_tail()
+    if more:
+        rest = f", and {len(more) - 1} more places" if len(more) > 1 else ""
+        return f"messages would be lost that are not at the end of an unfinished recording: {describe(scan, more[0])}{rest}"
+    listed = scan.known.statistics if scan.known is not None else None
+    if listed is not None and listed.message_count > scan.messages:
+        return f"its summary lists {listed.message_count} messages, and {scan.messages} are found"
+    if scan.data_crc_wrong and scan.unchecked_messages + scan.unchecked_chunks:
+        return (
+            "the checksum of all its data is wrong, and which of its messages is damaged cannot be told; "
+            "repaired, it would have them all, unchecked"
+        )
+    if not scan.messages and scan.losses:
+        return f"no message would be left of its {scan.size} bytes: {describe(scan, scan.losses[0])}"
+    return ""
+
+
+def _messages_before(scan: Scan) -> dict[str, int]:
+    """Messages by topic as the summary lists them, or as far as is known without one."""
+    known = scan.known
+    counts: dict[str, int] = {}
+    if known is not None and known.statistics is not None and known.channels:
+        for channel_id, count in known.statistics.channel_message_counts.items():
+            if channel_id in known.channels:
+                name = known.channels[channel_id].topic
+                counts[name] = counts.get(name, 0) + count
+        return counts
+    if any(loss.kind != "cut" and not loss.counts and not loss.harmless for loss in scan.losses):
+        return {}
+    for lost in (scan.counts, *(loss.counts for loss in scan.losses)):
+        for channel_id, count in lost.items():
+            if channel_id in scan.channels:
+                name = scan.channels[channel_id].topic
+                counts[name] = counts.get(name, 0) + count
+    return counts
+
+
+def being_written(path: Path) -> bool:
+    """Whether some process has the file open for writing. A lease for reading is given only where nobody has."""
+    with open(path, "rb") as file:
+        try:
+            fcntl.fcntl(file, fcntl.F_SETLEASE, fcntl.F_RDLCK)
+            fcntl.fcntl(file, fcntl.F_SETLEASE, fcntl.F_UNLCK)
+        except BlockingIOError:
+            return True
+        except OSError:
+            return False  # a file system without leases, or somebody else's file
+    return False
+
+
+def _swap(path: Path, layout: Layout, scan: Scan, before: os.stat_result, keep_original: bool) -> Path | None:
+    """Write the new file, check it, give it the name; the old one is complete under one name or another at every moment."""
+    temporary = path.with_name(f".{path.name}.repair")
+    try:
+        with open(path, "rb") as old, open(temporary, "wb") as new:
+            for part in layout.parts:
+                _copy(old, new, part)
+            new.flush()
+            os.fsync(new.fileno())
+        shutil.copymode(path, temporary)
+        check = scan_file(temporary)
+        if not check.whole or check.counts != {i: n for i, n in scan.counts.items() if n}:
+            raise BagError(f"{path} could not be repaired: the new file does not hold what was found; it is as it was")
+        now = path.stat()
+        if (now.st_size, now.st_mtime_ns, now.st_ino) != (before.st_size, before.st_mtime_ns, before.st_ino):
+            raise BagError(f"{path} changed while it was being repaired; it is as it is now, and not repaired")
+        kept = _keep(path) if keep_original else None
+        temporary.replace(path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+    _sync_folder(path.parent)
+    return kept
+
+
+def _copy(old: Any, new: Any, part: range | bytes) -> None:
+    if isinstance(part, bytes):
+        new.write(part)
+        return
+    new.flush()
+    old.seek(part.start)
+    left = len(part)
+    while left:
+        block = old.read(min(left, _BLOCK_BYTES))
+        if not block:
+            raise BagError("the file became shorter while it was being repaired")
+        new.write(block)
+        left -= len(block)
+
+
+def kept_names(path: Path) -> Iterator[Path]:
+    """Names for the file as it was: never one that is taken."""
+    yield path.with_name(path.name + KEPT_SUFFIX)
+    number = 2
+    while True:
+        yield path.with_name(f"{path.name}{KEPT_SUFFIX}.{number}")
+        number += 1
+
+
+def _keep(path: Path) -> Path:
+    """Give the old file a second name."""
+    for name in kept_names(path):
+        try:
+            os.link(path, name)
+        except FileExistsError:
+            if name.samefile(path):  # of a repair that was stopped here
+                return name
+        except OSError:  # a file system without links
+            if not os.path.lexists(name):
+                path.rename(name)
+                return name
+        else:
+            return name
+    raise AssertionError("unreachable")
+
+
+def _extend(path: Path, layout: Layout) -> None:
+    """Cut off what is behind the part that stays, and append the rest."""
+    unchanged = layout.unchanged
+    rest, at = [], 0
+    for part in layout.parts:
+        if at >= unchanged:
+            if isinstance(part, range):
+                raise BagError(f"{path} is damaged in the middle; repair it with: advnerf bag repair {path}")
+            rest.append(part)
+        at += len(part)
+    with open(path, "r+b") as file:
+        file.truncate(unchanged)
+        file.seek(unchanged)
+        for content in rest:
+            file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def _sync_folder(folder: Path) -> None:
+    with contextlib.suppress(OSError):
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+
+def _complete_folder(path: Path, scan: Scan, kept: Path | None) -> None:
+    """Write ``metadata.yaml`` where it is missing, and put away what the recorder left beside the file."""
+    reserve, journal = path.with_name(RESERVE_NAME), journal_of(path)
+    if reserve.exists() and reserve.stat().st_size == RESERVE_BYTES:
+        reserve.unlink()
+    if journal.exists():
+        if kept is not None:
+            journal.replace(kept.with_name(kept.name + ".journal"))
+        else:
+            journal.unlink()
+    yaml = path.with_name(METADATA_FILE)
+    alone = [file for file in path.parent.glob("*.mcap") if file.is_file()] == [path]
+    if alone and not yaml.exists():
+        write_atomically(yaml, rosbag2_metadata(path.name, contents_of(scan)))
+
+
+def _add_journal(scan: Scan, path: Path) -> None:
+    """Add, as one more chunk, the messages of the chunk that the recorder was filling."""
+    position, entries = read_journal(path)
+    chunks = [piece for piece in scan.pieces if isinstance(piece.record, ChunkIndex)]
+    # A chunk behind that position is the one: the recorder died, or an earlier repair, before the journal was emptied.
+    if not entries or scan.data_end is not None or any(piece.offset >= position for piece in chunks):
+        return
+    builder = RecordBuilder()
+    ids = {channel.topic: channel.id for channel in scan.channels.values()}
+    indexes: dict[int, list[tuple[int, int]]] = {}
+    for entry in entries:
+        if entry.topic not in ids:
+            ids[entry.topic] = _introduce(builder, scan, entry.topic, max(ids.values(), default=0) + 1)
+        channel_id = ids[entry.topic]
+        indexes.setdefault(channel_id, []).append((entry.log_ns, builder.count))
+        Message(channel_id, entry.log_ns, entry.cdr, entry.publish_ns, entry.sequence).write(builder)
+        _count(scan, channel_id, entry)
+    scan.pieces.append(_chunk_piece(bytes(builder.end()), entries, indexes))
+
+
+def _count(scan: Scan, channel_id: int, entry: Entry) -> None:
+    scan.start_ns = min(scan.start_ns, entry.log_ns) if scan.counts else entry.log_ns
+    scan.end_ns = max(scan.end_ns, entry.log_ns)
+    scan.counts[channel_id] = scan.counts.get(channel_id, 0) + 1
+    last = scan.sequences.get(channel_id)
+    if last is not None and entry.sequence > last + 1:
+        scan.gaps[channel_id] = scan.gaps.get(channel_id, 0) + entry.sequence - last - 1
+    scan.sequences[channel_id] = entry.sequence
+
+
+def _chunk_piece(data: bytes, entries: list[Entry], indexes: dict[int, list[tuple[int, int]]]) -> Piece:
+    start_ns, end_ns = min(entry.log_ns for entry in entries), max(entry.log_ns for entry in entries)
+    builder = RecordBuilder()
+    Chunk("", data, end_ns, start_ns, zlib.crc32(data), len(data)).write(builder)
+    length, offsets = builder.count, {}
+    for channel_id, rows in indexes.items():
+        offsets[channel_id] = builder.count
+        MessageIndex(channel_id, rows).write(builder)
+    record = ChunkIndex(
+        chunk_length=length, chunk_start_offset=0, compression="", compressed_size=len(data), message_end_time=end_ns,
+        message_index_length=builder.count - length, message_index_offsets=offsets, message_start_time=start_ns,
+        uncompressed_size=len(data),
+    )  # fmt: skip
+    return Piece(0, 0, record, bytes(builder.end()))
+
+
+def _introduce(builder: RecordBuilder, scan: Scan, topic: str, channel_id: int) -> int:
+    """Write schema and channel of a topic whose first message is in the journal."""
+    typename = topic_row(topic).type
+    known = {schema.name: schema.id for schema in scan.schemas.values()}
+    if typename not in known:
+        schema = Schema(max(scan.schemas, default=0) + 1, type_definition(typename).encode(), "ros2msg", typename)
+        scan.schemas[schema.id] = schema
+        schema.write(builder)
+        known[typename] = schema.id
+    channel = Channel(channel_id, topic, "cdr", {"topic_type_hash": type_hash(typename)}, known[typename])
+    scan.channels[channel_id] = channel
+    channel.write(builder)
+    return channel_id

@@ -1,0 +1,78 @@
+"""Make a bag of several parts whole: every part by itself, then ``metadata.yaml``, which lists them all."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from advnerf_core.files import write_atomically
+from nodes.bags.metadata import Contents, FileEntry, rosbag2_metadata
+from nodes.bags.parts import METADATA_FILE, bag_parts, listed_files
+from nodes.bags.repair import Repaired, kept_names, repair
+from nodes.bags.whole import read_summary
+from nodes.runtime.errors import BagError
+
+
+def repair_bag(bag: Path, force: bool = False, keep_original: bool = True, in_place: bool = False) -> list[Repaired]:
+    """Make every part of a bag whole.
+
+    Args:
+        bag: Bag folder or any of its files.
+        force: See `nodes.bags.repair.repair`, as for the other two.
+        keep_original: Keep the parts, and ``metadata.yaml``, as they were.
+        in_place: Write no second files.
+
+    Returns:
+        What was done to each part, in order.
+
+    Raises:
+        BagError: A part cannot be repaired, or is missing.
+    """
+    parts = bag_parts(bag)
+    folder = parts[0].parent
+    repaired = [repair(part, force, keep_original, in_place) for part in parts]
+    _remove_what_was_begun(folder)
+    names, listed = tuple(part.name for part in parts), listed_files(folder)
+    if len(parts) > 1 and listed != names:
+        _list(folder, parts, listed != () and keep_original)
+    elif listed == names and any(not part.was_whole for part in repaired):
+        _list(folder, parts, keep_original)  # its counts are those of before
+    return repaired
+
+
+def _remove_what_was_begun(folder: Path) -> None:
+    """A part that the recorder was about to begin when it was killed; it has no message."""
+    for begun in folder.glob(".*.mcap.opening"):
+        begun.unlink()
+    for journal in folder.glob(".*.mcap.journal"):
+        if not (folder / journal.name[1:].removesuffix(".journal")).exists():
+            journal.unlink()
+
+
+def _list(folder: Path, parts: tuple[Path, ...], keep_old: bool) -> None:
+    """Write ``metadata.yaml`` from what the parts say now."""
+    total, files = Contents(), []
+    for part in parts:
+        contents = _contents(part)
+        total.add(contents)
+        files.append(FileEntry.of(part.name, contents))
+    file = folder / METADATA_FILE
+    if keep_old:
+        os.link(file, next(name for name in kept_names(file) if not os.path.lexists(name)))
+    write_atomically(file, rosbag2_metadata(parts[0].name, total, files))
+
+
+def _contents(part: Path) -> Contents:
+    """What the summary of a whole file says."""
+    found = read_summary(part)
+    if found is None:
+        raise BagError(f"{part}: expected a summary with statistics after the repair, got none; repair it again")
+    summary, statistics = found
+    contents = Contents(start_ns=statistics.message_start_time, end_ns=statistics.message_end_time)
+    for channel in summary.channels.values():
+        schema = summary.schemas.get(channel.schema_id)
+        contents.add_topic(
+            channel.topic, "" if schema is None else schema.name, channel.metadata.get("topic_type_hash", "")
+        )
+        contents.counts[channel.topic] += statistics.channel_message_counts.get(channel.id, 0)
+    return contents

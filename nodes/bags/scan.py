@@ -1,0 +1,647 @@
+"""Everything an MCAP file holds, record by record: what can be kept, what is lost, and what no checksum covers."""
+
+from __future__ import annotations
+
+import contextlib
+import zlib
+from bisect import bisect_right
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
+from mcap.records import (
+    AttachmentIndex,
+    Channel,
+    Chunk,
+    ChunkIndex,
+    Header,
+    MessageIndex,
+    Metadata,
+    MetadataIndex,
+    Schema,
+)
+from mcap.summary import Summary
+
+from nodes.bags.file import mapped
+from nodes.bags.records import (
+    CHUNK_HEAD_BYTES,
+    DATA_END_BYTES,
+    MAGIC,
+    MESSAGE_HEAD,
+    RECORD_HEAD,
+    ChunkHead,
+    Damaged,
+    checked_attachment,
+    chunk_head,
+    index_entries,
+    parse,
+    record_at,
+    records_of,
+    unpack_chunk,
+)
+from nodes.bags.resync import makes_sense, next_record, only_zeros, plausible_end
+from nodes.bags.summary import Ending, read_ending, read_summary_section
+from nodes.runtime.errors import BagError
+
+# Messages outside chunks are read in runs of so many bytes.
+_RUN_BYTES = 1 << 20
+_CRC_BLOCK_BYTES = 1 << 22
+_SUMMARY_ONLY = (Opcode.FOOTER, Opcode.STATISTICS, Opcode.SUMMARY_OFFSET, Opcode.CHUNK_INDEX)  # fmt: skip
+# How a loss came about.
+BAD, CUT, ZEROS, JUNK = "bad", "cut", "zeros", "junk"
+
+
+@dataclass
+class Piece:
+    """Bytes of the file that are kept, or what stands in their place.
+
+    Attributes:
+        offset: Where they are in the file.
+        length: How many.
+        record: Their entry in the summary, with the offsets of the file; None for what has none.
+        content: Other bytes in their place; ``record`` is then as if they stood at ``offset``.
+    """
+
+    offset: int
+    length: int
+    record: ChunkIndex | AttachmentIndex | MetadataIndex | None = None
+    content: bytes | None = None
+
+
+@dataclass
+class Loss:
+    """Bytes that cannot be kept.
+
+    Attributes:
+        offset: Where they are.
+        length: How many.
+        what: What they were, as far as can be told.
+        reason: Why they cannot be kept.
+        kind: ``bad`` (a whole record with a wrong checksum), ``cut``, ``zeros``, or ``junk``.
+        span_ns: Log times of the first and the last message in them, if known [ns since 1970].
+        counts: Messages in them by channel, as far as known.
+        harmless: No message, attachment or metadata was in them.
+    """
+
+    offset: int
+    length: int
+    what: str
+    reason: str
+    kind: str
+    span_ns: tuple[int, int] | None = None
+    counts: dict[int, int] = field(default_factory=dict)
+    harmless: bool = False
+
+
+@dataclass
+class Run:
+    """Messages one behind the other outside any chunk; as `ChunkIndex`, for reading."""
+
+    offset: int
+    length: int
+    start_ns: int
+    end_ns: int
+    channels: set[int]
+
+
+@dataclass
+class Scan:
+    """What a file holds.
+
+    Attributes:
+        size: Bytes of the file.
+        ending: Its footer; None where it has none.
+        known: Its summary; None where it has none, or a damaged one.
+        summary_damage: What is wrong with the summary; empty for nothing.
+        data_end: Where the record that ends the data begins; None where it is missing.
+        data_crc: Checksum of all data; 0 means none.
+        data_crc_wrong: It is that of other bytes.
+        pieces: What is kept, in order.
+        losses: What is not.
+        fixes: What was mended without a loss.
+        headers, schemas, channels: Records of the data section; schemas and channels by id.
+        counts: Messages by channel id.
+        gaps: Numbers missing between the messages of a channel.
+        sequences: Number of the last message of a channel.
+        start_ns, end_ns: Log times of the first and the last message [ns since 1970].
+        unchecked_chunks: Chunks without a checksum.
+        unchecked_messages: Messages outside chunks, which have none.
+        runs: Messages outside chunks.
+        insert_at: Before which piece definitions belong that the file has lost.
+        lost_definitions: These definitions.
+    """
+
+    size: int = 0
+    ending: Ending | None = None
+    known: Summary | None = None
+    summary_damage: str = ""
+    data_end: int | None = None
+    data_crc: int = 0
+    data_crc_wrong: bool = False
+    pieces: list[Piece] = field(default_factory=list)
+    losses: list[Loss] = field(default_factory=list)
+    fixes: list[str] = field(default_factory=list)
+    header: Header | None = None
+    schemas: dict[int, Schema] = field(default_factory=dict)
+    channels: dict[int, Channel] = field(default_factory=dict)
+    counts: dict[int, int] = field(default_factory=dict)
+    gaps: dict[int, int] = field(default_factory=dict)
+    sequences: dict[int, int] = field(default_factory=dict)
+    start_ns: int = 0
+    end_ns: int = 0
+    unchecked_chunks: int = 0
+    unchecked_messages: int = 0
+    runs: list[Run] = field(default_factory=list)
+    insert_at: int | None = None
+    lost_definitions: list[Schema | Channel] = field(default_factory=list)
+
+    @property
+    def messages(self) -> int:
+        """Messages that are kept."""
+        return sum(self.counts.values())
+
+    @property
+    def complete(self) -> bool:
+        """The file has an end: data, footer, magic."""
+        return self.data_end is not None and self.ending is not None
+
+    @property
+    def whole(self) -> bool:
+        """Nothing is missing, and nothing is wrong."""
+        wrong = self.losses or self.fixes or self.lost_definitions or self.summary_damage or self.data_crc_wrong
+        return self.complete and not wrong
+
+    @property
+    def unchecked(self) -> str:
+        """Why the messages may have changed without a sign of it; empty where checksums cover them."""
+        if self.data_crc and not self.data_crc_wrong:
+            return ""
+        parts = []
+        if self.unchecked_messages:
+            parts.append(f"{self.unchecked_messages} of its messages are in no chunk")
+        if self.unchecked_chunks:
+            parts.append(f"{self.unchecked_chunks} of its chunks carry no checksum")
+        return " and ".join(parts)
+
+    def loses_more_than_the_tail(self) -> list[Loss]:
+        """Losses in front of what is kept, or from a file that had been finished."""
+        last = max((piece.offset for piece in self.pieces if piece.length), default=0)
+        tail_is_fine = self.ending is None and self.data_end is None
+        return [
+            loss for loss in self.losses
+            if not loss.harmless and (not tail_is_fine or loss.offset < last or loss.kind == JUNK)
+        ]  # fmt: skip
+
+
+def scan_file(path: Path) -> Scan:
+    """Read a file from its beginning to its end, over whatever is damaged.
+
+    Raises:
+        BagError: It is no MCAP file, or is packed in a way that is not known here.
+    """
+    with mapped(path) as buffer:
+        scan = _Scanner(buffer, path)
+        scan.run()
+        return scan.found
+
+
+class _Scanner:
+    def __init__(self, buffer: Any, path: Path) -> None:
+        self._buffer, self._path = buffer, path
+        self.found = found = Scan(size=len(buffer))
+        self._limit = found.size
+        # Of the last chunk: its piece, its entries by channel, and the message indexes that were found behind it.
+        self._chunk: Piece | None = None
+        self._entries: dict[int, list[tuple[int, int]]] = {}
+        self._indexed: dict[int, int] = {}
+        self._index_wrong = False
+        self._bad_chunk: Loss | None = None
+        self._listed: dict[int, ChunkIndex] = {}
+        found.ending = read_ending(buffer, found.size)
+        if found.ending is not None and found.ending.summary_start:
+            self._read_summary(found.ending)
+
+    def _read_summary(self, ending: Ending) -> None:
+        try:
+            self.found.known = read_summary_section(self._buffer, ending)
+        except Damaged as error:
+            self.found.summary_damage = str(error)
+        else:
+            self._limit = ending.summary_start
+            self._listed = {index.chunk_start_offset: index for index in self.found.known.chunk_indexes}
+
+    def run(self) -> None:
+        """Walk over all records."""
+        at = self._begin()
+        while at < self._limit and self.found.data_end is None:
+            try:
+                at = self._take(at)
+            except Damaged as error:
+                at = self._over_damage(at, str(error))
+        self._close_chunk(at_end=True)
+        if self.found.data_end is None and self.found.ending is not None:
+            self.found.fixes.append("the record that ends the data was missing")
+        self._name_what_was_lost()
+        if self.found.known is not None and not self.found.summary_damage and not self.found.losses:
+            self.found.summary_damage = self._contradiction(self.found.known)
+
+    def _begin(self) -> int:
+        buffer, at = self._buffer, len(MAGIC)
+        if buffer[:at] == MAGIC:
+            return at
+        try:
+            opcode, body, end = record_at(buffer, at, self._limit)
+            parse(Header, buffer[body:end] if opcode == Opcode.HEADER else b"")
+        except Damaged:
+            raise BagError(f"{self._path}: expected an MCAP file, but it does not begin like one") from None
+        self.found.fixes.append("its first eight bytes were damaged")
+        return at
+
+    def _take(self, at: int) -> int:
+        """Take the record at a place into the scan; where the next one begins."""
+        opcode, body, end = record_at(self._buffer, at, self._limit)
+        if opcode == Opcode.MESSAGE_INDEX:
+            self._take_index(at, body, end)
+            return end
+        self._close_chunk()
+        self._bad_chunk = None
+        if opcode == Opcode.CHUNK:
+            self._take_chunk(at, body, end)
+        elif opcode == Opcode.MESSAGE:
+            self._take_message(at, body, end)
+        elif opcode == Opcode.ATTACHMENT:
+            a, _ = checked_attachment(self._buffer[body:end])
+            index = AttachmentIndex(at, end - at, a.log_time, a.create_time, len(a.data), a.name, a.media_type)
+            self.found.pieces.append(Piece(at, end - at, index))
+        elif opcode == Opcode.METADATA:
+            name = parse(Metadata, self._buffer[body:end]).name
+            self.found.pieces.append(Piece(at, end - at, MetadataIndex(offset=at, length=end - at, name=name)))
+        elif opcode == Opcode.DATA_END:
+            self._take_data_end(at, body, end)
+        elif opcode in _SUMMARY_ONLY or opcode in (Opcode.ATTACHMENT_INDEX, Opcode.METADATA_INDEX):
+            raise Damaged("a record of the summary stands among the data")
+        else:
+            self._take_plain(opcode, at, body, end)
+        return end
+
+    def _take_plain(self, opcode: int, at: int, body: int, end: int) -> None:
+        content = self._buffer[body:end]
+        if opcode == Opcode.SCHEMA:
+            schema = parse(Schema, content)
+            self.found.schemas[schema.id] = schema
+        elif opcode == Opcode.CHANNEL:
+            self._add_channel(parse(Channel, content))
+        elif opcode == Opcode.HEADER:
+            if at != len(MAGIC):
+                raise Damaged("a second header stands among the data")
+            self.found.header = parse(Header, content)
+        elif not plausible_end(self._buffer, end, self._limit) or self._chunk_in_disguise(at) is not None:
+            # A kind of record that did not exist when this was written is kept, if what follows makes sense.
+            raise Damaged(f"there is no record of kind {opcode}")
+        self._keep(at, end)
+
+    def _keep(self, at: int, end: int) -> None:
+        pieces = self.found.pieces
+        # The header stays by itself, so that something can be put behind it.
+        if len(pieces) > 1 and pieces[-1].record is None and self._end_of(pieces[-1]) == at:
+            pieces[-1].length += end - at
+        else:
+            pieces.append(Piece(at, end - at))
+
+    @staticmethod
+    def _end_of(piece: Piece) -> int:
+        return piece.offset + piece.length
+
+    def _take_message(self, at: int, body: int, end: int) -> None:
+        if end - body < MESSAGE_HEAD.size:
+            raise Damaged(f"a message has {end - body} bytes, fewer than its own head")
+        channel_id, sequence, log_ns, _ = MESSAGE_HEAD.unpack_from(self._buffer, body)
+        if channel_id not in self.found.channels and not plausible_end(self._buffer, end, self._limit):
+            raise Damaged(f"a message is of channel {channel_id}, which does not exist")
+        self._count(channel_id, sequence, log_ns)
+        self.found.unchecked_messages += 1
+        self._keep(at, end)
+        runs = self.found.runs
+        if runs and runs[-1].offset + runs[-1].length == at and runs[-1].length < _RUN_BYTES:
+            run = runs[-1]
+            run.length = end - run.offset
+            run.start_ns, run.end_ns = min(run.start_ns, log_ns), max(run.end_ns, log_ns)
+            run.channels.add(channel_id)
+        else:
+            runs.append(Run(at, end - at, log_ns, log_ns, {channel_id}))
+
+    def _take_chunk(self, at: int, body: int, end: int) -> None:
+        head = chunk_head(self._buffer, body, end - body)
+        try:
+            records = unpack_chunk(head, self._buffer[head.data_at : end])
+            self._commit(at, end, head, records, *_contents(records))
+        except Damaged as error:
+            if not plausible_end(self._buffer, end, self._limit):
+                raise
+            self._lose_chunk(at, end, head, str(error))
+
+    def _commit(
+        self, at: int, end: int, head: ChunkHead, records: bytes,
+        definitions: list[Schema | Channel], messages: list[tuple[int, int, int, int]],
+    ) -> None:  # fmt: skip
+        for definition in definitions:
+            if isinstance(definition, Schema):
+                self.found.schemas[definition.id] = definition
+            else:
+                self._add_channel(definition)
+        entries: dict[int, list[tuple[int, int]]] = {}
+        for channel_id, sequence, log_ns, place in messages:
+            entries.setdefault(channel_id, []).append((log_ns, place))
+            self._count(channel_id, sequence, log_ns)
+        self.found.unchecked_chunks += head.crc == 0 and bool(messages)
+        times = [log_ns for _, _, log_ns, _ in messages] or [head.start_ns, head.end_ns]
+        index = ChunkIndex(
+            chunk_length=end - at, chunk_start_offset=at, compression=head.compression, compressed_size=head.data_length,
+            message_end_time=max(times), message_index_length=0, message_index_offsets={}, message_start_time=min(times),
+            uncompressed_size=len(records),
+        )  # fmt: skip
+        self._chunk, self._entries, self._indexed, self._index_wrong = Piece(at, end - at, index), entries, {}, False
+        fits = RECORD_HEAD.pack(Opcode.CHUNK, end - at - RECORD_HEAD.size) == self._buffer[at : at + RECORD_HEAD.size]
+        if not fits or (head.start_ns, head.end_ns, head.size) != (min(times), max(times), len(records)):
+            self.found.fixes.append(f"the head of the chunk at byte {at} did not agree with its content")
+            data = self._buffer[head.data_at : end]
+            self._chunk.content = _record(Chunk(head.compression, data, max(times), min(times), head.crc, len(records)))
+
+    def _chunk_in_disguise(self, at: int) -> tuple[int, ChunkHead, bytes] | None:
+        """End, head and records of the chunk that begins here for sure, whatever opcode and length of its record say."""
+        try:
+            head = chunk_head(self._buffer, at + RECORD_HEAD.size, None)
+            end = head.data_at + head.data_length
+            if not head.crc or end > self._limit:
+                return None
+            return end, head, unpack_chunk(head, self._buffer[head.data_at : end])
+        except (Damaged, BagError):
+            return None
+
+    def _lose_chunk(self, at: int, end: int, head: ChunkHead, reason: str) -> None:
+        indexed = self._index_of(at)
+        span = (head.start_ns, head.end_ns)
+        if indexed is not None:
+            span = indexed.message_start_time, indexed.message_end_time
+        self._bad_chunk = Loss(at, end - at, "a chunk", reason, BAD, span)
+        self.found.losses.append(self._bad_chunk)
+
+    def _index_of(self, at: int) -> ChunkIndex | None:
+        return self._listed.get(at)
+
+    def _take_index(self, at: int, body: int, end: int) -> None:
+        """A message index belongs to the chunk in front of it; one that is wrong or cut is made again from the chunk."""
+        channel_id, entries = index_entries(self._buffer[body:end])
+        if self._bad_chunk is not None:
+            self._bad_chunk.counts[channel_id] = len(entries)
+            self._bad_chunk.length += end - at
+        elif self._chunk is None:
+            self._note_harmless(at, end, "a message index belongs to no chunk")
+        else:
+            # Some writers list channels without messages.
+            wrong = sorted(entries) != sorted(self._entries.get(channel_id, [])) or channel_id in self._indexed
+            self._index_wrong |= wrong
+            self._indexed[channel_id] = at
+            self._chunk.length += end - at
+
+    def _note_harmless(self, at: int, end: int, reason: str) -> None:
+        self.found.losses.append(Loss(at, end - at, f"{end - at} bytes", reason, BAD, harmless=True))
+
+    def _close_chunk(self, at_end: bool = False) -> None:
+        """The chunk and its message indexes are one piece."""
+        piece, self._chunk = self._chunk, None
+        if piece is None:
+            return
+        assert isinstance(piece.record, ChunkIndex)
+        index = piece.record
+        missing = bool(self._entries.keys() - self._indexed.keys())
+        # A writer may leave all of them out; in an unfinished file nothing tells it from one that was killed here.
+        left_out = not self._indexed and not (at_end and self.found.ending is None)
+        if self._index_wrong or (missing and not left_out):
+            if self._index_wrong or self.found.ending is not None:
+                self.found.fixes.append(
+                    f"the message index of the chunk at byte {piece.offset} was wrong or incomplete"
+                )
+            chunk = piece.content or self._buffer[piece.offset : piece.offset + index.chunk_length]
+            index.message_index_offsets.clear()
+            rows = bytearray()
+            for channel_id, entries in self._entries.items():
+                index.message_index_offsets[channel_id] = piece.offset + len(chunk) + len(rows)
+                rows += _record(MessageIndex(channel_id, entries))
+            piece.content, index.message_index_length = chunk + bytes(rows), len(rows)
+        else:
+            index.message_index_offsets.update(self._indexed)
+            index.message_index_length = piece.length - index.chunk_length
+            if piece.content is not None:
+                piece.content += self._buffer[piece.offset + index.chunk_length : self._end_of(piece)]
+        self.found.pieces.append(piece)
+
+    def _take_data_end(self, at: int, body: int, end: int) -> None:
+        if end - at != DATA_END_BYTES:
+            raise Damaged("the record that ends the data has the wrong length")
+        if self.found.known is not None and end != self._limit:
+            raise Damaged("the data end before their end")
+        self.found.data_end = at
+        self.found.data_crc = int.from_bytes(self._buffer[body:end], "little")
+        if self.found.data_crc:
+            crc = 0
+            for block in range(0, at, _CRC_BLOCK_BYTES):
+                crc = zlib.crc32(self._buffer[block : min(at, block + _CRC_BLOCK_BYTES)], crc)
+            self.found.data_crc_wrong = crc != self.found.data_crc
+
+    def _over_damage(self, at: int, reason: str) -> int:
+        """Note a loss; where the file makes sense again, or its end."""
+        if (end := self._index_end(at)) is not None:
+            return end
+        self._close_chunk(at_end=self._runs_over(at))
+        if (disguised := self._chunk_in_disguise(at)) is not None:
+            end, head, records = disguised
+            self._commit(at, end, head, records, *_contents(records))
+            return end
+        buffer, limit, found = self._buffer, self._limit, self.found
+        opcode = buffer[at]
+        if only_zeros(buffer, at):
+            found.losses.append(Loss(at, limit - at, f"{limit - at} zeros", "nothing was written there", ZEROS))
+            return limit
+        if found.known is not None and limit - at <= DATA_END_BYTES:
+            self._note_harmless(at, limit, "the end of the data is damaged")
+            return limit
+        bad, self._bad_chunk = self._bad_chunk, None
+        if self._is_cut(at):
+            found.losses.append(Loss(at, limit - at, _KINDS.get(opcode, "a record"), "the file ends in it", CUT))
+            return limit
+        after = self._next(at, opcode)
+        end = limit if after is None else after
+        if after is None and found.known is None and self._runs_over(at):
+            kind, reason = CUT, "the file ends in it"
+        elif after is None:
+            kind = JUNK
+        else:
+            kind = BAD
+        index_only = opcode == Opcode.MESSAGE_INDEX and after is not None and buffer[after] == Opcode.CHUNK
+        if bad is not None and index_only:
+            bad.length = end - bad.offset
+        else:
+            loss = Loss(at, end - at, f"{end - at} bytes", reason, kind, self._span(at, end))
+            found.losses.append(loss)
+        return end
+
+    def _index_end(self, at: int) -> int | None:
+        """End of the message indexes of the present chunk, if this place is among them for sure: they can be made again."""
+        piece = self._chunk
+        listed = self._index_of(piece.offset) if piece is not None else None
+        if piece is None or listed is None:
+            return None
+        end = piece.offset + listed.chunk_length + listed.message_index_length
+        if not at < end <= self._limit:
+            return None
+        piece.length, self._index_wrong = end - piece.offset, True
+        return end
+
+    def _span(self, at: int, end: int) -> tuple[int, int] | None:
+        """Log times of the chunks that the summary has between two places."""
+        indexes = self.found.known.chunk_indexes if self.found.known is not None else []
+        inside = [index for index in indexes if at <= index.chunk_start_offset < end]
+        if not inside:
+            return None
+        return min(index.message_start_time for index in inside), max(index.message_end_time for index in inside)
+
+    def _runs_over(self, at: int) -> bool:
+        """Whether the record that begins here would end behind the end of the file."""
+        if at + RECORD_HEAD.size > self._limit:
+            return True
+        opcode, length = RECORD_HEAD.unpack_from(self._buffer, at)
+        return 0 < opcode <= Opcode.DATA_END and length > self._limit - at - RECORD_HEAD.size
+
+    def _is_cut(self, at: int) -> bool:
+        """Whether the file ends in this record for sure: in its head, or in data whose two lengths agree."""
+        if self.found.known is not None or not self._runs_over(at):
+            return False
+        if at + RECORD_HEAD.size > self._limit:
+            return True
+        opcode, length = RECORD_HEAD.unpack_from(self._buffer, at)
+        if opcode == Opcode.CHUNK:
+            if self._limit - at < RECORD_HEAD.size + CHUNK_HEAD_BYTES:
+                return True
+            try:
+                chunk_head(self._buffer, at + RECORD_HEAD.size, length)
+            except Damaged:
+                return False
+            return True
+        return opcode == Opcode.ATTACHMENT and _attachment_agrees(self._buffer, at + RECORD_HEAD.size, length)
+
+    def _next(self, at: int, opcode: int) -> int | None:
+        found = self.found
+        known = found.known
+        channels = found.channels.keys() | (known.channels.keys() if known is not None else set())
+        with contextlib.suppress(Damaged):
+            end = record_at(self._buffer, at, self._limit)[2]
+            if end < self._limit and makes_sense(self._buffer, end, self._limit, channels, messages=True):
+                return end  # only this record is damaged, its length is not
+        if known is not None and known.statistics is not None and known.statistics.chunk_count and not found.runs:
+            places = sorted(
+                [index.chunk_start_offset for index in known.chunk_indexes]
+                + [attachment.offset for attachment in known.attachment_indexes]
+                + [metadata.offset for metadata in known.metadata_indexes]
+                + [self._limit - DATA_END_BYTES]
+            )
+            after = bisect_right(places, at)
+            if after < len(places):
+                return places[after]
+        # Inside a chunk that is damaged there are messages, too, which its checksum would have covered.
+        messages = opcode != Opcode.CHUNK or bool(found.runs)
+        return next_record(self._buffer, at, self._limit, channels, messages)
+
+    def _add_channel(self, channel: Channel) -> None:
+        self.found.channels[channel.id] = channel
+
+    def _count(self, channel_id: int, sequence: int, log_ns: int) -> None:
+        """Count a message, and what is missing in front of it; a step back is a publisher that was started again."""
+        found = self.found
+        if not found.counts:
+            found.start_ns = found.end_ns = log_ns
+        elif log_ns > found.end_ns:
+            found.end_ns = log_ns
+        elif log_ns < found.start_ns:
+            found.start_ns = log_ns
+        found.counts[channel_id] = found.counts.get(channel_id, 0) + 1
+        last = found.sequences.get(channel_id)
+        if last is not None and sequence > last + 1:
+            found.gaps[channel_id] = found.gaps.get(channel_id, 0) + sequence - last - 1
+        found.sequences[channel_id] = sequence
+
+    def _name_what_was_lost(self) -> None:
+        """Definitions of kept messages that went with what is lost: from the summary, else without a name."""
+        found = self.found
+        known = found.known if found.known is not None else Summary()
+        for channel_id in sorted(found.counts.keys() - found.channels.keys()):
+            channel = known.channels.get(channel_id) or Channel(channel_id, f"/unnamed_channel_{channel_id}", "", {}, 0)
+            found.channels[channel_id] = channel
+            found.lost_definitions.append(channel)
+        for channel in list(found.channels.values()):
+            if channel.schema_id and channel.schema_id not in found.schemas:
+                schema = known.schemas.get(channel.schema_id) or Schema(channel.schema_id, b"", "", "unknown")
+                found.schemas[schema.id] = schema
+                found.lost_definitions.append(schema)
+        if found.lost_definitions:
+            # A schema stands in front of its channels, and both in front of their messages.
+            found.lost_definitions.sort(key=lambda record: isinstance(record, Channel))
+            first = min((loss.offset for loss in found.losses if not loss.harmless), default=0)
+            found.insert_at = next(
+                (i for i, piece in enumerate(found.pieces) if piece.offset >= max(first, len(MAGIC) + 1)),
+                len(found.pieces),
+            )
+
+    def _contradiction(self, known: Summary) -> str:
+        """What the summary says differently from the data; empty for nothing. A summary may leave things out."""
+        found, statistics = self.found, known.statistics
+        counts = {channel_id: n for channel_id, n in found.counts.items() if n}
+        if statistics is not None:
+            listed = {channel_id: n for channel_id, n in statistics.channel_message_counts.items() if n}
+            if statistics.message_count != found.messages or (listed and listed != counts):
+                return f"its summary says {statistics.message_count} messages, it has {found.messages}"
+        chunks = {
+            (piece.record.chunk_start_offset, piece.record.chunk_length)
+            for piece in found.pieces
+            if isinstance(piece.record, ChunkIndex)
+        }
+        if known.chunk_indexes and {(i.chunk_start_offset, i.chunk_length) for i in known.chunk_indexes} != chunks:
+            return "its summary lists other chunks than it has"
+        return ""
+
+
+_KINDS = {Opcode.CHUNK: "a chunk", Opcode.ATTACHMENT: "an attachment", Opcode.MESSAGE: "a message"}
+
+
+def _contents(records: bytes) -> tuple[list[Schema | Channel], list[tuple[int, int, int, int]]]:
+    """Definitions of a chunk; channel, sequence, log time and place of its messages."""
+    definitions: list[Schema | Channel] = []
+    messages = []
+    for opcode, body, end in records_of(records):
+        if opcode == Opcode.MESSAGE:
+            messages.append((*MESSAGE_HEAD.unpack_from(records, body)[:3], body - RECORD_HEAD.size))
+        elif opcode == Opcode.SCHEMA:
+            definitions.append(parse(Schema, records[body:end]))
+        elif opcode == Opcode.CHANNEL:
+            definitions.append(parse(Channel, records[body:end]))
+    return definitions, messages
+
+
+def _record(record: Any) -> bytes:
+    builder = RecordBuilder()
+    record.write(builder)
+    return bytes(builder.end())
+
+
+def _attachment_agrees(buffer: Any, body: int, length: int) -> bool:
+    """Whether the length inside an attachment agrees with that of its record; its end may be missing."""
+    at = body + 16
+    for _ in range(2):
+        if at + 4 > len(buffer):
+            return True
+        at += 4 + int.from_bytes(buffer[at : at + 4], "little")
+    if at + 8 > len(buffer):
+        return at < body + length
+    return at + 8 + int.from_bytes(buffer[at : at + 8], "little") + 4 == body + length

@@ -1,0 +1,82 @@
+"""How honest the times in a bag are: from capture to publication to reception, topic by topic."""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from nodes.bags.reader import read_info, read_messages
+from nodes.runtime.errors import TopicError
+from nodes.runtime.messages import types
+from nodes.runtime.topics import topic as topic_row
+
+# A CDR message that begins with a header begins with four bytes of encapsulation, then the stamp.
+_STAMP = struct.Struct("<iI"), struct.Struct(">iI")
+_STAMP_AT, _NS_PER_S, _NS_PER_MS = 4, 1_000_000_000, 1e6
+
+
+@dataclass(frozen=True)
+class Delays:
+    """Times of one topic in milliseconds; None where messages carry no stamp, or a stamp of zero.
+
+    Attributes:
+        publish_ms: Median from capture to publication.
+        publish_worst_ms: Longest.
+        receive_ms: Median from publication to reception by the recorder.
+        receive_worst_ms: Longest.
+        backwards: Messages whose stamp is older than that of the one before them.
+        future: Messages that were captured after they were received: a clock that is wrong.
+    """
+
+    publish_ms: float | None
+    publish_worst_ms: float | None
+    receive_ms: float
+    receive_worst_ms: float
+    backwards: int
+    future: int
+
+
+def read_delays(bag: Path) -> dict[str, Delays]:
+    """Times of every topic with a message, by name; the whole bag is read for it."""
+    names = {topic.name: _begins_with_stamp(topic.name, topic.type) for topic in read_info(bag).topics}
+    rows: dict[str, list[tuple[int, int, int]]] = {}
+    for message in read_messages(bag, as_recorded=True):
+        stamp_ns = _stamp_ns(message.cdr) if names[message.topic] else 0
+        rows.setdefault(message.topic, []).append((stamp_ns, message.publish_ns, message.log_ns))
+    return {topic: _delays(found) for topic, found in rows.items()}
+
+
+def _delays(times_ns: list[tuple[int, int, int]]) -> Delays:
+    """Of stamp, publish and log time of each message [ns]; whole numbers, because a damaged bag may say anything."""
+    received = [(log - publish) / _NS_PER_MS for _, publish, log in times_ns]
+    stamped = [row for row in times_ns if row[0] > 0]
+    published = [(publish - stamp) / _NS_PER_MS for stamp, publish, _ in stamped]
+    return Delays(
+        float(np.median(published)) if published else None,
+        max(published, default=None),
+        float(np.median(received)), max(received),
+        sum(after[0] < before[0] for before, after in pairwise(stamped)),
+        sum(stamp > log for stamp, _, log in stamped),
+    )  # fmt: skip
+
+
+def _begins_with_stamp(topic: str, typename: str) -> bool:
+    """Whether a topic is one of ours, with a type whose first field is a header."""
+    try:
+        if topic_row(topic).type != typename:
+            return False
+    except TopicError:
+        return False
+    fields = getattr(types, typename.rsplit("/", 1)[-1]).__dataclass_fields__
+    return next(iter(fields), "") == "header"
+
+
+def _stamp_ns(cdr: bytes) -> int:
+    if len(cdr) < _STAMP_AT + 8:
+        return 0
+    seconds, nanoseconds = _STAMP[0 if cdr[1] & 1 else 1].unpack_from(cdr, _STAMP_AT)
+    return int(seconds) * _NS_PER_S + int(nanoseconds)

@@ -1,0 +1,123 @@
+"""What a finished file says about itself, checked: from its summary, or from its data where the summary does not say enough."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from mcap.opcode import Opcode
+from mcap.records import AttachmentIndex, ChunkIndex, Statistics
+from mcap.summary import Summary
+
+from nodes.bags.damage import describe
+from nodes.bags.file import mapped
+from nodes.bags.records import DATA_END_BYTES, MAGIC, RECORD_HEAD, Damaged, record_at
+from nodes.bags.scan import Run, Scan, scan_file
+from nodes.bags.summary import Ending, read_ending, read_summary_section
+from nodes.runtime.errors import BagError
+
+_CRC_AT = RECORD_HEAD.size + 24  # of a chunk
+
+
+class FileSummary(Summary):
+    """The summary of a file.
+
+    Attributes:
+        runs: Messages outside chunks.
+        unchecked: Why messages may have changed without a sign of it; empty where checksums cover them.
+    """
+
+    runs: list[Run]
+    unchecked: str
+
+
+def read_summary(path: Path) -> tuple[FileSummary, Statistics] | None:
+    """Summary of a file, or None if it has no end: its recorder was killed, or is still at work.
+
+    Raises:
+        BagError: It has an end, but is damaged.
+    """
+    with mapped(path) as buffer:
+        ending = read_ending(buffer, len(buffer))
+        if ending is None:
+            return None
+        try:
+            found = _from_summary(buffer, ending)
+        except Damaged as error:
+            raise BagError(
+                f"{path} is damaged: {error}; advnerf bag repair {path} writes it again, if the messages are whole"
+            ) from error
+    return _from_data(path) if found is None else found
+
+
+def _from_summary(buffer: Any, ending: Ending) -> tuple[FileSummary, Statistics] | None:
+    """The summary that the file has; None if it leaves something out, or has no checksum."""
+    # Without a checksum a list of topics or times in it may have changed, and messages would be left out.
+    if not ending.summary_start or not ending.summary_crc:
+        return None
+    read = read_summary_section(buffer, ending)
+    if read.statistics is None or not _lists_everything(buffer, ending, read):
+        return None
+    summary = FileSummary()
+    summary.__dict__.update(read.__dict__)
+    summary.runs, summary.unchecked = [], ""
+    for index in read.chunk_indexes:
+        at = index.chunk_start_offset + _CRC_AT
+        if buffer[at : at + 4] == b"\0\0\0\0" and index.uncompressed_size:
+            return None  # what covers this chunk, if anything, is the checksum of all data
+    return summary, read.statistics
+
+
+def _lists_everything(buffer: Any, ending: Ending, summary: Summary) -> bool:
+    """Whether chunks, attachments and metadata in the summary are all that is in the data, and their channels are known."""
+    statistics = summary.statistics
+    assert statistics is not None
+    if len(summary.channels) != statistics.channel_count or len(summary.schemas) != statistics.schema_count:
+        return False
+    spans = [(i.chunk_start_offset, i.chunk_length + i.message_index_length) for i in summary.chunk_indexes]
+    spans += [(i.offset, i.length) for i in summary.attachment_indexes]
+    spans += [(i.offset, i.length) for i in summary.metadata_indexes]
+    try:
+        at = record_at(buffer, len(MAGIC), ending.summary_start)[2]
+    except Damaged:
+        return False
+    for offset, length in sorted(spans):
+        if offset != at:
+            return False
+        at += length
+    return at == ending.summary_start - DATA_END_BYTES and buffer[at] == Opcode.DATA_END
+
+
+def _from_data(path: Path) -> tuple[FileSummary, Statistics]:
+    scan = scan_file(path)
+    advice = f"advnerf bag info {path} lists what is damaged, advnerf bag repair {path} keeps what can be kept"
+    if scan.summary_damage:
+        raise BagError(f"{path} is damaged: {scan.summary_damage}; {advice}")
+    if scan.losses:
+        raise BagError(f"{path} is damaged: {describe(scan, scan.losses[0])}; {advice}")
+    if scan.data_crc_wrong and scan.unchecked:
+        raise BagError(f"{path} is damaged: the checksum of its data is that of other data; {advice}")
+    if not scan.complete:
+        raise BagError(f"{path} is damaged: the record that ends its data is missing; {advice}")
+    return summary_of(scan)
+
+
+def summary_of(scan: Scan) -> tuple[FileSummary, Statistics]:
+    """The summary that belongs to what was found in a file."""
+    summary = FileSummary()
+    summary.schemas, summary.channels = dict(scan.schemas), dict(scan.channels)
+    summary.runs, summary.unchecked = scan.runs, scan.unchecked
+    for piece in scan.pieces:
+        if isinstance(piece.record, ChunkIndex):
+            summary.chunk_indexes.append(piece.record)
+        elif isinstance(piece.record, AttachmentIndex):
+            summary.attachment_indexes.append(piece.record)
+        elif piece.record is not None:
+            summary.metadata_indexes.append(piece.record)
+    summary.statistics = statistics = Statistics(
+        attachment_count=len(summary.attachment_indexes), channel_count=len(scan.channels),
+        channel_message_counts=dict(scan.counts), chunk_count=len(summary.chunk_indexes), message_count=scan.messages,
+        message_end_time=scan.end_ns, message_start_time=scan.start_ns, metadata_count=len(summary.metadata_indexes),
+        schema_count=len(scan.schemas),
+    )  # fmt: skip
+    return summary, statistics

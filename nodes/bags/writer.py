@@ -1,0 +1,221 @@
+"""Bags: what rosbag2, Foxglove, ``mcap`` and ``rosbags`` open. The bytes of the wire go in as they are.
+
+A bag is a folder with one ``.mcap`` file, or with numbered parts, and ``metadata.yaml``. Chunks of 64 KiB are written through to the
+file at once and reach the disk once a second. A journal beside the file keeps the messages of the chunk that is being filled, so
+that a killed recorder loses none that it had received (`nodes.bags.repair` puts them together).
+
+A file's index is kept in memory until the file is finished, about 700 bytes for every chunk. A recorder therefore begins a new part
+from time to time; the old one is finished by another thread.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import queue
+import shutil
+import threading
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from advnerf_core.files import write_atomically
+from nodes.bags.journal import RESERVE_BYTES, RESERVE_NAME
+from nodes.bags.metadata import Contents, FileEntry, rosbag2_metadata
+from nodes.bags.part import PartWriter
+from nodes.bags.parts import METADATA_FILE, part_name
+from nodes.runtime.clock import NS_PER_S
+from nodes.runtime.errors import BagError
+
+_SYNC_PERIOD_S = 1.0
+_BYTES_PER_MIB = 1 << 20
+
+
+@dataclass(frozen=True)
+class SplitLimits:
+    """When a new part is begun: as soon as one of the limits is reached.
+
+    Attributes:
+        duration_s: Time between the first and the last message of a part [s].
+        size_mib: Size of a part [MiB].
+    """
+
+    duration_s: float = 600.0
+    size_mib: float = 256.0
+
+    def reached(self, part: PartWriter, log_ns: int) -> bool:
+        """Whether a message with this log time belongs into a new part; a clock that was set back also begins one."""
+        if part.first_log_ns is None:
+            return False
+        late = abs(log_ns - part.first_log_ns) >= self.duration_s * NS_PER_S
+        return late or part.size_bytes >= self.size_mib * _BYTES_PER_MIB
+
+
+class BagWriter:
+    """Writes one bag; for one thread.
+
+    Args:
+        folder: New folder of the bag; its name is also that of the files in it.
+        attachments: Content of the files that ride along, by name; in the first part of a split bag.
+        metadata: Facts that ride along in every part: versions, git hash.
+        attached_ns: Time at which the files were attached [ns since 1970]; none means now.
+        limits: When to begin a new part; none writes a single file without a number, whose index stays in memory.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        attachments: Mapping[str, bytes] | None = None,
+        metadata: Mapping[str, str] | None = None,
+        attached_ns: int | None = None,
+        limits: SplitLimits | None = None,
+    ) -> None:
+        self.folder = Path(folder)
+        self.messages = 0
+        self._limits, self._metadata = limits, dict(metadata or {})
+        self._total, self._files = Contents(), list[FileEntry]()
+        self._open = False
+        if self.folder.exists() and any(self.folder.iterdir()):
+            raise BagError(f"{self.folder} exists and is not empty; record to another folder, or remove it")
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            self._hold_reserve()
+            name = f"{self.folder.name}.mcap" if limits is None else part_name(self.folder.name, 0)
+            self._part = PartWriter(self.folder / name, attachments or {}, self._metadata, attached_ns)
+        except OSError as error:
+            shutil.rmtree(self.folder, ignore_errors=True)
+            raise BagError(
+                f"cannot record to {self.folder}: {error.strerror}; it needs {RESERVE_BYTES // 2**20} MiB of free space to begin"
+            ) from error
+        self._open = True
+        self._full: queue.Queue[PartWriter | None] = queue.Queue()
+        self._finishing = False
+        self._failure: OSError | None = None
+        self._keeper = threading.Thread(target=self._keep, name="bag keeper", daemon=True)
+        self._keeper.start()
+
+    def __enter__(self) -> BagWriter:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    @property
+    def path(self) -> Path:
+        """The file that is being written."""
+        return self._part.path
+
+    def write(
+        self, topic: str, cdr: bytes, log_ns: int, publish_ns: int, sequence: int, lost: int | None = None
+    ) -> None:
+        """Add a message.
+
+        Args:
+            topic: Name from the topic table.
+            cdr: Bytes of the wire.
+            log_ns: When it was received [ns since 1970].
+            publish_ns: When it was published [ns since 1970].
+            sequence: Number of its publisher.
+            lost: Messages of the topic that were lost before this one; none if that is not known.
+        """
+        try:
+            self._raise_failure()
+            # While the last part is still being finished, this one grows: waiting would hold up the bus.
+            if self._limits is not None and not self._finishing and self._limits.reached(self._part, log_ns):
+                self._split()
+            self._part.write(topic, cdr, log_ns, publish_ns, sequence, lost)
+        except OSError as error:
+            self._rescue(error)
+        self.messages += 1
+
+    def flush(self) -> None:
+        """End the present chunk, so that it reaches the disk with the next sync."""
+        try:
+            self._raise_failure()
+            self._part.flush()
+        except OSError as error:
+            self._rescue(error)
+
+    def close(self, metadata: Mapping[str, str] | None = None) -> None:
+        """Write what makes a bag whole: the summary of its last file and ``metadata.yaml``.
+
+        Args:
+            metadata: Facts known only at the end.
+        """
+        if not self._open:
+            return
+        try:
+            self._stop_keeper()
+            self._raise_failure()
+            self._finish(self._part, metadata)
+            self._let_go()
+        except OSError as error:
+            self._rescue(error)
+
+    def _split(self) -> None:
+        """Go on in a new part. The old one has all its chunks in its file before the new one begins."""
+        old = self._part
+        old.flush()
+        number = len(self._files) + 1
+        self._part = PartWriter(self.folder / part_name(self.folder.name, number), {}, self._metadata)
+        self._finishing = True
+        self._full.put(old)
+
+    def _finish(self, part: PartWriter, metadata: Mapping[str, str] | None = None) -> None:
+        """Finish a part, then list it: ``metadata.yaml`` never names a file that is not whole."""
+        part.finish(metadata)
+        self._total.add(part.contents)
+        self._files.append(FileEntry.of(part.path.name, part.contents))
+        text = rosbag2_metadata(part.path.name, self._total, self._files)
+        write_atomically(self.folder / METADATA_FILE, text)
+
+    def _keep(self) -> None:
+        """What takes long: once a second, see that the file is on the disk; finish parts that are full."""
+        while True:
+            try:
+                part = self._full.get(timeout=_SYNC_PERIOD_S)
+            except queue.Empty:
+                with contextlib.suppress(OSError):  # the next write reports it
+                    self._part.sync()
+                continue
+            if part is None:
+                return
+            try:
+                self._finish(part)
+            except OSError as error:
+                part.let_go()
+                self._failure = error
+            self._finishing = False
+
+    def _raise_failure(self) -> None:
+        if self._failure is not None:
+            raise self._failure
+
+    def _rescue(self, error: OSError) -> None:
+        """After a failed write: finish the files as far as they go, in the space held back for it."""
+        from nodes.bags.repair_parts import repair_bag
+
+        if self._open:
+            self._stop_keeper()
+            self._let_go()
+        try:
+            messages = sum(part.messages for part in repair_bag(self.folder, in_place=True))
+            saved = f"{messages} messages up to then are readable in it"
+        except (BagError, OSError) as second:
+            saved = (
+                f"and it could not be finished ({second}); free some space and run: advnerf bag repair {self.folder}"
+            )
+        raise BagError(f"cannot go on recording to {self.folder}: {error.strerror}; {saved}") from error
+
+    def _hold_reserve(self) -> None:
+        with open(self.folder / RESERVE_NAME, "wb") as reserve:
+            os.posix_fallocate(reserve.fileno(), 0, RESERVE_BYTES)
+
+    def _stop_keeper(self) -> None:
+        self._full.put(None)
+        self._keeper.join()
+
+    def _let_go(self) -> None:
+        self._open = False
+        self._part.let_go()
+        (self.folder / RESERVE_NAME).unlink(missing_ok=True)

@@ -1,0 +1,1 @@
+"""The command ``advnerf``: one module for each group of commands."""

@@ -1,0 +1,82 @@
+"""The commands ``advnerf attack request`` and ``advnerf attack cancel``: they speak to a running attack node."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from nodes.runtime.terminal import Overrides, RunDir
+
+_FAILURE_EXIT = 1
+
+
+def add_to(app: typer.Typer) -> None:
+    """Put the commands into the group ``attack``."""
+    app.command("request")(attack_request)
+    app.command("cancel")(attack_cancel)
+
+
+def attack_request(
+    file: Annotated[Path, typer.Argument(help="A *.attack.yaml file.", exists=True, dir_okay=False)],
+    run_dir: RunDir = None,
+    request_id: Annotated[
+        str, typer.Option("--id", help="Name of the request; the same again goes on.", show_default="<name>-<time>")
+    ] = "",
+    follow: Annotated[bool, typer.Option(help="Wait for the end; Ctrl-C only stops waiting.")] = True,
+    overrides: Overrides = None,
+) -> None:
+    """Ask the attack node of a running launch for an attack; the compositor takes it over when it is found."""
+    from nodes.experiment.request.client import ask_for_attack, new_request_id
+    from nodes.experiment.request.request import load_request
+    from nodes.launching.watching import find_run_dir
+
+    request = load_request(file, overrides or [])
+    name = request_id or new_request_id(request.name)
+    print(f"request {name}", flush=True)
+    seen: set[Any] = set()
+
+    def tell(progress: Any) -> None:
+        key = (progress.state, progress.seed, progress.evaluation)
+        if key not in seen:
+            seen.add(key)
+            print(in_words(progress), flush=True)
+
+    last = ask_for_attack(find_run_dir(run_dir), request, name, tell, follow)
+    if last.state in ("failed", "refused", "cancelled"):
+        raise typer.Exit(_FAILURE_EXIT)
+
+
+def attack_cancel(
+    run_dir: RunDir = None,
+    request_id: Annotated[str, typer.Option("--id", help="Only this request.", show_default="whichever it is")] = "",
+    reason: Annotated[str, typer.Option("--reason", help="Why, for the record.")] = "",
+) -> None:
+    """End the search of a running attack node; what was found so far stays in its folder."""
+    from nodes.experiment.request.client import cancel_attack
+    from nodes.launching.watching import find_run_dir
+
+    print(in_words(cancel_attack(find_run_dir(run_dir), request_id, reason)))
+
+
+def in_words(progress: Any) -> str:
+    """A line about an ``AttackProgress``; its totals stand beside that without an attack."""
+    what = " ".join(filter(None, (progress.state, progress.text)))
+    if progress.state == "done":
+        return f"done: attack {progress.attack_id}, best total CTE {progress.best_total_cte_m:.2f} m{_beside(progress)} ({progress.text})"
+    if progress.evaluation:
+        return (
+            f"{what} seed {progress.seed}: {progress.evaluation}/{progress.evaluations}, total CTE "
+            f"{progress.total_cte_m:.2f} m, best {progress.best_total_cte_m:.2f} m{_beside(progress)}"
+        )
+    return what
+
+
+def _beside(progress: Any) -> str:
+    """The drive without an attack; empty before it is known."""
+    if math.isnan(progress.clean_total_cte_m):
+        return ""
+    none = "" if progress.clean_drives else ": NO DRIVE, so the total of an attack proves nothing"
+    return f", without attack {progress.clean_total_cte_m:.2f} m{none}"

@@ -1,0 +1,110 @@
+"""The commands of ``advnerf attack`` about where objects stand: ``poses``, ``landscape`` and ``robustness``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, TextIO
+
+import typer
+
+from nodes.runtime.terminal import Overrides, print_table, table
+
+RequestFile = Annotated[
+    Path, typer.Argument(help="A *.attack.yaml file with the key poses.", exists=True, dir_okay=False)
+]
+Output = Annotated[
+    Path | None, typer.Option("--output", "-o", help="Folder of the results.", show_default="runs/<name>")
+]
+FoundAttack = Annotated[
+    Path | None,
+    typer.Option("--attack", help="An attack file that gives poses and colours; without it, those of the request.",
+                 exists=True, dir_okay=False),
+]  # fmt: skip
+
+
+def attack_poses(file: RequestFile, output: Output = None, overrides: Overrides = None) -> None:
+    """Search for where objects should stand, alone or with their colours; the same command goes on after a kill."""
+    from advnerf_core.attack.artifact import load_attack
+    from nodes.experiment.request.poses import run_poses
+    from nodes.experiment.request.printed import print_attacks
+    from nodes.experiment.request.request import load_request
+    from nodes.runtime.progress import ProgressDisplay
+
+    request = load_request(file, overrides or [])
+    folder = output or Path("runs") / request.name
+    with _held(folder), ProgressDisplay() as display:
+        files = run_poses(request, folder, display)
+    rows = table("attack", "object", "x [m]", "y [m]", "yaw [rad]", "scale", "predicted total CTE [m]")
+    for each in files:
+        attack = load_attack(each)
+        for k, place in enumerate(attack.extra["placements"]):
+            total = f"{attack.predicted_total_cte_m:.1f}" if k == 0 else ""
+            rows.add_row(attack.attack_id if k == 0 else "", str(k), *(f"{v:.3f}" for v in place), total)
+    print_table(rows)
+    print_attacks(files)
+
+
+def attack_landscape(
+    file: RequestFile, output: Output = None, attack: FoundAttack = None, overrides: Overrides = None
+) -> None:
+    """Map the total CTE over where one object stands: landscape.json and landscape.png; goes on after a kill."""
+    import numpy as np
+
+    from nodes.experiment.request.pose_maps import make_landscape
+    from nodes.experiment.request.request import load_request
+    from nodes.runtime.progress import ProgressDisplay
+
+    request = load_request(file, overrides or [])
+    folder = output or Path("runs") / request.name
+    with _held(folder), ProgressDisplay() as display:
+        found, picture = make_landscape(request, folder, attack, display.start("landscape"))
+    values = found.total_cte_m
+    if np.isnan(values).all():
+        print(f"no point of the grid is clear of the lane: {picture}")
+        return
+    best = np.unravel_index(int(np.nanargmax(values)), values.shape)
+    place = (found.x_m[best[0]], found.y_m[best[1]], found.yaw_rad[best[2]])
+    print(
+        f"total CTE {np.nanmin(values):.1f} to {np.nanmax(values):.1f} m, largest with object {found.object} at "
+        f"x {place[0]:.2f} m, y {place[1]:.2f} m, yaw {place[2]:.2f} rad; {np.isnan(values).mean():.0%} of the grid is lane: {picture}"
+    )
+
+
+def attack_robustness(
+    file: RequestFile, output: Output = None, attack: FoundAttack = None, overrides: Overrides = None
+) -> None:
+    """Map what an attack does from other starts and with an object moved: robustness.json and .png; goes on after a kill."""
+    import numpy as np
+
+    from nodes.experiment.request.pose_maps import make_robustness
+    from nodes.experiment.request.request import load_request
+    from nodes.runtime.progress import ProgressDisplay
+
+    request = load_request(file, overrides or [])
+    folder = output or Path("runs") / request.name
+    with _held(folder), ProgressDisplay() as display:
+        found, picture = make_robustness(request, folder, attack, display.start("robustness"))
+    ratios = found.total_cte_m / found.plain_cte_m
+    clear = ratios[np.isfinite(ratios)]
+    text = "no move leaves the lane clear" if not len(clear) else (
+        f"ratio to plain colours: median {np.median(clear):.2f}, {clear.min():.2f} to {clear.max():.2f} over {len(clear)} cells"
+    )  # fmt: skip
+    print(f"{text}: {picture}")
+
+
+def _held(folder: Path) -> TextIO:
+    from nodes.runtime.errors import ConfigError
+    from nodes.runtime.locks import HeldError, hold
+
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        return hold(folder / ".lock")
+    except HeldError as error:
+        raise ConfigError(f"{folder} is in use by process {error.owner}: wait for it, or stop it") from None
+
+
+def add_to(app: typer.Typer) -> None:
+    """Register the commands."""
+    app.command("poses")(attack_poses)
+    app.command("landscape")(attack_landscape)
+    app.command("robustness")(attack_robustness)

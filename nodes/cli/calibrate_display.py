@@ -1,0 +1,77 @@
+"""The commands ``advnerf calibrate display-colours`` and ``advnerf calibrate display``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from nodes.lab.wizards.output import save_and_print
+from nodes.runtime.terminal import RunDir
+
+
+def add_to(app: typer.Typer) -> None:
+    """Register the commands with their group."""
+    app.command("display-colours")(display_colours)
+    app.command("display")(display)
+
+
+def display_colours(
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the pictures to show and a shown.csv to fill in.")],
+    width: Annotated[int, typer.Option("--width", min=16, help="Of the monitor [px].")] = 1920,
+    height: Annotated[int, typer.Option("--height", min=16, help="Of the monitor [px].")] = 1080,
+    seed: Annotated[int, typer.Option("--seed", help="Of the mixed colours.")] = 0,
+) -> None:  # fmt: skip
+    """Write the sequence of plain pictures to show full-screen for ``calibrate display``."""
+    import cv2
+    import numpy as np
+
+    from advnerf_core.files import write_atomically
+    from calibration.display_colour import colours_to_show
+
+    colours = colours_to_show(seed=seed)
+    lines = ["file,red,green,blue"]
+    for index, (red, green, blue) in enumerate(colours.tolist()):
+        picture = np.full((height, width, 3), (blue, green, red), np.uint8)
+        write_atomically(output / "show" / f"{index:03d}.png", cv2.imencode(".png", picture)[1].tobytes())
+        lines.append(f"seen/{index:03d}.png,{red},{green},{blue}")
+    write_atomically(output / "shown.csv", "\n".join(lines) + "\n")
+    print(
+        f"{len(colours)} pictures in {output / 'show'}; put what the camera sees of each into {output / 'seen'} under the same name"
+    )
+
+
+def display(
+    output: Annotated[Path, typer.Option("--output", "-o", help="YAML file to write; its picture goes beside it.")],
+    folder: Annotated[Path, typer.Argument(help="Folder with shown.csv and what the camera saw; with --screen or --twin it is made.", file_okay=False)],
+    screen: Annotated[int | None, typer.Option("--screen", min=0, help="Show the colours on this screen, watch by the running launch.")] = None,
+    twin: Annotated[Path | None, typer.Option("--twin", exists=True, help="Show them on the simulated lab's monitor: its socket.")] = None,
+    conditions: Annotated[str, typer.Option("--conditions", help="Light, exposure, monitor settings; kept in the file.")] = "exposure and white balance locked",
+    run_dir: RunDir = None,
+) -> None:  # fmt: skip
+    """What the camera sees of the monitor's colours: curves, mixing, ambient light, response."""
+    from calibration.display_colour import fit_display
+    from calibration.plots import display_plot
+    from nodes.lab.wizards.bags import read_shown
+
+    if screen is not None or twin is not None:
+        _show_colours(folder, screen, twin, run_dir)
+    fit = fit_display(*read_shown(folder))
+    save_and_print(fit.calibration(conditions), output, display_plot(fit))
+
+
+def _show_colours(folder: Path, screen: int | None, twin: Path | None, run_dir: Path | None) -> None:
+    from calibration.display_colour import colours_to_show
+    from hardware.screen.display import Display, PygameDisplay, TwinDisplay
+    from nodes.lab.wizards.screen import live_frames, show_and_watch
+    from nodes.launching.watching import find_run_dir
+    from nodes.runtime.progress import ProgressDisplay
+
+    run = find_run_dir(run_dir)
+    shown_on: Display = PygameDisplay(screen or 0) if twin is None else TwinDisplay(twin)
+    try:
+        with ProgressDisplay() as progress:
+            show_and_watch(shown_on, live_frames(run), colours_to_show().tolist(), folder, progress.start("display"))
+    finally:
+        shown_on.close()

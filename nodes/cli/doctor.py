@@ -1,0 +1,80 @@
+"""The command ``advnerf doctor``."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from nodes.runtime.terminal import Overrides
+
+if TYPE_CHECKING:
+    from nodes.lab.doctor.check import Check, Finding
+
+_COLOURS = {"ok": "green", "absent": "bright_black", "warning": "yellow", "failure": "red"}
+_FAILURE_EXIT = 1
+
+
+def add_to(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("doctor")(doctor)
+
+
+def doctor(
+    file: Annotated[
+        Path | None,
+        typer.Argument(metavar="[LAUNCH]", help="Check what this *.launch.yaml needs.", exists=True, dir_okay=False),
+    ] = None,
+    folder: Annotated[Path, typer.Option("--folder", help="Where results will be written.")] = Path("runs"),
+    vicon_port: Annotated[int, typer.Option("--vicon-port", min=1, max=65535)] = 51001,
+    vesc: Annotated[
+        str | None, typer.Option("--vesc", help="Serial device of the VESC.", show_default="what looks like one")
+    ] = None,
+    host: Annotated[
+        str | None, typer.Option("--host", help="Which of the launch file's hosts this computer is, or all.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the findings as JSON.")] = False,
+    overrides: Overrides = None,
+) -> None:
+    """Say what this computer has and lacks, and what to do about it; with a launch file, only what that needs.
+
+    Exit code 0: nothing stands in the way; 1: something will not work; 2: the launch file or an option is wrong.
+    """
+    from nodes.lab.doctor.check import FAILURE, examine, worst
+
+    findings = []
+    for finding in examine(_checks(file, folder, vicon_port, vesc, host, overrides or [])):
+        findings.append(finding)
+        if not as_json:
+            _print(finding)
+    state = worst(findings)
+    if as_json:
+        print(json.dumps({"state": state, "findings": [finding.to_dict() for finding in findings]}, indent=1))
+    else:
+        counts = {word: sum(finding.state == word for finding in findings) for word in ("failure", "warning")}
+        print(", ".join(f"{count} {word}{'s' * (count != 1)}" for word, count in counts.items()))
+    if state == FAILURE:
+        raise typer.Exit(_FAILURE_EXIT)
+
+
+def _checks(
+    file: Path | None, folder: Path, vicon_port: int, vesc: str | None, host: str | None, overrides: list[str]
+) -> list[Check]:
+    if file is None:
+        from nodes.lab.doctor.general import checks
+
+        if overrides or host:
+            raise typer.BadParameter("--set and --host are about a launch file; name one")
+        return checks(folder, vicon_port, vesc)
+    from nodes.lab.doctor.launch import checks_of
+    from nodes.launching.launch_file import load_launch
+
+    return checks_of(load_launch(file, overrides, host=host), folder)
+
+
+def _print(finding: Finding) -> None:
+    cure = f" -> {finding.do}" if finding.do else ""
+    state = typer.style(f"{finding.state:8}", fg=_COLOURS[finding.state])
+    typer.echo(f"{state} {finding.check:13} {' '.join(finding.found.split())}{cure}")

@@ -1,0 +1,310 @@
+"""The command ``advnerf``. Each command imports what it needs when it is called, so that ``--help`` is quick."""
+
+from __future__ import annotations
+
+import errno
+import os
+import signal
+import time
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from advnerf_core.errors import AdvnerfError
+from nodes.cli import attack as cli_attack
+from nodes.cli import attack_node as cli_attack_node
+from nodes.cli import attack_poses as cli_attack_poses
+from nodes.cli import bag as cli_bag
+from nodes.cli import calibrate as cli_calibrate
+from nodes.cli import camera as cli_camera
+from nodes.cli import campaign as cli_campaign
+from nodes.cli import carla as cli_carla
+from nodes.cli import doctor as cli_doctor
+from nodes.cli import keys as cli_keys
+from nodes.cli import motor as cli_motor
+from nodes.cli import node as cli_node
+from nodes.cli import object as cli_object
+from nodes.cli import policy as cli_policy
+from nodes.cli import replay as cli_replay
+from nodes.cli import room as cli_room
+from nodes.cli import scene as cli_scene
+from nodes.cli import teleop as cli_teleop
+from nodes.cli import topic as cli_topic
+from nodes.cli import trial as cli_trial
+from nodes.runtime.terminal import Overrides, RunDir, print_table, say_error, table
+from nodes.runtime.termination import ends_in_order
+
+if TYPE_CHECKING:
+    from nodes.launching.launch import Launch
+
+OUR_PACKAGES = ("advnerf_core", "hardware", "calibration", "nodes")
+ERROR_EXIT, FAILURE_EXIT = 2, 1
+# Which extra brings what a base installation, such as the car's, does not have.
+_EXTRA_OF = dict.fromkeys(("torch", "numba", "scipy", "matplotlib", "jinja2", "av"), "core") | {
+    "mujoco": "twin", "pycolmap": "sfm", "trimesh": "mesh", "viser": "view", "onnxruntime": "onnx", "onnx": "onnx",
+    "mitsuba": "mesh", "drjit": "mesh", "joblib": "cluster", "ray": "cluster", "carla": "carla",
+}  # fmt: skip
+
+app = typer.Typer(
+    name="advnerf", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
+    help="Find objects that drive a self-driving policy off its path, and prove it on the car or on its simulated lab.",
+)  # fmt: skip
+app.add_typer(cli_topic.app, name="topic")
+app.add_typer(cli_bag.app, name="bag")
+app.add_typer(cli_keys.app, name="keys")
+app.add_typer(cli_node.app, name="node")
+cli_node.add_to(app)
+app.add_typer(cli_motor.app, name="motor")
+app.add_typer(cli_calibrate.app, name="calibrate")
+app.add_typer(cli_camera.app, name="camera")
+app.add_typer(cli_campaign.app, name="campaign")
+cli_attack_node.add_to(cli_attack.app)
+cli_attack_poses.add_to(cli_attack.app)
+app.add_typer(cli_attack.app, name="attack")
+app.add_typer(cli_object.app, name="object")
+app.add_typer(cli_policy.app, name="policy")
+app.add_typer(cli_scene.app, name="scene")
+app.add_typer(cli_room.app, name="room")
+app.add_typer(cli_carla.app, name="carla")
+cli_doctor.add_to(app)
+cli_replay.add_to(app)
+cli_teleop.add_to(app)
+cli_trial.add_to(app)
+stage_app = typer.Typer(
+    no_args_is_help=True,
+    help="One stage of an experiment, and what it needs first: capture, scene, policy, object, attack, deploy, report.",
+)
+app.add_typer(stage_app, name="stage")
+
+_debug = False
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+
+        print(f"advnerf {version('advnerf')}")
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    show_version: Annotated[
+        bool, typer.Option("--version", help="Show the version.", callback=_print_version, is_eager=True)
+    ] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")] = False,
+) -> None:
+    """Options of all commands."""
+    global _debug
+    _debug = debug
+
+
+@app.command()
+def launch(
+    file: Annotated[Path, typer.Argument(help="A *.launch.yaml file.", exists=True, dir_okay=False)],
+    overrides: Overrides = None,
+    run_dir: Annotated[
+        Path | None,
+        typer.Option("--run-dir", help="Folder for logs, sockets and bag.", show_default="runs/<name>-<time>"),
+    ] = None,
+    duration_s: Annotated[
+        float | None, typer.Option("--duration", min=0.0, help="Stop by itself after so many seconds.")
+    ] = None,
+    host: Annotated[
+        str | None, typer.Option("--host", help="Which of the file's hosts this computer is, or all.")
+    ] = None,
+    check: Annotated[
+        bool, typer.Option("--check", help="Only say what would be started, and what is wrong with it.")
+    ] = False,
+) -> None:
+    """Start the nodes of a launch file and watch them; Ctrl-C stops them, twice stops them at once."""
+    from nodes.launching.launch import Launch
+    from nodes.launching.launch_file import load_launch
+
+    plan = load_launch(file, overrides or [], host=host)
+    if check:
+        _print_plan(plan)
+        _say_problems(plan)
+        return
+    run_dir = run_dir or Path("runs") / f"{plan.launch.name}-{time.strftime('%Y%m%d-%H%M%S')}"
+    started = Launch(file, overrides or [], run_dir, lambda line: print(f"[launch] {line}", flush=True), host)
+    _watch_launch(started, duration_s)
+
+
+def _watch_launch(started: Launch, duration_s: float | None) -> None:
+    asked = 0
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        nonlocal asked
+        asked += 1
+        started.request_stop(kill=asked > 1)
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, stop)
+    print(f"[launch] {started.plan.launch.name} in {started.run_dir}", flush=True)
+    started.start()
+    try:
+        if started.wait(duration_s) is None:
+            started.request_stop()
+    finally:
+        code = started.stop()
+    if code:
+        say_error(started.failure)
+        raise typer.Exit(code)
+
+
+def _print_plan(plan: Any) -> None:
+    rows = table("node", "module", "required", "config")
+    for name, entry in plan.nodes.items():
+        rows.add_row(name, entry.module, "yes" if entry.required else "no", str(plan.documents[name].data))
+    print_table(rows)
+
+
+def _say_problems(plan: Any) -> None:
+    from nodes.lab.doctor.launch import policy_problems
+    from nodes.launching.launch_check import check_nodes
+
+    # A policy is loaded only when its node accepts the configuration that names it.
+    problems = list(check_nodes(plan).values()) or policy_problems(plan)
+    for problem in problems:
+        say_error(problem)
+    if problems:
+        raise typer.Exit(ERROR_EXIT)
+
+
+@app.command()
+def experiment(
+    file: Annotated[Path, typer.Argument(help="A *.experiment.yaml file.", exists=True, dir_okay=False)],
+    setting: Annotated[str, typer.Option("--setting", help="Which of the file's settings.")] = "demo",
+    run_folder: Annotated[
+        Path | None, typer.Option("--run-folder", help="Folder of all results.", show_default="runs/<setting>")
+    ] = None,
+    until: Annotated[str | None, typer.Option("--until", metavar="STAGE", help="Stop after this stage.")] = None,
+    overrides: Overrides = None,
+) -> None:
+    """Run an experiment: every stage that is not there yet, from the photographs to the report."""
+    _run_experiment(file, setting, run_folder, until, overrides)
+
+
+def _run_experiment(
+    file: Path, setting: str, folder: Path | None, until: str | None, overrides: list[str] | None
+) -> None:
+    # Rendering without a display is the only way the stages know; an import of MuJoCo decides on it.
+    os.environ.setdefault("MUJOCO_GL", "egl")
+    from nodes.experiment.run import kind_of
+
+    folder = folder or Path("runs") / setting
+    if kind_of(file) in ("intersection", "carla"):
+        from nodes.experiment.junction import run as intersection
+
+        with ends_in_order():
+            intersection.run_experiment(intersection.load_experiment(file, setting, overrides or [], folder), until)
+        return
+    from nodes.experiment.run import load_experiment, run_experiment
+
+    with ends_in_order():
+        run_experiment(load_experiment(file, setting, overrides or [], folder), until)
+
+
+def _add_stage(name: str, what: str) -> None:
+    def command(
+        file: Annotated[Path, typer.Argument(help="A *.experiment.yaml file.", exists=True, dir_okay=False)],
+        setting: Annotated[str, typer.Option("--setting", help="Which of the file's settings.")] = "demo",
+        run_folder: Annotated[Path | None, typer.Option("--run-folder", show_default="runs/<setting>")] = None,
+        overrides: Overrides = None,
+    ) -> None:
+        _run_experiment(file, setting, run_folder, name, overrides)
+
+    stage_app.command(name, help=f"{what[0].upper()}{what[1:]} (and what it needs first).")(command)
+
+
+for _name, _what in {
+    "capture": "photograph the room",
+    "scene": "learn the room from its photographs",
+    "policy": "train the policy that will be attacked",
+    "object": "make the object that carries the attack",
+    "attack": "search for the texture",
+    "deploy": "drive through the real nodes, with and without the attack",
+    "report": "put everything on one page",
+}.items():
+    _add_stage(_name, _what)
+
+
+@app.command()
+def arm(
+    run_dir: RunDir = None, reason: Annotated[str, typer.Option("--reason", help="Why, for the record.")] = ""
+) -> None:
+    """Ask the safety node of a running launch to let the car move."""
+    from nodes.launching.watching import find_run_dir
+    from nodes.runtime.arm_requests import ask_to_arm
+
+    answer = ask_to_arm(find_run_dir(run_dir), reason)
+    if answer.granted and answer.armed:
+        print(f"armed by {answer.text}")
+        return
+    print(f"armed, and stopped since: {answer.text}" if answer.granted else f"not armed: {answer.text}")
+    raise typer.Exit(FAILURE_EXIT)
+
+
+@app.command()
+def disarm(
+    run_dir: RunDir = None, reason: Annotated[str, typer.Option("--reason", help="Why, for the record.")] = ""
+) -> None:
+    """Stop the car of a running launch and keep it stopped."""
+    from nodes.launching.watching import find_run_dir
+    from nodes.runtime.arm_requests import BRAKE_WAIT_S, ask_to_disarm
+
+    def silent(waited_s: float) -> None:
+        say_error(
+            f"NOT CONFIRMED: no answer of the safety node for {waited_s:.1f} s, the car may be driving; still asking"
+            " (Ctrl-C gives up). Use the e-stop or cut the power"
+        )
+
+    answer = ask_to_disarm(find_run_dir(run_dir), reason, silent)
+    if answer.armed:
+        say_error("disarmed, but somebody has armed the car again since")
+        raise typer.Exit(FAILURE_EXIT)
+    print(f"not armed: {answer.text}")
+    if not answer.braked:
+        say_error(
+            f"NOT CONFIRMED: disarmed, but the motor node has not said within {BRAKE_WAIT_S:g} s that it brakes; look at the"
+            " car. If the motor node is down, the controller brakes after its own time-out"
+        )
+        raise typer.Exit(FAILURE_EXIT)
+
+
+def _is_for_people(error: Exception) -> bool:
+    """Whether the message of an exception was written for whoever typed the command."""
+    return isinstance(error, AdvnerfError | OSError)
+
+
+def main() -> None:
+    """Run the command line; what a person can put right is one line and exit code 2, never a traceback."""
+    try:
+        app()
+    except KeyboardInterrupt:
+        raise SystemExit(130) from None
+    except ModuleNotFoundError as error:
+        missing = (error.name or "").split(".")[0]
+        if _debug or missing in OUR_PACKAGES or missing not in _EXTRA_OF:
+            raise
+        say_error(f"this command needs {missing}, which is not installed: pip install 'advnerf[{_EXTRA_OF[missing]}]'")
+        raise SystemExit(ERROR_EXIT) from None
+    except Exception as error:  # everything else is a defect of ours and keeps its traceback
+        if _debug or not _is_for_people(error):
+            raise
+        say_error(_words(error))
+        raise SystemExit(ERROR_EXIT) from None
+
+
+def _words(error: Exception) -> str:
+    if isinstance(error, OSError) and error.errno == errno.ENOSPC:
+        where = f" of {error.filename}" if error.filename else ""
+        return f"the disk{where} is full: free some space or choose another folder; what was finished is kept"
+    return str(error) or type(error).__name__
+
+
+if __name__ == "__main__":
+    main()

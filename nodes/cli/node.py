@@ -1,0 +1,70 @@
+"""The commands ``advnerf node ...`` and ``advnerf top``."""
+
+from __future__ import annotations
+
+import contextlib
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from nodes.runtime.terminal import RunDir, print_table, table
+
+if TYPE_CHECKING:
+    from nodes.launching.watching_nodes import NodeRow
+
+app = typer.Typer(no_args_is_help=True, help="Look at the nodes of a running launch.")
+
+
+def add_to(root: typer.Typer) -> None:
+    """Register ``top`` beside the group."""
+    root.command("top")(top)
+
+
+@app.command("list")
+def node_list(run_dir: RunDir = None) -> None:
+    """List the nodes with their state and what they say; those that do not report are silent."""
+    from nodes.launching.watching import find_run_dir, node_statuses
+    from nodes.launching.watching_nodes import SILENT, describe_silence
+
+    run = find_run_dir(run_dir)
+    rows = table("node", "state", "process", "text")
+    for name, status in sorted(node_statuses(run).items()):
+        if status is None:
+            silence = describe_silence(run, name)
+            rows.add_row(name, SILENT, str(silence.pid or "-"), silence.text)
+        else:
+            rows.add_row(name, str(status.state), str(status.pid), str(status.text))
+    print_table(rows)
+
+
+def top(
+    period_s: Annotated[float, typer.Option("--period", min=0.5, help="Seconds between two tables.")] = 2.0,
+    count: Annotated[int | None, typer.Option("--count", min=1, help="Stop after so many tables.")] = None,
+    run_dir: RunDir = None,
+) -> None:
+    """Show what each node uses and how it keeps up: processor, memory, rate, drops, missed ticks, restarts."""
+    from nodes.launching.watching import find_run_dir
+
+    with contextlib.suppress(KeyboardInterrupt):  # Ctrl-C is how this usually ends
+        _watch(find_run_dir(run_dir), period_s, count)
+
+
+def _watch(run_dir: Path, period_s: float, count: int | None) -> None:
+    from nodes.launching.watching_nodes import NodeWatch
+
+    shown = 0
+    with NodeWatch(run_dir) as watch:
+        while count is None or shown < count:
+            _print(watch.rows(period_s))
+            shown += 1
+
+
+def _print(found: list[NodeRow]) -> None:
+    rows = table("node", "state", "CPU %", "MiB", "rate Hz", "dropped", "missed", "queue drops", "restarts", "text")
+    for row in found:
+        cpu = "-" if row.cpu_percent is None else f"{row.cpu_percent:.0f}"
+        memory = "-" if row.memory_mib is None else f"{row.memory_mib:.0f}"
+        numbers = (cpu, memory, f"{row.rate_hz:.0f}", *map(str, (row.dropped, row.missed, row.queue, row.restarts)))
+        rows.add_row(row.name, row.state, *numbers, row.text)
+    print_table(rows)

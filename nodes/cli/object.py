@@ -1,0 +1,205 @@
+"""The commands ``advnerf object ...``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from nodes.runtime.terminal import print_table, table
+
+if TYPE_CHECKING:
+    from advnerf_core.data.views import PosedImages
+    from advnerf_core.objects.voxel.model import ObjectModel
+    from nodes.runtime.progress import Report
+
+app = typer.Typer(no_args_is_help=True, help="Make objects from meshes, photographs or generators, and look at them.")
+
+ObjectPath = Annotated[Path, typer.Argument(help="An object file (*.object.safetensors).", dir_okay=False)]
+_TURNTABLE_VIEWS, _TURNTABLE_PIXELS = 8, 240
+_HELD_OUT_EVERY, _FEWEST_TO_SPLIT = 8, 16
+_DEFAULT_STEPS, _NO_STEP_LIMIT = 600, 1_000_000
+
+
+@app.command("build")
+def object_build(
+    file: Annotated[Path | None, typer.Argument(help="A mesh: GLB, OBJ, PLY, STL.", dir_okay=False)] = None,
+    generate: Annotated[str | None, typer.Option("--generate", help="Instead of a file: hydrant or car.")] = None,
+    images: Annotated[
+        Path | None, typer.Option("--images", help="Instead of a file: transforms.json of pictures with transparency.")
+    ] = None,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="Object file.", show_default="<name>.object.safetensors")
+    ] = None,
+    resolution: Annotated[
+        int, typer.Option("--resolution", min=8, max=128, help="Voxels along the longest side.")
+    ] = 64,
+    height_m: Annotated[float | None, typer.Option("--height", help="Scale to this height [m].")] = None,
+    up: Annotated[str, typer.Option("--up", help="Which axis of the file points up: z or y.")] = "z",
+    steps: Annotated[
+        int | None,
+        typer.Option("--steps", min=0, help="Steps of the fit.", show_default="400 of a mesh, 600 of pictures"),
+    ] = None,
+    minutes: Annotated[
+        float | None, typer.Option("--minutes", min=0.01, help="With --images: stop the fit after so long, instead.")
+    ] = None,
+    size: Annotated[
+        tuple[int, int] | None,
+        typer.Option(
+            "--size",
+            min=1,
+            help="With --images: width and height to bring the pictures to. Of the object itself see --resolution.",
+            show_default="as they are",
+        ),
+    ] = None,
+) -> None:
+    """Make an object file.
+
+    Of pictures, the data set's own training split is learned from, or 7 of 8 pictures of 16 or more. Ends with the PSNR on
+    training and held-out pictures, and with advice if it is poor.
+    """
+    from advnerf_core.objects.voxel.build import build_from_mesh
+    from advnerf_core.objects.voxel.model import save_object
+    from nodes.runtime.errors import ConfigError
+    from nodes.runtime.progress import ProgressDisplay
+
+    if sum(given is not None for given in (file, generate, images)) != 1:
+        raise ConfigError("expected one of FILE, --generate and --images")
+    if images is None and (minutes is not None or size is not None):
+        raise ConfigError("expected --minutes and --size only with --images")
+    if minutes is not None and steps is not None:
+        raise ConfigError("expected either --steps or --minutes, got both")
+    name = generate or _name(file or images or Path())
+    with ProgressDisplay() as display:
+        report = display.start("object")
+        if images is not None:
+            model = _from_images(images, name, resolution, steps, minutes, size, report)
+        else:
+            mesh, source = _mesh(file, generate, up, height_m)
+            model = build_from_mesh(mesh, name, resolution, 400 if steps is None else steps, source, report)
+    path = output or Path(f"{name}.object.safetensors")
+    save_object(path, model)
+    _print_quality(path, model)
+
+
+@app.command("show")
+def object_show(
+    file: ObjectPath,
+    output: Annotated[Path | None, typer.Option("--output", "-o", help="PNG.", show_default="beside FILE")] = None,
+) -> None:
+    """Draw an object from eight sides."""
+    import cv2
+    import numpy as np
+
+    from advnerf_core.files import write_atomically
+    from advnerf_core.objects.voxel.build import draw_object
+    from advnerf_core.objects.voxel.model import load_object
+    from advnerf_core.objects.voxel.views import ring, viewing_lens
+
+    model = load_object(file)
+    poses = ring(model.solid_box, _TURNTABLE_VIEWS)
+    drawn = draw_object(model, poses, viewing_lens(_TURNTABLE_PIXELS))
+    pictures = drawn[..., :3] + 1.0 - drawn[..., 3:]
+    half = _TURNTABLE_VIEWS // 2
+    sheet = np.concatenate([np.concatenate(list(row), axis=1) for row in (pictures[:half], pictures[half:])])
+    pixels = np.rint(255 * np.clip(sheet[..., ::-1], 0.0, 1.0)).astype(np.uint8)
+    path = output or file.with_suffix(".png")
+    write_atomically(path, cv2.imencode(".png", pixels)[1].tobytes())
+    print(path)
+
+
+@app.command("info")
+def object_info(file: ObjectPath) -> None:
+    """Say what an object file holds."""
+    from advnerf_core.objects.voxel.model import load_object
+
+    model = load_object(file)
+    rows = table("what", "value")
+    rows.add_row("name", model.name)
+    rows.add_row("size", " x ".join(f"{side:.3f}" for side in model.size_m) + " m")
+    rows.add_row("voxels", " x ".join(map(str, model.grids.density.shape)) + f" of {1e3 * model.grids.voxel:.1f} mm")
+    rows.add_row("free colours", str(int(model.slots.max())))
+    for key, value in model.about.items():
+        rows.add_row(key, str(value))
+    print_table(rows)
+
+
+def _mesh(file: Path | None, generate: str | None, up: str, height_m: float | None):  # type: ignore[no-untyped-def]
+    import hashlib
+
+    from advnerf_core.objects.voxel.generators import GENERATORS
+    from advnerf_core.objects.voxel.mesh import load_mesh, stand
+    from nodes.runtime.errors import ConfigError
+
+    if file is not None:
+        mesh = load_mesh(file, up, height_m)
+        return mesh, {"mesh": file.name, "sha256": hashlib.sha256(file.read_bytes()).hexdigest()}
+    if generate not in GENERATORS:
+        raise ConfigError(f"expected --generate to be one of {', '.join(GENERATORS)}; got {generate!r}")
+    return stand(GENERATORS[generate](), height_m=height_m), {"generator": generate}
+
+
+def _name(source: Path) -> str:
+    """What an object is called after its source: the mesh's file, or the folder of the pictures."""
+    source = source.resolve()
+    return source.parent.name if source.suffix == ".json" else source.stem
+
+
+def _from_images(
+    transforms: Path, name: str, resolution: int, steps: int | None, minutes: float | None, size: tuple[int, int] | None,
+    report: Report,
+) -> ObjectModel:  # fmt: skip
+    from advnerf_core.data.dataset import load_transforms
+    from advnerf_core.objects.voxel.build import build_from_images
+    from advnerf_core.objects.voxel.pictures import load_pictures
+
+    listed = load_transforms(transforms)
+    for path in listed.missing:
+        print(f"missing, left out: {path}")
+    training, held_out = _split(listed)
+    rule = "the data set's own split" if listed.splits else f"every {_HELD_OUT_EVERY}th is held out"
+    counts = f"{len(training.frames)} training, {0 if held_out is None else len(held_out.frames)} held-out pictures"
+    print(f"{counts} ({rule})" if held_out is not None else f"{counts} (of 16 or more, {rule})")
+    return build_from_images(
+        load_pictures(training, size), name, resolution,
+        (_DEFAULT_STEPS if minutes is None else _NO_STEP_LIMIT) if steps is None else steps, {"images": str(transforms)},
+        report, None if held_out is None else load_pictures(_spread(held_out), size),
+        None if minutes is None else 60.0 * minutes,
+    )  # fmt: skip
+
+
+def _split(listed: PosedImages) -> tuple[PosedImages, PosedImages | None]:
+    """Pictures to learn from, and pictures to compare with if there are enough."""
+    from advnerf_core.data.views import HELD_OUT_SPLITS, TRAIN
+
+    split = {TRAIN} < set(listed.splits) and not set(listed.splits).isdisjoint(HELD_OUT_SPLITS)
+    if not split and len(listed.frames) < _FEWEST_TO_SPLIT:
+        return listed.sorted_by_name(), None
+    return listed.training_and_held_out(_HELD_OUT_EVERY)
+
+
+def _spread(listed: PosedImages) -> PosedImages:
+    """As many held-out pictures as are compared: blender's sets have hundreds, and their memory is not needed."""
+    from advnerf_core.objects.voxel.build import HELD_OUT_VIEWS
+
+    frames, most = listed.frames, HELD_OUT_VIEWS
+    return listed.with_frames(frames if len(frames) <= most else [frames[k * len(frames) // most] for k in range(most)])
+
+
+def _print_quality(path: Path, model: ObjectModel) -> None:
+    from advnerf_core.objects.voxel.build import advice
+
+    size = " x ".join(f"{side:.2f}" for side in model.size_m)
+    parts = [f"{path}: {size} m"]
+    for key, where in (("train_psnr_db", "training"), ("held_out_psnr_db", "held-out")):
+        if key in model.about:
+            own = model.about.get(key.replace("psnr", "object_psnr"))
+            parts.append(
+                f"{model.about[key]:.1f} dB on {where} views"
+                + ("" if own is None else f" ({own:.1f} dB on the object)")
+            )
+    print(", ".join(parts))
+    if "train_object_psnr_db" in model.about:
+        for text in advice(model.about):
+            print(f"warning: {text}")

@@ -1,0 +1,141 @@
+"""The commands ``advnerf policy ...``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from nodes.cli import policy_train as cli_policy_train
+from nodes.runtime.terminal import print_table, table
+
+if TYPE_CHECKING:
+    from advnerf_core.policies.view import PolicyView
+    from nodes.lab.policy_reference import Reference
+
+app = typer.Typer(
+    no_args_is_help=True,
+    help="A policy from recordings or of any origin: train, evaluate, check its adapter, export it, look into it.",
+)
+Spec = Annotated[
+    str, typer.Argument(metavar="POLICY", help="A .safetensors, .onnx or .pt2 file, or package.module:factory.")
+]
+cli_policy_train.add_to(app)
+_COLOURS = {"ok": "green", "warning": "yellow", "failure": "red"}
+_FAILURE_EXIT = 1
+
+
+@app.command("check")
+def policy_check(
+    policy: Spec,
+    run_folder: Annotated[
+        Path | None,
+        typer.Option(
+            "--run-folder", help="An experiment: the camera frames of its capture, and drives in its learned scene."
+        ),
+    ] = None,
+    scene: Annotated[
+        Path | None, typer.Option("--scene", help="Views of a learned scene and drives in it; with --calibration.")
+    ] = None,
+    calibration: Annotated[
+        Path | None,
+        typer.Option("--calibration", help="Folder with camera.yaml, room.yaml and vehicle.yaml of the scene."),
+    ] = None,
+    bag: Annotated[Path | None, typer.Option("--bag", help="Frames and poses of a driven bag.")] = None,
+    room: Annotated[
+        Path, typer.Option("--room", help="Room calibration with the path that the bag's expert follows.")
+    ] = Path("calibration/twin/room.yaml"),
+    goal: Annotated[list[float] | None, typer.Option("--goal", help="One number of the goal vector; repeat.")] = None,
+) -> None:
+    """Say what is wrong with a policy's adapter, and whether it drives; in the simulated lab if no place is given.
+
+    Exit code 1 if the adapter is wrong, or if the policy does not drive in the place that was given.
+    """
+    from advnerf_core.policies.conformance import FAILURE, check_policy
+    from advnerf_core.policies.load import load_adapted
+    from nodes.lab.policy_reference import judged_by_drives
+
+    adapted, sha256 = load_adapted(policy)
+    reference = _reference(adapted.contract.view, run_folder, bag, room, scene, calibration)
+    print(f"{policy} ({sha256[:12]}) on {reference.source}")
+    told = tuple(goal) if goal else None
+    findings = check_policy(adapted, reference.images, reference.steering_rad, told)
+    findings = judged_by_drives(adapted, reference, findings, told)
+    rows = table("check", "state", "found")
+    for finding in findings:
+        rows.add_row(
+            finding.name, f"[{_COLOURS[finding.verdict]}]{finding.verdict}[/]", finding.text.replace("[", r"\[")
+        )
+    print_table(rows)
+    if any(finding.verdict == FAILURE for finding in findings):
+        raise typer.Exit(_FAILURE_EXIT)
+
+
+def _reference(
+    view: PolicyView,
+    run_folder: Path | None,
+    bag: Path | None,
+    room: Path,
+    scene: Path | None,
+    calibration: Path | None,
+) -> Reference:
+    from nodes.lab.policy_reference import from_bag, from_run, from_scene, from_twin
+    from nodes.runtime.errors import ConfigError
+
+    if sum(each is not None for each in (run_folder, bag, scene)) > 1:
+        raise ConfigError("expected one of --run-folder, --bag and --scene, got several")
+    if (scene is None) != (calibration is None):
+        raise ConfigError("expected --scene and --calibration together, got one of them")
+    if scene is not None and calibration is not None:
+        return from_scene(scene, calibration, view)
+    if run_folder is not None:
+        return from_run(run_folder, view)
+    return from_bag(bag, room, view) if bag is not None else from_twin(view)
+
+
+@app.command("export")
+def policy_export(
+    policy: Spec,
+    onnx: Annotated[Path | None, typer.Option("--onnx", help="Write an ONNX file: runs without torch.")] = None,
+    pt2: Annotated[Path | None, typer.Option("--pt2", help="Write an exported program: keeps its gradient.")] = None,
+) -> None:
+    """Write a policy with its declaration as a file that needs none of its source."""
+    from advnerf_core.policies.load import load_adapted, load_any_policy
+    from nodes.runtime.errors import ConfigError
+
+    if onnx is None and pt2 is None:
+        raise ConfigError("expected --onnx FILE or --pt2 FILE, got neither")
+    load_any_policy(policy)  # refuses what could not be used either
+    adapted, _ = load_adapted(policy)
+    adapted.requires_grad_(False)
+    if onnx is not None:
+        from advnerf_core.policies.onnx_policy import OnnxNetwork, export_onnx
+
+        export_onnx(adapted.network, adapted.contract, onnx)
+        print(f"{onnx} {OnnxNetwork(onnx).sha256[:12]}")
+    if pt2 is not None:
+        from advnerf_core.policies.exported_policy import export_program, load_program
+
+        export_program(adapted.network, adapted.contract, pt2)
+        print(f"{pt2} {load_program(pt2)[2][:12]}")
+
+
+@app.command("info")
+def policy_info(policy: Spec) -> None:
+    """Say what a policy declares, and its hash."""
+    from advnerf_core.policies.load import load_adapted
+
+    adapted, sha256 = load_adapted(policy)
+    contract = adapted.contract
+    rows = table("what", "value")
+    for name, value in contract.to_dict().items():
+        if name != "view":
+            rows.add_row(name, str(value).replace("[", r"\["))
+    view = contract.view
+    rows.add_row("image", f"{view.width} x {view.height}")
+    kept_rows, kept_columns = view.window
+    crop = f"rows {kept_rows.start} to {kept_rows.stop - 1}, columns {kept_columns.start} to {kept_columns.stop - 1}"
+    rows.add_row("view", f"{crop} of {view.camera.width} x {view.camera.height}")
+    rows.add_row("sha256", sha256)
+    print_table(rows)

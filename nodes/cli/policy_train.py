@@ -1,0 +1,239 @@
+"""The commands ``advnerf policy train`` and ``advnerf policy eval``: a policy from recordings, and how well it predicts one."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from nodes.runtime.terminal import print_table, table
+
+if TYPE_CHECKING:
+    from advnerf_core.driving.expert import Expert
+    from advnerf_core.learning.imitation import SourcePlan
+    from advnerf_core.policies.view import PolicyView
+    from nodes.lab.policy_data.train import Part
+
+Camera = Annotated[
+    Path | None, typer.Option("--camera", help="Camera calibration.", show_default="the one in the first bag")
+]
+Room = Annotated[
+    Path | None, typer.Option("--room", help="Room calibration: the path.", show_default="the one in the first bag")
+]
+Stiffness = Annotated[
+    float, typer.Option("--stiffness", min=0.1, help="How firmly the expert returns to the path [1/m].")
+]
+Delay = Annotated[
+    float, typer.Option("--delay", min=0.0, help="From an image to wheels that have turned by it, in the label [s].")
+]
+Speed = Annotated[float, typer.Option("--speed", min=0.1, help="Speed at which the policy will drive [m/s].")]
+LogColumns = Annotated[
+    tuple[str, str], typer.Option("--log-columns", help="Columns of the image file and of the steering.")
+]
+LogScale = Annotated[
+    float, typer.Option("--log-scale", help="From the logs' steering to radians, left positive; e.g. -0.26.")
+]
+
+
+def train(
+    out: Annotated[Path, typer.Option("--out", help="Folder of the policy; the same call goes on where it was killed.")],
+    bags: Annotated[
+        list[Path] | None, typer.Option("--bags", help="A driven bag; repeat. Whoever drove, the expert labels it.")
+    ] = None,
+    logs: Annotated[list[Path] | None, typer.Option("--log", help="CSV file of a foreign log; repeat.")] = None,
+    labels: Annotated[
+        Literal["expert", "recorded"], typer.Option("--labels", help="The expert at the measured pose, or what was sent.")
+    ] = "expert",
+    image_topic: Annotated[str | None, typer.Option("--image-topic", show_default="compositor's, or camera's")] = None,
+    camera: Camera = None,
+    room: Room = None,
+    surrogate: Annotated[
+        Path | None, typer.Option("--surrogate", help="Run folder of an experiment whose learned room is trained on too.")
+    ] = None,
+    experiment: Annotated[
+        Path, typer.Option("--experiment", help="The experiment file of that run.")
+    ] = Path("launch/room.experiment.yaml"),
+    setting: Annotated[str, typer.Option("--setting", help="And its setting.")] = "demo",
+    steps: Annotated[int, typer.Option("--steps", min=1, help="Optimiser steps.")] = 800,
+    seed: Annotated[int, typer.Option("--seed")] = 0,
+    speed_mps: Speed = 0.8,
+    delay_s: Delay = 0.16,
+    stiffness_1pm: Stiffness = 1.0,
+    log_columns: LogColumns = ("image", "steering"),
+    log_scale: LogScale = 1.0,
+) -> None:  # fmt: skip
+    """Train a policy on recordings: the expert's laps, its own drives relabelled (DAgger), foreign logs."""
+    from advnerf_core.learning.imitation import ImitationConfig
+    from nodes.lab.policy_data.train import train_from_recordings
+    from nodes.runtime.errors import ConfigError
+    from nodes.runtime.progress import ProgressDisplay
+
+    bags, logs = bags or [], logs or []
+    if not bags and not logs:
+        raise ConfigError("expected --bags BAG or --log FILE.csv, got neither; see docs/driving.md")
+    options = (bags, logs, labels, image_topic, log_columns, log_scale)
+    view = _view(camera, bags, logs, log_columns, log_scale)
+    expert = _expert(room, bags, speed_mps, delay_s, stiffness_1pm, needed=labels == "expert" and bool(bags))
+    parts = _parts(view, expert, *options)
+    config = ImitationConfig(
+        seed=seed, dagger_rounds=1 if surrogate else 0, first_steps=steps, round_steps=max(steps // 3, 1)
+    )
+    plan = None if surrogate is None else _surrogate(surrogate, experiment, setting, view)
+    with ProgressDisplay() as display:
+        done = train_from_recordings(parts, view, expert, config, out, plan, display.start("policy"))
+    rows = table("recording", "frames", "left out")
+    for name, count in done.frames.items():
+        left_out = ", ".join(f"{n} {why}" for why, n in done.left_out.get(name, {}).items() if n)
+        rows.add_row(name.replace("[", r"\["), str(count), left_out)
+    print_table(rows)
+    print(
+        f"{done.path} {done.sha256[:12]}, {1e3 * done.validation_mae_rad:.1f} mrad from the labels on held-out frames"
+        + "".join(f"; {name} unchecked: {reason}" for name, reason in done.unchecked.items())
+    )
+
+
+def evaluate(
+    policy: Annotated[str, typer.Argument(metavar="POLICY", help="A .safetensors, .onnx or .pt2 file, or a factory.")],
+    recording: Annotated[Path, typer.Argument(metavar="BAG", help="A driven bag, or the CSV file of a foreign log.")],
+    out: Annotated[Path | None, typer.Option("--out", help="Folder for the plot and the saliency maps.")] = None,
+    labels: Annotated[
+        Literal["expert", "recorded"], typer.Option("--labels", help="What the policy should have steered.")
+    ] = "recorded",
+    image_topic: Annotated[str | None, typer.Option("--image-topic", show_default="compositor's, or camera's")] = None,
+    room: Room = None,
+    maps: Annotated[int, typer.Option("--saliency", min=0, help="Frames whose saliency is drawn.")] = 8,
+    video: Annotated[bool, typer.Option("--video", help="And all of them as a film.")] = False,
+    goal: Annotated[list[float] | None, typer.Option("--goal", help="One number of the goal vector; repeat.")] = None,
+    speed_mps: Speed = 0.8,
+    delay_s: Delay = 0.16,
+    stiffness_1pm: Stiffness = 1.0,
+    log_columns: LogColumns = ("image", "steering"),
+    log_scale: LogScale = 1.0,
+) -> None:  # fmt: skip
+    """Compare what a policy would steer with what a recording says: table, plot, saliency."""
+    import numpy as np
+
+    from advnerf_core.policies.load import load_any_policy
+    from nodes.lab.policy_data import evaluate as measure
+    from nodes.lab.policy_data.frames import frames_of_bag, frames_of_log
+
+    loaded = load_any_policy(policy)
+    if recording.suffix == ".csv":
+        found = frames_of_log(recording, loaded.view, *log_columns, log_scale)[0]
+    else:
+        expert = _expert(room, [recording], speed_mps, delay_s, stiffness_1pm, needed=labels == "expert")
+        found = frames_of_bag(recording, loaded.view, expert, labels, image_topic)
+    goals = tuple(goal or ())
+    predicted = measure.predict(loaded.policy, found.frames.images, goals)
+    rows = table("predicted against", "frames", "mean |error|", "RMS", "worst", "bias", "r", "straight on")
+    pairs: list[tuple[str, Any]] = [(labels, np.asarray(found.frames.steering_rad))]
+    if labels == "expert" and np.isfinite(found.recorded_rad).any():
+        pairs.append(("recorded", found.recorded_rad))
+    for name, true in pairs:
+        e = measure.compare(predicted, true)
+        angles = (e.mean_abs_rad, e.rms_rad, e.worst_rad, e.bias_rad)
+        numbers = [f"{1e3 * v:.1f} mrad" for v in angles] + [f"{e.correlation:.3f}", f"{1e3 * e.zero_rad:.1f} mrad"]
+        rows.add_row(name, str(e.count), *numbers)
+    print_table(rows)
+    folder = out or Path("runs") / f"eval_{recording.resolve().parent.name}_{recording.stem}"
+    folder.mkdir(parents=True, exist_ok=True)
+    measure.draw(found, predicted, f"{policy} on {recording}", folder / "steering.png")
+    files = measure.write_saliency(loaded.policy, found, folder, maps, video, goals)
+    print(f"{folder / 'steering.png'}, {len(files)} of saliency in {folder}")
+
+
+def add_to(app: typer.Typer) -> None:
+    """Add the commands to ``advnerf policy``."""
+    app.command("train")(train)
+    app.command("eval")(evaluate)
+
+
+def _parts(
+    view: PolicyView, expert: Expert, bags: list[Path], logs: list[Path], labels: Any, image_topic: str | None,
+    columns: tuple[str, str], scale: float,
+) -> list[Part]:  # fmt: skip
+    from nodes.bags.reader import read_info
+    from nodes.lab.policy_data.frames import frames_of_bag, frames_of_log
+    from nodes.lab.policy_data.train import Part
+
+    parts = []
+    for bag in bags:
+        cut = partial(frames_of_bag, bag, view, expert, labels, image_topic)
+        info = read_info(bag)
+        parts.append(Part(str(bag), info.parts, {"labels": labels, "images": image_topic}, cut, info.unchecked))
+    for log in logs:
+        options = {"columns": columns, "scale": scale}
+        parts.append(Part(str(log), (log,), options, partial(_own_view, frames_of_log, log, view, columns, scale)))
+    return parts
+
+
+def _own_view(read: Any, log: Path, view: PolicyView, columns: tuple[str, str], scale: float) -> Any:
+    """A foreign camera has another size than ours; its images are cut at the same share of the picture."""
+    import cv2
+
+    from nodes.lab.policy_data.frames import first_image
+
+    picture = cv2.imread(str(first_image(log, columns[0])))
+    same = picture is not None and picture.shape[:2] == (view.camera.height, view.camera.width)
+    return read(log, view if same else None, *columns, scale)[0]
+
+
+def _view(
+    camera: Path | None, bags: list[Path], logs: list[Path], columns: tuple[str, str], scale: float
+) -> PolicyView:
+    from advnerf_core.policies.view import PolicyView
+    from calibration.schema import CameraCalibration
+    from nodes.lab.policy_data.frames import frames_of_log
+
+    if camera is None and not bags:
+        return frames_of_log(logs[0], None, *columns, scale)[1]
+    calibration = _calibration(CameraCalibration, camera, bags, "camera")
+    return PolicyView(calibration.pinhole, distortion=calibration.distortion)
+
+
+def _expert(
+    room: Path | None, bags: list[Path], speed_mps: float, delay_s: float, stiffness_1pm: float, needed: bool
+) -> Expert:
+    from advnerf_core.driving.expert import Expert, ExpertConfig
+    from advnerf_core.driving.path import Path as DrivingPath
+    from calibration.schema import RoomCalibration
+
+    config = ExpertConfig(speed_mps=speed_mps, delay_s=delay_s, stiffness_1pm=stiffness_1pm)
+    if not needed and room is None:
+        return Expert(DrivingPath.rounded_square(4.0, 1.1), config)  # labels nothing: they were recorded
+    return Expert(_calibration(RoomCalibration, room, bags, "room").reference_path, config)
+
+
+def _calibration(model: Any, given: Path | None, bags: list[Path], name: str) -> Any:
+    """A calibration file, or the one that rides in the first bag."""
+    import tempfile
+
+    from calibration.schema import load_calibration
+    from nodes.bags.reader import read_attachments
+    from nodes.runtime.errors import ConfigError
+
+    if given is not None:
+        return load_calibration(model, given)
+    if f"{name}.yaml" not in (attached := read_attachments(bags[0])):
+        raise ConfigError(
+            f"expected {name}.yaml attached to {bags[0]}, got {', '.join(attached) or 'nothing'}; use --{name}"
+        )
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / f"{name}.yaml"
+        file.write_bytes(attached[f"{name}.yaml"])
+        return load_calibration(model, file)
+
+
+def _surrogate(folder: Path, file: Path, setting: str, view: PolicyView) -> SourcePlan:
+    from advnerf_core.learning.imitation import SourcePlan
+    from nodes.experiment.policy import surrogate_source
+    from nodes.experiment.run import load_experiment
+    from nodes.runtime.errors import ConfigError
+
+    run = load_experiment(file, setting, [], folder)
+    if run.view != view:
+        raise ConfigError(f"expected the camera of the recordings in {folder}, got another; use its bags and --camera")
+    config = run.config.policy
+    return SourcePlan(surrogate_source(run), config.surrogate_stills, config.surrogate_drives, config.drive_steps)

@@ -1,0 +1,277 @@
+"""The commands ``advnerf room ...``: reference path, fence, targets, and the placement of board and monitor."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from nodes.runtime.terminal import RunDir, print_table, say_error, table
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from advnerf_core.geometry import Array
+    from calibration.path_fit import PathFit
+    from calibration.schema import RoomCalibration
+
+app = typer.Typer(
+    no_args_is_help=True, help="Measure the room by motion capture: path, fence, targets; place board and monitor."
+)
+
+BagFile = Annotated[Path, typer.Argument(help="Bag with the trace.", exists=True)]
+Topic = Annotated[str, typer.Option("--topic", help="Who drew the trace: /vicon/car, or /vicon/wand.")]
+Output = Annotated[Path, typer.Option("--output", "-o", help="YAML file to write.")]
+FAILURE_EXIT = 1
+
+
+@app.command("path")
+def room_path(
+    bag: BagFile,
+    output: Output = Path("room.yaml"),
+    topic: Topic = "/vicon/car",
+    closed: Annotated[bool | None, typer.Option("--closed/--open", help="A loop or not.", show_default="looks")] = None,
+    corner: Annotated[int, typer.Option("--corner", help="The corner of the attack: which arc, from 1.")] = 1,
+    before_m: Annotated[float, typer.Option("--before", help="Start of the experiments before that corner [m].")] = 2.0,
+    off_track_m: Annotated[float, typer.Option("--off-track", help="|CTE| beyond which the car is off [m].")] = 0.4,
+    fence_margin_m: Annotated[
+        float, typer.Option("--fence-margin", help="Of a new file: fence around the path, until one is walked [m].")
+    ] = 0.8,
+) -> None:
+    """Fit the reference path to a driven or drawn trace; keeps the fence of a file that is there."""
+    from calibration.path_fit import PathFitConfig, fit_path
+    from calibration.plots import save_with_plot
+    from calibration.room import clearance, fence_around, start_before_corner
+
+    trace = _trace(bag, topic)
+    fit = fit_path(trace, PathFitConfig(closed=closed))
+    old = _old_room(output)
+    fence = old.fence_m if old else fence_around(fit.path, fence_margin_m)
+    room = _room(
+        fit.path.to_dict(), fence, old.off_track_m if old else off_track_m,
+        start_before_corner(fit.path, corner, before_m), f"path fitted to {topic}",
+        {"path_rms_mm": round(1e3 * fit.rms_m, 2), "path_worst_mm": round(1e3 * fit.worst_m, 2)}, len(fit.trace),
+    )  # fmt: skip
+    _require_clearance(clearance(fit.path, fence))
+    picture = save_with_plot(room, output, lambda figure: _draw(figure, room, fit.trace, fit))
+    _print_fit(fit)
+    print(f"start {before_m:g} m before corner {corner}: {room.start_pose}")
+    print(
+        f"{output} and {picture}" + ("" if old else "; the fence is only the path's surroundings: advnerf room fence")
+    )
+
+
+@app.command("fence")
+def room_fence(
+    bag: BagFile,
+    output: Output = Path("room.yaml"),
+    topic: Topic = "/vicon/wand",
+    margin_m: Annotated[float, typer.Option("--margin", min=0.0, help="How far inside of the walk it lies [m].")] = 0.3,
+) -> None:
+    """Take the fence from a walk around the free floor with the car or a wand; the path must already be there."""
+    from calibration.plots import save_with_plot
+    from calibration.room import clearance, fence_from_trace
+    from calibration.schema import CalibrationError
+
+    old = _old_room(output)
+    if old is None:
+        raise CalibrationError(f"expected a room file at {output}: fit the path first, with advnerf room path")
+    trace = _trace(bag, topic)
+    fence = fence_from_trace(trace, margin_m)
+    least_m = clearance(old.reference_path, fence)
+    _require_clearance(least_m)
+    room = _room(
+        old.path, fence, old.off_track_m, old.start_pose, f"{old.method}; fence walked with {topic}", old.residuals, old.views
+    )  # fmt: skip
+    picture = save_with_plot(room, output, lambda figure: _draw(figure, room, trace))
+    print(f"fence of {len(fence)} corners, at least {least_m:.2f} m from the path; {output} and {picture}")
+
+
+@app.command("target")
+def room_target(
+    output: Annotated[Path, typer.Option("--output", "-o", help="YAML file to write.")],
+    subject: Annotated[str, typer.Option("--subject", help="Motion-capture subject: board or monitor.")],
+    bag: Annotated[Path | None, typer.Argument(help="Bag in which a wand touches the corners.", exists=True)] = None,
+    size: Annotated[str | None, typer.Option("--size", metavar="WxH", help="Instead: width x height [m].")] = None,
+    centre: Annotated[
+        str, typer.Option("--centre", metavar="X,Y,Z", help="Its middle in the subject's frame [m].")
+    ] = "0,0,0",
+    yaw_deg: Annotated[float, typer.Option("--yaw", help="Where it looks, about the subject's z [deg].")] = 0.0,
+    wand: Annotated[str, typer.Option("--wand", help="Topic of the wand.")] = "/vicon/wand",
+    tip: Annotated[str, typer.Option("--tip", metavar="X,Y,Z", help="The wand's tip in its own frame [m].")] = "0,0,0",
+) -> None:
+    """Write where a face is in its subject's frame: by a ruler, or by touching its corners with a wand.
+
+    With the wand rest a second at the top left, top right, bottom right and bottom left corner, as seen by somebody who faces it.
+    Of a monitor give the whole panel; the attack uses its centre square, whose size is printed.
+    """
+    import numpy as np
+
+    from calibration.panel import target_size
+    from calibration.room import target_of_size, target_of_touches
+    from calibration.schema import CalibrationError, save_calibration
+
+    if (bag is None) == (size is None):
+        raise CalibrationError("expected either a bag in which a wand touches the corners, or --size WxH")
+    if size is not None:
+        width, height = _numbers(size.replace("x", ","), 2, "--size")
+        target = target_of_size(
+            subject, (width, height), _point(centre, "--centre"), float(np.deg2rad(yaw_deg)), "measured with a ruler"
+        )
+    else:
+        assert bag is not None
+        target = target_of_touches(subject, _touches(bag, wand, f"/vicon/{subject}", _point(tip, "--tip")))
+    save_calibration(target, output)
+    width, height = target_size(target)
+    print(f"{output}: {subject}, {width:.4f} x {height:.4f} m, {target.residuals or 'nothing fitted'}")
+    print(f"an attack for it may be {min(width, height):.4f} m wide: size_m: {min(width, height):.4f}")
+
+
+@app.command("place")
+def room_place(
+    attack_file: Annotated[Path, typer.Argument(help="Attack file.", exists=True, dir_okay=False)],
+    target_file: Annotated[Path, typer.Option("--target", help="Target file of what shows it.", exists=True)],
+    request: Annotated[
+        Path | None, typer.Option("--request", help="Its *.attack.yaml: writes one for the measured pose.", exists=True)
+    ] = None,
+    tolerance_cm: Annotated[float, typer.Option("--tolerance-cm", min=0.1)] = 2.0,
+    tolerance_deg: Annotated[float, typer.Option("--tolerance-deg", min=0.1)] = 2.0,
+    once: Annotated[bool, typer.Option("--once", help="Look once; exit code 1 if it stands wrong.")] = False,
+    timeout_s: Annotated[float, typer.Option("--timeout", min=1.0, help="Give up after so long [s].")] = 600.0,
+    run_dir: RunDir = None,
+) -> None:
+    """Guide board or monitor to where its attack was computed, live; refuses what stands wrong."""
+    import numpy as np
+
+    from advnerf_core.attack.artifact import load_attack
+    from calibration.panel import make_panel, require_fits
+    from calibration.schema import TargetCalibration, load_calibration
+    from nodes.lab.room.placing import guide, in_short, say_how_to_attack_again
+    from nodes.launching.watching import find_run_dir
+
+    attack, target = load_attack(attack_file), load_calibration(TargetCalibration, target_file)
+    require_fits(attack, make_panel((1000, 1000), target), target)
+    limits = tolerance_cm / 100.0, float(np.deg2rad(tolerance_deg))
+    found = guide(find_run_dir(run_dir), attack, target, limits, once, timeout_s)
+    if found is None:
+        say_error(f"no pose of {target.subject} within {timeout_s:g} s: is it in sight of motion capture?")
+        raise typer.Exit(FAILURE_EXIT)
+    off, T_world_from_subject = found
+    if off.within(*limits):
+        print(f"{target.subject} stands where attack {attack.attack_id} wants it: {in_short(off)}")
+        return
+    say_error(
+        f"{target.subject} stands {in_short(off)} from where attack {attack.attack_id} was computed: move it, or attack again"
+    )
+    say_how_to_attack_again(request, target, T_world_from_subject)
+    raise typer.Exit(FAILURE_EXIT)
+
+
+def _trace(bag: Path, topic: str) -> Array:
+    from nodes.lab.wizards.bags import read_poses
+
+    return read_poses(bag, topic).T[:, :2, 3]
+
+
+def _touches(bag: Path, wand: str, subject: str, tip: tuple[float, float, float]) -> Any:
+    import numpy as np
+
+    from calibration.room import find_touches
+    from nodes.lab.wizards.bags import read_poses
+
+    drawn, carried = read_poses(bag, wand), read_poses(bag, subject)
+    # The carrier stands still while its corners are touched: its nearest pose is its pose.
+    nearest = np.clip(np.searchsorted(carried.stamps_ns, drawn.stamps_ns), 0, len(carried.stamps_ns) - 1)
+    return find_touches(drawn.stamps_ns, drawn.T, carried.T[nearest], tip)
+
+
+def _old_room(file: Path) -> RoomCalibration | None:
+    from calibration.schema import RoomCalibration, load_calibration
+
+    return load_calibration(RoomCalibration, file) if file.exists() else None
+
+
+def _room(
+    path: dict[str, Any],
+    fence: Any,
+    off_track_m: float,
+    start: Any,
+    method: str,
+    residuals: dict[str, float],
+    views: int | None,
+) -> RoomCalibration:
+    import datetime
+
+    from calibration.schema import RoomCalibration
+
+    return RoomCalibration.model_validate(
+        {
+            "date": datetime.date.today(), "method": method, "path": path, "off_track_m": off_track_m, "fence_m": fence,
+            "start_pose": start, "residuals": residuals, "views": views,
+        }
+    )  # fmt: skip
+
+
+def _require_clearance(least_m: float) -> None:
+    from calibration.degeneracy import DegenerateDataError
+
+    if least_m <= 0.0:
+        raise DegenerateDataError(
+            f"expected the path inside the fence, it is {-least_m:.2f} m outside: walk around all of it"
+        )
+
+
+def _print_fit(fit: PathFit) -> None:
+    from advnerf_core.driving.path import Line
+
+    rows = table("piece", "length \\[m]", "radius \\[m]", "turn \\[deg]")
+    for piece in fit.path.segments:
+        if isinstance(piece, Line):
+            rows.add_row("line", f"{piece.length_m:.3f}", "", "")
+        else:
+            rows.add_row("arc", f"{piece.length_m:.3f}", f"{piece.radius_m:.3f}", f"{57.29578 * piece.angle_rad:+.1f}")
+    print_table(rows)
+    kind = (
+        f"closed, {fit.path.length_m:.2f} m, {fit.laps:.1f} laps"
+        if fit.path.closed
+        else f"open, {fit.path.length_m:.2f} m"
+    )
+    print(f"{kind}; residuals {1e3 * fit.rms_m:.1f} mm rms, {1e3 * fit.worst_m:.1f} mm at worst")
+
+
+def _draw(figure: Figure, room: RoomCalibration, trace: Array, fit: PathFit | None = None) -> None:
+    import numpy as np
+
+    axes = figure.subplots(1, 2 if fit else 1, squeeze=False)[0]
+    path = room.reference_path
+    drawn = path.pose_at(np.linspace(0.0, path.length_m, 1000))
+    fence = np.array([*room.fence_m, room.fence_m[0]])
+    axes[0].plot(trace[:, 0], trace[:, 1], ".", markersize=2, color="tab:gray", label="trace")
+    axes[0].plot(drawn[:, 0], drawn[:, 1], color="tab:green", label="path")
+    axes[0].plot(fence[:, 0], fence[:, 1], "--", color="tab:red", label="fence")
+    axes[0].plot(*room.start_pose[:2], "k>", label="start")
+    axes[0].set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
+    axes[0].legend(fontsize="small")
+    if fit:
+        axes[1].plot(path.project(fit.trace).s_m, 1e3 * fit.residuals_m, ".", markersize=2)
+        axes[1].set(xlabel="along the path [m]", ylabel="distance from it [mm]", title=f"rms {1e3 * fit.rms_m:.1f} mm")
+
+
+def _numbers(text: str, count: int, option: str) -> tuple[float, ...]:
+    from calibration.schema import CalibrationError
+
+    try:
+        values = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        values = ()
+    if len(values) != count:
+        raise CalibrationError(
+            f"{option} {text}: expected {count} numbers in metres, e.g. {'0.598x0.336' if count == 2 else '0,0,0.1'}"
+        )
+    return values
+
+
+def _point(text: str, option: str) -> tuple[float, float, float]:
+    x, y, z = _numbers(text, 3, option)
+    return x, y, z

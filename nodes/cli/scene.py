@@ -1,0 +1,210 @@
+"""The commands ``advnerf scene ...``: from photographs to a scene field, and looking at it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from nodes.cli import scene_gate as cli_scene_gate
+from nodes.cli import scene_import as cli_scene_import
+from nodes.runtime.terminal import print_table, table
+
+app = typer.Typer(
+    no_args_is_help=True, help="Scenes: posed images from videos, photographs and bags, and what is learned from them."
+)
+app.add_typer(cli_scene_import.app)
+cli_scene_gate.add_to(app)
+
+DataSet = Annotated[Path, typer.Argument(help="A transforms.json, or its folder.", exists=True)]
+SceneFile = Annotated[Path, typer.Argument(help="A scene file (scene.safetensors).", dir_okay=False)]
+Size = Annotated[
+    tuple[int, int] | None,
+    typer.Option("--size", help="Width and height to bring the images to.", show_default="as they are"),
+]
+Corner = Annotated[
+    tuple[float, float, float] | None, typer.Option(help="Corner of the learned box, in the file's unit.")
+]
+IntervalScale = Annotated[
+    float,
+    typer.Option(
+        "--interval-scale",
+        min=0.05,
+        max=20.0,
+        help="Sample intervals in those of the training; longer ones are quicker.",
+    ),
+]
+_HELD_OUT_EVERY = 8
+
+
+@app.command("train")
+def scene_train(
+    transforms: DataSet,
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="Folder of the results; a stopped training goes on there.")
+    ],
+    steps: Annotated[int | None, typer.Option("--steps", min=1, show_default="1000 without --minutes")] = None,
+    minutes: Annotated[float | None, typer.Option("--minutes", min=0.01, help="Stop after so long, instead.")] = None,
+    box_low: Corner = None,
+    box_high: Corner = None,
+    size: Size = None,
+    open_scene: Annotated[bool, typer.Option("--open", help="Out of doors: rays may leave the box.")] = False,
+    every: Annotated[int, typer.Option("--every", min=2, help="Hold out every so-manieth image.")] = _HELD_OUT_EVERY,
+    near: Annotated[
+        float, typer.Option("--near", min=0.0, help="Nothing is learned nearer to a camera than this.")
+    ] = 0.05,
+    seed: Annotated[int, typer.Option("--seed")] = 0,
+    checkpoint_every_s: Annotated[
+        float, typer.Option("--checkpoint-every", min=0.0, help="A kill loses at most so much training [s].")
+    ] = 30.0,
+    unbounded: Annotated[
+        bool | None,
+        typer.Option(
+            "--unbounded/--bounded",
+            help="The scene goes on outside the box, to the horizon, with detail that fades with distance.",
+            show_default="unbounded where aabb_scale in the file is more than 1",
+        ),
+    ] = None,
+    preset: Annotated[
+        str,
+        typer.Option(
+            "--preset",
+            help="room: ours, for rooms and for a CPU (8 levels of 4 features, 2^17 entries, matte colours unless --open or "
+            "--unbounded). instant-ngp: its default sizes (16 levels of 2 features, 2^19 entries, finest 2048 x aabb_scale, "
+            "directions to degree 4), for detail and for comparisons; slower.",
+        ),
+    ] = "room",
+    interval_px: Annotated[
+        float | None,
+        typer.Option(
+            "--interval-px",
+            help="Sample intervals in pixels of the images; fewer are finer and slower.",
+            show_default="4; 1.5 if all cameras stand outside the box",
+        ),
+    ] = None,
+    interval: Annotated[
+        tuple[float, float] | None,
+        typer.Option(
+            "--interval",
+            help="Shortest and longest sample interval, in the file's unit.",
+            show_default="1/1024 and 1/64 of the box",
+        ),
+    ] = None,
+    interval_growth: Annotated[
+        float | None,
+        typer.Option(
+            "--interval-growth", help="Sample interval per distance.", show_default="--interval-px by focal length"
+        ),
+    ] = None,
+) -> None:
+    """Learn a scene from posed images; ends with PSNR and SSIM on held-out ones.
+
+    Images with alpha are learned with it: what they show as transparent stays so.
+    """
+    from nodes.lab.scene_training import FIGURES, SCENE, TrainingRequest, train
+    from nodes.runtime.errors import ConfigError
+    from nodes.runtime.locks import HeldError, hold
+    from nodes.runtime.progress import ProgressDisplay
+
+    if (box_low is None) != (box_high is None):
+        raise ConfigError("expected both --box-low and --box-high, or neither")
+    box = None if box_low is None or box_high is None else (box_low, box_high)
+    request = TrainingRequest(
+        transforms,
+        output,
+        steps or (None if minutes is not None else 1000),
+        minutes,
+        box,
+        size,
+        open_scene,
+        every,
+        near,
+        seed,
+        checkpoint_every_s,
+        unbounded,
+        preset,
+        interval_px,
+        interval,
+        interval_growth,
+    )
+    output.mkdir(parents=True, exist_ok=True)
+    try:
+        lock = hold(output / ".lock")
+    except HeldError as error:
+        raise ConfigError(f"{output} is in use by process {error.owner}: wait for it, or stop it") from None
+    with lock, ProgressDisplay() as display:
+        figures = train(request, display.start("scene"))
+    _print_figures(figures)
+    print(f"{output / SCENE}; every image in {output / FIGURES}")
+
+
+@app.command("eval")
+def scene_eval(
+    scene: SceneFile,
+    transforms: DataSet,
+    size: Size = None,
+    every: int = _HELD_OUT_EVERY,
+    interval_scale: IntervalScale = 1.0,
+) -> None:
+    """Compare a scene with the held-out images of a data set."""
+    from advnerf_core.data.dataset import load_transforms
+    from advnerf_core.scene.render_field import FieldRenderer
+    from nodes.lab.scene_training import evaluate
+
+    renderer = FieldRenderer.from_file(scene, interval_scale=interval_scale)
+    _print_figures(evaluate(renderer, load_transforms(transforms).training_and_held_out(every)[1], size))
+
+
+@app.command("render")
+def scene_render(
+    scene: SceneFile,
+    transforms: DataSet,
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder of the pictures.")],
+    video: Annotated[Path | None, typer.Option("--video", help="Also one video (MP4) through all views.")] = None,
+    size: Size = None,
+    held_out: Annotated[bool, typer.Option("--held-out", help="Only the held-out images' cameras.")] = False,
+    every: int = _HELD_OUT_EVERY,
+    interval_scale: IntervalScale = 1.0,
+) -> None:
+    """Draw what a scene shows from the cameras of a data set: colour, depth, and a video."""
+    from advnerf_core.data.dataset import load_transforms
+    from advnerf_core.scene.render_field import FieldRenderer
+    from nodes.lab.scene_training import render
+    from nodes.runtime.progress import ProgressDisplay
+
+    renderer = FieldRenderer.from_file(scene, interval_scale=interval_scale)
+    listed = load_transforms(transforms)
+    listed = listed.training_and_held_out(every)[1] if held_out else listed.sorted_by_name()
+    with ProgressDisplay() as display:
+        count = render(renderer, listed, size, output, video, display.start("render"))
+    print(f"{count} views in {output}" + ("" if video is None else f", and {video}"))
+
+
+@app.command("view")
+def scene_view(
+    scene: SceneFile,
+    transforms: Annotated[
+        Path | None, typer.Option("--cameras", help="A transforms.json whose cameras are shown.", exists=True)
+    ] = None,
+    objects: Annotated[list[Path] | None, typer.Option("--object", help="An object file to put at the origin.")] = None,
+    room: Annotated[
+        Path | None, typer.Option("--room", help="A room calibration: its path is drawn.", exists=True)
+    ] = None,
+    port: Annotated[int, typer.Option("--port", min=1, max=65535)] = 8080,
+    host: Annotated[str, typer.Option("--host", help="0.0.0.0 lets others on the network look, too.")] = "127.0.0.1",
+) -> None:
+    """Fly through a scene in the browser."""
+    from nodes.lab.scene_view import SceneView
+
+    view = SceneView(scene, transforms, objects or [], room, host, port)
+    print(f"http://{host}:{view.port} shows {scene}; Ctrl-C ends it", flush=True)
+    view.serve()
+
+
+def _print_figures(figures: dict[str, Any]) -> None:
+    rows = table("held-out image", "PSNR", "SSIM")
+    for row in figures["images"]:
+        rows.add_row(row["image"], f"{row['psnr_db']:.2f} dB", f"{row['ssim']:.3f}")
+    rows.add_row("mean", f"{figures['mean']['psnr_db']:.2f} dB", f"{figures['mean']['ssim']:.3f}")
+    print_table(rows)

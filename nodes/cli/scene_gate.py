@@ -1,0 +1,65 @@
+"""The command ``advnerf scene gate``: is a surrogate good enough that attacks found in it mean something?"""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from nodes.runtime.terminal import Overrides, print_table, table
+
+_REFUSED_EXIT = 1
+
+
+def add_to(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("gate")(gate)
+
+
+def gate(
+    file: Annotated[Path, typer.Argument(help="A *.experiment.yaml file.", exists=True, dir_okay=False)],
+    setting: Annotated[str, typer.Option("--setting", help="Which of the file's settings.")] = "full",
+    run_folder: Annotated[Path | None, typer.Option("--run-folder", show_default="runs/<setting>")] = None,
+    kind: Annotated[str, typer.Option("--kind", help="room, intersection, or a module of cells.")] = "room",
+    scenario: Annotated[str, typer.Option("--scenario", help="Which drive, where there are several.")] = "straight",
+    victim: Annotated[str, typer.Option("--victim", help="hardened or naive.")] = "hardened",
+    bag: Annotated[
+        Path | None, typer.Option("--bag", help="A bag of a drive without attack, to look at as well.", exists=True)
+    ] = None,
+    psnr_db: Annotated[float | None, typer.Option("--psnr", help="Least mean PSNR at the policy's size [dB].")] = None,
+    ssim: Annotated[float | None, typer.Option("--ssim", help="Least mean SSIM at the policy's size.")] = None,
+    steering: Annotated[
+        float | None, typer.Option("--steering", help="Greatest mean steering difference [rad or rad/s].")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print everything as JSON.")] = False,
+    overrides: Overrides = None,
+) -> None:
+    """Compare learned with real views, in looks and in what the policy makes of them; exit code 1 refuses the surrogate."""
+    os.environ.setdefault("MUJOCO_GL", "egl")
+    from advnerf_core.scene.gate_limits import GateLimits
+    from nodes.experiment.campaign.gate import judge_scene
+    from nodes.experiment.campaign.kinds import load_kind
+
+    found = load_kind(kind)
+    experiment = found.load(file, setting, overrides or [], run_folder or Path("runs") / setting)
+    wanted = {"psnr_db": psnr_db, "ssim": ssim, "steering": steering}
+    limits = GateLimits.model_validate({name: value for name, value in wanted.items() if value is not None})
+    verdicts = judge_scene(found, experiment, scenario, victim, limits, bag)
+    if as_json:
+        print(json.dumps({of: verdict.record() for of, verdict in verdicts}))
+    else:
+        rows = table("pictures", "views", "PSNR [dB]", "SSIM", "steering difference", "worst", "correlation", "verdict")
+        for of, verdict in verdicts:
+            n = verdict.numbers
+            rows.add_row(
+                of, str(n["views"]), f"{n['psnr_db']:.2f}", f"{n['ssim']:.3f}", f"{n['steering']:.4f}", f"{n['steering_worst']:.4f}",
+                f"{n['correlation']:.4f}", "[green]pass[/]" if verdict.passed else "[red]refused[/]",
+            )  # fmt: skip
+        print_table(rows)
+        for reason in [reason for _, verdict in verdicts for reason in verdict.reasons]:
+            print(reason)
+    if not all(verdict.passed for _, verdict in verdicts):
+        raise typer.Exit(_REFUSED_EXIT)

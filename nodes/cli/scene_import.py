@@ -1,0 +1,201 @@
+"""The commands ``advnerf scene from-...``: posed images (``transforms.json``) out of what a person has recorded."""
+
+from __future__ import annotations
+
+import math
+import signal
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from nodes.runtime.terminal import print_table, table
+
+if TYPE_CHECKING:
+    from nodes.lab.importing.data_set import Imported
+
+app = typer.Typer()
+
+Output = Annotated[
+    Path,
+    typer.Option(
+        "--output", "-o", help="Folder of the data set, written when it is whole; a stopped run goes on in OUTPUT.part."
+    ),
+]
+Media = Annotated[list[Path], typer.Argument(help="Videos and folders of photographs.", exists=True)]
+Bag = Annotated[Path, typer.Argument(help="Bag folder, or a .mcap, .db3 or .bag file of a drive.", exists=True)]
+Most = Annotated[int, typer.Option("--most", min=3, help="At most so many images of each video, folder or bag.")]
+OneCamera = Annotated[
+    bool, typer.Option("--one-camera", help="All were taken by one camera with one focal length (no zoom).")
+]
+Movement = Annotated[
+    float,
+    typer.Option(
+        "--movement", min=0.005, max=0.9, help="Keep a frame when the picture moved by this share of its width."
+    ),
+]
+ExtentM = Annotated[
+    float,
+    typer.Option(
+        "--extent", min=0.001, help="Distance between the two farthest places photographed from [m]; fixes the scale."
+    ),
+]
+Seed = Annotated[int, typer.Option("--seed", help="Of all randomness.")]
+Calibration = Annotated[
+    Path | None,
+    typer.Option(
+        "--calibration",
+        exists=True,
+        dir_okay=False,
+        show_default="camera.yaml in the bag",
+        help="The driving camera's.",
+    ),
+]
+StepM = Annotated[float, typer.Option("--step", min=0.0, help="Take a frame of the bag after so many metres.")]
+StepDeg = Annotated[float, typer.Option("--step-angle", min=0.0, help="Or after so many degrees of turning.")]
+
+
+@app.command("from-video")
+def from_video(
+    media: Media, output: Output, movement: Movement = 0.06, most: Most = 300, one_camera: OneCamera = False,
+    extent_m: ExtentM = 4.0, seed: Seed = 0,
+) -> None:  # fmt: skip
+    """Find poses and lenses of the sharpest frames of videos, several videos and cameras in one model."""
+    _from_media(media, output, movement, most, one_camera, extent_m, seed)
+
+
+@app.command("from-images")
+def from_images(
+    media: Media, output: Output, most: Most = 300, one_camera: OneCamera = False, extent_m: ExtentM = 4.0, seed: Seed = 0
+) -> None:  # fmt: skip
+    """Find poses and lenses of photographs; images of a folder share a camera unless size or EXIF data differ; videos may join in."""
+    _from_media(media, output, 0.06, most, one_camera, extent_m, seed)
+
+
+@app.command("from-bag")
+def from_bag(
+    bag: Bag, output: Output, calibration: Calibration = None, step_m: StepM = 0.1, step_deg: StepDeg = 5.0, most: Most = 300,
+    margin_m: Annotated[
+        float, typer.Option("--margin", min=0.0, help="How far the scene reaches beyond the car's way [m].")
+    ] = 3.0,
+) -> None:  # fmt: skip
+    """Take recorded frames with their motion-capture poses; nothing is estimated."""
+    from nodes.lab.importing.data_set import from_bag as run
+    from nodes.lab.importing.driven_bag import BagConfig
+
+    config = BagConfig(step_m, math.radians(step_deg), most=most)
+    _run("from-bag", output, lambda report: run(bag, output, config, margin_m, report, calibration))
+
+
+@app.command("from-phone-and-car")
+def from_phone_and_car(
+    media: Media, output: Output,
+    bag: Annotated[Path, typer.Option("--bag", help="Bag of a drive through the same room.", exists=True)],
+    calibration: Calibration = None, movement: Movement = 0.06, step_m: StepM = 0.15, step_deg: StepDeg = 8.0,
+    most: Most = 200, one_camera: OneCamera = False, seed: Seed = 0,
+    tolerance_m: Annotated[
+        float, typer.Option("--tolerance", min=0.001, help="Farthest a frame may be from its motion-capture pose [m].")
+    ] = 0.08,
+) -> None:  # fmt: skip
+    """Put phone media and the frames of a driven bag into one model, metric and in the motion-capture world."""
+    from advnerf_core.data.keyframes import KeyframeConfig
+    from calibration.phone_and_car import PlacingConfig
+    from calibration.structure_from_motion import SfmConfig
+    from nodes.lab.importing.data_set import from_phone_and_car as run
+    from nodes.lab.importing.driven_bag import BagConfig
+    from nodes.lab.importing.media import MediaConfig
+
+    media_config = MediaConfig(KeyframeConfig(movement), most, one_camera)
+    bag_config, placing = BagConfig(step_m, math.radians(step_deg), most=most), PlacingConfig(tolerance_m)
+    _run(
+        "from-phone-and-car", output,
+        lambda report: run(media, bag, output, media_config, bag_config, SfmConfig(seed=seed), placing, report, calibration),
+    )  # fmt: skip
+
+
+@app.command("match-colours")
+def match_colours(
+    scene: Annotated[Path, typer.Argument(help="Scene file, learned from the phone's images.", exists=True, dir_okay=False)],
+    images: Annotated[Path, typer.Argument(help="transforms_car.json: frames of the driving camera in the same world.", exists=True)],
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="Where to write the scene with the map.", show_default="the scene file")
+    ] = None,
+    most: Annotated[int, typer.Option("--most", min=1, help="At most so many frames, evenly spread.")] = 16,
+) -> None:  # fmt: skip
+    """Fit the map from the colours a scene was learned in to the driving camera's, and store it in the scene file."""
+    from nodes.lab.importing.colours import match_colours as run
+
+    result = run(scene, images, output or scene, most)
+    print(
+        f"{output or scene}: colour map of {result.frames} frames, PSNR {result.before_db:.2f} dB without it, {result.after_db:.2f} dB with it"
+    )
+
+
+def _from_media(
+    media: list[Path], output: Path, movement: float, most: int, one_camera: bool, extent_m: float, seed: int
+) -> None:
+    from advnerf_core.data.keyframes import KeyframeConfig
+    from calibration.structure_from_motion import SfmConfig
+    from nodes.lab.importing.data_set import from_media as run
+    from nodes.lab.importing.media import MediaConfig
+
+    config = MediaConfig(KeyframeConfig(movement), most, one_camera)
+    _run("from-media", output, lambda report: run(media, output, config, SfmConfig(seed=seed), extent_m, report))
+
+
+def _run(name: str, output: Path, work: Any) -> None:
+    from nodes.lab.importing.staging import work_folder
+    from nodes.runtime.progress import ProgressDisplay
+    from nodes.runtime.terminal import say_error
+    from nodes.runtime.termination import ends_in_order
+
+    code = 0
+    try:
+        with ends_in_order(), ProgressDisplay() as display:
+            imported: Imported = work(display.start(name))
+    except KeyboardInterrupt:
+        code = 128 + signal.SIGINT
+    except SystemExit as asked:
+        code = int(asked.code or 0)
+    if code:
+        kept = work_folder(output)
+        going_on = f"finished work is kept in {kept}, and the same command goes on there"
+        say_error(f"stopped; {going_on if kept.exists() else 'nothing is left behind'}")
+        raise typer.Exit(code)
+    _print_report(imported)
+
+
+def _print_report(imported: Imported) -> None:
+    facts = imported.report
+    if "recorded_frames" in facts:
+        print(
+            f"{facts['taken_frames']} of {facts['recorded_frames']} frames taken, {facts['without_pose']} had no motion-capture pose"
+            + (f"; unchecked: {facts['unchecked']}" if facts.get("unchecked") else "")
+        )
+    if model := facts.get("structure_from_motion"):
+        _print_model(model)
+    if placing := facts.get("placing"):
+        print(
+            f"placed in the motion-capture world by {placing['inliers']} of {placing['cameras']} frames of the car: scale {placing['scale']:.4f}, "
+            f"rms {1000 * placing['rms_position_m']:.1f} mm and {math.degrees(placing['rms_rotation_rad']):.2f} degrees"
+        )
+    print(f"scale: {facts['scale']}")
+    print("\n".join(str(path) for path in imported.transforms))
+
+
+def _print_model(model: dict[str, Any]) -> None:
+    rows = table("camera", "images", "lens", "focal length [px]", "k1, k2, p1, p2")
+    for camera, found in model["cameras"].items():
+        focal = f"{found['fl_x']:.1f}" + (f", {found['fl_y']:.1f}" if found["fl_y"] != found["fl_x"] else "")
+        error = f" +- {found['focal_error_percent']:.1f} %" if found["focal_error_percent"] else ""
+        k = ", ".join(f"{value:.4f}" for value in found["distortion"][:4])
+        rows.add_row(camera, str(found["registered"]), found["model"], focal + error, k)
+    print_table(rows)
+    for camera, found in model["cameras"].items():
+        print(f"{camera}: {found['model']}: {found['why']}")
+    total = model["registered"] + len(model["left_out"])
+    print(
+        f"{model['registered']} of {total} images placed, {model['points']} points, reprojection error {model['reprojection_error_px']:.2f} px"
+    )
+    for image in model["left_out"]:
+        print(f"left out: {image['name']}: {image['why']}")

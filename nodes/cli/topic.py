@@ -1,0 +1,81 @@
+"""The commands ``advnerf topic ...``."""
+
+from __future__ import annotations
+
+import contextlib
+from typing import Annotated
+
+import typer
+
+from nodes.runtime.terminal import RunDir, print_table, table
+
+app = typer.Typer(no_args_is_help=True, help="Look at what the nodes of a running launch say.")
+
+
+@app.command("list")
+def topic_list(run_dir: RunDir = None) -> None:
+    """List all topics, who publishes them and to how many."""
+    from nodes.launching.watching import find_run_dir, list_topics
+    from nodes.runtime.topics import topic
+
+    rows = table("topic", "type", "rate", "publisher", "subscribers")
+    for row in list_topics(find_run_dir(run_dir)):
+        rate_hz = topic(row.name).rate_hz
+        rows.add_row(
+            row.name, row.type, f"{rate_hz:g} Hz" if rate_hz else "", row.publisher or "-", str(row.subscribers)
+        )
+    print_table(rows)
+
+
+@app.command("hz")
+def topic_hz(
+    topic: str,
+    duration_s: Annotated[float, typer.Option("--duration", min=0.1, help="Listen for so many seconds.")] = 5.0,
+    run_dir: RunDir = None,
+) -> None:
+    """Measure the rate of a topic, its gaps, its losses, and how old its capture stamps are."""
+    from nodes.launching.watching import find_run_dir, measure_rate
+
+    report = measure_rate(find_run_dir(run_dir), topic, duration_s)
+    print(f"{topic}: {report.rate_hz:.2f} Hz, {report.messages} messages, {report.lost} lost")
+    print(f"gaps: {report.shortest_s * 1e3:.1f} to {report.longest_s * 1e3:.1f} ms")
+    if report.age_median_s is not None and report.age_worst_s is not None:
+        print(f"age of the stamp: median {report.age_median_s * 1e3:.1f} ms, worst {report.age_worst_s * 1e3:.1f} ms")
+
+
+@app.command("echo")
+def topic_echo(
+    topic: str,
+    count: Annotated[int | None, typer.Option("--count", min=1, help="Stop after so many messages.")] = None,
+    duration_s: Annotated[float | None, typer.Option("--duration", min=0.1, help="Stop after so many seconds.")] = None,
+    run_dir: RunDir = None,
+) -> None:
+    """Print the messages of a topic."""
+    from nodes.launching.watching import describe, find_run_dir, listen
+
+    with contextlib.suppress(KeyboardInterrupt):  # Ctrl-C is how this usually ends
+        for shown, received in enumerate(listen(find_run_dir(run_dir), topic, duration_s), start=1):
+            print(f"{describe(received.message())}\n---", flush=True)
+            if count is not None and shown >= count:
+                return
+
+
+@app.command("delay")
+def topic_delay(
+    topic: str,
+    duration_s: Annotated[float, typer.Option("--duration", min=0.1, help="Listen for so many seconds.")] = 5.0,
+    run_dir: RunDir = None,
+) -> None:
+    """Measure where the time of a topic goes: from capture to publication, and from there to a reader."""
+    from nodes.launching.watching import find_run_dir
+    from nodes.launching.watching_nodes import measure_delay
+
+    report = measure_delay(find_run_dir(run_dir), topic, duration_s)
+    rows = table("way", "median", "99 %", "worst")
+    ways = (("capture to publish", report.capture_to_publish), ("publish to receive", report.publish_to_receive))
+    for name, delay in ways:
+        if delay is not None:
+            times = (delay.median_s, delay.p99_s, delay.worst_s)
+            rows.add_row(name, *(f"{value * 1e3:.2f} ms" for value in times))
+    print(f"{topic}: {report.messages} messages")
+    print_table(rows)

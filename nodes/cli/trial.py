@@ -1,0 +1,163 @@
+"""The commands ``advnerf trial`` and ``advnerf evaluate``."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from nodes.runtime.terminal import Overrides, print_table, table
+
+if TYPE_CHECKING:
+    from nodes.lab.trials.plan import Run
+
+
+def add_to(app: typer.Typer) -> None:
+    """Add both commands."""
+    app.command("trial")(trial)
+    app.command("evaluate")(evaluate)
+
+
+def trial(
+    file: Annotated[Path, typer.Argument(help="A *.launch.yaml file.", exists=True, dir_okay=False)],
+    attack: Annotated[
+        list[str] | None,
+        typer.Option("--attack", metavar="CONDITION=FILE", help="Attack file of a condition; may be repeated."),
+    ] = None,
+    folder: Annotated[Path, typer.Option("--folder", help="Plan, results and bags; the same folder goes on.")] = Path(
+        "runs/trials"
+    ),
+    repeats: Annotated[int, typer.Option("--repeats", min=1, help="Runs of each condition.")] = 5,
+    seed: Annotated[int, typer.Option("--seed", help="Of the order of the runs.")] = 0,
+    ticks: Annotated[int, typer.Option("--ticks", min=1, help="Control ticks of a drive, 10 a second.")] = 60,
+    start: Annotated[
+        str | None, typer.Option("--start", metavar="X,Y,YAW", help="Start pose [m, rad].", show_default="the room's")
+    ] = None,
+    ready_timeout_s: Annotated[float, typer.Option("--ready-timeout", min=1.0)] = 60.0,
+    host: Annotated[
+        str | None,
+        typer.Option("--host", help="Which of the file's hosts this computer is, or all; the other must be running."),
+    ] = None,
+    show: Annotated[bool, typer.Option("--show", help="Only print the order and what is done.")] = False,
+    overrides: Overrides = None,
+) -> None:
+    """Drive none, random and gradient in a fair order, each from the same start; goes on where it was left."""
+    from nodes.lab.trials.series import drive_series, prepare_series
+
+    attacks = _attacks(attack or [])
+    series = prepare_series(
+        file, overrides or [], folder, attacks, repeats, seed, ticks, None if start is None else _pose(start), host,
+    )  # fmt: skip
+    count = len(series.plan.runs)
+    if show:
+        done = series.results
+        for run in series.plan.runs:
+            print(
+                f"{run.number:3d}  {run.condition:12s} {run.attack_id or '-':14s} {'done' if run.name in done else ''}"
+            )
+    else:
+
+        def begin(run: Run) -> None:
+            print(f"run {run.number} of {count}: {run.condition} {run.attack_id}".rstrip(), flush=True)
+
+        drive_series(series, ready_timeout_s, begin, lambda text: print(f"  {text}", flush=True))
+    results = list(series.results.values())
+    if results:
+        _print_summary(results)
+        _write_summary(folder, results)
+
+
+def evaluate(
+    bags: Annotated[list[Path], typer.Argument(help="Bag folders, or .mcap, .db3 or .bag files.", exists=True)],
+    room: Annotated[
+        Path | None, typer.Option("--room", help="Room file.", show_default="the one in the bag", exists=True)
+    ] = None,
+    ticks: Annotated[int, typer.Option("--ticks", min=1, help="Control ticks, 10 a second.")] = 60,
+    as_json: Annotated[bool, typer.Option("--json", help="Print everything as JSON, one line per drive.")] = False,
+) -> None:
+    """Say how far the car left its path in a bag: the same numbers as a trial's, from any recording of a drive."""
+    from nodes.lab.trials.bags import evaluate_bag
+
+    rows = table(
+        "bag", "attack", "total CTE \\[m]", "mean \\[m]", "max \\[m]", "off track", "left after", "attack adds",
+        "stopped early", "checksums",
+    )  # fmt: skip
+    for bag in bags:
+        for found in evaluate_bag(bag, room, ticks):
+            if as_json:
+                print(json.dumps(found))
+                continue
+            leaving = found["time_to_leave_s"]
+            rows.add_row(
+                str(bag), " ".join(found["attack_ids"]) or "none", f"{found['total_cte_m']:.3f}",
+                f"{found['mean_abs_cte_m']:.3f}", f"{found['max_abs_cte_m']:.3f}", "yes" if found["off_track"] else "no",
+                "" if leaving is None else f"{leaving:.1f} s", _added(found.get("counterfactual")), found["stopped_early"],
+                "unchecked" if found["unchecked"] else "agree",
+            )  # fmt: skip
+    if not as_json:
+        print_table(rows)
+
+
+def _added(compared: dict[str, Any] | None) -> str:
+    """What the attack added to the steering, in degrees; nothing where nobody compared."""
+    if compared is None:
+        return ""
+    mean, largest = compared["mean_abs_delta_rad"], math.degrees(compared["max_abs_delta_rad"])
+    seen = f"mean {math.degrees(mean):.2f}" if mean is not None else "never in view"
+    return f"{seen}, max {largest:.2f} deg ({compared['frames_drawn']} of {compared['frames']} images)"
+
+
+def _attacks(texts: list[str]) -> dict[str, list[Path]]:
+    from nodes.lab.trials.plan import NONE, CampaignError
+
+    attacks: dict[str, list[Path]] = {}
+    for text in texts:
+        condition, separator, file = text.partition("=")
+        if not separator or not condition.replace("_", "").isalnum() or condition == NONE or not file:
+            raise CampaignError(f"--attack {text}: expected CONDITION=FILE, e.g. gradient=runs/g.safetensors")
+        attacks.setdefault(condition, []).append(Path(file).resolve())
+    return attacks
+
+
+def _pose(text: str) -> tuple[float, float, float]:
+    from nodes.lab.trials.plan import CampaignError
+
+    try:
+        x, y, yaw = (float(part) for part in text.split(","))
+    except ValueError:
+        raise CampaignError(f"--start {text}: expected X,Y,YAW in metres and radians, e.g. -1.1,-2.0,0") from None
+    return x, y, yaw
+
+
+def _print_summary(results: list[dict[str, Any]]) -> None:
+    from nodes.lab.trials.series import summarise
+
+    rows = table(
+        "condition",
+        "runs",
+        "total CTE \\[m]",
+        "ratio",
+        "off track",
+        "stopped early",
+        "capture to serial p50",
+        "checksums",
+    )
+    for row in summarise(results):
+        spread = "" if row["std_m"] is None else f" +- {row['std_m']:.3f}"
+        rows.add_row(
+            row["condition"], str(row["runs"]), f"{row['mean_m']:.3f}{spread}",
+            "" if row["ratio"] is None else f"{row['ratio']:.2f}", f"{row['off_track']} of {row['runs']}",
+            str(row["stopped_early"]), "" if row["latency_p50_ms"] is None else f"{row['latency_p50_ms']:.1f} ms",
+            f"unchecked in {row['unchecked']}" if row["unchecked"] else "agree",
+        )  # fmt: skip
+    print_table(rows)
+
+
+def _write_summary(folder: Path, results: list[dict[str, Any]]) -> None:
+    from advnerf_core.files import write_atomically
+    from nodes.lab.trials.series import summarise
+
+    write_atomically(folder / "summary.json", json.dumps(summarise(results), indent=1) + "\n")

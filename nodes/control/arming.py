@@ -1,0 +1,343 @@
+"""When the car may move: checks, and an arming that any failed check ends until somebody arms again.
+
+Pure: time and messages come as arguments.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+from nodes.control.arming_gates import ClockGate, HandGate, edge_distance_m, inside
+from nodes.runtime.clock import NS_PER_S
+from nodes.runtime.wire import MessageInfo
+
+OPERATOR = "operator"
+TWIN_PEER = "TWIN"
+_ALIVE_STATES = ("ready", "active")
+
+
+@dataclass(frozen=True)
+class ArmingLimits:
+    """Numbers of the checks.
+
+    Attributes:
+        nodes: Nodes whose status must be fresh and good.
+        fence_m: Corners of the polygon that the rear axle may not leave [m].
+        drivers: Who may command, first the one that goes before the others.
+        fence_margin_m: The rear axle stays at least this far inside the fence [m].
+        drive_age_s: Oldest command of who drives, since publication [s].
+        image_age_s: Oldest camera image, since publication, and oldest capture behind a command [s].
+        pose_age_s: Oldest pose of the car, since publication [s].
+        status_age_s: Oldest status of a node [s].
+        held_up_s: A pause of this process after which it disarms itself [s].
+        speed_mps: Greatest magnitude of a commanded speed [m/s].
+        steering_rad: Greatest magnitude of a commanded steering angle that is not absurd [rad].
+        arm_age_s: A request to arm older than this is void [s].
+    """
+
+    nodes: tuple[str, ...]
+    fence_m: tuple[tuple[float, float], ...]
+    drivers: tuple[str, ...] = ("policy",)
+    fence_margin_m: float = 0.0
+    drive_age_s: float = 0.22
+    image_age_s: float = 0.25
+    pose_age_s: float = 0.2
+    status_age_s: float = 1.0
+    held_up_s: float = 0.2
+    speed_mps: float = 1.0
+    steering_rad: float = 0.6
+    arm_age_s: float = 1.0
+
+
+class Gate(Protocol):
+    """A check that stands on its own."""
+
+    def problem(self, mono_ns: int) -> str:
+        """Why the car may not move; empty if it may."""
+        ...
+
+
+@dataclass
+class _Source:
+    """Something that must keep coming."""
+
+    publish_ns: int | None = None
+    instance_id: int | None = None
+    restarted: bool = False
+
+    def heard(self, info: MessageInfo) -> None:
+        self.restarted |= self.instance_id is not None and info.instance_id != self.instance_id
+        self.publish_ns, self.instance_id = info.publish_mono_ns, info.instance_id
+
+    def age_s(self, mono_ns: int) -> float:
+        return math.inf if self.publish_ns is None else (mono_ns - self.publish_ns) / NS_PER_S
+
+
+@dataclass
+class _Driver(_Source):
+    capture_ns: int = 0
+
+
+@dataclass
+class _NodeStatus(_Source):
+    state: str = ""
+    text: str = ""
+
+
+@dataclass
+class Arming:
+    """The state machine. Call `check` at every opportunity; it disarms by itself.
+
+    Attributes:
+        limits: Numbers of the checks.
+        armed: Whether commands to move may pass.
+        reason: Why it is not armed.
+        source: Who armed it.
+        peer: What the motor controller says it is.
+        hand: Who holds the button.
+        clocks: Clocks of other hosts.
+        gates: Further checks, in this order, after all others but the fence.
+        driver: Whose commands pass; the next one in line may not stand in for it when it falls silent.
+    """
+
+    limits: ArmingLimits
+    hand: HandGate = field(default_factory=HandGate)
+    clocks: ClockGate = field(default_factory=ClockGate)
+    gates: Sequence[Gate] = ()
+    armed: bool = False
+    reason: str = "nobody has armed"
+    source: str = ""
+    peer: str = ""
+    driver: str = ""
+    _estop: str = ""
+    _position_m: tuple[float, float] | None = None
+    _disarmed_ns: int = 0
+    _fault: str = ""
+    _fault_ns: int = 0
+    _last_ns: int | None = None
+    _camera: _Source = field(default_factory=_Source)
+    _car: _Source = field(default_factory=_Source)
+    _drivers: dict[str, _Driver] = field(default_factory=dict)
+    _nodes: dict[str, _NodeStatus] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self._nodes = {name: _NodeStatus() for name in self.limits.nodes}
+        self._drivers = {name: _Driver() for name in self.limits.drivers}
+        self.driver = self.limits.drivers[0]
+
+    def heard_camera(self, info: MessageInfo) -> None:
+        """An image was taken."""
+        self._camera.heard(info)
+
+    def heard_car(self, x_m: float, y_m: float, info: MessageInfo) -> None:
+        """The car was measured [m]."""
+        self._car.heard(info)
+        self._position_m = (x_m, y_m)
+
+    def heard_status(self, name: str, state: str, text: str, info: MessageInfo) -> None:
+        """A node reported."""
+        if name in self._nodes:
+            node = self._nodes[name]
+            node.heard(info)
+            node.state, node.text = state, text
+
+    def heard_drive(
+        self, speed_mps: float, steering_rad: float, capture_real_ns: int, info: MessageInfo, mono_ns: int, real_ns: int,
+        driver: str = "policy",
+    ) -> bool:  # fmt: skip
+        """A driver commands; whether the command may pass on."""
+        self._check_held_up(mono_ns)
+        fault = self._command_fault(speed_mps, steering_rad) or self._capture_fault(capture_real_ns, real_ns)
+        source = self._drivers[driver]
+        if capture_real_ns > source.capture_ns:
+            # A command from an image already used is no sign of life: a frozen camera makes the policy repeat itself.
+            source.heard(info)
+            source.capture_ns = capture_real_ns
+        elif not fault:
+            return False
+        order = self.limits.drivers
+        if not fault and (not self.armed or order.index(driver) < order.index(self.driver)):
+            self._give_way(driver, mono_ns)
+        if driver != self.driver or self.hand.drives:
+            return False
+        if fault and self.armed:
+            self.disarm(fault, mono_ns)
+        return not fault and self.check(mono_ns)
+
+    def heard_hand(
+        self, mode: str, pressed_stop: bool, speed_mps: float, steering_rad: float, info: MessageInfo, mono_ns: int
+    ) -> bool:
+        """The teleop node reports; whether its own command may pass on.
+
+        Beginning to hold arms; letting go, and everything else that disarms, must be followed by a new press. An e-stop is
+        cleared only by an explicit request of a person.
+        """
+        self._check_held_up(mono_ns)
+        began = self.hand.heard(mode, pressed_stop, info)
+        if pressed_stop:
+            self._estop = "e-stop pressed; let it go and re-arm"
+            self.disarm(self._estop, mono_ns)
+        elif began and self.hand.required:
+            self.arm(OPERATOR, info.publish_mono_ns, mono_ns, explicit=False)
+        if self.hand.drives and self.armed and (fault := self._command_fault(speed_mps, steering_rad)):
+            self.disarm(fault, mono_ns)
+        return self.check(mono_ns) and self.hand.drives
+
+    def check(self, mono_ns: int) -> bool:
+        """Disarm if anything is wrong; whether commands to move may pass."""
+        self._check_held_up(mono_ns)
+        if self.armed:
+            if problem := self.problem(mono_ns):
+                self.disarm(problem, mono_ns)
+        elif fault := self._passing_fault(mono_ns):
+            self._fault, self._fault_ns = fault, mono_ns
+        return self.armed
+
+    def arm(self, source: str, asked_ns: int, mono_ns: int, explicit: bool = True) -> str:
+        """Somebody wants to arm. A person may; a program only if no real car can move.
+
+        Args:
+            source: Who.
+            asked_ns: When it was first asked [ns].
+            mono_ns: Now [ns].
+            explicit: Whether it was asked for in so many words, which clears an e-stop; a held button does not.
+
+        Returns:
+            Why the car is not armed; empty if it is.
+        """
+        self._check_held_up(mono_ns)
+        if self.armed:
+            return ""
+        asked_ns -= self.clocks.doubt_ns(mono_ns)
+        if void := self._void(asked_ns, mono_ns):
+            return void
+        for watched in self._watched():
+            watched.restarted = False  # whatever happened before, this is who is armed with
+        if explicit and source == OPERATOR and not self.hand.pressed_stop:
+            self._estop = ""
+        self.driver = self._first_fresh(mono_ns)
+        if source != OPERATOR and TWIN_PEER not in self.peer.upper():
+            refusal = (
+                f"{source!r} is not a person, and the motor's peer is {self.peer or 'unknown'}, not the twin;"
+                f" a real car is armed by source {OPERATOR!r} only"
+            )
+        elif not (refusal := self.problem(mono_ns)) and explicit and asked_ns <= self._fault_ns:
+            refusal = f"since the request there was a fault: {self._fault}; arm again"
+        if refusal:
+            self.reason = f"not armed: {refusal}"
+        else:
+            self.armed, self.source, self.reason = True, source, ""
+        return refusal
+
+    def disarm(self, reason: str, mono_ns: int) -> None:
+        """Stop, and stay stopped until somebody arms again."""
+        self.armed, self.reason, self._disarmed_ns = False, reason, mono_ns
+
+    def problem(self, mono_ns: int) -> str:
+        """The first thing that is wrong, causes before effects; empty if all is well."""
+        return self._estop or self.hand.problem(mono_ns) or self._restart_problem() or self._passing_fault(mono_ns)
+
+    def _restart_problem(self) -> str:
+        """Which source is no longer the process that was armed with; the next arming takes it as it is."""
+        for name, node in self._nodes.items():
+            if node.restarted:
+                return f"node {name} was restarted"
+        for what, source, _ in self._sources():
+            if source.restarted:
+                return f"{what} from the process that was armed with: it was restarted"
+        return ""
+
+    def _passing_fault(self, mono_ns: int) -> str:
+        """The first fault that goes away without anybody arming."""
+        if problem := self.clocks.problem(mono_ns):
+            return problem
+        for name, node in self._nodes.items():
+            if problem := self._node_problem(name, node, mono_ns):
+                return problem
+        for what, source, limit_s in self._sources():
+            if (age_s := source.age_s(mono_ns)) > limit_s:
+                return f"{what} yet" if math.isinf(age_s) else f"{what} for {age_s:.2f} s"
+        return next(filter(None, (gate.problem(mono_ns) for gate in self.gates)), "") or self._fence_problem()
+
+    def _sources(self) -> list[tuple[str, _Source, float]]:
+        limits = self.limits
+        sources: list[tuple[str, _Source, float]] = [("no pose of the car", self._car, limits.pose_age_s)]
+        if "camera" in limits.nodes:
+            sources.insert(0, ("no camera image", self._camera, limits.image_age_s))
+        if not self.hand.drives:
+            sources.append((f"no command of the {self.driver}", self._drivers[self.driver], limits.drive_age_s))
+        return sources
+
+    def drive_age_s(self, mono_ns: int) -> float:
+        """Age of the newest command [s]."""
+        return self._drivers[self.driver].age_s(mono_ns)
+
+    def pose_age_s(self, mono_ns: int) -> float:
+        """Age of the newest pose of the car [s]."""
+        return self._car.age_s(mono_ns)
+
+    def _void(self, asked_ns: int, mono_ns: int) -> str:
+        """Why a request to arm does not count any more; empty if it does."""
+        if asked_ns <= self._disarmed_ns:
+            return f"the request is older than the last stop ({self.reason}); arm again"
+        age_s, limit_s = (mono_ns - asked_ns) / NS_PER_S, self.limits.arm_age_s
+        if age_s > limit_s:
+            return f"the request is {age_s:.1f} s old, older than {limit_s:g} s; arm again"
+        return ""
+
+    def _watched(self) -> list[_Source]:
+        return [self._camera, self._car, *self._drivers.values(), *self._nodes.values()]
+
+    def _first_fresh(self, mono_ns: int) -> str:
+        fresh = [name for name, d in self._drivers.items() if d.age_s(mono_ns) <= self.limits.drive_age_s]
+        return fresh[0] if fresh else self.limits.drivers[0]
+
+    def _give_way(self, driver: str, mono_ns: int) -> None:
+        """A driver of higher rank takes over at once; while nobody is armed the first fresh one is next."""
+        self.driver = driver if self.armed else self._first_fresh(mono_ns)
+        self._drivers[self.driver].restarted &= self.armed
+
+    def _fence_problem(self) -> str:
+        assert self._position_m is not None
+        x_m, y_m = self._position_m
+        if not inside(self._position_m, self.limits.fence_m):
+            return f"the car is outside the fence, at ({x_m:.2f}, {y_m:.2f}) m"
+        margin_m = self.limits.fence_margin_m
+        if margin_m and (distance_m := edge_distance_m(self._position_m, self.limits.fence_m)) < margin_m:
+            return f"the car is {distance_m:.2f} m from the fence, at ({x_m:.2f}, {y_m:.2f}) m; the margin is {margin_m:.2f} m"
+        return ""
+
+    def _node_problem(self, name: str, node: _NodeStatus, mono_ns: int) -> str:
+        if (age_s := node.age_s(mono_ns)) > self.limits.status_age_s:
+            return (
+                f"node {name} has not reported yet" if math.isinf(age_s) else f"node {name} is silent for {age_s:.1f} s"
+            )
+        if node.state not in _ALIVE_STATES:
+            return f"node {name} is in state {node.state}: {node.text}"
+        return ""
+
+    def _command_fault(self, speed_mps: float, steering_rad: float) -> str:
+        if not (math.isfinite(speed_mps) and math.isfinite(steering_rad)):
+            return f"a command that is not finite: {speed_mps} m/s, {steering_rad} rad"
+        if abs(speed_mps) > self.limits.speed_mps:
+            return f"a command of {speed_mps:.2f} m/s, the limit is {self.limits.speed_mps:.2f} m/s"
+        if abs(steering_rad) > self.limits.steering_rad:
+            return f"a command of {steering_rad:.2f} rad, the limit is {self.limits.steering_rad:.2f} rad"
+        return ""
+
+    def _capture_fault(self, capture_real_ns: int, real_ns: int) -> str:
+        age_s = (real_ns - capture_real_ns) / NS_PER_S
+        return "" if -0.05 <= age_s <= self.limits.image_age_s else f"a command from an image {age_s:.2f} s old"
+
+    def _check_held_up(self, mono_ns: int) -> None:
+        if self._last_ns is None:
+            # Stopped until now: what was asked of a safety node before this one is void.
+            self._last_ns = self._disarmed_ns = mono_ns
+        pause_s = (mono_ns - self._last_ns) / NS_PER_S
+        self._last_ns = mono_ns
+        if self.armed and pause_s > self.limits.held_up_s:
+            # Stopped by a signal, or the computer was: what was checked before says nothing about now.
+            self.disarm(f"the safety node was held up for {pause_s:.2f} s", mono_ns)

@@ -1,0 +1,152 @@
+"""What the motor node knows about its controller beside the commands: telemetry, settings, steering; and whether that is enough to arm."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from advnerf_core.geometry import yaw_of
+from hardware.motor.odometry import Odometry
+from hardware.motor.vesc import Vesc
+from hardware.motor.vesc_replies import FirmwareVersion, Values
+from hardware.motor.vesc_settings import AppConfiguration, TimeoutSettings
+from nodes.control.motor_reports import ControllerReport, odometry_message
+from nodes.control.steering_check import CheckSettings, SteeringCheck
+from nodes.runtime.clock import NS_PER_S, Now
+from nodes.runtime.errors import MessageError
+from nodes.runtime.messages import pose_matrix
+from nodes.runtime.node import Out
+from nodes.runtime.requests import Answer, Answers
+
+# How often a controller is asked for its settings before it counts as one that does not tell them.
+_SETTINGS_ASKS = 3
+_TWIN = "TWIN"
+
+
+class ControllerWatch:
+    """Collects what a controller says.
+
+    Args:
+        wanted: The longest time-out and the smallest brake current that the controller may have.
+        steering_check: ``required``, ``unless_twin`` or ``never``.
+        shown: Numbers of the steering check.
+
+    Attributes:
+        check: The steering check.
+        values: Last telemetry; None before the first.
+        timeout: Time-out as read back; None where the controller does not tell.
+        answers: What was answered to requests about the check.
+    """
+
+    def __init__(self, wanted: TimeoutSettings, steering_check: str, shown: CheckSettings) -> None:
+        self.check = SteeringCheck(shown)
+        self.answers = Answers()
+        self.values: Values | None = None
+        self.timeout: TimeoutSettings | None = None
+        self._wanted = wanted
+        self._policy = steering_check
+        self._odometry = Odometry(shown.wheelbase_m)
+        self._firmware: FirmwareVersion | None = None
+        self._checked_with: FirmwareVersion | None = None
+        self._asks_left = _SETTINGS_ASKS
+
+    def connected(self, firmware: FirmwareVersion) -> None:
+        """A controller answered; whatever was known is known again only when it says so."""
+        self.values = self.timeout = None
+        self._firmware, self._asks_left = firmware, _SETTINGS_ASKS
+        if self._checked_with not in (None, firmware):
+            self.check.forget(f"{self._checked_with} was replaced by {firmware}")
+
+    def poll(self, vesc: Vesc) -> None:
+        """Ask for telemetry, and for the settings until they are known."""
+        if self.timeout is None and self._asks_left:
+            self._asks_left -= 1
+            vesc.request_app_configuration()
+        vesc.request_values()
+
+    def settings_unreadable(self) -> None:
+        """What came cannot be read: asking again would not help."""
+        self._asks_left = 0
+
+    def hear(self, reply: Any, vesc: Vesc, now: Now) -> list[Out]:
+        """Note a reply; odometry if it was telemetry."""
+        if isinstance(reply, AppConfiguration):
+            self.timeout = reply.timeout
+        if not isinstance(reply, Values):
+            return []
+        self.values = reply
+        speed, steering = vesc.gains.speed_mps(reply.erpm), vesc.gains.steering_rad(vesc.servo)
+        state = self._odometry.update(speed, steering, vesc.last_reply_mono_ns)
+        return [Out("/odom", odometry_message(state, now.real_ns))]
+
+    def start_check(self, mono_ns: int) -> None:
+        """Begin to show the wheels."""
+        self._checked_with = self._firmware
+        self.check.start(mono_ns)
+
+    def obey(self, message: Any, refusal: str, mono_ns: int) -> None:
+        """Do what a person asks about the check, once; a repeat only gets its answer again.
+
+        Args:
+            message: A ``SteeringCheck``.
+            refusal: Why nothing can be done now; empty if it can.
+            mono_ns: Monotonic time [ns].
+        """
+        ask_id, action = str(message.ask_id), str(message.action)
+        if self.answers.repeat(ask_id):
+            return
+        if action not in ("start", "confirm", "deny"):
+            refusal = f"expected start, confirm or deny, got {action[:40]!r}"
+        elif not refusal and action != "start" and not self.check.awaits_answer(mono_ns):
+            refusal = "no steering check awaits an answer; start one"
+        if not refusal and action == "start":
+            self.start_check(mono_ns)
+        elif not refusal:
+            self.check.answer(action == "confirm", str(message.source), mono_ns)
+        self.answers.give(Answer(ask_id, not refusal, refusal or self.check.text))
+
+    def see(self, message: Any, mono_ns: int) -> None:
+        """The car was measured while its wheels are shown."""
+        if not self.check.showing:
+            return
+        try:
+            T = pose_matrix(message)
+        except MessageError:
+            return  # no measurement
+        self.check.pose(float(T[0, 3]), float(T[1, 3]), yaw_of(T), mono_ns)
+
+    @property
+    def steering_good(self) -> bool:
+        """Whether arming may rely on the steering."""
+        twin = _TWIN in str(self._firmware).upper()
+        exempt = self._policy == "never" or (self._policy == "unless_twin" and twin)
+        # A check that is going on, or that failed, counts for every car.
+        return self.check.passed or (exempt and self._checked_with is None)
+
+    def missing(self) -> str:
+        """What keeps the car from being armed; empty if nothing does."""
+        if self.values is None:
+            return "no telemetry yet"
+        if self.timeout is None and self._asks_left:
+            return "reading the controller's settings"
+        if self.timeout is not None and not self.timeout.at_least(self._wanted):
+            return (
+                f"expected a time-out of the controller of at most {self._wanted.timeout_ms} ms with at least"
+                f" {self._wanted.brake_current_a:g} A, it is {self.timeout}: stop the launch and call advnerf motor set-timeout"
+            )
+        return "" if self.steering_good else self.check.text
+
+    def text(self) -> str:
+        """The controller in one line."""
+        if self.timeout is None:
+            return (
+                f"{self._firmware}, own time-out not read back (this firmware does not tell; look at it in VESC Tool)"
+            )
+        return f"{self._firmware}, own time-out {self.timeout}"
+
+    def report(self, vesc: Vesc, link: str, battery_warning_v: float, now: Now) -> ControllerReport:
+        """Everything, for the diagnostics."""
+        age_s = (now.mono_ns - vesc.last_reply_mono_ns) / NS_PER_S
+        return ControllerReport(
+            self.values, age_s, self._firmware, self.timeout, self._wanted, vesc.skipped_bytes, link, self.check.text,
+            self.steering_good, battery_warning_v, self.answers.last,
+        )  # fmt: skip

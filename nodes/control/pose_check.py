@@ -1,0 +1,187 @@
+"""Whether consecutive poses of the car are a motion that the car can make. Pure: stamps come with the poses.
+
+From one pose to the next the car may travel at most ``speed * dt`` along its axis, a small share of that sideways or upward, and
+turn by at most ``turn rate * dt``, each plus an allowance for the noise of the measurement. A pose beyond that was not measured on
+this car: another stream, a confused marker set, a subject that was swapped.
+
+``dt`` is the longest gap between stamps in the last 0.1 s, not only the gap before the pose. Stamps are taken on receipt, so a
+datagram that waits in the network or in a busy computer brings the next ones too near to it, and the car seems to leap. Such a leap
+is always preceded by a gap of its own length, and therefore allowed for exactly as long as it can come.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hardware.motor.limits import DriveLimits
+from nodes.runtime.clock import NS_PER_S
+from nodes.runtime.wire import MessageInfo
+
+# Gaps this recent count: a late datagram and what it held up arrive within this time [s].
+_GAP_WINDOW_S = 0.1
+# Beside its predecessor a pose is compared with one this much older, so that small steps cannot add up [s].
+_BASE_S = 0.25
+_FARTHEST_M = 1e4
+
+
+@dataclass(frozen=True)
+class MotionBounds:
+    """What the car can do, and how well it is measured.
+
+    Attributes:
+        forward_mps: Fastest forward [m/s].
+        backward_mps: Fastest backward [m/s].
+        turn_radps: Fastest turn [rad/s].
+        sideways_share: Sideways and vertical motion, as a share of the fastest one: the sine of the largest slip angle.
+        reach_m: How far the tracked point may be from the rear axle [m]; turning moves it sideways.
+        noise_m: What noise can add between two poses [m].
+        noise_rad: What noise can add between two headings [rad].
+        longest_gap_s: After a longer gap nothing is known of the motion [s].
+    """
+
+    forward_mps: float
+    backward_mps: float
+    turn_radps: float
+    sideways_share: float = 0.25
+    reach_m: float = 0.25
+    noise_m: float = 0.005
+    noise_rad: float = 0.01
+    longest_gap_s: float = 0.25
+
+    @classmethod
+    def of_car(
+        cls, limits: DriveLimits, wheelbase_m: float, margin: float, noise_m: float, noise_rad: float
+    ) -> MotionBounds:
+        """From the limits of a vehicle calibration; ``margin`` is how much faster the car may be than it is commanded."""
+        fastest_mps = max(limits.speed_max_mps, -limits.speed_min_mps)
+        sharpest_rad = max(limits.steering_max_rad, -limits.steering_min_rad)
+        turn_radps = fastest_mps * math.tan(sharpest_rad) / wheelbase_m
+        # A limit of 0 backwards means that nothing backwards is commanded; a car that is stopped still rolls back a little.
+        backward_mps = max(-limits.speed_min_mps, 0.1 * limits.speed_max_mps)
+        return cls(
+            margin * limits.speed_max_mps, margin * backward_mps, margin * turn_radps, reach_m=wheelbase_m,
+            noise_m=noise_m, noise_rad=noise_rad,
+        )  # fmt: skip
+
+
+@dataclass
+class PoseCheck:
+    """Judges poses in the order in which they come.
+
+    Attributes:
+        bounds: What the car can do.
+    """
+
+    bounds: MotionBounds
+    _poses: deque[tuple[int, NDArray[np.float64]]] = field(default_factory=deque)
+    _gaps: deque[tuple[int, float]] = field(default_factory=deque)
+
+    def judge(self, stamp_ns: int, T_world_from_car: NDArray[np.float64]) -> str:
+        """What is impossible about a pose ``[4, 4]`` with its capture stamp [ns]; empty if nothing is.
+
+        A pose that is impossible begins a new motion: the next ones are compared with it.
+        """
+        T = np.asarray(T_world_from_car, dtype=np.float64)
+        if not (np.abs(T) < _FARTHEST_M).all():  # also what is not a number
+            return f"expected a pose of the car within {_FARTHEST_M:g} m, got {T[:3, 3].tolist()}"
+        if not self._poses:
+            self._begin(stamp_ns, T)
+            return ""
+        last_ns, last = self._poses[-1]
+        gap_s = (stamp_ns - last_ns) / NS_PER_S
+        if gap_s > self.bounds.longest_gap_s:
+            self._begin(stamp_ns, T)
+            self._gaps.append((stamp_ns, self.bounds.longest_gap_s))  # for what was held up with it
+            return ""
+        if gap_s < -_GAP_WINDOW_S:
+            self._begin(stamp_ns, T)
+            return f"the stamps of the car's poses went back by {-gap_s:.2f} s"
+        allowed_s = self._allowed_s(stamp_ns, gap_s)
+        problem = self._impossible(last, T, allowed_s, gap_s)
+        if not problem:
+            base_ns, base = self._poses[0]
+            base_s = (stamp_ns - base_ns) / NS_PER_S
+            problem = self._impossible(base, T, base_s + allowed_s, base_s)
+        if problem:
+            self._begin(stamp_ns, T)
+            return problem
+        self._poses.append((stamp_ns, T))
+        while stamp_ns - self._poses[1][0] >= _BASE_S * NS_PER_S:
+            self._poses.popleft()
+        return ""
+
+    def _begin(self, stamp_ns: int, T: NDArray[np.float64]) -> None:
+        self._poses.clear()
+        self._gaps.clear()
+        self._poses.append((stamp_ns, T))
+
+    def _allowed_s(self, stamp_ns: int, gap_s: float) -> float:
+        self._gaps.append((stamp_ns, gap_s))
+        while stamp_ns - self._gaps[0][0] > _GAP_WINDOW_S * NS_PER_S:
+            self._gaps.popleft()
+        return max(0.0, *(gap for _, gap in self._gaps))
+
+    def _impossible(self, A: NDArray[np.float64], B: NDArray[np.float64], allowed_s: float, dt_s: float) -> str:
+        bounds = self.bounds
+        turned_rad = _angle(A[:3, :3].T @ B[:3, :3])
+        if turned_rad > bounds.turn_radps * allowed_s + bounds.noise_rad:
+            limit = bounds.turn_radps * allowed_s + bounds.noise_rad
+            return f"the car's pose turned by {turned_rad:.2f} rad in {dt_s:.3f} s; the car can turn by {limit:.2f} rad"
+        # In the frame of the mean heading: the chord of an arc lies along it.
+        axis = A[:3, 0] + B[:3, 0]
+        step = B[:3, 3] - A[:3, 3]
+        along_m = float(step @ axis) / max(float(np.linalg.norm(axis)), 1e-9)
+        across_m = math.sqrt(max(float(step @ step) - along_m * along_m, 0.0))
+        speed_mps = bounds.forward_mps if along_m > 0.0 else bounds.backward_mps
+        off_axle_m = bounds.reach_m * turned_rad
+        if abs(along_m) > (limit := speed_mps * allowed_s + bounds.noise_m + off_axle_m):
+            way = "forward" if along_m > 0.0 else "backward"
+            return f"the car's pose jumped {abs(along_m):.3f} m {way} in {dt_s:.3f} s; the car can move {limit:.3f} m"
+        sideways_mps = bounds.sideways_share * max(bounds.forward_mps, bounds.backward_mps)
+        if across_m > (limit := sideways_mps * allowed_s + bounds.noise_m + off_axle_m):
+            return f"the car's pose jumped {across_m:.3f} m sideways in {dt_s:.3f} s; the car can slip {limit:.3f} m"
+        return ""
+
+
+def _angle(R: NDArray[np.float64]) -> float:
+    # From the skew part for small angles, where the trace has lost its digits.
+    skew = 0.5 * math.sqrt((R[2, 1] - R[1, 2]) ** 2 + (R[0, 2] - R[2, 0]) ** 2 + (R[1, 0] - R[0, 1]) ** 2)
+    return math.atan2(skew, 0.5 * (R[0, 0] + R[1, 1] + R[2, 2] - 1.0))
+
+
+@dataclass
+class PoseGate:
+    """Lets the car move only while its poses are possible.
+
+    A car that is carried or pushed while disarmed moves as no car can, and that is no fault: it only has to rest before arming.
+
+    Attributes:
+        check: Judges the poses.
+        rest_s: So long no pose may have been impossible [s].
+        count: Impossible poses so far.
+    """
+
+    check: PoseCheck
+    rest_s: float = 0.5
+    count: int = 0
+    _text: str = ""
+    _seen_ns: int = 0
+
+    def heard(self, stamp_ns: int, T_world_from_car: NDArray[np.float64], info: MessageInfo) -> None:
+        """Note a pose ``[4, 4]`` of the car."""
+        if text := self.check.judge(stamp_ns, T_world_from_car):
+            self.refuse(text, info)
+
+    def refuse(self, text: str, info: MessageInfo) -> None:
+        """Note a message that is no pose."""
+        self._text, self._seen_ns = text, info.publish_mono_ns
+        self.count += 1
+
+    def problem(self, mono_ns: int) -> str:
+        """Why the car may not move; empty if it may."""
+        return self._text if self._text and mono_ns - self._seen_ns < self.rest_s * NS_PER_S else ""

@@ -1,0 +1,158 @@
+"""The check that the front wheels really turn. Pure: time and poses come as arguments.
+
+The servo acknowledges nothing, and stock firmware drops its commands without a word (hardware/emulators/vesc_firmware.py), so a car can
+be armed that cannot steer. Before the first arming the wheels are therefore shown to the left, to the right and straight, while
+the motor stays off. Two witnesses count: motion capture, when the car is pushed by hand in each position and its path bends as
+far as the wheels were told to turn; or a person, who says so.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from nodes.runtime.clock import NS_PER_S
+
+# The servo, 50 Hz and slewing, has arrived after so long; what the car did before does not count [s].
+_SETTLE_S = 0.5
+_LEFT, _RIGHT = 0, 1
+
+
+@dataclass(frozen=True)
+class CheckSettings:
+    """Numbers of the check.
+
+    Attributes:
+        wheelbase_m: Distance between the axles [m].
+        angle_rad: Front wheel angle shown to both sides [rad].
+        hold_s: Time for which each side is shown [s].
+        push_m: A car pushed at least this far shows whether it turns [m].
+        agreement: Greatest relative deviation of the curvature that was driven from the one that was told.
+        answer_s: Time that a person has to answer [s].
+    """
+
+    wheelbase_m: float
+    angle_rad: float = 0.2
+    hold_s: float = 4.0
+    push_m: float = 0.15
+    agreement: float = 0.5
+    answer_s: float = 60.0
+
+
+@dataclass
+class _Arc:
+    """What the car did while one side was shown."""
+
+    forward_m: float = 0.0
+    driven_m: float = 0.0
+    turned_rad: float = 0.0
+
+
+class SteeringCheck:
+    """State machine of one check after the other.
+
+    Attributes:
+        passed: Whether somebody or something saw the wheels turn.
+        text: How it stands, for a person.
+    """
+
+    def __init__(self, settings: CheckSettings) -> None:
+        self._settings = settings
+        self._began_ns: int | None = None
+        self._arcs = (_Arc(), _Arc())
+        self._last: tuple[float, float, float] | None = None
+        self.passed = False
+        self.text = "steering was not checked: advnerf motor check-steering"
+
+    @property
+    def showing(self) -> bool:
+        """Whether the wheels are being shown, or an answer is awaited."""
+        return self._began_ns is not None
+
+    def awaits_answer(self, mono_ns: int) -> bool:
+        """Whether both sides were shown and a person may say what was seen."""
+        return self.showing and self._side(mono_ns) is None
+
+    def start(self, mono_ns: int) -> None:
+        """Begin to show the wheels; an earlier result is void."""
+        self._began_ns, self.passed, self._last = mono_ns, False, None
+        self._arcs = (_Arc(), _Arc())
+        self.text = "steering check: wheels left, then right; push the car half a metre each time, or watch and confirm"
+
+    def forget(self, reason: str) -> None:
+        """The result is void: another controller, perhaps."""
+        self._began_ns, self.passed = None, False
+        self.text = f"{reason}: steering must be checked again: advnerf motor check-steering"
+
+    def steering_rad(self, mono_ns: int) -> float | None:
+        """Where the wheels are to point now [rad]; None when nothing is shown."""
+        side = self._side(mono_ns)
+        if side is None:
+            return 0.0 if self.showing else None
+        return self._settings.angle_rad if side == _LEFT else -self._settings.angle_rad
+
+    def pose(self, x_m: float, y_m: float, yaw_rad: float, mono_ns: int) -> None:
+        """The car was measured; poses that are not finite are no measurements."""
+        if not (self.showing and all(map(math.isfinite, (x_m, y_m, yaw_rad)))):
+            return
+        side, last, self._last = self._side(mono_ns), self._last, (x_m, y_m, yaw_rad)
+        if side is None or last is None or not self._settled(mono_ns):
+            return
+        dx, dy = x_m - last[0], y_m - last[1]
+        middle = last[2] + 0.5 * math.remainder(yaw_rad - last[2], 2.0 * math.pi)
+        forward = dx * math.cos(middle) + dy * math.sin(middle)
+        arc = self._arcs[side]
+        arc.forward_m += forward
+        arc.driven_m += abs(forward)
+        # Rolling backwards turns the other way round.
+        arc.turned_rad += math.copysign(1.0, forward) * math.remainder(yaw_rad - last[2], 2.0 * math.pi)
+
+    def tick(self, mono_ns: int) -> None:
+        """Time has passed: judge what was seen, or give up waiting."""
+        if self._began_ns is None or self._side(mono_ns) is not None:
+            return
+        if all(abs(arc.forward_m) >= self._settings.push_m for arc in self._arcs):
+            self._judge()
+        elif (mono_ns - self._began_ns) / NS_PER_S > 2.0 * self._settings.hold_s + self._settings.answer_s:
+            self._end(False, "steering check: nobody answered; start it again: advnerf motor check-steering")
+        else:
+            self.text = "steering check: did the front wheels turn left, then right? confirm or deny"
+
+    def answer(self, turned: bool, source: str, mono_ns: int) -> None:
+        """A person says whether the wheels turned; counts only after both sides were shown."""
+        if not self.awaits_answer(mono_ns):
+            return
+        if turned:
+            self._end(True, f"steering confirmed by {source}")
+        else:
+            self._end(False, f"steering denied by {source}: {_CAUSES}")
+
+    def _judge(self) -> None:
+        for arc, sign, name in zip(self._arcs, (1.0, -1.0), ("left", "right"), strict=True):
+            told = sign * math.tan(self._settings.angle_rad) / self._settings.wheelbase_m
+            driven = arc.turned_rad / arc.driven_m
+            if abs(driven - told) > self._settings.agreement * abs(told):
+                self._end(
+                    False, f"with wheels told to turn {name} the car was seen to drive a curve of {driven:+.2f} 1/m, expected {told:+.2f}"
+                    f" 1/m: {_CAUSES}",
+                )  # fmt: skip
+                return
+        self._end(True, "steering seen by motion capture")
+
+    def _end(self, passed: bool, text: str) -> None:
+        self._began_ns, self.passed, self.text = None, passed, text
+
+    def _side(self, mono_ns: int) -> int | None:
+        if self._began_ns is None:
+            return None
+        step = int((mono_ns - self._began_ns) / NS_PER_S / self._settings.hold_s)
+        return step if step in (_LEFT, _RIGHT) else None
+
+    def _settled(self, mono_ns: int) -> bool:
+        assert self._began_ns is not None
+        return (mono_ns - self._began_ns) / NS_PER_S % self._settings.hold_s >= _SETTLE_S
+
+
+_CAUSES = (
+    "servo output off in the controller's firmware or application settings, servo unplugged, or gains of another car"
+)

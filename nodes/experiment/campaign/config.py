@@ -1,0 +1,189 @@
+"""The campaign file: which scenarios, victims, methods and seeds make a table, and where each scenario's experiment is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints, model_validator
+
+from advnerf_core.report.cells import cell_name
+from advnerf_core.scene.gate_limits import GateLimits
+from nodes.runtime.config import load_config
+from nodes.runtime.errors import ConfigError
+
+Method = Literal["none", "random", "cem", "gradient"]
+Victim = Literal["hardened", "naive", "retrained"]
+# Names become file names, whose parts are separated by "_" and "."; a scenario may hold "_" as its victim is one of three words.
+Name = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_-]*$")]
+METHODS: tuple[Method, ...] = ("none", "random", "cem", "gradient")
+VICTIMS: tuple[Victim, ...] = ("hardened", "naive")  # of a file that names none
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class PlacementConfig(_Section):
+    """The objects somewhere else: changes of the experiment, in a run folder of their own."""
+
+    run_folder: Path = Field(
+        description="Run folder of the experiment with these changes; relative to the working folder."
+    )
+    set: tuple[str, ...] = Field(default=(), description="key=value texts over the scenario's own.")
+
+
+class _NothingTwice(_Section):
+    """Cells are named by these: one that is named twice would be run twice under one name."""
+
+    @model_validator(mode="after")
+    def _nothing_twice(self) -> _NothingTwice:
+        for name in ("seeds", "victims", "methods"):
+            values = getattr(self, name) or ()
+            if len(set(values)) != len(values):
+                raise ValueError(f"expected every one of {name} once, got {list(values)}")
+        return self
+
+
+class ScenarioConfig(_NothingTwice):
+    """One scenario: an experiment, and how it is read."""
+
+    kind: str = Field(
+        default="room", min_length=1,
+        description="room, room_search, intersection, intersection_poses, intersection_meshes, carla, or a Python module that runs cells (see nodes/experiment/campaign/kinds.py).",
+    )  # fmt: skip
+    experiment: Path = Field(description="Experiment file; relative to the campaign file.")
+    setting: str = Field(default="full", description="Which of its settings.")
+    run_folder: Path = Field(description="Run folder of the experiment; relative to the working folder.")
+    set: tuple[str, ...] = Field(default=(), description="key=value texts over the file, as --set.")
+    as_scenario: str = Field(
+        default="", description="What the experiment calls it, where the name here is another; else the name."
+    )
+    placements: dict[Name, PlacementConfig] = Field(default_factory=dict, description="Other places of the objects.")
+    seeds: tuple[int, ...] | None = Field(default=None, min_length=1, description="Instead of the campaign's.")
+    victims: tuple[Victim, ...] | None = Field(default=None, min_length=1, description="Instead of the campaign's.")
+    methods: tuple[Method, ...] | None = Field(default=None, min_length=1, description="Instead of the campaign's.")
+    gate: GateLimits | None = Field(default=None, description="Instead of the campaign's.")
+
+
+class CampaignConfig(_NothingTwice):
+    """A campaign file."""
+
+    name: Name
+    folder: Path | None = Field(default=None, description="Where cells go; default runs/campaigns/NAME.")
+    seeds: tuple[int, ...] = Field(default=(0, 1, 2), min_length=1)
+    victims: tuple[Victim, ...] = Field(default=VICTIMS, min_length=1)
+    methods: tuple[Method, ...] = Field(default=METHODS, min_length=1)
+    scenarios: dict[Name, ScenarioConfig] = Field(min_length=1)
+    gate: GateLimits = GateLimits()
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One cell that a campaign asks for.
+
+    Attributes:
+        scenario: Its name in the campaign file.
+        placement: Name of the placement; empty for the scenario's own.
+        victim: Which policy.
+        method: Which search.
+        seed: Of starts and search.
+    """
+
+    scenario: str
+    placement: str
+    victim: str
+    method: str
+    seed: int
+
+    @property
+    def name(self) -> str:
+        """Name of its file and folder."""
+        return cell_name(self.scenario, self.victim, self.method, self.seed, self.placement)
+
+
+@dataclass(frozen=True)
+class Campaign:
+    """A campaign file that was read.
+
+    Attributes:
+        config: Its content.
+        file: Where it is.
+        folder: Where its cells go.
+    """
+
+    config: CampaignConfig
+    file: Path
+    folder: Path
+
+    @property
+    def cells(self) -> list[Cell]:
+        """All cells, in the order in which they are run: per scenario and seed, none first, as others are compared with it."""
+        return [
+            Cell(name, placement, victim, method, seed)
+            for name, scenario in self.config.scenarios.items()
+            for placement in ("", *scenario.placements)
+            for seed in scenario.seeds or self.config.seeds
+            for victim in scenario.victims or self.config.victims
+            for method in sorted(scenario.methods or self.config.methods, key=METHODS.index)
+        ]
+
+    def scenario(self, cell: Cell) -> ScenarioConfig:
+        """The scenario of a cell."""
+        return self.config.scenarios[cell.scenario]
+
+    def experiment_file(self, cell: Cell) -> Path:
+        """The experiment file of a cell."""
+        return (self.file.parent / self.scenario(cell).experiment).resolve()
+
+    def run_folder(self, cell: Cell) -> Path:
+        """The run folder of a cell's experiment."""
+        scenario = self.scenario(cell)
+        chosen = scenario.placements[cell.placement].run_folder if cell.placement else scenario.run_folder
+        return chosen.resolve()
+
+    def overrides(self, cell: Cell) -> list[str]:
+        """Changes of a cell's experiment."""
+        scenario = self.scenario(cell)
+        return [*scenario.set, *(scenario.placements[cell.placement].set if cell.placement else ())]
+
+
+def load_campaign(file: Path, folder: Path | None = None, overrides: tuple[str, ...] = ()) -> Campaign:
+    """Read a campaign file.
+
+    Args:
+        file: A ``*.campaign.yaml`` file.
+        folder: Instead of the file's.
+        overrides: ``key=value`` texts over the file.
+
+    Raises:
+        ConfigError: With file, line and the valid keys.
+    """
+    config = load_config(CampaignConfig, file, overrides)
+    campaign = Campaign(
+        config, file.resolve(), (folder or config.folder or Path("runs/campaigns") / config.name).resolve()
+    )
+    for cell in campaign.cells:
+        if not campaign.experiment_file(cell).is_file():
+            raise ConfigError(
+                f"{file}: expected the experiment file of scenario {cell.scenario} at {campaign.experiment_file(cell)}, which is "
+                "not there; the path is relative to the campaign file"
+            )
+    return campaign
+
+
+def select(cells: list[Cell], only: str) -> list[Cell]:
+    """The cells that fit a text such as ``scenario=straight,method=gradient+none,seed=0``; an empty text takes all."""
+    wanted: dict[str, set[str]] = {}
+    for part in filter(None, only.split(",")):
+        key, separator, value = part.partition("=")
+        if not separator or key.strip() not in Cell.__dataclass_fields__:
+            raise ConfigError(
+                f"--only {only}: expected KEY=VALUE with KEY one of {', '.join(Cell.__dataclass_fields__)}, got {part!r}"
+            )
+        wanted[key.strip()] = {each.strip() for each in value.split("+")}
+    chosen = [cell for cell in cells if all(str(getattr(cell, key)) in values for key, values in wanted.items())]
+    if not chosen:
+        raise ConfigError(f"--only {only}: expected some cells of the campaign, got none; see advnerf campaign status")
+    return chosen

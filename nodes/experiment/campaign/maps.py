@@ -1,0 +1,48 @@
+"""Pictures about what finished cells found, where their kind can draw some."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from advnerf_core.report.cells import NONE
+from nodes.experiment.campaign.config import Campaign, Cell
+from nodes.experiment.campaign.kinds import load_kind
+from nodes.experiment.campaign.run import plan_cells
+from nodes.experiment.campaign.store import store_of
+from nodes.runtime.errors import ConfigError
+from nodes.runtime.progress import ProgressDisplay
+
+
+def map_cells(campaign: Campaign, cells: Sequence[Cell], number: int) -> list[Path]:
+    """Draw the maps of all cells that are finished; those that are drawn already are read from their files.
+
+    Args:
+        campaign: The campaign.
+        cells: Which of its cells.
+        number: Of the object that is moved.
+
+    Raises:
+        ConfigError: No cell is finished, or none is of a kind that has maps.
+    """
+    store, pictures = store_of(campaign), []
+    experiments: dict[tuple[str, str], Any] = {}
+    for cell in cells:
+        (planned,) = plan_cells(campaign, [cell], experiments)
+        draw = getattr(load_kind(planned.job.kind).module, "draw_maps", None)
+        status = store.status(cell, planned.job.settings_hash)
+        if draw is None or cell.method == NONE or status.state != "done" or status.result is None:
+            continue
+        experiment = experiments[cell.scenario, cell.placement]
+        with ProgressDisplay() as display:
+            pictures += draw(
+                experiment, planned.job.scenario, cell.victim, cell.seed, status.result.extra, number, store.work(cell.name),
+                display.start(cell.name),
+            )  # fmt: skip
+    if not pictures:
+        raise ConfigError(
+            f"expected finished cells that have placed objects (kind intersection_poses), got none of {len(cells)}; run them first, "
+            "see advnerf campaign status"
+        )
+    return pictures

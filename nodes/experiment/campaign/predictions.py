@@ -1,0 +1,103 @@
+"""Predicted against measured transfer: one prediction per attacked cell, made without its deployed drives, and how good they were."""
+
+# ruff: noqa: RUF001 (typography for readers: multiplication signs)
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from advnerf_core.files import write_atomically
+from advnerf_core.report.cells import NONE, CellResult
+from advnerf_core.report.transfer_prediction import Predicted
+from nodes.experiment.campaign.config import Campaign, Cell
+from nodes.experiment.campaign.gate import CleanDrive, predict_cell
+from nodes.experiment.campaign.kinds import load_kind
+from nodes.experiment.campaign.run import plan_cells
+from nodes.experiment.campaign.store import store_of
+
+_KEYS = {"ratio", "ratio_low", "ratio_high", "retained", "total_cte_m", "clean_drive"}
+
+
+def predict_campaign(campaign: Campaign, cells: Sequence[Cell], say: Callable[[str], None], draws: int = 6) -> int:
+    """Predict every attacked cell that has been searched and is not predicted yet; returns how many were.
+
+    A prediction needs the finished search (``campaign run --search-only`` makes no more than that) and the drive without attack. It reads
+    no drive with the attack, so it is the same before and after that drive.
+    """
+    store, made = store_of(campaign), 0
+    experiments: dict[tuple[str, str], Any] = {}
+    clean: dict[tuple[str, str, str, int], CleanDrive] = {}
+    for cell in cells:
+        if cell.method == NONE:
+            continue
+        planned = plan_cells(campaign, [cell], experiments)[0]
+        kind = load_kind(planned.job.kind)
+        # Work of other settings may hold a search too, of another attack.
+        if not kind.predicts:
+            continue
+        file = prediction_file(campaign.folder, cell.name)
+        kept = kept_prediction(file, planned.job.settings_hash)
+        if kept is not None and kept.get("draws") == draws:
+            continue
+        if not store.has_begun(cell.name, planned.job.settings_hash):
+            if kept is not None or store.result(cell.name) is not None:
+                say(f"{cell.name}: not predicted, as its search is not in {store.work(cell.name)}")
+            continue
+        experiment = experiments[cell.scenario, cell.placement]
+        which = (experiment, planned.job.scenario, cell.victim, cell.method, cell.seed, store.work(cell.name))
+        if lacking := kind.fidelity.lacks(*which):
+            say(f"{cell.name}: not predicted, as it lacks {lacking}")
+            continue
+        drive = (cell.scenario, cell.placement, cell.victim, cell.seed)
+        found, clean[drive] = predict_cell(kind, *which, draws, clean.get(drive))
+        summary = clean[drive].agreement.summary()
+        record = {"settings_hash": planned.job.settings_hash, **found.record(), "clean_drive": summary}
+        write_atomically(file, json.dumps(record, indent=1) + "\n")
+        say(f"{cell.name}: {found.ratio:.2f} × no attack expected, {100 * found.retained:.0f} % of the effect survives")
+        made += 1
+    return made
+
+
+def predicted(folder: Path, results: Sequence[CellResult]) -> list[Predicted]:
+    """Predictions of finished cells, each with what was measured.
+
+    Args:
+        folder: Of the campaign, or of what was published of it.
+        results: Its finished cells.
+    """
+    pairs = []
+    for cell in results:
+        if cell.deployed is None or cell.method == NONE:
+            continue
+        kept = kept_prediction(prediction_file(folder, cell.name), cell.settings_hash)
+        if kept is None:
+            continue
+        none_m = sum(cell.deployed.none_total_cte_m)
+        measured = sum(cell.deployed.total_cte_m) / none_m if none_m > 0.0 else math.nan
+        starts = cell.shared_starts
+        learned, learned_none = (
+            sum(each[:starts]) for each in (cell.surrogate.total_cte_m, cell.surrogate.none_total_cte_m)
+        )
+        pairs.append(Predicted(
+            cell.name, cell.method, kept["ratio"], kept["ratio_low"], kept["ratio_high"], measured, kept["retained"],
+            kept["total_cte_m"], cell.deployed.mean_m, learned / learned_none if learned_none > 0.0 else math.nan, learned / starts,
+        ))  # fmt: skip
+    return [pair for pair in pairs if math.isfinite(pair.measured) and math.isfinite(pair.surrogate)]
+
+
+def prediction_file(folder: Path, name: str) -> Path:
+    """Where the prediction of a cell is kept, in the folder of a campaign or of what was published of it."""
+    return folder / "predictions" / f"{name}.json"
+
+
+def kept_prediction(file: Path, settings_hash: str) -> dict[str, Any] | None:
+    """A prediction that was made of a cell with these settings; None where there is none."""
+    try:
+        kept: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    return kept if kept.get("settings_hash") == settings_hash and kept.keys() >= _KEYS else None

@@ -1,0 +1,354 @@
+"""Runs a campaign: prepares its experiments, then its cells, over cores or over a cluster; what is there and fits is not run again."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import joblib
+
+from advnerf_core.report.cells import NONE, CellResult
+from nodes.experiment.campaign.config import Campaign, Cell, ScenarioConfig
+from nodes.experiment.campaign.kinds import load_kind, settings_hash
+from nodes.experiment.campaign.store import CellStatus, Store, store_of
+from nodes.experiment.campaign.worker import Ended, Job, run_in_process
+from nodes.runtime.errors import ConfigError, RuntimeFault
+from nodes.runtime.progress import Report
+
+Backend = Literal["local", "ray"]
+Say = Callable[[str], None]
+# How often cells are handed out again after a whole machine of a cluster was lost.
+_ROUNDS = 3
+
+
+@dataclass(frozen=True)
+class Options:
+    """How a campaign is run.
+
+    Attributes:
+        jobs: Cells at a time; 0 takes one per core, or the cores of the cluster.
+        threads: Threads per cell; 0 shares the cores among the jobs.
+        backend: ``local`` or ``ray``.
+        address: Of a running Ray cluster; empty takes the one in RAY_ADDRESS, or starts one here.
+        retry: Also run cells that failed before.
+        gate: Whether scenarios whose surrogate the fidelity gate refuses are left out; else it is only told.
+        search_only: Search, and deploy nothing: for predictions before the drives, or to choose what is worth one.
+    """
+
+    jobs: int = 0
+    threads: int = 0
+    backend: Backend = "local"
+    address: str = ""
+    retry: bool = False
+    gate: bool = True
+    search_only: bool = False
+
+
+@dataclass(frozen=True)
+class Planned:
+    """A cell with its settings, as they are now.
+
+    Attributes:
+        cell: Which.
+        job: How it is run; without threads and phase.
+        live: Whether it drives a live graph.
+        searches: Whether it has a part that may run beside others.
+    """
+
+    cell: Cell
+    job: Job
+    live: bool
+    searches: bool
+
+
+def plan_cells(
+    campaign: Campaign, cells: Sequence[Cell], experiments: dict[tuple[str, str], Any] | None = None
+) -> list[Planned]:
+    """Settings of every cell as they are; reads experiments and digests of their stages, prepares nothing.
+
+    Args:
+        campaign: The campaign.
+        cells: Which of its cells.
+        experiments: Those that were read already, by scenario and placement; it gets what is read.
+    """
+    experiments = {} if experiments is None else experiments
+    planned = []
+    for cell in cells:
+        scenario = campaign.scenario(cell)
+        kind = load_kind(scenario.kind)
+        key = (cell.scenario, cell.placement)
+        if key not in experiments:
+            experiments[key] = _experiment(campaign, cell)
+        inside = _inside(scenario, cell)
+        digest = settings_hash(kind, experiments[key], inside, cell.victim, cell.method, cell.seed)
+        job = Job(
+            str(campaign.folder), cell.name, scenario.kind, str(campaign.experiment_file(cell)), scenario.setting,
+            tuple(campaign.overrides(cell)), str(campaign.run_folder(cell)), inside, cell.scenario, cell.placement,
+            cell.victim, cell.method, cell.seed, digest, threads=1,
+        )  # fmt: skip
+        planned.append(Planned(cell, job, kind.live, kind.search_cell is not None))
+    return planned
+
+
+def statuses(campaign: Campaign, cells: Sequence[Cell]) -> list[CellStatus]:
+    """Where every cell is; one whose experiment cannot be read, as it is not made yet, is missing."""
+    store = store_of(campaign)
+    experiments: dict[tuple[str, str], Any] = {}
+    return [store.status(cell, hash_as_it_is(campaign, cell, experiments)) for cell in cells]
+
+
+def hash_as_it_is(campaign: Campaign, cell: Cell, experiments: dict[tuple[str, str], Any]) -> str | None:
+    """Hash of everything that a cell depends on; None if it cannot be known yet, as what the cell needs is not made.
+
+    Args:
+        campaign: The campaign.
+        cell: Which of its cells.
+        experiments: As of `plan_cells`.
+
+    Raises:
+        ConfigError: Its experiment or its kind is wrong.
+    """
+    try:
+        return plan_cells(campaign, [cell], experiments)[0].job.settings_hash
+    except ConfigError:
+        raise
+    except (RuntimeFault, OSError):
+        return None
+
+
+def run_campaign(campaign: Campaign, cells: Sequence[Cell], options: Options, say: Say) -> list[Ended]:
+    """Run the cells that are not there yet.
+
+    Args:
+        campaign: The campaign.
+        cells: Those of its cells that are wanted.
+        options: Over what, and how many at a time.
+        say: Told of every start and end.
+
+    Returns:
+        How every cell that was run ended, in the order of their ends.
+
+    Raises:
+        ConfigError: An experiment or a kind of scenario is wrong; nothing was run.
+    """
+    store = store_of(campaign)
+    _prepare(campaign, cells, say)
+    # Before the gate, so that a cell that there cannot be is told first.
+    plan = plan_cells(campaign, cells)
+    judged = _past_the_gate(campaign, cells, options, say)
+    wanted = [each for each in plan if each.cell in judged and _is_wanted(store, each, options, say)]
+    if not wanted:
+        there = sum(store.status(each.cell, each.job.settings_hash).state == "done" for each in plan)
+        say(f"nothing to do: {'every cell is' if there == len(plan) else f'{there} of {len(plan)} cells are'} there")
+        return []
+    _require_positive(options)
+    jobs, threads = _shares(options)
+    if options.search_only:
+        return _search(wanted, jobs, threads, options, say)
+    say(f"{len(wanted)} of {len(cells)} cells to run, {_at_a_time(jobs, threads)}")
+    beside = [replace(each.job, threads=threads) for each in wanted if not each.live]
+    beside += [replace(each.job, threads=threads, phase="search") for each in wanted if each.live and each.searches]
+    ended = _run_beside(beside, jobs, options, say)
+    lost = {end.name for end in ended if end.how != "done"}
+    searched = {job.name for job in beside if job.phase == "search"}
+    ended = [end for end in ended if end.name not in searched or end.how != "done"]
+    # The live graphs have the machine to themselves, one after the other.
+    for each in wanted:
+        if each.live and each.cell.name not in lost:
+            ended.append(_tell(run_in_process(replace(each.job, threads=_cores())), say))
+    # Their drives without attack are there now.
+    _past_the_gate(campaign, [each.cell for each in wanted if each.live], options, say)
+    return ended
+
+
+def _search(wanted: Sequence[Planned], jobs: int, threads: int, options: Options, say: Say) -> list[Ended]:
+    """Only the searches of cells; what has none apart from its drives waits."""
+    found = [replace(each.job, threads=threads, phase="search") for each in wanted if each.searches]
+    kinds = sorted({each.job.kind for each in wanted if not each.searches})
+    if not found:
+        raise ConfigError(
+            f"expected cells whose search can be run alone, got kinds {', '.join(kinds)}; run them without --search-only"
+        )
+    for kind in kinds:
+        say(f"cells of kind {kind} search and drive in one and are left out")
+    say(f"{len(found)} cells to search, {_at_a_time(jobs, threads)}")
+    return _run_beside(found, jobs, options, say)
+
+
+def _at_a_time(jobs: int, threads: int) -> str:
+    return f"{jobs or 'all the cluster has cores for'} at a time, {threads} threads each"
+
+
+def _inside(scenario: ScenarioConfig, cell: Cell) -> str:
+    return scenario.as_scenario or cell.scenario
+
+
+def _experiment(campaign: Campaign, cell: Cell) -> Any:
+    scenario = campaign.scenario(cell)
+    kind = load_kind(scenario.kind)
+    return kind.load(
+        campaign.experiment_file(cell), scenario.setting, campaign.overrides(cell), campaign.run_folder(cell)
+    )
+
+
+def _prepare(campaign: Campaign, cells: Sequence[Cell], say: Say) -> None:
+    done: set[tuple[Path, str]] = set()
+    # All files are read before anything is made, so that a mistake in the last does not cost the hours of the first.
+    experiments = {(cell.scenario, cell.placement): (cell, _experiment(campaign, cell)) for cell in cells}
+    _refuse_two_in_one_folder(campaign, cells)
+    for cell, experiment in experiments.values():
+        folder = campaign.run_folder(cell)
+        kind = campaign.scenario(cell).kind  # kinds need different stages of one experiment
+        if (folder, kind) in done:
+            continue
+        done.add((folder, kind))
+        say(f"{cell.scenario}{'.' * bool(cell.placement)}{cell.placement}: {folder}")
+        load_kind(kind).prepare(experiment, _PrintedReport(say))
+
+
+def _refuse_two_in_one_folder(campaign: Campaign, cells: Sequence[Cell]) -> None:
+    """Scenarios of one run folder must need the same scene and policies, or each would run on, or remake, those of the other."""
+    folders = {campaign.run_folder(cell) for cell in cells}
+    first: dict[Path, tuple[str, dict[str, Any]]] = {}
+    for cell in {(each.scenario, each.placement): each for each in campaign.cells}.values():
+        if (folder := campaign.run_folder(cell)) not in folders:
+            continue
+        needed = load_kind(campaign.scenario(cell).kind).needed_settings(_experiment(campaign, cell))
+        name, others = first.setdefault(folder, (cell.scenario, needed))
+        if wrong := [stage for stage in needed.keys() & others.keys() if needed[stage] != others[stage]]:
+            raise ConfigError(
+                f"{campaign.file}: expected scenarios {name} and {cell.scenario} to have the same settings of stage {', '.join(sorted(wrong))}, as "
+                f"both are in {folder}, got different ones; give one of them a run_folder of its own"
+            )
+
+
+def _past_the_gate(campaign: Campaign, cells: Sequence[Cell], options: Options, say: Say) -> list[Cell]:
+    """The cells whose surrogate is good enough; judged once per scenario and victim, and kept."""
+    passed: dict[str, bool] = {}
+    for cell in cells:
+        if (key := gate_key(cell)) not in passed:
+            passed[key] = _judge(campaign, cell, options, say)
+    return [cell for cell in cells if passed[gate_key(cell)]]
+
+
+def _judge(campaign: Campaign, cell: Cell, options: Options, say: Say) -> bool:
+    """Whether the cells of this one's scenario and victim may be run: by held-out views, and by a drive without attack where there is one."""
+    scenario = campaign.scenario(cell)
+    kind, key = load_kind(scenario.kind), gate_key(cell)
+    if kind.fidelity is None:
+        return True
+    from nodes.experiment.campaign.gate import cached_verdict  # loads torch
+
+    limits = scenario.gate or campaign.config.gate
+    which = (kind, _experiment(campaign, cell), _inside(scenario, cell), cell.victim)
+    found = [cached_verdict(*which, limits, gate_file(campaign.folder, key))]
+    first = min(each.seed for each in campaign.cells if gate_key(each) == key)
+    without = replace(cell, method=NONE, seed=first)
+    try:
+        drive = first, store_of(campaign).work(without.name)
+        found.append(cached_verdict(*which, limits, gate_file(campaign.folder, key, drive=True), drive))
+    except RuntimeFault as fault:
+        say(f"fidelity gate, {key}: only held-out views are judged, as there is no drive without attack yet: {fault}")
+    may = not options.gate or all(verdict is None or verdict.passed for verdict in found)
+    for reason in [reason for verdict in found if verdict is not None for reason in verdict.reasons]:
+        left_out = "" if may else "; its cells are left out (--no-gate runs them all the same)"
+        say(f"fidelity gate, {key}: {reason}{left_out}")
+    return may
+
+
+def gate_file(folder: Path, key: str, drive: bool = False) -> Path:
+    """Where a campaign, or what is published of it, keeps the verdict on held-out views, or on a drive without attack."""
+    return folder / "gate" / f"{key}{'.drive' * drive}.json"
+
+
+def gate_key(cell: Cell | CellResult) -> str:
+    """Name of what the fidelity gate judges for a cell."""
+    return f"{cell.scenario}{'.' * bool(cell.placement)}{cell.placement}_{cell.victim}"
+
+
+class _PrintedReport(Report):
+    def __init__(self, say: Say) -> None:
+        self._say, self._text = say, ""
+
+    def __call__(self, fraction: float, text: str = "") -> None:
+        """Say what is new."""
+        if text and text != self._text:
+            self._text = text
+            self._say(f"  {100 * fraction:.0f} % {text}")
+
+
+def _is_wanted(store: Store, each: Planned, options: Options, say: Say) -> bool:
+    status = store.status(each.cell, each.job.settings_hash)
+    if status.state == "failed" and not options.retry:
+        say(f"{each.cell.name}: failed before, not run again without --retry: {status.text}")
+        return False
+    if status.state == "running":
+        say(f"{each.cell.name}: another process runs it")
+        return False
+    return status.state != "done"
+
+
+def _run_beside(jobs: list[Job], at_a_time: int, options: Options, say: Say) -> list[Ended]:
+    if not jobs:
+        return []
+    if options.backend == "local":
+        with joblib.parallel_config(backend="threading", n_jobs=at_a_time):
+            return _collect(jobs, say)
+    return _run_on_ray(jobs, at_a_time, options, say)
+
+
+def _collect(jobs: list[Job], say: Say) -> list[Ended]:
+    """Hand the jobs out to joblib's backend in force; tell of each as it ends."""
+    parallel = joblib.Parallel(return_as="generator_unordered", batch_size=1, pre_dispatch="all")
+    return [_tell(end, say) for end in parallel(joblib.delayed(run_in_process)(job) for job in jobs)]
+
+
+def _run_on_ray(jobs: list[Job], at_a_time: int, options: Options, say: Say) -> list[Ended]:
+    from nodes.experiment.campaign.cluster import collect_on_ray, ray_session
+
+    with ray_session(options.address, at_a_time or _cores()) as cores:
+        say(f"Ray cluster with {cores} cores; advnerf campaign status tells how far it is")
+        at_a_time = at_a_time or max(1, cores // (options.threads or 1))
+        ended: list[Ended] = []
+        left = jobs
+        for _ in range(_ROUNDS):
+            found = collect_on_ray(left, min(at_a_time, cores))
+            if found is not None:
+                return ended + [_tell(end, say) for end in found]
+            finished = [Ended(job.name, "done", "", 0.0) for job in left if _is_finished(job)]
+            ended += [_tell(end, say) for end in finished]
+            left = [job for job in left if not _is_finished(job)]
+            say(f"a machine of the cluster was lost: {len(left)} cells are handed out again")
+        text = "its machine was lost again and again; it goes on when the campaign is run again"
+        return ended + [_tell(Ended(job.name, "lost", text, 0.0), say) for job in left]
+
+
+def _is_finished(job: Job) -> bool:
+    """Whether a result of these settings is there, whoever was to tell of it; a search has none of its own and goes on from its state."""
+    result = Store(Path(job.campaign_folder)).result(job.name)
+    return result is not None and result.settings_hash == job.settings_hash
+
+
+def _tell(end: Ended, say: Say) -> Ended:
+    say(f"{end.name}: {end.how} after {end.seconds:.1f} s{': ' * bool(end.text)}{end.text}")
+    return end
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0))
+
+
+def _require_positive(options: Options) -> None:
+    if options.jobs < 0 or options.threads < 0:
+        raise ConfigError(f"expected --jobs and --threads of at least 1, got {options.jobs} and {options.threads}")
+
+
+def _shares(options: Options) -> tuple[int, int]:
+    """Cells at a time, 0 for as many as a cluster has cores for, which only the cluster can tell; and threads of each."""
+    if options.backend == "ray":
+        return options.jobs, options.threads or 1
+    jobs = options.jobs or (_cores() // options.threads if options.threads else _cores()) or 1
+    return jobs, options.threads or max(1, _cores() // jobs)

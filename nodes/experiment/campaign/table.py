@@ -1,0 +1,59 @@
+"""The table of a campaign from its cells, and the page of it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+from markupsafe import Markup
+
+from advnerf_core.files import write_atomically
+from advnerf_core.report.transfer import TransferTable, Wanted, make_table
+from advnerf_core.report.transfer_page import as_csv, as_json, as_markdown, gather_clips, render_transfer_page
+from nodes.experiment.campaign.config import Campaign, Cell
+from nodes.experiment.campaign.store import CellStatus
+
+
+def wanted_rows(campaign: Campaign, cells: Sequence[Cell]) -> list[Wanted]:
+    """The lines that some cells of a campaign fill."""
+    seeds: dict[tuple[str, str, str, str], list[int]] = {}
+    for cell in cells:
+        seeds.setdefault((cell.scenario, cell.placement, cell.victim, cell.method), []).append(cell.seed)
+    # By victim before method: the reader compares the methods on one victim.
+    order = sorted(seeds, key=lambda key: (list(campaign.config.scenarios).index(key[0]), key[1]))
+    return [Wanted(*key, tuple(seeds[key])) for key in order]
+
+
+def campaign_table(campaign: Campaign, found: Sequence[CellStatus]) -> TransferTable:
+    """The table of the cells that are there.
+
+    Args:
+        campaign: The campaign.
+        found: Where the cells are that the table is of; only results of the settings as they are now are taken.
+    """
+    cells = [each.result for each in found if each.result is not None and each.state == "done"]
+    return make_table(wanted_rows(campaign, [each.cell for each in found]), cells, campaign.config.name)
+
+
+def write_table(
+    table: TransferTable, cells_folder: Path, folder: Path, sections: Sequence[tuple[str, Markup]] = ()
+) -> Path:
+    """Write JSON, CSV, Markdown and the page with the clips beside it.
+
+    Args:
+        table: The table.
+        cells_folder: Where the cells' clips are.
+        folder: Where to write.
+        sections: Further parts of the page.
+
+    Returns:
+        The page.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    clips = gather_clips(table, cells_folder, folder)
+    write_atomically(folder / "table.json", json.dumps(as_json(table), indent=1, allow_nan=False) + "\n")
+    write_atomically(folder / "table.csv", as_csv(table))
+    write_atomically(folder / "table.md", as_markdown(table))
+    write_atomically(folder / "index.html", render_transfer_page(table, clips, sections))
+    return folder / "index.html"

@@ -1,0 +1,192 @@
+"""The experiment file of the intersection: what is captured, learned, attacked and deployed, in its settings."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from hardware.worlds.junction.paths import PathName
+
+Count = Annotated[int, Field(ge=0)]
+Positive = Annotated[int, Field(ge=1)]
+PositiveNumber = Annotated[float, Field(gt=0)]
+Method = Literal["random", "cem", "gradient"]
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class CaptureConfig(_Section):
+    """How the junction is photographed."""
+
+    photos: Positive = Field(default=450, description="Posed photographs that the scene is learned from.")
+    held_out: Annotated[int, Field(ge=3)] = Field(
+        default=36, description="Views of the driving camera along the three drives that nothing learns from."
+    )
+    seed: int = 0
+
+
+class SceneConfig(_Section):
+    """How the radiance field is trained; the length is in steps, so that the result does not depend on the machine."""
+
+    steps: Positive = Field(default=1500, description="Training iterations.")
+    levels: Annotated[int, Field(ge=1, le=20)] = Field(default=8, description="Levels of the hash grid.")
+    finest: Positive = Field(default=2048, description="Cells of its finest level along the box's longest side.")
+    log2_entries: Annotated[int, Field(ge=10, le=24)] = Field(
+        default=18, description="Entries of a level of the hash grid, as a power of two."
+    )
+    occupancy: Positive = Field(default=128, description="Cells of the occupancy grid along the box's longest side.")
+    refine_depth: PositiveNumber = Field(
+        default=0.005, description="Optical depth from which rendering looks into a cell; see TrainConfig."
+    )
+    margin_m: Annotated[float, Field(ge=0)] = Field(
+        default=0.5, description="The box reaches so far beyond the world [m]."
+    )
+    interval_px: PositiveNumber | None = Field(
+        default=None,
+        description="Sample intervals in pixels of the policy's view; none: the default of pixel_intervals.",
+    )
+    seed: int = 0
+
+
+class PolicyConfig(_Section):
+    """How the goal-conditioned policy is trained: frames per path and domain, rounds, optimiser steps."""
+
+    stiffness_1pm: PositiveNumber = Field(
+        default=0.2, description="How firmly the expert returns to the path [1/m]; see ExpertConfig."
+    )
+    feed_forward: Annotated[float, Field(ge=0, le=1)] = Field(
+        default=1.0, description="Share of the path's curvature that the expert steers ahead."
+    )
+    delay_s: Annotated[float, Field(ge=0)] = Field(
+        default=0.1, description="What the expert looks ahead by: half a tick and part of the deployed car's lag [s]."
+    )
+    driven_m: PositiveNumber = Field(default=44.0, description="Frames are taken so far along each path [m].")
+    drives_from_m: PositiveNumber = Field(
+        default=12.0,
+        description="DAgger drives start so far along each path at most, so that they pass the junction [m].",
+    )
+    deployed_stills: Count = Field(default=320, description="Poses about each path in the deployment scene.")
+    surrogate_stills: Count = Field(default=240, description="The same in the surrogate.")
+    deployed_drives: Count = Field(
+        default=3, description="Drives on each path in the deployment scene, per DAgger round."
+    )
+    surrogate_drives: Count = Field(default=3, description="The same in the surrogate.")
+    drive_steps: Positive = Field(default=60, description="Control ticks of such a drive; finer ticks need more.")
+    dagger_rounds: Count = Field(default=2, description="Rounds of DAgger.")
+    first_steps: Positive = Field(default=800, description="Optimiser steps of behaviour cloning.")
+    round_steps: Positive = Field(default=300, description="Optimiser steps after each round.")
+    naive_steps: Count = Field(
+        default=800, description="Optimiser steps of the victim that never sees a random texture; 0: none."
+    )
+    hidden: tuple[int, int, int] = Field(default=(200, 100, 20), description="Widths of the policy's linear layers.")
+    seed: int = 0
+
+
+class ObjectConfig(_Section):
+    """The objects; where they stand is the world's part of the file."""
+
+    car_resolution: Annotated[int, Field(ge=8, le=128)] = Field(
+        default=64, description="Voxels along a car's longest side."
+    )
+    hydrant_resolution: Annotated[int, Field(ge=8, le=128)] = Field(default=48, description="The same of a hydrant.")
+    fit_steps: Count = Field(default=300, description="Steps that refine the voxels on pictures of the mesh.")
+
+
+class AttackConfig(_Section):
+    """The adversary, and what it may spend: all methods evaluate equally often."""
+
+    methods: tuple[Method, ...] = Field(default=("random", "cem", "gradient"), min_length=1)
+    starts: Positive = Field(
+        default=1, description="Start poses optimised together; the first of seed 0 is the nominal one."
+    )
+    start_sigma: Annotated[float, Field(ge=0)] = Field(
+        default=0.1, description="Spread of all other starts [m and rad]; headings a quarter of it."
+    )
+    evaluations: Positive = Field(default=50, description="Closed-loop evaluations of each search.")
+    learning_rate: PositiveNumber = 0.1
+    random_sigma: PositiveNumber = Field(default=5.0, description="Spread of the random textures' theta.")
+    cem_population: Annotated[int, Field(ge=4)] = Field(default=10, description="Candidates of a generation.")
+    seeds: tuple[int, ...] = Field(default=(0,), min_length=1, description="One search of each method per seed.")
+    time_batch: Positive = Field(default=16, description="Frames per gradient batch.")
+    cache_mib: Annotated[float, Field(ge=0)] = Field(default=512.0, description="Budget of the frame cache [MiB].")
+
+
+class RetrainConfig(_Section):
+    """The defence: how often the victim answers the attack, and what it learns from."""
+
+    rounds: Positive = Field(default=1, description="Rounds of attack and retraining, at most.")
+    pays_ratio: PositiveNumber = Field(
+        default=1.5,
+        description="The loop ends when no attack's total CTE in the surrogate is this many times that of none.",
+    )
+    stills: Positive = Field(
+        default=120, description="Poses about each path, per domain, seen plain and with a found texture."
+    )
+    drives: Positive = Field(
+        default=2,
+        description="Pairs of the victim's drives on each path, per domain: past plain objects and past a found texture.",
+    )
+    drive_steps: Positive = Field(default=60, description="Control ticks of such a drive; finer ticks need more.")
+    placements: Count = Field(
+        default=0,
+        description="Random places of all objects in random colours that the victim also learns from; see poses.py.",
+    )
+    steps: Positive = Field(default=500, description="Optimiser steps of the fine-tuning.")
+    new_share: Annotated[float, Field(gt=0, lt=1)] = Field(
+        default=0.4, description="Share of new frames in the training."
+    )
+    seed: int = 0
+
+
+class IntersectionExperimentConfig(_Section):
+    """One experiment, resolved: the file's values, one of its settings over them, then the command line."""
+
+    @model_validator(mode="after")
+    def _retraining_needs_the_gradient(self) -> IntersectionExperimentConfig:
+        if self.retrain is not None and "gradient" not in self.attack.methods:
+            raise ValueError(
+                f"expected gradient among attack.methods, as retrain learns from what it finds, got {', '.join(self.attack.methods)}"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _training_drives_last(self) -> IntersectionExperimentConfig:
+        """Fine ticks with the default number of them would train on drives that end before the junction."""
+        policy, asked = self.policy, {}
+        if policy.dagger_rounds and (policy.deployed_drives or policy.surrogate_drives):
+            asked["policy.drive_steps"] = policy.drive_steps
+        if self.retrain is not None:
+            asked["retrain.drive_steps"] = self.retrain.drive_steps
+        for key, ticks in asked.items():
+            if 2 * ticks < self.horizon:
+                raise ValueError(
+                    f"expected {key} to be at least half of horizon = {self.horizon} ticks, so that what is learned from passes the "
+                    f"junction too, got {ticks} ticks of dt_s = {self.dt_s:g} s, {ticks * self.dt_s:g} s; set {key}={self.horizon}"
+                )
+        return self
+
+    kind: Literal["intersection", "carla"] = Field(description="The simulated junction, or one of a CARLA map.")
+    name: str = Field(min_length=1)
+    scenarios: tuple[PathName, ...] = Field(default=("straight", "right", "left"), min_length=1)
+    horizon: Positive = Field(default=60, description="Control ticks of every drive (T).")
+    dt_s: PositiveNumber = Field(
+        default=0.1,
+        description="Control tick [s]; the paper's CARLA runs have finer ones: docs/intersection_experiment.md.",
+    )
+    held_cap_m: PositiveNumber = Field(
+        default=6.0, description="Largest |CTE| that a stopped car is charged per tick [m]."
+    )
+    world: dict[str, Any] = Field(
+        default_factory=dict, description="Changes to IntersectionConfig, or to CarlaConfig of hardware/carla_scene."
+    )
+    capture: CaptureConfig = CaptureConfig()
+    scene: SceneConfig = SceneConfig()
+    policy: PolicyConfig = PolicyConfig()
+    object: ObjectConfig = ObjectConfig()
+    attack: AttackConfig = AttackConfig()
+    retrain: RetrainConfig | None = Field(
+        default=None, description="Retrain the hardened victim on what was found; none: not."
+    )

@@ -1,0 +1,73 @@
+"""Stage object: cars and hydrants as voxels; and the five of them as they stand at the junction."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from advnerf_core.fields.voxel_grid import VoxelGridObject
+from advnerf_core.objects.voxel.build import build_from_mesh
+from advnerf_core.objects.voxel.generators import GENERATORS
+from advnerf_core.objects.voxel.mesh import stand
+from advnerf_core.objects.voxel.model import ObjectModel, load_object, save_object
+from advnerf_core.scene.surrogate import BackgroundRenderer, Surrogate
+from hardware.worlds.junction.config import ObjectKind
+from nodes.experiment.junction.context import Experiment
+from nodes.experiment.learned_scene import load_background
+from nodes.runtime.progress import Report
+
+GENERATOR_OF: dict[ObjectKind, str] = {"small_car": "car", "hydrant": "hydrant"}
+
+
+def run(experiment: Experiment, folder: Path, report: Report) -> None:
+    """Write one object file for each kind; where they stand is not part of it."""
+    kinds = sorted({thing.kind for thing in experiment.world.objects})
+    for index, kind in enumerate(kinds):
+
+        def progress(fraction: float, text: str, index: int = index, kind: str = kind) -> None:
+            report((index + fraction) / len(kinds), f"{kind}: {text}")
+
+        if not object_file(experiment, kind).exists():
+            save_object(object_file(experiment, kind), build(experiment, kind, progress))
+
+
+def build(experiment: Experiment, kind: ObjectKind, progress: Any = None) -> ObjectModel:
+    """One kind of object from its generator."""
+    wanted, generator = experiment.config.object, GENERATOR_OF[kind]
+    resolution = wanted.car_resolution if kind == "small_car" else wanted.hydrant_resolution
+    mesh = stand(GENERATORS[generator]())
+    return build_from_mesh(mesh, kind, resolution, wanted.fit_steps, {"generator": generator}, progress)
+
+
+def object_file(experiment: Experiment, kind: str) -> Path:
+    """Where a kind of object is."""
+    return experiment.stage_folder("object") / f"{kind}.object.safetensors"
+
+
+def placed_objects(experiment: Experiment) -> list[VoxelGridObject]:
+    """The objects in the order of the world's configuration, in their plain colours."""
+    models = {thing.kind: load_object(object_file(experiment, thing.kind)) for thing in experiment.world.objects}
+    return [models[thing.kind].placed(thing.T_world_from_object, thing.scale) for thing in experiment.world.objects]
+
+
+def describe(experiment: Experiment) -> list[dict[str, Any]]:
+    """Names, places and free colours of the objects, as plain data."""
+    things = zip(experiment.world.objects, placed_objects(experiment), strict=True)
+    return [{**thing.model_dump(), "free_colours": field.free_count} for thing, field in things]
+
+
+def surrogate_of(
+    experiment: Experiment, objects: Sequence[VoxelGridObject], background: BackgroundRenderer | None = None
+) -> Surrogate:
+    """The learned junction as the policy's camera sees it; ``background`` if it is loaded already."""
+    render = background or load_background(experiment)
+    return Surrogate(render, experiment.view.pinhole, experiment.mount, objects)
+
+
+def random_theta(shape: tuple[int, ...], sigma: float, rng: np.random.Generator) -> torch.Tensor:
+    """Grid values as the random attack draws them."""
+    return torch.from_numpy(sigma * rng.standard_normal(shape, dtype=np.float32))

@@ -1,0 +1,159 @@
+"""Stage report: the transfer table, what every drive did from above and from the driver's seat, and the textures as they were seen."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from rich.console import Console
+
+from advnerf_core.files import write_atomically
+from advnerf_core.report.tables import Table, spread
+from advnerf_core.report.transfer_page import METHOD_NAMES
+from nodes.experiment.junction import films, page
+from nodes.experiment.junction.attack import Cell, cells, load_theta
+from nodes.experiment.junction.context import Experiment
+from nodes.experiment.junction.deployed import DressedScene
+from nodes.experiment.junction.objects import placed_objects
+from nodes.experiment.junction.policy import HARDENED
+from nodes.runtime.progress import Report
+
+# Where along a drive its objects are shown [m]: most of them are in view, some close.
+_SEEN_AT_M = (9.0, 14.0)
+
+
+@dataclass(frozen=True)
+class Row:
+    """Drives of one domain, scenario, victim and method, over seeds and starts.
+
+    Attributes:
+        domain: surrogate or deployed.
+        scenario: straight, right or left.
+        victim: hardened or naive.
+        method: none, random, cem or gradient.
+        total_cte_m: Total CTE of each drive [m].
+        ratios: Each over the drive past the plain objects from the same start in the same domain.
+        off_track: Drives that left the lane.
+    """
+
+    domain: str
+    scenario: str
+    victim: str
+    method: str
+    total_cte_m: tuple[float, ...]
+    ratios: tuple[float, ...]
+    off_track: int
+
+    @property
+    def ratio(self) -> float:
+        """Sum over sum, so that a start that is driven without error does not decide."""
+        clean = sum(total / ratio for total, ratio in zip(self.total_cte_m, self.ratios, strict=True))
+        return sum(self.total_cte_m) / clean
+
+
+def run(experiment: Experiment, folder: Path, report: Report) -> None:
+    """Write ``report.html``, ``results.json``, ``results.csv`` and a clip of each drive."""
+    rows = rows_of(experiment)
+    table = transfer_table(rows)
+    write_results(experiment, rows, folder)
+    clips = []
+    with experiment.site.open() as scene:
+        dressed = DressedScene(scene, experiment.view, placed_objects(experiment))
+        overview = experiment.site.overview(scene)
+        for index, name in enumerate(experiment.config.scenarios):
+            report(0.1 + 0.8 * index / len(experiment.config.scenarios), f"filming {name}")
+            clips.append(films.film_scenario(experiment, dressed, name, folder))
+        seen: dict[str, dict[str, NDArray[np.uint8]]] = {
+            name: textures_seen(experiment, dressed, name) for name in experiment.config.scenarios
+        }
+    report(0.95, "writing the page")
+    page.write(experiment, folder, table, overview, clips, seen)
+
+
+def print_summary(experiment: Experiment, console: Console) -> None:
+    """The transfer table, and where the page is."""
+    console.print(transfer_table(rows_of(experiment)).rich())
+    console.print(f"report: {experiment.stage_folder('report') / 'report.html'}", highlight=False, soft_wrap=True)
+
+
+def read_cell(experiment: Experiment, cell: Cell) -> dict[str, Any]:
+    """A finished cell."""
+    found: dict[str, Any] = json.loads((experiment.stage_folder("deploy") / f"{cell.name}.cell.json").read_text())
+    return found
+
+
+def rows_of(experiment: Experiment) -> list[Row]:
+    """The transfer table's rows, from all finished cells."""
+    drives: dict[tuple[str, str, str, str], list[tuple[float, float, bool]]] = {}
+    for cell in cells(experiment):
+        data = read_cell(experiment, cell)
+        for domain in films.DOMAINS:
+            part = data[domain]
+            kept = drives.setdefault((cell.victim, cell.scenario, domain, cell.method), [])
+            kept += zip(part["total_cte_m"], part["none_total_cte_m"], part["off_track"], strict=True)
+    rows = []
+    for (victim, scenario, domain, method), found in sorted(
+        drives.items(), key=lambda item: _order(experiment, item[0])
+    ):
+        totals = tuple(total for total, _, _ in found)
+        ratios = tuple(total / max(clean, 1e-9) for total, clean, _ in found)
+        rows.append(Row(domain, scenario, victim, method, totals, ratios, sum(off for _, _, off in found)))
+    return rows
+
+
+def _order(experiment: Experiment, key: tuple[str, str, str, str]) -> tuple[bool, int, int, int]:
+    victim, scenario, domain, method = key
+    return (
+        victim != HARDENED, experiment.config.scenarios.index(scenario), films.DOMAINS.index(domain),
+        list(METHOD_NAMES).index(method),
+    )  # fmt: skip
+
+
+def transfer_table(rows: Sequence[Row]) -> Table:
+    """The rows as text."""
+    texts, groups, before = [], [], ("", "", "")
+    for index, row in enumerate(rows):
+        here = (row.victim, row.scenario, row.domain)
+        if here != before:
+            groups.append(index)
+        first = tuple(now if here != before else "" for now in here)
+        std = float(np.std(row.total_cte_m, ddof=1)) if len(row.total_cte_m) > 1 else None
+        ratio_std = float(np.std(row.ratios, ddof=1)) if len(row.ratios) > 1 else None
+        texts.append((
+            *first, METHOD_NAMES[row.method], str(len(row.total_cte_m)), spread(float(np.mean(row.total_cte_m)), std),
+            "" if row.method == "none" else spread(row.ratio, ratio_std), f"{row.off_track} of {len(row.total_cte_m)}",
+        ))  # fmt: skip
+        before = here
+    columns = ("victim", "drive", "domain", "objects show", "runs", "total CTE [m]", "over no attack", "off-track")
+    return Table("Total CTE: surrogate and deployed", columns, tuple(texts), (False,) * 4 + (True,) * 4, tuple(groups))
+
+
+def write_results(experiment: Experiment, rows: Sequence[Row], folder: Path) -> None:
+    """All cells as JSON, and the table as CSV."""
+    kept = {"setting": experiment.setting, "cells": [read_cell(experiment, cell) for cell in cells(experiment)]}
+    write_atomically(folder / "results.json", json.dumps(kept, indent=1) + "\n")
+    lines = ["victim,scenario,domain,method,runs,total_cte_mean_m,total_cte_std_m,ratio,off_track"]
+    for row in rows:
+        std = np.std(row.total_cte_m, ddof=1) if len(row.total_cte_m) > 1 else float("nan")
+        numbers = f"{len(row.total_cte_m)},{np.mean(row.total_cte_m):.4f},{std:.4f},{row.ratio:.4f},{row.off_track}"
+        lines.append(f"{row.victim},{row.scenario},{row.domain},{row.method},{numbers}")
+    write_atomically(folder / "results.csv", "\n".join(lines) + "\n")
+
+
+def textures_seen(experiment: Experiment, dressed: DressedScene, scenario: str) -> dict[str, NDArray[np.uint8]]:
+    """The same views of the driving camera past the plain, random and attacked objects of the first seed, one row each."""
+    searched, seed = experiment.stage_folder("attack"), experiment.config.attack.seeds[0]
+    states = [np.array(experiment.references[scenario].pose_at(at)) for at in _SEEN_AT_M]
+    shown: dict[str, torch.Tensor] = {"none": dressed.plain_theta()}
+    for method in experiment.config.attack.methods:
+        shown[method] = load_theta(searched, Cell(scenario, HARDENED, method, seed))
+    return {
+        method: np.concatenate([dressed.camera_image(state, theta) for state in states], axis=1)
+        for method, theta in shown.items()
+    }

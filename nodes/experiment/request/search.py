@@ -1,0 +1,219 @@
+"""Running a prepared attack: the method that was asked for, resumable, ending in an attack file."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from advnerf_core.attack.adjoint import BlackBoxError, evaluate
+from advnerf_core.attack.artifact import BLACK_BOX_METHODS_TEXT, AttackFile, save_attack
+from advnerf_core.attack.search.baselines import random_search
+from advnerf_core.attack.search.distil import Distillation
+from advnerf_core.attack.search.guided import BlackBoxSearch, black_box_attack
+from advnerf_core.attack.search.optimise import gradient_attack
+from advnerf_core.attack.search.population import CrossEntropy, Evolution, population_search
+from advnerf_core.attack.search.query_count import calls_per_evaluation
+from advnerf_core.attack.search.search import Evaluation, OnEvaluation, SearchResult
+from advnerf_core.attack.search.together import gradient_attacks
+from advnerf_core.files import write_atomically
+from advnerf_core.objects.mesh.shape import ShapeSensor
+from nodes.experiment.request.meshes import write_meshes
+from nodes.experiment.request.prepare import Prepared, prepare
+from nodes.experiment.request.request import AttackRequest, load_request, request_text
+from nodes.experiment.request.telling import telling
+from nodes.runtime.errors import ConfigError
+from nodes.runtime.progress import Display
+
+REQUEST = "request.attack.yaml"
+TOGETHER_STATE = "together.state.safetensors"
+
+
+def search(
+    prepared: Prepared, state_path: Path | None = None, on_evaluation: OnEvaluation | None = None
+) -> SearchResult:
+    """Search as the request asks; what ``on_evaluation`` raises ends it, and a state file then goes on from there."""
+    wanted, problem = prepared.request.search, prepared.problem
+    if wanted.method == "gradient" and not problem.differentiable:
+        raise BlackBoxError(f"{prepared.request.policy} has no gradient: use the method {BLACK_BOX_METHODS_TEXT}")
+    common: dict[str, Any] = {
+        "seed": prepared.seed, "state_path": state_path, "on_evaluation": on_evaluation,
+        "settings_hash": prepared.settings_hash,
+    }  # fmt: skip
+    rate, sigma = 0.1, 5.0
+    if isinstance(problem.sensor, ShapeSensor):
+        rate, sigma = problem.sensor.limits.learning_rate, problem.sensor.random_sigma
+    if wanted.method == "gradient":
+        return gradient_attack(problem, wanted.evaluations, wanted.learning_rate or rate, **common)
+    if wanted.method == "random":
+        return random_search(problem, wanted.evaluations, wanted.sigma or sigma, **common)
+    if (black_box := black_box_search(prepared.request)) is not None:
+        return black_box_attack(problem, black_box, policy_calls(prepared), **common)
+    if wanted.method == "cem":
+        strategy: CrossEntropy | Evolution = CrossEntropy(wanted.sigma or 3.0)
+    else:
+        strategy = Evolution(wanted.sigma or 1.0, wanted.learning_rate or 0.5)
+    return population_search(problem, strategy, wanted.evaluations, wanted.population, wanted.cells, **common)
+
+
+def black_box_search(request: AttackRequest) -> BlackBoxSearch | None:
+    """The settings of the methods that ask the policy more than they drive; None for the others."""
+    wanted = request.search
+    if wanted.method != "distilled" and wanted.method != "guided":
+        return None
+    lessons = Distillation() if wanted.warm_pairs is None else Distillation(warm_pairs=wanted.warm_pairs)
+    return BlackBoxSearch.usual(
+        wanted.method, wanted.learning_rate, wanted.probes, cells=wanted.cells, distillation=lessons
+    )
+
+
+def policy_calls(prepared: Prepared) -> int:
+    """The budget of a request in policy calls, the same for all methods: evaluations x starts x ticks."""
+    return prepared.request.search.evaluations * calls_per_evaluation(prepared.problem)
+
+
+def planned_evaluations(prepared: Prepared) -> int:
+    """Drives that the budget allows the method."""
+    black_box = black_box_search(prepared.request)
+    if black_box is None:
+        return prepared.request.search.evaluations
+    return black_box.evaluations(prepared.problem, policy_calls(prepared))
+
+
+def finish(prepared: Prepared, result: SearchResult) -> AttackFile:
+    """The attack file; its prediction is made without disturbances."""
+    if prepared.problem.disturbances is None:
+        return prepared.make_attack_file(result)
+    _, totals = evaluate(prepared.problem.undisturbed(), result.theta)
+    return prepared.make_attack_file(result, float(totals.protocol_cte_m.mean()))
+
+
+def run_attack(
+    request: AttackRequest,
+    folder: Path,
+    display: Display,
+    on_evaluation: OnEvaluation | None = None,
+    on_prepared: Callable[[Prepared], None] | None = None,
+) -> list[Path]:
+    """Run every seed of a request in a folder, going on where it was stopped.
+
+    Args:
+        request: What is asked for; kept in the folder.
+        folder: Where states and attack files go.
+        display: Told of the progress of each seed.
+        on_evaluation: Also called after every evaluation.
+        on_prepared: Called before the search of each seed.
+
+    Returns:
+        The attack files, ``seed_<seed>.attack.safetensors``, each with its curve in a JSON file beside it.
+
+    Raises:
+        ConfigError: The folder holds another request.
+    """
+    keep_request(request, folder)
+    if request.search.together:
+        return _run_together(request, folder, display, on_evaluation, on_prepared)
+    prepared, files = None, []
+    for seed in request.search.seeds:
+        name = f"seed_{seed}"
+        file = attack_file(folder, seed)
+        files.append(file)
+        if file.exists():
+            display.finish(name, 0.0, cached=True)
+            continue
+        prepared = prepare(request, seed) if prepared is None else prepared.with_seed(seed)
+        if on_prepared is not None:
+            on_prepared(prepared)
+        _run_seed(prepared, folder, display, on_evaluation)
+    return files
+
+
+def attack_file(folder: Path, seed: int) -> Path:
+    """Where the attack file of a seed is."""
+    return folder / f"seed_{seed}.attack.safetensors"
+
+
+def keep_request(request: AttackRequest, folder: Path) -> None:
+    """Write the request into a fresh folder; another one in it is refused."""
+    kept = folder / REQUEST
+    if not kept.exists():
+        write_atomically(kept, request_text(request))
+    elif load_request(kept) != request:
+        raise ConfigError(f"{kept}: this folder belongs to another attack; resume it, or choose another folder")
+
+
+def kept_request(folder: Path) -> AttackRequest:
+    """The request of a folder."""
+    if not (folder / REQUEST).exists():
+        raise ConfigError(f"expected a folder of 'advnerf attack run' with a {REQUEST}, found none in {folder}")
+    return load_request(folder / REQUEST)
+
+
+def _run_seed(prepared: Prepared, folder: Path, display: Display, on_evaluation: OnEvaluation | None) -> None:
+    name, state_path = f"seed_{prepared.seed}", folder / f"seed_{prepared.seed}.state.safetensors"
+    report = display.start(name)
+    report(0.0, "drive without attack")
+    told = telling(planned_evaluations(prepared), report, clean=prepared.clean_drive)
+    result = search(prepared, state_path, _both(told, on_evaluation))
+    _keep(prepared, result, folder)
+    state_path.unlink(missing_ok=True)
+    display.finish(name, sum(e.seconds for e in result.history), cached=False)
+
+
+def _run_together(
+    request: AttackRequest, folder: Path, display: Display, on_evaluation: OnEvaluation | None,
+    on_prepared: Callable[[Prepared], None] | None,
+) -> list[Path]:  # fmt: skip
+    """All seeds of a gradient attack in one batch; their files are written when all are done."""
+    seeds, state_path = request.search.seeds, folder / TOGETHER_STATE
+    files = [attack_file(folder, seed) for seed in seeds]
+    if all(file.exists() for file in files):
+        for seed in seeds:
+            display.finish(f"seed_{seed}", 0.0, cached=True)
+        return files
+    prepared = prepare(request, seeds[0])
+    each = [prepared, *(prepared.with_seed(seed) for seed in seeds[1:])]
+    if on_prepared is not None:
+        on_prepared(prepared)
+    told = [
+        _both(
+            telling(request.search.evaluations, display.start(f"seed_{one.seed}"), clean=one.clean_drive), on_evaluation
+        )
+        for one in each
+    ]
+    results = gradient_attacks(
+        [one.problem for one in each], seeds, request.search.evaluations, request.search.learning_rate or 0.1,
+        state_path, lambda k, evaluation: told[k](evaluation), prepared.settings_hash,
+    )  # fmt: skip
+    for one, result in zip(each, results, strict=True):
+        _keep(one, result, folder)
+        display.finish(f"seed_{one.seed}", sum(e.seconds for e in result.history), cached=False)
+    state_path.unlink(missing_ok=True)
+    return files
+
+
+def _keep(prepared: Prepared, result: SearchResult, folder: Path) -> None:
+    """Write the attack file of a finished search, and its curve beside it."""
+    file, names = attack_file(folder, prepared.seed), [each.name for each in prepared.objects]
+    # Before the attack file, which says that the seed is done.
+    write_meshes(file, names, prepared.meshes(result.theta))
+    attack_id = save_attack(file, finish(prepared, result))
+    curve = {
+        "attack_id": attack_id, "method": prepared.request.search.method, "seed": prepared.seed,
+        "best_evaluation": result.best.iteration, "loss_m": [e.loss_m for e in result.history],
+        "predicted_total_cte_m": [e.predicted_total_cte_m for e in result.history],
+        "seconds": [e.seconds for e in result.history], "clean_drive": prepared.clean_drive.to_dict(),
+    }  # fmt: skip
+    write_atomically(folder / f"seed_{prepared.seed}.json", json.dumps(curve, indent=1) + "\n")
+
+
+def _both(first: OnEvaluation, second: OnEvaluation | None) -> OnEvaluation:
+    if second is None:
+        return first
+
+    def told(evaluation: Evaluation) -> None:
+        first(evaluation)
+        second(evaluation)
+
+    return told

@@ -1,0 +1,1 @@
+"""What a person at the lab does: import scenes, train policies, calibrate, run trials."""

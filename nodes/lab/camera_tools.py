@@ -1,0 +1,152 @@
+"""What ``advnerf camera`` does: finds cameras, tries a source, makes a calibration file of a ZED's factory file. No node."""
+
+from __future__ import annotations
+
+import datetime
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+from pydantic import TypeAdapter, ValidationError
+
+from advnerf_core.errors import AdvnerfError
+from calibration.schema import CameraCalibration, load_calibration
+from hardware.cameras.interface import Frame
+from hardware.cameras.sources import CameraSource
+from hardware.cameras.v4l2.controls import available
+from hardware.cameras.v4l2.negotiation import identify, modes
+from hardware.cameras.v4l2.port import KernelPort, VideoPort, open_device
+from hardware.cameras.zed.calibration import Rectifier, load_factory_calibration
+from hardware.cameras.zed.exposure import ExtensionUnit, automatic_is_on, read_exposure_lines, read_gain
+from hardware.errors import HardwareError
+from nodes.runtime.errors import ConfigError
+
+
+class CameraToolError(AdvnerfError):
+    """A camera does not do what it should."""
+
+
+def describe_devices(port: VideoPort | None = None) -> Iterator[str]:
+    """Lines about every video device: what it is, what it offers, and its controls with their ranges and present values."""
+    port = port or KernelPort()
+    for name in port.names():
+        path = Path(name)
+        try:
+            fd = open_device(port, path)
+        except HardwareError as error:
+            yield str(error)
+            continue
+        try:
+            identity = identify(port, fd, path)
+            yield f"{name}: {identity.card} ({identity.driver}, {identity.bus})"
+            yield from (f"    {mode}" for mode in modes(port, fd))
+            for control, (low, high, step, value) in available(port, fd, path).items():
+                yield f"    {control}: {value}  ({low} to {high}, step {step})"
+            if "ZED" in identity.card.upper():
+                unit = ExtensionUnit(port, fd, path)
+                automatic = "automatic" if automatic_is_on(unit) else "fixed"
+                yield f"    exposure {read_exposure_lines(unit)} lines, gain_raw: {read_gain(unit)} ({automatic})"
+        except HardwareError as error:
+            yield f"{name}: {error}"
+        finally:
+            port.close(fd)
+
+
+def describe_oaks() -> Iterator[str]:
+    """One line for each OAK; nothing where depthai is not installed."""
+    try:
+        import depthai
+    except ImportError:
+        return
+    for info in depthai.Device.getAllAvailableDevices():
+        yield f"OAK {info.getDeviceId()} at {info.name} ({info.state.name})"
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What came out of a source.
+
+    Attributes:
+        frames: How many frames came.
+        rate_hz: Frames per second.
+        missed: Frames that were never delivered, by their numbers.
+        age_ms: Age of the frames on arrival: median and worst [ms].
+        brightness: Mean of all pixels of the last frame, 0 to 255.
+        counters: What device and driver counted.
+        picture: The last frame.
+    """
+
+    frames: int
+    rate_hz: float
+    missed: int
+    age_ms: tuple[float, float]
+    brightness: float
+    counters: dict[str, float]
+    picture: NDArray[np.uint8]
+
+
+def parse_source(text: str) -> Any:
+    """A source as it stands in a launch file, in YAML."""
+    try:
+        return TypeAdapter(CameraSource).validate_python(yaml.safe_load(text))
+    except yaml.YAMLError as error:
+        raise ConfigError(
+            f"expected YAML such as '{{kind: v4l2, device: ...}}': {' '.join(str(error).split())}"
+        ) from None
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        key = ".".join(map(str, first["loc"])) or "source"
+        raise ConfigError(f"{key}: {first['msg'].removeprefix('Value error, ')}") from None
+
+
+def try_source(source: Any, frames: int = 50, timeout_s: float = 10.0) -> Trial:
+    """Read so many frames of a source, as the camera node would, and measure them."""
+    device = source.steady()
+    got: list[Frame] = []
+    ages_ms = []
+    deadline = time.monotonic() + timeout_s
+    try:
+        while len(got) < frames and time.monotonic() < deadline:
+            if (frame := device.read(0.2)) is not None:
+                ages_ms.append((time.monotonic_ns() - frame.stamp_mono_ns) / 1e6)
+                got.append(frame)
+    finally:
+        device.close()
+    if len(got) < 2:
+        raise CameraToolError(f"expected frames, got {len(got)} in {timeout_s:g} s: {device.error or 'it is silent'}")
+    span_s = (got[-1].stamp_mono_ns - got[0].stamp_mono_ns) / 1e9
+    steps = np.diff([frame.sequence for frame in got])
+    return Trial(
+        frames=len(got),
+        rate_hz=(len(got) - 1) / span_s,
+        missed=int(np.maximum(steps - 1, 0).sum()),
+        age_ms=(float(np.median(ages_ms)), max(ages_ms)),
+        brightness=float(got[-1].rgb.mean()),
+        counters=device.counters(),
+        picture=got[-1].rgb,
+    )
+
+
+def calibration_from_zed(
+    factory: Path, mode: str, size: tuple[int, int], mount: Path, latency_s: float = 0.0
+) -> CameraCalibration:
+    """Calibration of the rectified left eye; the pose on the car comes from another camera file."""
+    pinhole = Rectifier(load_factory_calibration(factory, mode), size).pinhole
+    return CameraCalibration(
+        date=datetime.date.today(),
+        method=f"factory calibration {factory.name}, left eye, {mode}, rectified",
+        notes=f"T_car_from_camera from {mount}",
+        width=size[0],
+        height=size[1],
+        fx=round(pinhole.fx, 4),
+        fy=round(pinhole.fy, 4),
+        cx=round(pinhole.cx, 4),
+        cy=round(pinhole.cy, 4),
+        T_car_from_camera=load_calibration(CameraCalibration, mount).T_car_from_camera,
+        latency_s=latency_s,
+    )

@@ -1,0 +1,102 @@
+"""The files that a launch file names: calibration, room, attack, policy, bag. Are they there, whole, and do they fit one another?"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from advnerf_core.attack.artifact import load_attack
+from advnerf_core.errors import AdvnerfError
+from calibration.schema import (
+    Calibration,
+    CalibrationError,
+    CameraCalibration,
+    RoomCalibration,
+    TargetCalibration,
+    VehicleCalibration,
+    load_calibration,
+)
+from nodes.compositor import show
+from nodes.lab.doctor.check import FAILURE, OK, Finding
+from nodes.launching.launch_file import Plan
+
+_CURE = "advnerf calibrate, docs/calibration.md; params.calibration names the folder"
+_COMMON: dict[str, type[Calibration]] = {
+    "camera": CameraCalibration, "target": TargetCalibration, "room": RoomCalibration, "vehicle": VehicleCalibration,
+}  # fmt: skip
+# The key that only says "calibration" means what its node is about.
+_OWN: dict[str, type[Calibration]] = {"nodes.camera": CameraCalibration, "nodes.motor": VehicleCalibration}
+_FILES = (".safetensors", ".onnx", ".pt2", ".conf", ".yaml", ".mcap", ".db3", ".bag")
+
+
+def calibrations(plan: Plan) -> list[Finding]:
+    """Load every calibration file once."""
+    rows, good = [], []
+    for file, kind in dict.fromkeys(_calibration_files(plan)):
+        try:
+            good.append((file, load_calibration(kind, file)))
+        except (AdvnerfError, OSError, ValueError) as error:
+            rows.append(Finding("calibration", FAILURE, str(error), _CURE))
+    if good:
+        oldest = min(good, key=lambda item: item[1].date)
+        text = f"{', '.join(str(file) for file, _ in good)}; the oldest, {oldest[0].name}, is of {oldest[1].date}"
+        rows.append(Finding("calibration", OK, text))
+    return rows
+
+
+def _calibration_files(plan: Plan) -> Iterator[tuple[Path, type[Calibration]]]:
+    for name, entry in plan.nodes.items():
+        data = plan.documents[name].data
+        for key, value in (data if isinstance(data, dict) else {}).items():
+            kind = _OWN.get(entry.module) if key == "calibration" else _COMMON.get(key)
+            if kind is not None and isinstance(value, str):
+                yield Path(value), kind
+
+
+def named(plan: Plan) -> list[Finding]:
+    """Whether every other file is there, and whether attacks fit camera and face."""
+    rows = []
+    known = {str(file) for file, _ in _calibration_files(plan)}
+    for name in plan.nodes:
+        data = plan.documents[name].data
+        rows += [
+            Finding(
+                "files", FAILURE, f"{name}: no file {value}", "correct the path; it counts from the folder you are in"
+            )
+            for value in _paths(data)
+            if value not in known and not Path(value).exists()
+        ]
+        if isinstance(data, dict) and data.get("attack"):
+            rows += _attack(name, data)
+    return rows or [Finding("files", OK, "all that the nodes name are there")]
+
+
+def _paths(value: Any) -> Iterator[str]:
+    if isinstance(value, dict):
+        for item in value.values():
+            yield from _paths(item)
+    elif isinstance(value, list):
+        for item in value:
+            yield from _paths(item)
+    elif isinstance(value, str) and value.endswith(_FILES) and not value.startswith("<"):
+        yield value
+
+
+def _attack(name: str, data: dict[str, Any]) -> list[Finding]:
+    file = Path(data["attack"])
+    if not file.exists():
+        return []  # said already
+    try:
+        attack = load_attack(file)
+    except AdvnerfError as error:
+        return [Finding("attack", FAILURE, str(error), "run the attack again, or name another file")]
+    try:
+        if "camera" in data and "target" in data:
+            camera = load_calibration(CameraCalibration, data["camera"])
+            show(attack, camera, load_calibration(TargetCalibration, data["target"]))
+    except CalibrationError:
+        pass  # said under "calibration"
+    except AdvnerfError as error:
+        return [Finding("attack", FAILURE, f"{name}: {error}", "name the target that it was made for")]
+    return [Finding("attack", OK, f"{name}: {attack.attack_id}, {attack.method}, for {attack.subject}")]

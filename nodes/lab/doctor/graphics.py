@@ -1,0 +1,117 @@
+"""Graphics and compilers: off-screen rendering, graphics processors, LLVM, screens. Nothing of it is imported here."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from typing import Any
+
+from hardware.screen.edid import connected_displays
+from nodes.lab.doctor.check import ABSENT, FAILURE, OK, WARNING, Answer, Finding, in_child
+
+_EGL_CURE = "apt-get install libegl1 libgl1-mesa-dri libegl-mesa0 libopengl0 (Debian, Ubuntu)"
+_SCREEN_CURE = "run it on the desktop of the computer with the screen (DISPLAY or WAYLAND_DISPLAY is set there)"
+
+
+# SDL takes one of these when there is no window system, and then every picture is shown to nobody.
+_NO_SCREEN = ("offscreen", "dummy")
+
+
+def _missing(answer: Answer) -> bool:
+    return "ModuleNotFoundError" in answer.trouble
+
+
+def egl(required: bool = False) -> list[Finding]:
+    """Whether the simulated lab can render."""
+    answer = in_child("egl")
+    if answer.data is not None:
+        return [Finding("EGL", OK, f"MuJoCo {answer.data['version']} renders off-screen")]
+    if _missing(answer):
+        state = FAILURE if required else ABSENT
+        return [Finding("EGL", state, "no simulated lab: MuJoCo is missing", "pip install 'advnerf[twin]'")]
+    state = FAILURE if required else WARNING
+    return [Finding("EGL", state, f"the simulated lab cannot render: {answer.trouble}", _EGL_CURE)]
+
+
+def torch(required: bool = False) -> list[Finding]:
+    """Version of torch, and on what it computes."""
+    answer = in_child("torch")
+    if answer.data is None:
+        text = "is missing: no training, no attack, only ONNX policies" if _missing(answer) else answer.trouble
+        state = FAILURE if required else ABSENT if _missing(answer) else WARNING
+        return [Finding("torch", state, text, "pip install 'advnerf[core]'")]
+    version, gpus, built_for = (answer.data[key] for key in ("version", "gpus", "built_for"))
+    if gpus:
+        return [Finding("torch", OK, f"{version}, CUDA {built_for}: {', '.join(gpus)}")]
+    if built_for:
+        do = "nvidia-smi must work first: driver, container with --gpus all"
+        return [Finding("torch", WARNING, f"{version} is built for CUDA {built_for}, but sees no GPU", do)]
+    return [Finding("torch", OK, f"{version}, CPU only")]
+
+
+def llvm() -> list[Finding]:
+    """Whether Mitsuba can compile, for attacks on meshes."""
+    answer = in_child("llvm")
+    if answer.data is not None:
+        return [Finding("LLVM", OK, f"{answer.data['llvm']} compiles for Mitsuba {answer.data['version']}")]
+    if "cannot be imported" in answer.trouble or _missing(answer):
+        return [Finding("LLVM", ABSENT, "Mitsuba is missing: no attacks on meshes", "pip install 'advnerf[mesh]'")]
+    return [Finding("LLVM", WARNING, answer.trouble, "apt-get install libllvm19 (Debian, Ubuntu)")]
+
+
+def screens(display: Any | None = None) -> list[Finding]:
+    """Screens of the window system, and what is plugged in.
+
+    Args:
+        display: ``display`` of the monitor node, of kind ``screen``; None where none is needed.
+    """
+    answer, plugged = in_child("screens"), connected_displays()
+    named = ", ".join(
+        f"{name} {edid.name or edid.maker} {edid.size_px[0]} x {edid.size_px[1]}" for name, edid in plugged.items()
+    )
+    state = ABSENT if display is None else FAILURE
+    if answer.data is None:
+        if _missing(answer):
+            text = "pygame-ce is missing: no attack on a monitor"
+            return [Finding("screens", state, text, "pip install 'advnerf[monitor]'")]
+        return [_no_window_system(answer.trouble, state, named)]
+    if answer.data["driver"] in _NO_SCREEN and os.environ.get("SDL_VIDEODRIVER") != answer.data["driver"]:
+        return [_no_window_system("SDL found neither X11 nor Wayland", state, named)]
+    sizes = [tuple(size) for size in answer.data["sizes"]]
+    text = f"{answer.data['driver']}: " + ", ".join(f"{n}: {w} x {h}" for n, (w, h) in enumerate(sizes))
+    rows = [Finding("screens", OK, text + (f"; plugged in: {named}" if named else ""))]
+    return rows if display is None else [*rows, *_fits(display, sizes, plugged)]
+
+
+def _no_window_system(trouble: str, state: str, named: str) -> Finding:
+    text = f"no window system: {trouble}" + (f"; plugged in: {named}" if named else "")
+    return Finding("screens", state, text, _SCREEN_CURE)
+
+
+def _fits(display: Any, sizes: Sequence[tuple[int, ...]], plugged: dict[str, Any]) -> Sequence[Finding]:
+    if display.index >= len(sizes):
+        return [
+            Finding(
+                "screens",
+                FAILURE,
+                f"no screen with index {display.index}",
+                "monitor.display={kind: screen, index: ...}",
+            )
+        ]
+    if display.connector is None:
+        return []
+    if display.connector not in plugged:
+        there = ", ".join(plugged) or "none"
+        return [
+            Finding(
+                "screens",
+                FAILURE,
+                f"no monitor at {display.connector}; there are {there}",
+                "cable, or monitor.display.connector",
+            )
+        ]
+    native = plugged[display.connector].size_px
+    if tuple(native) != tuple(sizes[display.index]):
+        text = f"screen {display.index} is {sizes[display.index][0]} x {sizes[display.index][1]}, the panel {native[0]} x {native[1]}"
+        return [Finding("screens", FAILURE, text, "native resolution and 100 % scaling, or another index")]
+    return []

@@ -1,0 +1,280 @@
+"""What one launch file needs of this computer: its devices, files, ports and libraries, and nothing else."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import BaseModel
+
+from advnerf_core.errors import AdvnerfError
+from advnerf_core.policies.load import is_factory
+from calibration.schema import CameraCalibration, load_calibration
+from hardware.mocap.vicon import ViconConfig
+from hardware.motor.vesc_settings import TimeoutSettings
+from nodes.camera import CameraConfig
+from nodes.gateway import GatewayConfig
+from nodes.lab.doctor import cameras, files, graphics, machine, mocap, motor, network
+from nodes.lab.doctor.check import CHILD_S, FAILURE, OK, Check, Finding, in_child
+from nodes.lab.doctor.recording import Pictures, bytes_per_s
+from nodes.launching.launch_check import check_nodes
+from nodes.launching.launch_file import Plan
+from nodes.launching.launch_hosts import GATEWAY
+from nodes.monitor import MonitorConfig, ScreenConfig
+from nodes.motor import MotorConfig
+from nodes.policy import PolicyConfig
+from nodes.recorder import RecorderConfig
+from nodes.runtime.config import validate
+from nodes.runtime.errors import ConfigError
+from nodes.safety import SafetyConfig
+from nodes.vicon import ViconNodeConfig
+from nodes.viewer import ViewerConfig
+
+_CHILD_DEADLINE_S = CHILD_S + 5.0
+_NODES_S = 90.0
+_TWIN, _POLICY = "nodes.twin", "nodes.policy"
+# What the launch makes itself does not exist before it runs.
+_OF_THE_RUN = ("<run_dir>", "<socket_dir>")
+_POLICY_SLOW_MS = 60.0
+M = TypeVar("M", bound=BaseModel)
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """A launch file and one of its nodes."""
+
+    plan: Plan
+    name: str
+
+    @property
+    def on_twin(self) -> bool:
+        return any(entry.module == _TWIN for entry in self.plan.nodes.values())
+
+    def config(self, kind: type[M]) -> M:
+        return validate(kind, self.plan.documents[self.name])
+
+
+def checks_of(plan: Plan, folder: Path) -> list[Check]:
+    """Everything that a launch file needs here, as checks.
+
+    Args:
+        plan: The launch file for this host.
+        folder: Where its runs will be written.
+    """
+    checks = [
+        Check("versions", machine.versions), Check("machine", machine.machine), Check("sockets", machine.sockets),
+        Check("launches", machine.launches), Check("nodes", partial(_nodes, plan), _NODES_S),
+        Check("calibration", partial(files.calibrations, plan)), Check("files", partial(files.named, plan)),
+    ]  # fmt: skip
+    for name, entry in plan.nodes.items():
+        asked = _Asked(plan, name)
+        if (make := _BY_MODULE.get(entry.module)) is not None:
+            try:
+                checks += make(asked)
+            except (AdvnerfError, OSError):
+                continue  # the node itself says under "nodes" what is wrong with its configuration
+    if "recorder" in plan.documents:
+        checks.append(Check("disk", partial(_disk, plan, folder)))
+    return checks
+
+
+def policy_problems(plan: Plan) -> list[str]:
+    """What is wrong with the policies of a launch file: no such file, another image size than the camera's, another goal.
+
+    Each policy is loaded in a process of its own; nodes and devices are left alone.
+    """
+    problems = []
+    for name, entry in plan.nodes.items():
+        if entry.module != _POLICY:
+            continue
+        asked = _Asked(plan, name)
+        if (missing := _missing_policy(asked.config(PolicyConfig))) is not None:
+            problems.append(f"{name}: {missing} does not exist; --set params.policy=FILE names another")
+            continue
+        _, unfit = _try_policy(asked.config(PolicyConfig), _image_size(plan))
+        problems += [f"{name}: {finding.found}; {finding.do}" for finding in unfit]
+    return problems
+
+
+def _missing_policy(config: PolicyConfig) -> str | None:
+    return None if is_factory(config.policy) or Path(config.policy).exists() else str(config.policy)
+
+
+def _nodes(plan: Plan) -> list[Finding]:
+    """Whether every node accepts its configuration, asked of the nodes themselves."""
+    problems = check_nodes(plan)
+    if problems:
+        return [
+            Finding("nodes", FAILURE, " ".join(text.split()), "correct the launch file") for text in problems.values()
+        ]
+    return [Finding("nodes", OK, f"{', '.join(plan.nodes)} accept their configuration")]
+
+
+def _camera(asked: _Asked) -> list[Check]:
+    config = asked.config(CameraConfig)
+    where = str(getattr(config.source, "path", ""))
+    if config.source.kind == "socket" and where.startswith(_OF_THE_RUN):
+        return [] if asked.on_twin else [Check("camera", partial(_nobody, "camera", where))]
+    checks: list[Check] = []
+    if config.source.kind == "oak":
+        checks.append(Check("OAK", partial(cameras.oaks, True), 30.0, "unplug the OAK and plug it in again"))
+    calibration = _calibration(config.calibration)
+    checks.append(
+        Check(
+            "camera",
+            partial(cameras.source, config.source, calibration),
+            20.0,
+            "unplug the camera and plug it in again",
+        )
+    )
+    return checks
+
+
+def _calibration(file: Path) -> CameraCalibration | None:
+    try:
+        return load_calibration(CameraCalibration, file)
+    except AdvnerfError:
+        return None  # said under "calibration"
+
+
+def _nobody(name: str, where: str) -> list[Finding]:
+    do = "give the real device, or switch the simulated lab on (twin.if=true)"
+    return [Finding(name, FAILURE, f"expected at {where}, but this launch has no node that makes it", do)]
+
+
+def _vicon(asked: _Asked) -> list[Check]:
+    config = asked.config(ViconNodeConfig)
+    if config.library is not None:
+        return [Check("VICON", partial(network.mocap_library, config.library, config.hostname))]
+    if asked.on_twin:
+        return [Check("VICON", partial(mocap.free_port, config.port, config.host))]
+    listening = ViconConfig(config.subjects, config.host, config.port, source=config.source)
+    # Boards and wands come and go; without the car nothing can be armed.
+    return [Check("VICON", partial(mocap.listen, listening, True, mocap.LISTEN_S, ("car",)))]
+
+
+def _motor(asked: _Asked) -> list[Check]:
+    config = asked.config(MotorConfig)
+    if config.port.startswith(_OF_THE_RUN):
+        return [] if asked.on_twin else [Check("VESC", partial(_nobody, "VESC", config.port))]
+    wanted = TimeoutSettings(config.controller_timeout_ms, config.controller_brake_current_a)
+    return [
+        Check("serial", motor.serial_ports),
+        Check("VESC", partial(motor.vesc, config.port, wanted, config.battery_warning_v, True)),
+    ]
+
+
+def _safety(asked: _Asked) -> list[Check]:
+    return [Check("gamepad", partial(motor.gamepads, True))] if asked.config(SafetyConfig).teleop == "hold" else []
+
+
+def _policy(asked: _Asked) -> list[Check]:
+    config = asked.config(PolicyConfig)
+    if _missing_policy(config) is not None:
+        return []  # said under "files"
+    return [Check("policy", partial(_policy_findings, config, _image_size(asked.plan)), _CHILD_DEADLINE_S)]
+
+
+def _image_size(plan: Plan) -> tuple[int, int] | None:
+    """Width and height of the launch's camera [px], from the first calibration that a node names."""
+    for entry in plan.documents.values():
+        for key in ("calibration", "camera"):
+            if (found := _camera_file(entry.data.get(key))) is not None:
+                return found.width, found.height
+    return None
+
+
+def _camera_file(value: Any) -> CameraCalibration | None:
+    return _calibration(Path(value)) if isinstance(value, str) and value.endswith(".yaml") else None
+
+
+def _policy_findings(config: PolicyConfig, size: tuple[int, int] | None) -> list[Finding]:
+    data, rows = _try_policy(config, size)
+    if data is None:
+        return rows
+    if data["ms"] > _POLICY_SLOW_MS:
+        rows.append(
+            Finding("policy", FAILURE, f"{data['ms']:.0f} ms for one image", "another computer, or an ONNX policy")
+        )
+    return [Finding("policy", OK, f"{config.policy}, {data['sha256'][:12]}, {data['ms']:.1f} ms for one image"), *rows]
+
+
+def _try_policy(config: PolicyConfig, size: tuple[int, int] | None) -> tuple[dict[str, Any] | None, list[Finding]]:
+    """Load a policy in a process of its own.
+
+    Args:
+        config: Of the policy node.
+        size: Width and height of the camera's images [px], if known.
+
+    Returns:
+        What the policy says of itself (None if it cannot be loaded), and a finding for each thing that does not fit.
+    """
+    answer = in_child("policy", config.policy, config.sha256)
+    if answer.data is None:
+        trouble = answer.trouble.partition(": ")[2] or answer.trouble
+        return None, [Finding("policy", FAILURE, trouble, "params.policy names it")]
+    data, rows = answer.data, []
+    if size is not None and tuple(data["size"]) != size:
+        text = f"trained for {data['size'][0]} x {data['size'][1]}, the camera is calibrated for {size[0]} x {size[1]}"
+        rows.append(Finding("policy", FAILURE, text, "train for this camera, or set the size of the source"))
+    if data["goal_size"] != len(config.goal):
+        text = f"wants a goal of {data['goal_size']} numbers, got {len(config.goal)}"
+        rows.append(Finding("policy", FAILURE, text, "set policy.goal"))
+    return data, rows
+
+
+def _twin(asked: _Asked) -> list[Check]:
+    return [Check("EGL", partial(graphics.egl, True), _CHILD_DEADLINE_S)]
+
+
+def _attack(asked: _Asked) -> list[Check]:
+    return [Check("torch", partial(graphics.torch, True), _CHILD_DEADLINE_S)]
+
+
+def _monitor(asked: _Asked) -> list[Check]:
+    config = asked.config(MonitorConfig)
+    if not isinstance(config.display, ScreenConfig):
+        return [] if asked.on_twin else [Check("screens", partial(_nobody, "screens", str(config.display.path)))]
+    return [Check("screens", partial(graphics.screens, config.display), _CHILD_DEADLINE_S)]
+
+
+def _gateway(asked: _Asked) -> list[Check]:
+    config = asked.config(GatewayConfig)
+    return [Check("clock", machine.clock), Check("network", partial(network.gateway, config))]
+
+
+def _viewer(asked: _Asked) -> list[Check]:
+    config = asked.config(ViewerConfig)
+    return [Check("viewer", partial(network.viewer, config.host, config.port))]
+
+
+def _disk(plan: Plan, folder: Path) -> Sequence[Finding]:
+    config = validate(RecorderConfig, plan.documents["recorder"])
+    # With two hosts everything that is recorded comes here, from wherever its publisher is.
+    roles = None
+    if GATEWAY not in plan.nodes:
+        roles = {role for name, entry in plan.nodes.items() for role in (name, entry.module.rsplit(".", 1)[-1])}
+    return machine.disk(folder, bytes_per_s(pictures_of(plan), config.topics, roles, len(config.statuses_of)))
+
+
+def pictures_of(plan: Plan) -> Pictures:
+    """Size and rate of the pictures of a launch file; the defaults where its camera is on another host."""
+    for name, entry in plan.nodes.items():
+        if entry.module == "nodes.camera":
+            try:
+                config = validate(CameraConfig, plan.documents[name])
+                size = load_calibration(CameraCalibration, config.calibration)
+            except (ConfigError, AdvnerfError):
+                break
+            rate_hz = 1.0 / config.source.period_s() if config.source.period_s() else Pictures.rate_hz
+            return Pictures(size.width, size.height, rate_hz, config.compressed is not None)
+    return Pictures()
+
+
+_BY_MODULE: dict[str, Callable[[_Asked], list[Check]]] = {
+    "nodes.camera": _camera, "nodes.vicon": _vicon, "nodes.motor": _motor, "nodes.safety": _safety, "nodes.policy": _policy,
+    "nodes.twin": _twin, "nodes.attack": _attack, "nodes.monitor": _monitor, "nodes.gateway": _gateway, "nodes.viewer": _viewer,
+}  # fmt: skip

@@ -1,0 +1,220 @@
+"""The computer itself: versions, memory, disk, sockets, keys, clock, and what runs on it already."""
+
+from __future__ import annotations
+
+import ctypes
+import importlib.metadata
+import os
+import platform
+import re
+import shutil
+import struct
+import subprocess
+import sys
+import time
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from nodes.lab.doctor.check import ABSENT, FAILURE, OK, WARNING, Finding
+from nodes.launching.launch import active_launches
+from nodes.linking.keys import DRIVE, KeyFolder, default_folder
+from nodes.runtime.bus import Bus
+from nodes.runtime.errors import BusError, SecurityError
+from nodes.runtime.machine import memory_gib
+from nodes.runtime.paths import user_folder
+from nodes.safety import SafetyConfig
+
+_MEMORY_WARNING_GIB = 4
+# Of the age limits, which are about 0.2 s, nothing is lost to a clock that is off by less.
+CLOCK_ERROR_S = 0.005
+_UNSYNCHRONISED = 0x0040
+_CHRONYC_S = 2.0
+_OFFSET_WAIT_S = 0.8
+_REQUIREMENT = re.compile(r"^([A-Za-z0-9._-]+)\s*(?:\[[^\]]*\])?\s*([^;]*)(?:;.*extra == ['\"]([a-z]+)['\"])?")
+_NOT_OURS = ("all", "dev")
+
+
+def versions() -> list[Finding]:
+    """Python, ours, and whether what our base needs is there in versions that it accepts; which extras are."""
+    found = platform.python_version()
+    tested = (3, 10) <= sys.version_info[:2] <= (3, 12)
+    text = f"{found}, advnerf {importlib.metadata.version('advnerf')}, Linux {platform.release()} {platform.machine()}"
+    do = "" if tested else "tested are 3.10, 3.11 and 3.12: make the environment with one of them"
+    rows = [Finding("python", OK if tested else WARNING, text, do)]
+    return rows + packages(importlib.metadata.requires("advnerf") or [])
+
+
+def packages(requirements: Iterable[str]) -> list[Finding]:
+    """Findings about a package's requirements: what is missing or too old or too new, and which extras are complete."""
+    wrong: dict[str, list[str]] = {}
+    for requirement in requirements:
+        match = _REQUIREMENT.match(requirement)
+        if match is None or (extra := match[3] or "") in _NOT_OURS:
+            continue
+        wrong.setdefault(extra, [])
+        if trouble := _trouble(match[1], match[2].strip()):
+            wrong[extra].append(trouble)
+    extras = [name for name in wrong if name and not wrong[name]]
+    rows = [Finding("extras", OK, f"complete: {', '.join(extras) or 'none'}")]
+    if base := wrong.get("", []):
+        rows.insert(0, Finding("packages", FAILURE, "; ".join(base), "pip install -c constraints.txt advnerf"))
+    for name in (name for name in wrong if name and wrong[name]):
+        stale = [trouble for trouble in wrong[name] if not trouble.endswith("missing")]
+        if stale:
+            rows.append(Finding("extras", WARNING, "; ".join(stale), f"pip install 'advnerf[{name}]'"))
+    return rows
+
+
+def _trouble(name: str, specifier: str) -> str:
+    try:
+        found = importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return f"{name} is missing"
+    return "" if satisfies(found, specifier) else f"{name} {found} is not {specifier}"
+
+
+def satisfies(version: str, specifier: str) -> bool:
+    """Whether a release fits a specifier of the kinds that we use: ``>=``, ``<``, ``==``, joined by commas."""
+    have = _release(version)
+    for part in filter(None, specifier.replace(" ", "").split(",")):
+        operator, wanted = re.match(r"(>=|<|==)?(.*)", part).groups()  # type: ignore[union-attr]
+        want = _release(wanted)
+        width = max(len(have), len(want))
+        left, right = (release + (0,) * (width - len(release)) for release in (have, want))
+        if not {">=": left >= right, "<": left < right, "==": left == right}.get(operator or "==", True):
+            return False
+    return True
+
+
+def _release(text: str) -> tuple[int, ...]:
+    match = re.match(r"\d+(?:\.\d+)*", text)
+    return tuple(map(int, match[0].split("."))) if match else ()
+
+
+def machine() -> list[Finding]:
+    """Cores and memory."""
+    memory = memory_gib()
+    text = f"{os.cpu_count()} cores, {memory:.0f} GiB memory"
+    if memory < _MEMORY_WARNING_GIB:
+        do = f"train and attack elsewhere: that wants {_MEMORY_WARNING_GIB} GiB"
+        return [Finding("machine", WARNING, text, do)]
+    return [Finding("machine", OK, text)]
+
+
+def disk(folder: Path, bytes_per_s: float, minutes: float = 30.0) -> list[Finding]:
+    """Minutes of recording that fit at a rate.
+
+    Args:
+        folder: Where bags will be written; need not exist.
+        bytes_per_s: What a recording takes [bytes/s].
+        minutes: So many at least should fit.
+    """
+    existing = next(path for path in (folder.resolve(), *folder.resolve().parents) if path.is_dir())
+    if not os.access(existing, os.W_OK):
+        return [Finding("disk", FAILURE, f"{existing} cannot be written to", "choose another folder, or its rights")]
+    free = shutil.disk_usage(existing).free
+    lasts = free / bytes_per_s / 60.0
+    hourly = bytes_per_s * 3600.0 / 1e9
+    text = f"{free / 2**30:.1f} GiB free in {existing}: {lasts:.0f} minutes of recording at {hourly:.1f} GB an hour"
+    if lasts < 1.0:
+        return [Finding("disk", FAILURE, text, "free some, or name another --folder")]
+    if lasts < minutes:
+        return [Finding("disk", WARNING, text, "free some: advnerf bag info says what a bag holds")]
+    return [Finding("disk", OK, text)]
+
+
+def sockets() -> list[Finding]:
+    """Whether nodes can have their sockets."""
+    try:
+        return [Finding("sockets", OK, f"in {user_folder()}")]
+    except (BusError, OSError) as error:
+        return [Finding("sockets", FAILURE, str(error), "make that folder ours, or set XDG_RUNTIME_DIR")]
+
+
+def keys(folder: Path | None = None) -> list[Finding]:
+    """Keys for a second host."""
+    folder = folder or default_folder()
+    store = KeyFolder(folder)
+    try:
+        rows = store.rows()
+        for row in rows:
+            if row.ours:
+                store.secret(row.name)
+    except (SecurityError, OSError) as error:
+        return [Finding("keys", WARNING, str(error))]
+    ours = ", ".join(row.name for row in rows if row.ours)
+    drivers = ", ".join(row.name for row in rows if DRIVE in row.rights) or "nobody"
+    if not ours:
+        return [Finding("keys", ABSENT, f"none in {folder}", "two hosts need them: advnerf keys new NAME")]
+    return [Finding("keys", OK, f"ours: {ours}; {drivers} may drive over the network")]
+
+
+def clock() -> list[Finding]:
+    """Whether this computer's clock is kept by somebody: ages between hosts are no better than their clocks."""
+    seconds, keeper = adjtimex_error_s(), _keeper()
+    if seconds is None:
+        do = "with two hosts install chrony on both: sudo apt-get install chrony"
+        return [Finding("clock", WARNING, f"not synchronised, says the kernel; {keeper or 'nobody keeps it'}", do)]
+    text = f"off by at most {seconds * 1e3:.1f} ms{', ' + keeper if keeper else ''}"
+    if seconds > CLOCK_ERROR_S:
+        return [Finding("clock", WARNING, text, "wait for chrony; chronyc sources says whom it hears")]
+    return [Finding("clock", OK, text)]
+
+
+def adjtimex_error_s() -> float | None:
+    """Estimated error of the clock [s] from adjtimex(2); None when the kernel calls it unsynchronised."""
+    # struct timex of 64-bit Linux: modes, offset, freq, maxerror, esterror, status, ...; 208 bytes in all.
+    buffer = ctypes.create_string_buffer(208)
+    state = ctypes.CDLL(None, use_errno=True).adjtimex(buffer)
+    esterror_us, status = struct.unpack_from("<qi", buffer, 32)
+    return None if state < 0 or status & _UNSYNCHRONISED else float(esterror_us) / 1e6
+
+
+def _keeper() -> str:
+    """Who keeps the clock: chrony in its own words, or systemd's daemon."""
+    if shutil.which("chronyc"):
+        try:
+            told = subprocess.run(
+                ["chronyc", "-n", "-c", "tracking"], capture_output=True, text=True, timeout=_CHRONYC_S, check=False
+            )
+        except (subprocess.TimeoutExpired, OSError):
+            return "chronyc does not answer"
+        fields = told.stdout.strip().split(",")
+        if told.returncode or len(fields) < 6:
+            return "chronyd does not run: sudo systemctl start chrony"
+        return f"chrony follows {fields[1] or fields[0]}, offset {float(fields[4]) * 1e3:+.2f} ms"
+    return "kept by systemd-timesyncd" if Path("/run/systemd/timesync/synchronized").exists() else ""
+
+
+def launches() -> list[Finding]:
+    """What runs already: it holds ports and devices; with two hosts, how far the other one's clock is off."""
+    rows = []
+    for launch in active_launches():
+        text = f"running: {launch['name']} in {launch['run_dir']} (process {launch['pid']})"
+        rows.append(Finding("launches", WARNING, text, "its devices are taken; Ctrl-C in its terminal stops it"))
+        rows += _offset(Path(launch["run_dir"]))
+    return rows or [Finding("launches", OK, "none running")]
+
+
+def _offset(run_dir: Path) -> Sequence[Finding]:
+    """How far the other host's clock is off, if a gateway of this launch measures it."""
+    with Bus(run_dir) as bus:
+        bus.subscribe("/clock/offset")
+        deadline = time.monotonic() + _OFFSET_WAIT_S
+        while (left_s := deadline - time.monotonic()) > 0.0:
+            bus.wait(left_s)
+            for received in bus.receive():
+                message = received.message()
+                return [offset_finding(str(message.peer), float(message.offset_s), float(message.error_s))]
+    return []
+
+
+def offset_finding(peer: str, offset_s: float, error_s: float) -> Finding:
+    """Judgement about the clock of another host; the limits are those of the safety node."""
+    text = f"{peer} is {offset_s * 1e3:+.1f} +- {error_s * 1e3:.1f} ms off"
+    limit_s = SafetyConfig.model_fields["clock_offset_limit_s"].default
+    if abs(offset_s) > limit_s:
+        do = "the car cannot be armed: chrony on both hosts, then chronyc makestep"
+        return Finding("clock offset", FAILURE, text, do)
+    near = abs(offset_s) <= CLOCK_ERROR_S
+    return Finding("clock offset", OK if near else WARNING, text, "" if near else "chrony on both hosts")

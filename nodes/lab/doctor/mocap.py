@@ -1,0 +1,95 @@
+"""Motion capture: is the stream there, on our port, with the subjects that we follow?"""
+
+from __future__ import annotations
+
+import errno
+import socket
+import time
+from collections.abc import Sequence
+
+from hardware.errors import DeviceBusy, ProtocolError
+from hardware.mocap.vicon import DEFAULT_PORT, ViconConfig, ViconReceiver
+from hardware.mocap.vicon_codec import decode_block
+from nodes.lab.doctor.check import ABSENT, FAILURE, OK, WARNING, Finding
+
+LISTEN_S = 1.5
+_NAME = "VICON"
+_CURE = "Tracker: System, UDP Object Stream on, to this computer's address; firewall: sudo ufw allow {port}/udp"
+
+
+def free_port(port: int = DEFAULT_PORT, host: str = "") -> list[Finding]:
+    """Whether nobody else has the port."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.bind((host, port))
+        except OSError as error:
+            do = f"stop what uses it (sudo ss -ulpn 'sport = {port}'), or choose another port here and in Tracker"
+            if error.errno == errno.EADDRNOTAVAIL:
+                do = "give an address of this computer, or 0.0.0.0 for all"
+            return [Finding(_NAME, FAILURE, f"UDP {host or '*'}:{port}: {error.strerror}", do)]
+    return [Finding(_NAME, OK, f"UDP {port} is free")]
+
+
+def listen(
+    config: ViconConfig, required: bool = False, listen_s: float = LISTEN_S, needed: Sequence[str] | None = None
+) -> list[Finding]:
+    """Listen for a moment: datagrams, who sends them, which subjects are seen and how often.
+
+    Args:
+        config: How to listen; without subjects every subject counts.
+        required: Whether silence is a failure.
+        listen_s: How long [s].
+        needed: Subjects whose absence is a failure; None means all of the configuration.
+    """
+    try:
+        if not config.subjects:
+            config = ViconConfig(_names(config, listen_s / 3), config.host, config.port, source=config.source)
+        with ViconReceiver(config) as receiver:
+            seen = dict.fromkeys(config.subjects, 0)
+            deadline = time.monotonic() + listen_s
+            while (left_s := deadline - time.monotonic()) > 0.0:
+                for pose in receiver.read(left_s):
+                    seen[pose.name] += 1
+            counts = receiver.counts
+    except DeviceBusy:
+        return free_port(config.port, config.host)
+    where = f"UDP {config.host or '*'}:{config.port}"
+    if not counts.datagrams:
+        text = f"no datagram on {where} within {listen_s:g} s"
+        return [Finding(_NAME, FAILURE if required else ABSENT, text, _CURE.format(port=config.port))]
+    rate_hz = counts.datagrams / listen_s
+    rows = [Finding(_NAME, OK, f"{rate_hz:.0f} datagrams a second on {where}")]
+    if counts.refused:
+        do = "who else sends there? vicon.source takes Tracker's address alone"
+        rows = [Finding(_NAME, WARNING, f"{counts.refused} of {counts.datagrams} datagrams are not Tracker's", do)]
+    return rows + [
+        _subject(name, number / listen_s, required and name in (needed or config.subjects))
+        for name, number in seen.items()
+    ]
+
+
+def _subject(name: str, rate_hz: float, required: bool) -> Finding:
+    if rate_hz:
+        return Finding(_NAME, OK, f"{name}: {rate_hz:.0f} poses a second")
+    do = "the subject's name in Tracker, its tick mark, its markers"
+    return Finding(_NAME, FAILURE if required else WARNING, f"{name} is not seen", do)
+
+
+def _names(config: ViconConfig, listen_s: float) -> tuple[str, ...]:
+    """Subjects that are in the stream."""
+    names: set[str] = set()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.bind((config.host, config.port))
+        except OSError as error:
+            raise DeviceBusy(str(error)) from error
+        deadline = time.monotonic() + listen_s
+        while (left_s := deadline - time.monotonic()) > 0.0:
+            probe.settimeout(left_s)
+            try:
+                names |= {item.name for item in decode_block(probe.recv(4096)).objects}
+            except TimeoutError:
+                break
+            except ProtocolError:
+                continue
+    return tuple(sorted(names))

@@ -1,0 +1,168 @@
+"""Serial ports and the motor controller behind one: may we open it, what is it, and does it stop the car by itself?"""
+
+from __future__ import annotations
+
+import getpass
+import grp
+import os
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from hardware.errors import DeviceBusy, DeviceNotFound, HardwareError, LinkTimeout, ProtocolError
+from hardware.motor.limits import DriveLimits, VehicleGains
+from hardware.motor.vesc import Vesc
+from hardware.motor.vesc_settings import TimeoutSettings
+from nodes.lab.doctor.check import ABSENT, FAILURE, OK, WARNING, Finding
+
+# The VESC's USB port is ST's virtual COM port.
+VESC_USB = (0x0483, 0x5740)
+FIXED_NAME = Path("/dev/vesc")
+BY_ID = Path("/dev/serial/by-id")
+# What docs/wiring.md asks for; a launch file may ask for something else.
+WANTED = TimeoutSettings(250, 20.0)
+BATTERY_WARNING_V = 13.2
+_SERIAL_GROUP = "dialout"
+
+
+def ports() -> list[Any]:
+    """Serial ports with a USB device behind them."""
+    from serial.tools import list_ports
+
+    # Ports without hardware behind them have no vendor; every board has a row of those.
+    return [port for port in list_ports.comports() if port.vid is not None]
+
+
+def serial_ports() -> list[Finding]:
+    """Serial devices on USB, by their stable names, and whether we may open them."""
+    found = ports()
+    if not found:
+        return [Finding("serial", ABSENT, "no USB serial device", "the twin brings its own; the car's VESC: its cable")]
+    rows = [_port(port) for port in found]
+    if manager := _running("ModemManager"):
+        do = 'ENV{ID_MM_DEVICE_IGNORE}="1" in the udev rule (docs/wiring.md), or: sudo apt-get purge modemmanager'
+        rows.append(
+            Finding("serial", WARNING, f"ModemManager runs (process {manager}) and talks to serial devices unasked", do)
+        )
+    return rows
+
+
+def _port(port: Any) -> Finding:
+    names = stable_names(Path(port.device))
+    text = f"{port.device} ({port.description})" + (f", {', '.join(map(str, names))}" if names else "")
+    if not os.access(port.device, os.R_OK | os.W_OK):
+        return Finding("serial", WARNING, f"no permission for {text}", permission_cure(_SERIAL_GROUP))
+    if (port.vid, port.pid) == VESC_USB and FIXED_NAME not in names:
+        do = f"install the udev rule of docs/wiring.md: {FIXED_NAME} stays the VESC whatever else is plugged in"
+        return Finding("serial", WARNING, text, do)
+    return Finding("serial", OK, text)
+
+
+def stable_names(device: Path, folders: Iterable[Path] = (BY_ID,), fixed: Path = FIXED_NAME) -> list[Path]:
+    """Names of a device that outlive its unplugging."""
+    candidates = [fixed, *(link for folder in folders if folder.is_dir() for link in sorted(folder.iterdir()))]
+    return [link for link in candidates if link.is_symlink() and link.resolve() == device.resolve()]
+
+
+def permission_cure(group: str) -> str:
+    """What to do when a device of a group cannot be opened."""
+    try:
+        entry = grp.getgrnam(group)
+    except KeyError:
+        return f"this system has no group {group}; ls -l shows who may"
+    user = getpass.getuser()
+    if entry.gr_gid in os.getgroups():
+        return f"you are in the group {group}: ls -l shows who may open it; its udev rule sets GROUP and MODE"
+    if user in entry.gr_mem:
+        return f"you are in the group {group}, but since after you logged in: log out and in again"
+    return f"sudo usermod -aG {group} {user}, then log out and in again"
+
+
+def find_vesc() -> str | None:
+    """Port on which a VESC would be; None if nothing looks like one."""
+    if FIXED_NAME.exists():
+        return str(FIXED_NAME)
+    return next((str(port.device) for port in ports() if (port.vid, port.pid) == VESC_USB), None)
+
+
+def vesc(
+    port: str | None, wanted: TimeoutSettings = WANTED, battery_v: float = BATTERY_WARNING_V, required: bool = False
+) -> list[Finding]:
+    """What a motor controller is, and when it stops the car by itself. It is only asked, never commanded.
+
+    Args:
+        port: Serial device; None takes the one that looks like a VESC.
+        wanted: The latest and weakest stop of its own that is good enough.
+        battery_v: Supply voltage below which there is a warning [V].
+        required: Whether its absence is a failure.
+    """
+    port = port or find_vesc()
+    if port is None:
+        return [Finding("VESC", FAILURE if required else ABSENT, "none found", "its USB cable; docs/wiring.md")]
+    device = Vesc(port, VehicleGains(), DriveLimits())
+    try:
+        device.open()
+    except DeviceBusy as error:
+        return [Finding("VESC", WARNING, str(error), "stop the launch, or close VESC Tool")]
+    except DeviceNotFound as error:
+        denied = os.path.exists(port) and not os.access(port, os.R_OK | os.W_OK)
+        do = permission_cure(_SERIAL_GROUP) if denied else "its USB cable and udev rule (docs/wiring.md)"
+        return [Finding("VESC", FAILURE, str(error), do)]
+    try:
+        return _ask(device, wanted, battery_v)
+    except LinkTimeout as error:
+        return [Finding("VESC", FAILURE, str(error), "motor battery in? right port? VESC Tool disconnected?")]
+    except HardwareError as error:
+        return [Finding("VESC", FAILURE, str(error), "advnerf motor info; then cable and firmware")]
+    finally:
+        device.abandon()
+
+
+def _ask(device: Vesc, wanted: TimeoutSettings, battery_v: float) -> list[Finding]:
+    firmware, values = device.identify(), device.read_values(0.5)
+    rows = [Finding("VESC", OK, f"{firmware} at {device.port}, telemetry {values.generation}")]
+    if values.fault:
+        rows.append(Finding("VESC", WARNING, f"reports a fault: {values.fault_name}", "docs/faults.md says why"))
+    rows.append(_time_out(device, wanted))
+    low = values.v_in < battery_v
+    do = "charge, or connect the motor battery" if low else ""
+    return [*rows, Finding("battery", WARNING if low else OK, f"{values.v_in:.1f} V at the VESC", do)]
+
+
+def _time_out(device: Vesc, wanted: TimeoutSettings) -> Finding:
+    name = "VESC time-out"
+    try:
+        found = device.read_timeout()
+    except (LinkTimeout, ProtocolError) as error:
+        return Finding(name, WARNING, f"this firmware does not tell: {error}", "look at it in VESC Tool")
+    if found.at_least(wanted):
+        return Finding(name, OK, f"{found}; at most {wanted} wanted")
+    do = (
+        f"advnerf motor set-timeout --port {device.port} --timeout-ms {wanted.timeout_ms} "
+        f"--brake-current {wanted.brake_current_a:g}"
+    )
+    return Finding(name, FAILURE, f"{found}, at most {wanted} wanted: the car rolls on when its computer is gone", do)
+
+
+def _running(name: str) -> int | None:
+    """Process id of a program by its name."""
+    for folder in Path("/proc").iterdir():
+        if folder.name.isdigit():
+            try:
+                if (folder / "comm").read_text().strip() == name:
+                    return int(folder.name)
+            except OSError:
+                continue  # it ended while we looked
+    return None
+
+
+def gamepads(required: bool) -> Sequence[Finding]:
+    """Gamepads that the teleop node could read."""
+    found = sorted(Path("/dev/input/by-id").glob("*-event-joystick")) or sorted(Path("/dev/input").glob("js*"))
+    if not found:
+        do = "advnerf teleop with a keyboard; or plug one in (docs/driving.md)"
+        return [Finding("gamepad", WARNING if required else ABSENT, "none", do)]
+    denied = [str(path) for path in found if not os.access(path, os.R_OK)]
+    if denied:
+        return [Finding("gamepad", WARNING, f"no permission for {', '.join(denied)}", permission_cure("input"))]
+    return [Finding("gamepad", OK, ", ".join(map(str, found)))]

@@ -1,0 +1,95 @@
+"""Network: the other host of a launch file, its keys, the viewer's port, systems of the library ``motioncapture``."""
+
+from __future__ import annotations
+
+import errno
+import importlib.util
+import socket
+
+from hardware.mocap.library import SYSTEMS
+from nodes.gateway import GatewayConfig
+from nodes.lab.doctor.check import FAILURE, OK, WARNING, Finding
+from nodes.linking.keys import DRIVE, KeyFolder, require_keys
+from nodes.runtime.errors import SecurityError
+
+_CONNECT_S = 2.0
+
+
+def gateway(config: GatewayConfig) -> list[Finding]:
+    """Keys of this end, and whether the other one, or our own port, is there."""
+    address = config.listen or config.connect or ""
+    rows = _keys(config, address)
+    for port in (config.watch_port, config.drive_port):
+        rows += _own_port(address, port) if config.listen else _other_host(address, port)
+    return rows
+
+
+def _keys(config: GatewayConfig, address: str) -> list[Finding]:
+    store = None if config.keys is None else KeyFolder(config.keys)
+    try:
+        if config.listen:
+            require_keys(address, store)
+        if store is None:
+            return [Finding("keys", OK, f"none, on the loopback address {address}")]
+        store.secret(config.key)
+        if not config.listen:
+            store.public(config.peer_key)
+            return [Finding("keys", OK, f"ours is {config.key}, the other host's {config.peer_key}")]
+        drivers = ", ".join(store.allowed(DRIVE))
+    except (SecurityError, OSError) as error:
+        return [Finding("keys", FAILURE, str(error), "docs/two_hosts.md: advnerf keys new, add, allow")]
+    if not drivers:
+        return [
+            Finding("keys", FAILURE, "nobody may drive over the network", "advnerf keys allow workstation --to drive")
+        ]
+    return [Finding("keys", OK, f"ours is {config.key}; {drivers} may drive")]
+
+
+def _own_port(address: str, port: int) -> list[Finding]:
+    with socket.socket(socket.AF_INET6 if ":" in address else socket.AF_INET, socket.SOCK_STREAM) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((address, port))
+        except OSError as error:
+            mine = error.errno != errno.EADDRNOTAVAIL
+            do = (
+                f"stop what uses it (sudo ss -tlpn 'sport = {port}')"
+                if mine
+                else "ip addr says which addresses this computer has"
+            )
+            return [Finding("network", FAILURE, f"cannot listen on {address}:{port}: {error.strerror}", do)]
+    return [Finding("network", OK, f"TCP {address}:{port} is free")]
+
+
+def _other_host(address: str, port: int) -> list[Finding]:
+    try:
+        socket.create_connection((address, port), timeout=_CONNECT_S).close()
+    except OSError as error:
+        why = error.strerror or str(error) or "no answer"
+        do = "start the launch there; then ping, and its firewall (sudo ufw allow from ... to any port ...)"
+        return [Finding("network", WARNING, f"{address}:{port} does not answer: {why}", do)]
+    return [Finding("network", OK, f"{address}:{port} answers")]
+
+
+def viewer(host: str, port: int) -> list[Finding]:
+    """Whether the viewer can listen."""
+    if importlib.util.find_spec("foxglove") is None:
+        return [Finding("viewer", FAILURE, "foxglove-sdk is missing", "pip install 'advnerf[view]'")]
+    return [] if port == 0 else _own_port(host, port)
+
+
+def mocap_library(system: str, hostname: str) -> list[Finding]:
+    """Whether the library is there and its host can be found."""
+    if importlib.util.find_spec("motioncapture") is None:
+        return [
+            Finding(
+                "VICON", FAILURE, "the library motioncapture is missing", "pip install 'advnerf[mocap]' (Linux on x86)"
+            )
+        ]
+    if system not in SYSTEMS:
+        return [Finding("VICON", FAILURE, f"no system {system}", f"one of {', '.join(SYSTEMS)}")]
+    try:
+        socket.getaddrinfo(hostname, None)
+    except OSError as error:
+        return [Finding("VICON", FAILURE, f"{hostname}: {error.strerror or error}", "its IP address as vicon.hostname")]
+    return [Finding("VICON", OK, f"{system} at {hostname}; the node says what it sees")]

@@ -1,0 +1,80 @@
+"""The map from the colours a scene was learned in to those of the camera that drives through it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from advnerf_core.data.dataset import ImageSet, load_transforms
+from advnerf_core.scene.colour import IDENTITY, ColourMap, fit_colour_map
+from advnerf_core.scene.field import load_scene, save_scene
+from advnerf_core.scene.metrics import psnr
+from advnerf_core.scene.render_field import FieldRenderer
+from nodes.lab.importing.errors import ImportRecordingError
+
+# Where a ray got through, the scene has no colour to compare.
+_LEAST_ALPHA = 0.9
+_LEAST_SEEN = 0.05
+
+
+@dataclass(frozen=True)
+class ColourMatch:
+    """A fitted map.
+
+    Attributes:
+        map: From learned to driving colours.
+        frames: How many frames it was fitted to.
+        before_db: PSNR of the learned colours against the frames [dB].
+        after_db: The same with the map.
+    """
+
+    map: ColourMap
+    frames: int
+    before_db: float
+    after_db: float
+
+
+def match_colours(scene: Path, images: Path, output: Path, most: int) -> ColourMatch:
+    """Fit the map on frames of the driving camera and store it with the scene.
+
+    Args:
+        scene: Scene file.
+        images: ``transforms.json`` of the driving camera, in the scene's world.
+        output: Scene file to write; may be the same.
+        most: At most so many frames, evenly spread.
+
+    Raises:
+        ImportRecordingError: The frames look at nothing of the scene.
+    """
+    listed = load_transforms(images)
+    chosen = np.unique(np.linspace(0, len(listed.frames) - 1, min(most, len(listed.frames))).round().astype(int))
+    frames = listed.with_frames([listed.frames[i] for i in chosen]).load()
+    field, occupied, metadata = load_scene(scene)
+    # A map of an earlier fit must not be mapped again.
+    learned = seen_colours(FieldRenderer.from_file(scene, IDENTITY), frames)
+    inside = np.isfinite(learned).all(axis=-1)
+    if inside.mean() < _LEAST_SEEN:
+        raise ImportRecordingError(
+            f"expected frames that look into the scene of {scene}, got {100 * inside.mean():.1f} % of their pixels inside it; "
+            "are both in one world? make them by one: advnerf scene from-phone-and-car"
+        )
+    found = fit_colour_map(learned[inside], frames.rgb[inside])
+    real = frames.rgb[inside] / np.float32(255.0)
+    match = ColourMatch(found, len(frames.rgb), psnr(learned[inside], real), psnr(found.apply(learned[inside]), real))
+    kept = {key: value for key, value in metadata.items() if key != "scene_hash"}
+    save_scene(output, field, occupied, {**kept, "colour_map": found.to_dict()})
+    return match
+
+
+def seen_colours(renderer: FieldRenderer, views: ImageSet) -> NDArray[np.float32]:
+    """Rendered colours of every view ``[N, H, W, 3]`` in 0..1; NaN where the scene lets the ray through."""
+    images = []
+    for pose, pinhole in zip(views.T_world_from_camera, views.pinholes, strict=True):
+        rgb, _, alpha = renderer.render(pose[None], pinhole)
+        image = rgb[0].numpy().copy()
+        image[alpha[0].numpy() < _LEAST_ALPHA] = np.nan
+        images.append(image)
+    return np.stack(images)

@@ -1,0 +1,253 @@
+"""Images and recordings become data sets: a ``transforms.json`` and a report beside it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from advnerf_core.data.dataset import write_transforms
+from advnerf_core.data.lens import Lens
+from advnerf_core.data.similarity import Similarity, extent
+from advnerf_core.files import write_atomically
+from advnerf_core.geometry import Array, Pinhole, make_transform
+from calibration.phone_and_car import Placed, PlacingConfig, place_in_mocap
+from calibration.structure_from_motion import Model, SfmConfig, Source, reconstruct
+from nodes.lab.importing.driven_bag import CAR_CAMERA, BagConfig, DrivenFrames, take_frames
+from nodes.lab.importing.errors import ImportRecordingError
+from nodes.lab.importing.media import IMAGES, MediaConfig, gather
+from nodes.lab.importing.staging import (
+    COLMAP,
+    REPORT_FILE,
+    TRANSFORMS,
+    TRANSFORMS_CAR,
+    TRANSFORMS_PHONE,
+    build_beside,
+)
+from nodes.runtime.progress import Report
+
+_MEDIA_SHARE = 0.3
+_BOX_PERCENT, _BOX_MARGIN = 0.5, 0.05
+# Against the spread of the x axes: small, so that they decide as soon as the cameras have turned a little.
+_LEVEL_WEIGHT = 0.005
+
+
+@dataclass(frozen=True, eq=False)
+class Imported:
+    """What an import made.
+
+    Attributes:
+        transforms: The ``transforms.json`` files, the one with everything first.
+        report: Facts, as in the report file.
+    """
+
+    transforms: tuple[Path, ...]
+    report: dict[str, Any]
+
+    def moved_to(self, folder: Path) -> Imported:
+        """The same in another folder."""
+        return replace(self, transforms=tuple(folder / path.name for path in self.transforms))
+
+
+def from_media(
+    media: Sequence[Path], output: Path, media_config: MediaConfig, sfm: SfmConfig, extent_m: float, report: Report
+) -> Imported:
+    """Videos and photographs to a data set, upright and centred, in a scale that is only as good as ``extent_m``.
+
+    Args:
+        media: Videos and folders of photographs.
+        output: Folder of the data set; a run that was stopped goes on there.
+        media_config: Which frames.
+        sfm: How they are put together.
+        extent_m: Largest distance between two places the photographs were taken from [m].
+        report: Progress callback.
+    """
+    imported = build_beside(
+        output, media, lambda folder: _from_media(media, folder, media_config, sfm, extent_m, report)
+    )
+    return imported.moved_to(output)
+
+
+def _from_media(
+    media: Sequence[Path], output: Path, media_config: MediaConfig, sfm: SfmConfig, extent_m: float, report: Report
+) -> Imported:
+    sources = gather(media, output, media_config, lambda share, text="": report(_MEDIA_SHARE * share, text))
+    model = _reconstruct(output, sources, sfm, report)
+    similarity = upright(model, extent_m)
+    poses, points = similarity.poses(model.poses), similarity.points(model.points)
+    facts = {
+        "structure_from_motion": model.summary(),
+        "scale": "not metric: the extent was assumed",
+        "extent_m": extent_m,
+    }
+    return _write(output, model, poses, points, facts)
+
+
+def from_bag(
+    bag: Path, output: Path, config: BagConfig, margin_m: float, report: Report, calibration: Path | None = None
+) -> Imported:
+    """Recorded frames with motion-capture poses to a data set; nothing is estimated.
+
+    Args:
+        bag: Bag folder or file.
+        output: Folder of the data set.
+        config: Which frames.
+        margin_m: How far the scene reaches beyond the camera's way [m].
+        report: Progress callback.
+        calibration: The camera's file; None takes the bag's.
+    """
+    imported = build_beside(
+        output, (), lambda folder: _from_bag(bag, folder, config, margin_m, report, calibration), resumes=False
+    )
+    return imported.moved_to(output)
+
+
+def _from_bag(
+    bag: Path, output: Path, config: BagConfig, margin_m: float, report: Report, calibration: Path | None
+) -> Imported:
+    frames = take_frames(bag, output / IMAGES / CAR_CAMERA, config, report, calibration)
+    positions = frames.T_world_from_camera[:, :3, 3]
+    facts = {"bag": str(bag), **_bag_facts(frames), "scale": "metric: motion capture"}
+    reach = np.concatenate([positions - margin_m, positions + margin_m])
+    path = output / TRANSFORMS
+    _write_car(path, frames, {**_box(reach, margin=0.0), "world": "mocap"})
+    return _finish(output, (path,), facts)
+
+
+def from_phone_and_car(
+    media: Sequence[Path], bag: Path, output: Path, media_config: MediaConfig, bag_config: BagConfig, sfm: SfmConfig,
+    placing: PlacingConfig, report: Report, calibration: Path | None = None,
+) -> Imported:  # fmt: skip
+    """Phone media and frames of a driven bag in one model, metric and in the motion-capture world.
+
+    ``transforms.json`` holds all registered images with the model's poses, ``transforms_phone.json`` only the phone's (to learn a
+    scene from), ``transforms_car.json`` all frames of the car with their motion-capture poses (to fit colours and to compare).
+    """
+    imported = build_beside(
+        output, media,
+        lambda folder: _from_phone_and_car(media, bag, folder, media_config, bag_config, sfm, placing, report, calibration),
+    )  # fmt: skip
+    return imported.moved_to(output)
+
+
+def _from_phone_and_car(
+    media: Sequence[Path], bag: Path, output: Path, media_config: MediaConfig, bag_config: BagConfig, sfm: SfmConfig,
+    placing: PlacingConfig, report: Report, calibration: Path | None,
+) -> Imported:  # fmt: skip
+    frames = take_frames(
+        bag, output / IMAGES / CAR_CAMERA, bag_config, lambda share, text="": report(0.1 * share, text), calibration
+    )
+    sources = gather(
+        media, output, media_config, lambda share, text="": report(0.1 + (_MEDIA_SHARE - 0.1) * share, text)
+    )
+    if any(source.camera_id == CAR_CAMERA for source in sources):
+        raise ImportRecordingError(
+            f"expected phone media under another name than {CAR_CAMERA!r}, the driving camera's; rename it"
+        )
+    names = tuple(file.relative_to(output).as_posix() for file in frames.files)
+    camera = frames.calibration
+    car = Source(CAR_CAMERA, names, ordered=True, pinhole=camera.pinhole, lens=Lens(camera.distortion))
+    model = _reconstruct(output, [*sources, car], sfm, report)
+    placed = place_in_mocap(model, dict(zip(names, frames.T_world_from_camera, strict=True)), placing)
+    facts = {
+        "bag": str(bag), **_bag_facts(frames), "structure_from_motion": model.summary(), "placing": placed.summary(),
+        "scale": "metric: motion capture",
+    }  # fmt: skip
+    return _write_joint(output, model, placed, frames, facts)
+
+
+def upright(model: Model, extent_m: float) -> Similarity:
+    """The similarity that makes z point up and puts the middle of the points at the origin.
+
+    Up is where the cameras' own up points in the mean, drawn to what is square to all their x axes: people hold a camera level more
+    exactly than they look straight ahead.
+    """
+    poses = model.poses
+    sideways, up = poses[:, :3, 0], -poses[:, :3, 1].mean(axis=0)
+    up = np.linalg.solve(sideways.T @ sideways / len(poses) + _LEVEL_WEIGHT * np.eye(3), up)
+    up = up / np.linalg.norm(up) if np.linalg.norm(up) > 1e-6 else np.array([0.0, 0.0, 1.0])
+    aside = np.cross([0.0, 1.0, 0.0] if abs(up[1]) < 0.9 else [1.0, 0.0, 0.0], up)
+    x = aside / np.linalg.norm(aside)
+    R = np.stack([x, np.cross(up, x), up])
+    spread = extent(poses[:, :3, 3])
+    if spread <= 0.0:
+        raise ImportRecordingError("expected photographs from different places, got all from one; move, not only turn")
+    scale = extent_m / spread
+    middle = np.median(model.points, axis=0) if len(model.points) else poses[:, :3, 3].mean(axis=0)
+    return Similarity(scale, make_transform(R, -scale * R @ middle))
+
+
+def _reconstruct(output: Path, sources: Sequence[Source], sfm: SfmConfig, report: Report) -> Model:
+    return reconstruct(
+        output, sources, output / COLMAP, sfm, lambda share, text: report(_MEDIA_SHARE + (1.0 - _MEDIA_SHARE) * share, text)
+    )  # fmt: skip
+
+
+def _write(output: Path, model: Model, poses: Array, points: Array, facts: dict[str, Any]) -> Imported:
+    path = output / TRANSFORMS
+    _write_model(path, output, model, poses, range(len(model.images)), _box_of(points, poses))
+    return _finish(output, (path,), facts)
+
+
+def _write_joint(output: Path, model: Model, placed: Placed, frames: DrivenFrames, facts: dict[str, Any]) -> Imported:
+    poses, everything = placed.T_world_from_camera, range(len(model.images))
+    extra = {**_box_of(placed.points, poses), "world": "mocap"}
+    phone = [index for index in everything if model.images[index].camera_id != CAR_CAMERA]
+    if not phone:
+        raise ImportRecordingError(
+            "expected images of the phone in one model with the car's, got none; film at the car's height along its track too"
+        )
+    paths = (output / TRANSFORMS, output / TRANSFORMS_PHONE, output / TRANSFORMS_CAR)
+    _write_model(paths[0], output, model, poses, everything, extra)
+    _write_model(paths[1], output, model, poses, phone, extra)
+    _write_car(paths[2], frames, extra)
+    return _finish(output, paths, facts)
+
+
+def _write_model(
+    path: Path, output: Path, model: Model, poses: Array, chosen: Sequence[int], extra: dict[str, Any]
+) -> None:
+    images = [model.images[index] for index in chosen]
+    write_transforms(
+        path, [output.absolute() / image.name for image in images], poses[list(chosen)],
+        [image.pinhole for image in images], lens=[image.lens for image in images],
+        camera_ids=[image.camera_id for image in images], extra=extra,
+    )  # fmt: skip
+
+
+def _write_car(path: Path, frames: DrivenFrames, extra: dict[str, Any]) -> None:
+    camera, count = frames.calibration, len(frames.files)
+    pinhole: Pinhole = camera.pinhole
+    write_transforms(
+        path, [file.absolute() for file in frames.files], frames.T_world_from_camera, pinhole,
+        lens=Lens(camera.distortion), camera_ids=[CAR_CAMERA] * count, extra=extra,
+    )  # fmt: skip
+
+
+def _bag_facts(frames: DrivenFrames) -> dict[str, Any]:
+    return {
+        "recorded_frames": frames.recorded, "without_pose": frames.without_pose, "taken_frames": len(frames.files),
+        "unchecked": frames.unchecked,
+    }  # fmt: skip
+
+
+def _box_of(points: Array, poses: Array) -> dict[str, Any]:
+    """The box of nearly all points and of all cameras; a few points of every model lie far outside."""
+    ends = np.percentile(points, [_BOX_PERCENT, 100.0 - _BOX_PERCENT], axis=0) if len(points) else np.zeros((0, 3))
+    return _box(np.concatenate([ends, poses[:, :3, 3]]), _BOX_MARGIN)
+
+
+def _box(corners: Array, margin: float) -> dict[str, Any]:
+    """Instant-NGP's way to say which cube the scene is in: its unit cube is ``scale x + offset``."""
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    scale = 1.0 / (float((high - low).max()) * (1.0 + 2.0 * margin))
+    return {"aabb_scale": 1, "scale": scale, "offset": (0.5 - scale * 0.5 * (low + high)).tolist()}
+
+
+def _finish(output: Path, transforms: tuple[Path, ...], facts: dict[str, Any]) -> Imported:
+    write_atomically(output / REPORT_FILE, json.dumps(facts, indent=1) + "\n")
+    return Imported(transforms, facts)

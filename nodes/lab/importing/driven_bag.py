@@ -1,0 +1,185 @@
+"""Frames of a driven bag with the camera's pose at the moment each was taken, by motion capture and calibration."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import yaml
+from pydantic import ValidationError
+
+from advnerf_core.data.image_files import Rgb
+from advnerf_core.data.similarity import rotation_angles
+from advnerf_core.files import write_atomically
+from advnerf_core.geometry import Array
+from calibration.schema import CalibrationError, CameraCalibration, load_calibration
+from nodes.bags.images import image_messages, image_topic
+from nodes.bags.reader import read_attachment, read_info, read_messages
+from nodes.control.pose_buffer import PoseBuffer
+from nodes.lab.importing.errors import ImportRecordingError
+from nodes.runtime.errors import BagError
+from nodes.runtime.messages import decode, pose_matrix, stamp_ns
+from nodes.runtime.pictures import rgb_image
+from nodes.runtime.progress import Report
+from nodes.runtime.topics import topic as topic_row
+
+CAR_TOPIC = "/vicon/car"
+CAR_CAMERA = "car"
+_ATTACHED_CALIBRATION = "camera.yaml"
+_WHOLE_DRIVE_S = 1e6
+
+
+@dataclass(frozen=True)
+class BagConfig:
+    """Which frames of a bag are taken.
+
+    Attributes:
+        step_m: A new frame after the camera has moved so far [m].
+        step_rad: Or turned so far [rad].
+        max_gap_s: Frames in a longer gap of the motion capture have no pose [s].
+        most: At most so many, evenly thinned out.
+    """
+
+    step_m: float = 0.1
+    step_rad: float = 0.087
+    max_gap_s: float = 0.1
+    most: int = 300
+
+
+@dataclass(frozen=True, eq=False)
+class DrivenFrames:
+    """Frames on disk with poses.
+
+    Attributes:
+        files: Image files in order of time.
+        stamps_ns: Capture stamps [ns since 1970].
+        T_world_from_camera: ``[N, 4, 4]`` in the motion-capture world.
+        calibration: The camera.
+        recorded: Frames in the bag.
+        without_pose: Frames that were left out because motion capture had a gap.
+        unchecked: Why the bag may be damaged without a sign of it; empty where checksums cover it.
+    """
+
+    files: tuple[Path, ...]
+    stamps_ns: tuple[int, ...]
+    T_world_from_camera: Array
+    calibration: CameraCalibration
+    recorded: int
+    without_pose: int
+    unchecked: str = ""
+
+
+def take_frames(
+    bag: Path, folder: Path, config: BagConfig, report: Report, calibration: Path | None = None
+) -> DrivenFrames:
+    """Write frames of a bag as PNG files and find their poses.
+
+    Args:
+        bag: Bag folder or file.
+        folder: Where the files go, named by their capture stamps.
+        config: Which frames.
+        report: Told of the progress.
+        calibration: The camera's file; None takes the one that rides along in the bag.
+
+    Raises:
+        BagError: The bag is unfinished or has not the topics.
+        ImportRecordingError: No calibration, another image size than calibrated, no poses for the frames.
+    """
+    camera = _camera(bag, calibration)
+    poses = _car_poses(bag, config)
+    topic = image_topic(bag)
+    stamps = [stamp_ns(message) for message in image_messages(bag, topic)]
+    placed = [(index, stamp, pose.T @ camera.mount) for index, stamp in enumerate(stamps) if (pose := poses.at(stamp))]
+    if not placed:
+        raise ImportRecordingError(
+            f"expected frames of {bag} with poses of {CAR_TOPIC} at their stamps, got {len(stamps)} frames and not one pose in time; "
+            "was the motion capture on, and were both clocks in step?"
+        )
+    chosen = choose_by_motion(np.stack([T for _, _, T in placed]), config)
+    wanted = {placed[i][0]: placed[i] for i in chosen}
+    files = _write_frames(bag, topic, folder, wanted, camera, report)
+    rows = [wanted[index] for index in sorted(wanted)]
+    return DrivenFrames(
+        tuple(files), tuple(stamp for _, stamp, _ in rows), np.stack([T for _, _, T in rows]), camera, len(stamps),
+        len(stamps) - len(placed), read_info(bag).unchecked,
+    )  # fmt: skip
+
+
+def choose_by_motion(T_world_from_camera: Array, config: BagConfig) -> list[int]:
+    """Indices of poses ``[N, 4, 4]`` that are a step apart in place or angle from the one before; at most ``config.most``."""
+    chosen = [0]
+    for index, pose in enumerate(T_world_from_camera):
+        last = T_world_from_camera[chosen[-1]]
+        moved = float(np.linalg.norm(pose[:3, 3] - last[:3, 3]))
+        turned = float(rotation_angles(last[:3, :3].T @ pose[:3, :3]))
+        if moved >= config.step_m or turned >= config.step_rad:
+            chosen.append(index)
+    if len(chosen) <= config.most:
+        return chosen
+    return [chosen[i] for i in np.linspace(0, len(chosen) - 1, config.most).round().astype(int)]
+
+
+def _camera(bag: Path, file: Path | None) -> CameraCalibration:
+    if file is not None:
+        return load_calibration(CameraCalibration, file)
+    try:
+        text = read_attachment(bag, _ATTACHED_CALIBRATION)
+    except BagError as error:
+        raise ImportRecordingError(
+            f"expected the camera's calibration: {error}; give its file with --calibration"
+        ) from error
+    try:
+        return CameraCalibration.model_validate(yaml.safe_load(text))
+    except (yaml.YAMLError, ValidationError) as error:
+        raise CalibrationError(f"{_ATTACHED_CALIBRATION} in {bag}: {' '.join(str(error).split())}") from error
+
+
+def _car_poses(bag: Path, config: BagConfig) -> PoseBuffer:
+    poses = PoseBuffer(keep_s=_WHOLE_DRIVE_S, max_gap_s=config.max_gap_s)
+    for message in read_messages(bag, [CAR_TOPIC]):
+        pose = decode(topic_row(CAR_TOPIC).type, message.cdr)
+        T = pose_matrix(pose)
+        if np.isfinite(T).all():
+            poses.add(stamp_ns(pose), T)
+    return poses
+
+
+def _write_frames(
+    bag: Path,
+    topic: str,
+    folder: Path,
+    wanted: dict[int, tuple[int, int, Array]],
+    camera: CameraCalibration,
+    report: Report,
+) -> list[Path]:
+    folder.mkdir(parents=True, exist_ok=True)
+    total = next((t.count for t in read_info(bag).topics if t.name == topic), 0)
+    files = []
+    for index, message in enumerate(image_messages(bag, topic)):
+        report(index / max(total, 1), f"frame {index + 1} of {total}")
+        if index not in wanted:
+            continue
+        file = folder / f"{wanted[index][1]}.png"
+        if not file.exists():  # whole or not there: it was written under another name first
+            _write_png(file, _rgb(message, camera, f"{topic} in {bag}"))
+        files.append(file)
+    for stranger in set(folder.glob("*.png")) - set(files):
+        stranger.unlink()
+    return files
+
+
+def _rgb(message: Any, camera: CameraCalibration, source: str) -> Rgb:
+    image = rgb_image(message, source)
+    if image.shape[:2] != (camera.height, camera.width):
+        raise ImportRecordingError(
+            f"expected frames of {camera.width} x {camera.height}, as calibrated, got {image.shape[1]} x {image.shape[0]} on {source}; "
+            "give the calibration of this camera with --calibration"
+        )
+    return image
+
+
+def _write_png(file: Path, rgb: Rgb) -> None:
+    write_atomically(file, cv2.imencode(".png", np.ascontiguousarray(rgb[..., ::-1]))[1].tobytes())

@@ -1,0 +1,141 @@
+"""Videos and folders of photographs become one folder of upright images, by camera."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from advnerf_core.data import image_files, video
+from advnerf_core.data.keyframes import KeyframeConfig
+from advnerf_core.files import write_atomically
+from calibration.structure_from_motion import Source
+from nodes.lab.importing.errors import ImportRecordingError
+from nodes.runtime.progress import Report
+
+IMAGES = "images"
+
+
+@dataclass(frozen=True)
+class MediaConfig:
+    """How media become images.
+
+    Attributes:
+        keyframes: How frames of videos are chosen.
+        most: At most so many images of each video or folder.
+        one_camera: Whether all were taken by one camera, with one focal length.
+    """
+
+    keyframes: KeyframeConfig = field(default_factory=KeyframeConfig)
+    most: int = 300
+    one_camera: bool = False
+
+
+def gather(media: Sequence[Path], output: Path, config: MediaConfig, report: Report) -> list[Source]:
+    """Fill ``output/images`` from videos and folders of photographs; what an earlier run finished is left as it is.
+
+    Args:
+        media: Video files, folders of photographs, or single photographs; single ones count as one folder.
+        output: Folder of the data set.
+        config: How.
+        report: Told of the progress.
+
+    Returns:
+        One source for each video or folder, with paths relative to ``output``.
+    """
+    singles = [path for path in media if path.is_file() and path.suffix.lower() in image_files.SUFFIXES]
+    entries: list[tuple[str, list[Path], bool]] = [("photos", singles, False)] if singles else []
+    for path in media:
+        if path in singles:
+            continue
+        if path.is_dir():
+            entries.append((path.resolve().name, photographs_in(path), False))
+        elif path.is_file():
+            entries.append((path.stem, [path], True))
+        else:
+            raise ImportRecordingError(f"expected a video or a folder of photographs, got {path}, which does not exist")
+    sources, names = [], set[str]()
+    for index, (label, files, is_video) in enumerate(entries):
+        name = _unique(label, names)
+        folder = output / IMAGES / name
+        progress = _part_of(report, index, len(entries))
+        if is_video:
+            kept = video.keep_keyframes(files[0], folder, config.keyframes, config.most, progress)
+        else:
+            kept = _copy_photographs(_thinned(files, config.most), folder, progress)
+        images = tuple(path.relative_to(output).as_posix() for path in kept)
+        sources.append(Source("camera" if config.one_camera else name, images, ordered=is_video))
+    return sources
+
+
+def _part_of(report: Report, index: int, parts: int) -> Report:
+    def progress(fraction: float, text: str = "") -> None:
+        report((index + fraction) / parts, text)
+
+    return progress
+
+
+def photographs_in(folder: Path) -> list[Path]:
+    """Image files of a folder, by name; numbers in names count as numbers."""
+    files = [path for path in folder.iterdir() if path.suffix.lower() in image_files.SUFFIXES and path.is_file()]
+    if not files:
+        raise ImportRecordingError(
+            f"expected photographs ({', '.join(image_files.SUFFIXES)}) in {folder}, got none; give the folder that holds them"
+        )
+    return sorted(
+        files, key=lambda path: [(int(p), "") if p.isdigit() else (-1, p) for p in re.split(r"(\d+)", path.name)]
+    )
+
+
+def _unique(label: str, taken: set[str]) -> str:
+    # Spaces would break the list of pairs that is handed to COLMAP.
+    base = re.sub(r"[^A-Za-z0-9_-]+", "_", label).strip("_") or "camera"
+    name, number = base, 2
+    while name in taken:
+        name, number = f"{base}_{number}", number + 1
+    taken.add(name)
+    return name
+
+
+def _thinned(files: list[Path], most: int) -> list[Path]:
+    if len(files) <= most:
+        return files
+    return [files[i] for i in np.linspace(0, len(files) - 1, most).round().astype(int)]
+
+
+def _copy_photographs(files: Sequence[Path], folder: Path, report: Report) -> list[Path]:
+    folder.mkdir(parents=True, exist_ok=True)
+    copies, names = [], set[str]()
+    for index, file in enumerate(files):
+        suffix = file.suffix.lower()
+        copy = folder / f"{_unique(file.stem, names)}{suffix}"
+        if not (copy.exists() and copy.stat().st_mtime_ns >= file.stat().st_mtime_ns):
+            _copy(file, copy)
+        copies.append(copy)
+        report((index + 1) / len(files), f"{index + 1} of {len(files)} photographs copied")
+    for stranger in set(folder.iterdir()) - set(copies):  # of an earlier run with other photographs
+        stranger.unlink() if stranger.is_file() else shutil.rmtree(stranger)
+    return copies
+
+
+def _copy(file: Path, copy: Path) -> None:
+    """A copy that is whole, readable, and upright for readers that do not know EXIF too."""
+    data = image_files.read_bytes(file)
+    image_files.read_image(file)  # a damaged one is an error that names it
+    if data.startswith(b"\xff\xd8") and b"Exif" in data[:65536]:
+        raw = np.frombuffer(data, np.uint8)
+        as_stored = cv2.imdecode(raw, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+        upright = cv2.imdecode(raw, cv2.IMREAD_COLOR)
+        if as_stored is not None and upright is not None and not np.array_equal(as_stored, upright):
+            turned = cv2.imencode(".jpg", upright, [cv2.IMWRITE_JPEG_QUALITY, video.JPEG_QUALITY])[1].tobytes()
+            # The camera and its focal length are in the EXIF data, and structure from motion wants them.
+            data = turned[:2] + image_files.upright_exif(data) + turned[2:]
+    write_atomically(copy, data)
+    now = file.stat()
+    os.utime(copy, ns=(now.st_atime_ns, max(now.st_mtime_ns, copy.stat().st_mtime_ns)))

@@ -1,0 +1,28 @@
+"""Whether a policy's view was made for the camera that it is to see through."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from advnerf_core.policies.view import PolicyView
+from calibration.schema import CameraCalibration
+from nodes.runtime.errors import ConfigError
+
+_TOLERANCE_PX = 1e-6
+
+
+def require_camera(view: PolicyView, camera: CameraCalibration, policy: str, file: Path) -> None:
+    """Refuse a policy that was made for another camera than the one calibrated in ``file``.
+
+    Raises:
+        ConfigError: Image size or intrinsics differ.
+    """
+    trained, mounted = view.camera, camera.pinhole
+    same_size = (trained.width, trained.height) == (mounted.width, mounted.height)
+    if not same_size or np.abs(trained.matrix - mounted.matrix).max() > _TOLERANCE_PX:
+        raise ConfigError(
+            f"{file}: expected the camera that the policy {policy} was trained with, {trained}, got {mounted}; use its "
+            "calibration, or train the policy again"
+        )

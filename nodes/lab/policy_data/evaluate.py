@@ -1,0 +1,160 @@
+"""How well a policy predicts a recording: error table, curve, and where in the image its steering comes from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from advnerf_core.files import write_atomically
+from nodes.lab.policy_data.frames import Recording
+from nodes.runtime.clock import NS_PER_S
+from nodes.runtime.errors import ConfigError
+
+_BATCH = 64
+_VIDEO_SCALE = 4
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Predicted minus true steering.
+
+    Attributes:
+        count: Frames compared.
+        mean_abs_rad: Mean absolute error [rad].
+        rms_rad: Root mean square error [rad].
+        worst_rad: Largest absolute error [rad].
+        bias_rad: Mean error; positive steers further left [rad].
+        correlation: Pearson's, NaN where one side is constant.
+        zero_rad: Mean absolute error of always steering straight on, to compare with [rad].
+    """
+
+    count: int
+    mean_abs_rad: float
+    rms_rad: float
+    worst_rad: float
+    bias_rad: float
+    correlation: float
+    zero_rad: float
+
+
+def compare(predicted_rad: NDArray[np.floating[Any]], true_rad: NDArray[np.floating[Any]]) -> Errors:
+    """Errors over the frames where both are known."""
+    known = np.isfinite(predicted_rad) & np.isfinite(true_rad)
+    predicted, true = np.asarray(predicted_rad, float)[known], np.asarray(true_rad, float)[known]
+    if not len(true):
+        raise ConfigError("expected frames with a steering angle to compare with, got none")
+    error = predicted - true
+    varies = predicted.std() > 0.0 and true.std() > 0.0
+    return Errors(
+        len(true), float(np.abs(error).mean()), float(np.sqrt((error**2).mean())), float(np.abs(error).max()),
+        float(error.mean()), float(np.corrcoef(predicted, true)[0, 1]) if varies else float("nan"),
+        float(np.abs(true).mean()),
+    )  # fmt: skip
+
+
+def predict(policy: Any, images: NDArray[np.uint8], goal: tuple[float, ...] = ()) -> NDArray[np.float64]:
+    """Steering ``[N]`` [rad] of a loaded policy on policy images ``[N, H, W, 3]`` uint8."""
+    parts = []
+    with torch.no_grad():
+        for start in range(0, len(images), _BATCH):
+            parts.append(_steer(policy, _tensor(images[start : start + _BATCH]), goal).double().numpy())
+    return np.concatenate(parts)
+
+
+def saliency(policy: Any, images: NDArray[np.uint8], goal: tuple[float, ...] = ()) -> NDArray[np.float32]:
+    """Share ``[N, H, W]`` in 0..1 of each pixel: absolute gradient of the steering, summed over colours, smoothed.
+
+    Gradient saliency after Simonyan et al., "Deep Inside Convolutional Networks", 2014, with a blur of 1.5 px.
+    """
+    maps = []
+    for start in range(0, len(images), _BATCH):
+        batch = _tensor(images[start : start + _BATCH]).requires_grad_(True)
+        (gradient,) = torch.autograd.grad(_steer(policy, batch, goal).sum(), batch)
+        for one in gradient.abs().sum(1).numpy():
+            smooth = cv2.GaussianBlur(one, (0, 0), 1.5)
+            maps.append(smooth / max(float(smooth.max()), 1e-12))
+    return np.stack(maps).astype(np.float32)
+
+
+def overlay(image: NDArray[np.uint8], share: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """The image with its saliency in red, ``[H, W, 3]`` uint8 RGB."""
+    grey = cv2.cvtColor(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), cv2.COLOR_GRAY2RGB).astype(np.float32)
+    red = np.array([255.0, 40.0, 0.0], np.float32)
+    return np.asarray(grey + share[..., None] * (red - grey), dtype=np.float32).round().astype(np.uint8)
+
+
+def draw(recording: Recording, predicted_rad: NDArray[np.float64], title: str, out: Path) -> None:
+    """Predicted, recorded and labelled steering over time, as PNG."""
+    import io
+
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(10, 4), layout="constrained")
+    axes, scatter = figure.subplots(1, 2, width_ratios=[2, 1])
+    time_s = (recording.stamps_ns - recording.stamps_ns[0]) / NS_PER_S
+    if recording.stamps_ns[0] == 0:
+        time_s = recording.stamps_ns.astype(float)
+    labels = np.asarray(recording.frames.steering_rad)
+    axes.plot(time_s, recording.recorded_rad, color="0.6", lw=1, label="recorded")
+    axes.plot(time_s, labels, color="C0", lw=1, label="label")
+    axes.plot(time_s, predicted_rad, color="C3", lw=1, label="predicted")
+    axes.set(xlabel="frame" if recording.stamps_ns[0] == 0 else "time [s]", ylabel="steering, left positive [rad]")
+    axes.set_title(title, fontsize=9)
+    axes.legend(fontsize=8)
+    scatter.plot(labels, predicted_rad, ".", ms=2, color="C3")
+    low, high = float(min(labels.min(), predicted_rad.min())), float(max(labels.max(), predicted_rad.max()))
+    scatter.plot([low, high], [low, high], color="0.6", lw=1)
+    scatter.set(xlabel="label [rad]", ylabel="predicted [rad]")
+    picture = io.BytesIO()
+    figure.savefig(picture, format="png", dpi=110)
+    write_atomically(out, picture.getvalue())
+
+
+def write_saliency(
+    policy: Any, recording: Recording, out: Path, count: int, video: bool, goal: tuple[float, ...] = ()
+) -> list[Path]:
+    """PNG files of ``count`` frames spread over the recording, image above saliency; with ``video`` an MP4 of all frames."""
+    images = recording.frames.images
+    chosen = np.unique(np.linspace(0, len(images) - 1, min(count, len(images))).round().astype(int))
+    out.mkdir(parents=True, exist_ok=True)
+    files = []
+    for index, share in zip(chosen, saliency(policy, images[chosen], goal), strict=True) if len(chosen) else ():
+        both = np.concatenate([images[index], overlay(images[index], share)])
+        files.append(out / f"saliency_{index:05d}.png")
+        write_atomically(files[-1], cv2.imencode(".png", both[..., ::-1])[1].tobytes())
+    if video:
+        files.append(_write_video(policy, images, out / "saliency.mp4", goal))
+    return files
+
+
+def _write_video(policy: Any, images: NDArray[np.uint8], path: Path, goal: tuple[float, ...]) -> Path:
+    height, width = images.shape[1] * 2, images.shape[2]
+    partial = path.with_name(f".{path.stem}.partial.mp4")
+    size = (width * _VIDEO_SCALE, height * _VIDEO_SCALE)
+    writer = cv2.VideoWriter(str(partial), cv2.VideoWriter.fourcc(*"mp4v"), 10.0, size)
+    if not writer.isOpened():
+        raise ConfigError(f"this OpenCV cannot write {path}; leave --video out, the PNG files are there")
+    for start in range(0, len(images), _BATCH):
+        batch = images[start : start + _BATCH]
+        for image, share in zip(batch, saliency(policy, batch, goal), strict=True):
+            both = np.concatenate([image, overlay(image, share)])
+            writer.write(cv2.resize(both, size, interpolation=cv2.INTER_NEAREST)[..., ::-1])
+    writer.release()
+    partial.replace(path)
+    return path
+
+
+def _tensor(images: NDArray[np.uint8]) -> torch.Tensor:
+    return torch.from_numpy(np.array(images)).permute(0, 3, 1, 2).float() / 255.0
+
+
+def _steer(policy: Any, images: torch.Tensor, goal: tuple[float, ...]) -> torch.Tensor:
+    goals = torch.tensor(goal).expand(len(images), -1) if goal else None
+    result: torch.Tensor = policy(images, goals)
+    return result

@@ -1,0 +1,250 @@
+"""Training frames from recordings: images joined with steering by capture stamp.
+
+Of a bag, only what was captured while the car was armed counts. The label is what the expert would steer at the measured pose
+(which makes every bag with poses a DAgger round, whoever drove), or what was sent to the motor controller. A disturbance that
+the expert added to its own steering is in neither place: it is not in the expert's law, and `recorded` leaves such frames out.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from bisect import bisect_left
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+
+from advnerf_core.driving.expert import Expert
+from advnerf_core.geometry import Pinhole, yaw_of
+from advnerf_core.learning.frames import Frames
+from advnerf_core.policies.view import PolicyView
+from nodes.bags.images import CAMERA_TOPICS, image_messages, image_topic
+from nodes.bags.reader import read_info, read_messages
+from nodes.control.pose_buffer import PoseBuffer
+from nodes.runtime.clock import NS_PER_S
+from nodes.runtime.errors import BagError, ConfigError
+from nodes.runtime.messages import decode, ns_from_stamp, pose_matrix
+from nodes.runtime.pictures import rgb_image
+from nodes.runtime.topics import topic as topic_row
+
+Labels = Literal["expert", "recorded"]
+_CAR, _SAFETY, _SENT, _EXPERT = "/vicon/car", "/safety/state", "/motor/sent", "/expert/state"
+_IMAGES = ("/compositor/image", *CAMERA_TOPICS)
+_JOIN_S = 0.12
+_GIVE_UP_M = 0.7
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """Frames with their stamps.
+
+    Attributes:
+        frames: Images, states (NaN where none was measured) and labels.
+        stamps_ns: Capture stamps ``[N]`` [ns]; row numbers for a log without any.
+        recorded_rad: Steering ``[N]`` that was sent [rad]; NaN where none was.
+        name: Where it comes from.
+        counts: Images that were left out, by reason.
+    """
+
+    frames: Frames
+    stamps_ns: np.ndarray[Any, np.dtype[np.int64]]
+    recorded_rad: np.ndarray[Any, np.dtype[np.float64]]
+    name: str
+    counts: dict[str, int]
+
+
+@dataclass
+class _Track:
+    """Everything of a bag that images are joined with."""
+
+    poses: PoseBuffer = field(default_factory=lambda: PoseBuffer(keep_s=1e6))
+    armed: list[tuple[int, bool]] = field(default_factory=list)
+    sent: list[tuple[int, float]] = field(default_factory=list)
+    disturbed: list[tuple[int, bool]] = field(default_factory=list)
+
+    def is_armed(self, stamp_ns: int) -> bool:
+        """Whether the car was armed; a bag without the safety node's word is taken as driven throughout."""
+        return not self.armed or bool(_last(self.armed, stamp_ns))
+
+    def is_disturbed(self, stamp_ns: int) -> bool:
+        return bool(self.disturbed) and bool(_last(self.disturbed, stamp_ns))
+
+    def steering_rad(self, stamp_ns: int) -> float:
+        """Steering that was sent for an image: by its stamp, or the first one written after it."""
+        index = bisect_left(self.sent, (stamp_ns, -math.inf))
+        if index == len(self.sent) or self.sent[index][0] - stamp_ns > _JOIN_S * NS_PER_S:
+            return math.nan
+        return self.sent[index][1]
+
+
+def frames_of_bag(
+    bag: Path, view: PolicyView, expert: Expert | None, labels: Labels = "expert", images_on: str | None = None
+) -> Recording:
+    """Frames of a driven bag.
+
+    Args:
+        bag: Bag folder or file.
+        view: How camera images become policy images.
+        expert: The teacher, at the policy's delay; may be None for recorded labels.
+        labels: Where they come from.
+        images_on: Topic of the images, raw or compressed; None takes the compositor's if there are any, else the camera's.
+    """
+    counts_of = {topic.name: topic.count for topic in read_info(bag).topics}
+    topic = image_topic(bag, [images_on] if images_on else _IMAGES)
+    if labels == "expert" and (expert is None or not counts_of.get(_CAR)):
+        raise BagError(f"expected poses on {_CAR} in {bag} for the expert's labels, got none; use --labels recorded")
+    track = _read_track(bag, [t for t in (_CAR, _SAFETY, _SENT, _EXPERT) if counts_of.get(t)])
+    counts = dict.fromkeys(("not armed", "no pose", "no command", "disturbed", "too far from the path"), 0)
+    images, states, steering, recorded, stamps = [], [], [], [], []
+    for image in image_messages(bag, topic):
+        stamp_ns = ns_from_stamp(image.header.stamp)
+        sent_rad = track.steering_rad(stamp_ns)
+        state, why = _usable(track, stamp_ns, sent_rad, expert, labels)
+        if why:
+            counts[why] += 1
+            continue
+        rgb = rgb_image(image, f"{topic} in {bag}")
+        _require_size(rgb, view, str(bag))
+        images.append(view.image(rgb))
+        states.append(state)
+        recorded.append(sent_rad)
+        stamps.append(stamp_ns)
+        steering.append(sent_rad if labels == "recorded" or expert is None else float(expert.steer(*state)))
+    if len(images) < 4:
+        why = ", ".join(f"{count} {reason}" for reason, count in counts.items() if count)
+        raise BagError(f"expected at least 4 usable frames in {bag}, got {len(images)} ({why or 'no images at all'})")
+    return _recording(images, states, steering, recorded, stamps, str(bag), counts)
+
+
+def frames_of_log(
+    log: Path, view: PolicyView | None, image_column: str, steering_column: str, rad_per_unit: float = 1.0
+) -> tuple[Recording, PolicyView]:
+    """Frames of a foreign log: a CSV file with a header, one row per image; images lie relative to the file.
+
+    Args:
+        log: The CSV file.
+        view: How its images become policy images; None takes the same part of the picture as for our own camera.
+        image_column: Name of the column with image files.
+        steering_column: Name of the column with the steering.
+        rad_per_unit: Factor from that column to radians, left positive (negative for logs that steer right).
+    """
+    images, steering = [], []
+    for number, row in enumerate(_rows(log, (image_column, steering_column)), start=2):
+        picture = cv2.imread(str(log.parent / row[image_column].strip()), cv2.IMREAD_COLOR)
+        if picture is None:
+            raise ConfigError(f"{log}:{number}: expected an image, got {row[image_column]!r}, which cannot be read")
+        try:
+            angle_rad = float(row[steering_column]) * rad_per_unit
+        except ValueError:
+            angle_rad = math.nan
+        if not abs(angle_rad) < 1.0:
+            raise ConfigError(
+                f"{log}:{number}: expected a steering angle below 1 rad, got {row[steering_column]!r} times {rad_per_unit:g};"
+                " give the factor from the log's unit to radians with --log-scale"
+            )
+        rgb = np.ascontiguousarray(picture[..., ::-1], dtype=np.uint8)
+        view = view or view_for_size(rgb.shape[1], rgb.shape[0])
+        _require_size(rgb, view, str(log))
+        images.append(view.image(rgb))
+        steering.append(angle_rad)
+    if len(images) < 4 or view is None:
+        raise ConfigError(f"expected at least 4 rows in {log}, got {len(images)}")
+    nowhere = [(math.nan,) * 3] * len(images)
+    return _recording(images, nowhere, steering, steering, list(range(len(images))), str(log), {}), view
+
+
+def view_for_size(width: int, height: int) -> PolicyView:
+    """View of a camera of which only the image size is known: the same share of the picture as for our own camera."""
+    camera = Pinhole(width, height, 0.52 * width, 0.52 * width, 0.5 * width, 0.5 * height)
+    return PolicyView(camera, round(height * 24 / 188), round(height * 111 / 188))
+
+
+def first_image(log: Path, image_column: str) -> Path:
+    """The first image of a foreign log."""
+    for row in _rows(log, (image_column,)):
+        return log.parent / row[image_column].strip()
+    raise ConfigError(f"expected at least 4 rows in {log}, got none")
+
+
+def _rows(log: Path, columns: tuple[str, ...]) -> Iterator[dict[str, str]]:
+    try:
+        with open(log, newline="", encoding="utf-8") as file:
+            reader = csv.DictReader(file, strict=True)
+            missing = [name for name in columns if name not in (reader.fieldnames or ())]
+            if missing:
+                raise ConfigError(
+                    f"expected columns {', '.join(columns)} in {log}, got {', '.join(reader.fieldnames or ()) or 'an empty file'}"
+                )
+            for row in reader:
+                if any(row[name] is None for name in columns):
+                    raise ConfigError(
+                        f"{log}:{reader.line_num}: expected {len(columns)} columns and more, got a short row"
+                    )
+                yield row
+    except (OSError, csv.Error, UnicodeDecodeError) as error:
+        raise ConfigError(f"expected a CSV file at {log}, got {error}") from error
+
+
+def _read_track(bag: Path, topics: list[str]) -> _Track:
+    track = _Track()
+    for message in read_messages(bag, topics) if topics else ():
+        decoded = decode(topic_row(message.topic).type, message.cdr)
+        stamp_ns = ns_from_stamp(decoded.header.stamp)
+        if message.topic == _CAR:
+            track.poses.add(stamp_ns, pose_matrix(decoded))
+        elif message.topic == _SAFETY:
+            track.armed.append((stamp_ns, bool(decoded.armed)))
+        elif message.topic == _EXPERT:
+            track.disturbed.append((stamp_ns, decoded.disturbance_rad != 0.0))
+        elif not decoded.braking:
+            # In a policy's drive the stamp is that of the image; in an expert's that of a pose just after it.
+            track.sent.append((stamp_ns, float(decoded.steering_rad)))
+    for stream in (track.armed, track.sent, track.disturbed):
+        stream.sort()
+    return track
+
+
+def _usable(
+    track: _Track, stamp_ns: int, sent_rad: float, expert: Expert | None, labels: Labels
+) -> tuple[tuple[float, float, float], str]:
+    nowhere = (math.nan, math.nan, math.nan)
+    if not track.is_armed(stamp_ns):
+        return nowhere, "not armed"
+    if labels == "recorded" and math.isnan(sent_rad):
+        return nowhere, "no command"
+    if labels == "recorded" and track.is_disturbed(stamp_ns):
+        return nowhere, "disturbed"
+    pose = track.poses.at(stamp_ns, 0.0)
+    if pose is None:
+        return nowhere, "no pose" if labels == "expert" else ""
+    state = (float(pose.T[0, 3]), float(pose.T[1, 3]), yaw_of(pose.T))
+    far = expert is not None and abs(float(expert.path.project(np.array(state[:2])).cte_m)) > _GIVE_UP_M
+    return state, "too far from the path" if far else ""
+
+
+def _recording(
+    images: Any, states: Any, steering: Any, recorded: Any, stamps: Any, name: str, counts: Any
+) -> Recording:
+    count = len(images)
+    frames = Frames(
+        np.stack(images), np.array(states, dtype=np.float64), np.array(steering, dtype=np.float32),
+        np.zeros((count, 0), np.float32), np.zeros(count, bool),
+    )  # fmt: skip
+    return Recording(frames, np.array(stamps, np.int64), np.array(recorded, np.float64), name, counts)
+
+
+def _require_size(rgb: Any, view: PolicyView, source: str) -> None:
+    if rgb.shape[:2] != (view.camera.height, view.camera.width):
+        raise ConfigError(
+            f"expected images of {view.camera.width} x {view.camera.height} in {source}, got {rgb.shape[1]} x {rgb.shape[0]};"
+            " give the calibration of its camera with --camera"
+        )
+
+
+def _last(stream: list[tuple[int, bool]], stamp_ns: int) -> bool:
+    index = bisect_left(stream, (stamp_ns + 1,)) - 1
+    return stream[index][1] if index >= 0 else False

@@ -1,0 +1,147 @@
+"""A policy from recordings: frames are cut once, training goes on where it was killed, the result appears whole."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from advnerf_core.driving.expert import Expert
+from advnerf_core.files import write_atomically
+from advnerf_core.learning.fit import FitConfig, fit, mean_absolute_error
+from advnerf_core.learning.frames import FrameSet, FrameStore
+from advnerf_core.learning.imitation import ImitationConfig, Progress, SourcePlan, train_policy
+from advnerf_core.policies.pilotnet import PilotNet, save_policy
+from advnerf_core.policies.view import PolicyView
+from nodes.lab.policy_data.frames import Recording
+
+POLICY = "policy.safetensors"
+
+
+@dataclass(frozen=True)
+class Part:
+    """One recording that is trained on.
+
+    Attributes:
+        name: For people and for the policy's metadata.
+        files: What it is made of; other sizes or times make it another recording.
+        options: How it is cut and labelled.
+        cut: Makes its frames.
+        unchecked: Why its messages may be damaged without a sign of it; empty where checksums cover them.
+    """
+
+    name: str
+    files: tuple[Path, ...]
+    options: dict[str, Any]
+    cut: Callable[[], Recording]
+    unchecked: str = ""
+
+    @property
+    def digest(self) -> str:
+        """Changes with the content of the recording, and with how it is cut."""
+        files = [(file.name, file.stat().st_size, file.stat().st_mtime_ns) for file in self.files]
+        return _digest([self.name, files, self.options])
+
+
+@dataclass(frozen=True)
+class Training:
+    """What came out.
+
+    Attributes:
+        path: Policy file.
+        sha256: Its hash.
+        validation_mae_rad: Mean absolute steering error on held-out frames [rad].
+        frames: Frames of each recording, and of the surrogate.
+        left_out: Images of each recording that were not used, by reason.
+        unchecked: Recordings that no checksum covers, and why.
+    """
+
+    path: Path
+    sha256: str
+    validation_mae_rad: float
+    frames: dict[str, int]
+    left_out: dict[str, dict[str, int]]
+    unchecked: dict[str, str]
+
+
+def train_from_recordings(
+    parts: Sequence[Part], view: PolicyView, expert: Expert, config: ImitationConfig, out: Path,
+    surrogate: SourcePlan | None = None, progress: Progress | None = None,
+) -> Training:  # fmt: skip
+    """Train on recordings, and on the surrogate if there is one; writes ``policy.safetensors`` into ``out``.
+
+    Frames and checkpoints lie in ``out/work/<digest of everything>``: the same call again goes on, or returns at once; other
+    recordings or settings begin anew, and the work of before is removed when they are through.
+    """
+    claim = {
+        "parts": {part.name: part.digest for part in parts}, "view": view.to_dict(), "expert": expert.to_dict(),
+        "config": asdict(config),
+        "surrogate": None if surrogate is None else [surrogate.source.name, surrogate.stills, surrogate.drives],
+    }  # fmt: skip
+    work = out / "work" / _digest(claim)
+    report = progress or (lambda share, text: None)
+    store = FrameStore(work / "frames")
+    left_out = {part.name: _cut(part, store, work, report) for part in parts}
+    if surrogate is None:
+        sha256, mae = _clone(store, view, expert, config, work, {"recordings": claim["parts"]}, report)
+    else:
+        trained = train_policy(config, [surrogate], expert, view, work, report)
+        sha256, mae = trained.sha256, trained.validation_mae_rad
+    write_atomically(out / POLICY, (work / POLICY).read_bytes())
+    frames = {name: len(store.load(name)) for name in store.names()}
+    named = {part.name: frames.pop(_shard(part)) for part in parts}
+    unchecked = {part.name: part.unchecked for part in parts if part.unchecked}
+    result = Training(out / POLICY, sha256, mae, {**named, **frames}, left_out, unchecked)
+    summary = {**asdict(result), "path": POLICY, "settings": claim}
+    write_atomically(out / "policy.json", json.dumps(summary, indent=1) + "\n")
+    for old in (out / "work").iterdir():
+        if old != work:
+            shutil.rmtree(old, ignore_errors=True)
+    return result
+
+
+def _cut(part: Part, store: FrameStore, work: Path, report: Progress) -> dict[str, int]:
+    """Cut a recording into a shard, once; returns what was left out."""
+    record = work / f"{_shard(part)}.json"
+    if _shard(part) not in store.names() or not record.is_file():
+        report(0.0, f"cutting {part.name}")
+        shutil.rmtree(store.folder / _shard(part), ignore_errors=True)
+        recording = part.cut()
+        write_atomically(record, json.dumps(recording.counts) + "\n")
+        store.append(_shard(part), recording.frames)
+    return {reason: int(count) for reason, count in json.loads(record.read_text()).items()}
+
+
+def _clone(
+    store: FrameStore, view: PolicyView, expert: Expert, config: ImitationConfig, work: Path, metadata: dict[str, Any],
+    report: Progress,
+) -> tuple[str, float]:  # fmt: skip
+    torch.manual_seed(config.seed)
+    policy = PilotNet(0, config.max_steering_rad, config.hidden)
+    frames = FrameSet([store.load(name) for name in store.names()], True, config.holdout_every)
+    settings = FitConfig(
+        steps=config.first_steps, batch_size=config.batch_size, learning_rate=config.learning_rate, seed=config.seed,
+        augment=config.augment,
+    )  # fmt: skip
+
+    def tell(step: int, loss: float) -> None:
+        report(step / config.first_steps, f"training: step {step}/{config.first_steps}, error {loss**0.5:.3f} rad")
+
+    fit(policy, frames, settings, work / "clone.checkpoint.safetensors", tell)
+    mae = mean_absolute_error(policy, frames)
+    details = {**metadata, "settings": asdict(config), "expert": expert.to_dict(), "validation_mae_rad": mae}
+    return save_policy(work / POLICY, policy, view, details), mae
+
+
+def _shard(part: Part) -> str:
+    return f"recording-{part.digest}"
+
+
+def _digest(data: Any) -> str:
+    return hashlib.sha256(json.dumps(data, sort_keys=True, default=str).encode()).hexdigest()[:16]

@@ -1,0 +1,232 @@
+"""Reference frames for the conformance test: camera images with what the expert would steer there."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from advnerf_core.data.dataset import load_image, load_transforms
+from advnerf_core.driving.clean_drive import CleanDrive
+from advnerf_core.driving.expert import Expert
+from advnerf_core.geometry import invert_transform, yaw_of
+from advnerf_core.policies.adapter import AdaptedPolicy
+from advnerf_core.policies.conformance import FAILURE, OK, WARNING, Finding, Verdict
+from advnerf_core.policies.pilotnet import images_to_tensor
+from advnerf_core.policies.view import PolicyView
+from calibration.schema import CameraCalibration, RoomCalibration, VehicleCalibration, load_calibration
+from nodes.bags.images import image_messages, image_topic
+from nodes.bags.reader import read_info, read_messages
+from nodes.control.pose_buffer import PoseBuffer
+from nodes.lab.policy_camera import require_camera
+from nodes.lab.policy_drive import See, drive_round
+from nodes.runtime.errors import BagError, ConfigError
+from nodes.runtime.messages import decode, pose_matrix, stamp_ns
+from nodes.runtime.pictures import rgb_image
+from nodes.runtime.topics import topic as topic_row
+
+_CAR = "/vicon/car"
+_LATERAL_M, _HEADING_RAD = 0.15, 0.2
+_FEWEST = 4
+
+Drives = Callable[[Any, tuple[float, ...]], CleanDrive]
+"""Drives a policy with a goal where a reference is from, without an attack."""
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """Frames of which the right steering is known.
+
+    Attributes:
+        images: Policy images ``[N, H, W, 3]`` uint8 RGB.
+        steering_rad: The expert's steering ``[N]`` [rad], left positive.
+        source: Where they come from, for people.
+        drives: Drives a policy without an attack where the frames are from; None if that cannot be driven, as a bag cannot.
+        asked: Whether the user named this place: a policy that does not drive there fails.
+    """
+
+    images: NDArray[np.uint8]
+    steering_rad: NDArray[np.float64]
+    source: str
+    drives: Drives | None = None
+    asked: bool = False
+
+
+def from_twin(view: PolicyView, count: int = 48, seed: int = 0) -> Reference:
+    """Frames of the simulated lab around its path; needs no recording."""
+    os.environ.setdefault("MUJOCO_GL", "egl")
+    from hardware.worlds.lab.config import LabConfig
+    from hardware.worlds.lab.lab import Lab
+
+    expert = Expert(load_calibration(RoomCalibration, _twin_calibration() / "room.yaml").reference_path)
+    poses = _about_the_path(expert, count, seed)
+
+    def frame(lab: Lab, x_m: float, y_m: float, yaw_rad: float) -> NDArray[np.uint8]:
+        return _seen(view, lab.observe_at(x_m, y_m, yaw_rad, depth=False)[0], "the simulated lab")
+
+    def drives(policy: Any, goal: tuple[float, ...]) -> CleanDrive:
+        with Lab(LabConfig()) as lab:
+
+            def see(states: torch.Tensor) -> torch.Tensor:
+                return images_to_tensor(np.stack([frame(lab, *state) for state in states[:, :3].tolist()]))
+
+            return _drives(see, _twin_calibration())(policy, goal)
+
+    with Lab(LabConfig()) as lab:
+        images = np.stack([frame(lab, *pose) for pose in poses.tolist()])
+    source = f"{count} frames of the simulated lab"
+    return Reference(images, np.asarray(expert.steer_states(poses)), source, drives)
+
+
+def from_bag(bag: Path, room: Path, view: PolicyView, count: int = 96) -> Reference:
+    """Frames of a driven bag, spread over it, labelled by the expert at the recorded poses."""
+    poses = PoseBuffer(keep_s=1e6)
+    for message in read_messages(bag, [_CAR]):
+        pose = decode(topic_row(_CAR).type, message.cdr)
+        poses.add(stamp_ns(pose), pose_matrix(pose))
+    topic = image_topic(bag)
+    recorded = next(row.count for row in read_info(bag).topics if row.name == topic)
+    wanted = set(np.linspace(0, recorded - 1, min(count, recorded)).astype(int).tolist())
+    expert = Expert(load_calibration(RoomCalibration, room).reference_path)
+    images, steering = [], []
+    for number, image in enumerate(image_messages(bag, topic)):
+        if number not in wanted:
+            continue
+        found = poses.at(stamp_ns(image), 0.0)
+        if found is None:
+            continue
+        T = found.T
+        images.append(_seen(view, rgb_image(image, f"{topic} in {bag}"), str(bag)))
+        steering.append(float(expert.steer(T[0, 3], T[1, 3], np.arctan2(T[1, 0], T[0, 0]))))
+    if len(images) < _FEWEST or np.ptp(steering) == 0.0:
+        raise BagError(
+            f"expected at least {_FEWEST} frames with poses and varying steering in {bag}, got {len(images)}; drive further"
+        )
+    unchecked = ", unchecked" if read_info(bag).unchecked else ""
+    return Reference(np.stack(images), np.array(steering), f"{len(images)} frames of {bag}{unchecked}", asked=True)
+
+
+def from_run(folder: Path, view: PolicyView) -> Reference:
+    """The driving camera's own frames of an experiment's capture, and drives in the scene that it learned.
+
+    The frames are whole camera images, so that the policy's own view crops and resizes them.
+    """
+    capture = folder / "capture"
+    calibration = capture / "calibration"
+    if not (capture / "held_out" / "transforms.json").is_file() or not (calibration / "room.yaml").is_file():
+        raise ConfigError(
+            f"expected the run folder of an experiment in a room, with capture/held_out and capture/calibration, got {folder}; "
+            "give another folder, a bag (--bag) or a scene (--scene)"
+        )
+    camera = _camera(view, calibration)
+    expert = Expert(load_calibration(RoomCalibration, calibration / "room.yaml").reference_path)
+    images, steering = [], []
+    for name in ("held_out", "colour_pairs"):
+        if not (capture / name / "transforms.json").is_file():
+            continue
+        for frame in load_transforms(capture / name / "transforms.json").frames:
+            car = frame.T_world_from_camera @ invert_transform(camera.mount)
+            images.append(_seen(view, load_image(frame)[0], str(folder)))
+            steering.append(float(expert.steer(car[0, 3], car[1, 3], yaw_of(car))))
+    if len(images) < _FEWEST or np.ptp(steering) == 0.0:
+        raise ConfigError(f"expected at least {_FEWEST} frames of varying steering in {capture}, got {len(images)}")
+    scene = folder / "scene" / "scene.safetensors"
+    drives = _drives_in_scene(scene, calibration, view) if scene.is_file() else None
+    return Reference(np.stack(images), np.array(steering), f"{len(images)} camera frames of {folder}", drives, True)
+
+
+def from_scene(scene: Path, calibration: Path, view: PolicyView, count: int = 48, seed: int = 0) -> Reference:
+    """Frames of a learned scene about the path of a room, and drives in it.
+
+    Args:
+        scene: Scene file.
+        calibration: Folder with ``camera.yaml``, ``room.yaml`` and ``vehicle.yaml``.
+        view: The policy's.
+        count: Frames.
+        seed: Of the offsets from the path.
+    """
+    _camera(view, calibration)
+    expert = Expert(load_calibration(RoomCalibration, calibration / "room.yaml").reference_path)
+    poses = _about_the_path(expert, count, seed)
+    seen = _sight_of_scene(scene, calibration, view)(torch.from_numpy(poses))
+    images = np.round(255.0 * seen.permute(0, 2, 3, 1).clamp(0.0, 1.0).numpy()).astype(np.uint8)
+    drives = _drives_in_scene(scene, calibration, view)
+    return Reference(images, np.asarray(expert.steer_states(poses)), f"{count} frames of {scene}", drives, True)
+
+
+def _drives_in_scene(scene: Path, calibration: Path, view: PolicyView) -> Drives:
+    return _drives(_sight_of_scene(scene, calibration, view), calibration)
+
+
+def _sight_of_scene(scene: Path, calibration: Path, view: PolicyView) -> See:
+    """What the policy sees of a learned scene, rendered with the intrinsics of its own view, crop included."""
+    from advnerf_core.scene.render_field import FieldRenderer
+    from advnerf_core.scene.surrogate import Surrogate
+
+    mount = load_calibration(CameraCalibration, calibration / "camera.yaml").mount
+    surrogate = Surrogate(FieldRenderer.from_file(scene), view.pinhole, mount, [])
+    nothing = torch.zeros(surrogate.theta_shape)
+    return lambda states: surrogate.sense(states, nothing).images
+
+
+def _drives(see: See, calibration: Path) -> Drives:
+    room = load_calibration(RoomCalibration, calibration / "room.yaml")
+    vehicle = load_calibration(VehicleCalibration, calibration / "vehicle.yaml")
+    return lambda policy, goal: drive_round(policy, see, room, vehicle, goal)
+
+
+def _camera(view: PolicyView, calibration: Path) -> CameraCalibration:
+    camera = load_calibration(CameraCalibration, calibration / "camera.yaml")
+    require_camera(view, camera, "", calibration / "camera.yaml")
+    return camera
+
+
+def _about_the_path(expert: Expert, count: int, seed: int) -> NDArray[np.float64]:
+    """Car states ``[count, 3]`` round the path, a little beside it and turned from it."""
+    offsets = np.random.default_rng(seed).uniform(-1.0, 1.0, (count, 2)) * (_LATERAL_M, _HEADING_RAD)
+    poses: NDArray[np.float64] = expert.path.pose_at(np.arange(count) / count * expert.path.length_m)
+    poses[:, 0] -= np.sin(poses[:, 2]) * offsets[:, 0]
+    poses[:, 1] += np.cos(poses[:, 2]) * offsets[:, 0]
+    poses[:, 2] += offsets[:, 1]
+    return poses
+
+
+def judged_by_drives(
+    policy: AdaptedPolicy, reference: Reference, findings: list[Finding], goal: tuple[float, ...] | None = None
+) -> list[Finding]:
+    """The findings of a policy's adapter with that of its drives; the adapter must be right before it is driven.
+
+    A policy that does not drive where the user asked fails. Of a place that cannot be driven, such as a bag, the comparison
+    with the expert decides.
+    """
+    if any(finding.verdict == FAILURE for finding in findings):
+        return findings
+    if reference.drives is None:
+        return [replace(f, verdict=FAILURE) if f.name == "expert" and f.verdict == WARNING else f for f in findings]
+    size = policy.contract.goal_size
+    clean = reference.drives(policy, goal if goal is not None else (0.0,) * size)
+    text = clean.warning or f"drives without attack: {clean.in_words.removeprefix('drive without attack: ')}"
+    verdict: Verdict = OK if clean.drives else FAILURE if reference.asked else WARNING
+    return [*findings, Finding("drive", verdict, text)]
+
+
+def _seen(view: PolicyView, rgb: NDArray[np.uint8], source: str) -> NDArray[np.uint8]:
+    camera = view.camera
+    if rgb.shape[:2] != (camera.height, camera.width):
+        raise ConfigError(
+            f"expected images of {camera.width} x {camera.height}, for which the policy's view was made, got {rgb.shape[1]} x "
+            f"{rgb.shape[0]} from {source}; give frames of the policy's own camera with --bag"
+        )
+    return view.image(rgb)
+
+
+def _twin_calibration() -> Path:
+    import calibration
+
+    return Path(calibration.__file__).parent / "twin"

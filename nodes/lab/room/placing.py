@@ -1,0 +1,82 @@
+"""The live guide that brings board or monitor to where its attack was computed."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.live import Live
+
+from advnerf_core.attack.artifact import AttackFile
+from advnerf_core.geometry import Array
+from calibration.placement import Misplacement, measured_pose, misplacement
+from calibration.schema import TargetCalibration
+from nodes.lab.room.live import standing_poses
+from nodes.lab.room.measured_request import write_measured_request
+from nodes.runtime.terminal import table
+
+
+def guide(
+    run_dir: Path,
+    attack: AttackFile,
+    target: TargetCalibration,
+    limits: tuple[float, float],
+    once: bool,
+    timeout_s: float,
+) -> tuple[Misplacement, Array] | None:
+    """Show what is off until it stands well, or the time is over.
+
+    Args:
+        run_dir: Folder of the running launch.
+        attack: What should be shown where.
+        target: Corners of what shows it.
+        limits: Tolerated distance [m] and angle [rad].
+        once: Look once.
+        timeout_s: Give up after so long [s].
+
+    Returns:
+        What was off last, and the subject's pose ``[4, 4]``; None if it was never seen.
+    """
+    found, deadline = None, time.monotonic() + timeout_s
+    with Live(console=Console(stderr=True), refresh_per_second=4, transient=True) as live:
+        for T in standing_poses(run_dir, f"/vicon/{target.subject}", 0.5):
+            if T is None:
+                live.update(f"{target.subject} is lost")
+            else:
+                off = misplacement(attack, target, T)
+                found = off, T
+                live.update(_placement_table(off, limits))
+                if once or off.within(*limits):
+                    break
+            if time.monotonic() > deadline:
+                break
+    return found
+
+
+def _placement_table(off: Misplacement, limits: tuple[float, float]) -> Any:
+    colour = "green" if off.within(*limits) else "red"
+    rows = table("", f"[{colour}]{in_short(off)} off[/]: move it")
+    for name, advice in off.advice():
+        rows.add_row(name, advice)
+    return rows
+
+
+def in_short(off: Misplacement) -> str:
+    """Distance and angle, for a person."""
+    return f"{100 * off.distance_m:.1f} cm and {np.rad2deg(off.angle_rad):.1f} deg"
+
+
+def say_how_to_attack_again(request: Path | None, target: TargetCalibration, T_world_from_subject: Array) -> None:
+    """Print the command for an attack at the measured pose; with a request, write it."""
+    pose = measured_pose(target, T_world_from_subject)
+    if request is None:
+        print(
+            "its face is at "
+            + ", ".join(f"{key}: {value}" for key, value in pose.items())
+            + "; with --request a file is written"
+        )
+    else:
+        print(f"advnerf attack run {write_measured_request(request, pose)}")

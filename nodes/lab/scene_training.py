@@ -1,0 +1,281 @@
+"""What ``advnerf scene train|eval|render`` do: a data set in, a scene file, its figures and its pictures out."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import av
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from advnerf_core.data.dataset import ImageSet, PosedImages, load_transforms
+from advnerf_core.data.image_files import OPAQUE
+from advnerf_core.fields.hash_grid import HashGridConfig
+from advnerf_core.files import write_atomically
+from advnerf_core.geometry import Array
+from advnerf_core.render.march import MarchConfig
+from advnerf_core.scene.field import SceneFieldConfig, save_scene
+from advnerf_core.scene.intervals import pixel_intervals
+from advnerf_core.scene.metrics import psnr, ssim
+from advnerf_core.scene.render_field import FieldRenderer
+from advnerf_core.scene.train import Progress, TrainConfig, train_scene
+from nodes.runtime.errors import ConfigError
+from nodes.runtime.progress import Report
+
+SCENE, CHECKPOINT, FIGURES = "scene.safetensors", "checkpoint.safetensors", "held_out.json"
+MM_PER_M = 1000.0
+_NO_TIME_LIMIT_STEPS = 1_000_000
+PRESETS = ("room", "instant-ngp")
+_WHITE = (1.0, 1.0, 1.0)
+_VIDEO_FPS = 10
+
+
+@dataclass(frozen=True)
+class TrainingRequest:
+    """How a scene is to be trained.
+
+    Attributes:
+        transforms: The data set: a ``transforms.json`` or its folder.
+        output: Folder of the results; a stopped training goes on there.
+        steps: Optimisation steps; None with ``minutes``.
+        minutes: Time limit instead.
+        box_m: Low and high corner of what is learned, in the data set's unit; None is Instant-NGP's box of the file.
+        size: ``(width, height)`` to bring the images to; None keeps theirs.
+        open_scene: Rays may leave the box and colours may depend on the direction, as out of doors.
+        every: Every so-manieth image is held out, unless the data set splits itself.
+        near: Nothing nearer to a camera than this is learned, in the data set's unit.
+        seed: Of everything random.
+        checkpoint_every_s: A kill loses at most so much training [s].
+        unbounded: Whether the scene goes on outside the box, contracted; None: if the file's ``aabb_scale`` is more than 1.
+        preset: Sizes of the field: ``room``, ours, or ``instant-ngp``.
+        interval_px: Sample intervals in pixels of the training images; None: those of the rule, see `pixel_intervals`.
+        interval: Shortest and longest sample interval instead of the rule's, in the data set's unit.
+        interval_growth: Interval per distance instead of the rule's.
+    """
+
+    transforms: Path
+    output: Path
+    steps: int | None = 1000
+    minutes: float | None = None
+    box_m: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
+    size: tuple[int, int] | None = None
+    open_scene: bool = False
+    every: int = 8
+    near: float = 0.05
+    seed: int = 0
+    checkpoint_every_s: float = 30.0
+    unbounded: bool | None = None
+    preset: str = "room"
+    interval_px: float | None = None
+    interval: tuple[float, float] | None = None
+    interval_growth: float | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be trained."""
+        if (self.steps is None) == (self.minutes is None):
+            raise ConfigError("expected either a number of steps or a time limit")
+        if self.box_m is not None and not all(low < high for low, high in zip(*self.box_m, strict=True)):
+            raise ConfigError(f"expected a box with low < high, got {self.box_m}")
+        if self.preset not in PRESETS:
+            raise ConfigError(f"expected a preset of {', '.join(PRESETS)}, got {self.preset!r}")
+        if self.interval_px is not None and not self.interval_px > 0.0:
+            raise ConfigError(f"expected --interval-px above 0, got {self.interval_px}")
+        if self.interval is not None and not 0.0 < self.interval[0] <= self.interval[1]:
+            raise ConfigError(f"expected --interval as 0 < SHORTEST <= LONGEST, got {list(self.interval)}")
+        if self.interval_growth is not None and not self.interval_growth >= 0.0:
+            raise ConfigError(f"expected --interval-growth of 0 or more, got {self.interval_growth}")
+
+
+def train(request: TrainingRequest, report: Report) -> dict[str, Any]:
+    """Train, write the scene file and the figures on held-out images; returns the figures."""
+    training, held_out = load_transforms(request.transforms).training_and_held_out(request.every)
+    for path in training.missing:
+        print(f"missing, left out: {path}")
+    images = training.load(request.size)
+    field = scene_field(request, training, transparent=_transparent(images))
+    march = sample_intervals(request, field, images)
+    print(_described(request, field, march))
+
+    def progress(at: Progress) -> None:
+        report(0.95 * at.fraction, f"step {at.step}, {at.psnr_db:.1f} dB on training rays")
+
+    trained = train_scene(images, field, _train_config(request, field, march), request.output / CHECKPOINT, progress)
+    metadata = {
+        "march": vars(trained.march), "steps": trained.history[-1][0], "seed": request.seed, "photographs": len(images.rgb),
+        "dataset": str(request.transforms),
+    }  # fmt: skip
+    save_scene(request.output / SCENE, trained.scene, trained.occupied, metadata)
+    figures = evaluate(FieldRenderer.from_file(request.output / SCENE), held_out, request.size)
+    write_atomically(request.output / FIGURES, json.dumps(figures, indent=1) + "\n")
+    return figures
+
+
+def evaluate(renderer: FieldRenderer, listed: PosedImages, size: tuple[int, int] | None) -> dict[str, Any]:
+    """PSNR [dB] and SSIM on images that nothing was learned from, each and on average; masked pixels do not count for PSNR."""
+    views = listed.load(size)
+    rows = []
+    # Pictures with alpha are compared before white, which the renderer takes, too.
+    for index, real in enumerate(views.on_background(_WHITE)):
+        rendered = renderer.render(views.T_world_from_camera[index][None], views.pinholes[index])[0][0].numpy()
+        usable = np.ones(real.shape[:2], dtype=bool) if views.valid is None else views.valid[index]
+        rows.append(
+            {
+                "image": listed.frames[index].path.name,
+                "psnr_db": psnr(rendered[usable], real[usable] / 255.0),
+                "ssim": ssim(rendered, real / 255.0),
+            }
+        )
+    means = {key: float(np.mean([row[key] for row in rows])) for key in ("psnr_db", "ssim")}
+    return {"mean": means, "images": rows}
+
+
+def render(
+    renderer: FieldRenderer,
+    listed: PosedImages,
+    size: tuple[int, int] | None,
+    output: Path,
+    video: Path | None,
+    report: Report,
+) -> int:
+    """Write what the field shows from every camera of a data set: colour, depth in millimetres (16 bit), and a video.
+
+    Pictures of a scene that was learned with alpha have alpha; the video shows it before white.
+
+    Returns:
+        The number of views.
+    """
+    loaded = listed.load(size)
+    frames: list[NDArray[np.uint8]] = []
+    for index, (pose, pinhole) in enumerate(zip(loaded.T_world_from_camera, loaded.pinholes, strict=True)):
+        rgb, depth_m, alpha = renderer.render(pose[None], pinhole)
+        picture = np.rint(255 * rgb[0].numpy()).astype(np.uint8)
+        name = listed.frames[index].path.stem
+        if renderer.config.learned_background:
+            _write_png(output / f"{index:04d}_{name}.png", picture[..., ::-1])
+        else:
+            _write_png(output / f"{index:04d}_{name}.png", _with_alpha(rgb[0].numpy(), alpha[0].numpy()))
+        depth_mm = np.nan_to_num(MM_PER_M * depth_m[0].numpy(), posinf=0.0)
+        _write_png(output / f"{index:04d}_{name}_depth_mm.png", np.clip(depth_mm, 0, 65535).astype(np.uint16))
+        frames.append(picture)
+        report((index + 1) / len(loaded.rgb), name)
+    if video is not None:
+        write_video(video, frames)
+    return len(frames)
+
+
+def write_video(path: Path, frames: Sequence[NDArray[np.uint8]]) -> None:
+    """Write pictures ``[H, W, 3]`` as an H.264 video; the file appears when it is whole."""
+    partial = path.with_name(path.name + ".part")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        with av.open(str(partial), "w", format="mp4") as container:
+            stream = container.add_stream("libx264", rate=_VIDEO_FPS)
+            # The format wants even sides.
+            stream.height, stream.width = (side - side % 2 for side in frames[0].shape[:2])
+            stream.pix_fmt = "yuv420p"
+            for picture in frames:
+                even = np.ascontiguousarray(picture[: stream.height, : stream.width])
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(even, format="rgb24")))
+            container.mux(stream.encode())
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def scene_field(request: TrainingRequest, listed: PosedImages, transparent: bool = False) -> SceneFieldConfig:
+    """Sizes of the field that a request asks for.
+
+    Args:
+        request: What was asked for.
+        listed: The training images.
+        transparent: Whether they have alpha.
+
+    Raises:
+        ConfigError: No box was given, and the file has none that holds its cameras.
+    """
+    aabb_scale = listed.aabb_scale or 1.0
+    unbounded = aabb_scale > 1.0 if request.unbounded is None else request.unbounded
+    if request.box_m is not None:
+        low, high = (np.array(corner) for corner in request.box_m)
+    else:
+        low, high = listed.inner_box() if unbounded else listed.box()
+    inside = [
+        np.all((low <= f.T_world_from_camera[:3, 3]) & (f.T_world_from_camera[:3, 3] <= high)) for f in listed.frames
+    ]
+    if request.box_m is None and listed.aabb_scale is None and not all(inside):
+        raise ConfigError(
+            f"expected a box: {request.transforms} has no aabb_scale, and {len(inside) - sum(inside)} of {len(inside)} cameras "
+            f"stand outside its unit cube; give --box-low and --box-high (cameras are at {_span(listed)}) or --unbounded"
+        )
+    common = {"contraction": unbounded, "learned_background": not transparent}
+    if request.preset == "instant-ngp":
+        # Müller et al. 2022, table 1 and section 5.4, and the sizes of its configs/nerf/base.json.
+        grid = HashGridConfig(levels=16, features=2, log2_entries=19, coarsest=16, finest=round(2048 * aabb_scale))
+        return SceneFieldConfig(_corner(low), _corner(high), grid, direction_bands=4, **common)
+    # The contracted cube is two inner regions wide: twice the cells keep its detail.
+    grid = HashGridConfig(levels=8, features=4, finest=4096 if unbounded else 2048)
+    bands = 3 if request.open_scene or unbounded else 1
+    return SceneFieldConfig(_corner(low), _corner(high), grid, direction_bands=bands, **common)
+
+
+def sample_intervals(request: TrainingRequest, field: SceneFieldConfig, images: ImageSet) -> MarchConfig:
+    """How samples are placed, in training and rendering: by the rule, where the request does not say otherwise."""
+    march = pixel_intervals(images.pinholes, images.T_world_from_camera, field, request.near, request.interval_px)
+    if request.interval is not None:
+        march = replace(march, smallest_step_m=request.interval[0], largest_step_m=request.interval[1])
+    return march if request.interval_growth is None else replace(march, step_growth=request.interval_growth)
+
+
+def _train_config(request: TrainingRequest, field: SceneFieldConfig, march: MarchConfig) -> TrainConfig:
+    is_open = request.open_scene or field.contraction
+    return TrainConfig(
+        steps=request.steps or _NO_TIME_LIMIT_STEPS, seed=request.seed, checkpoint_every_s=request.checkpoint_every_s,
+        max_seconds=None if request.minutes is None else 60.0 * request.minutes, march=march,
+        opacity=0.0 if is_open else TrainConfig.opacity, distortion=2e-3 if is_open else TrainConfig.distortion,
+    )  # fmt: skip
+
+
+def _described(request: TrainingRequest, field: SceneFieldConfig, march: MarchConfig) -> str:
+    """What was decided for the user, and how to decide otherwise."""
+    inside = "inner region" if field.contraction else "box"
+    low, high = (np.round(corner, 2).tolist() for corner in (field.box_low_m, field.box_high_m))
+    text = f"{inside} {low} .. {high}"
+    if field.contraction:
+        why = "" if request.unbounded is not None else " since the file's aabb_scale is more than 1 (--bounded: not so)"
+        text += f", unbounded{why}"
+    if not field.learned_background:
+        text += "; images have alpha: learned before random colours, transparent where they are"
+    intervals = (
+        f"{march.smallest_step_m:.3g} .. {march.largest_step_m:.3g}, {march.step_growth:.3g} of the distance between"
+    )
+    return f"{text}; preset {request.preset}; sample intervals {intervals}"
+
+
+def _span(listed: PosedImages) -> str:
+    places = np.stack([frame.T_world_from_camera[:3, 3] for frame in listed.frames])
+    return f"{np.round(places.min(axis=0), 2).tolist()} .. {np.round(places.max(axis=0), 2).tolist()}"
+
+
+def _corner(corner: Array) -> tuple[float, float, float]:
+    x, y, z = (float(value) for value in corner)
+    return x, y, z
+
+
+def _transparent(images: ImageSet) -> bool:
+    return images.alpha is not None and bool((images.alpha < OPAQUE).any())
+
+
+def _with_alpha(over_white: NDArray[np.float32], alpha: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Pixels ``[H, W, 4]``, blue first, not premultiplied, of colours over white."""
+    opacity = alpha[..., None]
+    own = np.clip((over_white - (1.0 - opacity)) / np.maximum(opacity, 1e-3), 0.0, 1.0)
+    return np.rint(255 * np.concatenate([own[..., ::-1], opacity], axis=-1)).astype(np.uint8)
+
+
+def _write_png(path: Path, pixels: NDArray[Any]) -> None:
+    write_atomically(path, cv2.imencode(".png", pixels)[1].tobytes())

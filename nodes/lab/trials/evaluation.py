@@ -1,0 +1,169 @@
+"""What a bag of a drive says: trajectory at the control ticks, cross-track error, latency from capture to serial write."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from advnerf_core.driving.metrics import DriveMetrics, Horizon, drive_metrics, states_at_ticks
+from advnerf_core.driving.path import Array
+from advnerf_core.driving.path import Path as DrivingPath
+from advnerf_core.geometry import yaw_of
+from nodes.bags.reader import read_info, read_messages
+from nodes.runtime.errors import BagError
+from nodes.runtime.messages import decode, ns_from_stamp, pose_matrix
+from nodes.runtime.pictures import rgb_image
+from nodes.runtime.topics import topic as topic_row
+
+# Derived messages carry the capture stamp of the image they come from, so each hop is publish time minus that stamp.
+HOPS = {
+    "camera": "/camera/image_raw",
+    "compositor": "/compositor/image",
+    "policy": "/policy/drive",
+    "safety": "/safety/drive",
+}
+# Who shows an attack says so here, with the attack's id.
+SHOWN_BY = ("/compositor/attack", "/monitor/attack")
+_SEEN = "/compositor/image"
+COUNTERFACTUAL = "/policy/counterfactual"
+_NS_PER_MS = 1e6
+
+
+@dataclass(frozen=True)
+class Counterfactual:
+    """What the attack added to the steering of a drive, image by image; see `nodes.counterfactual`.
+
+    Attributes:
+        frames: Images that were compared.
+        frames_drawn: Those into which the attack was drawn.
+        mean_abs_delta_rad: Mean size of the difference over the images with the attack in them [rad]; None without any.
+        mean_delta_rad: Mean difference over these, left positive [rad]; None without any.
+        max_abs_delta_rad: Largest difference [rad].
+        max_at_s: When that was, since the beginning [s].
+    """
+
+    frames: int
+    frames_drawn: int
+    mean_abs_delta_rad: float | None
+    mean_delta_rad: float | None
+    max_abs_delta_rad: float
+    max_at_s: float
+
+
+@dataclass(frozen=True, eq=False)
+class Timing:
+    """Live timing of one drive.
+
+    Attributes:
+        capture_to_serial_ms: Per frame that reached the motor controller, ``[n]`` [ms].
+        hops_ms: From capture to publication by each node, per frame [ms].
+        frames: Frames captured during the drive.
+        missed: Frames during the drive for which no driving command was written to the serial port.
+    """
+
+    capture_to_serial_ms: Array
+    hops_ms: dict[str, Array]
+    frames: int
+    missed: int
+
+
+def trajectory(bag: Path, start_real_ns: int, horizon: Horizon) -> Array:
+    """States ``[K, 3]`` of the rear axle at the control ticks, from motion capture; tick 0 is at ``start_real_ns``."""
+    stamps: list[int] = []
+    poses: list[tuple[float, float, float]] = []
+    for message in _decoded(bag, "/vicon/car"):
+        stamp_ns = ns_from_stamp(message.header.stamp)
+        if stamps and stamp_ns <= stamps[-1]:
+            continue
+        T = pose_matrix(message)
+        stamps.append(stamp_ns)
+        poses.append((T[0, 3], T[1, 3], yaw_of(T)))
+    if len(stamps) < 2:
+        raise BagError(f"expected a stream of poses on /vicon/car in {bag}, got {len(stamps)}")
+    return states_at_ticks(np.array(stamps), np.array(poses), start_real_ns, horizon)
+
+
+def score(
+    states: Array, path: DrivingPath, horizon: Horizon, stopped_after_s: float | None
+) -> tuple[DriveMetrics, Array]:
+    """Metrics of a drive, and the states ``[ticks + 1, 3]`` with the last one held if the stack stopped it early."""
+    # 43 x 0.1 s / 0.1 s is a little less than 43.
+    stopped = None if stopped_after_s is None else int(np.floor(stopped_after_s / horizon.dt_s + 1e-6))
+    metrics = drive_metrics(path, states, horizon, stopped)
+    seen = len(states) if stopped is None else min(len(states), max(stopped, 1) + 1)
+    held = np.repeat(states[seen - 1 : seen], max(0, horizon.ticks + 1 - seen), axis=0)
+    return metrics, np.concatenate([states[:seen], held])[: horizon.ticks + 1]
+
+
+def timing(bag: Path, start_real_ns: int, end_real_ns: int) -> Timing:
+    """Latency of every frame captured between two moments [ns, CLOCK_REALTIME]."""
+    captured = [stamp for stamp, _ in _stamps(bag, HOPS["camera"]) if start_real_ns <= stamp < end_real_ns]
+    inside = set(captured)
+    written: dict[int, float] = {}
+    for message in _decoded(bag, "/motor/sent"):
+        stamp_ns = ns_from_stamp(message.header.stamp)
+        if stamp_ns in inside and not message.braking:
+            written.setdefault(stamp_ns, (int(message.serial_write_real_ns) - stamp_ns) / _NS_PER_MS)
+    hops = {
+        name: np.array(
+            [(published - stamp) / _NS_PER_MS for stamp, published in _stamps(bag, topic) if stamp in inside]
+        )
+        for name, topic in HOPS.items()
+    }
+    return Timing(np.array(list(written.values())), hops, len(captured), len(inside - written.keys()))
+
+
+def frames(bag: Path, start_real_ns: int, count: int, period_s: float = 0.1) -> NDArray[np.uint8]:
+    """What the policy saw at the control ticks, ``[count, H, W, 3]``: the newest image at each tick."""
+    stamps, images = [], []
+    for message in _decoded(bag, _SEEN):
+        stamps.append(ns_from_stamp(message.header.stamp))
+        images.append(rgb_image(message, f"{_SEEN} in {bag}").copy())
+    if not images:
+        raise BagError(f"expected images on {_SEEN} in {bag}, got none")
+    ticks = start_real_ns + np.arange(count) * round(period_s * 1e9)
+    newest = np.clip(np.searchsorted(stamps, ticks, side="right") - 1, 0, len(images) - 1)
+    return np.stack([images[index] for index in newest])
+
+
+def attack_ids(bag: Path, topics: Sequence[str] = SHOWN_BY) -> set[str]:
+    """Ids of the attacks that were drawn into at least one frame, or were on the monitor."""
+    present = {topic.name for topic in read_info(bag).topics}
+    return {str(m.attack_id) for name in topics if name in present for m in _decoded(bag, name) if m.drawn}
+
+
+def counterfactual(bag: Path, start_real_ns: int, end_real_ns: int) -> Counterfactual | None:
+    """What the attack added to the steering between two moments [ns, CLOCK_REALTIME]; None if nobody compared."""
+    if COUNTERFACTUAL not in {topic.name for topic in read_info(bag).topics}:
+        return None
+    rows = [
+        (stamp, float(message.delta_rad), bool(message.drawn))
+        for message in _decoded(bag, COUNTERFACTUAL)
+        if start_real_ns <= (stamp := ns_from_stamp(message.header.stamp)) < end_real_ns
+    ]
+    if not rows:
+        return None
+    delta, drawn = np.array([row[1] for row in rows]), np.array([row[2] for row in rows])
+    worst = int(np.abs(delta).argmax())
+    return Counterfactual(
+        len(rows), int(drawn.sum()), float(np.abs(delta[drawn]).mean()) if drawn.any() else None,
+        float(delta[drawn].mean()) if drawn.any() else None, float(np.abs(delta[worst])),
+        (rows[worst][0] - start_real_ns) / 1e9,
+    )  # fmt: skip
+
+
+def _decoded(bag: Path, topic: str) -> Iterator[Any]:
+    typename = topic_row(topic).type
+    return (decode(typename, message.cdr) for message in read_messages(bag, [topic]))
+
+
+def _stamps(bag: Path, topic: str) -> Iterator[tuple[int, int]]:
+    """Capture stamp and publish time of every message [ns]."""
+    typename = topic_row(topic).type
+    for message in read_messages(bag, [topic]):
+        yield ns_from_stamp(decode(typename, message.cdr).header.stamp), message.publish_ns

@@ -1,0 +1,191 @@
+"""A series of trials: drives what the plan says and is not driven yet. A run counts when its result file is there, whole.
+
+On the twin everything goes by itself. On a real car a person places the car under guidance and arms it; between two runs, and
+between two days, the series may be left at any time.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from advnerf_core.files import write_atomically
+from calibration.schema import RoomCalibration, load_calibration
+from nodes.lab.trials.bags import measure_drives
+from nodes.lab.trials.plan import NONE, CampaignError, Run, TrialsPlan, finished, keep_plan, make_runs, sha256_of
+from nodes.lab.trials.trial import NotStartedError, TrialPlan, counts
+from nodes.lab.trials.trial_runner import run_trial
+from nodes.launching.launch_file import Plan, load_launch
+from nodes.launching.launch_hosts import ALL_HOSTS, operator_of
+from nodes.runtime.errors import ConfigError
+
+TICK_S = 0.1
+# After the last tick the car drives on for a moment, so that the poses reach over it.
+_TAIL_S = 0.2
+_ATTEMPTS = 3
+_NOT_WATCHED = ("recorder", "viewer")
+
+
+@dataclass(frozen=True)
+class Series:
+    """Trials that are ready to be driven.
+
+    Attributes:
+        folder: Where the plan, the results and one folder per run go.
+        plan: What is driven.
+        room: Reference path and limits.
+        nodes: Nodes that must be ready before anything moves.
+    """
+
+    folder: Path
+    plan: TrialsPlan
+    room: RoomCalibration
+    nodes: tuple[str, ...]
+
+    @property
+    def results(self) -> dict[str, dict[str, Any]]:
+        """What is driven already, by name of the run."""
+        return finished(self.folder, self.plan)
+
+
+def prepare_series(
+    launch_file: Path, overrides: Sequence[str], folder: Path, attacks: dict[str, list[Path]], repeats: int, seed: int,
+    ticks: int, start_pose: tuple[float, float, float] | None = None, host: str | None = None,
+) -> Series:  # fmt: skip
+    """Read everything, fix the order, and keep the plan in the folder.
+
+    Args:
+        launch_file: Node graph with a safety node (whose room it is) and a bag.
+        overrides: ``node.key=value`` and ``params.name=value``.
+        folder: New, or that of the same series.
+        attacks: Attack files of each condition besides ``none``.
+        repeats: Runs of each condition.
+        seed: Of the order.
+        ticks: Control ticks of each drive, 10 a second.
+        start_pose: Where each drive starts; None is the room's.
+        host: Which of the file's hosts this computer is, or all; the operator's, with the recorder.
+
+    Raises:
+        CampaignError: The folder belongs to another series.
+    """
+    launched = load_launch(launch_file, overrides, host=host)
+    # Both hosts are asked, here as there: the room belongs to the safety node, which is on the car.
+    whole = launched if host is None else load_launch(launch_file, overrides, host=ALL_HOSTS)
+    room_file = _room_file(whole)
+    _require_trials_here(launched, whole, host)
+    room = load_calibration(RoomCalibration, room_file)
+    policy = whole.documents["policy"].data.get("policy") if "policy" in whole.documents else None
+    policy_file = Path(policy) if policy and Path(policy).is_file() else None
+    plan = TrialsPlan(
+        str(launch_file), tuple(overrides), seed, ticks, start_pose or room.start_pose, sha256_of(room_file),
+        sha256_of(policy_file), make_runs(attacks, repeats, seed), host,
+    )  # fmt: skip
+    keep_plan(folder, plan)
+    nodes = tuple(name for name, entry in whole.nodes.items() if entry.required and name not in _NOT_WATCHED)
+    return Series(folder, plan, room, nodes)
+
+
+def drive_series(
+    series: Series, ready_timeout_s: float, begin: Callable[[Run], None], guide: Callable[[str], None]
+) -> None:
+    """Drive what is not driven yet.
+
+    Args:
+        series: The trials.
+        ready_timeout_s: How long a graph may take to become ready [s].
+        begin: Called before each run.
+        guide: Told what a person has to do.
+    """
+    done = series.results
+    for run in series.plan.runs:
+        if run.name not in done:
+            begin(run)
+            drive_run(series, run, ready_timeout_s, guide)
+
+
+def drive_run(series: Series, run: Run, ready_timeout_s: float, guide: Callable[[str], None]) -> dict[str, Any]:
+    """Drive one run and write its result; a run that a fault of the stack ended is driven again, a few times."""
+    for attempt in range(1, _ATTEMPTS + 1):
+        try:
+            result = _attempt(series, run, ready_timeout_s, guide)
+            stopped = result["stopped_early"]
+        except NotStartedError as error:
+            stopped = str(error)
+        else:
+            if counts(stopped):
+                write_atomically(series.folder / f"{run.name}.json", json.dumps(result) + "\n")
+                return result
+        guide(f"this run does not count, the stack stopped it: {stopped} (attempt {attempt} of {_ATTEMPTS})")
+    raise CampaignError(f"run {run.name} was stopped {_ATTEMPTS} times by the stack itself: {stopped}; cure that first")
+
+
+def _attempt(series: Series, run: Run, ready_timeout_s: float, guide: Callable[[str], None]) -> dict[str, Any]:
+    plan, run_dir = series.plan, series.folder / run.name
+    shutil.rmtree(run_dir, ignore_errors=True)  # of a run that was broken off
+    trial = TrialPlan(plan.start_pose, plan.ticks * TICK_S + _TAIL_S, series.nodes, by_hand=True)
+    overrides = [*plan.overrides, f"params.attack={run.attack}"]
+    outcome = run_trial(Path(plan.launch), overrides, run_dir, trial, ready_timeout_s, guide, plan.host)
+    # From the bag alone, as `advnerf evaluate` does: the same numbers, to the last digit.
+    found = measure_drives(run_dir / "bag", series.room, plan.ticks)[-1]
+    wanted = [run.attack_id] if run.attack_id else []
+    if found["attack_ids"] != wanted:
+        raise CampaignError(f"expected the attacks {wanted} to be shown in run {run.name}, got {found['attack_ids']}")
+    return {"condition": run.condition, "repeat": run.repeat, "peer": outcome.peer, **found}
+
+
+def summarise(results: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """One row per condition: runs, total CTE [m] mean and standard deviation, ratio to no attack, times off the track; in how many
+    runs no checksum covers what was measured.
+
+    The standard deviation is that of a sample (n - 1), and None of a single run; the ratio is of the means.
+    """
+    groups: dict[str, list[dict[str, Any]]] = {}
+    for result in results:
+        groups.setdefault(result["condition"], []).append(result)
+    base = np.mean([each["total_cte_m"] for each in groups[NONE]]) if NONE in groups else None
+    rows = []
+    for condition in sorted(groups, key=lambda name: (name != NONE, name != "random", name)):
+        totals = [each["total_cte_m"] for each in groups[condition]]
+        latencies = [ms for each in groups[condition] for ms in each.get("capture_to_serial_ms", [])]
+        rows.append({
+            "condition": condition, "runs": len(totals), "mean_m": float(np.mean(totals)),
+            "std_m": float(np.std(totals, ddof=1)) if len(totals) > 1 else None,
+            "ratio": float(np.mean(totals) / base) if base else None,
+            "off_track": sum(bool(each["off_track"]) for each in groups[condition]),
+            "stopped_early": sum(bool(each["stopped_early"]) for each in groups[condition]),
+            "latency_p50_ms": float(np.median(latencies)) if latencies else None,
+            "unchecked": sum(bool(each.get("unchecked")) for each in groups[condition]),
+        })  # fmt: skip
+    return rows
+
+
+def _require_trials_here(launched: Plan, whole: Plan, host: str | None) -> None:
+    """Whoever drives trials must be allowed to arm from here, and must find the bag here."""
+    hosts = launched.launch.hosts
+    if host not in (None, ALL_HOSTS) and (operator := operator_of(launched.launch)) != host:
+        raise ConfigError(
+            f"{launched.file}: trials are driven where people arm, on {operator}, got --host {host}; go there, or set operator={host}"
+        )
+    if "recorder" in launched.documents:
+        return
+    if "recorder" in whole.documents:
+        home = whole.nodes["recorder"].host
+        raise ConfigError(
+            f"{launched.file}: trials are measured from their bags, but {home} records, not {host} (of {', '.join(hosts)}); set record.host"
+        )
+    raise ConfigError(f"{launched.file}: trials are measured from their bags; give the launch file the key record")
+
+
+def _room_file(launched: Plan) -> Path:
+    room = launched.documents["safety"].data.get("room") if "safety" in launched.documents else None
+    if not room:
+        raise ConfigError(f"{launched.file}: expected a node safety with a room; its path is the one that is measured")
+    if "attack" not in launched.launch.params:
+        raise ConfigError(f"{launched.file}: expected a parameter called attack, for the conditions of the trials")
+    return Path(room)

@@ -1,0 +1,253 @@
+"""Series out of a bag: poses, frames, commands; and the moments at which everything stood still."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from advnerf_core.data.similarity import rotation_angles
+from advnerf_core.geometry import Array, make_transform
+from calibration.camera_to_car import MountView
+from calibration.charuco import BoardDetector, Detection
+from calibration.degeneracy import DegenerateDataError, mean_rotation
+from calibration.display_colour import mean_colour, screen_region
+from calibration.schema import CalibrationError
+from calibration.vehicle import Drive
+from nodes.bags.images import image_messages, image_topic
+from nodes.bags.parts import holds_bag
+from nodes.bags.reader import read_info, read_messages
+from nodes.runtime.errors import BagError
+from nodes.runtime.messages import decode, pose_matrix, stamp_ns
+from nodes.runtime.pictures import rgb_image
+from nodes.runtime.topics import topic as topic_row
+
+Rgb = NDArray[np.uint8]
+IMAGES, CAR, SENT = "/camera/image_raw", "/vicon/car", "/motor/sent"
+PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
+
+
+@dataclass(frozen=True, eq=False)
+class PoseSeries:
+    """Poses of a subject.
+
+    Attributes:
+        stamps_ns: Increasing ``[N]`` [ns since 1970].
+        T: ``[N, 4, 4]``.
+    """
+
+    stamps_ns: NDArray[np.int64]
+    T: Array
+
+    def around(self, stamp: int, half_ns: int) -> Array | None:
+        """Poses within half a window of a stamp ``[n, 4, 4]``; None unless there are some on both sides."""
+        first, last = np.searchsorted(self.stamps_ns, [stamp - half_ns, stamp + half_ns])
+        middle = int(np.searchsorted(self.stamps_ns, stamp))
+        return self.T[first:last] if first < middle < last and last - first >= 3 else None
+
+
+def read_poses(bag: Path, topic: str) -> PoseSeries:
+    """All finite poses of a topic, in order of their stamps."""
+    rows = {}
+    for message in _decoded(bag, topic):
+        T = pose_matrix(message)
+        if np.isfinite(T).all():
+            rows[stamp_ns(message)] = T
+    if len(rows) < 2:
+        raise DegenerateDataError(f"expected poses on {topic} in {bag}, got {len(rows)}; was motion capture on?")
+    stamps = sorted(rows)
+    return PoseSeries(np.array(stamps, np.int64), np.stack([rows[stamp] for stamp in stamps]))
+
+
+def read_frames(bag: Path) -> Iterator[tuple[int, Rgb]]:
+    """Stamp [ns] and picture ``[H, W, 3]`` RGB of every frame."""
+    topic = image_topic(bag)
+    for message in image_messages(bag, topic):
+        yield stamp_ns(message), rgb_image(message, f"{topic} in {bag}")
+
+
+def read_pictures(source: Path) -> Iterator[tuple[str, Rgb]]:
+    """Name and picture of every file of a folder, or of every frame of a bag."""
+    if source.is_dir() and not holds_bag(source):
+        files = sorted(file for file in source.iterdir() if file.suffix.lower() in PICTURES)
+        if not files:
+            raise CalibrationError(f"expected a bag, or a folder of pictures ({', '.join(PICTURES)}), got {source}")
+        for file in files:
+            yield file.name, read_picture(file)
+        return
+    for stamp, image in read_frames(source):
+        yield str(stamp), image
+
+
+def read_picture(file: Path) -> Rgb:
+    """A picture file ``[H, W, 3]`` RGB."""
+    try:
+        data = np.frombuffer(file.read_bytes(), np.uint8)
+    except OSError as error:
+        raise CalibrationError(f"expected a picture at {file}: {error.strerror or error}") from error
+    bgr = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
+    if bgr is None:
+        raise CalibrationError(f"expected a picture at {file}, cannot decode its {data.size} bytes")
+    return np.ascontiguousarray(bgr[..., ::-1], np.uint8)
+
+
+def read_drive(bag: Path) -> Drive:
+    """Commands that really went out, and the car's poses."""
+    rows = []
+    for message in _decoded(bag, SENT):
+        written = int(message.serial_write_real_ns)
+        erpm = np.nan if message.braking else float(message.erpm)
+        pipeline = np.nan if message.braking else (written - stamp_ns(message)) / 1e9
+        rows.append((written, float(message.servo), erpm, pipeline))
+    if len(rows) < 2:
+        raise DegenerateDataError(f"expected commands on {SENT} in {bag}, got {len(rows)}; was the car armed?")
+    rows.sort(key=lambda row: row[0])
+    poses = read_poses(bag, CAR)
+    start = int(poses.stamps_ns[0])
+    yaw = np.unwrap(np.arctan2(poses.T[:, 1, 0], poses.T[:, 0, 0]))
+    planar = np.stack([poses.T[:, 0, 3], poses.T[:, 1, 3], yaw], axis=1)
+    when = np.array([(row[0] - start) / 1e9 for row in rows])
+    # Telemetry and commands may be written in one microsecond; time has to increase.
+    kept = np.concatenate([[True], np.diff(when) > 0.0])
+    table = np.array([row[1:] for row in rows])[kept]
+    return Drive((poses.stamps_ns - start) / 1e9, planar, when[kept], table[:, 0], table[:, 1], table[:, 2])
+
+
+@dataclass(frozen=True)
+class StillConfig:
+    """When car and board count as standing still.
+
+    Attributes:
+        half_window_s: Poses this long before and after a frame are looked at, and averaged [s].
+        most_motion_m: Largest distance of a pose from their mean [m].
+        most_turn_rad: Largest angle of a pose from their mean [rad].
+        per_stop: Frames taken of each stop.
+    """
+
+    half_window_s: float = 0.15
+    most_motion_m: float = 0.004
+    most_turn_rad: float = 0.008
+    per_stop: int = 1
+
+
+def still_views(
+    bag: Path, detector: BoardDetector, board_topic: str | None, config: StillConfig | None = None
+) -> tuple[list[MountView], int]:
+    """Moments at which a board was seen while everything stood still.
+
+    Args:
+        bag: Bag with frames and poses.
+        detector: The board's.
+        board_topic: Poses of the board; None if it is not tracked.
+        config: What is still.
+
+    Returns:
+        The views, and how many frames the bag has.
+    """
+    config = config or StillConfig()
+    car = read_poses(bag, CAR)
+    board = None if board_topic is None else read_poses(bag, board_topic)
+    stops: list[list[MountView]] = [[]]
+    count = 0
+    for stamp, image in read_frames(bag):
+        count += 1
+        view = _still_view(stamp, image, car, board, detector, config)
+        if view is not None:
+            stops[-1].append(view)
+        elif stops[-1]:
+            stops.append([])
+    chosen = []
+    for stop in stops:
+        if stop:
+            middles = np.linspace(0, len(stop) - 1, min(config.per_stop, len(stop)) + 2)[1:-1]
+            chosen += [stop[round(i)] for i in middles]
+    return chosen, count
+
+
+def read_shown(folder: Path) -> tuple[Array, Array, Array]:
+    """Shown colours, their camera means ``[N, 3]`` in 0..1, and cosines of the viewing angle ``[N]``, out of a folder with ``shown.csv``.
+
+    Its columns: ``file, red, green, blue`` (0..255) and optionally ``cos_angle``; rows of one colour in a row are averaged. The screen is
+    found by the difference of the first black and the first white picture of each angle.
+    """
+    table = folder / "shown.csv"
+    try:
+        with table.open(newline="", encoding="utf-8") as stream:
+            rows = list(csv.DictReader(stream))
+        keyed = [
+            ((float(r["red"]), float(r["green"]), float(r["blue"]), float(r.get("cos_angle") or 1.0)), folder / r["file"])
+            for r in rows
+        ]  # fmt: skip
+    except FileNotFoundError:
+        raise CalibrationError(
+            f"expected {table} with columns file, red, green, blue; write one row per picture"
+        ) from None
+    except (KeyError, TypeError, ValueError) as error:
+        raise CalibrationError(f"{table}: expected columns file, red, green, blue in 0..255, got {error}") from error
+    regions = {angle: _region(keyed, angle) for angle in {key[3] for key, _ in keyed}}
+    shown, seen, angles = [], [], []
+    for key, group in groupby(keyed, key=lambda row: row[0]):
+        shown.append(np.array(key[:3]) / 255.0)
+        pictures = [read_picture(file) for _, file in group]
+        region = regions[key[3]]
+        if any(picture.shape[:2] != region.shape for picture in pictures):
+            raise CalibrationError(
+                f"expected pictures of {region.shape[1]} x {region.shape[0]} in {folder}, as the black one, got others too"
+            )
+        seen.append(mean_colour(pictures, region))
+        angles.append(key[3])
+    return np.array(shown).reshape(-1, 3), np.array(seen).reshape(-1, 3), np.array(angles)
+
+
+def has_topic(bag: Path, topic: str) -> bool:
+    """Whether a bag has messages of a topic."""
+    return any(row.name == topic and row.count > 0 for row in read_info(bag).topics)
+
+
+def _decoded(bag: Path, topic: str) -> Iterator[Any]:
+    if not has_topic(bag, topic):
+        found = ", ".join(row.name for row in read_info(bag).topics if row.count)
+        raise BagError(f"expected {topic} in {bag}, it has {found or 'no messages'}; record it too")
+    typename = topic_row(topic).type
+    for message in read_messages(bag, [topic]):
+        yield decode(typename, message.cdr)
+
+
+def _still_view(
+    stamp: int, image: Rgb, car: PoseSeries, board: PoseSeries | None, detector: BoardDetector, config: StillConfig
+) -> MountView | None:
+    T_car = _still_pose(car, stamp, config)
+    T_board = None if board is None else _still_pose(board, stamp, config)
+    if T_car is None or (board is not None and T_board is None):
+        return None
+    found: Detection | None = detector.find(image)
+    return None if found is None else MountView(T_car, T_board, found)
+
+
+def _still_pose(series: PoseSeries, stamp: int, config: StillConfig) -> Array | None:
+    poses = series.around(stamp, round(config.half_window_s * 1e9))
+    if poses is None:
+        return None
+    mean = make_transform(mean_rotation(poses[:, :3, :3]), poses[:, :3, 3].mean(axis=0))
+    moved = float(np.linalg.norm(poses[:, :3, 3] - mean[:3, 3], axis=1).max())
+    turned = float(rotation_angles(mean[:3, :3].T @ poses[:, :3, :3]).max())
+    return mean if moved <= config.most_motion_m and turned <= config.most_turn_rad else None
+
+
+def _region(keyed: Sequence[tuple[tuple[float, ...], Path]], angle: float) -> NDArray[np.bool_]:
+    ends: list[Rgb] = []
+    for level, name in ((0.0, "black"), (255.0, "white")):
+        file = next((file for key, file in keyed if key[:3] == (level,) * 3 and key[3] == angle), None)
+        if file is None:
+            raise DegenerateDataError(f"expected a {name} picture at every angle, got none: the screen is found by it")
+        ends.append(read_picture(file))
+    if ends[0].shape != ends[1].shape:
+        raise CalibrationError("expected the black and the white picture to have one size")
+    return screen_region(ends[0], ends[1])

@@ -1,0 +1,43 @@
+"""A bag of what a running launch says now: the way from topics to a calibration, so that what was fitted is kept."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from nodes.bags.writer import BagWriter
+from nodes.runtime.bus import Bus
+from nodes.runtime.errors import BagError
+
+
+def record_live(run_dir: Path, topics: Sequence[str], duration_s: float, bag: Path) -> Path:
+    """Record topics for a while.
+
+    Args:
+        run_dir: Folder of the running launch.
+        topics: Topics of the table.
+        duration_s: For how long [s].
+        bag: New folder.
+
+    Raises:
+        BagError: One of the topics said nothing.
+    """
+    heard = dict.fromkeys(topics, 0)
+    with Bus(run_dir) as bus, BagWriter(bag) as writer:
+        for topic in topics:
+            bus.subscribe(topic, queue=2000)
+        end = time.monotonic() + duration_s
+        while (left := end - time.monotonic()) > 0.0:
+            bus.wait(min(left, 0.1))
+            for received in bus.receive():
+                info = received.info
+                writer.write(received.topic, info.raw, info.receive_real_ns, info.publish_real_ns, info.sequence)
+                heard[received.topic] += 1
+            writer.flush()
+    silent = [topic for topic, count in heard.items() if count == 0]
+    if silent:
+        raise BagError(
+            f"expected {', '.join(silent)} to come within {duration_s:g} s, heard nothing; are their nodes running?"
+        )
+    return bag

@@ -1,0 +1,105 @@
+"""One supervised process."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import IO, Any
+
+from nodes.launching.launch_file import NodeEntry
+
+_SHIM = Path(__file__).with_name("shim.py")
+
+
+class Child:
+    """A node's process, in a group of its own, bound to the life of the thread that starts it.
+
+    Args:
+        name: Name of the node.
+        entry: Its entry in the launch file.
+        run_dir: Folder of the run.
+    """
+
+    def __init__(self, name: str, entry: NodeEntry, run_dir: Path) -> None:
+        self.name = name
+        self.entry = entry
+        self.log = run_dir / "logs" / f"{name}.log"
+        self.config = run_dir / "config" / f"{name}.yaml"
+        self._run_dir = run_dir
+        self._process: subprocess.Popen[bytes] | None = None
+        self.restarts: list[float] = []
+        self.restart_at: float | None = None
+        self.started_at = 0.0
+        self.status: Any = None
+        self.status_at: float | None = None
+        self.given_up = False
+
+    @property
+    def pid(self) -> int:
+        """Process id; 0 when it was never started."""
+        return self._process.pid if self._process is not None else 0
+
+    @property
+    def running(self) -> bool:
+        """Whether the process lives."""
+        if self._process is None or self._process.returncode is not None:
+            return False
+        if os.waitid(os.P_PID, self._process.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is None:
+            return True
+        # While it is not reaped, its process group cannot be anybody else's: end what it started and left behind.
+        self.signal(signal.SIGKILL)
+        self._process.wait()
+        return False
+
+    @property
+    def exit_code(self) -> int | None:
+        """Exit code, negative for a signal; None while it lives."""
+        return None if self.running or self._process is None else self._process.returncode
+
+    def start(self) -> None:
+        """Start the process; only from a thread that outlives it, because PDEATHSIG counts threads."""
+        self.log.parent.mkdir(parents=True, exist_ok=True)
+        command = [
+            *(sys.executable, "-I", "-S", str(_SHIM), str(os.getpid())),
+            *(sys.executable, "-m", self.entry.module, "--config", str(self.config)),
+            *("--run-dir", str(self._run_dir), "--name", self.name),
+        ]
+        environment = {**os.environ, "PYTHONUNBUFFERED": "1", **self.entry.env}
+        with open(self.log, "ab") as log:
+            self._process = self._spawn(command, environment, log)
+        self.started_at, self.status, self.status_at, self.restart_at = time.monotonic(), None, None, None
+
+    @staticmethod
+    def _spawn(command: list[str], environment: dict[str, str], log: IO[bytes]) -> subprocess.Popen[bytes]:
+        return subprocess.Popen(
+            command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=environment, start_new_session=True
+        )
+
+    def signal(self, number: int) -> None:
+        """Send a signal to the whole process group."""
+        if self._process is not None and self._process.returncode is None:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(self._process.pid, number)
+
+    def how_it_ended(self) -> str:
+        """What to tell a person about its end."""
+        code = self.exit_code
+        if code is None:
+            return "still runs"
+        how = f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
+        last = self.last_line() if code > 0 else ""
+        return f"{how}{': ' + last if last else ''} (log: {self.log})"
+
+    def last_line(self) -> str:
+        """Last line of its log that carries its name, as its errors do, or else the last at all; without the name."""
+        try:
+            lines = self.log.read_bytes()[-4000:].decode("utf-8", "replace").strip().splitlines()
+        except OSError:
+            return ""
+        own = [line for line in lines if line.startswith(f"{self.name}: ")]
+        return (own or lines or [""])[-1].removeprefix(f"{self.name}: ")[:500]

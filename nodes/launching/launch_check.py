@@ -1,0 +1,59 @@
+"""Whether the nodes of a launch file would accept their configuration, asked of the nodes themselves; nothing is started."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import yaml
+
+from nodes.launching.launch_file import Plan
+from nodes.runtime.config import node_document
+
+_TIMEOUT_S = 60.0
+
+
+def check_nodes(plan: Plan) -> dict[str, str]:
+    """What is wrong with the configuration of each node, by name; empty when every node accepts its own.
+
+    Each node's module is run with ``--check``: it reads its configuration, says what is wrong with it and ends. Files that a
+    node reads when it starts (a policy, an attack) are not opened.
+    """
+    with tempfile.TemporaryDirectory(prefix="advnerf-check-") as folder, _processes(plan, Path(folder)) as processes:
+        problems: dict[str, str] = {}
+        for name, process in processes.items():
+            try:
+                _, errors = process.communicate(timeout=_TIMEOUT_S)
+            except subprocess.TimeoutExpired:
+                problems[name] = f"{name}: did not answer within {_TIMEOUT_S:g} s"
+                continue
+            if process.returncode:
+                lines = errors.strip().splitlines()
+                problems[name] = lines[-1] if lines else f"{name}: ended with exit code {process.returncode}"
+        return problems
+
+
+@contextmanager
+def _processes(plan: Plan, folder: Path) -> Iterator[dict[str, subprocess.Popen[str]]]:
+    processes: dict[str, subprocess.Popen[str]] = {}
+    try:
+        for name, entry in plan.nodes.items():
+            config = folder / f"{name}.yaml"
+            config.write_text(yaml.safe_dump(node_document(plan.documents[name]), sort_keys=False), encoding="utf-8")
+            command = [sys.executable, "-m", entry.module, "--check", "--config", str(config)]
+            processes[name] = subprocess.Popen(
+                [*command, "--run-dir", str(folder), "--name", name],
+                stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
+            )  # fmt: skip
+        yield processes
+    finally:
+        for process in processes.values():
+            if process.poll() is None:
+                process.kill()
+                process.wait()
+            if process.stderr is not None:
+                process.stderr.close()

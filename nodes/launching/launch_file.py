@@ -1,0 +1,307 @@
+"""Launch files: YAML in, a plan of processes out."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+
+from nodes.launching.launch_hosts import HostEntry, choose_host
+from nodes.runtime.config import Document, apply_overrides, read_yaml, validate
+from nodes.runtime.errors import ConfigError, TopicError
+from nodes.runtime.paths import bus_folder
+from nodes.runtime.topics import status_topic
+
+RECORDER = "recorder"
+_REFERENCE = re.compile(r"\$\{([A-Za-z_][A-Za-z0-9_]*)\}")
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=True)
+
+
+class Respawn(_Strict):
+    """How often a node that is not required may come back.
+
+    Attributes:
+        max_restarts: Restarts within the window, after which the node stays down.
+        window_s: Length of the window [s].
+        delay_s: Wait before the first restart; doubled for each further one in the window [s].
+        max_delay_s: Longest wait [s].
+    """
+
+    max_restarts: int = Field(default=5, ge=1)
+    window_s: float = Field(default=60.0, gt=0)
+    delay_s: float = Field(default=0.2, ge=0)
+    max_delay_s: float = Field(default=5.0, ge=0)
+
+
+class NodeEntry(_Strict):
+    """One node of a launch file.
+
+    Attributes:
+        module: Python module that is run, e.g. ``nodes.camera``.
+        config: Its configuration.
+        enabled: Key ``if``; false leaves the node out.
+        required: Its death stops the whole launch.
+        respawn: Restart rule of a node that is not required; none means that it stays down.
+        ends_launch: Its regular end (a player at the end of its bag) ends the launch with exit code 0.
+        stop_last: Stopped only when the others are down (a recorder, a simulated lab).
+        host: Which of the file's hosts it runs on; only where the file has hosts.
+        env: Environment variables to add.
+        start_timeout_s: Time until its first status [s].
+        hang_timeout_s: Silence of its status after which it counts as hung and is killed [s].
+    """
+
+    module: str
+    config: dict[str, Any] = Field(default_factory=dict)
+    enabled: bool = Field(default=True, alias="if")
+    required: bool = True
+    respawn: Respawn | None = None
+    ends_launch: bool = False
+    stop_last: bool = False
+    host: str | None = None
+    env: dict[str, str] = Field(default_factory=dict)
+    start_timeout_s: float = Field(default=60.0, gt=0)
+    hang_timeout_s: float = Field(default=5.0, gt=0)
+
+    @field_validator("config", mode="before")
+    @classmethod
+    def _no_config_is_an_empty_one(cls, value: Any) -> Any:
+        return {} if value is None else value
+
+
+class RecordEntry(_Strict):
+    """What the launch's own recorder does.
+
+    Attributes:
+        output: Bag folder, relative to the run folder.
+        topics: Topics to record; none means all of the topic table.
+        attachments: Files that ride along in the bag, besides the resolved launch file: calibration, attack file; an empty
+            entry (a parameter without a value) is left out.
+        host: Host that records; none means the one without an address, whose disk is larger.
+        max_bag_duration_s: Begin a new file after so long [s]; none leaves it to the recorder.
+        max_bag_size_mb: Begin a new file when one has so many MiB; none leaves it to the recorder.
+    """
+
+    output: str = "bag"
+    topics: list[str] | None = None
+    attachments: list[str | None] = Field(default_factory=list)
+    host: str | None = None
+    max_bag_duration_s: float | None = Field(default=None, gt=0)
+    max_bag_size_mb: float | None = Field(default=None, gt=0)
+
+
+class LaunchFile(_Strict):
+    """Content of a launch file.
+
+    Attributes:
+        name: Name of the launch.
+        params: Values to use elsewhere, in other parameters too, as ``${name}``. Two always exist: ``${run_dir}``, and ``${socket_dir}``, a folder
+            whose path is short enough for Unix sockets however long that of the run folder is.
+        nodes: The nodes, in the order in which they are started.
+        record: Add a recorder of everything; true for the defaults.
+        include: Launch files, relative to this one, on which this one builds.
+        hosts: The two computers of the launch; none means that all runs on one.
+        operator: Host from which people arm and ask; none means the one without an address.
+        keys: Key folder of each host; may be left out only on a loopback address, and then the other host can only watch.
+    """
+
+    name: str
+    params: dict[str, Any] = Field(default_factory=dict)
+    nodes: dict[str, NodeEntry]
+    record: bool | RecordEntry = False
+    include: list[str] = Field(default_factory=list)
+    hosts: dict[str, HostEntry] = Field(default_factory=dict)
+    operator: str | None = None
+    keys: str | None = None
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A launch file after includes, parameters and overrides.
+
+    Attributes:
+        file: Where it came from.
+        launch: The typed content.
+        documents: Configuration of each enabled node with the places of its keys, for error messages.
+        resolved: The whole as plain data, to be stored beside the results.
+    """
+
+    file: Path
+    launch: LaunchFile
+    documents: dict[str, Document]
+    resolved: dict[str, Any]
+
+    @property
+    def nodes(self) -> dict[str, NodeEntry]:
+        """The enabled nodes."""
+        return {name: entry for name, entry in self.launch.nodes.items() if name in self.documents}
+
+
+def load_launch(
+    file: Path, overrides: Sequence[str] = (), run_dir: Path | str = "<run_dir>", host: str | None = None
+) -> Plan:
+    """Read a launch file and resolve it.
+
+    Args:
+        file: A ``*.launch.yaml`` file.
+        overrides: ``node.key=value`` for a node's configuration (``node.config.key`` where the key is also one of `NodeEntry`), ``params.name=value``, ``record=true``,
+            ``hosts.name.key=value``, or ``keys=folder``.
+        run_dir: What ``${run_dir}`` stands for.
+        host: Which of the file's hosts this computer is, or ``all``; None where the file has none.
+    """
+    file = Path(file)
+    document = _read_with_includes(file, ())
+    if not isinstance(document.data, dict) or not isinstance(document.data.get("nodes"), dict):
+        raise ConfigError(f"{document.place(())}: expected a launch file with keys name and nodes")
+    for override in overrides:
+        _apply_override(document, override)
+    socket_dir = str(bus_folder(run_dir)) if isinstance(run_dir, Path) else "<socket_dir>"
+    params = {**(document.data.get("params") or {}), "run_dir": str(run_dir), "socket_dir": socket_dir}
+    document.data = _substitute(document.data, params, document, ())
+    launch = validate(LaunchFile, document)
+    if launch.record is not False:
+        _add_recorder(document, launch)
+        launch = validate(LaunchFile, document)
+    choose_host(document, launch, host)
+    launch = validate(LaunchFile, document)
+    enabled = [name for name, entry in launch.nodes.items() if entry.enabled]
+    for name in enabled:
+        _check(name, launch.nodes[name], document)
+    documents = {name: document.part(("nodes", name, "config")) for name in enabled}
+    return Plan(file, launch, documents, document.data)
+
+
+def _read_with_includes(file: Path, above: tuple[Path, ...]) -> Document:
+    file = file.resolve() if above else file
+    if file.resolve() in above:
+        raise ConfigError(f"{file}: includes itself through {' -> '.join(map(str, above))}")
+    document = read_yaml(file)
+    if not isinstance(document.data, dict):
+        raise ConfigError(f"{file}:1: expected a launch file with keys name and nodes")
+    includes = document.data.pop("include", None) or []
+    if not isinstance(includes, list) or not all(isinstance(entry, str) for entry in includes):
+        raise ConfigError(f"{document.place(('include',))}: expected a list of launch files, got {includes!r:.80}")
+    base = Document({}, str(file))
+    for entry in includes:
+        included = _read_with_includes(file.parent / entry, (*above, file.resolve()))
+        base.data = _merge(base.data, included.data)
+        base.places |= included.places
+    base.data = _merge(base.data, document.data)
+    base.places |= document.places
+    return base
+
+
+def _merge(below: Any, above: Any) -> Any:
+    if isinstance(below, dict) and isinstance(above, dict):
+        kinds = below.get("kind"), above.get("kind")
+        # A section of another kind (of camera, of motion capture) has other keys: it replaces the one below.
+        if None not in kinds and kinds[0] != kinds[1]:
+            return above
+        return {**below, **{key: _merge(below.get(key), value) for key, value in above.items()}}
+    return above
+
+
+def _apply_override(document: Document, override: str) -> None:
+    head = override.partition("=")[0].split(".")[0].strip()
+    nodes = document.data["nodes"]
+    if head in ("params", "record", "hosts", "keys", "operator"):
+        known = document.data.get("params") or {}
+        name = override.partition("=")[0].split(".", 1)[-1].strip()
+        if head == "params" and name not in known:
+            raise ConfigError(f"--set {override}: unknown parameter; known are {', '.join(known) or 'none'}")
+        apply_overrides(document, [override])
+    elif head in nodes:
+        name, separator, value = override.partition("=")
+        if "." not in name or not separator:
+            raise ConfigError(f"--set {override}: expected NODE.KEY=VALUE")
+        rest = name.split(".", 1)[1]
+        prefix = (head,) if _is_about_the_process(rest, value, document, override) else (head, "config")
+        apply_overrides(document, [f"{'.'.join((*prefix, rest))}={value}"], ("nodes",))
+        document.places[("nodes", *prefix, *rest.split("."))] = f"--set {override}"
+    else:
+        raise ConfigError(f"--set {override}: no node called {head!r}; known are {', '.join(nodes)}, and params")
+
+
+def _is_about_the_process(key: str, value: str, document: Document, override: str) -> bool:
+    """Whether a key of ``--set NODE.KEY`` is one of `NodeEntry`, such as ``if`` or ``config.rate_hz``, not of the node itself."""
+    if key.split(".")[0] not in {field.alias or name for name, field in NodeEntry.model_fields.items()}:
+        return False
+    hosts = document.data.get("hosts") or {}
+    if key != "host":
+        return True
+    # Some nodes have a key of this name, too: the address they listen on.
+    if hosts and value.strip() not in hosts:
+        node = override.split(".")[0].strip()
+        raise ConfigError(
+            f"--set {override}: expected the host that runs {node}, one of {', '.join(hosts)}, got {value.strip()}; "
+            f"the node's own key is {node}.config.host"
+        )
+    return bool(hosts)
+
+
+def _substitute(
+    value: Any, params: dict[str, Any], document: Document, key: tuple[str | int, ...], above: tuple[str, ...] = ()
+) -> Any:
+    """Put in the values of parameters, which may name others. ``above`` are the parameters that are being put in."""
+    if isinstance(value, dict):
+        return {name: _substitute(item, params, document, (*key, name), above) for name, item in value.items()}
+    if isinstance(value, list):
+        return [_substitute(item, params, document, (*key, index), above) for index, item in enumerate(value)]
+    if not isinstance(value, str):
+        return value
+
+    def lookup(name: str) -> Any:
+        if name not in params:
+            raise ConfigError(f"{document.place(key)}: unknown parameter ${{{name}}}; known are {', '.join(params)}")
+        if name in above:
+            circle = " -> ".join((*above, name))
+            raise ConfigError(f"{document.place(key)}: parameter {name} is made of itself: {circle}")
+        return _substitute(params[name], params, document, ("params", name), (*above, name))
+
+    if whole := _REFERENCE.fullmatch(value):
+        return lookup(whole[1])
+    return _REFERENCE.sub(lambda match: str(lookup(match[1])), value)
+
+
+def _add_recorder(document: Document, launch: LaunchFile) -> None:
+    record = RecordEntry() if launch.record is True else launch.record
+    assert isinstance(record, RecordEntry)
+    if RECORDER in launch.nodes:
+        raise ConfigError(f"{document.place(('nodes', RECORDER))}: this node and the key record exclude each other")
+    others = [name for name, entry in launch.nodes.items() if entry.enabled]
+    attachments = [file for file in record.attachments if file]
+    limits = record.model_dump(include={"max_bag_duration_s", "max_bag_size_mb"}, exclude_none=True)
+    config = {
+        "output": record.output, "topics": record.topics, "attachments": attachments, "statuses_of": others, **limits,
+    }  # fmt: skip
+    home = record.host or next((name for name, entry in launch.hosts.items() if entry.address is None), None)
+    document.data["nodes"][RECORDER] = {
+        "module": "nodes.recorder", "stop_last": True, "config": config, "host": home,
+    }  # fmt: skip
+    document.data["record"] = False
+    document.places[("nodes", RECORDER)] = document.place(("record",))
+
+
+def _check(name: str, entry: NodeEntry, document: Document) -> None:
+    place = document.place(("nodes", name))
+    try:
+        status_topic(name)
+    except TopicError as error:
+        raise ConfigError(f"{place}: {error}") from None
+    if name in ("params", "record", "hosts", "keys", "operator"):
+        raise ConfigError(f"{place}: a node cannot be called {name}, because --set uses that word")
+    if entry.required and entry.respawn is not None:
+        raise ConfigError(f"{place}: node {name} has respawn, so it must also say required: false")
+    try:
+        found = importlib.util.find_spec(entry.module) is not None
+    except ModuleNotFoundError:
+        found = False
+    if not found:
+        raise ConfigError(f"{document.place(('nodes', name, 'module'))}: no Python module called {entry.module}")

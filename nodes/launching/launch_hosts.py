@@ -1,0 +1,185 @@
+"""Host roles of a launch file: which nodes run here, and the gateway that joins the two hosts.
+
+Two hosts at most: the one with an address listens (the car, a thin client), the other connects (the workstation). The topic
+table says who publishes what, so that the gateways' lists follow from where the nodes are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, Protocol
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from nodes.runtime.config import Document
+from nodes.runtime.errors import ConfigError
+from nodes.runtime.topics import STATUS_PREFIX, TOPICS, status_topic
+
+if TYPE_CHECKING:
+    from nodes.launching.launch_file import LaunchFile
+
+GATEWAY = "gateway"
+ALL_HOSTS = "all"
+_OPERATOR = "operator"
+_HOST_COUNT = 2
+# A command to move must reach the motor through a check on the same computer, whatever the network does.
+_TOGETHER = ("safety", "motor")
+_SAFETY_MODULE = "nodes.safety"
+_COMMANDS = ("/policy/drive", "/expert/drive")
+
+
+class HostEntry(BaseModel):
+    """One host of a launch file.
+
+    Attributes:
+        address: Where the other host finds this one; exactly one host has an address, and listens there.
+        watch_port: TCP port by which it speaks.
+        drive_port: TCP port by which it hears.
+        key: Name of its key; none means the host's own name.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    address: str | None = None
+    watch_port: int = Field(default=5570, ge=1024, le=65535)
+    drive_port: int = Field(default=5571, ge=1024, le=65535)
+    key: str | None = None
+
+
+class _Entry(Protocol):
+    module: str
+    host: str | None
+    enabled: bool
+
+
+def choose_host(document: Document, launch: LaunchFile, host: str | None) -> None:
+    """Leave out the nodes of other hosts and add this host's gateway, in place.
+
+    Args:
+        document: The launch file's plain data.
+        launch: The same, typed.
+        host: Name of this host, ``all`` to run everything on this computer, or None where the file knows no hosts.
+    """
+    _check(document, launch, host)
+    if host is None or host == ALL_HOSTS:
+        return
+    exports, imports = routes(launch, host)
+    if launch.keys is None:
+        exports, imports = _watching_only(document, launch, host, exports, imports)
+    document.data["nodes"] = {
+        name: entry for name, entry in document.data["nodes"].items() if launch.nodes[name].host == host
+    }
+    config = _gateway_config(launch, host, exports, imports)
+    document.data["nodes"][GATEWAY] = {"module": "nodes.gateway", "host": host, "stop_last": True, "config": config}
+    document.places[("nodes", GATEWAY)] = document.place(("hosts",))
+    if host == _listener(launch) and not set(_COMMANDS).isdisjoint(imports):
+        _require_clock(document, launch, host)
+
+
+def _require_clock(document: Document, launch: LaunchFile, host: str) -> None:
+    """Commands come from the other host: their age is known only as well as its clock is, so nobody arms before that."""
+    other = next(name for name in launch.hosts if name != host)
+    peer = launch.hosts[other].key or other
+    for name, node in document.data["nodes"].items():
+        if launch.nodes.get(name) is not None and launch.nodes[name].module == _SAFETY_MODULE:
+            node["config"] = {"clock_peers": [peer], **(node.get("config") or {})}
+
+
+def _watching_only(
+    document: Document, launch: LaunchFile, host: str, exports: list[str], imports: list[str]
+) -> tuple[list[str], list[str]]:
+    """Routes of a launch without keys: nothing goes to the host that listens. Statuses are dropped, all else is refused."""
+    listens = host == _listener(launch)
+    towards = imports if listens else exports
+    if commands := [topic for topic in towards if not topic.startswith(STATUS_PREFIX)]:
+        raise ConfigError(
+            f"{document.place(('hosts',))}: without keys the hosts can only watch each other, but {_listener(launch)} would take "
+            f"{', '.join(commands[:4])}{' and more' if len(commands) > 4 else ''} from the other: any local process could drive the "
+            f"car. Give --set keys=FOLDER (advnerf keys new), put what commands on {_listener(launch)} (people too: operator: "
+            f"{_listener(launch)}), or run everything on one computer with --host all"
+        )
+    return (exports, []) if listens else ([], imports)
+
+
+def routes(launch: LaunchFile, host: str) -> tuple[list[str], list[str]]:
+    """Topics that a host exports, and those it imports."""
+    listener = _listener(launch)
+    operator = operator_of(launch)
+    exports, imports = [], []
+    entries = {name: entry for name, entry in launch.nodes.items() if entry.enabled}
+    for topic, row in TOPICS.items():
+        if row.publisher == GATEWAY:
+            source: str | None = listener
+        elif row.publisher == _OPERATOR:
+            source = operator
+        else:
+            source = _host_of(row.publisher, entries)
+        if source == host:
+            exports.append(topic)
+        elif source is not None:
+            imports.append(topic)
+    for name, entry in entries.items():
+        (exports if entry.host == host else imports).append(status_topic(name))
+    return exports, imports
+
+
+def operator_of(launch: LaunchFile) -> str:
+    """Host from which people arm and ask."""
+    listener = _listener(launch)
+    return launch.operator or next(name for name in launch.hosts if name != listener)
+
+
+def _host_of(role: str, entries: Mapping[str, _Entry]) -> str | None:
+    """Host of the node that plays a role, by its name or by its module."""
+    for name, entry in entries.items():
+        if role in (name, entry.module.rsplit(".", 1)[-1]):
+            return entry.host
+    return None
+
+
+def _listener(launch: LaunchFile) -> str:
+    return next(name for name, entry in launch.hosts.items() if entry.address is not None)
+
+
+def _gateway_config(launch: LaunchFile, host: str, exports: list[str], imports: list[str]) -> dict[str, Any]:
+    listener = _listener(launch)
+    entry = launch.hosts[listener]
+    end = {"listen": entry.address} if host == listener else {"connect": entry.address}
+    return {
+        **end, "watch_port": entry.watch_port, "drive_port": entry.drive_port, "keys": launch.keys,
+        "key": launch.hosts[host].key or host, "peer_key": entry.key or listener, "imports": imports,
+        # The clock's offset is made by the gateway itself: it says it on its bus and hears it there.
+        "exports": exports,
+    }  # fmt: skip
+
+
+def _check(document: Document, launch: LaunchFile, host: str | None) -> None:
+    place = document.place(("hosts",))
+    if not launch.hosts:
+        if host is not None and host != ALL_HOSTS:
+            raise ConfigError(f"--host {host}: {document.source} knows no hosts; leave --host out")
+        if named := [name for name, entry in launch.nodes.items() if entry.host]:
+            raise ConfigError(
+                f"{document.place(('nodes', named[0]))}: node {named[0]} has a host, but there is no hosts"
+            )
+        return
+    known = ", ".join(launch.hosts)
+    if host is None or (host != ALL_HOSTS and host not in launch.hosts):
+        raise ConfigError(f"{place}: say which host this is: --host with one of {known}, or all; got {host}")
+    listeners = [name for name, entry in launch.hosts.items() if entry.address is not None]
+    if len(launch.hosts) != _HOST_COUNT or len(listeners) != 1:
+        raise ConfigError(
+            f"{place}: expected two hosts, one of them with an address, got {known} with addresses of "
+            f"{', '.join(listeners) or 'none'}"
+        )
+    if launch.operator is not None and launch.operator not in launch.hosts:
+        raise ConfigError(f"{document.place(('operator',))}: expected one of {known}, got {launch.operator}")
+    for name, entry in launch.nodes.items():
+        if entry.enabled and entry.host not in launch.hosts:
+            raise ConfigError(f"{document.place(('nodes', name))}: node {name} needs a host: {known}; got {entry.host}")
+    enabled = {name: entry for name, entry in launch.nodes.items() if entry.enabled}
+    homes = {role: home for role in _TOGETHER if (home := _host_of(role, enabled)) is not None}
+    if len(set(homes.values())) > 1:
+        raise ConfigError(
+            f"{place}: safety and motor must be on one host, got {homes}: no network between check and wheel"
+        )

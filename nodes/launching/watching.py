@@ -1,0 +1,157 @@
+"""What a person asks a running launch: which topics there are, how often they come, what they say."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nodes.launching.launch import active_launches, is_running
+from nodes.runtime.bus import Bus, Received
+from nodes.runtime.clock import NS_PER_S
+from nodes.runtime.config import parse_yaml
+from nodes.runtime.errors import LaunchError, MessageError
+from nodes.runtime.messages import stamp_ns
+from nodes.runtime.paths import RESOLVED_NAME, bus_folder
+from nodes.runtime.topics import STATUS_PREFIX, TOPICS, status_topic
+from nodes.runtime.topics import topic as topic_row
+
+_STATUS_WAIT_S = 1.0
+_ECHO_ITEMS = 12
+
+
+@dataclass(frozen=True)
+class TopicRow:
+    """One topic of a running launch."""
+
+    name: str
+    type: str
+    publisher: str
+    subscribers: int
+
+
+@dataclass(frozen=True)
+class RateReport:
+    """How a topic came during a while; ages are those of the capture stamps at reception."""
+
+    messages: int
+    lost: int
+    rate_hz: float
+    shortest_s: float
+    longest_s: float
+    age_median_s: float | None
+    age_worst_s: float | None
+
+
+def find_run_dir(given: Path | None) -> Path:
+    """The run folder to look at: the one that was given, or that of the only launch that is running."""
+    if given is not None:
+        if not given.is_dir():
+            raise LaunchError(f"no run folder {given}")
+        return given
+    launches = active_launches()
+    if len(launches) != 1:
+        found = ", ".join(str(launch["run_dir"]) for launch in launches) or "none"
+        raise LaunchError(f"expected one running launch, found {len(launches)} ({found}); say which with --run-dir")
+    return Path(launches[0]["run_dir"])
+
+
+def node_names(run_dir: Path) -> list[str]:
+    """Names of the nodes that have, or had, a socket in a run folder, and of those of its launch while it is at work."""
+    prefix = status_topic("x")[:-1].strip("/").replace("/", ".")
+    sockets = (path.name for path in bus_folder(run_dir).iterdir() if path.suffix != ".lock")
+    names = {name.removeprefix(prefix + ".") for name in sockets if name.startswith(prefix + ".")}
+    return sorted(names | set(_launched(run_dir)))
+
+
+def _launched(run_dir: Path) -> list[str]:
+    """Nodes of the launch that is at work in a run folder."""
+    try:
+        if not is_running(run_dir):
+            return []
+        resolved = parse_yaml((run_dir / RESOLVED_NAME).read_text(encoding="utf-8"), RESOLVED_NAME).data
+        return [name for name, entry in resolved["nodes"].items() if entry.get("if", True)]
+    except FileNotFoundError:
+        return []
+
+
+def node_statuses(run_dir: Path, wait_s: float = _STATUS_WAIT_S) -> dict[str, Any]:
+    """Last status of every node that reports within a moment; None for a node that is silent."""
+    names = node_names(run_dir)
+    statuses: dict[str, Any] = dict.fromkeys(names)
+    with Bus(run_dir) as bus:
+        for name in names:
+            bus.subscribe(status_topic(name))
+        deadline = time.monotonic() + wait_s
+        while None in statuses.values() and (left := deadline - time.monotonic()) > 0:
+            bus.wait(left)
+            for received in bus.receive():
+                statuses[received.topic.removeprefix(STATUS_PREFIX)] = received.message()
+    return statuses
+
+
+def list_topics(run_dir: Path) -> list[TopicRow]:
+    """All topics of the table and all statuses, with who publishes them now and to how many."""
+    publishers: dict[str, tuple[str, int]] = {}
+    statuses = {name: status for name, status in node_statuses(run_dir).items() if status is not None}
+    for name, status in statuses.items():
+        for topic, subscribers in zip(status.publications, status.subscribers, strict=True):
+            publishers[topic] = (name, int(subscribers))
+    rows = [TopicRow(name, row.type, *publishers.get(name, ("", 0))) for name, row in TOPICS.items()]
+    return rows + [
+        TopicRow(status_topic(name), topic_row(status_topic(name)).type, name, 0) for name in sorted(statuses)
+    ]
+
+
+def listen(run_dir: Path, topic: str, duration_s: float | None) -> Iterator[Received]:
+    """Every message of a topic as it comes, until the time is over (None: for ever)."""
+    deadline = None if duration_s is None else time.monotonic() + duration_s
+    with Bus(run_dir) as bus:
+        bus.subscribe(topic, queue=1000)
+        while deadline is None or time.monotonic() < deadline:
+            bus.wait(0.1 if deadline is None else min(0.1, max(0.0, deadline - time.monotonic())))
+            yield from bus.receive()
+
+
+def measure_rate(run_dir: Path, topic: str, duration_s: float) -> RateReport:
+    """Listen for a while and say how the topic came."""
+    times, ages, lost = [], [], 0
+    for received in listen(run_dir, topic, duration_s):
+        times.append(received.info.publish_mono_ns)
+        lost += received.info.lost
+        message = received.message()
+        if hasattr(message, "header"):
+            ages.append((received.info.receive_real_ns - stamp_ns(message)) / NS_PER_S)
+    if len(times) < 2:
+        raise MessageError(
+            f"expected {topic} to come at least twice in {duration_s:g} s, got {len(times)}; is its node running?"
+        )
+    gaps = [(b - a) / NS_PER_S for a, b in pairwise(times)]
+    return RateReport(
+        len(times), lost, len(gaps) / sum(gaps), min(gaps), max(gaps),
+        statistics.median(ages) if ages else None, max(ages) if ages else None,
+    )  # fmt: skip
+
+
+def describe(message: Any, indent: str = "") -> str:
+    """A message as indented text; long arrays are cut."""
+    lines = []
+    for name, value in vars(message).items():
+        if name.startswith("__"):
+            continue
+        if hasattr(value, "__msgtype__"):
+            lines.append(f"{indent}{name}:\n{describe(value, indent + '  ')}")
+        elif isinstance(value, np.ndarray | list) and len(value) > _ECHO_ITEMS:
+            shown = ", ".join(str(item) for item in value[:_ECHO_ITEMS])
+            lines.append(f"{indent}{name}: [{shown}, ... {len(value)} in all]")
+        elif isinstance(value, np.ndarray):
+            lines.append(f"{indent}{name}: {value.tolist()}")
+        else:
+            lines.append(f"{indent}{name}: {value!r}")
+    return "\n".join(lines)

@@ -1,0 +1,226 @@
+"""What a person asks about the nodes of a running launch: who is there, what they use, where messages grow old."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+
+from nodes.launching.watching import listen, node_names
+from nodes.runtime.bus import Bus
+from nodes.runtime.clock import NS_PER_S
+from nodes.runtime.errors import MessageError
+from nodes.runtime.messages import stamp_ns
+from nodes.runtime.paths import lock_path, socket_path
+from nodes.runtime.topics import STATUS_PREFIX, status_topic
+
+SILENT = "silent"
+_MIB = 2**20
+_QUEUE_WORDS = ("inbox_dropped",)
+
+
+@dataclass(frozen=True)
+class Delay:
+    """Percentiles of one delay [s]."""
+
+    median_s: float
+    p99_s: float
+    worst_s: float
+
+
+@dataclass(frozen=True)
+class DelayReport:
+    """Where the time of a topic goes.
+
+    Attributes:
+        messages: How many came.
+        capture_to_publish: From the stamp in the header to publication, in real time; None without a header.
+        publish_to_receive: From publication to reception here.
+    """
+
+    messages: int
+    capture_to_publish: Delay | None
+    publish_to_receive: Delay
+
+
+@dataclass(frozen=True)
+class NodeRow:
+    """One node over a while.
+
+    Attributes:
+        name: Name in the launch file.
+        pid: Its process; 0 for one on another host.
+        state: What it says it is, or ``silent``.
+        text: What it says about it.
+        cpu_percent: Of one core; None for a process that is not here.
+        memory_mib: Resident memory [MiB]; None for a process that is not here.
+        rate_hz: Messages it took and ticks it ran, per second.
+        dropped: Messages it skipped for newer ones, lost on the way, or refused, since it started.
+        missed: Ticks it missed since it started.
+        restarts: Changes of its process while we looked.
+        queue: Messages dropped from the queue of its drivers since it started.
+    """
+
+    name: str
+    pid: int
+    state: str
+    text: str
+    cpu_percent: float | None
+    memory_mib: float | None
+    rate_hz: float
+    dropped: int
+    missed: int
+    restarts: int
+    queue: int
+
+
+@dataclass(frozen=True)
+class Silence:
+    """A node that does not report.
+
+    Attributes:
+        pid: Its process; 0 for one that has ended, or runs on another host.
+        text: How long ago it reported, and what its process does.
+    """
+
+    pid: int
+    text: str
+
+
+def describe_silence(run_dir: Path, name: str) -> Silence:
+    """Say since when a node has not reported, from the lock that its publisher touches at every status."""
+    lock = lock_path(socket_path(run_dir, status_topic(name)))
+    try:
+        age_s = max(0.0, time.time() - lock.stat().st_mtime)
+        owner = int(lock.read_text(encoding="ascii").strip() or 0)
+    except (FileNotFoundError, ValueError):
+        return Silence(0, "has never reported")
+    process = _process_of(name, owner)
+    if process is None:
+        return Silence(0, f"last status {age_s:.1f} s ago; its process is not here any more")
+    try:
+        stopped = process.status() == psutil.STATUS_STOPPED
+    except psutil.Error:
+        stopped = False
+    return Silence(
+        owner, f"last status {age_s:.1f} s ago; its process is {'stopped by a signal' if stopped else 'alive'}"
+    )
+
+
+def _process_of(name: str, pid: int) -> psutil.Process | None:
+    """The process of a node, if it is here: a node of another host may have the number of a stranger."""
+    try:
+        process = psutil.Process(pid)
+        command = process.cmdline()
+        return process if "--name" in command and command[command.index("--name") + 1] == name else None
+    except (psutil.Error, IndexError):
+        return None
+
+
+def measure_delay(run_dir: Path, topic: str, duration_s: float) -> DelayReport:
+    """Listen to a topic for a while and say how old its messages are at publication and on arrival."""
+    capture, way = [], []
+    for received in listen(run_dir, topic, duration_s):
+        info, message = received.info, received.message()
+        way.append((info.receive_mono_ns - info.publish_mono_ns) / NS_PER_S)
+        if hasattr(message, "header"):
+            capture.append((info.publish_real_ns - stamp_ns(message)) / NS_PER_S)
+    if not way:
+        raise MessageError(f"expected {topic} to come within {duration_s:g} s, nothing came; is its node running?")
+    return DelayReport(len(way), _delay(capture) if capture else None, _delay(way))
+
+
+def _delay(values_s: list[float]) -> Delay:
+    median_s, p99_s = np.percentile(values_s, [50, 99])
+    return Delay(float(median_s), float(p99_s), max(values_s))
+
+
+class NodeWatch:
+    """Looks at all nodes of a run folder again and again.
+
+    Args:
+        run_dir: Folder of the run.
+    """
+
+    def __init__(self, run_dir: Path) -> None:
+        self._run_dir = run_dir
+        self._bus = Bus(run_dir)
+        self._first: dict[str, tuple[float, Any]] = {}
+        self._last: dict[str, tuple[float, Any]] = {}
+        self._restarts: dict[str, int] = {}
+        self._processes: dict[int, psutil.Process] = {}
+
+    def __enter__(self) -> NodeWatch:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._bus.close()
+
+    def rows(self, duration_s: float) -> list[NodeRow]:
+        """Watch for a while; what each node did in it."""
+        names = node_names(self._run_dir)
+        for name in names:
+            self._bus.subscribe(status_topic(name))
+        self._first.clear()
+        deadline = time.monotonic() + duration_s
+        while (left := deadline - time.monotonic()) > 0:
+            self._bus.wait(left)
+            for received in self._bus.receive():
+                name = received.topic.removeprefix(STATUS_PREFIX)
+                self._note(name, received.message())
+        return [
+            self._row(name) if name in self._first else self._silent(name) for name in sorted({*names, *self._first})
+        ]
+
+    def _note(self, name: str, status: Any) -> None:
+        now, pid = time.monotonic(), int(status.pid)
+        if name in self._last and int(self._last[name][1].pid) != pid:
+            self._restarts[name] = self._restarts.get(name, 0) + 1
+            self._first[name] = (now, status)  # its counters begin again
+        self._first.setdefault(name, (now, status))
+        self._last[name] = (now, status)
+        self._process(name, pid)
+
+    def _process(self, name: str, pid: int) -> psutil.Process | None:
+        if pid not in self._processes:
+            process = _process_of(name, pid)
+            if process is None:
+                return None
+            process.cpu_percent()  # the first call begins the measurement
+            self._processes[pid] = process
+        return self._processes[pid]
+
+    def _usage(self, process: psutil.Process | None) -> tuple[float | None, float | None]:
+        """Processor [% of one core] and memory [MiB]; None for a process that is not here."""
+        try:
+            return (None, None) if process is None else (process.cpu_percent(), process.memory_info().rss / _MIB)
+        except psutil.Error:
+            return None, None
+
+    def _silent(self, name: str) -> NodeRow:
+        silence = describe_silence(self._run_dir, name)
+        cpu, memory = self._usage(self._process(name, silence.pid) if silence.pid else None)
+        restarts = self._restarts.get(name, 0)
+        return NodeRow(name, silence.pid, SILENT, silence.text, cpu, memory, 0.0, 0, 0, restarts, 0)
+
+    def _row(self, name: str) -> NodeRow:
+        (began, first), (ended, last) = self._first[name], self._last[name]
+        before, after = _counters(first), _counters(last)
+        work = sum(after[key] - before.get(key, 0.0) for key in after if key == "ticks" or key.startswith("received "))
+        process = self._process(name, int(last.pid))
+        cpu, memory = self._usage(process)
+        return NodeRow(
+            name, 0 if memory is None else int(last.pid), str(last.state), str(last.text), cpu, memory,
+            work / (ended - began) if ended > began else 0.0,
+            int(sum(v for k, v in after.items() if k.split(" ")[0] in ("dropped", "lost", "refused") and " " in k)),
+            int(after.get("ticks_missed", 0)), self._restarts.get(name, 0),
+            int(sum(after.get(word, 0) for word in _QUEUE_WORDS)),
+        )  # fmt: skip
+
+
+def _counters(status: Any) -> dict[str, float]:
+    return dict(zip(status.counter_names, map(float, status.counter_values), strict=True))

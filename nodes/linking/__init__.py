@@ -1,0 +1,1 @@
+"""The link between two hosts: keys, doors, and the offset of their clocks."""

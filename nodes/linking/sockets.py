@@ -1,0 +1,199 @@
+"""The two doors of a link as ZeroMQ sockets: opened with their keys and limits, closed, and watched for handshakes."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import zmq
+from zmq.utils.monitor import recv_monitor_message
+
+from nodes.linking.keys import DRIVE, WATCH, KeyFolder
+from nodes.runtime.errors import BusError
+
+# Enough for a breath of poses and images; what waits longer is stale, and PUB drops new messages while the pipe is full.
+LINK_QUEUE = 50
+# No message is larger; the socket itself cuts off whoever sends one.
+MOST_BYTES = 16 * 2**20
+# What the listener and the other end say to one another beneath all topics: the clock's question, and a sign of life.
+CLOCK, PULSE = b"_clock", b"_pulse"
+_HEARTBEAT_MS, _HEARTBEAT_TIMEOUT_MS = 500, 3000
+_FAILURES = {
+    int(zmq.EVENT_HANDSHAKE_FAILED_AUTH): "refused: its key is not on the list",
+    int(zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL): "refused: no CURVE key at all, or the wrong key of this host",
+    int(zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL): "failed",
+}
+
+
+@dataclass(frozen=True)
+class LinkConfig:
+    """Both ends of a link.
+
+    Attributes:
+        address: Address to listen on, or to connect to.
+        listens: Which end this is.
+        watch_port: TCP port of what the listener says.
+        drive_port: TCP port of what the listener hears.
+        keys: Key folder; none only on a loopback address, and to watch.
+        own: Name of our own key.
+        peer: Name of the listener's key, at the end that connects.
+        imports: Topics taken from the other end; anything else is refused.
+        exports: Topics given to the other end.
+    """
+
+    address: str
+    listens: bool
+    watch_port: int
+    drive_port: int
+    keys: KeyFolder | None
+    own: str
+    peer: str
+    imports: tuple[str, ...]
+    exports: tuple[str, ...] = ()
+
+    @property
+    def commands(self) -> tuple[str, ...]:
+        """Topics that go by the drive door: towards the end that listens."""
+        return self.imports if self.listens else self.exports
+
+    @property
+    def drives(self) -> bool:
+        """Whether the drive door is used: by a listener that has keys, and by an end that has something to say there."""
+        return self.keys is not None and (self.listens or bool(self.exports))
+
+
+@dataclass(frozen=True)
+class Handshake:
+    """What happened at a door.
+
+    Attributes:
+        right: Which door.
+        refusal: Why somebody was not let in; empty otherwise.
+        ended: Whether a connection ended.
+    """
+
+    right: str
+    refusal: str = ""
+    ended: bool = False
+
+
+class Doors:
+    """The sockets of one end, and their monitors. Not thread-safe: the link's thread owns them.
+
+    Args:
+        config: Which end, where, and with which keys.
+        context: Where the sockets live.
+        poller: Gets what must be waited for: the monitors, and the door through which messages come in.
+    """
+
+    def __init__(self, config: LinkConfig, context: zmq.Context[Any], poller: zmq.Poller) -> None:
+        self._config, self._context, self._poller = config, context, poller
+        self._sockets: dict[str, zmq.Socket[Any]] = {}
+        self._monitors: dict[str, zmq.Socket[Any]] = {}
+        self._subscribed: set[str] = set()
+        # What the listener says leaves by the watch door; what the other end says enters by the drive door.
+        self._in, self._out = (DRIVE, WATCH) if config.listens else (WATCH, DRIVE)
+
+    @property
+    def inward(self) -> zmq.Socket[Any] | None:
+        """The door through which messages come in; none at a listener without keys."""
+        return self._sockets.get(self._in)
+
+    @property
+    def outward(self) -> zmq.Socket[Any] | None:
+        """The door through which messages go out; none at an end that only watches."""
+        return self._sockets.get(self._out)
+
+    def open(self, right: str) -> None:
+        """Open a door."""
+        config = self._config
+        socket = self._context.socket(zmq.SUB if right == self._in else zmq.PUB)
+        socket.linger = 0
+        socket.sndhwm = socket.rcvhwm = LINK_QUEUE
+        socket.setsockopt(zmq.MAXMSGSIZE, MOST_BYTES)
+        socket.setsockopt(zmq.HEARTBEAT_IVL, _HEARTBEAT_MS)
+        socket.setsockopt(zmq.HEARTBEAT_TIMEOUT, _HEARTBEAT_TIMEOUT_MS)
+        socket.setsockopt(zmq.RECONNECT_IVL, 100)
+        socket.setsockopt(zmq.RECONNECT_IVL_MAX, 1000)
+        socket.setsockopt(zmq.IPV6, ":" in config.address)
+        if config.keys is not None:
+            self._arm_curve(socket, right)
+        monitor = socket.get_monitor_socket(zmq.EVENT_HANDSHAKE_SUCCEEDED | zmq.EVENT_DISCONNECTED | sum(_FAILURES))
+        self._sockets[right], self._monitors[right] = socket, monitor
+        self._poller.register(monitor, zmq.POLLIN)
+        if right == self._in:
+            socket.subscribe(CLOCK)
+            socket.subscribe(PULSE)
+            self._subscribed = set()
+            self._poller.register(socket, zmq.POLLIN)
+        self._attach(socket, config.watch_port if right == WATCH else config.drive_port)
+
+    def close(self, right: str) -> None:
+        """Close a door; whoever is connected there is cut off."""
+        socket, monitor = self._sockets.pop(right), self._monitors.pop(right)
+        self._poller.unregister(monitor)
+        if right == self._in:
+            self._poller.unregister(socket)
+        socket.disable_monitor()
+        monitor.close(linger=0)
+        socket.close(linger=0)
+
+    def close_all(self) -> None:
+        """Close what is open."""
+        for right in list(self._sockets):
+            self.close(right)
+
+    def follow(self, wanted: frozenset[str]) -> None:
+        """Take these topics and no others from the other end."""
+        if self.inward is None:
+            return
+        for topic in wanted - self._subscribed:
+            self.inward.subscribe(topic.encode())
+        for topic in self._subscribed - wanted:
+            self.inward.unsubscribe(topic.encode())
+        self._subscribed = set(wanted)
+
+    def handshakes(self, ready: set[Any]) -> Iterator[Handshake]:
+        """What happened at the doors whose monitors are ready."""
+        for right, monitor in list(self._monitors.items()):
+            if monitor not in ready:
+                continue
+            with contextlib.suppress(zmq.Again):
+                while True:
+                    number = int(recv_monitor_message(monitor, zmq.NOBLOCK)["event"])
+                    yield Handshake(right, _FAILURES.get(number, ""), number == zmq.EVENT_DISCONNECTED)
+
+    def _arm_curve(self, socket: zmq.Socket[Any], right: str) -> None:
+        keys, own = self._config.keys, self._config.own
+        assert keys is not None
+        socket.curve_secretkey = keys.secret(own).encode()
+        socket.curve_publickey = keys.public(own).encode()
+        if self._config.listens:
+            socket.curve_server = True
+            # Named, never "*": to pyzmq's own authenticator that is a name like any other, and no wildcard.
+            socket.setsockopt(zmq.ZAP_DOMAIN, right.encode())
+            socket.setsockopt(zmq.ZAP_ENFORCE_DOMAIN, 1)
+        else:
+            socket.curve_serverkey = keys.public(self._config.peer).encode()
+
+    def _attach(self, socket: zmq.Socket[Any], port: int) -> None:
+        address = f"[{self._config.address}]" if ":" in self._config.address else self._config.address
+        endpoint = f"tcp://{address}:{port}"
+        if not self._config.listens:
+            socket.connect(endpoint)
+            return
+        deadline = time.monotonic() + 2.0
+        while True:
+            try:
+                socket.bind(endpoint)
+                return
+            except zmq.ZMQError as error:
+                # After a revocation the old door is still being closed by ZeroMQ's own thread.
+                if error.errno != zmq.EADDRINUSE or time.monotonic() > deadline:
+                    raise BusError(
+                        f"cannot listen on {endpoint}: {error.strerror}; is another launch running?"
+                    ) from error
+                time.sleep(0.02)

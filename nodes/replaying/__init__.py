@@ -1,0 +1,1 @@
+"""Recorded drives again: in lockstep, against golden results, with an attack."""

@@ -1,0 +1,199 @@
+"""Retro-attack: an attack over an old clean drive. What would the policy have steered, had the face been there?
+
+Compositor and policy run over the recorded images twice, without the attack and with it, in lockstep. It is an open loop: the car
+in the recording goes where it went, so this says what the attack does to the steering at each image, not where the car would be.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from advnerf_core.files import write_atomically
+from nodes.bags.reader import read_info, read_messages
+from nodes.replaying.nodes import Choice
+from nodes.replaying.replay import Replay
+from nodes.runtime.clock import NS_PER_S
+from nodes.runtime.errors import BagError
+from nodes.runtime.messages import decode, stamp_ns
+from nodes.runtime.topics import topic as topic_row
+
+_DRIVE, _LABEL = "/policy/drive", "/compositor/attack"
+_DEG = 180.0 / np.pi
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class RetroAttack:
+    """Steering with and without an attack over the images of one recording; left is positive.
+
+    Attributes:
+        stamps_ns: Capture stamps of the images that both replays steered by, ``[n]`` [ns since 1970].
+        recorded_rad: What the policy of the recording steered, ``[n]`` [rad]; NaN where it said nothing.
+        clean_rad: What the policy steers without the attack, ``[n]`` [rad].
+        attacked_rad: What it steers with the attack, ``[n]`` [rad].
+        drawn: Where the face was in view and drawn, ``[n]``.
+        attack_id: Id of the attack.
+        start_ns: Beginning of the recording [ns since 1970].
+        digests: Digests of the two replays: clean, attacked.
+        unchecked: Why the recording may be damaged without a sign of it; empty where checksums cover it.
+    """
+
+    stamps_ns: NDArray[np.int64]
+    recorded_rad: Array
+    clean_rad: Array
+    attacked_rad: Array
+    drawn: NDArray[np.bool_]
+    attack_id: str
+    start_ns: int
+    digests: tuple[str, str]
+    unchecked: str = ""
+
+    @property
+    def delta_rad(self) -> Array:
+        """What the attack adds to the steering, ``[n]`` [rad]."""
+        return self.attacked_rad - self.clean_rad
+
+    @property
+    def time_s(self) -> Array:
+        """Time in the recording, ``[n]`` [s]."""
+        return (self.stamps_ns - self.start_ns) / NS_PER_S
+
+    def numbers(self) -> dict[str, Any]:
+        """The result in numbers, ready for JSON."""
+        delta, seen = self.delta_rad, self.drawn
+        far = np.abs(self.recorded_rad - self.clean_rad)
+        worst = int(np.abs(delta).argmax())
+        return {
+            "attack_id": self.attack_id,
+            "frames": len(delta),
+            "frames_drawn": int(seen.sum()),
+            "mean_abs_delta_rad": float(np.abs(delta).mean()),
+            "mean_abs_delta_drawn_rad": float(np.abs(delta[seen]).mean()) if seen.any() else None,
+            "mean_delta_drawn_rad": float(delta[seen].mean()) if seen.any() else None,
+            "largest_delta_rad": float(delta[worst]),
+            "largest_delta_at_s": float(self.time_s[worst]),
+            "clean_against_recorded_rad": None if np.isnan(far).all() else float(np.nanmean(far)),
+            "digest_clean": self.digests[0],
+            "digest_attacked": self.digests[1],
+            "unchecked": self.unchecked,
+        }
+
+    def verdict(self) -> str:
+        """What would have been steered, in a sentence."""
+        return self._sentence() + (f"; unchecked: {self.unchecked}" if self.unchecked else "")
+
+    def _sentence(self) -> str:
+        n = self.numbers()
+        if not self.drawn.any():
+            return f"the face of attack {self.attack_id} was in view in none of {n['frames']} images; nothing would have changed"
+        mean, worst = n["mean_delta_drawn_rad"] * _DEG, n["largest_delta_rad"] * _DEG
+        return (
+            f"with the face in view ({n['frames_drawn']} of {n['frames']} images) the policy would have steered "
+            f"{abs(mean):.2f} degrees more to the {_side(mean)} on average (mean |delta| {n['mean_abs_delta_drawn_rad'] * _DEG:.2f}), "
+            f"at most {abs(worst):.2f} to the {_side(worst)}, {n['largest_delta_at_s']:.1f} s into the recording"
+        )
+
+    def rows(self) -> Iterator[dict[str, Any]]:
+        """One row per image."""
+        columns = (self.stamps_ns, self.time_s, self.recorded_rad, self.clean_rad, self.attacked_rad, self.drawn)
+        for stamp, time_s, recorded, clean, attacked, drawn in zip(*columns, strict=True):
+            yield {
+                "stamp_ns": int(stamp), "time_s": round(float(time_s), 6), "drawn": bool(drawn),
+                "recorded_rad": None if np.isnan(recorded) else float(recorded), "clean_rad": float(clean),
+                "attacked_rad": float(attacked), "delta_rad": float(attacked - clean),
+            }  # fmt: skip
+
+    def write_json(self, path: Path) -> None:
+        """Write numbers and rows."""
+        write_atomically(path, json.dumps({**self.numbers(), "images": list(self.rows())}, indent=1) + "\n")
+
+
+def retro_attack(bag: Path, attack: Path, choice: Choice) -> RetroAttack:
+    """Run an attack over a recording.
+
+    Args:
+        bag: Bag folder or file, with camera images and poses.
+        attack: Attack file.
+        choice: Nodes to run, of which ``compositor`` gets the attack; overrides name the policy.
+    """
+    clean, _, clean_digest = _steering(bag, choice, "compositor.attack=null")
+    attacked, labels, digest = _steering(bag, choice, f"compositor.attack={json.dumps(str(attack.resolve()))}")
+    stamps = sorted(clean.keys() & attacked.keys())
+    if not stamps:
+        raise BagError(
+            f"{bag}: the policy steered by no image (clean {len(clean)}, attacked {len(attacked)} commands); "
+            "does it fit the camera of the recording, and are poses of car and face in it?"
+        )
+    recorded = _recorded(bag)
+    return RetroAttack(
+        np.array(stamps, np.int64),
+        np.array([recorded.get(stamp, np.nan) for stamp in stamps]),
+        np.array([clean[stamp] for stamp in stamps]),
+        np.array([attacked[stamp] for stamp in stamps]),
+        np.array([stamp in labels and labels[stamp][0] for stamp in stamps], bool),
+        next((name for _, name in labels.values() if name), ""),
+        read_info(bag).start_ns,
+        (clean_digest, digest),
+        read_info(bag).unchecked,
+    )
+
+
+def plot_retro_attack(result: RetroAttack, path: Path) -> None:
+    """Draw steering over time, with and without the attack, and what it adds."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    figure, (above, below) = plt.subplots(2, 1, sharex=True, figsize=(9, 5.5), layout="constrained")
+    t = result.time_s
+    above.plot(t, result.recorded_rad * _DEG, color="0.65", label="recorded")
+    above.plot(t, result.clean_rad * _DEG, color="C0", label="clean, replayed")
+    above.plot(t, result.attacked_rad * _DEG, color="C3", label=f"attack {result.attack_id}")
+    above.set_ylabel("steering (left +) [degrees]")
+    above.legend(frameon=False)
+    if result.unchecked:
+        above.set_title("unchecked: the recording has no checksums", loc="right", fontsize="small")
+    delta = result.delta_rad * _DEG
+    below.axhline(0.0, color="0.8", linewidth=0.8)
+    below.plot(t, delta, color="0.4")
+    below.plot(t[result.drawn], delta[result.drawn], "o", color="C3", markersize=3, label="face in view")
+    below.set(ylabel="attack adds [degrees]", xlabel="time in the recording [s]")
+    below.legend(frameon=False)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=120)
+    plt.close(figure)
+
+
+def _steering(bag: Path, choice: Choice, setting: str) -> tuple[dict[int, float], dict[int, tuple[bool, str]], str]:
+    """Steering [rad] and labels of the compositor (drawn, attack id) by capture stamp, and the digest."""
+    steering: dict[int, float] = {}
+    labels: dict[int, tuple[bool, str]] = {}
+    with Replay(bag, Choice(choice.nodes, choice.replacements, choice.launch, (*choice.overrides, setting))) as replay:
+        for entry in replay:
+            if entry.message.topic not in (_DRIVE, _LABEL):
+                continue
+            message = decode(topic_row(entry.message.topic).type, entry.message.cdr)
+            if entry.message.topic == _DRIVE:
+                steering[stamp_ns(message)] = float(message.drive.steering_angle)
+            else:
+                labels[stamp_ns(message)] = (bool(message.drawn), str(message.attack_id))
+        return steering, labels, replay.summary.digest
+
+
+def _recorded(bag: Path) -> dict[int, float]:
+    if _DRIVE not in [topic.name for topic in read_info(bag).topics]:
+        return {}
+    messages = (decode(topic_row(_DRIVE).type, message.cdr) for message in read_messages(bag, [_DRIVE]))
+    return {stamp_ns(message): float(message.drive.steering_angle) for message in messages}
+
+
+def _side(angle: float) -> str:
+    return "left" if angle >= 0.0 else "right"

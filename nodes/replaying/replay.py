@@ -1,0 +1,127 @@
+"""Lockstep replay: node classes run in this process, fed message by message in the order of the recording, on its time.
+
+Nothing here reads a clock or waits: the same bag gives the same bytes, however fast or busy the machine is. What the replayed
+nodes said when the bag was recorded is left out and made again; an output has the time of the message or tick that caused it, and
+reaches the other replayed nodes before the next message does. No message is dropped for being late.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from nodes.bags.reader import BagMessage, read_attachments, read_info, read_messages, require_readable
+from nodes.bags.writer import BagWriter
+from nodes.replaying.lockstep import BagClock, Lockstep, Summary
+from nodes.replaying.nodes import Choice, build_nodes, close_nodes
+from nodes.runtime.errors import BagError
+from nodes.runtime.node import Node
+from nodes.runtime.topics import topic as topic_row
+from nodes.runtime.topics import type_of_topic
+
+
+@dataclass(frozen=True)
+class Replayed:
+    """One message of a replay.
+
+    Attributes:
+        message: The message; log and publish time of one that was made are the recording's time at which it was.
+        made: Made by a replayed node, not taken from the bag.
+    """
+
+    message: BagMessage
+    made: bool
+
+
+class Replay:
+    """A bag and the nodes to run over it.
+
+    Args:
+        bag: Bag folder or file.
+        choice: What to replay.
+        whole: Also yield what is in the bag but interests no node (to write another bag).
+
+    Topics of foreign bags that are not in the topic table are left out, and listed in `left_out`. Iterate over it once; then `summary` is complete. Use it as a context manager: leaving it closes the nodes.
+    """
+
+    def __init__(self, bag: Path, choice: Choice, whole: bool = False) -> None:
+        self.info = read_info(bag)
+        self.bag, self._whole = bag, whole
+        self._folder = tempfile.TemporaryDirectory(prefix="advnerf-replay-")
+        self._clock = BagClock(self.info.start_ns)
+        self._nodes: dict[str, Node] = {}
+        try:
+            self._nodes = build_nodes(bag, choice, Path(self._folder.name), self._clock)
+            self._lockstep = Lockstep(self._nodes, self._clock, self.info.start_ns)
+            recorded = [topic.name for topic in self.info.topics]
+            self.left_out = [topic for topic in recorded if type_of_topic(topic) is None]
+            self._heard = [topic for topic in recorded if topic in self._lockstep.heard_topics - self.made_topics]
+            require_readable(bag, {topic: topic_row(topic).type for topic in self._heard})
+            if not self._heard:
+                raise BagError(
+                    f"{self.info.path} has nothing for {', '.join(choice.nodes)}: they listen to "
+                    f"{', '.join(sorted(self._lockstep.heard_topics)) or 'nothing'}, it has {', '.join(recorded)}"
+                )
+        except BaseException:
+            self.close()
+            raise
+
+    def __enter__(self) -> Replay:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the replayed nodes."""
+        return list(self._nodes)
+
+    @property
+    def made_topics(self) -> set[str]:
+        """Topics whose recorded messages are left out, because they are made again."""
+        return self._lockstep.made_topics
+
+    @property
+    def summary(self) -> Summary:
+        """What was done so far."""
+        return self._lockstep.summary
+
+    def __iter__(self) -> Iterator[Replayed]:
+        """Every message that was made, and with ``whole`` also those that were kept, in order."""
+        recorded = [topic.name for topic in self.info.topics]
+        topics = [topic for topic in recorded if topic not in self.left_out] if self._whole else self._heard
+        heard = frozenset(self._heard)
+        for message in read_messages(self.bag, topics):
+            if message.topic in self.made_topics:
+                continue
+            yield from (Replayed(made, True) for made in self._lockstep.advance_to(message.log_ns))
+            if self._whole:
+                yield Replayed(message, False)
+            if message.topic in heard:
+                yield from (Replayed(made, True) for made in self._lockstep.feed(message))
+        yield from (Replayed(m, True) for m in self._lockstep.advance_to(self.info.end_ns))
+        self._lockstep.finish()
+        self.summary.duration_s = self.info.duration_s
+
+    def close(self) -> None:
+        """Close the nodes."""
+        nodes, self._nodes = self._nodes, {}
+        close_nodes(nodes)
+        self._folder.cleanup()
+
+
+def write_replay(replay: Replay, folder: Path) -> None:
+    """Write a replay, made with ``whole``, as a new bag: what was kept, and what was made again in its place.
+
+    Everything that rides along in the old bag does so in the new one; the same replay gives the same bytes.
+    """
+    metadata = {**replay.info.metadata, "replayed": ", ".join(sorted(replay.names))}
+    attachments = read_attachments(replay.bag)
+    with BagWriter(folder, attachments, metadata, attached_ns=replay.info.start_ns) as writer:
+        for entry in replay:
+            message = entry.message
+            writer.write(message.topic, message.cdr, message.log_ns, message.publish_ns, message.sequence)
+        writer.close({"digest": replay.summary.digest})
