@@ -7,7 +7,7 @@ export MUJOCO_GL ?= egl
 export PYTHONDONTWRITEBYTECODE :=
 DEFAULT_TESTS := not slow and not gpu and not hardware and not data
 
-.PHONY: help setup demo experiment test test-slow check bench campaign fmt clean
+.PHONY: help setup demo experiment test test-slow check bench campaign rooms fmt clean
 
 help:  ## Show this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
@@ -49,6 +49,9 @@ bench: setup  ## The benchmarks (about an hour); each writes its rows to docs/re
 
 campaign: setup  ## What the live stack must bear: faults, strangers, kills, half an hour (hours; goes on where it was stopped)
 	@$(BIN)/python -m benchmarks.run_all --campaign
+
+rooms: setup  ## Draw the rooms of the code into docs/architecture.md
+	@$(BIN)/python docs/draw_rooms.py
 
 fmt: setup  ## Format and fix what can be fixed
 	@$(BIN)/ruff check --fix .

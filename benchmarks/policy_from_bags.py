@@ -1,7 +1,7 @@
 """Row: a policy trained only from bags of the expert driving the twin drives three laps live.
 
 Three stages under ``runs/policy_from_bags``, each kept once it is there: collect (``launch/collect.launch.yaml``: the expert
-disturbs itself and corrects), train (``nodes/policy_data``, labels by the expert at the recorded poses), drive (three laps of the
+disturbs itself and corrects), train (``nodes/lab/policy_data``, labels by the expert at the recorded poses), drive (three laps of the
 policy alone, scored from the bag). One DAgger round by relabelling lies between: the policy drives, the expert says what it
 should have done, and the training is done again on everything. Run as ``python -m benchmarks.policy_from_bags [--trial]``.
 """

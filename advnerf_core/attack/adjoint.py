@@ -22,7 +22,6 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from advnerf_core.attack.artifact import BLACK_BOX_METHODS_TEXT
 from advnerf_core.attack.problem import (
     AttackProblem,
     RecurrentPolicy,
@@ -34,6 +33,7 @@ from advnerf_core.attack.problem import (
 from advnerf_core.driving.dynamics import Dynamics
 from advnerf_core.driving.rollout import Rollout, drive
 from advnerf_core.errors import AdvnerfError
+from advnerf_core.policies.black_box import BLACK_BOX_METHODS_TEXT
 from advnerf_core.scene.surrogate import Rendered
 
 __all__ = [

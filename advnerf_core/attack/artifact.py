@@ -29,9 +29,6 @@ FILE_FORMAT = "advnerf-attack-1"
 TEXTURE_PX = 512
 
 Method = Literal["none", "random", "gradient", "cem", "evolution", "distilled", "guided"]
-# Those that need no gradient of the policy, the strongest first.
-BLACK_BOX_METHODS: tuple[Method, ...] = ("guided", "distilled", "evolution", "cem", "random")
-BLACK_BOX_METHODS_TEXT = f"{', '.join(BLACK_BOX_METHODS[:-1])} or {BLACK_BOX_METHODS[-1]}"
 
 
 class AttackFileError(AdvnerfError, ValueError):

@@ -1,1 +1,1 @@
-"""Vehicle dynamics, reference path, expert, policy, imitation learning and the one rollout loop."""
+"""Vehicle dynamics, reference path, expert, cross-track error, and the one rollout loop."""

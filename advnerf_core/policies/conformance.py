@@ -11,8 +11,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from advnerf_core.attack.artifact import BLACK_BOX_METHODS
 from advnerf_core.policies.adapter import AdaptedPolicy
+from advnerf_core.policies.black_box import BLACK_BOX_METHODS
 from advnerf_core.policies.contract import PolicyContractError
 from advnerf_core.policies.hypotheses import USEFUL_ERROR, Array, judge, steering_of
 from advnerf_core.policies.pilotnet import images_to_tensor

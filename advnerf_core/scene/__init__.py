@@ -1,1 +1,1 @@
-"""Posed image sets, scene training, and the surrogate built from a trained scene."""
+"""The learned scene, its training, and the surrogate built from it."""

@@ -1,1 +1,1 @@
-"""The whole experiment as stages: capture, scene, policy, object, attack, deploy, report. Wires parts together, decides nothing."""
+"""Experiments: stages, searches, deployed drives, campaigns of cells, and their reports."""

@@ -1,1 +1,1 @@
-"""What all nodes share: messages, topics, bus, clock, node loop, bags, launch."""
+"""What every node is made of: messages, topics, bus, clock, loop, process, configuration."""

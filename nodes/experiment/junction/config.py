@@ -180,7 +180,7 @@ class IntersectionExperimentConfig(_Section):
         default=6.0, description="Largest |CTE| that a stopped car is charged per tick [m]."
     )
     world: dict[str, Any] = Field(
-        default_factory=dict, description="Changes to IntersectionConfig, or to CarlaConfig of hardware/carla_scene."
+        default_factory=dict, description="Changes to IntersectionConfig, or to CarlaConfig of hardware/worlds/carla."
     )
     capture: CaptureConfig = CaptureConfig()
     scene: SceneConfig = SceneConfig()

@@ -13,7 +13,6 @@ import torch
 from torch import Tensor, nn
 
 from advnerf_core.attack.adjoint import AdjointResult, AttackProblem, BlackBoxError, adjoint_gradient
-from advnerf_core.attack.artifact import BLACK_BOX_METHODS_TEXT
 from advnerf_core.attack.closed_loop import ClosedLoopCosine, closed_loop_cosine
 from advnerf_core.attack.health import (
     TickHealth,
@@ -31,6 +30,7 @@ from advnerf_core.attack.health import (
 from advnerf_core.attack.health_plot import draw_health
 from advnerf_core.driving.clean_drive import CleanDrive
 from advnerf_core.files import write_atomically
+from advnerf_core.policies.black_box import BLACK_BOX_METHODS_TEXT
 from nodes.experiment.request.memory import measured_mib
 from nodes.experiment.request.prepare import Prepared, prepare, sensor_of
 from nodes.experiment.request.request import AttackRequest

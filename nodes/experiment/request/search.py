@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from advnerf_core.attack.adjoint import BlackBoxError, evaluate
-from advnerf_core.attack.artifact import BLACK_BOX_METHODS_TEXT, AttackFile, save_attack
+from advnerf_core.attack.artifact import AttackFile, save_attack
 from advnerf_core.attack.search.baselines import random_search
 from advnerf_core.attack.search.distil import Distillation
 from advnerf_core.attack.search.guided import BlackBoxSearch, black_box_attack
@@ -19,6 +19,7 @@ from advnerf_core.attack.search.search import Evaluation, OnEvaluation, SearchRe
 from advnerf_core.attack.search.together import gradient_attacks
 from advnerf_core.files import write_atomically
 from advnerf_core.objects.mesh.shape import ShapeSensor
+from advnerf_core.policies.black_box import BLACK_BOX_METHODS_TEXT
 from nodes.experiment.request.meshes import write_meshes
 from nodes.experiment.request.prepare import Prepared, prepare
 from nodes.experiment.request.request import AttackRequest, load_request, request_text

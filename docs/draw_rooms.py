@@ -1,0 +1,172 @@
+"""Draws the rooms of the house from the code: ``make rooms`` (or ``python docs/draw_rooms.py``).
+
+A room is a sub-package, or a module that stands beside them; an arrow is an import, wherever in the file it stands, those for type
+checkers left out. Arrows that follow from others are not drawn. Writes ``docs/rooms_PACKAGE.svg`` and the tables of ``docs/architecture.md``.
+"""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Mapping
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+
+import grimp
+
+from advnerf_core.files import write_atomically
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGE = ROOT / "docs" / "architecture.md"
+PACKAGES = ("advnerf_core", "hardware", "calibration", "nodes")
+DRAWN = ("nodes", "hardware", "advnerf_core")
+PROCESSES = "processes"
+# These two run a search and whole drives, so that they stand above the rooms that search and drive.
+_CONDUCTORS = ("attack", "collect")
+_BOX_W, _BOX_H, _GAP_X, _GAP_Y, _MARGIN = 118, 34, 16, 46, 16
+_STYLE = "font: 13px sans-serif; fill: #1f2933"
+
+
+@dataclass(frozen=True)
+class House:
+    """Rooms of a package.
+
+    Attributes:
+        about: What each room holds, by name.
+        files: How many modules each room has.
+        arrows: Which rooms each one imports from.
+    """
+
+    about: dict[str, str]
+    files: dict[str, int]
+    arrows: dict[str, frozenset[str]]
+
+
+def survey(package: str, graph: grimp.ImportGraph) -> House:
+    """Read the rooms of a package from its imports."""
+    about: dict[str, str] = {}
+    files: dict[str, int] = {}
+    arrows: dict[str, set[str]] = {}
+    for module in sorted(graph.modules):
+        name = _room(package, module)
+        if name is None:
+            continue
+        files[name] = files.get(name, 0) + (not (ROOT / module.replace(".", "/")).is_dir())
+        arrows.setdefault(name, set())
+        about.setdefault(name, "One process per file." if name == PROCESSES else _first_line(package, name))
+        for imported in graph.find_modules_directly_imported_by(module):
+            other = _room(package, imported)
+            if other is not None and other != name:
+                arrows[name].add(other)
+    return House(about, files, {name: frozenset(found) for name, found in arrows.items()})
+
+
+def _room(package: str, module: str) -> str | None:
+    parts = module.split(".")
+    if parts[0] != package or len(parts) < 2:
+        return None
+    if package == "nodes" and parts[1] not in _CONDUCTORS and not (ROOT / "nodes" / parts[1]).is_dir():
+        return PROCESSES
+    return parts[1]
+
+
+def _first_line(package: str, name: str) -> str:
+    folder = ROOT / package / name
+    file = folder / "__init__.py" if folder.is_dir() else folder.with_suffix(".py")
+    docstring = ast.get_docstring(ast.parse(file.read_text(encoding="utf-8"))) or ""
+    return docstring.split("\n\n")[0].replace("\n", " ").replace("``", "`")
+
+
+def reduced(arrows: Mapping[str, frozenset[str]]) -> dict[str, set[str]]:
+    """The arrows that do not follow from others."""
+    reach = {name: set(found) for name, found in arrows.items()}
+    for _ in reach:
+        for name in reach:
+            reach[name] = reach[name].union(*(reach[other] for other in arrows[name])) if arrows[name] else set()
+    return {
+        name: {other for other in found if not any(other in reach[third] for third in found if third != other)}
+        for name, found in arrows.items()
+    }
+
+
+def floors(arrows: Mapping[str, frozenset[str]]) -> list[list[str]]:
+    """Rooms by floor, the roof first: each room stands above all that it imports. A circle is an error."""
+    height: dict[str, int] = {}
+
+    def climb(name: str, above: tuple[str, ...]) -> int:
+        if name in above:
+            raise ValueError(f"expected no circle of imports, got {' -> '.join((*above, name))}")
+        if name not in height:
+            height[name] = 1 + max((climb(other, (*above, name)) for other in arrows[name]), default=-1)
+        return height[name]
+
+    for name in arrows:
+        climb(name, ())
+    return [sorted(name for name in arrows if height[name] == level) for level in range(max(height.values()), -1, -1)]
+
+
+def draw(house: House) -> str:
+    """The rooms as an SVG picture."""
+    rows = floors(house.arrows)
+    width = 2 * _MARGIN + max(map(len, rows)) * (_BOX_W + _GAP_X) - _GAP_X
+    place: dict[str, tuple[float, float]] = {}
+    for y, row in enumerate(rows):
+        left = (width - len(row) * (_BOX_W + _GAP_X) + _GAP_X) / 2
+        for x, name in enumerate(row):
+            place[name] = (left + x * (_BOX_W + _GAP_X), _MARGIN + y * (_BOX_H + _GAP_Y))
+    height = 2 * _MARGIN + len(rows) * (_BOX_H + _GAP_Y) - _GAP_Y
+    parts = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" width="{width:g}" height="{height:g}" viewBox="0 0 {width:g} {height:g}">',
+        '<defs><marker id="a" markerWidth="8" markerHeight="8" refX="7" refY="3.5" orient="auto">'
+        '<path d="M0,0 L7,3.5 L0,7 z" fill="#7b8794"/></marker></defs>',
+        f'<rect width="{width:g}" height="{height:g}" fill="#ffffff"/>',
+    ]
+    for name, found in sorted(reduced(house.arrows).items()):
+        for other in sorted(found):
+            (ax, ay), (bx, by) = place[name], place[other]
+            x1, y1, x2, y2 = ax + _BOX_W / 2, ay + _BOX_H, bx + _BOX_W / 2, by
+            bend = (y2 - y1) / 2
+            parts.append(
+                f'<path d="M{x1:g},{y1:g} C{x1:g},{y1 + bend:g} {x2:g},{y2 - bend:g} {x2:g},{y2:g}" fill="none" '
+                'stroke="#7b8794" marker-end="url(#a)"/>'
+            )
+    for name, (x, y) in sorted(place.items()):
+        parts.append(
+            f'<rect x="{x:g}" y="{y:g}" width="{_BOX_W}" height="{_BOX_H}" rx="4" fill="#e6f0fa" stroke="#486581"/>'
+            f'<text x="{x + _BOX_W / 2:g}" y="{y + _BOX_H / 2 + 5:g}" text-anchor="middle" style="{_STYLE}">{escape(name)}</text>'
+        )
+    return "\n".join([*parts, "</svg>", ""])
+
+
+def table(house: House) -> str:
+    """The rooms as a Markdown table, the roof first."""
+    lines = ["| room | files | what it holds | imports from |", "|---|---|---|---|"]
+    for row in floors(house.arrows):
+        for name in row:
+            imports = ", ".join(f"`{other}`" for other in sorted(house.arrows[name])) or "-"
+            lines.append(f"| `{name}` | {house.files[name]} | {house.about[name]} | {imports} |")
+    return "\n".join(lines)
+
+
+def written() -> dict[Path, str]:
+    """What every file should hold, from the code as it is now."""
+    graph = grimp.build_graph(*PACKAGES, exclude_type_checking_imports=True, cache_dir=None)
+    texts, page = {}, PAGE.read_text(encoding="utf-8")
+    for package in DRAWN:
+        house = survey(package, graph)
+        texts[ROOT / "docs" / f"rooms_{package}.svg"] = draw(house)
+        begin, end = f"<!-- rooms of {package} -->", f"<!-- end of rooms of {package} -->"
+        head, _, rest = page.partition(begin)
+        page = f"{head}{begin}\n{table(house)}\n{end}{rest.partition(end)[2]}"
+    return {**texts, PAGE: page}
+
+
+def main() -> None:
+    """Write the pictures and the tables."""
+    for file, text in written().items():
+        write_atomically(file, text)
+        print(f"wrote {file.relative_to(ROOT)}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,34 @@
+"""The pictures and tables of the architecture page are those of the code; ``make rooms`` draws them again."""
+
+from pathlib import Path
+
+import pytest
+
+from docs import draw_rooms
+
+ROOT = Path(__file__).parents[1]
+
+
+def test_the_architecture_page_is_drawn_from_the_code():
+    stale = [file.name for file, text in draw_rooms.written().items() if file.read_text(encoding="utf-8") != text]
+    assert stale == [], "run `make rooms`"
+
+
+def test_floors_put_every_room_above_what_it_imports():
+    arrows = {
+        "roof": frozenset({"a", "b", "base"}),
+        "a": frozenset({"b"}),
+        "b": frozenset({"base"}),
+        "base": frozenset(),
+    }
+    assert draw_rooms.floors(arrows) == [["roof"], ["a"], ["b"], ["base"]]
+    assert draw_rooms.reduced(arrows) == {"roof": {"a"}, "a": {"b"}, "b": {"base"}, "base": set()}
+    with pytest.raises(ValueError, match="circle of imports, got a -> b -> a"):
+        draw_rooms.floors({"a": frozenset({"b"}), "b": frozenset({"a"})})
+
+
+def test_the_top_of_nodes_holds_processes_only():
+    files = [file for file in (ROOT / "nodes").glob("*.py") if file.name != "__init__.py"]
+    assert len(files) == 18
+    runs = 'if __name__ == "__main__":'
+    assert [file.name for file in files if runs not in file.read_text(encoding="utf-8")] == []
