@@ -39,4 +39,7 @@ def test_the_drive_is_described_from_all_files_of_its_bag(tmp_path):
             t_ns = 1_800_000_000_000_000_000 + i * 10_000_000
             writer.write("/vicon/car", encode(pose_message(T, t_ns)), t_ns, t_ns, i)
     assert describe_drive(tmp_path / "bag").startswith("1 m driven, mean |CTE| 0.050 m, largest 0.05 m, bag of ")
-    assert Stops([(12.3, "no image for 0.3 s")]).describe() == "1 stops (12 s: no image for 0.3 s)"
+    assert (
+        Stops([(12.3, "no image for 0.3 s")]).describe()
+        == "1 stops, 0 of them while the host paused (12 s: no image for 0.3 s)"
+    )
