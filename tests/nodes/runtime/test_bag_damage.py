@@ -270,7 +270,7 @@ def test_repair_never_overwrites_what_it_kept_before(bags, write):
 SLOW_REPAIR = """
 import os, sys
 from pathlib import Path
-from nodes.runtime import bag_repair
+from nodes.bags import repair as bag_repair
 replace, link = Path.replace, os.link
 def at(step):
     if sys.argv[2] == step:
