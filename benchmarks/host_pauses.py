@@ -45,7 +45,7 @@ class HostPauses:
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._processes: list[subprocess.Popen[bytes]] = []
-        self._began = _stolen()
+        self._began = stolen()
 
     def __enter__(self) -> HostPauses:
         for cpu in sorted(os.sched_getaffinity(0)):
@@ -81,8 +81,8 @@ class HostPauses:
 
     def describe(self) -> str:
         """The pauses in words."""
-        pauses, (stolen, spent) = self.found(), _stolen()
-        share = 100.0 * (stolen - self._began[0]) / max(1, spent - self._began[1])
+        pauses, (withheld, spent) = self.found(), stolen()
+        share = 100.0 * (withheld - self._began[0]) / max(1, spent - self._began[1])
         longest_s = max((pause.length_s for pause in pauses), default=0.0)
         return (
             f"the host withheld {share:.1f} % of the processors' time: {len(pauses)} pauses of {1e3 * _LATE_S:g} ms and more, "
@@ -90,7 +90,7 @@ class HostPauses:
         )
 
 
-def _stolen() -> tuple[int, int]:
+def stolen() -> tuple[int, int]:
     """Time stolen by the host, and all time, of all processors together since the start [jiffies]."""
     numbers = [int(word) for word in Path("/proc/stat").read_text(encoding="ascii").splitlines()[0].split()[1:9]]
     return numbers[7], sum(numbers)

@@ -5,8 +5,12 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import time
 
 import pytest
+from _pytest.runner import runtestprotocol
+
+from benchmarks.host_pauses import stolen
 
 # Where tests start processes, open sockets and terminals, or hold code to a clock; what lies below _COMPUTING only computes.
 _LIVE = (
@@ -24,6 +28,8 @@ _COMPUTING = (
     "tests/nodes/test_trials.py", "tests/hardware/cameras/test_conformance.py", "tests/hardware/carla_scene",
     "tests/hardware/twin",
 )  # fmt: skip
+# A live test that fails while this share of the processors was withheld by the host says nothing.
+_STOLEN_SHARE, _ATTEMPTS, _REST_S = 0.01, 5, 4.0
 _INSIDE = "ADVNERF_TEST_IN_ITS_OWN_PROCESS"
 
 
@@ -32,6 +38,36 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if item.nodeid.startswith(_LIVE) and not item.nodeid.startswith(_COMPUTING):
             item.add_marker(pytest.mark.live)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> bool | None:
+    """Run a live test again that failed while the host withheld the processors.
+
+    On a shared host a virtual machine may stand still for half a second, and then a car stops as it should, whatever the test
+    expects. The kernel counts such time; where it counts none (a machine of one's own), a failure is a failure at once.
+    """
+    if not item.get_closest_marker("live"):
+        return None
+    for attempt in range(_ATTEMPTS):
+        before = stolen()
+        item.ihook.pytest_runtest_logstart(nodeid=item.nodeid, location=item.location)
+        reports = runtestprotocol(item, nextitem=nextitem, log=False)
+        share = (stolen()[0] - before[0]) / max(1, stolen()[1] - before[1])
+        again = any(report.failed for report in reports) and share >= _STOLEN_SHARE and attempt + 1 < _ATTEMPTS
+        if again:
+            print(
+                f"\n{item.nodeid} failed while the host withheld {share:.0%} of the processors; again",
+                file=sys.__stderr__,
+            )
+        else:
+            for report in reports:
+                item.ihook.pytest_runtest_logreport(report=report)
+        item.ihook.pytest_runtest_logfinish(nodeid=item.nodeid, location=item.location)
+        if not again:
+            break
+        time.sleep(_REST_S)
+    return True
 
 
 def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
