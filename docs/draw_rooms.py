@@ -7,9 +7,10 @@ checkers left out. Arrows that follow from others are not drawn. Writes ``docs/r
 from __future__ import annotations
 
 import ast
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
+from itertools import pairwise
 from pathlib import Path
 
 import grimp
@@ -23,7 +24,8 @@ DRAWN = ("nodes", "hardware", "advnerf_core")
 PROCESSES = "processes"
 # These two run a search and whole drives, so that they stand above the rooms that search and drive.
 _CONDUCTORS = ("attack", "collect")
-_BOX_W, _BOX_H, _GAP_X, _GAP_Y, _MARGIN = 118, 34, 16, 46, 16
+_BOX_W, _BOX_H, _PASSAGE_W, _GAP_X, _GAP_Y, _MARGIN = 118, 34, 6, 16, 46, 16
+_SWEEPS = 12
 _STYLE = "font: 13px sans-serif; fill: #1f2933"
 
 
@@ -107,13 +109,8 @@ def floors(arrows: Mapping[str, frozenset[str]]) -> list[list[str]]:
 
 def draw(house: House) -> str:
     """The rooms as an SVG picture."""
-    rows = floors(house.arrows)
-    width = 2 * _MARGIN + max(map(len, rows)) * (_BOX_W + _GAP_X) - _GAP_X
-    place: dict[str, tuple[float, float]] = {}
-    for y, row in enumerate(rows):
-        left = (width - len(row) * (_BOX_W + _GAP_X) + _GAP_X) / 2
-        for x, name in enumerate(row):
-            place[name] = (left + x * (_BOX_W + _GAP_X), _MARGIN + y * (_BOX_H + _GAP_Y))
+    rows, lines = _laid_out(house)
+    place, width = _places(rows)
     height = 2 * _MARGIN + len(rows) * (_BOX_H + _GAP_Y) - _GAP_Y
     parts = [
         f'<svg xmlns="http://www.w3.org/2000/svg" width="{width:g}" height="{height:g}" viewBox="0 0 {width:g} {height:g}">',
@@ -121,21 +118,67 @@ def draw(house: House) -> str:
         '<path d="M0,0 L7,3.5 L0,7 z" fill="#7b8794"/></marker></defs>',
         f'<rect width="{width:g}" height="{height:g}" fill="#ffffff"/>',
     ]
-    for name, found in sorted(reduced(house.arrows).items()):
-        for other in sorted(found):
-            (ax, ay), (bx, by) = place[name], place[other]
-            x1, y1, x2, y2 = ax + _BOX_W / 2, ay + _BOX_H, bx + _BOX_W / 2, by
-            bend = (y2 - y1) / 2
-            parts.append(
-                f'<path d="M{x1:g},{y1:g} C{x1:g},{y1 + bend:g} {x2:g},{y2 - bend:g} {x2:g},{y2:g}" fill="none" '
-                'stroke="#7b8794" marker-end="url(#a)"/>'
-            )
-    for name, (x, y) in sorted(place.items()):
+    for line in lines:
+        (x, y), *others = (place[stop] for stop in line)
+        path = [f"M{x:g},{y + _BOX_H:g}"]
+        for nx, ny in others:
+            middle = (y + _BOX_H + ny) / 2
+            path.append(f"C{x:g},{middle:g} {nx:g},{middle:g} {nx:g},{ny:g}")
+            path.append(f"L{nx:g},{ny + _BOX_H:g}")  # between the boxes of a floor that it only passes
+            x, y = nx, ny
+        parts.append(f'<path d="{" ".join(path[:-1])}" fill="none" stroke="#7b8794" marker-end="url(#a)"/>')
+    for name in sorted(house.arrows):
+        x, y = place[name]
         parts.append(
-            f'<rect x="{x:g}" y="{y:g}" width="{_BOX_W}" height="{_BOX_H}" rx="4" fill="#e6f0fa" stroke="#486581"/>'
-            f'<text x="{x + _BOX_W / 2:g}" y="{y + _BOX_H / 2 + 5:g}" text-anchor="middle" style="{_STYLE}">{escape(name)}</text>'
+            f'<rect x="{x - _BOX_W / 2:g}" y="{y:g}" width="{_BOX_W}" height="{_BOX_H}" rx="4" fill="#e6f0fa" stroke="#486581"/>'
+            f'<text x="{x:g}" y="{y + _BOX_H / 2 + 5:g}" text-anchor="middle" style="{_STYLE}">{escape(name)}</text>'
         )
     return "\n".join([*parts, "</svg>", ""])
+
+
+def _laid_out(house: House) -> tuple[list[list[str]], list[list[str]]]:
+    """Rooms and passages of each floor from left to right, and each arrow as the names it goes by.
+
+    An arrow over several floors gets a passage on each of those between (Sugiyama's layered drawing). Everything then moves towards
+    the mean place of what it is joined to, which leaves few crossings.
+    """
+    rows = floors(house.arrows)
+    floor = {name: number for number, row in enumerate(rows) for name in row}
+    lines = []
+    for name, found in sorted(reduced(house.arrows).items()):
+        for other in sorted(found):
+            passages = [f"{name}>{other} {number}" for number in range(floor[name] + 1, floor[other])]
+            for number, passage in enumerate(passages, floor[name] + 1):
+                rows[number].append(passage)
+            lines.append([name, *passages, other])
+    joined: dict[str, list[str]] = {}
+    for line in lines:
+        for upper, lower in pairwise(line):
+            joined.setdefault(upper, []).append(lower)
+            joined.setdefault(lower, []).append(upper)
+    for _ in range(_SWEEPS):
+        for row in rows:
+            place, _ = _places(rows)
+            row.sort(key=lambda name, p=place: _mean([p[o][0] for o in joined.get(name, [])], p[name][0]))
+    return rows, lines
+
+
+def _places(rows: list[list[str]]) -> tuple[dict[str, tuple[float, float]], float]:
+    """Middle of the upper edge of everything [px], and the width of the picture [px]."""
+    widths = [[_PASSAGE_W if ">" in name else _BOX_W for name in row] for row in rows]
+    totals = [sum(found) + _GAP_X * (len(found) - 1) for found in widths]
+    width = 2 * _MARGIN + max(totals)
+    place = {}
+    for number, row in enumerate(rows):
+        x = (width - totals[number]) / 2
+        for name, wide in zip(row, widths[number], strict=True):
+            place[name] = (x + wide / 2, _MARGIN + number * (_BOX_H + _GAP_Y))
+            x += wide + _GAP_X
+    return place, width
+
+
+def _mean(values: Sequence[float], otherwise: float) -> float:
+    return sum(values) / len(values) if values else otherwise
 
 
 def table(house: House) -> str:
