@@ -13,32 +13,46 @@ import tempfile
 from pathlib import Path
 
 from benchmarks.fault_campaign import SLOW_LIMITS_MS, Graph, suffer
+from benchmarks.fault_stops import BrokenPromise
 from benchmarks.results import record_row
 
 COMMAND = "python -m benchmarks.stalls"
-COUNT, SEED = 20, 0
+COUNT, SEED, _MOST_OTHERS = 20, 0, 5
 FAULTS = ("car jammed", "car spinning")
 SETTINGS = ("record=false", "policy.module=benchmarks.straight_policy")
 LIMIT_S = SLOW_LIMITS_MS["car jammed"] / 1e3
 
 
-def stall(count: int) -> list[tuple[str, float, str]]:
-    """Kind of each stall, time to the brake [s], and what the safety node said."""
-    moments, found = random.Random(SEED), []
+def stall(count: int) -> tuple[list[tuple[str, float, str]], list[str]]:
+    """Kind of each stall, time to the brake [s] and what the safety node said; and the reasons of what stopped other drives first.
+
+    A drive that another check stops before the stall is noticed, such as a late command on a busy machine, says nothing about stalls
+    and is repeated.
+    """
+    moments, found, others = random.Random(SEED), [], []
     with tempfile.TemporaryDirectory(prefix="advnerf-") as folder:
         graph = Graph(Path(folder), SETTINGS)
         try:
-            for number in range(count):
-                fault = FAULTS[number % len(FAULTS)]
-                brake_s = suffer(graph, fault, moments.uniform(0.6, 1.6))["stop_ms"] / 1e3
-                reason = str(graph.operator.seen["/safety/state"].reason)
-                if "stalled" not in reason:
+            while len(found) < count:
+                fault = FAULTS[len(found) % len(FAULTS)]
+                try:
+                    brake_s = suffer(graph, fault, moments.uniform(0.6, 1.6))["stop_ms"] / 1e3
+                    reason = str(graph.operator.seen["/safety/state"].reason)
+                except BrokenPromise as broken:
+                    if "did not drive before the fault" not in str(broken):
+                        raise
+                    reason = str(broken)
+                if "stalled" in reason:
+                    found.append((fault, brake_s, reason))
+                    print(f"{len(found):3d} {fault:14s} brake after {brake_s:.2f} s: {reason}", flush=True)
+                    continue
+                others.append(reason)
+                print(f"    {fault:14s} stopped first by: {reason[:200]}", flush=True)
+                if len(others) > _MOST_OTHERS * count:
                     raise RuntimeError(f"expected the safety node to name the stall, it says: {reason}")
-                found.append((fault, brake_s, reason))
-                print(f"{number:3d} {fault:14s} brake after {brake_s:.2f} s: {reason}", flush=True)
         finally:
             graph.close()
-    return found
+    return found, others
 
 
 def main() -> None:
@@ -47,10 +61,11 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=COUNT)
     parser.add_argument("--trial", action="store_true", help="record nothing")
     options = parser.parse_args()
-    found = stall(options.count)
+    found, others = stall(options.count)
     times = [brake_s for _, brake_s, _ in found]
     note = (
-        f"worst {max(times):.2f} s of {len(times)}, locked and spinning wheels in turn; a stall is 1 s without motion"
+        f"worst {max(times):.2f} s of {len(times)}, locked and spinning wheels in turn; a stall is 1 s without motion; "
+        f"{len(others)} more drives were stopped by another check first"
     )
     print(f"median {statistics.median(times):.2f} s; {note}")
     if not options.trial:
