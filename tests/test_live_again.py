@@ -1,11 +1,16 @@
 """A live test is run again only if the host withheld the processors while it failed."""
 
+from pathlib import Path
+
 import pytest
 
+ROOT = Path(__file__).parents[1]
 pytest_plugins = ["pytester"]
 
 CONFTEST = """
 import itertools
+import sys
+sys.path.insert(0, {root!r})
 import tests.conftest as ours
 from tests.conftest import pytest_runtest_protocol
 
@@ -36,7 +41,7 @@ def test_it():
     ("share", "failures", "outcome", "runs"), [(10, 2, "passed", 3), (0, 2, "failed", 1), (10, 99, "failed", 5)]
 )
 def test_a_live_test_is_run_again_while_the_host_withholds_the_processors(pytester, share, failures, outcome, runs):
-    pytester.makeconftest(CONFTEST.format(share=share))
+    pytester.makeconftest(CONFTEST.format(share=share, root=str(ROOT)))
     pytester.makepyfile(TEST.format(failures=failures))
     result = pytester.runpytest_subprocess("-p", "no:cacheprovider")
     result.assert_outcomes(**{outcome: 1})
