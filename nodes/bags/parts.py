@@ -19,7 +19,7 @@ SUFFIXES = (".mcap", ".db3", ".bag")
 _NUMBERED = re.compile(r"(?P<name>.+)_(?P<number>\d{1,9})")
 # 83 parts take 15 kB; a stranger's file may have any size.
 _MOST_METADATA_BYTES = 1 << 24
-_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+_SafeLoader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 def part_name(bag_name: str, number: int) -> str:
@@ -113,7 +113,7 @@ def _names_in(path: Path, mtime_ns: int, size_bytes: int) -> tuple[str, ...]:
             raise BagError(
                 f"{path}: expected at most {_MOST_METADATA_BYTES >> 20} MiB, got {size_bytes} bytes; {advice}"
             )
-        content = yaml.load(path.read_bytes(), Loader=_LOADER)
+        content = yaml.load(path.read_bytes(), Loader=_SafeLoader)
         information = content["rosbag2_bagfile_information"]
         # Old versions of rosbag2 wrote the folder in front of the name.
         names = tuple(PurePosixPath(name).name for name in information["relative_file_paths"])
