@@ -23,9 +23,7 @@ class PluginError(AdvnerfError):
     """A name stands for nothing, or for code that cannot be loaded."""
 
 
-def resolve(
-    name: str, what: str, built_in: Mapping[str, Callable[[], T]], group: str, folder: Path | None = None
-) -> T:
+def resolve(name: str, what: str, built_in: Mapping[str, Callable[[], T]], group: str, folder: Path | None = None) -> T:
     """The object that a name stands for.
 
     Args:
@@ -45,7 +43,10 @@ def resolve(
     found = {each.name: each for each in entry_points(group=group)}
     if name in found:
         return _load_entry_point(found[name], what)  # type: ignore[no-any-return]
-    raise PluginError(unknown(name, what, [*built_in, *sorted(found)]) + f"; one of your own is file.py:Name, or an entry point of {group}")
+    raise PluginError(
+        unknown(name, what, [*built_in, *sorted(found)])
+        + f"; one of your own is file.py:Name, or an entry point of {group}"
+    )
 
 
 def known_names(built_in: Iterable[str], group: str) -> tuple[str, ...]:

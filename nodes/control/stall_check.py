@@ -85,10 +85,10 @@ class StallGate:
         limits = self.limits
         if self._commanded_ns is None or mono_ns - self._commanded_ns < limits.time_s * NS_PER_S:
             return ""
-        if not any(self._rest_s(name, mono_ns) >= limits.time_s for name in limits.sources):
+        rest_s = max((self._rest_s(name, mono_ns) for name in limits.sources), default=0.0)
+        if rest_s < limits.time_s:
             return ""
-        told = f"stalled: commanded {self._commanded_mps:.2f} m/s for {(mono_ns - self._commanded_ns) / NS_PER_S:.1f} s"
-        return f"{told}, {self._finding(mono_ns)}"
+        return f"stalled for {rest_s:.1f} s: commanded {self._commanded_mps:.2f} m/s, {self._finding(mono_ns)}"
 
     def _measured(self, name: str, speed_mps: float, mono_ns: int) -> None:
         # Anything but a rest counts as motion, also what is not a number: a broken measurement is another check's business.

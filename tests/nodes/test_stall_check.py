@@ -51,7 +51,7 @@ def drive(seconds, command, jams=(), gate=None, dead_s=0.0, blind=(), seed=0):
 def test_a_jam_is_found_in_its_time(how, words, speed):
     found_s, problem = drive(6.0, lambda t: speed, jams=[(3.0, how)])
     assert 3.95 <= found_s <= 4.2
-    assert f"stalled: commanded {speed:.2f} m/s" in problem
+    assert f"stalled for 1.0 s: commanded {speed:.2f} m/s" in problem
     assert words in problem
 
 

@@ -118,7 +118,7 @@ def drive_run(series: Series, run: Run, ready_timeout_s: float, guide: Callable[
         except NotStartedError as error:
             stopped = str(error)
         else:
-            if counts(stopped):
+            if counts(stopped, result["off_track"]):
                 write_atomically(series.folder / f"{run.name}.json", json.dumps(result) + "\n")
                 return result
         guide(f"this run does not count, the stack stopped it: {stopped} (attempt {attempt} of {_ATTEMPTS})")

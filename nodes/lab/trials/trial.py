@@ -39,10 +39,20 @@ class TrialError(RuntimeFault):
 
 # A stop that belongs to the drive: the car left the floor it has, or a person ended it. Any other is a fault of the stack.
 _COUNTED_STOPS = ("fence", "disarmed by", "released")
+STALLED = "stalled"
 
 
-def counts(stopped_early: str) -> bool:
-    """Whether a drive that was stopped so measures the policy; an empty text is a drive that went on to its end."""
+def counts(stopped_early: str, off_track: bool) -> bool:
+    """Whether a drive measures the policy, or was ended by a fault of the stack.
+
+    A car that stalls beside its track has run into something, which is the policy's doing. One that stalls on its track is jammed.
+
+    Args:
+        stopped_early: Why the stack stopped the car; empty for a drive that went on to its end.
+        off_track: Whether the car had left the track by then.
+    """
+    if STALLED in stopped_early:
+        return off_track
     return not stopped_early or any(word in stopped_early for word in _COUNTED_STOPS)
 
 

@@ -38,3 +38,4 @@ def test_a_car_that_runs_into_something_stands_from_then_on():
     assert blocked_tick(driven(free)) is None
     assert blocked_tick(driven(against_it)) == 19
     assert blocked_tick(driven(against_it, "outside of the fence")) is None
+    assert blocked_tick(driven(against_it, "stalled: the car does not move")) == 19

@@ -93,8 +93,8 @@ def test_folders_from_before_settings_were_kept_are_known_by_their_key(tmp_path)
     assert not has_same_graph(owner)
 
 
-def driven(attack_ids, stopped_early=""):
-    return json.dumps({"attack_ids": attack_ids, "outcome": {"stopped_early": stopped_early}})
+def driven(attack_ids, stopped_early="", off_track=False):
+    return json.dumps({"attack_ids": attack_ids, "outcome": {"stopped_early": stopped_early}, "off_track": off_track})
 
 
 def test_a_live_drive_is_taken_of_the_same_graph_the_same_attack_and_no_fault(tmp_path, monkeypatch):
@@ -112,6 +112,7 @@ def test_a_live_drive_is_taken_of_the_same_graph_the_same_attack_and_no_fault(tm
     for text, taken in (
         (driven(["abc"]), True), (driven(["old"]), False), (driven([]), False),
         (driven(["abc"], "outside of the fence"), True), (driven(["abc"], "no fresh pose"), False),
+        (driven(["abc"], "stalled: ...", off_track=True), True), (driven(["abc"], "stalled: ..."), False),
     ):  # fmt: skip
         live.write_text(text)
         assert (cell.driven_in("gradient") == folder) is taken, text
