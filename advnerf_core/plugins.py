@@ -85,7 +85,8 @@ def load_from_file(reference: str, what: str, folder: Path | None = None) -> Any
     module = sys.modules.get(name := f"advnerf_plugin_{file.stem}_{digest}")
     if module is None:
         spec = importlib.util.spec_from_file_location(name, file)
-        assert spec is not None and spec.loader is not None, "a file with the ending .py has a loader"
+        assert spec is not None, "a file with the ending .py has a specification"
+        assert spec.loader is not None, "a file with the ending .py has a loader"
         module = importlib.util.module_from_spec(spec)
         sys.modules[name] = module  # dataclasses look their module up while it is being loaded
         try:
