@@ -13,6 +13,10 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
+from advnerf_core.kernel_cache import use_own_folder
+
+use_own_folder()
+
 # Kernels may reorder and contract float sums, but must honour NaN and infinity: trainers test for them.
 KERNEL_OPTIONS: dict[str, Any] = {
     "nogil": True,

@@ -25,7 +25,7 @@ from benchmarks.results import REPOSITORY, record_row
 
 COMMAND = "python -m benchmarks.two_hosts"
 FOLDER = REPOSITORY / "runs" / "two_hosts"
-POLICY = REPOSITORY / "runs" / "full" / "policy" / "policy.safetensors"
+POLICY = REPOSITORY / "runs" / "demo" / "policy" / "policy.safetensors"
 SPEED_MPS, LIMIT_MS = 0.8, 350.0
 DRIVE_S, LOSSY_S, BEFORE_S = 15.0, 40.0, 3.0
 LOSS, DELAY_S, STALL_S, SKEW_S = 0.05, 0.3, 2.0, 0.05

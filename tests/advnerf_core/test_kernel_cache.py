@@ -1,0 +1,74 @@
+"""A kernel that calls one of another file computes with that file as it is now."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from advnerf_core.kernel_cache import sources_digest, use_own_folder
+
+CALLED = "from numba import njit\n\n@njit(cache=True)\ndef number():\n    return {value}\n"
+CALLER = (
+    "from numba import njit\nfrom pack.called import number\n\n@njit(cache=True)\ndef asked():\n    return number()\n"
+)
+ASK = "{before}from pack.caller import asked\nprint(asked())\n"
+OWN = "from pathlib import Path\nfrom advnerf_core.kernel_cache import use_own_folder\nuse_own_folder(Path('pack'))\n"
+
+
+def ask(folder: Path, value: int, before: str) -> int:
+    """What a fresh process computes when the called kernel returns a value."""
+    (folder / "pack" / "called.py").write_text(CALLED.format(value=value))
+    environment = {key: text for key, text in os.environ.items() if key != "NUMBA_CACHE_DIR"}
+    environment["PYTHONPATH"] = os.pathsep.join([str(folder), str(Path(__file__).parents[2])])
+    done = subprocess.run(
+        [sys.executable, "-c", ASK.format(before=before)],
+        cwd=folder, env=environment, check=True, stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    return int(done.stdout)
+
+
+@pytest.fixture
+def package(tmp_path: Path) -> Path:
+    """A package of two kernels, one of which calls the other."""
+    (tmp_path / "pack").mkdir()
+    (tmp_path / "pack" / "__init__.py").write_text("")
+    (tmp_path / "pack" / "caller.py").write_text(CALLER)
+    return tmp_path
+
+
+def test_a_changed_kernel_is_compiled_into_those_that_call_it(package: Path) -> None:
+    # The hazard: numba alone goes on with the kernel of before.
+    assert [ask(package, 1, ""), ask(package, 2, "")] == [1, 1]
+    assert [ask(package, value, OWN) for value in (1, 2, 1)] == [1, 2, 1]
+
+
+def test_folders_follow_the_sources_and_old_ones_go(package: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(package / "cache"))
+    seen = []
+    for value in range(6):
+        (package / "pack" / "called.py").write_text(CALLED.format(value=value))
+        seen.append(use_own_folder(package / "pack"))
+        assert os.environ["NUMBA_CACHE_DIR"] == str(seen[-1])  # and children find the same
+    assert len(set(seen)) == 6
+    assert use_own_folder(package / "pack") == seen[-1]
+    assert len(list((package / "cache").iterdir())) == 4
+    assert seen[-1].is_dir()
+
+
+def test_files_without_kernels_change_nothing(package: Path) -> None:
+    (package / "pack" / "called.py").write_text(CALLED.format(value=1))
+    before = sources_digest(package / "pack")
+    (package / "pack" / "other.py").write_text("x = 1\n")
+    assert sources_digest(package / "pack") == before
+    (package / "pack" / "called.py").rename(package / "pack" / "renamed.py")
+    assert sources_digest(package / "pack") != before
+
+
+def test_the_kernels_of_this_package_use_it() -> None:
+    code = "import numba, advnerf_core.render.march_kernels; print(numba.config.CACHE_DIR)"
+    done = subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.PIPE, text=True)
+    assert Path(done.stdout.strip()).name.startswith("advnerf-")
