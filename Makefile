@@ -7,7 +7,7 @@ export MUJOCO_GL ?= egl
 export PYTHONDONTWRITEBYTECODE :=
 DEFAULT_TESTS := not slow and not gpu and not hardware and not data
 
-.PHONY: help setup demo experiment test test-slow check bench campaign rooms fmt clean
+.PHONY: help setup demo experiment test test-slow test-gpu test-hardware check bench campaign rooms fmt clean
 
 help:  ## Show this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
@@ -37,6 +37,12 @@ test: setup  ## The default tests (about 6 minutes on 2 cores)
 
 test-slow: setup  ## The tests that take minutes, the default ones excluded
 	@$(BIN)/pytest -q -m 'slow' --timeout 1200
+
+test-gpu: setup  ## The tests that need a CUDA device
+	@$(BIN)/pytest -q -m 'gpu' --timeout 1200
+
+test-hardware: setup  ## The tests that need a real device; each says which, and skips without it
+	@$(BIN)/pytest -q -m 'hardware' --timeout 1200
 
 check: setup  ## Lint, types, import contracts
 	@$(BIN)/ruff check .
