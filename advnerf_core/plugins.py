@@ -39,14 +39,47 @@ def resolve(name: str, what: str, built_in: Mapping[str, Callable[[], T]], group
     if name in built_in:
         return built_in[name]()
     if is_file_reference(name):
-        return load_from_file(name, what, folder)  # type: ignore[no-any-return]
+        return load_from_file(name, what, folder)
     found = {each.name: each for each in entry_points(group=group)}
     if name in found:
-        return _load_entry_point(found[name], what)  # type: ignore[no-any-return]
-    raise PluginError(
-        unknown(name, what, [*built_in, *sorted(found)])
-        + f"; one of your own is file.py:Name, or an entry point of {group}"
-    )
+        return _load_entry_point(found[name], what)
+    raise PluginError(_stands_for_nothing(name, what, built_in, group))
+
+
+def require_known(name: str, what: str, built_in: Iterable[str], group: str, folder: Path | None = None) -> None:
+    """Refuse a name that stands for nothing. No code is loaded: what the name stands for may still be broken.
+
+    Args:
+        name: As of `resolve`, like the other arguments.
+        what: What is being named, for messages.
+        built_in: Names of what this project brings.
+        group: Entry point group.
+        folder: Folder that a relative ``file.py`` is relative to; the working folder if it is not given.
+
+    Raises:
+        PluginError: There is no such name, or no such file.
+    """
+    if is_file_reference(name):
+        _file_of(name, what, folder)
+    elif name not in known_names(built_in, group):
+        raise PluginError(_stands_for_nothing(name, what, built_in, group))
+
+
+def code_digest(name: str, group: str, folder: Path | None = None) -> str:
+    """Names the code behind a user's name: it changes with the content of the file, or with the version of the package.
+
+    Returns:
+        16 characters, the same on every machine; empty for a name that is neither a file's nor an entry point's.
+    """
+    if is_file_reference(name):
+        code = Path(absolute_reference(name, folder or Path.cwd()).rpartition(":")[0]).read_bytes()
+    else:
+        entry = next((each for each in entry_points(group=group) if each.name == name), None)
+        if entry is None:
+            return ""
+        version = f"{entry.dist.name} {entry.dist.version}" if entry.dist is not None else ""
+        code = f"{entry.value} {version}".encode()
+    return hashlib.sha256(code).hexdigest()[:16]
 
 
 def known_names(built_in: Iterable[str], group: str) -> tuple[str, ...]:
@@ -77,15 +110,12 @@ def load_from_file(reference: str, what: str, folder: Path | None = None) -> Any
     Raises:
         PluginError: There is no such file or attribute, or the file raises an error.
     """
-    file_text, _, attribute = absolute_reference(reference, folder or Path.cwd()).rpartition(":")
-    file = Path(file_text)
-    if not file.is_file():
-        raise PluginError(f"{what} {reference}: expected a Python file at {file}, found none; correct the path")
+    file, attribute = _file_of(reference, what, folder)
     digest = hashlib.sha256(str(file).encode() + b"\0" + file.read_bytes()).hexdigest()[:16]
     module = sys.modules.get(name := f"advnerf_plugin_{file.stem}_{digest}")
     if module is None:
         spec = importlib.util.spec_from_file_location(name, file)
-        assert spec is not None, "a file with the ending .py has a specification"
+        assert spec is not None, "a file with the ending .py has a loader"
         assert spec.loader is not None, "a file with the ending .py has a loader"
         module = importlib.util.module_from_spec(spec)
         sys.modules[name] = module  # dataclasses look their module up while it is being loaded
@@ -98,6 +128,22 @@ def load_from_file(reference: str, what: str, folder: Path | None = None) -> Any
         public = [each for each in vars(module) if not each.startswith("_")]
         raise PluginError(f"{what} {reference}: " + unknown(attribute, f"name in {file.name}", public))
     return getattr(module, attribute)
+
+
+def _file_of(reference: str, what: str, folder: Path | None) -> tuple[Path, str]:
+    """File and attribute of ``file.py:Name``."""
+    file_text, _, attribute = absolute_reference(reference, folder or Path.cwd()).rpartition(":")
+    file = Path(file_text)
+    if not file.is_file():
+        raise PluginError(f"{what} {reference}: expected a Python file at {file}, found none; correct the path")
+    return file, attribute
+
+
+def _stands_for_nothing(name: str, what: str, built_in: Iterable[str], group: str) -> str:
+    return (
+        unknown(name, what, known_names(built_in, group))
+        + f"; one of your own is file.py:Name, or an entry point of {group}"
+    )
 
 
 def unknown(name: str, what: str, known: Iterable[str]) -> str:

@@ -18,10 +18,7 @@ from pathlib import Path
 import torch
 from safetensors.torch import save
 
-from advnerf_core.attack.search.baselines import random_search
-from advnerf_core.attack.search.optimise import gradient_attack
-from advnerf_core.attack.search.population import CrossEntropy, Evolution, population_search
-from advnerf_core.attack.search.search import SearchResult
+from advnerf_core.attack.methods import SearchRun, SearchSettings, load_method
 from advnerf_core.files import write_atomically
 from benchmarks.attack_toy import toy_problem
 from benchmarks.results import REPOSITORY, record_row
@@ -35,13 +32,8 @@ def run_in(folder: Path, method: str, evaluations: int) -> None:
     """The whole attack, or the rest of it; ends in a file of what was found and of every loss."""
     torch.set_num_threads(1)
     problem, state = toy_problem(6, resolution=16, dtype=torch.float32), folder / STATE
-    if method == "gradient":
-        result: SearchResult = gradient_attack(problem, evaluations, seed=3, state_path=state)
-    elif method == "random":
-        result = random_search(problem, evaluations, seed=3, state_path=state)
-    else:
-        strategy = CrossEntropy() if method == "cem" else Evolution()
-        result = population_search(problem, strategy, evaluations, population=4, seed=3, state_path=state)
+    settings = SearchSettings(evaluations, population=4)
+    result = load_method(method).search(problem, settings, SearchRun(seed=3, state_path=state))
     losses = torch.tensor([evaluation.loss_m for evaluation in result.history], dtype=torch.float64)
     write_atomically(folder / RESULT, save({"theta": result.theta, "losses": losses}))
 

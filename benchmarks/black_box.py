@@ -3,7 +3,7 @@
 In the learned scene of an experiment's run folder, against its hardened victim written as an ONNX file, on its one path. Methods:
 
 - white box: the gradient attack on the same policy in torch; its calls are iterations x starts x ticks, forward only;
-- distilled, guided: `advnerf_core.attack.search.guided`; everything that is asked counts;
+- distilled, guided: `advnerf_core.attack.search.black_box`; everything that is asked counts;
 - evolution, cem, random: closed-loop evaluations only, starts x ticks calls each; random textures are the floor.
 
 The effect is what the best texture so far adds to the total CTE of the plain board, and is given as a share of the white box's. Every
@@ -29,11 +29,10 @@ import torch
 
 from advnerf_core.attack.adjoint import AttackProblem, BlackBoxError, adjoint_gradient, evaluate
 from advnerf_core.attack.artifact import load_attack
-from advnerf_core.attack.search.baselines import random_search
+from advnerf_core.attack.methods import SearchRun, SearchSettings, load_method
+from advnerf_core.attack.search.black_box import BlackBoxSearch, black_box_attack
 from advnerf_core.attack.search.distil import Distillation
-from advnerf_core.attack.search.guided import BlackBoxSearch, black_box_attack
-from advnerf_core.attack.search.optimise import gradient_attack
-from advnerf_core.attack.search.population import CrossEntropy, Evolution, population_search
+from advnerf_core.attack.search.gradient import gradient_attack
 from advnerf_core.attack.search.query_count import CountedPolicy, calls_per_evaluation
 from advnerf_core.attack.search.search import Evaluation, OnEvaluation, draw_start_states
 from advnerf_core.fields.voxel_grid import cube_face_object
@@ -108,16 +107,15 @@ class Search:
 def runner(name: str, problem: AttackProblem, calls: int, lessons: Distillation) -> tuple[int, int, Callable[..., Any]]:
     """First calls, calls of a step, and the search of a method within a budget of calls."""
     each = calls_per_evaluation(problem)
-    evaluations = calls // each
-    if name == "random":
-        return 0, each, lambda **kept: random_search(problem, evaluations, **kept)
-    if name in ("cem", "evolution"):
-        strategy = CrossEntropy() if name == "cem" else Evolution()
-        return 0, each, lambda **kept: population_search(problem, strategy, evaluations, 20, 8, **kept)
-    search = BlackBoxSearch.usual("distilled" if name == "distilled" else "guided", distillation=lessons)
-    return (
-        search.first_calls(), search.step_calls(problem), lambda **kept: black_box_attack(problem, search, calls, **kept)
-    )  # fmt: skip
+    if name == "distilled" or name == "guided":
+        search = BlackBoxSearch.usual(name, distillation=lessons)
+        return (
+            search.first_calls(),
+            search.step_calls(problem),
+            lambda **kept: black_box_attack(problem, search, calls, **kept),
+        )
+    settings = SearchSettings(calls // each, population=20)
+    return 0, each, lambda **kept: load_method(name).search(problem, settings, SearchRun(**kept))
 
 
 def white_box(problem: AttackProblem, out: Path, end_s: float) -> tuple[float, float]:

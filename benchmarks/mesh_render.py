@@ -24,7 +24,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from advnerf_core.attack.search.optimise import gradient_attack
+from advnerf_core.attack.search.gradient import gradient_attack
 from advnerf_core.geometry import Array, Pinhole, camera_mount, make_transform, planar_pose, rotation_z
 from advnerf_core.objects.mesh.engine import engine
 from advnerf_core.objects.mesh.field import MeshField

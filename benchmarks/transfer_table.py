@@ -14,8 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from advnerf_core.report.cells import CellResult, Drives
+from advnerf_core.report.conditions import style_of
 from advnerf_core.report.transfer import DOMAINS, Domain, TableRow, TransferTable, drives_in
-from advnerf_core.report.transfer_page import METHOD_NAMES, ran_into_something
+from advnerf_core.report.transfer_page import ran_into_something
 from advnerf_core.report.transfer_prediction import skill_of, skill_text
 from advnerf_core.report.transfer_targets import VICTIM, TableTarget, table_targets
 from benchmarks.results import record_row
@@ -53,7 +54,7 @@ def line_of(row: TableRow, cells: Sequence[CellResult] = ()) -> str:
     """What a row of the ledger is called, e.g. ``#5 straight, gradient, surrogate``."""
     own_frames = row.domain == "surrogate" and any(cell.extra.get("frames") == "deployment" for cell in cells)
     where = "ideal car over the same frames" if own_frames else row.domain
-    parts = [row.scenario, row.placement, METHOD_NAMES.get(row.method, row.method), where]
+    parts = [row.scenario, row.placement, style_of(row.method).title, where]
     return "#5 " + ", ".join(filter(None, [*parts, "" if row.victim == VICTIM else f"{row.victim} victim"]))
 
 
@@ -239,7 +240,7 @@ def main() -> None:
         )  # fmt: skip
     for target in table_targets(table):
         if target.what != "ratio to no attack" and target.value is not None:
-            line = f"#5 {target.scenario}, {METHOD_NAMES[target.method]}, {target.domain}: {target.what}"
+            line = f"#5 {target.scenario}, {style_of(target.method).title}, {target.domain}: {target.what}"
             row_of_target = table.find(target.scenario, target.victim, target.method, target.domain)
             cells = table.cells_of(row_of_target) if row_of_target else []
             note = f"{target.seeds} seeds" + (how_far(cells) if "off the track" in target.what else "")

@@ -22,6 +22,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
+from advnerf_core.attack.methods import alternatives, black_box_methods
 from advnerf_core.attack.problem import (
     AttackProblem,
     RecurrentPolicy,
@@ -33,7 +34,6 @@ from advnerf_core.attack.problem import (
 from advnerf_core.driving.dynamics import Dynamics
 from advnerf_core.driving.rollout import Rollout, drive
 from advnerf_core.errors import AdvnerfError
-from advnerf_core.policies.black_box import BLACK_BOX_METHODS_TEXT
 from advnerf_core.scene.surrogate import Rendered
 
 __all__ = [
@@ -147,7 +147,7 @@ def adjoint_gradient(problem: AttackProblem, theta: Tensor) -> AdjointResult:
     if not problem.differentiable:
         raise BlackBoxError(
             "expected a policy with a gradient, got one that declares differentiable = False; search with the methods "
-            f"{BLACK_BOX_METHODS_TEXT} instead"
+            f"{alternatives(black_box_methods())} instead"
         )
     theta = theta.detach()
     cache = RenderCache(problem.cache_bytes)

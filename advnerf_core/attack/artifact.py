@@ -12,7 +12,7 @@ import os
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any
 
 import cv2
 import numpy as np
@@ -27,8 +27,6 @@ from advnerf_core.geometry import Array, Pinhole
 
 FILE_FORMAT = "advnerf-attack-1"
 TEXTURE_PX = 512
-
-Method = Literal["none", "random", "gradient", "cem", "evolution", "distilled", "guided"]
 
 
 class AttackFileError(AdvnerfError, ValueError):
@@ -65,7 +63,7 @@ class AttackFile:
     """An attack, ready to be shown.
 
     Attributes:
-        method: How the texture was found; ``none`` is the plain object.
+        method: Name of the method that found the texture; ``none`` is the plain object.
         theta: Colour grid before squashing, ``[N, N, 3]`` float32; row 0 on top, column 0 left for the viewer. Empty if no object
             has a face that can be displayed.
         texture: The face as it is displayed, ``[H, W, 3]`` uint8 sRGB; empty like ``theta``.
@@ -86,7 +84,7 @@ class AttackFile:
         objects: All objects with their colours, where there is more to them than the one face.
     """
 
-    method: Method
+    method: str
     theta: NDArray[np.float32]
     texture: NDArray[np.uint8]
     size_m: tuple[float, float]
@@ -105,8 +103,8 @@ class AttackFile:
     objects: tuple[AttackedObject, ...] = ()
 
     def __post_init__(self) -> None:
-        if self.method not in get_args(Method):
-            raise AttackFileError(f"expected a method of {', '.join(get_args(Method))}, got {self.method!r}")
+        if not self.method or not isinstance(self.method, str):
+            raise AttackFileError(f"expected the name of a method, got {self.method!r}")
         if self.theta.ndim != 3 or self.theta.shape[2] != 3 or self.theta.dtype != np.float32:
             raise AttackFileError(f"expected theta [N, N, 3] float32, got {self.theta.shape} {self.theta.dtype}")
         if self.texture.ndim != 3 or self.texture.shape[2] != 3 or self.texture.dtype != np.uint8:

@@ -16,6 +16,7 @@ from advnerf_core.attack.pose_maps import Landscape, RobustnessMap
 from advnerf_core.attack.spaces.placement import PoseSpace, footprint
 from advnerf_core.driving.path import Path
 from advnerf_core.geometry import Array, rotation_z
+from advnerf_core.report.conditions import style_of
 from advnerf_core.report.palette import LIGHT
 
 _COLOURS = "magma"
@@ -107,7 +108,7 @@ def draw_placements(space: PoseSpace, placements: Tensor, paths: Sequence[Path],
         box = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * [half_x, half_y] + [x, y]
         axes.add_patch(Polygon(box, closed=True, fill=False, linestyle=":", edgecolor=LIGHT["muted"]))
     for name, xy in drives.items():
-        colour = LIGHT.get(name, LIGHT["ink"])
+        colour = style_of(name).light
         axes.plot(xy[:, 0], xy[:, 1], color=colour, label=f"drive: {name}")
     axes.set(aspect="equal", xlabel="x [m]", ylabel="y [m]", title="objects, their bounds (dotted) and the drives")
     axes.legend(fontsize=8)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -38,6 +38,19 @@ class Sensor(Protocol):
 
     def sense(self, states: Tensor, theta: Tensor) -> Rendered:
         """Images at detached states ``[B, n]`` with their vjp."""
+
+
+@runtime_checkable
+class ScaledSensor(Protocol):
+    """A sensor whose theta is not colours before squashing, so that searches need steps and spreads of another size."""
+
+    @property
+    def learning_rate(self) -> float:
+        """Step of Adam along a gradient, in units of theta."""
+
+    @property
+    def random_sigma(self) -> float:
+        """Spread of random thetas."""
 
 
 class RecurrentPolicy(Protocol):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import traceback
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Literal
 
@@ -12,7 +13,6 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from advnerf_core.policies.adapter import AdaptedPolicy
-from advnerf_core.policies.black_box import BLACK_BOX_METHODS
 from advnerf_core.policies.contract import PolicyContractError
 from advnerf_core.policies.hypotheses import USEFUL_ERROR, Array, judge, steering_of
 from advnerf_core.policies.pilotnet import images_to_tensor
@@ -28,8 +28,6 @@ LARGEST_STEERING_RAD = 1.2
 _EQUAL_SHARE = 1e-3
 _CONSTANT_RAD = 1e-6
 _PROBES = 4
-# These ask about single images, which do not tell the steering of a policy with memory.
-_OF_ONE_IMAGE = ("guided", "distilled")
 _MODES = (nn.modules.dropout._DropoutNd, nn.modules.batchnorm._BatchNorm)
 
 
@@ -53,6 +51,7 @@ def check_policy(
     images: NDArray[np.uint8],
     steering_rad: Array | None = None,
     goal: tuple[float, ...] | None = None,
+    methods: Sequence[str] = (),
 ) -> list[Finding]:
     """Everything that can be told of a policy from the outside; what an earlier failure hides is left out.
 
@@ -61,10 +60,11 @@ def check_policy(
         images: Policy images ``[N, H, W, 3]`` uint8 RGB of the policy's own view, at least 4 and not all alike.
         steering_rad: What an expert would steer on them ``[N]`` [rad], left positive; None leaves the comparison out.
         goal: Goal vector for a policy that has goals; zeros if not given.
+        methods: Methods of attack that can search against it without a gradient; named where it declares that it has none.
     """
     if len(images) < _PROBES:
         raise ValueError(f"expected at least {_PROBES} images, got {len(images)}")
-    examined = _Examined(policy, goal)
+    examined = _Examined(policy, goal, methods)
     findings = [_mode(policy)]
     runs = _runs(examined, images)
     findings.append(runs)
@@ -86,8 +86,8 @@ def check_policy(
 class _Examined:
     """A policy and its goal, called on plain images."""
 
-    def __init__(self, policy: AdaptedPolicy, goal: tuple[float, ...] | None) -> None:
-        self.policy = policy
+    def __init__(self, policy: AdaptedPolicy, goal: tuple[float, ...] | None, methods: Sequence[str] = ()) -> None:
+        self.policy, self.methods = policy, methods
         size = policy.contract.goal_size
         self.goal = None if size == 0 else np.array(goal if goal is not None else (0.0,) * size)
 
@@ -222,10 +222,8 @@ def _independent(examined: _Examined, images: NDArray[np.uint8]) -> Finding:
 def _gradient(examined: _Examined, images: NDArray[np.uint8]) -> Finding:
     declared = examined.policy.differentiable
     if not declared:
-        methods = ", ".join(
-            each for each in BLACK_BOX_METHODS if examined.policy.stateless or each not in _OF_ONE_IMAGE
-        )
-        return Finding("gradient", OK, f"declared a black box: attacked without a gradient ({methods})")
+        how = f" ({', '.join(examined.methods)})" if examined.methods else ""
+        return Finding("gradient", OK, f"declared a black box: attacked without a gradient{how}")
     batch = images_to_tensor(images[:_PROBES]).contiguous().requires_grad_()
     with torch.enable_grad():
         steering = examined(batch)

@@ -10,7 +10,6 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from advnerf_core.errors import AdvnerfError
 
-NONE = "none"
 Metres = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 
 
@@ -54,7 +53,7 @@ class CellResult(BaseModel):
     Attributes:
         scenario: straight, right, left, green_screen, monitor or another.
         victim: ``hardened``, ``naive`` or ``retrained``.
-        method: ``none``, ``random``, ``cem`` or ``gradient``.
+        method: ``none``, or the name of the method of attack.
         seed: Seed of starts and search.
         placement: Name of the placement; empty for the scenario's own.
         attack_id: Id of the attack file; None for none.

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image, ImageDraw, ImageFont  # comes with matplotlib
 
-from advnerf_core.report.data import Condition
+from advnerf_core.report.conditions import style_of
 from advnerf_core.report.palette import DARK
 
 MAX_BYTES = 1_500_000
@@ -37,7 +37,7 @@ class ClipTrack:
 
     Attributes:
         title: What is seen, such as "deployed, gradient".
-        condition: What the object shows; gives the colour.
+        condition: What the object shows, by the name in `conditions`; gives the colour.
         frames: First-person images, ``[N]`` of uint8 RGB ``[height, width, 3]``, one per control tick.
         cte_m: Signed cross-track error at the frames, ``[N]`` [m].
         attack_id: Short hash of the attack file; "" for none.
@@ -45,7 +45,7 @@ class ClipTrack:
     """
 
     title: str
-    condition: Condition
+    condition: str
     frames: Sequence[Frames] | Frames
     cte_m: ArrayLike
     attack_id: str = ""
@@ -177,7 +177,7 @@ def _panel(track: ClipTrack, step: int, rate_hz: float, off_track_m: float) -> F
 
 def _draw_title(canvas: Image.Image, track: ClipTrack) -> None:
     draw = ImageDraw.Draw(canvas)
-    draw.rectangle((0, 0, 4, _TITLE_PX - 3), fill=_rgb(track.condition))
+    draw.rectangle((0, 0, 4, _TITLE_PX - 3), fill=_rgb(style_of(track.condition).key))
     draw.text((11, _TITLE_PX / 2 - 1), track.title, fill=_rgb("ink"), font=_font(13, bold=True), anchor="lm")
     if track.attack_id:
         draw.text(

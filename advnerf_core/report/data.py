@@ -19,16 +19,13 @@ from advnerf_core.report.measurements import Fidelity, FidelityView, Hop, Latenc
 from advnerf_core.report.record import Floats, Image, Record
 
 Domain = Literal["surrogate", "deployed"]
-Condition = Literal["none", "random", "gradient", "empty"]
 Victim = Literal["hardened", "naive"]
 
 __all__ = [
-    "CONDITIONS",
     "DOMAINS",
     "VICTIMS",
     "Check",
     "Clip",
-    "Condition",
     "Domain",
     "Fidelity",
     "FidelityView",
@@ -49,7 +46,6 @@ __all__ = [
 ]
 
 DOMAINS: tuple[Domain, ...] = get_args(Domain)
-CONDITIONS: tuple[Condition, ...] = get_args(Condition)
 VICTIMS: tuple[Victim, ...] = get_args(Victim)
 
 
@@ -95,8 +91,8 @@ class Run(Record):
 
     Attributes:
         domain: Where it was driven: in the learned scene or by the live node graph.
-        condition: What the object shows: "none" plain colours, "random" the best random texture, "gradient" the attack,
-            "empty" no object at all.
+        condition: What the object shows: "none" plain colours, the name of a method what it found, "empty" no object at all;
+            see `conditions`.
         victim: "hardened" has seen random textures in training, "naive" has not.
         seed: Seed of the attack; 0 where nothing is random.
         start: Index into `Settings.start_poses`.
@@ -112,7 +108,7 @@ class Run(Record):
     """
 
     domain: Domain
-    condition: Condition
+    condition: str
     victim: Victim
     seed: int
     start: int
@@ -129,7 +125,7 @@ class Run(Record):
     def __post_init__(self) -> None:
         super().__post_init__()
         self.check_choice("domain", DOMAINS)
-        self.check_choice("condition", CONDITIONS)
+        self.check_named("condition")
         self.check_choice("victim", VICTIMS)
         self.set_floats("cte_m", None)
         self.set_floats("states", len(self.cte_m), 3)
@@ -180,14 +176,14 @@ def face_segment(T_world_from_face: ArrayLike, width_m: float) -> NDArray[np.flo
 class LossCurve(Record):
     """Total CTE of each evaluation of one search, mean over the start poses, ``[E]`` [m], in order of evaluation."""
 
-    method: Literal["gradient", "random"]
+    method: str
     seed: int
     total_cte_m: Floats
     victim: Victim = "hardened"
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.check_choice("method", ("gradient", "random"))
+        self.check_named("method")
         self.check_choice("victim", VICTIMS)
         self.set_floats("total_cte_m", None)
 
@@ -197,7 +193,7 @@ class Texture(Record):
     """What the face shows: row 0 is its top, column 0 its left for a viewer in front of it."""
 
     label: str
-    condition: Condition
+    condition: str
     image: Image | None
     attack_id: str = ""
     seed: int = 0
@@ -205,7 +201,7 @@ class Texture(Record):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.check_choice("condition", CONDITIONS)
+        self.check_named("condition")
         self.check_choice("victim", VICTIMS)
         self.check_image("image")
 

@@ -41,7 +41,7 @@ def laps_map(laps: Laps, scene: Scene) -> Figure:
     box = np.reshape(scene.room_m, (2, 2))
     with new_axes(6.0, _height_in(box)) as ax:
         _draw_scene(ax, scene)
-        ax.plot(laps.states[:, 0], laps.states[:, 1], color=LIGHT["none"], lw=1.2)
+        ax.plot(laps.states[:, 0], laps.states[:, 1], color=LIGHT["laps"], lw=1.2)
         _frame(ax, box)
     return ax.figure
 

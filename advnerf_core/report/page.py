@@ -13,8 +13,9 @@ from markupsafe import Markup
 
 from advnerf_core.report import maps, plots, tables
 from advnerf_core.report.clips import Frames, data_uri, film_strip, image_uri
+from advnerf_core.report.conditions import style_of
 from advnerf_core.report.data import ReportData, Victim
-from advnerf_core.report.palette import CONDITION_NAMES, DARK, LIGHT, css_variables
+from advnerf_core.report.palette import DARK, LIGHT, css_variables
 from advnerf_core.report.results import write_results, write_text_atomic
 from advnerf_core.report.summary import key_figures, opening
 from advnerf_core.report.targets import evaluate_targets, targets_table
@@ -59,7 +60,7 @@ def render_page(data: ReportData) -> str:
         style=Markup(style),
         light=Markup(css_variables(LIGHT)),
         dark=Markup(css_variables(DARK)),
-        condition_names=CONDITION_NAMES,
+        style_of=style_of,
         paragraphs=opening(data),
         key_figures=key_figures(data),
         targets=targets_table(targets).html(),
@@ -127,7 +128,7 @@ def _videos(data: ReportData) -> dict[str, list[dict[str, Any]]]:
     wanted = [("comparisons", c.title, c.caption, c.path) for c in data.clips]
     for run in data.runs:
         if run.clip is not None:
-            title = f"{run.domain}, {CONDITION_NAMES[run.condition]}, {run.victim} policy, start {run.start + 1}, seed {run.seed}"
+            title = f"{run.domain}, {style_of(run.condition).title}, {run.victim} policy, start {run.start + 1}, seed {run.seed}"
             wanted.append(("drives", title, run.note, run.clip))
     embedded, seen = 0, set()
     for group, title, caption, path in wanted:

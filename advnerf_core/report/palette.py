@@ -8,12 +8,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from types import MappingProxyType
 
+from advnerf_core.report.conditions import CONDITIONS, SPARE
+
+_STYLES = {**CONDITIONS, **SPARE}
 LIGHT: Mapping[str, str] = MappingProxyType(
     {
-        "none": "#0072b2",
-        "random": "#dd9300",
-        "gradient": "#b0123c",
-        "empty": "#7d848d",
+        **{key: style.light for key, style in _STYLES.items()},
         "ink": "#1c2128",
         "muted": "#59626d",
         "grid": "#dde2e7",
@@ -24,10 +24,7 @@ LIGHT: Mapping[str, str] = MappingProxyType(
 )
 DARK: Mapping[str, str] = MappingProxyType(
     {
-        "none": "#4fb0f2",
-        "random": "#f7cc5a",
-        "gradient": "#f4577a",
-        "empty": "#8f98a3",
+        **{key: style.dark for key, style in _STYLES.items()},
         "ink": "#e4e8ec",
         "muted": "#9da7b1",
         "grid": "#30373f",
@@ -37,10 +34,6 @@ DARK: Mapping[str, str] = MappingProxyType(
     }
 )
 
-CONDITION_NAMES: Mapping[str, str] = MappingProxyType(
-    {"none": "no attack", "random": "best random", "gradient": "gradient", "empty": "empty scene"}
-)
-MARKERS: Mapping[str, str] = MappingProxyType({"none": "o", "random": "s", "gradient": "^", "empty": "D"})
 LINE_STYLES: Mapping[str, str] = MappingProxyType({"surrogate": "--", "deployed": "-"})
 
 

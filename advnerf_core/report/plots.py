@@ -19,8 +19,9 @@ from markupsafe import escape
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from advnerf_core.report.conditions import NONE, order_of, style_of
 from advnerf_core.report.data import Domain, Fidelity, Laps, Latency, MemoryRow, ReportData, Run, Victim
-from advnerf_core.report.palette import CONDITION_NAMES, LIGHT, LINE_STYLES, MARKERS, themed_svg
+from advnerf_core.report.palette import LIGHT, LINE_STYLES, themed_svg
 
 _STYLE: dict[str, Any] = {
     "font.family": "DejaVu Sans",
@@ -83,27 +84,26 @@ def cte_over_time(data: ReportData, domain: Domain, victim: Victim = "hardened")
 def loss_curves(data: ReportData, victim: Victim = "hardened") -> Figure:
     """Total CTE per evaluation of the searches; the no-attack level of the surrogate as reference."""
     curves = [c for c in data.curves if c.victim == victim]
-    clean = [r.total_cte_m for r in data.select(domain="surrogate", condition="none", victim=victim)]
+    clean = [r.total_cte_m for r in data.select(domain="surrogate", condition=NONE, victim=victim)]
     handles = []
     with new_axes() as ax:
         for curve in curves:
-            x, style = np.arange(1, len(curve.total_cte_m) + 1), {"color": LIGHT[curve.method]}
-            if curve.method == "random":
-                ax.plot(x, curve.total_cte_m, MARKERS["random"], ms=2.4, alpha=0.55, mew=0, **style)
-                ax.plot(x, np.maximum.accumulate(curve.total_cte_m), drawstyle="steps-post", **style)
+            x, style = np.arange(1, len(curve.total_cte_m) + 1), style_of(curve.method)
+            if style.climbs:
+                ax.plot(x, curve.total_cte_m, color=style.light)
+                ax.plot(x[-1], curve.total_cte_m[-1], style.marker, ms=5, color=style.light)
             else:
-                ax.plot(x, curve.total_cte_m, **style)
-                ax.plot(x[-1], curve.total_cte_m[-1], MARKERS["gradient"], ms=5, **style)
-        present = {c.method for c in curves}
-        if "gradient" in present:
-            handles.append(Line2D([], [], color=LIGHT["gradient"], label="gradient, one line per seed"))
-        if "random" in present:
-            handles.append(
-                Line2D([], [], color=LIGHT["random"], marker="s", ms=2.4, label="random: each texture, best so far")
-            )
+                ax.plot(x, curve.total_cte_m, style.marker, ms=2.4, alpha=0.55, mew=0, color=style.light)
+                ax.plot(x, np.maximum.accumulate(curve.total_cte_m), drawstyle="steps-post", color=style.light)
+        # Lines before dots.
+        for method in sorted({c.method for c in curves}, key=lambda name: (not style_of(name).climbs, order_of(name))):
+            style = style_of(method)
+            text = f"{method}, one line per seed" if style.climbs else f"{method}: each texture, best so far"
+            marker = None if style.climbs else style.marker
+            handles.append(Line2D([], [], color=style.light, label=text, marker=marker, ms=2.4))
         if clean:
             handles.append(
-                ax.axhline(float(np.mean(clean)), color=LIGHT["none"], ls="--", lw=1.2, label="no attack, surrogate")
+                ax.axhline(float(np.mean(clean)), color=LIGHT[NONE], ls="--", lw=1.2, label="no attack, surrogate")
             )
         ax.set(xlabel="evaluation", ylabel="total CTE, surrogate [m]")
         ax.set_ylim(bottom=0.0)
@@ -197,7 +197,7 @@ def laps_cte(laps: Laps, period_s: float, off_track_m: float) -> Figure:
     with new_axes(6.0, 2.6) as ax:
         ax.axhspan(-off_track_m, off_track_m, color=LIGHT["band"], lw=0)
         ax.axhline(0.0, color=LIGHT["tape"], lw=1.2)
-        ax.plot(np.arange(len(laps.cte_m)) * period_s, laps.cte_m, color=LIGHT["none"], lw=1.2)
+        ax.plot(np.arange(len(laps.cte_m)) * period_s, laps.cte_m, color=LIGHT["laps"], lw=1.2)
         limit = max(off_track_m * 1.2, float(abs(laps.cte_m).max()) * 1.1)
         ax.set(xlabel="time [s]", ylabel="cross-track error, left + [m]", ylim=(-limit, limit))
         ax.set_xlim(left=0.0)
@@ -206,17 +206,20 @@ def laps_cte(laps: Laps, period_s: float, off_track_m: float) -> Figure:
 
 def run_style(run: Run) -> dict[str, Any]:
     """How a drive is drawn: colour by condition, line by domain."""
-    front = {"empty": 2.0, "none": 2.1, "random": 2.2, "gradient": 2.3}[run.condition]
-    return {"color": LIGHT[run.condition], "ls": LINE_STYLES[run.domain], "zorder": front, "alpha": 0.9}
+    style = style_of(run.condition)
+    # Attacks in front of drives without one, and these in front of the empty scene.
+    front = {"empty": 2.0, NONE: 2.1}.get(run.condition, 2.2 + 0.01 * order_of(run.condition)[0])
+    return {"color": style.light, "ls": LINE_STYLES[run.domain], "zorder": front, "alpha": 0.9}
 
 
 def end_style(run: Run) -> dict[str, Any]:
     """The mark at the end of a drive: shape by condition, filled if deployed."""
-    fill = LIGHT[run.condition] if run.domain == "deployed" else LIGHT["paper"]
+    style = style_of(run.condition)
+    fill = style.light if run.domain == "deployed" else LIGHT["paper"]
     return {
-        "marker": MARKERS[run.condition],
+        "marker": style.marker,
         "ms": 5,
-        "color": LIGHT[run.condition],
+        "color": style.light,
         "mfc": fill,
         "ls": "none",
         "zorder": 3,
@@ -227,11 +230,11 @@ def add_run_legend(ax: Any, runs: Iterable[Run]) -> None:
     """A legend of the cells that occur, above the axes."""
     cells: dict[tuple[str, str], Run] = {(r.condition, r.domain): r for r in runs}
     handles = []
-    for condition, name in CONDITION_NAMES.items():
+    for condition in sorted({condition for condition, _ in cells}, key=order_of):
         for domain in LINE_STYLES:
             if run := cells.get((condition, domain)):
                 style = {**run_style(run), **{k: v for k, v in end_style(run).items() if k in ("marker", "ms", "mfc")}}
-                handles.append(Line2D([], [], label=f"{name}, {domain}", **style))
+                handles.append(Line2D([], [], label=f"{style_of(condition).title}, {domain}", **style))
     _legend_above(ax, handles)
 
 

@@ -46,6 +46,11 @@ class Record:
                 f"expected {type(self).__name__}.{name} to be one of {', '.join(choices)}, got {getattr(self, name)!r}"
             )
 
+    def check_named(self, name: str) -> None:
+        """Raise unless field ``name`` is a name."""
+        if not getattr(self, name):
+            raise ValueError(f"expected {type(self).__name__}.{name} to be a name, got {getattr(self, name)!r}")
+
     def check_image(self, name: str) -> None:
         """Raise unless field ``name`` is None or an RGB image."""
         image = getattr(self, name)

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from advnerf_core.driving.metrics import drives, mean_cte_limit_m
-from advnerf_core.report.data import Condition, Domain, ReportData
+from advnerf_core.report.data import Domain, ReportData
 from advnerf_core.report.tables import TransferRow, find_row, number, transfer_rows
 from advnerf_core.report.targets import Target, evaluate_targets
 
-_COMPARED: tuple[Condition, ...] = ("none", "gradient", "random")
+_COMPARED = ("none", "gradient", "random")
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class KeyFigure:
 def key_figures(data: ReportData) -> tuple[KeyFigure, ...]:
     """The numbers a reader looks for first."""
     rows = transfer_rows(data)
-    cells: tuple[tuple[Domain, Condition, float, bool, str], ...] = (
+    cells: tuple[tuple[Domain, str, float, bool, str], ...] = (
         ("surrogate", "gradient", 3.3, True, "gradient attack, surrogate"),
         ("deployed", "gradient", 3.0, True, "gradient attack, driven live"),
         ("deployed", "random", 1.5, False, "best random texture, driven live"),

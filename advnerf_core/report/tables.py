@@ -14,8 +14,8 @@ import rich.table
 from markupsafe import Markup
 from rich.text import Text
 
-from advnerf_core.report.data import DOMAINS, VICTIMS, Condition, Domain, ReportData, Run, Victim
-from advnerf_core.report.palette import CONDITION_NAMES
+from advnerf_core.report.conditions import NONE, order_of, style_of
+from advnerf_core.report.data import DOMAINS, VICTIMS, Domain, ReportData, Run, Victim
 
 # The paper's car, green screen (its section 4): all divided by the one deployed drive without attack, 48.
 PAPER_RATIOS: dict[tuple[str, str], float] = {
@@ -24,7 +24,6 @@ PAPER_RATIOS: dict[tuple[str, str], float] = {
     ("deployed", "random"): 46 / 48,
     ("deployed", "gradient"): 248 / 48,
 }
-_TABLE_CONDITIONS: tuple[Condition, ...] = ("none", "random", "gradient", "empty")
 
 
 @dataclass(frozen=True)
@@ -48,7 +47,7 @@ class TransferRow:
 
     victim: Victim
     domain: Domain
-    condition: Condition
+    condition: str
     runs: int
     total_cte_mean_m: float
     total_cte_std_m: float | None
@@ -69,16 +68,15 @@ def transfer_rows(data: ReportData) -> tuple[TransferRow, ...]:
     rows = []
     for victim in VICTIMS:
         for domain in DOMAINS:
-            clean = data.select(victim=victim, domain=domain, condition="none")
-            for condition in _TABLE_CONDITIONS:
-                runs = data.select(victim=victim, domain=domain, condition=condition)
-                if runs:
-                    rows.append(_transfer_row(runs, clean))
+            clean = data.select(victim=victim, domain=domain, condition=NONE)
+            met = {run.condition for run in data.select(victim=victim, domain=domain)}
+            for condition in sorted(met, key=order_of):
+                rows.append(_transfer_row(data.select(victim=victim, domain=domain, condition=condition), clean))
     return tuple(rows)
 
 
 def find_row(
-    rows: Sequence[TransferRow], domain: Domain, condition: Condition, victim: Victim = "hardened"
+    rows: Sequence[TransferRow], domain: Domain, condition: str, victim: Victim = "hardened"
 ) -> TransferRow | None:
     """The row of one cell; None if nothing was driven there."""
     return next((r for r in rows if (r.domain, r.condition, r.victim) == (domain, condition, victim)), None)
@@ -208,7 +206,7 @@ def transfer_table(rows: Sequence[TransferRow]) -> Table:
             (
                 *((r.victim if first else "",) if several else ()),
                 r.domain if first else "",
-                CONDITION_NAMES[r.condition],
+                style_of(r.condition).title,
                 str(r.runs),
                 spread(r.total_cte_mean_m, r.total_cte_std_m),
                 spread(r.ratio, r.ratio_std),

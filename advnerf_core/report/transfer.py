@@ -11,7 +11,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
-from advnerf_core.report.cells import NONE, CellResult, Drives
+from advnerf_core.report.cells import CellResult, Drives
+from advnerf_core.report.conditions import NONE
 from advnerf_core.report.statistics import Interval, mean_and_std, ratio_interval, ratio_of_sums, transfer_interval
 
 Domain = Literal["surrogate", "deployed"]

@@ -18,6 +18,7 @@ import jinja2
 from markupsafe import Markup
 
 from advnerf_core.report.cells import CellResult
+from advnerf_core.report.conditions import NONE, style_of
 from advnerf_core.report.palette import DARK, LIGHT, css_variables
 from advnerf_core.report.statistics import Interval
 from advnerf_core.report.tables import Table, number, spread
@@ -25,7 +26,6 @@ from advnerf_core.report.transfer import TableRow, TransferTable
 from advnerf_core.report.transfer_targets import TableTarget, table_targets
 
 SCHEMA = "advnerf-transfer/1"
-METHOD_NAMES = {"none": "no attack", "random": "best random", "cem": "cross-entropy", "gradient": "gradient"}
 STRAYED_FROM = 1.5
 OUTCOMES = (LEFT, RAN_INTO, STRAYED, HELD) = ("left the track", "ran into something", "strayed", "held its course")
 _EXPLAINED = {
@@ -72,7 +72,7 @@ def outcome_of(cell: CellResult) -> str:
     if ran_into_something(cell):
         return RAN_INTO
     strayed = sum(drives.total_cte_m) >= STRAYED_FROM * sum(drives.none_total_cte_m)
-    return STRAYED if strayed and cell.method != "none" else HELD
+    return STRAYED if strayed and cell.method != NONE else HELD
 
 
 def ran_into_something(cell: CellResult) -> bool:
@@ -94,7 +94,7 @@ def text_table(table: TransferTable) -> Table:
         if new_victim:
             groups.append(index)
         where = f"{row.scenario}, {row.placement}" if row.placement else row.scenario
-        name = METHOD_NAMES.get(row.method, row.method) if row.domain == "surrogate" else ""
+        name = style_of(row.method).title if row.domain == "surrogate" else ""
         cells.append((where if new_scenario else "", row.victim if new_victim else "", name, *_numbers(row)))
         classes.append(row.method if row.seeds else "unmeasured")
     right = (False, False, False, False, *[True] * 9)
@@ -118,8 +118,8 @@ def _numbers(row: TableRow) -> tuple[str, ...]:
         )
     return (
         row.domain, seeds, spread(row.mean_m, row.std_m), number(row.ratio), _interval(row.ratio_interval),
-        "" if row.domain == "surrogate" or row.method == "none" else number(row.transfer),
-        "" if row.method == "none" else _interval(row.transfer_interval),
+        "" if row.domain == "surrogate" or row.method == NONE else number(row.transfer),
+        "" if row.method == NONE else _interval(row.transfer_interval),
         f"{row.off_track} of {row.drives}", spread(row.paper_m, row.paper_std_m, 0), number(row.paper_ratio),
     )  # fmt: skip
 
@@ -131,7 +131,7 @@ def _interval(interval: Interval | None) -> str:
 def target_table(targets: Sequence[TableTarget]) -> Table:
     """The targets as text."""
     cells = tuple(
-        (t.scenario, METHOD_NAMES[t.method], t.domain, t.what, t.target, number(t.value), str(t.seeds), t.verdict)
+        (t.scenario, style_of(t.method).title, t.domain, t.what, t.target, number(t.value), str(t.seeds), t.verdict)
         for t in targets
     )
     classes = tuple({True: "met", False: "missed", None: "unmeasured"}[t.met] for t in targets)
@@ -241,5 +241,5 @@ def render_transfer_page(
         light=Markup(css_variables(LIGHT)), dark=Markup(css_variables(DARK)),
         table=text_table(table).html(), targets=target_table(table_targets(table)).html(),
         missing=sum(len(row.missing) for row in table.rows if row.domain == "surrogate"), cells=len(table.cells),
-        machines=sorted({cell.machine for cell in table.cells.values()}), groups=groups, sections=sections, methods=METHOD_NAMES,
+        machines=sorted({cell.machine for cell in table.cells.values()}), groups=groups, sections=sections, style_of=style_of,
     )  # fmt: skip

@@ -13,13 +13,13 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 from scipy.stats import spearmanr
 
-from advnerf_core.report.palette import LIGHT, MARKERS
+from advnerf_core.report.conditions import order_of, style_of
+from advnerf_core.report.palette import LIGHT
 from advnerf_core.report.plots import new_axes, svg
 from advnerf_core.report.tables import Table
 
 # An attack that makes the car stray by this ratio counts as one that works.
 WORKS_FROM = 1.5
-_COLOUR_OF = {"cem": "empty"}
 
 
 @dataclass(frozen=True)
@@ -138,14 +138,14 @@ def prediction_plot(pairs: Sequence[Predicted]) -> Figure:
         values = [value for pair in pairs for value in (pair.ratio, pair.measured)]
         low, high = min([0.5, *values]) / 1.3, max([4.0, *values]) * 1.3
         ax.plot([low, high], [low, high], color=LIGHT["muted"], lw=1.0, ls="--", zorder=1)
-        for method in dict.fromkeys(pair.method for pair in pairs):
+        for method in sorted({pair.method for pair in pairs}, key=order_of):
+            style = style_of(method)
             chosen = [pair for pair in pairs if pair.method == method]
             expected = np.array([pair.ratio for pair in chosen])
             bars = np.abs(np.array([[pair.low, pair.high] for pair in chosen]).T - expected)
-            key = _COLOUR_OF.get(method, method)
             ax.errorbar(
-                expected, [pair.measured for pair in chosen], xerr=bars, fmt=MARKERS.get(key, "o"), ms=6, lw=1.2,
-                color=LIGHT.get(key, LIGHT["ink"]), label=method,
+                expected, [pair.measured for pair in chosen], xerr=bars, fmt=style.marker, ms=6, lw=1.2,
+                color=style.light, label=style.title,
             )  # fmt: skip
         ax.set(xscale="log", yscale="log", xlim=(low, high), ylim=(low, high))
         ax.set(xlabel="expected ratio to no attack", ylabel="measured ratio to no attack")

@@ -52,6 +52,7 @@ def policy_check(
 
     Exit code 1 if the adapter is wrong, or if the policy does not drive in the place that was given.
     """
+    from advnerf_core.attack.methods import black_box_methods
     from advnerf_core.policies.conformance import FAILURE, check_policy
     from advnerf_core.policies.load import load_adapted
     from nodes.lab.policy_reference import judged_by_drives
@@ -60,7 +61,8 @@ def policy_check(
     reference = _reference(adapted.contract.view, run_folder, bag, room, scene, calibration)
     print(f"{policy} ({sha256[:12]}) on {reference.source}")
     told = tuple(goal) if goal else None
-    findings = check_policy(adapted, reference.images, reference.steering_rad, told)
+    methods = black_box_methods(adapted.stateless)
+    findings = check_policy(adapted, reference.images, reference.steering_rad, told, methods)
     findings = judged_by_drives(adapted, reference, findings, told)
     rows = table("check", "state", "found")
     for finding in findings:

@@ -7,7 +7,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -15,9 +14,7 @@ import torch
 from advnerf_core.attack.adjoint import AttackProblem, evaluate
 from advnerf_core.attack.artifact import AttackFile, face_texture, save_attack
 from advnerf_core.attack.clean import clean_drive
-from advnerf_core.attack.search.baselines import random_search
-from advnerf_core.attack.search.optimise import gradient_attack
-from advnerf_core.attack.search.population import CrossEntropy, population_search
+from advnerf_core.attack.methods import Method, SearchRun, SearchSettings, load_method
 from advnerf_core.attack.search.search import SearchResult, draw_start_states
 from advnerf_core.attack.spaces.displayed import DisplayedSensor
 from advnerf_core.driving.clean_drive import CleanDrive
@@ -33,20 +30,24 @@ from nodes.experiment.screen import shown
 from nodes.experiment.stages import hash_of
 from nodes.runtime.progress import Report
 
-Method = Literal["random", "cem", "gradient"]
-METHODS: tuple[Method, ...] = (
-    "random",
-    "gradient",
-)  # of an experiment; a campaign compares with the cross-entropy method too
+METHODS = ("random", "gradient")  # of an experiment; a campaign may compare any
 
 
 @dataclass(frozen=True)
 class Search:
-    """One search: which victim, which method, which seed."""
+    """One search.
+
+    Attributes:
+        victim: Which policy.
+        method: Name of the method.
+        seed: Of starts and search.
+        reference: Where the method's code is, as `load_method` takes it, if its name does not say.
+    """
 
     victim: str
-    method: Method
+    method: str
     seed: int
+    reference: str = ""
 
     @property
     def name(self) -> str:
@@ -149,20 +150,14 @@ def run_search(
     progress: Callable[..., None],
 ) -> None:
     """One search; leaves its attack file and a JSON of surrogate drives, and goes on from its state file if it was stopped."""
-    attack = experiment.config.attack
+    method = load_method(search.reference or search.method)
+    settings = search_settings(experiment, method)
     policy = load_policy(victim_file(experiment, search.victim))
     problem = attack_problem(experiment, surrogate, policy, search.seed)
-    wanted = attack.iterations if search.method == "gradient" else attack.random_evaluations
-    common: dict[str, Any] = {
-        "seed": search.seed, "state_path": folder / f"{search.name}.state.safetensors", "on_evaluation": telling(wanted, progress),
-        "settings_hash": hash_of(frozen_hashes(experiment)),
-    }  # fmt: skip
-    if search.method == "gradient":
-        result = gradient_attack(problem, attack.iterations, attack.learning_rate, **common)
-    elif search.method == "cem":
-        result = population_search(problem, CrossEntropy(), attack.random_evaluations, **common)
-    else:
-        result = random_search(problem, attack.random_evaluations, attack.random_sigma, **common)
+    state_path = folder / f"{search.name}.state.safetensors"
+    told = telling(method.evaluations(problem, settings), progress)
+    searching = SearchRun(search.seed, state_path, told, hash_of(frozen_hashes(experiment)))
+    result = method.search(problem, settings, searching)
     clean = clean_drive(problem, plain_theta(surrogate))
     attack_id = save_attack(attack_path(folder, search), _attack_file(experiment, policy, search, result, clean))
     rollout, totals = evaluate(measured(experiment, problem), result.theta)
@@ -175,7 +170,18 @@ def run_search(
         "seconds": sum(evaluation.seconds for evaluation in result.history),
     }
     write_atomically(folder / f"{search.name}.json", json.dumps(drives) + "\n")
-    common["state_path"].unlink(missing_ok=True)
+    state_path.unlink(missing_ok=True)
+
+
+def search_settings(experiment: Experiment, method: Method) -> SearchSettings:
+    """What a method may spend: the budget of the gradient attack if it needs a gradient, else that of random search."""
+    attack = experiment.config.attack
+    return SearchSettings(
+        attack.iterations if method.needs_gradient else attack.random_evaluations,
+        gradient_rate=attack.learning_rate,
+        random_sigma=attack.random_sigma,
+        options=method.options({}),
+    )
 
 
 def attack_path(folder: Path, search: Search) -> Path:

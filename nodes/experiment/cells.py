@@ -12,13 +12,15 @@ from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any
 
 import numpy as np
 
 from advnerf_core.attack.artifact import AttackFile, load_attack
+from advnerf_core.attack.methods import method_name
 from advnerf_core.driving.metrics import Horizon, first_still_tick
 from advnerf_core.report.clips import ClipTrack, write_clip
+from advnerf_core.report.conditions import NONE, style_of
 from nodes.experiment import attack, deploy
 from nodes.experiment.config import AttackConfig
 from nodes.experiment.context import CONTROL_PERIOD_S, Experiment
@@ -37,9 +39,15 @@ __all__ = ["LIVE", "cell_inputs", "load_experiment", "prepare", "run_cell", "sea
 LIVE = True
 _VERSION = 1
 _NEEDED = ("capture", "scene", "policy", "object")
-# What each search may spend; the rest of the attack's settings concerns all of them.
-_SPENT_BY = {"none": (), "random": ("random_evaluations", "random_sigma"), "cem": ("random_evaluations",), "gradient": ("iterations", "learning_rate")}  # fmt: skip
-_TITLES = {"none": "no attack", "random": "best random", "cem": "cross-entropy", "gradient": "gradient"}
+# What searches may spend; the rest of the attack's settings concerns all cells.
+_SPENT = ("iterations", "learning_rate", "random_evaluations", "random_sigma")
+# Methods that are known to read only some of it; any other may read all.
+_SPENT_BY = {
+    NONE: (),
+    "random": ("random_evaluations", "random_sigma"),
+    "cem": ("random_evaluations",),
+    "gradient": ("iterations", "learning_rate"),
+}
 
 
 class CellFault(RuntimeFault):
@@ -52,7 +60,7 @@ class _Cell:
 
     experiment: Experiment
     victim: str
-    method: str
+    reference: str
     seed: int
     folder: Path
     taken: bool
@@ -60,10 +68,14 @@ class _Cell:
 
     @property
     def search(self) -> attack.Search:
-        return attack.Search(self.victim, cast("attack.Method", self.method), self.seed)
+        return attack.Search(self.victim, self.method, self.seed, self.reference)
+
+    @property
+    def method(self) -> str:
+        return method_name(self.reference)
 
     def live(self, condition: str) -> deploy.LiveRun:
-        return deploy.LiveRun(self.victim, cast("deploy.Condition", condition), self.seed)
+        return deploy.LiveRun(self.victim, condition, self.seed)
 
     def searched_in(self, method: str) -> Path:
         """Folder of the drives in the learned room: the run folder's, if it has them."""
@@ -77,9 +89,9 @@ class _Cell:
         taken = self.experiment.stage_folder("deploy")
         if self.searched_in(condition) != self.folder and self._is_driven_in(taken, condition):
             return taken
-        if condition != "none":
+        if condition != NONE:
             return self.folder / "live"  # a search and a live drive of one cell leave files of one name
-        inputs = hash_of(cell_inputs(self.experiment, "", self.victim, "none", self.seed))
+        inputs = hash_of(cell_inputs(self.experiment, "", self.victim, NONE, self.seed))
         return self.folder.parent / "shared" / f"{self.experiment.config.name}_{self.live('none').name}_{inputs[:12]}"
 
     def _is_driven_in(self, folder: Path, condition: str) -> bool:
@@ -91,7 +103,7 @@ class _Cell:
         except FileNotFoundError:
             return False
         shown = []
-        if condition != "none":
+        if condition != NONE:
             shown = [load_attack(attack.attack_path(self.searched_in(condition), self.search)).attack_id]
         return driven["attack_ids"] == shown and counts(driven["outcome"]["stopped_early"], driven["off_track"])
 
@@ -119,7 +131,7 @@ def cell_inputs(experiment: Experiment, scenario: str, victim: str, method: str,
     config = experiment.config
     # How much memory may be used changes no result.
     searched = config.attack.model_dump(mode="json") | {"cache_mib": AttackConfig().cache_mib}
-    other = {key for keys in _SPENT_BY.values() for key in keys} - set(_SPENT_BY[method])
+    other = set(_SPENT) - set(_SPENT_BY.get(method, _SPENT))
     records = {stage: read_record(experiment.stage_folder(stage)) for stage in _NEEDED}
     return {
         "version": _VERSION, "horizon": config.horizon, "lab": experiment.lab_config.model_dump(mode="json"),
@@ -135,16 +147,15 @@ def search_cell(
 ) -> None:
     """The part of a cell that needs no live graph: drives without attack in the learned room, and the search."""
     cell = _cell(experiment, scenario, victim, method, seed, folder)
-    wanted = [
-        each for each in ("none", method) if not (cell.searched_in(each) / f"{victim}_{each}_{seed}.json").exists()
-    ]
+    method = cell.method
+    wanted = [each for each in (NONE, method) if not (cell.searched_in(each) / f"{victim}_{each}_{seed}.json").exists()]
     if not wanted:
         return
     background = load_background(cell.experiment)
-    if "none" in wanted:
+    if NONE in wanted:
         bare = surrogate_of(cell.experiment, [], background)
         attack.drive_without_attack(cell.experiment, bare, victim, seed, folder)
-    if method in wanted and method != "none":
+    if method in wanted and method != NONE:
         surrogate = surrogate_of(cell.experiment, [attacked_object(cell.experiment)], background)
         attack.run_search(cell.experiment, attack.sensor_of(cell.experiment, surrogate), cell.search, folder, report)
 
@@ -169,12 +180,12 @@ def run_cell(
     cell = _cell(experiment, scenario, victim, method, seed, folder)
     report(0.9, "driving live")
     tell = partial(report, 0.9)
-    none = _drive(cell, "none", tell)
-    driven = none if method == "none" else _drive(cell, method, tell)
+    none = _drive(cell, NONE, tell)
+    driven = none if method == NONE else _drive(cell, cell.method, tell)
     deployed = {
         "total_cte_m": [driven["total_cte_m"]], "off_track": [driven["off_track"]], "none_total_cte_m": [none["total_cte_m"]],
     }  # fmt: skip
-    where = cell.driven_in(method)
+    where = cell.driven_in(cell.method)
     extra: dict[str, Any] = {
         "clip": _clip(cell, driven, where), "stopped_early": driven["outcome"]["stopped_early"],
         "missed_frames": driven["missed"], "mean_abs_cte_m": driven["mean_abs_cte_m"], "time_to_leave_s": driven["time_to_leave_s"],
@@ -182,7 +193,7 @@ def run_cell(
     }  # fmt: skip
     result = {**found, "deployed": deployed, "extra": extra}
     if where == experiment.stage_folder("deploy"):
-        driven_at = (where / f"{cell.live(method).name}.json").stat().st_mtime
+        driven_at = (where / f"{cell.live(cell.method).name}.json").stat().st_mtime
         result["date"] = datetime.fromtimestamp(driven_at, timezone.utc).isoformat(timespec="seconds")
         extra["taken_from"] = experiment.folder.name
     return result
@@ -216,7 +227,7 @@ def _require_victim(experiment: Experiment, victim: str) -> None:
 def _surrogate(cell: _Cell) -> dict[str, Any]:
     name = f"{cell.victim}_{cell.method}_{cell.seed}.json"
     drives = json.loads((cell.searched_in(cell.method) / name).read_text())
-    none_file = cell.searched_in("none") / f"{cell.victim}_none_{cell.seed}.json"
+    none_file = cell.searched_in(NONE) / f"{cell.victim}_none_{cell.seed}.json"
     none = json.loads(none_file.read_text())
     found = {
         "attack_id": drives.get("attack_id"),
@@ -247,7 +258,7 @@ def _drive(cell: _Cell, condition: str, tell: Callable[[str], None]) -> dict[str
     folder, live = cell.driven_in(condition), cell.live(condition)
     file = folder / f"{live.name}.json"
     if not file.exists():
-        shown = None if condition == "none" else attack.attack_path(cell.searched_in(condition), cell.search)
+        shown = None if condition == NONE else attack.attack_path(cell.searched_in(condition), cell.search)
         deploy.drive_until_it_counts(cell.experiment, live, folder, shown, tell)
     driven: dict[str, Any] = json.loads(file.read_text())
     return driven
@@ -258,12 +269,16 @@ def _clip(cell: _Cell, driven: dict[str, Any], where: Path) -> str | None:
     bag = where / cell.live(cell.method).name / "bag"
     if not bag.exists():
         return None
-    condition: Literal["none", "random", "gradient"] = "random" if cell.method == "cem" else cast("Any", cell.method)
     frames = evaluation.frames(bag, driven["outcome"]["start_real_ns"], len(driven["cte_m"]), CONTROL_PERIOD_S)
-    title = f"{_TITLES[cell.method]}, {cell.victim}, seed {cell.seed}"
+    title = f"{style_of(cell.method).title}, {cell.victim}, seed {cell.seed}"
     shown = "".join(driven["attack_ids"])
     track = ClipTrack(
-        title, condition, list(frames), np.array(driven["cte_m"]), shown, driven["outcome"]["stopped_early"] or "ended"
+        title,
+        cell.method,
+        list(frames),
+        np.array(driven["cte_m"]),
+        shown,
+        driven["outcome"]["stopped_early"] or "ended",
     )
     path = write_clip(cell.folder / "clip.mp4", [track], 1.0 / CONTROL_PERIOD_S, cell.experiment.room.off_track_m)
     return f"{cell.folder.name}/{path.name}"
@@ -272,13 +287,13 @@ def _clip(cell: _Cell, driven: dict[str, Any], where: Path) -> str | None:
 def is_searched(experiment: Experiment, victim: str, method: str, seed: int, folder: Path) -> bool:
     """Whether the search of a cell is finished, here or in the experiment's run folder."""
     cell = _cell(experiment, "", victim, method, seed, folder)
-    return (cell.searched_in(method) / f"{cell.search.name}.json").exists()
+    return (cell.searched_in(cell.method) / f"{cell.search.name}.json").exists()
 
 
 def attack_file(experiment: Experiment, victim: str, method: str, seed: int, folder: Path) -> AttackFile:
     """The attack file of a cell whose search is finished."""
     cell = _cell(experiment, "", victim, method, seed, folder)
-    return load_attack(attack.attack_path(cell.searched_in(method), cell.search))
+    return load_attack(attack.attack_path(cell.searched_in(cell.method), cell.search))
 
 
 def drive_without_attack_of(experiment: Experiment, victim: str, seed: int, folder: Path) -> Path:
@@ -287,8 +302,8 @@ def drive_without_attack_of(experiment: Experiment, victim: str, seed: int, fold
     Raises:
         CellFault: It is not driven yet, or its bag is gone.
     """
-    cell = _cell(experiment, "", victim, "none", seed, folder)
-    bag = cell.driven_in("none") / cell.live("none").name / "bag"
+    cell = _cell(experiment, "", victim, NONE, seed, folder)
+    bag = cell.driven_in(NONE) / cell.live(NONE).name / "bag"
     if not bag.exists():
         raise CellFault(
             f"expected the live drive without attack of the {victim} victim, seed {seed}, at {bag}, got none; run that cell first"

@@ -9,12 +9,13 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from advnerf_core.attack.artifact import load_attack
 from advnerf_core.driving.metrics import Horizon
 from advnerf_core.files import write_atomically
 from advnerf_core.policies.pilotnet import load_policy
+from advnerf_core.report.conditions import NONE
 from nodes.experiment.attack import METHODS, Search, attack_path, frozen_hashes, victims
 from nodes.experiment.context import CONTROL_PERIOD_S, Experiment
 from nodes.experiment.policy import HARDENED, NAIVE, victim_file
@@ -25,7 +26,6 @@ from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import RuntimeFault
 from nodes.runtime.progress import Report
 
-Condition = Literal["none", "random", "cem", "gradient", "empty", "laps"]
 # The absent board or monitor of the empty scene stands outside the room, out of every camera's sight.
 _OUT_OF_SIGHT_M = 60.0
 
@@ -40,15 +40,15 @@ class DriveFault(RuntimeFault):
 
 _ATTEMPTS = 3
 # What every victim meets, in this order.
-_CONDITIONS: tuple[Condition, ...] = ("none", *METHODS)
+_CONDITIONS = (NONE, *METHODS)
 
 
 @dataclass(frozen=True)
 class LiveRun:
-    """One live run: which victim meets what."""
+    """One live run: which victim meets what; conditions have the names of `advnerf_core.report.conditions`."""
 
     victim: str
-    condition: Condition
+    condition: str
     seed: int
 
     @property
@@ -212,7 +212,7 @@ def _free_udp_port() -> int:
 
 
 def _attack_file(experiment: Experiment, live: LiveRun) -> Path:
-    assert live.condition in ("random", "gradient")
+    assert live.condition in METHODS
     return attack_path(experiment.stage_folder("attack"), Search(live.victim, live.condition, live.seed))
 
 

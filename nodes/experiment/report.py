@@ -8,7 +8,7 @@ import platform
 from collections.abc import Iterator
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import cv2
 import numpy as np
@@ -21,6 +21,7 @@ from advnerf_core.geometry import planar_poses
 from advnerf_core.report import data as rd
 from advnerf_core.report import tables, targets
 from advnerf_core.report.clips import ClipTrack, write_clip
+from advnerf_core.report.conditions import NONE
 from advnerf_core.report.page import write_report
 from advnerf_core.report.results import read_results
 from nodes.experiment import memory
@@ -104,8 +105,8 @@ def _surrogate_runs(experiment: Experiment) -> Iterator[rd.Run]:
     folder, path = experiment.stage_folder("attack"), experiment.path
     horizon = Horizon(experiment.config.horizon, CONTROL_PERIOD_S, experiment.room.off_track_m)
     fence_m = float(np.abs(np.array(experiment.room.fence_m)).min())
-    attacked = [(s.victim, str(s.method), s.seed) for s in searches(experiment)]
-    clean = sorted({(victim, "none", seed) for victim, _, seed in attacked})
+    attacked = [(s.victim, s.method, s.seed) for s in searches(experiment)]
+    clean = sorted({(victim, NONE, seed) for victim, _, seed in attacked})
     for victim, condition, seed in [*clean, *attacked]:
         result = json.loads((folder / f"{victim}_{condition}_{seed}.json").read_text())
         for start, states in enumerate(result["states"]):
@@ -218,7 +219,7 @@ def _clips(experiment: Experiment, folder: Path) -> tuple[rd.Clip, ...]:
     seed = experiment.config.attack.seeds[0]
     tracks = [
         _surrogate_track(experiment, seed),
-        _deployed_track(experiment, "none", seed),
+        _deployed_track(experiment, NONE, seed),
         _deployed_track(experiment, "gradient", seed),
     ]
     path = write_clip(folder / "attack.mp4", tracks, 1.0 / CONTROL_PERIOD_S, experiment.room.off_track_m)
@@ -241,12 +242,12 @@ def _surrogate_track(experiment: Experiment, seed: int) -> ClipTrack:
     return ClipTrack("learned scene, attacked", "gradient", frames, cte_m, attack.attack_id)
 
 
-def _deployed_track(experiment: Experiment, condition: Literal["none", "gradient"], seed: int) -> ClipTrack:
+def _deployed_track(experiment: Experiment, condition: str, seed: int) -> ClipTrack:
     live = LiveRun(HARDENED, condition, seed)
     result = _live_result(experiment, live)
     bag = experiment.stage_folder("deploy") / live.name / "bag"
     frames = evaluation.frames(bag, result["outcome"]["start_real_ns"], len(result["cte_m"]), CONTROL_PERIOD_S)
-    title = "live, no attack" if condition == "none" else "live, attacked"
+    title = "live, no attack" if condition == NONE else "live, attacked"
     note = result["outcome"]["stopped_early"] or "ended"
     return ClipTrack(title, condition, list(frames), np.array(result["cte_m"]), "".join(result["attack_ids"]), note)
 

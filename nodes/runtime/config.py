@@ -14,6 +14,9 @@ from pydantic import BaseModel, ValidationError
 
 from nodes.runtime.errors import ConfigError
 
+# Type of a pydantic error whose message says what came.
+COMPLETE = "complete"
+
 M = TypeVar("M", bound=BaseModel)
 Key = tuple[str | int, ...]
 
@@ -116,12 +119,18 @@ def apply_overrides(document: Document, overrides: Iterable[str], prefix: Key = 
         document.places[key] = f"--set {text}"
 
 
-def validate(model: type[M], document: Document) -> M:
-    """Typed object of a document; anything unknown or invalid is one `ConfigError`."""
+def validate(model: type[M], document: Document, folder: Path | None = None) -> M:
+    """Typed object of a document; anything unknown or invalid is one `ConfigError`.
+
+    Args:
+        model: What the document describes.
+        document: The document.
+        folder: What ``file.py:Name`` in it is relative to; the working folder if it is not given.
+    """
     if not isinstance(document.data, dict):
         raise ConfigError(f"{document.place(())}: expected keys and values, got {type(document.data).__name__}")
     try:
-        return model.model_validate(document.data)
+        return model.model_validate(document.data, context={"folder": folder})
     except ValidationError as error:
         raise ConfigError(_explain(model, document, error)) from None
 
@@ -130,7 +139,7 @@ def load_config(model: type[M], path: Path, overrides: Sequence[str] = ()) -> M:
     """Read, override and validate a configuration file."""
     document = read_yaml(path)
     apply_overrides(document, overrides)
-    return validate(model, document)
+    return validate(model, document, Path(path).parent)
 
 
 def load_node_config(model: type[M], node: str, path: Path | None, overrides: Sequence[str] = ()) -> M:
@@ -169,8 +178,11 @@ def _explain(model: type[BaseModel], document: Document, error: ValidationError)
     else:
         message = str(first["msg"]).removeprefix("Value error, ")
         message = message[:1].lower() + message[1:]
-        # A check of several keys together says itself what it got; all of a file would not help.
-        what = f"{name}: {message}, got {first['input']!r:.80}" if key else message
+        # A check of several keys together, or of a name, says itself what it got; all of a file would not help.
+        complete = not key or first["type"] == COMPLETE
+        what = (
+            (f"{name}: {message}" if key else message) if complete else f"{name}: {message}, got {first['input']!r:.80}"
+        )
     more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
     return f"{document.place(key)}: {what}{more}"
 

@@ -1,13 +1,12 @@
-"""Searches that need no gradient, so a policy may be a black box: the cross-entropy method and an evolution strategy.
+"""Searches by populations of candidates, which need no gradient, so a policy may be a black box: `cem`, `evolution`, and others alike.
 
-Both sample candidates around a mean, and both search a coarse texture, as a few dozen evaluations cannot tell thousands
+A strategy samples candidates around a mean; what is searched is a coarse texture, as a few dozen evaluations cannot tell thousands
 of cells apart. One evaluation is one closed-loop rollout from all start poses, as for the gradient attack and for random
 search, so methods compare at equal evaluations.
 """
 
 from __future__ import annotations
 
-import math
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +16,7 @@ import torch
 from torch import Tensor
 
 from advnerf_core.attack.adjoint import AttackProblem
+from advnerf_core.attack.methods import SearchRun, SearchSettings
 from advnerf_core.attack.search.search import (
     Evaluation,
     OnEvaluation,
@@ -26,11 +26,6 @@ from advnerf_core.attack.search.search import (
     search_fingerprint,
     without_gradient,
 )
-
-_ELITE_SHARE = 0.3
-_CEM_SMOOTHING = 0.7
-_LEAST_SIGMA = 0.1  # of the first one; a spread of zero finds nothing new
-_ADAM = (0.9, 0.999, 1e-8)
 
 
 @dataclass(frozen=True)
@@ -77,83 +72,6 @@ class Strategy(Protocol):
         """What is known after their losses ``[population]``."""
 
 
-@dataclass(frozen=True)
-class CrossEntropy:
-    """Refit a normal distribution with a diagonal covariance to the best candidates.
-
-    de Boer, Kroese, Mannor and Rubinstein 2005, "A Tutorial on the Cross-Entropy Method", with their smoothing.
-
-    Attributes:
-        sigma: First spread of every cell; the first mean is zero, which is grey.
-    """
-
-    sigma: float = 3.0
-    name: str = "cem"
-
-    def fresh(self, shape: tuple[int, ...]) -> dict[str, Tensor]:
-        """Grey, and the first spread."""
-        return {"mean": torch.zeros(shape), "spread": torch.full(shape, self.sigma)}
-
-    def ask(self, known: dict[str, Tensor], population: int, generator: torch.Generator) -> Tensor:
-        """Draw from the distribution."""
-        return known["mean"] + known["spread"] * torch.randn((population, *known["mean"].shape), generator=generator)
-
-    def tell(self, known: dict[str, Tensor], candidates: Tensor, losses: Tensor) -> dict[str, Tensor]:
-        """Move toward mean and spread of the best."""
-        count = max(2, round(_ELITE_SHARE * len(candidates)))
-        elite = candidates[torch.argsort(losses, stable=True)[:count]]
-        mean = torch.lerp(known["mean"], elite.mean(0), _CEM_SMOOTHING)
-        spread = torch.lerp(known["spread"], elite.std(0, correction=0), _CEM_SMOOTHING)
-        return {"mean": mean, "spread": spread.clamp_min(_LEAST_SIGMA * self.sigma)}
-
-
-@dataclass(frozen=True)
-class Evolution:
-    """Follow an estimate of the gradient of the smoothed loss, from antithetic pairs and ranks only.
-
-    Salimans et al. 2017, "Evolution Strategies as a Scalable Alternative to Reinforcement Learning"; utilities of ranks after
-    Wierstra et al. 2014, "Natural Evolution Strategies"; steps by Adam.
-
-    Attributes:
-        sigma: Spread of candidates around the mean, which starts grey.
-        learning_rate: Of Adam.
-    """
-
-    sigma: float = 1.0
-    learning_rate: float = 0.5
-    name: str = "evolution"
-
-    def fresh(self, shape: tuple[int, ...]) -> dict[str, Tensor]:
-        """Grey, and Adam's moments."""
-        return {"mean": torch.zeros(shape), "m": torch.zeros(shape), "v": torch.zeros(shape), "steps": torch.zeros(())}
-
-    def ask(self, known: dict[str, Tensor], population: int, generator: torch.Generator) -> Tensor:
-        """Pairs on opposite sides of the mean; of an odd number the last is alone."""
-        half = torch.randn(((population + 1) // 2, *known["mean"].shape), generator=generator)
-        return known["mean"] + self.sigma * torch.stack([half, -half], dim=1).flatten(0, 1)[:population]
-
-    def tell(self, known: dict[str, Tensor], candidates: Tensor, losses: Tensor) -> dict[str, Tensor]:
-        """One step of Adam against the estimated gradient."""
-        away = (candidates - known["mean"]) / self.sigma
-        weights = rank_utilities(losses).reshape(-1, *[1] * (away.ndim - 1))
-        gradient = -(weights * away).sum(0) / self.sigma
-        first, second, tiny = _ADAM
-        steps = known["steps"] + 1
-        m, v = torch.lerp(gradient, known["m"], first), torch.lerp(gradient**2, known["v"], second)
-        corrected = m / (1 - first ** float(steps)), v / (1 - second ** float(steps))
-        mean = known["mean"] - self.learning_rate * corrected[0] / (corrected[1].sqrt() + tiny)
-        return {"mean": mean, "m": m, "v": v, "steps": steps}
-
-
-def rank_utilities(losses: Tensor) -> Tensor:
-    """Utilities ``[n]`` that depend on the order of the losses only: positive for the lowest, with sum zero."""
-    count = len(losses)
-    ranks = torch.empty(count)
-    ranks[torch.argsort(losses, stable=True)] = torch.arange(1, count + 1, dtype=torch.float32)
-    raw = (math.log(count / 2 + 1) - torch.log(ranks)).clamp_min(0.0)
-    return raw / raw.sum() - 1.0 / count
-
-
 def population_search(
     problem: AttackProblem,
     strategy: Strategy,
@@ -169,7 +87,7 @@ def population_search(
 
     Args:
         problem: What is attacked.
-        strategy: `CrossEntropy` or `Evolution`.
+        strategy: How candidates are drawn, such as `cem.CrossEntropy` or `evolution.Evolution`.
         evaluations: Rollouts in all, those of a resumed state included; a last generation may stay unfinished.
         population: Candidates of a generation.
         cells: See `Coarse`.
@@ -203,6 +121,21 @@ def population_search(
         if on_evaluation is not None:
             on_evaluation(evaluation)
     return state.result()
+
+
+def search_with(strategy: Strategy, problem: AttackProblem, settings: SearchSettings, run: SearchRun) -> SearchResult:
+    """`population_search` with the settings of a method."""
+    return population_search(
+        problem,
+        strategy,
+        settings.evaluations,
+        settings.population,
+        settings.cells,
+        run.seed,
+        run.state_path,
+        run.on_evaluation,
+        run.settings_hash,
+    )
 
 
 def _evaluate_next(problem: AttackProblem, state: SearchState, coarse: Coarse, population: int) -> Evaluation:

@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from advnerf_core.attack.methods import alternatives, black_box_methods
 from advnerf_core.attack.problem import AttackProblem
 from advnerf_core.errors import AdvnerfError
 
@@ -36,7 +37,7 @@ class CountedPolicy:
         if not policy.stateless:
             raise VictimError(
                 "expected a stateless policy, got one with memory: an image alone does not tell its steering; search with the "
-                "methods random, cem or evolution instead"
+                f"methods {alternatives(black_box_methods(stateless=False))} instead"
             )
         self._policy = policy
         self.calls = calls

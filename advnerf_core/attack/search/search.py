@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -21,13 +22,15 @@ from safetensors.torch import save
 from torch import Tensor
 
 from advnerf_core.attack.adjoint import AttackProblem, Totals, evaluate
-from advnerf_core.attack.problem import SearchDivergedError
+from advnerf_core.attack.methods import SearchRun, SearchSettings
+from advnerf_core.attack.problem import ScaledSensor, SearchDivergedError
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.files import write_atomically
 
 __all__ = [
     "Evaluation", "OnEvaluation", "SearchDivergedError", "SearchResult", "SearchState", "SearchStateError", "begin",
-    "draw_start_states", "evaluation_from_json", "load_state", "search_fingerprint", "without_gradient",
+    "draw_start_states", "evaluate_theta", "evaluation_from_json", "gradient_step", "load_state", "random_spread", "search_fingerprint",
+    "without_gradient",
 ]  # fmt: skip
 
 _FORMAT = "advnerf-search-1"
@@ -168,6 +171,45 @@ def without_gradient(problem: AttackProblem, theta: Tensor, number: int) -> tupl
             f"expected a finite loss at evaluation {number}, got {loss_m}; check the policy and the scene for NaN"
         )
     return loss_m, totals
+
+
+def evaluate_theta(
+    problem: AttackProblem, theta: Tensor, state: SearchState, run: SearchRun, fingerprint: str
+) -> Evaluation:
+    """The next evaluation of a search that asks for no gradient: driven, recorded, on disk, then told.
+
+    Args:
+        problem: What is attacked.
+        theta: What is evaluated, of the sensor's ``theta_shape``.
+        state: Of the search; its tensors must be those to go on with.
+        run: Where the state is kept and who is told.
+        fingerprint: Of the search, see `search_fingerprint`.
+
+    Raises:
+        SearchDivergedError: The loss is not finite.
+    """
+    began = time.perf_counter()
+    loss_m, totals = without_gradient(problem, theta, len(state.history))
+    evaluation = state.record(theta, loss_m, totals, time.perf_counter() - began)
+    if run.state_path is not None:
+        state.save(run.state_path, fingerprint)
+    if run.on_evaluation is not None:
+        run.on_evaluation(evaluation)
+    return evaluation
+
+
+def gradient_step(problem: AttackProblem, settings: SearchSettings) -> float:
+    """Step of Adam along a gradient: as asked, or as the sensor says, or the usual one of colours."""
+    if settings.learning_rate is not None:
+        return settings.learning_rate
+    return problem.sensor.learning_rate if isinstance(problem.sensor, ScaledSensor) else settings.gradient_rate
+
+
+def random_spread(problem: AttackProblem, settings: SearchSettings) -> float:
+    """Spread of random thetas: as asked, or as the sensor says, or the usual one of colours."""
+    if settings.sigma is not None:
+        return settings.sigma
+    return problem.sensor.random_sigma if isinstance(problem.sensor, ScaledSensor) else settings.random_sigma
 
 
 def evaluation_from_json(entry: dict[str, Any]) -> Evaluation:

@@ -88,6 +88,11 @@ class ShapeSensor:
         """The plain shapes, with a noise that tells seeds apart."""
         return INITIAL_NOISE * torch.randn(self.theta_shape, generator=generator)
 
+    @property
+    def learning_rate(self) -> float:
+        """Step of Adam in ``theta`` that suits the limits [m]."""
+        return self.limits.learning_rate
+
     @cached_property
     def random_sigma(self) -> float:
         """Spread of a random ``theta`` whose displacements are in the mean as large as the bound, before they are bounded [m]."""

@@ -8,17 +8,20 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, model_validator
 
+from advnerf_core.attack.methods import method_name
 from advnerf_core.report.cells import cell_name
+from advnerf_core.report.conditions import NONE, order_of
 from advnerf_core.scene.gate_limits import GateLimits
+from nodes.experiment.method_names import ConditionReference
 from nodes.runtime.config import load_config
 from nodes.runtime.errors import ConfigError
 
-Method = Literal["none", "random", "cem", "gradient"]
 Victim = Literal["hardened", "naive", "retrained"]
 # Names become file names, whose parts are separated by "_" and "."; a scenario may hold "_" as its victim is one of three words.
 Name = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_-]*$")]
-METHODS: tuple[Method, ...] = ("none", "random", "cem", "gradient")
-VICTIMS: tuple[Victim, ...] = ("hardened", "naive")  # of a file that names none
+# Of a file that names none.
+METHODS: tuple[str, ...] = (NONE, "random", "cem", "gradient")
+VICTIMS: tuple[Victim, ...] = ("hardened", "naive")
 
 
 class _Section(BaseModel):
@@ -41,7 +44,9 @@ class _NothingTwice(_Section):
     def _nothing_twice(self) -> _NothingTwice:
         for name in ("seeds", "victims", "methods"):
             values = getattr(self, name) or ()
-            if len(set(values)) != len(values):
+            # Two files may have methods of one name.
+            names = [method_name(value) for value in values] if name == "methods" else values
+            if len(set(names)) != len(names):
                 raise ValueError(f"expected every one of {name} once, got {list(values)}")
         return self
 
@@ -63,7 +68,9 @@ class ScenarioConfig(_NothingTwice):
     placements: dict[Name, PlacementConfig] = Field(default_factory=dict, description="Other places of the objects.")
     seeds: tuple[int, ...] | None = Field(default=None, min_length=1, description="Instead of the campaign's.")
     victims: tuple[Victim, ...] | None = Field(default=None, min_length=1, description="Instead of the campaign's.")
-    methods: tuple[Method, ...] | None = Field(default=None, min_length=1, description="Instead of the campaign's.")
+    methods: tuple[ConditionReference, ...] | None = Field(
+        default=None, min_length=1, description="Instead of the campaign's."
+    )
     gate: GateLimits | None = Field(default=None, description="Instead of the campaign's.")
 
 
@@ -74,7 +81,11 @@ class CampaignConfig(_NothingTwice):
     folder: Path | None = Field(default=None, description="Where cells go; default runs/campaigns/NAME.")
     seeds: tuple[int, ...] = Field(default=(0, 1, 2), min_length=1)
     victims: tuple[Victim, ...] = Field(default=VICTIMS, min_length=1)
-    methods: tuple[Method, ...] = Field(default=METHODS, min_length=1)
+    methods: tuple[ConditionReference, ...] = Field(
+        default=METHODS,
+        min_length=1,
+        description="none, and methods of attack; also file.py:Name, relative to the campaign file.",
+    )
     scenarios: dict[Name, ScenarioConfig] = Field(min_length=1)
     gate: GateLimits = GateLimits()
 
@@ -87,7 +98,7 @@ class Cell:
         scenario: Its name in the campaign file.
         placement: Name of the placement; empty for the scenario's own.
         victim: Which policy.
-        method: Which search.
+        method: Name of the search, or ``none``.
         seed: Of starts and search.
     """
 
@@ -126,12 +137,17 @@ class Campaign:
             for placement in ("", *scenario.placements)
             for seed in scenario.seeds or self.config.seeds
             for victim in scenario.victims or self.config.victims
-            for method in sorted(scenario.methods or self.config.methods, key=METHODS.index)
+            for method in sorted(map(method_name, scenario.methods or self.config.methods), key=order_of)
         ]
 
     def scenario(self, cell: Cell) -> ScenarioConfig:
         """The scenario of a cell."""
         return self.config.scenarios[cell.scenario]
+
+    def method(self, cell: Cell) -> str:
+        """The method of a cell as `advnerf_core.attack.methods.load_method` takes it, or ``none``."""
+        references = self.scenario(cell).methods or self.config.methods
+        return next((each for each in references if method_name(each) == cell.method), cell.method)
 
     def experiment_file(self, cell: Cell) -> Path:
         """The experiment file of a cell."""

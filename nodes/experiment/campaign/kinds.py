@@ -14,7 +14,8 @@ A module of cells has one function that it must have, and may have others::
     UNPUBLISHED = ("colours",)   # names in a cell's extra that stay in the campaign's folder: megabytes
     TAKEN_FROM = "deploy"    # stage of the experiment in whose folder such cells may be finished already
 
-What it lacks comes from the package it is in (``run.load_experiment``, ``run.run_experiment``), as the experiments of this project have it.
+``method`` is ``none``, or a method as `advnerf_core.attack.methods.load_method` takes it; `method_name` gives its name for files.
+What a module lacks comes from the package it is in (``run.load_experiment``, ``run.run_experiment``), as the experiments of this project have it.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+from advnerf_core.attack.methods import method_digest, method_name
 from nodes.experiment.stages import hash_of, is_current, read_record
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import Report
@@ -87,7 +89,7 @@ class Kind:
     def finished(self, experiment: Any, scenario: str, victim: str, method: str, seed: int) -> dict[str, Any] | None:
         """The cell as the experiment itself has run it, with these settings; None where it has not, or where the kind keeps none."""
         stage = getattr(self.module, "TAKEN_FROM", "")
-        file = experiment.folder / stage / f"{scenario}_{victim}_{method}_{seed}.cell.json"
+        file = experiment.folder / stage / f"{scenario}_{victim}_{method_name(method)}_{seed}.cell.json"
         if (
             not stage
             or not file.exists()
@@ -171,6 +173,8 @@ def stage_digests(folder: Path) -> dict[str, str]:
 def settings_hash(kind: Kind, experiment: Any, scenario: str, victim: str, method: str, seed: int) -> str:
     """Hash of everything that the result of a cell depends on; a change of it makes the cell run again."""
     inputs = kind.inputs(experiment, scenario, victim, method, seed)
-    named = {"scenario": scenario, "victim": victim, "method": method, "seed": seed, "inputs": inputs}
+    named = {"scenario": scenario, "victim": victim, "method": method_name(method), "seed": seed, "inputs": inputs}
+    if code := method_digest(method):
+        named["code"] = code
     # Through JSON, so that tuples and lists, or paths that a module forgot to turn into text, cannot change the hash between processes.
     return hash_of(json.loads(json.dumps(named, default=str)))

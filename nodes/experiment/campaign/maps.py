@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from advnerf_core.report.cells import NONE
+from advnerf_core.report.conditions import NONE
 from nodes.experiment.campaign.config import Campaign, Cell
 from nodes.experiment.campaign.kinds import load_kind
 from nodes.experiment.campaign.run import plan_cells

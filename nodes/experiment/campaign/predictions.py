@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from advnerf_core.files import write_atomically
-from advnerf_core.report.cells import NONE, CellResult
+from advnerf_core.report.cells import CellResult
+from advnerf_core.report.conditions import NONE
 from advnerf_core.report.transfer_prediction import Predicted
 from nodes.experiment.campaign.config import Campaign, Cell
 from nodes.experiment.campaign.gate import CleanDrive, predict_cell

@@ -10,7 +10,8 @@ from typing import Any, Literal
 
 import joblib
 
-from advnerf_core.report.cells import NONE, CellResult
+from advnerf_core.report.cells import CellResult
+from advnerf_core.report.conditions import NONE
 from nodes.experiment.campaign.config import Campaign, Cell, ScenarioConfig
 from nodes.experiment.campaign.kinds import load_kind, settings_hash
 from nodes.experiment.campaign.store import CellStatus, Store, store_of
@@ -82,12 +83,12 @@ def plan_cells(
         key = (cell.scenario, cell.placement)
         if key not in experiments:
             experiments[key] = _experiment(campaign, cell)
-        inside = _inside(scenario, cell)
-        digest = settings_hash(kind, experiments[key], inside, cell.victim, cell.method, cell.seed)
+        inside, method = _inside(scenario, cell), campaign.method(cell)
+        digest = settings_hash(kind, experiments[key], inside, cell.victim, method, cell.seed)
         job = Job(
             str(campaign.folder), cell.name, scenario.kind, str(campaign.experiment_file(cell)), scenario.setting,
             tuple(campaign.overrides(cell)), str(campaign.run_folder(cell)), inside, cell.scenario, cell.placement,
-            cell.victim, cell.method, cell.seed, digest, threads=1,
+            cell.victim, method, cell.seed, digest, threads=1,
         )  # fmt: skip
         planned.append(Planned(cell, job, kind.live, kind.search_cell is not None))
     return planned

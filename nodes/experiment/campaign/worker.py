@@ -21,6 +21,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any, Literal, TextIO
 
+from advnerf_core.attack.methods import method_name
 from advnerf_core.files import write_atomically
 from nodes.experiment.campaign.kinds import Kind, load_kind, settings_hash, stage_digests
 from nodes.experiment.campaign.store import LOG, Store
@@ -59,7 +60,7 @@ class Job:
         shown_scenario: What the campaign calls it.
         placement: Name of the placement.
         victim: Which policy.
-        method: Which search.
+        method: Which search: a name, or ``file.py:Name`` with an absolute path.
         seed: Of starts and search.
         settings_hash: Of what the result depends on, when it was planned.
         threads: Threads that it may use.
@@ -208,7 +209,7 @@ def _run(job: Job, store: Store, work: Path, kind: Kind, experiment: Any) -> Non
             taken = kind.run_cell(*arguments, work, report)
     found = taken
     ours = {
-        "scenario": job.shown_scenario, "placement": job.placement, "victim": job.victim, "method": job.method, "seed": job.seed,
+        "scenario": job.shown_scenario, "placement": job.placement, "victim": job.victim, "method": method_name(job.method), "seed": job.seed,
         "settings_hash": job.settings_hash, "stages": stage_digests(Path(job.run_folder)), "machine": found.get("machine") or machine_name(),
         "date": found.get("date") or datetime.now(timezone.utc).isoformat(timespec="seconds"),
     }  # fmt: skip

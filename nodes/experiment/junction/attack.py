@@ -5,11 +5,11 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,15 +17,13 @@ import torch
 from advnerf_core.attack.adjoint import AttackProblem
 from advnerf_core.attack.artifact import AttackedObject, AttackFile, load_attack, save_attack
 from advnerf_core.attack.clean import clean_drive
-from advnerf_core.attack.search.baselines import random_search
-from advnerf_core.attack.search.optimise import gradient_attack
-from advnerf_core.attack.search.population import CrossEntropy, population_search
+from advnerf_core.attack.methods import SearchRun, SearchSettings, load_method, method_name
 from advnerf_core.attack.search.search import SearchResult
 from advnerf_core.driving.clean_drive import CleanDrive
 from advnerf_core.files import write_atomically
 from advnerf_core.policies.pilotnet import LoadedPolicy, load_policy
+from advnerf_core.report.conditions import NONE
 from advnerf_core.scene.surrogate import Surrogate, split_theta
-from nodes.experiment.junction.config import Method
 from nodes.experiment.junction.context import Experiment
 from nodes.experiment.junction.drives import learned_drives, totals
 from nodes.experiment.junction.objects import object_file, placed_objects, surrogate_of
@@ -35,17 +33,30 @@ from nodes.experiment.request.telling import telling
 from nodes.experiment.stages import hash_of
 from nodes.runtime.progress import Report
 
-Condition = Literal["none", "random", "cem", "gradient"]
-
 
 @dataclass(frozen=True)
 class Cell:
-    """One entry of the transfer table: which drive, which victim meets what, which seed."""
+    """One entry of the transfer table.
+
+    Attributes:
+        scenario: Which drive.
+        victim: Which policy.
+        method: Name of the method, or ``none``.
+        seed: Of starts and search.
+        reference: Where the method's code is, as `load_method` takes it, if its name does not say.
+    """
 
     scenario: str
     victim: str
-    method: Condition
+    method: str
     seed: int
+    reference: str = field(default="", compare=False)
+
+    @classmethod
+    def of(cls, scenario: str, victim: str, method: str, seed: int) -> Cell:
+        """The cell of a method as `load_method` takes it, or of ``none``."""
+        name = method_name(method)
+        return cls(scenario, victim, name, seed, "" if method == name else method)
 
     @property
     def name(self) -> str:
@@ -55,18 +66,17 @@ class Cell:
     @property
     def clean(self) -> Cell:
         """The same drive past the plain objects."""
-        return Cell(self.scenario, self.victim, "none", self.seed)
+        return Cell(self.scenario, self.victim, NONE, self.seed)
 
 
 def cells(experiment: Experiment) -> list[Cell]:
     """All cells in order: every seed against the hardened victim, the first also against the naive one; quick ones first."""
     seeds, methods = experiment.config.attack.seeds, experiment.config.attack.methods
     rows = [(victim, seed) for victim in victims(experiment) for seed in (seeds if victim == HARDENED else seeds[:1])]
-    conditions: tuple[Condition, ...] = ("none", *methods)
     return [
-        Cell(scenario, victim, condition, seed)
+        Cell.of(scenario, victim, condition, seed)
         for victim, seed in rows
-        for condition in conditions
+        for condition in (NONE, *methods)
         for scenario in experiment.config.scenarios
     ]
 
@@ -123,7 +133,7 @@ def surrogate_part(
     policy = _victim(victim_file(experiment, cell.victim))
     problem = attack_problem(experiment, surrogate, policy, cell.scenario, cell.seed)
     attack_id, curve, seconds, theta = None, [], 0.0, surrogate.plain_theta()
-    if cell.method != "none":
+    if cell.method != NONE:
         result = _search(experiment, problem, cell, folder, report)
         theta, seconds = result.theta, sum(evaluation.seconds for evaluation in result.history)
         curve = [evaluation.predicted_total_cte_m for evaluation in result.history]
@@ -172,17 +182,18 @@ def _search(
     frozen = {
         key: value for key, value in frozen_hashes(experiment).items() if key not in ("config", "starts_and_seeds")
     }
-    common: dict[str, Any] = {
-        "seed": cell.seed, "state_path": _state_path(folder, cell), "on_evaluation": telling(attack.evaluations, report),
-        "settings_hash": hash_of({**frozen, "victim": cell.victim, "scenario": cell.scenario}),
-    }  # fmt: skip
-    method: Method | Literal["none"] = cell.method
-    if method == "gradient":
-        return gradient_attack(problem, attack.evaluations, attack.learning_rate, **common)
-    if method == "cem":
-        # Objects that are no face have no coarse texture: every colour is searched.
-        return population_search(problem, CrossEntropy(), attack.evaluations, attack.cem_population, 0, **common)
-    return random_search(problem, attack.evaluations, attack.random_sigma, **common)
+    method = load_method(cell.reference or cell.method)
+    settings = SearchSettings(
+        attack.evaluations,
+        population=attack.cem_population,
+        cells=0,  # objects that are no face have no coarse texture: every colour is searched
+        gradient_rate=attack.learning_rate,
+        random_sigma=attack.random_sigma,
+        options=method.options({}),
+    )
+    told = telling(method.evaluations(problem, settings), report)
+    digest = hash_of({**frozen, "victim": cell.victim, "scenario": cell.scenario})
+    return method.search(problem, settings, SearchRun(cell.seed, _state_path(folder, cell), told, digest))
 
 
 def _state_path(folder: Path, cell: Cell) -> Path:

@@ -8,10 +8,13 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
+from advnerf_core.attack.methods import require_method
 from advnerf_core.files import write_atomically
+from advnerf_core.plugins import PluginError
 from advnerf_core.policies.pilotnet import load_policy
+from advnerf_core.report.conditions import NONE
 from nodes.experiment.campaign.kinds import stage_digests
-from nodes.experiment.junction.attack import Cell, Condition, cells, frozen_hashes, load_theta, surrogate_part
+from nodes.experiment.junction.attack import Cell, cells, frozen_hashes, load_theta, surrogate_part
 from nodes.experiment.junction.context import Experiment
 from nodes.experiment.junction.deployed import DressedScene
 from nodes.experiment.junction.drives import deployed_drives, totals
@@ -25,7 +28,6 @@ from nodes.runtime.progress import Report
 
 PREPARED_AT = "policy"  # the last stage that a cell needs of its experiment
 TAKEN_FROM = "deploy"
-METHODS: tuple[Condition, ...] = ("none", "random", "cem", "gradient")
 # What a cell does not depend on: which others there are, how much memory may be used, and what is told of the world elsewhere.
 _FREE: Mapping[str, bool | set[str]] = {
     "name": True,
@@ -47,13 +49,13 @@ def cell_inputs(experiment: Experiment, scenario: str, victim: str, method: str,
         CellError: No such drive, victim or method.
     """
     del seed
-    require_known(experiment, scenario, victims(experiment), victim, METHODS, method)
+    require_known(experiment, scenario, victims(experiment), victim, method)
     config = experiment.config.model_dump(mode="json", exclude=_FREE)
     return {"config": config, "world": experiment.site.settings, "stages": stage_digests(experiment.folder)}
 
 
 def run_cell(
-    experiment: Experiment, scenario: str, victim: str, method: Condition, seed: int, folder: Path, report: Report
+    experiment: Experiment, scenario: str, victim: str, method: str, seed: int, folder: Path, report: Report
 ) -> dict[str, Any]:
     """Search in the surrogate, drive in both domains, and keep the result in ``folder``.
 
@@ -61,7 +63,7 @@ def run_cell(
         experiment: Its scene, objects and policies must be there (``advnerf experiment FILE --until policy``).
         scenario: Drive: straight, right or left.
         victim: hardened or naive.
-        method: none, random, cem or gradient.
+        method: none, or a method as `advnerf_core.attack.methods.load_method` takes it.
         seed: Of the search and its starts.
         folder: Where search states, attack files and results are kept.
         report: Told the finished fraction.
@@ -84,15 +86,15 @@ def run_cell(
 
 
 def search_cell(
-    experiment: Experiment, scenario: str, victim: str, method: Condition, seed: int, folder: Path, report: Report
+    experiment: Experiment, scenario: str, victim: str, method: str, seed: int, folder: Path, report: Report
 ) -> Cell:
     """The part of `run_cell` that needs no deployment scene: search and drive in the surrogate.
 
     Raises:
         CellError: No such drive, victim or method.
     """
-    require_known(experiment, scenario, victims(experiment), victim, METHODS, method)
-    cell = Cell(scenario, victim, method, seed)
+    require_known(experiment, scenario, victims(experiment), victim, method)
+    cell = Cell.of(scenario, victim, method, seed)
     surrogate = surrogate_of(experiment, placed_objects(experiment))
     for each in dict.fromkeys((cell.clean, cell)):
         surrogate_part(experiment, surrogate, each, folder, report)
@@ -100,17 +102,36 @@ def search_cell(
 
 
 def require_known(
-    experiment: Experiment, scenario: str, victims: Sequence[str], victim: str, methods: Sequence[str], method: str
+    experiment: Experiment,
+    scenario: str,
+    victims: Sequence[str],
+    victim: str,
+    method: str,
+    methods: Sequence[str] | None = None,
 ) -> None:
     """Refuse a cell that there cannot be.
+
+    Args:
+        experiment: The experiment.
+        scenario: Which drive.
+        victims: The victims that there are.
+        victim: Which of them.
+        method: none, or a method of attack.
+        methods: Those that these cells can be searched with; None for all.
 
     Raises:
         CellError: No such drive, victim or method.
     """
-    known = (experiment.config.scenarios, victims, methods)
-    for what, value, choices in zip(("scenario", "victim", "method"), (scenario, victim, method), known, strict=True):
+    asked = [("scenario", scenario, experiment.config.scenarios), ("victim", victim, victims)]
+    asked += [] if methods is None else [("method", method, methods)]
+    for what, value, choices in asked:
         if value not in choices:
             raise CellError(f"expected a {what} of {', '.join(choices)}, got {value!r}")
+    if method != NONE:
+        try:
+            require_method(method)
+        except PluginError as error:
+            raise CellError(str(error)) from None
 
 
 def deployed_part(
@@ -164,7 +185,7 @@ def _drives(experiment: Experiment, dressed: DressedScene, cell: Cell, searched:
         found: dict[str, Any] = json.loads(kept.read_text())
         return found
     policy = load_policy(victim_file(experiment, cell.victim)).policy
-    theta = dressed.plain_theta() if cell.method == "none" else load_theta(searched, cell)
+    theta = dressed.plain_theta() if cell.method == NONE else load_theta(searched, cell)
     starts = experiment.start_states(cell.scenario, cell.seed)
     drives = deployed_drives(experiment, dressed, policy, cell.scenario, starts, theta)
     data = {

@@ -6,12 +6,13 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from advnerf_core.attack.methods import method_name
 from hardware.worlds.junction.paths import PathName
+from nodes.experiment.method_names import MethodReference
 
 Count = Annotated[int, Field(ge=0)]
 Positive = Annotated[int, Field(ge=1)]
 PositiveNumber = Annotated[float, Field(gt=0)]
-Method = Literal["random", "cem", "gradient"]
 
 
 class _Section(BaseModel):
@@ -98,7 +99,11 @@ class ObjectConfig(_Section):
 class AttackConfig(_Section):
     """The adversary, and what it may spend: all methods evaluate equally often."""
 
-    methods: tuple[Method, ...] = Field(default=("random", "cem", "gradient"), min_length=1)
+    methods: tuple[MethodReference, ...] = Field(
+        default=("random", "cem", "gradient"),
+        min_length=1,
+        description="Methods of attack; also file.py:Name, relative to the experiment file.",
+    )
     starts: Positive = Field(
         default=1, description="Start poses optimised together; the first of seed 0 is the nominal one."
     )
@@ -112,6 +117,17 @@ class AttackConfig(_Section):
     seeds: tuple[int, ...] = Field(default=(0,), min_length=1, description="One search of each method per seed.")
     time_batch: Positive = Field(default=16, description="Frames per gradient batch.")
     cache_mib: Annotated[float, Field(ge=0)] = Field(default=512.0, description="Budget of the frame cache [MiB].")
+
+    @property
+    def method_names(self) -> tuple[str, ...]:
+        """What the methods are called in tables and file names."""
+        return tuple(map(method_name, self.methods))
+
+    @model_validator(mode="after")
+    def _told_apart(self) -> AttackConfig:
+        if len(set(self.method_names)) != len(self.methods):
+            raise ValueError(f"expected methods of different names, got {', '.join(self.method_names)}")
+        return self
 
 
 class RetrainConfig(_Section):

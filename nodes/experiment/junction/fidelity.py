@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,7 +21,7 @@ from advnerf_core.policies.pilotnet import load_policy
 from advnerf_core.scene.fidelity import Pictures
 from nodes.experiment.images import as_uint8
 from nodes.experiment.junction import capture
-from nodes.experiment.junction.attack import Cell, Condition, attack_path, attack_problem, load_theta
+from nodes.experiment.junction.attack import Cell, attack_path, attack_problem, load_theta
 from nodes.experiment.junction.context import Experiment
 from nodes.experiment.junction.deployed import DressedScene
 from nodes.experiment.junction.drives import deployed_drives
@@ -86,7 +86,7 @@ def loop(
 
 
 def _cell(scenario: str, victim: str, method: str, seed: int) -> Cell:
-    return Cell(scenario, victim, cast("Condition", method), seed)
+    return Cell.of(scenario, victim, method, seed)
 
 
 def _searched_in(experiment: Experiment, cell: Cell, folder: Path) -> Path | None:

@@ -13,7 +13,7 @@ from torch import Tensor
 from advnerf_core.geometry import Array, planar_poses
 from advnerf_core.policies.pilotnet import Policy
 from advnerf_core.report.clips import ClipTrack, write_clip
-from advnerf_core.report.transfer_page import METHOD_NAMES
+from advnerf_core.report.conditions import NONE, style_of
 from advnerf_core.scene.surrogate import Surrogate
 from nodes.experiment.images import as_uint8
 from nodes.experiment.junction.attack import Cell, load_theta
@@ -30,14 +30,14 @@ _FRAME_S = 0.1  # of films: finer ticks are not all filmed
 
 def strongest(experiment: Experiment) -> str:
     """The method that films show: the gradient if it was searched."""
-    methods = experiment.config.attack.methods
+    methods = experiment.config.attack.method_names
     return "gradient" if "gradient" in methods else methods[-1]
 
 
 def film_scenario(experiment: Experiment, dressed: DressedScene, scenario: str, folder: Path) -> Path:
     """The attacked drive in the surrogate, and the deployed ones past plain and attacked objects, side by side; first seed and start."""
     seed, method = experiment.config.attack.seeds[0], strongest(experiment)
-    attacked = Cell(scenario, HARDENED, method, seed)  # type: ignore[arg-type]
+    attacked = Cell(scenario, HARDENED, method, seed)
     theta = load_theta(experiment.stage_folder("attack"), attacked)
     whole = Surrogate(load_background(experiment), experiment.camera, experiment.mount, placed_objects(experiment))
     every, rate_hz = filmed(experiment.config.dt_s)
@@ -47,14 +47,14 @@ def film_scenario(experiment: Experiment, dressed: DressedScene, scenario: str, 
     for cell, colours in ((attacked.clean, dressed.plain_theta()), (attacked, theta)):
         states = drives_of(experiment, "deployed", cell)[0][::every]
         views = [dressed.camera_image(state, colours) for state in states]
-        title = "deployed, no attack" if cell.method == "none" else "deployed, attacked"
+        title = "deployed, no attack" if cell.method == NONE else "deployed, attacked"
         tracks.append(_track(experiment, scenario, title, cell.method, views, states))
     return write_clip(folder / f"{scenario}.mp4", tracks, rate_hz, experiment.site.off_track_m)
 
 
 def film_cell(experiment: Experiment, dressed: DressedScene, cell: Cell, folder: Path) -> Path:
     """The deployed drive of one cell, from its first start; its files are in ``folder``, and ``clip.mp4`` will be."""
-    colours = dressed.plain_theta() if cell.method == "none" else load_theta(folder, cell)
+    colours = dressed.plain_theta() if cell.method == NONE else load_theta(folder, cell)
     return _film(experiment, dressed, cell, _states(folder / f"{cell.name}.drives.json")[0], colours, folder)
 
 
@@ -81,7 +81,7 @@ def _film(
     experiment: Experiment, dressed: DressedScene, cell: Cell, states: Array, colours: Tensor, folder: Path
 ) -> Path:
     every, rate_hz = filmed(experiment.config.dt_s)
-    title = f"{METHOD_NAMES[cell.method]}, {cell.victim}, seed {cell.seed}"
+    title = f"{style_of(cell.method).title}, {cell.victim}, seed {cell.seed}"
     views = [dressed.camera_image(state, colours) for state in states[::every]]
     track = _track(experiment, cell.scenario, title, cell.method, views, states[::every])
     return write_clip(folder / "clip.mp4", [track], rate_hz, experiment.site.off_track_m)
@@ -97,8 +97,7 @@ def _track(
     experiment: Experiment, scenario: str, title: str, method: str, frames: list[NDArray[np.uint8]], states: Array
 ) -> ClipTrack:
     cte_m = experiment.paths[scenario].project(np.asarray(states)[:, :2]).cte_m
-    condition = "gradient" if method == "cem" else method
-    return ClipTrack(title, condition, frames, cte_m)  # type: ignore[arg-type]
+    return ClipTrack(title, method, frames, cte_m)
 
 
 def drives_of(experiment: Experiment, domain: str, cell: Cell) -> list[Array]:

@@ -14,12 +14,11 @@ from advnerf_core.policies.pilotnet import load_policy
 from nodes.experiment.junction import run
 from nodes.experiment.junction.attack import Cell
 from nodes.experiment.junction.cell_settings import inputs_of, load_with
-from nodes.experiment.junction.cells import require_known
 from nodes.experiment.junction.context import Experiment
 from nodes.experiment.junction.deployed import DressedScene
 from nodes.experiment.junction.films import film_again, kept_film, with_film
-from nodes.experiment.junction.meshes import METHODS, MeshMethod, MeshSettings, found_meshes, mesh_cell, mesh_hash
-from nodes.experiment.junction.policy import attackable, victim_file
+from nodes.experiment.junction.meshes import MeshSettings, found_meshes, mesh_cell, mesh_hash, require_cell
+from nodes.experiment.junction.policy import victim_file
 from nodes.runtime.progress import Report
 
 FIDELITY = None  # the frames are the deployment scene's own: there is no learned scene to judge
@@ -44,12 +43,12 @@ def load_experiment(file: Path, setting: str, overrides: Sequence[str], folder: 
 
 def cell_inputs(experiment: MeshExperiment, scenario: str, victim: str, method: str, seed: int) -> dict[str, Any]:
     """What a cell depends on; not known before there is a victim."""
-    require_known(experiment, scenario, attackable(experiment), victim, METHODS, method)
+    require_cell(experiment, scenario, victim, method, experiment.meshes)
     return inputs_of(experiment, victim, lambda: mesh_hash(experiment, scenario, victim, seed, experiment.meshes))
 
 
 def run_cell(
-    experiment: MeshExperiment, scenario: str, victim: str, method: MeshMethod, seed: int, folder: Path, report: Report
+    experiment: MeshExperiment, scenario: str, victim: str, method: str, seed: int, folder: Path, report: Report
 ) -> dict[str, Any]:
     """Search over the deployment scene's frames, drive there; see `mesh_cell`. The film is past the objects as they were exported."""
     data = mesh_cell(experiment, scenario, victim, method, seed, folder, report, experiment.meshes)
@@ -58,6 +57,6 @@ def run_cell(
         policy = load_policy(victim_file(experiment, victim)).policy
         with experiment.site.open() as scene:
             dressed = DressedScene(scene, experiment.view, fields)
-            cell = Cell(scenario, victim, method, seed)
+            cell = Cell.of(scenario, victim, method, seed)
             film = film_again(experiment, dressed, cell, policy, dressed.plain_theta(), folder)
     return with_film(data, film)

@@ -17,8 +17,7 @@ import torch
 from torch import Tensor
 
 from advnerf_core.attack.adjoint import AttackProblem
-from advnerf_core.attack.search.baselines import random_search
-from advnerf_core.attack.search.optimise import gradient_attack
+from advnerf_core.attack.methods import METHODS, SearchRun, SearchSettings, load_method, method_name
 from advnerf_core.attack.search.search import Evaluation, SearchResult
 from advnerf_core.files import write_atomically
 from advnerf_core.objects.mesh.field import MeshField
@@ -28,10 +27,11 @@ from advnerf_core.objects.mesh.surface import sphere, unwrapped
 from advnerf_core.objects.voxel.generators import GENERATORS
 from advnerf_core.objects.voxel.mesh import SurfaceMesh, stand
 from advnerf_core.policies.pilotnet import Policy, load_policy
+from advnerf_core.report.conditions import NONE
 from advnerf_core.scene.surrogate import Surrogate, split_theta
 from hardware.worlds.world import DeploymentScene
 from nodes.experiment.junction.attack import attack_problem
-from nodes.experiment.junction.cells import require_known
+from nodes.experiment.junction.cells import CellError, require_known
 from nodes.experiment.junction.context import Experiment
 from nodes.experiment.junction.deployed import DressedScene
 from nodes.experiment.junction.drives import deployed_drives, learned_drives, totals
@@ -44,8 +44,6 @@ from nodes.runtime.machine import machine_name
 from nodes.runtime.progress import Report
 
 Target = Literal["texture", "shape"]
-MeshMethod = Literal["none", "random", "gradient"]
-METHODS: tuple[MeshMethod, ...] = ("none", "random", "gradient")
 _HASHES: dict[str, list[str]] = {}
 
 
@@ -89,7 +87,7 @@ def mesh_objects(experiment: Experiment, settings: MeshSettings) -> list[MeshFie
 
 
 def mesh_cell(
-    experiment: Experiment, scenario: str, victim: str, method: MeshMethod, seed: int, folder: Path, report: Report,
+    experiment: Experiment, scenario: str, victim: str, method: str, seed: int, folder: Path, report: Report,
     settings: MeshSettings | None = None, scene: DeploymentScene | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """Search over the deployment scene's frames, drive there, and keep the result in ``folder``.
@@ -98,7 +96,7 @@ def mesh_cell(
         experiment: Its policies must be there (``advnerf experiment FILE --until policy``).
         scenario: Drive: straight, right or left.
         victim: hardened or naive, or retrained where the experiment retrains.
-        method: none, random or gradient.
+        method: none, or a method as `advnerf_core.attack.methods.load_method` takes it; shapes only with one that reads their scale.
         seed: Of the search and its starts.
         folder: Where the search state, the found meshes (GLB) and the results are kept.
         report: Told the finished fraction.
@@ -113,7 +111,7 @@ def mesh_cell(
         MeshEngineError: Mitsuba or LLVM is missing.
     """
     settings = settings or MeshSettings()
-    require_known(experiment, scenario, attackable(experiment), victim, METHODS, method)
+    require_cell(experiment, scenario, victim, method, settings)
     result = folder / _result_name(settings, scenario, victim, method, seed)
     frozen = mesh_hash(experiment, scenario, victim, seed, settings)
     if result.exists() and (kept := json.loads(result.read_text()))["settings_hash"] == frozen:
@@ -128,13 +126,13 @@ def found_meshes(
     experiment: Experiment,
     scenario: str,
     victim: str,
-    method: MeshMethod,
+    method: str,
     seed: int,
     folder: Path,
     settings: MeshSettings,
 ) -> list[MeshField]:
     """The objects of a finished cell, read from the GLB files that it has written; the plain ones without an attack."""
-    if method == "none":
+    if method == NONE:
         return mesh_objects(experiment, settings)
     result = folder / _result_name(settings, scenario, victim, method, seed)
     return [
@@ -144,7 +142,19 @@ def found_meshes(
 
 
 def _result_name(settings: MeshSettings, scenario: str, victim: str, method: str, seed: int) -> str:
-    return f"mesh_{settings.target}_{scenario}_{victim}_{method}_{seed}.cell.json"
+    return f"mesh_{settings.target}_{scenario}_{victim}_{method_name(method)}_{seed}.cell.json"
+
+
+def require_cell(experiment: Experiment, scenario: str, victim: str, method: str, settings: MeshSettings) -> None:
+    """Refuse a cell that there cannot be.
+
+    Raises:
+        CellError: No such drive, victim or method, or a built-in method that cannot search shapes.
+    """
+    of_colours = [name for name, row in METHODS.items() if not row.reads_scale]
+    refused = settings.target == "shape" and method in of_colours
+    methods = [NONE, *(name for name in METHODS if name not in of_colours)] if refused else None
+    require_known(experiment, scenario, attackable(experiment), victim, method, methods)
 
 
 def mesh_hash(experiment: Experiment, scenario: str, victim: str, seed: int, settings: MeshSettings) -> str:
@@ -167,7 +177,7 @@ def _objects_sha256(experiment: Experiment, settings: MeshSettings) -> list[str]
 
 
 def _cell(
-    experiment: Experiment, scenario: str, victim: str, method: MeshMethod, seed: int, result: Path, report: Report,
+    experiment: Experiment, scenario: str, victim: str, method: str, seed: int, result: Path, report: Report,
     settings: MeshSettings, frozen: str, scene: DeploymentScene,
 ) -> dict[str, Any]:  # fmt: skip
     fields = mesh_objects(experiment, settings)
@@ -180,7 +190,7 @@ def _cell(
     plain = surrogate.plain_theta() if settings.target == "texture" else torch.zeros(problem.sensor.theta_shape)
     theta = plain
     history: tuple[Evaluation, ...] = ()
-    if method != "none":
+    if method != NONE:
         found = _search(experiment, problem, method, seed, settings, result, report, frozen)
         theta, history = found.theta, found.history
         _keep_meshes(experiment, problem, fields, theta, result)
@@ -188,7 +198,7 @@ def _cell(
     for drives, each in ((clean, plain), (attacked, theta)):
         drives["deployed"], blocked = _deployed(experiment, scene, problem, fields, each, scenario, policy.policy)
     data = {
-        "scenario": scenario, "victim": victim, "method": method, "seed": seed, "attack_id": None, "settings_hash": frozen,
+        "scenario": scenario, "victim": victim, "method": method_name(method), "seed": seed, "attack_id": None, "settings_hash": frozen,
         "seconds": round(sum(evaluation.seconds for evaluation in history), 1),
         "machine": machine_name(),
         "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
@@ -204,21 +214,25 @@ def _cell(
 
 
 def _search(
-    experiment: Experiment, problem: AttackProblem, method: MeshMethod, seed: int, settings: MeshSettings, result: Path,
+    experiment: Experiment, problem: AttackProblem, method: str, seed: int, settings: MeshSettings, result: Path,
     report: Report, settings_hash: str,
 ) -> SearchResult:  # fmt: skip
     attack = experiment.config.attack
-    common: dict[str, Any] = {
-        "seed": seed, "state_path": _beside(result, ".state.safetensors"), "on_evaluation": telling(attack.evaluations, report),
-        "settings_hash": settings_hash,
-    }  # fmt: skip
-    sensor = problem.sensor
-    rate, sigma = settings.learning_rate or attack.learning_rate, attack.random_sigma
-    if isinstance(sensor, ShapeSensor):
-        rate, sigma = settings.learning_rate or sensor.limits.learning_rate, sensor.random_sigma
-    if method == "gradient":
-        return gradient_attack(problem, attack.evaluations, rate, **common)
-    return random_search(problem, attack.evaluations, sigma, **common)
+    chosen = load_method(method)
+    if settings.target == "shape" and not chosen.reads_scale:
+        raise CellError(f"expected a method that searches shapes, got {method_name(method)}; attack textures with it")
+    # No population: what a cell of meshes depends on leaves cem_population out.
+    asked = SearchSettings(
+        attack.evaluations,
+        settings.learning_rate,
+        cells=0,
+        gradient_rate=attack.learning_rate,
+        random_sigma=attack.random_sigma,
+        options=chosen.options({}),
+    )
+    told = telling(chosen.evaluations(problem, asked), report)
+    run = SearchRun(seed, _beside(result, ".state.safetensors"), told, settings_hash)
+    return chosen.search(problem, asked, run)
 
 
 def _keep_meshes(

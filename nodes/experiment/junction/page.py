@@ -15,17 +15,16 @@ from numpy.typing import NDArray
 
 from advnerf_core.files import write_atomically
 from advnerf_core.report.clips import data_uri, image_uri
+from advnerf_core.report.conditions import style_of
 from advnerf_core.report.palette import DARK, LIGHT, LINE_STYLES, css_variables
 from advnerf_core.report.plots import new_axes, svg
 from advnerf_core.report.tables import Table
-from advnerf_core.report.transfer_page import METHOD_NAMES
 from nodes.experiment.junction import films
 from nodes.experiment.junction.attack import Cell, cells
 from nodes.experiment.junction.context import Experiment
 from nodes.experiment.junction.policy import HARDENED
 from nodes.experiment.stages import read_record
 
-COLOURS = {"none": LIGHT["none"], "random": LIGHT["random"], "cem": "#7a3f98", "gradient": LIGHT["gradient"]}
 _MARGIN_M, _SHOWN_VIEWS = 3.0, 3
 _HEAD = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
@@ -73,7 +72,7 @@ def write(
 def opening(experiment: Experiment) -> str:
     """What was done, in one paragraph."""
     attack, things = experiment.config.attack, experiment.world.objects
-    methods = ", ".join(METHOD_NAMES[name] for name in attack.methods)
+    methods = ", ".join(style_of(name).title for name in attack.method_names)
     where = "junction of the CARLA map" if experiment.config.kind == "carla" else "simulated junction"
     kinds = {kind: sum(thing.kind == kind for thing in things) for kind in ("small_car", "hydrant")}
     return (
@@ -97,7 +96,7 @@ def _drive(experiment: Experiment, name: str, clip: Path, seen: Mapping[str, NDA
         Markup("<figure>{}<figcaption>{}</figcaption></figure>").format(Markup(svg(trajectories(experiment, name), text)), text),
         Markup('<video controls loop muted src="{}"></video>').format(data_uri(clip)),
     ]  # fmt: skip
-    return [*parts, *(_picture(image, f"Objects seen: {METHOD_NAMES[key]}") for key, image in seen.items())]
+    return [*parts, *(_picture(image, f"Objects seen: {style_of(key).title}") for key, image in seen.items())]
 
 
 def trajectories(experiment: Experiment, name: str) -> Figure:
@@ -113,7 +112,8 @@ def trajectories(experiment: Experiment, name: str) -> Figure:
         _ground(ax, experiment)
         ax.plot(*line.T, color=LIGHT["tape"], lw=7.0, alpha=0.25, zorder=1)
         for cell, domain, states in drives:
-            ax.plot(*states[:, :2].T, color=COLOURS[cell.method], ls=LINE_STYLES[domain], lw=1.2, label=_label(cell, domain), zorder=2)  # fmt: skip
+            drawn = {"color": style_of(cell.method).light, "ls": LINE_STYLES[domain], "lw": 1.2, "zorder": 2}
+            ax.plot(*states[:, :2].T, label=_label(cell, domain), **drawn)
         entries = dict(zip(*reversed(ax.get_legend_handles_labels()), strict=True))
         ax.figure.legend(entries.values(), entries.keys(), loc="outside upper left", ncols=3, columnspacing=1.4)
         ax.set(xlabel="x [m]", ylabel="y [m]", xlim=(low[0], high[0]), ylim=(low[1], high[1]))
@@ -122,7 +122,7 @@ def trajectories(experiment: Experiment, name: str) -> Figure:
 
 
 def _label(cell: Cell, domain: str) -> str:
-    return f"{METHOD_NAMES[cell.method]}, {domain}"
+    return f"{style_of(cell.method).title}, {domain}"
 
 
 def _ground(ax: Any, experiment: Experiment) -> None:

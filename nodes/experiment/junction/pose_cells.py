@@ -47,7 +47,7 @@ def load_experiment(file: Path, setting: str, overrides: Sequence[str], folder: 
 
 def cell_inputs(experiment: PoseExperiment, scenario: str, victim: str, method: str, seed: int) -> dict[str, Any]:
     """What a cell depends on; not known before there are scene, objects and victim."""
-    require_known(experiment, scenario, attackable(experiment), victim, METHODS, method)
+    require_known(experiment, scenario, attackable(experiment), victim, method, METHODS)
 
     def digest() -> str:
         return pose_hash(experiment, load_policy(victim_file(experiment, victim)), scenario, seed, experiment.poses)
@@ -67,7 +67,7 @@ def run_cell(
     experiment: PoseExperiment, scenario: str, victim: str, method: PoseMethod, seed: int, folder: Path, report: Report
 ) -> dict[str, Any]:
     """Search for places (and colours), drive in both domains, film the first deployed drive; see `pose_cell`."""
-    require_known(experiment, scenario, attackable(experiment), victim, METHODS, method)
+    require_known(experiment, scenario, attackable(experiment), victim, method, METHODS)
     policy = load_policy(victim_file(experiment, victim))
     with experiment.site.open() as scene:
         data = pose_cell(experiment, policy, scenario, method, seed, folder, report, scene, experiment.poses)

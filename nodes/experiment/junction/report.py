@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from advnerf_core.files import write_atomically
+from advnerf_core.report.conditions import NONE, order_of, style_of
 from advnerf_core.report.tables import Table, spread
-from advnerf_core.report.transfer_page import METHOD_NAMES
 from nodes.experiment.junction import films, page
 from nodes.experiment.junction.attack import Cell, cells, load_theta
 from nodes.experiment.junction.context import Experiment
@@ -36,7 +36,7 @@ class Row:
         domain: surrogate or deployed.
         scenario: straight, right or left.
         victim: hardened or naive.
-        method: none, random, cem or gradient.
+        method: none, or the name of a method of attack.
         total_cte_m: Total CTE of each drive [m].
         ratios: Each over the drive past the plain objects from the same start in the same domain.
         off_track: Drives that left the lane.
@@ -107,12 +107,10 @@ def rows_of(experiment: Experiment) -> list[Row]:
     return rows
 
 
-def _order(experiment: Experiment, key: tuple[str, str, str, str]) -> tuple[bool, int, int, int]:
+def _order(experiment: Experiment, key: tuple[str, str, str, str]) -> tuple[bool, int, int, tuple[int, str]]:
     victim, scenario, domain, method = key
-    return (
-        victim != HARDENED, experiment.config.scenarios.index(scenario), films.DOMAINS.index(domain),
-        list(METHOD_NAMES).index(method),
-    )  # fmt: skip
+    place = experiment.config.scenarios.index(scenario), films.DOMAINS.index(domain)
+    return (victim != HARDENED, *place, order_of(method))
 
 
 def transfer_table(rows: Sequence[Row]) -> Table:
@@ -126,8 +124,8 @@ def transfer_table(rows: Sequence[Row]) -> Table:
         std = float(np.std(row.total_cte_m, ddof=1)) if len(row.total_cte_m) > 1 else None
         ratio_std = float(np.std(row.ratios, ddof=1)) if len(row.ratios) > 1 else None
         texts.append((
-            *first, METHOD_NAMES[row.method], str(len(row.total_cte_m)), spread(float(np.mean(row.total_cte_m)), std),
-            "" if row.method == "none" else spread(row.ratio, ratio_std), f"{row.off_track} of {len(row.total_cte_m)}",
+            *first, style_of(row.method).title, str(len(row.total_cte_m)), spread(float(np.mean(row.total_cte_m)), std),
+            "" if row.method == NONE else spread(row.ratio, ratio_std), f"{row.off_track} of {len(row.total_cte_m)}",
         ))  # fmt: skip
         before = here
     columns = ("victim", "drive", "domain", "objects show", "runs", "total CTE [m]", "over no attack", "off-track")
@@ -150,8 +148,8 @@ def textures_seen(experiment: Experiment, dressed: DressedScene, scenario: str) 
     """The same views of the driving camera past the plain, random and attacked objects of the first seed, one row each."""
     searched, seed = experiment.stage_folder("attack"), experiment.config.attack.seeds[0]
     states = [np.array(experiment.references[scenario].pose_at(at)) for at in _SEEN_AT_M]
-    shown: dict[str, torch.Tensor] = {"none": dressed.plain_theta()}
-    for method in experiment.config.attack.methods:
+    shown: dict[str, torch.Tensor] = {NONE: dressed.plain_theta()}
+    for method in experiment.config.attack.method_names:
         shown[method] = load_theta(searched, Cell(scenario, HARDENED, method, seed))
     return {
         method: np.concatenate([dressed.camera_image(state, theta) for state in states], axis=1)

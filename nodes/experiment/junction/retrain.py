@@ -20,7 +20,7 @@ import torch
 from numpy.typing import NDArray
 
 from advnerf_core.attack.adjoint import evaluate
-from advnerf_core.attack.search.optimise import gradient_attack
+from advnerf_core.attack.search.gradient import gradient_attack
 from advnerf_core.driving.path import Array
 from advnerf_core.files import write_atomically
 from advnerf_core.learning.frames import Frames, FrameStore

@@ -11,6 +11,7 @@ from typing import Any
 
 from rich.console import Console
 
+from advnerf_core.attack.methods import method_digest, method_name
 from hardware.worlds.carla.config import CarlaConfig
 from hardware.worlds.junction.config import IntersectionConfig
 from nodes.experiment.junction import attack, capture, deploy, objects, policy, report, retrain, scene
@@ -39,7 +40,7 @@ def load_experiment(file: Path, setting: str, overrides: Sequence[str], folder: 
         ConfigError: With file, line and the valid keys.
     """
     document = read_setting(file, setting, overrides)
-    config = validate(IntersectionExperimentConfig, document)
+    config = validate(IntersectionExperimentConfig, document, file.parent)
     if config.kind == "carla":
         render = validate(CarlaConfig, document.part(("world",))).render
         try:
@@ -115,17 +116,22 @@ def stages_of(experiment: Experiment) -> list[Stage]:
     def part(name: str) -> Any:
         return getattr(config, name).model_dump(mode="json")
 
+    # Of users' methods the code counts, not where it is.
+    searched = {**part("attack"), "methods": config.attack.method_names}
+    if codes := {method_name(each): code for each in config.attack.methods if (code := method_digest(each))}:
+        searched["code"] = codes
+
     stages = [
         stage("capture", capture, {"world": seen, "capture": part("capture"), **measured, **other_speed}, ()),
         stage("scene", scene, {"scene": part("scene")}, ("capture",)),
         stage("object", objects, {"object": part("object"), "kinds": kinds}, ()),
         stage("policy", policy, {"world": world, "policy": part("policy"), "sigma": config.attack.random_sigma, **measured}, ("capture", "scene", "object")),
-        stage("attack", attack, {"world": world, "attack": part("attack"), **measured}, ("scene", "object", "policy")),
+        stage("attack", attack, {"world": world, "attack": searched, **measured}, ("scene", "object", "policy")),
         stage("deploy", deploy, {"world": world, **measured}, ("object", "policy", "attack")),
-        stage("report", report, {"attack": part("attack"), **measured}, ("capture", "scene", "policy", "attack", "deploy")),
+        stage("report", report, {"attack": searched, **measured}, ("capture", "scene", "policy", "attack", "deploy")),
     ]  # fmt: skip
     if config.retrain is not None:
-        settings = {"world": world, "retrain": part("retrain"), "attack": part("attack"), **measured}
+        settings = {"world": world, "retrain": part("retrain"), "attack": searched, **measured}
         fewer = [
             {**settings, "retrain": {**settings["retrain"], "rounds": rounds}}
             for rounds in range(1, config.retrain.rounds)

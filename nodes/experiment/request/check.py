@@ -28,9 +28,9 @@ from advnerf_core.attack.health import (
     with_remembered_frames,
 )
 from advnerf_core.attack.health_plot import draw_health
+from advnerf_core.attack.methods import alternatives, black_box_methods
 from advnerf_core.driving.clean_drive import CleanDrive
 from advnerf_core.files import write_atomically
-from advnerf_core.policies.black_box import BLACK_BOX_METHODS_TEXT
 from nodes.experiment.request.memory import measured_mib
 from nodes.experiment.request.prepare import Prepared, prepare, sensor_of
 from nodes.experiment.request.request import AttackRequest
@@ -93,7 +93,7 @@ def check(request: AttackRequest, directions: int, memory: bool, report: Report)
     prepared = prepare(request)
     if not prepared.problem.differentiable:
         raise BlackBoxError(
-            f"{request.policy} has no gradient that could be checked; search with {BLACK_BOX_METHODS_TEXT}"
+            f"{request.policy} has no gradient that could be checked; search with {alternatives(black_box_methods())}"
         )
     if request.shape is not None:
         raise ConfigError(

@@ -118,7 +118,7 @@ def _checked(request: AttackRequest) -> PosesRequest:
     if asked is None:
         raise ConfigError("expected the key poses in the request, with bounds of each object; see docs/poses.md")
     if request.search.method not in ("gradient", "random"):
-        raise ConfigError(f"search.method: expected gradient or random for poses, got {request.search.method}")
+        raise ConfigError(f"search.method: expected gradient or random for poses, got {request.search.method_name}")
     if request.search.together or request.robustness.smoothness or any(o.display for o in request.objects):
         raise ConfigError("poses: expected no search.together, robustness.smoothness or display with them")
     if asked.colours and asked.attack is not None:

@@ -15,6 +15,7 @@ from torch import Tensor
 from advnerf_core.attack.adjoint import AttackProblem
 from advnerf_core.attack.artifact import AttackedObject, AttackFile, face_texture
 from advnerf_core.attack.clean import clean_drive
+from advnerf_core.attack.methods import method_digest
 from advnerf_core.attack.robustness import Disturbances, Smoothness
 from advnerf_core.attack.search.search import SearchResult, draw_start_states
 from advnerf_core.attack.spaces.displayed import DisplayedSensor
@@ -96,7 +97,7 @@ class Prepared:
         if self.request.shape is not None:
             extra["shape"] = self.request.shape.model_dump(mode="json")
         return AttackFile(
-            method=self.request.search.method, **self._face(result.theta), camera=self.surrogate.camera,
+            method=self.request.search.method_name, **self._face(result.theta), camera=self.surrogate.camera,
             scene_sha256=self.hashes["scene"], policy_sha256=self.hashes["policy"], config_sha256=self.hashes["config"],
             seed=self.seed, predicted_total_cte_m=predicted, software_version=version("advnerf"), extra=extra,
             clean_drive=clean or self.clean_drive,
@@ -169,6 +170,11 @@ def request_hash(request: AttackRequest) -> str:
     )
     for key in ("evaluations", "cache_mib", "time_batch", "seeds", "together"):
         asked["search"].pop(key)
+    search = request.search
+    if code := method_digest(search.method):
+        asked["search"]["method"] = [search.method_name, code]
+    if not search.options:
+        del asked["search"]["options"]
     for key in ("probes", "warm_pairs"):
         if asked["search"][key] is None:  # so that hashes of requests without them stay what they were
             del asked["search"][key]

@@ -13,19 +13,21 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
+from advnerf_core.attack.methods import METHODS, alternatives, method_name
 from advnerf_core.geometry import Array, make_transform, rotation_z
 from advnerf_core.policies.load import is_factory
+from nodes.experiment.method_names import MethodReference
 from nodes.experiment.request.mesh_request import MeshRequest, ShapeRequest
 from nodes.experiment.request.pose_request import PosesRequest
 from nodes.runtime.config import Document, apply_overrides, parse_yaml, read_yaml, validate
 
-Method = Literal["gradient", "random", "cem", "evolution", "distilled", "guided"]
 Count = Annotated[int, Field(ge=1)]
 NotNegative = Annotated[float, Field(ge=0)]
 AboveZero = Annotated[float, Field(gt=0)]
 Row = tuple[float, float, float, float]
 Unit = Annotated[float, Field(ge=0, le=1)]
 _RIGID_TOLERANCE = 1e-6
+SHAPE_METHODS = alternatives(name for name, row in METHODS.items() if row.reads_scale)
 
 
 class _Section(BaseModel):
@@ -153,7 +155,11 @@ class RobustnessRequest(_Section):
 class SearchRequest(_Section):
     """The adversary and its budget."""
 
-    method: Method = "gradient"
+    method: MethodReference = Field(
+        default="gradient",
+        description="A method of attack: built in, of an installed package, or file.py:Name, relative to this file.",
+    )
+    options: dict[str, Any] = Field(default_factory=dict, description="What the method alone knows.")
     evaluations: Count = Field(default=50, description="Closed-loop evaluations; an iteration of the gradient is one.")
     learning_rate: AboveZero | None = Field(
         default=None,
@@ -179,6 +185,11 @@ class SearchRequest(_Section):
     )
     cache_mib: NotNegative = Field(default=512.0, description="Budget of the frames kept for the gradient [MiB].")
     time_batch: Count = Field(default=16, description="Frames per gradient batch.")
+
+    @property
+    def method_name(self) -> str:
+        """What the method is called in tables and attack files."""
+        return method_name(self.method)
 
 
 class AttackRequest(_Section):
@@ -209,6 +220,8 @@ class AttackRequest(_Section):
     @model_validator(mode="after")
     def _complete(self) -> AttackRequest:
         missing = [name for name in ("camera", "vehicle", "room") if getattr(self, name) is None]
+        if (built_in := METHODS.get(self.search.method)) is not None:  # others are looked at when they are loaded
+            built_in.options(self.search.options, "search.options")
         if self.search.together and self.search.method != "gradient":
             raise ValueError(f"search.together is for the gradient method only, got method {self.search.method}")
         one_face = len(self.objects) == 1 and self.objects[0].kind in ("face", "cube")
@@ -226,9 +239,10 @@ class AttackRequest(_Section):
         if self.shape is not None:
             if not all(meshes):
                 raise ValueError("shape: expected objects of kind 'mesh' only")
-            if self.search.method not in ("gradient", "random") or self.search.together or self.robustness.smoothness:
+            of_colours = built_in is not None and not built_in.reads_scale
+            if of_colours or self.search.together or self.robustness.smoothness:
                 raise ValueError(
-                    "shape: expected method gradient or random, no search.together and no smoothness of colours"
+                    f"shape: expected method {SHAPE_METHODS}, no search.together and no smoothness of colours"
                 )
         count = len(self.starts.poses) or self.starts.count
         if len(self.goals) not in (0, 1, count):
@@ -265,7 +279,7 @@ def request_text(request: AttackRequest) -> str:
 
 def _resolve(document: Document, folder: Path, overrides: Sequence[str]) -> AttackRequest:
     apply_overrides(document, overrides)
-    request = validate(AttackRequest, document)
+    request = validate(AttackRequest, document, folder)
 
     def absolute(path: Path | None) -> Path | None:
         if path is None or is_factory(str(path)):

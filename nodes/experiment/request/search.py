@@ -5,24 +5,23 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from advnerf_core.attack.adjoint import BlackBoxError, evaluate
 from advnerf_core.attack.artifact import AttackFile, save_attack
-from advnerf_core.attack.search.baselines import random_search
-from advnerf_core.attack.search.distil import Distillation
-from advnerf_core.attack.search.guided import BlackBoxSearch, black_box_attack
-from advnerf_core.attack.search.optimise import gradient_attack
-from advnerf_core.attack.search.population import CrossEntropy, Evolution, population_search
-from advnerf_core.attack.search.query_count import calls_per_evaluation
+from advnerf_core.attack.methods import (
+    Method,
+    SearchRun,
+    SearchSettings,
+    alternatives,
+    black_box_methods,
+    load_method,
+)
 from advnerf_core.attack.search.search import Evaluation, OnEvaluation, SearchResult
 from advnerf_core.attack.search.together import gradient_attacks
 from advnerf_core.files import write_atomically
-from advnerf_core.objects.mesh.shape import ShapeSensor
-from advnerf_core.policies.black_box import BLACK_BOX_METHODS_TEXT
 from nodes.experiment.request.meshes import write_meshes
 from nodes.experiment.request.prepare import Prepared, prepare
-from nodes.experiment.request.request import AttackRequest, load_request, request_text
+from nodes.experiment.request.request import SHAPE_METHODS, AttackRequest, load_request, request_text
 from nodes.experiment.request.telling import telling
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import Display
@@ -31,55 +30,50 @@ REQUEST = "request.attack.yaml"
 TOGETHER_STATE = "together.state.safetensors"
 
 
+def chosen_method(request: AttackRequest) -> tuple[Method, SearchSettings]:
+    """The method of a request, loaded, and its settings.
+
+    Raises:
+        PluginError: The method's code cannot be loaded.
+        MethodError: It has no such options.
+        ConfigError: It cannot search what is asked for.
+    """
+    wanted = request.search
+    method = load_method(wanted.method)
+    if request.shape is not None and not method.reads_scale:
+        raise ConfigError(
+            f"search.method: expected a method that searches shapes, such as {SHAPE_METHODS}, got {wanted.method_name}"
+        )
+    settings = SearchSettings(
+        wanted.evaluations,
+        wanted.learning_rate,
+        wanted.sigma,
+        wanted.population,
+        wanted.cells,
+        wanted.probes,
+        wanted.warm_pairs,
+        options=method.options(wanted.options, "search.options"),
+    )
+    return method, settings
+
+
 def search(
     prepared: Prepared, state_path: Path | None = None, on_evaluation: OnEvaluation | None = None
 ) -> SearchResult:
     """Search as the request asks; what ``on_evaluation`` raises ends it, and a state file then goes on from there."""
-    wanted, problem = prepared.request.search, prepared.problem
-    if wanted.method == "gradient" and not problem.differentiable:
-        raise BlackBoxError(f"{prepared.request.policy} has no gradient: use the method {BLACK_BOX_METHODS_TEXT}")
-    common: dict[str, Any] = {
-        "seed": prepared.seed, "state_path": state_path, "on_evaluation": on_evaluation,
-        "settings_hash": prepared.settings_hash,
-    }  # fmt: skip
-    rate, sigma = 0.1, 5.0
-    if isinstance(problem.sensor, ShapeSensor):
-        rate, sigma = problem.sensor.limits.learning_rate, problem.sensor.random_sigma
-    if wanted.method == "gradient":
-        return gradient_attack(problem, wanted.evaluations, wanted.learning_rate or rate, **common)
-    if wanted.method == "random":
-        return random_search(problem, wanted.evaluations, wanted.sigma or sigma, **common)
-    if (black_box := black_box_search(prepared.request)) is not None:
-        return black_box_attack(problem, black_box, policy_calls(prepared), **common)
-    if wanted.method == "cem":
-        strategy: CrossEntropy | Evolution = CrossEntropy(wanted.sigma or 3.0)
-    else:
-        strategy = Evolution(wanted.sigma or 1.0, wanted.learning_rate or 0.5)
-    return population_search(problem, strategy, wanted.evaluations, wanted.population, wanted.cells, **common)
-
-
-def black_box_search(request: AttackRequest) -> BlackBoxSearch | None:
-    """The settings of the methods that ask the policy more than they drive; None for the others."""
-    wanted = request.search
-    if wanted.method != "distilled" and wanted.method != "guided":
-        return None
-    lessons = Distillation() if wanted.warm_pairs is None else Distillation(warm_pairs=wanted.warm_pairs)
-    return BlackBoxSearch.usual(
-        wanted.method, wanted.learning_rate, wanted.probes, cells=wanted.cells, distillation=lessons
-    )
-
-
-def policy_calls(prepared: Prepared) -> int:
-    """The budget of a request in policy calls, the same for all methods: evaluations x starts x ticks."""
-    return prepared.request.search.evaluations * calls_per_evaluation(prepared.problem)
+    method, settings = chosen_method(prepared.request)
+    if method.needs_gradient and not prepared.problem.differentiable:
+        raise BlackBoxError(
+            f"{prepared.request.policy} has no gradient: use the method {alternatives(black_box_methods())}"
+        )
+    run = SearchRun(prepared.seed, state_path, on_evaluation, prepared.settings_hash)
+    return method.search(prepared.problem, settings, run)
 
 
 def planned_evaluations(prepared: Prepared) -> int:
     """Drives that the budget allows the method."""
-    black_box = black_box_search(prepared.request)
-    if black_box is None:
-        return prepared.request.search.evaluations
-    return black_box.evaluations(prepared.problem, policy_calls(prepared))
+    method, settings = chosen_method(prepared.request)
+    return method.evaluations(prepared.problem, settings)
 
 
 def finish(prepared: Prepared, result: SearchResult) -> AttackFile:
@@ -110,8 +104,10 @@ def run_attack(
         The attack files, ``seed_<seed>.attack.safetensors``, each with its curve in a JSON file beside it.
 
     Raises:
-        ConfigError: The folder holds another request.
+        ConfigError: The folder holds another request, or the method cannot search what is asked for.
+        PluginError: The method's code cannot be loaded.
     """
+    chosen_method(request)  # before anything is loaded or written
     keep_request(request, folder)
     if request.search.together:
         return _run_together(request, folder, display, on_evaluation, on_prepared)
@@ -201,7 +197,7 @@ def _keep(prepared: Prepared, result: SearchResult, folder: Path) -> None:
     write_meshes(file, names, prepared.meshes(result.theta))
     attack_id = save_attack(file, finish(prepared, result))
     curve = {
-        "attack_id": attack_id, "method": prepared.request.search.method, "seed": prepared.seed,
+        "attack_id": attack_id, "method": prepared.request.search.method_name, "seed": prepared.seed,
         "best_evaluation": result.best.iteration, "loss_m": [e.loss_m for e in result.history],
         "predicted_total_cte_m": [e.predicted_total_cte_m for e in result.history],
         "seconds": [e.seconds for e in result.history], "clean_drive": prepared.clean_drive.to_dict(),

@@ -76,6 +76,8 @@ class Speaker:
     def _show(self, prepared: Prepared) -> None:
         """The best texture so far, and what the policy sees of it from the first start."""
         theta = self._best_theta(prepared)
+        if theta is None:  # the method keeps no state
+            return
         texture = _texture(prepared, theta)
         if texture is not None:
             self._image(TEXTURE, texture)
@@ -83,10 +85,13 @@ class Speaker:
         pixels = np.round(255.0 * seen.detach().permute(1, 2, 0).clamp(0.0, 1.0).numpy()).astype(np.uint8)
         self._image(PREVIEW, pixels.repeat(_PREVIEW_SCALE, 0).repeat(_PREVIEW_SCALE, 1))
 
-    def _best_theta(self, prepared: Prepared) -> Tensor:
-        """Of the seed at work; of the best, where all are searched together."""
+    def _best_theta(self, prepared: Prepared) -> Tensor | None:
+        """Of the seed at work; of the best, where all are searched together; None without a state file."""
         together = prepared.request.search.together
-        with safe_open(self._folder / TOGETHER_STATE if together else self._state(prepared), framework="pt") as handle:
+        state = self._folder / TOGETHER_STATE if together else self._state(prepared)
+        if not state.exists():
+            return None
+        with safe_open(state, framework="pt") as handle:
             best: Tensor = handle.get_tensor("best_theta")
             histories = json.loads((handle.metadata() or {}).get("histories", "[]"))
         if not together:

@@ -10,10 +10,11 @@ from torch import nn
 
 from advnerf_core.attack.adjoint import AttackProblem, BlackBoxError, adjoint_gradient, evaluate
 from advnerf_core.attack.robustness import Disturbances
+from advnerf_core.attack.search.black_box import BlackBoxSearch, BudgetError, black_box_attack
 from advnerf_core.attack.search.distil import Distillation, Lessons, Student
-from advnerf_core.attack.search.guided import BlackBoxSearch, BudgetError, black_box_attack
-from advnerf_core.attack.search.optimise import gradient_attack
-from advnerf_core.attack.search.population import Evolution, population_search
+from advnerf_core.attack.search.evolution import Evolution
+from advnerf_core.attack.search.gradient import gradient_attack
+from advnerf_core.attack.search.population import population_search
 from advnerf_core.attack.search.query_count import CountedPolicy, VictimError, calls_per_evaluation
 from advnerf_core.attack.search.search import SearchStateError
 from advnerf_core.attack.search.visited import PreparingSensor, VisitedDrive

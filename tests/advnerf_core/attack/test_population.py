@@ -7,7 +7,9 @@ import pytest
 import torch
 
 from advnerf_core.attack.adjoint import BlackBoxError, adjoint_gradient
-from advnerf_core.attack.search.population import Coarse, CrossEntropy, Evolution, population_search, rank_utilities
+from advnerf_core.attack.search.cem import CrossEntropy
+from advnerf_core.attack.search.evolution import Evolution, rank_utilities
+from advnerf_core.attack.search.population import Coarse, population_search
 from advnerf_core.attack.search.search import SearchDivergedError, SearchStateError
 from benchmarks.attack_toy import random_policy, toy_problem
 
@@ -114,7 +116,7 @@ def test_a_black_box_can_be_searched_but_not_differentiated(problem):
     assert len(result.history) == 6
     with pytest.raises(
         BlackBoxError,
-        match="differentiable = False; search with the methods guided, distilled, evolution, cem or random",
+        match="differentiable = False; search with the methods random, cem, evolution, guided or distilled",
     ):
         adjoint_gradient(closed, result.theta)
 

@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from advnerf_core.attack.adjoint import adjoint_gradient, evaluate
-from advnerf_core.attack.search.baselines import random_search
-from advnerf_core.attack.search.optimise import gradient_attack
+from advnerf_core.attack.search.gradient import gradient_attack
+from advnerf_core.attack.search.random_search import random_search
 from advnerf_core.attack.search.search import SearchDivergedError, SearchStateError, draw_start_states
 from advnerf_core.scene.surrogate import Rendered
 from benchmarks.attack_toy import toy_problem

@@ -7,7 +7,7 @@ import torch
 
 from advnerf_core.attack.adjoint import adjoint_gradient
 from advnerf_core.attack.robustness import Smoothness
-from advnerf_core.attack.search.optimise import gradient_attack
+from advnerf_core.attack.search.gradient import gradient_attack
 from advnerf_core.attack.search.search import SearchStateError
 from advnerf_core.attack.search.together import gradient_attacks
 from advnerf_core.scene.many_textures import ManyTextures

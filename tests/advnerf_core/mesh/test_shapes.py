@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from advnerf_core.attack.adjoint import AttackProblem, adjoint_gradient
-from advnerf_core.attack.search.optimise import gradient_attack
+from advnerf_core.attack.search.gradient import gradient_attack
 from advnerf_core.driving.dynamics import Ackermann
 from advnerf_core.driving.path import Line, Path
 from advnerf_core.geometry import Pinhole, camera_mount, make_transform

@@ -1,3 +1,5 @@
+import itertools
+
 import cv2
 import numpy as np
 import pytest
@@ -5,6 +7,7 @@ from matplotlib.colors import to_rgb
 
 from advnerf_core.geometry import make_transform, rotation_z
 from advnerf_core.report import maps, plots
+from advnerf_core.report.conditions import CONDITIONS
 from advnerf_core.report.data import face_segment
 from advnerf_core.report.palette import DARK, LIGHT
 
@@ -30,6 +33,12 @@ def test_conditions_differ_for_colour_blind_readers(palette, seen):
     colours = lab([palette[c] for c in ("none", "random", "gradient")], DICHROMATS[seen])
     distances = [np.linalg.norm(colours[i] - colours[j]) for i, j in ((0, 1), (0, 2), (1, 2))]
     assert min(distances) > 25  # CIE 1976; 2.3 is just noticeable
+
+
+@pytest.mark.parametrize("palette", [LIGHT, DARK], ids=["light", "dark"])
+def test_colours_of_all_conditions_are_told_apart(palette):
+    places = lab([palette[name] for name in CONDITIONS], DICHROMATS["none"])
+    assert min(np.linalg.norm(a - b) for a, b in itertools.combinations(places, 2)) > 18
 
 
 def test_palette_colours_are_distinct_and_all_themed():

@@ -18,6 +18,7 @@ from nodes.experiment.request.request import load_request
 from nodes.experiment.request.search import run_attack
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import ProgressDisplay
+from tests.strangers import write_spiral
 
 sys.path.insert(0, str(Path(__file__).parent))
 from tiny import tiny_request
@@ -68,6 +69,18 @@ def test_textures_of_a_mesh_are_searched_resumed_and_exported(tmp_path):
     found = 1.0 / (1.0 + np.exp(-attack.objects[0].theta))
     used = prepare(request).surrogate.objects[0].mesh.charts >= 0
     assert np.abs(read_glb(glb).texture - found)[used].max() < 0.6 / 255
+
+
+def test_shapes_are_searched_only_by_methods_that_read_their_scale(tmp_path):
+    write_spiral(tmp_path)
+    file = asked(tmp_path, BALL, rest="shape: {bound_m: 0.1, samples: 1}")
+    with pytest.raises(ConfigError, match="shape: expected method random or gradient"):
+        load_request(file, ["search.method=cem"])
+    with pytest.raises(
+        ConfigError, match="expected a method that searches shapes, such as random or gradient, got Spiral"
+    ):
+        run_attack(load_request(file, ["search.method=spiral.py:Spiral"]), tmp_path / "out", ProgressDisplay())
+    assert not (tmp_path / "out").exists()
 
 
 def test_the_gradient_of_textures_passes_the_check(tmp_path):

@@ -11,7 +11,7 @@ import torch
 
 from advnerf_core.attack.adjoint import BlackBoxError, evaluate
 from advnerf_core.attack.artifact import load_attack
-from advnerf_core.attack.search.guided import BudgetError
+from advnerf_core.attack.search.black_box import BudgetError
 from advnerf_core.display import DisplayModel
 from advnerf_core.policies.contract import PolicyContract
 from advnerf_core.policies.onnx_policy import export_onnx

@@ -67,7 +67,11 @@ def test_cells_are_selected_by_what_they_are(file):
         ("seeds: [0, 1]", "seed: [0, 1]", r"mine.campaign.yaml:2: unknown key seed; valid keys here: .*seeds"),
         ("    run_folder: runs/one\n", "", r":4: scenarios.straight.run_folder is missing"),
         ("placements:\n      near: {run", "placements:\n      near: {rum", r":10: unknown key .*near.rum_folder"),
-        ("[none, gradient]", "[none, gradiant]", r":7: scenarios.straight.methods.1: .*'gradient'.*got 'gradiant'"),
+        (
+            "[none, gradient]",
+            "[none, gradiant]",
+            r":7: scenarios.straight.methods.1: expected an attack method .*got 'gradiant' \(did you mean gradient\?\)",
+        ),
         ("seeds: [0, 1]", "seeds: [0, 0]", "every one of seeds once"),
         ("seeds: [7]", "seeds: [7, 7]", "every one of seeds once"),
         ("methods: [none, gradient]", "methods: []", r":7: scenarios.straight.methods: .*at least 1 item"),

@@ -13,7 +13,8 @@ import torch
 
 from advnerf_core.attack.artifact import load_attack
 from advnerf_core.attack.search.search import SearchStateError
-from nodes.experiment.junction import attack, report
+from nodes.experiment.campaign.kinds import load_kind, settings_hash
+from nodes.experiment.junction import attack, page, report, run
 from nodes.experiment.junction.attack import Cell, cells, load_theta, surrogate_part
 from nodes.experiment.junction.cells import CellError, deployed_part, run_cell
 from nodes.experiment.junction.context import Experiment
@@ -22,7 +23,9 @@ from nodes.experiment.junction.deployed import DressedScene
 from nodes.experiment.junction.films import film_cell
 from nodes.experiment.junction.objects import placed_objects, surrogate_of
 from nodes.experiment.junction.policy import NAIVE, victim_file
+from tests.strangers import spiral_code, spiral_theta, write_spiral
 
+PLACE = ("right", "hardened")
 GRADIENT = Cell("right", "hardened", "gradient", 0)
 
 
@@ -67,6 +70,39 @@ def test_search_is_kept_and_its_file_brings_the_colours_back(fresh: Experiment, 
     marked = {**found, "seconds": -1.0}
     (folder / f"{cell.name}.json").write_text(json.dumps(marked))
     assert surrogate_part(fresh, surrogate, cell, folder, silent) == marked
+
+
+def test_a_method_of_a_file_runs_a_cell_and_appears_in_the_tables(fresh: Experiment, wall: Any, tmp_path: Path) -> None:
+    spiral_file, file = write_spiral(tmp_path), Path(shutil.copy(fresh.file, tmp_path))
+    changes = ["attack.methods=[spiral.py:Spiral, gradient]", "scenarios=[right]", "policy.naive_steps=0"]
+    experiment = run.load_experiment(file, "tiny", changes, fresh.folder)
+    names = [f"right_hardened_{method}_0" for method in ("none", "Spiral", "gradient")]
+    assert [cell.name for cell in cells(experiment)] == names
+    objects, out = placed_objects(experiment), experiment.stage_folder("deploy")
+    surrogate, dressed = surrogate_of(experiment, objects), DressedScene(wall, experiment.view, objects)
+    for cell in cells(experiment):
+        surrogate_part(experiment, surrogate, cell, out, silent)
+        deployed_part(experiment, dressed, cell, out, out)
+    spiral = cells(experiment)[1]
+    found = load_theta(out, spiral)
+    thetas = [spiral_theta(tuple(surrogate.theta_shape), number) for number in range(2)]
+    assert min(float((found - theta).abs().max()) for theta in thetas) < 1e-5
+    assert load_attack(attack.attack_path(out, spiral)).method == "Spiral"
+    assert film_cell(experiment, dressed, spiral, out).exists()
+    table = report.transfer_table(report.rows_of(experiment))
+    assert [row[3] for row in table.rows] == 2 * ["no attack", "gradient", "Spiral"]
+    assert "Spiral" in page.opening(experiment)
+
+    # What its code is decides, not where it lies.
+    def digests() -> tuple[str, Any]:
+        reference = f"{spiral_file}:Spiral"
+        (stage,) = (each for each in run.stages_of(experiment) if each.name == "attack")
+        assert stage.settings["attack"]["methods"] == ["Spiral", "gradient"]
+        return settings_hash(load_kind("intersection"), experiment, *PLACE, reference, 0), stage.settings
+
+    before = digests()
+    spiral_file.write_text(spiral_code() + "# changed\n")
+    assert all(now != then for now, then in zip(digests(), before, strict=True))
 
 
 def test_a_stopped_search_goes_on_and_refuses_another_victim(fresh: Experiment) -> None:
@@ -123,7 +159,7 @@ def test_a_cell_is_filmed_frame_by_frame(fresh: Experiment, wall: Any) -> None:
 
 def test_unknown_cells_are_refused(trained: Experiment, tmp_path: Path) -> None:
     for wrong in (("back", "hardened", "none"), ("left", "nobody", "none"), ("left", "hardened", "luck")):
-        with pytest.raises(CellError, match=r"expected a (scenario|victim|method) of"):
+        with pytest.raises(CellError, match=r"expected an? (scenario|victim|attack method) of"):
             run_cell(trained, *wrong, 0, tmp_path, silent)  # type: ignore[arg-type]
     assert not list(tmp_path.iterdir())
 

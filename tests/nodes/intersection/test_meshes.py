@@ -89,4 +89,4 @@ def test_no_attack_is_one_everywhere_and_wrong_names_are_told(trained, wall, tmp
     with pytest.raises(CellError, match="scenario of straight, right, left"):
         mesh_cell(trained, "up", "naive", "none", 0, tmp_path, quiet)
     with pytest.raises(CellError, match="method of none, random, gradient"):
-        mesh_cell(trained, "left", "naive", "cem", 0, tmp_path, quiet)
+        mesh_cell(trained, "left", "naive", "cem", 0, tmp_path, quiet, MeshSettings("shape"))

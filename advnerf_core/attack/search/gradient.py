@@ -1,4 +1,4 @@
-"""The gradient attack: Adam on the grid values, the gradient from the discrete adjoint, several start poses together."""
+"""The method ``gradient``: Adam on the grid values, the gradient from the discrete adjoint, several start poses together."""
 
 from __future__ import annotations
 
@@ -10,14 +10,29 @@ import torch
 from torch import Tensor
 
 from advnerf_core.attack.adjoint import AttackProblem, adjoint_gradient
+from advnerf_core.attack.methods import SearchRun, SearchSettings
 from advnerf_core.attack.search.search import (
     OnEvaluation,
     SearchDivergedError,
     SearchResult,
     SearchState,
     begin,
+    gradient_step,
     search_fingerprint,
 )
+
+
+def search(problem: AttackProblem, settings: SearchSettings, run: SearchRun) -> SearchResult:
+    """The method as `advnerf_core.attack.methods` has it."""
+    return gradient_attack(
+        problem,
+        settings.evaluations,
+        gradient_step(problem, settings),
+        run.seed,
+        run.state_path,
+        run.on_evaluation,
+        run.settings_hash,
+    )
 
 
 def gradient_attack(

@@ -1,14 +1,34 @@
-"""The baseline: random textures, the best of as many as the gradient attack may evaluate."""
+"""The method ``random``, the baseline: random textures, the best of as many as the gradient attack may evaluate."""
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 
 import torch
 
 from advnerf_core.attack.adjoint import AttackProblem
-from advnerf_core.attack.search.search import OnEvaluation, SearchResult, begin, search_fingerprint, without_gradient
+from advnerf_core.attack.methods import SearchRun, SearchSettings
+from advnerf_core.attack.search.search import (
+    OnEvaluation,
+    SearchResult,
+    begin,
+    evaluate_theta,
+    random_spread,
+    search_fingerprint,
+)
+
+
+def search(problem: AttackProblem, settings: SearchSettings, run: SearchRun) -> SearchResult:
+    """The method as `advnerf_core.attack.methods` has it."""
+    return random_search(
+        problem,
+        settings.evaluations,
+        random_spread(problem, settings),
+        run.seed,
+        run.state_path,
+        run.on_evaluation,
+        run.settings_hash,
+    )
 
 
 def random_search(
@@ -38,14 +58,9 @@ def random_search(
     generator = torch.Generator().manual_seed(seed)
     state = begin(state_path, fingerprint, lambda: {"generator": generator.get_state()})
     generator.set_state(state.tensors["generator"])
+    run = SearchRun(seed, state_path, on_evaluation, settings_hash)
     while len(state.history) < evaluations:
-        began = time.perf_counter()
         theta = sigma * torch.randn(shape, generator=generator)
-        loss_m, totals = without_gradient(problem, theta, len(state.history))
-        evaluation = state.record(theta, loss_m, totals, time.perf_counter() - began)
         state.tensors["generator"] = generator.get_state()
-        if state_path is not None:
-            state.save(state_path, fingerprint)
-        if on_evaluation is not None:
-            on_evaluation(evaluation)
+        evaluate_theta(problem, theta, state, run, fingerprint)
     return state.result()

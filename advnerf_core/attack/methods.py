@@ -1,0 +1,264 @@
+"""The methods of attack: one table of the built-in ones, and those that users bring as an entry point or a file.
+
+A method is one file with a function ``search(problem, settings, run)`` that returns a `SearchResult`, and one `Method` that says what the
+search needs. A built-in one is a row of `METHODS`; a user's is an entry point of the group ``advnerf.methods`` or ``file.py:Name``, see
+docs/methods.md. ``none`` is not a method but a condition (`advnerf_core.report.conditions`): there is nothing to search.
+
+Names and needs are known without torch: the code of a built-in method is imported when it is first called.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
+
+from pydantic import BaseModel, TypeAdapter, ValidationError
+
+from advnerf_core.errors import AdvnerfError
+from advnerf_core.plugins import (
+    PluginError,
+    code_digest,
+    is_file_reference,
+    known_names,
+    require_known,
+    resolve,
+    unknown,
+)
+from advnerf_core.report.conditions import CONDITIONS
+
+if TYPE_CHECKING:
+    from advnerf_core.attack.problem import AttackProblem
+    from advnerf_core.attack.search.search import OnEvaluation, SearchResult
+
+GROUP = "advnerf.methods"
+_WHAT = "attack method"
+# Names become parts of file names.
+_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
+
+
+class MethodError(AdvnerfError, ValueError):
+    """A method was given options that it does not have."""
+
+
+@dataclass(frozen=True)
+class SearchSettings:
+    """What a search may spend, and how it searches. A method reads what concerns it.
+
+    Attributes:
+        evaluations: Budget: closed-loop drives from all start poses, or as many policy calls as these make.
+        learning_rate: Step of the method's optimiser; None for the method's own default.
+        sigma: Spread of the method's candidates; None for the method's own default.
+        population: Candidates of a generation.
+        cells: Cells along an edge of the coarse textures that a face is searched over; 0 for its own grid.
+        probes: Pairs of textures asked about after each drive; None for the method's own default.
+        warm_pairs: Pairs of a student's first lesson; None for the default.
+        gradient_rate: Step of Adam along a gradient, where neither ``learning_rate`` nor the sensor says another one.
+        random_sigma: Spread of random textures' theta, where neither ``sigma`` nor the sensor says another one.
+        options: What the method alone knows: its `Method.Options`.
+    """
+
+    evaluations: int = 50
+    learning_rate: float | None = None
+    sigma: float | None = None
+    population: int = 10
+    cells: int = 8
+    probes: int | None = None
+    warm_pairs: int | None = None
+    gradient_rate: float = 0.1
+    random_sigma: float = 5.0
+    options: Any = None
+
+
+@dataclass(frozen=True, eq=False)
+class SearchRun:
+    """One run of a search.
+
+    Attributes:
+        seed: Of everything that the search draws.
+        state_path: State file, written after every evaluation; if it exists, the search goes on from it. None keeps none.
+        on_evaluation: Called after every evaluation, when the state is on disk; what it raises ends the search.
+        settings_hash: Hash of scene, policy and configuration; a state file of another one is refused.
+    """
+
+    seed: int = 0
+    state_path: Path | None = None
+    on_evaluation: OnEvaluation | None = None
+    settings_hash: str = ""
+
+
+Search = Callable[["AttackProblem", SearchSettings, SearchRun], "SearchResult"]
+Planned = Callable[["AttackProblem", SearchSettings], int]
+
+
+def _all_evaluations(problem: AttackProblem, settings: SearchSettings) -> int:
+    del problem
+    return settings.evaluations
+
+
+@dataclass(frozen=True)
+class Method:
+    """A method of attack. Its name is that of its row, of its entry point, or of the attribute of its file.
+
+    Attributes:
+        search: ``search(problem, settings, run)`` maximises the total cross-track error of a problem within the budget.
+        needs_gradient: Whether it needs a policy with a gradient; else it asks the policy for answers only.
+        single_images: Whether it asks about images outside a drive, which a policy with a memory cannot answer.
+        reads_scale: Whether it asks the sensor for the scale of theta (`search.gradient_step`, `search.random_spread`), so that it also
+            searches shapes; else theta must be colours.
+        evaluations: ``evaluations(problem, settings)``: how many drives the budget allows it, for the progress.
+        Options: Dataclass or pydantic model of options that only this method has; None if it has none.
+    """
+
+    search: Search
+    needs_gradient: bool = False
+    single_images: bool = False
+    reads_scale: bool = False
+    evaluations: Planned = _all_evaluations
+    Options: type[Any] | None = None
+
+    def __post_init__(self) -> None:
+        own = self.Options
+        if own is None or (isinstance(own, type) and (dataclasses.is_dataclass(own) or issubclass(own, BaseModel))):
+            return
+        raise MethodError(f"expected Options to be a dataclass or a pydantic model, got {own!r:.80}")
+
+    def options(self, written: Mapping[str, Any], key: str = "options") -> Any:
+        """The options as `SearchSettings` carries them.
+
+        Args:
+            written: Keys and values as a user wrote them.
+            key: What stands before each key in messages.
+
+        Raises:
+            MethodError: An unknown key, or a wrong value.
+        """
+        names = _fields_of(self.Options)
+        for name in written:
+            if name not in names:
+                raise MethodError(f"{key}.{name}: {unknown(name, 'option of this method', names)}")
+        if self.Options is None:
+            return None
+        try:
+            return TypeAdapter(self.Options).validate_python(dict(written))
+        except ValidationError as error:
+            first = error.errors(include_url=False)[0]
+            place, message = ".".join(map(str, (key, *first["loc"]))), str(first["msg"]).removeprefix("Value error, ")
+            raise MethodError(f"{place}: {message[:1].lower()}{message[1:]}, got {first['input']!r:.80}") from None
+
+
+def _fields_of(options: type[Any] | None) -> tuple[str, ...]:
+    if options is None:
+        return ()
+    if issubclass(options, BaseModel):
+        return tuple(options.model_fields)
+    return tuple(each.name for each in dataclasses.fields(options))
+
+
+def _late(module: str, function: str = "search") -> Callable[..., Any]:
+    """A function of a module beside the searches, which is imported when the function is first called."""
+
+    def call(*arguments: Any) -> Any:
+        return getattr(import_module(f"advnerf_core.attack.search.{module}"), function)(*arguments)
+
+    return call
+
+
+# In the order of tables. One row and one file in `search/` make a method.
+METHODS: Mapping[str, Method] = MappingProxyType(
+    {
+        "random": Method(_late("random_search"), reads_scale=True),
+        "cem": Method(_late("cem")),
+        "evolution": Method(_late("evolution")),
+        "gradient": Method(_late("gradient"), needs_gradient=True, reads_scale=True),
+        "guided": Method(_late("guided"), single_images=True, evaluations=_late("guided", "evaluations")),
+        "distilled": Method(_late("distilled"), single_images=True, evaluations=_late("distilled", "evaluations")),
+    }
+)
+
+
+def load_method(reference: str, folder: Path | None = None) -> Method:
+    """The method that a reference stands for.
+
+    Args:
+        reference: A built-in name, an entry point's name, or ``file.py:Name``.
+        folder: Folder that a relative ``file.py`` is relative to; the working folder if it is not given.
+
+    Raises:
+        PluginError: There is no such method, its code cannot be loaded, or it is none.
+    """
+    require_method(reference, folder)
+    found: Any = resolve(reference, _WHAT, {name: _row(name) for name in METHODS}, GROUP, folder)
+    if not isinstance(found, Method):
+        raise PluginError(
+            f"{_WHAT} {reference}: expected a Method (advnerf_core/attack/methods.py), got {_described(found)}; see docs/methods.md"
+        )
+    return found
+
+
+def require_method(reference: str, folder: Path | None = None) -> None:
+    """Refuse a reference that stands for no method; nothing is loaded.
+
+    Args:
+        reference: As of `load_method`.
+        folder: As of `load_method`.
+
+    Raises:
+        PluginError: There is no such method, or its name cannot be told from another's.
+    """
+    require_known(reference, _WHAT, METHODS, GROUP, folder)
+    name = method_name(reference)
+    if not _NAME.fullmatch(name):
+        raise PluginError(
+            f"{_WHAT} {reference}: expected a name of letters, digits, - and _, as it becomes part of file names, got {name!r}; rename it"
+        )
+    taken = tuple(dict.fromkeys((*CONDITIONS, *METHODS)))
+    if name in taken and reference not in METHODS:
+        raise PluginError(
+            f"{_WHAT} {reference}: expected a name that no other condition has, got {name} of {', '.join(taken)}; rename it"
+        )
+
+
+def method_name(reference: str) -> str:
+    """What a method is called in tables and file names; of ``file.py:Name`` it is ``Name``. Names stay as they are."""
+    return reference.rpartition(":")[2] if is_file_reference(reference) else reference
+
+
+def method_digest(reference: str) -> str:
+    """Names the code of a user's method: it changes with the file, or with the version of the package. Empty for a built-in one."""
+    return "" if reference in METHODS else code_digest(reference, GROUP)
+
+
+def method_names() -> tuple[str, ...]:
+    """Built-in methods, then those of installed packages."""
+    return known_names(METHODS, GROUP)
+
+
+def black_box_methods(stateless: bool = True) -> tuple[str, ...]:
+    """Built-in methods that ask a policy for its answers only.
+
+    Args:
+        stateless: Whether the policy has no memory.
+    """
+    return tuple(
+        name for name, row in METHODS.items() if not row.needs_gradient and (stateless or not row.single_images)
+    )
+
+
+def alternatives(names: Iterable[str]) -> str:
+    """Names in words: ``a, b or c``."""
+    *first, last = names
+    return f"{', '.join(first)} or {last}" if first else last
+
+
+def _row(name: str) -> Callable[[], Method]:
+    return lambda: METHODS[name]
+
+
+def _described(found: Any) -> str:
+    return f"the class {found.__name__}" if isinstance(found, type) else f"an object of type {type(found).__name__}"

@@ -1,0 +1,81 @@
+"""What an attacked drive is compared by: the conditions, what they are called, and how they are drawn. The one table of both.
+
+A condition says what the objects show: nothing but their own colours (``none``), what a method of attack found (named by the
+method), or a special drive (``empty``, ``laps``). A method that is not in the table is called by its name and gets a spare style, always
+the same one.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+
+NONE = "none"
+
+
+@dataclass(frozen=True)
+class Style:
+    """How a condition is called and drawn.
+
+    Attributes:
+        title: Its name for readers.
+        key: Name of its colour in the palettes, and of the page's CSS variable.
+        light: Colour on a light page, ``#rrggbb``.
+        dark: Colour on a dark page, ``#rrggbb``.
+        marker: Marker of matplotlib.
+        climbs: Whether each evaluation of its search starts from the one before, so that a line joins them; else they are dots.
+    """
+
+    title: str
+    key: str
+    light: str
+    dark: str
+    marker: str
+    climbs: bool = False
+
+
+def _rows(*styles: Style) -> Mapping[str, Style]:
+    return MappingProxyType({style.key: style for style in styles})
+
+
+# In the order of tables and legends.
+CONDITIONS: Mapping[str, Style] = _rows(
+    Style("no attack", NONE, "#0072b2", "#4fb0f2", "o"),
+    Style("best random", "random", "#dd9300", "#f7cc5a", "s"),
+    Style("cross-entropy", "cem", "#7a3f98", "#b884dc", "v"),
+    Style("evolution strategy", "evolution", "#0b8a8f", "#3fd0c9", "P"),
+    Style("gradient", "gradient", "#b0123c", "#f4577a", "^", climbs=True),
+    Style("guided", "guided", "#e0559d", "#ff9fd0", "X", climbs=True),
+    Style("distilled", "distilled", "#7b5234", "#c79a6f", "*", climbs=True),
+    Style("empty scene", "empty", "#7d848d", "#8f98a3", "D"),
+    Style("laps without attack", "laps", "#33407a", "#8793e6", "p"),
+)
+# Of methods that the table does not have; the titles stand for their names.
+SPARE: Mapping[str, Style] = _rows(
+    Style("", "spare-1", "#5c7a00", "#b6d957", "<"),
+    Style("", "spare-2", "#a63d00", "#ff9466", ">"),
+    Style("", "spare-3", "#00587a", "#5fc3e8", "h"),
+    Style("", "spare-4", "#a400a4", "#ec7bec", "d"),
+    Style("", "spare-5", "#8f7a00", "#d8c84a", "H"),
+    Style("", "spare-6", "#4b3fb5", "#a99cff", "8"),
+)
+
+
+def style_of(name: str) -> Style:
+    """The style of a condition; one that is not in the table has its name as title and a spare colour that depends on the name only."""
+    if name in CONDITIONS:
+        return CONDITIONS[name]
+    spare = tuple(SPARE.values())[zlib.crc32(name.encode()) % len(SPARE)]
+    return Style(name, spare.key, spare.light, spare.dark, spare.marker)
+
+
+def order_of(name: str) -> tuple[int, str]:
+    """Sort key of conditions: methods of the table in its order, then other methods by name, then special drives."""
+    names = tuple(CONDITIONS)
+    special = names.index("empty")
+    if name not in CONDITIONS:
+        return special, name
+    place = names.index(name)
+    return (place if place < special else place + 1), name

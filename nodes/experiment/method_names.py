@@ -1,0 +1,34 @@
+"""Names of methods of attack in experiment, campaign and request files: checked where they stand, and absolute for other processes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import AfterValidator, ValidationInfo
+from pydantic_core import PydanticCustomError
+
+from advnerf_core.attack.methods import require_method
+from advnerf_core.plugins import PluginError, absolute_reference
+from advnerf_core.report.conditions import NONE
+from nodes.runtime.config import COMPLETE
+
+
+def _checked(name: str, info: ValidationInfo) -> str:
+    folder = (info.context or {}).get("folder") or Path.cwd()
+    try:
+        require_method(name, folder)
+    except PluginError as error:
+        raise PydanticCustomError(COMPLETE, "{text}", {"text": str(error)}) from None
+    return absolute_reference(name, folder)
+
+
+def _checked_condition(name: str, info: ValidationInfo) -> str:
+    return name if name == NONE else _checked(name, info)
+
+
+MethodReference = Annotated[str, AfterValidator(_checked)]
+"""A method as `advnerf_core.attack.methods.load_method` takes it; ``file.py:Name`` becomes absolute. Nothing is loaded."""
+
+ConditionReference = Annotated[str, AfterValidator(_checked_condition)]
+"""The same, or ``none``."""

@@ -1,0 +1,58 @@
+"""What conditions are called and how they are drawn: the same everywhere, told apart, and the same for a stranger in every process."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+from advnerf_core.report import plots
+from advnerf_core.report.conditions import CONDITIONS, SPARE, order_of, style_of
+from advnerf_core.report.data import LossCurve, ReportData
+from advnerf_core.report.page import render_page
+from advnerf_core.report.palette import DARK, LIGHT
+from advnerf_core.report.tables import transfer_rows, transfer_table
+
+ROOT = Path(__file__).parents[3]
+STYLES = {**CONDITIONS, **SPARE}
+
+
+def test_every_condition_has_a_name_a_marker_and_a_colour_of_its_own():
+    for values in ([s.title for s in CONDITIONS.values()], [s.marker for s in STYLES.values()]):
+        assert len(set(values)) == len(values)
+    for palette in (LIGHT, DARK):
+        assert len({palette[key] for key in STYLES}) == len(STYLES)
+    assert all(LIGHT[key] == style.light and DARK[key] == style.dark for key, style in STYLES.items())
+
+
+def test_a_stranger_is_called_by_its_name_and_keeps_its_colour_in_every_process():
+    style = style_of("Spiral")
+    assert style.title == "Spiral"
+    assert style.key in SPARE
+    assert (style.light, style.dark) == (LIGHT[style.key], DARK[style.key])
+    code = "from advnerf_core.report.conditions import style_of; print(style_of('Spiral').key)"
+    done = subprocess.run(
+        [sys.executable, "-c", code], check=True, capture_output=True, text=True, cwd=ROOT, timeout=60
+    )
+    assert done.stdout.strip() == style.key
+    assert len({style_of(f"method{k}").key for k in range(100)}) == len(SPARE)
+
+
+def test_tables_have_built_in_methods_first_then_strangers_by_name_then_special_drives():
+    names = ["empty", "gradient", "zigzag", "none", "Spiral", "cem", "laps", "distilled", "random"]
+    ordered = ["none", "random", "cem", "gradient", "distilled", "Spiral", "zigzag", "empty", "laps"]
+    assert sorted(names, key=order_of) == ordered
+
+
+def test_a_stranger_appears_in_the_report(make):
+    amplitudes = {"none": 0.05, "Spiral": 0.5, "cem": 0.3, "gradient": 0.6}
+    runs = tuple(make.drive("surrogate", name, amplitude) for name, amplitude in amplitudes.items())
+    curves = (LossCurve("Spiral", 0, [1.0, 3.0, 2.0]), LossCurve("gradient", 0, [1.0, 2.0, 3.0]))
+    data = ReportData(make.settings(), make.scene(), runs, make.manifest(), curves=curves)
+    shown = [row[1] for row in transfer_table(transfer_rows(data)).rows]
+    assert shown == ["no attack", "cross-entropy", "gradient", "Spiral"]
+    legend = [text.get_text() for text in plots.cte_over_time(data, "surrogate").legends[0].get_texts()]
+    assert legend == [f"{name}, surrogate" for name in shown]
+    legend = [text.get_text() for text in plots.loss_curves(data).legends[0].get_texts()]
+    assert legend == ["gradient, one line per seed", "Spiral: each texture, best so far", "no attack, surrogate"]
+    page = render_page(data)
+    assert f"var(--{style_of('Spiral').key})" in page
+    assert "Spiral" in page

@@ -1,0 +1,125 @@
+"""A method that a user brings, in the worker processes of a campaign: named, found, run again when its code changes, alone when it fails."""
+
+import json
+
+import pytest
+import torch
+
+from advnerf_core.report.transfer_page import text_table
+from benchmarks.attack_toy import toy_problem
+from nodes.experiment.campaign.config import load_campaign, select
+from nodes.experiment.campaign.run import Options, run_campaign, statuses
+from nodes.experiment.campaign.table import campaign_table
+from nodes.runtime.errors import ConfigError
+from tests.strangers import install_method, spiral_code, spiral_theta, write_spiral
+
+# Cells that really search, over a closed loop of two ticks.
+SEARCHES = """
+import torch
+from advnerf_core.attack.adjoint import evaluate
+from advnerf_core.attack.methods import SearchRun, SearchSettings, load_method
+from benchmarks.attack_toy import toy_problem
+
+def run_cell(experiment, scenario, victim, method, seed, folder, report):
+    _note(folder, f"begin {scenario}_{victim}_{method}_{seed}")
+    problem = toy_problem(2, dtype=torch.float32)
+    plain = evaluate(problem, problem.sensor.plain_theta())[1].protocol_cte_m.tolist()
+    found, theta = plain, None
+    if method != "none":
+        chosen = load_method(method)
+        settings = SearchSettings(3, population=4, options=chosen.options({}))
+        result = chosen.search(problem, settings, SearchRun(seed))
+        found, theta = list(result.best.protocol_cte_m), result.theta.flatten().tolist()
+    drives = {"total_cte_m": found, "off_track": [False] * len(found), "none_total_cte_m": plain}
+    return {"attack_id": None, "surrogate": drives, "extra": {"theta": theta}}
+"""
+
+
+@pytest.fixture
+def searching(here):
+    module = here.folder / "toy_cells.py"
+    module.write_text(module.read_text() + SEARCHES)
+    write_spiral(here.folder)
+    here.write("seeds: [1]\nmethods: [spiral.py:Spiral, gradient, none]\nvictims: [hardened]\n")
+    return here
+
+
+def run(bench, **options):
+    campaign, said = load_campaign(bench.file), []
+    return run_campaign(campaign, campaign.cells, Options(jobs=2, **options), said.append), said
+
+
+def states(bench):
+    campaign = load_campaign(bench.file)
+    return {each.cell.name: each.state for each in statuses(campaign, campaign.cells)}
+
+
+def test_a_method_of_a_file_runs_in_worker_processes_and_appears_in_the_table(searching, monkeypatch, tmp_path):
+    campaign = load_campaign(searching.file)
+    names = [f"straight_hardened_{method}_1" for method in ("none", "gradient", "Spiral")]
+    assert [cell.name for cell in campaign.cells] == names
+    assert [cell.name for cell in select(campaign.cells, "method=Spiral")] == names[2:]
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    monkeypatch.chdir(elsewhere)  # references are relative to the campaign file
+    ended, _ = run(searching)
+    assert {end.how for end in ended} == {"done"}
+    assert f"begin straight_hardened_{searching.folder / 'spiral.py'}:Spiral_1" in searching.calls
+    result = json.loads((searching.cells / f"{names[2]}.json").read_text())
+    assert result["method"] == "Spiral"
+    shape = toy_problem(2).sensor.theta_shape
+    thetas = [spiral_theta(shape, number, seed=1).flatten() for number in range(3)]
+    found = torch.tensor(result["extra"]["theta"])
+    assert min(float((found - theta).abs().max()) for theta in thetas) < 1e-5
+    table = text_table(campaign_table(campaign, statuses(campaign, campaign.cells)))
+    assert [row[2] for row in table.rows if row[2]] == ["no attack", "gradient", "Spiral"]
+
+
+def test_its_cells_run_again_when_its_code_changes_and_no_others(searching):
+    run(searching)
+    (searching.folder / "spiral.py").write_text(spiral_code().replace("growth: float = 0.2", "growth: float = 0.4"))
+    assert [name for name, state in states(searching).items() if state != "done"] == ["straight_hardened_Spiral_1"]
+    ended, _ = run(searching)
+    assert [(end.name, end.how) for end in ended] == [("straight_hardened_Spiral_1", "done")]
+
+
+def test_a_broken_method_fails_alone_and_in_one_line(searching):
+    (searching.folder / "spiral.py").write_text("turns = 1 / 0\n")
+    ended, _ = run(searching)
+    how = {end.name: (end.how, end.text) for end in ended}
+    state, text = how.pop("straight_hardened_Spiral_1")
+    assert state == "failed"
+    assert "cannot be loaded: ZeroDivisionError: division by zero" in text
+    assert "\n" not in text
+    assert {state for state, _ in how.values()} == {"done"}
+
+
+def test_a_method_of_an_installed_package_runs_in_worker_processes(here, monkeypatch):
+    module = here.folder / "toy_cells.py"
+    module.write_text(module.read_text() + SEARCHES)
+    install_method(here.folder, monkeypatch, spiral_code())
+    here.write("seeds: [0]\nmethods: [spiral]\nvictims: [hardened]\n")
+    ended, _ = run(here)
+    assert [(end.name, end.how) for end in ended] == [("straight_hardened_spiral_0", "done")]
+
+
+@pytest.mark.parametrize(
+    ("methods", "says"),
+    [
+        (
+            "[none, spirel.py:Spiral]",
+            r"toy.campaign.yaml:4: methods.1: attack method spirel.py:Spiral: expected a Python file at",
+        ),
+        (
+            "[none, spiral]",
+            r":4: methods.1: expected an attack method of random, .*; got 'spiral'; one of your own is file.py:Name",
+        ),
+        ("[spiral.py:Spiral, other.py:Spiral]", "every one of methods once"),
+        ("[spiral.py:cem]", "expected a name that no other condition has, got cem"),
+    ],
+)
+def test_what_cannot_be_is_told_with_its_line(searching, methods, says):
+    (searching.folder / "other.py").write_text(spiral_code())
+    searching.write(f"seeds: [0]\nmethods: {methods}\nvictims: [hardened]\n")
+    with pytest.raises(ConfigError, match=says):
+        load_campaign(searching.file)
