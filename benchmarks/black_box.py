@@ -61,7 +61,8 @@ def make_problem(folder: Path, steps: int) -> AttackProblem:
     """The experiment's own attack: its face where its attack files have it, its starts of seed 0, over fewer ticks."""
     attack = load_attack(folder / "attack" / "hardened_gradient_0.attack.safetensors")
     plain = json.loads((folder / "manifest.json").read_text())["config"]["object"]["plain_rgb"]
-    face = cube_face_object(attack.size_m[0], attack.theta.shape[0], tuple(plain), attack.T_world_from_object)
+    shown, carrier = attack.required_face(), attack.face_object
+    face = cube_face_object(shown.size_m[0], carrier.theta.shape[0], tuple(plain), carrier.T_world_from_object)
     problem = lab_problem(folder, [face], steps, time_batch=16, cache_bytes=512 * 2**20)
     nominal = tuple(problem.start_states[0].tolist())
     starts = draw_start_states((nominal[0], nominal[1], nominal[2]), STARTS, 0.1, 0)
@@ -143,7 +144,8 @@ def about(folder: Path, steps: int) -> str:
     """Short hash of the victim, the scene, the attacked face and the ticks: another one has a folder of its own."""
     attack = load_attack(folder / "attack" / "hardened_gradient_0.attack.safetensors")
     policy = load_policy(folder / "policy" / "policy.safetensors")
-    told = [policy.sha256, attack.scene_sha256, attack.T_world_from_object.tolist(), list(attack.size_m), steps]
+    pose, size_m = attack.face_object.T_world_from_object, attack.required_face().size_m
+    told = [policy.sha256, attack.scene_sha256, pose.tolist(), list(size_m), steps]
     return hashlib.sha256(json.dumps(told).encode()).hexdigest()[:8]
 
 

@@ -150,7 +150,7 @@ def attack_reader(folder: Path) -> tuple[Sequence[bytes], Callable[[bytes], None
 
     theta = np.zeros((2, 2, 3), np.float32)
     corners = np.array([[0.0, 0.4, 0.4], [0.0, -0.4, 0.4], [0.0, -0.4, -0.4], [0.0, 0.4, -0.4]])
-    attack = AttackFile(
+    attack = AttackFile.of_face(
         method="gradient", theta=theta, texture=face_texture(theta, 4), size_m=(0.8, 0.8), T_world_from_object=np.eye(4),
         subject="board", corners_in_subject=corners, camera=Pinhole(200, 66, 103.6, 103.4, 100, 32),
         scene_sha256="a" * 64, policy_sha256="b" * 64, config_sha256="c" * 64, seed=3, predicted_total_cte_m=9.25,

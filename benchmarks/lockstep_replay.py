@@ -44,7 +44,7 @@ def make_bag(folder: Path, seconds: int) -> Path:
     target = load_calibration(TargetCalibration, CALIBRATION / "board.yaml")
     T_world_from_board = make_transform(rotation_z(np.pi), [3.0, 0.0, 0.5])
     theta = np.random.default_rng(0).normal(size=(8, 8, 3)).astype(np.float32)
-    attack = AttackFile(
+    attack = AttackFile.of_face(
         method="gradient", theta=theta, texture=face_texture(theta, 256), size_m=(1.0, 1.0),
         T_world_from_object=T_world_from_board, subject="board", corners_in_subject=target.corners, camera=camera.pinhole,
         scene_sha256="", policy_sha256="", config_sha256="", seed=0, predicted_total_cte_m=1.0, software_version="0",

@@ -86,15 +86,16 @@ def make_panel(
 
 def require_fits(attack: AttackFile, panel: Panel, target: TargetCalibration) -> None:
     """Refuse an attack that this panel cannot show as it was computed: another carrier, too large, or off the centre."""
-    if not attack.has_face or attack.subject != target.subject:
-        what = f"for {attack.subject}" if attack.has_face else "without a face"
+    face = attack.face
+    if face is None or face.subject != target.subject:
+        what = f"for {face.subject}" if face is not None else "without a face"
         raise CalibrationError(f"attack {attack.attack_id} is {what}, but this is {target.subject}: search one for it")
-    if max(attack.size_m) > panel.square_m * (1.0 + _FIT_TOLERANCE):
+    if max(face.size_m) > panel.square_m * (1.0 + _FIT_TOLERANCE):
         raise CalibrationError(
-            f"attack {attack.attack_id} is {attack.size_m[0]:.3f} x {attack.size_m[1]:.3f} m, more than the {panel.square_m:.3f} m of "
+            f"attack {attack.attack_id} is {face.size_m[0]:.3f} x {face.size_m[1]:.3f} m, more than the {panel.square_m:.3f} m of "
             f"the centre square of {target.subject}: search one with size_m: {panel.square_m:.3f}"
         )
-    off_m = float(np.linalg.norm(attack.corners_in_subject.mean(axis=0) - target.corners.mean(axis=0)))
+    off_m = float(np.linalg.norm(face.corners_in_subject.mean(axis=0) - target.corners.mean(axis=0)))
     if off_m > _CENTRE_TOLERANCE_M:
         raise CalibrationError(
             f"attack {attack.attack_id} has its face {100 * off_m:.1f} cm from the middle of {target.subject}; only the centre square "

@@ -80,13 +80,12 @@ def misplacement(attack: AttackFile, target: TargetCalibration, T_world_from_sub
     Raises:
         CalibrationError: The attack is for something else.
     """
-    if not attack.has_face or attack.subject != target.subject:
-        raise CalibrationError(
-            f"attack {attack.attack_id} is for {attack.subject or 'nothing that can be shown'}, the target is {target.subject}"
-        )
+    if attack.face is None or attack.face.subject != target.subject:
+        subject = "nothing that can be shown" if attack.face is None else attack.face.subject
+        raise CalibrationError(f"attack {attack.attack_id} is for {subject}, the target is {target.subject}")
     # As computed: the object's own frame has the face's axes, and its corners say nothing about the world.
     now = T_world_from_subject @ face_frame(target.corners)
-    off = invert_transform(np.asarray(attack.T_world_from_object)) @ now
+    off = invert_transform(np.asarray(attack.face_object.T_world_from_object)) @ now
     x_axis, z_axis = off[:3, 0], off[:3, 2]
     return Misplacement(
         right_m=float(off[1, 3]), up_m=float(off[2, 3]), near_m=float(off[0, 3]),

@@ -275,16 +275,17 @@ class CompositorNode(Node):
 
 
 def show(attack: AttackFile, camera: CameraCalibration, target: TargetCalibration, supersample: int = 2) -> Showing:
-    """Prepare an attack for a camera and a face; a face of another size or subject is refused."""
+    """Prepare an attack for a camera and a face; one without a face, or of another size or subject, is refused."""
+    face = attack.required_face()
     corners = target.corners
     size_m = (np.linalg.norm(corners[1] - corners[0]), np.linalg.norm(corners[3] - corners[0]))
-    wrong_size = any(abs(got / want - 1.0) > _SIZE_TOLERANCE for got, want in zip(size_m, attack.size_m, strict=True))
-    if wrong_size or attack.subject != target.subject:
+    wrong_size = any(abs(got / want - 1.0) > _SIZE_TOLERANCE for got, want in zip(size_m, face.size_m, strict=True))
+    if wrong_size or face.subject != target.subject:
         raise ConfigError(
-            f"attack {attack.attack_id} was made for {attack.subject}, {attack.size_m[0]:.2f} x {attack.size_m[1]:.2f} m, but the "
+            f"attack {attack.attack_id} was made for {face.subject}, {face.size_m[0]:.2f} x {face.size_m[1]:.2f} m, but the "
             f"target is {target.subject}, {size_m[0]:.2f} x {size_m[1]:.2f} m; name the target it was made for"
         )
-    overlay = FaceOverlay(attack.texture, corners, camera.pinhole, camera.distortion, supersample)
+    overlay = FaceOverlay(face.texture, corners, camera.pinhole, camera.distortion, supersample)
     return Showing(attack.attack_id, overlay, camera.mount, target.subject)
 
 

@@ -256,10 +256,11 @@ class MonitorNode(Node):
         return [Out("/monitor/attack", label), Out("/monitor/shown", shown)]
 
     def _load(self, attack: AttackFile | None, sha256: str = "") -> None:
-        size = (self._face_m, self._face_m) if attack is None else attack.size_m
+        face = None if attack is None else attack.required_face()
+        size = (self._face_m, self._face_m) if face is None else face.size_m
         self._pictures = {False: self._panel.picture(self._plain, size)}
-        if attack is not None:
-            self._pictures[True] = self._panel.picture(attack.texture, size)
+        if face is not None:
+            self._pictures[True] = self._panel.picture(face.texture, size)
         self._attack, self._attack_sha256 = attack, sha256
         self._reason = "" if attack else "no attack file"
         self._put(False)

@@ -23,10 +23,13 @@ from safetensors.numpy import load, save
 from advnerf_core.driving.clean_drive import CleanDrive
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.files import with_sorted_header, write_atomically
-from advnerf_core.geometry import Array, Pinhole
+from advnerf_core.geometry import Array, Pinhole, yaw_of
 
-FILE_FORMAT = "advnerf-attack-1"
+FILE_FORMAT = "advnerf-attack-2"
 TEXTURE_PX = 512
+
+# What a search changed.
+COLOURS, PLACES, MESH_TEXTURE, MESH_SHAPE = "colours", "places", "mesh_texture", "mesh_shape"
 
 
 class AttackFileError(AdvnerfError, ValueError):
@@ -35,14 +38,16 @@ class AttackFileError(AdvnerfError, ValueError):
 
 @dataclass(frozen=True, eq=False)
 class AttackedObject:
-    """One of several objects of an attack, or one without a face that could be displayed.
+    """One object of an attack, as the attack found it.
 
     Attributes:
         name: What it is, e.g. ``hydrant.object`` or ``face``.
-        theta: Its free colours before squashing, ``[..., 3]`` float32.
+        theta: What was found for it, ``[..., 3]`` float32: colours before squashing; of an attack on shapes the search's parameters of
+            each vertex ``[V, 3]``.
         T_world_from_object: Its pose, ``[4, 4]``.
         scale: World metres per object unit.
         sha256: Hash of its geometry and fixed colours.
+        glb: Of a mesh, the found mesh as a binary glTF file, in the object's frame; empty for other objects.
     """
 
     name: str
@@ -50,28 +55,62 @@ class AttackedObject:
     T_world_from_object: Array
     scale: float
     sha256: str
+    glb: bytes = b""
+
+    @property
+    def placement(self) -> tuple[float, float, float, float]:
+        """Where it stands: x [m], y [m], yaw [rad] and scale."""
+        T = np.asarray(self.T_world_from_object)
+        return float(T[0, 3]), float(T[1, 3]), yaw_of(T), float(self.scale)
 
     def __post_init__(self) -> None:
         if self.theta.ndim < 2 or self.theta.shape[-1] != 3 or self.theta.dtype != np.float32:
             raise AttackFileError(f"expected theta [..., 3] float32, got {self.theta.shape} {self.theta.dtype}")
+        if np.shape(self.T_world_from_object) != (4, 4):
+            raise AttackFileError(f"expected a pose [4, 4] of {self.name}, got {np.shape(self.T_world_from_object)}")
         if not (np.isfinite(self.theta).all() and np.isfinite(self.T_world_from_object).all()):
             raise AttackFileError(f"expected finite colours and a finite pose of {self.name}, got some that are not")
 
 
 @dataclass(frozen=True, eq=False)
-class AttackFile:
-    """An attack, ready to be shown.
+class Face:
+    """The face of an object that a projection or a display can show.
 
     Attributes:
-        method: Name of the method that found the texture; ``none`` is the plain object.
-        theta: Colour grid before squashing, ``[N, N, 3]`` float32; row 0 on top, column 0 left for the viewer. Empty if no object
-            has a face that can be displayed.
-        texture: The face as it is displayed, ``[H, W, 3]`` uint8 sRGB; empty like ``theta``.
-        size_m: Width and height of the face [m].
-        T_world_from_object: Pose of the object when it was attacked, ``[4, 4]``.
+        texture: The face as it is displayed, ``[H, W, 3]`` uint8 sRGB.
+        size_m: Width and height [m].
         subject: Motion-capture subject that carries the face.
-        corners_in_subject: Corners ``[4, 3]`` of the face in the subject's frame: top left, top right, bottom right, bottom
-            left for the viewer [m].
+        corners_in_subject: Corners ``[4, 3]`` in the subject's frame: top left, top right, bottom right, bottom left for the viewer [m].
+        carried_by: Number of the object that carries it; its theta is the colour grid ``[N, N, 3]``, row 0 on top, column 0 left for the viewer.
+    """
+
+    texture: NDArray[np.uint8]
+    size_m: tuple[float, float]
+    subject: str
+    corners_in_subject: Array
+    carried_by: int = 0
+
+    def __post_init__(self) -> None:
+        if (
+            self.texture.ndim != 3
+            or self.texture.shape[2] != 3
+            or self.texture.dtype != np.uint8
+            or not self.texture.size
+        ):
+            raise AttackFileError(f"expected a texture [H, W, 3] uint8, got {self.texture.shape} {self.texture.dtype}")
+        if np.shape(self.corners_in_subject) != (4, 3) or not np.isfinite(self.corners_in_subject).all():
+            raise AttackFileError("expected four finite corners [4, 3] of the face, got others")
+
+
+@dataclass(frozen=True, eq=False)
+class AttackFile:
+    """An attack, whatever was searched, ready to be shown.
+
+    Attributes:
+        method: Name of the method that found it; ``none`` is the plain object.
+        space: What was searched: ``colours``, ``places`` (with or without colours), ``mesh_texture``, ``mesh_shape``, or a user's own.
+        objects: The objects as they were found, at least one.
+        face: The face that a projection or a display shows; None if no object has one.
         camera: Intrinsics of the images the policy saw during the attack.
         scene_sha256: Hash of the scene the attack was computed in.
         policy_sha256: Hash of the victim.
@@ -81,16 +120,12 @@ class AttackFile:
         software_version: Version of advnerf that wrote the file.
         clean_drive: The victim's drive without an attack, from the same starts in the same scene; None if it was not driven.
         extra: Anything else worth keeping, as plain data.
-        objects: All objects with their colours, where there is more to them than the one face.
     """
 
     method: str
-    theta: NDArray[np.float32]
-    texture: NDArray[np.uint8]
-    size_m: tuple[float, float]
-    T_world_from_object: Array
-    subject: str
-    corners_in_subject: Array
+    space: str
+    objects: tuple[AttackedObject, ...]
+    face: Face | None
     camera: Pinhole
     scene_sha256: str
     policy_sha256: str
@@ -100,20 +135,53 @@ class AttackFile:
     software_version: str
     clean_drive: CleanDrive | None = None
     extra: dict[str, Any] = field(default_factory=dict)
-    objects: tuple[AttackedObject, ...] = ()
 
     def __post_init__(self) -> None:
-        if not self.method or not isinstance(self.method, str):
-            raise AttackFileError(f"expected the name of a method, got {self.method!r}")
-        if self.theta.ndim != 3 or self.theta.shape[2] != 3 or self.theta.dtype != np.float32:
-            raise AttackFileError(f"expected theta [N, N, 3] float32, got {self.theta.shape} {self.theta.dtype}")
-        if self.texture.ndim != 3 or self.texture.shape[2] != 3 or self.texture.dtype != np.uint8:
-            raise AttackFileError(f"expected a texture [H, W, 3] uint8, got {self.texture.shape} {self.texture.dtype}")
-        numbers = (self.theta, self.T_world_from_object, self.corners_in_subject)
-        if np.shape(self.corners_in_subject) != (4, 3) or np.shape(self.T_world_from_object) != (4, 4):
-            raise AttackFileError("expected corners [4, 3] and a pose [4, 4]")
-        if not all(np.isfinite(part).all() for part in numbers):
-            raise AttackFileError("expected finite colours, corners and pose, got some that are not")
+        for name in ("method", "space"):
+            value = getattr(self, name)
+            if not isinstance(value, str) or not value:
+                raise AttackFileError(f"expected the name of a {name}, got {value!r}")
+        if not self.objects:
+            raise AttackFileError("expected at least one object, got none")
+        if self.face is not None:
+            if not 0 <= self.face.carried_by < len(self.objects):
+                raise AttackFileError(
+                    f"expected a face of object 0 to {len(self.objects) - 1}, got {self.face.carried_by}"
+                )
+            if self.face_object.theta.ndim != 3:
+                raise AttackFileError(f"expected theta [N, N, 3] of the face, got {self.face_object.theta.shape}")
+
+    @classmethod
+    def of_face(
+        cls,
+        *,
+        theta: NDArray[np.float32],
+        size_m: tuple[float, float],
+        subject: str,
+        corners_in_subject: Array,
+        T_world_from_object: Array,
+        texture: NDArray[np.uint8] | None = None,
+        name: str = "face",
+        sha256: str = "",
+        **others: Any,
+    ) -> AttackFile:
+        """The attack file of one face.
+
+        Args:
+            theta: Colour grid before squashing ``[N, N, 3]`` float32.
+            size_m: Width and height of the face [m].
+            subject: Motion-capture subject that carries it.
+            corners_in_subject: As of `Face`, ``[4, 3]`` [m].
+            T_world_from_object: Its pose ``[4, 4]``.
+            texture: The face as it is displayed; made of ``theta`` if it is not given.
+            name: What it is called.
+            sha256: Hash of its geometry.
+            others: The other attributes of an attack file.
+        """
+        carrier = AttackedObject(name, theta, T_world_from_object, 1.0, sha256)
+        shown = face_texture(theta) if texture is None else texture
+        face = Face(shown, size_m, subject, corners_in_subject)
+        return cls(space=COLOURS, objects=(carrier,), face=face, **others)
 
     @cached_property
     def sha256(self) -> str:
@@ -125,29 +193,48 @@ class AttackFile:
         return digest.hexdigest()
 
     @property
-    def has_face(self) -> bool:
-        """Whether there is a face that a projection or a display can show."""
-        return self.texture.size > 0
-
-    @property
     def attack_id(self) -> str:
         """Short hash that names this attack everywhere."""
         return self.sha256[:12]
 
+    @property
+    def face_object(self) -> AttackedObject:
+        """The object that carries the face.
+
+        Raises:
+            AttackFileError: The attack has no face.
+        """
+        return self.objects[self.required_face().carried_by]
+
+    def required_face(self) -> Face:
+        """The face, for a projection or a display.
+
+        Raises:
+            AttackFileError: The attack has none.
+        """
+        if self.face is None:
+            names = ", ".join(each.name for each in self.objects)
+            raise AttackFileError(
+                f"expected an attack with a face that can be shown, got one on the {self.space} of {names}; search one for a face"
+            )
+        return self.face
+
     def _tensors(self) -> dict[str, NDArray[Any]]:
-        others = {f"objects.{k}.theta": np.ascontiguousarray(each.theta) for k, each in enumerate(self.objects)}
-        return {"theta": np.ascontiguousarray(self.theta), "texture": np.ascontiguousarray(self.texture), **others}
+        found: dict[str, NDArray[Any]] = {}
+        for k, each in enumerate(self.objects):
+            found[f"objects.{k}.theta"] = np.ascontiguousarray(each.theta)
+            if each.glb:
+                found[f"objects.{k}.glb"] = np.frombuffer(each.glb, np.uint8)
+        if self.face is not None:
+            found["face.texture"] = np.ascontiguousarray(self.face.texture)
+        return found
 
     def _metadata(self) -> dict[str, Any]:
-        # Left out when there are none: a file with one face, or without a drive, keeps its hash.
-        clean = {"clean_drive": self.clean_drive.to_dict()} if self.clean_drive is not None else {}
-        objects = {"objects": [_object_metadata(each) for each in self.objects]} if self.objects else {}
         return {
             "method": self.method,
-            "size_m": [float(v) for v in self.size_m],
-            "T_world_from_object": np.asarray(self.T_world_from_object, dtype=np.float64).tolist(),
-            "subject": self.subject,
-            "corners_in_subject": np.asarray(self.corners_in_subject, dtype=np.float64).tolist(),
+            "space": self.space,
+            "objects": [_object_metadata(each) for each in self.objects],
+            "face": None if self.face is None else _face_metadata(self.face),
             "camera": vars(self.camera) | {},
             "scene_sha256": self.scene_sha256,
             "policy_sha256": self.policy_sha256,
@@ -155,15 +242,23 @@ class AttackFile:
             "seed": int(self.seed),
             "predicted_total_cte_m": self.predicted_total_cte_m,
             "software_version": self.software_version,
+            "clean_drive": None if self.clean_drive is None else self.clean_drive.to_dict(),
             "extra": self.extra,
-            **clean,
-            **objects,
         }
 
 
 def _object_metadata(each: AttackedObject) -> dict[str, Any]:
     pose = np.asarray(each.T_world_from_object, dtype=np.float64).tolist()
     return {"name": each.name, "T_world_from_object": pose, "scale": float(each.scale), "sha256": each.sha256}
+
+
+def _face_metadata(face: Face) -> dict[str, Any]:
+    return {
+        "size_m": [float(v) for v in face.size_m],
+        "subject": face.subject,
+        "corners_in_subject": np.asarray(face.corners_in_subject, dtype=np.float64).tolist(),
+        "carried_by": int(face.carried_by),
+    }
 
 
 def face_texture(theta: ArrayLike, size_px: int = TEXTURE_PX) -> NDArray[np.uint8]:
@@ -232,11 +327,8 @@ def _checked(header: dict[str, Any], tensors: dict[str, NDArray[Any]], source: s
 def _from_parts(metadata: dict[str, Any], tensors: dict[str, NDArray[Any]]) -> AttackFile:
     values = dict(metadata)
     values["camera"] = Pinhole(**values["camera"])
-    values["size_m"] = tuple(values["size_m"])
-    values["T_world_from_object"] = np.array(values["T_world_from_object"])
-    values["corners_in_subject"] = np.array(values["corners_in_subject"])
-    if "clean_drive" in values:
-        values["clean_drive"] = CleanDrive.from_dict(values["clean_drive"])
+    clean, face = values["clean_drive"], values["face"]
+    values["clean_drive"] = None if clean is None else CleanDrive.from_dict(clean)
     values["objects"] = tuple(
         AttackedObject(
             each["name"],
@@ -244,10 +336,16 @@ def _from_parts(metadata: dict[str, Any], tensors: dict[str, NDArray[Any]]) -> A
             np.array(each["T_world_from_object"]),
             each["scale"],
             each["sha256"],
+            tensors[f"objects.{k}.glb"].tobytes() if f"objects.{k}.glb" in tensors else b"",
         )
-        for k, each in enumerate(values.get("objects", ()))
+        for k, each in enumerate(values["objects"])
     )
-    return AttackFile(theta=tensors["theta"], texture=tensors["texture"], **values)
+    if face is not None:
+        corners = np.array(face["corners_in_subject"])
+        values["face"] = Face(
+            tensors["face.texture"], tuple(face["size_m"]), face["subject"], corners, face["carried_by"]
+        )
+    return AttackFile(**values)
 
 
 def _canonical(data: Any) -> str:

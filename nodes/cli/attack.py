@@ -61,43 +61,48 @@ def _run(folder: Path, request: object) -> None:
 @app.command("show")
 def attack_show(
     file: Annotated[Path, typer.Argument(help="An attack file.", dir_okay=False)],
-    texture: Annotated[
+    output: Annotated[
         Path | None,
-        typer.Option("--texture", help="Write the displayed texture here (PNG).", show_default="beside FILE"),
+        typer.Option("--output", "-o", help="Folder of the pictures and meshes.", show_default="beside FILE"),
     ] = None,
 ) -> None:
-    """Say what an attack file holds, and write its texture as an image."""
-    import cv2
-
+    """Say what an attack file holds; write the face's texture as PNG and found meshes as GLB."""
     from advnerf_core.attack.artifact import load_attack
-    from advnerf_core.files import write_atomically
+    from nodes.experiment.request.printed import export_attack
 
     attack = load_attack(file)
-    total, clean = attack.predicted_total_cte_m, attack.clean_drive
+    total, clean, face = attack.predicted_total_cte_m, attack.clean_drive, attack.face
     rows = table("what", "value")
     for name, value in {
-        "attack id": attack.attack_id, "method": attack.method, "seed": attack.seed,
+        "attack id": attack.attack_id,
+        "method": attack.method,
+        "searched": attack.space.replace("_", " "),
+        "seed": attack.seed,
         "predicted total CTE": "unknown" if total is None else f"{total:.2f} m",
-        "drive without attack": "not driven" if clean is None else clean.in_words.removeprefix("drive without attack: "),
+        "drive without attack": "not driven"
+        if clean is None
+        else clean.in_words.removeprefix("drive without attack: "),
         **({} if clean is None else {"of each start": ", ".join(f"{value:.2f} m" for value in clean.total_cte_m)}),
-        "face": f"{attack.size_m[0]:.3f} x {attack.size_m[1]:.3f} m on {attack.subject}" if attack.has_face else "none",
-        "theta": " x ".join(map(str, attack.theta.shape)),
-        "position": ", ".join(f"{v:.3f}" for v in attack.T_world_from_object[:3, 3]) + " m",
-        "camera": f"{attack.camera.width} x {attack.camera.height}", "scene": attack.scene_sha256,
-        "policy": attack.policy_sha256, "config": attack.config_sha256, "software": attack.software_version,
-        **{f"object {k}": f"{o.name}, {o.theta.size} values" for k, o in enumerate(attack.objects)},
+        "face": "none" if face is None else f"{face.size_m[0]:.3f} x {face.size_m[1]:.3f} m on {face.subject}",
+        "camera": f"{attack.camera.width} x {attack.camera.height}",
+        "scene": attack.scene_sha256,
+        "policy": attack.policy_sha256,
+        "config": attack.config_sha256,
+        "software": attack.software_version,
         **{key: str(value) for key, value in attack.extra.items()},
-    }.items():  # fmt: skip
+    }.items():
         rows.add_row(name, str(value))
     print_table(rows)
+    things = table("object", "searched values", "x [m]", "y [m]", "z [m]", "yaw [rad]", "scale")
+    for each in attack.objects:
+        x_m, y_m, yaw_rad, scale = each.placement
+        place = (x_m, y_m, float(each.T_world_from_object[2, 3]), yaw_rad, scale)
+        things.add_row(each.name, " x ".join(map(str, each.theta.shape)), *(f"{value:.3f}" for value in place))
+    print_table(things)
     if clean is not None and clean.warning:
         print(clean.warning)
-    if attack.has_face:
-        path = texture or file.with_name(
-            file.name.removesuffix(".safetensors").removesuffix(".attack") + ".texture.png"
-        )
-        write_atomically(path, cv2.imencode(".png", attack.texture[..., ::-1])[1].tobytes())
-        print(f"texture: {path}")
+    for path in export_attack(attack, output or file.parent, file.name.partition(".")[0]):
+        print(f"written: {path}")
 
 
 @app.command("check")

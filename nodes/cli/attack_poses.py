@@ -37,9 +37,9 @@ def attack_poses(file: RequestFile, output: Output = None, overrides: Overrides 
     rows = table("attack", "object", "x [m]", "y [m]", "yaw [rad]", "scale", "predicted total CTE [m]")
     for each in files:
         attack = load_attack(each)
-        for k, place in enumerate(attack.extra["placements"]):
+        for k, found in enumerate(attack.objects):
             total = f"{attack.predicted_total_cte_m:.1f}" if k == 0 else ""
-            rows.add_row(attack.attack_id if k == 0 else "", str(k), *(f"{v:.3f}" for v in place), total)
+            rows.add_row(attack.attack_id if k == 0 else "", str(k), *(f"{v:.3f}" for v in found.placement), total)
     print_table(rows)
     print_attacks(files)
 

@@ -289,5 +289,5 @@ def restore(
         print(campaign.folder / "cells" / f"{name}.json")
     print(
         f"{len(found.taken)} cells taken back, {len(found.there)} were there, {len(found.other)} were made with other settings, scenes or "
-        f"policies than are there, {len(found.incomplete)} are kept without what their maps and films need, {len(found.missing)} are not published"
+        f"policies than are there, {len(found.missing)} are not published"
     )

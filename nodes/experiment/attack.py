@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from advnerf_core.attack.adjoint import AttackProblem, evaluate
-from advnerf_core.attack.artifact import AttackFile, face_texture, save_attack
+from advnerf_core.attack.artifact import AttackFile, save_attack
 from advnerf_core.attack.clean import clean_drive
 from advnerf_core.attack.methods import Method, SearchRun, SearchSettings, load_method
 from advnerf_core.attack.search.search import SearchResult, draw_start_states
@@ -25,6 +25,7 @@ from nodes.experiment.context import Experiment
 from nodes.experiment.learned_scene import load_background, scene_sha256
 from nodes.experiment.objects import attacked_object, surrogate_of
 from nodes.experiment.policy import HARDENED, NAIVE, victim_file
+from nodes.experiment.request.objects import object_sha256
 from nodes.experiment.request.telling import telling
 from nodes.experiment.screen import shown
 from nodes.experiment.stages import hash_of
@@ -199,10 +200,10 @@ def plain_theta(sensor: Surrogate | DisplayedSensor) -> torch.Tensor:
 def _attack_file(
     experiment: Experiment, policy: LoadedPolicy, search: Search, result: SearchResult, clean: CleanDrive
 ) -> AttackFile:
-    theta = result.theta.numpy().astype(np.float32)
-    return AttackFile(
-        method=search.method, theta=theta, texture=face_texture(theta), size_m=(experiment.face_m, experiment.face_m),
-        T_world_from_object=np.asarray(attacked_object(experiment).T_world_from_object),
+    theta, field = result.theta.numpy().astype(np.float32), attacked_object(experiment)
+    return AttackFile.of_face(
+        method=search.method, theta=theta, size_m=(experiment.face_m, experiment.face_m),
+        T_world_from_object=np.asarray(field.T_world_from_object), sha256=object_sha256(field),
         subject=experiment.target.subject, corners_in_subject=experiment.target.corners,
         camera=experiment.view.pinhole, scene_sha256=scene_sha256(experiment), policy_sha256=policy.sha256,
         config_sha256=hash_of(experiment.config.model_dump(mode="json")), seed=search.seed,

@@ -102,7 +102,7 @@ def attacked(experiment: Experiment, scenario: str, victim: str, method: str, se
         drawn, _ = overlay.draw(rgb, invert_transform(car @ experiment.camera.mount) @ T_world_from_subject)
         real.append(experiment.view.image(drawn))
     sensor = attack.sensor_of(experiment, surrogate_of(experiment, [attacked_object(experiment)]))
-    theta = torch.from_numpy(np.array(found.theta))
+    theta = torch.from_numpy(np.array(found.face_object.theta))
     return Pictures("driven bag, attacked", np.stack(real), _learned(sensor, cars @ experiment.camera.mount, theta))
 
 
@@ -111,7 +111,7 @@ def loop(
 ) -> tuple[AttackProblem, Callable[[torch.Tensor, bool], torch.Tensor], torch.Tensor, Horizon]:
     """What a prediction drives: the problem, pictures with or without the attack, the deployed starts ``[S, n]`` and the horizon."""
     del scenario
-    theta = torch.from_numpy(np.array(attack_file(experiment, victim, method, seed, folder).theta))
+    theta = torch.from_numpy(np.array(attack_file(experiment, victim, method, seed, folder).face_object.theta))
     background = load_background(experiment)
     bare = surrogate_of(experiment, [], background)
     sensor = attack.sensor_of(experiment, surrogate_of(experiment, [attacked_object(experiment)], background))
@@ -125,10 +125,10 @@ def loop(
 
 
 def _overlay(experiment: Experiment, found: AttackFile) -> FaceOverlay:
-    texture = found.texture
+    texture = found.required_face().texture
     if experiment.shown_on_monitor:
         sensor = shown(experiment, surrogate_of(experiment, [attacked_object(experiment)]))
-        texture = face_texture(sensor.seen_theta(torch.from_numpy(np.array(found.theta))).numpy())
+        texture = face_texture(sensor.seen_theta(torch.from_numpy(np.array(found.face_object.theta))).numpy())
     return FaceOverlay(texture, experiment.target.corners, experiment.camera.pinhole, experiment.camera.distortion)
 
 

@@ -152,7 +152,7 @@ def _textures(experiment: Experiment) -> Iterator[rd.Texture]:
         label = f"{search.method}, seed {search.seed}" + (
             "" if search.victim == HARDENED else f", {search.victim} victim"
         )
-        yield rd.Texture(label, search.method, attack.texture, attack.attack_id, search.seed, search.victim)  # type: ignore[arg-type]
+        yield rd.Texture(label, search.method, attack.required_face().texture, attack.attack_id, search.seed, search.victim)  # type: ignore[arg-type]
 
 
 def _fidelity(experiment: Experiment) -> rd.Fidelity:
@@ -236,7 +236,7 @@ def _surrogate_track(experiment: Experiment, seed: int) -> ClipTrack:
     surrogate.camera = experiment.camera.pinhole
     sensor = sensor_of(experiment, surrogate)
     poses = planar_poses(states) @ experiment.camera.mount
-    images = [sensor.render(pose[None], torch.from_numpy(attack.theta)).images[0] for pose in poses]
+    images = [sensor.render(pose[None], torch.from_numpy(attack.face_object.theta)).images[0] for pose in poses]
     frames = [as_uint8(image) for image in images]
     cte_m = experiment.path.project(states[:, :2]).cte_m
     return ClipTrack("learned scene, attacked", "gradient", frames, cte_m, attack.attack_id)

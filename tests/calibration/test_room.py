@@ -116,7 +116,7 @@ def test_wrong_touches_are_refused_with_what_to_do():
 
 def attack(T, size=1.0, subject="board"):
     theta = np.zeros((4, 4, 3), np.float32)
-    return AttackFile(
+    return AttackFile.of_face(
         method="random", theta=theta, texture=face_texture(theta, 8), size_m=(size, size), T_world_from_object=T,
         subject=subject, corners_in_subject=np.zeros((4, 3)), camera=Pinhole(200, 66, 103.6, 103.4, 100, 32),
         scene_sha256="", policy_sha256="", config_sha256="", seed=0, predicted_total_cte_m=None, software_version="0",

@@ -298,7 +298,7 @@ def test_a_killed_node_goes_on_and_a_running_compositor_takes_the_attack_over(tm
         assert sorted(set(ids)) == ["", direct.attack_id]
         assert ids == sorted(ids)
         assert car.labels[-1].drawn
-        np.testing.assert_array_equal(direct.theta, whole.theta)
+        np.testing.assert_array_equal(direct.face_object.theta, whole.face_object.theta)
         end(attack)
         end(compositor)
     finally:

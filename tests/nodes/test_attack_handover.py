@@ -28,7 +28,7 @@ INPUTS = ("/camera/image_raw", "/vicon/car", "/vicon/board", "/attack/file")
 
 def attack(folder, seed):
     theta = np.random.default_rng(seed).normal(size=(8, 8, 3)).astype(np.float32)
-    made = AttackFile(
+    made = AttackFile.of_face(
         method="gradient", theta=theta, texture=face_texture(theta), size_m=(1.0, 1.0), T_world_from_object=BOARD,
         subject="board", corners_in_subject=TARGET.corners, camera=Pinhole(200, 66, 103.6, 103.4, 100, 32),
         scene_sha256="", policy_sha256="", config_sha256="", seed=seed, predicted_total_cte_m=1.0, software_version="0",

@@ -84,7 +84,7 @@ REQUEST = {
 
 def save_attack_at(folder, T):
     theta = np.zeros((4, 4, 3), np.float32)
-    attack = AttackFile(
+    attack = AttackFile.of_face(
         method="random", theta=theta, texture=face_texture(theta, 8), size_m=(1.0, 1.0), T_world_from_object=T,
         subject="board", corners_in_subject=FACE.corners, camera=Pinhole(200, 66, 103.6, 103.4, 100, 32), scene_sha256="",
         policy_sha256="", config_sha256="", seed=0, predicted_total_cte_m=None, software_version="0",

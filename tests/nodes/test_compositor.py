@@ -36,7 +36,7 @@ def attack(**changes):
         "camera": Pinhole(200, 66, 103.6, 103.4, 100, 32), "scene_sha256": "", "policy_sha256": "", "config_sha256": "",
         "seed": 0, "predicted_total_cte_m": 1.0, "software_version": "0",
     }  # fmt: skip
-    return AttackFile(**{**values, **changes})
+    return AttackFile.of_face(**{**values, **changes})
 
 
 def car_at(t_s):
@@ -89,7 +89,7 @@ def bench():
 
 
 def expected_image(t_s, value=90):
-    overlay = FaceOverlay(attack().texture, TARGET.corners, CAMERA.pinhole)
+    overlay = FaceOverlay(attack().required_face().texture, TARGET.corners, CAMERA.pinhole)
     T = invert_transform(car_at(t_s) @ CAMERA.mount) @ T_WORLD_FROM_BOARD
     return overlay.draw(np.full((188, 336, 3), value, np.uint8), T)[0]
 
@@ -103,7 +103,7 @@ def test_the_face_is_drawn_in_its_own_colours_into_a_picture_in_bgr(bench):
     bench.poses(0.03)
     (image,) = bench.images()
     T = invert_transform(car_at(0.02) @ CAMERA.mount) @ T_WORLD_FROM_BOARD
-    expected = FaceOverlay(attack().texture, TARGET.corners, CAMERA.pinhole).draw(rgb, T)[0]
+    expected = FaceOverlay(attack().required_face().texture, TARGET.corners, CAMERA.pinhole).draw(rgb, T)[0]
     assert image.encoding == "rgb8"
     assert np.abs(rgb_image(image, "test").astype(int) - expected).mean() < 0.3
     assert (expected != rgb).any()

@@ -74,7 +74,7 @@ def untrained(folder: Path) -> Path:
 def red_board(folder: Path) -> AttackFile:
     """The attack: all of the board is red."""
     target = load_calibration(TargetCalibration, TWIN / "board.yaml")
-    attack = AttackFile(
+    attack = AttackFile.of_face(
         method="random", theta=np.zeros((4, 4, 3), np.float32), texture=np.full((64, 64, 3), (250, 0, 0), np.uint8),
         size_m=(1.0, 1.0), T_world_from_object=np.eye(4), subject="board", corners_in_subject=target.corners,
         camera=Pinhole(200, 66, 103.6, 103.4, 100, 32), scene_sha256="", policy_sha256="", config_sha256="", seed=0,

@@ -32,7 +32,7 @@ def attack(seed=0, **changes):
         "camera": Pinhole(200, 66, 103.6, 103.4, 100, 32), "scene_sha256": "", "policy_sha256": "", "config_sha256": "",
         "seed": seed, "predicted_total_cte_m": 1.0, "software_version": "0",
     }  # fmt: skip
-    return AttackFile(**{**values, **changes})
+    return AttackFile.of_face(**{**values, **changes})
 
 
 class Screen:

@@ -22,7 +22,7 @@ NODES = ("twin", "camera", "vicon", "compositor", "monitor", "policy", "safety",
 
 def red_attack(folder):
     target = load_calibration(TargetCalibration, ROOT / "calibration" / "twin" / "monitor.yaml")
-    attack = AttackFile(
+    attack = AttackFile.of_face(
         method="random", theta=np.zeros((4, 4, 3), np.float32), texture=np.full((64, 64, 3), (250, 0, 0), np.uint8),
         size_m=(0.3362, 0.3362), T_world_from_object=np.eye(4), subject="monitor",
         corners_in_subject=centre_square(target).corners, camera=Pinhole(200, 66, 103.6, 103.4, 100, 32), scene_sha256="",

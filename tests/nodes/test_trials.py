@@ -61,7 +61,7 @@ def free_ports(count, kind=socket.SOCK_STREAM):
 def attack_file(folder, seed):
     theta = np.random.default_rng(seed).normal(size=(4, 4, 3)).astype(np.float32)
     corners = [[0.0, y, z] for y, z in ((-0.5, 0.5), (0.5, 0.5), (0.5, -0.5), (-0.5, -0.5))]
-    attack = AttackFile(
+    attack = AttackFile.of_face(
         method="random", theta=theta, texture=face_texture(theta, 16), size_m=(1.0, 1.0), T_world_from_object=np.eye(4),
         subject="board", corners_in_subject=np.array(corners), camera=Pinhole(200, 66, 103.6, 103.4, 100, 32),
         scene_sha256="", policy_sha256="", config_sha256="", seed=seed, predicted_total_cte_m=None, software_version="0",

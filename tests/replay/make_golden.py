@@ -67,7 +67,7 @@ def attack_bytes(folder: Path) -> bytes:
     texture = np.zeros((32, 32, 3), np.uint8)
     texture[:, ::4] = (200, 40, 120)
     texture[:, :16, 1] += 150
-    attack = AttackFile(
+    attack = AttackFile.of_face(
         method="gradient", theta=np.zeros((4, 4, 3), np.float32), texture=texture, size_m=(1.0, 1.0),
         T_world_from_object=board_pose(), subject="board", corners_in_subject=np.array(CORNERS_M),
         camera=Pinhole(WIDTH, HEIGHT, 24.0, 24.0, 24.0, 13.5), scene_sha256="", policy_sha256="", config_sha256="", seed=0,

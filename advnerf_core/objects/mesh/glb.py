@@ -6,6 +6,7 @@ differs by. Viewers light it; it was attacked unlit.
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,11 @@ _Y_UP_FROM_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 def write_glb(path: Path, mesh: TexturedMesh) -> None:
     """Write a mesh with its texture, whole or not at all."""
+    write_atomically(path, glb_bytes(mesh))
+
+
+def glb_bytes(mesh: TexturedMesh) -> bytes:
+    """The content of a GLB file of a mesh with its texture; the same mesh gives the same bytes."""
     import trimesh
     from PIL import Image
 
@@ -40,7 +46,7 @@ def write_glb(path: Path, mesh: TexturedMesh) -> None:
     visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
     out: Any = trimesh.Trimesh(vertices, place.reshape(-1, 3), visual=visual, process=False)
     content: bytes = out.export(file_type="glb")
-    write_atomically(path, content)
+    return content
 
 
 def read_glb(path: Path) -> TexturedMesh:
@@ -49,19 +55,24 @@ def read_glb(path: Path) -> TexturedMesh:
     Raises:
         MeshError: No file, or not a single mesh with a texture.
     """
-    import trimesh
-
     if not path.is_file():
         raise MeshError(f"expected a GLB file at {path}, found none")
+    return mesh_from_glb(path.read_bytes(), str(path))
+
+
+def mesh_from_glb(content: bytes, source: str) -> TexturedMesh:
+    """The mesh of a GLB file's content; see `read_glb`. Errors call it ``source``."""
+    import trimesh
+
     try:
-        parts = list(trimesh.load_scene(path, file_type="glb", process=False).geometry.values())
+        parts = list(trimesh.load_scene(io.BytesIO(content), file_type="glb", process=False).geometry.values())
         (part,) = parts
         uv = np.asarray(part.visual.uv, dtype=np.float64)
         pixels = np.asarray(part.visual.material.baseColorTexture.convert("RGB"))
         faces = np.asarray(part.faces, dtype=np.int64)
     except Exception as error:  # trimesh's readers raise whatever they stumble over
         raise MeshError(
-            f"expected {path} to be one mesh with one texture, as 'advnerf attack run' writes it ({type(error).__name__}: {error})"
+            f"expected {source} to be one mesh with one texture, as 'advnerf attack run' writes it ({type(error).__name__}: {error})"
         ) from error
     height, width = pixels.shape[:2]
     texels = np.stack([uv[:, 0] * width, (1.0 - uv[:, 1]) * height], axis=-1)[faces]

@@ -4,14 +4,13 @@ A module of cells has one function that it must have, and may have others::
 
     def run_cell(experiment, scenario, victim, method, seed, folder, report) -> dict      # a cell, see report/cells.py
     def search_cell(experiment, scenario, victim, method, seed, folder, report) -> None   # its part that may run beside others
-    def draw_maps(experiment, scenario, victim, seed, extra, number, folder, report) -> list[Path]   # pictures about what a finished cell found
+    def draw_maps(experiment, scenario, victim, seed, method, number, folder, report) -> list[Path]   # pictures about what a finished cell found
     def load_experiment(file, setting, overrides, folder) -> experiment
     def prepare(experiment, report) -> None                                               # what all its cells need
     def cell_inputs(experiment, scenario, victim, method, seed) -> dict                   # what the result depends on, JSON
     LIVE = True        # run_cell drives a live graph: such cells run alone, after all that may run beside others
-    FIDELITY = None    # there is no learned scene, and so no gate, though the package has a module fidelity
-    PREDICTS = False   # the gate holds, but nothing predicts these attacks
-    UNPUBLISHED = ("colours",)   # names in a cell's extra that stay in the campaign's folder: megabytes
+    def has_learned_scene(experiment) -> bool   # whether there is a learned scene for the gate of the package's module fidelity; else there is
+    def predictable(experiment) -> bool         # whether transfer can be predicted where the gate holds; else it can
     TAKEN_FROM = "deploy"    # stage of the experiment in whose folder such cells may be finished already
 
 ``method`` is ``none``, or a method as `advnerf_core.attack.methods.load_method` takes it; `method_name` gives its name for files.
@@ -37,8 +36,6 @@ KINDS = {
     "room": "nodes.experiment.cells",
     "room_search": "nodes.experiment.search_cells",
     "intersection": "nodes.experiment.junction.cells",
-    "intersection_poses": "nodes.experiment.junction.pose_cells",
-    "intersection_meshes": "nodes.experiment.junction.mesh_cells",
     "carla": "nodes.experiment.junction.carla_cells",
 }
 RunCell = Callable[[Any, str, str, str, int, Path, Report], dict[str, Any]]
@@ -64,15 +61,15 @@ class Kind:
         """Whether `run_cell` drives a live graph and so runs alone."""
         return bool(getattr(self.module, "LIVE", False))
 
-    @property
-    def unpublished(self) -> tuple[str, ...]:
-        """Names in a cell's ``extra`` that stay in the campaign's folder."""
-        return tuple(getattr(self.module, "UNPUBLISHED", ()))
-
-    @property
-    def predicts(self) -> bool:
+    def predicts(self, experiment: Any) -> bool:
         """Whether transfer can be predicted from pictures."""
-        return self.fidelity is not None and bool(getattr(self.module, "PREDICTS", True))
+        predictable = getattr(self.module, "predictable", None)
+        return self.judges(experiment) and (predictable is None or bool(predictable(experiment)))
+
+    def judges(self, experiment: Any) -> bool:
+        """Whether there is a learned scene that the fidelity gate judges."""
+        learned = getattr(self.module, "has_learned_scene", None)
+        return self.fidelity is not None and (learned is None or bool(learned(experiment)))
 
     @property
     def run_cell(self) -> RunCell:
@@ -102,8 +99,6 @@ class Kind:
     @property
     def fidelity(self) -> Any:
         """The module with the pictures of the fidelity gate, beside the module of cells; None where there is none."""
-        if hasattr(self.module, "FIDELITY"):
-            return self.module.FIDELITY
         package = getattr(self.module, "__package__", "")
         name = f"{package}.fidelity"
         return importlib.import_module(name) if package and find_spec(name) is not None else None

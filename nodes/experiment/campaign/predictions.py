@@ -38,7 +38,7 @@ def predict_campaign(campaign: Campaign, cells: Sequence[Cell], say: Callable[[s
         planned = plan_cells(campaign, [cell], experiments)[0]
         kind = load_kind(planned.job.kind)
         # Work of other settings may hold a search too, of another attack.
-        if not kind.predicts:
+        if not kind.predicts(experiments[cell.scenario, cell.placement]):
             continue
         file = prediction_file(campaign.folder, cell.name)
         kept = kept_prediction(file, planned.job.settings_hash)

@@ -12,7 +12,6 @@ from advnerf_core.files import write_atomically
 from advnerf_core.report.cells import CellResult, read_cell, read_cells
 from advnerf_core.report.transfer import TransferTable, make_table
 from nodes.experiment.campaign.config import Campaign, Cell
-from nodes.experiment.campaign.kinds import load_kind
 from nodes.experiment.campaign.predictions import kept_prediction, prediction_file
 from nodes.experiment.campaign.run import gate_file, gate_key, hash_as_it_is
 from nodes.experiment.campaign.store import CellStatus, store_of
@@ -45,14 +44,12 @@ class Restored:
         taken: Now finished in the campaign's folder.
         there: Finished there already.
         other: Kept with the code, but made with other settings, or with a scene or a policy that was made anew since or is not there.
-        incomplete: Kept without what its kind's maps and films need.
         missing: Not kept.
     """
 
     taken: tuple[str, ...] = ()
     there: tuple[str, ...] = ()
     other: tuple[str, ...] = ()
-    incomplete: tuple[str, ...] = ()
     missing: tuple[str, ...] = ()
 
 
@@ -77,7 +74,7 @@ def publish(campaign: Campaign, found: Sequence[CellStatus], folder: Path, prune
                 prediction_file(folder / campaign.config.name, each.cell.name).unlink(missing_ok=True)
         if each.state != "done":
             continue
-        text = _published_text(campaign, each.cell)
+        text = store_of(campaign).result_file(each.cell.name).read_text(encoding="utf-8")
         if target.exists() and target.read_text(encoding="utf-8") == text:
             same.append(each.cell.name)
             continue
@@ -90,17 +87,6 @@ def publish(campaign: Campaign, found: Sequence[CellStatus], folder: Path, prune
 def _is_of(published: Path, result: CellResult | None) -> bool:
     """Whether a published cell is that result, and not one of newer settings from elsewhere."""
     return result is not None and published.exists() and read_cell(published).settings_hash == result.settings_hash
-
-
-def _published_text(campaign: Campaign, cell: Cell) -> str:
-    """The cell's file, less what its kind keeps for its own maps and is megabytes long."""
-    text = store_of(campaign).result_file(cell.name).read_text(encoding="utf-8")
-    left_out = load_kind(campaign.config.scenarios[cell.scenario].kind).unpublished
-    if not left_out:
-        return text
-    data = json.loads(text)
-    extra = {name: value for name, value in data["extra"].items() if name not in left_out}
-    return json.dumps({**data, "extra": extra}, indent=1) + "\n"
 
 
 def _publish_beside(campaign: Campaign, done: Sequence[CellStatus], folder: Path) -> None:
@@ -156,8 +142,6 @@ def restore(campaign: Campaign, cells: Sequence[Cell], folder: Path) -> Restored
             how = "missing"
         elif digest is None or read_cell(file).settings_hash != digest:
             how = "other"
-        elif load_kind(campaign.scenario(cell).kind).unpublished:
-            how = "incomplete"
         else:
             how = "taken"
             store.keep_result(cell.name, json.loads(file.read_text(encoding="utf-8")))

@@ -239,7 +239,7 @@ def _judge(campaign: Campaign, cell: Cell, options: Options, say: Say) -> bool:
     """Whether the cells of this one's scenario and victim may be run: by held-out views, and by a drive without attack where there is one."""
     scenario = campaign.scenario(cell)
     kind, key = load_kind(scenario.kind), gate_key(cell)
-    if kind.fidelity is None:
+    if not kind.judges(_experiment(campaign, cell)):
         return True
     from nodes.experiment.campaign.gate import cached_verdict  # loads torch
 

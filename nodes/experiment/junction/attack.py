@@ -1,33 +1,32 @@
-"""Stage attack: for each drive, victim and seed the searches at equal evaluations, in the learned junction only."""
+"""The part of a cell in the surrogate: the search, its attack file, and the drives past what was found."""
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
 from advnerf_core.attack.adjoint import AttackProblem
-from advnerf_core.attack.artifact import AttackedObject, AttackFile, load_attack, save_attack
+from advnerf_core.attack.artifact import AttackFile, load_attack, save_attack
 from advnerf_core.attack.clean import clean_drive
-from advnerf_core.attack.methods import SearchRun, SearchSettings, load_method, method_name
+from advnerf_core.attack.methods import Method, SearchRun, SearchSettings, load_method, method_name
 from advnerf_core.attack.search.search import SearchResult
-from advnerf_core.driving.clean_drive import CleanDrive
+from advnerf_core.attack.spaces.space import Shown, Space
 from advnerf_core.files import write_atomically
 from advnerf_core.policies.pilotnet import LoadedPolicy, load_policy
+from advnerf_core.report.cells import cell_name
 from advnerf_core.report.conditions import NONE
-from advnerf_core.scene.surrogate import Surrogate, split_theta
 from nodes.experiment.junction.context import Experiment
 from nodes.experiment.junction.drives import learned_drives, totals
-from nodes.experiment.junction.objects import object_file, placed_objects, surrogate_of
 from nodes.experiment.junction.policy import HARDENED, victim_file, victims
+from nodes.experiment.junction.space_config import MeshShapeConfig, MeshTextureConfig, PlacesConfig
+from nodes.experiment.junction.spaces import geometry_sha256, make_space, over_the_world
 from nodes.experiment.learned_scene import scene_sha256
 from nodes.experiment.request.telling import telling
 from nodes.experiment.stages import hash_of
@@ -36,13 +35,13 @@ from nodes.runtime.progress import Report
 
 @dataclass(frozen=True)
 class Cell:
-    """One entry of the transfer table.
+    """One entry of the transfer table: which drive, which victim meets what, which seed.
 
     Attributes:
-        scenario: Which drive.
+        scenario: Name of the drive.
         victim: Which policy.
-        method: Name of the method, or ``none``.
-        seed: Of starts and search.
+        method: Name of the method that found what it meets; ``none``: the plain objects.
+        seed: Of the search and its starts.
         reference: Where the method's code is, as `load_method` takes it, if its name does not say.
     """
 
@@ -61,7 +60,7 @@ class Cell:
     @property
     def name(self) -> str:
         """Name of its files."""
-        return f"{self.scenario}_{self.victim}_{self.method}_{self.seed}"
+        return cell_name(self.scenario, self.victim, self.method, self.seed)
 
     @property
     def clean(self) -> Cell:
@@ -89,28 +88,28 @@ def frozen_hashes(experiment: Experiment) -> dict[str, str]:
         for scenario in experiment.config.scenarios
         for seed in experiment.config.attack.seeds
     }
+    things = experiment.world.objects
     return {
         "scene": scene_sha256(experiment),
         **policies,
-        **frozen_objects(experiment),
+        "objects": hash_of([geometry_sha256(experiment, thing.kind) for thing in things]),
+        "placement": hash_of([thing.model_dump(mode="json") for thing in things]),
         "starts_and_seeds": hash_of(starts),
         "config": hash_of(experiment.config.model_dump(mode="json")),
-    }
-
-
-def frozen_objects(experiment: Experiment) -> dict[str, str]:
-    """Hashes of the objects, and of where they were placed by hand."""
-    things = experiment.world.objects
-    return {
-        "objects": hash_of([hash_of(_geometry(experiment, thing.kind)) for thing in things]),
-        "placement": hash_of([thing.model_dump(mode="json") for thing in things]),
     }
 
 
 def run(experiment: Experiment, folder: Path, report: Report) -> None:
     """Freeze, then search what is not searched yet; one attack file and one JSON of surrogate drives per cell."""
     write_atomically(folder / "frozen.json", json.dumps(frozen_hashes(experiment), indent=1) + "\n")
-    surrogate = surrogate_of(experiment, placed_objects(experiment))
+    if over_the_world(experiment):
+        with experiment.site.open() as scene:
+            _search_all(experiment, make_space(experiment, scene), folder, report)
+    else:
+        _search_all(experiment, make_space(experiment, None), folder, report)
+
+
+def _search_all(experiment: Experiment, space: Space, folder: Path, report: Report) -> None:
     plan = cells(experiment)
     for index, cell in enumerate(plan):
 
@@ -119,49 +118,76 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
                 (index + fraction) / len(plan), f"{cell.scenario} {cell.victim} {cell.method} seed {cell.seed}: {text}"
             )
 
-        surrogate_part(experiment, surrogate, cell, folder, progress)
+        surrogate_part(experiment, space, cell, folder, progress)
 
 
 def surrogate_part(
-    experiment: Experiment, surrogate: Surrogate, cell: Cell, folder: Path, report: Callable[..., None]
+    experiment: Experiment, space: Space, cell: Cell, folder: Path, report: Callable[..., None]
 ) -> dict[str, Any]:
-    """Search if the cell has a method, drive in the surrogate, and keep both; what is there already is read."""
+    """Search if the cell has a method, drive in the surrogate, and keep both; what is there already is read.
+
+    Args:
+        experiment: The experiment.
+        space: What is searched.
+        cell: Which.
+        folder: Gets ``<cell>.attack.safetensors`` and ``<cell>.json``.
+        report: Told the finished fraction.
+
+    Returns:
+        Attack id (None without an attack), states and metrics of the drives, the curve of the search [m], and its seconds.
+    """
     kept = folder / f"{cell.name}.json"
     if kept.exists():
         found: dict[str, Any] = json.loads(kept.read_text())
         return found
     policy = _victim(victim_file(experiment, cell.victim))
-    problem = attack_problem(experiment, surrogate, policy, cell.scenario, cell.seed)
-    attack_id, curve, seconds, theta = None, [], 0.0, surrogate.plain_theta()
+    problem = attack_problem(experiment, space, policy, cell.scenario, cell.seed)
+    attack_id, curve, seconds = None, [], 0.0
     if cell.method != NONE:
-        result = _search(experiment, problem, cell, folder, report)
-        theta, seconds = result.theta, sum(evaluation.seconds for evaluation in result.history)
+        result = _search(experiment, space, problem, cell, folder, report)
+        seconds = sum(evaluation.seconds for evaluation in result.history)
         curve = [evaluation.predicted_total_cte_m for evaluation in result.history]
-        clean = clean_drive(problem, surrogate.plain_theta())
-        attack_id = save_attack(
-            attack_path(folder, cell), _attack_file(experiment, surrogate, policy, cell, result, clean)
-        )
-    states, scores = learned_drives(experiment, problem, theta)
+        attack = _attack_file(experiment, space, problem, policy, cell, result)
+        attack_id = save_attack(attack_path(folder, cell), attack)
+    shown = load_shown(space, folder, cell)
+    states, scores = learned_drives(experiment, past(problem, space, shown), shown.colours)
     data = {
-        "attack_id": attack_id, "states": states.tolist(), **totals(scores), "mean_cte_m": [score.mean_cte_m for score in scores],
-        "curve_total_cte_m": curve, "seconds": seconds,
-    }  # fmt: skip
+        "attack_id": attack_id,
+        "states": states.tolist(),
+        **totals(scores),
+        "mean_cte_m": [score.mean_cte_m for score in scores],
+        "curve_total_cte_m": curve,
+        "seconds": seconds,
+    }
     write_atomically(kept, json.dumps(data) + "\n")
     _state_path(folder, cell).unlink(missing_ok=True)
     return data
 
 
 def attack_problem(
-    experiment: Experiment, surrogate: Surrogate, policy: LoadedPolicy, scenario: str, seed: int
+    experiment: Experiment, space: Space, policy: LoadedPolicy, scenario: str, seed: int
 ) -> AttackProblem:
     """The attack on one victim on one drive, with the starts of one seed."""
     attack, starts = experiment.config.attack, experiment.start_states(scenario, seed)
     goals = torch.tensor([experiment.goal(scenario)], dtype=torch.float32).expand(len(starts), -1)
     return AttackProblem(
-        policy.policy, surrogate, experiment.dynamics, experiment.paths[scenario], starts, experiment.config.horizon, goals,
-        time_batch=attack.time_batch, cache_bytes=int(attack.cache_mib * 2**20), held_cap_m=experiment.config.held_cap_m,
+        policy.policy,
+        space.sensor,
+        experiment.dynamics,
+        experiment.paths[scenario],
+        starts,
+        experiment.config.horizon,
+        goals,
+        time_batch=attack.time_batch,
+        cache_bytes=int(attack.cache_mib * 2**20),
+        held_cap_m=experiment.config.held_cap_m,
         off_track_m=experiment.site.off_track_m,
-    )  # fmt: skip
+    )
+
+
+def past(problem: AttackProblem, space: Space, shown: Shown) -> AttackProblem:
+    """The problem with the surrogate as its sensor, in which objects stand as they are shown; its theta are their colours."""
+    return replace(problem, sensor=shown.seen_by(space.surrogate))
 
 
 def attack_path(folder: Path, cell: Cell) -> Path:
@@ -169,31 +195,50 @@ def attack_path(folder: Path, cell: Cell) -> Path:
     return folder / f"{cell.name}.attack.safetensors"
 
 
-def load_theta(folder: Path, cell: Cell) -> torch.Tensor:
-    """Colours of all objects ``[K, 3]`` that a search found."""
-    objects = load_attack(attack_path(folder, cell)).objects
-    return torch.cat([torch.from_numpy(thing.theta).reshape(-1, 3) for thing in objects])
+def load_shown(space: Space, folder: Path, cell: Cell) -> Shown:
+    """The objects as a search found them, of its attack file; as they are where the cell has no method."""
+    return space.plain if cell.method == NONE else space.restored(load_attack(attack_path(folder, cell)))
 
 
-def _search(
-    experiment: Experiment, problem: AttackProblem, cell: Cell, folder: Path, report: Callable[..., None]
-) -> SearchResult:
-    attack = experiment.config.attack
-    frozen = {
-        key: value for key, value in frozen_hashes(experiment).items() if key not in ("config", "starts_and_seeds")
-    }
-    method = load_method(cell.reference or cell.method)
-    settings = SearchSettings(
-        attack.evaluations,
+def search_settings(experiment: Experiment, method: Method) -> SearchSettings:
+    """What a search may spend."""
+    attack, space = experiment.config.attack, experiment.config.space
+    return SearchSettings(
+        evaluations=planned_evaluations(experiment),
+        learning_rate=space.learning_rate if isinstance(space, (MeshTextureConfig, MeshShapeConfig)) else None,
         population=attack.cem_population,
         cells=0,  # objects that are no face have no coarse texture: every colour is searched
         gradient_rate=attack.learning_rate,
         random_sigma=attack.random_sigma,
         options=method.options({}),
     )
+
+
+def planned_evaluations(experiment: Experiment) -> int:
+    """Drives of each search."""
+    space = experiment.config.space
+    return space.samples * space.steps if isinstance(space, PlacesConfig) else experiment.config.attack.evaluations
+
+
+def _search(
+    experiment: Experiment,
+    space: Space,
+    problem: AttackProblem,
+    cell: Cell,
+    folder: Path,
+    report: Callable[..., None],
+) -> SearchResult:
+    frozen = {
+        key: value for key, value in frozen_hashes(experiment).items() if key not in ("config", "starts_and_seeds")
+    }
+    wanted = experiment.config.space.model_dump(mode="json")
+    settings_hash = hash_of({**frozen, "victim": cell.victim, "scenario": cell.scenario, "space": wanted})
+    reference = cell.reference or cell.method
+    method = load_method(reference)
+    settings = search_settings(experiment, method)
     told = telling(method.evaluations(problem, settings), report)
-    digest = hash_of({**frozen, "victim": cell.victim, "scenario": cell.scenario})
-    return method.search(problem, settings, SearchRun(cell.seed, _state_path(folder, cell), told, digest))
+    run = SearchRun(cell.seed, _state_path(folder, cell), told, settings_hash)
+    return space.search(reference, problem, settings, run)
 
 
 def _state_path(folder: Path, cell: Cell) -> Path:
@@ -205,37 +250,27 @@ def _victim(path: Path) -> LoadedPolicy:
     return load_policy(path)
 
 
-@lru_cache(maxsize=8)
-def _file_hash(path: Path, changed_ns: int) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
-
-
-def _geometry(experiment: Experiment, kind: str) -> str:
-    path = object_file(experiment, kind)
-    return _file_hash(path, path.stat().st_mtime_ns)
-
-
 def _attack_file(
     experiment: Experiment,
-    surrogate: Surrogate,
+    space: Space,
+    problem: AttackProblem,
     policy: LoadedPolicy,
     cell: Cell,
     result: SearchResult,
-    clean: CleanDrive,
 ) -> AttackFile:
-    parts = split_theta(surrogate.objects, result.theta)
-    objects = tuple(
-        AttackedObject(
-            thing.name, part.detach().numpy().astype(np.float32), thing.T_world_from_object, thing.scale,
-            _geometry(experiment, thing.kind),
-        )
-        for thing, part in zip(experiment.world.objects, parts, strict=True)
-    )  # fmt: skip
+    clean = clean_drive(past(problem, space, space.plain), space.plain.colours)
     return AttackFile(
-        method=cell.method, theta=np.zeros((0, 0, 3), np.float32), texture=np.zeros((0, 0, 3), np.uint8), size_m=(0.0, 0.0),
-        T_world_from_object=np.eye(4), subject="", corners_in_subject=np.zeros((4, 3)), camera=experiment.view.pinhole,
-        scene_sha256=scene_sha256(experiment), policy_sha256=policy.sha256,
-        config_sha256=hash_of(experiment.config.model_dump(mode="json")), seed=cell.seed,
-        predicted_total_cte_m=result.best.predicted_total_cte_m, software_version=version("advnerf"),
-        extra={"victim": cell.victim, "scenario": cell.scenario, "horizon": experiment.config.horizon}, objects=objects, clean_drive=clean,
-    )  # fmt: skip
+        method=cell.method,
+        space=space.name,
+        objects=space.attacked(result.theta),
+        face=None,
+        camera=experiment.view.pinhole,
+        scene_sha256=hash_of(experiment.site.settings) if over_the_world(experiment) else scene_sha256(experiment),
+        policy_sha256=policy.sha256,
+        config_sha256=hash_of(experiment.config.model_dump(mode="json")),
+        seed=cell.seed,
+        predicted_total_cte_m=result.best.predicted_total_cte_m,
+        software_version=version("advnerf"),
+        extra={"victim": cell.victim, "scenario": cell.scenario, "horizon": experiment.config.horizon},
+        clean_drive=clean,
+    )

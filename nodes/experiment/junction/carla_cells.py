@@ -2,8 +2,25 @@
 
 from __future__ import annotations
 
-from nodes.experiment.junction.cells import PREPARED_AT, TAKEN_FROM, cell_inputs, run_cell, search_cell
+from nodes.experiment.junction.cells import (
+    TAKEN_FROM,
+    cell_inputs,
+    has_learned_scene,
+    predictable,
+    prepare,
+    run_cell,
+    search_cell,
+)
 
 LIVE = True
 
-__all__ = ["LIVE", "PREPARED_AT", "TAKEN_FROM", "cell_inputs", "run_cell", "search_cell"]
+__all__ = [
+    "LIVE",
+    "TAKEN_FROM",
+    "cell_inputs",
+    "has_learned_scene",
+    "predictable",
+    "prepare",
+    "run_cell",
+    "search_cell",
+]

@@ -8,6 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from advnerf_core.attack.methods import method_name
 from hardware.worlds.junction.paths import PathName
+from nodes.experiment.junction.space_config import ColoursConfig, SpaceConfig
 from nodes.experiment.method_names import MethodReference
 
 Count = Annotated[int, Field(ge=0)]
@@ -203,6 +204,7 @@ class IntersectionExperimentConfig(_Section):
     policy: PolicyConfig = PolicyConfig()
     object: ObjectConfig = ObjectConfig()
     attack: AttackConfig = AttackConfig()
+    space: SpaceConfig = Field(default=ColoursConfig(), description="What the attacks may change.")
     retrain: RetrainConfig | None = Field(
         default=None, description="Retrain the hardened victim on what was found; none: not."
     )

@@ -21,13 +21,14 @@ from advnerf_core.policies.pilotnet import load_policy
 from advnerf_core.scene.fidelity import Pictures
 from nodes.experiment.images import as_uint8
 from nodes.experiment.junction import capture
-from nodes.experiment.junction.attack import Cell, attack_path, attack_problem, load_theta
+from nodes.experiment.junction.attack import Cell, attack_path, attack_problem, load_shown
 from nodes.experiment.junction.context import Experiment
 from nodes.experiment.junction.deployed import DressedScene
 from nodes.experiment.junction.drives import deployed_drives
 from nodes.experiment.junction.objects import placed_objects, surrogate_of
 from nodes.experiment.junction.policy import victim_file
 from nodes.experiment.junction.run import stages_of
+from nodes.experiment.junction.spaces import colour_space
 from nodes.experiment.stages import is_current
 from nodes.runtime.errors import RuntimeFault
 
@@ -60,7 +61,7 @@ def driven(
 
 def lacks(experiment: Experiment, scenario: str, victim: str, method: str, seed: int, folder: Path) -> str:
     """What a prediction still needs, in words; empty if all is there."""
-    found = _searched_in(experiment, _cell(scenario, victim, method, seed), folder)
+    found = _searched_in(experiment, Cell.of(scenario, victim, method, seed), folder)
     return "" if found is not None else "its search"
 
 
@@ -75,18 +76,14 @@ def loop(
 ) -> tuple[AttackProblem, Callable[[torch.Tensor, bool], torch.Tensor], torch.Tensor, Horizon]:
     """What a prediction drives: the problem, pictures with or without the attack, the deployed starts ``[S, n]`` and the horizon."""
     theta = _theta(experiment, scenario, victim, method, seed, folder)
-    surrogate = surrogate_of(experiment, placed_objects(experiment))
-    plain = surrogate.plain_theta()
-    problem = attack_problem(experiment, surrogate, load_policy(victim_file(experiment, victim)), scenario, seed)
+    space = colour_space(experiment)
+    surrogate, plain = space.surrogate, space.plain.colours
+    problem = attack_problem(experiment, space, load_policy(victim_file(experiment, victim)), scenario, seed)
 
     def images(states: torch.Tensor, with_attack: bool) -> torch.Tensor:
         return surrogate.sense(states, theta if with_attack else plain).images
 
     return problem, images, problem.start_states, experiment.limits
-
-
-def _cell(scenario: str, victim: str, method: str, seed: int) -> Cell:
-    return Cell.of(scenario, victim, method, seed)
 
 
 def _searched_in(experiment: Experiment, cell: Cell, folder: Path) -> Path | None:
@@ -98,8 +95,8 @@ def _searched_in(experiment: Experiment, cell: Cell, folder: Path) -> Path | Non
 
 
 def _theta(experiment: Experiment, scenario: str, victim: str, method: str, seed: int, folder: Path) -> torch.Tensor:
-    cell = _cell(scenario, victim, method, seed)
-    return load_theta(_searched_in(experiment, cell, folder) or folder, cell)
+    cell = Cell.of(scenario, victim, method, seed)
+    return load_shown(colour_space(experiment), _searched_in(experiment, cell, folder) or folder, cell).colours
 
 
 def _along_the_drive(

@@ -8,19 +8,17 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from torch import Tensor
 
+from advnerf_core.attack.spaces.space import Shown, Space
 from advnerf_core.geometry import Array, planar_poses
-from advnerf_core.policies.pilotnet import Policy
 from advnerf_core.report.clips import ClipTrack, write_clip
 from advnerf_core.report.conditions import NONE, style_of
 from advnerf_core.scene.surrogate import Surrogate
+from hardware.worlds.world import DeploymentScene
 from nodes.experiment.images import as_uint8
-from nodes.experiment.junction.attack import Cell, load_theta
+from nodes.experiment.junction.attack import Cell, load_shown
 from nodes.experiment.junction.context import Experiment
 from nodes.experiment.junction.deployed import DressedScene
-from nodes.experiment.junction.drives import deployed_drives
-from nodes.experiment.junction.objects import placed_objects
 from nodes.experiment.junction.policy import HARDENED
 from nodes.experiment.learned_scene import load_background
 
@@ -34,37 +32,35 @@ def strongest(experiment: Experiment) -> str:
     return "gradient" if "gradient" in methods else methods[-1]
 
 
-def film_scenario(experiment: Experiment, dressed: DressedScene, scenario: str, folder: Path) -> Path:
+def film_scenario(experiment: Experiment, scene: DeploymentScene, space: Space, scenario: str, folder: Path) -> Path:
     """The attacked drive in the surrogate, and the deployed ones past plain and attacked objects, side by side; first seed and start."""
     seed, method = experiment.config.attack.seeds[0], strongest(experiment)
     attacked = Cell(scenario, HARDENED, method, seed)
-    theta = load_theta(experiment.stage_folder("attack"), attacked)
-    whole = Surrogate(load_background(experiment), experiment.camera, experiment.mount, placed_objects(experiment))
+    shown = load_shown(space, experiment.stage_folder("attack"), attacked)
+    whole = Surrogate(load_background(experiment), experiment.camera, experiment.mount, shown.objects)
     every, rate_hz = filmed(experiment.config.dt_s)
     learned = drives_of(experiment, "surrogate", attacked)[0][::every]
-    frames = [as_uint8(whole.render(pose[None], theta).images[0]) for pose in planar_poses(learned) @ experiment.mount]
+    poses = planar_poses(learned) @ experiment.mount
+    frames = [as_uint8(whole.render(pose[None], shown.colours).images[0]) for pose in poses]
     tracks = [_track(experiment, scenario, "learned scene, attacked", method, frames, learned)]
-    for cell, colours in ((attacked.clean, dressed.plain_theta()), (attacked, theta)):
+    for cell, there in ((attacked.clean, space.plain), (attacked, shown)):
         states = drives_of(experiment, "deployed", cell)[0][::every]
-        views = [dressed.camera_image(state, colours) for state in states]
+        dressed = DressedScene(scene, experiment.view, there.objects)
+        views = [dressed.camera_image(state, there.colours) for state in states]
         title = "deployed, no attack" if cell.method == NONE else "deployed, attacked"
         tracks.append(_track(experiment, scenario, title, cell.method, views, states))
     return write_clip(folder / f"{scenario}.mp4", tracks, rate_hz, experiment.site.off_track_m)
 
 
-def film_cell(experiment: Experiment, dressed: DressedScene, cell: Cell, folder: Path) -> Path:
+def film_cell(experiment: Experiment, scene: DeploymentScene, shown: Shown, cell: Cell, folder: Path) -> Path:
     """The deployed drive of one cell, from its first start; its files are in ``folder``, and ``clip.mp4`` will be."""
-    colours = dressed.plain_theta() if cell.method == NONE else load_theta(folder, cell)
-    return _film(experiment, dressed, cell, _states(folder / f"{cell.name}.drives.json")[0], colours, folder)
-
-
-def film_again(
-    experiment: Experiment, dressed: DressedScene, cell: Cell, policy: Policy, colours: Tensor, folder: Path
-) -> Path:
-    """The deployed drive of a cell that keeps no states: driven once more from its first start, and filmed as ``clip.mp4``."""
-    start = experiment.start_states(cell.scenario, cell.seed)[:1]
-    (again,) = deployed_drives(experiment, dressed, policy, cell.scenario, start, colours)
-    return _film(experiment, dressed, cell, again.states, colours, folder)
+    every, rate_hz = filmed(experiment.config.dt_s)
+    states = _states(folder / f"{cell.name}.drives.json")[0][::every]
+    dressed = DressedScene(scene, experiment.view, shown.objects)
+    views = [dressed.camera_image(state, shown.colours) for state in states]
+    title = f"{style_of(cell.method).title}, {cell.victim}, seed {cell.seed}"
+    track = _track(experiment, cell.scenario, title, cell.method, views, states)
+    return write_clip(folder / "clip.mp4", [track], rate_hz, experiment.site.off_track_m)
 
 
 def kept_film(folder: Path) -> Path | None:
@@ -75,16 +71,6 @@ def kept_film(folder: Path) -> Path | None:
 def with_film(data: dict[str, Any], film: Path) -> dict[str, Any]:
     """The cell with the name of its film, relative to the folder of all cells."""
     return {**data, "extra": {**data["extra"], "clip": f"{film.parent.name}/{film.name}"}}
-
-
-def _film(
-    experiment: Experiment, dressed: DressedScene, cell: Cell, states: Array, colours: Tensor, folder: Path
-) -> Path:
-    every, rate_hz = filmed(experiment.config.dt_s)
-    title = f"{style_of(cell.method).title}, {cell.victim}, seed {cell.seed}"
-    views = [dressed.camera_image(state, colours) for state in states[::every]]
-    track = _track(experiment, cell.scenario, title, cell.method, views, states[::every])
-    return write_clip(folder / "clip.mp4", [track], rate_hz, experiment.site.off_track_m)
 
 
 def filmed(dt_s: float) -> tuple[int, float]:

@@ -9,19 +9,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from rich.console import Console
 
+from advnerf_core.attack.spaces.space import Space
 from advnerf_core.files import write_atomically
 from advnerf_core.report.conditions import NONE, order_of, style_of
 from advnerf_core.report.tables import Table, spread
+from hardware.worlds.world import DeploymentScene
 from nodes.experiment.junction import films, page
-from nodes.experiment.junction.attack import Cell, cells, load_theta
+from nodes.experiment.junction.attack import Cell, cells, load_shown
 from nodes.experiment.junction.context import Experiment
 from nodes.experiment.junction.deployed import DressedScene
-from nodes.experiment.junction.objects import placed_objects
 from nodes.experiment.junction.policy import HARDENED
+from nodes.experiment.junction.spaces import make_space
 from nodes.runtime.progress import Report
 
 # Where along a drive its objects are shown [m]: most of them are in view, some close.
@@ -64,13 +65,13 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
     write_results(experiment, rows, folder)
     clips = []
     with experiment.site.open() as scene:
-        dressed = DressedScene(scene, experiment.view, placed_objects(experiment))
+        space = make_space(experiment, scene)
         overview = experiment.site.overview(scene)
         for index, name in enumerate(experiment.config.scenarios):
             report(0.1 + 0.8 * index / len(experiment.config.scenarios), f"filming {name}")
-            clips.append(films.film_scenario(experiment, dressed, name, folder))
+            clips.append(films.film_scenario(experiment, scene, space, name, folder))
         seen: dict[str, dict[str, NDArray[np.uint8]]] = {
-            name: textures_seen(experiment, dressed, name) for name in experiment.config.scenarios
+            name: textures_seen(experiment, scene, space, name) for name in experiment.config.scenarios
         }
     report(0.95, "writing the page")
     page.write(experiment, folder, table, overview, clips, seen)
@@ -144,14 +145,15 @@ def write_results(experiment: Experiment, rows: Sequence[Row], folder: Path) -> 
     write_atomically(folder / "results.csv", "\n".join(lines) + "\n")
 
 
-def textures_seen(experiment: Experiment, dressed: DressedScene, scenario: str) -> dict[str, NDArray[np.uint8]]:
+def textures_seen(
+    experiment: Experiment, scene: DeploymentScene, space: Space, scenario: str
+) -> dict[str, NDArray[np.uint8]]:
     """The same views of the driving camera past the plain, random and attacked objects of the first seed, one row each."""
     searched, seed = experiment.stage_folder("attack"), experiment.config.attack.seeds[0]
     states = [np.array(experiment.references[scenario].pose_at(at)) for at in _SEEN_AT_M]
-    shown: dict[str, torch.Tensor] = {NONE: dressed.plain_theta()}
-    for method in experiment.config.attack.method_names:
-        shown[method] = load_theta(searched, Cell(scenario, HARDENED, method, seed))
-    return {
-        method: np.concatenate([dressed.camera_image(state, theta) for state in states], axis=1)
-        for method, theta in shown.items()
-    }
+    seen = {}
+    for method in (NONE, *experiment.config.attack.method_names):
+        shown = load_shown(space, searched, Cell(scenario, HARDENED, method, seed))
+        dressed = DressedScene(scene, experiment.view, shown.objects)
+        seen[method] = np.concatenate([dressed.camera_image(state, shown.colours) for state in states], axis=1)
+    return seen

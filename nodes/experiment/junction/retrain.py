@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from advnerf_core.attack.adjoint import evaluate
 from advnerf_core.attack.search.gradient import gradient_attack
+from advnerf_core.attack.spaces.space import ColourSpace
 from advnerf_core.driving.path import Array
 from advnerf_core.files import write_atomically
 from advnerf_core.learning.frames import Frames, FrameStore
@@ -28,16 +29,15 @@ from advnerf_core.learning.imitation import SourcePlan, recovery_states
 from advnerf_core.learning.retrain import RetrainConfig, fine_tune
 from advnerf_core.learning.sources import Seen, steer_with
 from advnerf_core.policies.pilotnet import LoadedPolicy, load_policy
-from advnerf_core.scene.surrogate import Surrogate
 from hardware.worlds.world import DeploymentScene
 from nodes.experiment.junction import retrain_plot
-from nodes.experiment.junction.attack import Cell, attack_problem, load_theta
+from nodes.experiment.junction.attack import Cell, attack_problem, load_shown
 from nodes.experiment.junction.context import Experiment
 from nodes.experiment.junction.deployed import DressedScene
 from nodes.experiment.junction.drives import deployed_drives
-from nodes.experiment.junction.objects import placed_objects, surrogate_of
+from nodes.experiment.junction.objects import placed_objects
 from nodes.experiment.junction.policy import HARDENED, plans, victim_file
-from nodes.experiment.junction.poses import random_placements
+from nodes.experiment.junction.spaces import colour_space, random_placements
 from nodes.experiment.stages import hash_of
 from nodes.runtime.progress import Report
 
@@ -62,17 +62,17 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
     """Write a folder per round, and after each ``retrain.json`` with the curve and the drives under the old attacks, and ``curve.png``."""
     wanted = experiment.config.retrain
     assert wanted is not None, "the stage runs only where the experiment asks for it"
-    surrogate = surrogate_of(experiment, placed_objects(experiment))
+    space = colour_space(experiment)
     file, rounds, kept = victim_file(experiment, HARDENED), [], _old_frames(experiment)
     victim = load_policy(file)
     thetas: list[torch.Tensor] = []
     with experiment.site.open() as scene:
         dressed = DressedScene(scene, experiment.view, placed_objects(experiment))
-        first, old_attacks = _first_attacks(experiment, surrogate, dressed, victim, folder / "round0"), {}
+        first, old_attacks = _first_attacks(experiment, space, dressed, victim, folder / "round0"), {}
         for number in range(wanted.rounds + 1):
             here = folder / f"round{number}"
             told = _part(report, number / (wanted.rounds + 1), 1.0 / (wanted.rounds + 1), f"round {number}")
-            found = first if number == 0 else _attack_again(experiment, surrogate, dressed, victim, here, told)
+            found = first if number == 0 else _attack_again(experiment, space, dressed, victim, here, told)
             rounds.append({"victim": victim.sha256, **found.ratios})
             if number == 1:
                 old_attacks = _under_old_attacks(experiment, dressed, folder / "round0", first)
@@ -127,25 +127,26 @@ def _old_frames(experiment: Experiment) -> list[Frames]:
 
 
 def _first_attacks(
-    experiment: Experiment, surrogate: Surrogate, dressed: DressedScene, victim: LoadedPolicy, folder: Path
+    experiment: Experiment, space: ColourSpace, dressed: DressedScene, victim: LoadedPolicy, folder: Path
 ) -> Found:
     """What the attack stage found for its first seed."""
     searched, seed = experiment.stage_folder("attack"), experiment.config.attack.seeds[0]
     thetas: dict[str, torch.Tensor] = {
-        name: load_theta(searched, Cell(name, HARDENED, "gradient", seed)) for name in experiment.config.scenarios
+        name: load_shown(space, searched, Cell(name, HARDENED, "gradient", seed)).colours
+        for name in experiment.config.scenarios
     }
-    return _judged(experiment, surrogate, dressed, victim, thetas, folder)
+    return _judged(experiment, space, dressed, victim, thetas, folder)
 
 
 def _attack_again(
-    experiment: Experiment, surrogate: Surrogate, dressed: DressedScene, victim: LoadedPolicy, folder: Path,
+    experiment: Experiment, space: ColourSpace, dressed: DressedScene, victim: LoadedPolicy, folder: Path,
     report: Callable[[float, str], None],
 ) -> Found:  # fmt: skip
     """The gradient attack of the first seed on a retrained victim, as long as the attack on the first one."""
     attack = experiment.config.attack
     thetas: dict[str, torch.Tensor] = {}
     for index, scenario in enumerate(experiment.config.scenarios):
-        problem = attack_problem(experiment, surrogate, victim, scenario, attack.seeds[0])
+        problem = attack_problem(experiment, space, victim, scenario, attack.seeds[0])
 
         def told(evaluation: Any, index: int = index, scenario: str = scenario) -> None:
             done = (index + (evaluation.iteration + 1) / attack.evaluations) / len(experiment.config.scenarios)
@@ -157,11 +158,11 @@ def _attack_again(
             settings_hash=hash_of({"victim": victim.sha256, "scenario": scenario}),
         )  # fmt: skip
         thetas[scenario] = result.theta
-    return _judged(experiment, surrogate, dressed, victim, thetas, folder)
+    return _judged(experiment, space, dressed, victim, thetas, folder)
 
 
 def _judged(
-    experiment: Experiment, surrogate: Surrogate, dressed: DressedScene, policy: LoadedPolicy,
+    experiment: Experiment, space: ColourSpace, dressed: DressedScene, policy: LoadedPolicy,
     thetas: dict[str, torch.Tensor], folder: Path,
 ) -> Found:  # fmt: skip
     """Ratios to no attack of the same victim in both domains, from the attack's starts; kept in the folder of the round."""
@@ -171,8 +172,8 @@ def _judged(
         return Found(thetas, known["ratios"])
     ratios: dict[str, dict[str, float]] = {"surrogate": {}, "deployed": {}}
     for scenario, theta in thetas.items():
-        problem = attack_problem(experiment, surrogate, policy, scenario, seed)
-        learned = [float(evaluate(problem, each)[1].protocol_cte_m.mean()) for each in (theta, surrogate.plain_theta())]
+        problem = attack_problem(experiment, space, policy, scenario, seed)
+        learned = [float(evaluate(problem, each)[1].protocol_cte_m.mean()) for each in (theta, space.plain.colours)]
         starts = experiment.start_states(scenario, seed)
         driven = [_total_cte_m(experiment, dressed, policy, scenario, starts, each) for each in (theta, None)]
         ratios["surrogate"][scenario], ratios["deployed"][scenario] = learned[0] / learned[1], driven[0] / driven[1]

@@ -126,8 +126,8 @@ def stages_of(experiment: Experiment) -> list[Stage]:
         stage("scene", scene, {"scene": part("scene")}, ("capture",)),
         stage("object", objects, {"object": part("object"), "kinds": kinds}, ()),
         stage("policy", policy, {"world": world, "policy": part("policy"), "sigma": config.attack.random_sigma, **measured}, ("capture", "scene", "object")),
-        stage("attack", attack, {"world": world, "attack": searched, **measured}, ("scene", "object", "policy")),
-        stage("deploy", deploy, {"world": world, **measured}, ("object", "policy", "attack")),
+        stage("attack", attack, {"world": world, "attack": searched, "space": part("space"), **measured}, ("scene", "object", "policy")),
+        stage("deploy", deploy, {"world": world, "space": part("space"), **measured}, ("object", "policy", "attack")),
         stage("report", report, {"attack": searched, **measured}, ("capture", "scene", "policy", "attack", "deploy")),
     ]  # fmt: skip
     if config.retrain is not None:

@@ -1,19 +1,15 @@
-"""Meshes of a request: made and placed, their shapes as what a search changes, and the GLB files of what was found."""
+"""Meshes of a request: made and placed, their shapes as what a search changes, and the meshes that a search found."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 
-import numpy as np
 from torch import Tensor
 
-from advnerf_core.attack.artifact import AttackedObject
 from advnerf_core.attack.problem import Sensor
 from advnerf_core.fields.coloured import ColouredObject
 from advnerf_core.geometry import Array
 from advnerf_core.objects.mesh.field import MeshField
-from advnerf_core.objects.mesh.glb import write_glb
 from advnerf_core.objects.mesh.shape import ShapeLimits, ShapeSensor
 from advnerf_core.objects.mesh.surface import TexturedMesh, sphere, unwrapped
 from advnerf_core.objects.voxel.generators import GENERATORS
@@ -58,23 +54,3 @@ def found_meshes(sensor: Sensor, objects: Sequence[ColouredObject], theta: Tenso
         field.mesh.with_texture(field.texture(part)) if isinstance(field, MeshField) else None
         for field, part in zip(objects, split_theta(objects, theta), strict=True)
     ]
-
-
-def write_meshes(attack_file: Path, names: Sequence[str], meshes: Sequence[TexturedMesh | None]) -> list[Path]:
-    """Write ``<attack>.<number>_<name>.glb`` beside an attack file."""
-    written = []
-    for number, (name, mesh) in enumerate(zip(names, meshes, strict=True)):
-        if mesh is not None:
-            stem = attack_file.name.removesuffix(".attack.safetensors")
-            written.append(attack_file.with_name(f"{stem}.{number}_{name}.glb"))
-            write_glb(written[-1], mesh)
-    return written
-
-
-def shaped_objects(sensor: ShapeSensor, names: Sequence[str], theta: Tensor) -> tuple[AttackedObject, ...]:
-    """What an attack file keeps of attacked shapes: the search's own parameters of each vertex, in the place of colours."""
-    parts = theta.detach().split([len(each.mesh.vertices) for each in sensor.meshes])
-    return tuple(
-        AttackedObject(name, part.numpy().astype(np.float32), each.T_world_from_object, each.scale, each.sha256)
-        for name, part, each in zip(names, parts, sensor.meshes, strict=True)
-    )

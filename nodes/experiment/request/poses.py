@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from advnerf_core.attack.adjoint import AttackProblem, BlackBoxError, evaluate
-from advnerf_core.attack.artifact import AttackFile, load_attack, save_attack
+from advnerf_core.attack.artifact import PLACES, AttackFile, load_attack, save_attack
 from advnerf_core.attack.pose_plots import draw_placements
 from advnerf_core.attack.search.poses import (
     KeepOut,
@@ -139,14 +139,11 @@ def placements_and_colours(file: Path, sensor: PlacedSensor) -> tuple[Tensor, Te
         ConfigError: It has other objects.
     """
     attack, fields = load_attack(file), sensor.space.objects
-    parts = [each.theta for each in attack.objects] or [attack.theta]
+    parts = [each.theta for each in attack.objects]
     shapes, expected = [part.shape for part in parts], [tuple(field.theta_shape) for field in fields]
     if shapes != expected:
         raise ConfigError(f"{file}: expected colours of shapes {expected} for the objects of the request, got {shapes}")
-    if attack.objects:
-        moved = [f.moved(each.T_world_from_object, each.scale) for f, each in zip(fields, attack.objects, strict=True)]
-    else:
-        moved = [fields[0].moved(attack.T_world_from_object)]
+    moved = [f.moved(each.T_world_from_object, each.scale) for f, each in zip(fields, attack.objects, strict=True)]
     colours = torch.cat([torch.from_numpy(part).double().reshape(-1, 3) for part in parts])
     return torch.stack([placement_of(each) for each in moved]), colours.reshape(sensor.surrogate.theta_shape)
 
@@ -179,10 +176,10 @@ def pose_attack_file(ready: PreparedPoses, result: SearchResult) -> AttackFile:
     # Without an attack the objects stand where the request has them, in their plain colours.
     file = prepared.make_attack_file(replace(result, theta=colours), predicted_m, ready.prepared.clean_drive)
     extra = {
-        **file.extra, "placements": ready.sensor.placements(result.theta).tolist(), "colours_free": ready.asked.colours,
+        **file.extra, "colours_free": ready.asked.colours,
         "keep_out_m": ready.asked.keep_out_m, "searched_total_cte_m": result.best.predicted_total_cte_m,
     }  # fmt: skip
-    return replace(file, extra=extra, objects=file.objects or prepared.attacked_objects(colours))
+    return replace(file, space=PLACES, extra=extra)
 
 
 def run_poses(request: AttackRequest, folder: Path, display: Display) -> list[Path]:
@@ -219,7 +216,7 @@ def _keep(ready: PreparedPoses, result: SearchResult, file: Path) -> None:
     curve = {
         "attack_id": attack.attack_id, "method": attack.method, "seed": attack.seed, "best_evaluation": result.best.iteration,
         "predicted_total_cte_m": attack.predicted_total_cte_m, "clean_drive": ready.prepared.clean_drive.to_dict(),
-        "placements": attack.extra["placements"], "searched_total_cte_m": [e.predicted_total_cte_m for e in result.history],
+        "placements": [each.placement for each in attack.objects], "searched_total_cte_m": [e.predicted_total_cte_m for e in result.history],
         "seconds": [e.seconds for e in result.history],
     }  # fmt: skip
     write_atomically(file.with_name(f"seed_{ready.prepared.seed}.json"), json.dumps(curve, indent=1) + "\n")

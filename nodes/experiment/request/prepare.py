@@ -3,17 +3,25 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib.metadata import version
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from advnerf_core.attack.adjoint import AttackProblem
-from advnerf_core.attack.artifact import AttackedObject, AttackFile, face_texture
+from advnerf_core.attack.artifact import (
+    COLOURS,
+    MESH_SHAPE,
+    MESH_TEXTURE,
+    AttackedObject,
+    AttackFile,
+    Face,
+    face_texture,
+)
 from advnerf_core.attack.clean import clean_drive
 from advnerf_core.attack.methods import method_digest
 from advnerf_core.attack.robustness import Disturbances, Smoothness
@@ -22,6 +30,7 @@ from advnerf_core.attack.spaces.displayed import DisplayedSensor
 from advnerf_core.driving.actuated import ActuatedAckermann
 from advnerf_core.driving.clean_drive import CleanDrive
 from advnerf_core.driving.dynamics import Ackermann, Dynamics
+from advnerf_core.objects.mesh.glb import glb_bytes
 from advnerf_core.objects.mesh.shape import ShapeSensor
 from advnerf_core.objects.mesh.surface import TexturedMesh
 from advnerf_core.policies.load import load_any_policy
@@ -31,7 +40,7 @@ from advnerf_core.scene.render_field import FieldRenderer
 from advnerf_core.scene.surrogate import Surrogate, split_theta
 from calibration.display_colour import DisplayCalibration
 from calibration.schema import CameraCalibration, RoomCalibration, VehicleCalibration, load_calibration
-from nodes.experiment.request.meshes import found_meshes, shape_sensor, shaped_objects
+from nodes.experiment.request.meshes import found_meshes, shape_sensor
 from nodes.experiment.request.objects import PlacedObject, place
 from nodes.experiment.request.request import AttackRequest
 from nodes.experiment.stages import hash_of
@@ -90,6 +99,7 @@ class Prepared:
     ) -> AttackFile:
         """The attack file of a search's result; the prediction is the best evaluation's own unless another is given."""
         predicted = result.best.predicted_total_cte_m if predicted_total_cte_m is None else predicted_total_cte_m
+        objects = self.attacked_objects(result.theta)
         extra = {
             "name": self.request.name, "horizon": self.problem.steps, "evaluations": len(result.history),
             "start_states": self.problem.start_states[:, :3].tolist(), "objects_sha256": self.hashes["objects"],
@@ -97,7 +107,7 @@ class Prepared:
         if self.request.shape is not None:
             extra["shape"] = self.request.shape.model_dump(mode="json")
         return AttackFile(
-            method=self.request.search.method_name, **self._face(result.theta), camera=self.surrogate.camera,
+            method=self.request.search.method_name, space=self._space, objects=objects, face=self._face(objects), camera=self.surrogate.camera,
             scene_sha256=self.hashes["scene"], policy_sha256=self.hashes["policy"], config_sha256=self.hashes["config"],
             seed=self.seed, predicted_total_cte_m=predicted, software_version=version("advnerf"), extra=extra,
             clean_drive=clean or self.clean_drive,
@@ -105,35 +115,41 @@ class Prepared:
 
     def attacked_objects(self, theta: Tensor) -> tuple[AttackedObject, ...]:
         """All objects with their colours, or what their shapes were made of, as an attack file keeps them."""
-        if isinstance(self.problem.sensor, ShapeSensor):
-            return shaped_objects(self.problem.sensor, [each.name for each in self.objects], theta)
-        parts = [part.detach().numpy().astype(np.float32) for part in split_theta(self.surrogate.objects, theta)]
+        sensor = self.problem.sensor
+        if isinstance(sensor, ShapeSensor):
+            parts = list(theta.detach().split([len(each.mesh.vertices) for each in sensor.meshes]))
+        else:
+            parts = [part.detach() for part in split_theta(self.surrogate.objects, theta)]
+        rows = zip(self.objects, parts, self.meshes(theta), strict=True)
         return tuple(
-            AttackedObject(each.name, part, each.field.T_world_from_object, each.field.scale, each.sha256)
-            for each, part in zip(self.objects, parts, strict=True)
+            AttackedObject(
+                each.name,
+                part.numpy().astype(np.float32),
+                each.field.T_world_from_object,
+                each.field.scale,
+                each.sha256,
+                b"" if mesh is None else glb_bytes(mesh),
+            )
+            for each, part, mesh in rows
         )
 
     def meshes(self, theta: Tensor) -> list[TexturedMesh | None]:
         """The meshes that were found; None for an object that is none."""
         return found_meshes(self.problem.sensor, self.surrogate.objects, theta)
 
-    def _face(self, theta: Tensor) -> dict[str, Any]:
-        """What an attack file says about objects; the first that has a deployable face is the one that is shown."""
-        others = self.attacked_objects(theta)
-        parts = [each.theta for each in others]
-        for each, part in zip(self.objects, parts, strict=True):
-            if each.face is not None:
-                return {
-                    "theta": part, "texture": face_texture(part), "size_m": each.face.size_m, "subject": each.face.subject,
-                    "corners_in_subject": each.face.corners_in_subject,
-                    "T_world_from_object": each.field.T_world_from_object,
-                    "objects": others if len(others) > 1 else (),
-                }  # fmt: skip
-        return {
-            "theta": np.zeros((0, 0, 3), np.float32), "texture": np.zeros((0, 0, 3), np.uint8), "size_m": (0.0, 0.0),
-            "subject": "", "corners_in_subject": np.zeros((4, 3)), "objects": others,
-            "T_world_from_object": self.objects[0].field.T_world_from_object,
-        }  # fmt: skip
+    @property
+    def _space(self) -> str:
+        if isinstance(self.problem.sensor, ShapeSensor):
+            return MESH_SHAPE
+        return MESH_TEXTURE if all(wanted.mesh is not None for wanted in self.request.objects) else COLOURS
+
+    def _face(self, objects: Sequence[AttackedObject]) -> Face | None:
+        """The first face that can be deployed; None if no object has one."""
+        for number, (placed, found) in enumerate(zip(self.objects, objects, strict=True)):
+            if (face := placed.face) is not None:
+                texture = face_texture(found.theta)
+                return Face(texture, face.size_m, face.subject, face.corners_in_subject, number)
+        return None
 
 
 def prepare(request: AttackRequest, seed: int | None = None) -> Prepared:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from advnerf_core.attack.artifact import AttackFile, load_attack
+from advnerf_core.files import write_atomically
 
 
 def in_one_line(attack: AttackFile) -> str:
@@ -13,6 +14,21 @@ def in_one_line(attack: AttackFile) -> str:
     total = "unknown" if attack.predicted_total_cte_m is None else f"{attack.predicted_total_cte_m:.1f} m"
     clean = "without attack not driven" if attack.clean_drive is None else attack.clean_drive.short
     return f"attack {attack.attack_id}, {attack.method}, predicted total CTE {total}, {clean}"
+
+
+def export_attack(attack: AttackFile, folder: Path, stem: str) -> list[Path]:
+    """Write the texture of an attack's face as ``<stem>.texture.png``, and its meshes as ``<stem>.<number>_<name>.glb``."""
+    import cv2
+
+    written: list[Path] = []
+    if attack.face is not None:
+        written.append(folder / f"{stem}.texture.png")
+        write_atomically(written[-1], cv2.imencode(".png", attack.face.texture[..., ::-1])[1].tobytes())
+    for number, each in enumerate(attack.objects):
+        if each.glb:
+            written.append(folder / f"{stem}.{number}_{each.name}.glb")
+            write_atomically(written[-1], each.glb)
+    return written
 
 
 def print_attacks(files: Sequence[Path]) -> None:

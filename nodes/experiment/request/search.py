@@ -19,7 +19,6 @@ from advnerf_core.attack.methods import (
 from advnerf_core.attack.search.search import Evaluation, OnEvaluation, SearchResult
 from advnerf_core.attack.search.together import gradient_attacks
 from advnerf_core.files import write_atomically
-from nodes.experiment.request.meshes import write_meshes
 from nodes.experiment.request.prepare import Prepared, prepare
 from nodes.experiment.request.request import SHAPE_METHODS, AttackRequest, load_request, request_text
 from nodes.experiment.request.telling import telling
@@ -192,10 +191,7 @@ def _run_together(
 
 def _keep(prepared: Prepared, result: SearchResult, folder: Path) -> None:
     """Write the attack file of a finished search, and its curve beside it."""
-    file, names = attack_file(folder, prepared.seed), [each.name for each in prepared.objects]
-    # Before the attack file, which says that the seed is done.
-    write_meshes(file, names, prepared.meshes(result.theta))
-    attack_id = save_attack(file, finish(prepared, result))
+    attack_id = save_attack(attack_file(folder, prepared.seed), finish(prepared, result))
     curve = {
         "attack_id": attack_id, "method": prepared.request.search.method_name, "seed": prepared.seed,
         "best_evaluation": result.best.iteration, "loss_m": [e.loss_m for e in result.history],

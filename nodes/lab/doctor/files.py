@@ -99,4 +99,5 @@ def _attack(name: str, data: dict[str, Any]) -> list[Finding]:
         pass  # said under "calibration"
     except AdvnerfError as error:
         return [Finding("attack", FAILURE, f"{name}: {error}", "name the target that it was made for")]
-    return [Finding("attack", OK, f"{name}: {attack.attack_id}, {attack.method}, for {attack.subject}")]
+    subject = "no subject" if attack.face is None else attack.face.subject
+    return [Finding("attack", OK, f"{name}: {attack.attack_id}, {attack.method}, for {subject}")]

@@ -9,8 +9,9 @@ import torch
 from scipy.ndimage import map_coordinates
 
 from advnerf_core.attack.adjoint import adjoint_gradient, evaluate
+from advnerf_core.attack.artifact import AttackFile, AttackFileError
 from advnerf_core.attack.health import central_slopes, frozen_loss, random_directions, slopes_of
-from advnerf_core.attack.search.pose_attack import pose_attack, randomly_placed
+from advnerf_core.attack.methods import SearchRun, SearchSettings
 from advnerf_core.attack.search.poses import (
     KeepOut,
     MultiStart,
@@ -26,6 +27,8 @@ from advnerf_core.attack.search.poses import (
 )
 from advnerf_core.attack.search.search import SearchStateError
 from advnerf_core.attack.spaces.placement import footprint
+from advnerf_core.attack.spaces.places import PlaceLimits, PlaceSpace, randomly_placed
+from advnerf_core.attack.spaces.space import NamedObject, SpaceError
 from advnerf_core.fields.soft_edges import with_soft_edges
 from advnerf_core.fields.voxel_grid import cube_face_object
 from advnerf_core.geometry import planar_pose
@@ -264,37 +267,65 @@ def _lift(z_m):
     return lift
 
 
-def test_one_call_finds_poses_and_gives_what_a_deployment_shows():
-    placed_one = moving(2, objects=2)
-    surrogate, space = placed_one.sensor.surrogate, placed_one.sensor.space
-    problem = dataclasses.replace(placed_one, sensor=surrogate)
-    found = pose_attack(problem, space.bounds, space.keep_out, budget=MultiStart(2, 2), seed=7)
-    expected = multi_start(placed_one, MultiStart(2, 2), seed=7)
-    assert torch.equal(found.search.theta, expected.theta)
-    np.testing.assert_allclose(torch.stack([placement_of(each) for each in found.objects]), found.placements)
-    assert torch.equal(found.totals.protocol_cte_m, judge(placed_one, expected.theta).protocol_cte_m)
+def space_of(problem, budget, colours=True):
+    sensor = problem.sensor
+    named = [NamedObject(f"box{k}", str(k)) for k in range(len(sensor.surrogate.objects))]
+    limits = PlaceLimits(sensor.space.bounds, sensor.space.keep_out, colours)
+    return PlaceSpace(sensor.surrogate, named, limits, budget)
+
+
+def attack_of(space, problem, method, seed=7):
+    result = space.search(method, problem, SearchSettings(), SearchRun(seed))
+    face = AttackFile(
+        method=method, space=space.name, objects=space.attacked(result.theta), face=None, camera=space.surrogate.camera,
+        scene_sha256="", policy_sha256="", config_sha256="", seed=seed, predicted_total_cte_m=None, software_version="0",
+    )  # fmt: skip
+    return result, face
+
+
+def test_an_attack_file_of_places_gives_what_a_deployment_shows():
+    problem = moving(2, objects=2)
+    space = space_of(problem, MultiStart(2, 2))
+    surrogate, placed_there = space.surrogate, dataclasses.replace(problem, sensor=space.sensor)
+    result, attack = attack_of(space, placed_there, "gradient")
+    expected = multi_start(problem, MultiStart(2, 2), seed=7)
+    assert torch.equal(result.theta, expected.theta)
+    assert attack.space == "places"
+    found = space.restored(attack)
+    places = space.sensor.placements(result.theta)
+    np.testing.assert_allclose(torch.stack([placement_of(each) for each in found.objects]), places)
+    np.testing.assert_allclose([each.placement for each in attack.objects], places, atol=1e-12)
+    seen = dataclasses.replace(problem, sensor=found.seen_by(surrogate))
+    # The file holds float32, the toy computes in float64.
+    totals = [evaluate(seen, found.colours)[1], judge(problem, expected.theta)]
+    torch.testing.assert_close(*(each.protocol_cte_m for each in totals), rtol=1e-6, atol=1e-6)
     # Composed into a deployment's image: opaque objects at the found places, hidden by what is nearer.
     T = surrogate.camera_poses(problem.start_states)
     rgb, depth_m = surrogate.coloured_background(T)
-    deployed = found.deployed(surrogate)
+    deployed = surrogate.with_objects(found.objects, opaque=True)
     shown = deployed.overlay(rgb, depth_m, T, found.colours)
     assert torch.equal(shown, deployed.render(T, found.colours).images)
     assert float((shown - rgb.permute(0, 3, 1, 2)).abs().max()) > 0.1
     hidden = deployed.overlay(rgb, torch.full_like(depth_m, 0.1), T, found.colours)
     assert torch.equal(hidden, rgb.permute(0, 3, 1, 2))
-    guessed = pose_attack(problem, space.bounds, space.keep_out, "random", MultiStart(2, 2), free_colours=False)
-    assert len(guessed.search.history) == 4
-    assert torch.equal(guessed.colours, surrogate.plain_theta())
-    with pytest.raises(TypeError, match="Surrogate as sensor"):
-        pose_attack(placed_one, space.bounds, space.keep_out)
-    with pytest.raises(ValueError, match="gradient or random"):
-        pose_attack(problem, space.bounds, space.keep_out, "cem")
+
+
+def test_places_alone_keep_the_colours_and_other_methods_are_refused():
+    problem = moving(2, objects=2)
+    alone = space_of(problem, MultiStart(2, 2), colours=False)
+    result, attack = attack_of(alone, dataclasses.replace(problem, sensor=alone.sensor), "random")
+    assert len(result.history) == 4
+    torch.testing.assert_close(alone.restored(attack).colours, alone.plain.colours, rtol=1e-6, atol=1e-6)
+    with pytest.raises(SpaceError, match="random or gradient, got cem"):
+        alone.search("cem", problem, SearchSettings(), SearchRun())
+    others = dataclasses.replace(attack, objects=attack.objects[::-1])
+    with pytest.raises(AttackFileError, match="expected an attack on box0, box1, got attack"):
+        alone.restored(others)
 
 
 def test_the_scene_of_a_drive_is_rendered_once_for_its_gradient_too():
     placed_one = moving(2)
-    surrogate, space = placed_one.sensor.surrogate, placed_one.sensor.space
-    rendered = []
+    surrogate, rendered = placed_one.sensor.surrogate, []
 
     def counted(poses, pinhole):
         rendered.extend(poses)
@@ -302,21 +333,23 @@ def test_the_scene_of_a_drive_is_rendered_once_for_its_gradient_too():
 
     background, surrogate._background = surrogate._background, counted
     found = {}
-    for cache_bytes in (0, 2**20):
+    for kept_bytes in (0, 2**20):
         rendered.clear()
-        problem = dataclasses.replace(placed_one, sensor=surrogate, cache_bytes=cache_bytes)
-        result = pose_attack(problem, space.bounds, space.keep_out, budget=MultiStart(1, 2), seed=7)
-        found[cache_bytes] = (result.search.theta, len(rendered))
-    frames = problem.steps * len(problem.start_states)
-    # Two evaluations with gradients and the last one without; what is kept are those of one drive.
-    assert found[0][1] - found[2**20][1] >= 2 * (frames - len(problem.start_states))
+        space = placed_one.sensor.space
+        sensor = PlacedSensor(surrogate.remembering(kept_bytes), space)
+        result = multi_start(dataclasses.replace(placed_one, sensor=sensor), MultiStart(1, 2), seed=7)
+        found[kept_bytes] = (result.theta, len(rendered))
+    frames = placed_one.steps * len(placed_one.start_states)
+    # Two evaluations with gradients; what is kept are the frames of one drive.
+    assert found[0][1] - found[2**20][1] >= 2 * (frames - len(placed_one.start_states))
     assert torch.equal(found[0][0], found[2**20][0])
 
 
-def test_surrogates_for_retraining_have_their_objects_at_allowed_places():
+def test_objects_for_retraining_are_at_allowed_places():
     sensor = moving(1, objects=2).sensor
-    made = randomly_placed(sensor.surrogate, sensor.space.bounds, sensor.space.keep_out, 3, seed=1)
-    places = torch.stack([torch.stack([placement_of(each) for each in one.objects]) for one in made])
+    limits = PlaceLimits(sensor.space.bounds, sensor.space.keep_out)
+    made = randomly_placed(sensor.space.objects, limits, 3, seed=1)
+    places = torch.stack([torch.stack([placement_of(each) for each in one]) for one in made])
     assert len(torch.unique(places, dim=0)) == 3
     for placements in places:
         sensor.space.unit(placements)  # refuses what is not allowed

@@ -14,6 +14,7 @@ from advnerf_core.objects.mesh.glb import read_glb
 from nodes.cli import main as cli
 from nodes.experiment.request.check import check
 from nodes.experiment.request.prepare import prepare
+from nodes.experiment.request.printed import export_attack
 from nodes.experiment.request.request import load_request
 from nodes.experiment.request.search import run_attack
 from nodes.runtime.errors import ConfigError
@@ -64,8 +65,8 @@ def test_textures_of_a_mesh_are_searched_resumed_and_exported(tmp_path):
     assert resumed.read_bytes() == whole.read_bytes()
     attack = load_attack(whole)
     assert [each.name for each in attack.objects] == ["hydrant", "face"]
-    (glb,) = whole.parent.glob("*.glb")
-    assert glb.name == "seed_0.0_hydrant.glb"
+    (glb,) = (each for each in export_attack(attack, tmp_path, "found") if each.suffix == ".glb")
+    assert glb.name == "found.0_hydrant.glb"
     found = 1.0 / (1.0 + np.exp(-attack.objects[0].theta))
     used = prepare(request).surrogate.objects[0].mesh.charts >= 0
     assert np.abs(read_glb(glb).texture - found)[used].max() < 0.6 / 255
@@ -104,7 +105,8 @@ def test_shapes_are_searched_resumed_and_exported(tmp_path, method):
     prepared = prepare(request)
     (shape,) = prepared.meshes(prepared.problem.sensor.initial_theta(torch.Generator().manual_seed(5)))
     assert np.abs(shape.vertices - prepared.surrogate.objects[0].mesh.vertices).max() < 1e-3
-    (glb,) = whole.parent.glob("*.glb")
+    assert attack.space == "mesh_shape"
+    (glb,) = export_attack(attack, tmp_path, "found")
     assert len(read_glb(glb).vertices) == 642
     assert len(json.loads((tmp_path / "whole" / "seed_0.json").read_text())["loss_m"]) == 3
     if method == "gradient":

@@ -65,8 +65,8 @@ def test_a_method_of_a_file_runs_a_request_and_resumes_to_the_same_bytes(tmp_pat
     attack, curve = load_attack(whole), json.loads((tmp_path / "whole" / "seed_0.json").read_text())
     assert attack.method == curve["method"] == "Spiral"
     assert len(curve["loss_m"]) == 3
-    expected = spiral_theta(attack.theta.shape, curve["best_evaluation"], turns=0.25)
-    torch.testing.assert_close(torch.from_numpy(attack.theta), expected, rtol=1e-5, atol=1e-5)
+    expected = spiral_theta(attack.face_object.theta.shape, curve["best_evaluation"], turns=0.25)
+    torch.testing.assert_close(torch.from_numpy(attack.face_object.theta), expected, rtol=1e-5, atol=1e-5)
 
 
 def test_a_method_of_an_installed_package_runs_a_request(tmp_path, monkeypatch):

@@ -47,15 +47,17 @@ def test_commands_search_map_and_find_their_work_again(tmp_path, monkeypatch, ca
     attack_path = folder / "seed_0.attack.safetensors"
     assert command(monkeypatch, "poses", file, "-o", folder) == 0
     attack, content = load_attack(attack_path), attack_path.read_bytes()
-    (placement,) = attack.extra["placements"]
+    (found,) = attack.objects
+    placement = found.placement
+    assert attack.space == "places"
     assert 0.9 <= placement[0] <= 1.6
     assert -1.5 <= placement[1] <= -1.2
-    np.testing.assert_allclose(attack.T_world_from_object[:2, 3], placement[:2], atol=1e-12)
-    np.testing.assert_allclose(attack.objects[0].T_world_from_object, attack.T_world_from_object)
-    assert attack.objects[0].theta.shape == attack.theta.shape
+    assert attack.face is not None
+    assert attack.face_object is found
     curve = json.loads((folder / "seed_0.json").read_text())
     assert len(curve["searched_total_cte_m"]) == 4
     assert curve["attack_id"] == attack.attack_id
+    np.testing.assert_allclose(curve["placements"], [placement])
     assert (folder / "seed_0.poses.png").stat().st_size > 1000
     for name in ("landscape", "robustness"):
         assert command(monkeypatch, name, file, "-o", folder, "--attack", attack_path) == 0
@@ -74,7 +76,7 @@ def test_commands_search_map_and_find_their_work_again(tmp_path, monkeypatch, ca
 def test_a_killed_run_ends_in_the_same_bytes_and_seeds_differ(tmp_path):
     request = load_request(request_file(tmp_path), ["search.seeds=[0, 3]", "horizon=1", "poses.steps=1"])
     whole = run_poses(request, tmp_path / "whole", ProgressDisplay())
-    places = [load_attack(file).extra["placements"] for file in whole]
+    places = [load_attack(file).objects[0].placement for file in whole]
     assert places[0] != places[1]
 
     class Impatient(ProgressDisplay):
@@ -102,10 +104,10 @@ def test_poses_alone_keep_the_colours_they_are_given_and_random_ones_spend_as_mu
     (found,) = run_poses(request, tmp_path / "alone", ProgressDisplay())
     attack = load_attack(found)
     assert attack.method == "random"
-    np.testing.assert_array_equal(attack.theta, load_attack(coloured).theta)
+    np.testing.assert_array_equal(attack.face_object.theta, load_attack(coloured).face_object.theta)
     assert attack.extra["evaluations"] == 4
     assert attack.config_sha256 != load_attack(coloured).config_sha256
-    np.testing.assert_allclose(ready.sensor.placements(ready.theta_of(found)), attack.extra["placements"], atol=1e-9)
+    np.testing.assert_allclose(ready.sensor.placements(ready.theta_of(found)), [attack.objects[0].placement], atol=1e-9)
     with pytest.raises(ConfigError, match="expected the colours of the request"):
         prepare_poses(load_request(file, ["horizon=1", "poses.colours=false"])).theta_of(coloured)
 

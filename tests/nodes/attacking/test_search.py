@@ -63,7 +63,7 @@ def test_a_stopped_run_goes_on_to_the_same_bytes(tmp_path, method):
     assert resumed.read_bytes() == whole.read_bytes()
     attack = load_attack(whole)
     assert attack.method == method
-    assert attack.subject == "board"
+    assert attack.required_face().subject == "board"
     assert len(json.loads((tmp_path / "whole" / "seed_0.json").read_text())["loss_m"]) == 3
     with pytest.raises(ConfigError, match="belongs to another attack"):
         run_attack(load_request(file), tmp_path / "whole", ProgressDisplay())
@@ -110,7 +110,7 @@ def test_seeds_searched_together_resume_to_the_same_bytes_and_end_as_they_do_alo
         assert load_attack(one).predicted_total_cte_m == pytest.approx(
             load_attack(other).predicted_total_cte_m, rel=1e-4
         )
-        np.testing.assert_allclose(load_attack(one).theta, load_attack(other).theta, atol=1e-3)
+        np.testing.assert_allclose(load_attack(one).face_object.theta, load_attack(other).face_object.theta, atol=1e-3)
     with pytest.raises(ConfigError, match="gradient method only"):
         load_request(file, ["search.method=random", "search.together=true"])
 
@@ -132,7 +132,7 @@ def test_a_monitor_in_the_loop_is_searched_through_its_colours_and_the_gradient_
     torch.testing.assert_close(images, prepared.surrogate.sense(prepared.problem.start_states, seen).images)
     assert prepared.settings_hash != prepare(shown).settings_hash
     (attack,) = run_attack(request, tmp_path / "out", ProgressDisplay())
-    assert load_attack(attack).subject == "board"
+    assert load_attack(attack).required_face().subject == "board"
     assert check(load_request(file), 2, False, lambda fraction, text="": None).sound
     with pytest.raises(ConfigError, match="display: expected one object"):
         load_request(file, ["search.together=true"])

@@ -9,7 +9,6 @@ from typer.testing import CliRunner
 
 from nodes.cli.main import app
 from nodes.experiment.campaign.config import load_campaign, select
-from nodes.experiment.campaign.kinds import load_kind
 from nodes.experiment.campaign.predictions import prediction_file
 from nodes.experiment.campaign.published import Published, publish, published_table, restore
 from nodes.experiment.campaign.run import Options, plan_cells, run_campaign, statuses
@@ -36,7 +35,7 @@ def campaign_command(*arguments):
     return done.output
 
 
-def test_a_table_and_published_cells_from_finished_cells(here, monkeypatch, tmp_path):
+def test_a_table_and_published_cells_from_finished_cells(here, tmp_path):
     """Without running: results are put where workers put them; one of other settings is not taken."""
     bench = here
     campaign = load_campaign(bench.file)
@@ -56,11 +55,10 @@ def test_a_table_and_published_cells_from_finished_cells(here, monkeypatch, tmp_
     kept = tmp_path / "kept" / "toy" / f"{plan[0].cell.name}.json"
     whole = bench.cells / kept.name
     assert kept.read_text() == whole.read_text()
-    whole.write_text(json.dumps({**json.loads(whole.read_text()), "extra": {"short": 1, "colours": [0.5] * 9}}))
-    monkeypatch.setattr(load_kind(plan[0].job.kind).module, "UNPUBLISHED", ("colours",), raising=False)
+    whole.write_text(json.dumps({**json.loads(whole.read_text()), "extra": {"changed": 1}}))
     found = statuses(campaign, campaign.cells)
     assert publish(campaign, found, tmp_path / "kept") == Published((plan[0].cell.name,), (), ())
-    assert json.loads(kept.read_text())["extra"] == {"short": 1}
+    assert json.loads(kept.read_text())["extra"] == {"changed": 1}
     assert publish(campaign, found, tmp_path / "kept") == Published((), (plan[0].cell.name,), ())
     row = published_table(tmp_path / "kept" / "toy", campaign).find("straight", "hardened", "none", "deployed")
     assert row.ratio == 3.0
@@ -123,7 +121,7 @@ def test_a_lost_folder_comes_back_from_what_was_published(here, tmp_path):
     assert "0 cells taken back, 2 were there" in campaign_command("restore", here.file, "--from", kept, *only)
 
 
-def test_predictions_come_back_what_other_settings_made_or_what_is_kept_in_part_does_not(here, monkeypatch, tmp_path):
+def test_predictions_come_back_and_what_other_settings_made_does_not(here, tmp_path):
     kept, campaign = tmp_path / "kept", load_campaign(here.file)
     plan = plan_cells(campaign, campaign.cells)
     for each in plan[:2]:
@@ -133,10 +131,6 @@ def test_predictions_come_back_what_other_settings_made_or_what_is_kept_in_part_
     for each in plan[:2]:  # that of the second cell is of other settings than the cell
         prediction_file(kept / "toy", each.cell.name).parent.mkdir(exist_ok=True)
         prediction_file(kept / "toy", each.cell.name).write_text(json.dumps(prediction))
-    with monkeypatch.context() as partly:
-        partly.setattr(load_kind(here.kind).module, "UNPUBLISHED", ("colours",), raising=False)
-        found = restore(campaign, campaign.cells, kept)
-    assert (len(found.incomplete), len(found.missing), len(found.taken)) == (2, 2, 0)
     settings = (here.folder / "toy.experiment.yaml").read_text()
     (here.folder / "toy.experiment.yaml").write_text("base: 5.0\n")
     found = restore(campaign, campaign.cells, kept)

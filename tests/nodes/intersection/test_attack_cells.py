@@ -15,14 +15,13 @@ from advnerf_core.attack.artifact import load_attack
 from advnerf_core.attack.search.search import SearchStateError
 from nodes.experiment.campaign.kinds import load_kind, settings_hash
 from nodes.experiment.junction import attack, page, report, run
-from nodes.experiment.junction.attack import Cell, cells, load_theta, surrogate_part
-from nodes.experiment.junction.cells import CellError, deployed_part, run_cell
+from nodes.experiment.junction.attack import Cell, cells, load_shown, surrogate_part
+from nodes.experiment.junction.cells import CellError, run_cell
 from nodes.experiment.junction.context import Experiment
-from nodes.experiment.junction.deploy import FrozenChangedError, check_frozen
-from nodes.experiment.junction.deployed import DressedScene
+from nodes.experiment.junction.deploy import FrozenChangedError, check_frozen, deployed_part
 from nodes.experiment.junction.films import film_cell
-from nodes.experiment.junction.objects import placed_objects, surrogate_of
 from nodes.experiment.junction.policy import NAIVE, victim_file
+from nodes.experiment.junction.spaces import colour_space
 from tests.strangers import spiral_code, spiral_theta, write_spiral
 
 PLACE = ("right", "hardened")
@@ -53,23 +52,24 @@ def test_cells_are_all_methods_of_all_drives(trained: Experiment) -> None:
 @pytest.mark.parametrize("method", ["gradient", "random", "cem"])
 def test_search_is_kept_and_its_file_brings_the_colours_back(fresh: Experiment, method: str) -> None:
     folder, cell = fresh.stage_folder("attack"), replace(GRADIENT, method=method)
-    surrogate = surrogate_of(fresh, placed_objects(fresh))
-    found = surrogate_part(fresh, surrogate, cell, folder, silent)
+    space = colour_space(fresh)
+    found = surrogate_part(fresh, space, cell, folder, silent)
     assert len(found["curve_total_cte_m"]) == 2
     assert found["total_cte_m"][0] == pytest.approx(
         max(found["curve_total_cte_m"])
     )  # the best evaluation, driven again
-    theta, file = load_theta(folder, cell), load_attack(attack.attack_path(folder, cell))
-    assert theta.shape == surrogate.theta_shape
+    file = load_attack(attack.attack_path(folder, cell))
+    theta = space.restored(file).colours
+    assert theta.shape == space.sensor.theta_shape
     assert [thing.name for thing in file.objects] == [thing.name for thing in fresh.world.objects]
     assert file.attack_id == found["attack_id"]
-    moved = (theta - surrogate.plain_theta()).abs().max()
+    moved = (theta - space.plain.colours).abs().max()
     assert moved > (1e-5 if method == "gradient" else 1.0)
     assert not list(folder.glob("*.state.*"))
     # What is there is not searched again.
     marked = {**found, "seconds": -1.0}
     (folder / f"{cell.name}.json").write_text(json.dumps(marked))
-    assert surrogate_part(fresh, surrogate, cell, folder, silent) == marked
+    assert surrogate_part(fresh, space, cell, folder, silent) == marked
 
 
 def test_a_method_of_a_file_runs_a_cell_and_appears_in_the_tables(fresh: Experiment, wall: Any, tmp_path: Path) -> None:
@@ -78,17 +78,17 @@ def test_a_method_of_a_file_runs_a_cell_and_appears_in_the_tables(fresh: Experim
     experiment = run.load_experiment(file, "tiny", changes, fresh.folder)
     names = [f"right_hardened_{method}_0" for method in ("none", "Spiral", "gradient")]
     assert [cell.name for cell in cells(experiment)] == names
-    objects, out = placed_objects(experiment), experiment.stage_folder("deploy")
-    surrogate, dressed = surrogate_of(experiment, objects), DressedScene(wall, experiment.view, objects)
+    space, out = colour_space(experiment), experiment.stage_folder("deploy")
     for cell in cells(experiment):
-        surrogate_part(experiment, surrogate, cell, out, silent)
-        deployed_part(experiment, dressed, cell, out, out)
+        surrogate_part(experiment, space, cell, out, silent)
+        deployed_part(experiment, space, wall, cell, out, out)
     spiral = cells(experiment)[1]
-    found = load_theta(out, spiral)
-    thetas = [spiral_theta(tuple(surrogate.theta_shape), number) for number in range(2)]
+    shown = load_shown(space, out, spiral)
+    found = shown.colours
+    thetas = [spiral_theta(tuple(space.sensor.theta_shape), number) for number in range(2)]
     assert min(float((found - theta).abs().max()) for theta in thetas) < 1e-5
     assert load_attack(attack.attack_path(out, spiral)).method == "Spiral"
-    assert film_cell(experiment, dressed, spiral, out).exists()
+    assert film_cell(experiment, wall, shown, spiral, out).exists()
     table = report.transfer_table(report.rows_of(experiment))
     assert [row[3] for row in table.rows] == 2 * ["no attack", "gradient", "Spiral"]
     assert "Spiral" in page.opening(experiment)
@@ -106,29 +106,28 @@ def test_a_method_of_a_file_runs_a_cell_and_appears_in_the_tables(fresh: Experim
 
 
 def test_a_stopped_search_goes_on_and_refuses_another_victim(fresh: Experiment) -> None:
-    folder, surrogate = fresh.stage_folder("attack"), surrogate_of(fresh, placed_objects(fresh))
-    whole = surrogate_part(fresh, surrogate, GRADIENT, folder, silent)
+    folder, space = fresh.stage_folder("attack"), colour_space(fresh)
+    whole = surrogate_part(fresh, space, GRADIENT, folder, silent)
 
     def stop(fraction: float, text: str = "") -> None:
         raise KeyboardInterrupt
 
     other = fresh.folder / "again"
     with pytest.raises(KeyboardInterrupt):
-        surrogate_part(fresh, surrogate, GRADIENT, other, stop)
+        surrogate_part(fresh, space, GRADIENT, other, stop)
     stopped = (other / f"{GRADIENT.name}.state.safetensors").read_bytes()
-    assert surrogate_part(fresh, surrogate, GRADIENT, other, silent)["states"] == whole["states"]
+    assert surrogate_part(fresh, space, GRADIENT, other, silent)["states"] == whole["states"]
     naive = replace(GRADIENT, victim=NAIVE)
     (other / f"{naive.name}.state.safetensors").write_bytes(stopped)
     with pytest.raises(SearchStateError, match="other settings"):
-        surrogate_part(fresh, surrogate, naive, other, silent)
+        surrogate_part(fresh, space, naive, other, silent)
 
 
 def test_cell_has_both_domains_over_their_own_clean_drive(fresh: Experiment, wall: Any) -> None:
-    folder, objects = fresh.stage_folder("attack"), placed_objects(fresh)
-    surrogate = surrogate_of(fresh, objects)
-    learned = {cell: surrogate_part(fresh, surrogate, cell, folder, silent) for cell in (GRADIENT.clean, GRADIENT)}
+    folder, space = fresh.stage_folder("attack"), colour_space(fresh)
+    learned = {cell: surrogate_part(fresh, space, cell, folder, silent) for cell in (GRADIENT.clean, GRADIENT)}
     out = fresh.stage_folder("deploy")
-    cell = deployed_part(fresh, DressedScene(wall, fresh.view, objects), GRADIENT, folder, out)
+    cell = deployed_part(fresh, space, wall, GRADIENT, folder, out)
     assert cell["surrogate"]["total_cte_m"] == learned[GRADIENT]["total_cte_m"]
     assert cell["surrogate"]["none_total_cte_m"] == learned[GRADIENT.clean]["total_cte_m"]
     driven = np.array(json.loads((out / f"{GRADIENT.name}.drives.json").read_text())["states"][0])
@@ -138,20 +137,19 @@ def test_cell_has_both_domains_over_their_own_clean_drive(fresh: Experiment, wal
     assert cell["extra"]["blocked_tick"] == [None]
     # Once there, it is not driven again: here it would end where it starts.
     blocking = replace(wall, blocked_beyond_m=-1e3)
-    assert deployed_part(fresh, DressedScene(blocking, fresh.view, objects), GRADIENT, folder, out) == cell
+    assert deployed_part(fresh, space, blocking, GRADIENT, folder, out) == cell
     (out / f"{GRADIENT.name}.cell.json").unlink()
     (out / f"{GRADIENT.name}.drives.json").unlink()
-    held = deployed_part(fresh, DressedScene(blocking, fresh.view, objects), GRADIENT, folder, out)
+    held = deployed_part(fresh, space, blocking, GRADIENT, folder, out)
     assert held["extra"]["blocked_tick"] == [1]
 
 
 def test_a_cell_is_filmed_frame_by_frame(fresh: Experiment, wall: Any) -> None:
-    folder, objects = fresh.stage_folder("attack"), placed_objects(fresh)
-    surrogate, dressed = surrogate_of(fresh, objects), DressedScene(wall, fresh.view, objects)
+    folder, space = fresh.stage_folder("attack"), colour_space(fresh)
     for cell in (GRADIENT.clean, GRADIENT):
-        surrogate_part(fresh, surrogate, cell, folder, silent)
-    deployed_part(fresh, dressed, GRADIENT, folder, folder)
-    with av.open(str(film_cell(fresh, dressed, GRADIENT, folder))) as film:
+        surrogate_part(fresh, space, cell, folder, silent)
+    deployed_part(fresh, space, wall, GRADIENT, folder, folder)
+    with av.open(str(film_cell(fresh, wall, load_shown(space, folder, GRADIENT), GRADIENT, folder))) as film:
         frames = [frame.to_ndarray(format="rgb24") for frame in film.decode(video=0)]
     assert len(frames) >= fresh.config.horizon
     assert frames[0].std() > 5  # something is to be seen
@@ -198,7 +196,7 @@ def test_table_divides_by_the_clean_drive_of_the_same_domain(fresh: Experiment) 
 
 
 def test_attack_differs_between_seeds_and_repeats_itself(trained: Experiment) -> None:
-    surrogate = surrogate_of(trained, placed_objects(trained))
+    surrogate = colour_space(trained).surrogate
     first, again, other = (surrogate.initial_theta(torch.Generator().manual_seed(seed)) for seed in (0, 0, 1))
     assert torch.equal(first, again)
     assert not torch.equal(first, other)

@@ -20,14 +20,15 @@ from advnerf_core.geometry import Array
 from advnerf_core.policies.pilotnet import load_policy
 from advnerf_core.report.clips import read_clip
 from hardware.worlds.world import DeploymentScene
-from nodes.experiment.junction.attack import Cell, attack_problem, surrogate_part
-from nodes.experiment.junction.cells import deployed_part
+from nodes.experiment.junction.attack import Cell, attack_problem, load_shown, surrogate_part
 from nodes.experiment.junction.context import Experiment
-from nodes.experiment.junction.deployed import DressedScene, SelfDriving
+from nodes.experiment.junction.deploy import deployed_part
+from nodes.experiment.junction.deployed import SelfDriving
 from nodes.experiment.junction.films import film_cell, filmed
 from nodes.experiment.junction.objects import placed_objects, surrogate_of
 from nodes.experiment.junction.policy import HARDENED, victim_file
 from nodes.experiment.junction.run import load_experiment
+from nodes.experiment.junction.spaces import colour_space
 
 LAUNCH = Path(__file__).parents[3] / "launch" / "intersection.experiment.yaml"
 SECONDS, TICKS_S = 2.0, (0.1, 0.01)
@@ -129,12 +130,13 @@ def finer(trained: Experiment, horizon: int, folder: Path) -> Experiment:
 
 def test_the_gradient_is_what_a_turn_of_a_hundredth_of_a_second_is_worth(trained: Experiment, tmp_path: Path) -> None:
     experiment = finer(trained, 8, tmp_path / "run")
-    surrogate = surrogate_of(experiment, placed_objects(experiment)).in_type(torch.float64)
+    space = colour_space(experiment, surrogate_of(experiment, placed_objects(experiment)).in_type(torch.float64))
+    surrogate = space.surrogate
     loaded = load_policy(victim_file(experiment, HARDENED))
     loaded.policy.double()
     x_m, y_m, yaw_rad = experiment.references["straight"].start_pose
     aside = torch.tensor([[x_m, y_m + 0.5, yaw_rad]], dtype=torch.float64)  # where |CTE| has no kink
-    plain = attack_problem(experiment, surrogate, loaded, "straight", 0)
+    plain = attack_problem(experiment, space, loaded, "straight", 0)
     assert plain.goals is not None
     problem = replace(plain, start_states=aside, goals=plain.goals.double())
     theta = surrogate.initial_theta(torch.Generator().manual_seed(0))
@@ -162,19 +164,18 @@ def test_the_gradient_is_what_a_turn_of_a_hundredth_of_a_second_is_worth(trained
 @pytest.mark.slow
 def test_search_drive_and_film_in_finer_ticks(trained: Experiment, wall: Any, tmp_path: Path) -> None:
     experiment, cell = finer(trained, 10, tmp_path / "run"), Cell("straight", HARDENED, "gradient", 0)
-    objects, folder = placed_objects(experiment), experiment.stage_folder("deploy")
-    surrogate, dressed = surrogate_of(experiment, objects), DressedScene(wall, experiment.view, objects)
+    space, folder = colour_space(experiment), experiment.stage_folder("deploy")
     for each in (cell.clean, cell):
-        found = surrogate_part(experiment, surrogate, each, folder, lambda fraction, text="": None)
+        found = surrogate_part(experiment, space, each, folder, lambda fraction, text="": None)
     assert len(found["curve_total_cte_m"]) == experiment.config.attack.evaluations
-    result = deployed_part(experiment, dressed, cell, folder, folder)
+    result = deployed_part(experiment, space, wall, cell, folder, folder)
     assert result["extra"]["horizon"] == 10
     for name in (f"{cell.name}.json", f"{cell.name}.drives.json"):
         (states,) = np.array(json.loads((folder / name).read_text())["states"])
         way_m = np.linalg.norm(np.diff(states[:, :2], axis=0), axis=1).sum()
         assert way_m == pytest.approx(6.0 * 10 * 0.01, rel=1e-3)
     # A film shows every tenth tick: the start and the end.
-    assert len(read_clip(film_cell(experiment, dressed, cell, folder))) == 2
+    assert len(read_clip(film_cell(experiment, wall, load_shown(space, folder, cell), cell, folder))) == 2
 
 
 @pytest.mark.parametrize(("dt_s", "every", "rate_hz"), [(0.1, 1, 10.0), (0.01, 10, 10.0), (0.05, 2, 10.0), (0.2, 1, 5.0)])  # fmt: skip

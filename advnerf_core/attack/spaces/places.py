@@ -1,0 +1,116 @@
+"""The space of places: where objects stand beside the lanes, alone or together with their colours."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from advnerf_core.attack.artifact import PLACES, AttackedObject, AttackFile
+from advnerf_core.attack.methods import SearchRun, SearchSettings
+from advnerf_core.attack.problem import AttackProblem
+from advnerf_core.attack.search.poses import MultiStart, multi_start, random_poses
+from advnerf_core.attack.search.search import SearchResult
+from advnerf_core.attack.spaces.placed_sensor import PlacedSensor
+from advnerf_core.attack.spaces.placement import KeepOut, PoseBounds, PoseSpace, placed
+from advnerf_core.attack.spaces.space import NamedObject, Shown, SpaceError, colours_of, require_same
+from advnerf_core.fields.voxel_grid import VoxelGridObject
+from advnerf_core.scene.surrogate import Surrogate, split_theta
+
+METHODS = ("random", "gradient")
+
+
+@dataclass(frozen=True)
+class PlaceLimits:
+    """Where objects may stand.
+
+    Attributes:
+        bounds: Of each object.
+        keep_out: Lanes that stay free; None allows everything within the bounds.
+        colours: Whether colours are searched too; else the objects keep their own.
+    """
+
+    bounds: Sequence[PoseBounds]
+    keep_out: KeepOut | None
+    colours: bool = True
+
+
+class PlaceSpace:
+    """Places of voxel objects; its methods are ``gradient`` (several drawn placements, each refined) and ``random``.
+
+    Args:
+        surrogate: The scene with the objects where they stand without an attack.
+        named: What attack files say of them, in their order.
+        limits: Where they may stand.
+        budget: Placements that are drawn, and steps of each.
+
+    Raises:
+        PoseBoundsError: Not one bound for each object, or bounds that leave no place beside the lanes.
+        SpaceError: An object that is not made of voxels.
+    """
+
+    name = PLACES
+
+    def __init__(
+        self, surrogate: Surrogate, named: Sequence[NamedObject], limits: PlaceLimits, budget: MultiStart
+    ) -> None:
+        self.surrogate, self._named, self._budget = surrogate, tuple(named), budget
+        self._fields = [each for each in surrogate.objects if isinstance(each, VoxelGridObject)]
+        if len(self._fields) != len(surrogate.objects):
+            raise SpaceError(
+                "expected objects made of voxels, got a mesh: only voxels are differentiable in their pose"
+            )
+        self.sensor = PlacedSensor(surrogate, PoseSpace(self._fields, limits.bounds, limits.keep_out), limits.colours)
+
+    @property
+    def plain(self) -> Shown:
+        """The objects where they stand without an attack, in their own colours."""
+        return Shown(self.surrogate.objects, self.surrogate.plain_theta())
+
+    def search(self, method: str, problem: AttackProblem, settings: SearchSettings, run: SearchRun) -> SearchResult:
+        """Search places; see `Space.search`. The budget is that of the space."""
+        if method not in METHODS:
+            raise SpaceError(f"expected a method that searches places, {' or '.join(METHODS)}, got {method}")
+        common = (run.seed, run.state_path, run.on_evaluation, run.settings_hash)
+        if method == "gradient":
+            return multi_start(problem, self._budget, *common)
+        return random_poses(problem, self._budget.evaluations, settings.sigma or settings.random_sigma, *common)
+
+    def attacked(self, theta: Tensor) -> tuple[AttackedObject, ...]:
+        """Each object at its place, with its colours."""
+        colours = split_theta(self._fields, self.sensor.colours(theta).to(self.surrogate.dtype))
+        rows = zip(self._named, placed(self._fields, self.sensor.placements(theta)), colours, strict=True)
+        return tuple(
+            AttackedObject(
+                named.name,
+                part.detach().numpy().astype(np.float32),
+                field.T_world_from_object,
+                field.scale,
+                named.sha256,
+            )
+            for named, field, part in rows
+        )
+
+    def restored(self, attack: AttackFile) -> Shown:
+        """The objects at the places of the file; see `Space.restored`."""
+        require_same(attack, self._named)
+        moved = [
+            field.moved(each.T_world_from_object, each.scale)
+            for field, each in zip(self._fields, attack.objects, strict=True)
+        ]
+        return Shown(moved, colours_of(attack, self.surrogate.dtype))
+
+
+def randomly_placed(
+    objects: Sequence[VoxelGridObject], limits: PlaceLimits, count: int, seed: int = 0
+) -> list[tuple[VoxelGridObject, ...]]:
+    """The objects at ``count`` random allowed placements: a victim is retrained on them to bear moved objects.
+
+    Raises:
+        PoseBoundsError: Not one bound for each object, or bounds that leave no place beside the lanes.
+    """
+    space, generator = PoseSpace(objects, limits.bounds, limits.keep_out), torch.Generator().manual_seed(seed)
+    return [placed(objects, space.placements(space.draw(generator))) for _ in range(count)]

@@ -1,0 +1,214 @@
+"""What a search may change: the contract of a space, and the spaces of colours and of meshes.
+
+A space turns objects in a scene into a `Sensor` for the search, and turns what was found into objects that can be written into an attack
+file, put into a deployment, or driven past in the learned scene.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from advnerf_core.attack.artifact import (
+    COLOURS,
+    MESH_SHAPE,
+    MESH_TEXTURE,
+    AttackedObject,
+    AttackFile,
+    AttackFileError,
+)
+from advnerf_core.attack.methods import SearchRun, SearchSettings, load_method
+from advnerf_core.attack.problem import AttackProblem, Sensor
+from advnerf_core.attack.search.search import SearchResult
+from advnerf_core.errors import AdvnerfError
+from advnerf_core.fields.coloured import ColouredObject
+from advnerf_core.objects.mesh.field import MeshField
+from advnerf_core.objects.mesh.glb import glb_bytes
+from advnerf_core.objects.mesh.shape import ShapeLimits, ShapeSensor
+from advnerf_core.scene.surrogate import Surrogate, split_theta
+
+
+class SpaceError(AdvnerfError, ValueError):
+    """A method that does not search a space."""
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """Objects as they stand in a scene.
+
+    Attributes:
+        objects: Geometry and pose of each.
+        colours: Their colours before squashing, of the ``theta_shape`` of a `Surrogate` with these objects.
+    """
+
+    objects: Sequence[ColouredObject]
+    colours: Tensor
+
+    def seen_by(self, surrogate: Surrogate) -> Surrogate:
+        """The surrogate with these objects in the place of its own."""
+        return surrogate.with_objects(self.objects)
+
+
+@dataclass(frozen=True)
+class NamedObject:
+    """What an attack file says of an object beside what was found.
+
+    Attributes:
+        name: What it is called.
+        sha256: Hash of its geometry and fixed colours.
+    """
+
+    name: str
+    sha256: str
+
+
+class Space(Protocol):
+    """What is searched."""
+
+    @property
+    def name(self) -> str:
+        """As attack files have it: ``colours``, ``places``, ``mesh_texture``, ``mesh_shape``, or a user's own."""
+
+    @property
+    def surrogate(self) -> Surrogate:
+        """The scene with the objects as they are without an attack."""
+
+    @property
+    def sensor(self) -> Sensor:
+        """What a search looks through; its theta is what is searched."""
+
+    @property
+    def plain(self) -> Shown:
+        """The objects without an attack."""
+
+    def search(self, method: str, problem: AttackProblem, settings: SearchSettings, run: SearchRun) -> SearchResult:
+        """Search with a method for the theta of the problem's sensor, which is this space's.
+
+        Raises:
+            SpaceError: The method does not search this space.
+        """
+
+    def attacked(self, theta: Tensor) -> tuple[AttackedObject, ...]:
+        """What an attack file keeps of ``theta``."""
+
+    def restored(self, attack: AttackFile) -> Shown:
+        """The objects of an attack file, as a deployment shows them.
+
+        Raises:
+            AttackFileError: The attack is on other objects.
+        """
+
+
+def require_same(attack: AttackFile, named: Sequence[NamedObject]) -> None:
+    """Refuse an attack file of other objects.
+
+    Raises:
+        AttackFileError: Another number of objects, or other geometry.
+    """
+    found, expected = [each.sha256 for each in attack.objects], [each.sha256 for each in named]
+    if found != expected:
+        raise AttackFileError(
+            f"expected an attack on {', '.join(each.name for each in named)}, got attack {attack.attack_id} on "
+            f"{', '.join(each.name for each in attack.objects)}, or on others of these names; search again"
+        )
+
+
+def colours_of(attack: AttackFile, dtype: torch.dtype) -> Tensor:
+    """Colours of all objects of an attack file as one tensor ``[K, 3]``; of a single object in its own shape."""
+    parts = [torch.from_numpy(np.array(each.theta)).to(dtype) for each in attack.objects]
+    return parts[0] if len(parts) == 1 else torch.cat([part.reshape(-1, 3) for part in parts])
+
+
+class ColourSpace:
+    """Colours of objects that stay where they are: voxels, faces, or textures of meshes.
+
+    Args:
+        surrogate: The scene with the objects.
+        named: What attack files say of them, in their order.
+    """
+
+    def __init__(self, surrogate: Surrogate, named: Sequence[NamedObject]) -> None:
+        self.surrogate, self._named = surrogate, tuple(named)
+        self.name = MESH_TEXTURE if all(isinstance(each, MeshField) for each in surrogate.objects) else COLOURS
+
+    @property
+    def sensor(self) -> Surrogate:
+        """The surrogate: its theta are the colours."""
+        return self.surrogate
+
+    @property
+    def plain(self) -> Shown:
+        """The objects in their own colours."""
+        return Shown(self.surrogate.objects, self.surrogate.plain_theta())
+
+    def search(self, method: str, problem: AttackProblem, settings: SearchSettings, run: SearchRun) -> SearchResult:
+        """Search with any method; see `Space.search`."""
+        return load_method(method).search(problem, settings, run)
+
+    def attacked(self, theta: Tensor) -> tuple[AttackedObject, ...]:
+        """Colours of each object; of a mesh also the mesh with the found texture."""
+        rows = zip(self._named, self.surrogate.objects, split_theta(self.surrogate.objects, theta), strict=True)
+        return tuple(_attacked(named, field, part, _textured_glb(field, part)) for named, field, part in rows)
+
+    def restored(self, attack: AttackFile) -> Shown:
+        """The objects where they are, in the colours of the file; see `Space.restored`."""
+        require_same(attack, self._named)
+        return Shown(self.surrogate.objects, colours_of(attack, self.surrogate.dtype))
+
+
+class ShapeSpace:
+    """Shapes of meshes in their own colours.
+
+    Args:
+        surrogate: The scene with the meshes.
+        named: What attack files say of them, in their order.
+        limits: How far vertices may move.
+    """
+
+    name = MESH_SHAPE
+
+    def __init__(self, surrogate: Surrogate, named: Sequence[NamedObject], limits: ShapeLimits) -> None:
+        self.surrogate, self._named = surrogate, tuple(named)
+        self.sensor = ShapeSensor(surrogate, limits)
+
+    @property
+    def plain(self) -> Shown:
+        """The meshes in their own shape."""
+        return Shown(self.surrogate.objects, self.sensor.colours)
+
+    def search(self, method: str, problem: AttackProblem, settings: SearchSettings, run: SearchRun) -> SearchResult:
+        """Search with a method that asks for the scale of theta; see `Space.search`."""
+        found = load_method(method)
+        if not found.reads_scale:
+            raise SpaceError(
+                f"expected a method that searches shapes, such as gradient or random, got {method}: its steps are those of colours"
+            )
+        return found.search(problem, settings, run)
+
+    def attacked(self, theta: Tensor) -> tuple[AttackedObject, ...]:
+        """The search's parameters of each vertex, and the meshes in the found shape."""
+        parts = theta.detach().split([len(each.mesh.vertices) for each in self.sensor.meshes])
+        colours = split_theta(self.surrogate.objects, self.sensor.colours)
+        rows = zip(self._named, self.sensor.shaped(theta), parts, colours, strict=True)
+        return tuple(_attacked(named, field, part, _textured_glb(field, colour)) for named, field, part, colour in rows)
+
+    def restored(self, attack: AttackFile) -> Shown:
+        """The meshes in the shapes of the file; see `Space.restored`."""
+        require_same(attack, self._named)
+        theta = torch.cat([torch.from_numpy(np.array(each.theta)) for each in attack.objects])
+        return Shown(self.sensor.shaped(theta), self.sensor.colours)
+
+
+def _attacked(named: NamedObject, field: ColouredObject, part: Tensor, glb: bytes) -> AttackedObject:
+    theta = part.detach().numpy().astype(np.float32)
+    return AttackedObject(named.name, theta, field.T_world_from_object, field.scale, named.sha256, glb)
+
+
+def _textured_glb(field: ColouredObject, colours: Tensor) -> bytes:
+    """A mesh in its colours as a GLB file; empty for what is no mesh."""
+    return glb_bytes(field.mesh.with_texture(field.texture(colours))) if isinstance(field, MeshField) else b""

@@ -1,0 +1,135 @@
+"""The spaces of an experiment at the junction: its objects as what a search may change."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from advnerf_core.attack.search.poses import MultiStart
+from advnerf_core.attack.spaces.placement import KeepOut, PoseBounds
+from advnerf_core.attack.spaces.places import PlaceLimits, PlaceSpace, randomly_placed
+from advnerf_core.attack.spaces.space import ColourSpace, NamedObject, ShapeSpace, Space
+from advnerf_core.fields.voxel_grid import VoxelGridObject
+from advnerf_core.objects.mesh.field import MeshField
+from advnerf_core.objects.mesh.shape import ShapeLimits
+from advnerf_core.objects.mesh.surface import sphere, unwrapped
+from advnerf_core.objects.voxel.generators import GENERATORS
+from advnerf_core.objects.voxel.mesh import stand
+from advnerf_core.scene.remembered import frame_bytes
+from advnerf_core.scene.surrogate import Surrogate
+from hardware.worlds.junction.config import PlacedObject
+from hardware.worlds.world import DeploymentScene
+from nodes.experiment.junction.context import Experiment, as_path
+from nodes.experiment.junction.objects import GENERATOR_OF, object_file, placed_objects, surrogate_of
+from nodes.experiment.junction.space_config import (
+    ColoursConfig,
+    MeshShapeConfig,
+    MeshTextureConfig,
+    PlacesConfig,
+)
+from nodes.experiment.request.frames import DeployedFrames
+
+
+def colour_space(experiment: Experiment, surrogate: Surrogate | None = None) -> ColourSpace:
+    """The colours of the voxel objects, in the learned scene; ``surrogate`` if it is made already."""
+    return ColourSpace(surrogate or surrogate_of(experiment, placed_objects(experiment)), _named_voxels(experiment))
+
+
+def make_space(experiment: Experiment, scene: DeploymentScene | None) -> Space:
+    """The space that the experiment's section ``space`` asks for.
+
+    Args:
+        experiment: Its scene and objects must be there, for meshes nothing.
+        scene: The open deployment scene; needed where `over_the_world`.
+    """
+    wanted = experiment.config.space
+    if isinstance(wanted, ColoursConfig):
+        return colour_space(experiment)
+    if isinstance(wanted, PlacesConfig):
+        return _place_space(experiment, wanted)
+    assert scene is not None, "meshes are searched over the pictures of an open scene"
+    fields = mesh_objects(experiment, wanted)
+    frames = DeployedFrames(scene, experiment.view)
+    surrogate = Surrogate(frames, experiment.view.pinhole, experiment.mount, fields, depth_tolerance_m=0.0)
+    named = [
+        NamedObject(thing.name, field.sha256) for thing, field in zip(experiment.world.objects, fields, strict=True)
+    ]
+    if isinstance(wanted, MeshTextureConfig):
+        return ColourSpace(surrogate, named)
+    limits = ShapeLimits(wanted.bound_m, wanted.smoothness, wanted.samples, wanted.boundary_samples)
+    return ShapeSpace(surrogate, named, limits)
+
+
+def over_the_world(experiment: Experiment) -> bool:
+    """Whether attacks are searched over the world's own pictures, as those on meshes: nothing is learned for them."""
+    return isinstance(experiment.config.space, (MeshTextureConfig, MeshShapeConfig))
+
+
+def mesh_objects(experiment: Experiment, wanted: MeshTextureConfig | MeshShapeConfig) -> list[MeshField]:
+    """The experiment's objects as meshes, in their plain colours and shapes."""
+    found = []
+    for thing in experiment.world.objects:
+        if wanted.ball_m is None:
+            mesh = stand(GENERATORS[GENERATOR_OF[thing.kind]]())
+        else:
+            mesh = sphere(wanted.ball_m, wanted.ball_rgb)
+        found.append(MeshField(unwrapped(mesh, wanted.texels), thing.T_world_from_object, thing.scale))
+    return found
+
+
+def place_limits(experiment: Experiment, wanted: PlacesConfig) -> PlaceLimits:
+    """Where each object may stand: about its place in the configuration, at its size, in no lane."""
+    return PlaceLimits(bounds_of(experiment.world.objects, wanted), lanes_of(experiment), wanted.colours)
+
+
+def bounds_of(things: Sequence[PlacedObject], wanted: PlacesConfig) -> list[PoseBounds]:
+    """Bounds of each object about its place in the configuration."""
+    found = []
+    for thing in things:
+        turn_rad = np.pi if thing.kind == "hydrant" else wanted.turn_rad
+        x, y, yaw = (
+            (at - reach, at + reach)
+            for at, reach in ((thing.x_m, wanted.move_m), (thing.y_m, wanted.move_m), (thing.yaw_rad, turn_rad))
+        )
+        found.append(PoseBounds(x_m=x, y_m=y, yaw_rad=yaw))
+    return found
+
+
+def lanes_of(experiment: Experiment) -> KeepOut:
+    """All lanes, driven or not: objects stand at the height of the pavement."""
+    return KeepOut(tuple(as_path(lane) for lane in experiment.site.lanes), experiment.site.off_track_m)
+
+
+def random_placements(experiment: Experiment, count: int, seed: int) -> list[tuple[VoxelGridObject, ...]]:
+    """The objects at random allowed places, ``count`` times."""
+    if not count:
+        return []
+    return randomly_placed(placed_objects(experiment), place_limits(experiment, PlacesConfig()), count, seed)
+
+
+def geometry_sha256(experiment: Experiment, kind: str) -> str:
+    """Hash of the object file of a kind."""
+    path = object_file(experiment, kind)
+    return _file_sha256(path, path.stat().st_mtime_ns)
+
+
+def _place_space(experiment: Experiment, wanted: PlacesConfig) -> PlaceSpace:
+    surrogate, attack = surrogate_of(experiment, placed_objects(experiment)), experiment.config.attack
+    # The gradient is that of the frames that were driven past: the scene in them is not rendered a second time.
+    one_evaluation = experiment.config.horizon * attack.starts * frame_bytes(surrogate.camera)
+    remembering = surrogate.remembering(min(one_evaluation, int(attack.cache_mib * 2**20)))
+    budget = MultiStart(wanted.samples, wanted.steps, colour_rate=wanted.colour_rate)
+    return PlaceSpace(remembering, _named_voxels(experiment), place_limits(experiment, wanted), budget)
+
+
+def _named_voxels(experiment: Experiment) -> list[NamedObject]:
+    return [NamedObject(thing.name, geometry_sha256(experiment, thing.kind)) for thing in experiment.world.objects]
+
+
+@lru_cache(maxsize=8)
+def _file_sha256(path: Path, changed_ns: int) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
