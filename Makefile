@@ -7,7 +7,7 @@ export MUJOCO_GL ?= egl
 export PYTHONDONTWRITEBYTECODE :=
 DEFAULT_TESTS := not slow and not gpu and not hardware and not data
 
-.PHONY: help setup demo experiment test test-slow test-gpu test-hardware check bench campaign rooms fmt clean
+.PHONY: help setup demo experiment test test-slow test-gpu test-hardware check bench campaign rooms api fmt clean
 
 help:  ## Show this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
@@ -58,6 +58,9 @@ campaign: setup  ## What the live stack must bear: faults, strangers, kills, hal
 
 rooms: setup  ## Draw the rooms of the code into docs/architecture.md
 	@$(BIN)/python docs/draw_rooms.py
+
+api: setup  ## Write docs/api.md from the docstrings of the public names
+	@$(BIN)/python docs/write_api.py
 
 fmt: setup  ## Format and fix what can be fixed
 	@$(BIN)/ruff check --fix .

@@ -169,7 +169,7 @@ def rotation_z(angle_rad: float) -> Array:
 
 
 def camera_mount(x_m: float, y_m: float, z_m: float, pitch_down_rad: float = 0.0, yaw_rad: float = 0.0) -> Array:
-    """Transform ``T_parent_from_camera`` of a camera on a parent with x forward, y left, z up.
+    """Transform ``T_parent_from_camera [4, 4]`` of a camera on a parent with x forward, y left, z up.
 
     Args:
         x_m: Camera position in the parent frame [m].

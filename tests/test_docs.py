@@ -12,9 +12,9 @@ from benchmarks.results import MACHINE_PATH, record_row
 from nodes.cli.main import app
 
 ROOT = Path(__file__).parents[1]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [ROOT / "README.md", ROOT / "examples" / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 _FILE = re.compile(
-    r"`((?:nodes|advnerf_core|hardware|calibration|launch|benchmarks|tests|docs)/[\w/.\-]+?\.(?:py|yaml|md|json|sh))`"
+    r"`((?:nodes|advnerf_core|hardware|calibration|launch|benchmarks|tests|docs|examples)/[\w/.\-]+?\.(?:py|yaml|md|json|sh))`"
 )
 _NOT_OURS = ("my_", "ours")
 
@@ -24,7 +24,7 @@ def command():
     return typer.main.get_command(app)
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_links_and_files_of_a_page_are_there(page):
     text = page.read_text()
     links = [target for target in re.findall(r"\]\(([^)#\s]+)(?:#[^)]*)?\)", text) if "://" not in target]
@@ -46,7 +46,7 @@ def test_rows_name_benchmarks_that_are_there():
     assert [name for name in sorted(names) if not (ROOT / "benchmarks" / f"{name}.py").exists()] == []
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_commands_of_a_page_and_their_options_exist(page, command):
     wrong = [line for line in commands_of(page.read_text()) if not is_a_command(command, line)]
     assert wrong == []

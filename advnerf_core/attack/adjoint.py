@@ -52,7 +52,7 @@ class AdjointResult:
 
     Attributes:
         loss: ``mean_b sum_t C(x_t)`` [m], and the regulariser's part; lower is a stronger attack.
-        gradient: dJ/dtheta with camera poses frozen, of the shape of ``theta``.
+        gradient: dJ/dtheta with camera poses frozen, ``theta_shape``.
         lambdas: Adjoint states ``[T + 1, B, n]``; ``lambdas[0]`` is the derivative with respect to the start.
         rollout: The nominal trajectory.
         totals: Total CTE per start.
@@ -127,7 +127,7 @@ class _Remembering:
 
 
 def evaluate(problem: AttackProblem, theta: Tensor) -> tuple[Rollout, Totals]:
-    """One closed-loop evaluation without a gradient."""
+    """One closed-loop drive with parameters ``theta`` (``theta_shape``), and what it is charged; no gradient."""
     rollout, _ = roll_out(problem, theta)
     return rollout, _totals(problem, rollout.states)
 
@@ -139,7 +139,11 @@ def _totals(problem: AttackProblem, states: Tensor) -> Totals:
 
 
 def adjoint_gradient(problem: AttackProblem, theta: Tensor) -> AdjointResult:
-    """Loss and gradient of one rollout; see the module's docstring for what the gradient is and is not.
+    """Loss and gradient of one rollout; the module's docstring says what the gradient is and is not.
+
+    Args:
+        problem: What is attacked.
+        theta: Parameters of the objects, ``theta_shape``.
 
     Raises:
         BlackBoxError: The policy says that it has no gradient.

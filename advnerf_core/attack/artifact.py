@@ -173,7 +173,7 @@ class AttackFile:
             subject: Motion-capture subject that carries it.
             corners_in_subject: As of `Face`, ``[4, 3]`` [m].
             T_world_from_object: Its pose ``[4, 4]``.
-            texture: The face as it is displayed; made of ``theta`` if it is not given.
+            texture: The face as it is displayed, ``[H, W, 3]`` uint8 sRGB; made of ``theta`` if it is not given.
             name: What it is called.
             sha256: Hash of its geometry.
             others: The other attributes of an attack file.

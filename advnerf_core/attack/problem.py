@@ -34,10 +34,10 @@ class Sensor(Protocol):
         """Shape of the attacked parameters."""
 
     def initial_theta(self, generator: torch.Generator) -> Tensor:
-        """Where an attack starts."""
+        """Where an attack starts, ``theta_shape``."""
 
     def sense(self, states: Tensor, theta: Tensor) -> Rendered:
-        """Images at detached states ``[B, n]`` with their vjp."""
+        """Images at detached states ``[B, n]`` and parameters ``theta`` (``theta_shape``), with their vjp."""
 
 
 @runtime_checkable
@@ -78,7 +78,7 @@ class AttackProblem:
         steps: Horizon T in control ticks.
         goals: ``[B, goal_size]`` or None.
         time_batch: Steps whose policy gradients are evaluated at once.
-        cache_bytes: Budget for renders kept from the forward to the backward pass; 0 keeps none.
+        cache_bytes: Budget for renders kept from the forward to the backward pass [bytes]; 0 keeps none.
         fence_m: Half side of the square |x|, |y| beyond which the car is stopped in deployment [m]; None if there is no fence.
             It shapes the reported total only: the loss goes on driving, as its gradient would else be zero.
         held_cap_m: Cap of the |CTE| that a stopped car is charged per tick in the reported total [m].
@@ -132,7 +132,7 @@ class AttackProblem:
         Args:
             ticks: Their numbers.
             states: ``[ticks * B, n]``, ordered by tick.
-            theta: Parameters of the objects.
+            theta: Parameters of the objects, ``theta_shape``.
         """
         if self.disturbances is None:
             return self.sensor.sense(states, theta)

@@ -190,13 +190,13 @@ class PosedImages:
         )  # fmt: skip
 
     def box(self) -> tuple[Array, Array]:
-        """Low and high corner of Instant-NGP's box for this file, in its world units."""
+        """Low and high corner ``[3]`` of Instant-NGP's box for this file, in its world units."""
         half = 0.5 * (self.aabb_scale or 1.0) / self.scale
         centre = (0.5 - np.array(self.offset)) / self.scale
         return centre - half, centre + half
 
     def inner_box(self) -> tuple[Array, Array]:
-        """The part of Instant-NGP's box that a contracted field sees in full detail: its unit cube, larger if cameras need it."""
+        """Low and high corner ``[3]`` of what a contracted field sees in full detail: Instant-NGP's unit cube, larger if cameras need it."""
         centre = (0.5 - np.array(self.offset)) / self.scale
         places = np.stack([frame.T_world_from_camera[:3, 3] for frame in self.frames])
         half = max(0.5 / self.scale, float(np.abs(places - centre).max()))

@@ -148,7 +148,7 @@ class VoxelGridObject:
         return np.unique(together, axis=0)
 
     def moved(self, T_world_from_object: ArrayLike, scale: float | None = None) -> VoxelGridObject:
-        """The same object elsewhere, and with another scale if one is given; what renderers derived from it is shared."""
+        """The same object at another pose ``[4, 4]``, and with another scale if one is given; what renderers derived from it is shared."""
         pose = np.asarray(T_world_from_object, dtype=np.float64)
         other = replace(self, T_world_from_object=pose, scale=self.scale if scale is None else scale)
         object.__setattr__(other, "derived", self.derived)

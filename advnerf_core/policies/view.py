@@ -25,10 +25,10 @@ class PolicyView:
 
     Attributes:
         camera: Intrinsics of the (undistorted) camera image.
-        crop_top_px: First row that is kept.
-        crop_height_px: Number of rows that are kept.
-        crop_left_px: First column that is kept.
-        crop_width_px: Number of columns that are kept; None keeps all to the right edge.
+        crop_top_px: First row that is kept [px].
+        crop_height_px: Number of rows that are kept [px].
+        crop_left_px: First column that is kept [px].
+        crop_width_px: Number of columns that are kept [px]; None keeps all to the right edge.
         width: Width of the policy's image [px].
         height: Height of the policy's image [px].
         distortion: OpenCV distortion coefficients of the camera; empty for a camera without distortion.

@@ -32,7 +32,7 @@ class TrainConfig:
         warmup_steps: Steps during which sample intervals shrink to their final length and all cells are probed.
         march: How samples are placed, in training and rendering; None: by `pixel_intervals`, of the training images.
         near_m: Nothing nearer to a camera than this is learned [m]; not used if ``march`` is given.
-        interval_px: Sample intervals in pixels of the training images, instead of the rule's; not used if ``march`` is given.
+        interval_px: Sample intervals in pixels of the training images [px], instead of the rule's; not used if ``march`` is given.
         opacity: Weight of the rays' mean transmittance in the loss. A constant background is learned for what is left; without
             this pull it explains walls that all cameras see from one side, and is wrong from any other. Not used for images with
             alpha, which tell what is transparent.

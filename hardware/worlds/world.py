@@ -75,7 +75,7 @@ class DeploymentScene(Protocol):
     @overload
     def observe_at(self, x_m: float, y_m: float, yaw_rad: float, depth: Literal[False]) -> tuple[Rgb, None]: ...
     def observe_at(self, x_m: float, y_m: float, yaw_rad: float, depth: bool = True) -> tuple[Rgb, Depth | None]:
-        """What the driving camera would see from another pose of the car; the car stays where it is."""
+        """What the driving camera would see from another pose of the car (see :meth:`observe`); the car stays where it is."""
         ...
 
     def photograph(self, T_world_from_camera: Array) -> Rgb:

@@ -46,14 +46,14 @@ class TopicInfo:
 
 @dataclass(frozen=True)
 class BagInfo:
-    """What a bag holds; times are log times [ns since 1970].
+    """What a bag holds; times are log times.
 
     Attributes:
         path: Its file, or its folder if it was split.
         parts: Its files in order.
-        size_bytes: Size of all files.
-        start_ns: Time of the first message.
-        end_ns: Time of the last message.
+        size_bytes: Size of all files [bytes].
+        start_ns: Time of the first message [ns since 1970].
+        end_ns: Time of the last message [ns since 1970].
         topics: Its topics by name.
         attachments: Names of the files that ride along, in whichever part.
         metadata: Facts that the recorder noted: versions, git hash.
@@ -84,7 +84,15 @@ class BagInfo:
 
 @dataclass(frozen=True)
 class BagMessage:
-    """One message of a bag; the bytes on a topic of ours are CDR of our type, however the bag had them."""
+    """One message of a bag.
+
+    Attributes:
+        topic: Its topic.
+        cdr: Its CDR bytes; on a topic of the topic table they are converted to our type if the bag has another definition.
+        log_ns: When the recorder received it [ns since 1970].
+        publish_ns: When it was published [ns since 1970].
+        sequence: Its number in the order of its publisher.
+    """
 
     topic: str
     cdr: bytes

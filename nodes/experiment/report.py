@@ -152,7 +152,8 @@ def _textures(experiment: Experiment) -> Iterator[rd.Texture]:
         label = f"{search.method}, seed {search.seed}" + (
             "" if search.victim == HARDENED else f", {search.victim} victim"
         )
-        yield rd.Texture(label, search.method, attack.required_face().texture, attack.attack_id, search.seed, search.victim)  # type: ignore[arg-type]
+        texture = attack.required_face().texture
+        yield rd.Texture(label, search.method, texture, attack.attack_id, search.seed, search.victim)  # type: ignore[arg-type]
 
 
 def _fidelity(experiment: Experiment) -> rd.Fidelity:

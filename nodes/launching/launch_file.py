@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import re
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -299,6 +300,9 @@ def _check(name: str, entry: NodeEntry, document: Document) -> None:
         raise ConfigError(f"{place}: a node cannot be called {name}, because --set uses that word")
     if entry.required and entry.respawn is not None:
         raise ConfigError(f"{place}: node {name} has respawn, so it must also say required: false")
+    # The node's process is started by `python -m` in this folder, and finds its modules there.
+    if (folder := str(Path.cwd())) not in sys.path:
+        sys.path.append(folder)
     try:
         found = importlib.util.find_spec(entry.module) is not None
     except ModuleNotFoundError:

@@ -42,7 +42,12 @@ _NOBLOCK_MORE = _NOBLOCK | int(zmq.SNDMORE)
 
 @dataclass(frozen=True)
 class Received:
-    """One message off the wire, not decoded yet."""
+    """One message off the wire, not decoded yet.
+
+    Attributes:
+        topic: Its topic.
+        info: How it came, with its bytes.
+    """
 
     topic: str
     info: MessageInfo

@@ -66,6 +66,7 @@ class _Types:
 
 
 types = _Types()
+"""Message classes by short name, as in ``types.PoseStamped(header=..., pose=...)``: ROS 2 types, and ours in ``nodes/runtime/msg``."""
 
 
 def type_name(message: Any) -> str:
@@ -146,7 +147,7 @@ def stamp_ns(message: Any) -> int:
     return ns_from_stamp(message.header.stamp)
 
 
-def image_message(image: NDArray[np.uint8], stamp_ns: int, frame_id: str, encoding: str = _RGB8) -> Any:
+def image_message(image: NDArray[np.uint8], stamp_ns: int, frame_id: str, encoding: str = "rgb8") -> Any:
     """``sensor_msgs/Image`` of pixels ``[H, W, 3]`` uint8 (or ``[H, W]`` with encoding mono8)."""
     channels = _CHANNELS.get(encoding)
     if channels is None:
@@ -195,7 +196,10 @@ def drive_message(speed_mps: float, steering_rad: float, stamp_ns: int, frame_id
 def camera_info_message(
     pinhole: Pinhole, stamp_ns: int, frame_id: str, distortion: ArrayLike = (0.0, 0.0, 0.0, 0.0, 0.0)
 ) -> Any:
-    """``sensor_msgs/CameraInfo``; ROS puts pixel centres at integers, so half a pixel is taken off the principal point."""
+    """``sensor_msgs/CameraInfo`` of intrinsics and OpenCV's distortion coefficients ``[5]``.
+
+    ROS puts pixel centres at integers, so half a pixel is taken off the principal point.
+    """
     K = pinhole.matrix.copy()
     K[:2, 2] -= 0.5
     P = np.hstack([K, np.zeros((3, 1))])

@@ -22,7 +22,12 @@ STARTING, READY, ACTIVE, FAULT = "starting", "ready", "active", "fault"
 
 
 class Out(NamedTuple):
-    """A message to publish; CDR bytes of the topic's type are passed on as they are."""
+    """A message to publish.
+
+    Attributes:
+        topic: One of the node's publications.
+        message: A message of the topic's type, or its CDR bytes, which are passed on unchanged.
+    """
 
     topic: str
     message: Any

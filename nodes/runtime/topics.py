@@ -78,6 +78,7 @@ _ROWS = (
     Topic("/player/state", "advnerf_msgs/msg/PlayerState", None, 20, None, "player"),
 )
 TOPICS: dict[str, Topic] = {row.name: row for row in _ROWS}
+"""The rows of the table by name; every node also has a status topic, ``/status/<node>``."""
 _NODE_NAME = re.compile(r"[a-z][a-z0-9_]{0,23}")
 
 

@@ -69,7 +69,7 @@ class SearchResult:
     """What a search found.
 
     Attributes:
-        theta: The best parameters.
+        theta: The best parameters, ``theta_shape``.
         best: The evaluation that found them.
         history: All evaluations, in order.
     """

@@ -166,7 +166,7 @@ class CarlaScene:
     @overload
     def observe_at(self, x_m: float, y_m: float, yaw_rad: float, depth: Literal[False]) -> tuple[Rgb, None]: ...
     def observe_at(self, x_m: float, y_m: float, yaw_rad: float, depth: bool = True) -> tuple[Rgb, Depth | None]:
-        """What the driving camera would see from another pose of the car; the car stays where it is, and out of sight."""
+        """What the driving camera would see from another pose of the car (see :meth:`observe`); the car stays where it is, and out of sight."""
         with server_answers("looking from elsewhere"), self._without_car():
             return self._see(planar_pose(x_m, y_m, yaw_rad), depth)
 

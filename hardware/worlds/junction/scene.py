@@ -103,7 +103,7 @@ class Intersection:
     @overload
     def observe_at(self, x_m: float, y_m: float, yaw_rad: float, depth: Literal[False]) -> tuple[Rgb, None]: ...
     def observe_at(self, x_m: float, y_m: float, yaw_rad: float, depth: bool = True) -> tuple[Rgb, Depth | None]:
-        """What the driving camera would see from another pose of the car; the car stays where it is."""
+        """What the driving camera would see from another pose of the car (see :meth:`observe`); the car stays where it is."""
         return self._see(planar_pose(x_m, y_m, yaw_rad), depth)
 
     def photograph(self, T_world_from_camera: Array) -> Rgb:
@@ -111,7 +111,7 @@ class Intersection:
         return self._renderer.render_rgb(T_world_from_camera, self.photo_pinhole)
 
     def overview(self, width: int = 960, height: int = 720) -> Rgb:
-        """Picture of the junction from above the south, with the paths and the objects' places drawn in, for reports."""
+        """Picture ``[height, width, 3]`` of the junction from above the south, with paths and places of objects, for reports."""
         focal = 1.0 * width
         pinhole = Pinhole(width, height, focal, focal, 0.5 * width, 0.5 * height)
         T = look_at([0.0, -46.0, 62.0], [0.0, -7.0, 0.0])

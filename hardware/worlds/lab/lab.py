@@ -130,7 +130,7 @@ class Lab:
     @overload
     def observe_at(self, x_m: float, y_m: float, yaw_rad: float, depth: Literal[False]) -> tuple[Rgb, None]: ...
     def observe_at(self, x_m: float, y_m: float, yaw_rad: float, depth: bool = True) -> tuple[Rgb, Depth | None]:
-        """What the driving camera would see from another pose of the car; the car stays where it is."""
+        """What the driving camera would see from another pose of the car (see :meth:`observe`); the car stays where it is."""
         return self._see(planar_pose(x_m, y_m, yaw_rad), depth)
 
     def observe_held(self, T_world_from_car: Array) -> Rgb:
@@ -144,7 +144,7 @@ class Lab:
         return apply_colours(rgb, self.config.phone)
 
     def overview(self, width: int = 960, height: int = 720) -> Rgb:
-        """Picture of the whole room and the car from above the south wall, without the ceiling, for reports."""
+        """Picture ``[height, width, 3]`` of the whole room and the car from above the south wall, without the ceiling, for reports."""
         focal = 1.04 * width
         pinhole = Pinhole(width, height, focal, focal, 0.5 * width, 0.5 * height)
         side = self.config.room.side_m

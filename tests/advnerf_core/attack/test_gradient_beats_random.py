@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from advnerf_core.attack.adjoint import AttackProblem, evaluate
-from advnerf_core.attack.search.optimise import gradient_attack
+from advnerf_core.attack.search.gradient import gradient_attack
 from benchmarks.attack_toy import toy_problem
 
 STEPS, RESOLUTION, EVALUATIONS, SIGMA = 12, 16, 12, 5.0

@@ -176,7 +176,11 @@ def test_a_cell_depends_on_its_space_and_on_its_victim(trained: Experiment) -> N
         settings_hash(kind, searching(trained, ColoursConfig()), *PLACES),
     ]
     assert len({same, *others}) == 7
-    for wrong in (("up", "hardened", "random", 0), ("right", "retrained", "random", 0), ("right", "hardened", "luck", 0)):
+    for wrong in (
+        ("up", "hardened", "random", 0),
+        ("right", "retrained", "random", 0),
+        ("right", "hardened", "luck", 0),
+    ):
         with pytest.raises(CellError, match="expected a"):
             settings_hash(kind, experiment, *wrong)
 
@@ -197,7 +201,9 @@ def test_a_cell_of_colours_depends_on_the_world_and_not_on_what_else_is_searched
         digest("policy.naive_steps=0", victim="naive")
 
 
-def test_the_gate_judges_learned_scenes_and_predictions_need_objects_where_they_were_placed(trained: Experiment) -> None:
+def test_the_gate_judges_learned_scenes_and_predictions_need_objects_where_they_were_placed(
+    trained: Experiment,
+) -> None:
     kind = load_kind("intersection")
     judged = {space.kind: kind.judges(searching(trained, space)) for space in (ColoursConfig(), ONE, *MESHES)}
     assert judged == {"colours": True, "places": True, "mesh_texture": False, "mesh_shape": False}

@@ -1,6 +1,5 @@
 """Attacks on meshes at the junction, over the frames of a scene in closed form."""
 
-
 import cv2
 import numpy as np
 import pytest

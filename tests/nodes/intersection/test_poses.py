@@ -1,6 +1,5 @@
 """Where objects may stand at the junction."""
 
-
 import numpy as np
 import pytest
 

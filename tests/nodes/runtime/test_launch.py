@@ -4,6 +4,7 @@ import subprocess
 import sys
 import textwrap
 import time
+from pathlib import Path
 
 import psutil
 import pytest
@@ -282,6 +283,22 @@ def test_wrong_launch_file_is_one_error_with_file_and_line(probe, tmp_path, text
     ) as caught:
         load_launch(file)
     assert "\n" not in str(caught.value)
+
+
+def test_a_module_in_the_working_folder_is_found_whatever_started_the_command(tmp_path):
+    """As `advnerf` does, whose own folder is elsewhere; the node's process is started by ``python -m`` in the working folder."""
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "node_of_mine.py").write_text("")
+    write(tmp_path / "mine" / "a.launch.yaml", a={"module": "node_of_mine"})
+    script = tmp_path / "command.py"
+    script.write_text(
+        "from pathlib import Path\nfrom nodes.launching.launch_file import load_launch\n"
+        "print(list(load_launch(Path('a.launch.yaml')).nodes))\n"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])}
+    command = [sys.executable, script]
+    done = subprocess.run(command, cwd=tmp_path / "mine", env=environment, capture_output=True, text=True, timeout=60)
+    assert (done.stdout, done.stderr) == ("['a']\n", "")
 
 
 @pytest.mark.parametrize(
