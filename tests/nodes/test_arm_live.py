@@ -125,7 +125,7 @@ def test_no_request_is_lost_with_a_recorder(lab):
 def test_a_disarm_waits_loudly_for_a_safety_node_that_joins_late(lab):
     asking = command(lab, "disarm", "--reason", "look out")
     first = asking.stderr.readline()
-    assert "NOT CONFIRMED: no answer of the safety node for 0.3 s" in first
+    assert "NOT CONFIRMED: no answer from the safety node for 0.3 s" in first
     assert lab.recorded  # a recorder hears it all the time
     lab.start()
     output, _ = asking.communicate(timeout=30)
@@ -149,7 +149,7 @@ def test_a_disarm_without_a_motor_node_says_so(lab):
     output, errors = asking.communicate(timeout=30)
     assert asking.returncode == 1
     assert "not armed: disarmed by operator" in output
-    assert "NOT CONFIRMED: disarmed, but the motor node has not said within 0.3 s" in errors
+    assert "NOT CONFIRMED: disarmed, but the motor node did not report within 0.3 s" in errors
 
 
 def test_why_it_is_not_armed(lab):

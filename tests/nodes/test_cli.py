@@ -191,7 +191,7 @@ def test_bag_is_recorded_described_played_and_repaired(running, folder, command)
     code, output, _ = command("bag", "repair", bag)
     assert (code, "kept" in output) == (0, True)
     assert read_info(bag).messages > 50
-    assert "is whole" in command("bag", "repair", bag)[1]
+    assert "is intact" in command("bag", "repair", bag)[1]
 
 
 def test_second_launch_in_the_same_folder_is_one_clear_line(running, folder):

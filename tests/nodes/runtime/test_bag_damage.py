@@ -382,9 +382,9 @@ def test_the_command_says_what_was_before_and_after(bags, write):
     assert "40" in done.stdout
     assert "bag.mcap.damaged" in done.stdout
     again = run(app, ["bag", "repair", str(path)])
-    assert "is whole" in again.stdout
+    assert "is intact" in again.stdout
     assert "nothing was changed" in again.stdout
-    assert "checked: all messages agree" in run(app, ["bag", "info", str(path)]).stdout
+    assert "checked: all messages match" in run(app, ["bag", "info", str(path)]).stdout
     loose = write(bags["no chunks"], "loose")
     assert "unchecked: 60 of its messages are in no chunk" in run(app, ["bag", "info", str(loose)]).stdout
 
