@@ -1,1 +1,1 @@
-"""What every node is made of: messages, topics, bus, clock, loop, process, configuration."""
+"""The runtime that all nodes share: messages, topics, bus, clock, loop, process, configuration."""

@@ -153,7 +153,7 @@ def test_a_disarm_without_a_motor_node_says_so(lab):
 
 
 def test_why_it_is_not_armed(lab):
-    with pytest.raises(LaunchError, match=r"did not answer within 2 s, and the car may be armed or not"):
+    with pytest.raises(LaunchError, match=r"from the safety node within 2 s, got none; the car may be armed"):
         ask_to_arm(lab.folder, "")
     lab.start()
     lab.wait_ready()

@@ -64,7 +64,7 @@ def test_grey_pictures_train_and_other_encodings_are_one_line(tmp_path):
         frames_of_bag(depth, VIEW, EXPERT)
     text = str(caught.value)
     assert text.startswith(
-        f"/camera/image_raw in {depth}: cannot turn the encoding '32FC1' into RGB; supported are rgb8"
+        f"/camera/image_raw in {depth}: expected a supported image encoding, got '32FC1'; supported are rgb8"
     )
     assert "\n" not in text
 

@@ -218,7 +218,7 @@ def test_a_message_that_is_no_pose_disarms(drive):
     message = pose_message(planar_pose(drive.x, 0.0, 0.0), drive.now.real_ns)
     message.pose.orientation = types.Quaternion(x=0.0, y=0.0, z=0.0, w=0.0)
     drive.say("/vicon/car", message)
-    assert "pose without an orientation" in drive.reason
+    assert "expected a pose with an orientation" in drive.reason
 
 
 @pytest.mark.parametrize(

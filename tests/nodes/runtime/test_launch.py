@@ -269,7 +269,7 @@ def test_record_adds_a_recorder_that_stops_last(probe, tmp_path):
         (LAUNCH_TEXT.replace("${rate_hz}", "${rat}"), r":8: unknown parameter \$\{rat\}; known are rate_hz"),
         (LAUNCH_TEXT + "  a: {module: x}\n", r":12: nodes.a is given twice"),
         (LAUNCH_TEXT.replace("  a:", "  A-b:"), r":6: expected a node name"),
-        (LAUNCH_TEXT.replace("nodes:", "nodes: ["), r":\d+: not valid YAML"),
+        (LAUNCH_TEXT.replace("nodes:", "nodes: ["), r":\d+: expected valid YAML"),
         ("just text", r":1: expected a launch file"),
         (LAUNCH_TEXT.replace("    config:", "    respawn: {}\n    config:"), "must also say required: false"),
     ],
