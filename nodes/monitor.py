@@ -144,7 +144,7 @@ class MonitorNode(Node):
         self._plain = np.full((_PLAIN_PX, _PLAIN_PX, 3), np.round(255.0 * np.array(plain_rgb)), np.uint8)
         self._face_m = min(face_m or panel.square_m, panel.square_m)
         self._assembler = Assembler()
-        self._armed, self._safety_reason, self._state_ns = False, "nobody has armed", -1
+        self._armed, self._safety_reason, self._state_ns = False, "not armed since the start", -1
         self._trouble = ""
         self._taken = self._refused = self._changes = 0
         self._attack: AttackFile | None = None

@@ -68,7 +68,7 @@ class Lab:
             ]
         )
 
-    def wait_ready(self, reason="nobody has armed"):
+    def wait_ready(self, reason="not armed since the start"):
         with Bus(self.folder) as bus:
             bus.subscribe("/safety/state")
             deadline = time.monotonic() + 20.0
@@ -210,7 +210,7 @@ def test_a_restart_between_two_repeats_of_an_arm_leaves_the_car_disarmed(lab):
         lab.wait_ready()
         state = send.until_answered(asked)
     assert (state.armed, state.granted) == (False, False)
-    assert "older than the last stop (nobody has armed)" in state.answer
+    assert "older than the last stop (not armed since the start)" in state.answer
 
 
 class Sender:

@@ -175,7 +175,7 @@ def write_bag(folder, drives, offset_m=0.1, rate_hz=100):
         ))  # fmt: skip
 
     for stand_s, drive_s, reason in drives:
-        state(False, "nobody has armed")
+        state(False, "not armed since the start")
         for k in range(round((stand_s + drive_s) * rate_hz)):
             if k == round(stand_s * rate_hz) - 5:
                 state(True)
