@@ -95,7 +95,7 @@ class ControllerWatch:
         if self.answers.repeat(ask_id):
             return
         if action not in ("start", "confirm", "deny"):
-            refusal = f"expected start, confirm or deny; got {action[:40]!r}"
+            refusal = f"expected start, confirm or deny, got {action[:40]!r}"
         elif not refusal and action != "start" and not self.check.awaits_answer(mono_ns):
             refusal = "no steering check is waiting for an answer; start one"
         if not refusal and action == "start":

@@ -176,7 +176,7 @@ def _explain(model: type[BaseModel], document: Document, error: ValidationError)
         message = str(first["msg"]).removeprefix("Value error, ")
         message = message[:1].lower() + message[1:]
         # The message of a check over several keys already has their values. Printing the whole file would not help.
-        what = f"{name}: {message}; got {first['input']!r:.80}" if key else message
+        what = f"{name}: {message}, got {first['input']!r:.80}" if key else message
     more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
     return f"{document.place(key)}: {what}{more}"
 

@@ -105,8 +105,8 @@ def test_all_is_well_for_a_minute(armed):
         ("camera", "no camera image", 260),
         ("vicon", "no pose of the car", 220),
         ("policy", "no command from the policy", 240),
-        ("compositor", "node compositor is silent", 1250),
-        ("motor", "node motor is silent", 1250),
+        ("compositor", "node compositor has been silent", 1250),
+        ("motor", "node motor has been silent", 1250),
     ],
 )
 def test_a_source_that_falls_silent(armed, silent, word, limit_ms):

@@ -224,7 +224,7 @@ def clock(offset_s, error_s=0.002, peers=()):
         (clock(0.004), 10, ""),
         (clock(-0.05), 10, "the clock of robot is off by -50 ms, the limit is 30 ms"),
         (clock(math.nan), 10, "off by nan ms"),
-        (clock(0.0, 0.15), 10, "known to 150 ms only"),
+        (clock(0.0, 0.15), 10, "is only known to 150 ms"),
         (clock(0.0, peers=("workstation",)), 10, "the clock offset to workstation is not known yet"),
         (clock(0.0, peers=("robot",)), 4000, "last measured 4.0 s ago"),
         (clock(-0.05), 4000, ""),  # a host that left

@@ -132,8 +132,8 @@ def test_of_two_hosts_the_operators_drives_the_trials_and_waits_for_the_nodes_of
 @pytest.mark.parametrize(
     ("host", "overrides", "words"),
     [
-        (None, [], "say which host this is"),
-        ("tractor", [], "say which host this is"),
+        (None, [], "expected --host with one of"),
+        ("tractor", [], "expected --host with one of"),
         ("robot", [], "driven where people arm, on workstation, got --host robot"),
         ("workstation", ["record.host=robot"], "but robot records, not workstation"),
         ("workstation", ["record=false"], "give the launch file the key record"),

@@ -222,7 +222,7 @@ def test_wrong_choices_are_one_clear_error(tmp_path):
         (Choice(()), "expected at least one node to replay"),
         (Choice(("viewer",)), "was recorded without a node viewer; it had compositor, policy, recorder"),
         (Choice(("policy",), {"compositor": "x"}), "cannot replace compositor: only what is replayed can be"),
-        (Choice(("policy",), {"policy": "no_such_thing"}), "no Python module called no_such_thing"),
+        (Choice(("policy",), {"policy": "no_such_thing"}), "found none called no_such_thing"),
         (Choice(("policy",), {"policy": "green_policy:Nothing"}), "name it as module:Class"),
         (Choice(("policy",), {"policy": "json"}), "expected json to have one node class"),
         (Choice(("policy",)), r"policy cannot be built for replay: .*--set policy.KEY=VALUE"),
