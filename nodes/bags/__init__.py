@@ -1,1 +1,1 @@
-"""Recordings: writing, reading, checking, repairing, playing."""
+"""Bags (recordings): writing, reading, checking, repairing and playing."""

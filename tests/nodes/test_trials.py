@@ -219,7 +219,7 @@ def test_numbers_of_a_bag_without_checksums_are_unchecked(tmp_path):
         at += 9 + int.from_bytes(content[at + 1 : at + 9], "little")
     path.write_bytes(content)
     (unchecked,) = evaluate_bag(bag, None, ticks=20)
-    assert "chunks carry no checksum" in unchecked["unchecked"]
+    assert "chunks have no checksum" in unchecked["unchecked"]
     assert unchecked["total_cte_m"] == checked["total_cte_m"]
     shown = CliRunner().invoke(app, ["evaluate", str(bag), "--ticks", "20"], env={"COLUMNS": "240"})
     assert "unchecked" in shown.stdout

@@ -109,7 +109,7 @@ def test_a_truncated_file_without_chunks_keeps_its_messages(bags, write):
     assert result.kept.read_bytes() == content
     with open(path, "rb") as file:
         assert sum(1 for _ in make_reader(file).iter_messages()) == result.messages
-    assert "in no chunk" in read_info(path).unchecked
+    assert "outside chunks" in read_info(path).unchecked
 
 
 def test_a_bad_chunk_is_named_and_what_follows_is_kept_only_when_asked_for(bags, write):
@@ -323,7 +323,7 @@ def test_a_full_disk_leaves_the_file(bags, write):
         [sys.executable, "-c", code, str(path)], preexec_fn=limit, capture_output=True, text=True, check=False
     )
     assert "cannot repair" in done.stderr
-    assert "it is as it was" in done.stderr
+    assert "the file is unchanged" in done.stderr
     assert [file.name for file in path.parent.iterdir()] == ["bag.mcap"]
     assert path.read_bytes() == content
 
@@ -361,7 +361,7 @@ def test_a_compression_that_is_not_known_is_no_damage(bags, write):
     content = bags["zstd"].replace(b"zstd", b"zzip")
     path = write(content[:-1000])
     for force in (False, True):
-        with pytest.raises(BagError, match="compression 'zzip' is not known here"):
+        with pytest.raises(BagError, match="got 'zzip'"):
             repair(path, force=force)
     assert path.read_bytes() == content[:-1000]
 
@@ -386,7 +386,7 @@ def test_the_command_says_what_was_before_and_after(bags, write):
     assert "nothing was changed" in again.stdout
     assert "checked: all messages match" in run(app, ["bag", "info", str(path)]).stdout
     loose = write(bags["no chunks"], "loose")
-    assert "unchecked: 60 of its messages are in no chunk" in run(app, ["bag", "info", str(loose)]).stdout
+    assert "unchecked: 60 of its messages are outside chunks" in run(app, ["bag", "info", str(loose)]).stdout
 
 
 def test_journal_is_kept_with_the_file_as_it_was(tmp_path):

@@ -271,4 +271,4 @@ def test_command_plays_under_a_terminal_and_obeys_keys_and_bus(bag, tmp_path):
     assert re.match(r"error: expected pause, resume", wrong.stderr)
     absent = control_says("pause")
     assert absent.returncode == 2
-    assert "no player answered within 3 s" in absent.stderr
+    assert "expected an answer from a player within 3 s, got none" in absent.stderr

@@ -143,8 +143,8 @@ def test_without_keys_the_other_host_can_only_watch(launch_file):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (("operator: robot\n", ""), "without keys .* robot would take /arm"),
-        (("nodes.policy, host: robot", "nodes.policy, host: desk"), "robot would take /policy/drive"),
+        (("operator: robot\n", ""), "without keys .* robot would accept /arm"),
+        (("nodes.policy, host: robot", "nodes.policy, host: desk"), "robot would accept /policy/drive"),
     ],
 )
 def test_without_keys_nobody_commands_from_the_other_host(launch_file, change, words, host):
