@@ -103,7 +103,7 @@ def test_a_truncated_file_without_chunks_keeps_its_messages(bags, write):
     path = write(content)
     info = CliRunner().invoke(app, ["bag", "info", str(path)])
     assert info.exit_code == 2
-    assert f"advnerf bag repair {path} keeps all {len(reachable(content))} messages" in info.stderr
+    assert f"advnerf bag repair {path} keeps all {len(reachable(content))} intact messages" in info.stderr
     result = repair(path)
     assert result.messages == len(reachable(content)) > 40
     assert result.kept.read_bytes() == content

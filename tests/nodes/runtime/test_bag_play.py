@@ -142,7 +142,7 @@ def test_stop_ends_it_even_while_it_waits(bag):
     clock = ManualClock()
     assert node.tick(clock.now()) == []
     (pause,) = node.handle("/player/control", control("pause", "1"), None, clock.now())
-    assert (pause.message.granted, pause.message.answer) == (False, "it has not begun yet")
+    assert (pause.message.granted, pause.message.answer) == (False, "playback has not started yet")
     (stop,) = node.handle("/player/control", control("stop", "2"), None, clock.now())
     assert stop.message.granted
     clock.advance(0.2)
