@@ -255,7 +255,7 @@ def stop_of(rows: Sequence[Any], commands: Sequence[tuple[int, int]]) -> dict[st
         raise BrokenPromise(f"{len(moves)} commands to move came after it was stopped, the first of them {moves[0]}")
     fresh = [sent for heard, sent in commands if heard <= stop_ns and heard - sent <= _FRESH_NS]
     if not fresh:
-        raise BrokenPromise("it drove, and no command of the policy was heard")
+        raise BrokenPromise("it drove, and no command from the policy was heard")
     rolled = next((row for row in rows[first:] if row[0].mono_ns >= fresh[-1]), rows[stop])[2]
     standing = next((row for row in after if row[0].name == "STANDSTILL"), None)
     if standing is None:

@@ -1,8 +1,8 @@
-"""The drive that ``advnerf calibrate vehicle`` wants, in place of the policy: ``--set policy.module=nodes.calibration_drive``.
+"""The calibration drive for ``advnerf calibrate vehicle``. It replaces the policy: ``--set policy.module=nodes.calibration_drive``.
 
-Circles to both sides, straight runs and wide curves at two speeds, then steps of steering and speed; about 45 seconds in 6 x 5.5 m, of
-which 3.5 m lie behind the start and 3.2 m to its right. It drives only while the safety node has armed the car, under fence and limits as any policy, stands
-still otherwise, and after a stop begins the interrupted part again: the operator may carry the car back first.
+The car drives circles to both sides, straight runs and wide curves at two speeds, then steps of steering and speed. This takes about
+45 s and 6 x 5.5 m, of which 3.5 m lie behind the start and 3.2 m to its right. The car drives only while the safety node has armed it,
+within fence and limits like any policy. After a stop, the interrupted part starts again; the operator may carry the car back first.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ STEPS = 6
 
 @dataclass(frozen=True)
 class Part:
-    """One command, held.
+    """A command that is held for some time.
 
     Attributes:
-        duration_s: For how long [s].
+        duration_s: Duration [s].
         steering_rad: Wheel angle, left positive [rad].
         speed_mps: Speed [m/s].
     """
@@ -40,14 +40,14 @@ class Part:
 
 
 class CalibrationDriveConfig(BaseModel):
-    """Configuration; other keys of the policy node are ignored, so that it can stand in for it.
+    """Configuration of the calibration drive. Other keys of the policy node are ignored, so that this node can replace it.
 
     Attributes:
-        slow_mps: One speed [m/s].
-        fast_mps: The other [m/s].
+        slow_mps: The lower speed [m/s].
+        fast_mps: The higher speed [m/s].
         tight_rad: Wheel angle of the circles [rad].
         wide_rad: Wheel angle of the wide curves [rad].
-        wheelbase_m: For the length of a half circle [m].
+        wheelbase_m: Distance between the axles, for the length of a half circle [m].
     """
 
     model_config = ConfigDict(extra="ignore", frozen=True)
@@ -62,13 +62,13 @@ class CalibrationDriveConfig(BaseModel):
     def _apart(self) -> CalibrationDriveConfig:
         if self.fast_mps < 1.3 * self.slow_mps or self.tight_rad < 1.3 * self.wide_rad:
             raise ValueError(
-                "expected fast_mps and tight_rad at least 1.3 times slow_mps and wide_rad: the fits need both"
+                "expected fast_mps and tight_rad at least 1.3 times slow_mps and wide_rad, which the fits need; increase them"
             )
         return self
 
 
 def program(config: CalibrationDriveConfig) -> list[Part]:
-    """The drive: a loop to the left, a faster loop to the right, then two rows of steps with half circles between them."""
+    """Parts of the drive: a loop to the left, a faster loop to the right, then two rows of steps with half circles between them."""
     slow, fast, tight, wide = config.slow_mps, config.fast_mps, config.tight_rad, config.wide_rad
 
     def half_circle(steering: float, speed: float) -> Part:
@@ -88,7 +88,7 @@ def program(config: CalibrationDriveConfig) -> list[Part]:
 
 
 class CalibrationDrive(Node):
-    """Answers every image with the command that is due."""
+    """Answers every image with the current command of the drive."""
 
     subscriptions = (IMAGE, STATE)
     publications = (DRIVE,)
@@ -100,12 +100,12 @@ class CalibrationDrive(Node):
 
     @classmethod
     def build(cls, config: CalibrationDriveConfig, context: NodeContext) -> CalibrationDrive:
-        """Make the node of a process."""
+        """Build the node."""
         del context
         return cls(program(config))
 
     def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
-        """Note the state of the safety node; answer an image."""
+        """Note the state of the safety node, or answer an image."""
         if topic == STATE:
             armed = bool(message.armed) and not bool(message.stopping)
             if armed and not self._armed:
@@ -116,14 +116,14 @@ class CalibrationDrive(Node):
         return [Out(DRIVE, drive_message(speed, steering, stamp_ns(message)))]
 
     def status(self) -> tuple[str, str]:
-        """Which part it is at."""
+        """Report the current part."""
         if self._index == len(self._parts):
-            return "ready", "done: stop the recording"
+            return "ready", "done, stop the recording"
         where = f"part {self._index + 1} of {len(self._parts)}"
-        return ("active", where) if self._armed else ("ready", f"{where}, waits for arming")
+        return ("active", where) if self._armed else ("ready", f"{where}, waiting for arming")
 
     def _due(self, mono_ns: int) -> tuple[float, float]:
-        """Speed and steering now; without arming it stands, and the time of the part does not run."""
+        """Current speed [m/s] and steering [rad]. Without arming, the car stands and the time of the part does not advance."""
         if not self._armed:
             return 0.0, 0.0
         while self._index < len(self._parts):

@@ -1,4 +1,4 @@
-"""The camera node: publishes every frame the moment it arrives, under the time at which it was taken."""
+"""The camera node: publishes every frame when it arrives, with its capture time as the stamp."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ from nodes.runtime.pictures import COMPRESSED_TOPIC, RAW_TOPIC, compressed_image
 from nodes.runtime.process import run_node_main
 
 _READ_TIMEOUT_S = 0.2
-# Of the focal length and, as a share of the picture, of its centre: no calibration moves a factory's numbers so far.
+# Largest relative difference from the factory's focal length, and of the principal point as a fraction of the image size.
 _FACTORY_TOLERANCE = 0.05
 FRAME_ID = "camera"
 
 
 class CompressedConfig(BaseModel):
-    """JPEG pictures for the air.
+    """JPEG images for a wireless link.
 
     Attributes:
-        rate_hz: Pictures per second at most [Hz].
-        quality: Of the JPEG, 1 to 100.
+        rate_hz: Highest rate of images [Hz].
+        quality: JPEG quality, 1 to 100.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -47,11 +47,11 @@ class CameraConfig(BaseModel):
     """Configuration of the camera node.
 
     Attributes:
-        source: Device: ``kind`` v4l2, zed, oak, socket, file or folder; see `hardware.cameras.sources`.
-        calibration: Camera calibration file; frames of another size are refused.
-        max_age_s: A frame older than this when it arrives is not published [s].
+        source: Device with ``kind`` v4l2, zed, oak, socket, file or folder; see `hardware.cameras.sources`.
+        calibration: Camera calibration file. Frames of another size are refused.
+        max_age_s: Largest age of a frame on arrival; older frames are not published [s].
         silence_s: Time without a frame after which the node reports a fault [s].
-        compressed: Also publish JPEG pictures on ``/camera/image_raw/compressed``; only while somebody listens.
+        compressed: Also publish JPEG images on ``/camera/image_raw/compressed`` while the topic has subscribers.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -64,12 +64,12 @@ class CameraConfig(BaseModel):
 
 
 def _grid(compressed: CompressedConfig | None) -> Decimator | None:
-    # A frame may come a quarter of a period early and still be its slot's.
+    # A frame may arrive up to a quarter of a period early.
     return None if compressed is None else Decimator(compressed.rate_hz, 2.0 * compressed.rate_hz)
 
 
 class CameraNode(Node):
-    """Turns frames into images and camera infos."""
+    """Publishes frames as images and camera infos."""
 
     def __init__(
         self,
@@ -85,7 +85,7 @@ class CameraNode(Node):
         self._grid = _grid(config.compressed)
         self._device = device or config.source.steady()
         self._factory: Pinhole | None = None
-        # Two: the newest, and the one that may just be taken.
+        # Two: the newest frame, and the one that the loop is taking.
         self.inbox: Inbox[Frame] = Inbox(capacity=2)
         self._reader = ReaderThread(partial(self._device.read, _READ_TIMEOUT_S), self.inbox, "camera")
         self._sequence: int | None = None
@@ -95,14 +95,14 @@ class CameraNode(Node):
 
     @classmethod
     def build(cls, config: CameraConfig, context: NodeContext) -> CameraNode:
-        """Make the node of a process and begin to read."""
+        """Build the node and start reading frames."""
         node = cls(config, load_calibration(CameraCalibration, config.calibration), context.subscribers)
         node._now_ns = lambda: context.clock.now().mono_ns
         node._reader.start()
         return node
 
     def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
-        """It listens to nobody."""
+        """Do nothing: the node has no subscriptions."""
         return []
 
     def receive(self, item: Frame, now: Now) -> list[Out]:
@@ -111,10 +111,10 @@ class CameraNode(Node):
         if item.rgb.shape[:2] != expected:
             raise RuntimeFault(
                 f"expected frames of {expected[1]} x {expected[0]} as in {self._config.calibration}, got"
-                f" {item.rgb.shape[1]} x {item.rgb.shape[0]}: calibrate this mode, or set the camera to the calibrated one"
+                f" {item.rgb.shape[1]} x {item.rgb.shape[0]}; calibrate this mode, or set the camera to the calibrated one"
             )
         if (now.mono_ns - item.stamp_mono_ns) / NS_PER_S > self._config.max_age_s:
-            self._stale += 1  # left over from a time when this process was held up
+            self._stale += 1  # the frame waited while this process was held up
             return []
         self._require_this_camera()
         self._count_missed(item)
@@ -125,7 +125,7 @@ class CameraNode(Node):
         return outs + self._compressed(item, stamp_ns)
 
     def status(self) -> tuple[str, str]:
-        """Fault when frames have ceased."""
+        """Report a fault if frames have stopped."""
         if self._arrived_ns is None:
             return STARTING, self._device.error or "waiting for the first frame"
         silence_s = (self._now_ns() - self._arrived_ns) / NS_PER_S
@@ -134,7 +134,7 @@ class CameraNode(Node):
         return ACTIVE, ""
 
     def counters(self) -> dict[str, float]:
-        """Frames that were not published, and what the device counts."""
+        """Report frames that were not published, and the counters of the device."""
         return {"frames_stale": self._stale, "frames_missed": self._missed, **self._device.counters()}
 
     def close(self) -> None:
@@ -143,7 +143,7 @@ class CameraNode(Node):
         self._device.close()
 
     def _compressed(self, frame: Frame, stamp_ns: int) -> list[Out]:
-        """The same picture as JPEG, under the same stamp; nothing while nobody listens or it is not its turn."""
+        """Encode a frame as JPEG with the same stamp. Empty without subscribers, or if the frame is too early for the rate."""
         wanted = self._config.compressed
         if wanted is None or self._grid is None or self._subscribers(COMPRESSED_TOPIC) == 0:
             return []
@@ -152,7 +152,7 @@ class CameraNode(Node):
         return [Out(COMPRESSED_TOPIC, compressed_image_message(frame.rgb, stamp_ns, FRAME_ID, wanted.quality))]
 
     def _require_this_camera(self) -> None:
-        """A device that knows its own intrinsics must be the calibrated one: the calibration may only refine them."""
+        """Compare the calibration with the device's factory calibration, if it has one, to detect the file of another camera."""
         factory = self._device.camera.pinhole
         if factory is None or factory == self._factory:
             return
@@ -161,8 +161,8 @@ class CameraNode(Node):
         centre = max(abs(ours.cx - factory.cx) / factory.width, abs(ours.cy - factory.cy) / factory.height)
         if max(focal, centre) > _FACTORY_TOLERANCE:
             raise RuntimeFault(
-                f"{self._config.calibration} says fx {ours.fx:.1f}, cx {ours.cx:.1f}, cy {ours.cy:.1f}, but the device's own"
-                f" calibration fx {factory.fx:.1f}, cx {factory.cx:.1f}, cy {factory.cy:.1f}: it is the file of another camera or"
+                f"{self._config.calibration} has fx {ours.fx:.1f}, cx {ours.cx:.1f}, cy {ours.cy:.1f}, but the device's factory"
+                f" calibration has fx {factory.fx:.1f}, cx {factory.cx:.1f}, cy {factory.cy:.1f}: it is the file of another camera or"
                 " mode; calibrate this one"
             )
         self._factory = factory

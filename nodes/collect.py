@@ -1,7 +1,7 @@
-"""The collector: lets the expert (or a policy) drive from every declared start, one drive after the other, on the twin.
+"""The collector: on the twin, lets the expert (or a policy) drive from every configured start, one drive after the other.
 
-It is the operator of one trial after another, and arms by itself only where the motor's peer says that it is the twin. With a
-real car, leave it out (``--set collect.if=false``), put the car down at each start, and hold the button.
+The node is the operator of a series of trials. It arms the car only if the motor's peer reports that it is the twin. With a real car,
+disable it (``--set collect.if=false``), place the car at each start, and hold the button.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from nodes.runtime.process import run_node_main
 
 
 class Start(BaseModel):
-    """Where a drive begins.
+    """Start of a drive.
 
     Attributes:
-        s_m: Along the path, from its begin [m].
-        lateral_m: Left of the path positive [m].
-        heading_rad: Turned left of the path's heading positive [rad].
+        s_m: Distance along the path from its beginning [m].
+        lateral_m: Offset from the path, left positive [m].
+        heading_rad: Angle from the heading of the path, left positive [rad].
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
@@ -46,12 +46,12 @@ class CollectConfig(BaseModel):
     """Configuration of the collector.
 
     Attributes:
-        room: Room calibration file: the path.
-        starts: Where the drives begin.
-        laps: Laps of each drive.
-        speed_mps: Speed at which laps are counted as time [m/s].
+        room: Room calibration file with the path.
+        starts: Starts of the drives.
+        laps: Number of laps per drive.
+        speed_mps: Speed used to convert laps to time [m/s].
         nodes: Nodes that must be ready before anything moves.
-        patience_s: Time that getting ready, placing, arming and stopping may take each [s].
+        patience_s: Longest time for each of getting ready, placing, arming and stopping [s].
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -65,7 +65,7 @@ class CollectConfig(BaseModel):
 
 
 class CollectNode(Node):
-    """Hands everything to the trial that is on; goes on to the next when it is done.
+    """Runs one trial after the other.
 
     Args:
         plans: The drives.
@@ -83,19 +83,19 @@ class CollectNode(Node):
 
     @classmethod
     def build(cls, config: CollectConfig, context: NodeContext) -> CollectNode:
-        """Make the node of a process."""
-        del context  # it needs no clock of its own
+        """Build the node."""
+        del context  # not needed
         path = load_calibration(RoomCalibration, config.room).reference_path
         duration_s = config.laps * path.length_m / config.speed_mps
         poses = [start.pose_on(path) for start in config.starts]
         return cls([TrialPlan(pose, duration_s, config.nodes, config.patience_s) for pose in poses])
 
     def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
-        """The trial's business."""
+        """Pass a message to the current trial."""
         return self._trial.handle(topic, message, info, now)
 
     def tick(self, now: Now) -> list[Out]:
-        """The trial's business, until there is none left."""
+        """Advance the current trial, or start the next."""
         try:
             return self._trial.tick(now)
         except NodeFinished:
@@ -113,12 +113,12 @@ class CollectNode(Node):
             return []
 
     def status(self) -> tuple[str, str]:
-        """Which drive is on."""
+        """Report the current drive."""
         number = self._drives - len(self._waiting)
         return "active", f"drive {number} of {self._drives}: {self._trial.phase.value}"
 
     def counters(self) -> dict[str, float]:
-        """Drives begun, and those that the stack stopped."""
+        """Report started drives, and drives that the stack stopped."""
         return {"drives": self._drives - len(self._waiting), "stopped_early": len(self._stopped_early)}
 
 

@@ -1,11 +1,11 @@
-"""The compositor node: shows the attacked face in the live image, where the motion capture says that it is.
+"""The compositor node: draws the attack into the live image at the pose of its face from motion capture.
 
-Images and poses are joined by capture stamp. An image waits a bounded time for the poses after it; then the poses are continued
-at constant velocity, which is flagged, up to a limit; beyond that the image is dropped and counted, and the layers nearer to the
-motor stop the car. Without an attack file the images pass through unchanged.
+Images and poses are joined by capture stamp. An image waits a limited time for later poses. After that, poses are extrapolated at
+constant velocity up to a limit, which is flagged. Beyond the limit, the image is dropped and counted, and the safety and motor nodes
+stop the car. Without an attack file, images pass through unchanged.
 
-A new attack comes in pieces over the bus. What is shown stays until the new one is whole, verified, and fits camera and face;
-then it changes between two images. Whatever is wrong with it is said in the status and changes nothing.
+A new attack is received in pieces over the bus. It replaces the current one between two images, once it is complete, verified, and
+fits camera and face. If it is refused, the reason is in the status and the current attack stays.
 """
 
 from __future__ import annotations
@@ -44,15 +44,15 @@ class CompositorConfig(BaseModel):
     """Configuration of the compositor node.
 
     Attributes:
-        attack: Attack file to show; empty for none.
+        attack: Attack file to draw; empty for none.
         camera: Camera calibration file.
-        target: Calibration file of the face that carries the attack.
-        image_topic: Where images come from; ``/camera/image_raw/compressed`` over a wireless link.
-        wait_s: How long an image waits for poses [s].
-        extrapolation_limit_s: How far poses are continued at constant velocity after that [s].
-        max_gap_s: Longest gap in a pose stream across which is interpolated [s].
+        target: Calibration file of the face that shows the attack.
+        image_topic: Topic of the images; ``/camera/image_raw/compressed`` over a wireless link.
+        wait_s: Longest time that an image waits for poses [s].
+        extrapolation_limit_s: Longest time over which poses are then extrapolated at constant velocity [s].
+        max_gap_s: Longest gap in a pose stream that is interpolated [s].
         supersample: Samples along each side of a pixel.
-        interlock: Show the attack only while the safety node says that the car is armed: inside the fence, poses fresh.
+        interlock: Draw the attack only while the safety node reports that the car is armed, so inside the fence with fresh poses.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -75,13 +75,13 @@ class CompositorConfig(BaseModel):
 
 @dataclass(frozen=True, eq=False)
 class Showing:
-    """What is shown, and through which camera.
+    """The attack to draw, prepared for a camera.
 
     Attributes:
         attack_id: Short hash of the attack file.
-        overlay: Draws its face.
-        T_car_from_camera: Mount of the camera.
-        subject: Motion-capture subject that carries the face.
+        overlay: Draws the face.
+        T_car_from_camera: Pose of the camera on the car.
+        subject: Motion-capture subject of the face.
     """
 
     attack_id: str
@@ -98,17 +98,17 @@ class _Waiting:
 
 
 class CompositorNode(Node):
-    """Joins images with poses and draws the face; see the module's docstring.
+    """Joins images with poses and draws the face. See the module's docstring.
 
     Args:
-        showing: What is shown; None passes images through.
-        wait_s: How long an image waits for poses [s].
-        extrapolation_limit_s: How far poses are continued after that [s].
-        max_gap_s: Longest gap in a pose stream across which is interpolated [s].
-        subject: Motion-capture subject that carries the face; that of ``showing``, if there is one.
-        prepare: Makes a new attack ready to be shown, or refuses it; None listens to no new ones.
-        image_topic: Where images come from, raw or compressed.
-        interlock: When the attack may be shown; None shows it always.
+        showing: The attack to draw; None passes images through.
+        wait_s: Longest time that an image waits for poses [s].
+        extrapolation_limit_s: Longest time over which poses are then extrapolated [s].
+        max_gap_s: Longest gap in a pose stream that is interpolated [s].
+        subject: Motion-capture subject of the face; ``showing`` overrides it.
+        prepare: Prepares a new attack, or refuses it; None ignores new attacks.
+        image_topic: Topic of the images, raw or compressed.
+        interlock: Decides when the attack may be drawn; None draws it always.
     """
 
     publications = ("/compositor/image", "/compositor/attack")
@@ -146,8 +146,8 @@ class CompositorNode(Node):
 
     @classmethod
     def build(cls, config: CompositorConfig, context: NodeContext) -> CompositorNode:
-        """Make the node of a process."""
-        del context  # it needs no clock of its own
+        """Build the node."""
+        del context  # not needed
         camera = load_calibration(CameraCalibration, config.camera)
         target = load_calibration(TargetCalibration, config.target)
         prepare = partial(show, camera=camera, target=target, supersample=config.supersample)
@@ -158,7 +158,7 @@ class CompositorNode(Node):
         )  # fmt: skip
 
     def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
-        """Take an image or a pose."""
+        """Handle an image, a pose, a piece of an attack, or the state of the safety node."""
         self._now_ns = now.mono_ns
         if topic == _FILE:
             return self._take_piece(message, info, now)
@@ -177,36 +177,36 @@ class CompositorNode(Node):
             self._trouble = f"image dropped: {error}"
             return []
         refusal = self._interlock.refusal(now.mono_ns) if self._interlock else ""
-        # An older image that still waits gets what there is now: two never wait.
+        # An older image that still waits is published with the current poses, so that only one image waits.
         before = self._finish(now) if self._waiting else []
         if self._showing is None or refusal:
             self._trouble = refusal
-            # A raw image passes on in the very bytes in which it came.
+            # A raw image is forwarded as the received bytes.
             out = (info.raw or message) if image is message else image
             return [*before, Out("/compositor/image", out), self._label(image, False, refusal or "no attack file")]
         self._waiting = _Waiting(image, stamp_ns(image), now.mono_ns + self._wait_ns)
         return before + self._release(now)
 
     def tick(self, now: Now) -> list[Out]:
-        """Let a waiting image go when its time is over."""
+        """Publish a waiting image when its waiting time is over."""
         self._now_ns = now.mono_ns
         return self._release(now)
 
     def status(self) -> tuple[str, str]:
-        """Active while images come."""
+        """Report active while images arrive."""
         shown = f"attack {self._showing.attack_id}" if self._showing else "no attack file, images pass through"
         if self._last_image_ns is None or self._now_ns - self._last_image_ns > _ACTIVE_S * NS_PER_S:
             return READY, "; ".join(filter(None, (f"waiting for images; {shown}", self._transfer_trouble)))
         return ACTIVE, "; ".join(filter(None, (shown, self._trouble, self._transfer_trouble)))
 
     def counters(self) -> dict[str, float]:
-        """Images seen, drawn on, drawn with extrapolated poses, dropped; attacks taken over and refused."""
+        """Report images received, drawn on, drawn with extrapolated poses, and dropped; attacks accepted and refused."""
         counts = {key: float(value) for key, value in self._counts.items()}
         transfers = {"attacks_taken": self._taken, "attacks_refused": self._refused, "takeover_ms": self._takeover_ms}
         return counts | transfers
 
     def _take_piece(self, chunk: Any, info: MessageInfo, now: Now) -> list[Out]:
-        """Take a piece of a new attack; the last one changes what is shown, if all is well with it."""
+        """Handle a piece of a new attack. After the last piece, a valid attack replaces the current one."""
         if self._showing is not None and chunk.sha256 == self._shown_sha256 and not self._assembler.receiving:
             return []  # sent again for others
         received, trouble = self._assembler.add(chunk, info.instance_id)
@@ -216,16 +216,18 @@ class CompositorNode(Node):
 
     def _take_over(self, received: ReceivedFile, now: Now) -> list[Out]:
         assert self._prepare is not None
-        # The duration is reported only; no decision depends on this clock, so replays stay deterministic.
+        # This clock only measures the reported duration. No decision depends on it, so replays stay deterministic.
         start = time.perf_counter()
         try:
             showing = self._prepare(attack_from_bytes(received.content, f"the attack {received.name}"))
             if showing.subject != self._face_topic.removeprefix("/vicon/"):
-                raise ConfigError(f"attack {received.name} is for {showing.subject}, which is not followed here")
+                raise ConfigError(
+                    f"expected an attack for the configured subject, got {received.name} for {showing.subject}"
+                )
         except (AdvnerfError, ValueError) as error:
             self._refuse(str(error))
             return []
-        # An image that waits was seen under the old attack and gets it.
+        # A waiting image was captured before the change, so it gets the old attack.
         before = self._finish(now) if self._waiting else []
         self._showing, self._shown_sha256, self._transfer_trouble = showing, received.sha256, ""
         self._taken += 1
@@ -244,7 +246,7 @@ class CompositorNode(Node):
         return self._finish(now) if complete or now.mono_ns >= waiting.deadline_mono_ns else []
 
     def _finish(self, now: Now) -> list[Out]:
-        del now  # the decision is made; only stamps count from here on
+        del now  # only stamps matter from here on
         waiting, self._waiting = self._waiting, None
         assert waiting is not None
         assert self._showing is not None
@@ -275,7 +277,7 @@ class CompositorNode(Node):
 
 
 def show(attack: AttackFile, camera: CameraCalibration, target: TargetCalibration, supersample: int = 2) -> Showing:
-    """Prepare an attack for a camera and a face; one without a face, or of another size or subject, is refused."""
+    """Prepare an attack for a camera and a face. An attack without a face, or of another size or subject, is refused."""
     face = attack.required_face()
     corners = target.corners
     size_m = (np.linalg.norm(corners[1] - corners[0]), np.linalg.norm(corners[3] - corners[0]))

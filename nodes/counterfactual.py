@@ -1,11 +1,10 @@
-"""The counterfactual node: what would the policy steer, at this very image, had the attack not been drawn?
+"""The counterfactual node: computes how the policy would steer at each image without the attack.
 
-The camera's image and the compositor's image of the same stamp go through the same policy, and the difference is published. It
-only listens: nobody waits for it, nothing that drives reads it, and its process has the processor only while no other wants it.
-Where it cannot keep up it leaves images out and counts them. Between camera and policy nothing is added, so the way of a command
-is unchanged.
+The camera's image and the compositor's image with the same stamp go through the same policy, and the difference is published. No node
+that drives depends on this node, and its process runs at idle priority. If it cannot keep up, it skips images and counts them. The
+path from camera to motor is unchanged.
 
-There is no clean image of an attack on a monitor: the camera itself sees that one.
+An attack on a monitor has no clean image, because the camera itself sees the attack.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ COUNTERFACTUAL_TOPIC = "/policy/counterfactual"
 _ATTACKED, _LABEL = "/compositor/image", "/compositor/attack"
 _ACTIVE_S = 1.0
 _WARM_UP_RUNS = 3
-# Partners of one stamp come within the compositor's wait for poses; more than these are never open.
+# Largest number of incomplete pairs. The images of a pair arrive within the compositor's waiting time for poses.
 _OPEN = 12
 _QUEUE = 12
 _NICE = 15
@@ -42,12 +41,12 @@ class CounterfactualConfig(BaseModel):
     """Configuration of the counterfactual node.
 
     Attributes:
-        policy: The policy that drives, as the policy node has it.
-        sha256: Its hash, if it must be that very policy; empty accepts any.
-        clean_topic: Where the compositor takes its images from.
-        shown_by: Who shows the attack; only a compositor leaves a clean image to compare with.
+        policy: The policy that drives, as configured in the policy node.
+        sha256: Expected hash of the policy; empty accepts any.
+        clean_topic: Topic of the compositor's input images.
+        shown_by: Node that shows the attack. Only a compositor leaves a clean image for the comparison.
         goal: Goal vector of a goal-conditioned policy.
-        max_age_s: A pair that was published longer ago is left out, so that a busy computer does not fall further behind [s].
+        max_age_s: Largest age of a pair since publication. Older pairs are skipped, so that a busy computer can catch up [s].
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -65,20 +64,20 @@ class CounterfactualConfig(BaseModel):
         if shown_by == "monitor":
             raise ValueError(
                 "expected an attack that a compositor draws; one on a monitor is in the camera's own image, so there is no clean "
-                "image to compare with: leave the counterfactual node out (params.counterfactual=false)"
+                "image to compare with. Disable the counterfactual node (params.counterfactual=false)"
             )
         return shown_by
 
 
 class CounterfactualNode(Node):
-    """Joins both images by their stamp and steers by each; see the module's docstring.
+    """Joins both images by their stamp and runs the policy on each. See the module's docstring.
 
     Args:
         clean: The policy for the camera's images.
-        attacked: The same policy for the compositor's images; of its own, because a policy may have a memory.
-        clean_topic: Where the camera's images come from, raw or compressed.
-        goal: Goal vector, of the length that the policy wants.
-        max_age_s: A pair that was published longer ago is left out [s].
+        attacked: A second instance of the same policy for the compositor's images, because a policy may have a state.
+        clean_topic: Topic of the camera's images, raw or compressed.
+        goal: Goal vector, of the length that the policy expects.
+        max_age_s: Largest age of a pair since publication [s].
     """
 
     publications = (COUNTERFACTUAL_TOPIC,)
@@ -93,13 +92,13 @@ class CounterfactualNode(Node):
         max_age_s: float = 1.0,
     ) -> None:
         if clean.sha256 != attacked.sha256:
-            raise ConfigError(f"expected one policy twice, got {clean.sha256[:12]} and {attacked.sha256[:12]}")
+            raise ConfigError(f"expected the same policy twice, got {clean.sha256[:12]} and {attacked.sha256[:12]}")
         if len(goal) != clean.goal_size:
             raise ConfigError(
                 f"expected a goal of {clean.goal_size} numbers for this policy, got {len(goal)}; set 'goal'"
             )
         self.subscriptions = (clean_topic, _ATTACKED, _LABEL)
-        # Not only the newest: the two images and the label of one stamp come one after the other.
+        # A queue, because the two images and the label of a stamp arrive one after the other.
         self.queues = dict.fromkeys(self.subscriptions, _QUEUE)
         self._clean_topic = clean_topic
         self._clean, self._attacked, self._goal = clean, attacked, goal
@@ -114,14 +113,14 @@ class CounterfactualNode(Node):
 
     @classmethod
     def build(cls, config: CounterfactualConfig, context: NodeContext) -> CounterfactualNode:
-        """Make the node of a process: load the policy twice, check and warm it up."""
-        del context  # it needs no clock of its own
+        """Build the node: load the policy twice, check it and warm it up."""
+        del context  # not needed
         cv2.setNumThreads(1)
         clean, attacked = (load_driver(config.policy, config.sha256 or None) for _ in range(2))
         return cls(clean, attacked, config.clean_topic, config.goal, config.max_age_s)
 
     def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
-        """Keep what came until its partners are there; then steer by both images."""
+        """Store an image or label until its partners arrive, then run the policy on both images."""
         self._now_ns = now.mono_ns
         stamp = stamp_ns(message)
         entry = self._open.setdefault(stamp, {})
@@ -145,12 +144,12 @@ class CounterfactualNode(Node):
         return self._compare(clean, attacked, entry[_LABEL], stamp)
 
     def tick(self, now: Now) -> list[Out]:
-        """Only notes the time, so that the status shows when images stop."""
+        """Note the time, so that the status shows when images stop."""
         self._now_ns = now.mono_ns
         return []
 
     def status(self) -> tuple[str, str]:
-        """Active while pairs come."""
+        """Report active while pairs arrive."""
         if self._trouble:
             return FAULT, self._trouble
         name = f"policy {self._clean.sha256[:12]}"
@@ -159,11 +158,11 @@ class CounterfactualNode(Node):
         return ACTIVE, f"{name}, largest difference {np.rad2deg(self._largest_rad):.1f} degrees"
 
     def counters(self) -> dict[str, float]:
-        """Pairs compared, and what was left out."""
+        """Report compared and skipped pairs."""
         return {key: float(value) for key, value in self._counts.items()} | {"largest_delta_rad": self._largest_rad}
 
     def _seen(self, topic: str, message: Any) -> NDArray[np.uint8]:
-        """What the policy sees of an image."""
+        """Convert an image message to the policy's input."""
         rgb = rgb_image(message, topic)
         camera = self._clean.view.camera
         if rgb.shape[:2] != (camera.height, camera.width):
@@ -197,11 +196,11 @@ class CounterfactualNode(Node):
 
 
 def build_to_give_way(config: CounterfactualConfig, context: NodeContext) -> CounterfactualNode:
-    """The node of a process that, once it is ready, runs only while nobody else wants the processor."""
-    # Loading a policy in the idle class could take for ever on a busy computer, and the launch waits for it.
+    """Build the node, then set its process to idle priority."""
+    # The policy is loaded before, because loading at idle priority could take for ever on a busy computer.
     os.nice(_NICE)
     node = CounterfactualNode.build(config, context)
-    with contextlib.suppress(OSError):  # a container may forbid it; nice is what remains
+    with contextlib.suppress(OSError):  # a container may forbid it; then only nice applies
         os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
     return node
 

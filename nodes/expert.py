@@ -1,11 +1,10 @@
-"""The expert node: drives the reference path from motion capture, so that a policy can learn from it ("PID with VICON position").
+"""The expert node: drives the reference path with motion-capture poses, as a teacher for policies ("PID with VICON position").
 
-The pose it acts on is old when the wheels have turned, so it is carried forward along the arc that was last commanded, at the
-measured speed. Two slow integrals take out what a calibration left: a steering trim and a speed that is a few percent off. Both
-work only while the car is armed, and are bounded.
+The pose is old by the time the wheels have turned, so it is predicted along the last commanded arc at the measured speed. Two slow
+integrators correct calibration errors of the steering trim and of the speed. Both are bounded and run only while the car is armed.
 
-A policy that only ever saw perfect driving cannot come back to the path. So the node can disturb itself now and then, by a
-steering offset over a short distance, and then correct it. `/expert/state` carries the steering without the disturbance.
+A policy that has only seen perfect driving cannot return to the path. So the node can add occasional disturbances, a steering offset
+over a short distance, and then correct them. `/expert/state` has the steering without the disturbance.
 """
 
 from __future__ import annotations
@@ -33,14 +32,14 @@ _ARMED_AGE_S = 0.5
 
 
 class Disturbance(BaseModel):
-    """When and how the expert disturbs itself.
+    """Disturbances that the expert adds to its steering.
 
     Attributes:
-        every_m: Distance between the end of one and the begin of the next, drawn from this range [m].
-        over_m: Length of one [m].
-        steering_rad: Largest steering offset; drawn between half of it and all of it, to either side [rad].
-        within_m: None begins further than this from the path, and one ends beyond it [m].
-        seed: Of the draws.
+        every_m: Distance from the end of a disturbance to the start of the next, drawn from this range [m].
+        over_m: Length of a disturbance, drawn from this range [m].
+        steering_rad: Largest steering offset. The offset is drawn between half and all of it, to either side [rad].
+        within_m: Distance from the path beyond which no disturbance starts, and a running one ends [m].
+        seed: Random seed.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -64,18 +63,18 @@ class ExpertNodeConfig(BaseModel):
     """Configuration of the expert node.
 
     Attributes:
-        room: Room calibration file: the path.
-        vehicle: Vehicle calibration file: wheelbase and limits.
+        room: Room calibration file with the path.
+        vehicle: Vehicle calibration file with wheelbase and limits.
         speed_mps: Driving speed [m/s].
-        delay_s: From the capture of a pose to wheels that have turned [s].
+        delay_s: Delay from the capture of a pose to the resulting wheel angle [s].
         stiffness_1pm: Natural frequency of the return to the path, per metre driven [1/m].
-        integral_radpm2: Steering trim for one metre of offset over one metre driven [rad/m^2].
-        trim_limit_rad: Bound of that trim [rad].
-        speed_integral_1ps: Rate at which a speed error is taken out [1/s].
-        speed_trim_limit: Bound of that correction, as a share of the speed.
-        rate_hz: Commands per second [Hz].
-        max_age_s: Oldest pose, since capture, that is acted upon [s].
-        disturb: None drives as well as it can.
+        integral_radpm2: Integral gain: steering trim per metre of offset and metre driven [rad/m^2].
+        trim_limit_rad: Bound of the steering trim [rad].
+        speed_integral_1ps: Integral gain of the speed correction [1/s].
+        speed_trim_limit: Bound of the speed correction, as a fraction of the speed.
+        rate_hz: Rate of commands [Hz].
+        max_age_s: Largest age of a pose since its capture [s].
+        disturb: Disturbances; None drives without them.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -95,7 +94,7 @@ class ExpertNodeConfig(BaseModel):
 
 
 class _Disturber:
-    """Offsets by distance driven."""
+    """Steering offsets as a function of the driven distance."""
 
     def __init__(self, config: Disturbance) -> None:
         self._config = config
@@ -105,7 +104,7 @@ class _Disturber:
         self._offset_rad = 0.0
 
     def at(self, driven_m: float, cte_m: float) -> float:
-        """Offset of the steering [rad] here."""
+        """Steering offset [rad] at a driven distance [m] and cross-track error [m]."""
         config = self._config
         if self._offset_rad == 0.0 and driven_m >= self._begin_m and abs(cte_m) <= config.within_m:
             self._end_m = driven_m + float(self._rng.uniform(*config.over_m))
@@ -118,7 +117,7 @@ class _Disturber:
 
 
 class ExpertNode(Node):
-    """Poses in, drive commands out."""
+    """Turns poses into drive commands."""
 
     subscriptions = (_CAR, _STATE)
     publications = ("/expert/drive", "/expert/state")
@@ -138,8 +137,8 @@ class ExpertNode(Node):
 
     @classmethod
     def build(cls, config: ExpertNodeConfig, context: NodeContext) -> ExpertNode:
-        """Make the node of a process."""
-        del context  # it needs no clock of its own
+        """Build the node."""
+        del context  # not needed
         car = load_calibration(VehicleCalibration, config.vehicle)
         settings = ExpertConfig(
             wheelbase_m=car.wheelbase_m, speed_mps=config.speed_mps, delay_s=0.0, stiffness_1pm=config.stiffness_1pm,
@@ -148,7 +147,7 @@ class ExpertNode(Node):
         return cls(Expert(load_calibration(RoomCalibration, config.room).reference_path, settings), config)
 
     def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
-        """Steer by a pose, unless it is old, lost, or comes sooner than the next command is due."""
+        """Compute a command from a pose, unless the pose is too old, invalid, or earlier than the next command is due."""
         self._now_ns = now.mono_ns
         if topic == _STATE:
             self._armed_ns = info.publish_mono_ns if message.armed else None
@@ -162,7 +161,7 @@ class ExpertNode(Node):
         if self._track and capture_ns <= self._track[-1][0]:
             return []
         speed_mps = self._follow(capture_ns, x_m, y_m, yaw_rad)
-        # A tenth of a period early is on time: poses come on a grid of their own.
+        # A tenth of a period early counts as on time, because poses arrive on another grid.
         if now.mono_ns - self._commanded_ns < 0.9 / self._config.rate_hz * NS_PER_S:
             return []
         since_s = min(0.1, (now.mono_ns - self._commanded_ns) / NS_PER_S)
@@ -170,26 +169,26 @@ class ExpertNode(Node):
         return self._command(capture_ns, (x_m, y_m, yaw_rad), speed_mps, since_s)
 
     def tick(self, now: Now) -> list[Out]:
-        """Only notes the time, so that the status shows when poses stop."""
+        """Note the time, so that the status shows when poses stop."""
         self._now_ns = now.mono_ns
         return []
 
     def status(self) -> tuple[str, str]:
-        """Active while it commands."""
+        """Report active while it sends commands."""
         if self._now_ns - self._commanded_ns > NS_PER_S or not self._commanded_ns:
             return READY, f"no fresh pose of the car on {_CAR}"
         laps = self._driven_m / self._expert.path.length_m
         return ACTIVE, f"{100 * self._cte_m:+.0f} cm from the path, {self._driven_m:.1f} m driven, {laps:.1f} laps"
 
     def counters(self) -> dict[str, float]:
-        """Poses that could not be used, and the trims found."""
+        """Report unusable poses and the current trims."""
         return {"stale_poses": self._stale, "trim_rad": self._trim_rad, "speed_trim": self._speed_trim}
 
     def _armed(self) -> bool:
         return self._armed_ns is not None and self._now_ns - self._armed_ns < _ARMED_AGE_S * NS_PER_S
 
     def _follow(self, capture_ns: int, x_m: float, y_m: float, yaw_rad: float) -> float:
-        """Measured speed [m/s], forward positive; a car that was lifted elsewhere begins anew."""
+        """Update and return the measured speed [m/s], forward positive. After a jump of the car, the estimate restarts."""
         track = self._track
         if track and math.hypot(x_m - track[-1][1], y_m - track[-1][2]) > _JUMP_M:
             track.clear()
@@ -232,7 +231,7 @@ class ExpertNode(Node):
         return [Out("/expert/drive", drive_message(speed, steering, capture_ns)), Out("/expert/state", state)]
 
     def _ahead(self, pose: tuple[float, float, float], speed_mps: float) -> tuple[float, float, float]:
-        """Where the car will be after the delay, on the arc of the last command."""
+        """Predict the pose after the delay, on the arc of the last command."""
         x_m, y_m, yaw_rad = pose
         distance_m = max(speed_mps, 0.0) * self._config.delay_s
         turn_rad = distance_m * math.tan(self._steering_rad) / self._expert.config.wheelbase_m
@@ -245,7 +244,7 @@ class ExpertNode(Node):
         moved_m = max(speed_mps, 0.0) * since_s
         trim = self._trim_rad - config.integral_radpm2 * cte_m * moved_m
         self._trim_rad = min(max(trim, -config.trim_limit_rad), config.trim_limit_rad)
-        if speed_mps > 0.5 * config.speed_mps:  # not while it still speeds up
+        if speed_mps > 0.5 * config.speed_mps:  # not while the car still accelerates
             error = (config.speed_mps - speed_mps) / config.speed_mps
             speed_trim = self._speed_trim + config.speed_integral_1ps * error * since_s
             self._speed_trim = min(max(speed_trim, -config.speed_trim_limit), config.speed_trim_limit)

@@ -1,7 +1,7 @@
-"""The gateway node: the only process of a host that talks to the other one.
+"""The gateway node: the only process of a host that communicates with the other host.
 
-It hears the topics that this host exports, and publishes here what comes from there, so that no other node knows about hosts.
-On the end that listens (the car) it also measures how far the other host's clock is off.
+It sends this host's exported topics to the other host and publishes the imported ones, so that no other node needs to know about
+hosts. The listening end (the car) also measures the offset of the other host's clock.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from nodes.runtime.wire import Meta
 OFFSET_TOPIC = "/clock/offset"
 _TICK_HZ = 10.0
 _INBOX = 400
-# Three of the listener's clock questions.
+# Duration of three clock questions of the listener.
 _SILENCE_S = 0.8
 
 
@@ -33,14 +33,14 @@ class GatewayConfig(BaseModel):
     """Configuration of the gateway.
 
     Attributes:
-        listen: Address to listen on; the car's end.
-        connect: Address of the host that listens; the other end.
-        watch_port: TCP port by which the listener speaks.
-        drive_port: TCP port by which it hears.
-        keys: Key folder; none only on a loopback address, and then the link carries nothing to the end that listens.
-        key: Name of this host's own key.
-        peer_key: Name of the listener's key; only at the end that connects.
-        exports: Topics of this host that the other may hear.
+        listen: Address to listen on, for the end on the car.
+        connect: Address of the listening host, for the other end.
+        watch_port: TCP port on which the listener sends.
+        drive_port: TCP port on which the listener receives.
+        keys: Key folder. None is allowed only on a loopback address; then the link sends no topic to the listening end.
+        key: Name of this host's key.
+        peer_key: Name of the listener's key, for the connecting end.
+        exports: Topics of this host that are sent to the other host.
         imports: Topics of the other host that are published here.
     """
 
@@ -59,15 +59,17 @@ class GatewayConfig(BaseModel):
     @model_validator(mode="after")
     def _one_end(self) -> GatewayConfig:
         if (self.listen is None) == (self.connect is None):
-            raise ValueError("expected either listen or connect")
+            raise ValueError("expected either listen or connect; give exactly one of them")
         for name in (*self.exports, *self.imports):
             topic_row(name)
         if both := set(self.exports) & set(self.imports):
-            raise ValueError(f"{', '.join(sorted(both))} cannot be both exported and imported: it would go in circles")
+            raise ValueError(
+                f"{', '.join(sorted(both))} cannot be both exported and imported, because messages would go in circles; remove one"
+            )
         return self
 
     def link(self) -> LinkConfig:
-        """Both doors of the link."""
+        """Configuration of the link."""
         return LinkConfig(
             self.listen or self.connect or "", self.listen is not None, self.watch_port, self.drive_port,
             None if self.keys is None else KeyFolder(self.keys), self.key, self.peer_key, self.imports, self.exports,
@@ -79,7 +81,7 @@ class GatewayNode(Node):
 
     Args:
         config: Configuration.
-        subscribers: How many subscribers a topic has on this host.
+        subscribers: Returns the number of subscribers of a topic on this host.
     """
 
     raw = True
@@ -98,18 +100,18 @@ class GatewayNode(Node):
 
     @classmethod
     def build(cls, config: GatewayConfig, context: NodeContext) -> GatewayNode:
-        """Open the doors."""
+        """Build the node and open the link."""
         return cls(config, context.subscribers)
 
     def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
-        """Send a message of this host on."""
+        """Send a message of this host to the other host."""
         meta = Meta(info.publish_mono_ns, info.publish_real_ns, info.sequence, self._prefixes[topic], info.instance_id)
         self._link.send(topic, meta, info.raw)
         self._sent += 1
         return []
 
     def receive(self, item: Inbound | Offset, now: Now) -> list[Out]:
-        """Publish here what came from there."""
+        """Publish a message from the other host."""
         if isinstance(item, Inbound):
             self._taken += 1
             return [Out(item.topic, item.message)]
@@ -121,12 +123,12 @@ class GatewayNode(Node):
         return [Out(OFFSET_TOPIC, message)]
 
     def tick(self, now: Now) -> list[Out]:
-        """Ask the other host only for what somebody here reads."""
+        """Subscribe only to topics of the other host that have subscribers here."""
         self._link.want(frozenset(name for name in self._imports if self._subscribers(name) > 0))
         return []
 
     def status(self) -> tuple[str, str]:
-        """Ready while the other host is not heard; the nodes that need it say so themselves."""
+        """Report ready without messages from the other host. The nodes that need them report their own faults."""
         heard_ns = self._link.heard_mono_ns
         if heard_ns is None and self._watched_only:
             return ACTIVE, f"{self._sent} messages sent; without keys the other host can only watch"
@@ -134,12 +136,12 @@ class GatewayNode(Node):
             return READY, "the other host has not been heard yet"
         silence_s = (time.monotonic_ns() - heard_ns) / NS_PER_S
         if silence_s > _SILENCE_S:
-            return READY, f"the other host is silent for {silence_s:.1f} s"
+            return READY, f"the other host has been silent for {silence_s:.1f} s"
         clock = "" if self._offset is None else f", its clock is {self._offset.best.offset_s * 1e3:+.1f} ms off"
         return ACTIVE, f"{self._sent} messages sent, {self._taken} taken{clock}"
 
     def counters(self) -> dict[str, float]:
-        """What passed and what was refused."""
+        """Report forwarded and refused messages."""
         counters = {"sent": float(self._sent), "taken": float(self._taken), "refused": float(self._link.refused)}
         if self._offset is not None:
             counters["clock_offset_s"] = self._offset.best.offset_s
@@ -147,7 +149,7 @@ class GatewayNode(Node):
         return counters
 
     def close(self) -> None:
-        """Close the doors."""
+        """Close the link."""
         self._link.close()
 
 

@@ -1,8 +1,8 @@
-"""The monitor node: shows the attack on a real screen, in true size, while and only while the safety node lets it.
+"""The monitor node: shows the attack on a real screen in true size, only while the safety node allows it.
 
-The face is a square in the middle of the panel, the rest is black. Unless the car is armed and its safety node's word is fresh,
-the face is plain. After every change the screen is read back: pixels that differ from what was meant end the node. A new attack
-comes over the bus as to the compositor, and whatever is wrong with it changes nothing.
+The face is a square in the centre of the panel; the rest is black. The face is plain unless a fresh message of the safety node says
+that the car is armed. After every change the screen is read back, and wrong pixels end the node. New attacks are received over the
+bus as by the compositor. A refused one changes nothing.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ class ScreenConfig(_Config):
     """A real screen.
 
     Attributes:
-        index: Which screen, as the window system counts them.
-        connector: Where it is plugged in (``HDMI-A-1``), for its EDID; None trusts the measured corners.
+        index: Index of the screen in the window system.
+        connector: Connector of the monitor (``HDMI-A-1``), for its EDID; None relies on the measured corners.
     """
 
     kind: Literal["screen"] = "screen"
@@ -58,8 +58,8 @@ class TwinScreenConfig(_Config):
     """The monitor of the simulated lab.
 
     Attributes:
-        path: Its socket.
-        wait_s: How long the twin may take to build its world [s].
+        path: Socket of the simulated lab's monitor.
+        wait_s: Longest time for the twin to build its world [s].
     """
 
     kind: Literal["twin"] = "twin"
@@ -74,11 +74,11 @@ class MonitorConfig(_Config):
         attack: Attack file to show; empty for none.
         target: Calibration file with the corners of the whole panel.
         display: The screen.
-        size_mm: Measured width and height of the picture, instead of what the monitor says [mm].
+        size_mm: Measured width and height of the picture, instead of those in the EDID [mm].
         plain_rgb: Colour of the face without an attack, 0..1.
-        face_m: Side of the plain face when there is no attack; None is the centre square [m].
-        interlock: Show the attack only while the safety node says that the car is armed.
-        state_age_s: Oldest word of the safety node that counts [s].
+        face_m: Side of the plain face without an attack; None uses the centre square [m].
+        interlock: Show the attack only while the safety node reports that the car is armed.
+        state_age_s: Largest age of the safety node's state [s].
     """
 
     attack: Path | None = None
@@ -111,17 +111,17 @@ class MonitorConfig(_Config):
 
 
 class MonitorNode(Node):
-    """Shows the attack or the plain face; see the module's docstring.
+    """Shows the attack or the plain face. See the module's docstring.
 
     Args:
-        display: The screen, open; the node closes it.
-        panel: Its size.
-        attack: What to show; None for none.
-        check: Refuses an attack that does not fit.
+        display: The open screen, which the node closes.
+        panel: Size of the panel.
+        attack: The attack; None for none.
+        check: Raises an error for an attack that does not fit.
         plain_rgb: Colour of the plain face, 0..1.
-        face_m: Side of the plain face without an attack [m]; None is the centre square.
-        interlock: Whether the safety node decides.
-        state_age_s: Oldest word of the safety node that counts [s].
+        face_m: Side of the plain face without an attack [m]; None uses the centre square.
+        interlock: Whether to show the attack only while the car is armed.
+        state_age_s: Largest age of the safety node's state [s].
     """
 
     publications = ("/monitor/attack", "/monitor/shown")
@@ -144,7 +144,7 @@ class MonitorNode(Node):
         self._plain = np.full((_PLAIN_PX, _PLAIN_PX, 3), np.round(255.0 * np.array(plain_rgb)), np.uint8)
         self._face_m = min(face_m or panel.square_m, panel.square_m)
         self._assembler = Assembler()
-        self._armed, self._safety_reason, self._state_ns = False, "nobody has armed", -1
+        self._armed, self._safety_reason, self._state_ns = False, "not armed since the start", -1
         self._trouble = ""
         self._taken = self._refused = self._changes = 0
         self._attack: AttackFile | None = None
@@ -156,7 +156,7 @@ class MonitorNode(Node):
     @classmethod
     def build(cls, config: MonitorConfig, context: NodeContext) -> MonitorNode:
         """Open the screen and read the files."""
-        del context  # it needs no clock of its own
+        del context  # not needed
         target = load_calibration(TargetCalibration, config.target)
         attack = None if config.attack is None else load_attack(config.attack)
         display = _open(config.display)
@@ -177,7 +177,7 @@ class MonitorNode(Node):
             raise
 
     def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
-        """Obey the safety node at once; take a piece of a new attack."""
+        """Apply the state of the safety node at once, or handle a piece of a new attack."""
         if topic == _SAFETY:
             self._armed, self._safety_reason = bool(message.armed), str(message.reason)
             self._state_ns = info.publish_mono_ns
@@ -190,7 +190,7 @@ class MonitorNode(Node):
         return self._update(now)
 
     def tick(self, now: Now) -> list[Out]:
-        """Notice silence of the safety node and trouble of the screen; say what is shown."""
+        """Check the age of the safety node's state and the screen, and publish what is shown."""
         self._display.keep_alive()
         outs = self._update(now)
         if not outs and now.mono_ns - self._said_ns >= _SAY_S * NS_PER_S:
@@ -198,29 +198,29 @@ class MonitorNode(Node):
         return outs
 
     def status(self) -> tuple[str, str]:
-        """Active while the attack is on the screen."""
+        """Report active while the attack is on the screen."""
         name = f"attack {self._attack.attack_id}" if self._attack else "no attack file"
         text = name if self._showing else f"plain face ({self._reason}); {name}"
         return (ACTIVE if self._showing else READY), "; ".join(filter(None, (text, self._trouble)))
 
     def counters(self) -> dict[str, float]:
-        """Pictures shown; attacks taken over and refused; time of the last change."""
+        """Report shown pictures, accepted and refused attacks, and the duration of the last change."""
         return {
             "shown": self._changes, "attacks_taken": self._taken, "attacks_refused": self._refused, "show_ms": self._show_ms,
         }  # fmt: skip
 
     def close(self) -> None:
-        """Take the picture off the screen."""
+        """Clear and close the screen."""
         self._display.close()
 
     def _granted(self, now: Now) -> str:
-        """Why the attack may not be shown now; empty when it may."""
+        """Return why the attack may not be shown now; empty if it may."""
         if self._attack is None:
             return "no attack file"
         if not self._interlock:
             return ""
         if self._state_ns < 0 or now.mono_ns - self._state_ns > self._state_age_ns:
-            return "no word from the safety node"
+            return "no message from the safety node"
         return "" if self._armed else f"not armed: {self._safety_reason}"
 
     def _update(self, now: Now) -> list[Out]:
@@ -237,7 +237,7 @@ class MonitorNode(Node):
         if not np.array_equal(seen, picture):
             wrong = int((seen != picture).any(axis=-1).sum()) if seen.shape == picture.shape else picture.size
             raise HardwareError(
-                f"the screen holds other pixels than were shown ({wrong} differ): switch off its colour management, scaling and "
+                f"expected the screen to hold the shown pixels, but {wrong} differ; switch off its colour management, scaling and "
                 "night light"
             )
         self._sha256 = hashlib.sha256(np.ascontiguousarray(seen).tobytes()).hexdigest()
@@ -272,7 +272,7 @@ class MonitorNode(Node):
         except (AdvnerfError, ValueError) as error:
             self._refuse(str(error))
             return
-        # Plain for a moment: `_update` shows the new one, if it may.
+        # Show the plain face first. `_update` then shows the new attack if allowed.
         self._load(attack, received.sha256)
         self._taken += 1
         self._trouble = ""

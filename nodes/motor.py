@@ -1,11 +1,11 @@
-"""The motor node: drive commands in, VESC bytes out. Stopping is what it does unless it is told otherwise, freshly and again.
+"""The motor node: sends drive commands to the VESC, and stops the car unless it keeps receiving fresh commands.
 
-It obeys only commands younger than a limit. When they stop coming, are not finite, or come from another safety process than
-before, it brakes and latches: from then on it ignores every command to move until it has seen an explicit stop, which the safety
-node sends only while disarmed. So nothing that dies, hangs or wakes up again makes the car move without somebody arming it anew.
+It obeys only commands younger than a limit. If commands stop, are not finite, or come from a restarted safety node, it brakes and
+latches: it then ignores every command to move until it receives an explicit stop, which the safety node sends only while disarmed. So
+a process that dies, hangs or resumes cannot make the car move without a new arming.
 
-It is not ready, and the car cannot be armed, before the controller sent telemetry, showed a time-out of its own that is short
-enough (where its firmware tells), and somebody or something saw the front wheels turn.
+The node is not ready, and the car cannot be armed, until the controller has sent telemetry and reported a short enough time-out (if
+its firmware can), and the front wheels were confirmed to turn.
 """
 
 from __future__ import annotations
@@ -44,17 +44,17 @@ class MotorConfig(BaseModel):
     Attributes:
         port: Serial device; ``<run_dir>/vesc`` for the twin.
         calibration: Vehicle calibration file: gains and limits.
-        command_age_limit_s: A command older than this, since it was published, is no command [s].
-        brake_current_a: Brake current for every stop [A].
-        brake_ramp_s: Time over which the brake current rises from a third to the whole [s].
-        brake_hold_s: Time of braking, after which the motor is let go [s].
-        current_max_a: No current that is commanded is larger [A].
-        link_timeout_s: A controller that answers nothing for this long is a fault [s].
-        controller_timeout_ms: The longest command time-out of its own that the controller may have; not ready with more [ms].
-        controller_brake_current_a: The smallest brake current it may then use; not ready with less [A].
-        steering_check: Whether somebody must have seen the wheels turn before arming; the twin's controller always steers.
-        steering_angle_rad: Front wheel angle shown in that check [rad].
-        steering_hold_s: Time for which each side is shown [s].
+        command_age_limit_s: Largest age of a command since its publication [s].
+        brake_current_a: Brake current of a stop [A].
+        brake_ramp_s: Time over which the brake current rises from a third to its full value [s].
+        brake_hold_s: Duration of braking, after which the motor is released [s].
+        current_max_a: Largest commanded current [A].
+        link_timeout_s: Time without an answer of the controller after which the link is faulty [s].
+        controller_timeout_ms: Longest accepted command time-out of the controller [ms].
+        controller_brake_current_a: Smallest accepted brake current of the controller after its time-out [A].
+        steering_check: Whether the steering check is needed before arming: ``required``, ``unless_twin`` or ``never``.
+        steering_angle_rad: Front wheel angle of the steering check [rad].
+        steering_hold_s: Time for which each side is held in the check [s].
         battery_warning_v: Supply voltage below which the diagnostics warn [V].
     """
 
@@ -77,10 +77,10 @@ class MotorConfig(BaseModel):
 
 
 class MotorNode(Node):
-    """Connects the gate with the controller, and reports what was sent.
+    """Connects the command gate with the controller, and reports the commands that were sent.
 
     Args:
-        config: Its configuration.
+        config: Configuration.
         make_vesc: Makes a driver that is not open yet.
         wheelbase_m: Distance between the axles, for odometry [m].
         mono_ns: Monotonic time at the start [ns].
@@ -109,7 +109,7 @@ class MotorNode(Node):
 
     @classmethod
     def build(cls, config: MotorConfig, context: NodeContext) -> MotorNode:
-        """Make the node of a process; the port is opened by the first tick, and again whenever it went away."""
+        """Build the node. The first tick opens the port, and later ticks reopen it after a disconnection."""
         car = load_calibration(VehicleCalibration, config.calibration)
 
         limits = replace(car.drive_limits, current_max_a=config.current_max_a)
@@ -120,7 +120,7 @@ class MotorNode(Node):
         return cls(config, make, car.wheelbase_m, context.clock.now().mono_ns)
 
     def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
-        """Obey or refuse a command; watch the car while its steering is checked."""
+        """Execute or refuse a command, or note a pose during the steering check."""
         if topic == "/vicon/car":
             self._watch.see(message, now.mono_ns)
             return []
@@ -137,18 +137,18 @@ class MotorNode(Node):
         return self._act(action, now, first=True)
 
     def tick(self, now: Now) -> list[Out]:
-        """Keep what was commanded going, stop when it is stale, read telemetry, mend the link."""
+        """Continue the last command, stop if it is stale, read telemetry, and reconnect if needed."""
         if not self._vesc.is_open:
             self._connect(now)
         self._watch.check.tick(now.mono_ns)
         self._show_wheels(now)
-        # The last command again only while the limiter has not reached it: repeating it for ever is what keeps dead cars driving.
+        # Repeat the last command only until the limiter has reached it. Repeating it for ever would keep the car driving after a failure.
         action = self._gate.tick(now.mono_ns)
         outs = [] if isinstance(action, Drive) and self._reached(action) else self._act(action, now, first=False)
         return outs + self._telemetry(now) + self._diagnostics(now)
 
     def status(self) -> tuple[str, str]:
-        """Fault when the link is broken or commands ceased; active while driving."""
+        """Report a fault if the link is broken or commands stopped; active while driving."""
         if self._link_error:
             return (FAULT if self._linked_once else STARTING), self._link_error
         if missing := self._watch.missing():
@@ -162,11 +162,11 @@ class MotorNode(Node):
         return (STARTING if waiting else FAULT), f"latched: {self._gate.reason}"
 
     def counters(self) -> dict[str, float]:
-        """Commands that were not obeyed."""
+        """Report refused commands."""
         return {"commands_refused": self._gate.refused}
 
     def close(self) -> None:
-        """Brake until the car stands, let the motor go."""
+        """Brake until the car stands, then release the motor and close the port."""
         self._vesc.close()
 
     def _show_wheels(self, now: Now) -> None:
@@ -191,7 +191,7 @@ class MotorNode(Node):
             return
         self._link_error, self._linked_once = "", True
         self._watch.connected(firmware)
-        # Whatever the car did while nobody was connected, it is stopped first.
+        # After a connection, the car is stopped first, whatever it did before.
         self._gate.brake_again(now.mono_ns)
 
     def _lose(self, error: Exception, now: Now) -> None:
@@ -218,7 +218,7 @@ class MotorNode(Node):
         except HardwareError as error:
             self._lose(error, now)
             return []
-        # One report for each command, with the write that latency counts; the slewing that follows is not reported.
+        # One report per command, with the first write, which latency is measured to. The following slewing is not reported.
         return [self._report(sent)] if first or not isinstance(action, Drive) else []
 
     def _report(self, sent: Sent) -> Out:
@@ -250,7 +250,7 @@ class MotorNode(Node):
             return []
         silence_s = (now.mono_ns - self._vesc.last_reply_mono_ns) / NS_PER_S
         if silence_s > self._config.link_timeout_s:
-            # The line is still open: what it may yet carry is the brake.
+            # The port is still open, so try to brake.
             self._link_error = f"the VESC at {self._config.port} has not answered for {silence_s:.2f} s"
             self._gate.latch(f"link fault: {self._link_error}", now.mono_ns)
         elif self._link_error:

@@ -1,10 +1,10 @@
-"""The player node: a bag back onto the bus, at its own pace or another.
+"""The player node: publishes the messages of a bag on the bus, at the recorded speed or another.
 
-The bytes and the capture stamps are those of the recording; publish times are new, so that receivers see fresh messages.
-Statuses and requests (to arm, for an attack) stay in the bag unless they are asked for: a recording must not arm a car.
+Bytes and capture stamps are those of the recording. Publish times are new, so that receivers see fresh messages. Status messages and
+requests (to arm, for an attack) are played only if requested, because a recording must not arm a car.
 
-It can be told to pause, to go on, to step message by message, to change its speed and to end: by keys where it has a terminal,
-and by requests on ``/player/control``, which it answers on ``/player/state``. ``/clock`` says where in the recording it is.
+The player can pause, resume, step message by message, change its speed and stop, controlled by keys in a terminal and by requests on
+``/player/control``, which it answers on ``/player/state``. ``/clock`` has the position in the recording.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ from nodes.runtime.topics import topic as topic_row
 
 _CONTROL, _STATE, _CLOCK = "/player/control", "/player/state", "/clock"
 _STAYS = ("/arm", "/attack/request", "/attack/cancel", _CONTROL, _STATE, _CLOCK)
-# Messages leave at the first tick after they are due, so they are up to 2.5 ms late on average.
+# Messages are published at the first tick after they are due, on average up to 2.5 ms late.
 _TICK_HZ = 200.0
 _FASTER = 1.25
-# Who told it to stop may not have heard the answer yet, and asks again.
+# Time after a stop request in which its sender may repeat it, if it has not received the answer.
 _FAREWELL_NS = NS_PER_S // 4
 
 
@@ -42,15 +42,15 @@ class PlayerConfig(BaseModel):
     Attributes:
         bag: Bag folder or ``.mcap`` file.
         rate: Speed relative to the recording.
-        loop: Begin again at the end.
-        start_offset_s: Leave out so much of the beginning [s].
-        duration_s: Play only so much of the recording from there [s].
-        topics: What to play; none means all but statuses and requests.
-        remap: Other names for topics, by their recorded name.
-        paused: Stand still until told to go on or to step.
-        clock_hz: How often ``/clock`` says where in the recording it is [Hz]; none for never.
-        wait_for: Topics that must have a subscriber before the first message, by the names under which they are played; none
-            means that one of any topic will do, an empty list means do not wait, and lose what is sent before one is there.
+        loop: Start over at the end.
+        start_offset_s: Time to skip at the beginning [s].
+        duration_s: Time to play from there [s].
+        topics: Topics to play; none means all except statuses and requests.
+        remap: New names of topics, by recorded name.
+        paused: Start paused.
+        clock_hz: Rate of ``/clock`` [Hz]; none for never.
+        wait_for: Topics, by their played names, that must have a subscriber before the first message. None waits for a subscriber of
+            any topic. An empty list does not wait; messages without a subscriber are lost.
     """
 
     model_config = ConfigDict(extra="forbid")
@@ -73,7 +73,7 @@ class PlayerNode(Node):
     Args:
         config: Configuration.
         subscribers: Number of subscribers of a topic.
-        terminal: File descriptor of a terminal whose keys control it; none for no keys.
+        terminal: File descriptor of a terminal whose keys control the player; None for no keys.
     """
 
     subscriptions = (_CONTROL,)
@@ -94,7 +94,7 @@ class PlayerNode(Node):
         for topic in config.wait_for or ():
             if topic not in self.publications:
                 raise BagError(
-                    f"cannot wait for subscribers of {topic}, it is not played; played are {', '.join(self.publications)}"
+                    f"cannot wait for subscribers of {topic}, which is not played; played are {', '.join(self.publications)}"
                 )
         self._begin_ns = self._info.start_ns + round(config.start_offset_s * NS_PER_S)
         self._end_ns = self._info.end_ns
@@ -107,7 +107,7 @@ class PlayerNode(Node):
         self._played, self._trouble = 0, ""
         self._answers = Answers()
         self._ends_ns: int | None = None
-        self._rewind()  # a bag without a message in the wanted part is refused here, not when a subscriber comes
+        self._rewind()  # refuse a bag without messages in the wanted part here, and not when a subscriber connects
         self._keys, self._reader = None, None
         if terminal is not None:
             self.inbox = Inbox[str](capacity=16)
@@ -117,11 +117,11 @@ class PlayerNode(Node):
 
     @classmethod
     def build(cls, config: PlayerConfig, context: NodeContext) -> PlayerNode:
-        """Open the bag."""
+        """Build the node and open the bag."""
         return cls(config, context.subscribers)
 
     def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
-        """Do what a request says, once, and answer every repeat of it."""
+        """Execute a request once, and answer every repeat of it."""
         outs: list[Out] = []
         ask_id = str(message.ask_id)
         if not self._answers.repeat(ask_id):
@@ -133,7 +133,7 @@ class PlayerNode(Node):
         return [*outs, self._state(now)]
 
     def receive(self, item: str, now: Now) -> list[Out]:
-        """Do what a key says."""
+        """Execute the command of a key."""
         if item in ("faster", "slower"):
             rate = self._head.rate if self._head else self._config.rate
             return self._obey(
@@ -142,7 +142,7 @@ class PlayerNode(Node):
         return self._obey(Command(item), now, by_request=False)
 
     def tick(self, now: Now) -> list[Out]:
-        """Publish what is due."""
+        """Publish the messages that are due."""
         if self._ends_ns is not None:
             if now.mono_ns >= self._ends_ns:
                 raise NodeFinished
@@ -162,9 +162,9 @@ class PlayerNode(Node):
         return self._clock(now) + due
 
     def status(self) -> tuple[str, str]:
-        """Ready while it waits for subscribers."""
+        """Report ready while waiting for subscribers."""
         if self._head is None and (missing := self._missing()):
-            return READY, f"waits for subscribers of {', '.join(missing)}"
+            return READY, f"waiting for subscribers of {', '.join(missing)}"
         words = [f"{self._played} messages played"]
         if self._left_out:
             words.append(f"not in the topic table: {', '.join(self._left_out)}")
@@ -173,7 +173,7 @@ class PlayerNode(Node):
         return ACTIVE, "; ".join([*words, *filter(None, [self._trouble])])
 
     def close(self) -> None:
-        """Give the terminal back."""
+        """Restore the terminal."""
         if self._reader is not None and self._keys is not None:
             self._reader.stop()
             self._keys.close()
@@ -184,7 +184,7 @@ class PlayerNode(Node):
             self._ends_ns = now.mono_ns + (_FAREWELL_NS if by_request else 0)
             return []
         if self._head is None:
-            self._trouble = "it has not begun yet"
+            self._trouble = "playback has not started yet"
             return []
         if command.word in (PAUSE, RESUME, TOGGLE):
             paused = not self._head.paused if command.word == TOGGLE else command.word == PAUSE
@@ -205,7 +205,7 @@ class PlayerNode(Node):
         return Out(_STATE, message)
 
     def _step(self, count: int, now: Now) -> list[Out]:
-        """The next messages at once; it stands still behind them."""
+        """Publish the next messages at once and pause after them."""
         assert self._head is not None
         self._head.pause(True, now.mono_ns)
         outs = []
@@ -254,15 +254,15 @@ class PlayerNode(Node):
 
 
 def _renamed(config: PlayerConfig, topics: list[str]) -> dict[str, str]:
-    """Name under which each topic is played, by its recorded name."""
+    """Played name of each topic, by recorded name."""
     for old, new in config.remap.items():
         if old not in topics:
-            raise BagError(f"cannot play {old} as {new}: it is not played; played are {', '.join(topics)}")
+            raise BagError(f"cannot play {old} as {new}, because {old} is not played; played are {', '.join(topics)}")
     names = {topic: config.remap.get(topic, topic) for topic in topics}
     for name in names.values():
         topic_row(name)  # only topics of the table can be published
         if len(sources := [topic for topic, played in names.items() if played == name]) > 1:
-            raise BagError(f"{' and '.join(sources)} would both be played as {name}; leave one out with --topics")
+            raise BagError(f"{' and '.join(sources)} would both be played as {name}; select one with --topics")
     return names
 
 
@@ -277,7 +277,7 @@ def _choose_topics(config: PlayerConfig, recorded: list[str]) -> list[str]:
     if not chosen:
         raise BagError(
             f"{config.bag} has nothing to play; it has {', '.join(recorded) or 'no message'}. Only topics of the topic table can be "
-            "played; name others with --remap OLD:=NEW"
+            "played; rename others with --remap OLD:=NEW"
         )
     return chosen
 

@@ -1,8 +1,8 @@
-"""The policy node: steers by the newest image, and stamps its command with that image's capture time.
+"""The policy node: computes a drive command from the newest image, stamped with that image's capture time.
 
-It never acts on an old image: one that was captured or published too long ago is dropped and counted, so that the layers nearer
-to the motor notice that commands have stopped. The first inferences of a process are slow; they are done on a blank image before
-the node reports that it is ready. Any policy of the contract (docs/policies.md) drives; one in an ONNX file needs no torch.
+Images that were captured or published too long ago are dropped and counted, so that the safety and motor nodes notice that commands
+have stopped. The first inferences of a process are slow, so they run on a blank image before the node reports ready. Any policy that
+follows docs/policies.md can drive; a policy in an ONNX file does not need torch.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from nodes.runtime.process import run_node_main
 _DRIVE = "/policy/drive"
 _WARM_UP_RUNS = 5
 _ACTIVE_S = 1.0
-# A camera whose clock runs ahead of ours by more than this has the wrong clock.
+# Largest accepted lead of the camera's clock over the local clock.
 _CLOCK_TOLERANCE_S = 0.02
 
 
@@ -35,10 +35,10 @@ class PolicyConfig(BaseModel):
 
     Attributes:
         policy: Policy file (.safetensors, .onnx, .pt2), or ``package.module:factory``.
-        sha256: Its hash, if it must be that very policy; empty accepts any.
-        image_topic: Where images come from, raw or compressed.
+        sha256: Expected hash of the policy; empty accepts any.
+        image_topic: Topic of the images, raw or compressed.
         speed_mps: Speed of the commands [m/s].
-        max_age_s: Oldest image, since capture and since publication, that is acted upon [s].
+        max_age_s: Largest age of an image since capture and since publication [s].
         goal: Goal vector of a goal-conditioned policy.
     """
 
@@ -53,14 +53,14 @@ class PolicyConfig(BaseModel):
 
 
 class PolicyNode(Node):
-    """Image in, drive command out.
+    """Turns images into drive commands.
 
     Args:
         driver: The policy with its view.
-        image_topic: Where images come from.
+        image_topic: Topic of the images.
         speed_mps: Speed of the commands [m/s].
-        max_age_s: Oldest image that is acted upon [s].
-        goal: Goal vector, of the length that the policy wants.
+        max_age_s: Largest age of an image [s].
+        goal: Goal vector, of the length that the policy expects.
     """
 
     publications = (_DRIVE,)
@@ -93,15 +93,15 @@ class PolicyNode(Node):
 
     @classmethod
     def build(cls, config: PolicyConfig, context: NodeContext) -> PolicyNode:
-        """Make the node of a process: load, check and warm up the policy."""
-        del context  # it needs no clock of its own
-        # One image at a time: more threads would only take cores from the other nodes and wake up late.
+        """Build the node: load, check and warm up the policy."""
+        del context  # not needed
+        # One thread: with one image at a time, more would take cores from the other nodes and add wake-up delays.
         cv2.setNumThreads(1)
         driver = load_driver(config.policy, config.sha256 or None)
         return cls(driver, config.image_topic, config.speed_mps, config.max_age_s, config.goal)
 
     def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
-        """Steer by an image, unless it is too old or not what the policy was trained on."""
+        """Compute a command from an image, unless the image is too old or does not fit the policy."""
         self._now_ns = now.mono_ns
         self._counts["images"] += 1
         capture_ns = stamp_ns(message)
@@ -111,7 +111,8 @@ class PolicyNode(Node):
             return []
         if captured_age_ns < -_CLOCK_TOLERANCE_S * NS_PER_S:
             self._drop(
-                "dropped_bad", "image comes from the future; synchronise the clocks of camera and policy computer"
+                "dropped_bad",
+                "the image's stamp is in the future; synchronise the clocks of camera and policy computer",
             )
             return []
         try:
@@ -135,12 +136,12 @@ class PolicyNode(Node):
         return [Out(_DRIVE, drive_message(self._speed_mps, steering_rad, capture_ns))]
 
     def tick(self, now: Now) -> list[Out]:
-        """Only notes the time, so that the status shows when images stop."""
+        """Note the time, so that the status shows when images stop."""
         self._now_ns = now.mono_ns
         return []
 
     def status(self) -> tuple[str, str]:
-        """Active while commands go out; fault when images come that it cannot use."""
+        """Report active while sending commands; fault if images arrive that it cannot use."""
         name = f"policy {self._driver.sha256[:12]}"
         if self._trouble:
             return (FAULT if self._fault else READY), self._trouble
@@ -148,11 +149,11 @@ class PolicyNode(Node):
         return (ACTIVE, name) if recent else (READY, f"{name}, waiting for images")
 
     def counters(self) -> dict[str, float]:
-        """Images taken and dropped, and the time of the last inference [ms]."""
+        """Report used and dropped images, and the duration of the last inference [ms]."""
         return {**self._counts, "inference_ms": self._inference_ms}
 
     def _steer(self, rgb: NDArray[np.uint8]) -> float:
-        # The duration is reported only; no decision depends on this clock, so replays stay deterministic.
+        # This clock only measures the reported duration. No decision depends on it, so replays stay deterministic.
         start = time.perf_counter()
         steering_rad = self._driver.steer(self._driver.view.image(rgb), self._goal)
         self._inference_ms = 1e3 * (time.perf_counter() - start)

@@ -1,4 +1,4 @@
-"""The recorder node: everything that goes over the bus into a bag."""
+"""The recorder node: writes the messages on the bus to a bag."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from nodes.runtime.process import run_node_main
 from nodes.runtime.topics import TOPICS, status_topic
 from nodes.runtime.topics import topic as topic_row
 
-# The chunk in progress is ended so often, also of topics that come slowly; what a power cut takes is not much longer than this.
+# Period of finishing the current chunk. A power cut loses little more than this.
 _FLUSH_HZ = 1.0
 
 
@@ -26,14 +26,14 @@ class RecorderConfig(BaseModel):
     """Configuration of the recorder.
 
     Attributes:
-        output: Folder of the bag, relative to the run folder; it must not exist.
-        topics: What to record; none means the whole topic table.
-        statuses_of: Nodes whose status is recorded too.
-        attachments: Files that ride along: calibration, attack file.
-        queue: Messages that may wait per topic while the disk is busy.
-        max_bag_duration_s: A new file is begun after so long [s]; the default keeps the index of a quiet recording small.
-        max_bag_size_mb: A new file is begun when one has so many MiB; the default is 20 s of camera and compositor images.
-            The index of a file takes about 700 bytes of memory for every image, or for every 64 KiB of small messages.
+        output: Folder of the bag, relative to the run folder. It must not exist.
+        topics: Topics to record; none means the whole topic table.
+        statuses_of: Nodes whose status is also recorded.
+        attachments: Files to attach, such as calibration and attack files.
+        queue: Messages per topic that may wait while the disk is busy.
+        max_bag_duration_s: Time after which a new file starts [s]. The default keeps the index of a quiet recording small.
+        max_bag_size_mb: Size at which a new file starts [MiB]. The default is 20 s of camera and compositor images. The index of a
+            file takes about 700 bytes of memory per image, or per 64 KiB of small messages.
     """
 
     model_config = ConfigDict(extra="forbid")
@@ -48,11 +48,11 @@ class RecorderConfig(BaseModel):
 
 
 class RecorderNode(Node):
-    """Writes wire bytes to a bag, undecoded.
+    """Writes received bytes to a bag without decoding.
 
     Args:
         writer: The bag.
-        topics: What to subscribe to.
+        topics: Topics to subscribe to.
         queue: Messages that may wait per topic.
     """
 
@@ -67,7 +67,7 @@ class RecorderNode(Node):
 
     @classmethod
     def build(cls, config: RecorderConfig, context: NodeContext) -> RecorderNode:
-        """Open the bag and read what rides along."""
+        """Build the node: read the attachments and open the bag."""
         topics = list(TOPICS) if config.topics is None else [topic_row(name).name for name in config.topics]
         topics += [topic for name in config.statuses_of if (topic := status_topic(name)) not in topics]
         attachments = _read_attachments([context.run_dir / RESOLVED_NAME], must_exist=False)
@@ -83,16 +83,16 @@ class RecorderNode(Node):
         return []
 
     def tick(self, now: Now) -> list[Out]:
-        """Hand what has come to the system."""
+        """Flush the current chunk."""
         self._writer.flush()
         return []
 
     def status(self) -> tuple[str, str]:
-        """Active, with the number of messages."""
+        """Report active, with the number of messages."""
         return "active", f"{self._writer.messages} messages in {self._writer.folder}"
 
     def counters(self) -> dict[str, float]:
-        """Messages that were lost on the way."""
+        """Report lost messages."""
         return {"lost_total": float(sum(self._lost.values()))}
 
     def close(self) -> None:
@@ -101,7 +101,7 @@ class RecorderNode(Node):
 
 
 def provenance() -> dict[str, str]:
-    """Where a recording comes from: versions, git hash, machine."""
+    """Origin of a recording: versions, git hash, machine."""
     facts = {"python": platform.python_version(), "host": platform.node(), "machine": platform.machine()}
     try:
         facts["version"] = version("advnerf")
@@ -112,7 +112,7 @@ def provenance() -> dict[str, str]:
         result = subprocess.run(command, capture_output=True, text=True, timeout=5, check=False)
         facts["git"] = result.stdout.strip() if result.returncode == 0 else "not a checkout"
     except (OSError, subprocess.TimeoutExpired):
-        facts["git"] = "git did not answer"
+        facts["git"] = "no answer from git"
     return facts
 
 
@@ -122,11 +122,11 @@ def _read_attachments(paths: list[Path], must_exist: bool) -> dict[str, bytes]:
         if not must_exist and not path.exists():
             continue
         if path.name in contents:
-            raise BagError(f"two attachments are called {path.name}; rename one")
+            raise BagError(f"expected attachments with different names, got two called {path.name}; rename one")
         try:
             contents[path.name] = path.read_bytes()
         except OSError as error:
-            raise BagError(f"cannot attach {path}: {error.strerror}") from error
+            raise BagError(f"cannot attach {path}: {error.strerror}; correct its path or permissions") from error
     return contents
 
 

@@ -1,6 +1,6 @@
-"""The safety node: lets commands through while the car is armed and everything is well, and says stop otherwise.
+"""The safety node: forwards commands while the car is armed and all checks pass, and sends stops otherwise.
 
-A hand on the gamepad or keyboard goes before the drivers, and of these the first in ``drivers`` before the next.
+The operator on gamepad or keyboard has priority over the drivers, and these are listed in order of priority in ``drivers``.
 """
 
 from __future__ import annotations
@@ -33,37 +33,37 @@ class SafetyConfig(BaseModel):
     """Configuration of the safety node.
 
     Attributes:
-        room: Room calibration file: the fence.
-        vehicle: Vehicle calibration file: what motion of the car is possible.
-        nodes: Nodes whose status must be fresh and good.
-        drivers: Who may command, first the one that goes before the others: expert, policy.
-        teleop: ``hold``: the car moves only while somebody holds a button (see the teleop node); ``none``: once armed.
-        teleop_age_limit_s: Silence of the teleop node after which the button counts as released [s].
-        fence_margin_m: The rear axle stays at least this far inside the room's fence [m].
-        clock_offset_limit_s: Largest offset between the clocks of two hosts [s].
-        clock_error_limit_s: An offset known no better than this is not known [s].
-        clock_peers: Hosts whose clock offset must be known; others count too once they were heard.
-        max_speed_mps: A faster command disarms [m/s].
-        max_steering_rad: A sharper command than this disarms; the car's own limits are the motor node's [rad].
-        drive_age_limit_s: Oldest command of the policy [s].
-        image_age_limit_s: Oldest camera image [s].
-        pose_age_limit_s: Oldest pose of the car [s].
-        status_age_limit_s: Oldest status of a node [s].
-        held_up_limit_s: A pause of this process after which it disarms [s].
-        motion_margin: A motion this many times faster than the limits of the vehicle calibration disarms. 1.25: gains are a few
-            per cent off, a speed controller overshoots, and no car is ever a quarter faster than it is told.
-        pose_noise_m: What noise may add to the way between two poses [m]. 5 mm is seven standard deviations of the difference of
-            two positions with 0.5 mm each: no false stop in years at 100 Hz.
-        pose_noise_rad: The same for the turn [rad]: seven standard deviations with 1 mrad each.
-        stall_command_mps: A car that is commanded slower than this is not watched for a stall [m/s]. A VESC stands below 0.2 m/s
-            (its smallest speed in closed loop), and starts roughly just above it.
-        stall_speed_mps: A car slower than this does not move [m/s]: a third of the slowest command that is watched, ten times the
+        room: Room calibration file with the fence.
+        vehicle: Vehicle calibration file, which limits the possible motion of the car.
+        nodes: Nodes whose status must be fresh and without a fault.
+        drivers: Nodes that may command the car, highest priority first: expert, policy.
+        teleop: ``hold``: the car moves only while a button is held (see the teleop node); ``none``: once armed.
+        teleop_age_limit_s: Time without a message of the teleop node after which the button counts as released [s].
+        fence_margin_m: Smallest distance of the rear axle inside the room's fence [m].
+        clock_offset_limit_s: Largest accepted offset between the clocks of two hosts [s].
+        clock_error_limit_s: Largest accepted error bound of an offset [s].
+        clock_peers: Hosts whose clock offset must be known. Other hosts are checked once they have been measured.
+        max_speed_mps: Largest commanded speed; a larger one disarms [m/s].
+        max_steering_rad: Largest commanded steering angle; a larger one disarms. The motor node applies the car's own limits [rad].
+        drive_age_limit_s: Largest age of the driver's newest command [s].
+        image_age_limit_s: Largest age of the newest camera image [s].
+        pose_age_limit_s: Largest age of the car's newest pose [s].
+        status_age_limit_s: Largest age of a node's newest status [s].
+        held_up_limit_s: Longest pause of this process; a longer one disarms [s].
+        motion_margin: Factor over the limits of the vehicle calibration beyond which a motion disarms. 1.25 allows for gains that are
+            a few per cent off and an overshooting speed controller; no car is a quarter faster than commanded.
+        pose_noise_m: Largest noise of the distance between two poses [m]. 5 mm is seven standard deviations of the difference of two
+            positions with 0.5 mm each: no false stop in years at 100 Hz.
+        pose_noise_rad: Largest noise of the angle between two poses [rad]: seven standard deviations with 1 mrad each.
+        stall_command_mps: Smallest commanded speed at which stalls are detected [m/s]. A VESC stands still below 0.2 m/s (its smallest
+            closed-loop speed), and starts roughly just above it.
+        stall_speed_mps: Measured speed below which the car is at rest [m/s]: a third of the smallest checked command, ten times the
             noise of the measurement.
-        stall_time_s: A car that is commanded to move and does not is stalled after this time [s]. A standing start needs 0.1 s
-            for the command's way, 0.1 s for the slope of the speed (3.5 m/s^2 up to 0.3 m/s), 0.15 s for the motor's lag and
-            up to 0.5 s where a motor without sensors finds its rotor.
-        stall_sources: What measures the motion: motion capture, the motor controller's rpm; either at rest is a stall. On a
-            stand, where the wheels turn and the car does not move, only ``erpm``.
+        stall_time_s: Time at rest after which a car that is commanded to move is stalled [s]. A standing start needs 0.1 s for the
+            command's latency, 0.1 s for the speed ramp (3.5 m/s^2 up to 0.3 m/s), 0.15 s for the motor's lag and up to 0.5 s for a
+            sensorless motor to find its rotor position.
+        stall_sources: Measurements of the motion: motion capture, the motor controller's rpm. Either at rest is a stall. On a test
+            stand, where the wheels turn and the car does not move, use only ``erpm``.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -98,28 +98,28 @@ class SafetyConfig(BaseModel):
         if self.stall_speed_mps >= self.stall_command_mps:
             raise ValueError(
                 f"expected stall_speed_mps below stall_command_mps, got {self.stall_speed_mps} and {self.stall_command_mps}:"
-                " every drive would be a stall"
+                " otherwise every drive would be a stall"
             )
         return self
 
     def poses(self, car: VehicleCalibration) -> PoseGate:
-        """The check of the car's poses."""
+        """Make the check of the car's poses."""
         bounds = MotionBounds.of_car(
             car.drive_limits, car.wheelbase_m, self.motion_margin, self.pose_noise_m, self.pose_noise_rad
         )
         return PoseGate(PoseCheck(bounds))
 
     def stall(self) -> StallGate:
-        """The check for a car that does not move."""
+        """Make the stall check."""
         limits = StallLimits(self.stall_command_mps, self.stall_speed_mps, self.stall_time_s, self.stall_sources)
         return StallGate(limits)
 
     def limits(self, room: RoomCalibration) -> ArmingLimits:
-        """Numbers for the state machine; a fence that would never let the car drive is refused."""
+        """Make the limits of the arming. A fence that does not contain the start pose is refused."""
         require_simple(room.fence_m)
         if not inside(room.start_pose[:2], room.fence_m):
             raise ConfigError(
-                f"expected a fence about the start, got start_pose {room.start_pose} outside of fence_m in {self.room}"
+                f"expected start_pose inside fence_m in {self.room}, got {room.start_pose} outside; correct the room file"
             )
         return ArmingLimits(
             nodes=self.nodes, fence_m=room.fence_m, drivers=self.drivers, fence_margin_m=self.fence_margin_m, drive_age_s=self.drive_age_limit_s, image_age_s=self.image_age_limit_s,
@@ -129,14 +129,14 @@ class SafetyConfig(BaseModel):
 
 
 class SafetyNode(Node):
-    """Connects the arming state machine with the bus.
+    """Connects the arming state machine to the bus.
 
     Args:
-        limits: Numbers of the checks.
+        limits: Limits of the checks.
         poses: The check of the car's poses.
-        stall: The check for a car that does not move.
-        hand: Who holds the button.
-        clocks: Clocks of other hosts.
+        stall: The stall check.
+        hand: The check of the held button.
+        clocks: The check of other hosts' clocks.
     """
 
     publications = ("/safety/drive", "/safety/state")
@@ -162,8 +162,8 @@ class SafetyNode(Node):
 
     @classmethod
     def build(cls, config: SafetyConfig, context: NodeContext) -> SafetyNode:
-        """Make the node of a process."""
-        del context  # it needs no clock of its own
+        """Build the node."""
+        del context  # not needed
         hand = HandGate(config.teleop == "hold", config.teleop_age_limit_s)
         clocks = ClockGate(config.clock_offset_limit_s, config.clock_error_limit_s, config.clock_peers)
         limits = config.limits(load_calibration(RoomCalibration, config.room))
@@ -171,7 +171,7 @@ class SafetyNode(Node):
         return cls(limits, poses, config.stall(), hand, clocks)
 
     def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
-        """Note what came; pass a command on if it may pass."""
+        """Note a message. A command is forwarded if it may pass."""
         arming = self._arming
         if topic in self._topic_of:
             return self._pass_on(self._topic_of[topic], message, info, now)
@@ -195,7 +195,7 @@ class SafetyNode(Node):
         return self._news(now)
 
     def tick(self, now: Now) -> list[Out]:
-        """Check, and while disarmed say stop, again and again."""
+        """Run the checks, and send a stop at every tick while disarmed."""
         self._arming.check(now.mono_ns)
         outs = self._news(now)
         if not self._arming.armed and now.mono_ns - self._stopped_ns >= _STOP_PERIOD_S * NS_PER_S:
@@ -205,12 +205,12 @@ class SafetyNode(Node):
         return outs
 
     def status(self) -> tuple[str, str]:
-        """Active while armed."""
+        """Report active while armed."""
         arming = self._arming
         return (ACTIVE, f"armed by {arming.source}") if arming.armed else (READY, f"disarmed: {arming.reason}")
 
     def counters(self) -> dict[str, float]:
-        """How often it had to stop the car."""
+        """Report how often it stopped the car."""
         return {"disarmed": self._stops, "impossible_poses": self._poses.count}
 
     def _see_car(self, message: Any, info: MessageInfo, now: Now) -> None:
@@ -241,7 +241,7 @@ class SafetyNode(Node):
         return Out("/safety/drive", drive_message(speed_mps, steering_rad, stamp_ns))
 
     def _obey(self, message: Any, info: MessageInfo, now: Now) -> list[Out]:
-        """Do what a person asks, and answer every repeat of it."""
+        """Execute a request to arm or disarm, and answer every repeat of it."""
         ask_id, source, asked_ns = (
             str(message.ask_id),
             str(message.source),
@@ -255,7 +255,7 @@ class SafetyNode(Node):
         return self._news(now) or [self._state(now)]
 
     def _news(self, now: Now) -> list[Out]:
-        """What must be said at once when the car was armed or disarmed."""
+        """Messages to publish at once after the car was armed or disarmed."""
         if self._arming.armed is self._stated_armed:
             return []
         if self._stated_armed:

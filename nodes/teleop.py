@@ -1,7 +1,8 @@
-"""The teleop node: a person's hand on a gamepad or keyboard, over the bus, again and again.
+"""The teleop node: repeatedly publishes the operator's input from a gamepad or keyboard.
 
-The safety node lets the car move only while a button is held (``safety.teleop: hold``); silence of this node means that it was
-let go. Left shoulder button (or w, a, d, s): the hand drives. Right one (or o): the software drives. Both: the hand does.
+The safety node lets the car move only while a button is held (``safety.teleop: hold``). If this node stops publishing, the button
+counts as released. Left shoulder button (or w, a, d, s): the operator drives. Right one (or o): the software drives. Both: the
+operator drives.
 """
 
 from __future__ import annotations
@@ -32,8 +33,8 @@ class TeleopConfig(BaseModel):
     """Configuration of the teleop node.
 
     Attributes:
-        device: ``keyboard``, or the device file of a gamepad, best one under ``/dev/input/by-id``.
-        axes: Numbers of the axes of throttle and steering, where they are not the usual ones.
+        device: ``keyboard``, or the device file of a gamepad, preferably under ``/dev/input/by-id``.
+        axes: Numbers of the throttle and steering axes, if they are not the usual ones.
         speed_mps: Speed at full throttle [m/s].
         steering_rad: Steering at full deflection [rad].
     """
@@ -47,12 +48,12 @@ class TeleopConfig(BaseModel):
 
 
 class TeleopNode(Node):
-    """Hands in, their state out.
+    """Publishes the state of the operator's input.
 
     Args:
-        config: Its configuration.
-        read: Blocks for a bounded time and says what is held.
-        release: Lets the device go.
+        config: Configuration.
+        read: Blocks for a bounded time and returns the input.
+        release: Releases the device.
     """
 
     subscriptions = ("/safety/state",)
@@ -73,7 +74,7 @@ class TeleopNode(Node):
 
     @classmethod
     def build(cls, config: TeleopConfig, context: NodeContext) -> TeleopNode:
-        """Make the node of a process; its keyboard is the terminal that it was started in."""
+        """Build the node. Its keyboard is the terminal in which it was started."""
         del context
         device: Keyboard | Gamepad
         if config.device == "keyboard":
@@ -84,26 +85,26 @@ class TeleopNode(Node):
         return cls(config, device.read, device.close)
 
     def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
-        """Hear whether the safety node has answered the request to re-arm."""
+        """Check whether the safety node has answered the request to re-arm."""
         if self._asked is not None and message.answered_id == self._asked.ask_id:
             self._asked = None
         return []
 
     def receive(self, item: Hands, now: Now) -> list[Out]:
-        """What the hand does now; a change is said at once."""
+        """Note the operator's input. A change is published at once."""
         self._hands, self._heard_ns, before = item, now.mono_ns, (self._mode, self._estop)
         if item.rearms > self._rearms:
             self._estop, self._arm_in_ticks = False, 2
         if item.stops > self._stops:
-            self._estop, self._arm_in_ticks, self._asked = True, 0, None  # of both at once, stopping counts
+            self._estop, self._arm_in_ticks, self._asked = True, 0, None  # if both are pressed, the stop wins
         self._stops, self._rearms = item.stops, item.rearms
         state = self._state(now)
         return [state] if (self._mode, self._estop) != before else []
 
     def tick(self, now: Now) -> list[Out]:
-        """Say it again; re-arm a moment after the e-stop was said to be over, for the two travel apart.
+        """Publish the state again. Re-arm a moment after the e-stop was reported as released, because they use different topics.
 
-        The request to re-arm is repeated until the safety node has answered, or no longer acts on it.
+        The request to re-arm is repeated until the safety node has answered, or until it is too old.
         """
         outs = [self._state(now)]
         if self._arm_in_ticks:
@@ -113,25 +114,25 @@ class TeleopNode(Node):
         if self._asked is not None and self._asked.age_ns(now) > _ARM_NS:
             self._asked = None
         if self._asked is not None:
-            outs.append(Out("/arm", arm_message(self._asked, now, True, OPERATOR, "re-armed by hand")))
+            outs.append(Out("/arm", arm_message(self._asked, now, True, OPERATOR, "re-armed by the operator")))
         return outs
 
     def status(self) -> tuple[str, str]:
-        """Active while something is held."""
+        """Report active while a button is held."""
         if not self._hands.connected:
             return FAULT, self._hands.text
         if self._estop:
-            return READY, f"{self._hands.text}: e-stop, re-arm to go on"
+            return READY, f"{self._hands.text}: e-stop, re-arm to continue"
         return (ACTIVE if self._mode != "idle" else READY), f"{self._hands.text}: {self._mode}"
 
     def close(self) -> None:
-        """Let the device go."""
+        """Release the device."""
         self._reader.stop()
         self._release()
 
     def _state(self, now: Now) -> Out:
         hands, config = self._hands, self._config
-        # A reader that hangs must not hold the button.
+        # If the reader hangs, the button must count as released.
         fresh = hands.connected and now.mono_ns - self._heard_ns <= _STALE_S * NS_PER_S
         self._mode = ("human" if hands.human else "autonomy" if hands.autonomy else "idle") if fresh else "idle"
         drives = self._mode == "human" and not self._estop

@@ -1,7 +1,7 @@
-"""The twin node: the simulated lab as a process, with its VESC, its VICON and its camera behind the real protocols.
+"""The twin node: the simulated lab as a process, whose VESC, VICON and camera use the real protocols.
 
-The other nodes do not know it: they open a serial port, a UDP port and a frame socket. Only who runs experiments uses the one
-topic it has, ``/twin/reset``, to lift the car to a start pose; that is refused while the car moves or is commanded to.
+The other nodes open a serial port, a UDP port and a frame socket, as in the real lab. The only topic of this node is ``/twin/reset``,
+with which experiments move the car to a start pose. It is refused while the car moves or is commanded to.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ RESET_TOPIC = "/twin/reset"
 
 
 class TwinConfig(LiveLabConfig):
-    """Configuration of the twin node: see `hardware.emulators.live.LiveLabConfig`."""
+    """Configuration of the twin node; see `hardware.emulators.live.LiveLabConfig`."""
 
 
 class TwinNode(Node):
-    """Owns the live lab."""
+    """Runs the simulated lab."""
 
     subscriptions = (RESET_TOPIC,)
     tick_rate_hz = 10.0
@@ -37,11 +37,11 @@ class TwinNode(Node):
 
     @classmethod
     def build(cls, config: TwinConfig, context: NodeContext) -> TwinNode:
-        """Build the lab; returns when it can be seen."""
+        """Build the lab. Returns when its devices are available."""
         return cls(LiveLab(config, context.run_dir, bus_folder(context.run_dir)))
 
     def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
-        """Lift the car to where a ``PoseStamped`` says."""
+        """Move the car to the pose of a ``PoseStamped``."""
         try:
             T = pose_matrix(message)
             self._lab.place(float(T[0, 3]), float(T[1, 3]), yaw_of(T))
@@ -53,21 +53,21 @@ class TwinNode(Node):
         return []
 
     def tick(self, now: Now) -> list[Out]:
-        """Notice when a part of the lab has died."""
+        """Raise an error if a part of the lab has failed."""
         self._lab.check()
         return []
 
     def status(self) -> tuple[str, str]:
-        """The last refusal, if any."""
+        """Report the last refusal, if any."""
         return ACTIVE, self._text
 
     def counters(self) -> dict[str, float]:
-        """Ticks that the lab's threads left out, and resets."""
+        """Report missed ticks of the lab's threads, and resets."""
         missed = {f"missed {name}": float(count) for name, count in self._lab.missed.items()}
         return {**missed, "resets": self._resets, "resets_refused": self._refused}
 
     def close(self) -> None:
-        """End the lab."""
+        """Stop the lab."""
         self._lab.close()
 
 

@@ -1,4 +1,4 @@
-"""The VICON node: one topic of poses for each tracked subject; a pose that cannot be trusted is not published."""
+"""The VICON node: publishes a topic of poses for each tracked subject. Unreliable poses are not published."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ class ViconNodeConfig(BaseModel):
     Attributes:
         host: Local address to listen on; empty for all.
         port: UDP port of Tracker's object stream.
-        source: Accept datagrams of this address only.
+        source: Accept only datagrams from this address.
         library: Use this system of the library ``motioncapture`` (vicon, optitrack, qualisys, ...) at ``hostname`` instead of
             Tracker's object stream.
         hostname: Computer of that system.
         subjects: Subjects to publish, each on ``/vicon/<subject>``.
-        latency_s: From exposure to receipt, as measured [s].
-        frozen_frames: So many frames with the same bits make a subject lost.
-        max_age_s: A pose older than this when it is published is dropped [s].
+        latency_s: Measured delay from exposure to reception [s].
+        frozen_frames: Number of bit-identical frames after which a subject counts as lost.
+        max_age_s: Largest age of a pose at its publication; older poses are dropped [s].
         silence_s: Time without any pose of the first subject after which the node reports a fault [s].
     """
 
@@ -62,7 +62,7 @@ class ViconNodeConfig(BaseModel):
 
 
 class ViconNode(Node):
-    """Turns poses into messages."""
+    """Publishes poses as messages."""
 
     def __init__(self, config: ViconNodeConfig) -> None:
         self._config = config
@@ -77,7 +77,7 @@ class ViconNode(Node):
 
     @classmethod
     def build(cls, config: ViconNodeConfig, context: NodeContext) -> ViconNode:
-        """Make the node of a process and begin to listen."""
+        """Build the node and start listening."""
         node = cls(config)
         node._now_ns = lambda: context.clock.now().mono_ns
         node._reader.start()
@@ -85,11 +85,11 @@ class ViconNode(Node):
 
     @property
     def port(self) -> int:
-        """UDP port it listens on; 0 with the library."""
+        """UDP port on which the node listens; 0 with the library."""
         return self._receiver.port if isinstance(self._receiver, ViconReceiver) else 0
 
     def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
-        """It listens to nobody on the bus."""
+        """Do nothing: the node has no subscriptions."""
         return []
 
     def receive(self, item: list[SubjectPose], now: Now) -> list[Out]:
@@ -97,7 +97,7 @@ class ViconNode(Node):
         outs = []
         for pose in item:
             if (now.mono_ns - pose.receive_mono_ns) / NS_PER_S > self._config.max_age_s:
-                self._stale += 1  # left over from a time when this process was held up
+                self._stale += 1  # the pose waited while this process was held up
                 continue
             self._seen_ns[pose.name] = now.mono_ns
             message = pose_message(pose.T_world_from_subject, pose.stamp_real_ns)
@@ -105,7 +105,7 @@ class ViconNode(Node):
         return outs
 
     def status(self) -> tuple[str, str]:
-        """Fault while the first subject is not seen, or any of them has two senders."""
+        """Report a fault while the first subject is not seen, or any subject has two senders."""
         now_ns, first = self._now_ns(), self._config.subjects[0]
         if fault := self._receiver.fault(now_ns):
             return FAULT, fault
@@ -119,7 +119,7 @@ class ViconNode(Node):
         return (FAULT if first in lost else ACTIVE), text
 
     def counters(self) -> dict[str, float]:
-        """What happened to datagrams and poses."""
+        """Report counts of datagrams and poses."""
         counts = self._receiver.counts
         totals: dict[str, float] = {
             "datagrams": counts.datagrams, "refused": counts.refused, "late": counts.late, "stale": self._stale,
@@ -135,7 +135,7 @@ class ViconNode(Node):
     def _read(self) -> list[SubjectPose] | None:
         poses = self._receiver.read(_READ_TIMEOUT_S)
         before, self._read_fault = self._read_fault, self._receiver.fault(time.monotonic_ns())
-        # A fault withholds the poses: the node must wake up to say so.
+        # During a fault no poses arrive, so the node must be woken to report it.
         return poses if poses or self._read_fault != before else None
 
     def _silence_s(self, name: str, now_ns: int) -> float:

@@ -1,7 +1,7 @@
-"""The viewer node: everything on the bus, live in Foxglove or Lichtblick, byte for byte as it was published.
+"""The viewer node: shows all topics live in Foxglove or Lichtblick, with the published bytes.
 
-A WebSocket server (protocol foxglove.sdk.v1) on this computer only, unless told otherwise. It speaks and never listens: what a
-browser sends moves nothing. Open the app, connect to ``ws://localhost:8765``, import the layout ``nodes/foxglove_layout.json``.
+It runs a WebSocket server (protocol foxglove.sdk.v1), by default for this computer only. The server only sends, so a browser cannot
+command the car. Open the app, connect to ``ws://localhost:8765``, and import the layout ``nodes/foxglove_layout.json``.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from nodes.runtime.process import run_node_main
 from nodes.runtime.topics import TOPICS, status_topic
 from nodes.runtime.topics import topic as topic_row
 
-# What waits for a slow browser; beyond it the oldest goes.
+# Messages that wait for a slow browser. If there are more, the oldest is dropped.
 _BACKLOG = 64
 
 
@@ -26,11 +26,11 @@ class ViewerConfig(BaseModel):
     """Configuration of the viewer.
 
     Attributes:
-        host: Address to listen on. Others than a loopback address show all topics to everybody in reach.
-        port: TCP port of the WebSocket; 0 takes a free one.
-        open_to_network: Must be true for an address that is not loopback: there are no keys on a WebSocket.
-        topics: What to show; none means all of the topic table.
-        statuses_of: Nodes whose status is shown too.
+        host: Address to listen on. Any address other than loopback shows all topics to every computer on the network.
+        port: TCP port of the WebSocket; 0 selects a free one.
+        open_to_network: Must be true for an address other than loopback, because a WebSocket has no keys.
+        topics: Topics to show; none means the whole topic table.
+        statuses_of: Nodes whose status is also shown.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -43,7 +43,7 @@ class ViewerConfig(BaseModel):
 
 
 class ViewerNode(Node):
-    """Passes CDR bytes on to a WebSocket; decodes nothing.
+    """Forwards CDR bytes to a WebSocket without decoding.
 
     Args:
         config: Configuration.
@@ -56,14 +56,14 @@ class ViewerNode(Node):
 
         if not (is_loopback(config.host) or config.open_to_network):
             raise SecurityError(
-                f"{config.host} shows all topics to everybody in reach, without keys; use 127.0.0.1 and an ssh tunnel, or say "
+                f"{config.host} shows all topics to every computer on the network, without keys; use 127.0.0.1 and an ssh tunnel, or set "
                 "open_to_network: true"
             )
         self.subscriptions = (
             *(tuple(TOPICS) if config.topics is None else config.topics),
             *map(status_topic, config.statuses_of),
         )
-        # The server sees the channels of a context only as long as somebody keeps it.
+        # Keep a reference: the server sees the channels only as long as the context exists.
         self._context = context = foxglove.Context()
         self._channels = {name: _channel(foxglove, name, context) for name in self.subscriptions}
         self._shown = 0
@@ -78,8 +78,8 @@ class ViewerNode(Node):
 
     @classmethod
     def build(cls, config: ViewerConfig, context: NodeContext) -> ViewerNode:
-        """Start the server."""
-        del context  # it needs nothing of the run
+        """Build the node and start the server."""
+        del context  # not needed
         return cls(config)
 
     @property
@@ -90,21 +90,21 @@ class ViewerNode(Node):
     def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
         """Show a message."""
         channel = self._channels[topic]
-        if channel.has_sinks():  # pixels that nobody looks at are not even joined
+        if channel.has_sinks():  # do not join the pixels without a client
             channel.log(info.raw, log_time=info.receive_real_ns)
             self._shown += 1
         return []
 
     def status(self) -> tuple[str, str]:
-        """Where it can be seen."""
+        """Report the port, and the number of shown messages."""
         return (ACTIVE if self._shown else READY), f"ws port {self.port}, {self._shown} messages shown"
 
     def counters(self) -> dict[str, float]:
-        """How much was shown."""
+        """Report the number of shown messages."""
         return {"shown": float(self._shown)}
 
     def close(self) -> None:
-        """End the server."""
+        """Stop the server."""
         self._server.stop()
 
 

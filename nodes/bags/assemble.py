@@ -1,4 +1,4 @@
-"""A whole MCAP file from what a scan of a damaged one keeps: where every piece goes, and the end that belongs to it."""
+"""Assembles an intact MCAP file from the pieces that a scan of a damaged file keeps."""
 
 from __future__ import annotations
 
@@ -31,18 +31,18 @@ ENDS, REPAIRS = "advnerf_end", "advnerf_repair"
 
 @dataclass
 class Layout:
-    """The parts of the new file in order: a range of the old one, or bytes."""
+    """The parts of the new file in order: ranges of the old file, or bytes."""
 
     parts: list[range | bytes]
 
     @property
     def size(self) -> int:
-        """Bytes of the new file."""
+        """Size of the new file [bytes]."""
         return sum(map(len, self.parts))
 
     @property
     def unchanged(self) -> int:
-        """So many bytes at the beginning are those of the old file, at the same place."""
+        """Number of bytes at the beginning that are the same as in the old file."""
         at = 0
         for part in self.parts:
             if not isinstance(part, range) or part.start != at:
@@ -52,12 +52,12 @@ class Layout:
 
 
 def recorded_here(scan: Scan) -> bool:
-    """Whether our recorder wrote the file: then a gap in the sequence numbers is a loss."""
+    """Whether the advnerf recorder wrote the file. If so, a gap in the sequence numbers is a loss."""
     return scan.header is not None and scan.header.library.startswith(LIBRARY)
 
 
 def contents_of(scan: Scan) -> Contents:
-    """What ``metadata.yaml`` says."""
+    """Contents of ``metadata.yaml``."""
     contents = Contents(start_ns=scan.start_ns, end_ns=scan.end_ns)
     for channel in scan.channels.values():
         schema = scan.schemas.get(channel.schema_id)
@@ -67,12 +67,12 @@ def contents_of(scan: Scan) -> Contents:
 
 
 def assemble(scan: Scan, file_name: str, notes: dict[str, str]) -> Layout:
-    """Place every piece and write what ends the file.
+    """Place every piece and write the end of the file.
 
     Args:
-        scan: What is kept; the entries of its pieces get their new offsets.
+        scan: The scan. The entries of its pieces get their new offsets.
         file_name: Name of the file.
-        notes: What the file is to say about its repair.
+        notes: Notes about the repair to store in the file.
     """
     pieces = _with_what_is_missing(scan)
     parts: list[range | bytes] = [range(len(MAGIC))] if "first eight" not in " ".join(scan.fixes) else [MAGIC]
@@ -123,11 +123,11 @@ def _move(record: Any, by: int) -> None:
 
 
 def _metadata(scan: Scan, file_name: str, notes: dict[str, str], at: int, entries: list[Any]) -> bytes:
-    """Metadata that the recorder did not come to write, and the end of the data."""
+    """Metadata that the killed recorder did not write, and the end of the data."""
     present = {entry.name for entry in entries if isinstance(entry, MetadataIndex)}
     records = []
     if recorded_here(scan) and ENDS not in present:
-        # Of what was lost on the way, the recorder took its count with it; the gaps in the sequence numbers are still there.
+        # The recorder's count of lost messages is gone, but the gaps in the sequence numbers are still in the file.
         lost: dict[str, int] = {}
         for channel_id, gap in scan.gaps.items():
             topic = scan.channels[channel_id].topic
@@ -146,14 +146,14 @@ def _metadata(scan: Scan, file_name: str, notes: dict[str, str], at: int, entrie
 
 
 def _ending(scan: Scan, entries: Sequence[Any], start: int) -> bytes:
-    """Summary section that begins at ``start``, footer and magic."""
+    """Bytes of the summary section that begins at ``start``, the footer and the magic."""
     summary, offsets_start = _summary(scan, entries, start)
     head = RECORD_HEAD.pack(Opcode.FOOTER, 20) + start.to_bytes(8, "little") + offsets_start.to_bytes(8, "little")
     return summary + _bytes_of(Footer(start, offsets_start, zlib.crc32(head, zlib.crc32(summary)))) + MAGIC
 
 
 def _summary(scan: Scan, entries: Sequence[Any], start: int) -> tuple[bytes, int]:
-    """Bytes of the summary section that begins at ``start``, and where its table of offsets begins."""
+    """Bytes of the summary section that begins at ``start``, and the offset of its table of offsets."""
     kinds = {kind: [entry for entry in entries if isinstance(entry, kind)] for kind in _KINDS}
     statistics = Statistics(
         attachment_count=len(kinds[AttachmentIndex]), channel_count=len(scan.channels),

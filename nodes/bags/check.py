@@ -1,4 +1,4 @@
-"""Is a file of a bag whole, checked, and would a repair be right? Every byte of it is read for the answer."""
+"""Diagnoses a file of a bag: whether it is intact, has checksums, and can be repaired. The whole file is read."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ _MOST_LINES = 20
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What is wrong with a file.
+    """Damage of a file.
 
     Attributes:
         path: The file.
-        whole: Nothing is.
-        unchecked: Why messages may have changed without a sign of it; empty where checksums cover them.
-        lines: What is wrong, and what to do, in words; empty for a whole file.
+        whole: Whether the file is intact.
+        unchecked: Why damage to messages may go unnoticed; empty if checksums cover them.
+        lines: The damage and what to do, as text; empty for an intact file.
     """
 
     path: Path
@@ -31,15 +31,15 @@ class Diagnosis:
 
 
 def diagnose(path: Path) -> Diagnosis:
-    """Read a file from its beginning to its end, and say what is wrong with it.
+    """Read a whole file and report its damage.
 
     Raises:
-        BagError: It is no bag, or is packed in a way that is not known here.
+        BagError: The file is not a bag, or its compression is unknown.
     """
     if (form := recognise(path)) is not Format.MCAP:
         return Diagnosis(path, True, no_checksums(form), ())
     if being_written(path):
-        raise BagError(f"{path} is being written at this moment; stop its recorder, then it has an end")
+        raise BagError(f"{path} is being written at this moment; stop its recorder first")
     scan = examine(path)
     if scan.whole:
         return Diagnosis(path, True, scan.unchecked, ())
@@ -50,14 +50,14 @@ def diagnose(path: Path) -> Diagnosis:
     if scan.summary_damage:
         lines.append(scan.summary_damage)
     if scan.data_crc_wrong:
-        lines.append("the checksum of all its data is that of other data")
+        lines.append("the checksum of all its data is wrong")
     if refusal := refusal_of(scan):
         lines.append(f"{refusal}")
         lines.append(
-            f"only advnerf bag repair --force {path} goes on all the same: it keeps {scan.messages} messages, and the file as it is beside it"
+            f"only advnerf bag repair --force {path} repairs it anyway: it keeps {scan.messages} messages, and a copy of the damaged file"
         )
     else:
         cut = sum(loss.length for loss in scan.losses)
-        lost = f"and leaves out {cut} bytes at its end" if cut else "and loses nothing"
-        lines.append(f"advnerf bag repair {path} keeps all {scan.messages} messages that are whole, {lost}")
+        lost = f"and drops {cut} bytes at its end" if cut else "and loses nothing"
+        lines.append(f"advnerf bag repair {path} keeps all {scan.messages} intact messages, {lost}")
     return Diagnosis(path, False, scan.unchecked, tuple(lines))

@@ -1,6 +1,6 @@
-"""The messages of an MCAP file in the order of their log time, chunk by chunk: several times as fast as the general reader.
+"""Reads the messages of an MCAP file in the order of their log time, chunk by chunk. Several times as fast as the ``mcap`` reader.
 
-Every chunk is compared with its checksum before a message of it is given away.
+The checksum of every chunk is verified before any of its messages is returned.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from nodes.runtime.errors import BagError
 
 
 class RawMessage(NamedTuple):
-    """A message as the file has it; of two with one log time the one written first comes first."""
+    """A message as stored in the file. Of two with the same log time, the one written first sorts first."""
 
     log_ns: int
     chunk_offset: int
@@ -55,21 +55,21 @@ class _Block(NamedTuple):
 def messages_in_order(
     file: BinaryIO, summary: Summary, channels: Collection[int], start_ns: int = 0
 ) -> Iterator[RawMessage]:
-    """Messages of some channels from a log time on, in order of log time.
+    """Yield the messages of some channels from a log time on, in order of log time.
 
     Args:
         file: The file.
-        summary: Its summary.
-        channels: Ids of the channels that are wanted.
+        summary: Summary of the file.
+        channels: Ids of the channels to read.
         start_ns: First log time [ns since 1970].
 
     Raises:
-        BagError: A chunk is damaged; the messages before it have been given away.
+        BagError: A chunk is damaged. The messages before it have already been yielded.
     """
     wanted = frozenset(channels)
     waiting: list[RawMessage] = []
     for block in _blocks(summary):
-        # Chunks overlap in time where messages came late; what is older than all of this one can go.
+        # Chunks overlap in time if messages arrived late. Messages older than this chunk can be yielded.
         while waiting and waiting[0].log_ns < block.start_ns:
             yield heappop(waiting)
         if block.end_ns < start_ns or (block.channels and wanted.isdisjoint(block.channels)):
@@ -124,10 +124,10 @@ def _messages(data: bytes, wanted: frozenset[int], chunk_offset: int) -> Iterato
 
 
 def _chunk_data(file: BinaryIO, index: ChunkIndex) -> bytes:
-    """Records of a chunk, unpacked and checked."""
+    """Unpack a chunk and verify its checksum."""
     if index.uncompressed_size > MOST_BYTES:
         raise Damaged(
-            f"the summary says that it has {index.uncompressed_size} bytes; at most {MOST_BYTES} are unpacked"
+            f"according to the summary it has {index.uncompressed_size} bytes; at most {MOST_BYTES} are unpacked"
         )
     record = _record(file, index.chunk_start_offset, index.chunk_length, Opcode.CHUNK)
     head = chunk_head(record, 0, len(record))
@@ -138,25 +138,25 @@ def _run_data(file: BinaryIO, run: Run) -> bytes:
     file.seek(run.offset)
     data = file.read(run.length)
     if len(data) != run.length:
-        raise Damaged("the file is shorter than it was")
+        raise Damaged("the file became shorter while it was read")
     return data
 
 
 def _record(file: BinaryIO, offset: int, length: int, opcode: int) -> bytes:
-    """Body of the record that the summary has at a place."""
+    """Body of the record that the summary lists at an offset."""
     size = file.seek(0, os.SEEK_END)
     if offset + length > size:
-        raise Damaged(f"the summary has {length} bytes of it at byte {offset} of {size}")
+        raise Damaged(f"the summary lists {length} bytes of it at byte {offset} of {size}")
     file.seek(offset)
     record = file.read(length)
     found, body, end = record_at(record, 0, length)
     if found != opcode or end != length:
-        raise Damaged(f"there is no such record of {length} bytes, where the summary has it")
+        raise Damaged(f"there is no such record of {length} bytes where the summary lists it")
     return record[body:end]
 
 
 def read_attachment_at(file: Any, index: AttachmentIndex) -> Attachment:
-    """An attachment, checked."""
+    """Read an attachment and verify its checksum."""
     try:
         attachment, _ = checked_attachment(_record(file, index.offset, index.length, Opcode.ATTACHMENT))
     except Damaged as error:
@@ -168,7 +168,7 @@ def read_attachment_at(file: Any, index: AttachmentIndex) -> Attachment:
 
 
 def read_metadata_at(file: Any, index: MetadataIndex) -> Metadata:
-    """A metadata record."""
+    """Read a metadata record."""
     try:
         found: Metadata = parse(Metadata, _record(file, index.offset, index.length, Opcode.METADATA))
     except Damaged as error:

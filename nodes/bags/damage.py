@@ -1,4 +1,4 @@
-"""What was lost of a file, in words."""
+"""Describes the losses of a damaged file as text."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from nodes.runtime.clock import NS_PER_S
 
 
 def describe(scan: Scan, loss: Loss) -> str:
-    """A loss in words: where, when, which topics, why."""
+    """Describe a loss: its offset, times, topics and reason."""
     words = [f"{loss.what} at byte {loss.offset}"]
     details = []
     if loss.span_ns is not None and loss.span_ns[1]:

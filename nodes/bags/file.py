@@ -1,4 +1,4 @@
-"""Reading MCAP files that may be damaged, or made to do damage: bounded reads, and one kind of error."""
+"""Reads MCAP files that may be damaged or malicious: reads are bounded, and all failures are one kind of error."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from zstandard import ZstdError
 
 from nodes.runtime.errors import BagError
 
-# What the readers of the format raise when the bytes make no sense.
+# Exceptions that the readers of the format raise for invalid bytes.
 NONSENSE = (
     McapError, ZstdError, ValueError, KeyError, IndexError, TypeError, RuntimeError, OverflowError, MemoryError, EOFError,
     struct.error,
@@ -23,7 +23,7 @@ NONSENSE = (
 
 
 class BoundedFile:
-    """A file of which no more is asked than there is: a length in a damaged file may say anything."""
+    """A file whose reads are limited to its size, because a length in a damaged file may have any value."""
 
     def __init__(self, file: BinaryIO) -> None:
         self._file = file
@@ -31,29 +31,29 @@ class BoundedFile:
         self._size = os.fstat(file.fileno()).st_size
 
     def read(self, size: int = -1) -> bytes:
-        """Read so many bytes, or what is left."""
+        """Read ``size`` bytes, or the rest of the file if it is shorter."""
         left = max(0, self._size - self._file.tell())
         return self._file.read(left if size < 0 else min(size, left))
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        """Go to a place; outside the file is an error."""
+        """Move to an offset. An offset outside the file is an error."""
         place = offset + {os.SEEK_SET: 0, os.SEEK_CUR: self._file.tell(), os.SEEK_END: self._size}[whence]
         if not 0 <= place <= self._size:
             raise EOFError(f"byte {place} of {self._size}")
         return self._file.seek(place)
 
     def tell(self) -> int:
-        """The present place."""
+        """Current offset."""
         return self._file.tell()
 
     def seekable(self) -> bool:
-        """Yes."""
+        """Return True."""
         return True
 
 
 @contextmanager
 def mapped(path: Path) -> Iterator[Any]:
-    """Bytes of a file, without reading it all into memory; nothing may hold on to a part of them."""
+    """Map the bytes of a file into memory. No view of them may outlive the context."""
     with open(path, "rb") as file:
         if os.fstat(file.fileno()).st_size == 0:
             yield b""
@@ -64,12 +64,12 @@ def mapped(path: Path) -> Iterator[Any]:
 
 @contextmanager
 def open_bag(path: Path) -> Iterator[Any]:
-    """A bag's file for the readers of the format; whatever they stumble over inside is one `BagError`."""
+    """Open a bag's file for the readers of the format. Their exceptions become one `BagError`."""
     try:
         with open(path, "rb") as file:
             yield BoundedFile(file)
     except NONSENSE as error:
         what = f"{type(error).__name__} {error}".strip()
         raise BagError(
-            f"{path} is damaged and cannot be read ({what:.120}); try a copy of it with: advnerf bag repair"
+            f"{path} is damaged and cannot be read ({what:.120}); try advnerf bag repair on a copy"
         ) from error

@@ -1,4 +1,4 @@
-"""Bags that are no MCAP, read through ``rosbags``: the SQLite files of rosbag2, and bags of ROS 1."""
+"""Reads bags in other formats than MCAP through ``rosbags``: the SQLite files of rosbag2, and ROS 1 bags."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from nodes.bags.message_definitions import IDL, MSG, full_type_name
 from nodes.bags.stored_types import CDR, ROS1, RecordedTopic
 from nodes.runtime.errors import BagError
 
-# What the readers raise at a damaged file.
+# Exceptions that the readers raise for a damaged file.
 _NONSENSE = (
     rosbag1.ReaderError, rosbag2.ReaderError, struct.error, ValueError, KeyError, IndexError, TypeError, AssertionError,
     OverflowError, EOFError, MemoryError, RuntimeError, OSError,
@@ -25,7 +25,7 @@ _LANGUAGES = {MessageDefinitionFormat.MSG: MSG, MessageDefinitionFormat.IDL: IDL
 
 
 class StoredTopic(NamedTuple):
-    """One topic of one writer: its number in the file, what the file says about it, and how many messages it has."""
+    """One topic of one writer: its number in the file, its description, and its number of messages."""
 
     number: int
     recorded: RecordedTopic
@@ -33,7 +33,7 @@ class StoredTopic(NamedTuple):
 
 
 class Stored(NamedTuple):
-    """What a file holds; times in nanoseconds since 1970, 0 for a file without messages."""
+    """Contents of a file. Times are in nanoseconds since 1970, 0 for a file without messages."""
 
     start_ns: int
     end_ns: int
@@ -50,10 +50,10 @@ class StoredMessage(NamedTuple):
 
 
 def read_stored(path: Path, form: Format) -> Stored:
-    """What a file holds.
+    """Read the contents of a file.
 
     Raises:
-        BagError: The file is damaged, or its recorder left a part of it in another file.
+        BagError: The file is damaged, or its recorder left messages in another file.
     """
     with _opened(path, form) as reader:
         topics = tuple(_topic(connection, form) for connection in reader.connections)
@@ -64,17 +64,17 @@ def read_stored(path: Path, form: Format) -> Stored:
 
 
 def stored_messages(path: Path, form: Format, numbers: Collection[int], start_ns: int) -> Iterator[StoredMessage]:
-    """Messages in order of their log time.
+    """Yield messages in order of their log time.
 
     Args:
         path: The file.
-        form: Its format.
-        numbers: Numbers of the topics that are wanted.
+        form: Format of the file.
+        numbers: Numbers of the topics to read.
         start_ns: First log time [ns since 1970].
     """
     with _opened(path, form) as reader:
         wanted = [connection for connection in reader.connections if connection.id in numbers]
-        if wanted:  # an empty list means all of them
+        if wanted:  # an empty list would mean all topics
             for connection, log_ns, data in reader.messages(wanted, start=start_ns):
                 yield StoredMessage(connection.id, log_ns, bytes(data))
 
@@ -94,8 +94,8 @@ def _opened(path: Path, form: Format) -> Iterator[Any]:
     rest = path.with_name(f"{path.name}-wal")
     if form is Format.SQLITE and rest.exists() and rest.stat().st_size:
         raise BagError(
-            f"{path} is unfinished: its recorder was killed or is still at work, and the newest messages are in {rest.name}; "
-            f"put them in with: sqlite3 {path} 'PRAGMA wal_checkpoint(TRUNCATE)'"
+            f"{path} is unfinished: its recorder was killed or is still running, and the newest messages are in {rest.name}; "
+            f"add them with: sqlite3 {path} 'PRAGMA wal_checkpoint(TRUNCATE)'"
         )
     try:
         with _reader(path, form) as reader:

@@ -1,4 +1,4 @@
-"""What a file is that somebody takes for a bag, by its first bytes."""
+"""Recognises the format of a bag by its first bytes."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Format(Enum):
 _MCAP, _SQLITE, _ROS1 = b"\x89MCAP", b"SQLite format 3\0", b"#ROSBAG V2.0\n"
 _EXPECTED = "expected a bag: MCAP (.mcap), rosbag2 in SQLite (.db3), or ROS 1 (.bag)"
 _CONVERT = "rosbags-convert --src {bag} --dst NEW_FOLDER --dst-storage mcap"
-# First bytes of other files, what they are, and what to do.
+# First bytes of other file types, their description, and what to do.
 _OTHERS = (
     (b"#ROSBAG V", "a ROS 1 bag of an old version", "migrate it on a machine with ROS 1: rosbag fix {bag} NEW.bag"),
     (b"\x28\xb5\x2f\xfd", "a file compressed with zstd", "unpack it: zstd -d {bag}; a whole rosbag2 folder: " + _CONVERT.replace("{bag}", "{folder}")),
@@ -34,10 +34,10 @@ _OTHERS = (
 
 
 def recognise(path: Path) -> Format:
-    """Format of a file.
+    """Recognise the format of a file.
 
     Raises:
-        BagError: It is no bag; the line says what it is and what to do.
+        BagError: The file is not a bag. The message says what it is and what to do.
     """
     try:
         with open(path, "rb") as file:
@@ -47,7 +47,7 @@ def recognise(path: Path) -> Format:
     for magic, found in ((_MCAP, Format.MCAP), (_SQLITE, Format.SQLITE), (_ROS1, Format.ROS1)):
         if head.startswith(magic):
             return found
-    # A recorder that was killed at once leaves less than the first bytes of the format.
+    # A recorder that is killed right after its start leaves fewer bytes than the format's signature.
     if head and _MCAP.startswith(head):
         return Format.MCAP
     kind, advice = _kind(head)
@@ -56,16 +56,16 @@ def recognise(path: Path) -> Format:
 
 
 def no_checksums(form: Format) -> str:
-    """Why nothing can be said about damage to a file of a format."""
+    """Explain why damage to a file of a format cannot be noticed."""
     return f"{form.value} has no checksums"
 
 
 def require_mcap(path: Path, verb: str) -> None:
-    """Refuse a bag of another format for what only works with MCAP.
+    """Refuse a bag of another format, for operations that only work with MCAP.
 
     Args:
         path: The file.
-        verb: What is to be done with it, e.g. ``repaired``.
+        verb: Participle of the operation for the message, for example ``repaired``.
     """
     if (found := recognise(path)) is not Format.MCAP:
         raise BagError(
@@ -87,5 +87,5 @@ def _kind(head: bytes) -> tuple[str, str]:
 
 def _is_text(head: bytes) -> bool:
     text = head.decode("utf-8", "replace")
-    # One character may be cut in two at the end.
+    # The last character may be cut.
     return text.count("\ufffd") <= 1 and all(letter.isprintable() or letter in "\t\r\n\f" for letter in text)

@@ -1,4 +1,4 @@
-"""The camera's pictures in a bag, whether they were recorded raw or compressed."""
+"""Reads the camera images of a bag, recorded raw or compressed."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ CAMERA_TOPICS = (RAW_TOPIC, COMPRESSED_TOPIC)
 
 
 def image_topic(bag: Path, candidates: Sequence[str] = CAMERA_TOPICS) -> str:
-    """The first of some topics that has messages.
+    """Return the first of some topics that has messages.
 
     Raises:
-        BagError: None has.
+        BagError: None of the topics has messages.
     """
     topics = {topic.name: topic for topic in read_info(bag).topics if topic.count}
     for name in candidates:
@@ -31,11 +31,11 @@ def image_topic(bag: Path, candidates: Sequence[str] = CAMERA_TOPICS) -> str:
 
 
 def image_messages(bag: Path, topic: str) -> Iterator[Any]:
-    """Every picture of a topic as ``sensor_msgs/Image``, in order of log time; a topic with compressed pictures is decoded.
+    """Yield the images of a topic as ``sensor_msgs/Image`` in order of log time. Compressed images are decoded.
 
     Args:
         bag: Bag folder or file.
-        topic: Any topic with images, also one that is not in the topic table.
+        topic: A topic with images. It need not be in the topic table.
     """
     for message in read_messages(bag, [topic], types={topic: IMAGE_TYPE}):
         yield decode(IMAGE_TYPE, message.cdr)

@@ -1,7 +1,7 @@
-"""What keeps the messages of a bag's unfinished chunk: a small file beside it, written message by message.
+"""The journal of a bag: a small file next to it with the messages of the unfinished chunk.
 
-A chunk reaches the bag only when it is full, so that files stay small and quick to search. Until then its messages are in the
-journal, where the death of the recorder cannot take them away; `nodes.bags.repair` puts them into the bag.
+A chunk is written to the bag when it is full, so that files stay small and fast to search. Until then, its messages are in the
+journal, which survives if the recorder is killed. `nodes.bags.repair` adds them to the bag.
 """
 
 from __future__ import annotations
@@ -13,19 +13,19 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-# Mark, and the length of the bag when its present chunk was begun.
+# Signature, and the length of the bag at the start of its current chunk.
 _HEAD = struct.Struct("<8sQ")
 _MARK = b"advnjrn1"
-# CRC-32 of all that follows, log time, publish time, sequence, length of the topic, length of the message.
+# CRC-32 of the following bytes, log time, publish time, sequence, length of the topic, length of the message.
 _ENTRY = struct.Struct("<IQQIHI")
 _CRC_BYTES = 4
-# Held back so that the summaries still fit when the disk is full: those of two parts of 1 GiB take 3 MB.
+# Reserved space for the summaries when the disk is full: those of two parts of 1 GiB take 3 MB.
 RESERVE_BYTES, RESERVE_NAME = 8 * 1024 * 1024, ".reserve"
 
 
 @dataclass(frozen=True)
 class Entry:
-    """A message that waits for its chunk."""
+    """A message of the unfinished chunk."""
 
     topic: str
     cdr: bytes
@@ -35,7 +35,7 @@ class Entry:
 
 
 def journal_of(bag_file: Path) -> Path:
-    """Where the journal of a ``.mcap`` file is."""
+    """Path of the journal of a ``.mcap`` file."""
     return bag_file.with_name(f".{bag_file.name}.journal")
 
 
@@ -44,7 +44,7 @@ class Journal:
 
     Args:
         bag_file: The ``.mcap`` file.
-        position: Its length now, where the first chunk will begin.
+        position: Current length of the file, where the first chunk will begin.
     """
 
     def __init__(self, bag_file: Path, position: int) -> None:
@@ -54,7 +54,7 @@ class Journal:
         self.restart(position)
 
     def add(self, entry: Entry) -> None:
-        """Note a message."""
+        """Append a message."""
         topic = entry.topic.encode()
         lengths = len(topic), len(entry.cdr)
         head = _ENTRY.pack(0, entry.log_ns, entry.publish_ns, entry.sequence & 0xFFFFFFFF, *lengths)[_CRC_BYTES:]
@@ -62,7 +62,7 @@ class Journal:
         _write_all(self._descriptor, zlib.crc32(body).to_bytes(_CRC_BYTES, "little") + body)
 
     def restart(self, position: int) -> None:
-        """Forget everything if the bag has grown since, because what was here is in it now."""
+        """Empty the journal if the bag has grown, because its messages are then in the bag."""
         if position != self._position:
             self._position = position
             os.ftruncate(self._descriptor, 0)
@@ -70,12 +70,12 @@ class Journal:
             _write_all(self._descriptor, _HEAD.pack(_MARK, position))
 
     def close(self) -> None:
-        """Let the file go; it stays where it is."""
+        """Close the file without removing it."""
         os.close(self._descriptor)
 
 
 def read_journal(bag_file: Path) -> tuple[int, list[Entry]]:
-    """Length of the bag when the chunk was begun, and the messages that were to be in it; nothing if there is no journal."""
+    """Read the length of the bag at the start of the chunk, and the chunk's messages; no messages without a journal."""
     try:
         content = journal_of(bag_file).read_bytes()
     except FileNotFoundError:
@@ -86,7 +86,7 @@ def read_journal(bag_file: Path) -> tuple[int, list[Entry]]:
 
 
 def _entries(content: bytes) -> Iterator[Entry]:
-    """Whole entries, up to the one that was cut off or damaged."""
+    """Yield the intact entries up to the first cut or damaged one."""
     at = _HEAD.size
     while at + _ENTRY.size <= len(content):
         crc, log_ns, publish_ns, sequence, topic_length, cdr_length = _ENTRY.unpack_from(content, at)

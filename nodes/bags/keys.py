@@ -1,4 +1,4 @@
-"""Keys for a player: space pauses and goes on, right arrow or s steps, + and - change the speed, q ends."""
+"""Keys of the player: space pauses and resumes, right arrow or s steps, + and - change the speed, q quits."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import select
 import termios
 import tty
 
-HELP = "space: pause, go on   right or s: one message   + -: speed   q: end"
+HELP = "space: pause, resume   right or s: one message   + -: speed   q: quit"
 _WAIT_S = 0.1
 _WORDS = {
     b" ": "toggle",
@@ -21,7 +21,7 @@ _WORDS = {
 
 
 class Keys:
-    """Reads single keys of a terminal; Ctrl-C keeps its meaning.
+    """Reads single keys of a terminal. Ctrl-C still interrupts.
 
     Args:
         descriptor: File descriptor of the terminal.
@@ -33,11 +33,11 @@ class Keys:
         tty.setcbreak(descriptor)
 
     def read(self) -> str | None:
-        """The word of the next key: ``toggle``, ``step``, ``faster``, ``slower`` or ``stop``; None after 0.1 s without one."""
+        """Read a key and return its command: ``toggle``, ``step``, ``faster``, ``slower`` or ``stop``; None after 0.1 s without a key."""
         if not select.select([self._descriptor], [], [], _WAIT_S)[0]:
             return None
         return _WORDS.get(os.read(self._descriptor, 16))
 
     def close(self) -> None:
-        """Make the terminal what it was."""
+        """Restore the terminal."""
         termios.tcsetattr(self._descriptor, termios.TCSADRAIN, self._before)

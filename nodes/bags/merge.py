@@ -1,4 +1,4 @@
-"""Messages of several files as one sequence in time; a file is opened only when its time has come."""
+"""Merges the messages of several files in order of time. A file is opened only when its first message is due."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Source(Generic[T]):
-    """Messages of one file.
+    """The messages of one file.
 
     Attributes:
-        start_ns: A time before which it has no message [ns since 1970].
-        open: Begins to read it; the messages come in order of time.
+        start_ns: Lower bound of the times of its messages [ns since 1970].
+        open: Opens the file and yields its messages in order of time.
     """
 
     start_ns: int
@@ -24,17 +24,17 @@ class Source(Generic[T]):
 
 
 def merge_by_time(sources: Sequence[Source[T]], time_ns: Callable[[T], int]) -> Iterator[T]:
-    """All messages in order of their time; of two with one time that of the earlier source comes first.
+    """Yield all messages in order of time. Of two with the same time, that of the earlier source comes first.
 
     Args:
-        sources: The files, in the order in which they were recorded.
-        time_ns: Time of a message [ns since 1970].
+        sources: The files, in the order of their recording.
+        time_ns: Returns the time of a message [ns since 1970].
     """
     if len(sources) == 1:
         yield from sources[0].open()
         return
     closed = sorted(range(len(sources)), key=lambda number: (sources[number].start_ns, number), reverse=True)
-    # Numbers differ, so that neither messages nor iterators are compared.
+    # The numbers are unique, so that neither messages nor iterators are compared.
     waiting: list[tuple[int, int, T, Iterator[T]]] = []
     while waiting or closed:
         while closed and (not waiting or sources[closed[-1]].start_ns <= waiting[0][0]):

@@ -1,7 +1,7 @@
-"""Messages of any type, read by the definition that their bag carries.
+"""Reads messages of any type by the definition in their bag.
 
-A definition from a stranger's bag is data here: it says in which order to read numbers, and no code is made of it. That is why the
-code generator of ``rosbags``, behind `nodes.runtime.messages`, only ever sees the definitions that we ship.
+A definition from a foreign bag is treated as data: it gives the order of the fields, and no code is generated from it. The code
+generator of ``rosbags``, which `nodes.runtime.messages` uses, only gets the definitions that advnerf ships.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from nodes.runtime.errors import MessageError
 from nodes.runtime.messages import fields_of, message_class
 
 MSG, IDL = "ros2msg", "ros2idl"
-# ROS 1 has no name of its own in rosbag2; in MCAP its definitions are called so.
+# Name of ROS 1 definitions in MCAP. rosbag2 has no name for them.
 _AS_MSG = frozenset({MSG, "ros1msg"})
 _MOST_CHARACTERS = 1 << 20
 _IDL_PART = re.compile(r"^=+\nIDL: [^\n]*\n", re.MULTILINE)
@@ -29,7 +29,7 @@ _NUMBERS = {
     "uint32": "u4", "int32": "i4", "uint64": "u8", "int64": "i8", "float32": "f4", "float64": "f8",
 }  # fmt: skip
 _PLACEHOLDER = "structure_needs_at_least_one_member"
-# What the parser of definitions raises at text that is none.
+# Exceptions that the parser of definitions raises for invalid text.
 _NO_DEFINITION = (
     TypesysError,
     RecursionError,
@@ -45,17 +45,17 @@ Fields = list[tuple[str, Any]]
 
 
 def full_type_name(name: str) -> str:
-    """Type name as ROS 2 writes it: ``sensor_msgs/Image`` of ROS 1 becomes ``sensor_msgs/msg/Image``."""
+    """Convert a type name to the form of ROS 2: ``sensor_msgs/Image`` of ROS 1 becomes ``sensor_msgs/msg/Image``."""
     package, separator, rest = name.partition("/")
     return f"{package}/msg/{rest}" if separator and "/" not in rest else name
 
 
 class Definition:
-    """The fields of a type and of everything in it, as a bag defines them.
+    """The fields of a type and of all types in it, as a bag defines them.
 
     Args:
         typename: Full type name.
-        types: Fields by type name; what is missing here is taken from our own types.
+        types: Fields by type name. Missing types are taken from advnerf's own.
     """
 
     def __init__(self, typename: str, types: Mapping[str, Fields]) -> None:
@@ -64,15 +64,15 @@ class Definition:
 
     @property
     def is_ours(self) -> bool:
-        """Whether our type of that name has the same fields, down to the last."""
+        """Whether advnerf's type with that name has exactly the same fields."""
         return self._same(self.typename, set())
 
     def missing(self, typename: str, own: str | None = None) -> list[str]:
-        """Fields of our type that this definition lacks, e.g. ``drive.speed``.
+        """Fields of an advnerf type that this definition lacks, for example ``drive.speed``.
 
         Args:
-            typename: Our type.
-            own: The type of this definition that stands for it; None for the one it was made for.
+            typename: The advnerf type.
+            own: The type of this definition to compare with it; None for its main type.
         """
         have = {name.lower(): kind for name, kind in self._fields(own or self.typename)}
         lacking = []
@@ -89,14 +89,14 @@ class Definition:
         return lacking
 
     def read(self, data: bytes, ros1: bool = False) -> dict[str, Any]:
-        """Fields of a message by their names in lower case; messages in it are dictionaries too.
+        """Decode a message to its fields by lower-case names. Nested messages are dictionaries too.
 
         Args:
-            data: Its bytes: CDR with its encapsulation, or the format of ROS 1.
-            ros1: Which of the two.
+            data: Bytes of the message: CDR with its encapsulation, or the ROS 1 format.
+            ros1: Whether the format is that of ROS 1.
 
         Raises:
-            MessageError: The bytes are no such message.
+            MessageError: The bytes do not decode.
         """
         try:
             reader = _Reader(data, ros1)
@@ -104,7 +104,7 @@ class Definition:
             reader.require_end()
         except (struct.error, ValueError, RecursionError, UnicodeDecodeError) as error:
             raise MessageError(
-                f"expected {self.typename} in {len(data)} bytes, got bytes that are not: {error}"
+                f"expected {self.typename} in {len(data)} bytes, got bytes that cannot be decoded: {error}"
             ) from error
         return found
 
@@ -147,15 +147,15 @@ class Definition:
 
 
 def parse_definition(typename: str, text: str, encoding: str) -> Definition:
-    """Definition of a type in the text that a bag carries.
+    """Parse the definition of a type from the text in a bag.
 
     Args:
         typename: Full type name.
-        text: Definition of it and of everything in it.
+        text: Definition of the type and of all types in it.
         encoding: ``ros2msg``, ``ros1msg`` or ``ros2idl``.
 
     Raises:
-        MessageError: The text is no such definition.
+        MessageError: The text is not a valid definition.
     """
     return _parsed(typename, text, encoding)
 
@@ -167,7 +167,7 @@ def _parsed(typename: str, text: str, encoding: str) -> Definition:
         if len(text) > _MOST_CHARACTERS:
             raise ValueError(f"{len(text)} characters, at most {_MOST_CHARACTERS} are read")
         if encoding in _AS_MSG:
-            # The parser knows one line between definitions, 80 characters long; some writers end it with a carriage return.
+            # The parser expects a separator line of exactly 80 characters. Some writers end it with a carriage return.
             types.update(get_types_from_msg(text.replace("\r\n", "\n"), typename))
         elif encoding == IDL:
             for part in _IDL_PART.split(text):
@@ -184,11 +184,11 @@ def _parsed(typename: str, text: str, encoding: str) -> Definition:
 
 
 def as_our_message(fields: Mapping[str, Any], typename: str) -> Any:
-    """Message of our own type with the fields of a foreign one that lacks none of them; further fields are left out.
+    """Make a message of an advnerf type from the fields of a foreign one, which must have all of them. Further fields are dropped.
 
     Args:
-        fields: Fields by their names in lower case: ROS 1 wrote some in capitals.
-        typename: Our type.
+        fields: Fields by lower-case names, because ROS 1 wrote some in capitals.
+        typename: The advnerf type.
     """
     ours = fields_of(typename) or []
     return message_class(typename)(**{name: _as_ours(fields.get(name.lower(), 0), kind) for name, kind in ours})
@@ -208,7 +208,7 @@ def _as_ours(value: Any, kind: Any) -> Any:
 
 
 def _type_in(kind: Any) -> str:
-    """Name of the type that a field has, or whose array it is; empty for numbers and texts."""
+    """Name of the message type of a field or of its array elements; empty for numbers and strings."""
     node, what = kind
     if node == Nodetype.NAME:
         return str(what)
@@ -222,7 +222,7 @@ def _number(name: str) -> str:
 
 
 class _Reader:
-    """Values one after the other out of the bytes of a message."""
+    """Reads values in sequence from the bytes of a message."""
 
     def __init__(self, data: bytes, ros1: bool) -> None:
         self.ros1 = ros1
@@ -231,7 +231,7 @@ class _Reader:
             if len(data) < 4 or data[0] != 0 or data[1] > 1:
                 raise ValueError(f"they begin with {bytes(data[:4]).hex()}, not with the encapsulation of CDR")
             self._order = "<" if data[1] else ">"
-            data = data[4:]  # values are aligned to what follows
+            data = data[4:]  # alignment counts from after the encapsulation
         self._data = data
 
     def number(self, code: str) -> Any:
@@ -257,12 +257,12 @@ class _Reader:
         return int(self.number("u4"))
 
     def require(self, size: int) -> None:
-        """Nothing takes less than a byte, so a count that is damaged cannot ask for more than there is."""
+        """Check that ``size`` bytes are left. Each element has at least one byte, so a damaged count cannot exceed the data."""
         if size > len(self._data) - self._at:
             raise ValueError(f"{size} bytes at byte {self._at} of {len(self._data)}")
 
     def require_end(self) -> None:
-        """Up to three bytes may follow: some writers fill up to a multiple of four."""
+        """Check that at most three bytes are left, because some writers pad to a multiple of four."""
         if len(self._data) - self._at > (0 if self.ros1 else 3):
             raise ValueError(f"they end at byte {self._at} of {len(self._data)}")
 

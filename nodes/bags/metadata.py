@@ -1,4 +1,4 @@
-"""What is said about a bag beside its messages: topics, counts and times, and ``metadata.yaml`` as rosbag2 writes it."""
+"""Metadata of a bag: topics, counts and times, and ``metadata.yaml`` in the format of rosbag2."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ import yaml
 
 from nodes.runtime.messages import ROS_DISTRO
 
-# The C emitter writes the same text ten times as fast.
+# The C emitter writes the same text ten times faster.
 _DUMPER: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 
 
 @dataclass
 class Contents:
-    """What a bag's summary says.
+    """Contents of a bag according to its summary.
 
     Attributes:
         types: Type name by topic.
         hashes: RIHS01 hash by topic.
         counts: Number of messages by topic.
-        lost: Messages by topic that were published but did not reach the recorder, where it said so.
-        start_ns: Log time of the first message [ns since 1970]; 0 when there is none.
+        lost: Number of published messages by topic that did not reach the recorder, if it counted them.
+        start_ns: Log time of the first message [ns since 1970]; 0 without messages.
         end_ns: Log time of the last message [ns since 1970].
     """
 
@@ -40,18 +40,18 @@ class Contents:
         return sum(self.counts.values())
 
     def add_topic(self, topic: str, typename: str, rihs: str) -> None:
-        """Note a topic."""
+        """Add a topic."""
         self.types[topic], self.hashes[topic] = typename, rihs
         self.counts.setdefault(topic, 0)
 
     def add_message(self, topic: str, log_ns: int) -> None:
-        """Note a message."""
+        """Count a message."""
         self.start_ns = min(self.start_ns, log_ns) if self.messages else log_ns
         self.end_ns = max(self.end_ns, log_ns)
         self.counts[topic] += 1
 
     def add(self, other: Contents) -> None:
-        """Note everything that another file holds."""
+        """Add the contents of another file."""
         if other.messages:
             self.start_ns = min(self.start_ns, other.start_ns) if self.messages else other.start_ns
             self.end_ns = max(self.end_ns, other.end_ns)
@@ -70,17 +70,17 @@ class FileEntry(NamedTuple):
 
     @classmethod
     def of(cls, name: str, contents: Contents) -> FileEntry:
-        """The entry of a file with these contents."""
+        """Make the entry of a file with these contents."""
         return cls(name, contents.start_ns, contents.end_ns, contents.messages)
 
 
 def rosbag2_metadata(file_name: str, contents: Contents, files: Sequence[FileEntry] = ()) -> str:
-    """Text of ``metadata.yaml``, version 9.
+    """Make the text of ``metadata.yaml``, version 9.
 
     Args:
         file_name: The file, if the bag has only one.
-        contents: What the whole bag holds.
-        files: The files of a split bag in order.
+        contents: Contents of the whole bag.
+        files: The files of a split bag, in order.
     """
     files = files or [FileEntry.of(file_name, contents)]
     topics = [
@@ -103,7 +103,7 @@ def rosbag2_metadata(file_name: str, contents: Contents, files: Sequence[FileEnt
         ],
         "custom_data": None, "ros_distro": ROS_DISTRO,
     }  # fmt: skip
-    # Without aliases: rosbag2's reader does not know them.
+    # No YAML aliases, because rosbag2's reader does not support them.
     return str(yaml.dump({"rosbag2_bagfile_information": information}, Dumper=_PlainDumper, sort_keys=False))
 
 

@@ -1,4 +1,4 @@
-"""One file of a bag while it is being written."""
+"""Writes one file (part) of a bag."""
 
 from __future__ import annotations
 
@@ -20,23 +20,23 @@ PROFILE, LIBRARY = "ros2", "advnerf"
 
 
 def opening_name(part: Path) -> Path:
-    """Name under which a part is begun; it gets its own when its header is whole, so that no part is ever empty."""
+    """Temporary name of a new part. The part gets its final name after its header is written, so that no part is ever empty."""
     return part.with_name(f".{part.name}.opening")
 
 
 class PartWriter:
-    """Writes one MCAP file that any reader opens by itself: schemas and channels are in every part.
+    """Writes one MCAP file that can be opened on its own: every part has all schemas and channels.
 
-    All methods are for one thread at a time.
+    Only one thread at a time may call its methods.
 
     Args:
-        path: The file; it must not exist.
-        attachments: Content of the files that ride along, by name.
-        metadata: Facts that ride along: versions, git hash.
-        attached_ns: Time at which the files were attached [ns since 1970]; none means now.
+        path: The file, which must not exist.
+        attachments: Content of the attachments, by name.
+        metadata: Facts to store: versions, git hash.
+        attached_ns: Time at which the files were attached [ns since 1970]; None means now.
 
     Attributes:
-        contents: What was written so far.
+        contents: Contents written so far.
         first_log_ns: Log time of the message that was written first [ns since 1970]; None before it.
     """
 
@@ -65,7 +65,7 @@ class PartWriter:
 
     @property
     def size_bytes(self) -> int:
-        """Length of the file so far, without the chunk in progress."""
+        """Length of the file so far, without the unfinished chunk."""
         return self._stream.tell()
 
     def write(
@@ -74,11 +74,11 @@ class PartWriter:
         """Add a message; see `nodes.bags.writer.BagWriter.write`.
 
         Raises:
-            OSError: The file cannot be written, e.g. the disk is full.
+            OSError: The file cannot be written, for example because the disk is full.
         """
         channel = self._channels.get(topic) or self._register(topic)
         self._journal.restart(self._stream.tell())  # a definition may have filled a chunk
-        # A message that fills a chunk by itself ends it at once and needs no journal.
+        # A message that fills a chunk completes it at once, so it needs no journal.
         if len(cdr) <= CHUNK_BYTES:
             self._journal.add(Entry(topic, cdr, log_ns, publish_ns, sequence))
         self._writer.add_message(channel, log_ns, cdr, publish_ns, sequence & 0xFFFFFFFF)
@@ -90,16 +90,16 @@ class PartWriter:
             self.contents.lost[topic] = self.contents.lost.get(topic, 0) + lost
 
     def flush(self) -> None:
-        """End the present chunk, so that it reaches the disk with the next sync."""
+        """Finish the current chunk, so that the next sync writes it to the disk."""
         self._writer.flush()
         self._journal.restart(self._stream.tell())
 
     def sync(self) -> None:
-        """Wait until what was written is on the disk."""
+        """Wait until all written data are on the disk."""
         os.fdatasync(self._stream.descriptor)
 
     def finish(self, metadata: Mapping[str, str] | None = None) -> None:
-        """Write what makes a file whole, its summary, and close it.
+        """Write the summary that completes the file, and close it.
 
         Args:
             metadata: Facts known only at the end.
@@ -116,7 +116,7 @@ class PartWriter:
         self._journal.path.unlink()
 
     def let_go(self) -> None:
-        """Close the files as they are; the journal stays, for a repair. May be called again."""
+        """Close the files without completing them. The journal is kept for a repair. May be called repeatedly."""
         with contextlib.suppress(OSError):
             self._stream.close()
         with contextlib.suppress(OSError):
@@ -134,9 +134,9 @@ class PartWriter:
 
 
 class _WriteThrough:
-    """The part of a file that ``mcap.Writer`` uses, without a buffer between it and the system.
+    """The file methods that ``mcap.Writer`` uses, without a buffer.
 
-    A file opened with ``buffering=0`` would not do: the writer wraps it in a buffer of its own, whose end is then lost.
+    A file opened with ``buffering=0`` does not work, because the writer wraps it in a buffer, whose last bytes are then lost.
     """
 
     def __init__(self, path: Path) -> None:
@@ -156,7 +156,7 @@ class _WriteThrough:
         return self._position
 
     def flush(self) -> None:
-        """Nothing is held back."""
+        """Do nothing, because there is no buffer."""
 
     def close(self) -> None:
         if self._open:

@@ -1,7 +1,7 @@
-"""The files of a bag, in order: one, or the numbered parts into which a recorder split it.
+"""Finds the files of a bag in order: one file, or the numbered parts of a split bag.
 
-A recorder names its parts ``NAME_0.mcap``, ``NAME_1.mcap`` ... in a folder ``NAME``, as rosbag2 does, and ``metadata.yaml`` lists
-them. A bag is given as its folder, as its ``metadata.yaml``, or as any of its parts: all three mean the whole bag.
+A recorder names its parts ``NAME_0.mcap``, ``NAME_1.mcap`` ... in a folder ``NAME``, as rosbag2 does, and lists them in
+``metadata.yaml``. The folder, its ``metadata.yaml`` and each part all stand for the whole bag.
 """
 
 from __future__ import annotations
@@ -17,33 +17,33 @@ from nodes.runtime.errors import BagError
 METADATA_FILE = "metadata.yaml"
 SUFFIXES = (".mcap", ".db3", ".bag")
 _NUMBERED = re.compile(r"(?P<name>.+)_(?P<number>\d{1,9})")
-# 83 parts take 15 kB; a stranger's file may have any size.
+# 83 parts take 15 kB. A foreign file may have any size.
 _MOST_METADATA_BYTES = 1 << 24
 _SafeLoader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 def part_name(bag_name: str, number: int) -> str:
-    """File name of a part, counted from 0."""
+    """File name of a part. Numbers start at 0."""
     return f"{bag_name}_{number}.mcap"
 
 
 def holds_bag(folder: Path) -> bool:
-    """Whether a folder has the files of a bag in it."""
+    """Whether a folder contains the files of a bag."""
     return bool(_files(Path(folder)))
 
 
 def bag_parts(bag: Path) -> tuple[Path, ...]:
-    """The files of a bag in the order in which they were recorded.
+    """Return the files of a bag in the order of their recording.
 
-    ``metadata.yaml`` gives the order; parts with higher numbers that it does not list yet (their recorder was killed, or is at work)
-    follow. Without it, parts are taken by number.
+    ``metadata.yaml`` gives the order. Parts with higher numbers that it does not list yet, because the recorder was killed or is still
+    running, follow. Without it, the parts are sorted by number.
 
     Args:
-        bag: Bag folder, its ``metadata.yaml``, or any of its files. A file is a part of its folder's bag if ``metadata.yaml`` lists
-            it or the folder has the bag's name; otherwise it is a bag by itself.
+        bag: Bag folder, its ``metadata.yaml``, or any of its files. A file belongs to its folder's bag if ``metadata.yaml`` lists it
+            or the folder has the name of the bag. Otherwise it is a separate bag.
 
     Raises:
-        BagError: There is no bag, a part is missing, or the files of the folder are no parts of one bag.
+        BagError: There is no bag, a part is missing, or the files of the folder are not parts of one bag.
     """
     bag = Path(bag)
     if bag.name == METADATA_FILE and bag.is_file():
@@ -61,7 +61,7 @@ def bag_parts(bag: Path) -> tuple[Path, ...]:
 
 
 def _parts_with(file: Path) -> tuple[Path, ...]:
-    """All parts of the bag that a file belongs to."""
+    """All parts of the bag to which a file belongs."""
     if listed := listed_files(file.parent):
         parts = _with_unlisted(file.parent, listed)
         return parts if file in parts else (file,)
@@ -73,7 +73,7 @@ def _parts_with(file: Path) -> tuple[Path, ...]:
 
 
 def _files(folder: Path) -> list[Path]:
-    """Recordings in a folder, of the first suffix that occurs."""
+    """Bag files in a folder, of the first suffix that occurs."""
     if not folder.is_dir():
         return []
     for suffix in SUFFIXES:
@@ -95,7 +95,7 @@ def _is_named_after_folder(file: Path) -> bool:
 
 
 def listed_files(folder: Path) -> tuple[str, ...]:
-    """File names in a folder's ``metadata.yaml`` in order; none if there is no such file."""
+    """File names listed in a folder's ``metadata.yaml``, in order; none without such a file."""
     path = folder / METADATA_FILE
     try:
         state = path.stat()
@@ -107,7 +107,7 @@ def listed_files(folder: Path) -> tuple[str, ...]:
 @lru_cache(maxsize=16)
 def _names_in(path: Path, mtime_ns: int, size_bytes: int) -> tuple[str, ...]:
     del mtime_ns
-    advice = "remove it, and the parts are taken by their numbers"
+    advice = "remove it to read the parts by their numbers"
     try:
         if size_bytes > _MOST_METADATA_BYTES:
             raise BagError(
@@ -115,12 +115,12 @@ def _names_in(path: Path, mtime_ns: int, size_bytes: int) -> tuple[str, ...]:
             )
         content = yaml.load(path.read_bytes(), Loader=_SafeLoader)
         information = content["rosbag2_bagfile_information"]
-        # Old versions of rosbag2 wrote the folder in front of the name.
+        # Old versions of rosbag2 wrote the folder before the name.
         names = tuple(PurePosixPath(name).name for name in information["relative_file_paths"])
     except (OSError, yaml.YAMLError, ValueError, TypeError, KeyError, RecursionError) as error:
         said = " ".join(str(error).split()) or type(error).__name__
         raise BagError(
-            f"{path}: expected the metadata of a rosbag2 bag, cannot read it ({said:.120}); {advice}"
+            f"{path}: expected the metadata of a rosbag2 bag, got an unreadable file ({said:.120}); {advice}"
         ) from error
     if not all(names):
         raise BagError(f"{path}: expected names of files under relative_file_paths, got an empty one; {advice}")
@@ -128,10 +128,10 @@ def _names_in(path: Path, mtime_ns: int, size_bytes: int) -> tuple[str, ...]:
 
 
 def _with_unlisted(folder: Path, listed: tuple[str, ...]) -> tuple[Path, ...]:
-    """The listed parts, and those behind them with higher numbers."""
+    """The listed parts, followed by parts with higher numbers."""
     for name in listed:
         if not (folder / name).is_file():
-            raise _missing(folder, name, f"{METADATA_FILE} lists it")
+            raise _missing(folder, name, f"but {METADATA_FILE} lists it")
     parts = [folder / name for name in listed]
     bag_name, last = _numbered(parts[-1])
     if last < 0:
@@ -139,7 +139,7 @@ def _with_unlisted(folder: Path, listed: tuple[str, ...]) -> tuple[Path, ...]:
     later = {number: file for file in _files(folder) for name, number in [_numbered(file)] if name == bag_name}
     for number in range(last + 1, max(later, default=last) + 1):
         if number not in later:
-            raise _missing(folder, f"{bag_name}_{number}{parts[-1].suffix}", "a later one is there")
+            raise _missing(folder, f"{bag_name}_{number}{parts[-1].suffix}", "but a later one exists")
         parts.append(later[number])
     return tuple(parts)
 
@@ -156,12 +156,12 @@ def _by_number(folder: Path, files: list[Path]) -> tuple[Path, ...]:
     (name,) = names
     for number in range(max(found) + 1):
         if number not in found:
-            raise _missing(folder, f"{name}_{number}{files[0].suffix}", "a later one is there")
+            raise _missing(folder, f"{name}_{number}{files[0].suffix}", "but a later one exists")
     return tuple(found[number] for number in range(max(found) + 1))
 
 
 def _no_bag(folder: Path) -> BagError:
-    """What to say of a folder without a recording, or of nothing."""
+    """Error about a folder without a bag, or a missing folder."""
     expected = f"expected a bag folder with {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]} files, or one such file"
     if not folder.is_dir():
         return BagError(f"{folder} does not exist; {expected}")
@@ -172,6 +172,6 @@ def _no_bag(folder: Path) -> BagError:
 
 def _missing(folder: Path, name: str, reason: str) -> BagError:
     return BagError(
-        f"{folder}: the part {name} of the bag is missing, {reason}; put it back, or copy the other parts to a folder with another "
+        f"{folder}: the part {name} of the bag is missing, {reason}; restore it, or copy the other parts to a folder with another "
         "name and read them one by one"
     )

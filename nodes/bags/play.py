@@ -1,4 +1,4 @@
-"""What a player of bags does, without the bus: where in the recording it is, and what a person can tell it."""
+"""Playback of bags without the bus: the position in the recording, and the commands of the user."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ _SLOWEST, _FASTEST = 1e-3, 1e3
 
 @dataclass(frozen=True)
 class Command:
-    """Something a person told the player.
+    """A command to the player.
 
     Attributes:
         word: ``pause``, ``resume``, ``toggle``, ``step``, ``rate`` or ``stop``.
-        number: Messages of a step; speed relative to the recording of a rate.
+        number: Number of messages of a step, or speed of a rate relative to the recording.
     """
 
     word: str
@@ -26,7 +26,7 @@ class Command:
 
     @classmethod
     def parse(cls, text: str) -> Command:
-        """A command of a text such as ``pause``, ``step``, ``step 10`` or ``rate 0.5``."""
+        """Parse a command such as ``pause``, ``step``, ``step 10`` or ``rate 0.5``."""
         words = text.split()
         if len(words) == 1 and words[0] in (*_PLAIN, STEP):
             return cls(words[0])
@@ -44,13 +44,13 @@ class Command:
 
 
 class Playhead:
-    """Where in the recording the player is.
+    """Position of the player in the recording.
 
     Args:
-        bag_ns: Time in the recording to begin at [ns since 1970].
-        mono_ns: Monotonic time now [ns].
+        bag_ns: Start time in the recording [ns since 1970].
+        mono_ns: Current monotonic time [ns].
         rate: Speed relative to the recording.
-        paused: Stand still at first.
+        paused: Whether to start paused.
     """
 
     def __init__(self, bag_ns: int, mono_ns: int, rate: float = 1.0, paused: bool = False) -> None:
@@ -62,15 +62,15 @@ class Playhead:
         return self._bag_ns if self.paused else self._bag_ns + round((mono_ns - self._mono_ns) * self.rate)
 
     def jump(self, bag_ns: int, mono_ns: int) -> None:
-        """Go to a time in the recording [ns since 1970]."""
+        """Move to a time in the recording [ns since 1970]."""
         self._bag_ns, self._mono_ns = bag_ns, mono_ns
 
     def pause(self, paused: bool, mono_ns: int) -> None:
-        """Stand still, or go on from there."""
+        """Pause or resume."""
         self.jump(self.time_ns(mono_ns), mono_ns)
         self.paused = paused
 
     def set_rate(self, rate: float, mono_ns: int) -> None:
-        """Go on at another speed."""
+        """Change the speed."""
         self.jump(self.time_ns(mono_ns), mono_ns)
         self.rate = rate

@@ -1,4 +1,4 @@
-"""What a person asks of a player of a bag, and what it answers."""
+"""Requests to a player of a bag, and its answers."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _REPEAT_S, _PATIENCE_S = 0.05, 3.0
 
 
 def ask_player(run_dir: Path, command: str) -> tuple[bool, str]:
-    """Tell a player to pause, go on, step, change its speed, or end; whether it did, and what it says.
+    """Send a command to a player: pause, resume, step, change the speed, or stop. Returns whether it succeeded, and the answer.
 
     Raises:
         LaunchError: No player answered.
@@ -35,5 +35,5 @@ def ask_player(run_dir: Path, command: str) -> tuple[bool, str]:
             return ask(bus, _CONTROL, make, _STATE, read, every_s=_REPEAT_S, patience_s=_PATIENCE_S)
         except NoAnswerError:
             raise LaunchError(
-                f"no player answered within {_PATIENCE_S:g} s; is one running with the same --run-dir ({run_dir})?"
+                f"expected an answer from a player within {_PATIENCE_S:g} s, got none; is one running with the same --run-dir ({run_dir})?"
             ) from None

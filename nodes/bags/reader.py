@@ -1,4 +1,4 @@
-"""Look into bags and take messages out of them."""
+"""Reads bags: their summary, attachments and messages."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ from nodes.runtime.topics import type_of_topic
 
 @dataclass(frozen=True)
 class TopicInfo:
-    """One topic of a bag.
+    """A topic of a bag.
 
     Attributes:
-        name: Topic.
+        name: Name of the topic.
         type: ROS 2 type.
-        count: Messages.
-        lost: Messages that were published but did not reach the recorder; None when the recorder did not say.
+        count: Number of messages.
+        lost: Number of published messages that did not reach the recorder; None if the recorder did not count them.
     """
 
     name: str
@@ -103,7 +103,7 @@ class BagMessage:
 
 @dataclass(frozen=True)
 class _Part:
-    """What one file says about itself, without the index of its chunks; ``recorded`` has its topics by their numbers in the file."""
+    """Summary of one file without the index of its chunks. ``recorded`` has the topics by their numbers in the file."""
 
     path: Path
     format: Format
@@ -119,7 +119,7 @@ class _Part:
 
 
 def read_info(bag: Path) -> BagInfo:
-    """Summary of a bag, over all its parts."""
+    """Read the summary of a bag with all its parts."""
     parts = _parts(bag)
     filled = [part for part in parts if part.messages]
     topics: dict[str, TopicInfo] = {}
@@ -136,7 +136,7 @@ def read_info(bag: Path) -> BagInfo:
 
 
 def read_attachment(bag: Path, name: str) -> bytes:
-    """Content of an attached file, from whichever part has it."""
+    """Read the content of an attachment from the part that has it."""
     parts = _parts(bag)
     for part in parts:
         if name in part.attachments:
@@ -146,7 +146,7 @@ def read_attachment(bag: Path, name: str) -> bytes:
 
 
 def read_attachments(bag: Path) -> dict[str, bytes]:
-    """Content of all attached files by name; of two with one name the later."""
+    """Read all attachments by name. Of two with the same name, the later is returned."""
     contents: dict[str, bytes] = {}
     for part in _parts(bag):
         if part.attachments:
@@ -162,12 +162,12 @@ def _attachments(path: Path, names: Sequence[str]) -> dict[str, bytes]:
 
 
 def extract_attachments(bag: Path, folder: Path, names: Sequence[str] = ()) -> list[Path]:
-    """Write attached files into a folder.
+    """Write attachments to a folder.
 
     Args:
         bag: Bag folder or file.
-        folder: Where they go; made if it is missing. A file that is there already is an error, never overwritten.
-        names: Only these; none means all.
+        folder: Destination, which is created if needed. An existing file is an error and is never overwritten.
+        names: Attachments to extract; none means all.
     """
     contents = read_attachments(bag)
     if unknown := [name for name in names if name not in contents]:
@@ -182,9 +182,9 @@ def extract_attachments(bag: Path, folder: Path, names: Sequence[str] = ()) -> l
 
 
 def plain_name(bag: Path, name: str) -> str:
-    """The name of an attachment, if it is that of a file and nothing else: a stranger's bag must not write where it likes."""
+    """Check that the name of an attachment is a plain file name, so that a foreign bag cannot write to other folders."""
     if name in ("", ".", "..") or Path(name).name != name or "\0" in name:
-        raise BagError(f"{bag}: the attachment {name!r} has no plain file name; it is not written anywhere")
+        raise BagError(f"{bag}: expected attachments with plain file names, got {name!r}; it is not extracted")
     return name
 
 
@@ -192,20 +192,20 @@ def read_messages(
     bag: Path, topics: Sequence[str] | None = None, start_offset_s: float = 0.0, types: Mapping[str, str] | None = None,
     as_recorded: bool = False,
 ) -> Iterator[BagMessage]:  # fmt: skip
-    """Messages in order of their log time.
+    """Yield messages in order of their log time.
 
-    Messages on topics of ours come as our type: a bag that has another definition of it, or a type that can stand for it (see
-    `nodes.bags.stored_types`), is converted.
+    Messages on topics of the topic table have the table's type. If a bag has another definition of the type, or an equivalent type
+    (see `nodes.bags.stored_types`), they are converted.
 
     Args:
         bag: Bag folder or file.
-        topics: Only these; every one must be in the bag.
-        start_offset_s: Leave out so much of the beginning [s].
-        types: Types that are wanted, by topic; None takes those of the topic table, and leaves other topics as they are.
-        as_recorded: Convert nothing.
+        topics: Topics to read, which must be in the bag; None means all.
+        start_offset_s: Time to skip at the beginning [s].
+        types: Wanted types by topic. None uses those of the topic table and does not convert other topics.
+        as_recorded: Do not convert any message.
 
     Raises:
-        BagError: The bag cannot be read, lacks a topic, or has a topic of a type that cannot become ours.
+        BagError: The bag cannot be read, lacks a topic, or has a topic of a type that cannot be converted.
     """
     info = read_info(bag)
     path = info.path
@@ -215,7 +215,7 @@ def read_messages(
     for name in topics or ():
         if name not in known:
             raise BagError(f"{path} has no topic {name}; it has {', '.join(known)}")
-    # Without an offset nothing is left out: of a file with log times of 0, the summary does not count these as its start.
+    # Without an offset no message is skipped: the summary does not count log times of 0 as the start of a file.
     start_ns = info.start_ns + round(start_offset_s * NS_PER_S) if start_offset_s else 0
     if start_offset_s < 0 or start_ns > info.end_ns:
         raise BagError(
@@ -234,7 +234,7 @@ def read_messages(
 def _messages_of(
     part: _Part, topics: frozenset[str], start_ns: int, converters: Mapping[int, Convert]
 ) -> Iterator[BagMessage]:
-    """Messages of one file in order of their log time."""
+    """Yield the messages of one file in order of their log time."""
     names = {number: recorded.topic for number, recorded in part.recorded.items() if recorded.topic in topics}
     stored = _mcap_messages if part.format is Format.MCAP else _stored_messages
     for number, message in stored(part, names, start_ns):
@@ -253,7 +253,7 @@ def _mcap_messages(part: _Part, names: Mapping[int, str], start_ns: int) -> Iter
 
 
 def _stored_messages(part: _Part, names: Mapping[int, str], start_ns: int) -> Iterator[tuple[int, BagMessage]]:
-    """Messages of a file that is no MCAP; it has neither publish times nor sequence numbers, so they are made up."""
+    """Yield the messages of a file in another format than MCAP. Publish times and sequence numbers are generated."""
     counts = dict.fromkeys(names.values(), 0)
     for number, log_ns, data in stored_messages(part.path, part.format, names, start_ns):
         topic = names[number]
@@ -262,18 +262,18 @@ def _stored_messages(part: _Part, names: Mapping[int, str], start_ns: int) -> It
 
 
 def require_readable(bag: Path, topics: Mapping[str, str]) -> None:
-    """Refuse a bag with a topic that cannot become the type that is wanted.
+    """Refuse a bag with a topic that cannot be converted to the wanted type.
 
     Args:
         bag: Bag folder or file.
-        topics: Types that are wanted, by topic.
+        topics: Wanted types by topic.
     """
     for part in _parts(bag):
         _converters(part, frozenset(topics), topics)
 
 
 def _converters(part: _Part, topics: frozenset[str], types: Mapping[str, str]) -> dict[int, Convert]:
-    """What makes the messages of a file ours, by the number of their topic; nothing for those that are ours."""
+    """Converters of a file's messages by the number of their topic; topics without conversion are missing."""
     found = {}
     for number, recorded in part.recorded.items():
         expected = types.get(recorded.topic) or type_of_topic(recorded.topic)
@@ -283,7 +283,7 @@ def _converters(part: _Part, topics: frozenset[str], types: Mapping[str, str]) -
 
 
 def type_of(summary: Summary, channel: Channel) -> str:
-    """Type of a channel's messages; empty if the file does not say."""
+    """Type of a channel's messages; empty if the file does not state it."""
     schema = summary.schemas.get(channel.schema_id)
     return full_type_name(schema.name) if schema is not None else ""
 
@@ -363,18 +363,18 @@ def _whole_file(path: Path) -> tuple[FileSummary, Statistics]:
 
 @lru_cache(maxsize=1024)
 def _say_unchecked(path: Path, reason: str) -> None:
-    """Once per bag, for everybody who takes numbers from it."""
+    """Print once per bag that its numbers are unchecked."""
     print(f"{path}: unchecked: {reason}, so damage to it cannot be noticed", file=sys.stderr, flush=True)
 
 
 def _unfinished(path: Path) -> BagError:
-    """What to say of a file without an end; what is advised depends on what is in it."""
+    """Error about an unfinished file, with advice that depends on its contents."""
     lines = diagnose(path).lines
     return BagError(f"{path} is unfinished: its recorder was killed; {'; '.join(lines[-2:])}")
 
 
 @lru_cache(maxsize=4)
 def _summary_of(path: Path, mtime_ns: int, size_bytes: int) -> tuple[FileSummary, Statistics] | None:
-    """Summary of a file in a certain state; one with an hour of chunks takes a second to read."""
+    """Summary of a file, cached by time and size, because reading the summary of an hour takes a second."""
     del mtime_ns, size_bytes  # they are the state
     return read_summary(path)

@@ -1,7 +1,7 @@
-"""Make an unfinished or damaged bag whole: keep everything that can be read, write the end that is missing.
+"""Repairs an unfinished or damaged bag: keeps everything that can be read, and writes the missing end.
 
-The new file is written beside the old one, checked, and only then takes its name; the old one stays under another. A repair that
-would lose more than the damaged end of an unfinished file is refused unless it is asked for.
+The new file is written next to the old one and checked before it takes the old name. The old file is kept under another name. A
+repair that would lose more than the damaged end of an unfinished file is refused without ``force``.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _BLOCK_BYTES = 1 << 24
 
 @dataclass(frozen=True)
 class TopicRepair:
-    """Messages of a topic before and after a repair; before is None where the file does not say."""
+    """Number of messages of a topic before and after a repair; before is None if the file does not state it."""
 
     name: str
     before: int | None
@@ -46,18 +46,18 @@ class TopicRepair:
 
 @dataclass(frozen=True)
 class Repaired:
-    """What a repair did.
+    """Result of a repair.
 
     Attributes:
         path: The file.
-        messages: Messages in it.
-        cut_bytes: Bytes that could not be kept.
-        was_whole: There was nothing to do.
-        kept: Where the file is as it was before; None where it was removed, or nothing was done.
-        topics: What became of the messages.
-        losses: What was lost, in words.
-        fixes: What was mended without a loss, in words.
-        unchecked: Why messages may have changed without a sign of it; empty where checksums cover them.
+        messages: Number of messages in the repaired file.
+        cut_bytes: Number of bytes that could not be kept.
+        was_whole: Whether the file was intact, so that it was not changed.
+        kept: Path of the damaged file; None if it was removed or the file was not changed.
+        topics: Message counts by topic.
+        losses: Losses, as text.
+        fixes: Repairs without a loss, as text.
+        unchecked: Why damage to messages may go unnoticed; empty if checksums cover them.
     """
 
     path: Path
@@ -72,7 +72,7 @@ class Repaired:
 
 
 def mcap_file(bag: Path) -> Path:
-    """The ``.mcap`` file of a bag given as its folder or as the file itself."""
+    """Return the ``.mcap`` file of a bag, given as its folder or as the file."""
     bag = Path(bag)
     if bag.is_file():
         return bag
@@ -86,22 +86,22 @@ def mcap_file(bag: Path) -> Path:
 
 
 def repair(bag: Path, force: bool = False, keep_original: bool = True, in_place: bool = False) -> Repaired:
-    """Make a file whole; one that is whole already stays as it is.
+    """Repair a file. An intact file is not changed.
 
     Args:
-        bag: The file, or a bag folder with one.
-        force: Also if messages are lost that are not at the damaged end of an unfinished file.
+        bag: The file, or a bag folder with one file.
+        force: Repair even if this loses messages that are not at the damaged end of an unfinished file.
         keep_original: Keep the old file, as ``NAME.mcap.damaged``.
-        in_place: Write no second file; only for an unfinished one whose beginning stays as it is. For a recorder on a full disk.
+        in_place: Write no second file. This only works for an unfinished file whose beginning stays the same, for a recorder on a full disk.
 
     Raises:
-        BagError: It is no MCAP file, is being written, or would lose too much; then it is as it was.
+        BagError: The file is not MCAP, is being written, or would lose too much. The file is then unchanged.
     """
     path = mcap_file(bag).resolve()
     require_mcap(path, "repaired")
     try:
         before = path.stat()
-        # A recorder at work would go on writing to the old file.
+        # A running recorder would continue to write to the old file.
         if not in_place and being_written(path):
             raise BagError(f"{path} is being written at this moment; stop its recorder first")
         scan = examine(path)
@@ -120,7 +120,7 @@ def repair(bag: Path, force: bool = False, keep_original: bool = True, in_place:
         else:
             kept = _swap(path, layout, scan, before, keep_original)
     except OSError as error:
-        raise BagError(f"cannot repair {path}: {error.strerror}; it is as it was") from error
+        raise BagError(f"cannot repair {path}: {error.strerror}; the file is unchanged") from error
     _complete_folder(path, scan, kept)
     topics = tuple(
         TopicRepair(name, known.get(name), after) for name, after in sorted(contents_of(scan).counts.items())
@@ -132,36 +132,36 @@ def repair(bag: Path, force: bool = False, keep_original: bool = True, in_place:
 
 
 def examine(path: Path) -> Scan:
-    """What a file holds, with the messages that its recorder had not yet written into it."""
+    """Scan a file, including the messages in its journal."""
     scan = scan_file(path)
     _add_journal(scan, path)
     return scan
 
 
-_ADVICE = "With --force it keeps the rest, and the file as it is now beside it"
+_ADVICE = "With --force the rest is kept, and a copy of the damaged file"
 
 
 def refusal_of(scan: Scan) -> str:
-    """Why a repair must be asked for twice; empty if it loses no more than the end of an unfinished file."""
+    """Explain why a repair needs ``force``; empty if it only loses the end of an unfinished file."""
     more = scan.loses_more_than_the_tail()
     if more:
         rest = f", and {len(more) - 1} more places" if len(more) > 1 else ""
         return f"messages would be lost that are not at the end of an unfinished recording: {describe(scan, more[0])}{rest}"
     listed = scan.known.statistics if scan.known is not None else None
     if listed is not None and listed.message_count > scan.messages:
-        return f"its summary lists {listed.message_count} messages, and {scan.messages} are found"
+        return f"its summary lists {listed.message_count} messages, but {scan.messages} were found"
     if scan.data_crc_wrong and scan.unchecked_messages + scan.unchecked_chunks:
         return (
-            "the checksum of all its data is wrong, and which of its messages is damaged cannot be told; "
-            "repaired, it would have them all, unchecked"
+            "the checksum of all its data is wrong, and the damaged messages cannot be identified; "
+            "the repaired file would have all messages, unchecked"
         )
     if not scan.messages and scan.losses:
-        return f"no message would be left of its {scan.size} bytes: {describe(scan, scan.losses[0])}"
+        return f"no message of its {scan.size} bytes would be left: {describe(scan, scan.losses[0])}"
     return ""
 
 
 def _messages_before(scan: Scan) -> dict[str, int]:
-    """Messages by topic as the summary lists them, or as far as is known without one."""
+    """Number of messages by topic according to the summary, or as far as known without one."""
     known = scan.known
     counts: dict[str, int] = {}
     if known is not None and known.statistics is not None and known.channels:
@@ -181,7 +181,7 @@ def _messages_before(scan: Scan) -> dict[str, int]:
 
 
 def being_written(path: Path) -> bool:
-    """Whether some process has the file open for writing. A lease for reading is given only where nobody has."""
+    """Whether a process has the file open for writing. The system grants a read lease only if no process has."""
     with open(path, "rb") as file:
         try:
             fcntl.fcntl(file, fcntl.F_SETLEASE, fcntl.F_RDLCK)
@@ -189,12 +189,12 @@ def being_written(path: Path) -> bool:
         except BlockingIOError:
             return True
         except OSError:
-            return False  # a file system without leases, or somebody else's file
+            return False  # a file system without leases, or a file of another user
     return False
 
 
 def _swap(path: Path, layout: Layout, scan: Scan, before: os.stat_result, keep_original: bool) -> Path | None:
-    """Write the new file, check it, give it the name; the old one is complete under one name or another at every moment."""
+    """Write the new file, check it, and rename it. The old file is complete under one of its names at every moment."""
     temporary = path.with_name(f".{path.name}.repair")
     try:
         with open(path, "rb") as old, open(temporary, "wb") as new:
@@ -205,10 +205,14 @@ def _swap(path: Path, layout: Layout, scan: Scan, before: os.stat_result, keep_o
         shutil.copymode(path, temporary)
         check = scan_file(temporary)
         if not check.whole or check.counts != {i: n for i, n in scan.counts.items() if n}:
-            raise BagError(f"{path} could not be repaired: the new file does not hold what was found; it is as it was")
+            raise BagError(
+                f"{path} could not be repaired: the new file does not have the expected contents; the old file is unchanged"
+            )
         now = path.stat()
         if (now.st_size, now.st_mtime_ns, now.st_ino) != (before.st_size, before.st_mtime_ns, before.st_ino):
-            raise BagError(f"{path} changed while it was being repaired; it is as it is now, and not repaired")
+            raise BagError(
+                f"{path} changed while it was being repaired, so it was not repaired; stop the program that writes it"
+            )
         kept = _keep(path) if keep_original else None
         temporary.replace(path)
     except BaseException:
@@ -234,7 +238,7 @@ def _copy(old: Any, new: Any, part: range | bytes) -> None:
 
 
 def kept_names(path: Path) -> Iterator[Path]:
-    """Names for the file as it was: never one that is taken."""
+    """Names for the damaged file that are not in use."""
     yield path.with_name(path.name + KEPT_SUFFIX)
     number = 2
     while True:
@@ -243,12 +247,12 @@ def kept_names(path: Path) -> Iterator[Path]:
 
 
 def _keep(path: Path) -> Path:
-    """Give the old file a second name."""
+    """Create a second name for the old file."""
     for name in kept_names(path):
         try:
             os.link(path, name)
         except FileExistsError:
-            if name.samefile(path):  # of a repair that was stopped here
+            if name.samefile(path):  # from a repair that was stopped at this point
                 return name
         except OSError:  # a file system without links
             if not os.path.lexists(name):
@@ -260,7 +264,7 @@ def _keep(path: Path) -> Path:
 
 
 def _extend(path: Path, layout: Layout) -> None:
-    """Cut off what is behind the part that stays, and append the rest."""
+    """Truncate the file after the unchanged part and append the rest."""
     unchanged = layout.unchanged
     rest, at = [], 0
     for part in layout.parts:
@@ -288,7 +292,7 @@ def _sync_folder(folder: Path) -> None:
 
 
 def _complete_folder(path: Path, scan: Scan, kept: Path | None) -> None:
-    """Write ``metadata.yaml`` where it is missing, and put away what the recorder left beside the file."""
+    """Write a missing ``metadata.yaml`` and remove files that the recorder left."""
     reserve, journal = path.with_name(RESERVE_NAME), journal_of(path)
     if reserve.exists() and reserve.stat().st_size == RESERVE_BYTES:
         reserve.unlink()
@@ -304,10 +308,10 @@ def _complete_folder(path: Path, scan: Scan, kept: Path | None) -> None:
 
 
 def _add_journal(scan: Scan, path: Path) -> None:
-    """Add, as one more chunk, the messages of the chunk that the recorder was filling."""
+    """Add the messages of the journal as one more chunk."""
     position, entries = read_journal(path)
     chunks = [piece for piece in scan.pieces if isinstance(piece.record, ChunkIndex)]
-    # A chunk behind that position is the one: the recorder died, or an earlier repair, before the journal was emptied.
+    # A chunk after that position already has these messages: the recorder or an earlier repair ended before it emptied the journal.
     if not entries or scan.data_end is not None or any(piece.offset >= position for piece in chunks):
         return
     builder = RecordBuilder()

@@ -1,4 +1,4 @@
-"""Make a bag of several parts whole: every part by itself, then ``metadata.yaml``, which lists them all."""
+"""Repairs a bag of several parts: each part separately, then ``metadata.yaml``, which lists all parts."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from nodes.runtime.errors import BagError
 
 
 def repair_bag(bag: Path, force: bool = False, keep_original: bool = True, in_place: bool = False) -> list[Repaired]:
-    """Make every part of a bag whole.
+    """Repair every part of a bag.
 
     Args:
         bag: Bag folder or any of its files.
-        force: See `nodes.bags.repair.repair`, as for the other two.
-        keep_original: Keep the parts, and ``metadata.yaml``, as they were.
-        in_place: Write no second files.
+        force: See `nodes.bags.repair.repair`.
+        keep_original: Keep copies of the damaged parts and of ``metadata.yaml``.
+        in_place: See `nodes.bags.repair.repair`.
 
     Returns:
-        What was done to each part, in order.
+        The result of each part, in order.
 
     Raises:
         BagError: A part cannot be repaired, or is missing.
@@ -36,12 +36,12 @@ def repair_bag(bag: Path, force: bool = False, keep_original: bool = True, in_pl
     if len(parts) > 1 and listed != names:
         _list(folder, parts, listed != () and keep_original)
     elif listed == names and any(not part.was_whole for part in repaired):
-        _list(folder, parts, keep_original)  # its counts are those of before
+        _list(folder, parts, keep_original)  # its counts are outdated
     return repaired
 
 
 def _remove_what_was_begun(folder: Path) -> None:
-    """A part that the recorder was about to begin when it was killed; it has no message."""
+    """Remove a part that the recorder had just opened when it was killed. It has no messages."""
     for begun in folder.glob(".*.mcap.opening"):
         begun.unlink()
     for journal in folder.glob(".*.mcap.journal"):
@@ -50,7 +50,7 @@ def _remove_what_was_begun(folder: Path) -> None:
 
 
 def _list(folder: Path, parts: tuple[Path, ...], keep_old: bool) -> None:
-    """Write ``metadata.yaml`` from what the parts say now."""
+    """Write ``metadata.yaml`` from the repaired parts."""
     total, files = Contents(), []
     for part in parts:
         contents = _contents(part)
@@ -63,7 +63,7 @@ def _list(folder: Path, parts: tuple[Path, ...], keep_old: bool) -> None:
 
 
 def _contents(part: Path) -> Contents:
-    """What the summary of a whole file says."""
+    """Contents of an intact file according to its summary."""
     found = read_summary(part)
     if found is None:
         raise BagError(f"{part}: expected a summary with statistics after the repair, got none; repair it again")

@@ -1,4 +1,4 @@
-"""Where an MCAP file makes sense again behind damage: the next place at which records follow each other."""
+"""Finds the next valid records of an MCAP file after damage."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from nodes.runtime.errors import BagError
 # An opcode of the data section and a length below 4 GiB.
 _CANDIDATE = re.compile(rb"(?=[\x03-\x07\x09\x0c\x0f][\x00-\xff]{4}\x00{4})", re.DOTALL)
 _NOT_ZERO = re.compile(rb"[^\x00]")
-# So many records in a row are no accident; one is enough where a checksum agrees.
+# This many valid records in a row are not a coincidence. One is enough if its checksum is right.
 _IN_A_ROW = 3
 _KINDS: dict[int, Any] = {
     Opcode.HEADER: Header, Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel, Opcode.METADATA: Metadata,
@@ -35,19 +35,19 @@ _KINDS: dict[int, Any] = {
 
 
 def only_zeros(buffer: Any, at: int) -> bool:
-    """Whether nothing but zeros follows: a file system after a power cut."""
+    """Whether only zeros follow, as after a power cut."""
     return _NOT_ZERO.search(buffer, at) is None
 
 
 def next_record(buffer: Any, at: int, limit: int, channels: Collection[int], messages: bool) -> int | None:
-    """The next place behind ``at`` from which records follow each other; None if there is none.
+    """Return the next offset after ``at`` from which valid records follow; None if there is none.
 
     Args:
         buffer: The file.
-        at: Where it is damaged.
-        limit: Where the data end.
-        channels: Ids that messages may have; empty for any.
-        messages: Whether messages outside chunks count; in a file with chunks they would be found inside a damaged chunk.
+        at: Offset of the damage.
+        limit: End of the data.
+        channels: Valid channel ids of messages; empty for any.
+        messages: Whether messages outside chunks are accepted. In a file with chunks, they would be found inside a damaged chunk.
     """
     for candidate in _CANDIDATE.finditer(buffer, at + 1, limit):
         if makes_sense(buffer, candidate.start(), limit, channels, messages):
@@ -56,19 +56,19 @@ def next_record(buffer: Any, at: int, limit: int, channels: Collection[int], mes
 
 
 def plausible_end(buffer: Any, at: int, limit: int) -> bool:
-    """Whether a record may begin here, or the data end: enough where another length has already agreed."""
+    """Whether a record may begin here or the data end here. This suffices if another length already agrees."""
     if at == limit:
         return True
     try:
         opcode, body, end = record_at(buffer, at, limit)
     except Damaged:
-        # Cut off: then what was said about this place before is all there is.
+        # The file ends here, so only the earlier evidence is available.
         return at + RECORD_HEAD.size > limit or 0 < buffer[at] <= Opcode.DATA_END
     return 0 < opcode <= Opcode.DATA_END and (opcode != Opcode.DATA_END or end - body == 4)
 
 
 def makes_sense(buffer: Any, at: int, limit: int, channels: Collection[int], messages: bool) -> bool:
-    """Whether records follow each other from here on, or the data end."""
+    """Whether valid records follow from here, or the data end."""
     for count in range(_IN_A_ROW):
         if at == limit:
             return count > 0
@@ -83,7 +83,7 @@ def makes_sense(buffer: Any, at: int, limit: int, channels: Collection[int], mes
 
 
 def _judge(buffer: Any, at: int, limit: int, channels: Collection[int], messages: bool) -> tuple[int, bool]:
-    """End of a record that makes sense, and whether a checksum says so too."""
+    """End of a valid record, and whether its checksum is verified."""
     opcode, body, end = record_at(buffer, at, limit)
     sure = False
     if opcode == Opcode.MESSAGE:
@@ -104,7 +104,7 @@ def _judge(buffer: Any, at: int, limit: int, channels: Collection[int], messages
         if end - at != DATA_END_BYTES:
             raise Damaged("not an end of data")
         sure = end == limit
-        # What follows is the summary, whose records have opcodes of their own.
+        # The summary follows, whose records have other opcodes.
         if not sure and buffer[end] not in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS, Opcode.FOOTER):
             raise Damaged("not an end of data")
         sure = True

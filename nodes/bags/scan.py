@@ -1,4 +1,4 @@
-"""Everything an MCAP file holds, record by record: what can be kept, what is lost, and what no checksum covers."""
+"""Scans an MCAP file record by record: what can be kept, what is lost, and what no checksum covers."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ from nodes.bags.resync import makes_sense, next_record, only_zeros, plausible_en
 from nodes.bags.summary import Ending, read_ending, read_summary_section
 from nodes.runtime.errors import BagError
 
-# Messages outside chunks are read in runs of so many bytes.
+# Messages outside chunks are read in runs of this many bytes.
 _RUN_BYTES = 1 << 20
 _CRC_BLOCK_BYTES = 1 << 22
 _SUMMARY_ONLY = (Opcode.FOOTER, Opcode.STATISTICS, Opcode.SUMMARY_OFFSET, Opcode.CHUNK_INDEX)  # fmt: skip
@@ -55,13 +55,13 @@ BAD, CUT, ZEROS, JUNK = "bad", "cut", "zeros", "junk"
 
 @dataclass
 class Piece:
-    """Bytes of the file that are kept, or what stands in their place.
+    """Bytes of the file to keep, or their replacement.
 
     Attributes:
-        offset: Where they are in the file.
-        length: How many.
-        record: Their entry in the summary, with the offsets of the file; None for what has none.
-        content: Other bytes in their place; ``record`` is then as if they stood at ``offset``.
+        offset: Offset in the file.
+        length: Number of bytes.
+        record: Entry in the summary, with the offsets of the file; None without an entry.
+        content: Bytes that replace them; ``record`` then refers to these bytes at ``offset``.
     """
 
     offset: int
@@ -75,14 +75,14 @@ class Loss:
     """Bytes that cannot be kept.
 
     Attributes:
-        offset: Where they are.
-        length: How many.
-        what: What they were, as far as can be told.
+        offset: Offset in the file.
+        length: Number of bytes.
+        what: Their description, as far as known.
         reason: Why they cannot be kept.
         kind: ``bad`` (a whole record with a wrong checksum), ``cut``, ``zeros``, or ``junk``.
-        span_ns: Log times of the first and the last message in them, if known [ns since 1970].
-        counts: Messages in them by channel, as far as known.
-        harmless: No message, attachment or metadata was in them.
+        span_ns: Log times of their first and last message, if known [ns since 1970].
+        counts: Number of their messages by channel, as far as known.
+        harmless: Whether they contained no message, attachment or metadata.
     """
 
     offset: int
@@ -97,7 +97,7 @@ class Loss:
 
 @dataclass
 class Run:
-    """Messages one behind the other outside any chunk; as `ChunkIndex`, for reading."""
+    """Consecutive messages outside chunks, with the fields of a `ChunkIndex` for reading."""
 
     offset: int
     length: int
@@ -108,29 +108,29 @@ class Run:
 
 @dataclass
 class Scan:
-    """What a file holds.
+    """Contents and damage of a file.
 
     Attributes:
-        size: Bytes of the file.
-        ending: Its footer; None where it has none.
-        known: Its summary; None where it has none, or a damaged one.
-        summary_damage: What is wrong with the summary; empty for nothing.
-        data_end: Where the record that ends the data begins; None where it is missing.
+        size: Size of the file [bytes].
+        ending: The footer; None if it is missing.
+        known: The summary; None if it is missing or damaged.
+        summary_damage: Damage of the summary; empty if there is none.
+        data_end: Offset of the record that ends the data; None if it is missing.
         data_crc: Checksum of all data; 0 means none.
-        data_crc_wrong: It is that of other bytes.
-        pieces: What is kept, in order.
-        losses: What is not.
-        fixes: What was mended without a loss.
+        data_crc_wrong: Whether this checksum is wrong.
+        pieces: Pieces to keep, in order.
+        losses: Bytes that are lost.
+        fixes: Repairs without a loss.
         headers, schemas, channels: Records of the data section; schemas and channels by id.
-        counts: Messages by channel id.
-        gaps: Numbers missing between the messages of a channel.
-        sequences: Number of the last message of a channel.
+        counts: Number of messages by channel id.
+        gaps: Number of missing sequence numbers by channel id.
+        sequences: Last sequence number by channel id.
         start_ns, end_ns: Log times of the first and the last message [ns since 1970].
-        unchecked_chunks: Chunks without a checksum.
-        unchecked_messages: Messages outside chunks, which have none.
+        unchecked_chunks: Number of chunks without a checksum.
+        unchecked_messages: Number of messages outside chunks, which have no checksum.
         runs: Messages outside chunks.
-        insert_at: Before which piece definitions belong that the file has lost.
-        lost_definitions: These definitions.
+        insert_at: Index of the piece before which the lost definitions are inserted.
+        lost_definitions: Definitions that the file has lost.
     """
 
     size: int = 0
@@ -159,34 +159,34 @@ class Scan:
 
     @property
     def messages(self) -> int:
-        """Messages that are kept."""
+        """Number of messages that are kept."""
         return sum(self.counts.values())
 
     @property
     def complete(self) -> bool:
-        """The file has an end: data, footer, magic."""
+        """Whether the file is complete: end of data, footer, magic."""
         return self.data_end is not None and self.ending is not None
 
     @property
     def whole(self) -> bool:
-        """Nothing is missing, and nothing is wrong."""
+        """Whether the file is intact."""
         wrong = self.losses or self.fixes or self.lost_definitions or self.summary_damage or self.data_crc_wrong
         return self.complete and not wrong
 
     @property
     def unchecked(self) -> str:
-        """Why the messages may have changed without a sign of it; empty where checksums cover them."""
+        """Why damage to messages may go unnoticed; empty if checksums cover them."""
         if self.data_crc and not self.data_crc_wrong:
             return ""
         parts = []
         if self.unchecked_messages:
-            parts.append(f"{self.unchecked_messages} of its messages are in no chunk")
+            parts.append(f"{self.unchecked_messages} of its messages are outside chunks")
         if self.unchecked_chunks:
-            parts.append(f"{self.unchecked_chunks} of its chunks carry no checksum")
+            parts.append(f"{self.unchecked_chunks} of its chunks have no checksum")
         return " and ".join(parts)
 
     def loses_more_than_the_tail(self) -> list[Loss]:
-        """Losses in front of what is kept, or from a file that had been finished."""
+        """Losses before the end of the kept data, or in a finished file."""
         last = max((piece.offset for piece in self.pieces if piece.length), default=0)
         tail_is_fine = self.ending is None and self.data_end is None
         return [
@@ -196,10 +196,10 @@ class Scan:
 
 
 def scan_file(path: Path) -> Scan:
-    """Read a file from its beginning to its end, over whatever is damaged.
+    """Scan a whole file, skipping damage.
 
     Raises:
-        BagError: It is no MCAP file, or is packed in a way that is not known here.
+        BagError: The file is not MCAP, or its compression is unknown.
     """
     with mapped(path) as buffer:
         scan = _Scanner(buffer, path)
@@ -212,7 +212,7 @@ class _Scanner:
         self._buffer, self._path = buffer, path
         self.found = found = Scan(size=len(buffer))
         self._limit = found.size
-        # Of the last chunk: its piece, its entries by channel, and the message indexes that were found behind it.
+        # For the last chunk: its piece, its entries by channel, and the message indexes found after it.
         self._chunk: Piece | None = None
         self._entries: dict[int, list[tuple[int, int]]] = {}
         self._indexed: dict[int, int] = {}
@@ -233,7 +233,7 @@ class _Scanner:
             self._listed = {index.chunk_start_offset: index for index in self.found.known.chunk_indexes}
 
     def run(self) -> None:
-        """Walk over all records."""
+        """Scan all records."""
         at = self._begin()
         while at < self._limit and self.found.data_end is None:
             try:
@@ -255,12 +255,12 @@ class _Scanner:
             opcode, body, end = record_at(buffer, at, self._limit)
             parse(Header, buffer[body:end] if opcode == Opcode.HEADER else b"")
         except Damaged:
-            raise BagError(f"{self._path}: expected an MCAP file, but it does not begin like one") from None
+            raise BagError(f"{self._path}: expected an MCAP file, got another beginning; give an MCAP file") from None
         self.found.fixes.append("its first eight bytes were damaged")
         return at
 
     def _take(self, at: int) -> int:
-        """Take the record at a place into the scan; where the next one begins."""
+        """Add the record at an offset to the scan. Returns the offset of the next record."""
         opcode, body, end = record_at(self._buffer, at, self._limit)
         if opcode == Opcode.MESSAGE_INDEX:
             self._take_index(at, body, end)
@@ -281,7 +281,7 @@ class _Scanner:
         elif opcode == Opcode.DATA_END:
             self._take_data_end(at, body, end)
         elif opcode in _SUMMARY_ONLY or opcode in (Opcode.ATTACHMENT_INDEX, Opcode.METADATA_INDEX):
-            raise Damaged("a record of the summary stands among the data")
+            raise Damaged("a record of the summary is among the data")
         else:
             self._take_plain(opcode, at, body, end)
         return end
@@ -295,16 +295,16 @@ class _Scanner:
             self._add_channel(parse(Channel, content))
         elif opcode == Opcode.HEADER:
             if at != len(MAGIC):
-                raise Damaged("a second header stands among the data")
+                raise Damaged("a second header is among the data")
             self.found.header = parse(Header, content)
         elif not plausible_end(self._buffer, end, self._limit) or self._chunk_in_disguise(at) is not None:
-            # A kind of record that did not exist when this was written is kept, if what follows makes sense.
+            # An unknown kind of record, from a newer version of the format, is kept if valid records follow.
             raise Damaged(f"there is no record of kind {opcode}")
         self._keep(at, end)
 
     def _keep(self, at: int, end: int) -> None:
         pieces = self.found.pieces
-        # The header stays by itself, so that something can be put behind it.
+        # The header is a separate piece, so that records can be inserted after it.
         if len(pieces) > 1 and pieces[-1].record is None and self._end_of(pieces[-1]) == at:
             pieces[-1].length += end - at
         else:
@@ -370,7 +370,7 @@ class _Scanner:
             self._chunk.content = _record(Chunk(head.compression, data, max(times), min(times), head.crc, len(records)))
 
     def _chunk_in_disguise(self, at: int) -> tuple[int, ChunkHead, bytes] | None:
-        """End, head and records of the chunk that begins here for sure, whatever opcode and length of its record say."""
+        """End, head and records of a chunk that certainly begins here, even if opcode and length of its record are damaged."""
         try:
             head = chunk_head(self._buffer, at + RECORD_HEAD.size, None)
             end = head.data_at + head.data_length
@@ -392,7 +392,7 @@ class _Scanner:
         return self._listed.get(at)
 
     def _take_index(self, at: int, body: int, end: int) -> None:
-        """A message index belongs to the chunk in front of it; one that is wrong or cut is made again from the chunk."""
+        """Assign a message index to the chunk before it. A wrong or cut index is rebuilt from the chunk."""
         channel_id, entries = index_entries(self._buffer[body:end])
         if self._bad_chunk is not None:
             self._bad_chunk.counts[channel_id] = len(entries)
@@ -400,7 +400,7 @@ class _Scanner:
         elif self._chunk is None:
             self._note_harmless(at, end, "a message index belongs to no chunk")
         else:
-            # Some writers list channels without messages.
+            # Some writers also list channels without messages.
             wrong = sorted(entries) != sorted(self._entries.get(channel_id, [])) or channel_id in self._indexed
             self._index_wrong |= wrong
             self._indexed[channel_id] = at
@@ -410,14 +410,14 @@ class _Scanner:
         self.found.losses.append(Loss(at, end - at, f"{end - at} bytes", reason, BAD, harmless=True))
 
     def _close_chunk(self, at_end: bool = False) -> None:
-        """The chunk and its message indexes are one piece."""
+        """Finish the piece that consists of a chunk and its message indexes."""
         piece, self._chunk = self._chunk, None
         if piece is None:
             return
         assert isinstance(piece.record, ChunkIndex)
         index = piece.record
         missing = bool(self._entries.keys() - self._indexed.keys())
-        # A writer may leave all of them out; in an unfinished file nothing tells it from one that was killed here.
+        # A writer may omit all message indexes. In an unfinished file, this looks the same as a recorder killed at this point.
         left_out = not self._indexed and not (at_end and self.found.ending is None)
         if self._index_wrong or (missing and not left_out):
             if self._index_wrong or self.found.ending is not None:
@@ -452,7 +452,7 @@ class _Scanner:
             self.found.data_crc_wrong = crc != self.found.data_crc
 
     def _over_damage(self, at: int, reason: str) -> int:
-        """Note a loss; where the file makes sense again, or its end."""
+        """Note a loss. Returns the offset of the next valid records, or the end of the file."""
         if (end := self._index_end(at)) is not None:
             return end
         self._close_chunk(at_end=self._runs_over(at))
@@ -489,7 +489,7 @@ class _Scanner:
         return end
 
     def _index_end(self, at: int) -> int | None:
-        """End of the message indexes of the present chunk, if this place is among them for sure: they can be made again."""
+        """End of the message indexes of the current chunk if this offset is certainly among them, because they can be rebuilt."""
         piece = self._chunk
         listed = self._index_of(piece.offset) if piece is not None else None
         if piece is None or listed is None:
@@ -501,7 +501,7 @@ class _Scanner:
         return end
 
     def _span(self, at: int, end: int) -> tuple[int, int] | None:
-        """Log times of the chunks that the summary has between two places."""
+        """Log times of the chunks that the summary lists between two offsets."""
         indexes = self.found.known.chunk_indexes if self.found.known is not None else []
         inside = [index for index in indexes if at <= index.chunk_start_offset < end]
         if not inside:
@@ -509,14 +509,14 @@ class _Scanner:
         return min(index.message_start_time for index in inside), max(index.message_end_time for index in inside)
 
     def _runs_over(self, at: int) -> bool:
-        """Whether the record that begins here would end behind the end of the file."""
+        """Whether the record that begins here would end after the end of the file."""
         if at + RECORD_HEAD.size > self._limit:
             return True
         opcode, length = RECORD_HEAD.unpack_from(self._buffer, at)
         return 0 < opcode <= Opcode.DATA_END and length > self._limit - at - RECORD_HEAD.size
 
     def _is_cut(self, at: int) -> bool:
-        """Whether the file ends in this record for sure: in its head, or in data whose two lengths agree."""
+        """Whether the file certainly ends in this record: in its head, or in data whose two lengths agree."""
         if self.found.known is not None or not self._runs_over(at):
             return False
         if at + RECORD_HEAD.size > self._limit:
@@ -539,7 +539,7 @@ class _Scanner:
         with contextlib.suppress(Damaged):
             end = record_at(self._buffer, at, self._limit)[2]
             if end < self._limit and makes_sense(self._buffer, end, self._limit, channels, messages=True):
-                return end  # only this record is damaged, its length is not
+                return end  # only the content of this record is damaged, not its length
         if known is not None and known.statistics is not None and known.statistics.chunk_count and not found.runs:
             places = sorted(
                 [index.chunk_start_offset for index in known.chunk_indexes]
@@ -550,7 +550,7 @@ class _Scanner:
             after = bisect_right(places, at)
             if after < len(places):
                 return places[after]
-        # Inside a chunk that is damaged there are messages, too, which its checksum would have covered.
+        # A damaged chunk also contains messages, which its checksum would have covered.
         messages = opcode != Opcode.CHUNK or bool(found.runs)
         return next_record(self._buffer, at, self._limit, channels, messages)
 
@@ -558,7 +558,7 @@ class _Scanner:
         self.found.channels[channel.id] = channel
 
     def _count(self, channel_id: int, sequence: int, log_ns: int) -> None:
-        """Count a message, and what is missing in front of it; a step back is a publisher that was started again."""
+        """Count a message and the missing ones before it. A decreasing sequence number means a restarted publisher."""
         found = self.found
         if not found.counts:
             found.start_ns = found.end_ns = log_ns
@@ -573,7 +573,7 @@ class _Scanner:
         found.sequences[channel_id] = sequence
 
     def _name_what_was_lost(self) -> None:
-        """Definitions of kept messages that went with what is lost: from the summary, else without a name."""
+        """Restore lost definitions of kept messages: from the summary, or else without a name."""
         found = self.found
         known = found.known if found.known is not None else Summary()
         for channel_id in sorted(found.counts.keys() - found.channels.keys()):
@@ -586,7 +586,7 @@ class _Scanner:
                 found.schemas[schema.id] = schema
                 found.lost_definitions.append(schema)
         if found.lost_definitions:
-            # A schema stands in front of its channels, and both in front of their messages.
+            # A schema precedes its channels, and both precede their messages.
             found.lost_definitions.sort(key=lambda record: isinstance(record, Channel))
             first = min((loss.offset for loss in found.losses if not loss.harmless), default=0)
             found.insert_at = next(
@@ -595,13 +595,13 @@ class _Scanner:
             )
 
     def _contradiction(self, known: Summary) -> str:
-        """What the summary says differently from the data; empty for nothing. A summary may leave things out."""
+        """Contradiction between summary and data; empty if there is none. A summary may be incomplete."""
         found, statistics = self.found, known.statistics
         counts = {channel_id: n for channel_id, n in found.counts.items() if n}
         if statistics is not None:
             listed = {channel_id: n for channel_id, n in statistics.channel_message_counts.items() if n}
             if statistics.message_count != found.messages or (listed and listed != counts):
-                return f"its summary says {statistics.message_count} messages, it has {found.messages}"
+                return f"its summary lists {statistics.message_count} messages, but it has {found.messages}"
         chunks = {
             (piece.record.chunk_start_offset, piece.record.chunk_length)
             for piece in found.pieces
@@ -616,7 +616,7 @@ _KINDS = {Opcode.CHUNK: "a chunk", Opcode.ATTACHMENT: "an attachment", Opcode.ME
 
 
 def _contents(records: bytes) -> tuple[list[Schema | Channel], list[tuple[int, int, int, int]]]:
-    """Definitions of a chunk; channel, sequence, log time and place of its messages."""
+    """Definitions of a chunk, and channel, sequence, log time and offset of its messages."""
     definitions: list[Schema | Channel] = []
     messages = []
     for opcode, body, end in records_of(records):
@@ -636,7 +636,7 @@ def _record(record: Any) -> bytes:
 
 
 def _attachment_agrees(buffer: Any, body: int, length: int) -> bool:
-    """Whether the length inside an attachment agrees with that of its record; its end may be missing."""
+    """Whether the length inside an attachment agrees with that of its record. The end of the attachment may be missing."""
     at = body + 16
     for _ in range(2):
         if at + 4 > len(buffer):

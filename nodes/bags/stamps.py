@@ -1,4 +1,4 @@
-"""How honest the times in a bag are: from capture to publication to reception, topic by topic."""
+"""Delays of the messages of a bag, from capture to publication to reception, by topic."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from nodes.runtime.errors import TopicError
 from nodes.runtime.messages import types
 from nodes.runtime.topics import topic as topic_row
 
-# A CDR message that begins with a header begins with four bytes of encapsulation, then the stamp.
+# In CDR, a message with a header begins with four bytes of encapsulation, followed by the stamp.
 _STAMP = struct.Struct("<iI"), struct.Struct(">iI")
 _STAMP_AT, _NS_PER_S, _NS_PER_MS = 4, 1_000_000_000, 1e6
 
 
 @dataclass(frozen=True)
 class Delays:
-    """Times of one topic in milliseconds; None where messages carry no stamp, or a stamp of zero.
+    """Delays of one topic [ms]; None if the messages have no stamp, or a stamp of zero.
 
     Attributes:
         publish_ms: Median from capture to publication.
-        publish_worst_ms: Longest.
+        publish_worst_ms: Longest delay from capture to publication.
         receive_ms: Median from publication to reception by the recorder.
-        receive_worst_ms: Longest.
-        backwards: Messages whose stamp is older than that of the one before them.
-        future: Messages that were captured after they were received: a clock that is wrong.
+        receive_worst_ms: Longest delay from publication to reception.
+        backwards: Number of messages whose stamp is older than that of the message before.
+        future: Number of messages with a capture time after their reception, which means a wrong clock.
     """
 
     publish_ms: float | None
@@ -41,7 +41,7 @@ class Delays:
 
 
 def read_delays(bag: Path) -> dict[str, Delays]:
-    """Times of every topic with a message, by name; the whole bag is read for it."""
+    """Read the delays of every topic with messages, by name. The whole bag is read."""
     names = {topic.name: _begins_with_stamp(topic.name, topic.type) for topic in read_info(bag).topics}
     rows: dict[str, list[tuple[int, int, int]]] = {}
     for message in read_messages(bag, as_recorded=True):
@@ -51,7 +51,7 @@ def read_delays(bag: Path) -> dict[str, Delays]:
 
 
 def _delays(times_ns: list[tuple[int, int, int]]) -> Delays:
-    """Of stamp, publish and log time of each message [ns]; whole numbers, because a damaged bag may say anything."""
+    """Compute delays from stamp, publish and log time of each message [ns]. Integers, because a damaged bag may have any value."""
     received = [(log - publish) / _NS_PER_MS for _, publish, log in times_ns]
     stamped = [row for row in times_ns if row[0] > 0]
     published = [(publish - stamp) / _NS_PER_MS for stamp, publish, _ in stamped]
@@ -65,7 +65,7 @@ def _delays(times_ns: list[tuple[int, int, int]]) -> Delays:
 
 
 def _begins_with_stamp(topic: str, typename: str) -> bool:
-    """Whether a topic is one of ours, with a type whose first field is a header."""
+    """Whether a topic is in the topic table and its type begins with a header."""
     try:
         if topic_row(topic).type != typename:
             return False

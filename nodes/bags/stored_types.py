@@ -1,4 +1,4 @@
-"""How a topic of a bag becomes a topic of ours: by its own definition, and from the types that mean the same."""
+"""Converts topics of a bag to the types of the topic table, using the bag's definitions and equivalent types."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from nodes.runtime.pictures import COMPRESSED_TYPE, rgb8_message
 
 POSE_TYPE = "geometry_msgs/msg/PoseStamped"
 CDR, ROS1 = "cdr", "ros1"
-# rosbag2 can compress every message; a message that is not compressed begins with zeros.
+# rosbag2 can compress single messages. An uncompressed message begins with zeros.
 _ZSTD = b"\x28\xb5\x2f\xfd"
 _MOST_BYTES = 1 << 28
 
@@ -25,15 +25,15 @@ Convert = Callable[[bytes], bytes]
 
 @dataclass(frozen=True)
 class RecordedTopic:
-    """What a bag says about the messages of one topic from one writer.
+    """Description of one topic of one writer in a bag.
 
     Attributes:
-        topic: Its name.
+        topic: Name of the topic.
         type: Full type name.
-        type_hash: RIHS01 hash of the type; empty if the bag has none.
-        definition: Text of the type's definition; empty if the bag has none.
+        type_hash: RIHS01 hash of the type; empty if missing.
+        definition: Text of the type's definition; empty if missing.
         definition_language: ``ros2msg``, ``ros1msg``, ``ros2idl``.
-        serialization: ``cdr`` or ``ros1``; whatever else the bag says cannot be read.
+        serialization: ``cdr`` or ``ros1``. Other values are not supported.
     """
 
     topic: str
@@ -45,15 +45,15 @@ class RecordedTopic:
 
 
 def converter(recorded: RecordedTopic, expected: str, source: str) -> Convert | None:
-    """What turns recorded bytes into CDR bytes of the expected type; None if they are that already.
+    """Return a converter from recorded bytes to CDR bytes of the expected type; None if no conversion is needed.
 
     Args:
         recorded: The topic in the bag.
-        expected: The type that readers of the topic want.
+        expected: The expected type.
         source: The bag, for errors.
 
     Raises:
-        BagError: The topic has a type that cannot stand for the expected one.
+        BagError: The topic has a type that cannot be converted to the expected one.
     """
     reshape = None
     if recorded.type != expected:
@@ -83,7 +83,7 @@ def converter(recorded: RecordedTopic, expected: str, source: str) -> Convert | 
 
 
 def unpacked(data: bytes, topic: str, source: str) -> bytes:
-    """Bytes of a message that rosbag2 may have compressed by itself."""
+    """Uncompress a message that rosbag2 may have compressed."""
     if not data.startswith(_ZSTD):
         return data
     try:
@@ -93,19 +93,21 @@ def unpacked(data: bytes, topic: str, source: str) -> bytes:
 
 
 def _foreign_definition(recorded: RecordedTopic, source: str) -> Definition | None:
-    """Definition by which to read a topic; None if ours serves."""
+    """Definition for reading a topic; None if advnerf's own type fits."""
     known = fields_of(recorded.type) is not None
     if recorded.serialization == CDR and known:
         if not recorded.definition or recorded.type_hash == type_hash(recorded.type):
             return None
     elif not recorded.definition:
-        raise BagError(f"{source}: {recorded.topic} is {recorded.type}, of which the bag has no definition")
+        raise BagError(
+            f"{source}: expected a definition of {recorded.type} for {recorded.topic}, found none in the bag"
+        )
     try:
         definition = parse_definition(recorded.type, recorded.definition, recorded.definition_language)
         if recorded.serialization == CDR and definition.is_ours:
             return None
         if missing := definition.missing(recorded.type):
-            raise MessageError(f"its {recorded.type} is another than ours and has no {', '.join(missing)}")
+            raise MessageError(f"expected the fields {', '.join(missing)}, which its {recorded.type} lacks")
         return definition
     except MessageError as error:
         raise BagError(f"{source}: {recorded.topic}: {error}") from error
@@ -117,7 +119,7 @@ def _pose(header: Any, position: Any, orientation: Any) -> Any:
 
 
 def _pose_of_transform(message: Any, topic: str) -> Any:
-    """A transform takes the child's coordinates to those of the header's frame: it is the child's pose."""
+    """Convert a transform to the pose of its child frame in the header's frame."""
     return _pose(message.header, message.transform.translation, message.transform.rotation)
 
 
@@ -126,7 +128,7 @@ def _pose_of_estimate(message: Any, topic: str) -> Any:
     return _pose(message.header, message.pose.pose.position, message.pose.pose.orientation)
 
 
-# By the type that is expected: the types that can stand for it.
+# Equivalent types by expected type.
 _ACCEPTED: dict[str, dict[str, Callable[[Any, str], Any]]] = {
     IMAGE_TYPE: {COMPRESSED_TYPE: rgb8_message},
     POSE_TYPE: {

@@ -1,4 +1,4 @@
-"""The end of an MCAP file: its footer, and the summary in front of it, checked."""
+"""Reads the end of an MCAP file: the footer and the summary before it, with checksums."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ _CRC_BYTES = 4
 
 
 class Ending(NamedTuple):
-    """What the footer says.
+    """Contents of the footer.
 
     Attributes:
-        summary_start: Where the summary begins; 0 if there is none.
+        summary_start: Offset of the summary; 0 if there is none.
         summary_crc: Checksum of summary and footer; 0 means none.
-        footer_at: Where the footer begins.
+        footer_at: Offset of the footer.
     """
 
     summary_start: int
@@ -29,11 +29,11 @@ class Ending(NamedTuple):
 
 
 def read_ending(buffer: Any, size: int) -> Ending | None:
-    """Footer of a file; None where the file does not end with one.
+    """Read the footer of a file; None if the file does not end with one.
 
     Args:
-        buffer: Anything that gives bytes for a slice.
-        size: Its length.
+        buffer: A buffer whose slices are bytes.
+        size: Length of the buffer.
     """
     at = size - FOOTER_BYTES - len(MAGIC)
     if at < len(MAGIC) or buffer[size - len(MAGIC) : size] != MAGIC:
@@ -50,10 +50,10 @@ def read_ending(buffer: Any, size: int) -> Ending | None:
 
 
 def read_summary_section(buffer: Any, ending: Ending) -> Summary:
-    """Records of the summary.
+    """Read the records of the summary.
 
     Raises:
-        Damaged: Its checksum is that of other bytes, or it makes no sense.
+        Damaged: Its checksum is wrong, or it is invalid.
     """
     end = ending.footer_at + FOOTER_BYTES - _CRC_BYTES
     content = bytes(buffer[ending.summary_start : end])

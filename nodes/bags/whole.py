@@ -1,4 +1,4 @@
-"""What a finished file says about itself, checked: from its summary, or from its data where the summary does not say enough."""
+"""Reads and checks the summary of a finished file. If the summary is incomplete, the data are scanned."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class FileSummary(Summary):
 
     Attributes:
         runs: Messages outside chunks.
-        unchecked: Why messages may have changed without a sign of it; empty where checksums cover them.
+        unchecked: Why damage to messages may go unnoticed; empty if checksums cover them.
     """
 
     runs: list[Run]
@@ -32,10 +32,10 @@ class FileSummary(Summary):
 
 
 def read_summary(path: Path) -> tuple[FileSummary, Statistics] | None:
-    """Summary of a file, or None if it has no end: its recorder was killed, or is still at work.
+    """Read the summary of a file; None if the file is unfinished because its recorder was killed or is still running.
 
     Raises:
-        BagError: It has an end, but is damaged.
+        BagError: The file is finished, but damaged.
     """
     with mapped(path) as buffer:
         ending = read_ending(buffer, len(buffer))
@@ -45,14 +45,14 @@ def read_summary(path: Path) -> tuple[FileSummary, Statistics] | None:
             found = _from_summary(buffer, ending)
         except Damaged as error:
             raise BagError(
-                f"{path} is damaged: {error}; advnerf bag repair {path} writes it again, if the messages are whole"
+                f"{path} is damaged: {error}; advnerf bag repair {path} rewrites the summary if the messages are intact"
             ) from error
     return _from_data(path) if found is None else found
 
 
 def _from_summary(buffer: Any, ending: Ending) -> tuple[FileSummary, Statistics] | None:
-    """The summary that the file has; None if it leaves something out, or has no checksum."""
-    # Without a checksum a list of topics or times in it may have changed, and messages would be left out.
+    """Read the summary of the file; None if it is incomplete or has no checksum."""
+    # Without a checksum, its list of topics or times may be damaged, and messages would be missed.
     if not ending.summary_start or not ending.summary_crc:
         return None
     read = read_summary_section(buffer, ending)
@@ -64,12 +64,12 @@ def _from_summary(buffer: Any, ending: Ending) -> tuple[FileSummary, Statistics]
     for index in read.chunk_indexes:
         at = index.chunk_start_offset + _CRC_AT
         if buffer[at : at + 4] == b"\0\0\0\0" and index.uncompressed_size:
-            return None  # what covers this chunk, if anything, is the checksum of all data
+            return None  # only the checksum of all data may cover this chunk
     return summary, read.statistics
 
 
 def _lists_everything(buffer: Any, ending: Ending, summary: Summary) -> bool:
-    """Whether chunks, attachments and metadata in the summary are all that is in the data, and their channels are known."""
+    """Whether the summary lists all chunks, attachments and metadata of the data, and their channels."""
     statistics = summary.statistics
     assert statistics is not None
     if len(summary.channels) != statistics.channel_count or len(summary.schemas) != statistics.schema_count:
@@ -96,14 +96,14 @@ def _from_data(path: Path) -> tuple[FileSummary, Statistics]:
     if scan.losses:
         raise BagError(f"{path} is damaged: {describe(scan, scan.losses[0])}; {advice}")
     if scan.data_crc_wrong and scan.unchecked:
-        raise BagError(f"{path} is damaged: the checksum of its data is that of other data; {advice}")
+        raise BagError(f"{path} is damaged: the checksum of its data is wrong; {advice}")
     if not scan.complete:
         raise BagError(f"{path} is damaged: the record that ends its data is missing; {advice}")
     return summary_of(scan)
 
 
 def summary_of(scan: Scan) -> tuple[FileSummary, Statistics]:
-    """The summary that belongs to what was found in a file."""
+    """Make a summary of the contents found in a file."""
     summary = FileSummary()
     summary.schemas, summary.channels = dict(scan.schemas), dict(scan.channels)
     summary.runs, summary.unchecked = scan.runs, scan.unchecked

@@ -1,11 +1,11 @@
-"""Bags: what rosbag2, Foxglove, ``mcap`` and ``rosbags`` open. The bytes of the wire go in as they are.
+"""Writes bags that rosbag2, Foxglove, ``mcap`` and ``rosbags`` can open. Messages are stored as the received bytes.
 
-A bag is a folder with one ``.mcap`` file, or with numbered parts, and ``metadata.yaml``. Chunks of 64 KiB are written through to the
-file at once and reach the disk once a second. A journal beside the file keeps the messages of the chunk that is being filled, so
-that a killed recorder loses none that it had received (`nodes.bags.repair` puts them together).
+A bag is a folder with one ``.mcap`` file, or with numbered parts, and ``metadata.yaml``. Chunks of 64 KiB are written to the file at
+once and reach the disk once a second. A journal next to the file has the messages of the unfinished chunk, so that a killed recorder
+loses no message that it had received (`nodes.bags.repair` adds them to the bag).
 
-A file's index is kept in memory until the file is finished, about 700 bytes for every chunk. A recorder therefore begins a new part
-from time to time; the old one is finished by another thread.
+The index of a file is kept in memory until the file is finished, about 700 bytes per chunk. So the recorder starts a new part from
+time to time, and another thread finishes the old one.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _BYTES_PER_MIB = 1 << 20
 
 @dataclass(frozen=True)
 class SplitLimits:
-    """When a new part is begun: as soon as one of the limits is reached.
+    """Limits of a part. A new part starts when one of them is reached.
 
     Attributes:
         duration_s: Time between the first and the last message of a part [s].
@@ -44,7 +44,7 @@ class SplitLimits:
     size_mib: float = 256.0
 
     def reached(self, part: PartWriter, log_ns: int) -> bool:
-        """Whether a message with this log time belongs into a new part; a clock that was set back also begins one."""
+        """Whether a message with this log time starts a new part. A clock that was set back also does."""
         if part.first_log_ns is None:
             return False
         late = abs(log_ns - part.first_log_ns) >= self.duration_s * NS_PER_S
@@ -52,14 +52,14 @@ class SplitLimits:
 
 
 class BagWriter:
-    """Writes one bag; for one thread.
+    """Writes one bag. Not thread-safe.
 
     Args:
-        folder: New folder of the bag; its name is also that of the files in it.
-        attachments: Content of the files that ride along, by name; in the first part of a split bag.
-        metadata: Facts that ride along in every part: versions, git hash.
-        attached_ns: Time at which the files were attached [ns since 1970]; none means now.
-        limits: When to begin a new part; none writes a single file without a number, whose index stays in memory.
+        folder: New folder of the bag. Its name is also used for the files.
+        attachments: Content of the attachments by name, stored in the first part of a split bag.
+        metadata: Facts to store in every part: versions, git hash.
+        attached_ns: Time at which the files were attached [ns since 1970]; None means now.
+        limits: Limits of a part. None writes a single file without a number, whose index stays in memory.
     """
 
     def __init__(
@@ -112,15 +112,15 @@ class BagWriter:
 
         Args:
             topic: Name from the topic table.
-            cdr: Bytes of the wire.
-            log_ns: When it was received [ns since 1970].
-            publish_ns: When it was published [ns since 1970].
-            sequence: Number of its publisher.
-            lost: Messages of the topic that were lost before this one; none if that is not known.
+            cdr: CDR bytes of the message.
+            log_ns: Time of reception [ns since 1970].
+            publish_ns: Time of publication [ns since 1970].
+            sequence: Sequence number of the publisher.
+            lost: Number of messages of the topic that were lost before this one; None if unknown.
         """
         try:
             self._raise_failure()
-            # While the last part is still being finished, this one grows: waiting would hold up the bus.
+            # While the previous part is being finished, this one keeps growing, because waiting would block the bus.
             if self._limits is not None and not self._finishing and self._limits.reached(self._part, log_ns):
                 self._split()
             self._part.write(topic, cdr, log_ns, publish_ns, sequence, lost)
@@ -129,7 +129,7 @@ class BagWriter:
         self.messages += 1
 
     def flush(self) -> None:
-        """End the present chunk, so that it reaches the disk with the next sync."""
+        """Finish the current chunk, so that the next sync writes it to the disk."""
         try:
             self._raise_failure()
             self._part.flush()
@@ -137,7 +137,7 @@ class BagWriter:
             self._rescue(error)
 
     def close(self, metadata: Mapping[str, str] | None = None) -> None:
-        """Write what makes a bag whole: the summary of its last file and ``metadata.yaml``.
+        """Complete the bag: write the summary of its last file and ``metadata.yaml``.
 
         Args:
             metadata: Facts known only at the end.
@@ -153,7 +153,7 @@ class BagWriter:
             self._rescue(error)
 
     def _split(self) -> None:
-        """Go on in a new part. The old one has all its chunks in its file before the new one begins."""
+        """Start a new part. All chunks of the old one are written to its file first."""
         old = self._part
         old.flush()
         number = len(self._files) + 1
@@ -162,7 +162,7 @@ class BagWriter:
         self._full.put(old)
 
     def _finish(self, part: PartWriter, metadata: Mapping[str, str] | None = None) -> None:
-        """Finish a part, then list it: ``metadata.yaml`` never names a file that is not whole."""
+        """Finish a part, then list it in ``metadata.yaml``, which never lists an unfinished file."""
         part.finish(metadata)
         self._total.add(part.contents)
         self._files.append(FileEntry.of(part.path.name, part.contents))
@@ -170,7 +170,7 @@ class BagWriter:
         write_atomically(self.folder / METADATA_FILE, text)
 
     def _keep(self) -> None:
-        """What takes long: once a second, see that the file is on the disk; finish parts that are full."""
+        """Run the slow work: sync the file to the disk once a second, and finish full parts."""
         while True:
             try:
                 part = self._full.get(timeout=_SYNC_PERIOD_S)
@@ -192,7 +192,7 @@ class BagWriter:
             raise self._failure
 
     def _rescue(self, error: OSError) -> None:
-        """After a failed write: finish the files as far as they go, in the space held back for it."""
+        """After a failed write, finish the files as far as possible, in the reserved space."""
         from nodes.bags.repair_parts import repair_bag
 
         if self._open:
@@ -200,12 +200,12 @@ class BagWriter:
             self._let_go()
         try:
             messages = sum(part.messages for part in repair_bag(self.folder, in_place=True))
-            saved = f"{messages} messages up to then are readable in it"
+            saved = f"{messages} messages up to that point are readable"
         except (BagError, OSError) as second:
             saved = (
                 f"and it could not be finished ({second}); free some space and run: advnerf bag repair {self.folder}"
             )
-        raise BagError(f"cannot go on recording to {self.folder}: {error.strerror}; {saved}") from error
+        raise BagError(f"cannot continue recording to {self.folder}: {error.strerror}; {saved}") from error
 
     def _hold_reserve(self) -> None:
         with open(self.folder / RESERVE_NAME, "wb") as reserve:

@@ -16,20 +16,20 @@ if TYPE_CHECKING:
 
 _DAMAGED_EXIT = 2  # as for every bag that cannot be read
 
-app = typer.Typer(no_args_is_help=True, help="Record, look into, play and repair bags (MCAP, as rosbag2 writes them).")
+app = typer.Typer(no_args_is_help=True, help="Record, inspect, play and repair bags (MCAP, as rosbag2 writes them).")
 
 
 @app.command("info")
 def bag_info(
     bag: Annotated[Path, typer.Argument(help="Bag folder, or a .mcap, .db3 or .bag file.", exists=True)],
     stamps: Annotated[
-        bool, typer.Option("--stamps", help="Also read every message and say how late they came.")
+        bool, typer.Option("--stamps", help="Also read every message and show how late they arrived.")
     ] = False,
     quick: Annotated[
-        bool, typer.Option("--quick", help="Believe the summary; do not read the bag to compare it with its checksums.")
+        bool, typer.Option("--quick", help="Trust the summary. Do not read the bag to verify its checksums.")
     ] = False,
 ) -> None:
-    """Say what is in a bag, what was lost on the way into it, and whether it is as it was recorded."""
+    """Show what a bag contains, how many messages were lost during recording, and whether its checksums match."""
     from datetime import datetime
 
     from nodes.bags.check import diagnose
@@ -41,7 +41,7 @@ def bag_info(
             if not found.whole:
                 for line in found.lines[:-1]:
                     print(f"{found.path}: {line}")
-                say_error(f"{found.path} is not whole; {found.lines[-1]}")
+                say_error(f"{found.path} is damaged; {found.lines[-1]}")
                 raise typer.Exit(_DAMAGED_EXIT)
     info = read_info(bag)
     start = datetime.fromtimestamp(info.start_ns / 1e9).isoformat(" ", "milliseconds")
@@ -63,10 +63,10 @@ def bag_info(
 
 
 def checked_line(info: BagInfo, quick: bool) -> str:
-    """Whether the messages are those that were recorded, as far as can be told."""
+    """Text that says whether the messages match the checksums of the recording."""
     if info.unchecked:
-        return f"unchecked: {info.unchecked}, so a damaged message in it cannot be told from a good one"
-    return "not compared with its checksums (--quick)" if quick else "checked: all messages agree with their checksums"
+        return f"unchecked: {info.unchecked}, so damaged messages cannot be detected"
+    return "checksums not verified (--quick)" if quick else "checked: all messages match their checksums"
 
 
 def _print_delays(bag: Path) -> None:
@@ -87,10 +87,10 @@ def _print_delays(bag: Path) -> None:
 @app.command("extract")
 def bag_extract(
     bag: Annotated[Path, typer.Argument(help="Bag folder, or a .mcap, .db3 or .bag file.", exists=True)],
-    names: Annotated[list[str] | None, typer.Argument(help="Attachments to take out.", show_default="all")] = None,
-    output: Annotated[Path, typer.Option("--output", "-o", help="Folder to put them in.")] = Path(),
+    names: Annotated[list[str] | None, typer.Argument(help="Attachments to extract.", show_default="all")] = None,
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the extracted files.")] = Path(),
 ) -> None:
-    """Take out the files that ride along in a bag: the launch file as it was run, calibration, the attack."""
+    """Extract the attachments of a bag: the launch file of the run, the calibration and the attack."""
     from nodes.bags.reader import extract_attachments
 
     for path in extract_attachments(bag, output, names or ()):
@@ -106,16 +106,22 @@ def bag_record(
     max_bag_duration_s: Annotated[
         float | None,
         typer.Option(
-            "--max-bag-duration", metavar="S", min=0.1, help="New file after so many seconds.", show_default="600"
+            "--max-bag-duration",
+            metavar="S",
+            min=0.1,
+            help="Start a new file after this many seconds.",
+            show_default="600",
         ),
     ] = None,
     max_bag_size_mb: Annotated[
         float | None,
-        typer.Option("--max-bag-size", metavar="MIB", min=0.1, help="New file after so many MiB.", show_default="256"),
+        typer.Option(
+            "--max-bag-size", metavar="MIB", min=0.1, help="Start a new file after this many MiB.", show_default="256"
+        ),
     ] = None,
     run_dir: RunDir = None,
 ) -> None:
-    """Record what a running launch says, until Ctrl-C."""
+    """Record the topics of a running launch until Ctrl-C."""
     from nodes.launching.watching import find_run_dir, node_names
     from nodes.recorder import RecorderConfig, RecorderNode
     from nodes.runtime.process import run_node
@@ -126,7 +132,7 @@ def bag_record(
     config = RecorderConfig(output=folder.resolve(), topics=topics, statuses_of=statuses)
     limits = {"max_bag_duration_s": max_bag_duration_s, "max_bag_size_mb": max_bag_size_mb}
     config = config.model_copy(update={key: value for key, value in limits.items() if value is not None})
-    print(f"recording to {folder}, Ctrl-C ends it", flush=True)
+    print(f"recording to {folder}; press Ctrl-C to stop", flush=True)
     raise typer.Exit(run_node(lambda context: RecorderNode.build(config, context), "bag_record", run))
 
 
@@ -134,33 +140,36 @@ def bag_record(
 def bag_play(
     bag: Annotated[Path, typer.Argument(help="Bag folder, or a .mcap, .db3 or .bag file.", exists=True)],
     rate: Annotated[float, typer.Option("--rate", min=0.001, help="Speed relative to the recording.")] = 1.0,
-    loop: Annotated[bool, typer.Option("--loop", help="Begin again at the end.")] = False,
+    loop: Annotated[bool, typer.Option("--loop", help="Start over at the end.")] = False,
     offset_s: Annotated[
-        float, typer.Option("--offset", "--start-offset", min=0.0, help="Leave out so many seconds.")
+        float, typer.Option("--offset", "--start-offset", min=0.0, help="Skip this many seconds at the start.")
     ] = 0.0,
     duration_s: Annotated[
-        float | None, typer.Option("--duration", min=0.001, help="Play so many seconds of the recording.")
+        float | None, typer.Option("--duration", min=0.001, help="Play this many seconds of the recording.")
     ] = None,
     topics: Topics = None,
     remap: Annotated[
         list[str] | None,
-        typer.Option("--remap", metavar="OLD:=NEW", help="Play a topic under another name; may be repeated."),
+        typer.Option("--remap", metavar="OLD:=NEW", help="Play a topic under another name. May be repeated."),
     ] = None,
-    paused: Annotated[bool, typer.Option("--paused", help="Begin standing still.")] = False,
+    paused: Annotated[bool, typer.Option("--paused", help="Start paused.")] = False,
     clock_hz: Annotated[
-        float | None, typer.Option("--clock", metavar="HZ", min=0.1, max=200.0, help="Say the recorded time on /clock.")
+        float | None,
+        typer.Option("--clock", metavar="HZ", min=0.1, max=200.0, help="Publish the recorded time on /clock."),
     ] = None,
     wait_for: Annotated[
         list[str] | None,
-        typer.Option("--wait-for", metavar="TOPIC", help="Wait for a subscriber of it.", show_default="any topic"),
+        typer.Option(
+            "--wait-for", metavar="TOPIC", help="Wait until this topic has a subscriber.", show_default="any topic"
+        ),
     ] = None,
-    no_wait: Annotated[bool, typer.Option("--no-wait", help="Begin at once, whether anybody listens or not.")] = False,
+    no_wait: Annotated[bool, typer.Option("--no-wait", help="Start at once, with or without subscribers.")] = False,
     run_dir: RunDir = None,
 ) -> None:
-    """Play a bag to the nodes of a run folder; statuses and requests only when named by --topics.
+    """Play a bag to the nodes of a run folder. Status and request topics are played only if --topics names them.
 
-    In a terminal: space pauses and goes on, right arrow or s steps, + and - change the speed, q ends.
-    From elsewhere: advnerf bag control pause|resume|toggle|step [N]|rate X|stop.
+    Keys in the terminal: space pauses and resumes, right arrow or s steps, + and - change the speed, q quits.
+    From another terminal: advnerf bag control pause|resume|toggle|step [N]|rate X|stop.
     """
     import sys
 
@@ -190,9 +199,11 @@ def _pairs(texts: list[str]) -> dict[str, str]:
     for text in texts:
         old, separator, new = text.partition(":=")
         if not separator or not old or not new:
-            raise BagError(f"--remap {text}: expected OLD:=NEW, e.g. /camera/image_raw:=/compositor/image")
+            raise BagError(f"--remap {text}: expected OLD:=NEW, for example /camera/image_raw:=/compositor/image")
         if old in pairs:
-            raise BagError(f"--remap {text}: {old} has another name already, {pairs[old]}")
+            raise BagError(
+                f"--remap {text}: expected one new name per topic; {old} is already remapped to {pairs[old]}. Remove one of the two"
+            )
         pairs[old] = new
     return pairs
 
@@ -202,7 +213,7 @@ def bag_control(
     words: Annotated[list[str], typer.Argument(help="pause, resume, toggle, step [N], rate X, or stop.")],
     run_dir: RunDir = None,
 ) -> None:
-    """Tell a player that is at work to pause, go on, step, change its speed, or end."""
+    """Control a running player: pause, resume, step, change the speed, or stop."""
     from nodes.bags.play import Command
     from nodes.bags.player_requests import ask_player
     from nodes.launching.watching import find_run_dir
@@ -219,13 +230,16 @@ def bag_control(
 def bag_repair(
     bag: Annotated[Path, typer.Argument(help="Bag folder or .mcap file.", exists=True)],
     force: Annotated[
-        bool, typer.Option("--force", help="Also if messages are lost that are not at the end of an unfinished file.")
+        bool,
+        typer.Option(
+            "--force", help="Repair even if this loses messages that are not at the end of an unfinished file."
+        ),
     ] = False,
     discard_original: Annotated[
-        bool, typer.Option("--discard-original", help="Do not keep the file as it was, as NAME.mcap.damaged.")
+        bool, typer.Option("--discard-original", help="Do not keep the damaged file as NAME.mcap.damaged.")
     ] = False,
 ) -> None:
-    """Make the bag of a killed recorder, or a damaged one, whole; the file as it was is kept beside it."""
+    """Repair a damaged bag, or the bag of a recorder that was killed. The damaged file is kept next to the repaired one."""
     from nodes.bags.repair_parts import repair_bag
 
     for result in repair_bag(bag, force, not discard_original):
@@ -235,15 +249,15 @@ def bag_repair(
 def _print_repair(result: Repaired) -> None:
     unchecked = f"; unchecked: {result.unchecked}" if result.unchecked else ""
     if result.was_whole:
-        print(f"{result.path} is whole: {result.messages} messages{unchecked}; nothing was changed")
+        print(f"{result.path} is intact: {result.messages} messages{unchecked}; nothing was changed")
         return
     for loss in result.losses:
         print(f"lost: {loss}")
     for fix in result.fixes:
-        print(f"mended: {fix}")
+        print(f"repaired: {fix}")
     rows = table("topic", "messages before", "after")
     for topic in result.topics:
         rows.add_row(topic.name, "?" if topic.before is None else str(topic.before), str(topic.after))
     print_table(rows)
     print(f"{result.path}: kept {result.messages} messages, left out {result.cut_bytes} bytes{unchecked}")
-    print("the file as it was is gone" if result.kept is None else f"the file as it was: {result.kept}")
+    print("the damaged file was not kept" if result.kept is None else f"damaged file: {result.kept}")

@@ -18,12 +18,12 @@ def add_to(app: typer.Typer) -> None:
 
 
 def display_colours(
-    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the pictures to show and a shown.csv to fill in.")],
-    width: Annotated[int, typer.Option("--width", min=16, help="Of the monitor [px].")] = 1920,
-    height: Annotated[int, typer.Option("--height", min=16, help="Of the monitor [px].")] = 1080,
-    seed: Annotated[int, typer.Option("--seed", help="Of the mixed colours.")] = 0,
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the images to show and for shown.csv, which you complete.")],
+    width: Annotated[int, typer.Option("--width", min=16, help="Width of the monitor [px].")] = 1920,
+    height: Annotated[int, typer.Option("--height", min=16, help="Height of the monitor [px].")] = 1080,
+    seed: Annotated[int, typer.Option("--seed", help="Random seed of the mixed colours.")] = 0,
 ) -> None:  # fmt: skip
-    """Write the sequence of plain pictures to show full-screen for ``calibrate display``."""
+    """Write the sequence of plain-colour images to show full-screen for ``calibrate display``."""
     import cv2
     import numpy as np
 
@@ -38,19 +38,19 @@ def display_colours(
         lines.append(f"seen/{index:03d}.png,{red},{green},{blue}")
     write_atomically(output / "shown.csv", "\n".join(lines) + "\n")
     print(
-        f"{len(colours)} pictures in {output / 'show'}; put what the camera sees of each into {output / 'seen'} under the same name"
+        f"{len(colours)} images in {output / 'show'}; save the camera image of each under the same name in {output / 'seen'}"
     )
 
 
 def display(
-    output: Annotated[Path, typer.Option("--output", "-o", help="YAML file to write; its picture goes beside it.")],
-    folder: Annotated[Path, typer.Argument(help="Folder with shown.csv and what the camera saw; with --screen or --twin it is made.", file_okay=False)],
-    screen: Annotated[int | None, typer.Option("--screen", min=0, help="Show the colours on this screen, watch by the running launch.")] = None,
-    twin: Annotated[Path | None, typer.Option("--twin", exists=True, help="Show them on the simulated lab's monitor: its socket.")] = None,
-    conditions: Annotated[str, typer.Option("--conditions", help="Light, exposure, monitor settings; kept in the file.")] = "exposure and white balance locked",
+    output: Annotated[Path, typer.Option("--output", "-o", help="YAML file to write. The plot is saved next to it.")],
+    folder: Annotated[Path, typer.Argument(help="Folder with shown.csv and the camera images. --screen and --twin create it.", file_okay=False)],
+    screen: Annotated[int | None, typer.Option("--screen", min=0, help="Show the colours on this screen and take the camera images from the running launch.")] = None,
+    twin: Annotated[Path | None, typer.Option("--twin", exists=True, help="Socket of the simulated lab: show the colours on its monitor.")] = None,
+    conditions: Annotated[str, typer.Option("--conditions", help="Lighting, exposure and monitor settings, stored in the file.")] = "exposure and white balance locked",
     run_dir: RunDir = None,
 ) -> None:  # fmt: skip
-    """What the camera sees of the monitor's colours: curves, mixing, ambient light, response."""
+    """Calibrate how the camera sees the monitor's colours: tone curves, mixing, ambient light, response."""
     from calibration.display_colour import fit_display
     from calibration.plots import display_plot
     from nodes.lab.wizards.bags import read_shown

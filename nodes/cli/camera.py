@@ -7,28 +7,28 @@ from typing import Annotated
 
 import typer
 
-app = typer.Typer(no_args_is_help=True, help="Find cameras, try them, and take over a ZED's factory calibration.")
+app = typer.Typer(no_args_is_help=True, help="Find cameras, test them, and import the factory calibration of a ZED.")
 
 
 @app.command("list")
 def camera_list() -> None:
-    """List the cameras here: stable paths, formats, sizes and rates, controls with their ranges and present values."""
+    """List the cameras of this computer: stable paths, formats, sizes, rates, and controls with ranges and values."""
     from nodes.lab.camera_tools import describe_devices, describe_oaks
 
     lines = [*describe_devices(), *describe_oaks()]
-    print("\n".join(lines) if lines else "no video device and no OAK found; is the cable in?")
+    print("\n".join(lines) if lines else "no video device and no OAK found; check the cable")
 
 
 @app.command("try")
 def camera_try(
     source: Annotated[
-        str, typer.Argument(help="As in a launch file, e.g. '{kind: v4l2, device: /dev/v4l/by-id/...}'.")
+        str, typer.Argument(help="Source as in a launch file, for example '{kind: v4l2, device: /dev/v4l/by-id/...}'.")
     ],
-    frames: Annotated[int, typer.Option("--frames", min=2, help="How many frames to read.")] = 50,
-    out: Annotated[Path | None, typer.Option("--out", help="Save the last picture here (.png, .jpg).")] = None,
-    timeout_s: Annotated[float, typer.Option("--timeout", min=0.5, help="Give up after so many seconds.")] = 15.0,
+    frames: Annotated[int, typer.Option("--frames", min=2, help="Number of frames to read.")] = 50,
+    out: Annotated[Path | None, typer.Option("--out", help="Save the last image here (.png, .jpg).")] = None,
+    timeout_s: Annotated[float, typer.Option("--timeout", min=0.5, help="Give up after this many seconds.")] = 15.0,
 ) -> None:
-    """Read a source as the camera node would: rate, missed frames, age of the stamps, brightness."""
+    """Read a source as the camera node does; print rate, missed frames, age of the stamps and brightness."""
     import cv2
 
     from advnerf_core.files import write_atomically
@@ -40,26 +40,26 @@ def camera_try(
     print(f"age on arrival: median {trial.age_ms[0]:.1f} ms, worst {trial.age_ms[1]:.1f} ms")
     print(f"mean brightness {trial.brightness:.0f} of 255")
     if counted := ", ".join(f"{name} {value:g}" for name, value in trial.counters.items() if value):
-        print(f"counted: {counted}")
+        print(f"counters: {counted}")
     if out is not None:
         try:
             done, data = cv2.imencode(out.suffix, trial.picture[:, :, ::-1])
         except cv2.error:
             done = False
         if not done:
-            raise CameraToolError(f"expected a file name that ends in .png or .jpg, got {out}")
+            raise CameraToolError(f"expected a file name that ends in .png or .jpg; got {out}")
         write_atomically(out, data.tobytes())
         print(f"saved {out}")
 
 
 @app.command("factory")
 def camera_factory(
-    factory: Annotated[Path, typer.Argument(help="The ZED's SN<serial>.conf.")],
-    mount: Annotated[Path, typer.Option("--mount", help="Camera file whose pose on the car is taken over.")],
-    out: Annotated[Path, typer.Option("--out", help="Where to write camera.yaml.")],
-    mode: Annotated[str, typer.Option("--mode", help="2K, HD1080, HD720 or VGA.")] = "VGA",
-    width: Annotated[int, typer.Option("--width", min=1, help="Width of the delivered pictures.")] = 336,
-    height: Annotated[int, typer.Option("--height", min=1, help="Height of the delivered pictures.")] = 188,
+    factory: Annotated[Path, typer.Argument(help="Factory calibration of the ZED, SN<serial>.conf.")],
+    mount: Annotated[Path, typer.Option("--mount", help="Camera file from which the pose on the car is copied.")],
+    out: Annotated[Path, typer.Option("--out", help="Path of the camera.yaml to write.")],
+    mode: Annotated[str, typer.Option("--mode", help="Camera mode: 2K, HD1080, HD720 or VGA.")] = "VGA",
+    width: Annotated[int, typer.Option("--width", min=1, help="Width of the delivered images [px].")] = 336,
+    height: Annotated[int, typer.Option("--height", min=1, help="Height of the delivered images [px].")] = 188,
 ) -> None:
     """Write the calibration file of a ZED's rectified left eye from its factory calibration."""
     from calibration.schema import save_calibration
@@ -67,10 +67,12 @@ def camera_factory(
     from nodes.lab.camera_tools import CameraToolError, calibration_from_zed
 
     if mode not in EYE_SIZES:
-        raise CameraToolError(f"expected a mode of {', '.join(EYE_SIZES)}, got {mode}")
+        raise CameraToolError(f"expected --mode {', '.join(EYE_SIZES)}; got {mode}")
     largest = EYE_SIZES[mode]
     if width > largest[0] or height > largest[1]:
-        raise CameraToolError(f"expected at most {largest[0]} x {largest[1]} in mode {mode}, got {width} x {height}")
+        raise CameraToolError(
+            f"expected at most {largest[0]} x {largest[1]} in mode {mode}; got {width} x {height}. Reduce --width and --height"
+        )
     found = calibration_from_zed(factory, mode, (width, height), mount)
     save_calibration(found, out)
     print(f"fx {found.fx:.2f}, fy {found.fy:.2f}, cx {found.cx:.2f}, cy {found.cy:.2f}: saved {out}")

@@ -18,29 +18,31 @@ _FAILURE_EXIT = 1
 
 
 def add_to(app: typer.Typer) -> None:
-    """Add the command."""
+    """Register the command."""
     app.command("doctor")(doctor)
 
 
 def doctor(
     file: Annotated[
         Path | None,
-        typer.Argument(metavar="[LAUNCH]", help="Check what this *.launch.yaml needs.", exists=True, dir_okay=False),
+        typer.Argument(
+            metavar="[LAUNCH]", help="Check only what this *.launch.yaml needs.", exists=True, dir_okay=False
+        ),
     ] = None,
-    folder: Annotated[Path, typer.Option("--folder", help="Where results will be written.")] = Path("runs"),
+    folder: Annotated[Path, typer.Option("--folder", help="Folder for results.")] = Path("runs"),
     vicon_port: Annotated[int, typer.Option("--vicon-port", min=1, max=65535)] = 51001,
     vesc: Annotated[
-        str | None, typer.Option("--vesc", help="Serial device of the VESC.", show_default="what looks like one")
+        str | None, typer.Option("--vesc", help="Serial device of the VESC.", show_default="detected")
     ] = None,
     host: Annotated[
-        str | None, typer.Option("--host", help="Which of the launch file's hosts this computer is, or all.")
+        str | None, typer.Option("--host", help="Host of the launch file that this computer is, or all.")
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the findings as JSON.")] = False,
     overrides: Overrides = None,
 ) -> None:
-    """Say what this computer has and lacks, and what to do about it; with a launch file, only what that needs.
+    """Check what this computer has and lacks, and how to fix it. With a launch file, check only what that file needs.
 
-    Exit code 0: nothing stands in the way; 1: something will not work; 2: the launch file or an option is wrong.
+    Exit code 0: no failure found. 1: something will not work. 2: the launch file or an option is wrong.
     """
     from nodes.lab.doctor.check import FAILURE, examine, worst
 
@@ -66,7 +68,7 @@ def _checks(
         from nodes.lab.doctor.general import checks
 
         if overrides or host:
-            raise typer.BadParameter("--set and --host are about a launch file; name one")
+            raise typer.BadParameter("--set and --host need a launch file; give one")
         return checks(folder, vicon_port, vesc)
     from nodes.lab.doctor.launch import checks_of
     from nodes.launching.launch_file import load_launch

@@ -1,4 +1,4 @@
-"""The commands ``advnerf keys ...``: who may watch this host over the network, and who may drive."""
+"""The commands ``advnerf keys ...``: which keys may watch this host over the network, and which may drive."""
 
 from __future__ import annotations
 
@@ -12,17 +12,18 @@ from nodes.runtime.terminal import print_table, table
 if TYPE_CHECKING:
     from nodes.linking.keys import KeyFolder
 
-app = typer.Typer(no_args_is_help=True, help="Keys of hosts, and who may watch or drive over the network.")
+app = typer.Typer(no_args_is_help=True, help="Manage the keys that may watch or drive this host over the network.")
 
 Folder = Annotated[
-    Path | None, typer.Option("--keys", help="Key folder.", show_default="advnerf/keys in the user's configuration")
+    Path | None,
+    typer.Option("--keys", help="Key folder.", show_default="advnerf/keys in the user's configuration folder"),
 ]
-Name = Annotated[str, typer.Argument(help="Name of the key: of a host or a person.")]
+Name = Annotated[str, typer.Argument(help="Name of the key, such as a host or a person.")]
 
 
 @app.command("new")
 def keys_new(name: Name, folder: Folder = None) -> None:
-    """Make a key pair for this host; prints the public half, to be allowed on the other host."""
+    """Create a key pair for this host and print its public key. Allow that key on the other host."""
     keys = _folder(folder)
     print(keys.new(name))
 
@@ -30,16 +31,20 @@ def keys_new(name: Name, folder: Folder = None) -> None:
 @app.command("allow")
 def keys_allow(
     name: Name,
-    right: Annotated[str, typer.Option("--to", help="watch, or drive (which includes watch).")] = "watch",
-    public: Annotated[str | None, typer.Option("--public", help="Its public key, if it is not known here yet.")] = None,
+    right: Annotated[
+        str, typer.Option("--to", help="Right to grant: watch, or drive (which includes watch).")
+    ] = "watch",
+    public: Annotated[
+        str | None, typer.Option("--public", help="Public key, if this host does not have it yet.")
+    ] = None,
     folder: Folder = None,
 ) -> None:
-    """Let a key watch, or drive; a running launch takes it at its next try."""
+    """Allow a key to watch or to drive. A running launch accepts the key at its next connection attempt."""
     from nodes.linking.keys import RIGHTS
     from nodes.runtime.errors import SecurityError
 
     if right not in RIGHTS:
-        raise SecurityError(f"--to {right}: expected {' or '.join(RIGHTS)}")
+        raise SecurityError(f"--to: expected {' or '.join(RIGHTS)}; got {right}")
     keys = _folder(folder)
     if public is not None:
         keys.add(name, public)
@@ -49,25 +54,27 @@ def keys_allow(
 
 @app.command("add")
 def keys_add(name: Name, public: str, folder: Folder = None) -> None:
-    """Remember the public key of a host that this one connects to."""
+    """Store the public key of a host that this host connects to."""
     _folder(folder).add(name, public)
 
 
 @app.command("revoke")
 def keys_revoke(
     name: Name,
-    right: Annotated[str | None, typer.Option("--to", help="Only the right to drive.", show_default="all")] = None,
+    right: Annotated[
+        str | None, typer.Option("--to", help="Revoke only this right (drive).", show_default="all")
+    ] = None,
     folder: Folder = None,
 ) -> None:
-    """Take a key's rights away; a running launch cuts it off within a second."""
+    """Revoke a key's rights. A running launch disconnects the key within a second."""
     taken = _folder(folder).revoke(name, right)
     print(f"{name} may no longer {' or '.join(taken)}")
 
 
 @app.command("list")
 def keys_list(folder: Folder = None) -> None:
-    """Show all keys and their rights."""
-    rows = table("name", "may", "secret half here", "public key")
+    """List all keys and their rights."""
+    rows = table("name", "may", "secret key here", "public key")
     for row in _folder(folder).rows():
         rows.add_row(row.name, ", ".join(row.rights) or "-", "yes" if row.ours else "no", row.public)
     print_table(rows)

@@ -1,4 +1,4 @@
-"""The command ``advnerf``. Each command imports what it needs when it is called, so that ``--help`` is quick."""
+"""The command ``advnerf``. Each command imports its modules when it is called, so that ``--help`` is fast."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 OUR_PACKAGES = ("advnerf_core", "hardware", "calibration", "nodes")
 ERROR_EXIT, FAILURE_EXIT = 2, 1
-# Which extra brings what a base installation, such as the car's, does not have.
+# The extra that installs each package which a base installation, such as the car's, does not have.
 _EXTRA_OF = dict.fromkeys(("torch", "numba", "scipy", "matplotlib", "jinja2", "av"), "core") | {
     "mujoco": "twin", "pycolmap": "sfm", "trimesh": "mesh", "viser": "view", "onnxruntime": "onnx", "onnx": "onnx",
     "mitsuba": "mesh", "drjit": "mesh", "joblib": "cluster", "ray": "cluster", "carla": "carla",
@@ -110,16 +110,16 @@ def launch(
         typer.Option("--run-dir", help="Folder for logs, sockets and bag.", show_default="runs/<name>-<time>"),
     ] = None,
     duration_s: Annotated[
-        float | None, typer.Option("--duration", min=0.0, help="Stop by itself after so many seconds.")
+        float | None, typer.Option("--duration", min=0.0, help="Stop after this many seconds.")
     ] = None,
     host: Annotated[
-        str | None, typer.Option("--host", help="Which of the file's hosts this computer is, or all.")
+        str | None, typer.Option("--host", help="Host of the launch file that this computer is, or all.")
     ] = None,
     check: Annotated[
-        bool, typer.Option("--check", help="Only say what would be started, and what is wrong with it.")
+        bool, typer.Option("--check", help="Start nothing; list the nodes that would start and the problems found.")
     ] = False,
 ) -> None:
-    """Start the nodes of a launch file and watch them; Ctrl-C stops them, twice stops them at once."""
+    """Start the nodes of a launch file and supervise them. Ctrl-C stops them; a second Ctrl-C kills them."""
     from nodes.launching.launch import Launch
     from nodes.launching.launch_file import load_launch
 
@@ -166,7 +166,7 @@ def _say_problems(plan: Any) -> None:
     from nodes.lab.doctor.launch import policy_problems
     from nodes.launching.launch_check import check_nodes
 
-    # A policy is loaded only when its node accepts the configuration that names it.
+    # The policies are loaded only if every node accepts its configuration.
     problems = list(check_nodes(plan).values()) or policy_problems(plan)
     for problem in problems:
         say_error(problem)
@@ -234,9 +234,9 @@ for _name, _what in {
 
 @app.command()
 def arm(
-    run_dir: RunDir = None, reason: Annotated[str, typer.Option("--reason", help="Why, for the record.")] = ""
+    run_dir: RunDir = None, reason: Annotated[str, typer.Option("--reason", help="Reason to record.")] = ""
 ) -> None:
-    """Ask the safety node of a running launch to let the car move."""
+    """Ask the safety node of a running launch to arm the car."""
     from nodes.launching.watching import find_run_dir
     from nodes.runtime.arm_requests import ask_to_arm
 
@@ -244,13 +244,13 @@ def arm(
     if answer.granted and answer.armed:
         print(f"armed by {answer.text}")
         return
-    print(f"armed, and stopped since: {answer.text}" if answer.granted else f"not armed: {answer.text}")
+    print(f"armed, but stopped again since: {answer.text}" if answer.granted else f"not armed: {answer.text}")
     raise typer.Exit(FAILURE_EXIT)
 
 
 @app.command()
 def disarm(
-    run_dir: RunDir = None, reason: Annotated[str, typer.Option("--reason", help="Why, for the record.")] = ""
+    run_dir: RunDir = None, reason: Annotated[str, typer.Option("--reason", help="Reason to record.")] = ""
 ) -> None:
     """Stop the car of a running launch and keep it stopped."""
     from nodes.launching.watching import find_run_dir
@@ -258,30 +258,30 @@ def disarm(
 
     def silent(waited_s: float) -> None:
         say_error(
-            f"NOT CONFIRMED: no answer of the safety node for {waited_s:.1f} s, the car may be driving; still asking"
-            " (Ctrl-C gives up). Use the e-stop or cut the power"
+            f"NOT CONFIRMED: no answer from the safety node for {waited_s:.1f} s, and the car may be driving. Use the e-stop or"
+            " cut the power. Still asking (Ctrl-C gives up)"
         )
 
     answer = ask_to_disarm(find_run_dir(run_dir), reason, silent)
     if answer.armed:
-        say_error("disarmed, but somebody has armed the car again since")
+        say_error("disarmed, but another request has armed the car again since")
         raise typer.Exit(FAILURE_EXIT)
     print(f"not armed: {answer.text}")
     if not answer.braked:
         say_error(
-            f"NOT CONFIRMED: disarmed, but the motor node has not said within {BRAKE_WAIT_S:g} s that it brakes; look at the"
-            " car. If the motor node is down, the controller brakes after its own time-out"
+            f"NOT CONFIRMED: disarmed, but the motor node did not report within {BRAKE_WAIT_S:g} s that it brakes. Watch the"
+            " car. If the motor node is down, the motor controller brakes after its own timeout"
         )
         raise typer.Exit(FAILURE_EXIT)
 
 
 def _is_for_people(error: Exception) -> bool:
-    """Whether the message of an exception was written for whoever typed the command."""
+    """Whether the message of an exception was written for the user."""
     return isinstance(error, AdvnerfError | OSError)
 
 
 def main() -> None:
-    """Run the command line; what a person can put right is one line and exit code 2, never a traceback."""
+    """Run the command line. An error that the user can fix is printed as one line, with exit code 2 and no traceback."""
     try:
         app()
     except KeyboardInterrupt:
@@ -292,7 +292,7 @@ def main() -> None:
             raise
         say_error(f"this command needs {missing}, which is not installed: pip install 'advnerf[{_EXTRA_OF[missing]}]'")
         raise SystemExit(ERROR_EXIT) from None
-    except Exception as error:  # everything else is a defect of ours and keeps its traceback
+    except Exception as error:  # any other exception is a bug and keeps its traceback
         if _debug or not _is_for_people(error):
             raise
         say_error(_words(error))
@@ -302,7 +302,7 @@ def main() -> None:
 def _words(error: Exception) -> str:
     if isinstance(error, OSError) and error.errno == errno.ENOSPC:
         where = f" of {error.filename}" if error.filename else ""
-        return f"the disk{where} is full: free some space or choose another folder; what was finished is kept"
+        return f"the disk{where} is full: free some space or choose another folder. Finished work is kept"
     return str(error) or type(error).__name__
 
 

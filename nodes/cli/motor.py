@@ -1,4 +1,4 @@
-"""The commands ``advnerf motor ...``: the controller itself, and the check that the car can steer."""
+"""The commands ``advnerf motor ...``, for the motor controller and the steering check."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ if TYPE_CHECKING:
     from nodes.runtime.clock import Now
     from nodes.runtime.requests import Asked
 
-app = typer.Typer(no_args_is_help=True, help="Look at the motor controller, set its time-out, check the steering.")
-Port = Annotated[str, typer.Option("--port", help="Serial device; the launch that uses it must be stopped.")]
+app = typer.Typer(no_args_is_help=True, help="Inspect the motor controller, set its timeout, check the steering.")
+Port = Annotated[str, typer.Option("--port", help="Serial device. Stop the launch that uses it first.")]
 _CHECK_S, _ANSWER_S = 75.0, 3.0
 
 
 @app.command("info")
 def info(port: Port = "/dev/vesc") -> None:
-    """Say what the controller is, how it is, and when it stops the car by itself."""
+    """Show the controller's firmware, telemetry, and the timeout after which it stops the car."""
     from hardware.errors import LinkTimeout, ProtocolError
     from hardware.motor.limits import DriveLimits, VehicleGains
     from hardware.motor.vesc import Vesc
@@ -33,12 +33,12 @@ def info(port: Port = "/dev/vesc") -> None:
         try:
             timeout = str(vesc.read_timeout())
         except (LinkTimeout, ProtocolError) as error:
-            timeout = f"not known: {error}"
+            timeout = f"unknown: {error}"
     finally:
-        vesc.abandon()  # it was only asked, never commanded: there is nothing to stop
+        vesc.abandon()  # this command sent no motor command, so there is nothing to stop
     rows = table("what", "value")
     for what, value in (
-        ("controller", str(firmware)), ("telemetry", f"generation {values.generation}"), ("time-out", timeout),
+        ("controller", str(firmware)), ("telemetry", f"generation {values.generation}"), ("timeout", timeout),
         ("supply", f"{values.v_in:.1f} V"), ("motor", f"{values.erpm:.0f} erpm, {values.motor_current_a:.2f} A"),
         ("used", f"{values.used_ah:.3f} Ah, {values.used_wh:.2f} Wh"), ("fault", values.fault_name),
     ):  # fmt: skip
@@ -48,11 +48,16 @@ def info(port: Port = "/dev/vesc") -> None:
 
 @app.command("set-timeout")
 def set_timeout(
-    timeout_ms: Annotated[int, typer.Option("--timeout-ms", min=50, max=2000, help="Silence before it brakes.")] = 250,
+    timeout_ms: Annotated[
+        int,
+        typer.Option(
+            "--timeout-ms", min=50, max=2000, help="Time without commands after which the controller brakes [ms]."
+        ),
+    ] = 250,
     brake_current_a: Annotated[float, typer.Option("--brake-current", min=0.0, max=60.0, help="Amperes.")] = 20.0,
     port: Port = "/dev/vesc",
 ) -> None:
-    """Store the time-out and brake current in the controller, whose motor must stand, and read them back."""
+    """Store timeout and brake current in the controller and read them back. The motor must stand still."""
     from hardware.motor.limits import DriveLimits, VehicleGains
     from hardware.motor.vesc import Vesc
     from hardware.motor.vesc_settings import TimeoutSettings
@@ -65,15 +70,15 @@ def set_timeout(
         after = vesc.set_timeout(TimeoutSettings(timeout_ms, brake_current_a))
     finally:
         vesc.abandon()
-    print(f"{firmware}: time-out was {before}, is {after}")
+    print(f"{firmware}: timeout was {before}, is {after}")
 
 
 @app.command("check-steering")
 def check_steering(
     run_dir: RunDir = None,
-    yes: Annotated[bool, typer.Option("--yes", help="Answer for the person: the wheels were seen to turn.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask; confirm that the wheels turned.")] = False,
 ) -> None:
-    """Show the front wheels to the left and to the right; motion capture or you must see them turn."""
+    """Turn the front wheels left, then right. Motion capture or you must confirm that they turned."""
     from nodes.launching.watching import find_run_dir
     from nodes.runtime.bus import Bus
 
@@ -97,12 +102,12 @@ def check_steering(
                     if not shown.startswith(("steering seen", "steering confirmed")):
                         raise typer.Exit(1)
                     return
-    print("the motor node gave no answer")
+    print("no answer from the motor node; is it running?")
     raise typer.Exit(1)
 
 
 def _ask_motor(bus: Bus, action: str) -> None:
-    """Send a request about the check until the motor node has answered; a refusal ends the command."""
+    """Repeat a request about the steering check until the motor node answers. A refusal raises `LaunchError`."""
     from nodes.runtime.asking import NoAnswerError, ask
     from nodes.runtime.errors import LaunchError
     from nodes.runtime.messages import header, types
@@ -118,7 +123,9 @@ def _ask_motor(bus: Bus, action: str) -> None:
     try:
         answer = ask(bus, "/motor/check", make, "/diagnostics", read, every_s=0.1, patience_s=_ANSWER_S)
     except NoAnswerError:
-        raise LaunchError(f"the motor node did not answer within {_ANSWER_S:g} s; is it running?") from None
+        raise LaunchError(
+            f"expected an answer from the motor node within {_ANSWER_S:g} s, got none; is it running?"
+        ) from None
     if answer["granted"] != str(True):
         raise LaunchError(f"the motor node refused to {action} the steering check: {answer['answer']}")
 

@@ -13,7 +13,7 @@ from nodes.runtime.terminal import RunDir, print_table, table
 if TYPE_CHECKING:
     from nodes.launching.watching_nodes import NodeRow
 
-app = typer.Typer(no_args_is_help=True, help="Look at the nodes of a running launch.")
+app = typer.Typer(no_args_is_help=True, help="Inspect the nodes of a running launch.")
 
 
 def add_to(root: typer.Typer) -> None:
@@ -23,7 +23,7 @@ def add_to(root: typer.Typer) -> None:
 
 @app.command("list")
 def node_list(run_dir: RunDir = None) -> None:
-    """List the nodes with their state and what they say; those that do not report are silent."""
+    """List the nodes with state and status text. A node that does not report is listed as silent."""
     from nodes.launching.watching import find_run_dir, node_statuses
     from nodes.launching.watching_nodes import SILENT, describe_silence
 
@@ -39,14 +39,14 @@ def node_list(run_dir: RunDir = None) -> None:
 
 
 def top(
-    period_s: Annotated[float, typer.Option("--period", min=0.5, help="Seconds between two tables.")] = 2.0,
-    count: Annotated[int | None, typer.Option("--count", min=1, help="Stop after so many tables.")] = None,
+    period_s: Annotated[float, typer.Option("--period", min=0.5, help="Time between two tables [s].")] = 2.0,
+    count: Annotated[int | None, typer.Option("--count", min=1, help="Stop after this many tables.")] = None,
     run_dir: RunDir = None,
 ) -> None:
-    """Show what each node uses and how it keeps up: processor, memory, rate, drops, missed ticks, restarts."""
+    """Show the load of each node: CPU, memory, rate, dropped messages, missed ticks, queue, restarts."""
     from nodes.launching.watching import find_run_dir
 
-    with contextlib.suppress(KeyboardInterrupt):  # Ctrl-C is how this usually ends
+    with contextlib.suppress(KeyboardInterrupt):  # the user stops this command with Ctrl-C
         _watch(find_run_dir(run_dir), period_s, count)
 
 

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from advnerf_core.objects.voxel.model import ObjectModel
     from nodes.runtime.progress import Report
 
-app = typer.Typer(no_args_is_help=True, help="Make objects from meshes, photographs or generators, and look at them.")
+app = typer.Typer(no_args_is_help=True, help="Build objects from meshes, photographs or generators, and inspect them.")
 
 ObjectPath = Annotated[Path, typer.Argument(help="An object file (*.object.safetensors).", dir_okay=False)]
 _TURNTABLE_VIEWS, _TURNTABLE_PIXELS = 8, 240
@@ -24,10 +24,15 @@ _DEFAULT_STEPS, _NO_STEP_LIMIT = 600, 1_000_000
 
 @app.command("build")
 def object_build(
-    file: Annotated[Path | None, typer.Argument(help="A mesh: GLB, OBJ, PLY, STL.", dir_okay=False)] = None,
-    generate: Annotated[str | None, typer.Option("--generate", help="Instead of a file: hydrant or car.")] = None,
+    file: Annotated[Path | None, typer.Argument(help="Mesh file: GLB, OBJ, PLY or STL.", dir_okay=False)] = None,
+    generate: Annotated[
+        str | None, typer.Option("--generate", help="Generate an object instead of reading FILE: hydrant or car.")
+    ] = None,
     images: Annotated[
-        Path | None, typer.Option("--images", help="Instead of a file: transforms.json of pictures with transparency.")
+        Path | None,
+        typer.Option(
+            "--images", help="Learn from images with an alpha channel instead of reading FILE: their transforms.json."
+        ),
     ] = None,
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="Object file.", show_default="<name>.object.safetensors")
@@ -36,28 +41,31 @@ def object_build(
         int, typer.Option("--resolution", min=8, max=128, help="Voxels along the longest side.")
     ] = 64,
     height_m: Annotated[float | None, typer.Option("--height", help="Scale to this height [m].")] = None,
-    up: Annotated[str, typer.Option("--up", help="Which axis of the file points up: z or y.")] = "z",
+    up: Annotated[str, typer.Option("--up", help="Axis of the file that points up: z or y.")] = "z",
     steps: Annotated[
         int | None,
-        typer.Option("--steps", min=0, help="Steps of the fit.", show_default="400 of a mesh, 600 of pictures"),
+        typer.Option(
+            "--steps", min=0, help="Optimiser steps of the fit.", show_default="400 for a mesh, 600 for images"
+        ),
     ] = None,
     minutes: Annotated[
-        float | None, typer.Option("--minutes", min=0.01, help="With --images: stop the fit after so long, instead.")
+        float | None,
+        typer.Option("--minutes", min=0.01, help="With --images: fit for this many minutes instead of --steps."),
     ] = None,
     size: Annotated[
         tuple[int, int] | None,
         typer.Option(
             "--size",
             min=1,
-            help="With --images: width and height to bring the pictures to. Of the object itself see --resolution.",
+            help="With --images: resize the images to this width and height. For the object itself, see --resolution.",
             show_default="as they are",
         ),
     ] = None,
 ) -> None:
-    """Make an object file.
+    """Build an object file from a mesh, a generator or images.
 
-    Of pictures, the data set's own training split is learned from, or 7 of 8 pictures of 16 or more. Ends with the PSNR on
-    training and held-out pictures, and with advice if it is poor.
+    With --images, the training split of the data set is used. Without a split, 7 of 8 images are used if there are 16 or
+    more. The command prints the PSNR on training and held-out images, and advice if it is low.
     """
     from advnerf_core.objects.voxel.build import build_from_mesh
     from advnerf_core.objects.voxel.model import save_object
@@ -65,11 +73,11 @@ def object_build(
     from nodes.runtime.progress import ProgressDisplay
 
     if sum(given is not None for given in (file, generate, images)) != 1:
-        raise ConfigError("expected one of FILE, --generate and --images")
+        raise ConfigError("expected exactly one of FILE, --generate and --images")
     if images is None and (minutes is not None or size is not None):
-        raise ConfigError("expected --minutes and --size only with --images")
+        raise ConfigError("expected --minutes and --size only with --images; add --images or remove them")
     if minutes is not None and steps is not None:
-        raise ConfigError("expected either --steps or --minutes, got both")
+        raise ConfigError("expected either --steps or --minutes, got both; remove one of them")
     name = generate or _name(file or images or Path())
     with ProgressDisplay() as display:
         report = display.start("object")
@@ -88,7 +96,7 @@ def object_show(
     file: ObjectPath,
     output: Annotated[Path | None, typer.Option("--output", "-o", help="PNG.", show_default="beside FILE")] = None,
 ) -> None:
-    """Draw an object from eight sides."""
+    """Render an object from eight sides."""
     import cv2
     import numpy as np
 
@@ -111,7 +119,7 @@ def object_show(
 
 @app.command("info")
 def object_info(file: ObjectPath) -> None:
-    """Say what an object file holds."""
+    """Show the contents of an object file."""
     from advnerf_core.objects.voxel.model import load_object
 
     model = load_object(file)
@@ -141,7 +149,7 @@ def _mesh(file: Path | None, generate: str | None, up: str, height_m: float | No
 
 
 def _name(source: Path) -> str:
-    """What an object is called after its source: the mesh's file, or the folder of the pictures."""
+    """Default name of an object: the stem of the mesh file, or the folder of the images."""
     source = source.resolve()
     return source.parent.name if source.suffix == ".json" else source.stem
 
@@ -156,11 +164,11 @@ def _from_images(
 
     listed = load_transforms(transforms)
     for path in listed.missing:
-        print(f"missing, left out: {path}")
+        print(f"skipped, file not found: {path}")
     training, held_out = _split(listed)
-    rule = "the data set's own split" if listed.splits else f"every {_HELD_OUT_EVERY}th is held out"
-    counts = f"{len(training.frames)} training, {0 if held_out is None else len(held_out.frames)} held-out pictures"
-    print(f"{counts} ({rule})" if held_out is not None else f"{counts} (of 16 or more, {rule})")
+    rule = "split of the data set" if listed.splits else f"every {_HELD_OUT_EVERY}th is held out"
+    counts = f"{len(training.frames)} training, {0 if held_out is None else len(held_out.frames)} held-out images"
+    print(f"{counts} ({rule})" if held_out is not None else f"{counts} (with 16 or more images, {rule})")
     return build_from_images(
         load_pictures(training, size), name, resolution,
         (_DEFAULT_STEPS if minutes is None else _NO_STEP_LIMIT) if steps is None else steps, {"images": str(transforms)},
@@ -170,7 +178,7 @@ def _from_images(
 
 
 def _split(listed: PosedImages) -> tuple[PosedImages, PosedImages | None]:
-    """Pictures to learn from, and pictures to compare with if there are enough."""
+    """Split the images into a training set and, if there are enough images, a held-out set."""
     from advnerf_core.data.views import HELD_OUT_SPLITS, TRAIN
 
     split = {TRAIN} < set(listed.splits) and not set(listed.splits).isdisjoint(HELD_OUT_SPLITS)
@@ -180,7 +188,7 @@ def _split(listed: PosedImages) -> tuple[PosedImages, PosedImages | None]:
 
 
 def _spread(listed: PosedImages) -> PosedImages:
-    """As many held-out pictures as are compared: blender's sets have hundreds, and their memory is not needed."""
+    """Keep only the held-out images that are compared. Blender data sets have hundreds, which would waste memory."""
     from advnerf_core.objects.voxel.build import HELD_OUT_VIEWS
 
     frames, most = listed.frames, HELD_OUT_VIEWS

@@ -16,10 +16,10 @@ if TYPE_CHECKING:
 
 app = typer.Typer(
     no_args_is_help=True,
-    help="A policy from recordings or of any origin: train, evaluate, check its adapter, export it, look into it.",
+    help="Train a policy from recordings; evaluate, check, export and inspect any policy.",
 )
 Spec = Annotated[
-    str, typer.Argument(metavar="POLICY", help="A .safetensors, .onnx or .pt2 file, or package.module:factory.")
+    str, typer.Argument(metavar="POLICY", help="Policy: a .safetensors, .onnx or .pt2 file, or package.module:factory.")
 ]
 cli_policy_train.add_to(app)
 _COLOURS = {"ok": "green", "warning": "yellow", "failure": "red"}
@@ -32,25 +32,29 @@ def policy_check(
     run_folder: Annotated[
         Path | None,
         typer.Option(
-            "--run-folder", help="An experiment: the camera frames of its capture, and drives in its learned scene."
+            "--run-folder",
+            help="Run folder of an experiment: check on the camera frames of its capture and on drives in its learned scene.",
         ),
     ] = None,
     scene: Annotated[
-        Path | None, typer.Option("--scene", help="Views of a learned scene and drives in it; with --calibration.")
+        Path | None,
+        typer.Option("--scene", help="Learned scene: check on its views and on drives in it. Needs --calibration."),
     ] = None,
     calibration: Annotated[
         Path | None,
         typer.Option("--calibration", help="Folder with camera.yaml, room.yaml and vehicle.yaml of the scene."),
     ] = None,
-    bag: Annotated[Path | None, typer.Option("--bag", help="Frames and poses of a driven bag.")] = None,
+    bag: Annotated[Path | None, typer.Option("--bag", help="Bag of a drive: check on its frames and poses.")] = None,
     room: Annotated[
-        Path, typer.Option("--room", help="Room calibration with the path that the bag's expert follows.")
+        Path, typer.Option("--room", help="Room calibration with the path that the expert follows in the bag.")
     ] = Path("calibration/twin/room.yaml"),
-    goal: Annotated[list[float] | None, typer.Option("--goal", help="One number of the goal vector; repeat.")] = None,
+    goal: Annotated[
+        list[float] | None, typer.Option("--goal", help="One number of the goal vector. Repeat for each number.")
+    ] = None,
 ) -> None:
-    """Say what is wrong with a policy's adapter, and whether it drives; in the simulated lab if no place is given.
+    """Check a policy's adapter and whether the policy drives. Without a source option, the simulated lab is used.
 
-    Exit code 1 if the adapter is wrong, or if the policy does not drive in the place that was given.
+    Exit code 1 if the adapter is wrong, or if the policy does not drive in the given scene.
     """
     from advnerf_core.attack.methods import black_box_methods
     from advnerf_core.policies.conformance import FAILURE, check_policy
@@ -86,9 +90,9 @@ def _reference(
     from nodes.runtime.errors import ConfigError
 
     if sum(each is not None for each in (run_folder, bag, scene)) > 1:
-        raise ConfigError("expected one of --run-folder, --bag and --scene, got several")
+        raise ConfigError("expected at most one of --run-folder, --bag and --scene, got several; keep one")
     if (scene is None) != (calibration is None):
-        raise ConfigError("expected --scene and --calibration together, got one of them")
+        raise ConfigError("expected --scene and --calibration together, got one of them; add the other")
     if scene is not None and calibration is not None:
         return from_scene(scene, calibration, view)
     if run_folder is not None:
@@ -99,16 +103,18 @@ def _reference(
 @app.command("export")
 def policy_export(
     policy: Spec,
-    onnx: Annotated[Path | None, typer.Option("--onnx", help="Write an ONNX file: runs without torch.")] = None,
-    pt2: Annotated[Path | None, typer.Option("--pt2", help="Write an exported program: keeps its gradient.")] = None,
+    onnx: Annotated[Path | None, typer.Option("--onnx", help="Write an ONNX file, which runs without torch.")] = None,
+    pt2: Annotated[
+        Path | None, typer.Option("--pt2", help="Write a torch.export program, which keeps the gradient.")
+    ] = None,
 ) -> None:
-    """Write a policy with its declaration as a file that needs none of its source."""
+    """Export a policy and its declaration to a file that does not need the policy's source code."""
     from advnerf_core.policies.load import load_adapted, load_any_policy
     from nodes.runtime.errors import ConfigError
 
     if onnx is None and pt2 is None:
-        raise ConfigError("expected --onnx FILE or --pt2 FILE, got neither")
-    load_any_policy(policy)  # refuses what could not be used either
+        raise ConfigError("expected --onnx FILE or --pt2 FILE, got neither; give at least one")
+    load_any_policy(policy)  # rejects a policy that nodes could not load
     adapted, _ = load_adapted(policy)
     adapted.requires_grad_(False)
     if onnx is not None:
@@ -125,7 +131,7 @@ def policy_export(
 
 @app.command("info")
 def policy_info(policy: Spec) -> None:
-    """Say what a policy declares, and its hash."""
+    """Show a policy's declaration and its hash."""
     from advnerf_core.policies.load import load_adapted
 
     adapted, sha256 = load_adapted(policy)

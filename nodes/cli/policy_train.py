@@ -1,4 +1,4 @@
-"""The commands ``advnerf policy train`` and ``advnerf policy eval``: a policy from recordings, and how well it predicts one."""
+"""The commands ``advnerf policy train`` and ``advnerf policy eval``: train a policy on recordings, and test it on one."""
 
 from __future__ import annotations
 
@@ -20,42 +20,47 @@ Camera = Annotated[
     Path | None, typer.Option("--camera", help="Camera calibration.", show_default="the one in the first bag")
 ]
 Room = Annotated[
-    Path | None, typer.Option("--room", help="Room calibration: the path.", show_default="the one in the first bag")
+    Path | None,
+    typer.Option("--room", help="Room calibration with the reference path.", show_default="the one in the first bag"),
 ]
 Stiffness = Annotated[
-    float, typer.Option("--stiffness", min=0.1, help="How firmly the expert returns to the path [1/m].")
+    float, typer.Option("--stiffness", min=0.1, help="Gain with which the expert returns to the path [1/m].")
 ]
 Delay = Annotated[
-    float, typer.Option("--delay", min=0.0, help="From an image to wheels that have turned by it, in the label [s].")
+    float,
+    typer.Option(
+        "--delay", min=0.0, help="Delay from an image to the resulting wheel angle that the labels account for [s]."
+    ),
 ]
 Speed = Annotated[float, typer.Option("--speed", min=0.1, help="Speed at which the policy will drive [m/s].")]
 LogColumns = Annotated[
-    tuple[str, str], typer.Option("--log-columns", help="Columns of the image file and of the steering.")
+    tuple[str, str], typer.Option("--log-columns", help="CSV columns of the image file and of the steering.")
 ]
 LogScale = Annotated[
-    float, typer.Option("--log-scale", help="From the logs' steering to radians, left positive; e.g. -0.26.")
+    float,
+    typer.Option("--log-scale", help="Factor from the logs' steering to radians, left positive; for example -0.26."),
 ]
 
 
 def train(
-    out: Annotated[Path, typer.Option("--out", help="Folder of the policy; the same call goes on where it was killed.")],
+    out: Annotated[Path, typer.Option("--out", help="Folder of the policy. Run the same command again to resume a stopped training.")],
     bags: Annotated[
-        list[Path] | None, typer.Option("--bags", help="A driven bag; repeat. Whoever drove, the expert labels it.")
+        list[Path] | None, typer.Option("--bags", help="Bag of a drive; may be repeated. The expert labels it, no matter which driver recorded it.")
     ] = None,
-    logs: Annotated[list[Path] | None, typer.Option("--log", help="CSV file of a foreign log; repeat.")] = None,
+    logs: Annotated[list[Path] | None, typer.Option("--log", help="CSV file of a log from another car; may be repeated.")] = None,
     labels: Annotated[
-        Literal["expert", "recorded"], typer.Option("--labels", help="The expert at the measured pose, or what was sent.")
+        Literal["expert", "recorded"], typer.Option("--labels", help="Source of the labels: the expert at the measured pose, or the recorded commands.")
     ] = "expert",
-    image_topic: Annotated[str | None, typer.Option("--image-topic", show_default="compositor's, or camera's")] = None,
+    image_topic: Annotated[str | None, typer.Option("--image-topic", show_default="the compositor's, else the camera's")] = None,
     camera: Camera = None,
     room: Room = None,
     surrogate: Annotated[
-        Path | None, typer.Option("--surrogate", help="Run folder of an experiment whose learned room is trained on too.")
+        Path | None, typer.Option("--surrogate", help="Run folder of an experiment. Views of its learned room are added to the training data.")
     ] = None,
     experiment: Annotated[
-        Path, typer.Option("--experiment", help="The experiment file of that run.")
+        Path, typer.Option("--experiment", help="Experiment file of that run.")
     ] = Path("launch/room.experiment.yaml"),
-    setting: Annotated[str, typer.Option("--setting", help="And its setting.")] = "demo",
+    setting: Annotated[str, typer.Option("--setting", help="Setting of that run.")] = "demo",
     steps: Annotated[int, typer.Option("--steps", min=1, help="Optimiser steps.")] = 800,
     seed: Annotated[int, typer.Option("--seed")] = 0,
     speed_mps: Speed = 0.8,
@@ -64,7 +69,7 @@ def train(
     log_columns: LogColumns = ("image", "steering"),
     log_scale: LogScale = 1.0,
 ) -> None:  # fmt: skip
-    """Train a policy on recordings: the expert's laps, its own drives relabelled (DAgger), foreign logs."""
+    """Train a policy on recordings: laps of the expert, relabelled drives of the policy (DAgger), logs of other cars."""
     from advnerf_core.learning.imitation import ImitationConfig
     from nodes.lab.policy_data.train import train_from_recordings
     from nodes.runtime.errors import ConfigError
@@ -72,7 +77,9 @@ def train(
 
     bags, logs = bags or [], logs or []
     if not bags and not logs:
-        raise ConfigError("expected --bags BAG or --log FILE.csv, got neither; see docs/driving.md")
+        raise ConfigError(
+            "expected --bags BAG or --log FILE.csv, got neither. Give at least one recording; see docs/driving.md"
+        )
     options = (bags, logs, labels, image_topic, log_columns, log_scale)
     view = _view(camera, bags, logs, log_columns, log_scale)
     expert = _expert(room, bags, speed_mps, delay_s, stiffness_1pm, needed=labels == "expert" and bool(bags))
@@ -95,24 +102,24 @@ def train(
 
 
 def evaluate(
-    policy: Annotated[str, typer.Argument(metavar="POLICY", help="A .safetensors, .onnx or .pt2 file, or a factory.")],
-    recording: Annotated[Path, typer.Argument(metavar="BAG", help="A driven bag, or the CSV file of a foreign log.")],
+    policy: Annotated[str, typer.Argument(metavar="POLICY", help="Policy: a .safetensors, .onnx or .pt2 file, or package.module:factory.")],
+    recording: Annotated[Path, typer.Argument(metavar="BAG", help="Bag of a drive, or CSV file of a log from another car.")],
     out: Annotated[Path | None, typer.Option("--out", help="Folder for the plot and the saliency maps.")] = None,
     labels: Annotated[
-        Literal["expert", "recorded"], typer.Option("--labels", help="What the policy should have steered.")
+        Literal["expert", "recorded"], typer.Option("--labels", help="Source of the reference steering: the expert at the measured pose, or the recorded commands.")
     ] = "recorded",
-    image_topic: Annotated[str | None, typer.Option("--image-topic", show_default="compositor's, or camera's")] = None,
+    image_topic: Annotated[str | None, typer.Option("--image-topic", show_default="the compositor's, else the camera's")] = None,
     room: Room = None,
-    maps: Annotated[int, typer.Option("--saliency", min=0, help="Frames whose saliency is drawn.")] = 8,
-    video: Annotated[bool, typer.Option("--video", help="And all of them as a film.")] = False,
-    goal: Annotated[list[float] | None, typer.Option("--goal", help="One number of the goal vector; repeat.")] = None,
+    maps: Annotated[int, typer.Option("--saliency", min=0, help="Number of frames for which a saliency map is drawn.")] = 8,
+    video: Annotated[bool, typer.Option("--video", help="Also write all saliency maps as a video.")] = False,
+    goal: Annotated[list[float] | None, typer.Option("--goal", help="One number of the goal vector. Repeat for each number.")] = None,
     speed_mps: Speed = 0.8,
     delay_s: Delay = 0.16,
     stiffness_1pm: Stiffness = 1.0,
     log_columns: LogColumns = ("image", "steering"),
     log_scale: LogScale = 1.0,
 ) -> None:  # fmt: skip
-    """Compare what a policy would steer with what a recording says: table, plot, saliency."""
+    """Compare the steering of a policy with a recording: table, plot and saliency maps."""
     import numpy as np
 
     from advnerf_core.policies.load import load_any_policy
@@ -141,11 +148,11 @@ def evaluate(
     folder.mkdir(parents=True, exist_ok=True)
     measure.draw(found, predicted, f"{policy} on {recording}", folder / "steering.png")
     files = measure.write_saliency(loaded.policy, found, folder, maps, video, goals)
-    print(f"{folder / 'steering.png'}, {len(files)} of saliency in {folder}")
+    print(f"{folder / 'steering.png'}, {len(files)} saliency files in {folder}")
 
 
 def add_to(app: typer.Typer) -> None:
-    """Add the commands to ``advnerf policy``."""
+    """Register the commands with ``advnerf policy``."""
     app.command("train")(train)
     app.command("eval")(evaluate)
 
@@ -170,7 +177,7 @@ def _parts(
 
 
 def _own_view(read: Any, log: Path, view: PolicyView, columns: tuple[str, str], scale: float) -> Any:
-    """A foreign camera has another size than ours; its images are cut at the same share of the picture."""
+    """The policy's view for another camera: images of another size are cropped at the same fraction of the image."""
     import cv2
 
     from nodes.lab.policy_data.frames import first_image
@@ -202,12 +209,12 @@ def _expert(
 
     config = ExpertConfig(speed_mps=speed_mps, delay_s=delay_s, stiffness_1pm=stiffness_1pm)
     if not needed and room is None:
-        return Expert(DrivingPath.rounded_square(4.0, 1.1), config)  # labels nothing: they were recorded
+        return Expert(DrivingPath.rounded_square(4.0, 1.1), config)  # not used for labels: the labels are recorded
     return Expert(_calibration(RoomCalibration, room, bags, "room").reference_path, config)
 
 
 def _calibration(model: Any, given: Path | None, bags: list[Path], name: str) -> Any:
-    """A calibration file, or the one that rides in the first bag."""
+    """Load the given calibration file, or else the one attached to the first bag."""
     import tempfile
 
     from calibration.schema import load_calibration
@@ -218,7 +225,7 @@ def _calibration(model: Any, given: Path | None, bags: list[Path], name: str) ->
         return load_calibration(model, given)
     if f"{name}.yaml" not in (attached := read_attachments(bags[0])):
         raise ConfigError(
-            f"expected {name}.yaml attached to {bags[0]}, got {', '.join(attached) or 'nothing'}; use --{name}"
+            f"expected {name}.yaml attached to {bags[0]}, got {', '.join(attached) or 'no attachment'}; give the file with --{name}"
         )
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / f"{name}.yaml"
@@ -234,6 +241,8 @@ def _surrogate(folder: Path, file: Path, setting: str, view: PolicyView) -> Sour
 
     run = load_experiment(file, setting, [], folder)
     if run.view != view:
-        raise ConfigError(f"expected the camera of the recordings in {folder}, got another; use its bags and --camera")
+        raise ConfigError(
+            f"expected the run in {folder} to have the camera of the recordings, got another; use bags of that run and its --camera"
+        )
     config = run.config.policy
     return SourcePlan(surrogate_source(run), config.surrogate_stills, config.surrogate_drives, config.drive_steps)

@@ -22,52 +22,54 @@ _RETRO_NODES = "compositor,policy"
 
 
 def add_to(app: typer.Typer) -> None:
-    """Add the command to a command line."""
+    """Register the command."""
     app.command("replay")(replay)
 
 
 def replay(
     bag: Annotated[Path, typer.Argument(help="Bag folder, or a .mcap, .db3 or .bag file.", exists=True)],
     nodes: Annotated[
-        str, typer.Option("--nodes", metavar="NAME,...", help="Nodes of the recorded launch to run again.")
+        str, typer.Option("--nodes", metavar="NAME,...", help="Nodes of the recorded launch to run, comma-separated.")
     ] = "",
     replace: Annotated[
         list[str] | None,
-        typer.Option("--replace", metavar="NODE=MODULE[:CLASS]", help="Other code for a node; may be repeated."),
+        typer.Option("--replace", metavar="NODE=MODULE[:CLASS]", help="Run a node with other code. May be repeated."),
     ] = None,
     launch: Annotated[
-        Path | None, typer.Option("--launch", help="Launch file to use instead of that in the bag.", exists=True)
+        Path | None, typer.Option("--launch", help="Launch file to use instead of the one in the bag.", exists=True)
     ] = None,
     overrides: Overrides = None,
     attack: Annotated[
         Path | None,
-        typer.Option("--attack", help="Attack file to run over the recording.", exists=True, dir_okay=False),
+        typer.Option("--attack", help="Attack file to apply to the recording.", exists=True, dir_okay=False),
     ] = None,
-    policy: Annotated[str, typer.Option("--policy", help="Policy to run instead of the recorded one.")] = "",
+    policy: Annotated[str, typer.Option("--policy", help="Policy to use instead of the recorded one.")] = "",
     golden: Annotated[Path | None, typer.Option("--golden", help="Golden bag (.mcap) to compare with.")] = None,
     update_golden: Annotated[
-        bool, typer.Option("--update-golden", help="Write the golden bag instead of comparing.")
+        bool, typer.Option("--update-golden", help="Write the golden bag instead of comparing with it.")
     ] = False,
     tolerance: Annotated[
         list[str] | None,
-        typer.Option("--tolerance", metavar="[TOPIC:FIELD=]VALUE", help="Allow differences; may be repeated."),
+        typer.Option(
+            "--tolerance", metavar="[TOPIC:FIELD=]VALUE", help="Allow differences up to VALUE. May be repeated."
+        ),
     ] = None,
     topics: Topics = None,
-    output: Annotated[Path | None, typer.Option("--output", "-o", help="Write the replay as a new bag.")] = None,
-    json_file: Annotated[Path | None, typer.Option("--json", help="With --attack: write the result.")] = None,
-    plot: Annotated[Path | None, typer.Option("--plot", help="With --attack: draw the steering (.png).")] = None,
+    output: Annotated[Path | None, typer.Option("--output", "-o", help="Write the replay to a new bag.")] = None,
+    json_file: Annotated[Path | None, typer.Option("--json", help="With --attack: write the result as JSON.")] = None,
+    plot: Annotated[Path | None, typer.Option("--plot", help="With --attack: plot the steering (.png).")] = None,
 ) -> None:
-    """Run nodes over a bag in lockstep: the same bag gives the same bytes. With --attack: what would have been steered?"""
+    """Replay a bag through nodes in lockstep. The same bag gives the same bytes. With --attack, compare the steering."""
     from nodes.runtime.errors import BagError
 
     if attack is None and (json_file or plot):
-        raise BagError("--json and --plot belong to --attack FILE, which was not given")
+        raise BagError("expected --json and --plot only with --attack FILE; add --attack or remove them")
     if update_golden and golden is None:
-        raise BagError("--update-golden needs to know which one: --golden FILE.mcap")
+        raise BagError("expected --golden FILE.mcap with --update-golden, got none; name the golden bag to write")
     if [golden is not None, output is not None, attack is not None].count(True) > 1:
         raise BagError("expected one of --golden, --output and --attack, got several; run the replay once for each")
     if (topics or tolerance) and golden is None:
-        raise BagError("--topics and --tolerance belong to --golden FILE, which was not given")
+        raise BagError("expected --topics and --tolerance only with --golden FILE; add --golden or remove them")
     choice = _choice(nodes or (_RETRO_NODES if attack else ""), replace or [], launch, policy, overrides or [])
     if attack is not None:
         _retro(bag, attack, choice, json_file, plot)
@@ -90,8 +92,10 @@ def _choice(nodes: str, replace: list[str], launch: Path | None, policy: str, ov
         replacements[name.strip()] = module.strip()
     if policy:
         if "policy" not in names:
-            raise BagError(f"--policy needs the node policy among --nodes, got {', '.join(names) or 'none'}")
-        # Another policy has another hash than the recorded one.
+            raise BagError(
+                f"expected the node policy among --nodes, because --policy is given; got {', '.join(names) or 'none'}. Add it"
+            )
+        # The recorded hash belongs to the recorded policy.
         overrides = [f"policy.policy={json.dumps(policy)}", 'policy.sha256=""', *overrides]
     return Choice(names, replacements, launch, tuple(overrides))
 
@@ -108,7 +112,7 @@ def _plain(bag: Path, choice: Choice, output: Path | None) -> None:
                 pass
         _say(run, time.perf_counter() - start)
     if output is not None:
-        left_out = f", without {', '.join(run.left_out)}: not in the topic table" if run.left_out else ""
+        left_out = f", without {', '.join(run.left_out)} (not in the topic table)" if run.left_out else ""
         print(f"wrote {output}{left_out}")
 
 
@@ -121,7 +125,7 @@ def _against(
 
     allowed = Tolerances.parse(tolerance)
     if not update and not golden.exists():
-        raise BagError(f"no golden bag {golden}; write it with --update-golden")
+        raise BagError(f"expected a golden bag at {golden}, found none; write it with --update-golden")
     with Replay(bag, choice) as run:
         start = time.perf_counter()
         if update:
@@ -135,9 +139,9 @@ def _against(
         difference = comparison.finish()
         _say(run, time.perf_counter() - start)
         if difference is not None:
-            say_error(f"not as in {golden}: {difference.text(run.info.start_ns)}")
+            say_error(f"differs from {golden}: {difference.text(run.info.start_ns)}")
             raise typer.Exit(_DIFFERENT_EXIT)
-        print(f"as in {golden}: {comparison.compared} messages compared")
+        print(f"equal to {golden}: {comparison.compared} messages compared")
 
 
 def _retro(bag: Path, attack: Path, choice: Choice, json_file: Path | None, plot: Path | None) -> None:
@@ -147,7 +151,9 @@ def _retro(bag: Path, attack: Path, choice: Choice, json_file: Path | None, plot
     _print_steering(result)
     print(result.verdict())
     if (changed := result.numbers()["clean_against_recorded_rad"]) is not None:
-        print(f"clean against recorded: {changed * _DEG:.3f} degrees on average; 0 if nothing changed since")
+        print(
+            f"clean against recorded: {changed * _DEG:.3f} degrees mean difference; 0 if the code did not change since the recording"
+        )
     if json_file is not None:
         result.write_json(json_file)
         print(f"wrote {json_file}")
@@ -168,7 +174,7 @@ def _print_steering(result: RetroAttack) -> None:
 def _say(run: Replay, wall_s: float) -> None:
     summary = run.summary
     made = ", ".join(f"{count} {topic}" for topic, count in sorted(summary.made.items())) or "nothing"
-    print(f"made {made} from {summary.messages} messages")
+    print(f"published {made} from {summary.messages} messages")
     for topic, reason in summary.refused.items():
         say_error(f"refused messages on {topic}: {reason}")
     speed = f", {summary.duration_s / wall_s:.0f} x real time" if wall_s > 0 else ""

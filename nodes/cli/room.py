@@ -17,11 +17,11 @@ if TYPE_CHECKING:
     from calibration.schema import RoomCalibration
 
 app = typer.Typer(
-    no_args_is_help=True, help="Measure the room by motion capture: path, fence, targets; place board and monitor."
+    no_args_is_help=True, help="Measure path, fence and targets with motion capture; place board and monitor."
 )
 
 BagFile = Annotated[Path, typer.Argument(help="Bag with the trace.", exists=True)]
-Topic = Annotated[str, typer.Option("--topic", help="Who drew the trace: /vicon/car, or /vicon/wand.")]
+Topic = Annotated[str, typer.Option("--topic", help="Topic of the trace: /vicon/car or /vicon/wand.")]
 Output = Annotated[Path, typer.Option("--output", "-o", help="YAML file to write.")]
 FAILURE_EXIT = 1
 
@@ -32,14 +32,19 @@ def room_path(
     output: Output = Path("room.yaml"),
     topic: Topic = "/vicon/car",
     closed: Annotated[bool | None, typer.Option("--closed/--open", help="A loop or not.", show_default="looks")] = None,
-    corner: Annotated[int, typer.Option("--corner", help="The corner of the attack: which arc, from 1.")] = 1,
-    before_m: Annotated[float, typer.Option("--before", help="Start of the experiments before that corner [m].")] = 2.0,
-    off_track_m: Annotated[float, typer.Option("--off-track", help="|CTE| beyond which the car is off [m].")] = 0.4,
+    corner: Annotated[int, typer.Option("--corner", help="Corner of the attack: number of the arc, from 1.")] = 1,
+    before_m: Annotated[
+        float, typer.Option("--before", help="Distance of the start pose before that corner [m].")
+    ] = 2.0,
+    off_track_m: Annotated[
+        float, typer.Option("--off-track", help="Absolute CTE beyond which the car is off track [m].")
+    ] = 0.4,
     fence_margin_m: Annotated[
-        float, typer.Option("--fence-margin", help="Of a new file: fence around the path, until one is walked [m].")
+        float,
+        typer.Option("--fence-margin", help="For a new file: distance of the provisional fence from the path [m]."),
     ] = 0.8,
 ) -> None:
-    """Fit the reference path to a driven or drawn trace; keeps the fence of a file that is there."""
+    """Fit the reference path to a trace of the car or the wand. The fence of an existing file is kept."""
     from calibration.path_fit import PathFitConfig, fit_path
     from calibration.plots import save_with_plot
     from calibration.room import clearance, fence_around, start_before_corner
@@ -57,9 +62,7 @@ def room_path(
     picture = save_with_plot(room, output, lambda figure: _draw(figure, room, fit.trace, fit))
     _print_fit(fit)
     print(f"start {before_m:g} m before corner {corner}: {room.start_pose}")
-    print(
-        f"{output} and {picture}" + ("" if old else "; the fence is only the path's surroundings: advnerf room fence")
-    )
+    print(f"{output} and {picture}" + ("" if old else "; the fence is provisional, measure it with advnerf room fence"))
 
 
 @app.command("fence")
@@ -67,16 +70,20 @@ def room_fence(
     bag: BagFile,
     output: Output = Path("room.yaml"),
     topic: Topic = "/vicon/wand",
-    margin_m: Annotated[float, typer.Option("--margin", min=0.0, help="How far inside of the walk it lies [m].")] = 0.3,
+    margin_m: Annotated[
+        float, typer.Option("--margin", min=0.0, help="Distance of the fence inside the walked outline [m].")
+    ] = 0.3,
 ) -> None:
-    """Take the fence from a walk around the free floor with the car or a wand; the path must already be there."""
+    """Fit the fence to a walk around the free floor with the car or a wand. Run ``advnerf room path`` first."""
     from calibration.plots import save_with_plot
     from calibration.room import clearance, fence_from_trace
     from calibration.schema import CalibrationError
 
     old = _old_room(output)
     if old is None:
-        raise CalibrationError(f"expected a room file at {output}: fit the path first, with advnerf room path")
+        raise CalibrationError(
+            f"expected a room file at {output}, found none; fit the path first with advnerf room path"
+        )
     trace = _trace(bag, topic)
     fence = fence_from_trace(trace, margin_m)
     least_m = clearance(old.reference_path, fence)
@@ -93,18 +100,24 @@ def room_target(
     output: Annotated[Path, typer.Option("--output", "-o", help="YAML file to write.")],
     subject: Annotated[str, typer.Option("--subject", help="Motion-capture subject: board or monitor.")],
     bag: Annotated[Path | None, typer.Argument(help="Bag in which a wand touches the corners.", exists=True)] = None,
-    size: Annotated[str | None, typer.Option("--size", metavar="WxH", help="Instead: width x height [m].")] = None,
+    size: Annotated[
+        str | None, typer.Option("--size", metavar="WxH", help="Width x height instead of a bag [m].")
+    ] = None,
     centre: Annotated[
-        str, typer.Option("--centre", metavar="X,Y,Z", help="Its middle in the subject's frame [m].")
+        str, typer.Option("--centre", metavar="X,Y,Z", help="Centre of the face in the subject's frame [m].")
     ] = "0,0,0",
-    yaw_deg: Annotated[float, typer.Option("--yaw", help="Where it looks, about the subject's z [deg].")] = 0.0,
+    yaw_deg: Annotated[
+        float, typer.Option("--yaw", help="Direction of the face, about the subject's z axis [deg].")
+    ] = 0.0,
     wand: Annotated[str, typer.Option("--wand", help="Topic of the wand.")] = "/vicon/wand",
-    tip: Annotated[str, typer.Option("--tip", metavar="X,Y,Z", help="The wand's tip in its own frame [m].")] = "0,0,0",
+    tip: Annotated[
+        str, typer.Option("--tip", metavar="X,Y,Z", help="Tip of the wand in the wand's frame [m].")
+    ] = "0,0,0",
 ) -> None:
-    """Write where a face is in its subject's frame: by a ruler, or by touching its corners with a wand.
+    """Measure the pose of a face in its subject's frame, with a ruler or by touching its corners with a wand.
 
-    With the wand rest a second at the top left, top right, bottom right and bottom left corner, as seen by somebody who faces it.
-    Of a monitor give the whole panel; the attack uses its centre square, whose size is printed.
+    Hold the wand for a second at the top left, top right, bottom right and bottom left corner, seen from the front.
+    For a monitor, measure the whole panel. The attack uses its centre square, whose size is printed.
     """
     import numpy as np
 
@@ -113,7 +126,9 @@ def room_target(
     from calibration.schema import CalibrationError, save_calibration
 
     if (bag is None) == (size is None):
-        raise CalibrationError("expected either a bag in which a wand touches the corners, or --size WxH")
+        raise CalibrationError(
+            "expected either a bag in which a wand touches the corners or --size WxH; give one of them"
+        )
     if size is not None:
         width, height = _numbers(size.replace("x", ","), 2, "--size")
         target = target_of_size(
@@ -125,23 +140,30 @@ def room_target(
     save_calibration(target, output)
     width, height = target_size(target)
     print(f"{output}: {subject}, {width:.4f} x {height:.4f} m, {target.residuals or 'nothing fitted'}")
-    print(f"an attack for it may be {min(width, height):.4f} m wide: size_m: {min(width, height):.4f}")
+    print(f"an attack on it may be {min(width, height):.4f} m wide: size_m: {min(width, height):.4f}")
 
 
 @app.command("place")
 def room_place(
     attack_file: Annotated[Path, typer.Argument(help="Attack file.", exists=True, dir_okay=False)],
-    target_file: Annotated[Path, typer.Option("--target", help="Target file of what shows it.", exists=True)],
+    target_file: Annotated[
+        Path, typer.Option("--target", help="Target file of the board or monitor that shows the attack.", exists=True)
+    ],
     request: Annotated[
-        Path | None, typer.Option("--request", help="Its *.attack.yaml: writes one for the measured pose.", exists=True)
+        Path | None,
+        typer.Option(
+            "--request", help="The attack's *.attack.yaml. A copy for the measured pose is written.", exists=True
+        ),
     ] = None,
     tolerance_cm: Annotated[float, typer.Option("--tolerance-cm", min=0.1)] = 2.0,
     tolerance_deg: Annotated[float, typer.Option("--tolerance-deg", min=0.1)] = 2.0,
-    once: Annotated[bool, typer.Option("--once", help="Look once; exit code 1 if it stands wrong.")] = False,
-    timeout_s: Annotated[float, typer.Option("--timeout", min=1.0, help="Give up after so long [s].")] = 600.0,
+    once: Annotated[
+        bool, typer.Option("--once", help="Measure once. Exit code 1 if the target is out of place.")
+    ] = False,
+    timeout_s: Annotated[float, typer.Option("--timeout", min=1.0, help="Give up after this time [s].")] = 600.0,
     run_dir: RunDir = None,
 ) -> None:
-    """Guide board or monitor to where its attack was computed, live; refuses what stands wrong."""
+    """Guide the board or monitor to the pose for which its attack was computed, live. Exit code 1 if it is off."""
     import numpy as np
 
     from advnerf_core.attack.artifact import load_attack
@@ -155,14 +177,16 @@ def room_place(
     limits = tolerance_cm / 100.0, float(np.deg2rad(tolerance_deg))
     found = guide(find_run_dir(run_dir), attack, target, limits, once, timeout_s)
     if found is None:
-        say_error(f"no pose of {target.subject} within {timeout_s:g} s: is it in sight of motion capture?")
+        say_error(
+            f"expected a pose of {target.subject} within {timeout_s:g} s, got none; is it in view of motion capture?"
+        )
         raise typer.Exit(FAILURE_EXIT)
     off, T_world_from_subject = found
     if off.within(*limits):
-        print(f"{target.subject} stands where attack {attack.attack_id} wants it: {in_short(off)}")
+        print(f"{target.subject} is in place for attack {attack.attack_id}: {in_short(off)}")
         return
     say_error(
-        f"{target.subject} stands {in_short(off)} from where attack {attack.attack_id} was computed: move it, or attack again"
+        f"{target.subject} is {in_short(off)} from the pose of attack {attack.attack_id}: move it, or compute the attack again"
     )
     say_how_to_attack_again(request, target, T_world_from_subject)
     raise typer.Exit(FAILURE_EXIT)
@@ -181,7 +205,7 @@ def _touches(bag: Path, wand: str, subject: str, tip: tuple[float, float, float]
     from nodes.lab.wizards.bags import read_poses
 
     drawn, carried = read_poses(bag, wand), read_poses(bag, subject)
-    # The carrier stands still while its corners are touched: its nearest pose is its pose.
+    # The target stands still while its corners are touched, so its nearest pose is exact.
     nearest = np.clip(np.searchsorted(carried.stamps_ns, drawn.stamps_ns), 0, len(carried.stamps_ns) - 1)
     return find_touches(drawn.stamps_ns, drawn.T, carried.T[nearest], tip)
 
@@ -218,7 +242,7 @@ def _require_clearance(least_m: float) -> None:
 
     if least_m <= 0.0:
         raise DegenerateDataError(
-            f"expected the path inside the fence, it is {-least_m:.2f} m outside: walk around all of it"
+            f"expected the path inside the fence; it is {-least_m:.2f} m outside. Walk around the whole path"
         )
 
 
@@ -267,7 +291,7 @@ def _numbers(text: str, count: int, option: str) -> tuple[float, ...]:
         values = ()
     if len(values) != count:
         raise CalibrationError(
-            f"{option} {text}: expected {count} numbers in metres, e.g. {'0.598x0.336' if count == 2 else '0,0,0.1'}"
+            f"{option} {text}: expected {count} numbers in metres, for example {'0.598x0.336' if count == 2 else '0,0,0.1'}"
         )
     return values
 

@@ -1,4 +1,4 @@
-"""The commands ``advnerf scene ...``: from photographs to a scene field, and looking at it."""
+"""The commands ``advnerf scene ...``, which train, evaluate, render and show scenes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from nodes.cli import scene_import as cli_scene_import
 from nodes.runtime.terminal import print_table, table
 
 app = typer.Typer(
-    no_args_is_help=True, help="Scenes: posed images from videos, photographs and bags, and what is learned from them."
+    no_args_is_help=True, help="Make posed images from videos, photographs and bags; train and show scenes."
 )
 app.add_typer(cli_scene_import.app)
 cli_scene_gate.add_to(app)
@@ -21,10 +21,10 @@ DataSet = Annotated[Path, typer.Argument(help="A transforms.json, or its folder.
 SceneFile = Annotated[Path, typer.Argument(help="A scene file (scene.safetensors).", dir_okay=False)]
 Size = Annotated[
     tuple[int, int] | None,
-    typer.Option("--size", help="Width and height to bring the images to.", show_default="as they are"),
+    typer.Option("--size", help="Resize the images to this width and height.", show_default="their size"),
 ]
 Corner = Annotated[
-    tuple[float, float, float] | None, typer.Option(help="Corner of the learned box, in the file's unit.")
+    tuple[float, float, float] | None, typer.Option(help="Corner of the scene box, in the unit of the file.")
 ]
 IntervalScale = Annotated[
     float,
@@ -32,7 +32,7 @@ IntervalScale = Annotated[
         "--interval-scale",
         min=0.05,
         max=20.0,
-        help="Sample intervals in those of the training; longer ones are quicker.",
+        help="Length of a sample interval relative to training. Longer intervals render faster.",
     ),
 ]
 _HELD_OUT_EVERY = 8
@@ -42,44 +42,47 @@ _HELD_OUT_EVERY = 8
 def scene_train(
     transforms: DataSet,
     output: Annotated[
-        Path, typer.Option("--output", "-o", help="Folder of the results; a stopped training goes on there.")
+        Path, typer.Option("--output", "-o", help="Folder of the results. A stopped training resumes there.")
     ],
     steps: Annotated[int | None, typer.Option("--steps", min=1, show_default="1000 without --minutes")] = None,
-    minutes: Annotated[float | None, typer.Option("--minutes", min=0.01, help="Stop after so long, instead.")] = None,
+    minutes: Annotated[
+        float | None, typer.Option("--minutes", min=0.01, help="Train for this many minutes instead of --steps.")
+    ] = None,
     box_low: Corner = None,
     box_high: Corner = None,
     size: Size = None,
-    open_scene: Annotated[bool, typer.Option("--open", help="Out of doors: rays may leave the box.")] = False,
-    every: Annotated[int, typer.Option("--every", min=2, help="Hold out every so-manieth image.")] = _HELD_OUT_EVERY,
-    near: Annotated[
-        float, typer.Option("--near", min=0.0, help="Nothing is learned nearer to a camera than this.")
-    ] = 0.05,
+    open_scene: Annotated[bool, typer.Option("--open", help="Outdoor scene: rays may leave the box.")] = False,
+    every: Annotated[int, typer.Option("--every", min=2, help="Hold out every N-th image.")] = _HELD_OUT_EVERY,
+    near: Annotated[float, typer.Option("--near", min=0.0, help="Learn nothing closer to a camera than this.")] = 0.05,
     seed: Annotated[int, typer.Option("--seed")] = 0,
     checkpoint_every_s: Annotated[
-        float, typer.Option("--checkpoint-every", min=0.0, help="A kill loses at most so much training [s].")
+        float,
+        typer.Option(
+            "--checkpoint-every", min=0.0, help="Time between checkpoints; the most training that a kill loses [s]."
+        ),
     ] = 30.0,
     unbounded: Annotated[
         bool | None,
         typer.Option(
             "--unbounded/--bounded",
-            help="The scene goes on outside the box, to the horizon, with detail that fades with distance.",
-            show_default="unbounded where aabb_scale in the file is more than 1",
+            help="Also learn the scene outside the box, to the horizon, with detail that decreases with distance.",
+            show_default="unbounded if aabb_scale in the file is more than 1",
         ),
     ] = None,
     preset: Annotated[
         str,
         typer.Option(
             "--preset",
-            help="room: ours, for rooms and for a CPU (8 levels of 4 features, 2^17 entries, matte colours unless --open or "
-            "--unbounded). instant-ngp: its default sizes (16 levels of 2 features, 2^19 entries, finest 2048 x aabb_scale, "
-            "directions to degree 4), for detail and for comparisons; slower.",
+            help="room: for rooms and for training on a CPU (8 levels of 4 features, 2^17 entries, view-independent colours unless "
+            "--open or --unbounded). instant-ngp: default sizes of instant-ngp (16 levels of 2 features, 2^19 entries, finest "
+            "2048 x aabb_scale, directions to degree 4), for detail and comparisons; slower.",
         ),
     ] = "room",
     interval_px: Annotated[
         float | None,
         typer.Option(
             "--interval-px",
-            help="Sample intervals in pixels of the images; fewer are finer and slower.",
+            help="Length of a sample interval in image pixels. Smaller values are finer and slower.",
             show_default="4; 1.5 if all cameras stand outside the box",
         ),
     ] = None,
@@ -87,20 +90,20 @@ def scene_train(
         tuple[float, float] | None,
         typer.Option(
             "--interval",
-            help="Shortest and longest sample interval, in the file's unit.",
+            help="Shortest and longest sample interval, in the unit of the file.",
             show_default="1/1024 and 1/64 of the box",
         ),
     ] = None,
     interval_growth: Annotated[
         float | None,
         typer.Option(
-            "--interval-growth", help="Sample interval per distance.", show_default="--interval-px by focal length"
+            "--interval-growth", help="Sample interval per distance.", show_default="--interval-px / focal length"
         ),
     ] = None,
 ) -> None:
-    """Learn a scene from posed images; ends with PSNR and SSIM on held-out ones.
+    """Train a scene on posed images and print PSNR and SSIM on the held-out images.
 
-    Images with alpha are learned with it: what they show as transparent stays so.
+    The alpha channel of images is learned too: transparent areas stay transparent.
     """
     from nodes.lab.scene_training import FIGURES, SCENE, TrainingRequest, train
     from nodes.runtime.errors import ConfigError
@@ -108,7 +111,7 @@ def scene_train(
     from nodes.runtime.progress import ProgressDisplay
 
     if (box_low is None) != (box_high is None):
-        raise ConfigError("expected both --box-low and --box-high, or neither")
+        raise ConfigError("expected both --box-low and --box-high or neither, got one; add the other")
     box = None if box_low is None or box_high is None else (box_low, box_high)
     request = TrainingRequest(
         transforms,
@@ -132,7 +135,7 @@ def scene_train(
     try:
         lock = hold(output / ".lock")
     except HeldError as error:
-        raise ConfigError(f"{output} is in use by process {error.owner}: wait for it, or stop it") from None
+        raise ConfigError(f"{output} is in use by process {error.owner}; wait until it ends, or stop it") from None
     with lock, ProgressDisplay() as display:
         figures = train(request, display.start("scene"))
     _print_figures(figures)
@@ -147,7 +150,7 @@ def scene_eval(
     every: int = _HELD_OUT_EVERY,
     interval_scale: IntervalScale = 1.0,
 ) -> None:
-    """Compare a scene with the held-out images of a data set."""
+    """Evaluate a scene on the held-out images of a data set."""
     from advnerf_core.data.dataset import load_transforms
     from advnerf_core.scene.render_field import FieldRenderer
     from nodes.lab.scene_training import evaluate
@@ -160,14 +163,14 @@ def scene_eval(
 def scene_render(
     scene: SceneFile,
     transforms: DataSet,
-    output: Annotated[Path, typer.Option("--output", "-o", help="Folder of the pictures.")],
-    video: Annotated[Path | None, typer.Option("--video", help="Also one video (MP4) through all views.")] = None,
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the rendered images.")],
+    video: Annotated[Path | None, typer.Option("--video", help="Also write a video (MP4) through all views.")] = None,
     size: Size = None,
-    held_out: Annotated[bool, typer.Option("--held-out", help="Only the held-out images' cameras.")] = False,
+    held_out: Annotated[bool, typer.Option("--held-out", help="Render only the cameras of held-out images.")] = False,
     every: int = _HELD_OUT_EVERY,
     interval_scale: IntervalScale = 1.0,
 ) -> None:
-    """Draw what a scene shows from the cameras of a data set: colour, depth, and a video."""
+    """Render a scene from the cameras of a data set: colour, depth and, optionally, a video."""
     from advnerf_core.data.dataset import load_transforms
     from advnerf_core.scene.render_field import FieldRenderer
     from nodes.lab.scene_training import render
@@ -187,18 +190,20 @@ def scene_view(
     transforms: Annotated[
         Path | None, typer.Option("--cameras", help="A transforms.json whose cameras are shown.", exists=True)
     ] = None,
-    objects: Annotated[list[Path] | None, typer.Option("--object", help="An object file to put at the origin.")] = None,
+    objects: Annotated[list[Path] | None, typer.Option("--object", help="Object file to place at the origin.")] = None,
     room: Annotated[
-        Path | None, typer.Option("--room", help="A room calibration: its path is drawn.", exists=True)
+        Path | None, typer.Option("--room", help="Room calibration whose path is drawn.", exists=True)
     ] = None,
     port: Annotated[int, typer.Option("--port", min=1, max=65535)] = 8080,
-    host: Annotated[str, typer.Option("--host", help="0.0.0.0 lets others on the network look, too.")] = "127.0.0.1",
+    host: Annotated[
+        str, typer.Option("--host", help="Address to serve on. 0.0.0.0 lets other computers on the network connect.")
+    ] = "127.0.0.1",
 ) -> None:
     """Fly through a scene in the browser."""
     from nodes.lab.scene_view import SceneView
 
     view = SceneView(scene, transforms, objects or [], room, host, port)
-    print(f"http://{host}:{view.port} shows {scene}; Ctrl-C ends it", flush=True)
+    print(f"http://{host}:{view.port} shows {scene}; press Ctrl-C to stop", flush=True)
     view.serve()
 
 

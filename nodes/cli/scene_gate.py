@@ -1,4 +1,4 @@
-"""The command ``advnerf scene gate``: is a surrogate good enough that attacks found in it mean something?"""
+"""The command ``advnerf scene gate``, which tests whether a surrogate is good enough for attacks."""
 
 from __future__ import annotations
 
@@ -15,29 +15,37 @@ _REFUSED_EXIT = 1
 
 
 def add_to(app: typer.Typer) -> None:
-    """Add the command."""
+    """Register the command."""
     app.command("gate")(gate)
 
 
 def gate(
     file: Annotated[Path, typer.Argument(help="A *.experiment.yaml file.", exists=True, dir_okay=False)],
-    setting: Annotated[str, typer.Option("--setting", help="Which of the file's settings.")] = "full",
+    setting: Annotated[str, typer.Option("--setting", help="Setting of the experiment file.")] = "full",
     run_folder: Annotated[Path | None, typer.Option("--run-folder", show_default="runs/<setting>")] = None,
-    kind: Annotated[str, typer.Option("--kind", help="room, intersection, or a module of cells.")] = "room",
-    scenario: Annotated[str, typer.Option("--scenario", help="Which drive, where there are several.")] = "straight",
-    victim: Annotated[str, typer.Option("--victim", help="hardened or naive.")] = "hardened",
+    kind: Annotated[
+        str, typer.Option("--kind", help="Kind of experiment: room, intersection, or a module of cells.")
+    ] = "room",
+    scenario: Annotated[
+        str, typer.Option("--scenario", help="Scenario, for experiments that have several.")
+    ] = "straight",
+    victim: Annotated[str, typer.Option("--victim", help="Victim: hardened or naive.")] = "hardened",
     bag: Annotated[
-        Path | None, typer.Option("--bag", help="A bag of a drive without attack, to look at as well.", exists=True)
+        Path | None, typer.Option("--bag", help="Bag of a drive without an attack, to compare as well.", exists=True)
     ] = None,
-    psnr_db: Annotated[float | None, typer.Option("--psnr", help="Least mean PSNR at the policy's size [dB].")] = None,
-    ssim: Annotated[float | None, typer.Option("--ssim", help="Least mean SSIM at the policy's size.")] = None,
+    psnr_db: Annotated[
+        float | None, typer.Option("--psnr", help="Lowest accepted mean PSNR at the policy's image size [dB].")
+    ] = None,
+    ssim: Annotated[
+        float | None, typer.Option("--ssim", help="Lowest accepted mean SSIM at the policy's image size.")
+    ] = None,
     steering: Annotated[
-        float | None, typer.Option("--steering", help="Greatest mean steering difference [rad or rad/s].")
+        float | None, typer.Option("--steering", help="Largest accepted mean steering difference [rad or rad/s].")
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print everything as JSON.")] = False,
     overrides: Overrides = None,
 ) -> None:
-    """Compare learned with real views, in looks and in what the policy makes of them; exit code 1 refuses the surrogate."""
+    """Compare learned with real views by image quality and by the policy's steering. Exit code 1 if the surrogate fails."""
     os.environ.setdefault("MUJOCO_GL", "egl")
     from advnerf_core.scene.gate_limits import GateLimits
     from nodes.experiment.campaign.gate import judge_scene

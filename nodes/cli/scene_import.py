@@ -1,4 +1,4 @@
-"""The commands ``advnerf scene from-...``: posed images (``transforms.json``) out of what a person has recorded."""
+"""The commands ``advnerf scene from-...``, which make posed images (``transforms.json``) from recordings."""
 
 from __future__ import annotations
 
@@ -19,28 +19,30 @@ app = typer.Typer()
 Output = Annotated[
     Path,
     typer.Option(
-        "--output", "-o", help="Folder of the data set, written when it is whole; a stopped run goes on in OUTPUT.part."
+        "--output",
+        "-o",
+        help="Folder of the data set, written when it is complete. A stopped run resumes from OUTPUT.part.",
     ),
 ]
 Media = Annotated[list[Path], typer.Argument(help="Videos and folders of photographs.", exists=True)]
 Bag = Annotated[Path, typer.Argument(help="Bag folder, or a .mcap, .db3 or .bag file of a drive.", exists=True)]
-Most = Annotated[int, typer.Option("--most", min=3, help="At most so many images of each video, folder or bag.")]
+Most = Annotated[int, typer.Option("--most", min=3, help="Use at most this many images of each video, folder or bag.")]
 OneCamera = Annotated[
-    bool, typer.Option("--one-camera", help="All were taken by one camera with one focal length (no zoom).")
+    bool, typer.Option("--one-camera", help="All images are from one camera with one focal length (no zoom).")
 ]
 Movement = Annotated[
     float,
     typer.Option(
-        "--movement", min=0.005, max=0.9, help="Keep a frame when the picture moved by this share of its width."
+        "--movement", min=0.005, max=0.9, help="Keep a frame when the image has moved by this fraction of its width."
     ),
 ]
 ExtentM = Annotated[
     float,
     typer.Option(
-        "--extent", min=0.001, help="Distance between the two farthest places photographed from [m]; fixes the scale."
+        "--extent", min=0.001, help="Distance between the two camera positions farthest apart [m]; sets the scale."
     ),
 ]
-Seed = Annotated[int, typer.Option("--seed", help="Of all randomness.")]
+Seed = Annotated[int, typer.Option("--seed", help="Random seed.")]
 Calibration = Annotated[
     Path | None,
     typer.Option(
@@ -48,11 +50,16 @@ Calibration = Annotated[
         exists=True,
         dir_okay=False,
         show_default="camera.yaml in the bag",
-        help="The driving camera's.",
+        help="Camera calibration of the driving camera.",
     ),
 ]
-StepM = Annotated[float, typer.Option("--step", min=0.0, help="Take a frame of the bag after so many metres.")]
-StepDeg = Annotated[float, typer.Option("--step-angle", min=0.0, help="Or after so many degrees of turning.")]
+StepM = Annotated[float, typer.Option("--step", min=0.0, help="Distance between two frames of the bag [m].")]
+StepDeg = Annotated[
+    float,
+    typer.Option(
+        "--step-angle", min=0.0, help="Rotation after which the next frame is used even without that distance [deg]."
+    ),
+]
 
 
 @app.command("from-video")
@@ -60,7 +67,7 @@ def from_video(
     media: Media, output: Output, movement: Movement = 0.06, most: Most = 300, one_camera: OneCamera = False,
     extent_m: ExtentM = 4.0, seed: Seed = 0,
 ) -> None:  # fmt: skip
-    """Find poses and lenses of the sharpest frames of videos, several videos and cameras in one model."""
+    """Estimate poses and lenses of the sharpest frames of videos. Several videos and cameras go into one model."""
     _from_media(media, output, movement, most, one_camera, extent_m, seed)
 
 
@@ -68,7 +75,10 @@ def from_video(
 def from_images(
     media: Media, output: Output, most: Most = 300, one_camera: OneCamera = False, extent_m: ExtentM = 4.0, seed: Seed = 0
 ) -> None:  # fmt: skip
-    """Find poses and lenses of photographs; images of a folder share a camera unless size or EXIF data differ; videos may join in."""
+    """Estimate poses and lenses of photographs, optionally with videos.
+
+    The images of a folder share a camera unless their sizes or EXIF data differ.
+    """
     _from_media(media, output, 0.06, most, one_camera, extent_m, seed)
 
 
@@ -76,10 +86,10 @@ def from_images(
 def from_bag(
     bag: Bag, output: Output, calibration: Calibration = None, step_m: StepM = 0.1, step_deg: StepDeg = 5.0, most: Most = 300,
     margin_m: Annotated[
-        float, typer.Option("--margin", min=0.0, help="How far the scene reaches beyond the car's way [m].")
+        float, typer.Option("--margin", min=0.0, help="Margin of the scene box around the car's trajectory [m].")
     ] = 3.0,
 ) -> None:  # fmt: skip
-    """Take recorded frames with their motion-capture poses; nothing is estimated."""
+    """Use recorded frames with their motion-capture poses. No pose is estimated."""
     from nodes.lab.importing.data_set import from_bag as run
     from nodes.lab.importing.driven_bag import BagConfig
 
@@ -94,10 +104,10 @@ def from_phone_and_car(
     calibration: Calibration = None, movement: Movement = 0.06, step_m: StepM = 0.15, step_deg: StepDeg = 8.0,
     most: Most = 200, one_camera: OneCamera = False, seed: Seed = 0,
     tolerance_m: Annotated[
-        float, typer.Option("--tolerance", min=0.001, help="Farthest a frame may be from its motion-capture pose [m].")
+        float, typer.Option("--tolerance", min=0.001, help="Largest accepted distance of a frame from its motion-capture pose [m].")
     ] = 0.08,
 ) -> None:  # fmt: skip
-    """Put phone media and the frames of a driven bag into one model, metric and in the motion-capture world."""
+    """Combine phone media and the frames of a bag into one model, metric and in the motion-capture world."""
     from advnerf_core.data.keyframes import KeyframeConfig
     from calibration.phone_and_car import PlacingConfig
     from calibration.structure_from_motion import SfmConfig
@@ -115,19 +125,19 @@ def from_phone_and_car(
 
 @app.command("match-colours")
 def match_colours(
-    scene: Annotated[Path, typer.Argument(help="Scene file, learned from the phone's images.", exists=True, dir_okay=False)],
-    images: Annotated[Path, typer.Argument(help="transforms_car.json: frames of the driving camera in the same world.", exists=True)],
+    scene: Annotated[Path, typer.Argument(help="Scene file learned from the phone's images.", exists=True, dir_okay=False)],
+    images: Annotated[Path, typer.Argument(help="transforms_car.json with frames of the driving camera in the same world.", exists=True)],
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="Where to write the scene with the map.", show_default="the scene file")
+        Path | None, typer.Option("--output", "-o", help="Scene file to write, with the colour map.", show_default="the scene file")
     ] = None,
-    most: Annotated[int, typer.Option("--most", min=1, help="At most so many frames, evenly spread.")] = 16,
+    most: Annotated[int, typer.Option("--most", min=1, help="Use at most this many frames, evenly spread.")] = 16,
 ) -> None:  # fmt: skip
-    """Fit the map from the colours a scene was learned in to the driving camera's, and store it in the scene file."""
+    """Fit the map from the colours of a scene to those of the driving camera, and store it in the scene file."""
     from nodes.lab.importing.colours import match_colours as run
 
     result = run(scene, images, output or scene, most)
     print(
-        f"{output or scene}: colour map of {result.frames} frames, PSNR {result.before_db:.2f} dB without it, {result.after_db:.2f} dB with it"
+        f"{output or scene}: colour map fitted to {result.frames} frames, PSNR {result.before_db:.2f} dB without it, {result.after_db:.2f} dB with it"
     )
 
 
@@ -159,8 +169,8 @@ def _run(name: str, output: Path, work: Any) -> None:
         code = int(asked.code or 0)
     if code:
         kept = work_folder(output)
-        going_on = f"finished work is kept in {kept}, and the same command goes on there"
-        say_error(f"stopped; {going_on if kept.exists() else 'nothing is left behind'}")
+        going_on = f"finished work is kept in {kept}; run the same command to resume"
+        say_error(f"stopped; {going_on if kept.exists() else 'no files were left'}")
         raise typer.Exit(code)
     _print_report(imported)
 
@@ -169,7 +179,7 @@ def _print_report(imported: Imported) -> None:
     facts = imported.report
     if "recorded_frames" in facts:
         print(
-            f"{facts['taken_frames']} of {facts['recorded_frames']} frames taken, {facts['without_pose']} had no motion-capture pose"
+            f"{facts['taken_frames']} of {facts['recorded_frames']} frames used, {facts['without_pose']} had no motion-capture pose"
             + (f"; unchecked: {facts['unchecked']}" if facts.get("unchecked") else "")
         )
     if model := facts.get("structure_from_motion"):

@@ -1,4 +1,4 @@
-"""The command ``advnerf teleop``: drive, or let drive, while a button is held."""
+"""The command ``advnerf teleop``, which lets the car drive while a button is held."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import typer
 
 
 def teleop(
-    device: Annotated[str, typer.Option("--device", help="keyboard, or a gamepad: /dev/input/by-id/...-event-joystick.")] = "keyboard",
+    device: Annotated[str, typer.Option("--device", help="keyboard, or the path of a gamepad: /dev/input/by-id/...-event-joystick.")] = "keyboard",
     run_dir: Annotated[Path | None, typer.Option("--run-dir", show_default="the launch that is running")] = None,
     speed_mps: Annotated[float, typer.Option("--speed", min=0.05, max=2.0, help="Speed at full throttle [m/s].")] = 0.8,
 ) -> None:  # fmt: skip
-    """Hold a button to let the car of a running launch move; letting go stops it."""
+    """Drive the car of a running launch while a button is held. Releasing the button stops it."""
     import sys
 
     from hardware.operator.keyboard import HELP
@@ -25,11 +25,15 @@ def teleop(
 
     if device == "keyboard" and not sys.stdin.isatty():
         raise ConfigError(
-            "expected a terminal to read keys from, got none; run it in one, or give --device of a gamepad"
+            "expected a terminal to read keys from, got none; run the command in a terminal, or give --device of a gamepad"
         )
     config = TeleopConfig(device="keyboard" if device == "keyboard" else Path(device), speed_mps=speed_mps)
     folder = find_run_dir(run_dir)
-    print(HELP if device == "keyboard" else "hold LB: drive, hold RB: let the software drive, B: e-stop, Start: re-arm")
+    print(
+        HELP
+        if device == "keyboard"
+        else "hold LB: drive by hand, hold RB: let the software drive, B: e-stop, Start: re-arm"
+    )
 
     def build(context: NodeContext) -> TeleopNode:
         return TeleopNode.build(config, context)
@@ -38,5 +42,5 @@ def teleop(
 
 
 def add_to(app: typer.Typer) -> None:
-    """Add the command."""
+    """Register the command."""
     app.command("teleop")(teleop)

@@ -9,12 +9,12 @@ import typer
 
 from nodes.runtime.terminal import RunDir, print_table, table
 
-app = typer.Typer(no_args_is_help=True, help="Look at what the nodes of a running launch say.")
+app = typer.Typer(no_args_is_help=True, help="Inspect the topics of a running launch.")
 
 
 @app.command("list")
 def topic_list(run_dir: RunDir = None) -> None:
-    """List all topics, who publishes them and to how many."""
+    """List all topics with type, rate, publisher and number of subscribers."""
     from nodes.launching.watching import find_run_dir, list_topics
     from nodes.runtime.topics import topic
 
@@ -30,10 +30,10 @@ def topic_list(run_dir: RunDir = None) -> None:
 @app.command("hz")
 def topic_hz(
     topic: str,
-    duration_s: Annotated[float, typer.Option("--duration", min=0.1, help="Listen for so many seconds.")] = 5.0,
+    duration_s: Annotated[float, typer.Option("--duration", min=0.1, help="Time to listen [s].")] = 5.0,
     run_dir: RunDir = None,
 ) -> None:
-    """Measure the rate of a topic, its gaps, its losses, and how old its capture stamps are."""
+    """Measure a topic: rate, gaps, lost messages, and age of the capture stamps."""
     from nodes.launching.watching import find_run_dir, measure_rate
 
     report = measure_rate(find_run_dir(run_dir), topic, duration_s)
@@ -46,14 +46,16 @@ def topic_hz(
 @app.command("echo")
 def topic_echo(
     topic: str,
-    count: Annotated[int | None, typer.Option("--count", min=1, help="Stop after so many messages.")] = None,
-    duration_s: Annotated[float | None, typer.Option("--duration", min=0.1, help="Stop after so many seconds.")] = None,
+    count: Annotated[int | None, typer.Option("--count", min=1, help="Stop after this many messages.")] = None,
+    duration_s: Annotated[
+        float | None, typer.Option("--duration", min=0.1, help="Stop after this many seconds.")
+    ] = None,
     run_dir: RunDir = None,
 ) -> None:
     """Print the messages of a topic."""
     from nodes.launching.watching import describe, find_run_dir, listen
 
-    with contextlib.suppress(KeyboardInterrupt):  # Ctrl-C is how this usually ends
+    with contextlib.suppress(KeyboardInterrupt):  # the user stops this command with Ctrl-C
         for shown, received in enumerate(listen(find_run_dir(run_dir), topic, duration_s), start=1):
             print(f"{describe(received.message())}\n---", flush=True)
             if count is not None and shown >= count:
@@ -63,10 +65,10 @@ def topic_echo(
 @app.command("delay")
 def topic_delay(
     topic: str,
-    duration_s: Annotated[float, typer.Option("--duration", min=0.1, help="Listen for so many seconds.")] = 5.0,
+    duration_s: Annotated[float, typer.Option("--duration", min=0.1, help="Time to listen [s].")] = 5.0,
     run_dir: RunDir = None,
 ) -> None:
-    """Measure where the time of a topic goes: from capture to publication, and from there to a reader."""
+    """Measure the delays of a topic: from capture to publication, and from publication to reception."""
     from nodes.launching.watching import find_run_dir
     from nodes.launching.watching_nodes import measure_delay
 

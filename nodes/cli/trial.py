@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def add_to(app: typer.Typer) -> None:
-    """Add both commands."""
+    """Register both commands."""
     app.command("trial")(trial)
     app.command("evaluate")(evaluate)
 
@@ -25,26 +25,28 @@ def trial(
     file: Annotated[Path, typer.Argument(help="A *.launch.yaml file.", exists=True, dir_okay=False)],
     attack: Annotated[
         list[str] | None,
-        typer.Option("--attack", metavar="CONDITION=FILE", help="Attack file of a condition; may be repeated."),
+        typer.Option("--attack", metavar="CONDITION=FILE", help="Attack file of a condition. May be repeated."),
     ] = None,
-    folder: Annotated[Path, typer.Option("--folder", help="Plan, results and bags; the same folder goes on.")] = Path(
-        "runs/trials"
-    ),
-    repeats: Annotated[int, typer.Option("--repeats", min=1, help="Runs of each condition.")] = 5,
-    seed: Annotated[int, typer.Option("--seed", help="Of the order of the runs.")] = 0,
-    ticks: Annotated[int, typer.Option("--ticks", min=1, help="Control ticks of a drive, 10 a second.")] = 60,
+    folder: Annotated[
+        Path, typer.Option("--folder", help="Folder of plan, results and bags. The same folder resumes the trial.")
+    ] = Path("runs/trials"),
+    repeats: Annotated[int, typer.Option("--repeats", min=1, help="Number of runs per condition.")] = 5,
+    seed: Annotated[int, typer.Option("--seed", help="Random seed of the order of runs.")] = 0,
+    ticks: Annotated[int, typer.Option("--ticks", min=1, help="Control ticks per drive, at 10 Hz.")] = 60,
     start: Annotated[
         str | None, typer.Option("--start", metavar="X,Y,YAW", help="Start pose [m, rad].", show_default="the room's")
     ] = None,
     ready_timeout_s: Annotated[float, typer.Option("--ready-timeout", min=1.0)] = 60.0,
     host: Annotated[
         str | None,
-        typer.Option("--host", help="Which of the file's hosts this computer is, or all; the other must be running."),
+        typer.Option(
+            "--host", help="Host of the launch file that this computer is, or all. The other host must be running."
+        ),
     ] = None,
-    show: Annotated[bool, typer.Option("--show", help="Only print the order and what is done.")] = False,
+    show: Annotated[bool, typer.Option("--show", help="Only print the order of runs and which are done.")] = False,
     overrides: Overrides = None,
 ) -> None:
-    """Drive none, random and gradient in a fair order, each from the same start; goes on where it was left."""
+    """Drive the conditions none, random and gradient in balanced order from the same start. Resumes a stopped trial."""
     from nodes.lab.trials.series import drive_series, prepare_series
 
     attacks = _attacks(attack or [])
@@ -75,10 +77,10 @@ def evaluate(
     room: Annotated[
         Path | None, typer.Option("--room", help="Room file.", show_default="the one in the bag", exists=True)
     ] = None,
-    ticks: Annotated[int, typer.Option("--ticks", min=1, help="Control ticks, 10 a second.")] = 60,
+    ticks: Annotated[int, typer.Option("--ticks", min=1, help="Number of control ticks to evaluate, at 10 Hz.")] = 60,
     as_json: Annotated[bool, typer.Option("--json", help="Print everything as JSON, one line per drive.")] = False,
 ) -> None:
-    """Say how far the car left its path in a bag: the same numbers as a trial's, from any recording of a drive."""
+    """Compute how far the car left its path in a bag, with the metrics of a trial."""
     from nodes.lab.trials.bags import evaluate_bag
 
     rows = table(
@@ -102,11 +104,11 @@ def evaluate(
 
 
 def _added(compared: dict[str, Any] | None) -> str:
-    """What the attack added to the steering, in degrees; nothing where nobody compared."""
+    """Text with the steering that the attack added [deg]; empty if the bag has no counterfactual."""
     if compared is None:
         return ""
     mean, largest = compared["mean_abs_delta_rad"], math.degrees(compared["max_abs_delta_rad"])
-    seen = f"mean {math.degrees(mean):.2f}" if mean is not None else "never in view"
+    seen = f"mean {math.degrees(mean):.2f}" if mean is not None else "attack never in view"
     return f"{seen}, max {largest:.2f} deg ({compared['frames_drawn']} of {compared['frames']} images)"
 
 
@@ -117,7 +119,7 @@ def _attacks(texts: list[str]) -> dict[str, list[Path]]:
     for text in texts:
         condition, separator, file = text.partition("=")
         if not separator or not condition.replace("_", "").isalnum() or condition == NONE or not file:
-            raise CampaignError(f"--attack {text}: expected CONDITION=FILE, e.g. gradient=runs/g.safetensors")
+            raise CampaignError(f"--attack {text}: expected CONDITION=FILE, for example gradient=runs/g.safetensors")
         attacks.setdefault(condition, []).append(Path(file).resolve())
     return attacks
 
@@ -128,7 +130,9 @@ def _pose(text: str) -> tuple[float, float, float]:
     try:
         x, y, yaw = (float(part) for part in text.split(","))
     except ValueError:
-        raise CampaignError(f"--start {text}: expected X,Y,YAW in metres and radians, e.g. -1.1,-2.0,0") from None
+        raise CampaignError(
+            f"--start {text}: expected X,Y,YAW in metres and radians, for example -1.1,-2.0,0"
+        ) from None
     return x, y, yaw
 
 

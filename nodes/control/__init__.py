@@ -1,1 +1,1 @@
-"""What decides whether the car may move. Pure: time and messages come as arguments."""
+"""Decides whether the car may move. Pure: time and messages come as arguments."""

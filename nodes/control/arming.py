@@ -1,4 +1,4 @@
-"""When the car may move: checks, and an arming that any failed check ends until somebody arms again.
+"""The arming state machine. Any failed check disarms the car until a new request arms it.
 
 Pure: time and messages come as arguments.
 """
@@ -21,21 +21,21 @@ _ALIVE_STATES = ("ready", "active")
 
 @dataclass(frozen=True)
 class ArmingLimits:
-    """Numbers of the checks.
+    """Limits of the checks.
 
     Attributes:
-        nodes: Nodes whose status must be fresh and good.
-        fence_m: Corners of the polygon that the rear axle may not leave [m].
-        drivers: Who may command, first the one that goes before the others.
-        fence_margin_m: The rear axle stays at least this far inside the fence [m].
-        drive_age_s: Oldest command of who drives, since publication [s].
-        image_age_s: Oldest camera image, since publication, and oldest capture behind a command [s].
-        pose_age_s: Oldest pose of the car, since publication [s].
-        status_age_s: Oldest status of a node [s].
-        held_up_s: A pause of this process after which it disarms itself [s].
-        speed_mps: Greatest magnitude of a commanded speed [m/s].
-        steering_rad: Greatest magnitude of a commanded steering angle that is not absurd [rad].
-        arm_age_s: A request to arm older than this is void [s].
+        nodes: Nodes whose status must be fresh and without a fault.
+        fence_m: Corners of the polygon that the rear axle must not leave [m].
+        drivers: Nodes that may command the car, highest priority first.
+        fence_margin_m: Smallest distance of the rear axle from the fence [m].
+        drive_age_s: Largest age of the active driver's newest command since publication [s].
+        image_age_s: Largest age of the newest camera image since publication, and of the image that a command is based on [s].
+        pose_age_s: Largest age of the car's newest pose since publication [s].
+        status_age_s: Largest age of a node's newest status [s].
+        held_up_s: Longest pause of this process; a longer one disarms the car [s].
+        speed_mps: Largest magnitude of a commanded speed [m/s].
+        steering_rad: Largest magnitude of a commanded steering angle [rad].
+        arm_age_s: Largest age of a request to arm [s].
     """
 
     nodes: tuple[str, ...]
@@ -53,16 +53,16 @@ class ArmingLimits:
 
 
 class Gate(Protocol):
-    """A check that stands on its own."""
+    """An independent check."""
 
     def problem(self, mono_ns: int) -> str:
-        """Why the car may not move; empty if it may."""
+        """Return why the car may not move; empty if it may."""
         ...
 
 
 @dataclass
 class _Source:
-    """Something that must keep coming."""
+    """A message stream that must not stop."""
 
     publish_ns: int | None = None
     instance_id: int | None = None
@@ -89,18 +89,18 @@ class _NodeStatus(_Source):
 
 @dataclass
 class Arming:
-    """The state machine. Call `check` at every opportunity; it disarms by itself.
+    """The arming state machine. Call `check` at every message and tick; it disarms the car if a check fails.
 
     Attributes:
-        limits: Numbers of the checks.
+        limits: Limits of the checks.
         armed: Whether commands to move may pass.
-        reason: Why it is not armed.
-        source: Who armed it.
-        peer: What the motor controller says it is.
-        hand: Who holds the button.
-        clocks: Clocks of other hosts.
-        gates: Further checks, in this order, after all others but the fence.
-        driver: Whose commands pass; the next one in line may not stand in for it when it falls silent.
+        reason: Why the car is not armed.
+        source: Source of the request that armed the car.
+        peer: Identity that the motor controller reports.
+        hand: The check of the held button.
+        clocks: The check of other hosts' clocks.
+        gates: Further checks, run in this order after all others except the fence.
+        driver: The active driver, whose commands pass. If it stops sending, the next driver does not replace it.
     """
 
     limits: ArmingLimits
@@ -108,7 +108,7 @@ class Arming:
     clocks: ClockGate = field(default_factory=ClockGate)
     gates: Sequence[Gate] = ()
     armed: bool = False
-    reason: str = "nobody has armed"
+    reason: str = "not armed since the start"
     source: str = ""
     peer: str = ""
     driver: str = ""
@@ -129,16 +129,16 @@ class Arming:
         self.driver = self.limits.drivers[0]
 
     def heard_camera(self, info: MessageInfo) -> None:
-        """An image was taken."""
+        """Note a camera image."""
         self._camera.heard(info)
 
     def heard_car(self, x_m: float, y_m: float, info: MessageInfo) -> None:
-        """The car was measured [m]."""
+        """Note a measured position of the car [m]."""
         self._car.heard(info)
         self._position_m = (x_m, y_m)
 
     def heard_status(self, name: str, state: str, text: str, info: MessageInfo) -> None:
-        """A node reported."""
+        """Note the status of a node."""
         if name in self._nodes:
             node = self._nodes[name]
             node.heard(info)
@@ -148,12 +148,13 @@ class Arming:
         self, speed_mps: float, steering_rad: float, capture_real_ns: int, info: MessageInfo, mono_ns: int, real_ns: int,
         driver: str = "policy",
     ) -> bool:  # fmt: skip
-        """A driver commands; whether the command may pass on."""
+        """Note a command of a driver. Returns whether the command may pass."""
         self._check_held_up(mono_ns)
         fault = self._command_fault(speed_mps, steering_rad) or self._capture_fault(capture_real_ns, real_ns)
         source = self._drivers[driver]
         if capture_real_ns > source.capture_ns:
-            # A command from an image already used is no sign of life: a frozen camera makes the policy repeat itself.
+            # A command based on an image that was already used does not count as fresh: with a frozen camera, the policy
+            # repeats its command.
             source.heard(info)
             source.capture_ns = capture_real_ns
         elif not fault:
@@ -170,15 +171,15 @@ class Arming:
     def heard_hand(
         self, mode: str, pressed_stop: bool, speed_mps: float, steering_rad: float, info: MessageInfo, mono_ns: int
     ) -> bool:
-        """The teleop node reports; whether its own command may pass on.
+        """Note a message of the teleop node. Returns whether its own command may pass.
 
-        Beginning to hold arms; letting go, and everything else that disarms, must be followed by a new press. An e-stop is
-        cleared only by an explicit request of a person.
+        Pressing the button arms the car. After it is released, or after any other disarming, it must be pressed again. Only an
+        explicit request of the operator clears an e-stop.
         """
         self._check_held_up(mono_ns)
         began = self.hand.heard(mode, pressed_stop, info)
         if pressed_stop:
-            self._estop = "e-stop pressed; let it go and re-arm"
+            self._estop = "e-stop pressed; release it and re-arm"
             self.disarm(self._estop, mono_ns)
         elif began and self.hand.required:
             self.arm(OPERATOR, info.publish_mono_ns, mono_ns, explicit=False)
@@ -187,7 +188,7 @@ class Arming:
         return self.check(mono_ns) and self.hand.drives
 
     def check(self, mono_ns: int) -> bool:
-        """Disarm if anything is wrong; whether commands to move may pass."""
+        """Disarm if a check fails. Returns whether commands to move may pass."""
         self._check_held_up(mono_ns)
         if self.armed:
             if problem := self.problem(mono_ns):
@@ -197,13 +198,13 @@ class Arming:
         return self.armed
 
     def arm(self, source: str, asked_ns: int, mono_ns: int, explicit: bool = True) -> str:
-        """Somebody wants to arm. A person may; a program only if no real car can move.
+        """Decide a request to arm. The operator may arm any car, a program only the simulated one.
 
         Args:
-            source: Who.
-            asked_ns: When it was first asked [ns].
-            mono_ns: Now [ns].
-            explicit: Whether it was asked for in so many words, which clears an e-stop; a held button does not.
+            source: Source of the request.
+            asked_ns: Time of the first repeat of the request [ns].
+            mono_ns: Current time [ns].
+            explicit: Whether the request is explicit and so clears an e-stop. A held button is not.
 
         Returns:
             Why the car is not armed; empty if it is.
@@ -215,17 +216,17 @@ class Arming:
         if void := self._void(asked_ns, mono_ns):
             return void
         for watched in self._watched():
-            watched.restarted = False  # whatever happened before, this is who is armed with
+            watched.restarted = False  # the running process is accepted
         if explicit and source == OPERATOR and not self.hand.pressed_stop:
             self._estop = ""
         self.driver = self._first_fresh(mono_ns)
         if source != OPERATOR and TWIN_PEER not in self.peer.upper():
             refusal = (
-                f"{source!r} is not a person, and the motor's peer is {self.peer or 'unknown'}, not the twin;"
-                f" a real car is armed by source {OPERATOR!r} only"
+                f"expected source {OPERATOR!r} for a real car, got {source!r}; the motor's peer is {self.peer or 'unknown'},"
+                " not the twin. Arm with advnerf arm"
             )
         elif not (refusal := self.problem(mono_ns)) and explicit and asked_ns <= self._fault_ns:
-            refusal = f"since the request there was a fault: {self._fault}; arm again"
+            refusal = f"a fault occurred after the request: {self._fault}; arm again"
         if refusal:
             self.reason = f"not armed: {refusal}"
         else:
@@ -233,25 +234,25 @@ class Arming:
         return refusal
 
     def disarm(self, reason: str, mono_ns: int) -> None:
-        """Stop, and stay stopped until somebody arms again."""
+        """Stop the car until the next request to arm is granted."""
         self.armed, self.reason, self._disarmed_ns = False, reason, mono_ns
 
     def problem(self, mono_ns: int) -> str:
-        """The first thing that is wrong, causes before effects; empty if all is well."""
+        """Return the first failed check, causes before effects; empty if all pass."""
         return self._estop or self.hand.problem(mono_ns) or self._restart_problem() or self._passing_fault(mono_ns)
 
     def _restart_problem(self) -> str:
-        """Which source is no longer the process that was armed with; the next arming takes it as it is."""
+        """Name a source that was restarted since the arming. The next arming accepts the new process."""
         for name, node in self._nodes.items():
             if node.restarted:
                 return f"node {name} was restarted"
         for what, source, _ in self._sources():
             if source.restarted:
-                return f"{what} from the process that was armed with: it was restarted"
+                return f"{what} from the process that ran at arming: it was restarted"
         return ""
 
     def _passing_fault(self, mono_ns: int) -> str:
-        """The first fault that goes away without anybody arming."""
+        """Return the first fault that ends without a new arming, such as missing messages."""
         if problem := self.clocks.problem(mono_ns):
             return problem
         for name, node in self._nodes.items():
@@ -268,7 +269,7 @@ class Arming:
         if "camera" in limits.nodes:
             sources.insert(0, ("no camera image", self._camera, limits.image_age_s))
         if not self.hand.drives:
-            sources.append((f"no command of the {self.driver}", self._drivers[self.driver], limits.drive_age_s))
+            sources.append((f"no command from the {self.driver}", self._drivers[self.driver], limits.drive_age_s))
         return sources
 
     def drive_age_s(self, mono_ns: int) -> float:
@@ -280,12 +281,12 @@ class Arming:
         return self._car.age_s(mono_ns)
 
     def _void(self, asked_ns: int, mono_ns: int) -> str:
-        """Why a request to arm does not count any more; empty if it does."""
+        """Return why a request to arm is void; empty if it is valid."""
         if asked_ns <= self._disarmed_ns:
             return f"the request is older than the last stop ({self.reason}); arm again"
         age_s, limit_s = (mono_ns - asked_ns) / NS_PER_S, self.limits.arm_age_s
         if age_s > limit_s:
-            return f"the request is {age_s:.1f} s old, older than {limit_s:g} s; arm again"
+            return f"the request is {age_s:.1f} s old, the limit is {limit_s:g} s; arm again"
         return ""
 
     def _watched(self) -> list[_Source]:
@@ -296,7 +297,7 @@ class Arming:
         return fresh[0] if fresh else self.limits.drivers[0]
 
     def _give_way(self, driver: str, mono_ns: int) -> None:
-        """A driver of higher rank takes over at once; while nobody is armed the first fresh one is next."""
+        """Let a driver of higher priority take over at once. While disarmed, the first driver with a fresh command is chosen."""
         self.driver = driver if self.armed else self._first_fresh(mono_ns)
         self._drivers[self.driver].restarted &= self.armed
 
@@ -313,7 +314,9 @@ class Arming:
     def _node_problem(self, name: str, node: _NodeStatus, mono_ns: int) -> str:
         if (age_s := node.age_s(mono_ns)) > self.limits.status_age_s:
             return (
-                f"node {name} has not reported yet" if math.isinf(age_s) else f"node {name} is silent for {age_s:.1f} s"
+                f"node {name} has not reported yet"
+                if math.isinf(age_s)
+                else f"node {name} has been silent for {age_s:.1f} s"
             )
         if node.state not in _ALIVE_STATES:
             return f"node {name} is in state {node.state}: {node.text}"
@@ -334,10 +337,10 @@ class Arming:
 
     def _check_held_up(self, mono_ns: int) -> None:
         if self._last_ns is None:
-            # Stopped until now: what was asked of a safety node before this one is void.
+            # First check: requests made before this process started are void.
             self._last_ns = self._disarmed_ns = mono_ns
         pause_s = (mono_ns - self._last_ns) / NS_PER_S
         self._last_ns = mono_ns
         if self.armed and pause_s > self.limits.held_up_s:
-            # Stopped by a signal, or the computer was: what was checked before says nothing about now.
+            # This process or the computer was suspended, so the earlier checks are no longer valid.
             self.disarm(f"the safety node was held up for {pause_s:.2f} s", mono_ns)

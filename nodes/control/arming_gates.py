@@ -1,4 +1,4 @@
-"""Gates of the arming that stand on their own: the hand that holds a button, the clocks of two hosts, the fence.
+"""Independent checks of the arming: the held button, the clocks of other hosts, the fence.
 
 Pure: time and messages come as arguments.
 """
@@ -20,13 +20,13 @@ _MOST_DOUBT_S = 3600.0
 
 @dataclass
 class HandGate:
-    """Hold to run: somebody holds a button, and says so again and again.
+    """Hold to run: the operator must hold a button, and the teleop node must keep reporting it.
 
     Attributes:
-        required: Whether nothing may move without it.
-        age_limit_s: Silence of the teleop node after which the button counts as released [s].
-        mode: What is held: ``human`` (the hand itself drives), ``autonomy`` (it lets drive) or ``idle``.
-        pressed_stop: Whether the e-stop is pressed, or was and nobody has re-armed.
+        required: Whether the car may only move while the button is held.
+        age_limit_s: Time without a message of the teleop node after which the button counts as released [s].
+        mode: What the button does: ``human`` (the operator drives), ``autonomy`` (the software drives) or ``idle``.
+        pressed_stop: Whether the e-stop is pressed, or was pressed since the last arming.
     """
 
     required: bool = False
@@ -37,49 +37,49 @@ class HandGate:
     _instance_id: int | None = None
 
     def heard(self, mode: str, pressed_stop: bool, info: MessageInfo) -> bool:
-        """Note a message; whether the hand has just begun to hold.
+        """Note a message. Returns whether the button was just pressed.
 
-        A message of a teleop node that was restarted never begins anything: the button must be seen released first.
+        After a restart of the teleop node, the button must be seen released before a press counts.
         """
         known = info.instance_id == self._instance_id
         began = known and self.mode == IDLE and mode in (HUMAN, AUTONOMY)
         if not known and mode != IDLE:
             mode = f"{mode} since before the teleop node was heard"
         elif known and self.mode not in (IDLE, HUMAN, AUTONOMY) and mode != IDLE:
-            mode = self.mode  # still the press from before
+            mode = self.mode  # still the earlier press
         self.mode, self.pressed_stop = mode, pressed_stop
         self._publish_ns, self._instance_id = info.publish_mono_ns, info.instance_id
         return began
 
     def problem(self, mono_ns: int) -> str:
-        """Why the car may not move; empty if it may."""
+        """Return why the car may not move; empty if it may."""
         if self.pressed_stop:
             return "the e-stop is pressed"
         if not self.required:
             return ""
         if self._publish_ns is None:
-            return "no sign of the teleop node yet; start one: advnerf teleop"
+            return "no message from the teleop node yet; start it: advnerf teleop"
         if (age_s := (mono_ns - self._publish_ns) / NS_PER_S) > self.age_limit_s:
-            return f"no sign of the teleop node for {age_s:.2f} s"
+            return f"no message from the teleop node for {age_s:.2f} s"
         if self.mode == IDLE:
-            return "nobody holds the button"
-        return "" if self.mode in (HUMAN, AUTONOMY) else f"the button is held as {self.mode}; let it go first"
+            return "the button is not held"
+        return "" if self.mode in (HUMAN, AUTONOMY) else f"the button is held as {self.mode}; release it first"
 
     @property
     def drives(self) -> bool:
-        """Whether the hand itself drives, before everything else that commands."""
+        """Whether the operator drives, which overrides all other drivers."""
         return self.required and self.mode == HUMAN
 
 
 @dataclass
 class ClockGate:
-    """Clocks of other hosts: with a wrong one, every age that is computed from a capture stamp is wrong.
+    """Check of the clocks of other hosts. A wrong clock makes every age computed from a capture stamp wrong.
 
     Attributes:
-        offset_limit_s: Largest offset between this host's clock and another's [s].
-        error_limit_s: An offset known no better than this is not known [s].
-        peers: Hosts whose offset must be known; others count too once they were heard.
-        age_limit_s: A measurement older than this is none [s].
+        offset_limit_s: Largest accepted offset between this host's clock and another's [s].
+        error_limit_s: Largest accepted error bound of an offset [s].
+        peers: Hosts whose offset must be known. Other hosts are checked once they have been measured.
+        age_limit_s: Largest accepted age of a measurement [s].
     """
 
     offset_limit_s: float = 0.03
@@ -93,17 +93,17 @@ class ClockGate:
         self._heard[peer] = (offset_s, error_s, info.publish_mono_ns)
 
     def doubt_ns(self, mono_ns: int) -> int:
-        """How wrong a time that another host gave can be, by the newest measurements [ns]; 0 without other hosts."""
+        """Largest error of a time from another host, by the newest measurements [ns]; 0 without other hosts."""
         worst_s = 0.0
         for offset_s, error_s, publish_ns in self._heard.values():
             if (mono_ns - publish_ns) / NS_PER_S <= self.age_limit_s:
                 doubt_s = abs(offset_s) + error_s
-                # Not finite, or beyond every limit: nothing that was asked can be known to be young.
+                # Not finite, or too large: the age of a request cannot be known.
                 worst_s = max(worst_s, doubt_s) if doubt_s <= _MOST_DOUBT_S else _MOST_DOUBT_S
         return round(worst_s * NS_PER_S)
 
     def problem(self, mono_ns: int) -> str:
-        """Why the car may not move; empty if it may."""
+        """Return why the car may not move; empty if it may."""
         for peer in self.peers:
             if peer not in self._heard:
                 return f"the clock offset to {peer} is not known yet"
@@ -112,19 +112,19 @@ class ClockGate:
             if age_s > self.age_limit_s:
                 if peer in self.peers:
                     return f"the clock offset to {peer} was last measured {age_s:.1f} s ago"
-                continue  # a host that left, and that nobody asked for
+                continue  # a host that is gone and is not required
             if not abs(offset_s) <= self.offset_limit_s:
                 return (
                     f"the clock of {peer} is off by {1e3 * offset_s:.0f} ms, the limit is {1e3 * self.offset_limit_s:.0f} ms;"
                     " synchronise both hosts (chrony)"
                 )
             if not error_s <= self.error_limit_s:
-                return f"the clock offset to {peer} is known to {1e3 * error_s:.0f} ms only; the link is too slow"
+                return f"the clock offset to {peer} is only known to {1e3 * error_s:.0f} ms; the link is too slow"
         return ""
 
 
 def inside(point_m: Point, polygon_m: Sequence[Point]) -> bool:
-    """Whether a point lies inside a simple polygon, convex or not (even-odd rule); false for points that are not finite."""
+    """Whether a point lies inside a simple polygon, convex or not (even-odd rule). False for points that are not finite."""
     x, y = point_m
     if not (math.isfinite(x) and math.isfinite(y)):
         return False
@@ -141,7 +141,7 @@ def edge_distance_m(point_m: Point, polygon_m: Sequence[Point]) -> float:
 
 
 def require_simple(polygon_m: Sequence[Point]) -> None:
-    """Refuse a fence whose edges cross: inside and outside would not mean what was drawn."""
+    """Refuse a fence whose edges cross, because its inside is not well defined."""
     edges = _edges(polygon_m)
     for i, (a, b) in enumerate(edges):
         for j in range(i + 1, len(edges)):

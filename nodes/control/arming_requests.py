@@ -1,4 +1,4 @@
-"""Requests to arm and to disarm: each is decided once, and a repeat never arms.
+"""Decides requests to arm and to disarm. Each is decided once, and a repeat never arms.
 
 Pure: time and messages come as arguments.
 """
@@ -10,10 +10,10 @@ from nodes.runtime.requests import Answer, Answers, is_id
 
 
 class ArmRequests:
-    """Decides requests, and remembers how.
+    """Decides requests and remembers the answers.
 
     Args:
-        arming: The state machine that is armed and disarmed.
+        arming: The arming state machine.
     """
 
     def __init__(self, arming: Arming) -> None:
@@ -28,35 +28,35 @@ class ArmRequests:
         return self._answers.last
 
     def arm(self, ask_id: str, source: str, asked_ns: int, mono_ns: int) -> None:
-        """Decide a request to arm; a repeat of one that was decided only gets its answer again.
+        """Decide a request to arm. A repeat gets the same answer.
 
         Args:
-            ask_id: Of the request.
-            source: Who asks.
-            asked_ns: When it was first asked, on our monotonic clock [ns].
-            mono_ns: Now [ns].
+            ask_id: Id of the request.
+            source: Source of the request.
+            asked_ns: Time of the first repeat, on this host's monotonic clock [ns].
+            mono_ns: Current time [ns].
         """
         if self._answers.repeat(ask_id):
             return
         if not is_id(ask_id):
             refusal = f"expected an ask_id of 1 to 64 characters, got {len(ask_id)}; use advnerf arm"
         elif asked_ns <= self._forgotten_ns:
-            refusal = "the request is older than one that was decided and forgotten; arm again"
+            refusal = "the request is older than one that was already decided and forgotten; arm again"
         else:
             refusal = self._arming.arm(source, asked_ns, mono_ns)
         self._keep(Answer(ask_id, not refusal, refusal or "armed"), asked_ns)
 
     def disarm(self, ask_id: str, reason: str, asked_ns: int, mono_ns: int) -> None:
-        """Disarm, at every repeat: who still asks for it has not been answered."""
+        """Disarm at every repeat, because a sender that still repeats the request has not received its answer."""
         if not self._answers.repeat(ask_id):
             self._keep(Answer(ask_id, True, "disarmed"), asked_ns)
         elif not self._arming.armed:
-            return  # the reason stays that of the first time
+            return  # keep the reason of the first repeat
         self._arming.disarm(reason, mono_ns)
 
     def _keep(self, answer: Answer, asked_ns: int) -> None:
         if is_id(answer.ask_id):
             self._asked_ns[answer.ask_id] = asked_ns
         if (forgotten := self._answers.give(answer)) is not None:
-            # Its id would not be known again, so that everything as old is void.
+            # A repeat of the forgotten request would not be recognised, so all requests of its age are void.
             self._forgotten_ns = max(self._forgotten_ns, self._asked_ns.pop(forgotten.ask_id))

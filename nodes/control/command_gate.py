@@ -1,4 +1,4 @@
-"""What stands between drive commands and the motor controller: freshness, and a latch that only an explicit stop opens.
+"""The gate between drive commands and the motor controller: a freshness check, and a latch that only an explicit stop opens.
 
 Pure: time and messages come as arguments.
 """
@@ -17,13 +17,13 @@ _IDLE_RESEND_S = 0.1
 
 @dataclass(frozen=True)
 class GateSettings:
-    """Numbers of the gate.
+    """Settings of the gate.
 
     Attributes:
-        command_age_limit_s: A command older than this, since it was published, is no command [s].
-        brake_current_a: Brake current for every stop [A].
-        brake_ramp_s: Time over which the brake current rises from a third to the whole [s].
-        brake_hold_s: Time of braking, after which the motor is let go [s].
+        command_age_limit_s: Largest age of a command since its publication [s].
+        brake_current_a: Brake current of a stop [A].
+        brake_ramp_s: Time over which the brake current rises from a third to its full value [s].
+        brake_hold_s: Duration of braking, after which the motor is released [s].
     """
 
     command_age_limit_s: float
@@ -33,10 +33,10 @@ class GateSettings:
 
 
 class GateState(Enum):
-    """What the gate lets through."""
+    """State of the gate."""
 
-    LATCHED = "latched"  # nothing, until an explicit stop comes
-    STOPPED = "stopped"  # told to stop; the next command to move is obeyed
+    LATCHED = "latched"  # obeys no command until an explicit stop arrives
+    STOPPED = "stopped"  # commanded to stop; the next command to move is obeyed
     DRIVING = "driving"
 
 
@@ -50,25 +50,25 @@ class Drive:
 
 @dataclass(frozen=True)
 class Brake:
-    """Send this brake current [A]; 0 lets the motor go."""
+    """Send this brake current [A]; 0 releases the motor."""
 
     current_a: float
 
 
 class CommandGate:
-    """Decides what goes to the controller.
+    """Decides which commands reach the controller.
 
     Attributes:
-        state: What it lets through.
-        reason: Why it does not drive.
-        refused: Commands that were too old, or to move while latched.
+        state: State of the gate.
+        reason: Why the gate does not drive.
+        refused: Number of commands that were too old, or that asked to move while the gate was latched.
     """
 
     def __init__(self, settings: GateSettings, mono_ns: int) -> None:
         self._settings = settings
         self._limit_ns = round(settings.command_age_limit_s * NS_PER_S)
         self._fresh_ns = mono_ns  # publication of the newest command that was obeyed
-        self._stop_began_ns = mono_ns  # a car that rolls when this node starts is stopped first
+        self._stop_began_ns = mono_ns  # a car that already rolls when this node starts is stopped first
         self._instance_id: int | None = None
         self._command = Drive(0.0, 0.0)
         self._idle_sent_ns = 0
@@ -77,7 +77,7 @@ class CommandGate:
         self.refused = 0
 
     def command(self, speed_mps: float, steering_rad: float, info: MessageInfo, mono_ns: int) -> Drive | Brake | None:
-        """A drive command came; what to send now."""
+        """Handle a drive command. Returns what to send to the controller."""
         self._notice_silence(mono_ns)
         known, self._instance_id = self._instance_id, info.instance_id
         if known is not None and info.instance_id != known:
@@ -99,7 +99,7 @@ class CommandGate:
         return self._command
 
     def tick(self, mono_ns: int) -> Drive | Brake | None:
-        """Time has passed; what to send now."""
+        """Advance the time. Returns what to send to the controller."""
         self._notice_silence(mono_ns)
         if self.state is GateState.DRIVING:
             return self._command
@@ -111,7 +111,7 @@ class CommandGate:
         return Brake(0.0)
 
     def latch(self, reason: str, mono_ns: int) -> None:
-        """Stop, and obey nothing until an explicit stop comes."""
+        """Stop, and obey no command until an explicit stop arrives."""
         if self.state is GateState.DRIVING:
             self._stop_began_ns = mono_ns
         if self.state is not GateState.LATCHED:
@@ -119,7 +119,7 @@ class CommandGate:
         self.state = GateState.LATCHED
 
     def brake_again(self, mono_ns: int) -> None:
-        """Begin the stop anew, after the controller was out of reach."""
+        """Restart the stop, after the connection to the controller was lost."""
         self._stop_began_ns = mono_ns
 
     def _notice_silence(self, mono_ns: int) -> None:

@@ -1,7 +1,7 @@
-"""When an attack may be shown: only while the safety node says, freshly, that the car is armed.
+"""The interlock of attacks: an attack is shown only while a fresh message of the safety node says that the car is armed.
 
-Armed means that the car is inside the fence, its poses are fresh, and everything else the safety node checks is well. So a
-texture is never left on a monitor, and never drawn into images, while people carry the car about. Compositor and monitor obey.
+Armed means that the car is inside the fence, its poses are fresh, and all other checks of the safety node pass. So a texture is
+neither left on a monitor nor drawn into images while people carry the car. The compositor and the monitor node use the interlock.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ SAFETY_STATE = "/safety/state"
 
 
 class Interlock:
-    """Remembers what the safety node said last.
+    """Remembers the last message of the safety node.
 
     Args:
-        age_limit_s: Older than this it says nothing any more [s].
+        age_limit_s: Largest age of a message [s].
     """
 
     def __init__(self, age_limit_s: float = 0.5) -> None:
@@ -31,7 +31,7 @@ class Interlock:
         self._armed, self._reason, self._publish_ns = bool(message.armed), str(message.reason), info.publish_mono_ns
 
     def refusal(self, mono_ns: int) -> str:
-        """Why the attack may not be shown; empty if it may."""
+        """Return why the attack may not be shown; empty if it may."""
         if self._publish_ns is None or mono_ns - self._publish_ns > self._age_limit_ns:
-            return "interlock: no word of the safety node"
+            return "interlock: no message from the safety node"
         return "" if self._armed else f"interlock: not armed: {self._reason}"

@@ -1,4 +1,4 @@
-"""What the motor node tells about its controller, as standard messages: odometry for maps, diagnostics for people."""
+"""Reports of the motor node as standard messages: odometry and diagnostics."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _HOT_C = 80.0
 
 
 def odometry_message(state: OdometryState, stamp_ns: int) -> Any:
-    """``nav_msgs/Odometry`` of dead reckoning: ``odom`` is where the car was when the node started, ``car`` its rear axle."""
+    """Make ``nav_msgs/Odometry`` from dead reckoning. Frame ``odom`` is the car's pose at the start of the node, ``car`` its rear axle."""
     half = 0.5 * state.yaw_rad
     pose = types.Pose(
         position=types.Point(x=state.x_m, y=state.y_m, z=0.0),
@@ -39,20 +39,20 @@ def odometry_message(state: OdometryState, stamp_ns: int) -> Any:
 
 @dataclass(frozen=True)
 class ControllerReport:
-    """What there is to tell.
+    """State of the controller for the diagnostics.
 
     Attributes:
         values: Last telemetry; None before the first.
-        values_age_s: Its age [s].
-        firmware: What the controller says it is.
-        timeout: Its own time-out as read back; None where it cannot be read.
-        wanted_timeout: What it is expected to be, at least.
-        skipped_bytes: Received bytes that belonged to no frame.
-        link: What is wrong with the link; empty if nothing is.
-        steering: How the steering check stands.
-        steering_good: Whether arming may rely on the steering.
-        battery_warning_v: Supply voltage below which a person is warned [V].
-        answer: To the last request about the steering check.
+        values_age_s: Age of the telemetry [s].
+        firmware: Firmware that the controller reports.
+        timeout: The controller's own time-out, as read back; None if the firmware does not report it.
+        wanted_timeout: Longest accepted time-out and smallest accepted brake current.
+        skipped_bytes: Number of received bytes outside of frames.
+        link: Fault of the link; empty if there is none.
+        steering: State of the steering check.
+        steering_good: Whether the steering check allows arming.
+        battery_warning_v: Supply voltage below which a warning is reported [V].
+        answer: Answer to the last request about the steering check.
     """
 
     values: Values | None
@@ -69,9 +69,9 @@ class ControllerReport:
 
 
 def diagnostics_message(report: ControllerReport, stamp_ns: int) -> Any:
-    """``diagnostic_msgs/DiagnosticArray`` with the rows controller, battery, time-out and steering.
+    """Make a ``diagnostic_msgs/DiagnosticArray`` with the rows controller, battery, time-out and steering.
 
-    The row on steering also carries the answer to the last request about its check: ``answered``, ``granted``, ``answer``.
+    The steering row also has the answer to the last request about the check: ``answered``, ``granted``, ``answer``.
     """
     hardware = str(report.firmware) if report.firmware else "VESC"
     rows = [_controller(report), _battery(report), _timeout(report), _steering(report)]
@@ -125,7 +125,7 @@ def _battery(report: ControllerReport) -> _Row:
 def _timeout(report: ControllerReport) -> _Row:
     wanted = {"expected at most": str(report.wanted_timeout)}
     if report.timeout is None:
-        return "time-out", WARN, "not read back: this firmware does not tell; look at it in VESC Tool", wanted
+        return "time-out", WARN, "not read back: this firmware does not report it; check it in VESC Tool", wanted
     good = report.timeout.at_least(report.wanted_timeout)
     return "time-out", OK if good else ERROR, str(report.timeout), wanted
 

@@ -1,4 +1,4 @@
-"""What the motor node knows about its controller beside the commands: telemetry, settings, steering; and whether that is enough to arm."""
+"""State of the motor controller (telemetry, settings, steering check), and whether it allows arming."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ from nodes.runtime.messages import pose_matrix
 from nodes.runtime.node import Out
 from nodes.runtime.requests import Answer, Answers
 
-# How often a controller is asked for its settings before it counts as one that does not tell them.
+# Number of requests for the settings before the controller counts as one that does not report them.
 _SETTINGS_ASKS = 3
 _TWIN = "TWIN"
 
 
 class ControllerWatch:
-    """Collects what a controller says.
+    """Collects the reports of a controller.
 
     Args:
-        wanted: The longest time-out and the smallest brake current that the controller may have.
+        wanted: Longest accepted time-out and smallest accepted brake current of the controller.
         steering_check: ``required``, ``unless_twin`` or ``never``.
-        shown: Numbers of the steering check.
+        shown: Settings of the steering check.
 
     Attributes:
         check: The steering check.
         values: Last telemetry; None before the first.
-        timeout: Time-out as read back; None where the controller does not tell.
-        answers: What was answered to requests about the check.
+        timeout: Time-out as read back; None if the controller does not report it.
+        answers: Answers to requests about the check.
     """
 
     def __init__(self, wanted: TimeoutSettings, steering_check: str, shown: CheckSettings) -> None:
@@ -50,25 +50,25 @@ class ControllerWatch:
         self._asks_left = _SETTINGS_ASKS
 
     def connected(self, firmware: FirmwareVersion) -> None:
-        """A controller answered; whatever was known is known again only when it says so."""
+        """Note that a controller answered. Earlier reports are discarded until it repeats them."""
         self.values = self.timeout = None
         self._firmware, self._asks_left = firmware, _SETTINGS_ASKS
         if self._checked_with not in (None, firmware):
             self.check.forget(f"{self._checked_with} was replaced by {firmware}")
 
     def poll(self, vesc: Vesc) -> None:
-        """Ask for telemetry, and for the settings until they are known."""
+        """Request telemetry, and the settings until they are known."""
         if self.timeout is None and self._asks_left:
             self._asks_left -= 1
             vesc.request_app_configuration()
         vesc.request_values()
 
     def settings_unreadable(self) -> None:
-        """What came cannot be read: asking again would not help."""
+        """Note that the settings cannot be parsed, so that they are not requested again."""
         self._asks_left = 0
 
     def hear(self, reply: Any, vesc: Vesc, now: Now) -> list[Out]:
-        """Note a reply; odometry if it was telemetry."""
+        """Note a reply. Returns odometry if the reply is telemetry."""
         if isinstance(reply, AppConfiguration):
             self.timeout = reply.timeout
         if not isinstance(reply, Values):
@@ -79,16 +79,16 @@ class ControllerWatch:
         return [Out("/odom", odometry_message(state, now.real_ns))]
 
     def start_check(self, mono_ns: int) -> None:
-        """Begin to show the wheels."""
+        """Start the steering check."""
         self._checked_with = self._firmware
         self.check.start(mono_ns)
 
     def obey(self, message: Any, refusal: str, mono_ns: int) -> None:
-        """Do what a person asks about the check, once; a repeat only gets its answer again.
+        """Execute a request about the steering check once. A repeat gets the same answer.
 
         Args:
             message: A ``SteeringCheck``.
-            refusal: Why nothing can be done now; empty if it can.
+            refusal: Why no request can be executed now; empty if it can.
             mono_ns: Monotonic time [ns].
         """
         ask_id, action = str(message.ask_id), str(message.action)
@@ -97,7 +97,7 @@ class ControllerWatch:
         if action not in ("start", "confirm", "deny"):
             refusal = f"expected start, confirm or deny, got {action[:40]!r}"
         elif not refusal and action != "start" and not self.check.awaits_answer(mono_ns):
-            refusal = "no steering check awaits an answer; start one"
+            refusal = "no steering check is waiting for an answer; start one"
         if not refusal and action == "start":
             self.start_check(mono_ns)
         elif not refusal:
@@ -105,7 +105,7 @@ class ControllerWatch:
         self.answers.give(Answer(ask_id, not refusal, refusal or self.check.text))
 
     def see(self, message: Any, mono_ns: int) -> None:
-        """The car was measured while its wheels are shown."""
+        """Note a pose of the car during the steering check."""
         if not self.check.showing:
             return
         try:
@@ -116,14 +116,14 @@ class ControllerWatch:
 
     @property
     def steering_good(self) -> bool:
-        """Whether arming may rely on the steering."""
+        """Whether the steering check allows arming."""
         twin = _TWIN in str(self._firmware).upper()
         exempt = self._policy == "never" or (self._policy == "unless_twin" and twin)
-        # A check that is going on, or that failed, counts for every car.
+        # A check that is running or has failed prevents arming on every car.
         return self.check.passed or (exempt and self._checked_with is None)
 
     def missing(self) -> str:
-        """What keeps the car from being armed; empty if nothing does."""
+        """Return why the car cannot be armed; empty if it can."""
         if self.values is None:
             return "no telemetry yet"
         if self.timeout is None and self._asks_left:
@@ -131,20 +131,18 @@ class ControllerWatch:
         if self.timeout is not None and not self.timeout.at_least(self._wanted):
             return (
                 f"expected a time-out of the controller of at most {self._wanted.timeout_ms} ms with at least"
-                f" {self._wanted.brake_current_a:g} A, it is {self.timeout}: stop the launch and call advnerf motor set-timeout"
+                f" {self._wanted.brake_current_a:g} A, it is {self.timeout}; stop the launch and run advnerf motor set-timeout"
             )
         return "" if self.steering_good else self.check.text
 
     def text(self) -> str:
-        """The controller in one line."""
+        """Describe the controller in one line."""
         if self.timeout is None:
-            return (
-                f"{self._firmware}, own time-out not read back (this firmware does not tell; look at it in VESC Tool)"
-            )
+            return f"{self._firmware}, own time-out not read back (this firmware does not report it; check it in VESC Tool)"
         return f"{self._firmware}, own time-out {self.timeout}"
 
     def report(self, vesc: Vesc, link: str, battery_warning_v: float, now: Now) -> ControllerReport:
-        """Everything, for the diagnostics."""
+        """Collect the report for the diagnostics."""
         age_s = (now.mono_ns - vesc.last_reply_mono_ns) / NS_PER_S
         return ControllerReport(
             self.values, age_s, self._firmware, self.timeout, self._wanted, vesc.skipped_bytes, link, self.check.text,

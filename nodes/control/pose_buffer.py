@@ -1,7 +1,7 @@
-"""Poses by capture stamp: what a subject's pose was at the moment an image was taken.
+"""Interpolates the poses of a subject at the capture stamp of an image.
 
-Asking for the newest pose instead gives another answer in every replay, and a wrong one: at 1.5 m/s and 50 Hz it is off by 6 mm
-in the median, where interpolation at the stamp is off by 0.1 mm.
+Using the newest pose instead would give a different result in every replay. It would also be wrong: at 1.5 m/s and 50 Hz, its
+median error is 6 mm, that of interpolation at the stamp 0.1 mm.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from advnerf_core.geometry import interpolate_transform
 
 _NS_PER_S = 1_000_000_000
-# Velocity is taken over at least this long: over one period of the stream it would be mostly noise.
+# Shortest time over which velocity is estimated. Over one period of the stream, the estimate would be mostly noise.
 _VELOCITY_BASE_S = 0.02
 
 
@@ -25,7 +25,7 @@ class TimedPose:
 
     Attributes:
         T: Transform ``[4, 4]``.
-        extrapolated_s: How far beyond the newest pose it lies [s]; 0 if it was interpolated.
+        extrapolated_s: Time after the newest pose [s]; 0 if the pose is interpolated.
     """
 
     T: NDArray[np.float64]
@@ -36,8 +36,8 @@ class PoseBuffer:
     """The recent poses of one subject, by capture stamp.
 
     Args:
-        keep_s: Poses older than this before the newest are forgotten [s].
-        max_gap_s: Across a longer gap in the stream nothing is interpolated [s].
+        keep_s: Poses that are this much older than the newest are discarded [s].
+        max_gap_s: Longest gap in the stream across which poses are interpolated [s].
     """
 
     def __init__(self, keep_s: float = 2.0, max_gap_s: float = 0.1) -> None:
@@ -53,11 +53,11 @@ class PoseBuffer:
 
     @property
     def newest_ns(self) -> int | None:
-        """Stamp of the newest pose [ns]; None if there is none."""
+        """Stamp of the newest pose [ns]; None if the buffer is empty."""
         return self._stamps[-1] if self._stamps else None
 
     def add(self, stamp_ns: int, T: NDArray[np.float64]) -> None:
-        """Add a pose; the order of arrival does not matter, and of one stamp the first is kept."""
+        """Add a pose. Poses may arrive in any order; of two with the same stamp, the first is kept."""
         if stamp_ns in self._poses:
             return
         if self._stamps and stamp_ns < self._stamps[-1] - self._keep_ns:
@@ -70,11 +70,11 @@ class PoseBuffer:
         del self._stamps[:first]
 
     def reaches(self, stamp_ns: int) -> bool:
-        """Whether a pose at or after the stamp is there, so that waiting longer is of no use."""
+        """Whether there is a pose at or after the stamp, so that waiting longer is useless."""
         return bool(self._stamps) and self._stamps[-1] >= stamp_ns
 
     def at(self, stamp_ns: int, extrapolation_limit_s: float = 0.0) -> TimedPose | None:
-        """The pose at a stamp: interpolated, or beyond the newest pose continued at constant velocity.
+        """Return the pose at a stamp: interpolated, or extrapolated at constant velocity beyond the newest pose.
 
         Returns:
             None if the stamp is before the first pose, in a gap, or further ahead than the limit.

@@ -1,12 +1,12 @@
-"""Whether consecutive poses of the car are a motion that the car can make. Pure: stamps come with the poses.
+"""Checks whether consecutive poses are a motion that the car can make. Pure: stamps come with the poses.
 
-From one pose to the next the car may travel at most ``speed * dt`` along its axis, a small share of that sideways or upward, and
-turn by at most ``turn rate * dt``, each plus an allowance for the noise of the measurement. A pose beyond that was not measured on
-this car: another stream, a confused marker set, a subject that was swapped.
+From one pose to the next, the car may travel at most ``speed * dt`` along its axis and a small fraction of that sideways or upward,
+and turn by at most ``turn rate * dt``, each plus an allowance for measurement noise. A pose beyond these bounds does not belong to
+this car: the stream, the marker set or the subject is wrong.
 
-``dt`` is the longest gap between stamps in the last 0.1 s, not only the gap before the pose. Stamps are taken on receipt, so a
-datagram that waits in the network or in a busy computer brings the next ones too near to it, and the car seems to leap. Such a leap
-is always preceded by a gap of its own length, and therefore allowed for exactly as long as it can come.
+``dt`` is the longest gap between stamps in the last 0.1 s, not only the gap before the pose. Stamps are taken on receipt. If a
+datagram is delayed in the network or in a busy computer, the next ones follow too closely, and the car seems to jump. Such a jump
+always follows a gap of the same length, so this definition of ``dt`` allows it.
 """
 
 from __future__ import annotations
@@ -22,26 +22,26 @@ from hardware.motor.limits import DriveLimits
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.wire import MessageInfo
 
-# Gaps this recent count: a late datagram and what it held up arrive within this time [s].
+# Gaps this recent are considered: a late datagram and those behind it arrive within this time [s].
 _GAP_WINDOW_S = 0.1
-# Beside its predecessor a pose is compared with one this much older, so that small steps cannot add up [s].
+# A pose is also compared with one this much older, so that small steps cannot add up [s].
 _BASE_S = 0.25
 _FARTHEST_M = 1e4
 
 
 @dataclass(frozen=True)
 class MotionBounds:
-    """What the car can do, and how well it is measured.
+    """Limits of the car's motion and noise of its measurement.
 
     Attributes:
-        forward_mps: Fastest forward [m/s].
-        backward_mps: Fastest backward [m/s].
-        turn_radps: Fastest turn [rad/s].
-        sideways_share: Sideways and vertical motion, as a share of the fastest one: the sine of the largest slip angle.
-        reach_m: How far the tracked point may be from the rear axle [m]; turning moves it sideways.
-        noise_m: What noise can add between two poses [m].
-        noise_rad: What noise can add between two headings [rad].
-        longest_gap_s: After a longer gap nothing is known of the motion [s].
+        forward_mps: Largest forward speed [m/s].
+        backward_mps: Largest backward speed [m/s].
+        turn_radps: Largest turn rate [rad/s].
+        sideways_share: Largest sideways and vertical motion as a fraction of the fastest motion: the sine of the largest slip angle.
+        reach_m: Largest distance of the tracked point from the rear axle [m]. Turning moves the point sideways.
+        noise_m: Largest noise between two poses [m].
+        noise_rad: Largest noise between two headings [rad].
+        longest_gap_s: Longest gap in the stream across which motion is checked [s].
     """
 
     forward_mps: float
@@ -57,11 +57,11 @@ class MotionBounds:
     def of_car(
         cls, limits: DriveLimits, wheelbase_m: float, margin: float, noise_m: float, noise_rad: float
     ) -> MotionBounds:
-        """From the limits of a vehicle calibration; ``margin`` is how much faster the car may be than it is commanded."""
+        """Make bounds from a vehicle calibration. ``margin`` is the factor by which the car may exceed its commanded speed."""
         fastest_mps = max(limits.speed_max_mps, -limits.speed_min_mps)
         sharpest_rad = max(limits.steering_max_rad, -limits.steering_min_rad)
         turn_radps = fastest_mps * math.tan(sharpest_rad) / wheelbase_m
-        # A limit of 0 backwards means that nothing backwards is commanded; a car that is stopped still rolls back a little.
+        # A backward limit of 0 means that no backward motion is commanded. A stopped car still rolls back a little.
         backward_mps = max(-limits.speed_min_mps, 0.1 * limits.speed_max_mps)
         return cls(
             margin * limits.speed_max_mps, margin * backward_mps, margin * turn_radps, reach_m=wheelbase_m,
@@ -71,10 +71,10 @@ class MotionBounds:
 
 @dataclass
 class PoseCheck:
-    """Judges poses in the order in which they come.
+    """Checks poses in their order of arrival.
 
     Attributes:
-        bounds: What the car can do.
+        bounds: Limits of the motion.
     """
 
     bounds: MotionBounds
@@ -82,12 +82,12 @@ class PoseCheck:
     _gaps: deque[tuple[int, float]] = field(default_factory=deque)
 
     def judge(self, stamp_ns: int, T_world_from_car: NDArray[np.float64]) -> str:
-        """What is impossible about a pose ``[4, 4]`` with its capture stamp [ns]; empty if nothing is.
+        """Return why a pose ``[4, 4]`` with its capture stamp [ns] is impossible; empty if it is possible.
 
-        A pose that is impossible begins a new motion: the next ones are compared with it.
+        After an impossible pose, the next poses are compared with that pose.
         """
         T = np.asarray(T_world_from_car, dtype=np.float64)
-        if not (np.abs(T) < _FARTHEST_M).all():  # also what is not a number
+        if not (np.abs(T) < _FARTHEST_M).all():  # also false for NaN
             return f"expected a pose of the car within {_FARTHEST_M:g} m, got {T[:3, 3].tolist()}"
         if not self._poses:
             self._begin(stamp_ns, T)
@@ -96,7 +96,7 @@ class PoseCheck:
         gap_s = (stamp_ns - last_ns) / NS_PER_S
         if gap_s > self.bounds.longest_gap_s:
             self._begin(stamp_ns, T)
-            self._gaps.append((stamp_ns, self.bounds.longest_gap_s))  # for what was held up with it
+            self._gaps.append((stamp_ns, self.bounds.longest_gap_s))  # for the poses that were delayed with it
             return ""
         if gap_s < -_GAP_WINDOW_S:
             self._begin(stamp_ns, T)
@@ -132,7 +132,7 @@ class PoseCheck:
         if turned_rad > bounds.turn_radps * allowed_s + bounds.noise_rad:
             limit = bounds.turn_radps * allowed_s + bounds.noise_rad
             return f"the car's pose turned by {turned_rad:.2f} rad in {dt_s:.3f} s; the car can turn by {limit:.2f} rad"
-        # In the frame of the mean heading: the chord of an arc lies along it.
+        # In the frame of the mean heading, because the chord of an arc is parallel to it.
         axis = A[:3, 0] + B[:3, 0]
         step = B[:3, 3] - A[:3, 3]
         along_m = float(step @ axis) / max(float(np.linalg.norm(axis)), 1e-9)
@@ -149,21 +149,21 @@ class PoseCheck:
 
 
 def _angle(R: NDArray[np.float64]) -> float:
-    # From the skew part for small angles, where the trace has lost its digits.
+    # From the skew part for small angles, where the trace is not accurate.
     skew = 0.5 * math.sqrt((R[2, 1] - R[1, 2]) ** 2 + (R[0, 2] - R[2, 0]) ** 2 + (R[1, 0] - R[0, 1]) ** 2)
     return math.atan2(skew, 0.5 * (R[0, 0] + R[1, 1] + R[2, 2] - 1.0))
 
 
 @dataclass
 class PoseGate:
-    """Lets the car move only while its poses are possible.
+    """Allows motion only while the car's poses are possible.
 
-    A car that is carried or pushed while disarmed moves as no car can, and that is no fault: it only has to rest before arming.
+    A disarmed car may be carried or pushed. It only has to rest before arming.
 
     Attributes:
-        check: Judges the poses.
-        rest_s: So long no pose may have been impossible [s].
-        count: Impossible poses so far.
+        check: The check of the poses.
+        rest_s: Time without an impossible pose after which the car may move [s].
+        count: Number of impossible poses so far.
     """
 
     check: PoseCheck
@@ -178,10 +178,10 @@ class PoseGate:
             self.refuse(text, info)
 
     def refuse(self, text: str, info: MessageInfo) -> None:
-        """Note a message that is no pose."""
+        """Note a message that is not a valid pose."""
         self._text, self._seen_ns = text, info.publish_mono_ns
         self.count += 1
 
     def problem(self, mono_ns: int) -> str:
-        """Why the car may not move; empty if it may."""
+        """Return why the car may not move; empty if it may."""
         return self._text if self._text and mono_ns - self._seen_ns < self.rest_s * NS_PER_S else ""

@@ -1,7 +1,7 @@
-"""Notices a car that does not move although it is told to: a wall, a jammed wheel, a motor without power. Pure.
+"""Detects a car that does not move although it is commanded to: a wall, a jammed wheel, a motor without power. Pure.
 
-Two measurements tell: motion capture (whether the car moves) and the motor controller's rpm (whether its motor turns). A car against
-a wall may spin its wheels, and a motor that is not connected turns nothing while the car rolls, so either of them at rest is a stall.
+Two measurements are used: motion capture (whether the car moves) and the motor controller's rpm (whether the motor turns). A car
+against a wall may spin its wheels, and a disconnected motor stands still while the car rolls. So either one at rest is a stall.
 """
 
 from __future__ import annotations
@@ -14,21 +14,21 @@ from nodes.runtime.clock import NS_PER_S
 
 MOCAP, ERPM = "mocap", "erpm"
 _WORDS = {MOCAP: "motion capture measures", ERPM: "the motor controller measures"}
-# Speed by motion capture is taken over this time: 1 mm of noise is then 10 mm/s [s].
+# Time over which motion capture gives the speed, so that 1 mm of noise causes an error of 10 mm/s [s].
 _BASE_S = 0.1
-# An older measurement says nothing about now; that it is missing is another check's business [s].
+# Largest age of a measurement. Another check reports a missing one [s].
 _FRESH_S = 0.3
 
 
 @dataclass(frozen=True)
 class StallLimits:
-    """What a stall is.
+    """Definition of a stall.
 
     Attributes:
-        command_mps: Slower commands are not judged [m/s].
-        measured_mps: Slower than this is at rest [m/s].
-        time_s: So long it must be commanded to move and be measured at rest [s].
-        sources: Measurements that are looked at.
+        command_mps: Smallest commanded speed that is checked [m/s].
+        measured_mps: Measured speed below which the car is at rest [m/s].
+        time_s: Duration of a stall: commanded to move and measured at rest [s].
+        sources: Measurements to use.
     """
 
     command_mps: float = 0.3
@@ -42,7 +42,7 @@ class StallGate:
     """Collects commands and measurements.
 
     Attributes:
-        limits: What a stall is.
+        limits: Definition of a stall.
     """
 
     limits: StallLimits
@@ -53,7 +53,7 @@ class StallGate:
     _heard: dict[str, tuple[int, float]] = field(default_factory=dict)
 
     def commanded(self, speed_mps: float, mono_ns: int) -> None:
-        """The car is told to drive [m/s]."""
+        """Note a command to drive [m/s]."""
         self._commanded_mps = speed_mps
         if abs(speed_mps) < self.limits.command_mps:
             self._commanded_ns = None
@@ -61,11 +61,11 @@ class StallGate:
             self._commanded_ns = mono_ns
 
     def stopped(self) -> None:
-        """The car is told to stop."""
+        """Note a command to stop."""
         self._commanded_ns = None
 
     def pose(self, x_m: float, y_m: float, mono_ns: int) -> None:
-        """Motion capture measured where it is [m]."""
+        """Note a position of the car from motion capture [m]."""
         if self._track and mono_ns - self._track[-1][0] > _FRESH_S * NS_PER_S:
             self._track.clear()
         self._track.append((mono_ns, x_m, y_m))
@@ -77,11 +77,11 @@ class StallGate:
             self._measured(MOCAP, math.hypot(x_m - first_x_m, y_m - first_y_m) / base_s, mono_ns)
 
     def motor(self, speed_mps: float, mono_ns: int) -> None:
-        """The motor controller measured how fast its motor turns, as a speed [m/s]."""
+        """Note the speed of the motor from the motor controller, as a speed of the car [m/s]."""
         self._measured(ERPM, speed_mps, mono_ns)
 
     def problem(self, mono_ns: int) -> str:
-        """How the car is stalled; empty if it is not."""
+        """Describe the stall; empty if the car is not stalled."""
         limits = self.limits
         if self._commanded_ns is None or mono_ns - self._commanded_ns < limits.time_s * NS_PER_S:
             return ""
@@ -91,7 +91,7 @@ class StallGate:
         return f"stalled for {rest_s:.1f} s: commanded {self._commanded_mps:.2f} m/s, {self._finding(mono_ns)}"
 
     def _measured(self, name: str, speed_mps: float, mono_ns: int) -> None:
-        # Anything but a rest counts as motion, also what is not a number: a broken measurement is another check's business.
+        # Everything except rest counts as motion, including NaN. Another check reports a broken measurement.
         if not self._fresh(name, mono_ns) or not abs(speed_mps) < self.limits.measured_mps:
             self._moved_ns[name] = mono_ns
         self._heard[name] = (mono_ns, speed_mps)
@@ -100,7 +100,7 @@ class StallGate:
         return name in self._heard and mono_ns - self._heard[name][0] <= _FRESH_S * NS_PER_S
 
     def _rest_s(self, name: str, mono_ns: int) -> float:
-        """How long a source has measured a car at rest while it was told to move [s]."""
+        """Time for which a source has measured the car at rest while it was commanded to move [s]."""
         if self._commanded_ns is None or not self._fresh(name, mono_ns):
             return 0.0
         return (mono_ns - max(self._moved_ns[name], self._commanded_ns)) / NS_PER_S

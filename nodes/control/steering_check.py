@@ -1,9 +1,9 @@
-"""The check that the front wheels really turn. Pure: time and poses come as arguments.
+"""The check that the front wheels turn. Pure: time and poses come as arguments.
 
-The servo acknowledges nothing, and stock firmware drops its commands without a word (hardware/emulators/vesc_firmware.py), so a car can
-be armed that cannot steer. Before the first arming the wheels are therefore shown to the left, to the right and straight, while
-the motor stays off. Two witnesses count: motion capture, when the car is pushed by hand in each position and its path bends as
-far as the wheels were told to turn; or a person, who says so.
+The servo sends no acknowledgement, and stock firmware may drop its commands silently (hardware/emulators/vesc_firmware.py). So a car
+that cannot steer could be armed. Before the first arming, the wheels are therefore turned left, right and straight while the motor
+stays off. Either motion capture confirms it, when the car is pushed by hand in each position and its path curves as commanded, or
+the operator does.
 """
 
 from __future__ import annotations
@@ -13,22 +13,22 @@ from dataclasses import dataclass
 
 from nodes.runtime.clock import NS_PER_S
 
-# The servo, 50 Hz and slewing, has arrived after so long; what the car did before does not count [s].
+# Time after which the servo (50 Hz, limited slew rate) has reached its position. Earlier motion is ignored [s].
 _SETTLE_S = 0.5
 _LEFT, _RIGHT = 0, 1
 
 
 @dataclass(frozen=True)
 class CheckSettings:
-    """Numbers of the check.
+    """Settings of the check.
 
     Attributes:
         wheelbase_m: Distance between the axles [m].
-        angle_rad: Front wheel angle shown to both sides [rad].
-        hold_s: Time for which each side is shown [s].
-        push_m: A car pushed at least this far shows whether it turns [m].
-        agreement: Greatest relative deviation of the curvature that was driven from the one that was told.
-        answer_s: Time that a person has to answer [s].
+        angle_rad: Front wheel angle to each side [rad].
+        hold_s: Time for which each angle is held [s].
+        push_m: Shortest distance that the car must be pushed to measure its curvature [m].
+        agreement: Largest relative deviation of the measured from the commanded curvature.
+        answer_s: Time for the operator's answer [s].
     """
 
     wheelbase_m: float
@@ -41,7 +41,7 @@ class CheckSettings:
 
 @dataclass
 class _Arc:
-    """What the car did while one side was shown."""
+    """Motion of the car while the wheels were turned to one side."""
 
     forward_m: float = 0.0
     driven_m: float = 0.0
@@ -49,11 +49,11 @@ class _Arc:
 
 
 class SteeringCheck:
-    """State machine of one check after the other.
+    """State machine of the steering check.
 
     Attributes:
-        passed: Whether somebody or something saw the wheels turn.
-        text: How it stands, for a person.
+        passed: Whether motion capture or the operator confirmed that the wheels turn.
+        text: State of the check, as text for the operator.
     """
 
     def __init__(self, settings: CheckSettings) -> None:
@@ -66,33 +66,33 @@ class SteeringCheck:
 
     @property
     def showing(self) -> bool:
-        """Whether the wheels are being shown, or an answer is awaited."""
+        """Whether the check is turning the wheels or waiting for an answer."""
         return self._began_ns is not None
 
     def awaits_answer(self, mono_ns: int) -> bool:
-        """Whether both sides were shown and a person may say what was seen."""
+        """Whether the wheels were turned to both sides and the operator may answer."""
         return self.showing and self._side(mono_ns) is None
 
     def start(self, mono_ns: int) -> None:
-        """Begin to show the wheels; an earlier result is void."""
+        """Start the check. An earlier result is discarded."""
         self._began_ns, self.passed, self._last = mono_ns, False, None
         self._arcs = (_Arc(), _Arc())
         self.text = "steering check: wheels left, then right; push the car half a metre each time, or watch and confirm"
 
     def forget(self, reason: str) -> None:
-        """The result is void: another controller, perhaps."""
+        """Discard the result, for example because the controller was replaced."""
         self._began_ns, self.passed = None, False
         self.text = f"{reason}: steering must be checked again: advnerf motor check-steering"
 
     def steering_rad(self, mono_ns: int) -> float | None:
-        """Where the wheels are to point now [rad]; None when nothing is shown."""
+        """Front wheel angle to command now [rad]; None if the check is not turning the wheels."""
         side = self._side(mono_ns)
         if side is None:
             return 0.0 if self.showing else None
         return self._settings.angle_rad if side == _LEFT else -self._settings.angle_rad
 
     def pose(self, x_m: float, y_m: float, yaw_rad: float, mono_ns: int) -> None:
-        """The car was measured; poses that are not finite are no measurements."""
+        """Note a pose of the car. Poses that are not finite are ignored."""
         if not (self.showing and all(map(math.isfinite, (x_m, y_m, yaw_rad)))):
             return
         side, last, self._last = self._side(mono_ns), self._last, (x_m, y_m, yaw_rad)
@@ -104,22 +104,22 @@ class SteeringCheck:
         arc = self._arcs[side]
         arc.forward_m += forward
         arc.driven_m += abs(forward)
-        # Rolling backwards turns the other way round.
+        # Rolling backwards reverses the turn.
         arc.turned_rad += math.copysign(1.0, forward) * math.remainder(yaw_rad - last[2], 2.0 * math.pi)
 
     def tick(self, mono_ns: int) -> None:
-        """Time has passed: judge what was seen, or give up waiting."""
+        """Advance the time: evaluate the measured motion, or give up waiting."""
         if self._began_ns is None or self._side(mono_ns) is not None:
             return
         if all(abs(arc.forward_m) >= self._settings.push_m for arc in self._arcs):
             self._judge()
         elif (mono_ns - self._began_ns) / NS_PER_S > 2.0 * self._settings.hold_s + self._settings.answer_s:
-            self._end(False, "steering check: nobody answered; start it again: advnerf motor check-steering")
+            self._end(False, "steering check: no answer; start it again: advnerf motor check-steering")
         else:
             self.text = "steering check: did the front wheels turn left, then right? confirm or deny"
 
     def answer(self, turned: bool, source: str, mono_ns: int) -> None:
-        """A person says whether the wheels turned; counts only after both sides were shown."""
+        """Note the operator's answer whether the wheels turned. It counts only after both sides were shown."""
         if not self.awaits_answer(mono_ns):
             return
         if turned:
@@ -133,8 +133,7 @@ class SteeringCheck:
             driven = arc.turned_rad / arc.driven_m
             if abs(driven - told) > self._settings.agreement * abs(told):
                 self._end(
-                    False, f"with wheels told to turn {name} the car was seen to drive a curve of {driven:+.2f} 1/m, expected {told:+.2f}"
-                    f" 1/m: {_CAUSES}",
+                    False, f"with wheels turned {name}, expected a curvature of {told:+.2f} 1/m, measured {driven:+.2f} 1/m; check: {_CAUSES}",
                 )  # fmt: skip
                 return
         self._end(True, "steering seen by motion capture")

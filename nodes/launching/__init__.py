@@ -1,1 +1,1 @@
-"""Launch files, the supervisor of a launch, and what a person asks a running one."""
+"""Launch files, the supervisor of a launch, and queries to a running launch."""

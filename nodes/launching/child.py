@@ -1,4 +1,4 @@
-"""One supervised process."""
+"""A supervised process."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _SHIM = Path(__file__).with_name("shim.py")
 
 
 class Child:
-    """A node's process, in a group of its own, bound to the life of the thread that starts it.
+    """The process of a node, in its own process group. It is killed when the thread that started it ends.
 
     Args:
         name: Name of the node.
@@ -41,28 +41,28 @@ class Child:
 
     @property
     def pid(self) -> int:
-        """Process id; 0 when it was never started."""
+        """Process id; 0 before the first start."""
         return self._process.pid if self._process is not None else 0
 
     @property
     def running(self) -> bool:
-        """Whether the process lives."""
+        """Whether the process is running."""
         if self._process is None or self._process.returncode is not None:
             return False
         if os.waitid(os.P_PID, self._process.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is None:
             return True
-        # While it is not reaped, its process group cannot be anybody else's: end what it started and left behind.
+        # Until the process is reaped, its group id cannot be reused. So the processes that it left behind can be killed safely.
         self.signal(signal.SIGKILL)
         self._process.wait()
         return False
 
     @property
     def exit_code(self) -> int | None:
-        """Exit code, negative for a signal; None while it lives."""
+        """Exit code, negative for a signal; None while the process is running."""
         return None if self.running or self._process is None else self._process.returncode
 
     def start(self) -> None:
-        """Start the process; only from a thread that outlives it, because PDEATHSIG counts threads."""
+        """Start the process. Call it from a thread that outlives the process, because PDEATHSIG is sent when this thread ends."""
         self.log.parent.mkdir(parents=True, exist_ok=True)
         command = [
             *(sys.executable, "-I", "-S", str(_SHIM), str(os.getpid())),
@@ -87,7 +87,7 @@ class Child:
                 os.killpg(self._process.pid, number)
 
     def how_it_ended(self) -> str:
-        """What to tell a person about its end."""
+        """Describe how the process ended."""
         code = self.exit_code
         if code is None:
             return "still runs"
@@ -96,7 +96,7 @@ class Child:
         return f"{how}{': ' + last if last else ''} (log: {self.log})"
 
     def last_line(self) -> str:
-        """Last line of its log that carries its name, as its errors do, or else the last at all; without the name."""
+        """Last line of the log that starts with the node's name, as errors do, or else the last line; without the name."""
         try:
             lines = self.log.read_bytes()[-4000:].decode("utf-8", "replace").strip().splitlines()
         except OSError:

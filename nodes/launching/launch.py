@@ -1,7 +1,7 @@
-"""The supervisor: starts the nodes of a launch file, watches them, and leaves nothing behind.
+"""The supervisor: starts the nodes of a launch file, watches them, and stops all of them.
 
-One thread starts and watches all processes (PR_SET_PDEATHSIG counts threads, so it must live as long as they do). A
-required node that dies, hangs or never starts stops the whole launch; nothing is ever re-armed from here.
+One thread starts and watches all processes. PR_SET_PDEATHSIG is sent when this thread ends, so it must live as long as they do. A
+required node that dies, hangs or does not start stops the whole launch. The supervisor never arms the car.
 """
 
 from __future__ import annotations
@@ -34,16 +34,16 @@ _UP = ("ready", "active")
 
 
 class Launch:
-    """A launch file at work.
+    """A running launch.
 
     Args:
         file: A ``*.launch.yaml`` file.
         overrides: ``node.key=value`` and ``params.name=value``.
         run_dir: Folder of the run: sockets, logs, resolved configuration.
-        report: Called with one line per event (from the supervisor's thread).
-        host: Which of the file's hosts this computer is; None where the file has none.
+        report: Called with one line per event, from the supervisor's thread.
+        host: Host of the launch file that this computer is; None if the file has no hosts.
 
-    Use it as a context manager: leaving it stops everything.
+    Use it as a context manager: leaving it stops all nodes.
     """
 
     def __init__(
@@ -59,7 +59,7 @@ class Launch:
         self.failure = ""
         self._report = report or (lambda line: None)
         self._children = {name: Child(name, entry, self.run_dir) for name, entry in self.plan.nodes.items()}
-        # Plain flags: an Event takes a lock, and a signal handler that sets it could interrupt itself.
+        # Plain flags: an Event takes a lock, and a signal handler that sets it could deadlock with itself.
         self._stopping = self._impatient = False
         self._started, self._ready, self._done = threading.Event(), threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._supervise, name="supervisor", daemon=True)
@@ -81,16 +81,16 @@ class Launch:
 
     @property
     def statuses(self) -> dict[str, Any]:
-        """Last ``NodeStatus`` of every node that has sent one."""
+        """Last ``NodeStatus`` of every node that has reported."""
         return {name: child.status for name, child in self._children.items() if child.status is not None}
 
     @property
     def exit_code(self) -> int:
-        """0, or 1 after a failure, which `failure` then names."""
+        """Exit code: 0, or 1 after a failure, which `failure` describes."""
         return 1 if self.failure else 0
 
     def start(self) -> None:
-        """Lock the run folder, write the resolved configuration, start all nodes."""
+        """Lock the run folder, write the resolved configuration and start all nodes."""
         self._lock = _lock_run(self.run_dir)
         try:
             self._write_configuration()
@@ -101,27 +101,27 @@ class Launch:
         self._started.wait()
 
     def wait_ready(self, timeout_s: float = 60.0) -> None:
-        """Wait until every node is up and every subscription is connected to its publisher."""
+        """Wait until every node is running and every subscription is connected to its publisher."""
         deadline = time.monotonic() + timeout_s
         while not self._ready.wait(0.02):
             if self._done.is_set():
                 raise LaunchError(self.failure or "the launch was stopped before it was ready")
             if time.monotonic() > deadline:
-                raise LaunchError(f"not ready after {timeout_s:g} s: {self._what_is_missing()}")
+                raise LaunchError(f"expected the launch to be ready within {timeout_s:g} s: {self._what_is_missing()}")
 
     def wait(self, timeout_s: float | None = None) -> int | None:
-        """Wait for the end; the exit code, or None when the time is over first."""
+        """Wait until the launch ends. Returns the exit code, or None on timeout."""
         return self.exit_code if self._done.wait(timeout_s) else None
 
     def stop(self) -> int:
-        """Stop all nodes (SIGINT, after 5 s SIGTERM, then SIGKILL) and wait for the end."""
+        """Stop all nodes (SIGINT, after 5 s SIGTERM, then SIGKILL) and wait until they have ended."""
         self.request_stop()
         if self._thread.ident is not None:
             self._thread.join()
         return self.exit_code
 
     def request_stop(self, kill: bool = False) -> None:
-        """Begin to stop without waiting; safe in a signal handler. ``kill`` leaves out the polite part."""
+        """Start stopping without waiting. Safe in a signal handler. ``kill`` skips SIGINT and SIGTERM."""
         self._stopping = True
         self._impatient = self._impatient or kill
 
@@ -144,7 +144,7 @@ class Launch:
             self._started.set()
             while not self._stopping:
                 self._watch(self._bus)
-        except Exception as error:  # whatever happens here, no process may stay behind
+        except Exception as error:  # after any error, no process may be left running
             self._fail(f"the supervisor failed: {type(error).__name__}: {error}")
         finally:
             self._take_down()
@@ -167,7 +167,7 @@ class Launch:
         if child.restart_at is not None:
             if now >= child.restart_at:
                 child.start()
-                self._report(f"{child.name}: started again, process {child.pid}")
+                self._report(f"{child.name}: restarted, process {child.pid}")
         elif child.running:
             if trouble := _silence(child, now):
                 child.signal(signal.SIGKILL)
@@ -189,12 +189,12 @@ class Launch:
         recent = [t for t in child.restarts if rule is not None and now - t < rule.window_s]
         if rule is None or len(recent) >= rule.max_restarts:
             child.given_up = True
-            self._report(f"{child.name} {how}; it stays down")
+            self._report(f"{child.name} {how}; it is not restarted")
             return
         delay_s = min(rule.delay_s * 2.0 ** len(recent), rule.max_delay_s)
         child.restarts = [*recent, now]
         child.restart_at = now + delay_s
-        self._report(f"{child.name} {how}; starting it again in {delay_s:g} s")
+        self._report(f"{child.name} {how}; restarting it in {delay_s:g} s")
 
     def _fail(self, why: str) -> None:
         if not self.failure:
@@ -203,7 +203,7 @@ class Launch:
         self._stopping = True
 
     def _what_is_missing(self) -> str:
-        """What keeps the launch from being ready; empty when nothing does."""
+        """Describe why the launch is not ready; empty if it is."""
         wanted: dict[str, int] = {}
         connected: dict[str, int] = {}
         missing: list[str] = []
@@ -261,7 +261,7 @@ class Launch:
 
 
 def active_launches() -> list[dict[str, Any]]:
-    """Launches of this user that are running on this host: name, run_dir, pid."""
+    """Running launches of this user on this host: name, run_dir, pid."""
     found = []
     for card in sorted((user_folder() / "active").glob("*.json")):
         try:
@@ -287,13 +287,13 @@ def _lock_run(run_dir: Path) -> TextIO:
         return hold(run_dir / "launch.lock")
     except HeldError as error:
         raise LaunchError(
-            f"{run_dir} is in use by the launch of process {error.owner}: two launches cannot share endpoints; stop it, or use "
+            f"{run_dir} is in use by the launch of process {error.owner}, and two launches cannot share endpoints; stop it, or use "
             "another --run-dir"
         ) from None
 
 
 def is_running(run_dir: Path) -> bool:
-    """Whether a launch is at work in a run folder."""
+    """Whether a launch is running in a run folder."""
     with open(run_dir / "launch.lock", encoding="ascii") as lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)

@@ -1,4 +1,4 @@
-"""Whether the nodes of a launch file would accept their configuration, asked of the nodes themselves; nothing is started."""
+"""Check the configuration of the nodes of a launch file, by asking the nodes themselves. No node is started."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ _TIMEOUT_S = 60.0
 
 
 def check_nodes(plan: Plan) -> dict[str, str]:
-    """What is wrong with the configuration of each node, by name; empty when every node accepts its own.
+    """Return the configuration errors by node; empty if every node accepts its configuration.
 
-    Each node's module is run with ``--check``: it reads its configuration, says what is wrong with it and ends. Files that a
-    node reads when it starts (a policy, an attack) are not opened.
+    Each node's module is run with ``--check``: it reads its configuration, prints errors and exits. Files that a node reads when it
+    starts, such as a policy or an attack, are not opened.
     """
     with tempfile.TemporaryDirectory(prefix="advnerf-check-") as folder, _processes(plan, Path(folder)) as processes:
         problems: dict[str, str] = {}
@@ -29,7 +29,7 @@ def check_nodes(plan: Plan) -> dict[str, str]:
             try:
                 _, errors = process.communicate(timeout=_TIMEOUT_S)
             except subprocess.TimeoutExpired:
-                problems[name] = f"{name}: did not answer within {_TIMEOUT_S:g} s"
+                problems[name] = f"{name}: expected the check to end within {_TIMEOUT_S:g} s, but it is still running"
                 continue
             if process.returncode:
                 lines = errors.strip().splitlines()

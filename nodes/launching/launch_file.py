@@ -1,4 +1,4 @@
-"""Launch files: YAML in, a plan of processes out."""
+"""Read launch files (YAML) and resolve them to a plan of processes."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ class _Strict(BaseModel):
 
 
 class Respawn(_Strict):
-    """How often a node that is not required may come back.
+    """Restart rule of a node that is not required.
 
     Attributes:
-        max_restarts: Restarts within the window, after which the node stays down.
+        max_restarts: Restarts within the window after which the node is not restarted again.
         window_s: Length of the window [s].
-        delay_s: Wait before the first restart; doubled for each further one in the window [s].
+        delay_s: Wait before the first restart, doubled for each further one in the window [s].
         max_delay_s: Longest wait [s].
     """
 
@@ -43,20 +43,20 @@ class Respawn(_Strict):
 
 
 class NodeEntry(_Strict):
-    """One node of a launch file.
+    """A node of a launch file.
 
     Attributes:
-        module: Python module that is run, e.g. ``nodes.camera``.
-        config: Its configuration.
-        enabled: Key ``if``; false leaves the node out.
-        required: Its death stops the whole launch.
-        respawn: Restart rule of a node that is not required; none means that it stays down.
-        ends_launch: Its regular end (a player at the end of its bag) ends the launch with exit code 0.
-        stop_last: Stopped only when the others are down (a recorder, a simulated lab).
-        host: Which of the file's hosts it runs on; only where the file has hosts.
+        module: Python module to run, for example ``nodes.camera``.
+        config: Configuration of the node.
+        enabled: Key ``if``. False disables the node.
+        required: Whether the end of the node stops the whole launch.
+        respawn: Restart rule of a node that is not required. None means no restart.
+        ends_launch: Whether the regular end of the node, such as a player at the end of its bag, ends the launch with exit code 0.
+        stop_last: Stop the node after the others have ended (a recorder, a simulated lab).
+        host: Host that runs the node, if the file has hosts.
         env: Environment variables to add.
         start_timeout_s: Time until its first status [s].
-        hang_timeout_s: Silence of its status after which it counts as hung and is killed [s].
+        hang_timeout_s: Time without a status after which the node counts as hung and is killed [s].
     """
 
     module: str
@@ -78,16 +78,16 @@ class NodeEntry(_Strict):
 
 
 class RecordEntry(_Strict):
-    """What the launch's own recorder does.
+    """Settings of the recorder that the launch adds.
 
     Attributes:
         output: Bag folder, relative to the run folder.
-        topics: Topics to record; none means all of the topic table.
-        attachments: Files that ride along in the bag, besides the resolved launch file: calibration, attack file; an empty
-            entry (a parameter without a value) is left out.
-        host: Host that records; none means the one without an address, whose disk is larger.
-        max_bag_duration_s: Begin a new file after so long [s]; none leaves it to the recorder.
-        max_bag_size_mb: Begin a new file when one has so many MiB; none leaves it to the recorder.
+        topics: Topics to record; none records all topics of the topic table.
+        attachments: Files to attach to the bag besides the resolved launch file, such as calibration and attack files. An empty
+            entry (a parameter without a value) is ignored.
+        host: Host that records; none selects the host without an address, whose disk is larger.
+        max_bag_duration_s: Start a new file after this time [s]; none uses the recorder's default.
+        max_bag_size_mb: Start a new file at this size [MiB]; none uses the recorder's default.
     """
 
     output: str = "bag"
@@ -103,14 +103,14 @@ class LaunchFile(_Strict):
 
     Attributes:
         name: Name of the launch.
-        params: Values to use elsewhere, in other parameters too, as ``${name}``. Two always exist: ``${run_dir}``, and ``${socket_dir}``, a folder
-            whose path is short enough for Unix sockets however long that of the run folder is.
-        nodes: The nodes, in the order in which they are started.
-        record: Add a recorder of everything; true for the defaults.
-        include: Launch files, relative to this one, on which this one builds.
-        hosts: The two computers of the launch; none means that all runs on one.
-        operator: Host from which people arm and ask; none means the one without an address.
-        keys: Key folder of each host; may be left out only on a loopback address, and then the other host can only watch.
+        params: Values that the file and other parameters can use as ``${name}``. Two are predefined: ``${run_dir}``, and
+            ``${socket_dir}``, a folder whose path is short enough for Unix sockets.
+        nodes: The nodes, in the order of their start.
+        record: Settings of an added recorder; true uses the defaults.
+        include: Launch files, relative to this one, that this one extends.
+        hosts: The two computers of the launch; none runs all nodes on one.
+        operator: Host from which the operator arms and sends requests; none selects the host without an address.
+        keys: Key folder of each host. It may be omitted only on a loopback address; then the other host can only watch.
     """
 
     name: str
@@ -125,13 +125,13 @@ class LaunchFile(_Strict):
 
 @dataclass(frozen=True)
 class Plan:
-    """A launch file after includes, parameters and overrides.
+    """A launch file with includes, parameters and overrides applied.
 
     Attributes:
-        file: Where it came from.
+        file: The launch file.
         launch: The typed content.
         documents: Configuration of each enabled node with the places of its keys, for error messages.
-        resolved: The whole as plain data, to be stored beside the results.
+        resolved: The complete launch as plain data, to be stored with the results.
     """
 
     file: Path
@@ -154,8 +154,8 @@ def load_launch(
         file: A ``*.launch.yaml`` file.
         overrides: ``node.key=value`` for a node's configuration (``node.config.key`` where the key is also one of `NodeEntry`), ``params.name=value``, ``record=true``,
             ``hosts.name.key=value``, or ``keys=folder``.
-        run_dir: What ``${run_dir}`` stands for.
-        host: Which of the file's hosts this computer is, or ``all``; None where the file has none.
+        run_dir: Value of ``${run_dir}``.
+        host: Host of the launch file that this computer is, or ``all``; None if the file has no hosts.
     """
     file = Path(file)
     document = _read_with_includes(file, ())
@@ -182,7 +182,9 @@ def load_launch(
 def _read_with_includes(file: Path, above: tuple[Path, ...]) -> Document:
     file = file.resolve() if above else file
     if file.resolve() in above:
-        raise ConfigError(f"{file}: includes itself through {' -> '.join(map(str, above))}")
+        raise ConfigError(
+            f"{file}: includes itself through {' -> '.join(map(str, above))}; remove one of these includes"
+        )
     document = read_yaml(file)
     if not isinstance(document.data, dict):
         raise ConfigError(f"{file}:1: expected a launch file with keys name and nodes")
@@ -202,7 +204,7 @@ def _read_with_includes(file: Path, above: tuple[Path, ...]) -> Document:
 def _merge(below: Any, above: Any) -> Any:
     if isinstance(below, dict) and isinstance(above, dict):
         kinds = below.get("kind"), above.get("kind")
-        # A section of another kind (of camera, of motion capture) has other keys: it replaces the one below.
+        # A section of another kind (of camera, of motion capture) has other keys, so it replaces the included one.
         if None not in kinds and kinds[0] != kinds[1]:
             return above
         return {**below, **{key: _merge(below.get(key), value) for key, value in above.items()}}
@@ -231,18 +233,18 @@ def _apply_override(document: Document, override: str) -> None:
 
 
 def _is_about_the_process(key: str, value: str, document: Document, override: str) -> bool:
-    """Whether a key of ``--set NODE.KEY`` is one of `NodeEntry`, such as ``if`` or ``config.rate_hz``, not of the node itself."""
+    """Whether a key of ``--set NODE.KEY`` belongs to `NodeEntry`, such as ``if`` or ``config.rate_hz``, instead of the node's configuration."""
     if key.split(".")[0] not in {field.alias or name for name, field in NodeEntry.model_fields.items()}:
         return False
     hosts = document.data.get("hosts") or {}
     if key != "host":
         return True
-    # Some nodes have a key of this name, too: the address they listen on.
+    # Some nodes also have a key with this name: the address they listen on.
     if hosts and value.strip() not in hosts:
         node = override.split(".")[0].strip()
         raise ConfigError(
-            f"--set {override}: expected the host that runs {node}, one of {', '.join(hosts)}, got {value.strip()}; "
-            f"the node's own key is {node}.config.host"
+            f"--set {override}: expected the host that runs {node}, one of {', '.join(hosts)}; got {value.strip()}. "
+            f"For the node's own key, use {node}.config.host"
         )
     return bool(hosts)
 
@@ -250,7 +252,7 @@ def _is_about_the_process(key: str, value: str, document: Document, override: st
 def _substitute(
     value: Any, params: dict[str, Any], document: Document, key: tuple[str | int, ...], above: tuple[str, ...] = ()
 ) -> Any:
-    """Put in the values of parameters, which may name others. ``above`` are the parameters that are being put in."""
+    """Substitute parameters, whose values may use other parameters. ``above`` are the parameters being substituted."""
     if isinstance(value, dict):
         return {name: _substitute(item, params, document, (*key, name), above) for name, item in value.items()}
     if isinstance(value, list):
@@ -263,7 +265,7 @@ def _substitute(
             raise ConfigError(f"{document.place(key)}: unknown parameter ${{{name}}}; known are {', '.join(params)}")
         if name in above:
             circle = " -> ".join((*above, name))
-            raise ConfigError(f"{document.place(key)}: parameter {name} is made of itself: {circle}")
+            raise ConfigError(f"{document.place(key)}: parameter {name} uses itself: {circle}; remove the cycle")
         return _substitute(params[name], params, document, ("params", name), (*above, name))
 
     if whole := _REFERENCE.fullmatch(value):
@@ -275,7 +277,9 @@ def _add_recorder(document: Document, launch: LaunchFile) -> None:
     record = RecordEntry() if launch.record is True else launch.record
     assert isinstance(record, RecordEntry)
     if RECORDER in launch.nodes:
-        raise ConfigError(f"{document.place(('nodes', RECORDER))}: this node and the key record exclude each other")
+        raise ConfigError(
+            f"{document.place(('nodes', RECORDER))}: expected either this node or the key record, got both; remove one of them"
+        )
     others = [name for name, entry in launch.nodes.items() if entry.enabled]
     attachments = [file for file in record.attachments if file]
     limits = record.model_dump(include={"max_bag_duration_s", "max_bag_size_mb"}, exclude_none=True)
@@ -297,9 +301,9 @@ def _check(name: str, entry: NodeEntry, document: Document) -> None:
     except TopicError as error:
         raise ConfigError(f"{place}: {error}") from None
     if name in ("params", "record", "hosts", "keys", "operator"):
-        raise ConfigError(f"{place}: a node cannot be called {name}, because --set uses that word")
+        raise ConfigError(f"{place}: expected another node name than {name}, which --set uses; rename the node")
     if entry.required and entry.respawn is not None:
-        raise ConfigError(f"{place}: node {name} has respawn, so it must also say required: false")
+        raise ConfigError(f"{place}: node {name} has respawn, so it must also have required: false")
     # The node's process is started by `python -m` in this folder, and finds its modules there.
     if (folder := str(Path.cwd())) not in sys.path:
         sys.path.append(folder)
@@ -308,4 +312,6 @@ def _check(name: str, entry: NodeEntry, document: Document) -> None:
     except ModuleNotFoundError:
         found = False
     if not found:
-        raise ConfigError(f"{document.place(('nodes', name, 'module'))}: no Python module called {entry.module}")
+        raise ConfigError(
+            f"{document.place(('nodes', name, 'module'))}: expected a Python module, found none called {entry.module}; correct the name"
+        )

@@ -1,7 +1,7 @@
-"""Host roles of a launch file: which nodes run here, and the gateway that joins the two hosts.
+"""Hosts of a launch file: selects the nodes of this host and adds the gateway that connects the two hosts.
 
-Two hosts at most: the one with an address listens (the car, a thin client), the other connects (the workstation). The topic
-table says who publishes what, so that the gateways' lists follow from where the nodes are.
+A launch has at most two hosts: the one with an address listens (the car, a thin client), the other connects (the workstation). The
+topic lists of the gateways follow from the topic table, which has the publisher of each topic, and from the hosts of the nodes.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ GATEWAY = "gateway"
 ALL_HOSTS = "all"
 _OPERATOR = "operator"
 _HOST_COUNT = 2
-# A command to move must reach the motor through a check on the same computer, whatever the network does.
+# The safety node must run on the motor's computer, so that the network cannot come between the check and the motor.
 _TOGETHER = ("safety", "motor")
 _SAFETY_MODULE = "nodes.safety"
 _COMMANDS = ("/policy/drive", "/expert/drive")
 
 
 class HostEntry(BaseModel):
-    """One host of a launch file.
+    """A host of a launch file.
 
     Attributes:
-        address: Where the other host finds this one; exactly one host has an address, and listens there.
-        watch_port: TCP port by which it speaks.
-        drive_port: TCP port by which it hears.
-        key: Name of its key; none means the host's own name.
+        address: Address of this host. Exactly one host has an address, and listens there.
+        watch_port: TCP port on which the listening host sends.
+        drive_port: TCP port on which the listening host receives.
+        key: Name of the host's key; none uses the name of the host.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -53,12 +53,12 @@ class _Entry(Protocol):
 
 
 def choose_host(document: Document, launch: LaunchFile, host: str | None) -> None:
-    """Leave out the nodes of other hosts and add this host's gateway, in place.
+    """Remove the nodes of other hosts and add this host's gateway, in place.
 
     Args:
-        document: The launch file's plain data.
-        launch: The same, typed.
-        host: Name of this host, ``all`` to run everything on this computer, or None where the file knows no hosts.
+        document: The launch file as plain data.
+        launch: The launch file as a typed object.
+        host: Name of this host, ``all`` to run all nodes on this computer, or None if the file has no hosts.
     """
     _check(document, launch, host)
     if host is None or host == ALL_HOSTS:
@@ -77,7 +77,7 @@ def choose_host(document: Document, launch: LaunchFile, host: str | None) -> Non
 
 
 def _require_clock(document: Document, launch: LaunchFile, host: str) -> None:
-    """Commands come from the other host: their age is known only as well as its clock is, so nobody arms before that."""
+    """Require the other host's clock offset for arming. The age of its commands is only as accurate as its clock."""
     other = next(name for name in launch.hosts if name != host)
     peer = launch.hosts[other].key or other
     for name, node in document.data["nodes"].items():
@@ -88,21 +88,21 @@ def _require_clock(document: Document, launch: LaunchFile, host: str) -> None:
 def _watching_only(
     document: Document, launch: LaunchFile, host: str, exports: list[str], imports: list[str]
 ) -> tuple[list[str], list[str]]:
-    """Routes of a launch without keys: nothing goes to the host that listens. Statuses are dropped, all else is refused."""
+    """Routes of a launch without keys, which send nothing to the listening host. Statuses are dropped; other topics are refused."""
     listens = host == _listener(launch)
     towards = imports if listens else exports
     if commands := [topic for topic in towards if not topic.startswith(STATUS_PREFIX)]:
         raise ConfigError(
-            f"{document.place(('hosts',))}: without keys the hosts can only watch each other, but {_listener(launch)} would take "
-            f"{', '.join(commands[:4])}{' and more' if len(commands) > 4 else ''} from the other: any local process could drive the "
-            f"car. Give --set keys=FOLDER (advnerf keys new), put what commands on {_listener(launch)} (people too: operator: "
-            f"{_listener(launch)}), or run everything on one computer with --host all"
+            f"{document.place(('hosts',))}: without keys the hosts can only watch each other, but {_listener(launch)} would accept "
+            f"{', '.join(commands[:4])}{' and more' if len(commands) > 4 else ''} from the other, so any local process could drive the "
+            f"car. Give --set keys=FOLDER (advnerf keys new), run the nodes that command on {_listener(launch)} (and set operator: "
+            f"{_listener(launch)}), or run all nodes on one computer with --host all"
         )
     return (exports, []) if listens else ([], imports)
 
 
 def routes(launch: LaunchFile, host: str) -> tuple[list[str], list[str]]:
-    """Topics that a host exports, and those it imports."""
+    """Topics that a host exports, and topics that it imports."""
     listener = _listener(launch)
     operator = operator_of(launch)
     exports, imports = [], []
@@ -124,13 +124,13 @@ def routes(launch: LaunchFile, host: str) -> tuple[list[str], list[str]]:
 
 
 def operator_of(launch: LaunchFile) -> str:
-    """Host from which people arm and ask."""
+    """Host from which the operator arms and sends requests."""
     listener = _listener(launch)
     return launch.operator or next(name for name in launch.hosts if name != listener)
 
 
 def _host_of(role: str, entries: Mapping[str, _Entry]) -> str | None:
-    """Host of the node that plays a role, by its name or by its module."""
+    """Host of the node with a role, found by the node's name or module."""
     for name, entry in entries.items():
         if role in (name, entry.module.rsplit(".", 1)[-1]):
             return entry.host
@@ -148,7 +148,7 @@ def _gateway_config(launch: LaunchFile, host: str, exports: list[str], imports: 
     return {
         **end, "watch_port": entry.watch_port, "drive_port": entry.drive_port, "keys": launch.keys,
         "key": launch.hosts[host].key or host, "peer_key": entry.key or listener, "imports": imports,
-        # The clock's offset is made by the gateway itself: it says it on its bus and hears it there.
+        # The gateway itself measures the clock offset and publishes it on its own bus.
         "exports": exports,
     }  # fmt: skip
 
@@ -157,15 +157,15 @@ def _check(document: Document, launch: LaunchFile, host: str | None) -> None:
     place = document.place(("hosts",))
     if not launch.hosts:
         if host is not None and host != ALL_HOSTS:
-            raise ConfigError(f"--host {host}: {document.source} knows no hosts; leave --host out")
+            raise ConfigError(f"--host {host}: {document.source} has no hosts; remove --host")
         if named := [name for name, entry in launch.nodes.items() if entry.host]:
             raise ConfigError(
-                f"{document.place(('nodes', named[0]))}: node {named[0]} has a host, but there is no hosts"
+                f"{document.place(('nodes', named[0]))}: node {named[0]} has a host, but the file has no hosts; add hosts, or remove the key"
             )
         return
     known = ", ".join(launch.hosts)
     if host is None or (host != ALL_HOSTS and host not in launch.hosts):
-        raise ConfigError(f"{place}: say which host this is: --host with one of {known}, or all; got {host}")
+        raise ConfigError(f"{place}: expected --host with one of {known}, or all; got {host}")
     listeners = [name for name, entry in launch.hosts.items() if entry.address is not None]
     if len(launch.hosts) != _HOST_COUNT or len(listeners) != 1:
         raise ConfigError(
@@ -176,10 +176,12 @@ def _check(document: Document, launch: LaunchFile, host: str | None) -> None:
         raise ConfigError(f"{document.place(('operator',))}: expected one of {known}, got {launch.operator}")
     for name, entry in launch.nodes.items():
         if entry.enabled and entry.host not in launch.hosts:
-            raise ConfigError(f"{document.place(('nodes', name))}: node {name} needs a host: {known}; got {entry.host}")
+            raise ConfigError(
+                f"{document.place(('nodes', name))}: node {name} needs a host of {known}; got {entry.host}"
+            )
     enabled = {name: entry for name, entry in launch.nodes.items() if entry.enabled}
     homes = {role: home for role in _TOGETHER if (home := _host_of(role, enabled)) is not None}
     if len(set(homes.values())) > 1:
         raise ConfigError(
-            f"{place}: safety and motor must be on one host, got {homes}: no network between check and wheel"
+            f"{place}: expected safety and motor on one host, so that no network lies between them; got {homes}"
         )

@@ -1,7 +1,7 @@
-"""Start a program that dies with its supervisor: ``python -I -S shim.py <supervisor pid> <program> <arguments...>``.
+"""Start a program that is killed when its supervisor ends: ``python -I -S shim.py <supervisor pid> <program> <arguments...>``.
 
-Run by path and without site packages, so that it costs a few milliseconds. It sets PR_SET_PDEATHSIG, which survives the
-exec, and checks afterwards that the supervisor did not die before it was set.
+The script runs by path and without site packages, so that it takes only a few milliseconds. It sets PR_SET_PDEATHSIG, which survives
+the exec, and then checks that the supervisor did not end before that.
 """
 
 import ctypes
@@ -13,12 +13,12 @@ _PR_SET_PDEATHSIG = 1
 
 
 def main() -> None:
-    """Bind this process to its parent's life and become the program."""
+    """Set PR_SET_PDEATHSIG and replace this process with the program."""
     supervisor, program = int(sys.argv[1]), sys.argv[2:]
     if ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0) != 0:
         sys.exit(f"shim: prctl failed: {os.strerror(ctypes.get_errno())}")
     if os.getppid() != supervisor:
-        sys.exit("shim: the supervisor is gone")
+        sys.exit("shim: the supervisor has ended")
     os.execvp(program[0], program)
 
 

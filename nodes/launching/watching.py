@@ -1,4 +1,4 @@
-"""What a person asks a running launch: which topics there are, how often they come, what they say."""
+"""Queries about the topics of a running launch: their list, rates and messages."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _ECHO_ITEMS = 12
 
 @dataclass(frozen=True)
 class TopicRow:
-    """One topic of a running launch."""
+    """A topic of a running launch."""
 
     name: str
     type: str
@@ -38,7 +38,7 @@ class TopicRow:
 
 @dataclass(frozen=True)
 class RateReport:
-    """How a topic came during a while; ages are those of the capture stamps at reception."""
+    """Rate of a topic over a period. Ages are those of the capture stamps at reception."""
 
     messages: int
     lost: int
@@ -50,20 +50,20 @@ class RateReport:
 
 
 def find_run_dir(given: Path | None) -> Path:
-    """The run folder to look at: the one that was given, or that of the only launch that is running."""
+    """Return the given run folder, or that of the only running launch."""
     if given is not None:
         if not given.is_dir():
-            raise LaunchError(f"no run folder {given}")
+            raise LaunchError(f"expected a run folder at {given}, found none; correct --run-dir")
         return given
     launches = active_launches()
     if len(launches) != 1:
         found = ", ".join(str(launch["run_dir"]) for launch in launches) or "none"
-        raise LaunchError(f"expected one running launch, found {len(launches)} ({found}); say which with --run-dir")
+        raise LaunchError(f"expected one running launch, found {len(launches)} ({found}); select one with --run-dir")
     return Path(launches[0]["run_dir"])
 
 
 def node_names(run_dir: Path) -> list[str]:
-    """Names of the nodes that have, or had, a socket in a run folder, and of those of its launch while it is at work."""
+    """Names of the nodes that have, or had, a socket in a run folder, and of the nodes of its running launch."""
     prefix = status_topic("x")[:-1].strip("/").replace("/", ".")
     sockets = (path.name for path in bus_folder(run_dir).iterdir() if path.suffix != ".lock")
     names = {name.removeprefix(prefix + ".") for name in sockets if name.startswith(prefix + ".")}
@@ -71,7 +71,7 @@ def node_names(run_dir: Path) -> list[str]:
 
 
 def _launched(run_dir: Path) -> list[str]:
-    """Nodes of the launch that is at work in a run folder."""
+    """Names of the nodes of the launch that is running in a run folder."""
     try:
         if not is_running(run_dir):
             return []
@@ -82,7 +82,7 @@ def _launched(run_dir: Path) -> list[str]:
 
 
 def node_statuses(run_dir: Path, wait_s: float = _STATUS_WAIT_S) -> dict[str, Any]:
-    """Last status of every node that reports within a moment; None for a node that is silent."""
+    """Last status of every node that reports within ``wait_s`` [s]; None for a silent node."""
     names = node_names(run_dir)
     statuses: dict[str, Any] = dict.fromkeys(names)
     with Bus(run_dir) as bus:
@@ -97,7 +97,7 @@ def node_statuses(run_dir: Path, wait_s: float = _STATUS_WAIT_S) -> dict[str, An
 
 
 def list_topics(run_dir: Path) -> list[TopicRow]:
-    """All topics of the table and all statuses, with who publishes them now and to how many."""
+    """All topics of the table and all status topics, with their current publisher and number of subscribers."""
     publishers: dict[str, tuple[str, int]] = {}
     statuses = {name: status for name, status in node_statuses(run_dir).items() if status is not None}
     for name, status in statuses.items():
@@ -110,7 +110,7 @@ def list_topics(run_dir: Path) -> list[TopicRow]:
 
 
 def listen(run_dir: Path, topic: str, duration_s: float | None) -> Iterator[Received]:
-    """Every message of a topic as it comes, until the time is over (None: for ever)."""
+    """Yield the messages of a topic as they arrive, for ``duration_s`` [s] (None: for ever)."""
     deadline = None if duration_s is None else time.monotonic() + duration_s
     with Bus(run_dir) as bus:
         bus.subscribe(topic, queue=1000)
@@ -120,7 +120,7 @@ def listen(run_dir: Path, topic: str, duration_s: float | None) -> Iterator[Rece
 
 
 def measure_rate(run_dir: Path, topic: str, duration_s: float) -> RateReport:
-    """Listen for a while and say how the topic came."""
+    """Listen for ``duration_s`` [s] and measure the rate of a topic."""
     times, ages, lost = [], [], 0
     for received in listen(run_dir, topic, duration_s):
         times.append(received.info.publish_mono_ns)
@@ -130,7 +130,7 @@ def measure_rate(run_dir: Path, topic: str, duration_s: float) -> RateReport:
             ages.append((received.info.receive_real_ns - stamp_ns(message)) / NS_PER_S)
     if len(times) < 2:
         raise MessageError(
-            f"expected {topic} to come at least twice in {duration_s:g} s, got {len(times)}; is its node running?"
+            f"expected at least two messages of {topic} in {duration_s:g} s, got {len(times)}; is its node running?"
         )
     gaps = [(b - a) / NS_PER_S for a, b in pairwise(times)]
     return RateReport(
@@ -140,7 +140,7 @@ def measure_rate(run_dir: Path, topic: str, duration_s: float) -> RateReport:
 
 
 def describe(message: Any, indent: str = "") -> str:
-    """A message as indented text; long arrays are cut."""
+    """Format a message as indented text. Long arrays are shortened."""
     lines = []
     for name, value in vars(message).items():
         if name.startswith("__"):

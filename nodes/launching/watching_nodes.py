@@ -1,4 +1,4 @@
-"""What a person asks about the nodes of a running launch: who is there, what they use, where messages grow old."""
+"""Queries about the nodes of a running launch: their state, their load, and the delays of their topics."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ class Delay:
 
 @dataclass(frozen=True)
 class DelayReport:
-    """Where the time of a topic goes.
+    """Delays of a topic.
 
     Attributes:
-        messages: How many came.
+        messages: Number of received messages.
         capture_to_publish: From the stamp in the header to publication, in real time; None without a header.
         publish_to_receive: From publication to reception here.
     """
@@ -49,19 +49,19 @@ class DelayReport:
 
 @dataclass(frozen=True)
 class NodeRow:
-    """One node over a while.
+    """State and load of a node over a period.
 
     Attributes:
         name: Name in the launch file.
-        pid: Its process; 0 for one on another host.
-        state: What it says it is, or ``silent``.
-        text: What it says about it.
-        cpu_percent: Of one core; None for a process that is not here.
-        memory_mib: Resident memory [MiB]; None for a process that is not here.
-        rate_hz: Messages it took and ticks it ran, per second.
-        dropped: Messages it skipped for newer ones, lost on the way, or refused, since it started.
-        missed: Ticks it missed since it started.
-        restarts: Changes of its process while we looked.
+        pid: Process id; 0 for a node on another host.
+        state: Reported state, or ``silent``.
+        text: Reported status text.
+        cpu_percent: CPU load in percent of one core; None for a process on another host.
+        memory_mib: Resident memory [MiB]; None for a process on another host.
+        rate_hz: Handled messages and ticks per second.
+        dropped: Messages skipped for newer ones, lost or refused since the node started.
+        missed: Ticks missed since the node started.
+        restarts: Number of restarts during the observation.
         queue: Messages dropped from the queue of its drivers since it started.
     """
 
@@ -80,11 +80,11 @@ class NodeRow:
 
 @dataclass(frozen=True)
 class Silence:
-    """A node that does not report.
+    """State of a node that does not report.
 
     Attributes:
-        pid: Its process; 0 for one that has ended, or runs on another host.
-        text: How long ago it reported, and what its process does.
+        pid: Process id; 0 for a process that has ended or runs on another host.
+        text: Time since the last status, and the state of the process.
     """
 
     pid: int
@@ -92,7 +92,7 @@ class Silence:
 
 
 def describe_silence(run_dir: Path, name: str) -> Silence:
-    """Say since when a node has not reported, from the lock that its publisher touches at every status."""
+    """Describe how long a node has not reported, from the lock file that its publisher touches at every status."""
     lock = lock_path(socket_path(run_dir, status_topic(name)))
     try:
         age_s = max(0.0, time.time() - lock.stat().st_mtime)
@@ -101,7 +101,7 @@ def describe_silence(run_dir: Path, name: str) -> Silence:
         return Silence(0, "has never reported")
     process = _process_of(name, owner)
     if process is None:
-        return Silence(0, f"last status {age_s:.1f} s ago; its process is not here any more")
+        return Silence(0, f"last status {age_s:.1f} s ago; its process has ended")
     try:
         stopped = process.status() == psutil.STATUS_STOPPED
     except psutil.Error:
@@ -112,7 +112,7 @@ def describe_silence(run_dir: Path, name: str) -> Silence:
 
 
 def _process_of(name: str, pid: int) -> psutil.Process | None:
-    """The process of a node, if it is here: a node of another host may have the number of a stranger."""
+    """Process of a node, if it runs on this host. The pid of a node on another host may belong to an unrelated process."""
     try:
         process = psutil.Process(pid)
         command = process.cmdline()
@@ -122,7 +122,7 @@ def _process_of(name: str, pid: int) -> psutil.Process | None:
 
 
 def measure_delay(run_dir: Path, topic: str, duration_s: float) -> DelayReport:
-    """Listen to a topic for a while and say how old its messages are at publication and on arrival."""
+    """Listen to a topic for ``duration_s`` [s] and measure the age of its messages at publication and reception."""
     capture, way = [], []
     for received in listen(run_dir, topic, duration_s):
         info, message = received.info, received.message()
@@ -130,7 +130,7 @@ def measure_delay(run_dir: Path, topic: str, duration_s: float) -> DelayReport:
         if hasattr(message, "header"):
             capture.append((info.publish_real_ns - stamp_ns(message)) / NS_PER_S)
     if not way:
-        raise MessageError(f"expected {topic} to come within {duration_s:g} s, nothing came; is its node running?")
+        raise MessageError(f"expected a message of {topic} within {duration_s:g} s, got none; is its node running?")
     return DelayReport(len(way), _delay(capture) if capture else None, _delay(way))
 
 
@@ -140,7 +140,7 @@ def _delay(values_s: list[float]) -> Delay:
 
 
 class NodeWatch:
-    """Looks at all nodes of a run folder again and again.
+    """Observes all nodes of a run folder repeatedly.
 
     Args:
         run_dir: Folder of the run.
@@ -161,7 +161,7 @@ class NodeWatch:
         self._bus.close()
 
     def rows(self, duration_s: float) -> list[NodeRow]:
-        """Watch for a while; what each node did in it."""
+        """Observe for ``duration_s`` [s] and return a row for each node."""
         names = node_names(self._run_dir)
         for name in names:
             self._bus.subscribe(status_topic(name))
@@ -190,12 +190,12 @@ class NodeWatch:
             process = _process_of(name, pid)
             if process is None:
                 return None
-            process.cpu_percent()  # the first call begins the measurement
+            process.cpu_percent()  # the first call starts the measurement
             self._processes[pid] = process
         return self._processes[pid]
 
     def _usage(self, process: psutil.Process | None) -> tuple[float | None, float | None]:
-        """Processor [% of one core] and memory [MiB]; None for a process that is not here."""
+        """CPU load [% of one core] and memory [MiB]; None for a process on another host."""
         try:
             return (None, None) if process is None else (process.cpu_percent(), process.memory_info().rss / _MIB)
         except psutil.Error:

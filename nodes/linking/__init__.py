@@ -1,1 +1,1 @@
-"""The link between two hosts: keys, doors, and the offset of their clocks."""
+"""The link between two hosts: keys, doors (ports with access control), and the offset of their clocks."""

@@ -1,4 +1,4 @@
-"""The keeper of a link's doors: answers ZeroMQ's question who may pass (ZAP, ZeroMQ RFC 27), and says whom it refused."""
+"""Access control of a link: answers ZeroMQ's authentication requests (ZAP, ZeroMQ RFC 27) and logs refusals."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ _ZAP_FRAMES = 7
 
 
 class RefusalLog:
-    """Counts refusals and says each at most once in ten seconds: a stranger who goes on trying must not fill the disk.
+    """Counts refusals and logs each at most once in ten seconds, so that repeated attempts cannot fill the disk.
 
     Attributes:
-        refused: Handshakes and messages that were refused.
+        refused: Number of refused handshakes and messages.
     """
 
     def __init__(self) -> None:
@@ -27,12 +27,12 @@ class RefusalLog:
         self._said: dict[str, float] = {}
 
     def refuse(self, what: str) -> None:
-        """Count and say a refusal."""
+        """Count and log a refusal."""
         self.refused += 1
         self.say(f"refused {what}")
 
     def say(self, what: str) -> None:
-        """One line into the node's log."""
+        """Write one line to the node's log."""
         now = time.monotonic()
         if now - self._said.get(what, -_REPEAT_S) < _REPEAT_S:
             return
@@ -43,12 +43,12 @@ class RefusalLog:
 
 
 class Doorkeeper:
-    """Lets in the keys of the allow-lists, as they are on disk at that moment.
+    """Admits the keys that are on the allow-lists on disk at that moment.
 
     Args:
-        context: The context whose doors it keeps.
+        context: The ZeroMQ context whose connections it authenticates.
         keys: Key folder with the lists.
-        log: Where refusals go.
+        log: Log of refusals.
     """
 
     def __init__(self, context: zmq.Context[Any], keys: KeyFolder, log: RefusalLog) -> None:
@@ -59,14 +59,14 @@ class Doorkeeper:
         self.socket.bind("inproc://zeromq.zap.01")
 
     def judge(self) -> None:
-        """Answer one question: may this key pass this door?"""
+        """Answer one authentication request."""
         frames = self.socket.recv_multipart()
         user = self._user(frames) if len(frames) == _ZAP_FRAMES else ""
         request = frames[1] if len(frames) > 1 else b""
         self.socket.send_multipart([b"1.0", request, b"200" if user else b"400", b"", user.encode(), b""])
 
     def _user(self, frames: list[bytes]) -> str:
-        """Name of the key that asks; empty if it may not pass."""
+        """Name of the requesting key; empty if it is refused."""
         right, address = (frame.decode("ascii", "replace") for frame in frames[2:4])
         if frames[5] != b"CURVE" or right not in self._allowed:
             self._log.refuse(f"{address} at the {right} door: expected a CURVE key, got {frames[5]!r}")
@@ -80,7 +80,7 @@ class Doorkeeper:
         return user
 
     def revoked(self) -> dict[str, list[str]]:
-        """Names taken off a list since the last call, by list."""
+        """Names removed from a list since the last call, by list."""
         gone = {}
         for right, before in self._allowed.items():
             now = self._keys.allowed(right)

@@ -1,8 +1,8 @@
-"""Who may talk to a host over the network: key pairs, and two allow-lists - who may watch, and who may drive.
+"""Keys for network access to a host: key pairs, and two allow-lists for the rights to watch and to drive.
 
-A key folder holds ``secret/NAME.key`` (ours, mode 0600), ``public/NAME.pub`` (of anybody we know), and the lists
-``watch/NAME.pub`` and ``drive/NAME.pub``. Files hold one Z85 text of 40 characters (ZeroMQ RFC 32), nothing else. A running
-gateway reads the lists at every handshake, and again twice a second: who is taken off them is cut off at once.
+A key folder holds ``secret/NAME.key`` (own keys, mode 0600), ``public/NAME.pub`` (all known keys), and the lists
+``watch/NAME.pub`` and ``drive/NAME.pub``. Each file holds one Z85 text of 40 characters (ZeroMQ RFC 32). A running gateway reads the
+lists at every handshake and twice a second, and disconnects keys that were removed.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from nodes.runtime.errors import SecurityError
 WATCH, DRIVE = "watch", "drive"
 RIGHTS = (WATCH, DRIVE)
 _MAKE_KEYS = (
-    "Make keys with advnerf keys new, allow the other host with advnerf keys allow, and name the folder under keys"
+    "Create keys with advnerf keys new, allow the other host with advnerf keys allow, and set keys to the folder"
 )
 _NAME = re.compile(r"[a-z][a-z0-9_-]{0,31}")
 _KEY = re.compile(r"[0-9a-zA-Z.\-:+=^!/*?&<>()\[\]{}@%$#]{40}")
@@ -31,13 +31,13 @@ _KEY = re.compile(r"[0-9a-zA-Z.\-:+=^!/*?&<>()\[\]{}@%$#]{40}")
 
 @dataclass(frozen=True)
 class KeyRow:
-    """One name of a key folder.
+    """An entry of a key folder.
 
     Attributes:
         name: Name of the key, usually of a host or a person.
         public: Its public key, Z85.
-        ours: Whether the secret half is here.
-        rights: The lists it is on.
+        ours: Whether the folder has the secret key.
+        rights: The lists that contain the key.
     """
 
     name: str
@@ -47,7 +47,7 @@ class KeyRow:
 
 
 def default_folder() -> Path:
-    """Key folder of this user."""
+    """Default key folder of this user."""
     base = os.environ.get("XDG_CONFIG_HOME") or str(Path.home() / ".config")
     return Path(base) / "advnerf" / "keys"
 
@@ -63,11 +63,11 @@ class KeyFolder:
         self.path = Path(path).expanduser()
 
     def new(self, name: str) -> str:
-        """Make a key pair and return the public half; a name that has one is refused."""
+        """Create a key pair and return the public key. A name that already has one is refused."""
         secret_file = self._file("secret", name, ".key")
         if secret_file.exists() or self._file("public", name).exists():
             raise SecurityError(
-                f"{self.path} has a key {name} already; take another name, or revoke it and remove its files"
+                f"{self.path} already has a key {name}; use another name, or revoke the key and remove its files"
             )
         public, secret = (half.decode("ascii") for half in zmq.curve_keypair())
         _private_folder(self.path)
@@ -81,7 +81,7 @@ class KeyFolder:
         return public
 
     def add(self, name: str, public: str) -> None:
-        """Remember the public key of another host; another key under a known name is refused."""
+        """Store the public key of another host. A different key under a known name is refused."""
         known = self._file("public", name)
         if not _KEY.fullmatch(public):
             raise SecurityError(f"expected a public key of 40 Z85 characters for {name}, got {public!r:.60}")
@@ -90,13 +90,13 @@ class KeyFolder:
         write_atomically(known, public + "\n")
 
     def allow(self, name: str, right: str) -> None:
-        """Put a known key on a list; who may drive may watch."""
+        """Add a known key to a list. The right to drive includes the right to watch."""
         public = self.public(name)
         for granted in RIGHTS if right == DRIVE else (right,):
             write_atomically(self._file(granted, name), public + "\n")
 
     def revoke(self, name: str, right: str | None = None) -> tuple[str, ...]:
-        """Take a key off a list; off both where no right is named, or the right to watch. Returns what was taken."""
+        """Remove a key from the drive list, or from both lists if the right is watch or None. Returns the revoked rights."""
         taken = []
         for lost in (DRIVE,) if right == DRIVE else RIGHTS:
             file = self._file(lost, name)
@@ -104,7 +104,7 @@ class KeyFolder:
                 file.unlink()
                 taken.append(lost)
         if not taken:
-            raise SecurityError(f"{name} is on no such list in {self.path}; see: advnerf keys list")
+            raise SecurityError(f"{name} has no such right in {self.path}; see advnerf keys list")
         return tuple(taken)
 
     def public(self, name: str) -> str:
@@ -113,25 +113,27 @@ class KeyFolder:
         if not file.exists():
             known = ", ".join(row.name for row in self.rows()) or "none"
             raise SecurityError(
-                f"no public key {file}; known are {known}. Make one with: advnerf keys new {name}, or bring it from its host "
-                f"with: advnerf keys allow {name} --public KEY"
+                f"expected a public key at {file}, found none; known are {known}. Create it with advnerf keys new {name}, or copy it from its "
+                f"host with advnerf keys allow {name} --public KEY"
             )
         return _read_key(file)
 
     def secret(self, name: str) -> str:
-        """Secret key of a name; refused when others could read the file."""
+        """Secret key of a name. A file that other users can read is refused."""
         file = self._file("secret", name, ".key")
         if not file.exists():
-            raise SecurityError(f"no secret key {file}; make one on this host with: advnerf keys new {name}")
+            raise SecurityError(
+                f"expected a secret key at {file}, found none; create it on this host with advnerf keys new {name}"
+            )
         mode = stat.S_IMODE(file.stat().st_mode)
         if mode & 0o077:
             raise SecurityError(
-                f"expected mode 0600 of {file}, got {mode:04o}: others may have read it; make a new key"
+                f"expected mode 0600 of {file}, got {mode:04o}: other users may have read it; create a new key"
             )
         return _read_key(file)
 
     def allowed(self, right: str) -> dict[str, str]:
-        """Names by public key of a list. A file that is no key allows nobody, and takes nobody else's right away."""
+        """Names of a list by public key. A file without a valid key is ignored."""
         found = {}
         for file in sorted((self.path / right).glob("*.pub")):
             try:
@@ -141,7 +143,7 @@ class KeyFolder:
         return found
 
     def rows(self) -> list[KeyRow]:
-        """Everything that is known, by name."""
+        """All keys of the folder, by name."""
         names = {file.stem for folder in ("public", *RIGHTS) for file in (self.path / folder).glob("*.pub")}
         rows = []
         for name in sorted(names):
@@ -157,7 +159,7 @@ class KeyFolder:
 
 
 def is_loopback(address: str) -> bool:
-    """Whether an address can be reached from this computer only."""
+    """Whether an address can only be reached from this computer."""
     try:
         return ipaddress.ip_address(address).is_loopback
     except ValueError:
@@ -165,30 +167,30 @@ def is_loopback(address: str) -> bool:
 
 
 def require_keys(address: str, keys: KeyFolder | None, commands: Sequence[str] = ()) -> None:
-    """Without keys, refuse an address that other computers can reach, and refuse to carry anything but watching.
+    """Without keys, refuse addresses that other computers can reach, and refuse topics that command the car.
 
-    Any process of this computer can connect to a TCP port of the loopback, whoever its user is. Commands therefore need keys
-    there too; without them a person arms through the bus's own sockets, which only the same user can open.
+    Any process of any user on this computer can connect to a TCP port of the loopback. So commands need keys there too. Without
+    keys, the operator arms through the bus's Unix sockets, which only the same user can open.
 
     Args:
-        address: Where the link listens, or connects to.
-        keys: The key folder, if there is one.
-        commands: Topics that would go by the drive door, towards the host that listens.
+        address: Address on which the link listens, or to which it connects.
+        keys: The key folder, or None.
+        commands: Topics that would be sent through the drive door to the listening host.
 
     Raises:
-        SecurityError: Keys are needed and there are none.
+        SecurityError: Keys are needed but not given.
     """
     if keys is not None:
         return
     if not is_loopback(address):
         raise SecurityError(
-            f"{address} can be reached from other computers, and no keys are given: anybody could connect. {_MAKE_KEYS}; or use 127.0.0.1"
+            f"{address} can be reached from other computers, and no keys are given, so any computer could connect. {_MAKE_KEYS}; or use 127.0.0.1"
         )
     if commands:
         shown = ", ".join(sorted(commands)[:4]) + (f" and {len(commands) - 4} more" if len(commands) > 4 else "")
         raise SecurityError(
-            f"without keys a link carries watching only, but this one would carry {shown} to the host that listens: any process on "
-            f"{address} could drive the car. {_MAKE_KEYS}; or run everything on one computer with --host all"
+            f"without keys a link can only be used to watch, but this one would carry {shown} to the listening host, so any process on "
+            f"{address} could drive the car. {_MAKE_KEYS}; or run all nodes on one computer with --host all"
         )
 
 

@@ -1,7 +1,8 @@
-"""The link between two hosts: CURVE over TCP, two doors - one to watch, one to drive - and nothing decoded unchecked.
+"""The link between two hosts: CURVE over TCP, with one door (port) to watch and one to drive.
 
-One host listens, the other connects. What the listener says leaves by the watch door; what the other says enters by the drive
-door, and only keys on that door's list get that far; without keys there is no drive door. The sockets live in one thread; messages come out of an `Inbox`.
+One host listens, the other connects. Messages of the listener leave through its watch door. Messages of the other host enter through
+the drive door, which admits only the keys on its list. Without keys there is no drive door. Every message is checked before it is
+decoded. The sockets belong to one thread, which passes the messages to an `Inbox`.
 """
 
 from __future__ import annotations
@@ -35,15 +36,15 @@ _PING_S = 0.2
 _KNOCK_S = 1.0
 _LARGE = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "advnerf_msgs/msg/FileChunk")
 _SMALL_BYTES = 64 * 2**10
-# TCP notices that a packet was lost when a later one arrives, and otherwise only after 200 ms or more, which is as long as a
-# command lives. So something follows every message soon; a topic that nobody wants does not travel, hence this.
+# TCP detects a lost packet when a later one arrives, and otherwise only after 200 ms or more, which is the lifetime of a command. So
+# another message must follow soon after each one. Topics without subscribers are not sent, so this heartbeat is.
 _PULSE_S = 0.015
 _PING, _PONG = struct.Struct("<Q"), struct.Struct("<QQQ")
 
 
 @dataclass(frozen=True)
 class Inbound:
-    """A message from the other host, checked, with its publish time on our clock."""
+    """A checked message from the other host, with its publish time on the local clock."""
 
     topic: str
     message: Relayed
@@ -51,7 +52,7 @@ class Inbound:
 
 @dataclass(frozen=True)
 class Offset:
-    """How far the other host's clock is off."""
+    """Offset of the other host's clock."""
 
     peer: str
     best: Exchange
@@ -59,14 +60,14 @@ class Offset:
 
 
 class Link:
-    """One end of a link, in a thread of its own.
+    """One end of a link, running in its own thread.
 
     Args:
-        config: Which end, where, and with which keys.
-        inbox: Takes `Inbound` and `Offset`, and the exception that ends the link.
+        config: End, addresses and keys of the link.
+        inbox: Receives `Inbound`, `Offset`, and the exception that ends the link.
 
     Attributes:
-        heard_mono_ns: When the other end was heard last; None before.
+        heard_mono_ns: Time of the last message from the other end; None before the first.
     """
 
     def __init__(self, config: LinkConfig, inbox: Inbox[Inbound | Offset]) -> None:
@@ -95,20 +96,20 @@ class Link:
 
     @property
     def refused(self) -> int:
-        """Handshakes and messages that were refused."""
+        """Number of refused handshakes and messages."""
         return self._log.refused
 
     def send(self, topic: str, meta: Meta, cdr: bytes) -> None:
-        """Give a message to the other end; never blocks, the oldest goes when the link does not keep up."""
+        """Send a message to the other end without blocking. If the link is too slow, the oldest message is dropped."""
         self._outbox.append([topic.encode(), pack_meta(meta), cdr])
         os.eventfd_write(self._wake, 1)
 
     def want(self, topics: frozenset[str]) -> None:
-        """Take only these of the imports from now on, so that nothing travels that nobody reads."""
+        """Receive only these imports from now on, so that topics without readers are not sent."""
         self._wanted = topics
 
     def close(self) -> None:
-        """Close the doors."""
+        """Close the link."""
         self._stopping = True
         os.eventfd_write(self._wake, 1)
         self._thread.join()
@@ -116,7 +117,7 @@ class Link:
 
     def _open(self) -> None:
         if self._config.listens and self._config.keys is not None:
-            # Before any door is open: without a keeper ZeroMQ lets every key in.
+            # Started before any door opens: without an authenticator ZeroMQ admits every key.
             self._keeper = Doorkeeper(self._context, self._config.keys, self._log)
             self._poller.register(self._keeper.socket, zmq.POLLIN)
         self._doors.open(WATCH)
@@ -154,7 +155,7 @@ class Link:
                     self._look_for_revocations()
                     self._knock_again(now)
                 self._doors.follow(self._wanted & frozenset(self._config.imports))
-        except Exception as failure:  # the gateway must not go on without its link
+        except Exception as failure:  # the gateway must not continue without its link
             self._inbox.fail(failure)
         finally:
             self._close_all()
@@ -177,7 +178,7 @@ class Link:
                 parts = socket.recv_multipart(zmq.NOBLOCK, copy=False)
             except zmq.Again:
                 return
-            # Copied only after the sizes were looked at: views of at most the socket's size limit until then.
+            # Copied only after the size check. Until then these are views of at most the socket's size limit.
             try:
                 self._take(parts)
             except MessageError as error:
@@ -191,17 +192,17 @@ class Link:
             return
         if name == PULSE and len(parts) == 1:
             return
-        # A subscription is a prefix: what comes may be longer than what was asked for.
+        # A subscription is a prefix, so a received topic may be longer than the subscribed one.
         topic = name.decode("utf-8", "replace")
         if topic not in self._config.imports:
-            raise MessageError(f"{topic!r:.80} is nothing this host takes from there")
+            raise MessageError(f"expected an imported topic, got {topic!r:.80}")
         typename = topic_row(topic).type
         limit = MOST_BYTES if typename in _LARGE else _SMALL_BYTES
         if len(parts) != 3 or len(parts[2]) > limit:
             sizes = [len(part) for part in parts[:8]]
             raise MessageError(f"expected three frames and at most {limit} bytes of {typename} on {topic}, got {sizes}")
         meta, cdr = unpack(topic, [part.bytes for part in parts])
-        decode(typename, cdr)  # what cannot be decoded goes no further
+        decode(typename, cdr)  # refuses messages that cannot be decoded
         self._inbox.put(Inbound(topic, Relayed(on_our_clock(meta, time.time_ns(), time.monotonic_ns()), cdr)))
 
     def _clock(self, parts: list[zmq.Frame]) -> None:
@@ -214,26 +215,28 @@ class Link:
             asked_ns, received_ns, answered_ns = _PONG.unpack(body)
             newest = Exchange(asked_ns, received_ns, answered_ns, heard_ns)
             if not 0.0 <= newest.round_trip_s < 60.0:
-                raise MessageError(f"a clock exchange with a round trip of {newest.round_trip_s:g} s")
+                raise MessageError(f"expected a clock exchange with a valid round trip, got {newest.round_trip_s:g} s")
             peer = str(
                 parts[1].get("User-Id")
-            )  # the doorkeeper's name for the key; the drive door is never open without keys
+            )  # the name that the doorkeeper found for the key; the drive door is never open without keys
             best = self._offsets.setdefault(peer, OffsetFilter()).add(newest)
             self._inbox.put(Offset(peer, best, newest))
         else:
             raise MessageError(f"expected a clock exchange, got {[len(part) for part in parts[:8]]} bytes")
 
     def _look_for_revocations(self) -> None:
-        """Who is off a list is cut off: ZeroMQ asks at the handshake only, so the door is closed and opened again."""
+        """Disconnect revoked keys. ZeroMQ authenticates only at the handshake, so the door is closed and reopened."""
         if self._keeper is None:
             return
         for right, gone in self._keeper.revoked().items():
-            self._log.say(f"{', '.join(gone)} may no longer {right}: all at that door must show their keys again")
+            self._log.say(
+                f"{', '.join(gone)} may no longer {right}; all connections of that door must authenticate again"
+            )
             self._doors.close(right)
             self._doors.open(right)
 
     def _knock_again(self, now: float) -> None:
-        """ZeroMQ itself gives up for good when its key is refused; it may be allowed a minute later."""
+        """Reconnect after a refusal. ZeroMQ itself does not retry, but the key may be allowed later."""
         for right, since in list(self._locked_out.items()):
             if now - since >= _KNOCK_S:
                 del self._locked_out[right]
@@ -244,7 +247,7 @@ class Link:
         if event.refusal:
             self._log.refuse(f"handshake at the {event.right} door {event.refusal}")
         if not self._config.listens:
-            # Whoever is let in stays: an end that knocked on an open door would cut itself off.
+            # No reconnection after a successful handshake, because it would end the connection.
             if event.refusal or event.ended:
                 self._locked_out.setdefault(event.right, time.monotonic())
             else:
@@ -252,15 +255,15 @@ class Link:
         elif event.ended:
             self._log.say(f"the {event.right} door: a connection ended")
         elif not event.refusal:
-            how = "without a key" if self._config.keys is None else "with a good key"
-            self._log.say(f"the {event.right} door: a connection {how} began")
+            how = "without a key" if self._config.keys is None else "with an allowed key"
+            self._log.say(f"the {event.right} door: a connection {how} started")
 
 
 def on_our_clock(meta: Meta, real_ns: int, mono_ns: int) -> Meta:
-    """Meta with its publish time moved to our monotonic clock by its age in real time; never in the future.
+    """Convert the publish time of a message to the local monotonic clock, using its age in real time. It is never in the future.
 
-    Monotonic clocks of two hosts have nothing to do with each other. Real time is compared behind the gate of the measured
-    clock offset, which the safety node keeps.
+    The monotonic clocks of two hosts are unrelated. The real-time clocks are comparable because the safety node checks their measured
+    offset.
     """
     age_ns = min(max(0, real_ns - meta.publish_real_ns), mono_ns, 3600 * NS_PER_S)
     return Meta(mono_ns - age_ns, meta.publish_real_ns, meta.sequence, meta.type_prefix, meta.instance_id)

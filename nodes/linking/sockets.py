@@ -1,4 +1,4 @@
-"""The two doors of a link as ZeroMQ sockets: opened with their keys and limits, closed, and watched for handshakes."""
+"""The two doors of a link as ZeroMQ sockets: opening with keys and limits, closing, and monitoring of handshakes."""
 
 from __future__ import annotations
 
@@ -14,34 +14,34 @@ from zmq.utils.monitor import recv_monitor_message
 from nodes.linking.keys import DRIVE, WATCH, KeyFolder
 from nodes.runtime.errors import BusError
 
-# Enough for a breath of poses and images; what waits longer is stale, and PUB drops new messages while the pipe is full.
+# Enough for short bursts of poses and images. Messages that wait longer are stale, and PUB drops new ones while the pipe is full.
 LINK_QUEUE = 50
-# No message is larger; the socket itself cuts off whoever sends one.
+# Larger than every message. The socket disconnects a peer that sends a larger one.
 MOST_BYTES = 16 * 2**20
-# What the listener and the other end say to one another beneath all topics: the clock's question, and a sign of life.
+# Internal messages of the two ends: the clock question and the heartbeat.
 CLOCK, PULSE = b"_clock", b"_pulse"
 _HEARTBEAT_MS, _HEARTBEAT_TIMEOUT_MS = 500, 3000
 _FAILURES = {
     int(zmq.EVENT_HANDSHAKE_FAILED_AUTH): "refused: its key is not on the list",
-    int(zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL): "refused: no CURVE key at all, or the wrong key of this host",
+    int(zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL): "refused: it has no CURVE key, or the wrong key of this host",
     int(zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL): "failed",
 }
 
 
 @dataclass(frozen=True)
 class LinkConfig:
-    """Both ends of a link.
+    """Configuration of one end of a link.
 
     Attributes:
         address: Address to listen on, or to connect to.
-        listens: Which end this is.
-        watch_port: TCP port of what the listener says.
-        drive_port: TCP port of what the listener hears.
-        keys: Key folder; none only on a loopback address, and to watch.
-        own: Name of our own key.
-        peer: Name of the listener's key, at the end that connects.
-        imports: Topics taken from the other end; anything else is refused.
-        exports: Topics given to the other end.
+        listens: Whether this end listens.
+        watch_port: TCP port on which the listener sends.
+        drive_port: TCP port on which the listener receives.
+        keys: Key folder. None is allowed only on a loopback address and for watching.
+        own: Name of this host's key.
+        peer: Name of the listener's key, for the connecting end.
+        imports: Topics received from the other end. Other topics are refused.
+        exports: Topics sent to the other end.
     """
 
     address: str
@@ -56,22 +56,22 @@ class LinkConfig:
 
     @property
     def commands(self) -> tuple[str, ...]:
-        """Topics that go by the drive door: towards the end that listens."""
+        """Topics sent through the drive door, to the listening end."""
         return self.imports if self.listens else self.exports
 
     @property
     def drives(self) -> bool:
-        """Whether the drive door is used: by a listener that has keys, and by an end that has something to say there."""
+        """Whether the drive door is used: by a listener with keys, and by a connecting end that exports topics."""
         return self.keys is not None and (self.listens or bool(self.exports))
 
 
 @dataclass(frozen=True)
 class Handshake:
-    """What happened at a door.
+    """An event at a door.
 
     Attributes:
-        right: Which door.
-        refusal: Why somebody was not let in; empty otherwise.
+        right: The door.
+        refusal: Why a connection was refused; empty otherwise.
         ended: Whether a connection ended.
     """
 
@@ -81,12 +81,12 @@ class Handshake:
 
 
 class Doors:
-    """The sockets of one end, and their monitors. Not thread-safe: the link's thread owns them.
+    """The sockets of one end and their monitors. Not thread-safe: the link's thread owns them.
 
     Args:
-        config: Which end, where, and with which keys.
-        context: Where the sockets live.
-        poller: Gets what must be waited for: the monitors, and the door through which messages come in.
+        config: Configuration of the end.
+        context: ZeroMQ context of the sockets.
+        poller: Poller to which the monitors and the inward door are added.
     """
 
     def __init__(self, config: LinkConfig, context: zmq.Context[Any], poller: zmq.Poller) -> None:
@@ -94,17 +94,17 @@ class Doors:
         self._sockets: dict[str, zmq.Socket[Any]] = {}
         self._monitors: dict[str, zmq.Socket[Any]] = {}
         self._subscribed: set[str] = set()
-        # What the listener says leaves by the watch door; what the other end says enters by the drive door.
+        # The listener sends through the watch door and receives through the drive door.
         self._in, self._out = (DRIVE, WATCH) if config.listens else (WATCH, DRIVE)
 
     @property
     def inward(self) -> zmq.Socket[Any] | None:
-        """The door through which messages come in; none at a listener without keys."""
+        """The door that receives messages; None for a listener without keys."""
         return self._sockets.get(self._in)
 
     @property
     def outward(self) -> zmq.Socket[Any] | None:
-        """The door through which messages go out; none at an end that only watches."""
+        """The door that sends messages; None for an end that only watches."""
         return self._sockets.get(self._out)
 
     def open(self, right: str) -> None:
@@ -132,7 +132,7 @@ class Doors:
         self._attach(socket, config.watch_port if right == WATCH else config.drive_port)
 
     def close(self, right: str) -> None:
-        """Close a door; whoever is connected there is cut off."""
+        """Close a door and disconnect its peers."""
         socket, monitor = self._sockets.pop(right), self._monitors.pop(right)
         self._poller.unregister(monitor)
         if right == self._in:
@@ -142,12 +142,12 @@ class Doors:
         socket.close(linger=0)
 
     def close_all(self) -> None:
-        """Close what is open."""
+        """Close all open doors."""
         for right in list(self._sockets):
             self.close(right)
 
     def follow(self, wanted: frozenset[str]) -> None:
-        """Take these topics and no others from the other end."""
+        """Receive exactly these topics from the other end."""
         if self.inward is None:
             return
         for topic in wanted - self._subscribed:
@@ -157,7 +157,7 @@ class Doors:
         self._subscribed = set(wanted)
 
     def handshakes(self, ready: set[Any]) -> Iterator[Handshake]:
-        """What happened at the doors whose monitors are ready."""
+        """Yield the events of the doors whose monitors are ready."""
         for right, monitor in list(self._monitors.items()):
             if monitor not in ready:
                 continue
@@ -173,7 +173,7 @@ class Doors:
         socket.curve_publickey = keys.public(own).encode()
         if self._config.listens:
             socket.curve_server = True
-            # Named, never "*": to pyzmq's own authenticator that is a name like any other, and no wildcard.
+            # A named domain instead of "*", which pyzmq's authenticator does not treat as a wildcard.
             socket.setsockopt(zmq.ZAP_DOMAIN, right.encode())
             socket.setsockopt(zmq.ZAP_ENFORCE_DOMAIN, 1)
         else:
@@ -191,7 +191,7 @@ class Doors:
                 socket.bind(endpoint)
                 return
             except zmq.ZMQError as error:
-                # After a revocation the old door is still being closed by ZeroMQ's own thread.
+                # After a revocation, ZeroMQ's own thread may still be closing the old door.
                 if error.errno != zmq.EADDRINUSE or time.monotonic() > deadline:
                     raise BusError(
                         f"cannot listen on {endpoint}: {error.strerror}; is another launch running?"

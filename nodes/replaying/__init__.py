@@ -1,1 +1,1 @@
-"""Recorded drives again: in lockstep, against golden results, with an attack."""
+"""Replays recorded drives: in lockstep, compared with golden bags, and with an attack."""

@@ -1,7 +1,7 @@
-"""Retro-attack: an attack over an old clean drive. What would the policy have steered, had the face been there?
+"""Retro-attack: applies an attack to a recorded clean drive and computes how the policy would have steered.
 
-Compositor and policy run over the recorded images twice, without the attack and with it, in lockstep. It is an open loop: the car
-in the recording goes where it went, so this says what the attack does to the steering at each image, not where the car would be.
+Compositor and policy run over the recorded images twice in lockstep, without and with the attack. This is an open loop: the recorded
+trajectory does not change. So the result is the effect of the attack on the steering at each image, not on the trajectory.
 """
 
 from __future__ import annotations
@@ -34,15 +34,15 @@ class RetroAttack:
     """Steering with and without an attack over the images of one recording; left is positive.
 
     Attributes:
-        stamps_ns: Capture stamps of the images that both replays steered by, ``[n]`` [ns since 1970].
-        recorded_rad: What the policy of the recording steered, ``[n]`` [rad]; NaN where it said nothing.
-        clean_rad: What the policy steers without the attack, ``[n]`` [rad].
-        attacked_rad: What it steers with the attack, ``[n]`` [rad].
-        drawn: Where the face was in view and drawn, ``[n]``.
+        stamps_ns: Capture stamps of the images with a command in both replays, ``[n]`` [ns since 1970].
+        recorded_rad: Steering in the recording, ``[n]`` [rad]; NaN for images without a command.
+        clean_rad: Steering of the policy without the attack, ``[n]`` [rad].
+        attacked_rad: Steering of the policy with the attack, ``[n]`` [rad].
+        drawn: Whether the face was in view and drawn, ``[n]``.
         attack_id: Id of the attack.
-        start_ns: Beginning of the recording [ns since 1970].
-        digests: Digests of the two replays: clean, attacked.
-        unchecked: Why the recording may be damaged without a sign of it; empty where checksums cover it.
+        start_ns: Start of the recording [ns since 1970].
+        digests: Digests of the clean and the attacked replay.
+        unchecked: Why damage to the recording may go unnoticed; empty if checksums cover it.
     """
 
     stamps_ns: NDArray[np.int64]
@@ -57,7 +57,7 @@ class RetroAttack:
 
     @property
     def delta_rad(self) -> Array:
-        """What the attack adds to the steering, ``[n]`` [rad]."""
+        """Steering that the attack adds, ``[n]`` [rad]."""
         return self.attacked_rad - self.clean_rad
 
     @property
@@ -66,7 +66,7 @@ class RetroAttack:
         return (self.stamps_ns - self.start_ns) / NS_PER_S
 
     def numbers(self) -> dict[str, Any]:
-        """The result in numbers, ready for JSON."""
+        """Summary of the result as plain data for JSON."""
         delta, seen = self.delta_rad, self.drawn
         far = np.abs(self.recorded_rad - self.clean_rad)
         worst = int(np.abs(delta).argmax())
@@ -86,13 +86,13 @@ class RetroAttack:
         }
 
     def verdict(self) -> str:
-        """What would have been steered, in a sentence."""
+        """Describe the effect on the steering in a sentence."""
         return self._sentence() + (f"; unchecked: {self.unchecked}" if self.unchecked else "")
 
     def _sentence(self) -> str:
         n = self.numbers()
         if not self.drawn.any():
-            return f"the face of attack {self.attack_id} was in view in none of {n['frames']} images; nothing would have changed"
+            return f"the face of attack {self.attack_id} was not in view in any of {n['frames']} images; the steering would not have changed"
         mean, worst = n["mean_delta_drawn_rad"] * _DEG, n["largest_delta_rad"] * _DEG
         return (
             f"with the face in view ({n['frames_drawn']} of {n['frames']} images) the policy would have steered "
@@ -111,25 +111,25 @@ class RetroAttack:
             }  # fmt: skip
 
     def write_json(self, path: Path) -> None:
-        """Write numbers and rows."""
+        """Write summary and rows."""
         write_atomically(path, json.dumps({**self.numbers(), "images": list(self.rows())}, indent=1) + "\n")
 
 
 def retro_attack(bag: Path, attack: Path, choice: Choice) -> RetroAttack:
-    """Run an attack over a recording.
+    """Apply an attack to a recording.
 
     Args:
         bag: Bag folder or file, with camera images and poses.
         attack: Attack file.
-        choice: Nodes to run, of which ``compositor`` gets the attack; overrides name the policy.
+        choice: Nodes to run. ``compositor`` gets the attack; overrides select the policy.
     """
     clean, _, clean_digest = _steering(bag, choice, "compositor.attack=null")
     attacked, labels, digest = _steering(bag, choice, f"compositor.attack={json.dumps(str(attack.resolve()))}")
     stamps = sorted(clean.keys() & attacked.keys())
     if not stamps:
         raise BagError(
-            f"{bag}: the policy steered by no image (clean {len(clean)}, attacked {len(attacked)} commands); "
-            "does it fit the camera of the recording, and are poses of car and face in it?"
+            f"{bag}: expected commands of the policy in both replays, got {len(clean)} clean and {len(attacked)} attacked; "
+            "does the policy fit the recorded camera, and does the bag have poses of car and face?"
         )
     recorded = _recorded(bag)
     return RetroAttack(
@@ -146,7 +146,7 @@ def retro_attack(bag: Path, attack: Path, choice: Choice) -> RetroAttack:
 
 
 def plot_retro_attack(result: RetroAttack, path: Path) -> None:
-    """Draw steering over time, with and without the attack, and what it adds."""
+    """Plot the steering over time with and without the attack, and the difference."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -173,7 +173,7 @@ def plot_retro_attack(result: RetroAttack, path: Path) -> None:
 
 
 def _steering(bag: Path, choice: Choice, setting: str) -> tuple[dict[int, float], dict[int, tuple[bool, str]], str]:
-    """Steering [rad] and labels of the compositor (drawn, attack id) by capture stamp, and the digest."""
+    """Run one replay. Returns steering [rad] and compositor labels (drawn, attack id) by capture stamp, and the digest."""
     steering: dict[int, float] = {}
     labels: dict[int, tuple[bool, str]] = {}
     with Replay(bag, Choice(choice.nodes, choice.replacements, choice.launch, (*choice.overrides, setting))) as replay:

@@ -1,7 +1,7 @@
-"""Golden bags: what replayed nodes said once, compared with what they say now.
+"""Golden bags: stored outputs of replayed nodes, with which new replays are compared.
 
-Messages of a topic are compared one by one in order: byte for byte first, then field by field with what tolerance there is.
-Statuses are signs of life and no results; they are neither in the digest of a replay nor in a golden bag.
+The messages of a topic are compared in order: first byte for byte, then field by field with the given tolerance. Status messages are
+not results, so they are neither in the digest of a replay nor in a golden bag.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ _SUFFIX = ".mcap"
 
 @dataclass(frozen=True)
 class Tolerances:
-    """By how much numbers may differ.
+    """Tolerances for the comparison of numbers.
 
     Attributes:
-        general: For all fields.
-        special: For single fields, by topic and field: ``("/policy/drive", "drive.steering_angle")``.
+        general: Tolerance of all other fields.
+        special: Tolerances of single fields, by topic and field: ``("/policy/drive", "drive.steering_angle")``.
     """
 
     general: float = 0.0
@@ -40,7 +40,7 @@ class Tolerances:
 
     @classmethod
     def parse(cls, texts: Sequence[str]) -> Tolerances:
-        """Tolerances of ``VALUE`` and ``TOPIC:FIELD=VALUE`` texts."""
+        """Parse ``VALUE`` and ``TOPIC:FIELD=VALUE`` texts."""
         general, special = 0.0, {}
         for text in texts:
             where, separator, value = text.rpartition("=")
@@ -52,7 +52,7 @@ class Tolerances:
             if not 0.0 <= number < float("inf") or (separator and not (colon and name and topic.startswith("/"))):
                 raise BagError(
                     f"--tolerance {text}: expected VALUE or TOPIC:FIELD=VALUE with a number >= 0, "
-                    "e.g. 1e-6 or /policy/drive:drive.steering_angle=1e-4"
+                    "for example 1e-6 or /policy/drive:drive.steering_angle=1e-4"
                 )
             if separator:
                 special[(topic_row(topic).name, name)] = number
@@ -67,18 +67,18 @@ class Tolerances:
 
 @dataclass(frozen=True)
 class Difference:
-    """The first message that is not what it was.
+    """The first message that differs from the golden bag.
 
     Attributes:
-        topic: Its topic.
-        index: Its place among the messages of the topic, from 0.
+        topic: Topic of the message.
+        index: Index among the messages of the topic, from 0.
         log_ns: Time in the recording [ns since 1970].
-        stamp_ns: Capture stamp in its header [ns since 1970]; None if it has no header.
-        name: Field, e.g. ``drive.steering_angle``.
-        golden: What it was, in words.
-        got: What it is now.
-        by: Largest difference, if it is one of numbers.
-        tolerance: What was allowed.
+        stamp_ns: Capture stamp in its header [ns since 1970]; None without a header.
+        name: Field, for example ``drive.steering_angle``.
+        golden: Golden value, as text.
+        got: Value of the replay, as text.
+        by: Largest difference, for numbers.
+        tolerance: Tolerance of the field.
     """
 
     topic: str
@@ -92,7 +92,7 @@ class Difference:
     tolerance: float = 0.0
 
     def text(self, start_ns: int) -> str:
-        """The difference as a sentence; ``start_ns`` is the beginning of the recording."""
+        """Describe the difference in a sentence. ``start_ns`` is the start of the recording [ns since 1970]."""
         stamp = "" if self.stamp_ns is None else f", captured at {self.stamp_ns} ns"
         where = (
             f"{self.topic} message {self.index}, {(self.log_ns - start_ns) / NS_PER_S:.3f} s into the recording{stamp}"
@@ -102,12 +102,12 @@ class Difference:
 
 
 class Golden:
-    """A golden bag against which a replay is held, message by message.
+    """Compares a replay with a golden bag, message by message.
 
     Args:
         path: The golden bag.
-        tolerances: By how much numbers may differ.
-        topics: Only these; none means all.
+        tolerances: Tolerances of numbers.
+        topics: Topics to compare; none means all.
     """
 
     def __init__(self, path: Path, tolerances: Tolerances | None = None, topics: Sequence[str] | None = None) -> None:
@@ -123,7 +123,7 @@ class Golden:
         self.compared = 0
 
     def take(self, message: BagMessage) -> None:
-        """Compare a message that was made with its counterpart."""
+        """Compare a message of the replay with its golden counterpart."""
         topic = message.topic
         if topic.startswith(STATUS_PREFIX) or (self._only is not None and topic not in self._only):
             return
@@ -142,7 +142,7 @@ class Golden:
             self._differences[topic] = found
 
     def finish(self) -> Difference | None:
-        """The earliest difference; None if there is none."""
+        """Finish the comparison and return the earliest difference; None if there is none."""
         for topic, messages in self._expected.items():
             if topic not in self._differences and (left := next(messages, None)) is not None:
                 stamp, index = _stamp(_decoded(left)), self._indices[topic]
@@ -153,7 +153,7 @@ class Golden:
 
 
 def compare(golden: BagMessage, got: BagMessage, index: int, tolerances: Tolerances) -> Difference | None:
-    """Difference between two messages of one topic, if there is one."""
+    """Compare two messages of a topic. Returns their difference, or None."""
     if golden.cdr == got.cdr and golden.log_ns == got.log_ns:
         return None
     was, now = _decoded(golden), _decoded(got)
@@ -172,13 +172,13 @@ def compare(golden: BagMessage, got: BagMessage, index: int, tolerances: Toleran
 
 
 def update_golden(path: Path, replay: Replay, topics: Sequence[str] | None = None) -> int:
-    """Write what a replay makes as the golden bag, in place of the old one; returns the number of messages.
+    """Replace the golden bag with the messages of a replay. Returns the number of messages.
 
     The same replay gives the same file, byte for byte.
     """
     path = Path(path)
     if path.suffix != _SUFFIX or path.is_dir():
-        raise BagError(f"expected a golden bag to be a file that ends with {_SUFFIX}, got {path}")
+        raise BagError(f"expected a golden bag file that ends with {_SUFFIX}, got {path}")
     path.parent.mkdir(parents=True, exist_ok=True)
     count = 0
     with tempfile.TemporaryDirectory(prefix=".golden-", dir=path.parent) as folder:
@@ -193,7 +193,7 @@ def update_golden(path: Path, replay: Replay, topics: Sequence[str] | None = Non
             writer.close({"digest": replay.summary.digest})
         if count == 0:
             raise BagError(
-                f"nothing was made{' on ' + ', '.join(topics) if topics else ''}; the golden bag {path} stays as it was"
+                f"expected messages{' on ' + ', '.join(topics) if topics else ''}, but the replay published none; the golden bag {path} is unchanged"
             )
         writer.path.replace(path)
     return count
@@ -204,7 +204,7 @@ def _decoded(message: BagMessage) -> Any:
         return decode(topic_row(message.topic).type, message.cdr)
     except MessageError as error:
         raise BagError(
-            f"{message.topic} in the golden bag cannot be read: {error}; make it again with --update-golden"
+            f"{message.topic} in the golden bag cannot be read: {error}; write it again with --update-golden"
         ) from error
 
 
@@ -214,7 +214,7 @@ def _stamp(message: Any) -> int | None:
 
 
 def _fields(was: Any, now: Any, prefix: str) -> Iterator[tuple[str, Any, Any]]:
-    """Pairs of values that are no messages themselves, with their names, in the order of the definition."""
+    """Yield name and both values of every leaf field, in the order of the definition."""
     for name, old in vars(was).items():
         if name.startswith("__"):
             continue
@@ -229,7 +229,7 @@ def _fields(was: Any, now: Any, prefix: str) -> Iterator[tuple[str, Any, Any]]:
 
 
 def _unlike(old: Any, new: Any, allowed: float) -> tuple[str, str, float | None] | None:
-    """What it was, what it is, and by how much it differs; None if it is near enough."""
+    """Return golden value, new value and difference; None if they agree within the tolerance."""
     if isinstance(old, str | bool) or not isinstance(old, int | float | np.ndarray):
         return None if old == new else (repr(old), repr(new), None)
     a, b = np.asarray(old), np.asarray(new)

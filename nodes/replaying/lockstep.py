@@ -1,4 +1,4 @@
-"""The engine of lockstep replay: nodes fed message by message, with ticks on a grid of recorded time."""
+"""The engine of lockstep replay: feeds nodes message by message and runs their ticks on a grid of recorded time."""
 
 from __future__ import annotations
 
@@ -18,35 +18,35 @@ from nodes.runtime.node import MessageInfo, Node, Out
 from nodes.runtime.topics import STATUS_PREFIX, STATUS_RATE_HZ, status_topic
 from nodes.runtime.topics import topic as topic_row
 
-# Nodes that answer each other for ever would never let the next message in.
+# Limit of messages caused by one message, because nodes that answer each other for ever would block the replay.
 _CASCADE_LIMIT = 10_000
 
 
 class BagClock:
-    """The clock of a replay: both clocks show the recording's real time, moved by the messages alone."""
+    """The clock of a replay. Both of its clocks show the recording's real time and advance only with the messages."""
 
     def __init__(self, real_ns: int = 0) -> None:
         self._ns = real_ns
 
     def now(self) -> Now:
-        """The present instant of the recording."""
+        """Read the current time of the recording."""
         return Now(self._ns, self._ns)
 
     def move_to(self, real_ns: int) -> Now:
-        """Go on to a time [ns since 1970]; never back."""
+        """Advance to a time [ns since 1970]. The clock never goes back."""
         self._ns = max(self._ns, real_ns)
         return self.now()
 
 
 @dataclass
 class Summary:
-    """What a replay did.
+    """Summary of a replay.
 
     Attributes:
-        messages: Messages fed to the nodes.
-        made: Messages made, by topic, without the nodes' statuses.
-        refused: Why messages could not be decoded, by topic: the last reason.
-        digest: SHA-256 of everything made but statuses: topic, time and bytes of each message in order.
+        messages: Number of messages fed to the nodes.
+        made: Number of messages published by the nodes, by topic, without statuses.
+        refused: Last reason why a message could not be decoded, by topic.
+        digest: SHA-256 over topic, time and bytes of all published messages in order, without statuses.
         duration_s: Length of the recording [s].
         counters: Counters of the nodes at the end, by node.
     """
@@ -61,13 +61,13 @@ class Summary:
 
 @dataclass
 class _Stream:
-    """Sequence numbers of one recorded topic: gaps are losses, a step back is another publisher."""
+    """Sequence numbers of one recorded topic. Gaps are losses, and a decrease means another publisher."""
 
     instance_id: int = 1
     sequence: int | None = None
 
     def take(self, sequence: int) -> int:
-        """Note a message; the number lost before it."""
+        """Note a message. Returns the number of messages lost before it."""
         last, self.sequence = self.sequence, sequence
         if last is not None and sequence <= last:
             self.instance_id += 1
@@ -84,10 +84,10 @@ class _Timer:
 
 
 class Lockstep:
-    """Feeds nodes on recorded time.
+    """Runs nodes on recorded time.
 
     Args:
-        nodes: Nodes by name; the order is that in which they get a message.
+        nodes: Nodes by name, in the order in which they get a message.
         clock: The clock they were built with.
         start_ns: Time of the first tick of all of them [ns since 1970].
     """
@@ -116,11 +116,11 @@ class Lockstep:
 
     @property
     def heard_topics(self) -> set[str]:
-        """Topics that at least one node listens to."""
+        """Topics to which at least one node subscribes."""
         return set(self._listeners)
 
     def feed(self, message: BagMessage) -> list[BagMessage]:
-        """Give the nodes a message of the bag, when the time before it has passed; what they say because of it, in order."""
+        """Advance to the time of a message and feed it to the nodes. Returns the messages that they publish, in order."""
         now = self._clock.move_to(message.log_ns)
         lost = self._streams.setdefault(message.topic, _Stream()).take(message.sequence)
         self.summary.messages += 1
@@ -147,7 +147,7 @@ class Lockstep:
         return made
 
     def finish(self) -> Summary:
-        """The summary, when everything was fed."""
+        """Return the summary, after the last message."""
         self.summary.digest = self._hash.hexdigest()
         self.summary.counters = {name: node.counters() for name, node in self._nodes.items()}
         return self.summary
@@ -157,7 +157,7 @@ class Lockstep:
         return messages + self._spread(deque((message, 0) for message in messages), now)
 
     def _spread(self, waiting: deque[tuple[BagMessage, int]], now: Now) -> list[BagMessage]:
-        """Hand messages to all who listen, then what these say, until there is nothing left to say."""
+        """Pass messages to their subscribers, then the messages that these publish, until there are none left."""
         made: list[BagMessage] = []
         while waiting:
             message, lost = waiting.popleft()
@@ -178,7 +178,9 @@ class Lockstep:
                 made += new
                 waiting.extend((entry, 0) for entry in new)
             if len(made) > _CASCADE_LIMIT:
-                raise BagError(f"{', '.join(self._nodes)} answer each other without end on {message.topic}")
+                raise BagError(
+                    f"{', '.join(self._nodes)} answer each other endlessly on {message.topic}; replay fewer of them"
+                )
         return made
 
     def _ask(self, name: str, now: Now, call: Callable[..., list[Out]], *arguments: Any) -> list[Out]:
@@ -187,7 +189,7 @@ class Lockstep:
         except NodeFinished:
             del self._nodes[name]
             return []
-        except Exception as error:  # whatever it is, the person wants to know where in the bag
+        except Exception as error:  # any error is reported with its place in the bag
             on = f" on {arguments[0]}" if arguments else ""
             raise BagError(
                 f"{name} failed at {now.real_ns} ns{on}: {type(error).__name__}: {error}; advnerf --debug replay shows the traceback"
@@ -218,7 +220,7 @@ class Lockstep:
         )  # fmt: skip
 
     def _status(self, name: str, node: Node, now: Now) -> Out:
-        # Without counters: some count milliseconds of this machine.
+        # Without counters, because some depend on the speed of this machine.
         state, text = node.status()
         status = types.NodeStatus(
             header=header(now.real_ns), node=name, pid=0, state=state, text=text, subscriptions=list(node.subscriptions),

@@ -1,7 +1,7 @@
-"""The nodes of a recorded launch, built again for replay: their classes, with the configuration the bag itself carries.
+"""Builds the nodes of a recorded launch for replay, with the configuration from the bag.
 
-Files that a configuration names (calibration, attack) are taken from the bag where they ride along in it, so that an old bag
-replays with what was used then, on a machine that has none of those paths.
+Files named in the configuration (calibration, attack) are taken from the bag's attachments, so that an old bag replays with the
+original files on a machine that does not have those paths.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ from nodes.runtime.errors import BagError, ConfigError
 from nodes.runtime.node import Node, NodeContext
 from nodes.runtime.paths import RESOLVED_NAME
 
-# Modules that a bag may name by itself; any other code is run only when the person who replays it names it.
+# Modules that a bag may name. Other code runs only if the user names it.
 _OUR_MODULES = "nodes."
 
 
 @dataclass(frozen=True)
 class Choice:
-    """What to replay, and how.
+    """Selection of nodes to replay.
 
     Attributes:
-        nodes: Names in the launch file, in the order in which they get a message.
-        replacements: Module, or ``module:Class``, that stands in for a node, by its name.
+        nodes: Node names of the launch file, in the order in which they get a message.
+        replacements: Module, or ``module:Class``, to use for a node, by the node's name.
         launch: Launch file to use instead of the one in the bag.
         overrides: ``node.key=value``, applied last.
     """
@@ -54,14 +54,18 @@ def build_nodes(bag: Path, choice: Choice, folder: Path, clock: Clock) -> dict[s
 
     Args:
         bag: Bag folder or file.
-        choice: What to replay.
-        folder: Empty folder for what rides along in the bag; must live as long as the nodes.
+        choice: The selection.
+        folder: Empty folder for the attachments of the bag, which must exist as long as the nodes.
         clock: The clock of the replay.
     """
     if not choice.nodes:
-        raise BagError("expected at least one node to replay, got none; name them: --nodes compositor,policy")
+        raise BagError(
+            "expected at least one node to replay, got none; name them, for example --nodes compositor,policy"
+        )
     if unknown := [name for name in choice.replacements if name not in choice.nodes]:
-        raise BagError(f"cannot replace {', '.join(unknown)}: only what is replayed can be, {', '.join(choice.nodes)}")
+        raise BagError(
+            f"cannot replace {', '.join(unknown)}, which is not replayed; replayed are {', '.join(choice.nodes)}"
+        )
     plan = _plan(bag, choice, folder)
     built: dict[str, Node] = {}
     try:
@@ -75,7 +79,7 @@ def build_nodes(bag: Path, choice: Choice, folder: Path, clock: Clock) -> dict[s
 
 
 def close_nodes(nodes: Mapping[str, Node]) -> None:
-    """Close all nodes, whatever one of them says."""
+    """Close all nodes, even if one of them fails."""
     for node in nodes.values():
         try:
             node.close()
@@ -88,7 +92,7 @@ def _plan(bag: Path, choice: Choice, folder: Path) -> Plan:
     modules = [f"{name}.module={spec.partition(':')[0]}" for name, spec in choice.replacements.items()]
     file = choice.launch or _launch_of_bag(bag, choice, folder)
     if (choice.replacements or choice.launch) and str(Path.cwd()) not in sys.path:
-        sys.path.append(str(Path.cwd()))  # as `python -m` does, by which a launch starts the modules of a file
+        sys.path.append(str(Path.cwd()))  # like `python -m`, with which a launch starts its modules
     plan = load_launch(file, [*modules, *choice.overrides], folder)
     if missing := [name for name in choice.nodes if name not in plan.nodes]:
         raise BagError(f"{file} has no node {', '.join(missing)}; it has {', '.join(plan.nodes)}")
@@ -96,10 +100,12 @@ def _plan(bag: Path, choice: Choice, folder: Path) -> Plan:
 
 
 def _launch_of_bag(bag: Path, choice: Choice, folder: Path) -> Path:
-    """The launch file attached to a bag, only with the chosen nodes, its paths turned to the other attachments."""
+    """Write the launch file attached to a bag with the chosen nodes only. Its paths are replaced by those of the attachments."""
     attachments = read_attachments(bag)
     if RESOLVED_NAME not in attachments:
-        raise BagError(f"{bag} carries no {RESOLVED_NAME}; say which launch file it was with --launch FILE")
+        raise BagError(
+            f"expected {RESOLVED_NAME} attached to {bag}, found none; give the launch file with --launch FILE"
+        )
     source = f"{bag}:{RESOLVED_NAME}"
     data = parse_yaml(attachments[RESOLVED_NAME].decode("utf-8", "replace"), source).data
     nodes = data.get("nodes") if isinstance(data, dict) else None
@@ -111,7 +117,7 @@ def _launch_of_bag(bag: Path, choice: Choice, folder: Path) -> Path:
         module = str(nodes[name].get("module")) if isinstance(nodes[name], dict) else ""
         if not module.startswith(_OUR_MODULES) and name not in choice.replacements:
             raise BagError(
-                f"{source}: {name} is {module!r}, code that is not part of advnerf; if you trust it, say --replace {name}={module}"
+                f"{source}: {name} is {module!r}, code that is not part of advnerf; if you trust it, give --replace {name}={module}"
             )
     files = _put_down(bag, attachments, folder / "attachments")
     kept = {name: _found_again(nodes[name], files) for name in choice.nodes}
@@ -122,7 +128,7 @@ def _launch_of_bag(bag: Path, choice: Choice, folder: Path) -> Path:
 
 
 def _put_down(bag: Path, attachments: Mapping[str, bytes], folder: Path) -> dict[str, str]:
-    """Write attachments where they live as long as the replay; their paths by name."""
+    """Write the attachments to the folder. Returns their paths by name."""
     folder.mkdir()
     files = {name: folder / plain_name(bag, name) for name in attachments}
     for name, path in files.items():
@@ -131,7 +137,7 @@ def _put_down(bag: Path, attachments: Mapping[str, bytes], folder: Path) -> dict
 
 
 def _found_again(value: Any, files: Mapping[str, str]) -> Any:
-    """A configuration whose file names are those of the attachments with the same last part."""
+    """Replace file names in a configuration by the attachments with the same last part."""
     if isinstance(value, dict):
         return {key: _found_again(item, files) for key, item in value.items()}
     if isinstance(value, list):
@@ -153,12 +159,14 @@ def _build(name: str, entry: NodeEntry, document: Document, choice: Choice, cont
     if node.inbox is not None or not node.publications:
         close_nodes({name: node})
         kind = "reads a device" if node.inbox is not None else "publishes nothing"
-        raise BagError(f"{name} cannot be replayed: it {kind}; only nodes that turn messages into messages can be")
+        raise BagError(
+            f"{name} cannot be replayed: it {kind}; only nodes that turn messages into messages can be replayed"
+        )
     return node
 
 
 def _known_keys(document: Document, config_type: type[BaseModel]) -> Document:
-    """The recorded configuration of a node as far as its stand-in understands it; what a person set must be understood."""
+    """The keys of a recorded configuration that the replacing node knows. Unknown keys set by the user are an error."""
     if config_type.model_config.get("extra") != "forbid" or not isinstance(document.data, dict):
         return document
     data = {
@@ -170,7 +178,7 @@ def _known_keys(document: Document, config_type: type[BaseModel]) -> Document:
 
 
 def _builder(module: ModuleType, class_name: str) -> tuple[Callable[[Any, NodeContext], Node], type[BaseModel]]:
-    """What makes the node of a module, and the type of its configuration."""
+    """Find the build function of a module's node, and the type of its configuration."""
     candidates: Sequence[Any]
     if class_name:
         candidates = [getattr(module, class_name, None)]
@@ -188,5 +196,7 @@ def _builder(module: ModuleType, class_name: str) -> tuple[Callable[[Any, NodeCo
     hints = typing.get_type_hints(build)
     config_type = hints.get(next(iter(inspect.signature(build).parameters)))
     if not (inspect.isclass(config_type) and issubclass(config_type, BaseModel)):
-        raise BagError(f"expected build() of {module.__name__} to name the type of its configuration, a pydantic model")
+        raise BagError(
+            f"expected build() of {module.__name__} to annotate its configuration with a pydantic model; add the annotation"
+        )
     return build, config_type

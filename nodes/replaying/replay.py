@@ -1,8 +1,8 @@
-"""Lockstep replay: node classes run in this process, fed message by message in the order of the recording, on its time.
+"""Lockstep replay: runs node classes in this process, message by message, in the order and on the time of the recording.
 
-Nothing here reads a clock or waits: the same bag gives the same bytes, however fast or busy the machine is. What the replayed
-nodes said when the bag was recorded is left out and made again; an output has the time of the message or tick that caused it, and
-reaches the other replayed nodes before the next message does. No message is dropped for being late.
+A replay neither reads a clock nor waits, so the same bag gives the same bytes on every machine. Recorded messages of the replayed
+nodes are replaced by new ones. An output has the time of the message or tick that caused it, and reaches the other replayed nodes
+before the next message. No message is dropped for being late.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ class Replayed:
     """One message of a replay.
 
     Attributes:
-        message: The message; log and publish time of one that was made are the recording's time at which it was.
-        made: Made by a replayed node, not taken from the bag.
+        message: The message. For a new message, log and publish time are the time in the recording.
+        made: Whether a replayed node published it. Otherwise it is from the bag.
     """
 
     message: BagMessage
@@ -40,10 +40,11 @@ class Replay:
 
     Args:
         bag: Bag folder or file.
-        choice: What to replay.
-        whole: Also yield what is in the bag but interests no node (to write another bag).
+        choice: The selection of nodes.
+        whole: Also yield messages of the bag to which no node subscribes (to write another bag).
 
-    Topics of foreign bags that are not in the topic table are left out, and listed in `left_out`. Iterate over it once; then `summary` is complete. Use it as a context manager: leaving it closes the nodes.
+    Topics that are not in the topic table are skipped and listed in `left_out`. Iterate once; then `summary` is complete. Use it as a
+    context manager: leaving it closes the nodes.
     """
 
     def __init__(self, bag: Path, choice: Choice, whole: bool = False) -> None:
@@ -81,16 +82,16 @@ class Replay:
 
     @property
     def made_topics(self) -> set[str]:
-        """Topics whose recorded messages are left out, because they are made again."""
+        """Topics whose recorded messages are replaced by those of the replayed nodes."""
         return self._lockstep.made_topics
 
     @property
     def summary(self) -> Summary:
-        """What was done so far."""
+        """Summary so far."""
         return self._lockstep.summary
 
     def __iter__(self) -> Iterator[Replayed]:
-        """Every message that was made, and with ``whole`` also those that were kept, in order."""
+        """Yield every new message, and with ``whole`` also the kept ones, in order."""
         recorded = [topic.name for topic in self.info.topics]
         topics = [topic for topic in recorded if topic not in self.left_out] if self._whole else self._heard
         heard = frozenset(self._heard)
@@ -114,9 +115,9 @@ class Replay:
 
 
 def write_replay(replay: Replay, folder: Path) -> None:
-    """Write a replay, made with ``whole``, as a new bag: what was kept, and what was made again in its place.
+    """Write a replay, created with ``whole``, as a new bag with the kept and the new messages.
 
-    Everything that rides along in the old bag does so in the new one; the same replay gives the same bytes.
+    All attachments are copied. The same replay gives the same bytes.
     """
     metadata = {**replay.info.metadata, "replayed": ", ".join(sorted(replay.names))}
     attachments = read_attachments(replay.bag)

@@ -1,4 +1,4 @@
-"""Requests to arm and to disarm: their messages, and how a command asks for them and hears what became of it."""
+"""Requests to arm and to disarm: their messages, and how a command sends one and waits for the answer."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ BRAKE_WAIT_S = 0.3
 
 @dataclass(frozen=True)
 class ArmAnswer:
-    """What became of a request.
+    """The answer to a request.
 
     Attributes:
         granted: Whether the safety node granted it.
-        armed: Whether the car is armed now.
-        text: Why not, or by whom the car is armed.
-        braked: Whether the motor node has said that it brakes since then; only for a request to disarm.
+        armed: Whether the car is armed after the request.
+        text: Why the car is not armed, or who armed it.
+        braked: Whether the motor node has reported since then that it brakes. Only set by a request to disarm.
     """
 
     granted: bool
@@ -40,14 +40,14 @@ class ArmAnswer:
 
 
 def arm_message(asked: Asked, now: Now, arm: bool, source: str, reason: str) -> Any:
-    """One repeat of a request to arm or to disarm."""
+    """Make the message for one repeat of a request to arm or to disarm."""
     return types.Arm(
         header=header(asked.real_ns), arm=arm, source=source, reason=reason, ask_id=asked.ask_id, age_ns=asked.age_ns(now)
     )  # fmt: skip
 
 
 def ask_to_arm(run_dir: Path, reason: str) -> ArmAnswer:
-    """Ask the safety node to arm, as a person.
+    """Ask the safety node to arm, as the operator.
 
     Raises:
         LaunchError: The safety node did not answer.
@@ -57,8 +57,8 @@ def ask_to_arm(run_dir: Path, reason: str) -> ArmAnswer:
             answered = _ask(bus, True, reason, _ARM_PATIENCE_S, lambda waited_s: None)
         except NoAnswerError:
             raise LaunchError(
-                f"the safety node did not answer within {_ARM_PATIENCE_S:g} s, and the car may be armed or not;"
-                " is the node running? To be sure: advnerf disarm"
+                f"expected an answer from the safety node within {_ARM_PATIENCE_S:g} s, got none; the car may be armed."
+                " Check that the node is running. To be safe, run advnerf disarm"
             ) from None
     state = answered.message()
     text = str(state.source if state.armed else state.reason) if state.granted else str(state.answer)
@@ -66,12 +66,12 @@ def ask_to_arm(run_dir: Path, reason: str) -> ArmAnswer:
 
 
 def ask_to_disarm(run_dir: Path, reason: str, silent: Callable[[float], None]) -> ArmAnswer:
-    """Ask the safety node to disarm, as a person, until it has answered; then look whether the motor node brakes.
+    """Ask the safety node to disarm, as the operator, until it answers. Then check that the motor node brakes.
 
     Args:
         run_dir: Folder of the run.
-        reason: Why, for the record.
-        silent: Called with the time waited so far [s], while the safety node does not answer.
+        reason: Reason to record.
+        silent: Called with the time waited so far [s] while the safety node does not answer.
     """
     with Bus(run_dir) as bus:
         bus.subscribe(SENT)
@@ -102,7 +102,7 @@ def _ask(bus: Bus, wanted: bool, reason: str, patience_s: float | None, silent: 
 
 
 def _wait_for_brake(bus: Bus, since_mono_ns: int) -> bool:
-    """Whether the motor node says within a moment that it brakes."""
+    """Whether the motor node reports within a moment that it brakes."""
     deadline = time.monotonic() + BRAKE_WAIT_S
     while (left_s := deadline - time.monotonic()) > 0.0:
         bus.wait(left_s)

@@ -1,7 +1,7 @@
-"""Ask a node for something: the request is repeated until the node has answered.
+"""Send a request to a node, and repeat it until the node answers.
 
-A publisher cannot know who listens: its only subscriber may be a recorder, and the node that a request is for may join later or
-be restarted. So a request has an id, every repeat carries the same one, and the node answers with it.
+A publisher does not know its subscribers: the only one may be a recorder, and the node that the request is for may join later or
+be restarted. So every repeat of a request carries the same id, and the node puts that id into its answer.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _TELL_S = 1.0
 
 
 class NoAnswerError(LaunchError):
-    """The node that a request is for did not answer in time."""
+    """The node did not answer a request in time."""
 
 
 def ask(
@@ -35,25 +35,25 @@ def ask(
     silent: Callable[[float], None] = lambda waited_s: None,
     silent_after_s: float = 1.0,
 ) -> T:
-    """Publish a request again and again until it is answered.
+    """Publish a request repeatedly until it is answered.
 
     Args:
-        bus: A bus of the calling thread; messages of its other subscriptions that come meanwhile are passed to `read` too.
+        bus: A bus of the calling thread. Messages of its other subscriptions that arrive meanwhile are also passed to `read`.
         topic: Topic of the request.
-        make: Makes the message for one repeat from the request's identity and the time.
+        make: Makes the message for one repeat from the identity of the request and the time.
         answers: Topic on which the node answers.
-        read: Returns the answer if a received message is one to this id, else None.
+        read: Returns the answer if a received message answers this id, else None.
         every_s: Time between two repeats [s].
-        patience_s: Time after which it gives up [s]; None asks for ever.
-        silent: Called with the time waited so far [s] while there is no answer, every second.
-        silent_after_s: When it is called first [s].
+        patience_s: Time after which `NoAnswerError` is raised [s]; None waits for ever.
+        silent: Called every second with the time waited so far [s] while there is no answer.
+        silent_after_s: Time of the first call of `silent` [s].
 
     Returns:
-        What `read` returned.
+        The result of `read`.
 
     Raises:
         NoAnswerError: No answer within the patience.
-        BusError: Others publish the topic, and did so for the whole time.
+        BusError: Other processes published the topic during the whole time.
     """
     clock = SystemClock()
     bus.subscribe(answers)
@@ -72,7 +72,9 @@ def ask(
                 return answer
         waited_s = time.monotonic() - began
         if patience_s is not None and waited_s > patience_s:
-            raise taken or NoAnswerError(f"no answer on {answers} to the request on {topic} within {patience_s:g} s")
+            raise taken or NoAnswerError(
+                f"expected an answer on {answers} to the request on {topic} within {patience_s:g} s, got none"
+            )
         if time.monotonic() >= tell_s:
             tell_s = time.monotonic() + _TELL_S
             silent(waited_s)
@@ -82,7 +84,7 @@ def _publish(bus: Bus, topic: str, message: Any) -> BusError | None:
     try:
         bus.publish(topic, message)
     except BusError as error:
-        return error  # all endpoints of the topic are taken now; one may become free
+        return error  # all endpoints of the topic are in use; one may become free
     return None
 
 
@@ -90,4 +92,4 @@ def _read(read: Callable[[str, Received], T | None], ask_id: str, received: Rece
     try:
         return read(ask_id, received)
     except MessageError:
-        return None  # bytes that are no message must not end a request to stop the car
+        return None  # invalid bytes must not end a request to stop the car

@@ -1,9 +1,9 @@
-"""Publish and subscribe between the processes of one host: one XPUB socket per topic, no broker. ZeroMQ stays in here.
+"""Publish and subscribe between the processes of one host, with one XPUB socket per topic and no broker.
 
-Receivers of a ``latest`` topic drain it to the newest message; a small high-water mark alone leaves frames stale, and
-CONFLATE keeps only the last frame of a multipart message. Other topics keep their queue; gaps in the sequence are counted.
-A bus belongs to the thread that made it, and that thread must call `Bus.wait` or `Bus.receive` now and then: ZeroMQ
-repeats a subscription to a restarted publisher only when its socket is used.
+This module is the only one that uses ZeroMQ inside a host. Receivers of a ``latest`` topic drain it to the newest message. A small
+high-water mark alone would leave stale frames, and CONFLATE keeps only the last frame of a multipart message. Other topics keep
+their queue, and gaps in the sequence are counted. A bus belongs to the thread that made it. That thread must call `Bus.wait` or
+`Bus.receive` regularly, because ZeroMQ renews a subscription to a restarted publisher only when the socket is used.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from nodes.runtime.topics import topic as topic_row
 from nodes.runtime.wire import MessageInfo, Meta, Relayed, pack_meta, unpack_parts
 
 _SEND_QUEUE = 16
-# Deep enough that a reader that stalls for seconds still drains to the true newest: a full pipe holds back what comes after.
+# Deep enough for a reader that stalls for seconds: a full pipe would block newer messages, and the newest would not be received.
 _LATEST_QUEUE = 64
-# A publisher that outruns its reader must not keep the reader in here for ever.
+# Limit of messages per call, so that a publisher that is faster than its reader cannot block the reader for ever.
 _DRAIN_LIMIT = 1000
 _FAREWELL_MS = 100
-# Plain numbers: every operation on pyzmq's enumerations costs a microsecond, and there are several per message.
+# Plain integers: every operation on pyzmq's enumerations costs a microsecond, and there are several per message.
 _POLLIN, _NOBLOCK = int(zmq.POLLIN), int(zmq.NOBLOCK)
 _EVENTS, _RCVMORE = int(zmq.EVENTS), int(zmq.RCVMORE)
 _NOBLOCK_MORE = _NOBLOCK | int(zmq.SNDMORE)
@@ -53,7 +53,7 @@ class Received:
     info: MessageInfo
 
     def message(self) -> Any:
-        """Decode it."""
+        """Decode the message."""
         if isinstance(self.info, PartedInfo):
             return join_image(*self.info.parts)
         return decode(topic_row(self.topic).type, self.info.raw)
@@ -61,16 +61,16 @@ class Received:
 
 @dataclass
 class Counts:
-    """What happened to the messages of one subscription."""
+    """Counts of received, dropped, lost and refused messages of one subscription."""
 
     received: int = 0
-    dropped: int = 0  # older than the newest, on a topic that wants only the newest
-    lost: int = 0  # published, but never came: a full queue on the way
-    refused: int = 0  # not our format, or another version of the type
+    dropped: int = 0  # skipped for a newer one, on a topic of which only the newest is kept
+    lost: int = 0  # published but not received, because a queue was full
+    refused: int = 0  # wrong format, or another version of the type
 
 
 class Publisher:
-    """Sends one topic; there can be only so many per topic and run folder as the topic has senders, for most of them one."""
+    """Publishes one topic. Each run folder allows as many publishers of a topic as the topic has senders, usually one."""
 
     def __init__(self, context: zmq.Context[Any], run_dir: Path, topic: Topic, instance_id: int, clock: Clock) -> None:
         self.topic = topic
@@ -85,17 +85,17 @@ class Publisher:
         self._socket = context.socket(zmq.XPUB)
         self._socket.linger = 0
         self._socket.sndhwm = _SEND_QUEUE
-        # Every subscriber is told to us, and every one that leaves: they are counted by the readiness barrier.
+        # XPUB_VERBOSER reports every subscriber that joins or leaves. The readiness barrier counts them.
         self._socket.setsockopt(zmq.XPUB_VERBOSER, 1)
         try:
             self._socket.bind(f"ipc://{path}")
         except zmq.ZMQError as error:
             self._socket.close()
             self._lock.close()
-            raise BusError(f"cannot publish {topic.name} at {path}: {error.strerror}") from error
+            raise BusError(f"cannot publish {topic.name} at {path}: {error.strerror}; check the run folder") from error
 
     def publish(self, message: Any) -> None:
-        """Send a message, or CDR bytes of the topic's type; never blocks."""
+        """Send a message, or CDR bytes of the topic's type, without blocking."""
         if isinstance(message, Relayed):
             self._send_frames(message.meta, message.cdr)
             return
@@ -124,11 +124,11 @@ class Publisher:
             send(part, _NOBLOCK_MORE)
         send(cdr[-1], _NOBLOCK)
         if self._is_status:
-            # The age of the last status must be known when the process hangs and cannot say it any more.
+            # The file's time keeps the age of the last status readable when this process hangs.
             os.utime(self._lock.fileno())
 
     def subscribers(self) -> int:
-        """How many subscribers are connected."""
+        """Number of connected subscribers."""
         while self._socket.poll(0, zmq.POLLIN):
             event = self._socket.recv(zmq.NOBLOCK)
             if event == b"\x01" + self._name:
@@ -138,11 +138,11 @@ class Publisher:
         return self._subscribers
 
     def close(self, linger_ms: int) -> None:
-        """Stop sending; the endpoint stays locked until `unlock`."""
+        """Close the socket. The endpoint stays locked until `unlock`."""
         self._socket.close(linger=linger_ms)
 
     def unlock(self) -> None:
-        """Give the endpoint free; only after the context is gone, because the socket dies in another thread."""
+        """Release the endpoint. Call it after the context is destroyed, because the socket closes in another thread."""
         self._lock.close()
 
 
@@ -159,11 +159,11 @@ class _Subscription:
 
 
 class Bus:
-    """All publishers and subscriptions of one process.
+    """The publishers and subscriptions of one process.
 
     Args:
-        run_dir: Folder of the run; who shares it shares the bus.
-        clock: Where publish and receive times come from.
+        run_dir: Folder of the run. Processes with the same folder share the bus.
+        clock: Clock for publish and receive times.
     """
 
     def __init__(self, run_dir: Path, clock: Clock | None = None) -> None:
@@ -173,7 +173,7 @@ class Bus:
         self._poller = zmq.Poller()
         self._publishers: dict[str, Publisher] = {}
         self._subscriptions: dict[str, _Subscription] = {}
-        self._readable: set[Any] | None = None  # what the last `wait` found; None when nobody looked since
+        self._readable: set[Any] | None = None  # result of the last `wait`; None if `receive` has used it
         self.instance_id = secrets.randbits(64)
 
     def __enter__(self) -> Bus:
@@ -183,7 +183,7 @@ class Bus:
         self.close()
 
     def publisher(self, topic: str) -> Publisher:
-        """The publisher of a topic, opened on first use."""
+        """Return the publisher of a topic, which is opened on first use."""
         if topic not in self._publishers:
             row = topic_row(topic)
             self._publishers[topic] = Publisher(self._context, self._run_dir, row, self.instance_id, self._clock)
@@ -194,11 +194,11 @@ class Bus:
         self.publisher(topic).publish(message)
 
     def subscribe(self, topic: str, queue: int | None = None) -> None:
-        """Listen to a topic, whether its publisher is there yet or not.
+        """Subscribe to a topic, even if its publisher does not exist yet.
 
         Args:
             topic: Name from the topic table.
-            queue: Keep every message, up to so many, even of a topic of which others want only the newest (recorder).
+            queue: Keep every message, up to this number, even of a ``latest`` topic (for the recorder).
         """
         if topic in self._subscriptions:
             return
@@ -209,7 +209,7 @@ class Bus:
         socket.linger = 0
         socket.rcvhwm = limit if take_all else _LATEST_QUEUE
         socket.setsockopt(zmq.MAXMSGSIZE, 2 * MAX_SEQUENCE_LENGTH)
-        # A publisher that starts later or again must be found within its first period, not after the default growth.
+        # A publisher that starts later must be found within its first period, without the growing default delay.
         socket.setsockopt(zmq.RECONNECT_IVL, 20)
         socket.setsockopt(zmq.RECONNECT_IVL_MAX, 100)
         socket.subscribe(row.name.encode())
@@ -219,12 +219,12 @@ class Bus:
         self._subscriptions[topic] = _Subscription(row, socket, take_all, limit)
 
     def watch(self, file_descriptor: int) -> None:
-        """Let `wait` also return when a file descriptor is readable."""
+        """Make `wait` also return when a file descriptor is readable."""
         self._poller.register(file_descriptor, zmq.POLLIN)
 
     def wait(self, timeout_s: float) -> set[int]:
-        """Sleep until something comes or the time is over; returns the watched file descriptors that are readable."""
-        # ZeroMQ counts in milliseconds; the last fraction is slept, so that a tick is neither late nor waited for by spinning.
+        """Sleep until a message arrives or the timeout ends. Returns the watched file descriptors that are readable."""
+        # ZeroMQ counts in milliseconds. The remaining fraction is slept, so that a tick is on time without spinning.
         ready = self._poller.poll(max(0, int(timeout_s * 1e3)))
         if not ready and 0.0 < timeout_s < 1e-3:
             time.sleep(timeout_s)
@@ -233,7 +233,7 @@ class Bus:
         return {entry for entry in found if isinstance(entry, int)}
 
     def receive(self) -> list[Received]:
-        """Everything that has come, in order of publication; the newest only of ``latest`` topics."""
+        """Return the messages that have arrived, in order of publication; of ``latest`` topics only the newest."""
         batch: list[Received] = []
         readable, self._readable = self._readable, None
         for subscription in self._subscriptions.values():
@@ -246,7 +246,7 @@ class Bus:
     def _receive_one(self, subscription: _Subscription) -> list[Received]:
         kept: list[Received] = []
         for _ in range(subscription.limit if subscription.take_all else _DRAIN_LIMIT):
-            # Asking first costs a tenth of the exception that an empty socket raises.
+            # Polling first costs a tenth of the exception that an empty socket raises.
             if not int(subscription.socket.get(_EVENTS)) & _POLLIN:
                 break
             frames = _frames(subscription.socket)
@@ -280,40 +280,40 @@ class Bus:
         return with_parts(info, (parts[0], parts[1])) if in_two else info
 
     def refuse(self, topic: str, reason: str) -> None:
-        """Count a message whose bytes turned out not to decode."""
+        """Count a message whose bytes could not be decoded."""
         subscription = self._subscriptions[topic]
         subscription.counts.refused += 1
         subscription.last_refusal = reason
 
     def refusals(self) -> dict[str, str]:
-        """Why messages were refused last, by topic."""
+        """Reason of the last refused message, by topic."""
         return {name: s.last_refusal for name, s in self._subscriptions.items() if s.last_refusal}
 
     def counts(self) -> dict[str, Counts]:
-        """What happened to the messages of every subscription."""
+        """Message counts of every subscription, by topic."""
         return {name: subscription.counts for name, subscription in self._subscriptions.items()}
 
     def subscribers(self, topic: str) -> int:
-        """How many subscribers are connected to a topic we publish."""
+        """Number of subscribers connected to a topic that this process publishes."""
         return self.publisher(topic).subscribers()
 
     def wait_for_subscribers(self, topics: Iterable[str], timeout_s: float, count: int = 1) -> None:
-        """Wait until every topic has so many subscribers; ZeroMQ drops what is sent before."""
+        """Wait until every topic has ``count`` subscribers. ZeroMQ drops messages that are sent before."""
         deadline = time.monotonic() + timeout_s
         waiting = list(topics)
         while waiting := [name for name in waiting if self.subscribers(name) < count]:
             if time.monotonic() > deadline:
                 raise BusError(
-                    f"expected {count} subscriber(s) of {', '.join(waiting)} within {timeout_s:g} s; is the receiving node running "
+                    f"expected {count} subscriber(s) of {', '.join(waiting)} within {timeout_s:g} s, got fewer; is the receiving node running "
                     f"with the same --run-dir ({self._run_dir})?"
                 )
             time.sleep(0.005)
 
     def close(self, farewell: bool = False) -> None:
-        """Close all sockets and give the endpoints free.
+        """Close all sockets and release the endpoints.
 
         Args:
-            farewell: Give messages just sent 100 ms to leave.
+            farewell: Wait up to 100 ms for messages that were just sent.
         """
         for subscription in self._subscriptions.values():
             self._poller.unregister(subscription.socket)
@@ -328,7 +328,7 @@ class Bus:
 
 
 def _frames(socket: zmq.Socket[Any]) -> list[bytes]:
-    """All frames of the message that is there."""
+    """Receive all frames of the waiting message."""
     frames = [socket.recv(_NOBLOCK)]
     while socket.get(_RCVMORE):
         frames.append(socket.recv(_NOBLOCK))
@@ -336,7 +336,7 @@ def _frames(socket: zmq.Socket[Any]) -> list[bytes]:
 
 
 def age_s(info: MessageInfo, mono_ns: int) -> float:
-    """Time since a message was published [s]."""
+    """Age of a message since its publication [s]."""
     return (mono_ns - info.publish_mono_ns) / NS_PER_S
 
 
@@ -347,7 +347,7 @@ def socket_paths(run_dir: Path, topic: Topic) -> list[Path]:
 
 
 def _lock_endpoint(topic: Topic, run_dir: Path) -> tuple[Path, TextIO]:
-    """Hold a lock beside a socket: a second bind to an ipc path succeeds silently and robs the first of its readers."""
+    """Hold a lock next to a socket. Without it, a second bind to an ipc path succeeds silently and takes the first one's readers."""
     owners = []
     for path in socket_paths(run_dir, topic):
         try:
@@ -355,6 +355,6 @@ def _lock_endpoint(topic: Topic, run_dir: Path) -> tuple[Path, TextIO]:
         except HeldError as error:
             owners.append(error.owner)
     raise BusError(
-        f"{topic.name} is already published in {run_dir} by process {', '.join(owners)}: another launch uses the same endpoints; "
-        "stop it, or give this one another --run-dir"
+        f"{topic.name} is already published in {run_dir} by process {', '.join(owners)}: another launch uses the same endpoints. "
+        "Stop it, or use another --run-dir"
     )

@@ -1,4 +1,4 @@
-"""The two clocks of a node, handed to it, so that tests and replays can hand it other ones.
+"""The two clocks of a node. They are passed to the node, so that tests and replays can pass other ones.
 
 Monotonic time is for durations, ages and deadlines on one host. Real time (CLOCK_REALTIME) is for capture stamps.
 """
@@ -36,10 +36,10 @@ class Now:
 
 
 class Clock(Protocol):
-    """Anything that tells the time."""
+    """Interface of a clock."""
 
     def now(self) -> Now:
-        """The present instant."""
+        """Read both clocks."""
         ...
 
 
@@ -47,18 +47,18 @@ class SystemClock:
     """The clocks of this computer."""
 
     def now(self) -> Now:
-        """The present instant."""
+        """Read both clocks."""
         return Now(time.monotonic_ns(), time.time_ns())
 
 
 class ManualClock:
-    """A clock that stands still until it is moved: for tests and for replay in lockstep."""
+    """A clock that moves only when `advance` is called, for tests and lockstep replay."""
 
     def __init__(self, mono_ns: int = 0, real_ns: int = 0) -> None:
         self._now = Now(mono_ns, real_ns)
 
     def now(self) -> Now:
-        """The present instant."""
+        """Read both clocks."""
         return self._now
 
     def advance(self, duration_s: float) -> Now:

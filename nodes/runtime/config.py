@@ -1,4 +1,4 @@
-"""Configuration: YAML in, a typed object out, and one error that says which file, which line, and what would be right."""
+"""Load YAML configuration into typed objects. An error names the file, the line and the valid values."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ Key = tuple[str | int, ...]
 
 @dataclass
 class Document:
-    """A parsed YAML file that remembers where everything stood.
+    """A parsed YAML file that knows the line of every key.
 
     Attributes:
-        data: The content.
-        source: File name for messages.
-        places: Where a key came from, as ``file:line`` or as the override that set it, by its path.
+        data: Content of the file.
+        source: File name for error messages.
+        places: Origin of each key by its path: ``file:line``, or the override that set it.
     """
 
     data: Any
@@ -36,13 +36,13 @@ class Document:
     places: dict[Key, str] = field(default_factory=dict)
 
     def place(self, key: Key) -> str:
-        """Where a key, or else what encloses it, stands."""
+        """Origin of a key, or of the nearest enclosing key."""
         while key and key not in self.places:
             key = key[:-1]
         return self.places.get(key, self.source)
 
     def part(self, key: Key) -> Document:
-        """What stands under a key, with its places; empty if there is nothing."""
+        """Return the section under a key with its places; empty if the key is missing."""
         data = self.data
         for step in key:
             data = (data or {}).get(step) if isinstance(data, dict) else data[step]
@@ -52,26 +52,26 @@ class Document:
 
 
 def read_yaml(path: Path) -> Document:
-    """Parse a YAML or JSON file; tags that build objects are refused, a key given twice is an error."""
+    """Parse a YAML or JSON file. Tags that build objects are refused, and a duplicate key is an error."""
     path = Path(path)
     try:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
-        raise ConfigError(f"{path}: no such file") from None
+        raise ConfigError(f"{path}: expected a file, found none; correct the path") from None
     except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot be read: {error}") from error
+        raise ConfigError(f"{path}: expected a readable file: {error}") from error
     return parse_yaml(text, str(path))
 
 
 def parse_yaml(text: str, source: str) -> Document:
-    """Parse YAML text; ``source`` is what messages call it."""
+    """Parse YAML text. Error messages refer to the text as ``source``."""
     try:
         root = yaml.compose(text, Loader=yaml.SafeLoader)
         data = yaml.safe_load(text)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         line = f":{mark.line + 1}" if mark is not None else ""
-        raise ConfigError(f"{source}{line}: not valid YAML: {getattr(error, 'problem', None) or error}") from error
+        raise ConfigError(f"{source}{line}: expected valid YAML: {getattr(error, 'problem', None) or error}") from error
     document = Document({} if data is None else data, source)
     if root is not None:
         _note_places(root, (), document)
@@ -85,7 +85,9 @@ def _note_places(node: yaml.Node, key: Key, document: Document) -> None:
         for name, value in node.value:
             here = f"{document.source}:{name.start_mark.line + 1}"
             if name.value in seen:
-                raise ConfigError(f"{here}: {'.'.join(map(str, (*key, name.value)))} is given twice")
+                raise ConfigError(
+                    f"{here}: {'.'.join(map(str, (*key, name.value)))} is given twice; remove one of them"
+                )
             seen.add(name.value)
             document.places[(*key, name.value)] = here
             _note_places(value, (*key, name.value), document)
@@ -98,23 +100,27 @@ _NONE = ("", "null", "Null", "NULL", "~")
 
 
 def apply_overrides(document: Document, overrides: Iterable[str], prefix: Key = ()) -> None:
-    """Apply ``key.of.it=value`` texts in place; values are YAML, and keys below ``prefix`` are meant."""
+    """Apply ``key.of.it=value`` overrides in place. Values are YAML, and keys are relative to ``prefix``."""
     for text in overrides:
         name, separator, value = text.partition("=")
         if not separator or not name.strip():
-            raise ConfigError(f"--set {text}: expected KEY=VALUE, e.g. --set camera.rate_hz=10")
+            raise ConfigError(f"--set {text}: expected KEY=VALUE, for example --set camera.rate_hz=10")
         key: Key = (*prefix, *name.strip().split("."))
-        # A file that says nothing has no keys; a value that says nothing, or null, is none.
+        # An empty file has no keys. An empty value, or null, is None.
         parsed = parse_yaml(value, f"--set {text}").data if value.strip() not in _NONE else None
         target = document.data
         for step in key[:-1]:
             if not isinstance(target, dict):
-                raise ConfigError(f"--set {text}: {step!r} is below something that has no keys")
+                raise ConfigError(
+                    f"--set {text}: expected a section above {step!r}, got a value without keys; correct the key"
+                )
             if target.get(step) is None:
                 target[step] = {}
             target = target[step]
         if not isinstance(target, dict):
-            raise ConfigError(f"--set {text}: {key[-1]!r} is below something that has no keys")
+            raise ConfigError(
+                f"--set {text}: expected a section above {key[-1]!r}, got a value without keys; correct the key"
+            )
         target[key[-1]] = parsed
         document.places[key] = f"--set {text}"
 
@@ -143,10 +149,10 @@ def load_config(model: type[M], path: Path, overrides: Sequence[str] = ()) -> M:
 
 
 def load_node_config(model: type[M], node: str, path: Path | None, overrides: Sequence[str] = ()) -> M:
-    """Configuration of one node.
+    """Load the configuration of one node.
 
-    The file is either plain (keys and values) or what the launch supervisor writes: keys and values under ``config``, and
-    under ``places`` where the user wrote them, so that an error names the launch file and not the copy.
+    The file is either plain (keys and values) or written by the launch supervisor: keys and values under ``config``, and their
+    origin in the user's launch file under ``places``, so that an error names the launch file instead of the copy.
     """
     document = Document({}, f"defaults of {node}") if path is None else read_yaml(path)
     if isinstance(document.data, dict) and set(document.data) == {"config", "places"}:
@@ -157,7 +163,7 @@ def load_node_config(model: type[M], node: str, path: Path | None, overrides: Se
 
 
 def node_document(document: Document) -> dict[str, Any]:
-    """What the supervisor writes for a node; the counterpart of `load_node_config`."""
+    """Content of the file that the supervisor writes for a node, the counterpart of `load_node_config`."""
     return {
         "config": document.data,
         "places": {".".join(map(str, key)): place for key, place in document.places.items()},
@@ -165,7 +171,7 @@ def node_document(document: Document) -> dict[str, Any]:
 
 
 def _explain(model: type[BaseModel], document: Document, error: ValidationError) -> str:
-    # A misspelt key is often the reason why another one is missing, so it is told first.
+    # A misspelt key is often the reason for a missing one, so it is reported first.
     problems = sorted(error.errors(include_url=False), key=lambda problem: problem["type"] != "extra_forbidden")
     first = problems[0]
     location = tuple(first["loc"])
@@ -174,7 +180,7 @@ def _explain(model: type[BaseModel], document: Document, error: ValidationError)
     if first["type"] == "extra_forbidden":
         what = f"unknown key {name}; valid keys here: {', '.join(_valid_keys(model, location[:-1])) or 'none'}"
     elif first["type"] == "missing":
-        what = f"{name} is missing"
+        what = f"{name} is missing; add it"
     else:
         message = str(first["msg"]).removeprefix("Value error, ")
         message = message[:1].lower() + message[1:]
@@ -188,7 +194,7 @@ def _explain(model: type[BaseModel], document: Document, error: ValidationError)
 
 
 def _as_written(data: Any, location: Key) -> Key:
-    """Path of a key as the user wrote it: where a section's ``kind`` chose the model, pydantic puts that into the path."""
+    """Path of a key as the user wrote it, without the ``kind`` that pydantic inserts for sections with several models."""
     key: list[str | int] = []
     for part in location:
         if isinstance(data, dict) and part not in data and data.get("kind") == part:
@@ -200,7 +206,7 @@ def _as_written(data: Any, location: Key) -> Key:
 
 
 def _valid_keys(annotation: Any, key: Key) -> list[str]:
-    """Keys of the model that stands under a path; empty if there is none."""
+    """Keys of the model at a path; empty if there is no model."""
     if typing.get_origin(annotation) is typing.Annotated:
         annotation = typing.get_args(annotation)[0]
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
@@ -220,6 +226,6 @@ def _valid_keys(annotation: Any, key: Key) -> list[str]:
 
 
 def _kind(option: Any) -> Any:
-    """The ``kind`` by which an alternative is chosen; None if it has none."""
+    """The ``kind`` value that selects a model; None if the model has no ``kind``."""
     fields = option.model_fields if isinstance(option, type) and issubclass(option, BaseModel) else {}
     return fields["kind"].default if "kind" in fields else None

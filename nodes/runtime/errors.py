@@ -1,4 +1,4 @@
-"""Exceptions of the runtime: what can go wrong between nodes, told in one line each."""
+"""Exceptions of the runtime. Each message is one line."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from advnerf_core.errors import AdvnerfError
 
 
 class RuntimeFault(AdvnerfError):
-    """Base of the errors raised by nodes and by what they share."""
+    """Base of the errors raised by nodes and the runtime."""
 
 
 class ConfigError(RuntimeFault, ValueError):
@@ -14,7 +14,7 @@ class ConfigError(RuntimeFault, ValueError):
 
 
 class MessageError(RuntimeFault, ValueError):
-    """Bytes are not the message they claim to be, or a message does not fit its type."""
+    """Bytes do not decode to the expected message, or a message does not fit its type."""
 
 
 class TopicError(RuntimeFault, KeyError):
@@ -41,4 +41,4 @@ class BagError(RuntimeFault):
 
 
 class NodeFinished(Exception):
-    """Raised by a node whose work is done (a player at the end of its bag); the loop then ends with exit code 0."""
+    """Raised by a node that has finished, such as a player at the end of its bag. The loop then ends with exit code 0."""

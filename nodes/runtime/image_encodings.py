@@ -1,9 +1,9 @@
-"""The pixel encodings of ``sensor_msgs/Image``: every supported one becomes RGB, 8 bits a channel.
+"""Convert the pixel encodings of ``sensor_msgs/Image`` to RGB with 8 bits per channel.
 
-Three conventions are not in the message, so they are fixed here:
+The message leaves three conventions open. They are fixed here:
 
-- ``8UC1``, ``8UC3`` and ``8UC4`` name a layout without colours. They are read as OpenCV writes them: grey, BGR and BGRA.
-- 16 bits become 8 by rounding ``value / 257``, so that 65535 becomes 255. Alpha is dropped.
+- ``8UC1``, ``8UC3`` and ``8UC4`` name a layout without colours. They are read in OpenCV's order: grey, BGR and BGRA.
+- 16-bit values are converted to 8 bits by rounding ``value / 257``, so that 65535 becomes 255. Alpha is dropped.
 - ROS names a Bayer pattern by the four pixels of its top left corner. OpenCV's older constants name it by the second and third
   pixel of the second row, so ``bayer_rggb8`` is its ``BayerBG``. The aliases used here carry the name of the corner.
 """
@@ -41,19 +41,19 @@ ENCODINGS = (*_SAMPLES, *_PAIRS, *_PLANES)
 
 
 def rgb_of_image(message: Any, source: str) -> NDArray[np.uint8]:
-    """Pixels ``[H, W, 3]`` uint8 RGB of a ``sensor_msgs/Image``; of ``rgb8`` without padding a view of the message's data.
+    """Convert a ``sensor_msgs/Image`` to RGB pixels ``[H, W, 3]`` uint8. For ``rgb8`` without padding, they are a view of the message.
 
     Args:
         message: The image, in one of `ENCODINGS`.
-        source: Where it comes from, for the error: its topic, and the bag if there is one.
+        source: Origin of the image for error messages: its topic and, if read from a bag, the bag.
 
     Raises:
-        MessageError: The encoding is another, or the data do not fit it.
+        MessageError: The encoding is not supported, or the data do not fit it.
     """
     encoding = str(message.encoding)
     if encoding not in ENCODINGS:
         raise MessageError(
-            f"{source}: cannot turn the encoding {encoding[:40]!r} into RGB; supported are {', '.join(ENCODINGS)}"
+            f"{source}: expected a supported image encoding, got {encoding[:40]!r}; supported are {', '.join(ENCODINGS)}"
         )
     try:
         if encoding in _PLANES:
@@ -69,15 +69,15 @@ def rgb_of_image(message: Any, source: str) -> NDArray[np.uint8]:
         return rgb_of_samples(rows.reshape(message.height, message.width, -1), layout)
     except cv2.error as error:
         raise MessageError(
-            f"{source}: cannot turn an image of {message.width} x {message.height} in {encoding} into RGB: {error.err}"
+            f"{source}: cannot convert an image of {message.width} x {message.height} in {encoding} to RGB: {error.err}"
         ) from error
 
 
 def rgb_of_samples(samples: NDArray[Any], layout: str) -> NDArray[np.uint8]:
-    """RGB ``[H, W, 3]`` uint8 of samples ``[H, W, C]``, uint8 or uint16.
+    """Convert samples ``[H, W, C]``, uint8 or uint16, to RGB ``[H, W, 3]`` uint8.
 
     Args:
-        samples: The picture.
+        samples: The image.
         layout: ``grey``, ``rgb``, ``bgr``, ``rgba``, ``bgra``, or a Bayer pattern such as ``bayer_rggb``.
     """
     if layout in _DEMOSAIC:
@@ -90,7 +90,7 @@ def rgb_of_samples(samples: NDArray[Any], layout: str) -> NDArray[np.uint8]:
 
 
 def is_bayer(encoding: str) -> bool:
-    """Whether an encoding is a Bayer pattern, with its bits or without."""
+    """Whether an encoding is a Bayer pattern, with or without its number of bits."""
     return encoding.rstrip("0123456789") in _DEMOSAIC
 
 
@@ -101,7 +101,7 @@ def _eight_bits(samples: NDArray[Any]) -> NDArray[np.uint8]:
 
 
 def _rows(message: Any, source: str, pixel_bytes: int, even: bool = False, planes: bool = False) -> NDArray[np.uint8]:
-    """Rows of an image without their padding: ``[H, W * pixel_bytes]``, with ``planes`` half as many rows again."""
+    """Rows of an image without padding, ``[H, W * pixel_bytes]``. With ``planes``, half as many rows follow."""
     height, width, step = int(message.height), int(message.width), int(message.step)
     count = height * 3 // 2 if planes else height
     row_bytes = width * pixel_bytes
@@ -112,7 +112,7 @@ def _rows(message: Any, source: str, pixel_bytes: int, even: bool = False, plane
         )
     if ((even or planes) and width % 2) or (planes and height % 2):
         raise MessageError(
-            f"{source}: expected an even size for {message.encoding}, whose pixels share colours, got {width} x {height}"
+            f"{source}: expected an even size for {message.encoding}, whose pixels share colours; got {width} x {height}"
         )
     rows = np.asarray(message.data, dtype=np.uint8).reshape(count, step)
     return rows if step == row_bytes else np.ascontiguousarray(rows[:, :row_bytes])

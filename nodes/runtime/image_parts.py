@@ -1,7 +1,7 @@
-"""Images in two parts, so that their pixels are never copied into a message or out of one.
+"""Images are sent in two parts, so that their pixels are not copied.
 
-``data`` is the last field of ``sensor_msgs/Image``: everything before it is a short prefix that is the same from image to image
-but for its stamp. Prefix and pixels joined are the image's CDR bytes, and recorders get them so.
+``data`` is the last field of ``sensor_msgs/Image``. The fields before it form a short prefix, of which only the stamp changes from
+image to image. Prefix and pixels joined are the CDR bytes of the image, which is what recorders receive.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from nodes.runtime.messages import decode, encode, header, types
 from nodes.runtime.wire import MessageInfo
 
 IMAGE_TYPE = "sensor_msgs/msg/Image"
-# Below this a copy costs less than another frame.
+# Smaller images are copied, because a copy costs less than a second frame.
 _WORTH_BYTES = 16 * 2**10
 _STAMP, _LENGTH = struct.Struct("<iI"), struct.Struct("<I")
 _STAMP_AT = 4  # after the encapsulation header of CDR
@@ -25,7 +25,7 @@ _REST_AT = _STAMP_AT + _STAMP.size
 
 
 def split_image(message: Any) -> tuple[bytes, memoryview] | None:
-    """Prefix and pixels of an image message; None for one that is better sent in one piece."""
+    """Split an image message into prefix and pixels; None if it should be sent in one piece."""
     data = message.data
     if (
         not isinstance(data, np.ndarray)
@@ -48,7 +48,7 @@ def split_image(message: Any) -> tuple[bytes, memoryview] | None:
 
 
 def join_image(prefix: bytes, pixels: bytes) -> Any:
-    """Image message of its two parts; its data is a read-only view of ``pixels``."""
+    """Join two parts to an image message whose data is a read-only view of ``pixels``."""
     if len(prefix) < _REST_AT + _LENGTH.size or _LENGTH.unpack(prefix[-_LENGTH.size :])[0] != len(pixels):
         raise MessageError(f"expected the two parts of {IMAGE_TYPE}, got {len(prefix)} and {len(pixels)} bytes")
     sample = _sample(prefix[:_STAMP_AT], prefix[_REST_AT : -_LENGTH.size])
@@ -61,7 +61,7 @@ def join_image(prefix: bytes, pixels: bytes) -> Any:
 
 
 class PartedInfo(MessageInfo):
-    """A `MessageInfo` of an image in two parts; ``raw`` is joined when somebody asks for it."""
+    """A `MessageInfo` of an image in two parts. ``raw`` is joined on first access."""
 
     parts: tuple[bytes, bytes]
 
@@ -72,7 +72,7 @@ class PartedInfo(MessageInfo):
 
 
 def with_parts(info: MessageInfo, parts: tuple[bytes, bytes]) -> PartedInfo:
-    """The same information about an image that came in two parts."""
+    """Convert the info of an image that was received in two parts."""
     parted = PartedInfo(**vars(info))
     del parted.__dict__["raw"]
     parted.__dict__["parts"] = parts
@@ -81,7 +81,7 @@ def with_parts(info: MessageInfo, parts: tuple[bytes, bytes]) -> PartedInfo:
 
 @lru_cache(maxsize=64)
 def _rest(frame_id: str, height: int, width: int, encoding: str, is_bigendian: int, step: int) -> bytes:
-    """CDR bytes of an image without stamp, length and pixels."""
+    """CDR bytes of an image between its stamp and its pixel data."""
     empty = types.Image(
         header=header(0, frame_id), height=height, width=width, encoding=encoding, is_bigendian=is_bigendian, step=step,
         data=np.empty(0, np.uint8),
@@ -91,5 +91,5 @@ def _rest(frame_id: str, height: int, width: int, encoding: str, is_bigendian: i
 
 @lru_cache(maxsize=64)
 def _sample(start: bytes, rest: bytes) -> Any:
-    """Message of a prefix, without its stamp and without pixels."""
+    """Decode a prefix to a message without stamp and pixels."""
     return decode(IMAGE_TYPE, b"".join((start, bytes(_STAMP.size), rest, bytes(_LENGTH.size))))

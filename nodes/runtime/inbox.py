@@ -1,4 +1,4 @@
-"""How a driver's thread hands data to its node: a small queue that wakes the node's loop at once."""
+"""The queue through which a driver thread passes data to its node. An item wakes the node's loop at once."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ T = TypeVar("T")
 
 
 class Inbox(Generic[T]):
-    """Queue from one or more driver threads to the loop of one node; when full, the oldest item goes and is counted.
+    """Queue from one or more driver threads to the loop of one node. When it is full, the oldest item is dropped and counted.
 
     Args:
-        capacity: How many items wait at most.
+        capacity: Largest number of waiting items.
 
     Attributes:
-        dropped: Items that went unseen.
+        dropped: Number of dropped items.
     """
 
     def __init__(self, capacity: int = 2) -> None:
@@ -42,7 +42,7 @@ class Inbox(Generic[T]):
             os.eventfd_write(self._event, 1)
 
     def fail(self, failure: BaseException) -> None:
-        """Make the next `take` raise: a driver that dies must take its node with it (any thread)."""
+        """Make the next `take` raise, so that the failure of a driver ends its node (any thread)."""
         with self._lock:
             if self._closed:
                 return
@@ -50,7 +50,7 @@ class Inbox(Generic[T]):
             os.eventfd_write(self._event, 1)
 
     def take(self) -> list[T]:
-        """All items that wait, oldest first (the loop's thread)."""
+        """Return all waiting items, oldest first (the loop's thread)."""
         with self._lock:
             with contextlib.suppress(BlockingIOError):
                 os.eventfd_read(self._event)
@@ -65,7 +65,7 @@ class Inbox(Generic[T]):
         return self._event
 
     def close(self) -> None:
-        """Give the file descriptor back; later items are ignored."""
+        """Close the file descriptor. Later items are ignored."""
         with self._lock:
             if not self._closed:
                 self._closed = True
@@ -73,11 +73,11 @@ class Inbox(Generic[T]):
 
 
 class ReaderThread(Generic[T]):
-    """The one read thread of all drivers: calls a blocking read again and again and puts what it returns into an inbox.
+    """Read thread of a driver: calls a blocking read in a loop and puts the results into an inbox.
 
     Args:
-        read: Blocks for a bounded time; returns None when nothing came.
-        inbox: Where results go, and the exception when ``read`` raises.
+        read: Blocks for a bounded time; returns None if no data arrived.
+        inbox: Receives the results, and the exception if ``read`` raises.
         name: Thread name.
     """
 
@@ -88,11 +88,11 @@ class ReaderThread(Generic[T]):
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
 
     def start(self) -> None:
-        """Begin to read."""
+        """Start reading."""
         self._thread.start()
 
     def stop(self, timeout_s: float = 2.0) -> None:
-        """End after the current read."""
+        """Stop after the current read."""
         self._stop.set()
         if self._thread.is_alive():
             self._thread.join(timeout_s)
@@ -103,6 +103,6 @@ class ReaderThread(Generic[T]):
                 item = self._read()
                 if item is not None:
                     self._inbox.put(item)
-        except Exception as failure:  # every failure of a driver is its node's failure, raised there
+        except Exception as failure:  # raised again in the node's loop
             if not self._stop.is_set():
                 self._inbox.fail(failure)

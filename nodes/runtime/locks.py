@@ -1,4 +1,4 @@
-"""Locks that die with their process: whoever holds one is named to whoever wants it."""
+"""File locks that end with their process. The error about a held lock names its owner."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ class HeldError(RuntimeFault, OSError):
     """Another process holds the lock.
 
     Attributes:
-        owner: Its process id, as it wrote it.
+        owner: Process id that the owner wrote into the lock file.
     """
 
     def __init__(self, owner: str) -> None:
-        super().__init__(f"held by process {owner}")
+        super().__init__(f"the lock is held by process {owner}")
         self.owner = owner
 
 
 def hold(path: Path) -> TextIO:
-    """Take the lock and write our process id into its file; it is held until the file returned is closed.
+    """Take the lock and write the process id into its file. The lock is held until the returned file is closed.
 
     Raises:
         HeldError: Another process holds it.

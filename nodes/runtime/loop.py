@@ -1,4 +1,4 @@
-"""The loop that runs a node: sockets, schedule, sign of life."""
+"""The loop that runs a node: sockets, schedule and status messages."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ _IDLE_S = 1.0
 
 
 class Schedule:
-    """Due times of something periodic, on an absolute grid: a stall skips ticks instead of running them in a burst.
+    """Due times of a periodic task on an absolute grid. After a stall, missed ticks are skipped instead of run in a burst.
 
     Args:
-        rate_hz: How often.
-        start_ns: Monotonic time of the first due time [ns].
+        rate_hz: Rate of the task [Hz].
+        start_ns: First due time on the monotonic clock [ns].
     """
 
     def __init__(self, rate_hz: float, start_ns: int) -> None:
@@ -37,7 +37,7 @@ class Schedule:
         self.worst_lag_s = 0.0
 
     def due(self, mono_ns: int) -> bool:
-        """Whether it is time; if so, the due time moves to the next point of the grid in the future."""
+        """Whether a tick is due. If so, the due time moves to the next point of the grid in the future."""
         if mono_ns < self.next_ns:
             return False
         behind = (mono_ns - self.next_ns) // self._period_ns
@@ -54,8 +54,8 @@ class NodeLoop:
     Args:
         name: Name of the node in the launch file.
         node: The node; the loop does not close it.
-        bus: Its bus; the loop opens the node's sockets on it.
-        clock: Where time comes from.
+        bus: The node's bus, on which the loop opens the node's sockets.
+        clock: The clock to read.
     """
 
     def __init__(self, name: str, node: Node, bus: Bus, clock: Clock) -> None:
@@ -65,8 +65,8 @@ class NodeLoop:
         self._clock = clock
         self._stop_read, self._stop_write = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
         self._stopping = False
-        # A loop that ends by itself closes its pipe while another thread may be about to write to it; a signal handler may come
-        # in between, in the same thread, so the lock can be taken twice.
+        # The loop may close its pipe while another thread is about to write to it. A signal handler may run in between in the
+        # same thread, so the lock is reentrant.
         self._ending = threading.RLock()
         self._refusals: dict[str, str] = {}
         self._stated = ""
@@ -83,20 +83,20 @@ class NodeLoop:
 
     @property
     def wakeup_fd(self) -> int:
-        """Writing a byte here ends the present wait; given to ``signal.set_wakeup_fd``."""
+        """File descriptor for ``signal.set_wakeup_fd``: writing a byte to it ends the current wait."""
         return self._stop_write
 
     def stop(self) -> None:
-        """End `run` soon (any thread or signal handler)."""
+        """Make `run` return soon (any thread or signal handler)."""
         with self._ending:
             if self._stopping:
                 return
             self._stopping = True
-            with contextlib.suppress(BlockingIOError):  # the pipe is full, so the loop is awake already
+            with contextlib.suppress(BlockingIOError):  # the pipe is full, so the loop will wake up anyway
                 os.write(self._stop_write, b"s")
 
     def run(self) -> None:
-        """Work until `stop`; raises what the node raises."""
+        """Run the node until `stop`. Exceptions of the node are raised here."""
         while not self._stopping:
             self._bus.wait(self._time_to_next_s())
             self._handle_messages()
@@ -105,19 +105,19 @@ class NodeLoop:
             if self._tick_schedule is not None and self._tick_schedule.due(now.mono_ns):
                 self._publish(self._node.tick(now))
             state, text = self._node.status()
-            # A change of state is said at once: the safety node waits for it, and its reason is better than a silence.
+            # A change of state is published at once, because the safety node acts on it.
             if self._status_schedule.due(now.mono_ns) or state != self._stated:
                 self.publish_status(now, state, text)
 
     def close(self) -> None:
-        """Give the loop's own file descriptors back, after the bus is closed; `stop` does nothing from then on."""
+        """Close the loop's own file descriptors. Call it after the bus is closed; `stop` then does nothing."""
         with self._ending:
             self._stopping = True
             os.close(self._stop_read)
             os.close(self._stop_write)
 
     def publish_status(self, now: Now, state: str, text: str) -> None:
-        """Send a sign of life with everything countable."""
+        """Publish the node's status with all counters."""
         self._stated = state
         counters = self._counters()
         publications = list(self._node.publications)

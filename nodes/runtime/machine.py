@@ -1,4 +1,4 @@
-"""The machine that a result comes from, in words."""
+"""Description of the machine that produced a result."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 
 def processor_name() -> str:
-    """The processor's name, or its architecture where the system does not tell the name."""
+    """Name of the processor, or its architecture if the system does not report the name."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:
@@ -22,6 +22,6 @@ def memory_gib() -> float:
 
 
 def machine_name() -> str:
-    """Processor, cores at hand and Python, e.g. ``AMD EPYC, 2 cores, Python 3.11.2``."""
+    """Processor, available cores and Python version, for example ``AMD EPYC, 2 cores, Python 3.11.2``."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return f"{processor_name()}, {cores} cores, Python {platform.python_version()}"

@@ -1,7 +1,7 @@
-"""ROS 2 messages without ROS: types, CDR bytes, and the conversions every node needs.
+"""ROS 2 messages without ROS: types, CDR bytes, and the conversions that nodes need.
 
-The type definitions are those of ROS 2 Jazzy plus the ``.msg`` files shipped in ``nodes/runtime/msg``. Only these are
-registered: the code generator behind them runs what a definition says, so a stranger's definitions never reach it here.
+The type definitions are those of ROS 2 Jazzy plus the ``.msg`` files shipped in ``nodes/runtime/msg``. No other definition is
+registered, because the code generator behind them runs code made from a definition. Definitions from foreign bags never reach it.
 
 Decoded arrays are read-only views of the received bytes: copy before drawing on them.
 """
@@ -24,7 +24,7 @@ from nodes.runtime.errors import MessageError
 
 ROS_DISTRO = "jazzy"
 MSG_FOLDER = Path(__file__).parent / "msg"
-# No message of ours comes near; a corrupt length field must not make a receiver ask for gigabytes.
+# Far above every message of advnerf. A corrupt length field must not make a receiver allocate gigabytes.
 MAX_SEQUENCE_LENGTH = 64 * 1024 * 1024
 _RGB8, _MONO8, _BGR8 = "rgb8", "mono8", "bgr8"
 _CHANNELS = {_RGB8: 3, _BGR8: 3, _MONO8: 1}
@@ -56,7 +56,7 @@ _PACKAGES = (
 
 
 class _Types:
-    """Message classes by short name, e.g. ``types.Image``; see ``nodes/runtime/msg`` for ours."""
+    """Message classes by short name, such as ``types.Image``. See ``nodes/runtime/msg`` for those of advnerf."""
 
     def __getattr__(self, name: str) -> Any:
         for package in _PACKAGES:
@@ -70,7 +70,7 @@ types = _Types()
 
 
 def type_name(message: Any) -> str:
-    """Full ROS 2 type name of a message, e.g. ``sensor_msgs/msg/Image``."""
+    """Full ROS 2 type name of a message, for example ``sensor_msgs/msg/Image``."""
     try:
         return str(message.__msgtype__)
     except AttributeError:
@@ -79,66 +79,70 @@ def type_name(message: Any) -> str:
 
 @cache
 def type_hash(typename: str) -> str:
-    """RIHS01 hash of a type, as ``ros2 topic info -v`` prints it."""
+    """RIHS01 hash of a type, in the format of ``ros2 topic info -v``."""
     _require_type(typename)
     return str(_STORE.hash_rihs01(typename))
 
 
 @cache
 def type_hash_prefix(typename: str) -> bytes:
-    """First 8 bytes of the type hash: what travels with every message."""
+    """First 8 bytes of the type hash, which are sent with every message."""
     return bytes.fromhex(type_hash(typename).removeprefix("RIHS01_")[:16])
 
 
 @cache
 def type_definition(typename: str) -> str:
-    """Definition text of a type with everything it contains, in the form bags carry (``ros2msg``)."""
+    """Definition text of a type and of all types in it, in the format of bags (``ros2msg``)."""
     _require_type(typename)
     return str(_STORE.generate_msgdef(typename, ros_version=2)[0])
 
 
 def encode(message: Any) -> bytes:
-    """CDR bytes of a message."""
+    """Encode a message to CDR bytes."""
     name = type_name(message)
     try:
         return bytes(_STORE.serialize_cdr(message, name))
     except (SerdeError, struct.error, AttributeError, TypeError, ValueError) as error:
-        raise MessageError(f"a field of {name} has a wrong type or is out of range: {error}") from error
+        raise MessageError(
+            f"expected fields that fit {name}, got a wrong type or a value out of range: {error}"
+        ) from error
 
 
 def decode(typename: str, data: bytes | memoryview) -> Any:
-    """Message of CDR bytes; its arrays are read-only views of ``data``."""
+    """Decode CDR bytes to a message whose arrays are read-only views of ``data``."""
     _require_type(typename)
     try:
         return _STORE.deserialize_cdr(memoryview(data).toreadonly(), typename)
     except (SerdeError, struct.error, ValueError, IndexError, UnicodeDecodeError, AssertionError) as error:
-        raise MessageError(f"expected CDR bytes of {typename}, got {len(data)} bytes that are not: {error}") from error
+        raise MessageError(
+            f"expected CDR bytes of {typename}, got {len(data)} bytes that cannot be decoded: {error}"
+        ) from error
 
 
 def fields_of(typename: str) -> list[tuple[str, Any]] | None:
-    """Names and kinds of the fields of a type, as ``rosbags`` describes them; None for a type that is not known."""
+    """Names and kinds of the fields of a type, as ``rosbags`` describes them; None for an unknown type."""
     found = _STORE.fielddefs.get(typename)
     return None if found is None else list(found[1])
 
 
 def message_class(typename: str) -> Any:
-    """Class of the messages of a type."""
+    """Message class of a type."""
     _require_type(typename)
     return _STORE.types[typename]
 
 
 def stamp_from_ns(stamp_ns: int) -> Any:
-    """``builtin_interfaces/Time`` of a real time [ns]."""
+    """Convert a real time [ns] to ``builtin_interfaces/Time``."""
     return types.Time(sec=int(stamp_ns) // NS_PER_S, nanosec=int(stamp_ns) % NS_PER_S)
 
 
 def ns_from_stamp(stamp: Any) -> int:
-    """Real time [ns] of a ``builtin_interfaces/Time``."""
+    """Convert a ``builtin_interfaces/Time`` to a real time [ns]."""
     return int(stamp.sec) * NS_PER_S + int(stamp.nanosec)
 
 
 def header(stamp_ns: int, frame_id: str = "") -> Any:
-    """``std_msgs/Header`` with a real time [ns] and a frame."""
+    """Make a ``std_msgs/Header`` from a real time [ns] and a frame."""
     return types.Header(stamp=stamp_from_ns(stamp_ns), frame_id=frame_id)
 
 
@@ -163,7 +167,7 @@ def image_message(image: NDArray[np.uint8], stamp_ns: int, frame_id: str, encodi
 
 
 def pose_message(T_frame_from_body: ArrayLike, stamp_ns: int, frame_id: str = "world") -> Any:
-    """``geometry_msgs/PoseStamped`` of a transform ``[4, 4]`` that takes body coordinates to ``frame_id``."""
+    """Make a ``geometry_msgs/PoseStamped`` from a transform ``[4, 4]`` from body coordinates to ``frame_id``."""
     T = np.asarray(T_frame_from_body, dtype=np.float64)
     x, y, z, w = (float(q) for q in quaternion_from_rotation(T[:3, :3]))
     position = types.Point(x=float(T[0, 3]), y=float(T[1, 3]), z=float(T[2, 3]))
@@ -172,17 +176,17 @@ def pose_message(T_frame_from_body: ArrayLike, stamp_ns: int, frame_id: str = "w
 
 
 def pose_matrix(message: Any) -> NDArray[np.float64]:
-    """Transform ``[4, 4]`` of a ``PoseStamped``; a quaternion of length zero is an error."""
+    """Convert a ``PoseStamped`` to a transform ``[4, 4]``. A quaternion of length zero is an error."""
     position, q = message.pose.position, message.pose.orientation
     try:
         rotation = rotation_from_quaternion([q.x, q.y, q.z, q.w])
     except ValueError as error:
-        raise MessageError(f"pose without an orientation: {error}") from error
+        raise MessageError(f"expected a pose with an orientation: {error}") from error
     return make_transform(rotation, np.array([position.x, position.y, position.z]))
 
 
 def drive_message(speed_mps: float, steering_rad: float, stamp_ns: int, frame_id: str = "car") -> Any:
-    """``AckermannDriveStamped``; ``stamp_ns`` is the capture time of the image behind the command."""
+    """Make an ``AckermannDriveStamped``. ``stamp_ns`` is the capture time of the image that the command is based on."""
     drive = types.AckermannDrive(
         steering_angle=float(steering_rad),
         steering_angle_velocity=0.0,
@@ -212,11 +216,11 @@ def camera_info_message(
 
 
 def pinhole_from_camera_info(message: Any) -> Pinhole:
-    """Intrinsics of a ``CameraInfo`` in our convention (pixel centres at +0.5)."""
+    """Convert a ``CameraInfo`` to intrinsics with pixel centres at +0.5."""
     K = np.asarray(message.k, dtype=np.float64).reshape(3, 3)
     return Pinhole(int(message.width), int(message.height), K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5)
 
 
 def _require_type(typename: str) -> None:
     if typename not in _STORE.fielddefs:
-        raise MessageError(f"unknown message type {typename!r}; ours are in {MSG_FOLDER}")
+        raise MessageError(f"expected a message type of ROS 2 or of {MSG_FOLDER}, got {typename!r}")

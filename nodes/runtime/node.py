@@ -1,7 +1,7 @@
-"""What a node is: a pure class that turns messages into messages. Sockets, signals and rates are the loop's business.
+"""The base class of nodes, which turn messages into messages. The loop handles sockets, signals and rates.
 
-The same class runs as a process (`nodes.runtime.process.run_node_main`), inside a test, and in lockstep replay, because everything it needs is
-handed to it: messages, time, and what its constructor got.
+A node gets messages and time as arguments and everything else through its constructor. So the same class runs as a process
+(`nodes.runtime.process.run_node_main`), in a test, and in lockstep replay.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ class Out(NamedTuple):
 
 @dataclass(frozen=True)
 class NodeContext:
-    """What a node's ``build`` is given besides its configuration.
+    """Arguments of a node's ``build`` besides its configuration.
 
     Attributes:
         name: Name of the node in the launch file.
         run_dir: Folder of the run.
-        clock: The clock to read wherever time is needed outside `Node.handle` and `Node.tick`.
-        subscribers: How many subscribers a topic of this node has.
+        clock: The clock to read outside `Node.handle` and `Node.tick`.
+        subscribers: Returns the number of subscribers of a topic of this node.
     """
 
     name: str
@@ -51,15 +51,15 @@ class NodeContext:
 
 
 class Node(ABC):
-    """Base of all nodes. Not thread-safe: only its loop calls it.
+    """Base class of nodes. It is not thread-safe: only its loop calls it.
 
     Attributes:
-        subscriptions: Topics it listens to.
-        publications: Topics it may send.
-        tick_rate_hz: How often `tick` is called [Hz]; None for never.
-        inbox: Queue through which its driver threads hand it data; items come to `receive` at once.
-        raw: Do not decode: `handle` gets None as message, and the bytes in ``info.raw``.
-        queues: Topics of which it wants every message, with the length of the queue, whatever the topic table says.
+        subscriptions: Topics that the node subscribes to.
+        publications: Topics that the node may publish.
+        tick_rate_hz: Rate at which `tick` is called [Hz]; None for never.
+        inbox: Queue for data from driver threads. Its items are passed to `receive` at once.
+        raw: Do not decode messages: `handle` gets None as message, and the bytes in ``info.raw``.
+        queues: Queue length by topic, for topics of which the node needs every message. It overrides the topic table.
     """
 
     subscriptions: Sequence[str] = ()
@@ -71,24 +71,24 @@ class Node(ABC):
 
     @abstractmethod
     def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
-        """React to a message; its arrays are read-only."""
+        """Handle a message, whose arrays are read-only, and return the messages to publish."""
 
     def receive(self, item: Any, now: Now) -> list[Out]:
-        """React to an item of the inbox."""
-        raise NotImplementedError(f"{type(self).__name__} has an inbox, but no receive()")
+        """Handle an item of the inbox and return the messages to publish."""
+        raise NotImplementedError(f"{type(self).__name__} has an inbox but no receive(); implement it")
 
     def tick(self, now: Now) -> list[Out]:
-        """Called at `tick_rate_hz` on an absolute schedule; missed ticks are skipped and counted."""
+        """Run a periodic step at `tick_rate_hz` on an absolute schedule. Missed ticks are skipped and counted."""
         del now  # most nodes only react
         return []
 
     def status(self) -> tuple[str, str]:
-        """State (``ready``: waiting for something, ``active``: at work, ``fault``) and a short text for a person."""
+        """Return the state (``ready``: waiting for input, ``active``: working, ``fault``) and a short text."""
         return ACTIVE, ""
 
     def counters(self) -> dict[str, float]:
-        """Numbers to report with the status."""
+        """Return the numbers to report with the status."""
         return {}
 
-    def close(self) -> None:  # noqa: B027 - most nodes have nothing to let go
-        """Make the device safe and let it go. Called once, also after an exception."""
+    def close(self) -> None:  # noqa: B027 - most nodes have nothing to release
+        """Make the device safe and release it. Called once, also after an exception."""

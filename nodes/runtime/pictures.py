@@ -1,6 +1,6 @@
-"""Pictures on topics and in bags: one entrance that turns any of them into RGB, and JPEG messages that keep the stamp of their picture.
+"""Convert image messages to RGB, and make JPEG messages that keep the stamp of their image.
 
-Nothing here trusts a received picture: the size in the header of compressed data is checked before they are decoded.
+Received images are not trusted: the size in the header of compressed data is checked before they are decoded.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from nodes.runtime.messages import header, image_message, stamp_ns, type_name, t
 
 RAW_TOPIC, COMPRESSED_TOPIC = "/camera/image_raw", "/camera/image_raw/compressed"
 COMPRESSED_TYPE = "sensor_msgs/msg/CompressedImage"
-# As ROS 2's image transport writes it: what the picture was, and what is inside the JPEG.
+# Format text of ROS 2's image transport: the encoding of the image, and the encoding inside the JPEG.
 _FORMAT = "rgb8; jpeg compressed bgr8"
 _RGB8 = "rgb8"
 MAX_PIXELS = 16_000_000
@@ -30,13 +30,13 @@ _BARE = frozenset({0x01, *range(0xD0, 0xD9)})
 
 
 def compressed_image_message(rgb: NDArray[np.uint8], stamp_ns: int, frame_id: str, quality: int = 80) -> Any:
-    """``sensor_msgs/CompressedImage`` of pixels ``[H, W, 3]`` uint8.
+    """Make a ``sensor_msgs/CompressedImage`` from pixels ``[H, W, 3]`` uint8.
 
     Args:
-        rgb: The picture.
-        stamp_ns: When it was taken, real time [ns].
+        rgb: The image.
+        stamp_ns: Capture time, real time [ns].
         frame_id: Frame of the camera.
-        quality: Of the JPEG, 1 to 100.
+        quality: JPEG quality, 1 to 100.
     """
     if rgb.dtype != np.uint8 or rgb.ndim != 3 or rgb.shape[2] != 3:
         raise MessageError(f"expected uint8 pixels [H, W, 3], got {rgb.dtype} {list(rgb.shape)}")
@@ -45,19 +45,19 @@ def compressed_image_message(rgb: NDArray[np.uint8], stamp_ns: int, frame_id: st
     bgr = cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)
     done, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])
     if not done:
-        raise MessageError(f"cannot compress a picture of {rgb.shape[1]} x {rgb.shape[0]}")
+        raise MessageError(f"cannot compress an image of {rgb.shape[1]} x {rgb.shape[0]} to JPEG; reduce its size")
     return types.CompressedImage(header=header(stamp_ns, frame_id), format=_FORMAT, data=data.reshape(-1))
 
 
 def rgb_image(message: Any, source: str) -> NDArray[np.uint8]:
-    """Pixels ``[H, W, 3]`` uint8 RGB of an ``Image`` or a ``CompressedImage``; read-only where it is a view of the message.
+    """Convert an ``Image`` or ``CompressedImage`` to RGB pixels ``[H, W, 3]`` uint8, read-only if they are a view of the message.
 
     Args:
-        message: The picture; see `nodes.runtime.image_encodings` for encodings, JPEG and PNG for compressed ones.
-        source: Where it comes from, for the error: its topic, and the bag if there is one.
+        message: The image, in an encoding of `nodes.runtime.image_encodings`, or JPEG or PNG.
+        source: Origin of the image for error messages: its topic and, if read from a bag, the bag.
 
     Raises:
-        MessageError: It is no picture, is damaged, or has an encoding that is not supported.
+        MessageError: The message is not an image, is damaged, or has an unsupported encoding.
     """
     typename = type_name(message)
     if typename == COMPRESSED_TYPE:
@@ -68,11 +68,11 @@ def rgb_image(message: Any, source: str) -> NDArray[np.uint8]:
 
 
 def rgb8_message(message: Any, source: str) -> Any:
-    """``sensor_msgs/Image`` in rgb8 of any picture, with its own stamp and frame; one that is so already is returned.
+    """Convert an image message to a ``sensor_msgs/Image`` in rgb8 with the same stamp and frame. An rgb8 image is returned as is.
 
     Args:
         message: An ``Image`` or a ``CompressedImage``.
-        source: Where it comes from, for the error.
+        source: Origin of the image for error messages.
     """
     rgb = rgb_image(message, source)
     if type_name(message) == IMAGE_TYPE and message.encoding == _RGB8:
@@ -84,22 +84,22 @@ def _decompressed(message: Any, source: str) -> NDArray[np.uint8]:
     data = np.asarray(message.data, dtype=np.uint8)
     width, height = _compressed_size(data.tobytes(), str(message.format), source)
     if width * height > MAX_PIXELS:
-        raise MessageError(f"{source}: expected a picture of at most {MAX_PIXELS} pixels, got {width} x {height}")
+        raise MessageError(f"{source}: expected an image of at most {MAX_PIXELS} pixels, got {width} x {height}")
     try:
-        # Unchanged: 16 bits stay, one channel stays, and a rotation in the file's EXIF data is not applied.
+        # IMREAD_UNCHANGED keeps 16 bits and single channels, and ignores a rotation in the EXIF data.
         samples = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
     except cv2.error:
         samples = None
     if samples is None or samples.shape[:2] != (height, width) or samples.dtype not in (np.uint8, np.uint16):
-        raise MessageError(f"{source}: expected a JPEG or PNG picture of {width} x {height}, its data are damaged")
+        raise MessageError(f"{source}: expected a JPEG or PNG image of {width} x {height}, got damaged data")
     return rgb_of_samples(samples.reshape(height, width, -1), _layout(str(message.format), samples))
 
 
 def _layout(picture_format: str, samples: NDArray[Any]) -> str:
-    """How decoded samples are laid out: OpenCV gives BGR, but image transport may have compressed something else as if it were BGR.
+    """Layout of decoded samples. OpenCV returns BGR, but image transport may have compressed another layout as if it were BGR.
 
-    The format reads ``<encoding>; <codec> compressed <what was given to the codec>``. Of a colour image the last part is ``bgr8``;
-    without it, image transport takes the samples in the order of red, green, blue.
+    The format reads ``<encoding>; <codec> compressed <layout given to the codec>``. For a colour image the last part is ``bgr8``.
+    Without it, image transport uses the order red, green, blue.
     """
     encoding, separator, rest = picture_format.partition(";")
     channels = 1 if samples.ndim == 2 else samples.shape[2]
@@ -112,7 +112,7 @@ def _layout(picture_format: str, samples: NDArray[Any]) -> str:
 
 
 def _compressed_size(data: bytes, picture_format: str, source: str) -> tuple[int, int]:
-    """Width and height [px] in the header of JPEG or PNG data; nothing is decoded."""
+    """Read width and height [px] from the header of JPEG or PNG data without decoding."""
     try:
         if data.startswith(_PNG):
             return png_size(data)
@@ -121,22 +121,22 @@ def _compressed_size(data: bytes, picture_format: str, source: str) -> tuple[int
     except MessageError as error:
         raise MessageError(f"{source}: {error}") from None
     raise MessageError(
-        f"{source}: cannot decompress the format {picture_format[:40]!r} ({len(data)} bytes); supported are JPEG and PNG data"
+        f"{source}: expected JPEG or PNG data, got the format {picture_format[:40]!r} ({len(data)} bytes)"
     )
 
 
 def png_size(data: bytes) -> tuple[int, int]:
-    """Width and height [px] in the header of PNG data; nothing is decoded.
+    """Read width and height [px] from the header of PNG data without decoding.
 
-    Source: PNG specification, second edition, 11.2.2: the chunk IHDR comes first.
+    Source: PNG specification, second edition, 11.2.2: the first chunk is IHDR.
     """
     if len(data) < 24 or data[12:16] != b"IHDR":
-        raise MessageError(f"expected PNG data, got {len(data)} bytes without a size in them")
+        raise MessageError(f"expected PNG data, got {len(data)} bytes without an image size")
     return int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")
 
 
 def jpeg_size(data: bytes) -> tuple[int, int]:
-    """Width and height [px] in the header of JPEG data; nothing is decoded.
+    """Read width and height [px] from the header of JPEG data without decoding.
 
     Source: ITU-T T.81, annex B: segments of a marker and a length, until the start of frame.
     """
@@ -153,4 +153,4 @@ def jpeg_size(data: bytes) -> tuple[int, int]:
         if marker == _SCAN:
             break
         position += 2 + int.from_bytes(data[position + 2 : position + 4], "big")
-    raise MessageError(f"expected JPEG data, got {len(data)} bytes without a size in them")
+    raise MessageError(f"expected JPEG data, got {len(data)} bytes without an image size")

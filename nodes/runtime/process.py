@@ -1,4 +1,4 @@
-"""A node as a process: build it, run its loop, and end in an orderly way whatever happens."""
+"""Run a node as a process: build it, run its loop, and close it in order, also after an error."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from nodes.runtime.node import FAULT, STARTING, Node, NodeContext
 from nodes.runtime.topics import status_topic
 
 C = TypeVar("C", bound=BaseModel)
-# Raised while a node is built, these say what the user has to change; no traceback helps with that.
+# Errors of a node's `build` that the user can fix. They are printed without a traceback.
 _WRONG_REQUEST = (BagError, ConfigError, TopicError)
 
 
 class _Signals:
-    """SIGINT and SIGTERM end the loop; before there is a loop they end the process."""
+    """Handler of SIGINT and SIGTERM, which end the loop or, before the loop exists, the process."""
 
     def __init__(self) -> None:
         self._loop: NodeLoop | None = None
@@ -46,7 +46,7 @@ class _Signals:
             signal.signal(number, handler)
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
-        del number, frame  # both signals mean the same
+        del number, frame  # both signals have the same effect
         if self._loop is None:
             raise SystemExit(0)
         self._loop.stop()
@@ -62,15 +62,15 @@ def run_node(
     """Run a node until SIGINT, SIGTERM, `NodeFinished` or an exception.
 
     Args:
-        build: Makes the node; devices are opened here.
-        name: Name of the node; its status goes to ``/status/<name>``.
+        build: Makes the node and opens its devices.
+        name: Name of the node, whose status is published on ``/status/<name>``.
         run_dir: Folder of the run.
-        clock: Where time comes from.
-        on_loop: Called with the loop before it runs; lets a test stop it.
+        clock: The clock to read.
+        on_loop: Called with the loop before it runs, so that a test can stop it.
 
     Returns:
-        Exit code: 0 after an orderly end, 1 after a fault (one line on stderr, traceback in ``<run_dir>/logs``), 2 when the node
-        cannot be built as it was asked for (one line on stderr).
+        Exit code: 0 after a regular end, 1 after a fault (one line on stderr, traceback in ``<run_dir>/logs``), 2 if the node
+        cannot be built with this configuration (one line on stderr).
     """
     clock = clock or SystemClock()
     in_main_thread = threading.current_thread() is threading.main_thread()
@@ -85,11 +85,11 @@ def run_node(
         runner.run()
     except NodeFinished:
         pass
-    except Exception as error:  # whatever it is: make the device safe, say it in one line, end with an error code
+    except Exception as error:  # any error: make the device safe, print one line, return an error code
         runner.close_node()
         runner.fail(error)
     finally:
-        runner.close_node()  # still deaf to a second Ctrl-C: making a device safe must not be interrupted
+        runner.close_node()  # signals are still ignored: a second Ctrl-C must not interrupt making the device safe
         if signals is not None:
             signals.restore()
         runner.close()
@@ -108,11 +108,11 @@ class _Runner:
 
     def start(self, build: Callable[[NodeContext], Node]) -> None:
         self._bus = Bus(self._run_dir, self._clock)
-        # Before any device is opened: a second node of this name in this run folder ends here.
+        # Opened before any device: a second node with this name in this run folder fails here.
         self._bus.publisher(status_topic(self._name))
         self._node = build(NodeContext(self._name, self._run_dir, self._clock, self._bus.subscribers))
-        # What is alive now stays alive: the collector need not walk it again and again while the car drives. Before the
-        # subscriptions are open, so that nothing waits for it.
+        # Freeze the existing objects, so that the garbage collector skips them while the car drives. This takes time, so it
+        # is done before the subscriptions open.
         gc.collect()
         gc.freeze()
         self.loop = NodeLoop(self._name, self._node, self._bus, self._clock)
@@ -144,7 +144,7 @@ class _Runner:
                 print(f"{self._name}: could not report the fault: {second}", file=sys.stderr, flush=True)
 
     def close_node(self) -> None:
-        """Close the node, once. Before anything is logged: a slow disk must not keep the car moving."""
+        """Close the node once. This happens before anything is logged, so that a slow disk cannot keep the car moving."""
         node, self._node = self._node, None
         if node is None:
             return
@@ -164,27 +164,27 @@ class _Runner:
 
 
 def run_node_main(config_type: type[C], build: Callable[[C, NodeContext], Node]) -> int:
-    """Command line of a node process, as the launch supervisor starts it.
+    """Run the command line of a node process, which the launch supervisor starts.
 
     Args:
         config_type: Schema of the node's configuration.
-        build: Makes the node of a configuration and a context.
+        build: Makes the node from its configuration and context.
 
     Returns:
-        Exit code: 0 after an orderly end, 1 after a fault, 2 when the configuration is wrong.
+        Exit code: 0 after a regular end, 1 after a fault, 2 if the configuration is wrong.
     """
     module = sys.modules["__main__"].__spec__
     role = module.name.rsplit(".", 1)[-1] if module is not None else Path(sys.argv[0]).stem
     parser = argparse.ArgumentParser(prog=f"python -m nodes.{role}", description=f"The {role} node.")
     parser.add_argument(
-        "--config", type=Path, help="YAML or JSON file with the node's configuration (default: all defaults)"
+        "--config", type=Path, help="YAML or JSON file with the configuration of the node (default: default values)"
     )
-    parser.add_argument("--run-dir", type=Path, required=True, help="folder of the run: sockets, logs")
+    parser.add_argument("--run-dir", type=Path, required=True, help="folder of the run, for sockets and logs")
     parser.add_argument("--name", default=role, help="name of the node (default: %(default)s)")
     parser.add_argument(
         "--set", action="append", default=[], metavar="KEY=VALUE", dest="overrides", help="override a key"
     )
-    parser.add_argument("--check", action="store_true", help="only say what is wrong with the configuration")
+    parser.add_argument("--check", action="store_true", help="check the configuration, print errors and exit")
     options = parser.parse_args()
     try:
         config = load_node_config(config_type, options.name, options.config, options.overrides)
@@ -198,5 +198,5 @@ def run_node_main(config_type: type[C], build: Callable[[C, NodeContext], Node])
 
 def _one_line(error: BaseException) -> str:
     text = " ".join(str(error).split()) or "no message"
-    # Our own exceptions and those of the system say what happened; of others the type is half of the message.
+    # Messages of advnerf's own exceptions are complete. Those of other exceptions need the type to be understood.
     return text if isinstance(error, AdvnerfError) else f"{type(error).__name__}: {text}"

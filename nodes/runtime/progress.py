@@ -1,4 +1,4 @@
-"""How far a long job is: progress bars with the time left on a terminal, a line now and then in a log."""
+"""Progress of long jobs: bars with the remaining time on a terminal, occasional lines in a log."""
 
 from __future__ import annotations
 
@@ -14,40 +14,40 @@ LOG_PERIOD_S = 15.0
 
 
 class Report(Protocol):
-    """Told about the progress of one stage."""
+    """Progress callback of one stage."""
 
     def __call__(self, fraction: float, text: str = "") -> None:
-        """Called with the finished fraction (0..1) and what is being done."""
+        """Report the finished fraction (0..1) and the current step."""
 
 
 def counted(report: Report, what: str, count: int, before: int, total: int) -> Callable[[int], None]:
-    """Progress of one part of a stage, for a loop that tells how many of its ``count`` items are done.
+    """Make a callback for a loop that reports how many of its ``count`` items are done, as one part of a stage.
 
     Args:
-        report: Of the stage.
-        what: The part.
-        count: Its items.
-        before: Items of the stage before it.
-        total: Items of the whole stage.
+        report: Progress callback of the stage.
+        what: Name of the part.
+        count: Number of items of the part.
+        before: Number of items of the stage before the part.
+        total: Number of items of the whole stage.
     """
     return lambda done: report((before + done) / total, f"{what} {done}/{count}")
 
 
 class Display(Protocol):
-    """Shows a person how far the stages are."""
+    """Shows the progress of stages to the user."""
 
     def start(self, stage: str) -> Report:
-        """A stage begins; the returned callable takes its progress."""
+        """Start a stage and return its progress callback."""
 
     def finish(self, stage: str, seconds: float, cached: bool) -> None:
-        """A stage has ended, or its earlier result is used."""
+        """Finish a stage, or report that its earlier result is reused."""
 
 
 class ProgressDisplay:
     """Implements `Display`.
 
     Args:
-        console: Where to write; a log file or pipe gets lines instead of bars.
+        console: Where to write. A log file or pipe gets lines instead of bars.
     """
 
     def __init__(self, console: Console | None = None) -> None:
@@ -70,15 +70,15 @@ class ProgressDisplay:
             self._progress.stop()
 
     def start(self, stage: str) -> Report:
-        """A stage begins."""
+        """Start a stage and return its progress callback."""
         if self._progress is None:
             self._console.print(f"{stage}: started", highlight=False, soft_wrap=True)
             return _LogReport(self._console, stage)
         return _BarReport(self._progress, self._progress.add_task("", total=1.0, stage=stage, text=""))
 
     def finish(self, stage: str, seconds: float, cached: bool) -> None:
-        """A stage has ended, or its earlier result is used."""
-        text = "unchanged, used again" if cached else f"done in {seconds:.1f} s"
+        """Finish a stage, or report that its earlier result is reused."""
+        text = "unchanged, reused" if cached else f"done in {seconds:.1f} s"
         self._console.print(f"{stage}: {text}", highlight=False, soft_wrap=True)
 
 

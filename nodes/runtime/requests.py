@@ -1,4 +1,4 @@
-"""What a request to a node carries and how the node keeps its answers: acted upon once, however often it is repeated. Pure."""
+"""Identity of requests to a node, and the answers that the node remembers. A repeated request is executed only once. Pure."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ _LONGEST_ID = 64
 
 @dataclass(frozen=True)
 class Asked:
-    """Identity of one request, the same in each of its repeats.
+    """Identity of a request, which is the same in all its repeats.
 
     Attributes:
-        ask_id: Its name.
-        mono_ns: When it was first asked, monotonic clock of the sender [ns].
-        real_ns: The same, CLOCK_REALTIME [ns].
+        ask_id: Id of the request.
+        mono_ns: Time of the first repeat, monotonic clock of the sender [ns].
+        real_ns: Time of the first repeat, CLOCK_REALTIME [ns].
     """
 
     ask_id: str
@@ -31,22 +31,22 @@ class Asked:
 
     @classmethod
     def at(cls, now: Now) -> Asked:
-        """A request that is asked now for the first time."""
+        """Make the identity of a request that is first sent now."""
         return cls(secrets.token_hex(8), now.mono_ns, now.real_ns)
 
     def age_ns(self, now: Now) -> int:
-        """Time since it was first asked [ns]."""
+        """Time since the first repeat [ns]."""
         return max(0, now.mono_ns - self.mono_ns)
 
 
 @dataclass(frozen=True)
 class Answer:
-    """What a node decided about a request.
+    """Decision of a node about a request.
 
     Attributes:
-        ask_id: Of the request.
-        granted: Whether the node did what was asked.
-        text: Why not, or what it did.
+        ask_id: Id of the request.
+        granted: Whether the node did what the request asked for.
+        text: What the node did, or why it refused.
     """
 
     ask_id: str = ""
@@ -55,15 +55,15 @@ class Answer:
 
 
 def is_id(ask_id: str) -> bool:
-    """Whether a text can be the id of a request: 1 to 64 characters."""
+    """Whether a text is a valid id of a request: 1 to 64 characters."""
     return 0 < len(ask_id) <= _LONGEST_ID
 
 
 class Answers:
-    """Remembers the answers of a node by the id of the request, so that a repeat gets the same answer and changes nothing.
+    """Remembers the answers of a node by request id. A repeat gets the same answer and has no further effect.
 
     Args:
-        limit: How many are remembered; the oldest are forgotten first.
+        limit: Number of remembered answers; the oldest is forgotten first.
     """
 
     def __init__(self, limit: int = _REMEMBERED) -> None:
@@ -72,14 +72,14 @@ class Answers:
         self.last = Answer()
 
     def repeat(self, ask_id: str) -> bool:
-        """Whether this request was decided before; its answer is then the last one again. A request without id never was."""
+        """Whether this request was decided before. If so, its answer becomes the last one. A request without id never is."""
         known = self._answers.get(ask_id)
         if known is not None:
             self.last = known
         return known is not None
 
     def give(self, answer: Answer) -> Answer | None:
-        """Keep a new answer; returns the one that was forgotten for it, if any."""
+        """Store a new answer. Returns the answer that was forgotten for it, if any."""
         self.last = answer
         if not is_id(answer.ask_id):
             return None
@@ -88,11 +88,11 @@ class Answers:
 
 
 def asked_mono_ns(message: Any, info: MessageInfo) -> int:
-    """When a request was first asked, on our monotonic clock [ns].
+    """Time at which a request was first sent, on this host's monotonic clock [ns].
 
-    Its publication is known on our clock, also behind a gateway; from there the sender's own clocks count back. Of its two clocks
-    the one that makes the request older counts: a real-time clock that is set back makes nothing younger, and neither does a
-    recording that is played again.
+    The publication time is known on this host's clock, also behind a gateway. The sender's clocks give the time from the first repeat
+    to this publication. Of its two clocks, the one that makes the request older is used. So neither a real-time clock that is set
+    back nor a replayed recording makes a request younger.
     """
     by_stamp_ns = info.publish_real_ns - stamp_ns(message)
     return info.publish_mono_ns - max(0, int(message.age_ns), by_stamp_ns)

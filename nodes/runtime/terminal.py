@@ -1,4 +1,4 @@
-"""What the commands share: options, tables, errors in one line."""
+"""Helpers that the commands share: options, tables, one-line errors."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 Overrides = Annotated[
-    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Change a value; may be repeated.")
+    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a value of the file. May be repeated.")
 ]
 RunDir = Annotated[
-    Path | None, typer.Option("--run-dir", help="Folder of the run.", show_default="that of the only running launch")
+    Path | None, typer.Option("--run-dir", help="Folder of the run.", show_default="the only running launch")
 ]
 Topics = Annotated[
-    list[str] | None, typer.Option("--topics", metavar="TOPIC", help="Only this topic; may be repeated.")
+    list[str] | None, typer.Option("--topics", metavar="TOPIC", help="Use only this topic. May be repeated.")
 ]
 
 
 def table(*columns: str) -> Table:
-    """An empty table without lines."""
+    """Make an empty table without lines."""
     from rich.table import Table
 
     empty = Table(box=None, pad_edge=False)
@@ -33,7 +33,7 @@ def table(*columns: str) -> Table:
 
 
 def print_table(full: Table) -> None:
-    """Print a table; into a pipe without breaking its lines."""
+    """Print a table. In a pipe, its lines are not wrapped."""
     from rich.console import Console
 
     Console(width=None if sys.stdout.isatty() else 240).print(full)

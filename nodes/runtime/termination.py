@@ -1,4 +1,4 @@
-"""Being asked to end."""
+"""Orderly termination on SIGTERM."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from collections.abc import Iterator
 
 @contextlib.contextmanager
 def ends_in_order() -> Iterator[None]:
-    """Asked to end (SIGTERM), end as after Ctrl-C, so that what is open is closed first: a CARLA server's world, a live graph."""
+    """Treat SIGTERM like Ctrl-C, so that open resources, such as a CARLA world or a live launch, are closed first."""
     before = signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
     try:
         yield

@@ -1,4 +1,4 @@
-"""The one table of topics: who sends what, how often, and how receivers treat it. Bus, recorder, CLI and tests read it."""
+"""The table of topics: publisher, type, rate and queue of each. Bus, recorder, CLI and tests use it."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ class Topic:
 
     Attributes:
         name: Name with a leading slash.
-        type: ROS 2 type, e.g. ``sensor_msgs/msg/Image``.
-        rate_hz: Nominal rate [Hz]; None for what comes on occasion.
-        queue: How many messages a receiver keeps; 1 means only the newest (older ones are dropped and counted).
-        max_age_s: Age since publication beyond which a receiver must not act on it [s]; None where age does not matter.
-        publisher: Role that sends it.
-        senders: How many processes of a host may send it at the same time. Whoever asks for a stop must not wait for another.
+        type: ROS 2 type, for example ``sensor_msgs/msg/Image``.
+        rate_hz: Nominal rate [Hz]; None for occasional messages.
+        queue: Number of messages that a receiver keeps. 1 keeps only the newest; older ones are dropped and counted.
+        max_age_s: Age since publication beyond which a receiver must not use a message [s]; None if age does not matter.
+        publisher: Role of the node that publishes the topic.
+        senders: Number of processes per host that may publish the topic at the same time. A request to stop must not have to wait for another sender.
     """
 
     name: str
@@ -35,7 +35,7 @@ class Topic:
 
     @property
     def latest(self) -> bool:
-        """Whether receivers take only the newest message."""
+        """Whether receivers keep only the newest message."""
         return self.queue == 1
 
 
@@ -90,7 +90,7 @@ def status_topic(node: str) -> str:
 
 
 def type_of_topic(name: str) -> str | None:
-    """Type of a topic; None for one that is not ours."""
+    """Type of a topic; None if the topic is not in the table."""
     try:
         return topic(name).type
     except TopicError:
@@ -98,7 +98,7 @@ def type_of_topic(name: str) -> str | None:
 
 
 def topic(name: str) -> Topic:
-    """Row of a topic; every node has a status topic besides the table."""
+    """Row of a topic. Every node also has a status topic, which is not in the table."""
     if row := TOPICS.get(name):
         return row
     if name.startswith(STATUS_PREFIX):

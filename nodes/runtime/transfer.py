@@ -1,7 +1,7 @@
-"""Files over the bus: cut into pieces by the sender, put together and verified by the receiver.
+"""File transfer over the bus: the sender cuts a file into pieces; the receiver joins and verifies them.
 
-A receiver has either the whole file, with the hash that was announced, or nothing. Pieces come in order from one publisher;
-whatever else comes ends the transfer, and the next one begins at piece 0. The sender repeats a file, so a lost piece costs time.
+A receiver gets either the complete file with the announced hash, or no file. Pieces arrive in order from one publisher. Any other
+piece ends the transfer, and the next one starts at piece 0. The sender repeats a file, so a lost piece only costs time.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ import numpy as np
 
 from nodes.runtime.messages import header, types
 
-# Well below what a full queue of 16 messages may hold in memory on the car's computer.
+# Small enough that a full queue of 16 messages fits into the memory of the car's computer.
 CHUNK_BYTES = 256 * 1024
 LARGEST_BYTES = 64 * 1024 * 1024
 
 
 def chunk_messages(content: bytes, name: str, stamp_ns: int) -> list[Any]:
-    """``FileChunk`` messages of a file of 1 byte to 64 MiB."""
+    """Cut a file of 1 byte to 64 MiB into ``FileChunk`` messages."""
     if not 0 < len(content) <= LARGEST_BYTES:
         raise ValueError(f"expected a file of 1 to {LARGEST_BYTES} bytes, got {len(content)}")
     sha256 = hashlib.sha256(content).hexdigest()
@@ -36,12 +36,12 @@ def chunk_messages(content: bytes, name: str, stamp_ns: int) -> list[Any]:
 
 @dataclass(frozen=True)
 class ReceivedFile:
-    """A whole file, verified.
+    """A complete, verified file.
 
     Attributes:
-        name: What its sender calls it.
-        sha256: Its hash.
-        content: Its bytes.
+        name: Name that the sender gave the file.
+        sha256: Hash of the content.
+        content: Bytes of the file.
     """
 
     name: str
@@ -50,7 +50,7 @@ class ReceivedFile:
 
 
 class Assembler:
-    """Puts one file at a time together."""
+    """Assembles one file at a time."""
 
     def __init__(self) -> None:
         self._key: tuple[int, str, str, int, int] | None = None
@@ -58,26 +58,29 @@ class Assembler:
 
     @property
     def receiving(self) -> bool:
-        """Whether a file has begun and not ended."""
+        """Whether a transfer is in progress."""
         return self._key is not None
 
     def add(self, chunk: Any, instance_id: int) -> tuple[ReceivedFile | None, str]:
-        """Take a piece.
+        """Add a piece.
 
         Args:
             chunk: A ``FileChunk``.
-            instance_id: Which publisher sent it.
+            instance_id: Instance id of the publisher.
 
         Returns:
-            The file when this was its last piece, and what went wrong with a transfer, or an empty text.
+            The file if this was its last piece, else None; and the error of a transfer, or an empty text.
         """
         key = (instance_id, str(chunk.name), str(chunk.sha256), int(chunk.size_bytes), int(chunk.count))
         index, trouble = int(chunk.index), ""
         if self._key is None and index > 0:
-            return None, ""  # the rest of a file that was given up, or that began before we listened; it is sent again
+            return (
+                None,
+                "",
+            )  # the rest of a transfer that was given up or began before the subscription; the file is sent again
         if self._key is not None and (key != self._key or index != len(self._parts)):
             came = f"piece {index + 1} of {key[4]} of {key[1]}"
-            trouble = f"expected piece {len(self._parts) + 1} of {self._key[4]} of {self._key[1]}, got {came}; waiting for it to be sent again"
+            trouble = f"expected piece {len(self._parts) + 1} of {self._key[4]} of {self._key[1]}, got {came}; waiting for the next transfer"
             self._forget()
             if index > 0:
                 return None, trouble
@@ -103,7 +106,7 @@ class Assembler:
         if hashlib.sha256(content).hexdigest() != sha256:
             return (
                 None,
-                f"{name} was damaged on the way: its bytes do not have the hash {sha256[:12]} that was announced",
+                f"expected {name} with the announced hash {sha256[:12]}, got other bytes; waiting for the next transfer",
             )
         return ReceivedFile(name, sha256, content), trouble
 

@@ -1,4 +1,4 @@
-"""What travels between processes: three frames ``[topic, meta, cdr]``. Pure bytes, no sockets."""
+"""Wire format between processes: three frames ``[topic, meta, cdr]``. Pure bytes, no sockets."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ META_BYTES = _META.size
 
 @dataclass(frozen=True)
 class MessageInfo:
-    """How a message came.
+    """Transport data of a received message.
 
     Attributes:
-        publish_mono_ns: Monotonic time of publication [ns]; comparable on the publisher's host only.
-        receive_mono_ns: Monotonic time at which this process took it off its socket [ns].
-        sequence: Counts the publisher's messages on this topic from 0.
+        publish_mono_ns: Monotonic time of publication [ns], valid only on the publisher's host.
+        receive_mono_ns: Monotonic time at which this process read it from its socket [ns].
+        sequence: Number of the message from this publisher on this topic, from 0.
         raw: The CDR bytes.
         publish_real_ns: Real time of publication [ns].
-        receive_real_ns: Real time at which this process took it off its socket [ns].
-        instance_id: Drawn when the publisher starts; a change means that it was restarted.
-        lost: Messages of the topic that were published but never came, just before this one.
+        receive_real_ns: Real time at which this process read it from its socket [ns].
+        instance_id: Random number that the publisher draws when it starts. A change means that it was restarted.
+        lost: Messages of the topic that were published just before this one but not received.
     """
 
     publish_mono_ns: int
@@ -53,27 +53,27 @@ class Meta:
 
 @dataclass(frozen=True)
 class Relayed:
-    """A message of another host's publisher, to be sent on under that publisher's own count and times."""
+    """A message from another host, to be forwarded with its publisher's sequence number and times."""
 
     meta: Meta
     cdr: bytes
 
 
 def pack_meta(meta: Meta) -> bytes:
-    """Bytes of the second frame."""
+    """Pack the second frame."""
     return _META.pack(
         meta.publish_mono_ns, meta.publish_real_ns, meta.sequence, meta.type_prefix, meta.instance_id
     )  # fmt: skip
 
 
 def unpack(topic: str, frames: Sequence[bytes]) -> tuple[Meta, bytes]:
-    """Meta and CDR bytes of a received message; refuses other topics, formats and types before anything is decoded."""
+    """Unpack a received message to meta and CDR bytes. Other topics, formats and types are refused before decoding."""
     meta, parts = unpack_parts(topic, frames)
     return meta, parts[0] if len(parts) == 1 else b"".join(parts)
 
 
 def unpack_parts(topic: str, frames: Sequence[bytes]) -> tuple[Meta, Sequence[bytes]]:
-    """The same with the CDR bytes in the pieces in which they came."""
+    """Unpack a received message to meta and the frames of its CDR bytes."""
     if len(frames) < 3 or frames[0] != topic.encode() or len(frames[1]) != META_BYTES:
         raise MessageError(
             f"expected frames [topic, {META_BYTES} bytes, cdr] on {topic}, got {[len(f) for f in frames]} bytes"
@@ -83,7 +83,7 @@ def unpack_parts(topic: str, frames: Sequence[bytes]) -> tuple[Meta, Sequence[by
     expected = type_hash_prefix(typename)
     if meta.type_prefix != expected:
         raise MessageError(
-            f"{topic} is {typename} with type hash {expected.hex()} here, but its publisher uses {meta.type_prefix.hex()}; "
+            f"{topic}: expected {typename} with type hash {expected.hex()}, got {meta.type_prefix.hex()}; "
             "run the same version of advnerf on both sides"
         )
     return meta, frames[2:]

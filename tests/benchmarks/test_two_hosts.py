@@ -77,7 +77,7 @@ def test_a_stalled_link_stops_the_car():
 
 def test_ten_short_drives_under_loss_are_no_drive(monkeypatch):
     """Every stop was in time, but the car covered 5 of 32 m."""
-    stops = [{"brake_ms": 230.0, "why": "no command of the policy for 0.22 s"}] * 10
+    stops = [{"brake_ms": 230.0, "why": "no command from the policy for 0.22 s"}] * 10
     monkeypatch.setattr(two_hosts, "_drive", lambda pair, duration_s: (4.7, stops))
     pair = SimpleNamespace(cable=Cable())
     assert not two_hosts.CONDITIONS["loss_untuned"](pair)["met"]

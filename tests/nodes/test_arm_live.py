@@ -68,7 +68,7 @@ class Lab:
             ]
         )
 
-    def wait_ready(self, reason="nobody has armed"):
+    def wait_ready(self, reason="not armed since the start"):
         with Bus(self.folder) as bus:
             bus.subscribe("/safety/state")
             deadline = time.monotonic() + 20.0
@@ -125,7 +125,7 @@ def test_no_request_is_lost_with_a_recorder(lab):
 def test_a_disarm_waits_loudly_for_a_safety_node_that_joins_late(lab):
     asking = command(lab, "disarm", "--reason", "look out")
     first = asking.stderr.readline()
-    assert "NOT CONFIRMED: no answer of the safety node for 0.3 s" in first
+    assert "NOT CONFIRMED: no answer from the safety node for 0.3 s" in first
     assert lab.recorded  # a recorder hears it all the time
     lab.start()
     output, _ = asking.communicate(timeout=30)
@@ -149,11 +149,11 @@ def test_a_disarm_without_a_motor_node_says_so(lab):
     output, errors = asking.communicate(timeout=30)
     assert asking.returncode == 1
     assert "not armed: disarmed by operator" in output
-    assert "NOT CONFIRMED: disarmed, but the motor node has not said within 0.3 s" in errors
+    assert "NOT CONFIRMED: disarmed, but the motor node did not report within 0.3 s" in errors
 
 
 def test_why_it_is_not_armed(lab):
-    with pytest.raises(LaunchError, match=r"did not answer within 2 s, and the car may be armed or not"):
+    with pytest.raises(LaunchError, match=r"from the safety node within 2 s, got none; the car may be armed"):
         ask_to_arm(lab.folder, "")
     lab.start()
     lab.wait_ready()
@@ -210,7 +210,7 @@ def test_a_restart_between_two_repeats_of_an_arm_leaves_the_car_disarmed(lab):
         lab.wait_ready()
         state = send.until_answered(asked)
     assert (state.armed, state.granted) == (False, False)
-    assert "older than the last stop (nobody has armed)" in state.answer
+    assert "older than the last stop (not armed since the start)" in state.answer
 
 
 class Sender:

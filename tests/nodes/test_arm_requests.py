@@ -74,7 +74,7 @@ def test_a_fault_between_a_lost_request_and_its_repeat_leaves_the_car_disarmed(c
     car.run(20)
     answer = car.ask("a", asked_ms)
     assert not car.arming.armed
-    assert answer.text == "since the request there was a fault: node motor is in state fault: ; arm again"
+    assert answer.text == "a fault occurred after the request: node motor is in state fault: ; arm again"
     assert car.ask("b").granted
 
 
@@ -84,7 +84,7 @@ def test_a_restart_between_two_repeats_leaves_the_car_disarmed(car):
     car.restart()
     answer = car.ask("a", asked_ms)
     assert (answer.granted, car.arming.armed) == (False, False)
-    assert "older than the last stop (nobody has armed)" in answer.text
+    assert "older than the last stop (not armed since the start)" in answer.text
     assert car.ask("b").granted
 
 
@@ -111,7 +111,7 @@ def test_an_old_request_is_void(car):
     answer = car.ask("a", car.ms - 1100)
     assert not answer.granted
     car.run(2000)
-    assert car.ask("b", car.ms - 1100).text == "the request is 1.1 s old, older than 1 s; arm again"
+    assert car.ask("b", car.ms - 1100).text == "the request is 1.1 s old, the limit is 1 s; arm again"
 
 
 def test_a_repeated_disarm_stops_a_car_that_was_armed_again(car):

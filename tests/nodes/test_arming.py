@@ -91,7 +91,7 @@ def time_to_disarm(world, limit_ms=3000):
 
 def test_nothing_passes_before_somebody_arms(world):
     assert not any(world.passed)
-    assert world.arming.reason == "nobody has armed"
+    assert world.arming.reason == "not armed since the start"
 
 
 def test_all_is_well_for_a_minute(armed):
@@ -104,9 +104,9 @@ def test_all_is_well_for_a_minute(armed):
     [
         ("camera", "no camera image", 260),
         ("vicon", "no pose of the car", 220),
-        ("policy", "no command of the policy", 240),
-        ("compositor", "node compositor is silent", 1250),
-        ("motor", "node motor is silent", 1250),
+        ("policy", "no command from the policy", 240),
+        ("compositor", "node compositor has been silent", 1250),
+        ("motor", "node motor has been silent", 1250),
     ],
 )
 def test_a_source_that_falls_silent(armed, silent, word, limit_ms):
@@ -190,10 +190,10 @@ def test_a_request_to_arm_from_before_the_stop_is_void(armed):
 
 def test_an_old_request_to_arm_is_void(world):
     assert not world.arm(age_ms=1500)
-    assert world.refusal == "the request is older than the last stop (nobody has armed); arm again"
+    assert world.refusal == "the request is older than the last stop (not armed since the start); arm again"
     world.run(2000)
     assert not world.arm(age_ms=1100)
-    assert world.refusal == "the request is 1.1 s old, older than 1 s; arm again"
+    assert world.refusal == "the request is 1.1 s old, the limit is 1 s; arm again"
 
 
 def test_disarming_is_at_once_and_latches(armed):
@@ -209,7 +209,7 @@ def test_a_program_arms_only_the_twin(world, peer, allowed):
     world.arming.peer = peer
     assert world.arm(source="trial") is allowed
     if not allowed:
-        assert "'trial' is not a person" in world.arming.reason
+        assert "got 'trial'; the motor's peer is" in world.arming.reason
         assert world.arm(source="operator")
 
 

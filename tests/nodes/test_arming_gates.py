@@ -72,7 +72,7 @@ def held():
     world = World()
     world.run(500)
     assert not world.arming.armed
-    assert world.arming.problem(world.ms * MS) == "nobody holds the button"
+    assert world.arming.problem(world.ms * MS) == "the button is not held"
     assert world.hold("autonomy")
     return world
 
@@ -80,7 +80,7 @@ def held():
 def test_holding_arms_and_letting_go_stops(held):
     assert set(held.passed) == {"expert"}
     assert not held.hold("idle", 60)
-    assert held.arming.reason == "nobody holds the button"
+    assert held.arming.reason == "the button is not held"
     assert held.passed == [] or held.passed[-1] != "hand"
     assert held.hold("autonomy")
 
@@ -92,7 +92,7 @@ def test_the_hand_goes_before_every_driver(held):
     held.talking -= {"expert", "policy"}
     assert held.run(600)  # nobody else is needed while the hand drives
     assert not held.hold("autonomy", 100)
-    assert "no command of the expert" in held.arming.reason
+    assert "no command from the expert" in held.arming.reason
 
 
 def test_silence_of_the_teleop_node_is_letting_go(held):
@@ -101,7 +101,7 @@ def test_silence_of_the_teleop_node_is_letting_go(held):
     while held.run(10):
         pass
     assert held.ms - start <= 260
-    assert "no sign of the teleop node for 0.2" in held.arming.reason
+    assert "no message from the teleop node for 0.2" in held.arming.reason
     held.talking.add("teleop")
     assert not held.run(1000)  # the button is still held: nothing arms by itself
     held.hold("idle")
@@ -111,7 +111,7 @@ def test_silence_of_the_teleop_node_is_letting_go(held):
 def test_a_teleop_node_that_comes_back_with_the_button_held_arms_nothing(held):
     held.instances["teleop"] = 2
     assert not held.run(500)
-    assert "let it go first" in held.arming.reason
+    assert "release it first" in held.arming.reason
     assert not held.arm()
     held.hold("idle")
     assert held.hold("autonomy")
@@ -170,7 +170,7 @@ def test_the_expert_goes_before_the_policy_and_the_policy_never_stands_in_for_it
     assert world.passed[-3:] == ["expert"] * 3
     world.talking.remove("expert")
     assert not world.run(400)
-    assert "no command of the expert for" in world.arming.reason
+    assert "no command from the expert for" in world.arming.reason
     assert "policy" not in world.passed
     assert world.arm()  # told so by a person, the policy drives on
     assert world.run(300)
@@ -224,7 +224,7 @@ def clock(offset_s, error_s=0.002, peers=()):
         (clock(0.004), 10, ""),
         (clock(-0.05), 10, "the clock of robot is off by -50 ms, the limit is 30 ms"),
         (clock(math.nan), 10, "off by nan ms"),
-        (clock(0.0, 0.15), 10, "known to 150 ms only"),
+        (clock(0.0, 0.15), 10, "is only known to 150 ms"),
         (clock(0.0, peers=("workstation",)), 10, "the clock offset to workstation is not known yet"),
         (clock(0.0, peers=("robot",)), 4000, "last measured 4.0 s ago"),
         (clock(-0.05), 4000, ""),  # a host that left

@@ -77,7 +77,7 @@ def test_it_keeps_to_the_room_it_says_it_needs(driven):
 def test_it_stands_until_armed_and_begins_an_interrupted_part_again():
     node = CalibrationDrive(program(CalibrationDriveConfig()))
     assert command(node, 0.0) == (0.0, 0.0)
-    assert "waits for arming" in node.status()[1]
+    assert "waiting for arming" in node.status()[1]
     say(node, True, 5.0)
     assert command(node, 5.0) == (0.5, 0.0)
     assert command(node, 6.7) == (0.5, 0.0)

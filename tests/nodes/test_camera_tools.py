@@ -90,7 +90,7 @@ def test_factory_file_becomes_a_camera_file(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("options", "message"), [(("--mode", "4K"), "a mode of 2K"), (("--width", 1344), "at most 672 x 376")]
+    ("options", "message"), [(("--mode", "4K"), "expected --mode 2K"), (("--width", 1344), "at most 672 x 376")]
 )
 def test_wrong_factory_options(tmp_path, options, message):
     with pytest.raises(CameraToolError, match=message):

@@ -101,7 +101,7 @@ def test_vehicle_from_a_bag(tmp_path, capsys):
 def test_a_source_is_needed_and_only_one(tmp_path, capsys):
     save_calibration(twin_calibrations(LabConfig())["vehicle"], tmp_path / "before.yaml")
     assert run("calibrate", "vehicle", "--before", tmp_path / "before.yaml", "-o", tmp_path / "v.yaml") == 2
-    assert "either a recording or --live SECONDS" in capsys.readouterr().err
+    assert "either a bag or --live SECONDS" in capsys.readouterr().err
 
 
 def view_of(board_picture, T_camera_from_board, board):

@@ -66,7 +66,7 @@ def test_build_from_cut_out_pictures(command, tmp_path):
         "object", "build", "--images", transforms, "--resolution", 16, "--steps", 3, "-o", path
     )
     assert (code, errors) == (0, "")
-    assert "8 training, 0 held-out pictures" in output
+    assert "8 training, 0 held-out images" in output
     assert "dB on training views" in output
     assert "held-out views" not in output
     assert "warning: " in output  # three steps are no fit
@@ -83,7 +83,7 @@ def test_a_data_sets_own_split_is_followed(command, tmp_path):
     arguments = ("object", "build", "--images", folder, "--resolution", 16, "--steps", 40, "-o", path)
     code, output, errors = command(*arguments)
     assert (code, errors) == (0, "")
-    assert "10 training, 16 held-out pictures (the data set's own split)" in output
+    assert "10 training, 16 held-out images (split of the data set)" in output
     model = load_object(path)
     assert model.name == "set"
     assert model.about["pictures"] == 10
@@ -99,7 +99,7 @@ def test_sixteen_pictures_hold_out_two_and_can_be_made_smaller(command, tmp_path
         "object", "build", "--images", tmp_path, "--resolution", 16, "--minutes", 0.01, "--size", 32, 32, "-o", path
     )
     assert (code, errors) == (0, "")
-    assert "14 training, 2 held-out pictures" in output
+    assert "14 training, 2 held-out images" in output
     assert load_object(path).about["steps"] < 600
     assert "held_out_psnr_db" in load_object(path).about
 
@@ -107,7 +107,7 @@ def test_sixteen_pictures_hold_out_two_and_can_be_made_smaller(command, tmp_path
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ([], "expected one of FILE, --generate and --images"),
+        ([], "expected exactly one of FILE, --generate and --images"),
         (["--generate", "tree"], "expected --generate to be one of hydrant, car; got 'tree'"),
         (["{folder}/none.glb"], "found none"),
         (["--generate", "car", "--height", "-1"], "height above zero"),

@@ -68,7 +68,7 @@ def test_path_and_fence_make_a_room_file_that_the_stack_reads(tmp_path):
     small = write_trace(tmp_path / "small", "/vicon/wand", np.column_stack([0.4 * walk, np.zeros(len(walk))]))
     done = advnerf("room", "fence", small, "-o", tmp_path / "room.yaml")
     assert done.returncode == 2
-    assert "outside: walk around all of it" in done.stderr
+    assert "outside. Walk around the whole path" in done.stderr
     assert load_calibration(RoomCalibration, tmp_path / "room.yaml") == fenced
 
 

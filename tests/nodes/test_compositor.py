@@ -283,7 +283,7 @@ def broken(case, tmp_path):
     [
         ("garbage", "cannot read the attack new as an attack file"),
         ("changed", "was changed after it was saved"),
-        ("corrupt", "damaged on the way"),
+        ("corrupt", "with the announced hash"),
         ("size", "name the target it was made for"),
         ("subject", "was made for monitor"),
     ],

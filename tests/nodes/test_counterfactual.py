@@ -154,7 +154,7 @@ def test_one_policy_its_goal_and_a_compositor(drivers, policy):
     class Other:
         sha256, goal_size, view = "0" * 64, 0, drivers[0].view
 
-    with pytest.raises(ConfigError, match="one policy twice"):
+    with pytest.raises(ConfigError, match="the same policy twice"):
         CounterfactualNode(drivers[0], Other())
     with pytest.raises(ConfigError, match="there is no clean image to compare with"):
         validate(CounterfactualConfig, parse_yaml(f"policy: {policy}\nshown_by: monitor", "a.yaml"))

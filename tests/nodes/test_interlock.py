@@ -36,7 +36,7 @@ def test_nothing_is_drawn_unless_armed_and_fresh():
     showing = show(bench_of.attack(), bench_of.CAMERA, bench_of.TARGET)
     bench = bench_of.Bench(CompositorNode(showing, interlock=Interlock()))
     assert "/safety/state" in bench.node.subscriptions
-    assert drawn(bench, 0.0) == (False, "interlock: no word of the safety node")
+    assert drawn(bench, 0.0) == (False, "interlock: no message from the safety node")
     say(bench, True)
     assert drawn(bench, 0.1) == (True, "")
     say(bench, False)
@@ -44,5 +44,5 @@ def test_nothing_is_drawn_unless_armed_and_fresh():
     say(bench, True)
     assert drawn(bench, 0.3)[0]
     bench.clock.advance(0.6)
-    assert drawn(bench, 0.4) == (False, "interlock: no word of the safety node")
+    assert drawn(bench, 0.4) == (False, "interlock: no message from the safety node")
     assert len(bench.images()) == 5  # what may not be drawn on passes unchanged: the policy still sees

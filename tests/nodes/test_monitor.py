@@ -129,7 +129,7 @@ def test_silence_of_the_safety_node_takes_the_attack_off(screen):
     assert bench.said["/monitor/attack"].drawn
     bench.pass_time(150)
     assert not bench.said["/monitor/attack"].drawn
-    assert bench.said["/monitor/attack"].reason == "no word from the safety node"
+    assert bench.said["/monitor/attack"].reason == "no message from the safety node"
 
 
 def test_every_pixel_of_the_texture_is_where_nearest_neighbour_puts_it():
@@ -170,7 +170,7 @@ def test_a_screen_that_changes_the_colours_ends_the_node(screen):
     bench = screen(attack())
     genuine = bench.node._display.read_back
     bench.node._display.read_back = lambda: genuine() // 2 * 2  # a night light, six bits
-    with pytest.raises(HardwareError, match="holds other pixels than were shown"):
+    with pytest.raises(HardwareError, match="to hold the shown pixels"):
         bench.safety(True)
 
 

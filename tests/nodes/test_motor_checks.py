@@ -182,7 +182,7 @@ def test_motion_capture_sees_wheels_that_turn(speed):
 def test_motion_capture_sees_wheels_that_do_not(turns):
     check = push(SteeringCheck(CheckSettings(0.25)), turns)
     assert not check.passed
-    assert "told to turn left" in check.text
+    assert "with wheels turned left" in check.text
     assert "servo output off" in check.text
 
 
@@ -199,7 +199,7 @@ def test_a_car_that_was_not_pushed_waits_for_a_person():
     assert (check.passed, check.showing) == (False, False)
     check.start(0)
     check.tick(69 * 10**9)
-    assert "nobody answered" in check.text
+    assert "no answer" in check.text
 
 
 def test_the_node_turns_the_wheels_and_listens_to_the_person(make):
@@ -232,12 +232,12 @@ def test_a_repeated_request_for_the_check_is_obeyed_once_and_answered_every_time
         values = {pair.key: pair.value for pair in car.rows()["motor: steering"].values}
         return values["answered"], values["granted"], values["answer"]
 
-    assert ask("confirm", "a") == ("a", "False", "no steering check awaits an answer; start one")
+    assert ask("confirm", "a") == ("a", "False", "no steering check is waiting for an answer; start one")
     assert ask("start", "b")[:2] == ("b", "True")
     began_ns = car.node._watch.check._began_ns
     assert ask("start", "b")[:2] == ("b", "True")
     assert car.node._watch.check._began_ns == began_ns
-    assert ask("confirm", "a") == ("a", "False", "no steering check awaits an answer; start one")
+    assert ask("confirm", "a") == ("a", "False", "no steering check is waiting for an answer; start one")
     assert ask("jump", "c") == ("c", "False", "expected start, confirm or deny, got 'jump'")
 
 

@@ -79,7 +79,7 @@ def test_waits_for_subscribers(bag):
     node = PlayerNode(PlayerConfig(bag=bag, wait_for=["/vicon/car"]), lambda topic: there[topic])
     clock = ManualClock()
     assert play(node, clock, steps=50) == ([], False)
-    assert node.status() == ("ready", "waits for subscribers of /vicon/car")
+    assert node.status() == ("ready", "waiting for subscribers of /vicon/car")
     there["/vicon/car"] = 1
     assert len(play(node, clock)[0]) == 120
 

@@ -132,8 +132,8 @@ def test_of_two_hosts_the_operators_drives_the_trials_and_waits_for_the_nodes_of
 @pytest.mark.parametrize(
     ("host", "overrides", "words"),
     [
-        (None, [], "say which host this is"),
-        ("tractor", [], "say which host this is"),
+        (None, [], "expected --host with one of"),
+        ("tractor", [], "expected --host with one of"),
         ("robot", [], "driven where people arm, on workstation, got --host robot"),
         ("workstation", ["record.host=robot"], "but robot records, not workstation"),
         ("workstation", ["record=false"], "give the launch file the key record"),
@@ -175,7 +175,7 @@ def write_bag(folder, drives, offset_m=0.1, rate_hz=100):
         ))  # fmt: skip
 
     for stand_s, drive_s, reason in drives:
-        state(False, "nobody has armed")
+        state(False, "not armed since the start")
         for k in range(round((stand_s + drive_s) * rate_hz)):
             if k == round(stand_s * rate_hz) - 5:
                 state(True)
@@ -219,7 +219,7 @@ def test_numbers_of_a_bag_without_checksums_are_unchecked(tmp_path):
         at += 9 + int.from_bytes(content[at + 1 : at + 9], "little")
     path.write_bytes(content)
     (unchecked,) = evaluate_bag(bag, None, ticks=20)
-    assert "chunks carry no checksum" in unchecked["unchecked"]
+    assert "chunks have no checksum" in unchecked["unchecked"]
     assert unchecked["total_cte_m"] == checked["total_cte_m"]
     shown = CliRunner().invoke(app, ["evaluate", str(bag), "--ticks", "20"], env={"COLUMNS": "240"})
     assert "unchecked" in shown.stdout

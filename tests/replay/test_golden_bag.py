@@ -44,7 +44,7 @@ def test_the_first_difference_is_named():
     assert result.returncode == 1
     line = result.stderr.strip()
     assert line.startswith(
-        f"error: not as in {GOLDEN}: /policy/drive message 0, 0.043 s into the recording, captured at"
+        f"error: differs from {GOLDEN}: /policy/drive message 0, 0.043 s into the recording, captured at"
     )
     # One tenth more gain is one tenth more steering.
     old, new = (float(line.split(word)[1].split(",")[0].split(":")[0]) for word in ("was ", "is "))

@@ -240,7 +240,7 @@ class TrialNode(Node):
             if not self._at_start():
                 self._enter(Phase.PLACING, now)
                 return []
-            why = self._seen.safety_reason or "nobody has armed"
+            why = self._seen.safety_reason or "not armed since the start"
             return self._tell(f"on the start. ARM to drive (gamepad, or: advnerf arm). Not armed: {why}", now)
         if self._asked is not None and self._seen.answered_id == self._asked.ask_id:
             if self._seen.granted:  # armed, and stopped before the trial heard of it: never armed a second time

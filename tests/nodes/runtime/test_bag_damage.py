@@ -103,13 +103,13 @@ def test_a_truncated_file_without_chunks_keeps_its_messages(bags, write):
     path = write(content)
     info = CliRunner().invoke(app, ["bag", "info", str(path)])
     assert info.exit_code == 2
-    assert f"advnerf bag repair {path} keeps all {len(reachable(content))} messages" in info.stderr
+    assert f"advnerf bag repair {path} keeps all {len(reachable(content))} intact messages" in info.stderr
     result = repair(path)
     assert result.messages == len(reachable(content)) > 40
     assert result.kept.read_bytes() == content
     with open(path, "rb") as file:
         assert sum(1 for _ in make_reader(file).iter_messages()) == result.messages
-    assert "in no chunk" in read_info(path).unchecked
+    assert "outside chunks" in read_info(path).unchecked
 
 
 def test_a_bad_chunk_is_named_and_what_follows_is_kept_only_when_asked_for(bags, write):
@@ -323,7 +323,7 @@ def test_a_full_disk_leaves_the_file(bags, write):
         [sys.executable, "-c", code, str(path)], preexec_fn=limit, capture_output=True, text=True, check=False
     )
     assert "cannot repair" in done.stderr
-    assert "it is as it was" in done.stderr
+    assert "the file is unchanged" in done.stderr
     assert [file.name for file in path.parent.iterdir()] == ["bag.mcap"]
     assert path.read_bytes() == content
 
@@ -361,7 +361,7 @@ def test_a_compression_that_is_not_known_is_no_damage(bags, write):
     content = bags["zstd"].replace(b"zstd", b"zzip")
     path = write(content[:-1000])
     for force in (False, True):
-        with pytest.raises(BagError, match="compression 'zzip' is not known here"):
+        with pytest.raises(BagError, match="got 'zzip'"):
             repair(path, force=force)
     assert path.read_bytes() == content[:-1000]
 
@@ -382,11 +382,11 @@ def test_the_command_says_what_was_before_and_after(bags, write):
     assert "40" in done.stdout
     assert "bag.mcap.damaged" in done.stdout
     again = run(app, ["bag", "repair", str(path)])
-    assert "is whole" in again.stdout
+    assert "is intact" in again.stdout
     assert "nothing was changed" in again.stdout
-    assert "checked: all messages agree" in run(app, ["bag", "info", str(path)]).stdout
+    assert "checked: all messages match" in run(app, ["bag", "info", str(path)]).stdout
     loose = write(bags["no chunks"], "loose")
-    assert "unchecked: 60 of its messages are in no chunk" in run(app, ["bag", "info", str(loose)]).stdout
+    assert "unchecked: 60 of its messages are outside chunks" in run(app, ["bag", "info", str(loose)]).stdout
 
 
 def test_journal_is_kept_with_the_file_as_it_was(tmp_path):

@@ -142,7 +142,7 @@ def test_stop_ends_it_even_while_it_waits(bag):
     clock = ManualClock()
     assert node.tick(clock.now()) == []
     (pause,) = node.handle("/player/control", control("pause", "1"), None, clock.now())
-    assert (pause.message.granted, pause.message.answer) == (False, "it has not begun yet")
+    assert (pause.message.granted, pause.message.answer) == (False, "playback has not started yet")
     (stop,) = node.handle("/player/control", control("stop", "2"), None, clock.now())
     assert stop.message.granted
     clock.advance(0.2)
@@ -271,4 +271,4 @@ def test_command_plays_under_a_terminal_and_obeys_keys_and_bus(bag, tmp_path):
     assert re.match(r"error: expected pause, resume", wrong.stderr)
     absent = control_says("pause")
     assert absent.returncode == 2
-    assert "no player answered within 3 s" in absent.stderr
+    assert "expected an answer from a player within 3 s, got none" in absent.stderr

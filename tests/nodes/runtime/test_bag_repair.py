@@ -241,7 +241,7 @@ def test_full_disk_is_one_clear_error_and_the_part_before_is_readable(tmp_path, 
         for i in range(10_000):
             writer.write("/vicon/car", pose, START_NS + i, START_NS + i, i)
 
-    with pytest.raises(BagError, match=r"No space left on device; \d+ messages up to then are readable"):
+    with pytest.raises(BagError, match=r"No space left on device; \d+ messages up to that point are readable"):
         fill()
     writer.close()
     kept = [m.sequence for m in read_messages(tmp_path / "bag")]

@@ -130,7 +130,7 @@ def test_a_part_that_cannot_be_finished_is_one_clear_error_and_everything_before
         fill(writer, 51)
         while writer._finishing:
             time.sleep(0.001)
-    with pytest.raises(BagError, match="No space left on device; 51 messages up to then are readable in it"):
+    with pytest.raises(BagError, match="No space left on device; 51 messages up to that point are readable"):
         fill(writer, 10, 51)
     writer.close()
     assert [m.sequence for m in read_messages(tmp_path / "drive")] == list(range(51))

@@ -268,9 +268,9 @@ module geometry_msgs { module msg { struct PoseStamped {
         (b"this is; no definition", "ros2msg", "cdr", "/vicon/car: cannot read the definition of geometry_msgs/msg/PoseStamped"),
         (b"{}", "jsonschema", "cdr", "its language is 'jsonschema'; ros2msg and ros2idl are read"),
         (b"{}", "jsonschema", "json", "/vicon/car is stored as 'json', expected cdr or ros1"),
-        (b"std_msgs/Header header\n", "ros2msg", "cdr", "is another than ours and has no pose"),
+        (b"std_msgs/Header header\n", "ros2msg", "cdr", "expected the fields pose, which its geometry_msgs/msg/PoseStamped lacks"),
         (b"std_msgs/Header header\nnowhere_msgs/Pose pose\n", "ros2msg", "cdr", "needs nowhere_msgs/msg/Pose, which the bag does not define"),
-        (b"std_msgs/Header header\nstring pose\n", "ros2msg", "cdr", "is another than ours and has no pose"),
+        (b"std_msgs/Header header\nstring pose\n", "ros2msg", "cdr", "expected the fields pose, which its geometry_msgs/msg/PoseStamped lacks"),
     ],
 )  # fmt: skip
 def test_a_definition_that_cannot_be_used_is_one_line(tmp_path, definition, language, encoding, message):
@@ -441,7 +441,7 @@ def test_what_is_left_in_a_write_ahead_log_is_not_passed_over(tmp_path):
     database.execute("PRAGMA journal_mode=WAL")
     database.execute("DELETE FROM messages WHERE id = 1")
     database.commit()
-    with pytest.raises(BagError, match=r"the newest messages are in drive\.db3-wal; put them in with: sqlite3"):
+    with pytest.raises(BagError, match=r"the newest messages are in drive\.db3-wal; add them with: sqlite3"):
         read_info(bag)
     database.close()
     assert read_info(bag).messages == 3 * COUNT - 1

@@ -69,7 +69,7 @@ def test_pose_survives_the_wire():
 def test_pose_without_orientation_is_refused():
     message = pose_message(np.eye(4), 0)
     message.pose.orientation.w = 0.0
-    with pytest.raises(MessageError, match="without an orientation"):
+    with pytest.raises(MessageError, match="expected a pose with an orientation"):
         pose_matrix(message)
 
 
@@ -82,11 +82,11 @@ def test_camera_info_has_the_principal_point_of_ros_and_comes_back_as_ours():
 
 
 def test_wrong_field_is_a_message_error():
-    with pytest.raises(MessageError, match="wrong type or is out of range"):
+    with pytest.raises(MessageError, match="a wrong type or a value out of range"):
         encode(types.Arm(header=header(0), arm=True, source=3, reason="", ask_id="a", age_ns=0))
     with pytest.raises(MessageError, match="expected a ROS 2 message, got int"):
         encode(3)
-    with pytest.raises(MessageError, match="unknown message type 'a/b'"):
+    with pytest.raises(MessageError, match="got 'a/b'"):
         decode("a/b", b"")
     with pytest.raises(AttributeError, match="no message type called Nothing"):
         _ = types.Nothing

@@ -74,11 +74,11 @@ def png_bomb():
     ("data", "form", "message"),
     [
         (bomb(), "jpeg", "at most 16000000 pixels, got 60000 x 60000"),
-        (b"", "jpeg", r"cannot decompress the format 'jpeg' \(0 bytes\)"),
-        (b"\xff\xd8\xff\xe0\x00\x00" + bytes(50), "jpeg", "without a size"),
-        (b"\x89PNG\r\n\x1a\n" + bytes(100), "png", "expected PNG data, got 108 bytes without a size"),
+        (b"", "jpeg", r"got the format 'jpeg' \(0 bytes\)"),
+        (b"\xff\xd8\xff\xe0\x00\x00" + bytes(50), "jpeg", "without an image size"),
+        (b"\x89PNG\r\n\x1a\n" + bytes(100), "png", "expected PNG data, got 108 bytes without an image size"),
         (png_bomb(), "png", "at most 16000000 pixels, got 60000 x 60000"),
-        (bytes(100), "png", "cannot decompress the format 'png'"),
+        (bytes(100), "png", "got the format 'png'"),
     ],
 )
 def test_what_strangers_may_send(data, form, message):

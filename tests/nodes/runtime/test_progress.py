@@ -28,7 +28,7 @@ def test_a_log_gets_a_line_now_and_then_with_the_time_left(moments):
         "scene: started",
         "scene: 25 % step 25, about 60 s left",
         "scene: done in 80.0 s",
-        "policy: unchanged, used again",
+        "policy: unchanged, reused",
     ]
 
 

@@ -101,13 +101,16 @@ def test_retro_attack_on_the_command_line(clean_drive, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["--nodes", "policy", "--json", "x.json"], "--json and --plot belong to --attack"),
-        (["--nodes", "policy", "--update-golden"], "--update-golden needs to know which one"),
+        (["--nodes", "policy", "--json", "x.json"], "expected --json and --plot only with --attack"),
+        (["--nodes", "policy", "--update-golden"], "expected --golden FILE.mcap with --update-golden"),
         (["--nodes", "policy", "--golden", "x.mcap", "-o", "out"], "expected one of --golden, --output and --attack"),
-        (["--nodes", "policy", "--tolerance", "1"], "--topics and --tolerance belong to --golden"),
+        (["--nodes", "policy", "--tolerance", "1"], "expected --topics and --tolerance only with --golden"),
         (["--nodes", "policy", "--replace", "policy"], "expected NODE=MODULE or NODE=MODULE:CLASS"),
-        (["--nodes", "compositor", "--policy", "x.onnx"], "--policy needs the node policy among --nodes"),
-        (["--nodes", "compositor", "--golden", "nothing.mcap"], "no golden bag nothing.mcap; write it with"),
+        (["--nodes", "compositor", "--policy", "x.onnx"], "expected the node policy among --nodes"),
+        (
+            ["--nodes", "compositor", "--golden", "nothing.mcap"],
+            "expected a golden bag at nothing.mcap, found none; write it with",
+        ),
         ([], "expected at least one node to replay"),
     ],
 )

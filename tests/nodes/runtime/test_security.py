@@ -132,12 +132,12 @@ def test_secret_keys_are_private_and_names_are_unique(tmp_path):
     assert stat.S_IMODE(file.parent.stat().st_mode) == 0o700
     # The pair belongs together, by ZeroMQ's own arithmetic.
     assert zmq.curve_public(keys.secret("robot").encode()).decode() == public
-    with pytest.raises(SecurityError, match="has a key robot already"):
+    with pytest.raises(SecurityError, match="already has a key robot"):
         keys.new("robot")
     with pytest.raises(SecurityError, match="expected a name"):
         keys.new("../robot")
     file.chmod(0o644)
-    with pytest.raises(SecurityError, match="got 0644: others may have read it"):
+    with pytest.raises(SecurityError, match="got 0644: other users may have read it"):
         keys.secret("robot")
 
 
@@ -154,9 +154,9 @@ def test_rights_are_separate_and_can_be_taken_back(tmp_path):
     assert not keys.allowed(DRIVE)
     keys.revoke("alice")
     assert keys.rows()[0].rights == ()
-    with pytest.raises(SecurityError, match="on no such list"):
+    with pytest.raises(SecurityError, match="has no such right"):
         keys.revoke("alice")
-    with pytest.raises(SecurityError, match="no public key"):
+    with pytest.raises(SecurityError, match="expected a public key at"):
         keys.allow("bob", WATCH)
     with pytest.raises(SecurityError, match="40 Z85 characters"):
         keys.add("bob", "short")
@@ -165,7 +165,7 @@ def test_rights_are_separate_and_can_be_taken_back(tmp_path):
 def test_an_address_for_all_without_keys_is_refused(tmp_path):
     for address in ("0.0.0.0", "192.168.1.20", "::", "robot.local"):
         config = GatewayConfig(listen=address, watch_port=5590, drive_port=5591)
-        with pytest.raises(SecurityError, match="anybody could connect"):
+        with pytest.raises(SecurityError, match="any computer could connect"):
             GatewayNode(config, lambda topic: 0)
     with pytest.raises(ValueError, match="either listen or connect"):
         GatewayConfig(listen="127.0.0.1", connect="127.0.0.1")
@@ -339,7 +339,7 @@ def test_without_keys_a_link_carries_nothing_towards_the_end_that_listens():
         GatewayConfig(connect="127.0.0.1", exports=("/arm",), **ports),
     ):
         with pytest.raises(
-            SecurityError, match=r"without keys a link carries watching only, .*/arm.* could drive the car"
+            SecurityError, match=r"without keys a link can only be used to watch, .*/arm.* could drive the car"
         ):
             GatewayNode(config, lambda topic: 1)
 
@@ -359,8 +359,8 @@ def test_without_keys_others_watch_and_no_door_leads_in(lab, capfd):
     assert state == "active"
     assert "can only watch" in text
     said = capfd.readouterr().err
-    assert "a connection without a key began" in said
-    assert "good key" not in said
+    assert "a connection without a key started" in said
+    assert "allowed key" not in said
 
 
 def connections(ports):

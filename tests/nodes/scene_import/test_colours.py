@@ -53,7 +53,7 @@ def test_the_map_of_the_driving_camera_is_found_and_stored_with_the_scene(tmp_pa
         cli.app, ["scene", "match-colours", str(scene), str(images), "--most", "4"], catch_exceptions=False
     )
     assert result.exit_code == 0
-    assert "colour map of 4 frames" in result.output
+    assert "colour map fitted to 4 frames" in result.output
     metadata = load_scene(scene)[2]
     assert metadata["scene_hash"] == before, "the scene itself is as it was"
     assert metadata["steps"] == 3

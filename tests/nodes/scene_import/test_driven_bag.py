@@ -37,7 +37,7 @@ def test_a_data_set_of_a_bag_reads_back_with_frames_poses_and_camera(tmp_path, w
     arguments = ["scene", "from-bag", str(bag), "-o", str(output), "--step", "0.2", "--margin", "2"]
     result = CliRunner().invoke(cli.app, arguments, catch_exceptions=False)
     assert result.exit_code == 0
-    assert "of 30 frames taken, 0 had no motion-capture pose" in result.output
+    assert "of 30 frames used, 0 had no motion-capture pose" in result.output
     listed = load_transforms(output)
     positions = np.stack([f.T_world_from_camera[:3, 3] for f in listed.frames])
     steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
