@@ -44,13 +44,13 @@ def _rows(*styles: Style) -> Mapping[str, Style]:
 CONDITIONS: Mapping[str, Style] = _rows(
     Style("no attack", NONE, "#0072b2", "#4fb0f2", "o"),
     Style("best random", "random", "#dd9300", "#f7cc5a", "s"),
-    Style("cross-entropy", "cem", "#7a3f98", "#b884dc", "v"),
-    Style("evolution strategy", "evolution", "#0b8a8f", "#3fd0c9", "P"),
+    Style("cross-entropy", "cem", "#7a3f98", "#a05ad2", "v"),
+    Style("evolution strategy", "evolution", "#006b70", "#2fe0d2", "P"),
     Style("gradient", "gradient", "#b0123c", "#f4577a", "^", climbs=True),
-    Style("guided", "guided", "#e0559d", "#ff9fd0", "X", climbs=True),
-    Style("distilled", "distilled", "#7b5234", "#c79a6f", "*", climbs=True),
+    Style("guided", "guided", "#ef7fb8", "#ffc2e2", "X", climbs=True),
+    Style("distilled", "distilled", "#b5895f", "#a87545", "*", climbs=True),
     Style("empty scene", "empty", "#7d848d", "#8f98a3", "D"),
-    Style("laps without attack", "laps", "#33407a", "#8793e6", "p"),
+    Style("laps without attack", "laps", "#232c66", "#c3caff", "p"),
 )
 # Of methods that the table does not have; the titles stand for their names.
 SPARE: Mapping[str, Style] = _rows(

@@ -76,6 +76,7 @@ def test_a_method_of_a_file_runs_in_worker_processes_and_appears_in_the_table(se
 
 
 def test_its_cells_run_again_when_its_code_changes_and_no_others(searching):
+    searching.write("seeds: [1]\nmethods: [spiral.py:Spiral, none]\nvictims: [hardened]\n")
     run(searching)
     (searching.folder / "spiral.py").write_text(spiral_code().replace("growth: float = 0.2", "growth: float = 0.4"))
     assert [name for name, state in states(searching).items() if state != "done"] == ["straight_hardened_Spiral_1"]
@@ -84,6 +85,7 @@ def test_its_cells_run_again_when_its_code_changes_and_no_others(searching):
 
 
 def test_a_broken_method_fails_alone_and_in_one_line(searching):
+    searching.write("seeds: [1]\nmethods: [spiral.py:Spiral, none]\nvictims: [hardened]\n")
     (searching.folder / "spiral.py").write_text("turns = 1 / 0\n")
     ended, _ = run(searching)
     how = {end.name: (end.how, end.text) for end in ended}
