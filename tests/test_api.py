@@ -82,6 +82,20 @@ def test_a_name_that_is_not_public_is_an_attribute_error_that_python_completes()
     assert repair.__name__ == "nodes.bags.repair"
 
 
+@pytest.mark.slow
+def test_a_type_checker_knows_the_types_of_public_names_and_no_others(tmp_path):
+    (tmp_path / "mine.py").write_text(
+        "from advnerf_core import Pth, load_attack\nfrom nodes.bags import read_info\n"
+        "reveal_type(load_attack)\nreveal_type(read_info)\n"
+    )
+    environment = {**os.environ, "MYPYPATH": str(ROOT)}
+    command = [sys.executable, "-m", "mypy", "--strict", "--config-file", str(ROOT / "pyproject.toml"), "mine.py"]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=600)
+    assert 'mine.py:1: error: Module "advnerf_core" has no attribute "Pth"' in done.stdout
+    assert '-> advnerf_core.attack.artifact.AttackFile"' in done.stdout
+    assert '(bag: pathlib.Path) -> nodes.bags.reader.BagInfo"' in done.stdout
+
+
 def test_public_names_can_be_looked_up_again_and_stay_the_same():
     package = importlib.import_module("advnerf_core")
     assert package.Pinhole is package.Pinhole
