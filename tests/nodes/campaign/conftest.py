@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 import textwrap
+from pathlib import Path
 
 import pytest
 
@@ -166,7 +167,8 @@ class Bench:
 
     @property
     def environment(self):
-        path = os.pathsep.join([str(self.folder), *filter(None, [os.environ.get("PYTHONPATH")])])
+        root = Path(__file__).parents[3]  # for what a cell of a test takes from the benchmarks
+        path = os.pathsep.join([str(self.folder), str(root), *filter(None, [os.environ.get("PYTHONPATH")])])
         return {**os.environ, "PYTHONPATH": path}
 
     def start(self, *arguments):
