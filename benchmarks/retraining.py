@@ -1,6 +1,6 @@
 """Question: does retraining on found attacks cure the policy, and for how long? ``python -m benchmarks.retraining RUN_FOLDER``.
 
-Reads what ``advnerf experiment launch/intersection.experiment.yaml --setting retrain`` wrote; computes nothing anew.
+Reads what ``advnerf experiment launch/junction.experiment.yaml --setting retrain`` wrote; computes nothing anew.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def main() -> None:
     parser.add_argument("folder", type=Path, help="run folder of the intersection's experiment")
     parser.add_argument("--dry", action="store_true", help="print only")
     options = parser.parse_args()
-    experiment = load_experiment(REPOSITORY / "launch" / "intersection.experiment.yaml", "retrain", [], options.folder)
+    experiment = load_experiment(REPOSITORY / "launch" / "junction.experiment.yaml", "retrain", [], options.folder)
     found = experiment.stage_folder("retrain")
     summary = json.loads((found / "retrain.json").read_text())
     allowed = experiment.config.retrain.rounds if experiment.config.retrain else 0

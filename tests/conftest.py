@@ -26,7 +26,7 @@ _COMPUTING = (
     "tests/nodes/test_attack.py", "tests/nodes/test_attack_handover.py", "tests/nodes/test_calibration_drive.py", "tests/nodes/test_cli",
     "tests/nodes/test_counterfactual.py", "tests/nodes/test_expert.py", "tests/nodes/test_policy_reference.py", "tests/nodes/test_scene_training.py",
     "tests/nodes/test_trials.py", "tests/hardware/cameras/test_conformance.py", "tests/hardware/carla_scene",
-    "tests/hardware/twin",
+    "tests/hardware/twin", "tests/hardware/worlds", "tests/nodes/worlds",
 )  # fmt: skip
 # A live test that fails while this share of the processors was withheld by the host says nothing.
 _STOLEN_SHARE, _ATTEMPTS, _REST_S = 0.01, 5, 4.0

@@ -49,7 +49,7 @@ def test_a_package_loads_nothing_but_itself_within_50_ms(package):
         "from advnerf_core import load_any_policy, load_transforms",
         "from nodes.runtime import Bus, Node, run_node_main",
         "from nodes.bags import BagWriter, read_messages",
-        "from hardware.worlds import DeploymentScene",
+        "from hardware.worlds import World",
     ],
 )
 def test_what_needs_no_torch_loads_none(statement):

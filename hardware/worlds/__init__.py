@@ -1,19 +1,25 @@
-"""Places that are driven: the lab, the junction, CARLA."""
+"""Places that are driven. `WORLDS` names those that this project brings; the contract is `hardware.worlds.world.World`."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
 from advnerf_core.lazy import lazy_names
 
 __all__ = [
+    "WORLDS",
+    "Box",
+    "CarDescription",
     "CarlaConfig",
     "CarlaScene",
-    "DeploymentScene",
     "Intersection",
     "IntersectionConfig",
     "Lab",
     "LabConfig",
+    "ReferencePath",
+    "World",
+    "WorldDescription",
 ]
 
 if TYPE_CHECKING:
@@ -23,7 +29,8 @@ if TYPE_CHECKING:
     from hardware.worlds.junction.scene import Intersection
     from hardware.worlds.lab.config import LabConfig
     from hardware.worlds.lab.lab import Lab
-    from hardware.worlds.world import DeploymentScene
+    from hardware.worlds.paths import ReferencePath
+    from hardware.worlds.world import Box, CarDescription, World, WorldClass, WorldDescription
 else:
     __getattr__, __dir__ = lazy_names(
         __name__,
@@ -34,6 +41,31 @@ else:
             "hardware.worlds.junction.scene": "Intersection",
             "hardware.worlds.lab.config": "LabConfig",
             "hardware.worlds.lab.lab": "Lab",
-            "hardware.worlds.world": "DeploymentScene",
+            "hardware.worlds.paths": "ReferencePath",
+            "hardware.worlds.world": "Box CarDescription World WorldDescription",
         },
     )
+
+ENTRY_POINTS = "advnerf.worlds"
+
+
+def _lab() -> WorldClass:
+    from hardware.worlds.lab.lab_world import LabWorld
+
+    return LabWorld
+
+
+def _junction() -> WorldClass:
+    from hardware.worlds.junction.scene import Intersection
+
+    return Intersection
+
+
+def _carla() -> WorldClass:
+    from hardware.worlds.carla.scene import CarlaScene
+
+    return CarlaScene
+
+
+WORLDS: Mapping[str, Callable[[], WorldClass]] = {"lab": _lab, "junction": _junction, "carla": _carla}
+"""Loaders of the worlds' classes by name; a simulator is imported when its world is opened."""

@@ -1,29 +1,196 @@
-"""What an experiment needs of the place where a found attack is tried: a car, a camera with depth, and photographs.
+"""The contract of a place that is driven: a world has a car, a camera with depth, photographs, and says about itself what an experiment needs.
 
-The simulated room (`hardware.worlds.lab.lab.Lab`), the simulated intersection (`hardware.worlds.junction.scene.Intersection`)
-and any other simulator fit it, so that one loop drives in all of them. Right-handed axes, world z up, metres, radians,
-seconds.
+The simulated junction (`hardware.worlds.junction.scene.Intersection`) and a junction of a CARLA map (`hardware.worlds.carla.scene.CarlaScene`)
+are worlds; a world of yours is one class in one file (docs/worlds.md), and ``advnerf world check`` says whether it keeps this contract.
+
+Axes are right-handed, the world's z points up; metres, radians, seconds. Cameras have OpenCV axes: x right, y down, z forward. The car's frame lies on
+the ground under the point whose x, y and heading are its state, x forward, y left.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
 from types import TracebackType
-from typing import Literal, Protocol, overload, runtime_checkable
+from typing import Any, Literal, Protocol, overload, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
+from advnerf_core.errors import AdvnerfError
 from advnerf_core.geometry import Array, Pinhole, VehicleState
+from hardware.worlds.paths import ReferencePath
 
 Rgb = NDArray[np.uint8]
 Depth = NDArray[np.float32]
+Vector3 = tuple[float, float, float]
+
+
+class WorldError(AdvnerfError, ValueError):
+    """A world's description, or what was kept of one, is not usable."""
+
+
+class NotOpenError(AdvnerfError, RuntimeError):
+    """Something was asked of a world that it knows only between ``__enter__`` and ``__exit__``."""
+
+
+@dataclass(frozen=True)
+class CarDescription:
+    """The car as an attack believes it to be: without lag and errors, which the world's own car may have.
+
+    Attributes:
+        kind: ``dubins``: a control is a turn rate [rad/s]; ``ackermann``: it is a wheel angle [rad]. Left is positive in both.
+        speed_mps: Speed of all drives [m/s].
+        control_limits: Rightmost and leftmost control.
+        wheelbase_m: Distance between the axles of an ``ackermann`` car [m]; the state's point is its rear axle.
+    """
+
+    kind: Literal["dubins", "ackermann"]
+    speed_mps: float
+    control_limits: tuple[float, float]
+    wheelbase_m: float | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot drive."""
+        right, left = self.control_limits
+        if self.kind not in ("dubins", "ackermann") or not (
+            0.0 < self.speed_mps < np.inf and -np.inf < right < left < np.inf
+        ):
+            raise WorldError(
+                f"expected a dubins or ackermann car, a speed above 0 m/s, and limits right < left; got {self}"
+            )
+        if (self.kind == "ackermann") != (self.wheelbase_m is not None and self.wheelbase_m > 0.0):
+            raise WorldError(f"expected wheelbase_m > 0 for an ackermann car, and none for a dubins car; got {self}")
+
+    @property
+    def largest_control(self) -> float:
+        """Largest control to either side: turn rate [rad/s] or wheel angle [rad]."""
+        return max(map(abs, self.control_limits))
+
+    @property
+    def control_unit(self) -> str:
+        """Unit of a control."""
+        return "rad/s" if self.kind == "dubins" else "rad"
+
+
+@dataclass(frozen=True)
+class Box:
+    """The part of the world that is learned.
+
+    Attributes:
+        min_m: Low corner [m].
+        max_m: High corner [m].
+        contraction: Whether there is more to see outside the box, such as a town and its sky; it is then learned with less detail. Without
+            it the box holds everything that any camera sees.
+    """
+
+    min_m: Vector3
+    max_m: Vector3
+    contraction: bool = False
+
+    def __post_init__(self) -> None:
+        """Refuse an empty box."""
+        if not (np.isfinite([self.min_m, self.max_m]).all() and np.all(np.less(self.min_m, self.max_m))):
+            raise WorldError(
+                f"expected a box with finite corners, min_m below max_m; got {self.min_m} and {self.max_m}"
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class WorldDescription:
+    """What an experiment must know of a world, as plain data: it is kept beside the photographs, and read where the world is not open.
+
+    Attributes:
+        paths: What is driven, by name; goals are equally long.
+        off_track_m: Cross-track error beyond which the car has left its lane [m]: half a lane's width.
+        car: The car.
+        camera: Intrinsics of the driving camera.
+        T_car_from_camera: Where it sits on the car ``[4, 4]``.
+        box: What is learned.
+        lanes: Middles of the lanes in which no object may stand: at least the paths, which stand here if nothing is given.
+        road_edge: Lines ``[N, 2]`` [m] where the road ends, for drawings.
+        facts: JSON data that the results depend on and that neither the configuration nor the rest of the description has, such as which
+            junction a server found.
+    """
+
+    paths: Mapping[str, ReferencePath]
+    off_track_m: float
+    car: CarDescription
+    camera: Pinhole
+    T_car_from_camera: Array
+    box: Box
+    lanes: tuple[ReferencePath, ...] = ()
+    road_edge: tuple[Array, ...] = ()
+    facts: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Check what the parts must have in common."""
+        if not self.paths:
+            raise WorldError("expected at least one path; got none")
+        if len({len(path.goal) for path in self.paths.values()}) != 1:
+            goals = ", ".join(f"{name} {list(path.goal)}" for name, path in self.paths.items())
+            raise WorldError(f"expected goals of one length; got {goals}")
+        if not 0.0 < self.off_track_m < np.inf:
+            raise WorldError(f"expected off_track_m > 0; got {self.off_track_m}")
+        T = np.asarray(self.T_car_from_camera, dtype=np.float64)
+        if (
+            T.shape != (4, 4)
+            or not np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-6)
+            or np.linalg.det(T) < 0.0
+        ):
+            raise WorldError(f"expected T_car_from_camera to be a rigid transform [4, 4]; got {T.tolist()}")
+        if not self.lanes:
+            object.__setattr__(self, "lanes", tuple(self.paths.values()))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data (JSON types) from which :meth:`from_dict` makes the same description."""
+        return {
+            "paths": {name: path.to_dict() for name, path in self.paths.items()},
+            "off_track_m": self.off_track_m,
+            "car": {**asdict(self.car), "control_limits": list(self.car.control_limits)},
+            "camera": asdict(self.camera),
+            "T_car_from_camera": np.asarray(self.T_car_from_camera, dtype=np.float64).tolist(),
+            "box": {"min_m": list(self.box.min_m), "max_m": list(self.box.max_m), "contraction": self.box.contraction},
+            "lanes": [lane.to_dict() for lane in self.lanes],
+            "road_edge": [np.asarray(line, dtype=np.float64).tolist() for line in self.road_edge],
+            "facts": dict(self.facts),
+        }
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> WorldDescription:
+        """Rebuild a description from :meth:`to_dict`.
+
+        Raises:
+            WorldError: The data is something else.
+        """
+        try:
+            box, car = data["box"], data["car"]
+            return cls(
+                paths={str(name): ReferencePath.from_dict(path) for name, path in data["paths"].items()},
+                off_track_m=float(data["off_track_m"]),
+                car=CarDescription(**{**car, "control_limits": tuple(car["control_limits"])}),
+                camera=Pinhole(**data["camera"]),
+                T_car_from_camera=np.array(data["T_car_from_camera"], dtype=np.float64),
+                box=Box(tuple(box["min_m"]), tuple(box["max_m"]), bool(box["contraction"])),
+                lanes=tuple(map(ReferencePath.from_dict, data["lanes"])),
+                road_edge=tuple(np.array(line, dtype=np.float64).reshape(-1, 2) for line in data["road_edge"]),
+                facts=dict(data["facts"]),
+            )
+        except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
+            raise WorldError(
+                f"expected a world as written by WorldDescription.to_dict; got something else: {error!r}"
+            ) from error
 
 
 @runtime_checkable
-class DeploymentScene(Protocol):
-    """A scene with one car in it that is observed and driven step by step; time passes only in ``step``.
+class World(Protocol):
+    """A place with one car in it that is observed and driven step by step; time passes only in ``step``.
 
-    The same configuration and the same calls give the same results.
+    Use it as a context manager: renderers and servers are opened by ``__enter__``, so that making one is cheap. The same configuration and the same
+    calls give the same results.
+
+    Its class has an attribute ``Config``, a pydantic model or a dataclass, and is called with one: ``Intersection(Intersection.Config())``. All of the
+    configuration counts as something that results depend on, but fields with ``exclude=True``: a server's address, or its patience.
 
     Attributes:
         camera_pinhole: Intrinsics of the driving camera.
@@ -48,6 +215,18 @@ class DeploymentScene(Protocol):
         """Whether the car stands against something or at the end of the world."""
         ...
 
+    def describe(self) -> WorldDescription:
+        """What an experiment must know; the same every time.
+
+        Raises:
+            NotOpenError: The world must be asked first, as a server for its map. Others may be described without being opened.
+        """
+        ...
+
+    def photo_poses(self, count: int, rng: np.random.Generator, /) -> list[Array]:
+        """From where it is photographed for learning: ``count`` transforms ``T_world_from_camera`` ``[4, 4]``, mixed so that any prefix covers the paths."""
+        ...
+
     def reset(self, x_m: float, y_m: float, yaw_rad: float, /) -> VehicleState:
         """Put the car down at rest; commands under way are forgotten."""
         ...
@@ -56,7 +235,7 @@ class DeploymentScene(Protocol):
         """Send one command and let time pass.
 
         Args:
-            control: Wheel angle of a steered car [rad], or turn rate of a Dubins car [rad/s]; left positive.
+            control: Wheel angle of an ``ackermann`` car [rad], or turn rate of a ``dubins`` car [rad/s]; left positive.
             speed_mps: Commanded speed [m/s].
             duration_s: Time to the next observation [s].
         """
@@ -78,16 +257,72 @@ class DeploymentScene(Protocol):
         """What the driving camera would see from another pose of the car (see :meth:`observe`); the car stays where it is."""
         ...
 
-    def photograph(self, T_world_from_camera: Array) -> Rgb:
-        """A photograph ``[H, W, 3]`` with ``photo_pinhole``, for learning the scene."""
+    def photograph(self, T_world_from_camera: Array, /) -> Rgb:
+        """A photograph ``[H, W, 3]`` with ``photo_pinhole``, in the driving camera's colours, for learning the scene."""
         ...
 
-    def close(self) -> None:
-        """Free what the scene holds; safe to call twice."""
-        ...
-
-    def __enter__(self) -> DeploymentScene: ...
+    def __enter__(self) -> World: ...
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /
     ) -> None: ...
+
+
+class WorldClass(Protocol):
+    """What a world's name stands for: a class that is called with its configuration.
+
+    Attributes:
+        Config: A pydantic model or a dataclass; all of its fields have defaults.
+    """
+
+    Config: Any
+
+    def __call__(self, config: Any, /) -> World:
+        """The world, not open yet."""
+        ...
+
+
+@dataclass(frozen=True)
+class Traits:
+    """What is known of a world before it is opened. A world without the attribute ``traits`` has these defaults.
+
+    Attributes:
+        unseen: Keys of the configuration (``car.turn_rate_lag_s``) that change how the world's own car moves, and neither a picture nor the
+            description: what was captured and learned stays valid when they change.
+        exclusive: Whether only one may be open at a time, as where one server steps one world.
+        step_s: Every step is a whole multiple of this [s]; None for any duration.
+    """
+
+    unseen: tuple[str, ...] = ()
+    exclusive: bool = False
+    step_s: float | None = None
+
+
+@runtime_checkable
+class HasTraits(Protocol):
+    """A world whose traits are not the defaults."""
+
+    @property
+    def traits(self) -> Traits:
+        """What is known of it before it is opened."""
+        ...
+
+
+@runtime_checkable
+class Overview(Protocol):
+    """A world that can be seen from above, for reports."""
+
+    def overview(self) -> tuple[Rgb, Pinhole, Array]:
+        """A picture ``[H, W, 3]``, and the camera that took it: its intrinsics and ``T_world_from_camera`` ``[4, 4]``."""
+        ...
+
+
+def traits_of(world: World) -> Traits:
+    """What is known of a world before it is opened."""
+    return world.traits if isinstance(world, HasTraits) else Traits()
+
+
+def members_of_a_world() -> tuple[str, ...]:
+    """Names of everything that a world must have."""
+    named = [name for name in vars(World) if not name.startswith("_") or name in ("__enter__", "__exit__")]
+    return tuple(sorted({*named, *World.__annotations__}))

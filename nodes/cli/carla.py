@@ -120,14 +120,13 @@ def carla_drive(
 
     from advnerf_core.files import write_atomically
     from hardware.worlds.carla.scene import CarlaScene
-    from nodes.experiment.junction.context import as_path
-    from nodes.lab.carla.drive import drive_expert, turn_rate_expert
+    from nodes.lab.worlds.expert_drive import as_path, drive_expert, lane_expert
 
     wanted = _config(config, overrides, host, port)
     dt_s = wanted.render.fixed_delta_s
     with ends_in_order(), CarlaScene(wanted) as scene:
         reference = scene.paths[path]
-        expert = turn_rate_expert(as_path(reference), wanted.car.speed_mps, dt_s, wanted.car.max_turn_rate_radps)
+        expert = lane_expert(as_path(reference), wanted.car.description, dt_s)
         drive = drive_expert(scene, expert, reference.start_pose, max(round(seconds / dt_s), 1), dt_s)
     worst, mean = abs(drive.cte_m).max(), abs(drive.cte_m).mean()
     print(

@@ -33,6 +33,7 @@ from nodes.cli import scene as cli_scene
 from nodes.cli import teleop as cli_teleop
 from nodes.cli import topic as cli_topic
 from nodes.cli import trial as cli_trial
+from nodes.cli import world as cli_world
 from nodes.runtime.terminal import Overrides, RunDir, print_table, say_error, table
 from nodes.runtime.termination import ends_in_order
 
@@ -68,6 +69,7 @@ app.add_typer(cli_policy.app, name="policy")
 app.add_typer(cli_scene.app, name="scene")
 app.add_typer(cli_room.app, name="room")
 app.add_typer(cli_carla.app, name="carla")
+app.add_typer(cli_world.app, name="world")
 cli_doctor.add_to(app)
 cli_replay.add_to(app)
 cli_teleop.add_to(app)
@@ -193,14 +195,14 @@ def _run_experiment(
 ) -> None:
     # Rendering without a display is the only way the stages know; an import of MuJoCo decides on it.
     os.environ.setdefault("MUJOCO_GL", "egl")
-    from nodes.experiment.run import kind_of
+    from nodes.experiment.run import is_in_a_world
 
     folder = folder or Path("runs") / setting
-    if kind_of(file) in ("intersection", "carla"):
-        from nodes.experiment.junction import run as intersection
+    if is_in_a_world(file):
+        from nodes.experiment.junction import run as world_run
 
         with ends_in_order():
-            intersection.run_experiment(intersection.load_experiment(file, setting, overrides or [], folder), until)
+            world_run.run_experiment(world_run.load_experiment(file, setting, overrides or [], folder), until)
         return
     from nodes.experiment.run import load_experiment, run_experiment
 

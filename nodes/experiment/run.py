@@ -38,17 +38,15 @@ def load_experiment(file: Path, setting: str, overrides: Sequence[str], folder: 
         ConfigError: With file, line and the valid keys.
     """
     document = read_setting(file, setting, overrides)
-    if document.data.pop("kind", "room") != "room":
-        raise ConfigError(f"{file}: expected kind room or intersection, got {kind_of(file)!r}")
     config = validate(ExperimentConfig, document)
     validate(LabConfig, document.part(("lab",)))
     return Experiment(config, file.resolve(), folder.resolve(), setting)
 
 
-def kind_of(file: Path) -> str:
-    """Which experiment a file describes: ``room`` unless its ``kind`` says otherwise."""
+def is_in_a_world(file: Path) -> bool:
+    """Whether an experiment file names a world; one that does not is the room's."""
     data = read_yaml(file).data
-    return str(data.get("kind", "room")) if isinstance(data, dict) else "room"
+    return isinstance(data, dict) and "world" in data
 
 
 def read_setting(file: Path, setting: str, overrides: Sequence[str]) -> Document:

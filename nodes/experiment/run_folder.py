@@ -8,7 +8,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -57,7 +57,7 @@ def run_to_end(
     Args:
         experiment: The experiment.
         stages: Its stages in order.
-        libraries: Whose versions the manifest names.
+        libraries: Whose versions the manifest names, of those that are installed.
         summarise: Prints the result; called if the stage ``report`` was reached.
         until: Last stage to run; None for all.
         console: Where to print.
@@ -93,6 +93,14 @@ def _refuse_the_folder_of_another(experiment: RunFolder[Any]) -> None:
         )
 
 
+def _installed(library: str) -> str:
+    """Version of a library; empty where it is not installed, as MuJoCo for a world that does without."""
+    try:
+        return version(library)
+    except PackageNotFoundError:
+        return ""
+
+
 def _write_manifest(experiment: RunFolder[Any], libraries: Sequence[str]) -> None:
     manifest = {
         "experiment": experiment.config.name,
@@ -101,6 +109,6 @@ def _write_manifest(experiment: RunFolder[Any], libraries: Sequence[str]) -> Non
         "command": " ".join(["advnerf", *sys.argv[1:]]),
         "config": experiment.config.model_dump(mode="json"),
         "versions": {"advnerf": version("advnerf"), "python": platform.python_version()}
-        | {name: version(name) for name in libraries},
+        | {name: found for name in libraries if (found := _installed(name))},
     }
     write_atomically(experiment.folder / _MANIFEST, json.dumps(manifest, indent=1) + "\n")

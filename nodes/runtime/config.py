@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import types
 import typing
 from collections.abc import Iterable, Sequence
@@ -10,14 +11,14 @@ from pathlib import Path
 from typing import Any, TypeVar, Union
 
 import yaml
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from nodes.runtime.errors import ConfigError
 
 # Type of a pydantic error whose message says what came.
 COMPLETE = "complete"
 
-M = TypeVar("M", bound=BaseModel)
+M = TypeVar("M")
 Key = tuple[str | int, ...]
 
 
@@ -129,14 +130,15 @@ def validate(model: type[M], document: Document, folder: Path | None = None) -> 
     """Typed object of a document; anything unknown or invalid is one `ConfigError`.
 
     Args:
-        model: What the document describes.
-        document: The document.
+        model: A pydantic model or a dataclass.
+        document: What it is made of.
         folder: What ``file.py:Name`` in it is relative to; the working folder if it is not given.
     """
     if not isinstance(document.data, dict):
         raise ConfigError(f"{document.place(())}: expected keys and values, got {type(document.data).__name__}")
+    _refuse_unknown(model, document, ())
     try:
-        return model.model_validate(document.data, context={"folder": folder})
+        return TypeAdapter(model).validate_python(document.data, context={"folder": folder})
     except ValidationError as error:
         raise ConfigError(_explain(model, document, error)) from None
 
@@ -170,7 +172,37 @@ def node_document(document: Document) -> dict[str, Any]:
     }
 
 
-def _explain(model: type[BaseModel], document: Document, error: ValidationError) -> str:
+def _refuse_unknown(model: Any, document: Document, key: Key) -> None:
+    """Refuse unknown keys of models that would take them in silence: dataclasses, and pydantic models that say nothing about extra keys."""
+    data = document.data
+    for step in key:
+        data = data[step]
+    silent = dataclasses.is_dataclass(model) or (
+        isinstance(model, type) and issubclass(model, BaseModel) and "extra" not in model.model_config
+    )
+    if not silent or not isinstance(data, dict):
+        return
+    hints = _hints(model)
+    for name in data:
+        if name not in hints:
+            written = ".".join(map(str, (*key, name)))
+            raise ConfigError(
+                f"{document.place((*key, name))}: unknown key {written}; valid keys here: {', '.join(sorted(hints)) or 'none'}"
+            )
+        _refuse_unknown(hints[name], document, (*key, name))
+
+
+def _hints(model: Any) -> dict[str, Any]:
+    """Fields of a model by the name that stands in files; empty if it is none."""
+    if isinstance(model, type) and issubclass(model, BaseModel):
+        return {each.alias or name: each.annotation for name, each in model.model_fields.items()}
+    if isinstance(model, type) and dataclasses.is_dataclass(model):
+        known = typing.get_type_hints(model)
+        return {each.name: known[each.name] for each in dataclasses.fields(model) if each.init}
+    return {}
+
+
+def _explain(model: Any, document: Document, error: ValidationError) -> str:
     # A misspelt key is often the reason for a missing one, so it is reported first.
     problems = sorted(error.errors(include_url=False), key=lambda problem: problem["type"] != "extra_forbidden")
     first = problems[0]
@@ -209,11 +241,10 @@ def _valid_keys(annotation: Any, key: Key) -> list[str]:
     """Keys of the model at a path; empty if there is no model."""
     if typing.get_origin(annotation) is typing.Annotated:
         annotation = typing.get_args(annotation)[0]
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+    if hints := _hints(annotation):
         if not key:
-            return sorted(f.alias or name for name, f in annotation.model_fields.items())
-        by_name = {f.alias or name: f for name, f in annotation.model_fields.items()}
-        return _valid_keys(by_name[str(key[0])].annotation, key[1:]) if key[0] in by_name else []
+            return sorted(hints)
+        return _valid_keys(hints[str(key[0])], key[1:]) if key[0] in hints else []
     arguments = typing.get_args(annotation)
     origin = typing.get_origin(annotation)
     if origin in (Union, types.UnionType):

@@ -1,4 +1,4 @@
-"""CARLA as a deployment scene. Importing it needs no ``carla``; using it does (``pip install 'advnerf[carla]'``)."""
+"""CARLA as a world. Importing it needs no ``carla``; using it does (``pip install 'advnerf[carla]'``)."""
 
 from hardware.worlds.carla.config import CarlaConfig
 from hardware.worlds.carla.errors import (

@@ -1,13 +1,13 @@
-"""Every number of CARLA as a deployment scene: the server, the junction, the cameras, the car, and where objects stand."""
+"""Every number of CARLA as a world: the server, the junction, the cameras and the car."""
 
 from __future__ import annotations
 
 import math
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field
 
-from hardware.worlds.junction.config import DubinsConfig, PhotoConfig, PlacedObject
+from hardware.worlds.junction.config import DubinsConfig, PhotoConfig
 from hardware.worlds.lab.config import CameraConfig
 
 _WHOLE_TICK_S = 1e-6
@@ -18,7 +18,7 @@ class _Frozen(BaseModel):
 
 
 class ServerConfig(_Frozen):
-    """Where the server is, and how long it may take.
+    """Where the server is, and how long it may take. Only the map is something that results depend on.
 
     Attributes:
         host: Computer of the server.
@@ -32,15 +32,15 @@ class ServerConfig(_Frozen):
         allow_traffic: Go on where there are other vehicles or walkers, which would be in the pictures.
     """
 
-    host: str = "127.0.0.1"
-    port: int = Field(default=2000, ge=1, le=65534)
-    timeout_s: float = Field(default=20.0, gt=0.0)
-    load_timeout_s: float = Field(default=180.0, gt=0.0)
-    frame_timeout_s: float = Field(default=5.0, gt=0.0)
+    host: str = Field(default="127.0.0.1", exclude=True)
+    port: int = Field(default=2000, ge=1, le=65534, exclude=True)
+    timeout_s: float = Field(default=20.0, gt=0.0, exclude=True)
+    load_timeout_s: float = Field(default=180.0, gt=0.0, exclude=True)
+    frame_timeout_s: float = Field(default=5.0, gt=0.0, exclude=True)
     town: str | None = "Town02"
-    load_town: bool = True
-    take_over: bool = False
-    allow_traffic: bool = False
+    load_town: bool = Field(default=True, exclude=True)
+    take_over: bool = Field(default=False, exclude=True)
+    allow_traffic: bool = Field(default=False, exclude=True)
 
 
 class JunctionConfig(_Frozen):
@@ -123,7 +123,7 @@ class BodyConfig(_Frozen):
 
 
 class CarlaConfig(_Frozen):
-    """CARLA as a deployment scene.
+    """CARLA as a world.
 
     Attributes:
         server: Server and map.
@@ -133,7 +133,6 @@ class CarlaConfig(_Frozen):
         camera: Driving camera, relative to the car's reference point. The default sits over the bonnet, which it does not see.
         photo: Camera of the posed images.
         car: How the car moves.
-        objects: Where the objects of the attack stand, in the scene's frame; composed by depth, not part of CARLA's world.
     """
 
     server: ServerConfig = ServerConfig()
@@ -143,11 +142,3 @@ class CarlaConfig(_Frozen):
     camera: CameraConfig = CameraConfig(x_m=3.2, z_m=1.6, pitch_down_rad=math.radians(8.0))
     photo: PhotoConfig = PhotoConfig()
     car: DubinsConfig = DubinsConfig()
-    objects: tuple[PlacedObject, ...] = ()
-
-    @model_validator(mode="after")
-    def _objects_have_names_of_their_own(self) -> CarlaConfig:
-        names = [thing.name for thing in self.objects]
-        if len(set(names)) != len(names):
-            raise ValueError(f"expected objects of different names, got {names}")
-        return self

@@ -8,10 +8,8 @@ from typing import Any
 
 from hardware.worlds.carla.errors import CarlaMapError
 from hardware.worlds.carla.frames import SceneFrame
-from hardware.worlds.junction.paths import ExitName, PathName, ReferencePath
-
-# The names of the simulated intersection, whose frame this is.
-EXIT_OF: dict[PathName, ExitName] = {"straight": "east", "right": "south", "left": "west"}
+from hardware.worlds.junction.paths import EXIT_OF, PathName
+from hardware.worlds.paths import ReferencePath
 
 
 @dataclass(frozen=True)
@@ -37,19 +35,21 @@ class Drives:
     height_range_m: float
     right_hand: bool
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain data (JSON types) from which :meth:`from_dict` makes the same drives, where no server is at hand."""
+    @property
+    def place(self) -> dict[str, Any]:
+        """Which junction it is and where, as JSON data."""
         T = self.frame.T_mirrored_from_world
         return {
             "junction_id": self.junction_id,
             "frame": {"x_m": T[0, 3], "y_m": T[1, 3], "z_m": T[2, 3], "yaw_rad": self.frame.yaw_rad},
-            "paths": {
-                name: {"start_pose": path.start_pose, "segments": path.segments} for name, path in self.paths.items()
-            },
-            "lane_width_m": self.lane_width_m,
             "height_range_m": self.height_range_m,
             "right_hand": self.right_hand,
         }
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data (JSON types) from which :meth:`from_dict` makes the same drives, where no server is at hand."""
+        paths = {name: path.to_dict() for name, path in self.paths.items()}
+        return {**self.place, "paths": paths, "lane_width_m": self.lane_width_m}
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Drives:
@@ -59,19 +59,12 @@ class Drives:
             CarlaMapError: The data is something else.
         """
         try:
-            paths = {
-                name: ReferencePath(
-                    name,
-                    EXIT_OF[name],
-                    (x, y, yaw),
-                    tuple(tuple(piece) for piece in path["segments"]),
-                )
-                for name, path in data["paths"].items()
-                for x, y, yaw in [map(float, path["start_pose"])]
+            paths: dict[PathName, ReferencePath] = {
+                name: ReferencePath.from_dict(data["paths"][name]) for name in EXIT_OF
             }
             rest = {name: data[name] for name in ("junction_id", "lane_width_m", "height_range_m", "right_hand")}
             return cls(frame=SceneFrame(**data["frame"]), paths=paths, **rest)
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
+        except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
             raise CarlaMapError(
                 f"expected drives as written by Drives.to_dict, got something else: {error!r}"
             ) from error

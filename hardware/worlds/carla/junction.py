@@ -14,11 +14,12 @@ from typing import Any
 import numpy as np
 
 from advnerf_core.geometry import Array, wrap_angle
-from hardware.worlds.carla.drives import EXIT_OF, Drives
+from hardware.worlds.carla.drives import Drives
 from hardware.worlds.carla.errors import CarlaMapError
-from hardware.worlds.carla.fitting import fit_lines_and_arcs
 from hardware.worlds.carla.frames import CarlaPose, SceneFrame
-from hardware.worlds.junction.paths import PathName, ReferencePath
+from hardware.worlds.fitting import fit_lines_and_arcs
+from hardware.worlds.junction.paths import PathName, goal_of
+from hardware.worlds.paths import ReferencePath
 
 _STRAIGHT_RAD = math.radians(30.0)
 _TURN_RAD = (math.radians(50.0), math.radians(130.0))
@@ -264,7 +265,7 @@ def _path(name: PathName, waypoints: Sequence[Any], frame: SceneFrame, tolerance
         segments = fit_lines_and_arcs(poses, tolerance_m)
     except ValueError as error:
         raise CarlaMapError(f"the lanes of the drive {name} do not join: {error}; take another junction") from error
-    return ReferencePath(name, EXIT_OF[name], start, segments)
+    return ReferencePath(start, segments, goal_of(name))
 
 
 def _pose(waypoint: Any) -> Array:

@@ -7,12 +7,11 @@ import logging
 import weakref
 from collections.abc import Iterator
 from types import TracebackType
-from typing import Any, Literal, overload
+from typing import Any, ClassVar, Literal, overload
 
 import numpy as np
-from numpy.typing import NDArray
 
-from advnerf_core.geometry import Array, Pinhole, VehicleState, planar_pose
+from advnerf_core.geometry import Array, Pinhole, VehicleState, look_at, planar_pose
 from hardware.worlds.carla.body import CarlaCar
 from hardware.worlds.carla.camera import DEPTH, RGB, Camera
 from hardware.worlds.carla.config import CarlaConfig
@@ -22,22 +21,26 @@ from hardware.worlds.carla.errors import CarlaError, CarlaFrameError
 from hardware.worlds.carla.frames import CarlaPose
 from hardware.worlds.carla.junction import find_drives
 from hardware.worlds.carla.library import load_carla, server_answers
+from hardware.worlds.carla.photos import photo_poses
 from hardware.worlds.carla.pixels import depth_of, rgb_of
 from hardware.worlds.carla.synchronous import TickedWorld, set_scenery
 from hardware.worlds.carla.undo import Undo
-from hardware.worlds.junction.paths import PathName, ReferencePath
+from hardware.worlds.junction.config import UNSEEN_OF_A_CAR
+from hardware.worlds.junction.paths import PathName
+from hardware.worlds.paths import ReferencePath
+from hardware.worlds.world import Box, Depth, NotOpenError, Rgb, Traits, WorldDescription
 
-Rgb = NDArray[np.uint8]
-Depth = NDArray[np.float32]
 _log = logging.getLogger(__name__)
 _CLOSING_TIMEOUT_S = 5.0
 _ATTEMPTS = 3  # ticks until a picture of the wanted pose must have come
+_LOW_M, _HIGH_M = -0.5, 20.0  # of the box that is learned
+_FROM_ABOVE_M = (-18.0, 0.0, 22.0)  # from where reports show the junction
 
 
 class CarlaScene:
-    """A junction of a CARLA map with a Dubins car in it; a `hardware.worlds.world.DeploymentScene`.
+    """A junction of a CARLA map with a Dubins car in it; a `hardware.worlds.world.World`.
 
-    The world belongs to the scene while it is open: synchronous, weather and traffic lights fixed, the server draws only when asked.
+    CARLA's world belongs to the scene while it is open: synchronous, weather and traffic lights fixed, the server draws only when asked.
     Closing puts all of it back, also after an error, or when the program ends without closing.
 
     ``step`` moves the car and ticks; pictures are those of the last tick. A picture from elsewhere (``observe`` after ``reset``,
@@ -47,18 +50,20 @@ class CarlaScene:
 
     Args:
         config: All numbers of the scene.
-        library: The ``carla`` module; None imports it.
+        library: The ``carla`` module; None imports it when the scene is opened.
 
     Raises:
-        CarlaError: One of `hardware.worlds.carla.errors`, for what is missing or wrong.
+        CarlaError: When it is opened; one of `hardware.worlds.carla.errors`, for what is missing or wrong.
 
     Attributes:
         camera_pinhole: Intrinsics of the driving camera.
         photo_pinhole: Intrinsics of the camera of ``photograph``.
         T_car_from_camera: Where the driving camera sits on the car ``[4, 4]``.
-        drives: Junction, frame and lanes, as the map has them.
+        drives: Junction, frame and lanes, as the map has them; known from the moment the scene was opened.
         repeated_frames: How often a picture did not come, or came from elsewhere, and another tick followed.
     """
+
+    Config: ClassVar[type[CarlaConfig]] = CarlaConfig
 
     def __init__(self, config: CarlaConfig | None = None, library: Any = None) -> None:
         self.config = CarlaConfig() if config is None else config
@@ -66,30 +71,83 @@ class CarlaScene:
         self.photo_pinhole: Pinhole = self.config.photo.pinhole
         self.T_car_from_camera: Array = self.config.camera.T_car_from_camera
         self.repeated_frames = 0
-        self._closed = False
+        self._drives: Drives | None = None
+        self._opened = False
         self._changed = True  # whether something stands elsewhere since the last tick
-        self._library = load_carla() if library is None else library
+        self._library = library
         self._cameras: dict[str, Camera] = {}
         self._undo = Undo()
         self._client: Any = None
+        self._car: CarlaCar | None = None
         # Also where nobody closes the scene: a world left synchronous stands still for everybody.
         self._at_exit = weakref.finalize(self, self._undo.run)
+
+    @property
+    def traits(self) -> Traits:
+        """A server steps one world, in whole ticks."""
+        return Traits(UNSEEN_OF_A_CAR, exclusive=True, step_s=self.config.render.fixed_delta_s)
+
+    def __enter__(self) -> CarlaScene:
+        if not self._at_exit.alive:
+            raise CarlaError("expected a scene that was never closed, got one that was; make another one")
+        self._library = load_carla() if self._library is None else self._library
         try:
             with server_answers("opening the scene"):
                 self._open()
         except BaseException:
             self._put_back()
             raise
+        return self
 
     def _open(self) -> None:
         config, library = self.config, self._library
         self._client = connect(config.server, library)
         self._world = open_world(self._client, config.server)
         check_nobody_else(self._world, config.server)
-        self.drives: Drives = drives_in(self._world.get_map(), library, config)
+        self._drives = drives_in(self._world.get_map(), library, config)
         self._ticked = TickedWorld(self._world, config.render.fixed_delta_s, config.server.timeout_s, self._undo)
         set_scenery(self._world, library, config.render, self._undo)
-        self._car = CarlaCar(self._world, library, self.drives.frame, config, self._undo)
+        self._car = CarlaCar(self._world, library, self._drives.frame, config, self._undo)
+        self._opened = True
+
+    @property
+    def drives(self) -> Drives:
+        """Junction, frame and lanes, as the map has them.
+
+        Raises:
+            NotOpenError: The scene was never opened.
+        """
+        if self._drives is None:
+            raise NotOpenError(
+                "expected an open CARLA scene, whose map says where its drives are; use it as a context manager"
+            )
+        return self._drives
+
+    def describe(self) -> WorldDescription:
+        """What the map says: drives, lanes and place; the town and the sky outside the box are contracted.
+
+        Raises:
+            NotOpenError: The scene was never opened.
+        """
+        reach, drives = self.config.junction.reach_m, self.drives
+        return WorldDescription(
+            paths={str(name): path for name, path in drives.paths.items()},
+            off_track_m=self.off_track_m,
+            car=self.config.car.description,
+            camera=self.camera_pinhole,
+            T_car_from_camera=self.T_car_from_camera,
+            box=Box((-reach, -reach, _LOW_M), (reach, reach, _HIGH_M), contraction=True),
+            facts=drives.place,
+        )
+
+    def photo_poses(self, count: int, rng: np.random.Generator) -> list[Array]:
+        """Along, beside and above the drives, no farther from them than a lane; see `hardware.worlds.carla.photos`."""
+        return photo_poses(self.drives, self.config, count, rng)
+
+    def overview(self) -> tuple[Rgb, Pinhole, Array]:
+        """A photograph from above the straight drive, and the camera that took it."""
+        T = look_at(_FROM_ABOVE_M, np.zeros(3))
+        return self.photograph(T), self.photo_pinhole, T
 
     @property
     def paths(self) -> dict[PathName, ReferencePath]:
@@ -104,24 +162,24 @@ class CarlaScene:
     @property
     def state(self) -> VehicleState:
         """True state of the car."""
-        return self._car.state
+        return self._driven.state
 
     @property
     def turn_rate_radps(self) -> float:
         """True turn rate of the car [rad/s], which lags behind its command."""
-        return self._car.turn_rate_radps
+        return self._driven.turn_rate_radps
 
     @property
     def blocked(self) -> bool:
         """Whether the car stands against something solid or at the end of the world."""
-        return self._car.blocked
+        return self._driven.blocked
 
     def reset(self, x_m: float, y_m: float, yaw_rad: float) -> VehicleState:
         """Put the car down at rest, turning nowhere."""
         self._require_open()
         self._changed = True
         with server_answers("putting the car down"):
-            return self._car.reset(x_m, y_m, yaw_rad)
+            return self._driven.reset(x_m, y_m, yaw_rad)
 
     def step(self, turn_rate_radps: float, speed_mps: float, duration_s: float) -> VehicleState:
         """Hold one command for a while.
@@ -140,7 +198,7 @@ class CarlaScene:
         with server_answers("moving the car"):
             for _ in range(ticks):
                 before = self._driving_pose()
-                self._car.advance(turn_rate_radps, speed_mps, delta)
+                self._driven.advance(turn_rate_radps, speed_mps, delta)
                 after = self._driving_pose()
                 for name in (RGB, DEPTH):
                     if name in self._cameras:
@@ -189,9 +247,6 @@ class CarlaScene:
                 f"could not put CARLA's world back: {'; '.join(failed)}. If the server still runs, `advnerf carla release` frees it"
             )
 
-    def __enter__(self) -> CarlaScene:
-        return self
-
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
@@ -203,7 +258,7 @@ class CarlaScene:
             _log.warning("could not put back %s", what)
 
     def _put_back(self) -> list[str]:
-        self._closed = True
+        self._opened = False
         self._cameras.clear()
         self._at_exit.detach()
         if self._client is not None:
@@ -211,10 +266,18 @@ class CarlaScene:
             self._client.set_timeout(min(_CLOSING_TIMEOUT_S, self.config.server.timeout_s))
         return self._undo.run()
 
+    @property
+    def _driven(self) -> CarlaCar:
+        if self._car is None:
+            raise NotOpenError(
+                "expected an open CARLA scene, as its car stands in the server's world; use it as a context manager"
+            )
+        return self._car
+
     def _require_open(self) -> None:
-        if self._closed:
+        if not self._opened:
             raise CarlaError(
-                "expected an open scene, this one is closed: its world is not ours any more; make another one"
+                "expected an open scene, this one is closed: CARLA's world is not ours; use a scene as a context manager"
             )
 
     def _tick(self) -> None:
@@ -223,14 +286,14 @@ class CarlaScene:
 
     @contextlib.contextmanager
     def _without_car(self) -> Iterator[None]:
-        if not self._car.hide():
+        if not self._driven.hide():
             yield
             return
         self._changed = True
         try:
             yield
         finally:
-            self._car.show()
+            self._driven.show()
             self._changed = True
 
     def _driving_pose(self) -> CarlaPose:

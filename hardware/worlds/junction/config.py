@@ -1,19 +1,16 @@
-"""Every number of the simulated intersection: roads, cameras, the car's true behaviour, and where the objects stand."""
+"""Every number of the simulated intersection: roads, cameras, the car's true behaviour."""
 
 from __future__ import annotations
 
 import math
-from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from advnerf_core.geometry import Array, Pinhole, make_transform, rotation_z
-from hardware.worlds.junction.paths import PathName, ReferencePath, junction_paths
+from advnerf_core.geometry import Pinhole
+from hardware.worlds.junction.paths import PathName, junction_paths
 from hardware.worlds.lab.config import CameraConfig
-
-ObjectKind = Literal["small_car", "hydrant"]
-# Length and width [m] at scale 1 of the objects that ``advnerf object build --generate`` makes.
-OBJECT_SIZES_M: dict[ObjectKind, tuple[float, float]] = {"small_car": (3.64, 1.7), "hydrant": (0.48, 0.48)}
+from hardware.worlds.paths import ReferencePath
+from hardware.worlds.world import CarDescription
 
 
 class _Frozen(BaseModel):
@@ -62,6 +59,16 @@ class PhotoConfig(_Frozen):
         return Pinhole(self.width, self.height, focal_px, focal_px, 0.5 * self.width, 0.5 * self.height)
 
 
+# Keys of a world with this car (``car:``) that change how it moves, and neither a picture nor its description.
+UNSEEN_OF_A_CAR = (
+    "car.turn_rate_lag_s",
+    "car.turn_rate_gain",
+    "car.body_length_m",
+    "car.body_width_m",
+    "car.body_ahead_m",
+)
+
+
 class DubinsConfig(_Frozen):
     """The car: what the experiment asks of it, and how it really behaves.
 
@@ -88,40 +95,11 @@ class DubinsConfig(_Frozen):
         """The car that the surrogate believes in: no lag, no gain error."""
         return cls(turn_rate_lag_s=0.0, turn_rate_gain=1.0)
 
-
-class PlacedObject(_Frozen):
-    """Where an object of the attack stands. It is not part of the simulated world: the deployment composes it by depth.
-
-    Attributes:
-        name: Unique name.
-        kind: What it is.
-        x_m: Middle of its foot [m].
-        y_m: Middle of its foot [m].
-        z_m: Height it stands on [m]: the kerb's on a pavement.
-        yaw_rad: Heading of its front [rad].
-        scale: Size relative to the object as it was built.
-    """
-
-    name: str = Field(min_length=1)
-    kind: ObjectKind
-    x_m: float
-    y_m: float
-    z_m: float = 0.12
-    yaw_rad: float = 0.0
-    scale: float = Field(default=1.0, gt=0.0, le=2.0)
-
     @property
-    def T_world_from_object(self) -> Array:
-        """Pose ``[4, 4]`` of its foot, x to its front, z up; the scale is not part of it."""
-        return make_transform(rotation_z(self.yaw_rad), [self.x_m, self.y_m, self.z_m])
-
-    def corners_m(self) -> list[tuple[float, float]]:
-        """The four corners [m] of the ground it covers."""
-        length, width = (0.5 * self.scale * size for size in OBJECT_SIZES_M[self.kind])
-        c, s = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
-        signs = ((1, 1), (-1, 1), (-1, -1), (1, -1))
-        ends = [(a * length, b * width) for a, b in signs]
-        return [(self.x_m + c * u - s * v, self.y_m + s * u + c * v) for u, v in ends]
+    def description(self) -> CarDescription:
+        """What an attack is told of the car."""
+        bound = self.max_turn_rate_radps
+        return CarDescription("dubins", self.speed_mps, (-bound, bound))
 
 
 class IntersectionConfig(_Frozen):
@@ -132,7 +110,6 @@ class IntersectionConfig(_Frozen):
         camera: Driving camera, mounted relative to the car's reference point.
         photo: Camera of the posed images that a surrogate is learned from.
         car: Vehicle.
-        objects: Where the objects of the attack stand.
         approach_m: How far from the junction's middle the drives start [m].
         left_radius_m: Radius of the left turn [m]; the right turn is concentric with the kerb.
         beyond_m: Length of the road after a turn that belongs to the reference path [m].
@@ -143,17 +120,6 @@ class IntersectionConfig(_Frozen):
     camera: CameraConfig = CameraConfig(x_m=1.2, z_m=1.5, pitch_down_rad=math.radians(8.0))
     photo: PhotoConfig = PhotoConfig()
     car: DubinsConfig = DubinsConfig()
-    # Cars on the pavements of the far side and of the near corner, hydrants at the kerb beside the three exits: each drive
-    # sees some of them close and most of them from afar.
-    objects: tuple[PlacedObject, ...] = (
-        PlacedObject(name="car_north", kind="small_car", x_m=-4.5, y_m=4.65, yaw_rad=math.pi, scale=1.2),
-        PlacedObject(name="car_corner", kind="small_car", x_m=5.47, y_m=-7.62, yaw_rad=math.radians(65.0), scale=1.2),
-        PlacedObject(
-            name="hydrant_corner", kind="hydrant", x_m=-5.75, y_m=-5.75, yaw_rad=math.radians(45.0), scale=1.6
-        ),
-        PlacedObject(name="hydrant_south", kind="hydrant", x_m=-3.95, y_m=-14.0, scale=1.6),
-        PlacedObject(name="hydrant_east", kind="hydrant", x_m=11.0, y_m=-3.95, yaw_rad=math.radians(90.0), scale=1.6),
-    )
     approach_m: float = Field(default=24.0, gt=0.0)
     left_radius_m: float = Field(default=8.75, gt=0.0)
     beyond_m: float = Field(default=30.0, gt=0.0)
@@ -182,20 +148,6 @@ class IntersectionConfig(_Frozen):
                 f"expected turns the car can follow, of at least speed / turn rate = {tightest:.2f} m, got a right turn of "
                 f"{self.right_radius_m} m and a left turn of {self.left_radius_m} m"
             )
-        return self
-
-    @model_validator(mode="after")
-    def _objects_beside_the_roads(self) -> IntersectionConfig:
-        names = [thing.name for thing in self.objects]
-        if len(set(names)) != len(names):
-            raise ValueError(f"expected objects of different names, got {names}")
-        for thing in self.objects:
-            inside = [corner for corner in thing.corners_m() if self.on_road(*corner)]
-            if inside:
-                x, y = inside[0]
-                raise ValueError(
-                    f"expected objects beside the roads, but {thing.name} reaches into a lane at ({x:.2f}, {y:.2f}); move it"
-                )
         return self
 
     @property

@@ -3,75 +3,21 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Literal
 
-Segment = tuple[Literal["line"], float] | tuple[Literal["arc"], float, float]
+from hardware.worlds.paths import ReferencePath, Segment, segment_length_m
+
 PathName = Literal["straight", "right", "left"]
 ExitName = Literal["east", "south", "west"]
 
 # The order of the one-hot goal that a goal-conditioned policy is given.
 EXITS: tuple[ExitName, ...] = ("east", "south", "west")
+EXIT_OF: dict[PathName, ExitName] = {"straight": "east", "right": "south", "left": "west"}
 
 
-@dataclass(frozen=True)
-class ReferencePath:
-    """One drive: continuous in position and heading, open at both ends.
-
-    Attributes:
-        name: What the car does at the junction.
-        exit: Road by which it leaves.
-        start_pose: x [m], y [m], yaw [rad] where the drive starts.
-        segments: In driving order, ``("line", length_m)`` or ``("arc", radius_m, angle_rad)``, left positive.
-    """
-
-    name: PathName
-    exit: ExitName
-    start_pose: tuple[float, float, float]
-    segments: tuple[Segment, ...]
-
-    @property
-    def goal(self) -> tuple[float, ...]:
-        """The exit as one-hot code in the order of ``EXITS``."""
-        return tuple(1.0 if name == self.exit else 0.0 for name in EXITS)
-
-    @property
-    def length_m(self) -> float:
-        """Length of the whole path [m]."""
-        return sum(segment_length_m(segment) for segment in self.segments)
-
-    def pose_at(self, s_m: float) -> tuple[float, float, float]:
-        """Point and heading (x [m], y [m], yaw [rad]) at a distance along the path, which is extended straight beyond its ends."""
-        x, y, yaw = self.start_pose
-        left = s_m
-        for index, segment in enumerate(self.segments):
-            last = index == len(self.segments) - 1
-            length = segment_length_m(segment)
-            along = left if last else min(left, length)
-            if segment[0] == "arc" and along > 0.0:
-                inside = min(along, length)
-                turn = math.copysign(inside / segment[1], segment[2])
-                chord = 2.0 * segment[1] * math.sin(0.5 * abs(turn))
-                x, y = x + chord * math.cos(yaw + 0.5 * turn), y + chord * math.sin(yaw + 0.5 * turn)
-                yaw, along, left = yaw + turn, along - inside, left - inside
-            x, y, left = x + along * math.cos(yaw), y + along * math.sin(yaw), left - along
-            if left <= 0.0:
-                break
-        return x, y, math.remainder(yaw, 2.0 * math.pi)
-
-    def mirrored(self, across: Literal["x", "y"]) -> ReferencePath:
-        """The same drive seen in a mirror along the x or the y axis of the world: what was on the left of the axis is on its right."""
-        x, y, yaw = self.start_pose
-        start = (x, -y, -yaw) if across == "x" else (-x, y, math.pi - yaw)
-        turned: tuple[Segment, ...] = tuple(
-            piece if piece[0] == "line" else (piece[0], piece[1], -piece[2]) for piece in self.segments
-        )
-        return ReferencePath(self.name, self.exit, start, turned)
-
-
-def segment_length_m(segment: Segment) -> float:
-    """Length of one piece of a path [m]."""
-    return segment[1] if segment[0] == "line" else segment[1] * abs(segment[2])
+def goal_of(name: PathName) -> tuple[float, ...]:
+    """The exit of a drive as one-hot code in the order of ``EXITS``."""
+    return tuple(1.0 if exit_name == EXIT_OF[name] else 0.0 for exit_name in EXITS)
 
 
 def junction_paths(
@@ -99,7 +45,7 @@ def junction_paths(
     west, south = (-approach_m, -middle, 0.0), (middle, -approach_m, quarter)
     longest = max(sum(map(segment_length_m, segments)) for segments in (right, left))
     return {
-        "straight": ReferencePath("straight", "east", west, (("line", longest),)),
-        "right": ReferencePath("right", "south", west, right),
-        "left": ReferencePath("left", "west", south, left),
+        "straight": ReferencePath(west, (("line", longest),), goal_of("straight")),
+        "right": ReferencePath(west, right, goal_of("right")),
+        "left": ReferencePath(south, left, goal_of("left")),
     }

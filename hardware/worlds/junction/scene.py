@@ -3,38 +3,39 @@
 from __future__ import annotations
 
 from types import TracebackType
-from typing import Literal, overload
+from typing import ClassVar, Literal, overload
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from advnerf_core.geometry import Array, Pinhole, VehicleState, invert_transform, look_at, planar_pose, transform_points
+from advnerf_core.geometry import Array, Pinhole, VehicleState, look_at, planar_pose
 from hardware.worlds.junction.car import DubinsCar
-from hardware.worlds.junction.config import IntersectionConfig
+from hardware.worlds.junction.config import UNSEEN_OF_A_CAR, IntersectionConfig
+from hardware.worlds.junction.ground import kerb_lines
+from hardware.worlds.junction.photos import photo_poses
 from hardware.worlds.junction.town import obstacles
 from hardware.worlds.junction.world import build_model
 from hardware.worlds.lab.renderer import Renderer
 from hardware.worlds.lab.vehicle import Footprint
+from hardware.worlds.world import Box, Depth, NotOpenError, Rgb, Traits, WorldDescription
 
-Rgb = NDArray[np.uint8]
-Depth = NDArray[np.float32]
 RANGE_M = (0.1, 250.0)  # from the near plane to past the farthest corner of the sky
-PATH_RGB = {"straight": (40, 110, 230), "right": (235, 140, 20), "left": (200, 40, 170)}
 
 
 class Intersection:
-    """A junction of three roads with a Dubins car in it; a `hardware.worlds.world.DeploymentScene`.
+    """A junction of three roads with a Dubins car in it; a `hardware.worlds.world.World`.
 
-    The same configuration and the same calls give the same bytes on one machine. It owns an OpenGL context: use it in the
-    thread that made it, and close it or use it as a context manager.
+    The same configuration and the same calls give the same bytes on one machine. While it is open it owns an OpenGL context: use it in the
+    thread that opened it.
 
     Args:
         config: All numbers of the scene.
 
     Raises:
-        TwinUnavailable: MuJoCo or EGL is missing; the message names the packages.
+        TwinUnavailable: When it is opened, MuJoCo or EGL is missing; the message names the packages.
     """
+
+    Config: ClassVar[type[IntersectionConfig]] = IntersectionConfig
+    traits: ClassVar[Traits] = Traits(unseen=UNSEEN_OF_A_CAR)
 
     def __init__(self, config: IntersectionConfig | None = None) -> None:
         self.config = IntersectionConfig() if config is None else config
@@ -43,7 +44,25 @@ class Intersection:
         self.T_car_from_camera: Array = self.config.camera.T_car_from_camera
         self._obstacles = obstacles(self.config)
         self._car = DubinsCar(self.config.car, self.fits)
-        self._renderer = Renderer(build_model(self.config), self.config.supersampling, range_m=RANGE_M)
+        self._renderer: Renderer | None = None
+
+    def describe(self) -> WorldDescription:
+        """The drives, and all lanes: within half a lane of their middles lies the whole asphalt. The box holds the painted sky: nothing lies outside."""
+        config, road = self.config, self.config.road
+        return WorldDescription(
+            paths={str(name): path for name, path in config.paths().items()},
+            off_track_m=config.off_track_m,
+            car=config.car.description,
+            camera=self.camera_pinhole,
+            T_car_from_camera=self.T_car_from_camera,
+            box=Box((-road.half_m, -road.half_m, 0.0), (road.half_m, road.half_m, road.sky_m)),
+            lanes=config.lanes(),
+            road_edge=tuple(kerb_lines(road, 0.0).values()),
+        )
+
+    def photo_poses(self, count: int, rng: np.random.Generator) -> list[Array]:
+        """Along, beside and above the drives; see `hardware.worlds.junction.photos`."""
+        return photo_poses(self.config, count, rng)
 
     def reset(self, x_m: float, y_m: float, yaw_rad: float) -> VehicleState:
         """Put the car down at rest, turning nowhere."""
@@ -108,28 +127,24 @@ class Intersection:
 
     def photograph(self, T_world_from_camera: Array) -> Rgb:
         """A photograph ``[H, W, 3]`` uint8 with ``photo_pinhole``, in the driving camera's colours."""
-        return self._renderer.render_rgb(T_world_from_camera, self.photo_pinhole)
+        return self._open_renderer().render_rgb(T_world_from_camera, self.photo_pinhole)
 
-    def overview(self, width: int = 960, height: int = 720) -> Rgb:
-        """Picture ``[height, width, 3]`` of the junction from above the south, with paths and places of objects, for reports."""
+    def overview(self, width: int = 960, height: int = 720) -> tuple[Rgb, Pinhole, Array]:
+        """The junction from above the south, and the camera that sees it so: intrinsics and ``T_world_from_camera`` ``[4, 4]``."""
         focal = 1.0 * width
         pinhole = Pinhole(width, height, focal, focal, 0.5 * width, 0.5 * height)
         T = look_at([0.0, -46.0, 62.0], [0.0, -7.0, 0.0])
-        picture = self._renderer.render_rgb(T, pinhole)  # the sky is seen from inside only
-        for name, path in self.config.paths().items():
-            along = np.arange(0.0, self.config.car.speed_mps * 6.0, 0.25)
-            points = np.array([[*path.pose_at(float(s))[:2], 0.05] for s in along])
-            _draw(picture, pinhole.project(transform_points(invert_transform(T), points)), PATH_RGB[name], False)
-        for thing in self.config.objects:
-            corners = np.array([[x, y, thing.z_m] for x, y in thing.corners_m()])
-            _draw(picture, pinhole.project(transform_points(invert_transform(T), corners)), (240, 30, 30), True)
-        return picture
+        return self._open_renderer().render_rgb(T, pinhole), pinhole, T  # the sky is seen from inside only
 
     def close(self) -> None:
         """Free the OpenGL context; safe to call twice."""
-        self._renderer.close()
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
 
     def __enter__(self) -> Intersection:
+        if self._renderer is None:
+            self._renderer = Renderer(build_model(self.config), self.config.supersampling, range_m=RANGE_M)
         return self
 
     def __exit__(
@@ -137,12 +152,14 @@ class Intersection:
     ) -> None:
         self.close()
 
+    def _open_renderer(self) -> Renderer:
+        if self._renderer is None:
+            raise NotOpenError(
+                "expected the junction to be open for a picture; it is closed: use it as a context manager"
+            )
+        return self._renderer
+
     def _see(self, T_world_from_car: Array, depth: bool) -> tuple[Rgb, Depth | None]:
-        T = T_world_from_car @ self.T_car_from_camera
-        rgb = self._renderer.render_rgb(T, self.camera_pinhole)
-        return rgb, self._renderer.render_depth(T, self.camera_pinhole) if depth else None
-
-
-def _draw(picture: Rgb, pixels: Array, rgb: tuple[int, int, int], closed: bool) -> None:
-    line = np.rint(pixels * 16.0).astype(np.int32)[:, None]
-    cv2.polylines(picture, [line], closed, rgb, thickness=2, lineType=cv2.LINE_AA, shift=4)
+        renderer, T = self._open_renderer(), T_world_from_car @ self.T_car_from_camera
+        rgb = renderer.render_rgb(T, self.camera_pinhole)
+        return rgb, renderer.render_depth(T, self.camera_pinhole) if depth else None

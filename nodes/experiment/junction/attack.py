@@ -88,7 +88,7 @@ def frozen_hashes(experiment: Experiment) -> dict[str, str]:
         for scenario in experiment.config.scenarios
         for seed in experiment.config.attack.seeds
     }
-    things = experiment.world.objects
+    things = experiment.objects
     return {
         "scene": scene_sha256(experiment),
         **policies,
@@ -103,7 +103,7 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
     """Freeze, then search what is not searched yet; one attack file and one JSON of surrogate drives per cell."""
     write_atomically(folder / "frozen.json", json.dumps(frozen_hashes(experiment), indent=1) + "\n")
     if over_the_world(experiment):
-        with experiment.site.open() as scene:
+        with experiment.open_world() as scene:
             _search_all(experiment, make_space(experiment, scene), folder, report)
     else:
         _search_all(experiment, make_space(experiment, None), folder, report)
@@ -181,7 +181,7 @@ def attack_problem(
         time_batch=attack.time_batch,
         cache_bytes=int(attack.cache_mib * 2**20),
         held_cap_m=experiment.config.held_cap_m,
-        off_track_m=experiment.site.off_track_m,
+        off_track_m=experiment.world.off_track_m,
     )
 
 
@@ -265,7 +265,7 @@ def _attack_file(
         objects=space.attacked(result.theta),
         face=None,
         camera=experiment.view.pinhole,
-        scene_sha256=hash_of(experiment.site.settings) if over_the_world(experiment) else scene_sha256(experiment),
+        scene_sha256=hash_of(experiment.world_settings) if over_the_world(experiment) else scene_sha256(experiment),
         policy_sha256=policy.sha256,
         config_sha256=hash_of(experiment.config.model_dump(mode="json")),
         seed=cell.seed,

@@ -1,4 +1,4 @@
-"""Stage capture: photograph the junction, and keep views of the driving camera that nothing learns from."""
+"""Stage capture: photograph the world, and keep what it says about itself and views of the driving camera that nothing learns from."""
 
 from __future__ import annotations
 
@@ -15,16 +15,17 @@ from nodes.experiment.learned_scene import HELD_OUT
 from nodes.runtime.progress import Report, counted
 
 PHOTOS = "photos"
-# Held-out views lie as far from a path as a fooled car drives [m], and as turned [rad].
+# Held-out views lie as far from a path as a fooled car drives [m, of half a lane of 1.75 m], and as turned [rad].
 _LATERAL_M, _HEADING_RAD = 1.0, 0.2
 
 
 def run(experiment: Experiment, folder: Path, report: Report) -> None:
-    """Write two posed image sets: ``photos`` (learned from) and ``held_out`` (driving camera, without objects)."""
+    """Write ``world.json`` and two posed image sets: ``photos`` (learned from) and ``held_out`` (driving camera, without objects)."""
     config = experiment.config.capture
     rng = np.random.default_rng(config.seed)
-    with experiment.site.open() as scene:
-        poses = experiment.site.photo_poses(config.photos, rng)
+    with experiment.open_world() as scene:
+        experiment.keep_world(scene)
+        poses = scene.photo_poses(config.photos, rng)
         states = held_out_states(experiment, rng)
         total = len(poses) + len(states)
 
@@ -42,11 +43,12 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
 
 
 def held_out_states(experiment: Experiment, rng: np.random.Generator) -> Array:
-    """Car states ``[held_out, 3]`` about the stretch of all drives that is measured."""
+    """Car states ``[held_out, 3]`` about the stretch of all paths that is measured."""
     names, count = list(experiment.paths), experiment.config.capture.held_out
-    driven_m = experiment.config.horizon * experiment.config.dt_s * experiment.world.car.speed_mps
+    driven_m = experiment.config.horizon * experiment.config.dt_s * experiment.car.speed_mps
     parts = []
     for index, name in enumerate(names):
         share = len(range(index, count, len(names)))
-        parts.append(recovery_states(experiment.paths[name], share, rng, _LATERAL_M, _HEADING_RAD, driven_m))
+        lateral_m = experiment.across_m(_LATERAL_M)
+        parts.append(recovery_states(experiment.paths[name], share, rng, lateral_m, _HEADING_RAD, driven_m))
     return np.concatenate(parts)

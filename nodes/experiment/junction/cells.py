@@ -51,7 +51,7 @@ def cell_inputs(experiment: Experiment, scenario: str, victim: str, method: str,
     del seed
     require_known(experiment, scenario, victim, method)
     config = experiment.config.model_dump(mode="json", exclude=_FREE)
-    inputs = {"config": config, "world": experiment.site.settings, "stages": stage_digests(experiment.folder)}
+    inputs = {"config": config, "world": experiment.world_settings, "stages": stage_digests(experiment.folder)}
     if victim != RETRAINED:
         return inputs
     file = victim_file(experiment, victim)
@@ -95,10 +95,10 @@ def run_cell(
         found: dict[str, Any] = json.loads(result.read_text())
         return with_film(found, film)
     with ExitStack() as stack:
-        scene = stack.enter_context(experiment.site.open()) if over_the_world(experiment) else None
+        scene = stack.enter_context(experiment.open_world()) if over_the_world(experiment) else None
         space = make_space(experiment, scene)
         _search(experiment, space, cell, folder, report)
-        scene = scene or stack.enter_context(experiment.site.open())
+        scene = scene or stack.enter_context(experiment.open_world())
         data = deployed_part(experiment, space, scene, cell, folder, folder)
         return with_film(data, film_cell(experiment, scene, load_shown(space, folder, cell), cell, folder))
 
@@ -159,7 +159,7 @@ def draw_maps(
     cell = Cell.of(scenario, victim, method, seed)
     if method == NONE or not isinstance(experiment.config.space, PlacesConfig):
         return []
-    count = len(experiment.world.objects)
+    count = len(experiment.objects)
     if not 0 <= number < count:
         raise CellError(f"expected an object of 0 to {count - 1}, got {number}")
     attack = load_attack(attack_path(folder, cell))

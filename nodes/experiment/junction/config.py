@@ -1,15 +1,15 @@
-"""The experiment file of the intersection: what is captured, learned, attacked and deployed, in its settings."""
+"""The experiment file of a world: where it is, what is captured, learned, attacked and deployed, in its settings."""
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from advnerf_core.attack.methods import method_name
-from hardware.worlds.junction.paths import PathName
 from nodes.experiment.junction.space_config import ColoursConfig, SpaceConfig
 from nodes.experiment.method_names import MethodReference
+from nodes.experiment.placed import PlacedObject
 
 Count = Annotated[int, Field(ge=0)]
 Positive = Annotated[int, Field(ge=1)]
@@ -21,11 +21,11 @@ class _Section(BaseModel):
 
 
 class CaptureConfig(_Section):
-    """How the junction is photographed."""
+    """How the world is photographed."""
 
     photos: Positive = Field(default=450, description="Posed photographs that the scene is learned from.")
     held_out: Annotated[int, Field(ge=3)] = Field(
-        default=36, description="Views of the driving camera along the three drives that nothing learns from."
+        default=36, description="Views of the driving camera along the paths that nothing learns from."
     )
     seed: int = 0
 
@@ -44,13 +44,25 @@ class SceneConfig(_Section):
         default=0.005, description="Optical depth from which rendering looks into a cell; see TrainConfig."
     )
     margin_m: Annotated[float, Field(ge=0)] = Field(
-        default=0.5, description="The box reaches so far beyond the world [m]."
+        default=0.5, description="The learned box reaches so far beyond the world's, if that is not contracted [m]."
     )
+    near_m: PositiveNumber = Field(default=0.3, description="Nothing stands nearer to the cameras [m].")
     interval_px: PositiveNumber | None = Field(
         default=None,
         description="Sample intervals in pixels of the policy's view; none: the default of pixel_intervals.",
     )
     seed: int = 0
+
+
+class ViewConfig(_Section):
+    """What the policy sees of the driving camera: a window of its image, resized to 200 x 66; the default fits 336 x 188."""
+
+    crop_top_px: Count = Field(default=24, description="First row that is kept.")
+    crop_height_px: Positive = Field(default=111, description="Number of rows that are kept.")
+    crop_left_px: Count = Field(default=0, description="First column that is kept.")
+    crop_width_px: Positive | None = Field(
+        default=None, description="Number of columns that are kept; none: all to the right edge."
+    )
 
 
 class PolicyConfig(_Section):
@@ -88,7 +100,7 @@ class PolicyConfig(_Section):
 
 
 class ObjectConfig(_Section):
-    """The objects; where they stand is the world's part of the file."""
+    """How the objects are made; where they stand is the section objects."""
 
     car_resolution: Annotated[int, Field(ge=8, le=128)] = Field(
         default=64, description="Voxels along a car's longest side."
@@ -162,6 +174,13 @@ class IntersectionExperimentConfig(_Section):
     """One experiment, resolved: the file's values, one of its settings over them, then the command line."""
 
     @model_validator(mode="after")
+    def _different_names(self) -> IntersectionExperimentConfig:
+        for what, names in (("scenarios", self.scenarios), ("names of objects", [each.name for each in self.objects])):
+            if len(set(names)) != len(names):
+                raise ValueError(f"expected different {what}, got {', '.join(names)}")
+        return self
+
+    @model_validator(mode="after")
     def _retraining_needs_the_gradient(self) -> IntersectionExperimentConfig:
         if self.retrain is not None and "gradient" not in self.attack.methods:
             raise ValueError(
@@ -185,9 +204,14 @@ class IntersectionExperimentConfig(_Section):
                 )
         return self
 
-    kind: Literal["intersection", "carla"] = Field(description="The simulated junction, or one of a CARLA map.")
     name: str = Field(min_length=1)
-    scenarios: tuple[PathName, ...] = Field(default=("straight", "right", "left"), min_length=1)
+    world: dict[str, Any] = Field(
+        description="kind: junction, carla, an installed package's, or file.py:Class relative to this file; and changes of that world's Config."
+    )
+    scenarios: tuple[str, ...] = Field(min_length=1, description="Which of the world's paths are driven.")
+    objects: tuple[PlacedObject, ...] = Field(
+        default=(), description="Where the objects of the attack stand; composed by depth, not part of the world."
+    )
     horizon: Positive = Field(default=60, description="Control ticks of every drive (T).")
     dt_s: PositiveNumber = Field(
         default=0.1,
@@ -196,11 +220,9 @@ class IntersectionExperimentConfig(_Section):
     held_cap_m: PositiveNumber = Field(
         default=6.0, description="Largest |CTE| that a stopped car is charged per tick [m]."
     )
-    world: dict[str, Any] = Field(
-        default_factory=dict, description="Changes to IntersectionConfig, or to CarlaConfig of hardware/worlds/carla."
-    )
     capture: CaptureConfig = CaptureConfig()
     scene: SceneConfig = SceneConfig()
+    view: ViewConfig = ViewConfig()
     policy: PolicyConfig = PolicyConfig()
     object: ObjectConfig = ObjectConfig()
     attack: AttackConfig = AttackConfig()

@@ -1,25 +1,39 @@
-"""What all stages of the intersection's experiment share: the resolved configuration, the world, paths, camera, car."""
+"""What all stages of an experiment in a world share: the resolved configuration, the world, paths, camera, car, objects."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path as FilePath
+from typing import Any
 
 import numpy as np
 import torch
 
-from advnerf_core.driving.dynamics import Dubins
+from advnerf_core.driving.dynamics import Ackermann, Dubins
 from advnerf_core.driving.expert import Expert, ExpertConfig
 from advnerf_core.driving.metrics import Horizon
-from advnerf_core.driving.path import Arc, Line, Path
+from advnerf_core.driving.path import Path
+from advnerf_core.files import write_atomically
 from advnerf_core.geometry import Array, Pinhole
+from advnerf_core.plugins import unknown
 from advnerf_core.policies.view import PolicyView
-from hardware.worlds.carla.config import CarlaConfig
-from hardware.worlds.junction.config import IntersectionConfig
-from hardware.worlds.junction.paths import ReferencePath
+from hardware.worlds.paths import ReferencePath
+from hardware.worlds.world import CarDescription, NotOpenError, Traits, World, WorldDescription, traits_of
 from nodes.experiment.junction.config import IntersectionExperimentConfig
-from nodes.experiment.junction.site import CarlaSite, Site, TwinSite, World
+from nodes.experiment.placed import PlacedObject, in_a_lane
 from nodes.experiment.run_folder import RunFolder
+from nodes.lab.worlds.expert_drive import as_path
+from nodes.lab.worlds.named import NamedWorld, read_world, without
+from nodes.runtime.config import Document
+from nodes.runtime.errors import ConfigError
+
+WORLD = "world.json"
+# Distances that stages use were chosen for half a lane of this width [m] and for this speed [m/s]: those of the simulated junction.
+_HALF_LANE_M, _SPEED_MPS = 1.75, 6.0
 
 
 @dataclass(frozen=True)
@@ -27,66 +41,199 @@ class Experiment(RunFolder[IntersectionExperimentConfig]):
     """One resolved experiment."""
 
     @cached_property
-    def site(self) -> Site:
-        """Where it is captured and deployed, with the experiment's changes."""
-        if self.config.kind == "carla":
-            return CarlaSite(CarlaConfig.model_validate(self.config.world), self.stage_folder("capture"))
-        return TwinSite(IntersectionConfig.model_validate(self.config.world))
+    def named_world(self) -> NamedWorld:
+        """The world as the file names it, with its changes."""
+        return read_world(Document(self.config.world, str(self.file)), self.file.parent)
 
     @property
-    def world(self) -> World:
-        """The site's configuration: cameras, car, objects."""
-        return self.site.world
+    def world_settings(self) -> dict[str, Any]:
+        """What of the world's configuration the results depend on, as JSON data."""
+        return self.named_world.settings
+
+    @cached_property
+    def traits(self) -> Traits:
+        """What is known of the world without opening it."""
+        return traits_of(self.named_world.make())
+
+    @property
+    def seen_settings(self) -> dict[str, Any]:
+        """What of the world's configuration its pictures and its description depend on, as JSON data."""
+        return without(self.world_settings, self.traits.unseen)
+
+    @cached_property
+    def world(self) -> WorldDescription:
+        """Paths, lanes, car and camera. A world that must be asked for them was asked by the capture stage, which has kept them.
+
+        Raises:
+            ConfigError: It must be asked, and nothing is captured yet.
+        """
+        try:
+            return self.named_world.make().describe()
+        except NotOpenError:
+            kept = self._captured()
+            if kept is None or kept["settings"] != self.seen_settings:
+                raise ConfigError(
+                    f"expected {self._kept_world} of this configuration, which the capture stage writes when the world {self.named_world.kind} is "
+                    "open; run that stage first"
+                ) from None
+            return WorldDescription.from_dict(kept["description"])
+
+    @property
+    def is_described(self) -> bool:
+        """Whether the world is known: not before the capture stage if it must be asked."""
+        try:
+            _ = self.world
+        except ConfigError:
+            return False
+        return True
+
+    @contextmanager
+    def open_world(self) -> Iterator[World]:
+        """The world, open; closed at the end.
+
+        Raises:
+            ConfigError: It is not the world that was captured.
+        """
+        with self.named_world.make() as world:
+            kept, found = self._captured(), as_json(world.describe())
+            if kept is not None and kept["settings"] == self.seen_settings and kept["description"] != found:
+                differ = [name for name, value in found.items() if kept["description"].get(name) != value]
+                raise ConfigError(
+                    f"expected the world of {self._kept_world}, got one with other {', '.join(differ)}: open the world that was captured, or name "
+                    "another run folder"
+                )
+            yield world
+
+    def keep_world(self, world: World) -> None:
+        """Write what an open world says about itself into the capture stage's folder.
+
+        Raises:
+            ConfigError: It says something else than before.
+        """
+        found = as_json(world.describe())
+        text = json.dumps({"settings": self.seen_settings, "description": found}, indent=1)
+        write_atomically(self._kept_world, text + "\n")
+        if as_json(self.world) != found:
+            raise ConfigError(
+                f"expected the world {self.named_world.kind} to say the same about itself every time, got something else once it was open; a world "
+                "that must be asked raises NotOpenError before"
+            )
+
+    @property
+    def _kept_world(self) -> FilePath:
+        return self.stage_folder("capture") / WORLD
+
+    def _captured(self) -> dict[str, Any] | None:
+        if not self._kept_world.exists():
+            return None
+        kept: dict[str, Any] = json.loads(self._kept_world.read_text(encoding="utf-8"))
+        return kept
 
     @cached_property
     def references(self) -> dict[str, ReferencePath]:
-        """The drives of the experiment by scenario."""
-        known = self.site.references
+        """The paths of the experiment by scenario.
+
+        Raises:
+            ConfigError: The world has no such path.
+        """
+        known = self.world.paths
+        for name in self.config.scenarios:
+            if name not in known:
+                raise ConfigError(f"{self.file}: scenarios: {unknown(name, 'scenario', known)}")
         return {name: known[name] for name in self.config.scenarios}
 
     @cached_property
     def paths(self) -> dict[str, Path]:
-        """Reference paths by scenario."""
-        return {name: as_path(reference) for name, reference in self.references.items()}
+        """Reference paths by scenario.
+
+        Raises:
+            ConfigError: The world's lines and arcs are no path, as one that does not close.
+        """
+        try:
+            return {name: as_path(reference) for name, reference in self.references.items()}
+        except ValueError as error:
+            raise ConfigError(f"world {self.named_world.kind}: {error}") from error
+
+    @cached_property
+    def objects(self) -> tuple[PlacedObject, ...]:
+        """The objects of the attack, beside the lanes.
+
+        Raises:
+            ConfigError: One stands in a lane.
+        """
+        if (found := in_a_lane(self.config.objects, self.world)) is not None:
+            raise ConfigError(f"{self.file}: objects.{found[0]}: {found[1]}")
+        return self.config.objects
 
     def goal(self, scenario: str) -> tuple[float, ...]:
-        """The exit as the policy is told it, one-hot."""
+        """What the policy is told on a path; empty where it is told nothing."""
         return self.references[scenario].goal
 
     def expert(self, scenario: str) -> Expert:
-        """The teacher on one path; its output is a turn rate [rad/s]."""
-        wanted, bound = self.config.policy, self.world.car.max_turn_rate_radps
+        """The teacher on one path; its output is the car's control: turn rate [rad/s] or wheel angle [rad]."""
+        wanted, car = self.config.policy, self.car
         config = ExpertConfig(
-            speed_mps=self.world.car.speed_mps, delay_s=wanted.delay_s, stiffness_1pm=wanted.stiffness_1pm,
-            feed_forward=wanted.feed_forward, smoothing_m=self.world.car.speed_mps * self.config.dt_s,
-            steering_limits_rad=(-bound, bound), output="turn_rate",
-        )  # fmt: skip
+            speed_mps=car.speed_mps,
+            delay_s=wanted.delay_s,
+            stiffness_1pm=wanted.stiffness_1pm,
+            feed_forward=wanted.feed_forward,
+            smoothing_m=car.speed_mps * self.config.dt_s,
+            steering_limits_rad=car.control_limits,
+            output="turn_rate",
+        )
+        if car.wheelbase_m is not None:
+            config = replace(config, wheelbase_m=car.wheelbase_m, output="wheel_angle")
         return Expert(self.paths[scenario], config)
+
+    @property
+    def car(self) -> CarDescription:
+        """The car as the surrogate believes it to be."""
+        return self.world.car
 
     @property
     def mount(self) -> Array:
         """Driving camera on the car ``[4, 4]``."""
-        return self.world.camera.T_car_from_camera
+        return self.world.T_car_from_camera
 
     @property
     def camera(self) -> Pinhole:
         """Intrinsics of the driving camera."""
-        return self.world.camera.pinhole
+        return self.world.camera
 
     @cached_property
     def view(self) -> PolicyView:
-        """What the policy sees of the driving camera."""
-        return PolicyView(self.camera)
+        """What the policy sees of the driving camera.
+
+        Raises:
+            ConfigError: The window leaves the camera's image.
+        """
+        try:
+            return PolicyView(self.camera, **self.config.view.model_dump())
+        except ValueError as error:
+            raise ConfigError(
+                f"{self.file}: view: {error}; give the section view the window of the camera's image that is kept"
+            ) from error
 
     @cached_property
-    def dynamics(self) -> Dubins:
+    def dynamics(self) -> Dubins | Ackermann:
         """The surrogate's car, without the lag and the gain error of the deployed one."""
-        return Dubins(self.world.car.speed_mps, self.config.dt_s)
+        car, dt_s = self.car, self.config.dt_s
+        if car.wheelbase_m is None:
+            return Dubins(car.speed_mps, dt_s)
+        return Ackermann(car.wheelbase_m, car.speed_mps, dt_s, car.control_limits)
 
     @property
     def limits(self) -> Horizon:
         """Over how many ticks a drive is measured, and what counts as off the track."""
-        return Horizon(self.config.horizon, self.config.dt_s, self.site.off_track_m, self.config.held_cap_m)
+        return Horizon(self.config.horizon, self.config.dt_s, self.world.off_track_m, self.config.held_cap_m)
+
+    def across_m(self, length_m: float) -> float:
+        """A distance sideways [m] that was chosen for half a lane of 1.75 m, in this world's lanes."""
+        return length_m * (self.world.off_track_m / _HALF_LANE_M)
+
+    def along_m(self, length_m: float) -> float:
+        """A distance along a path [m] that was chosen for 6 m/s, at this car's speed."""
+        return length_m * (self.car.speed_mps / _SPEED_MPS)
 
     def start_states(self, scenario: str, seed: int) -> torch.Tensor:
         """Start poses ``[B, 3]`` float64 of one attack, drawn about the nominal one; the first of seed 0 is the nominal one itself.
@@ -102,7 +249,7 @@ class Experiment(RunFolder[IntersectionExperimentConfig]):
         return torch.from_numpy(np.array(nominal) + spread * noise)
 
 
-def as_path(reference: ReferencePath) -> Path:
-    """The path that lines and arcs describe; open at both ends."""
-    pieces = [Line(piece[1]) if piece[0] == "line" else Arc(piece[1], piece[2]) for piece in reference.segments]
-    return Path.from_segments(reference.start_pose, pieces, closed=False)
+def as_json(description: WorldDescription) -> dict[str, Any]:
+    """A description as it is read back from a file."""
+    data: dict[str, Any] = json.loads(json.dumps(description.to_dict()))
+    return data

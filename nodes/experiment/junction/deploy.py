@@ -11,7 +11,7 @@ from typing import Any
 from advnerf_core.attack.spaces.space import Space
 from advnerf_core.files import write_atomically
 from advnerf_core.policies.pilotnet import load_policy
-from hardware.worlds.world import DeploymentScene
+from hardware.worlds.world import World
 from nodes.experiment.junction.attack import Cell, cells, frozen_hashes, load_shown
 from nodes.experiment.junction.context import Experiment
 from nodes.experiment.junction.deployed import DressedScene
@@ -32,7 +32,7 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
     """Drive what is not driven yet; one ``.cell.json`` per entry of the transfer table."""
     check_frozen(experiment)
     searched, plan = experiment.stage_folder("attack"), cells(experiment)
-    with experiment.site.open() as scene:
+    with experiment.open_world() as scene:
         space = make_space(experiment, scene)
         for index, cell in enumerate(plan):
             report(index / len(plan), f"{cell.scenario} {cell.victim} {cell.method} seed {cell.seed}")
@@ -51,7 +51,7 @@ def check_frozen(experiment: Experiment) -> None:
 
 
 def deployed_part(
-    experiment: Experiment, space: Space, scene: DeploymentScene, cell: Cell, searched: Path, folder: Path
+    experiment: Experiment, space: Space, scene: World, cell: Cell, searched: Path, folder: Path
 ) -> dict[str, Any]:
     """Drive a searched cell and its clean drive in the deployment scene; writes ``<cell>.cell.json`` and ``<cell>.drives.json``.
 
@@ -106,7 +106,7 @@ def _drives_of(found: Mapping[str, Any], clean: Mapping[str, Any]) -> dict[str, 
 
 
 def _drives(
-    experiment: Experiment, space: Space, scene: DeploymentScene, cell: Cell, searched: Path, folder: Path
+    experiment: Experiment, space: Space, scene: World, cell: Cell, searched: Path, folder: Path
 ) -> dict[str, Any]:
     """Deployed drives of a cell from all its starts; kept, as the clean ones are asked for again and again."""
     kept = folder / f"{cell.name}.drives.json"

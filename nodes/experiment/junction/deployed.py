@@ -1,6 +1,6 @@
 """The deployment side: what the car's camera sees when opaque objects stand in a scene that gives colours and depth.
 
-Works with any `DeploymentScene`: per pixel the nearer of scene and object wins (the paper, section 4), in the camera's own pixels, and
+Works with any `World`: per pixel the nearer of scene and object wins (the paper, section 4), in the camera's own pixels, and
 only then is the image cropped and resized for the policy.
 """
 
@@ -23,7 +23,7 @@ from advnerf_core.geometry import Array, Pinhole, planar_poses
 from advnerf_core.policies.pilotnet import Policy, images_to_tensor
 from advnerf_core.policies.view import PolicyView
 from advnerf_core.scene.surrogate import Frames, Surrogate
-from hardware.worlds.world import DeploymentScene, Depth, Rgb
+from hardware.worlds.world import Depth, Rgb, World
 from nodes.experiment.images import as_uint8
 
 # At a camera's own resolution one ray per pixel is what a rasteriser takes; the policy's resize averages three of them.
@@ -40,7 +40,7 @@ class DressedScene:
             `Surrogate.depth_tolerance_m` hides them: 0.15 m, so that where they touch the ground they do not flicker.
     """
 
-    def __init__(self, scene: DeploymentScene, view: PolicyView, objects: Sequence[ColouredObject]) -> None:
+    def __init__(self, scene: World, view: PolicyView, objects: Sequence[ColouredObject]) -> None:
         self.scene, self.view = scene, view
         self._window = Surrogate(
             self._observed, view.window_pinhole, scene.T_car_from_camera, objects, supersample=_SUPERSAMPLE, opaque=True
@@ -105,7 +105,7 @@ class SelfDriving:
 
     state_size = 3
 
-    def __init__(self, scene: DeploymentScene, speed_mps: float, dt_s: float) -> None:
+    def __init__(self, scene: World, speed_mps: float, dt_s: float) -> None:
         self.scene, self.speed_mps, self.dt_s = scene, speed_mps, dt_s
         self.blocked_tick: int | None = None
         self._tick = 0

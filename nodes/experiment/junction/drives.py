@@ -30,7 +30,7 @@ def deployed_drives(
     return [
         drive_deployed(
             dressed, policy, experiment.goal(scenario), np.asarray(start), experiment.paths[scenario], experiment.limits,
-            experiment.world.car.speed_mps, theta,
+            experiment.car.speed_mps, theta,
         )
         for start in starts.numpy()
     ]  # fmt: skip

@@ -104,7 +104,7 @@ def _along_the_drive(
 ) -> Pictures:
     objects = placed_objects(experiment)
     policy, _ = policy_of(experiment, victim, scenario)
-    with experiment.site.open() as scene:
+    with experiment.open_world() as scene:
         dressed = DressedScene(scene, experiment.view, objects)
         start = experiment.start_states(scenario, seed)[:1]
         (drive,) = deployed_drives(experiment, dressed, policy, scenario, start, dressed.plain_theta())

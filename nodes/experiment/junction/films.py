@@ -14,7 +14,7 @@ from advnerf_core.geometry import Array, planar_poses
 from advnerf_core.report.clips import ClipTrack, write_clip
 from advnerf_core.report.conditions import NONE, style_of
 from advnerf_core.scene.surrogate import Surrogate
-from hardware.worlds.world import DeploymentScene
+from hardware.worlds.world import World
 from nodes.experiment.images import as_uint8
 from nodes.experiment.junction.attack import Cell, load_shown
 from nodes.experiment.junction.context import Experiment
@@ -32,7 +32,7 @@ def strongest(experiment: Experiment) -> str:
     return "gradient" if "gradient" in methods else methods[-1]
 
 
-def film_scenario(experiment: Experiment, scene: DeploymentScene, space: Space, scenario: str, folder: Path) -> Path:
+def film_scenario(experiment: Experiment, scene: World, space: Space, scenario: str, folder: Path) -> Path:
     """The attacked drive in the surrogate, and the deployed ones past plain and attacked objects, side by side; first seed and start."""
     seed, method = experiment.config.attack.seeds[0], strongest(experiment)
     attacked = Cell(scenario, HARDENED, method, seed)
@@ -49,10 +49,10 @@ def film_scenario(experiment: Experiment, scene: DeploymentScene, space: Space, 
         views = [dressed.camera_image(state, there.colours) for state in states]
         title = "deployed, no attack" if cell.method == NONE else "deployed, attacked"
         tracks.append(_track(experiment, scenario, title, cell.method, views, states))
-    return write_clip(folder / f"{scenario}.mp4", tracks, rate_hz, experiment.site.off_track_m)
+    return write_clip(folder / f"{scenario}.mp4", tracks, rate_hz, experiment.world.off_track_m)
 
 
-def film_cell(experiment: Experiment, scene: DeploymentScene, shown: Shown, cell: Cell, folder: Path) -> Path:
+def film_cell(experiment: Experiment, scene: World, shown: Shown, cell: Cell, folder: Path) -> Path:
     """The deployed drive of one cell, from its first start; its files are in ``folder``, and ``clip.mp4`` will be."""
     every, rate_hz = filmed(experiment.config.dt_s)
     states = _states(folder / f"{cell.name}.drives.json")[0][::every]
@@ -60,7 +60,7 @@ def film_cell(experiment: Experiment, scene: DeploymentScene, shown: Shown, cell
     views = [dressed.camera_image(state, shown.colours) for state in states]
     title = f"{style_of(cell.method).title}, {cell.victim}, seed {cell.seed}"
     track = _track(experiment, cell.scenario, title, cell.method, views, states)
-    return write_clip(folder / "clip.mp4", [track], rate_hz, experiment.site.off_track_m)
+    return write_clip(folder / "clip.mp4", [track], rate_hz, experiment.world.off_track_m)
 
 
 def kept_film(folder: Path) -> Path | None:

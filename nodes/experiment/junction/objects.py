@@ -1,4 +1,4 @@
-"""Stage object: cars and hydrants as voxels; and the five of them as they stand at the junction."""
+"""Stage object: cars and hydrants as voxels; and all objects as they stand in the world."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from advnerf_core.objects.voxel.generators import GENERATORS
 from advnerf_core.objects.voxel.mesh import stand
 from advnerf_core.objects.voxel.model import ObjectModel, load_object, save_object
 from advnerf_core.scene.surrogate import BackgroundRenderer, Surrogate
-from hardware.worlds.junction.config import ObjectKind
 from nodes.experiment.junction.context import Experiment
 from nodes.experiment.learned_scene import load_background
+from nodes.experiment.placed import ObjectKind
 from nodes.runtime.progress import Report
 
 GENERATOR_OF: dict[ObjectKind, str] = {"small_car": "car", "hydrant": "hydrant"}
@@ -25,7 +25,7 @@ GENERATOR_OF: dict[ObjectKind, str] = {"small_car": "car", "hydrant": "hydrant"}
 
 def run(experiment: Experiment, folder: Path, report: Report) -> None:
     """Write one object file for each kind; where they stand is not part of it."""
-    kinds = sorted({thing.kind for thing in experiment.world.objects})
+    kinds = sorted({thing.kind for thing in experiment.config.objects})
     for index, kind in enumerate(kinds):
 
         def progress(fraction: float, text: str, index: int = index, kind: str = kind) -> None:
@@ -49,14 +49,14 @@ def object_file(experiment: Experiment, kind: str) -> Path:
 
 
 def placed_objects(experiment: Experiment) -> list[VoxelGridObject]:
-    """The objects in the order of the world's configuration, in their plain colours."""
-    models = {thing.kind: load_object(object_file(experiment, thing.kind)) for thing in experiment.world.objects}
-    return [models[thing.kind].placed(thing.T_world_from_object, thing.scale) for thing in experiment.world.objects]
+    """The objects in the order of the experiment file, in their plain colours."""
+    models = {thing.kind: load_object(object_file(experiment, thing.kind)) for thing in experiment.objects}
+    return [models[thing.kind].placed(thing.T_world_from_object, thing.scale) for thing in experiment.objects]
 
 
 def describe(experiment: Experiment) -> list[dict[str, Any]]:
     """Names, places and free colours of the objects, as plain data."""
-    things = zip(experiment.world.objects, placed_objects(experiment), strict=True)
+    things = zip(experiment.objects, placed_objects(experiment), strict=True)
     return [{**thing.model_dump(), "free_colours": field.free_count} for thing, field in things]
 
 

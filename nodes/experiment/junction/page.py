@@ -1,4 +1,4 @@
-"""The report page of the intersection: one self-contained HTML file that loads nothing."""
+"""The report page of an experiment in a world: one self-contained HTML file that loads nothing."""
 
 from __future__ import annotations
 
@@ -47,11 +47,11 @@ def write(
         experiment: With all stages before finished.
         folder: Where to.
         table: The transfer table.
-        overview: The junction from above.
+        overview: The world from above.
         clips: One film per drive.
         seen: Per drive and method, what the camera saw of the objects.
     """
-    title = f"The intersection ({experiment.setting})"
+    title = f"{experiment.config.name} ({experiment.setting})"
     style = files("advnerf_core.report").joinpath("page.css").read_text(encoding="utf-8")
     parts = [
         Markup(_HEAD).format(
@@ -59,7 +59,7 @@ def write(
         ),
         Markup("<h1>{}</h1><p>{}</p>").format(title, opening(experiment)),
         Markup("<h2>Total cross-track error</h2>{}").format(table.html()),
-        Markup("<h2>The junction</h2>"), _picture(overview, "Paths of the three drives, and the places of the objects"),
+        Markup("<h2>The world</h2>"), _picture(overview, "Paths of the drives, and the places of the objects"),
     ]  # fmt: skip
     for name, clip in zip(experiment.config.scenarios, clips, strict=True):
         parts += [Markup("<h2>{}</h2>").format(name.capitalize()), *_drive(experiment, name, clip, seen[name])]
@@ -71,15 +71,14 @@ def write(
 
 def opening(experiment: Experiment) -> str:
     """What was done, in one paragraph."""
-    attack, things = experiment.config.attack, experiment.world.objects
+    attack, things = experiment.config.attack, experiment.objects
     methods = ", ".join(style_of(name).title for name in attack.method_names)
-    where = "junction of the CARLA map" if experiment.config.kind == "carla" else "simulated junction"
     kinds = {kind: sum(thing.kind == kind for thing in things) for kind in ("small_car", "hydrant")}
     return (
         f"One goal-conditioned policy drives {', '.join(experiment.config.scenarios)}. The colours of {kinds['small_car']} cars and "
         f"{kinds['hydrant']} hydrants are searched together in the learned scene ({methods}; {attack.evaluations} evaluations each, "
         f"{len(attack.seeds)} seed(s), {attack.starts} start(s), T = {experiment.config.horizon} ticks of {experiment.config.dt_s:g} s), then the opaque objects are put into the "
-        f"{where} by depth. Total CTE is the sum of |CTE| over the drive's ticks; ratios are to the same start past the plain "
+        f"world {experiment.named_world.kind} by depth. Total CTE is the sum of |CTE| over the drive's ticks; ratios are to the same start past the plain "
         "objects in the same domain."
     )
 
@@ -130,24 +129,20 @@ def _ground(ax: Any, experiment: Experiment) -> None:
     from matplotlib.patches import Polygon
 
     ax.grid(False)
-    if (edge := experiment.site.road_edge) is not None:
-        half_m, on_road = edge
-        side = np.linspace(-half_m, half_m, 481)
-        x, y = np.meshgrid(side, side)
-        asphalt = np.vectorize(on_road)(x, y).astype(float)
-        ax.contour(x, y, asphalt, levels=[0.5], colors=LIGHT["muted"], linewidths=1.0, zorder=0.5)
-    for thing in experiment.world.objects:
+    for edge in experiment.world.road_edge:
+        ax.plot(*edge.T, color=LIGHT["muted"], lw=1.0, zorder=0.5)
+    for thing in experiment.objects:
         ax.add_patch(Polygon(thing.corners_m(), closed=True, fc=LIGHT["grid"], ec=LIGHT["ink"], lw=1.0, zorder=1.5))
 
 
 def _fidelity(experiment: Experiment) -> list[Markup]:
     scene = json.loads((experiment.stage_folder("scene") / "fidelity.json").read_text())
-    rates = json.loads((experiment.stage_folder("policy") / "policy.json").read_text())["on_held_out_views"]
-    difference = float(np.mean([abs(row["real_radps"] - row["surrogate_radps"]) for row in rates]))
+    controls = json.loads((experiment.stage_folder("policy") / "policy.json").read_text())["on_held_out_views"]
+    difference = float(np.mean([abs(row["real"] - row["surrogate"]) for row in controls]))
     mean, views = scene["mean"], scene["views"]
     text = (
         f"Held-out views of the driving camera: {mean['psnr_full_db']:.1f} dB at full size, {mean['psnr_policy_db']:.1f} dB at 200x66; "
-        f"the policy's turn rate on true and learned views differs by {difference:.3f} rad/s on average."
+        f"the policy's control on true and learned views differs by {difference:.3f} {experiment.car.control_unit} on average."
     )
     parts = [Markup("<h2>The learned scene</h2><p>{}</p>").format(text)]
     for index in np.linspace(0, len(views) - 1, min(_SHOWN_VIEWS, len(views))).round().astype(int):

@@ -19,7 +19,7 @@ from advnerf_core.geometry import planar_pose
 from advnerf_core.learning.imitation import ImitationConfig, SourcePlan, train_policy
 from advnerf_core.learning.sources import RenderedSource, Show
 from advnerf_core.policies.pilotnet import images_to_tensor, load_policy
-from hardware.worlds.world import DeploymentScene
+from hardware.worlds.world import World
 from nodes.experiment.images import as_uint8
 from nodes.experiment.junction import capture
 from nodes.experiment.junction.context import Experiment
@@ -31,31 +31,33 @@ from nodes.runtime.progress import Report
 HARDENED, NAIVE, RETRAINED = "hardened", "naive", "retrained"
 VICTIMS = (HARDENED, NAIVE)
 FILES = {HARDENED: "policy.safetensors", NAIVE: "naive.safetensors"}
-# Poses that the policy learns from: as far from the path [m], and as turned [rad], as a recovery may have to begin.
+# Poses that the policy learns from: as far from the path [m, of half a lane of 1.75 m], and as turned [rad], as a recovery may have to begin.
 _STILLS, _DRIVES, _GIVE_UP_M = (1.6, 0.3), (0.8, 0.12), 3.0
 
 Sample = Callable[[np.random.Generator], torch.Tensor]
 
 
 def run(experiment: Experiment, folder: Path, report: Report) -> None:
-    """Train the victims, then compare their turn rates on held-out views and on the surrogate's image of them."""
+    """Train the victims, then compare their controls on held-out views and on the surrogate's image of them."""
     config = experiment.config.policy
     settings = ImitationConfig(
         seed=config.seed, dagger_rounds=config.dagger_rounds, first_steps=config.first_steps,
         round_steps=config.round_steps, naive_steps=config.naive_steps, hidden=config.hidden,
-        lateral_m=_STILLS[0], heading_rad=_STILLS[1], drive_lateral_m=_DRIVES[0], drive_heading_rad=_DRIVES[1],
-        give_up_m=_GIVE_UP_M, max_steering_rad=experiment.world.car.max_turn_rate_radps,
+        lateral_m=experiment.across_m(_STILLS[0]), heading_rad=_STILLS[1],
+        drive_lateral_m=experiment.across_m(_DRIVES[0]), drive_heading_rad=_DRIVES[1],
+        give_up_m=experiment.across_m(_GIVE_UP_M), max_steering_rad=experiment.car.largest_control,
     )  # fmt: skip
     write_placement(experiment, folder)
-    with experiment.site.open() as scene:
+    with experiment.open_world() as scene:
         trained = train_policy(
             settings, plans(experiment, scene), experiment.expert(experiment.config.scenarios[0]), experiment.view,
             folder, lambda part, text: report(0.98 * part, text),
         )  # fmt: skip
-    report(0.98, "comparing turn rates on true and learned views")
+    report(0.98, "comparing controls on true and learned views")
     summary = {
         "sha256": trained.sha256, "naive_sha256": trained.naive_sha256, "frames": trained.frames,
-        "validation_mae_radps": trained.validation_mae_rad, "naive_validation_mae_radps": trained.naive_validation_mae_rad,
+        "validation_mae": trained.validation_mae_rad, "naive_validation_mae": trained.naive_validation_mae_rad,
+        "control_unit": experiment.car.control_unit,
         "on_held_out_views": agreement(experiment),
     }  # fmt: skip
     write_atomically(folder / "policy.json", json.dumps(summary, indent=1) + "\n")
@@ -79,7 +81,7 @@ def victim_file(experiment: Experiment, victim: str) -> Path:
 
 
 def plans(
-    experiment: Experiment, scene: DeploymentScene, sample: Sample | None = None,
+    experiment: Experiment, scene: World, sample: Sample | None = None,
     objects: Sequence[VoxelGridObject] | None = None, ending: str = "",
 ) -> list[SourcePlan]:  # fmt: skip
     """For each drive its frames from the deployment scene and from the surrogate, with its goal and its teacher.
@@ -125,7 +127,7 @@ def plans(
 
 
 def agreement(experiment: Experiment) -> list[dict[str, float]]:
-    """Turn rate [rad/s] of the hardened victim on each held-out view and on the surrogate's image of it, told to go straight on."""
+    """Control of the hardened victim on each held-out view and on the surrogate's image of it, told to follow the first path."""
     views = load_transforms(experiment.stage_folder("capture") / capture.HELD_OUT / "transforms.json")
     policy = load_policy(victim_file(experiment, HARDENED)).policy
     surrogate = surrogate_of(experiment, [])
@@ -136,7 +138,7 @@ def agreement(experiment: Experiment) -> list[dict[str, float]]:
         with torch.no_grad():
             on_real = float(policy(images_to_tensor(real), goal)[0])
             on_surrogate = float(policy(surrogate.render(frame.T_world_from_camera[None], None).images, goal)[0])
-        rows.append({"real_radps": on_real, "surrogate_radps": on_surrogate})
+        rows.append({"real": on_real, "surrogate": on_surrogate})
     return rows
 
 

@@ -61,7 +61,7 @@ def draw_maps(
     """
     settings = settings or PoseMapSettings()
     space = make_space(experiment, None)
-    sensor, name = space.sensor, experiment.world.objects[number].name
+    sensor, name = space.sensor, experiment.objects[number].name
     assert isinstance(sensor, PlacedSensor), "the space of places has this sensor"
     victim = load_policy(victim_file(experiment, cell.victim))
     problem = attack_problem(experiment, space, victim, cell.scenario, cell.seed)

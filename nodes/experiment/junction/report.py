@@ -16,16 +16,17 @@ from advnerf_core.attack.spaces.space import Space
 from advnerf_core.files import write_atomically
 from advnerf_core.report.conditions import NONE, order_of, style_of
 from advnerf_core.report.tables import Table, spread
-from hardware.worlds.world import DeploymentScene
+from hardware.worlds.world import World
 from nodes.experiment.junction import films, page
 from nodes.experiment.junction.attack import Cell, cells, load_shown
 from nodes.experiment.junction.context import Experiment
 from nodes.experiment.junction.deployed import DressedScene
+from nodes.experiment.junction.overview import from_above
 from nodes.experiment.junction.policy import HARDENED
 from nodes.experiment.junction.spaces import make_space
 from nodes.runtime.progress import Report
 
-# Where along a drive its objects are shown [m]: most of them are in view, some close.
+# Where along a drive its objects are shown [m, at 6 m/s]: most of them are in view, some close.
 _SEEN_AT_M = (9.0, 14.0)
 
 
@@ -64,9 +65,9 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
     table = transfer_table(rows)
     write_results(experiment, rows, folder)
     clips = []
-    with experiment.site.open() as scene:
+    with experiment.open_world() as scene:
         space = make_space(experiment, scene)
-        overview = experiment.site.overview(scene)
+        overview = from_above(experiment, scene)
         for index, name in enumerate(experiment.config.scenarios):
             report(0.1 + 0.8 * index / len(experiment.config.scenarios), f"filming {name}")
             clips.append(films.film_scenario(experiment, scene, space, name, folder))
@@ -145,12 +146,11 @@ def write_results(experiment: Experiment, rows: Sequence[Row], folder: Path) -> 
     write_atomically(folder / "results.csv", "\n".join(lines) + "\n")
 
 
-def textures_seen(
-    experiment: Experiment, scene: DeploymentScene, space: Space, scenario: str
-) -> dict[str, NDArray[np.uint8]]:
+def textures_seen(experiment: Experiment, scene: World, space: Space, scenario: str) -> dict[str, NDArray[np.uint8]]:
     """The same views of the driving camera past the plain, random and attacked objects of the first seed, one row each."""
     searched, seed = experiment.stage_folder("attack"), experiment.config.attack.seeds[0]
-    states = [np.array(experiment.references[scenario].pose_at(at)) for at in _SEEN_AT_M]
+    reference = experiment.references[scenario]
+    states = [np.array(reference.pose_at(experiment.along_m(at))) for at in _SEEN_AT_M]
     seen = {}
     for method in (NONE, *experiment.config.attack.method_names):
         shown = load_shown(space, searched, Cell(scenario, HARDENED, method, seed))

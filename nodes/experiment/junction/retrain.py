@@ -29,7 +29,7 @@ from advnerf_core.learning.imitation import SourcePlan, recovery_states
 from advnerf_core.learning.retrain import RetrainConfig, fine_tune
 from advnerf_core.learning.sources import Seen, steer_with
 from advnerf_core.policies.pilotnet import LoadedPolicy, load_policy
-from hardware.worlds.world import DeploymentScene
+from hardware.worlds.world import World
 from nodes.experiment.junction import retrain_plot
 from nodes.experiment.junction.attack import Cell, attack_problem, load_shown
 from nodes.experiment.junction.context import Experiment
@@ -41,7 +41,7 @@ from nodes.experiment.junction.spaces import colour_space, random_placements
 from nodes.experiment.stages import hash_of
 from nodes.runtime.progress import Report
 
-_NEAR_M, _TURNED_RAD, _GIVE_UP_M = 1.0, 0.15, 3.0
+_NEAR_M, _TURNED_RAD, _GIVE_UP_M = 1.0, 0.15, 3.0  # metres of half a lane of 1.75 m
 _PLACES_SEED = 10_000  # far from the seeds of pose attacks, which must not find the places that were learned
 
 
@@ -66,7 +66,7 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
     file, rounds, kept = victim_file(experiment, HARDENED), [], _old_frames(experiment)
     victim = load_policy(file)
     thetas: list[torch.Tensor] = []
-    with experiment.site.open() as scene:
+    with experiment.open_world() as scene:
         dressed = DressedScene(scene, experiment.view, placed_objects(experiment))
         first, old_attacks = _first_attacks(experiment, space, dressed, victim, folder / "round0"), {}
         for number in range(wanted.rounds + 1):
@@ -99,7 +99,7 @@ def unseen_start(experiment: Experiment, scenario: str) -> torch.Tensor:
     """A start ``[1, 3]`` that no attack and no training drive began at: a metre back, a third of a metre to the left."""
     x_m, y_m, yaw_rad = experiment.references[scenario].start_pose
     back, left = np.array([-np.cos(yaw_rad), -np.sin(yaw_rad)]), np.array([-np.sin(yaw_rad), np.cos(yaw_rad)])
-    place = np.array([x_m, y_m]) + 1.0 * back + 0.35 * left
+    place = np.array([x_m, y_m]) + experiment.along_m(1.0) * back + experiment.across_m(0.35) * left
     return torch.tensor([[place[0], place[1], yaw_rad]], dtype=torch.float64)
 
 
@@ -192,7 +192,7 @@ def _total_cte_m(
 
 
 def _collect(
-    experiment: Experiment, scene: DeploymentScene, victim: LoadedPolicy, thetas: Sequence[torch.Tensor], folder: Path,
+    experiment: Experiment, scene: World, victim: LoadedPolicy, thetas: Sequence[torch.Tensor], folder: Path,
     report: Callable[[float, str], None],
 ) -> list[Frames]:  # fmt: skip
     """Frames of both domains with the found objects: stills about the paths, and drives of the victim, labelled by the teacher.
@@ -210,26 +210,34 @@ def _collect(
     for number, (plan, stills, drives) in enumerate(chosen):
         if plan.source.name not in store.names():
             rng = np.random.default_rng([wanted.seed, len(thetas), number])
-            store.append(plan.source.name, _frames(plan, victim, stills, drives, wanted.drive_steps, rng))
+            frames = _frames(plan, victim, stills, drives, wanted.drive_steps, rng, experiment.across_m(1.0))
+            store.append(plan.source.name, frames)
         report(0.4 + 0.3 * (number + 1) / len(chosen), f"collecting: {plan.source.name}")
     return [store.load(plan.source.name) for plan, _, _ in chosen]
 
 
 def _frames(
-    plan: SourcePlan, victim: LoadedPolicy, stills: int, drives: int, steps: int, rng: np.random.Generator
+    plan: SourcePlan,
+    victim: LoadedPolicy,
+    stills: int,
+    drives: int,
+    steps: int,
+    rng: np.random.Generator,
+    width: float,
 ) -> Frames:
-    expert = plan.expert
-    assert expert is not None, "every plan of the intersection has its own teacher"
-    places = recovery_states(expert.path, stills, rng, _NEAR_M, _TURNED_RAD, plan.driven_m)
+    """Frames of one plan; distances sideways are ``width`` times those of the junction."""
+    expert, near_m = plan.expert, width * _NEAR_M
+    assert expert is not None, "every plan of a world has its own teacher"
+    places = recovery_states(expert.path, stills, rng, near_m, _TURNED_RAD, plan.driven_m)
     size = plan.source.batch_size
     parts = [plan.source.look(places[first : first + size], rng) for first in range(0, stills, size)]
     # Early on the path: what follows is driven through.
     begin_m = None if plan.driven_m is None else 0.3 * plan.driven_m
-    starts = recovery_states(expert.path, 2 * drives, rng, 0.5 * _NEAR_M, 0.5 * _TURNED_RAD, begin_m)
+    starts = recovery_states(expert.path, 2 * drives, rng, 0.5 * near_m, 0.5 * _TURNED_RAD, begin_m)
     steer = steer_with(victim.policy, torch.tensor([plan.goal]))
 
     def near(states: Array) -> NDArray[np.bool_]:
-        close: NDArray[np.bool_] = np.abs(expert.path.project(states[:, :2]).cte_m) <= _GIVE_UP_M
+        close: NDArray[np.bool_] = np.abs(expert.path.project(states[:, :2]).cte_m) <= width * _GIVE_UP_M
         return close
 
     # Two side by side, so that one of them meets a found texture throughout.

@@ -1,4 +1,4 @@
-"""Runs an experiment of kind ``intersection``: resolves its file, runs its stages, prints the table."""
+"""Runs an experiment in a world: resolves its file, runs its stages, prints the table."""
 
 from __future__ import annotations
 
@@ -12,26 +12,28 @@ from typing import Any
 from rich.console import Console
 
 from advnerf_core.attack.methods import method_digest, method_name
-from hardware.worlds.carla.config import CarlaConfig
-from hardware.worlds.junction.config import IntersectionConfig
+from advnerf_core.plugins import unknown
 from nodes.experiment.junction import attack, capture, deploy, objects, policy, report, retrain, scene
 from nodes.experiment.junction.config import IntersectionExperimentConfig
 from nodes.experiment.junction.context import Experiment
+from nodes.experiment.placed import in_a_lane
 from nodes.experiment.run import read_setting
 from nodes.experiment.run_folder import run_to_end
 from nodes.experiment.stages import Stage, StageRecord, begun_with
-from nodes.runtime.config import validate
+from nodes.lab.worlds.named import read_world
+from nodes.runtime.config import Document, validate
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import Report
 
 _LIBRARIES = ("torch", "numpy", "numba", "opencv-contrib-python-headless", "mujoco")
+_WHOLE_STEP_S = 1e-6
 
 
 def load_experiment(file: Path, setting: str, overrides: Sequence[str], folder: Path) -> Experiment:
     """Resolve an experiment file.
 
     Args:
-        file: A ``*.experiment.yaml`` file with ``kind: intersection`` or ``kind: carla``.
+        file: A ``*.experiment.yaml`` file with a section ``world``.
         setting: Which of its settings to lay over its values.
         overrides: ``section.key=value`` texts, applied last.
         folder: The run folder.
@@ -41,17 +43,33 @@ def load_experiment(file: Path, setting: str, overrides: Sequence[str], folder: 
     """
     document = read_setting(file, setting, overrides)
     config = validate(IntersectionExperimentConfig, document, file.parent)
-    if config.kind == "carla":
-        render = validate(CarlaConfig, document.part(("world",))).render
-        try:
-            render.whole_ticks(config.dt_s)
-        except ValueError as error:
-            raise ConfigError(
-                f"{file}: expected dt_s to be whole ticks of world.render.fixed_delta_s = {render.fixed_delta_s:g} s, got {config.dt_s:g} s"
-            ) from error
-    else:
-        validate(IntersectionConfig, document.part(("world",)))
-    return Experiment(config, file.resolve(), folder.resolve(), setting)
+    read_world(document.part(("world",)), file.resolve().parent)
+    experiment = Experiment(config, file.resolve(), folder.resolve(), setting)
+    _check_ticks(experiment, document)
+    if experiment.is_described:
+        _check_places(experiment, document)
+    return experiment
+
+
+def _check_ticks(experiment: Experiment, document: Document) -> None:
+    """A control tick must be whole steps of the world."""
+    step_s, dt_s = experiment.traits.step_s, experiment.config.dt_s
+    if step_s is not None and abs(round(dt_s / step_s) * step_s - dt_s) > _WHOLE_STEP_S:
+        raise ConfigError(
+            f"{document.place(('dt_s',))}: expected dt_s to be whole steps of the world {experiment.named_world.kind}, {step_s:g} s each, "
+            f"got {dt_s:g} s"
+        )
+
+
+def _check_places(experiment: Experiment, document: Document) -> None:
+    """Scenarios must be the world's, and objects must stand beside its lanes; said with the line of the file."""
+    for index, name in enumerate(experiment.config.scenarios):
+        if name not in experiment.world.paths:
+            message = unknown(name, "scenario", experiment.world.paths)
+            raise ConfigError(f"{document.place(('scenarios', index))}: scenarios: {message}")
+    if (found := in_a_lane(experiment.config.objects, experiment.world)) is not None:
+        raise ConfigError(f"{document.place(('objects', found[0]))}: {found[1]}")
+    _ = experiment.view
 
 
 def run_experiment(
@@ -89,20 +107,19 @@ def prepare_victims(experiment: Experiment, report: Report) -> None:
 def stages_of(experiment: Experiment) -> list[Stage]:
     """The stages with the part of the configuration that each depends on; moving an object keeps capture, scene and object files.
 
+    The world must not have been opened for them.
+
     More rounds of retraining go on from those that are there.
     """
-    config, world = experiment.config, experiment.site.settings
+    config, world = experiment.config, experiment.world_settings
     measured = {
         "horizon": config.horizon,
         "dt_s": config.dt_s,
         "held_cap_m": config.held_cap_m,
         "scenarios": config.scenarios,
     }
-    seen = {key: value for key, value in world.items() if key not in ("objects", "car")}
-    # Held-out views lie along what is driven. Only another speed than the usual one is named: captures of before stay what they are.
-    speed_mps, car = experiment.world.car.speed_mps, type(experiment.world.car)
-    other_speed = {} if speed_mps == car.model_fields["speed_mps"].default else {"speed_mps": speed_mps}
-    kinds = sorted({thing.kind for thing in experiment.world.objects})
+    kinds = sorted({thing.kind for thing in config.objects})
+    placed = [thing.model_dump(mode="json") for thing in config.objects]
 
     def stage(
         name: str, module: Any, settings: dict[str, Any], after: Sequence[str], parts: Sequence[dict[str, Any]] = ()
@@ -120,18 +137,19 @@ def stages_of(experiment: Experiment) -> list[Stage]:
     searched = {**part("attack"), "methods": config.attack.method_names}
     if codes := {method_name(each): code for each in config.attack.methods if (code := method_digest(each))}:
         searched["code"] = codes
-
+    view, space = part("view"), part("space")
+    driven = {"world": world, "objects": placed, "view": view, **measured}
     stages = [
-        stage("capture", capture, {"world": seen, "capture": part("capture"), **measured, **other_speed}, ()),
-        stage("scene", scene, {"scene": part("scene")}, ("capture",)),
+        stage("capture", capture, {"world": experiment.seen_settings, "capture": part("capture"), **measured}, ()),
+        stage("scene", scene, {"scene": part("scene"), "view": view}, ("capture",)),
         stage("object", objects, {"object": part("object"), "kinds": kinds}, ()),
-        stage("policy", policy, {"world": world, "policy": part("policy"), "sigma": config.attack.random_sigma, **measured}, ("capture", "scene", "object")),
-        stage("attack", attack, {"world": world, "attack": searched, "space": part("space"), **measured}, ("scene", "object", "policy")),
-        stage("deploy", deploy, {"world": world, "space": part("space"), **measured}, ("object", "policy", "attack")),
+        stage("policy", policy, {**driven, "policy": part("policy"), "sigma": config.attack.random_sigma}, ("capture", "scene", "object")),
+        stage("attack", attack, {**driven, "attack": searched, "space": space}, ("scene", "object", "policy")),
+        stage("deploy", deploy, {**driven, "space": space}, ("object", "policy", "attack")),
         stage("report", report, {"attack": searched, **measured}, ("capture", "scene", "policy", "attack", "deploy")),
     ]  # fmt: skip
     if config.retrain is not None:
-        settings = {"world": world, "retrain": part("retrain"), "attack": searched, **measured}
+        settings = {**driven, "retrain": part("retrain"), "attack": searched}
         fewer = [
             {**settings, "retrain": {**settings["retrain"], "rounds": rounds}}
             for rounds in range(1, config.retrain.rounds)

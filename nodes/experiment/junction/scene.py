@@ -1,4 +1,4 @@
-"""Stage scene: learn the junction from its photographs, and compare with held-out views of the driving camera."""
+"""Stage scene: learn the world from its photographs, and compare with held-out views of the driving camera."""
 
 from __future__ import annotations
 
@@ -14,8 +14,6 @@ from nodes.experiment.junction.context import Experiment
 from nodes.experiment.learned_scene import compare_views, scene_file
 from nodes.runtime.progress import Report
 
-# Nothing stands nearer to the cameras.
-_NEAR_M = 0.3
 _TRAINING_SHARE = 0.97
 
 
@@ -29,7 +27,7 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
 
     field = field_config(experiment)
     march = pixel_intervals(
-        [experiment.view.pinhole], photographs.T_world_from_camera, field, _NEAR_M, config.interval_px
+        [experiment.view.pinhole], photographs.T_world_from_camera, field, config.near_m, config.interval_px
     )
     training = TrainConfig(
         steps=config.steps, seed=config.seed, march=march, refine_depth=config.refine_depth,
@@ -46,7 +44,10 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
 
 
 def field_config(experiment: Experiment) -> SceneFieldConfig:
-    """A field in the box that the site is learned in."""
-    wanted = experiment.config.scene
+    """A field in the world's box: a little larger than that if it holds everything, as it is if what lies outside is contracted."""
+    wanted, box = experiment.config.scene, experiment.world.box
     grid = HashGridConfig(levels=wanted.levels, features=4, log2_entries=wanted.log2_entries, finest=wanted.finest)
-    return experiment.site.field_config(grid, wanted.margin_m)
+    margin_m = 0.0 if box.contraction else wanted.margin_m
+    low = (box.min_m[0] - margin_m, box.min_m[1] - margin_m, box.min_m[2] - margin_m)
+    high = (box.max_m[0] + margin_m, box.max_m[1] + margin_m, box.max_m[2] + margin_m)
+    return SceneFieldConfig(low, high, grid, contraction=box.contraction)

@@ -21,9 +21,8 @@ from advnerf_core.objects.voxel.generators import GENERATORS
 from advnerf_core.objects.voxel.mesh import stand
 from advnerf_core.scene.remembered import frame_bytes
 from advnerf_core.scene.surrogate import Surrogate
-from hardware.worlds.junction.config import PlacedObject
-from hardware.worlds.world import DeploymentScene
-from nodes.experiment.junction.context import Experiment, as_path
+from hardware.worlds.world import World
+from nodes.experiment.junction.context import Experiment
 from nodes.experiment.junction.objects import GENERATOR_OF, object_file, placed_objects, surrogate_of
 from nodes.experiment.junction.space_config import (
     ColoursConfig,
@@ -31,7 +30,9 @@ from nodes.experiment.junction.space_config import (
     MeshTextureConfig,
     PlacesConfig,
 )
+from nodes.experiment.placed import PlacedObject
 from nodes.experiment.request.frames import DeployedFrames
+from nodes.lab.worlds.expert_drive import as_path
 
 
 def colour_space(experiment: Experiment, surrogate: Surrogate | None = None) -> ColourSpace:
@@ -39,7 +40,7 @@ def colour_space(experiment: Experiment, surrogate: Surrogate | None = None) -> 
     return ColourSpace(surrogate or surrogate_of(experiment, placed_objects(experiment)), _named_voxels(experiment))
 
 
-def make_space(experiment: Experiment, scene: DeploymentScene | None) -> Space:
+def make_space(experiment: Experiment, scene: World | None) -> Space:
     """The space that the experiment's section ``space`` asks for.
 
     Args:
@@ -55,9 +56,7 @@ def make_space(experiment: Experiment, scene: DeploymentScene | None) -> Space:
     fields = mesh_objects(experiment, wanted)
     frames = DeployedFrames(scene, experiment.view)
     surrogate = Surrogate(frames, experiment.view.pinhole, experiment.mount, fields, depth_tolerance_m=0.0)
-    named = [
-        NamedObject(thing.name, field.sha256) for thing, field in zip(experiment.world.objects, fields, strict=True)
-    ]
+    named = [NamedObject(thing.name, field.sha256) for thing, field in zip(experiment.objects, fields, strict=True)]
     if isinstance(wanted, MeshTextureConfig):
         return ColourSpace(surrogate, named)
     limits = ShapeLimits(wanted.bound_m, wanted.smoothness, wanted.samples, wanted.boundary_samples)
@@ -72,7 +71,7 @@ def over_the_world(experiment: Experiment) -> bool:
 def mesh_objects(experiment: Experiment, wanted: MeshTextureConfig | MeshShapeConfig) -> list[MeshField]:
     """The experiment's objects as meshes, in their plain colours and shapes."""
     found = []
-    for thing in experiment.world.objects:
+    for thing in experiment.objects:
         if wanted.ball_m is None:
             mesh = stand(GENERATORS[GENERATOR_OF[thing.kind]]())
         else:
@@ -83,7 +82,7 @@ def mesh_objects(experiment: Experiment, wanted: MeshTextureConfig | MeshShapeCo
 
 def place_limits(experiment: Experiment, wanted: PlacesConfig) -> PlaceLimits:
     """Where each object may stand: about its place in the configuration, at its size, in no lane."""
-    return PlaceLimits(bounds_of(experiment.world.objects, wanted), lanes_of(experiment), wanted.colours)
+    return PlaceLimits(bounds_of(experiment.objects, wanted), lanes_of(experiment), wanted.colours)
 
 
 def bounds_of(things: Sequence[PlacedObject], wanted: PlacesConfig) -> list[PoseBounds]:
@@ -101,7 +100,7 @@ def bounds_of(things: Sequence[PlacedObject], wanted: PlacesConfig) -> list[Pose
 
 def lanes_of(experiment: Experiment) -> KeepOut:
     """All lanes, driven or not: objects stand at the height of the pavement."""
-    return KeepOut(tuple(as_path(lane) for lane in experiment.site.lanes), experiment.site.off_track_m)
+    return KeepOut(tuple(as_path(lane) for lane in experiment.world.lanes), experiment.world.off_track_m)
 
 
 def random_placements(experiment: Experiment, count: int, seed: int) -> list[tuple[VoxelGridObject, ...]]:
@@ -127,7 +126,7 @@ def _place_space(experiment: Experiment, wanted: PlacesConfig) -> PlaceSpace:
 
 
 def _named_voxels(experiment: Experiment) -> list[NamedObject]:
-    return [NamedObject(thing.name, geometry_sha256(experiment, thing.kind)) for thing in experiment.world.objects]
+    return [NamedObject(thing.name, geometry_sha256(experiment, thing.kind)) for thing in experiment.objects]
 
 
 @lru_cache(maxsize=8)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from advnerf_core.geometry import Array, Pinhole, yaw_of
 from advnerf_core.policies.view import PolicyView
-from hardware.worlds.world import DeploymentScene
+from hardware.worlds.world import World
 
 
 class DeployedFrames:
@@ -22,7 +22,7 @@ class DeployedFrames:
         view: What the policy sees of its camera.
     """
 
-    def __init__(self, scene: DeploymentScene, view: PolicyView) -> None:
+    def __init__(self, scene: World, view: PolicyView) -> None:
         self.scene, self.view = scene, view
         self._T_camera_from_car = np.linalg.inv(scene.T_car_from_camera)
 

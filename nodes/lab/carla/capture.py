@@ -79,7 +79,7 @@ def capture(
 
 def _claim(folder: Path, config: CarlaConfig, request: CaptureRequest, drives: dict[str, Any]) -> None:
     """Note what is captured into a folder, or see that it is the same as before; the server's address does not count."""
-    about = config.model_dump(mode="json", exclude={"server", "objects", "car", "body"}) | {"town": config.server.town}
+    about = config.model_dump(mode="json", exclude={"server", "car", "body"}) | {"town": config.server.town}
     text = json.dumps({"config": about, "request": vars(request), "drives": drives}, sort_keys=True)
     digest, file = hashlib.sha256(text.encode()).hexdigest(), folder / REQUEST
     if file.exists():

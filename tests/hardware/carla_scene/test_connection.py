@@ -56,7 +56,7 @@ def test_no_server(carla):
     with pytest.raises(
         CarlaUnreachable, match=rf"expected a CARLA server at 127.0.0.1:{port}, got: .*refused.*CarlaUE4.sh"
     ):
-        CarlaScene(CarlaConfig(server=ServerConfig(port=port)), carla)
+        CarlaScene(CarlaConfig(server=ServerConfig(port=port)), carla).__enter__()
 
 
 def test_a_host_that_does_not_exist(carla):
@@ -126,7 +126,7 @@ def test_without_the_library_importing_works_and_using_says_what_to_install():
         "import sys; sys.modules['carla'] = None\n"
         "import hardware.worlds.carla\n"
         "from hardware.worlds.carla import CarlaConfig, CarlaScene\n"
-        "try:\n    CarlaScene()\n"
+        "try:\n    CarlaScene().__enter__()\n"
         "except hardware.worlds.carla.CarlaNotInstalled as error:\n    print(error)\n"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from advnerf_core.driving.path import Arc, Line, Path
-from hardware.worlds.carla.fitting import advance, fit_lines_and_arcs
+from hardware.worlds.fitting import advance, fit_lines_and_arcs
 
 
 def as_path(start, segments):

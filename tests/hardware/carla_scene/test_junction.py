@@ -39,7 +39,7 @@ def test_paths_are_those_of_the_simulated_intersection(carla, TJunction, place):
     truth = junction_paths(3.5, right_radius_m=8.25, left_radius_m=11.75, approach_m=24.0, beyond_m=30.0)
     for name, expected in truth.items():
         found = drives.paths[name]
-        assert (found.name, found.exit, found.goal) == (expected.name, expected.exit, expected.goal)
+        assert found.goal == expected.goal
         assert found.start_pose == pytest.approx(expected.start_pose, abs=1e-3)
         if name != "straight":  # ours is as long after the junction as the others
             assert found.length_m == pytest.approx(expected.length_m, abs=0.02)

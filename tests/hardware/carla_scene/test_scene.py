@@ -6,14 +6,15 @@ import numpy as np
 import pytest
 
 from advnerf_core.geometry import camera_mount, planar_pose, transform_points
-from hardware.worlds.world import DeploymentScene
+from hardware.worlds.carla.errors import CarlaError
+from hardware.worlds.world import NotOpenError, World
 from tests.hardware.carla_scene.scenes import carla_points, is_put_back, scene_of
 
 
-def test_is_a_deployment_scene_and_owns_the_world_while_open(library, settings):
+def test_is_a_world_and_owns_the_servers_while_open(library, settings):
     world = library.world
     with scene_of(library, settings) as scene:
-        assert isinstance(scene, DeploymentScene)
+        assert isinstance(scene, World)
         assert world.settings.synchronous_mode
         assert world.settings.fixed_delta_seconds == 0.1
         assert world.lights_frozen
@@ -21,6 +22,22 @@ def test_is_a_deployment_scene_and_owns_the_world_while_open(library, settings):
         assert scene.off_track_m == pytest.approx(1.75)
     assert is_put_back(world)
     scene.close()  # twice is fine
+
+
+def test_before_it_is_open_it_asks_nothing(library, settings):
+    scene = scene_of(library, settings)
+    assert library.clients == []
+    assert scene.traits.exclusive
+    for ask in (scene.describe, lambda: scene.state, lambda: scene.blocked):
+        with pytest.raises(NotOpenError, match="as a context manager"):
+            ask()
+    with scene:
+        description = scene.describe()
+    assert list(description.paths) == ["straight", "right", "left"]
+    assert description.facts["junction_id"] == 100
+    assert description.box.contraction
+    with pytest.raises(CarlaError, match="never closed"), scene:
+        pass
 
 
 @pytest.mark.parametrize("where", [(-24.0, -1.75, 0.0), (1.75, -20.0, math.pi / 2), (3.0, 2.0, -2.5)])

@@ -86,7 +86,7 @@ def test_a_server_that_dies_leaves_its_own_error_to_be_seen(library, settings, c
 
 
 def test_closing_says_what_could_not_be_put_back(library, settings):
-    scene = scene_of(library, settings)
+    scene = scene_of(library, settings).__enter__()
     library.world.dead = True
     with pytest.raises(
         CarlaError,
@@ -103,7 +103,7 @@ def test_an_error_in_the_middle_puts_the_world_back(library, settings, error):
 
 
 def test_a_scene_that_nobody_closes_puts_the_world_back(library, settings):
-    scene = scene_of(library, settings)
+    scene = scene_of(library, settings).__enter__()
     scene.reset(-20.0, -1.75, 0.0)
     scene.observe()
     assert not is_put_back(library.world)
@@ -122,7 +122,7 @@ def test_a_scene_that_nobody_closes_puts_the_world_back(library, settings):
 )
 def test_a_scene_that_cannot_open_changes_nothing(library, settings, changes, error, message):
     with pytest.raises(error, match=message) as caught:
-        scene_of(library, settings, **changes)
+        scene_of(library, settings, **changes).__enter__()
     assert is_put_back(library.world)
     del caught  # kept till here: what is put back is not left to the garbage collector
 
@@ -161,7 +161,7 @@ def test_exposure_is_pinned_to_the_servers_upper_bound(library, settings):
 
 
 def test_a_closed_scene_touches_nothing(library, settings):
-    scene = scene_of(library, settings)
+    scene = scene_of(library, settings).__enter__()
     scene.close()
     calls = list(library.world.calls)
     T = planar_pose(-10.0, 0.0, 0.0) @ camera_mount(0.0, 0.0, 2.0)
@@ -185,7 +185,7 @@ def test_a_world_in_other_hands(library, settings):
     world = library.world
     world.settings.synchronous_mode = True
     with pytest.raises(CarlaBusy, match=r"another client drives it.*advnerf carla release.*server.take_over"):
-        scene_of(library, settings)
+        scene_of(library, settings).__enter__()
     assert world.settings.synchronous_mode  # not ours to change
     with scene_of(library, settings, server={**settings["server"], "take_over": True}):
         pass
@@ -196,7 +196,7 @@ def test_traffic_would_be_in_the_pictures(library, settings, scripted, carla):
     world = library.world
     world.actors.append(scripted.Actor(world, scripted.Blueprint("vehicle.lincoln.mkz_2020"), carla.Transform()))
     with pytest.raises(CarlaBusy, match=r"1 vehicles or walkers \(vehicle.lincoln.mkz_2020\)"):
-        scene_of(library, settings)
+        scene_of(library, settings).__enter__()
     with scene_of(library, settings, server={**settings["server"], "allow_traffic": True}):
         pass
     assert len(world.actors) == 1
@@ -207,4 +207,4 @@ def test_a_hill_is_refused(carla, scripted, settings, TJunction):
     with pytest.raises(
         CarlaMapError, match=r"expected a flat junction, heights within 0.15 m, got 2.00 m at junction 100"
     ):
-        scene_of(library, settings)
+        scene_of(library, settings).__enter__()

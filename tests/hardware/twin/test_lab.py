@@ -9,7 +9,6 @@ from advnerf_core.geometry import planar_pose
 from hardware.worlds.lab.config import CameraConfig, CarConfig, LabConfig
 from hardware.worlds.lab.lab import Lab
 from hardware.worlds.lab.phone import track_length, track_pose
-from hardware.worlds.world import DeploymentScene
 
 
 @pytest.fixture(scope="module")
@@ -27,11 +26,6 @@ def test_observation_has_the_documented_form(lab):
     assert depth.dtype == np.float32
     assert np.isfinite(depth).all()
     assert lab.observe(depth=False)[1] is None
-
-
-def test_the_lab_is_a_deployment_scene(lab):
-    assert isinstance(lab, DeploymentScene)
-    assert lab.photo_pinhole == lab.config.phone.pinhole
 
 
 def test_two_labs_of_one_configuration_agree_to_the_byte(lab):

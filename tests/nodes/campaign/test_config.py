@@ -105,7 +105,7 @@ scenarios:
 
 def test_two_scenarios_in_one_run_folder_need_the_same_scene_and_policies(tmp_path):
     """Or one would run on the policy of the other, under a hash that says otherwise."""
-    file, folder = ROOT / "launch" / "intersection.experiment.yaml", tmp_path / "run"
+    file, folder = ROOT / "launch" / "junction.experiment.yaml", tmp_path / "run"
     campaign = tmp_path / "twice.campaign.yaml"
     campaign.write_text(TWICE.format(file=file, folder=folder, change="policy.seed=1"))
     loaded = load_campaign(campaign, tmp_path)

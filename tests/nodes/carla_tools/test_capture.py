@@ -92,7 +92,7 @@ def test_drives_come_back_from_plain_data(library, settings, tmp_path):
     data = json.loads((tmp_path / "set" / "drives.json").read_text())
     drives = Drives.from_dict(data)
     assert json.loads(json.dumps(drives.to_dict())) == data
-    assert drives.paths["left"].exit == "west"
+    assert drives.paths["left"].goal == (0.0, 0.0, 1.0)
     for wrong in ({}, {**data, "paths": {"up": data["paths"]["left"]}}, {**data, "frame": {}}, []):
         with pytest.raises(CarlaMapError, match="expected drives as written"):
             Drives.from_dict(wrong)

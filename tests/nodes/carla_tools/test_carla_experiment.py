@@ -1,4 +1,4 @@
-"""The whole experiment of kind carla, every stage of it in its smallest size, against the scripted server."""
+"""The whole experiment in the world carla, every stage of it in its smallest size, against the scripted server."""
 
 import json
 
@@ -32,8 +32,8 @@ OBJECTS = [
 def file(tmp_path, settings):
     """An experiment file with one drive of three ticks."""
     camera = {**settings["camera"], "width": 336, "height": 188}  # the policy's view is cut from it
-    world = {**settings, "camera": camera, "objects": OBJECTS}
-    data = {"kind": "carla", "name": "tiny", "horizon": 3, "scenarios": ["right"], "world": world}
+    world = {"kind": "carla", **settings, "camera": camera}
+    data = {"name": "tiny", "horizon": 3, "scenarios": ["right"], "world": world, "objects": OBJECTS}
     file = tmp_path / "tiny.experiment.yaml"
     file.write_text(yaml.safe_dump({**data, "settings": {"tiny": TINY}}))
     return file
@@ -47,29 +47,46 @@ def test_every_stage_runs_against_a_server_and_leaves_it_as_it_was(as_carla, fil
     with pytest.raises(ConfigError, match="run that stage first"):
         _ = experiment.references
     run_experiment(experiment)
-    drives = json.loads((run / "capture" / "drives.json").read_text())
-    assert drives["lane_width_m"] == pytest.approx(2 * experiment.site.off_track_m)
+    kept = json.loads((run / "capture" / "world.json").read_text())["description"]
+    assert kept["off_track_m"] == experiment.world.off_track_m == pytest.approx(1.75)
+    assert kept["facts"]["junction_id"] == 100
     assert len(load_transforms(run / "capture" / "photos", require_all=True).frames) == 6
     cell = json.loads((run / "deploy" / "right_hardened_gradient_0.cell.json").read_text())
     driven = np.array(json.loads((run / "deploy" / "right_hardened_gradient_0.drives.json").read_text())["states"][0])
     cte_m = experiment.paths["right"].project(driven[1:, :2]).cte_m
     assert cell["deployed"]["total_cte_m"] == pytest.approx([np.abs(cte_m).sum()])
     assert len(read_clip(run / "report" / "right.mp4")) == 4  # three ticks and the start
-    assert "junction of the CARLA map" in (run / "report" / "report.html").read_text()
+    assert "the world carla" in (run / "report" / "report.html").read_text()
     assert not as_carla.world.get_settings().synchronous_mode
     assert as_carla.world.actors == []
 
 
 def test_another_junction_than_the_captured_one_is_refused(as_carla, file, tmp_path):
     experiment = load_experiment(file, "tiny", [], tmp_path / "run")
-    experiment.site.open().close()
-    kept = tmp_path / "run" / "capture" / "drives.json"
+    with experiment.open_world() as world:
+        experiment.keep_world(world)
+    kept = tmp_path / "run" / "capture" / "world.json"
     data = json.loads(kept.read_text())
-    kept.write_text(json.dumps({**data, "lane_width_m": 4.25}))
-    with pytest.raises(ConfigError, match="another run folder"):
-        experiment.site.open()
+    facts = {**data["description"]["facts"], "junction_id": 7}
+    kept.write_text(json.dumps({**data, "description": {**data["description"], "facts": facts}}))
+    with pytest.raises(ConfigError, match=r"with other facts.*another run folder"), experiment.open_world():
+        pass
     assert as_carla.world.actors == []
     assert not as_carla.world.get_settings().synchronous_mode
+
+
+def test_objects_are_held_against_the_lanes_once_these_are_known(as_carla, file, tmp_path):
+    in_the_lane = [*OBJECTS, {"name": "bump", "kind": "hydrant", "x_m": -12.0, "y_m": -2.0}]
+    changes = [f"objects={json.dumps(in_the_lane)}"]
+    experiment = load_experiment(file, "tiny", changes, tmp_path / "run")  # nobody knows where the lanes are
+    with experiment.open_world() as world:
+        experiment.keep_world(world)
+    with pytest.raises(ConfigError, match=r"bump reaches into a lane at \(-12"):
+        _ = experiment.objects
+    with pytest.raises(ConfigError, match=r"--set objects=.*bump reaches into a lane"):
+        load_experiment(file, "tiny", changes, tmp_path / "run")
+    # What was captured with other settings says nothing about these.
+    assert not load_experiment(file, "tiny", [*changes, "world.junction.beyond_m=31"], tmp_path / "run").is_described
 
 
 def test_the_servers_address_changes_no_cell_and_its_junction_does(as_carla, file, tmp_path):
@@ -86,6 +103,6 @@ def test_the_servers_address_changes_no_cell_and_its_junction_does(as_carla, fil
 
 
 def test_ticks_that_the_server_cannot_make_are_refused_before_anything_is_run(file, tmp_path):
-    with pytest.raises(ConfigError, match=r"whole ticks of world\.render\.fixed_delta_s = 0\.1 s, got 0\.25 s"):
+    with pytest.raises(ConfigError, match=r"whole steps of the world carla, 0\.1 s each, got 0\.25 s"):
         load_experiment(file, "tiny", ["dt_s=0.25"], tmp_path / "run")
     load_experiment(file, "tiny", ["dt_s=0.25", "world.render.fixed_delta_s=0.05"], tmp_path / "run")

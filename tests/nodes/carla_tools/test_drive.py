@@ -10,9 +10,8 @@ from advnerf_core.geometry import make_transform
 from advnerf_core.policies.view import PolicyView
 from advnerf_core.scene.surrogate import Surrogate
 from hardware.worlds.carla import CarlaConfig, CarlaScene
-from nodes.experiment.junction.context import as_path
 from nodes.experiment.junction.deployed import DressedScene, drive_deployed
-from nodes.lab.carla.drive import drive_expert, turn_rate_expert
+from nodes.lab.worlds.expert_drive import as_path, drive_expert, lane_expert
 
 
 @pytest.mark.parametrize("name", ["straight", "right", "left"])
@@ -21,7 +20,7 @@ def test_the_expert_keeps_its_lane_through_the_junction(library, settings, name)
     config = CarlaConfig.model_validate(settings)
     with CarlaScene(config, library) as scene:
         reference = scene.paths[name]
-        expert = turn_rate_expert(as_path(reference), 6.0, 0.1, config.car.max_turn_rate_radps)
+        expert = lane_expert(as_path(reference), config.car.description, 0.1)
         x, y, yaw = reference.start_pose
         drive = drive_expert(scene, expert, (x - 0.4 * np.sin(yaw), y + 0.4 * np.cos(yaw), yaw), 70, 0.1)
         off_track_m = scene.off_track_m
@@ -38,7 +37,7 @@ def test_the_expert_runs_into_a_wall(library, settings, carla):
         ends = [scene.drives.frame.carla_point([-5.0, y, 0.0])[:2] for y in (-8.0, 8.0)]
         library.world.walls = [(*ends, carla.CityObjectLabel.Walls)]
         reference = scene.paths["straight"]
-        expert = turn_rate_expert(as_path(reference), 6.0, 0.1, 1.2)
+        expert = lane_expert(as_path(reference), config.car.description, 0.1)
         drive = drive_expert(scene, expert, reference.start_pose, 60, 0.1)
     assert 22 < drive.blocked_tick < 28  # (19 - 3.85) m at 0.6 m a tick
     assert drive.states[-1, 0] < -5.0 - 3.85 + 1e-6

@@ -15,14 +15,15 @@ from advnerf_core.policies.pilotnet import PilotNet, save_policy
 from advnerf_core.scene.field import SceneField, SceneFieldConfig, save_scene
 from hardware.worlds.junction.car import DubinsCar
 from hardware.worlds.junction.config import DubinsConfig, IntersectionConfig
-from hardware.worlds.world import DeploymentScene
+from hardware.worlds.junction.scene import Intersection
+from hardware.worlds.world import World, WorldDescription
 from nodes.experiment.junction.context import Experiment
 from nodes.experiment.junction.objects import build, object_file
 from nodes.experiment.junction.policy import HARDENED, NAIVE, victim_file
 from nodes.experiment.junction.run import load_experiment
 from nodes.experiment.learned_scene import scene_file
 
-LAUNCH = Path(__file__).parents[3] / "launch" / "intersection.experiment.yaml"
+LAUNCH = Path(__file__).parents[3] / "launch" / "junction.experiment.yaml"
 TINY: dict[str, Any] = {
     "capture": {"photos": 9, "held_out": 3},
     "scene": {"steps": 20, "log2_entries": 10, "finest": 32},
@@ -64,7 +65,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Experiment:
 
 @dataclass
 class Wall:
-    """A deployment scene in closed form: grey ground, and a wall across the world at ``wall_x_m``."""
+    """A world in closed form: grey ground, and a wall across the world at ``wall_x_m``."""
 
     wall_x_m: float = 20.0
     blocked_beyond_m: float = np.inf
@@ -103,11 +104,14 @@ class Wall:
         rgb = np.where((ground < wall)[..., None], (90, 90, 90), (150, 170, 200)).astype(np.uint8)
         return rgb, np.minimum(ground, wall).astype(np.float32) if depth else None
 
-    def photograph(self, T_world_from_camera: Array) -> Any:
-        raise NotImplementedError("nothing is learned from this scene")
+    def describe(self) -> WorldDescription:
+        return Intersection().describe()
 
-    def close(self) -> None:
-        pass
+    def photo_poses(self, count: int, rng: np.random.Generator) -> list[Array]:
+        raise NotImplementedError("nothing is learned from this world")
+
+    def photograph(self, T_world_from_camera: Array) -> Any:
+        raise NotImplementedError("nothing is learned from this world")
 
     def __enter__(self) -> "Wall":
         return self
@@ -120,7 +124,7 @@ class Wall:
 def wall() -> Wall:
     """A scene with its defaults."""
     scene = Wall()
-    assert isinstance(scene, DeploymentScene)
+    assert isinstance(scene, World)
     return scene
 
 

@@ -61,7 +61,7 @@ def test_search_is_kept_and_its_file_brings_the_colours_back(fresh: Experiment, 
     file = load_attack(attack.attack_path(folder, cell))
     theta = space.restored(file).colours
     assert theta.shape == space.sensor.theta_shape
-    assert [thing.name for thing in file.objects] == [thing.name for thing in fresh.world.objects]
+    assert [thing.name for thing in file.objects] == [thing.name for thing in fresh.objects]
     assert file.attack_id == found["attack_id"]
     moved = (theta - space.plain.colours).abs().max()
     assert moved > (1e-5 if method == "gradient" else 1.0)

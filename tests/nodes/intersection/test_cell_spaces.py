@@ -115,7 +115,7 @@ def test_places_are_searched_and_the_file_says_where_things_stand(
     assert data["extra"]["evaluations"] == 1
     file = load_attack(attack_path(tmp_path, cell))
     assert file.space == "places"
-    hand = np.array([[thing.x_m, thing.y_m] for thing in experiment.world.objects])
+    hand = np.array([[thing.x_m, thing.y_m] for thing in experiment.objects])
     there = np.array([each.placement[:2] for each in file.objects])
     assert 0.0 < np.abs(there - hand).max() <= ONE.move_m + 1e-9
     # The surrogate's own prediction is what is driven again.
@@ -261,7 +261,7 @@ def test_maps_are_of_what_the_cell_found(trained: Experiment, tmp_path: Path, mo
     asked = (experiment, "right", "hardened", 0, "random")
     pictures = cells.draw_maps(*asked, 1, tmp_path, silent)
     assert [cv2.imread(str(picture)) is not None for picture in pictures] == [True, True]
-    rows = json.loads((tmp_path / f"robustness_{trained.world.objects[1].name}.json").read_text())["cells"]
+    rows = json.loads((tmp_path / f"robustness_{trained.objects[1].name}.json").read_text())["cells"]
     # The first start past objects that nobody has moved is the cell's own drive.
     assert rows["0"][0][0] == pytest.approx(np.mean(found["surrogate"]["total_cte_m"]), rel=1e-6)
     assert len(rows) == 2

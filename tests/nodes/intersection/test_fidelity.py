@@ -37,7 +37,7 @@ def test_real_pictures_are_what_the_policy_saw_on_the_clean_drive(searched: tupl
     clean = fidelity.driven(experiment, "right", "hardened", 0, cell)
     policy, goal = fidelity.policy_of(experiment, "hardened", "right")
     assert goal == experiment.goal("right")
-    with experiment.site.open() as scene:
+    with experiment.open_world() as scene:
         dressed = DressedScene(scene, experiment.view, placed_objects(experiment))
         start = experiment.start_states("right", 0)[:1]
         (drive,) = deployed_drives(experiment, dressed, policy, "right", start, dressed.plain_theta())

@@ -19,7 +19,8 @@ from advnerf_core.driving.rollout import drive
 from advnerf_core.geometry import Array
 from advnerf_core.policies.pilotnet import load_policy
 from advnerf_core.report.clips import read_clip
-from hardware.worlds.world import DeploymentScene
+from hardware.worlds.junction.config import DubinsConfig
+from hardware.worlds.world import World
 from nodes.experiment.junction.attack import Cell, attack_problem, load_shown, surrogate_part
 from nodes.experiment.junction.context import Experiment
 from nodes.experiment.junction.deploy import deployed_part
@@ -30,7 +31,7 @@ from nodes.experiment.junction.policy import HARDENED, victim_file
 from nodes.experiment.junction.run import load_experiment
 from nodes.experiment.junction.spaces import colour_space
 
-LAUNCH = Path(__file__).parents[3] / "launch" / "intersection.experiment.yaml"
+LAUNCH = Path(__file__).parents[3] / "launch" / "junction.experiment.yaml"
 SECONDS, TICKS_S = 2.0, (0.1, 0.01)
 ASKEW_RAD = 0.05
 
@@ -55,8 +56,8 @@ def in_ticks_of(dt_s: float, folder: Path) -> Experiment:
 
 
 @pytest.fixture(scope="module")
-def junction(tmp_path_factory: pytest.TempPathFactory) -> Iterator[DeploymentScene]:
-    with in_ticks_of(0.1, tmp_path_factory.mktemp("junction")).site.open() as scene:
+def junction(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
+    with in_ticks_of(0.1, tmp_path_factory.mktemp("junction")).open_world() as scene:
         yield scene
 
 
@@ -83,12 +84,10 @@ def where(start: Array, turn_rate_radps: float, lag_s: float, gain: float, after
 
 
 @pytest.mark.parametrize("turn_rate_radps", [0.0, 0.15])
-def test_both_cars_are_where_speed_and_time_say(
-    junction: DeploymentScene, tmp_path: Path, turn_rate_radps: float
-) -> None:
+def test_both_cars_are_where_speed_and_time_say(junction: World, tmp_path: Path, turn_rate_radps: float) -> None:
     for dt_s in TICKS_S:
         experiment = in_ticks_of(dt_s, tmp_path)
-        start, flaws = np.array(experiment.references["straight"].start_pose), experiment.world.car
+        start, flaws = np.array(experiment.references["straight"].start_pose), DubinsConfig()
         deployed = SelfDriving(junction, flaws.speed_mps, experiment.limits.dt_s)
         cars: list[tuple[Dubins | SelfDriving, float, float]] = [
             (experiment.dynamics, 0.0, 1.0), (deployed, flaws.turn_rate_lag_s, flaws.turn_rate_gain)
@@ -103,12 +102,12 @@ def test_both_cars_are_where_speed_and_time_say(
             assert way_m == pytest.approx(6.0 * SECONDS, rel=1e-4)
 
 
-def test_total_cte_is_the_sum_over_the_ticks_that_there_are(junction: DeploymentScene, tmp_path: Path) -> None:
+def test_total_cte_is_the_sum_over_the_ticks_that_there_are(junction: World, tmp_path: Path) -> None:
     found: dict[float, DriveMetrics] = {}
     for dt_s in TICKS_S:
         experiment = in_ticks_of(dt_s, tmp_path)
         start = np.add(experiment.references["straight"].start_pose, [0.0, 0.0, ASKEW_RAD])
-        car = SelfDriving(junction, experiment.world.car.speed_mps, dt_s)
+        car = SelfDriving(junction, experiment.car.speed_mps, dt_s)
         states = driven(experiment, car, 0.0, start)
         found[dt_s] = drive_metrics(experiment.paths["straight"], states, experiment.limits, car.blocked_tick)
         # A straight line away from a straight line: |CTE| = v t sin(angle) at t = dt, 2 dt, ..., T dt.

@@ -13,12 +13,12 @@ from nodes.cli.main import main
 from nodes.experiment.junction import run
 from nodes.experiment.junction.context import Experiment
 from nodes.experiment.junction.run import load_experiment, stages_of
-from nodes.experiment.run import kind_of
+from nodes.experiment.run import is_in_a_world
 from nodes.experiment.stages import run_stages
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import Report
 
-LAUNCH = Path(__file__).parents[3] / "launch" / "intersection.experiment.yaml"
+LAUNCH = Path(__file__).parents[3] / "launch" / "junction.experiment.yaml"
 
 
 def load(folder: Path, *overrides: str) -> Experiment:
@@ -52,7 +52,7 @@ def test_starts_are_drawn_about_the_nominal_one(tmp_path: Path) -> None:
     [
         ("scene.steps=3", {"scene"}),
         ("object.fit_steps=3", {"object"}),
-        ("world.objects=[]", {"object", "policy", "attack", "deploy"}),
+        ("objects=[]", {"object", "policy", "attack", "deploy"}),
         ("world.car.turn_rate_lag_s=0.2", {"policy", "attack", "deploy"}),
         ("world.car.speed_mps=5", {"capture", "policy", "attack", "deploy"}),
         ("world.road.lane_width_m=3.4", {"capture", "policy", "attack", "deploy"}),
@@ -66,17 +66,26 @@ def test_a_change_redoes_only_what_reads_it(tmp_path: Path, override: str, redon
     assert {name for name in before if before[name] != after[name]} == redone
 
 
-def test_kind_chooses_the_experiment(tmp_path: Path) -> None:
-    assert kind_of(LAUNCH) == "intersection"
-    assert kind_of(LAUNCH.parent / "room.experiment.yaml") == "room"
+def test_a_world_chooses_the_experiment(tmp_path: Path) -> None:
+    assert is_in_a_world(LAUNCH)
+    assert is_in_a_world(LAUNCH.parent / "carla.experiment.yaml")
+    assert not is_in_a_world(LAUNCH.parent / "room.experiment.yaml")
 
 
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"kind": "moon"}, "expected kind room or intersection"),
-        ({"scenarios": ["backwards"]}, "straight"),
-        ({"world": {"road": {"lane_width_m": 9.0}}}, "lane_width_m"),
+        ({"world": {"kind": "moon"}}, "expected a world of lab, junction, carla; got 'moon'"),
+        ({"world": {"road": {}}}, "expected kind: NAME"),
+        ({"scenarios": ["backwards"]}, "scenarios: expected a scenario of straight, right, left; got 'backwards'"),
+        ({"scenarios": ["left", "left"]}, "expected different scenarios, got left, left"),
+        ({"world": {"kind": "junction", "road": {"lane_width_m": 9.0}}}, "road.lane_width_m: input should be less"),
+        (
+            {"world": {"kind": "junction", "roads": {}}},
+            "unknown key roads; valid keys here: approach_m, beyond_m, camera",
+        ),
+        ({"objects": [{"name": "one", "kind": "hydrant", "x_m": 0.0, "y_m": -3.6}]}, "one reaches into a lane at (0."),
+        ({"view": {"crop_top_px": 100}}, "view: expected a crop inside 336 x 188"),
         ({"polcy": {}}, "polcy"),
     ],
 )

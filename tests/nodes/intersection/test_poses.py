@@ -12,7 +12,7 @@ from nodes.experiment.junction.spaces import bounds_of, lanes_of, random_placeme
 
 
 def test_objects_move_about_their_places_and_off_the_lanes(trained: Experiment) -> None:
-    things = trained.world.objects
+    things = trained.objects
     moved = random_placements(trained, 12, seed=3)
     assert len(moved) == 12
     for objects in moved:
@@ -27,7 +27,7 @@ def test_objects_move_about_their_places_and_off_the_lanes(trained: Experiment) 
                 IntersectionConfig().on_road(*corner) for corner in corners
             )  # they stand on pavements, so high
             place = (*there.T_world_from_object[:2, 3], yaw_of(there.T_world_from_object), there.scale)
-            assert lanes_of(trained).distance_m(place, footprint(there)) >= trained.site.off_track_m
+            assert lanes_of(trained).distance_m(place, footprint(there)) >= trained.world.off_track_m
     places = np.array([[each.T_world_from_object[:3, 3] for each in objects] for objects in moved])
     assert np.ptp(places[..., :2], axis=0).min() > 0.0
     assert np.ptp(places[..., 2], axis=0).max() == 0.0  # they stay on the ground
@@ -35,7 +35,7 @@ def test_objects_move_about_their_places_and_off_the_lanes(trained: Experiment) 
 
 
 def test_cars_turn_a_little_and_hydrants_all_the_way(trained: Experiment) -> None:
-    for thing, bound in zip(trained.world.objects, bounds_of(trained.world.objects, PlacesConfig()), strict=True):
+    for thing, bound in zip(trained.objects, bounds_of(trained.objects, PlacesConfig()), strict=True):
         assert bound.yaw_rad is not None
         width_rad = bound.yaw_rad[1] - bound.yaw_rad[0]
         assert width_rad == pytest.approx(2 * np.pi if thing.kind == "hydrant" else 2 * PlacesConfig().turn_rad)

@@ -33,7 +33,7 @@ def test_attack_deploy_and_report(trained: Experiment, tmp_path: Path) -> None:
     view = {"real_image": "real.png", "surrogate_image": "surrogate.png"}
     means = {"psnr_full_db": 28.0, "psnr_policy_db": 27.5}
     (folder / "scene" / "fidelity.json").write_text(json.dumps({"mean": means, "views": [view]}))
-    rates = [{"real_radps": 0.1, "surrogate_radps": 0.12}]
+    rates = [{"real": 0.1, "surrogate": 0.12}]
     (folder / "policy" / "policy.json").write_text(json.dumps({"on_held_out_views": rates}))
     (folder / "manifest.json").write_text(json.dumps({"command": "advnerf experiment <it>"}))
 

@@ -1,4 +1,4 @@
-"""A chain of lines and arcs, continuous in position and heading, through the poses of a lane."""
+"""A chain of lines and arcs, continuous in position and heading, through the poses of a lane or through points."""
 
 from __future__ import annotations
 
@@ -8,12 +8,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from advnerf_core.geometry import Array, wrap_angle
-from hardware.worlds.junction.paths import Segment
+from hardware.worlds.paths import ReferencePath, Segment
 
 # A lane's points are in single precision: a few hundred metres from the origin that is some 0.05 mm, and 1e-4 rad over half a metre.
 _STRAIGHT_M = 2e-3
 _STRAIGHT_RAD = 1e-3
 _MAX_RADIUS_M = 1e5
+_CLOSING_RADIUS_M = 1e8  # what is straighter than this misses its end by less than 1e-7 m over some metres
 _MAX_TURN_RAD = (
     0.75 * math.pi
 )  # no lane turns so far in one piece; where one seems to, its points do not belong together
@@ -43,6 +44,69 @@ def fit_lines_and_arcs(poses: ArrayLike, tolerance_m: float = 0.02) -> tuple[Seg
             here = advance(here, piece)
         done += reach
     return tuple(_joined(segments))
+
+
+def path_through(
+    points_m: ArrayLike, goal: tuple[float, ...] = (), closed: bool = False, tolerance_m: float = 0.02
+) -> ReferencePath:
+    """The reference path through points.
+
+    Args:
+        points_m: x [m], y [m] ``[N, 2]`` in driving order, at least three, at most a few metres apart; the first one is not repeated at the
+            end of a closed path.
+        goal: What a goal-conditioned policy is told on it.
+        closed: Whether the path goes on from the last point to the first.
+        tolerance_m: Largest distance of a point from the path [m].
+
+    Raises:
+        ValueError: There are too few points, two of them are the same, or they are on no smooth way.
+    """
+    points = np.asarray(points_m, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] != 2 or len(points) < 3 or not np.isfinite(points).all():
+        raise ValueError(f"expected at least three finite points [N, 2], got an array of shape {list(points.shape)}")
+    if (
+        not np.linalg.norm(np.diff(points, axis=0, append=points[:1] if closed else points[-1:] + 1.0), axis=1).min()
+        > 0
+    ):
+        raise ValueError("expected points that differ from their neighbours, got one twice; leave out the second")
+    poses = np.column_stack([points, _headings(points, closed)])
+    start = (float(poses[0, 0]), float(poses[0, 1]), float(poses[0, 2]))
+    segments = list(fit_lines_and_arcs(poses, tolerance_m))
+    if closed:
+        here = poses[0]
+        for segment in segments:
+            here = advance(here, segment)
+        segments += _closing(here, poses[0])
+    return ReferencePath(start, tuple(segments), goal, closed)
+
+
+def _headings(points: Array, closed: bool) -> Array:
+    """Heading ``[N]`` [rad] at each of the points ``[N, 2]``: the tangent of the circle through it and its neighbours, exact on lines and arcs."""
+    neighbours = np.concatenate([points[-1:], points, points[:1]]) if closed else points
+    chords = np.diff(neighbours, axis=0)
+    bearing, length = np.arctan2(chords[:, 1], chords[:, 0]), np.linalg.norm(chords, axis=1)
+    turn = wrap_angle(np.diff(bearing))
+    # On a circle the tangent divides the turn between two chords as their lengths.
+    share = length[:-1] / (length[:-1] + length[1:])
+    inner = bearing[:-1] + share * turn
+    if closed:
+        return inner
+    # A chord's bearing is the mean of the headings at its ends.
+    first, last = 2.0 * bearing[0] - inner[0], 2.0 * bearing[-1] - inner[-1]
+    return np.concatenate([[first], inner, [last]])
+
+
+def _closing(start: Array, end: Array) -> list[Segment]:
+    """Pieces that end in a pose to rounding, as the last ones of a closed path must."""
+    dx, dy = end[:2] - start[:2]
+    c, s = math.cos(start[2]), math.sin(start[2])
+    along, aside, turn = c * dx + s * dy, c * dy - s * dx, float(wrap_angle(end[2] - start[2]))
+    if along <= 0.0 or abs(turn) > _MAX_TURN_RAD:
+        raise ValueError(
+            f"expected points that lead back to the first one on a smooth way, got {end[:2].round(2).tolist()} after "
+            f"{start[:2].round(2).tolist()}"
+        )
+    return _biarc(float(along), float(aside), turn, max_radius_m=_CLOSING_RADIUS_M)
 
 
 def advance(pose: ArrayLike, segment: Segment) -> Array:
@@ -86,7 +150,7 @@ def _connect(start: Array, end: Array) -> list[Segment] | None:
     return arcs if all(arc[0] == "line" or abs(arc[2]) <= _MAX_TURN_RAD for arc in arcs) else None
 
 
-def _biarc(along: float, aside: float, turn: float) -> list[Segment]:
+def _biarc(along: float, aside: float, turn: float, max_radius_m: float = _MAX_RADIUS_M) -> list[Segment]:
     """Two arcs from the origin, heading along x, to a point and heading, their tangents of equal length.
 
     With unit tangents ``t0, t1``, chord ``v`` and both tangent lengths ``d``: ``|v - d (t0 + t1)| = 2 d``, a quadratic in ``d``; the
@@ -98,14 +162,14 @@ def _biarc(along: float, aside: float, turn: float) -> list[Segment]:
     d = 2.0 * c / (b + math.sqrt(b * b + 4.0 * a * c))
     joint = 0.5 * (v + d * (t0 - t1))
     middle = 2.0 * math.atan2(joint[1], joint[0])  # heading where the arcs meet: a chord is half-way through its turn
-    return [*_arc(joint, middle), *_arc(v - joint, float(wrap_angle(turn - middle)))]
+    return [*_arc(joint, middle, max_radius_m), *_arc(v - joint, float(wrap_angle(turn - middle)), max_radius_m)]
 
 
-def _arc(chord: Array, turn: float) -> list[Segment]:
+def _arc(chord: Array, turn: float, max_radius_m: float) -> list[Segment]:
     length = float(np.hypot(*chord))
     if length < 1e-9:
         return []
-    if abs(turn) * _MAX_RADIUS_M < length:
+    if turn == 0.0 or abs(turn) * max_radius_m < length:
         return [("line", length)]
     return [("arc", length / (2.0 * math.sin(0.5 * abs(turn))), turn)]
 

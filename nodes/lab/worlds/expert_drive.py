@@ -1,15 +1,16 @@
-"""The lane-following expert on ground-truth state, driving a reference path of a deployment scene."""
+"""The lane-following expert on ground-truth state, driving a reference path of a world."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from advnerf_core.driving.expert import Expert, ExpertConfig
-from advnerf_core.driving.path import Path
+from advnerf_core.driving.path import Arc, Line, Path
 from advnerf_core.geometry import Array
-from hardware.worlds.world import DeploymentScene
+from hardware.worlds.paths import ReferencePath
+from hardware.worlds.world import CarDescription, World
 
 # How firmly the expert returns to the lane, a little more than the teacher of the experiment, and how far it looks ahead.
 _STIFFNESS_1PM, _DELAY_S = 0.25, 0.1
@@ -21,7 +22,7 @@ class ExpertDrive:
 
     Attributes:
         states: x [m], y [m], yaw [rad] at the ticks ``[T + 1, 3]``.
-        controls: Turn rates [rad/s] ``[T]``.
+        controls: Turn rates [rad/s], or wheel angles [rad] ``[T]``.
         cte_m: Signed cross-track error at the ticks ``[T + 1]``, left positive.
         blocked_tick: When the car ran into something; None if it did not.
     """
@@ -32,17 +33,33 @@ class ExpertDrive:
     blocked_tick: int | None
 
 
-def turn_rate_expert(path: Path, speed_mps: float, dt_s: float, max_turn_rate_radps: float) -> Expert:
-    """The project's expert with a Dubins car's command, the turn rate."""
+def as_path(reference: ReferencePath) -> Path:
+    """The path that lines and arcs describe.
+
+    Raises:
+        ValueError: They are none, as those of a closed path that do not close.
+    """
+    pieces = [Line(piece[1]) if piece[0] == "line" else Arc(piece[1], piece[2]) for piece in reference.segments]
+    return Path.from_segments(reference.start_pose, pieces, closed=reference.closed)
+
+
+def lane_expert(path: Path, car: CarDescription, dt_s: float, stiffness_1pm: float = _STIFFNESS_1PM) -> Expert:
+    """The project's expert with a car's control: the turn rate of a Dubins car, the wheel angle of one with a wheelbase."""
     config = ExpertConfig(
-        speed_mps=speed_mps, delay_s=_DELAY_S, stiffness_1pm=_STIFFNESS_1PM, smoothing_m=speed_mps * dt_s,
-        steering_limits_rad=(-max_turn_rate_radps, max_turn_rate_radps), output="turn_rate",
-    )  # fmt: skip
+        speed_mps=car.speed_mps,
+        delay_s=_DELAY_S,
+        stiffness_1pm=stiffness_1pm,
+        smoothing_m=car.speed_mps * dt_s,
+        steering_limits_rad=car.control_limits,
+        output="turn_rate",
+    )
+    if car.wheelbase_m is not None:
+        config = replace(config, wheelbase_m=car.wheelbase_m, output="wheel_angle")
     return Expert(path, config)
 
 
 def drive_expert(
-    scene: DeploymentScene, expert: Expert, start: tuple[float, float, float], ticks: int, dt_s: float
+    scene: World, expert: Expert, start: tuple[float, float, float], ticks: int, dt_s: float
 ) -> ExpertDrive:
     """Drive from a start pose; the expert knows the true state, no picture is taken.
 
@@ -65,5 +82,5 @@ def drive_expert(
     return ExpertDrive(listed, np.array(controls), expert.path.project(listed[:, :2]).cte_m, blocked)
 
 
-def _now(scene: DeploymentScene) -> tuple[float, float, float]:
+def _now(scene: World) -> tuple[float, float, float]:
     return scene.state.x_m, scene.state.y_m, scene.state.yaw_rad

@@ -1,0 +1,111 @@
+"""Reference paths as plain data: straight lines and circular arcs from a start pose, and poses along them. Numpy is not needed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+Segment = tuple[Literal["line"], float] | tuple[Literal["arc"], float, float]
+Pose = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class ReferencePath:
+    """One drive: continuous in position and heading.
+
+    `hardware.worlds.fitting.path_through` makes one from points.
+
+    Attributes:
+        start_pose: x [m], y [m], yaw [rad] where the drive starts.
+        segments: In driving order, ``("line", length_m)`` or ``("arc", radius_m, angle_rad)``, left positive.
+        goal: What a goal-conditioned policy is told on this drive, such as a one-hot exit; empty where it is told nothing.
+        closed: Whether the end of the path is its start.
+    """
+
+    start_pose: Pose
+    segments: tuple[Segment, ...]
+    goal: tuple[float, ...] = ()
+    closed: bool = False
+
+    def __post_init__(self) -> None:
+        """Refuse what is no path."""
+        numbers = [*self.start_pose, *(value for segment in self.segments for value in segment[1:])]
+        positive = [segment[1] for segment in self.segments]
+        if len(self.start_pose) != 3 or not self.segments or not all(map(math.isfinite, numbers)) or min(positive) <= 0:
+            raise ValueError(
+                "expected a finite start pose (x, y, yaw) and at least one line or arc of positive length or radius, got "
+                f"{self.start_pose} and {self.segments}"
+            )
+
+    @property
+    def length_m(self) -> float:
+        """Length of the whole path [m]."""
+        return sum(segment_length_m(segment) for segment in self.segments)
+
+    def pose_at(self, s_m: float) -> Pose:
+        """Point and heading (x [m], y [m], yaw [rad]) at a distance along the path.
+
+        A closed path goes round again; an open one is extended straight beyond its ends.
+        """
+        x, y, yaw = self.start_pose
+        left = s_m % self.length_m if self.closed else s_m
+        for index, segment in enumerate(self.segments):
+            last = index == len(self.segments) - 1
+            length = segment_length_m(segment)
+            along = left if last else min(left, length)
+            if segment[0] == "arc" and along > 0.0:
+                inside = min(along, length)
+                turn = math.copysign(inside / segment[1], segment[2])
+                chord = 2.0 * segment[1] * math.sin(0.5 * abs(turn))
+                x, y = x + chord * math.cos(yaw + 0.5 * turn), y + chord * math.sin(yaw + 0.5 * turn)
+                yaw, along, left = yaw + turn, along - inside, left - inside
+            x, y, left = x + along * math.cos(yaw), y + along * math.sin(yaw), left - along
+            if left <= 0.0:
+                break
+        return x, y, math.remainder(yaw, 2.0 * math.pi)
+
+    def mirrored(self, across: Literal["x", "y"]) -> ReferencePath:
+        """The same drive seen in a mirror along the x or the y axis of the world: what was on the left of the axis is on its right."""
+        x, y, yaw = self.start_pose
+        start = (x, -y, -yaw) if across == "x" else (-x, y, math.pi - yaw)
+        turned: tuple[Segment, ...] = tuple(
+            piece if piece[0] == "line" else (piece[0], piece[1], -piece[2]) for piece in self.segments
+        )
+        return ReferencePath(start, turned, self.goal, self.closed)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data (JSON types) from which :meth:`from_dict` makes the same path."""
+        return {
+            "start_pose": list(self.start_pose),
+            "segments": [list(segment) for segment in self.segments],
+            "goal": list(self.goal),
+            "closed": self.closed,
+        }
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> ReferencePath:
+        """Rebuild a path from :meth:`to_dict`.
+
+        Raises:
+            KeyError, TypeError, ValueError: The data is something else.
+        """
+        x, y, yaw = map(float, data["start_pose"])
+        segments = tuple(_segment(piece) for piece in data["segments"])
+        return cls((x, y, yaw), segments, tuple(map(float, data["goal"])), bool(data["closed"]))
+
+
+def segment_length_m(segment: Segment) -> float:
+    """Length of one piece of a path [m]."""
+    return segment[1] if segment[0] == "line" else segment[1] * abs(segment[2])
+
+
+def _segment(piece: Any) -> Segment:
+    if piece[0] == "line":
+        (length_m,) = piece[1:]
+        return "line", float(length_m)
+    if piece[0] != "arc":
+        raise ValueError(f"expected a line or an arc, got {piece!r}")
+    radius_m, angle_rad = piece[1:]
+    return "arc", float(radius_m), float(angle_rad)

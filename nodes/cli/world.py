@@ -1,0 +1,58 @@
+"""The commands ``advnerf world ...``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from nodes.runtime.terminal import Overrides, print_table, table
+from nodes.runtime.termination import ends_in_order
+
+app = typer.Typer(
+    no_args_is_help=True, help="Places that are driven: which there are, and whether one keeps the contract."
+)
+Name = Annotated[
+    str, typer.Argument(metavar="WORLD", help="A world of `advnerf world list`, or file.py:Class of your own.")
+]
+_FAILURE_EXIT = 1
+
+
+@app.command("check")
+def world_check(
+    world: Name,
+    overrides: Overrides = None,
+    pictures: Annotated[
+        Path | None, typer.Option("--pictures", help="Folder for what the cameras see: look at it.")
+    ] = None,
+) -> None:
+    """Hold a world against the contract: handedness, metric depth, colour order, lateness, determinism, its car and its paths.
+
+    Exit code 1 if a part of it is not met.
+    """
+    from nodes.lab.worlds.check import check_world
+    from nodes.lab.worlds.named import read_world
+    from nodes.runtime.config import Document, apply_overrides
+
+    document = Document({"kind": world}, "command line")
+    apply_overrides(document, overrides or [])
+    with ends_in_order():
+        findings = check_world(read_world(document, Path.cwd()), pictures)
+    rows = table("part", "state", "found")
+    for finding in findings:
+        state = "[green]met[/]" if finding.met else "[red]not met[/]"
+        rows.add_row(finding.name, state, finding.text.replace("[", r"\["))
+    print_table(rows)
+    if not all(finding.met for finding in findings):
+        raise typer.Exit(_FAILURE_EXIT)
+
+
+@app.command("list")
+def world_list() -> None:
+    """Name the worlds that there are: built in, and of installed packages."""
+    from advnerf_core.plugins import known_names
+    from hardware.worlds import ENTRY_POINTS, WORLDS
+
+    for name in known_names(WORLDS, ENTRY_POINTS):
+        print(name)

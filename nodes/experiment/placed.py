@@ -1,0 +1,83 @@
+"""Where the objects of an attack stand in a world, as an experiment file lists them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from advnerf_core.geometry import Array, make_transform, rotation_z
+from hardware.worlds.world import WorldDescription
+
+ObjectKind = Literal["small_car", "hydrant"]
+# Length and width [m] at scale 1 of the objects that ``advnerf object build --generate`` makes.
+OBJECT_SIZES_M: dict[ObjectKind, tuple[float, float]] = {"small_car": (3.64, 1.7), "hydrant": (0.48, 0.48)}
+_SPACING_M = 0.05  # of the points that stand for a lane's middle
+
+
+class PlacedObject(BaseModel):
+    """Where an object of the attack stands. It is not part of the world: the deployment composes it by depth.
+
+    Attributes:
+        name: Unique name.
+        kind: What it is.
+        x_m: Middle of its foot [m].
+        y_m: Middle of its foot [m].
+        z_m: Height it stands on [m]: the kerb's on a pavement.
+        yaw_rad: Heading of its front [rad].
+        scale: Size relative to the object as it was built.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    name: str = Field(min_length=1)
+    kind: ObjectKind
+    x_m: float
+    y_m: float
+    z_m: float = 0.0
+    yaw_rad: float = 0.0
+    scale: float = Field(default=1.0, gt=0.0, le=2.0)
+
+    @property
+    def T_world_from_object(self) -> Array:
+        """Pose ``[4, 4]`` of its foot, x to its front, z up; the scale is not part of it."""
+        return make_transform(rotation_z(self.yaw_rad), [self.x_m, self.y_m, self.z_m])
+
+    def corners_m(self) -> list[tuple[float, float]]:
+        """The four corners [m] of the ground it covers."""
+        length, width = (0.5 * self.scale * size for size in OBJECT_SIZES_M[self.kind])
+        c, s = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
+        signs = ((1, 1), (-1, 1), (-1, -1), (1, -1))
+        ends = [(a * length, b * width) for a, b in signs]
+        return [(self.x_m + c * u - s * v, self.y_m + s * u + c * v) for u, v in ends]
+
+
+def in_a_lane(objects: Sequence[PlacedObject], world: WorldDescription) -> tuple[int, str] | None:
+    """The first object that reaches into a lane, nearer than half a lane's width to its middle.
+
+    Returns:
+        Its index, and what is wrong in words; None if all objects stand beside the lanes.
+    """
+    middles = np.array(
+        [
+            lane.pose_at(float(s))[:2]
+            for lane in world.lanes
+            for s in np.linspace(0.0, lane.length_m, 2 + int(lane.length_m / _SPACING_M))
+        ]
+    )
+    for index, thing in enumerate(objects):
+        turned, half = rotation_z(thing.yaw_rad)[:2, :2], 0.5 * thing.scale * np.array(OBJECT_SIZES_M[thing.kind])
+        seen_from_it = (middles - [thing.x_m, thing.y_m]) @ turned
+        nearest = np.clip(seen_from_it, -half, half)  # of the ground that it covers
+        distance_m = np.linalg.norm(seen_from_it - nearest, axis=1)
+        at = int(distance_m.argmin())
+        if distance_m[at] < world.off_track_m:
+            x, y = turned @ nearest[at] + [thing.x_m, thing.y_m]
+            return index, (
+                f"expected objects beside the lanes, at least {world.off_track_m:g} m from their middles, but {thing.name} reaches into a lane "
+                f"at ({x:.2f}, {y:.2f}); move it"
+            )
+    return None

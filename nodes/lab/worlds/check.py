@@ -1,0 +1,134 @@
+"""Does a world keep its contract? One line for each part of it, met or not, and why."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from advnerf_core.errors import AdvnerfError
+from advnerf_core.files import write_atomically
+from advnerf_core.geometry import planar_pose
+from hardware.worlds.world import NotOpenError, World, WorldDescription, traits_of
+from nodes.lab.worlds.bench import Bench, Check, Finding, NotMet
+from nodes.lab.worlds.driving import expert_keeps_its_lane, is_put_down, moves_as_described, paths_are_drivable
+from nodes.lab.worlds.geometry import box_holds_what_is_seen, ground_is_flat, photographs_cover, views_agree
+from nodes.lab.worlds.named import NamedWorld
+from nodes.lab.worlds.pictures import form, is_not_late, photographs_match, repeats, takes_no_time
+
+_DESCRIPTION = "description"
+# Without the first of these nothing else can be looked at.
+_FIRST: tuple[tuple[str, Check], ...] = (("pictures", form),)
+_CHECKS: tuple[tuple[str, Check], ...] = (
+    ("repeatable", repeats),
+    ("time", takes_no_time),
+    ("reset", is_put_down),
+    ("car", moves_as_described),
+    ("frames", is_not_late),
+    ("camera", views_agree),
+    ("ground", ground_is_flat),
+    ("photographs", photographs_match),
+    ("coverage", photographs_cover),
+    ("box", box_holds_what_is_seen),
+    ("paths", paths_are_drivable),
+    ("expert", expert_keeps_its_lane),
+)
+
+
+def check_world(named: NamedWorld, pictures: Path | None = None) -> list[Finding]:
+    """Look at everything that can be told of a world from the outside.
+
+    Args:
+        named: The world.
+        pictures: Folder for what the driving camera and a photograph show, for a person to look at.
+
+    Returns:
+        A line for each part of the contract; fewer if a first one fails without which the others cannot be looked at.
+
+    Raises:
+        AdvnerfError: The world cannot be made or opened; its own message.
+    """
+    closed = _described(named.make())
+    findings: list[Finding] = []
+    with named.make() as world:
+        described = world.describe()
+        findings.append(
+            _look(_DESCRIPTION, lambda bench: _is_consistent(bench, closed), Bench(named, world, described, None))
+        )
+        bench = Bench(named, world, described, traits_of(world).step_s)
+        for name, check in _FIRST:
+            findings.append(_look(name, check, bench))
+            if not findings[-1].met:
+                return findings
+        if pictures is not None:
+            _write_pictures(bench, pictures)
+        findings += [_look(name, check, bench) for name, check in _CHECKS]
+    return findings
+
+
+def _described(world: World) -> WorldDescription | None:
+    """What a world says about itself before it is opened; None if it must be asked."""
+    try:
+        return world.describe()
+    except NotOpenError:
+        return None
+
+
+def _look(name: str, check: Check, bench: Bench) -> Finding:
+    try:
+        return Finding(name, True, check(bench))
+    except NotMet as reason:
+        return Finding(name, False, str(reason))
+    except AdvnerfError:
+        raise  # a server that is gone, and what else a world says itself
+    except Exception as error:  # whatever a stranger's world raises
+        return Finding(name, False, f"raised {type(error).__name__}: {' '.join(str(error).split()):.200}")
+
+
+def _is_consistent(bench: Bench, closed: WorldDescription | None) -> str:
+    """The description says the same every time and through JSON, and has the camera that the world has; settings are JSON."""
+    world, described = bench.world, bench.description
+    text = json.dumps(described.to_dict())
+    for when, other in (("when it is asked again", world.describe()), ("before it is opened", closed)):
+        if other is not None and json.dumps(other.to_dict()) != text:
+            raise NotMet(
+                f"expected the same description every time; got another one {when}; raise NotOpenError where the world must be asked first"
+            )
+    if WorldDescription.from_dict(json.loads(text)).to_dict() != json.loads(text):
+        raise NotMet("expected a description that JSON keeps; facts must be plain data with text as keys")
+    if described.camera != world.camera_pinhole:
+        raise NotMet(f"expected camera to be camera_pinhole, {world.camera_pinhole}; got {described.camera}")
+    if not np.allclose(described.T_car_from_camera, world.T_car_from_camera, atol=1e-9):
+        raise NotMet("expected T_car_from_camera to be the same in the world and in its description; got two")
+    settings = bench.named.settings
+    json.dumps(settings)
+    unknown = [key for key in traits_of(world).unseen if not _has(settings, key)]
+    if unknown:
+        raise NotMet(f"expected traits.unseen to name keys of the configuration; got {', '.join(unknown)}")
+    paths = ", ".join(f"{name} ({path.length_m:.1f} m)" for name, path in described.paths.items())
+    return f"{described.car.kind} car, {described.car.speed_mps:g} m/s, lanes of {2.0 * described.off_track_m:g} m; paths {paths}"
+
+
+def _has(settings: dict[str, object], key: str) -> bool:
+    found: object = settings
+    for step in key.split("."):
+        if not isinstance(found, dict) or step not in found:
+            return False
+        found = found[step]
+    return True
+
+
+def _write_pictures(bench: Bench, folder: Path) -> None:
+    """What the driving camera sees where each path begins, its depth (near is bright), and a photograph from there."""
+    for name, path in bench.description.paths.items():
+        rgb, depth = bench.world.observe_at(*path.start_pose)
+        near = 255.0 * np.clip(1.0 - np.log1p(np.minimum(depth, 1e4)) / 5.0, 0.0, 1.0)
+        photo = bench.world.photograph(planar_pose(*path.start_pose) @ bench.world.T_car_from_camera)
+        for what, image in (
+            ("view", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)),
+            ("depth", near.astype(np.uint8)),
+            ("photograph", cv2.cvtColor(photo, cv2.COLOR_RGB2BGR)),
+        ):
+            write_atomically(folder / f"{name}_{what}.png", cv2.imencode(".png", image)[1].tobytes())

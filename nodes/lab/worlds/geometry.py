@@ -1,0 +1,299 @@
+"""Checks of where a world's camera is: depth of one view predicts depth of another, the ground is at z = 0, photographs and the box cover the paths.
+
+Points are taken from depth to the world by the declared intrinsics, mount and pose of the car, and from there into another view. Where that fails, the
+same is tried with what is commonly wrong (depth along the ray, millimetres, a mirrored picture, ...), so that the report can name it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from advnerf_core.geometry import (
+    OPENGL_FROM_OPENCV,
+    Array,
+    Pinhole,
+    camera_mount,
+    invert_transform,
+    planar_pose,
+    transform_points,
+)
+from hardware.worlds.paths import Pose
+from hardware.worlds.world import Depth
+from nodes.lab.worlds.bench import Bench, NotMet
+
+# Predicted depth may be off by this share, and colour by so much [grey levels, and of the picture's spread]; points on edges and behind others are.
+_SAME_DEPTH, _LEAST_AGREEMENT, _BETTER_BY = 0.02, 0.75, 0.1
+_SAME_COLOUR, _SAME_COLOUR_SHARE = 4.0, 0.2
+_EVERY_PX = 3
+# The second view of a pair: ahead by so many seconds of driving, aside by a share of half a lane, turned [rad].
+_PAIRS = ((0.25, 0.0, 0.0), (0.1, 0.3, 0.35), (0.1, -0.3, -0.35))
+# Ground under the lane ahead: height [m] as a share of the camera's, and of the distance.
+_GROUND_SHARE, _HEIGHT_SHARE, _RANGE_SHARE, _LEAST_GROUND = 0.7, 0.03, 0.01, 200
+_PHOTOS, _SEEN_BY, _SEEN_SHARE = 60, 3, 0.9
+_INSIDE_SHARE = 0.99
+
+
+@dataclass(frozen=True)
+class Reading:
+    """One way to read a world's depth and camera.
+
+    Attributes:
+        advice: What is wrong if the world fits this reading, and what to change; empty for the contract's own.
+        mount: Where the camera sits on the car ``[4, 4]``.
+        planar: From what the world gives to planar depth ``[H, W]`` [m], with the directions ``[H, W, 3]`` of its pixels.
+        seen: From the world's pictures to upright ones.
+        pose: From the pose that was asked for to the pose it was taken from.
+    """
+
+    advice: str
+    mount: Array
+    planar: Callable[[Depth, Array], Depth] = lambda depth, directions: depth
+    seen: Callable[[NDArray[np.float32]], NDArray[np.float32]] = lambda image: image
+    pose: Callable[[Pose], Pose] = lambda pose: pose
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """What the driving camera gives from a pose of the car: depth ``[H, W]``, and colours ``[H, W, 3]`` a little blurred [grey levels]."""
+
+    pose: Pose
+    depth: Depth
+    rgb: NDArray[np.float32]
+
+
+def views_agree(bench: Bench) -> str:
+    """Points that depth puts into the world from one pose of the car are there, in the same colour, from another pose."""
+    pairs = _pairs_of_views(bench)
+    readings = _readings(bench)
+    shares = [_agreement(reading, pairs, bench.world.camera_pinhole) for reading in readings]
+    best = int(np.argmax(shares))
+    if best and shares[best] > max(shares[0] + _BETTER_BY, 0.5 * _LEAST_AGREEMENT):
+        raise NotMet(
+            f"expected points seen from two poses to be in one place; {100 * shares[0]:.0f} % are as declared, {100 * shares[best]:.0f} % if "
+            f"{readings[best].advice}"
+        )
+    if shares[0] < _LEAST_AGREEMENT:
+        raise NotMet(
+            f"expected points seen from two poses to be in one place; {100 * shares[0]:.0f} % are (at least {100 * _LEAST_AGREEMENT:.0f} % will do): "
+            "compare T_car_from_camera and camera_pinhole with the camera that draws, and the pose with the one asked for"
+        )
+    return f"{100 * shares[0]:.0f} % of the points seen from two poses are in one place, within {100 * _SAME_DEPTH:.0f} % of their distance and of one colour"
+
+
+def ground_is_flat(bench: Bench) -> str:
+    """What lies in the lane ahead is at z = 0: the camera is as high as declared, and nothing stands in a lane."""
+    middles = np.array(
+        [
+            path.pose_at(float(s))[:2]
+            for path in bench.description.paths.values()
+            for s in np.arange(
+                0.0, bench.driven_m(path) + bench.description.car.speed_mps, 0.2 * bench.description.off_track_m
+            )
+        ]
+    )
+    height_m, found, seen = float(bench.world.T_car_from_camera[2, 3]), [], 0
+    for place in bench.places:
+        points, depth = _points(bench, place)
+        near = depth < 12.0 * max(height_m, 1e-3)
+        points, depth = points[near], depth[near]
+        apart = np.linalg.norm(points[:, None, :2] - middles[None], axis=2).min(axis=1) if len(points) else np.zeros(0)
+        on_lane = apart < 0.5 * bench.description.off_track_m
+        seen += int(on_lane.sum())
+        found.append((points[on_lane, 2], depth[on_lane]))
+    if seen < _LEAST_GROUND:
+        raise NotMet(
+            f"expected the driving camera to see the lane ahead; {seen} points of all views lie in a lane: is the camera above the ground, does it look "
+            "ahead, and are the paths where the lanes are?"
+        )
+    z_m, depth_m = (np.concatenate(each) for each in zip(*found, strict=True))
+    share = float(np.mean(np.abs(z_m) < _HEIGHT_SHARE * height_m + _RANGE_SHARE * depth_m))
+    if share < _GROUND_SHARE:
+        raise NotMet(
+            f"expected the ground in the lanes at z = 0; got a median of {float(np.median(z_m)):+.3f} m, and {100 * share:.0f} % of it where it belongs: "
+            f"compare the camera's height ({height_m:.3f} m) and pitch in T_car_from_camera with the camera that draws, and put the world's ground at z = 0"
+        )
+    return f"{100 * share:.0f} % of the lane ahead is at z = 0, its median at {float(np.median(z_m)):+.3f} m"
+
+
+def box_holds_what_is_seen(bench: Bench) -> str:
+    """The box holds what the driving camera sees, or at least what is driven if the rest is contracted."""
+    box = bench.description.box
+    if box.contraction:
+        points = np.array(
+            [
+                [*path.pose_at(float(s))[:2], 0.0]
+                for path in bench.description.paths.values()
+                for s in np.linspace(0.0, bench.driven_m(path), 50)
+            ]
+        )
+        what = "the paths"
+    else:
+        points = np.concatenate([_points(bench, place)[0] for place in bench.places])
+        what = "the points that the driving camera sees"
+    margin_m = 0.01 * np.subtract(box.max_m, box.min_m)
+    share = float(np.mean(np.all((points > box.min_m - margin_m) & (points < box.max_m + margin_m), axis=1)))
+    if share < _INSIDE_SHARE:
+        raise NotMet(
+            f"expected box to hold {what}; {100 * share:.1f} % are inside {box.min_m} .. {box.max_m} m: make it larger"
+            + ("" if box.contraction else ", or set contraction=True where there is more to see outside")
+        )
+    return f"{100 * share:.1f} % of {what} are inside"
+
+
+def photographs_cover(bench: Bench) -> str:
+    """Photographs for learning are upright, above the ground, and see the stretch of each path that is driven."""
+    world, count = bench.world, _PHOTOS
+    poses = np.asarray(world.photo_poses(count, np.random.default_rng(0)), dtype=np.float64)
+    if poses.shape != (count, 4, 4) or not np.isfinite(poses).all():
+        raise NotMet(
+            f"expected photo_poses({count}, rng) to give {count} finite transforms [4, 4]; got an array of shape {list(poses.shape)}"
+        )
+    R = poses[:, :3, :3]
+    if np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max() > 1e-6 or (np.linalg.det(R) < 0.0).any():
+        raise NotMet("expected photo poses to be rigid transforms; got scaled, sheared or mirrored ones")
+    upright, high = -R[:, 2, 1] > 0.0, poses[:, 2, 3] > 0.0
+    if not (upright.all() and high.all()):
+        raise NotMet(
+            f"expected cameras above the ground with y pointing down; got {int((~high).sum())} of {count} below the ground and {int((~upright).sum())} upside "
+            "down: OpenGL cameras, which look along -z with y up, must be turned: T @ diag(1, -1, -1, 1)"
+        )
+    points = np.array(
+        [
+            [*path.pose_at(float(s))[:2], 0.0]
+            for path in bench.description.paths.values()
+            for s in np.linspace(0.0, bench.driven_m(path), 40)
+        ]
+    )
+    lens = world.photo_pinhole
+    seen = np.zeros(len(points), dtype=int)
+    for T in poses:
+        there = transform_points(invert_transform(T), points)
+        pixels = lens.project(there)
+        inside = (pixels >= 0.0).all(axis=1) & (pixels < [lens.width, lens.height]).all(axis=1)
+        seen += inside & (there[:, 2] > 0.0)
+    share = float(np.mean(seen >= _SEEN_BY))
+    if share < _SEEN_SHARE:
+        raise NotMet(
+            f"expected at least {_SEEN_BY} of {count} photographs to look at every stretch of the paths; {100 * share:.0f} % of the paths are seen so often: "
+            "take photographs along all paths, looking where the car looks"
+        )
+    return f"{100 * share:.0f} % of the paths are looked at by {_SEEN_BY} of {count} photographs or more"
+
+
+def _pairs_of_views(bench: Bench) -> list[list[tuple[View, View]]]:
+    """Views from two poses near each other; one list for each kind of move."""
+    car, half_lane_m = bench.description.car, bench.description.off_track_m
+    first = [_view(bench, place) for place in bench.places]
+    return [
+        [
+            (one, _view(bench, bench.beside(one.pose, ahead_s * car.speed_mps, left * half_lane_m, turn_rad)))
+            for one in first
+        ]
+        for ahead_s, left, turn_rad in _PAIRS
+    ]
+
+
+def _view(bench: Bench, pose: Pose) -> View:
+    rgb, depth = bench.world.observe_at(*pose)
+    return View(pose, depth, np.asarray(cv2.blur(rgb, (3, 3)), dtype=np.float32))
+
+
+def _readings(bench: Bench) -> list[Reading]:
+    """The contract's reading first, then what is commonly wrong."""
+    T = np.asarray(bench.world.T_car_from_camera, dtype=np.float64)
+    level = camera_mount(*map(float, T[:3, 3]))
+    return [
+        Reading("", T),
+        Reading(
+            "depth is the distance along the ray; divide it by the length of the pixel's direction",
+            T,
+            lambda d, r: d / np.linalg.norm(r, axis=-1),
+        ),
+        Reading("depth is in millimetres; divide it by 1000", T, lambda d, r: d / 1000.0),
+        Reading("depth is in centimetres; divide it by 100", T, lambda d, r: d / 100.0),
+        Reading(
+            "pictures are mirrored left to right; the camera's x points right", T, seen=lambda image: image[:, ::-1]
+        ),
+        Reading("pictures are upside down; row 0 is the top", T, seen=lambda image: image[::-1]),
+        Reading(
+            "they are taken from the car's own pose; multiply it by T_car_from_camera", camera_mount(0.0, 0.0, 0.0)
+        ),
+        Reading("the camera that draws is level; turn it as T_car_from_camera says", level),
+        Reading(
+            "T_car_from_camera is the inverse of what is meant; it takes camera coordinates to the car",
+            invert_transform(T),
+        ),
+        Reading(
+            "T_car_from_camera has OpenGL axes; multiply it by diag(1, -1, -1, 1) from the right",
+            T @ OPENGL_FROM_OPENCV,
+        ),
+        Reading(
+            "yaw turns to the right; it is counter-clockwise seen from above", T, pose=lambda p: (p[0], p[1], -p[2])
+        ),
+        Reading("yaw is taken for degrees; it is in radians", T, pose=lambda p: (p[0], p[1], float(np.radians(p[2])))),
+    ]
+
+
+def _agreement(reading: Reading, pairs: list[list[tuple[View, View]]], pinhole: Pinhole) -> float:
+    """Share of points that are in one place from both poses, for the kind of move where it is lowest."""
+    shares = []
+    for kind in pairs:
+        found = np.array([_in_one_place(reading, one, other, pinhole) for one, other in kind])
+        same, total = found.sum(axis=0)
+        shares.append(same / max(total, 1))
+    return float(min(shares))
+
+
+def _in_one_place(reading: Reading, one: View, other: View, pinhole: Pinhole) -> tuple[int, int]:
+    """How many points of a view's lower part are where the other view has them, in depth and colour, and how many are in the other view at all."""
+    directions = pinhole.directions()
+    below = (
+        slice(pinhole.height // 2, None, _EVERY_PX),
+        slice(None, None, _EVERY_PX),
+    )  # the ground and what stands on it
+    z_m = np.asarray(reading.seen(reading.planar(one.depth, directions)), dtype=np.float64)[below]
+    known = np.isfinite(z_m) & (z_m > 0.0)
+    colour = reading.seen(one.rgb)[below][known]
+    T_other_from_one = (
+        invert_transform(planar_pose(*reading.pose(other.pose)) @ reading.mount)
+        @ planar_pose(*reading.pose(one.pose))
+        @ reading.mount
+    )
+    there = transform_points(T_other_from_one, directions[below][known] * z_m[known][:, None])
+    pixels = pinhole.project(there)
+    inside = (there[:, 2] > 0.0) & (pixels > 1.0).all(axis=1)
+    inside &= (pixels < [pinhole.width - 1.0, pinhole.height - 1.0]).all(axis=1)
+    if not inside.any():
+        return 0, 0
+    # On a plane the inverse of depth is linear in the picture.
+    other_depth = np.asarray(reading.seen(reading.planar(other.depth, directions)), dtype=np.float64)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inverse = np.where(other_depth > 0.0, 1.0 / other_depth, 0.0).astype(np.float32)
+    maps = (pixels[inside] - 0.5).astype(np.float32)
+    same_depth = np.abs(there[inside, 2] * _sampled(inverse, maps) - 1.0) < _SAME_DEPTH
+    apart = np.abs(colour[inside] - _sampled(np.ascontiguousarray(reading.seen(other.rgb)), maps)).mean(axis=1)
+    same_colour = apart < max(_SAME_COLOUR, _SAME_COLOUR_SHARE * float(other.rgb.std(axis=(0, 1)).mean()))
+    return int(np.sum(same_depth & same_colour)), len(maps)
+
+
+def _sampled(image: NDArray[np.float32], xy: NDArray[np.float32]) -> Array:
+    """Values ``[N, ...]`` between pixels; in one column, as OpenCV takes no longer rows than 32 767."""
+    parts = np.array_split(xy, 1 + len(xy) // 30_000)
+    values = [cv2.remap(image, part[:, :1], part[:, 1:], interpolation=cv2.INTER_LINEAR)[:, 0] for part in parts]
+    return np.concatenate(values).astype(np.float64)
+
+
+def _points(bench: Bench, place: Pose) -> tuple[Array, Array]:
+    """What the driving camera sees from a pose of the car, in the world ``[N, 3]`` [m], and its depth ``[N]`` [m]."""
+    depth = np.asarray(bench.world.observe_at(*place)[1], dtype=np.float64)
+    kept = slice(None, None, _EVERY_PX), slice(None, None, _EVERY_PX)
+    z_m = depth[kept]
+    known = np.isfinite(z_m)
+    in_camera = bench.world.camera_pinhole.directions()[kept][known] * z_m[known][:, None]
+    T = planar_pose(*place) @ bench.world.T_car_from_camera
+    return transform_points(T, in_camera), z_m[known]

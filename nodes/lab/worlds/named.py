@@ -1,0 +1,124 @@
+"""Worlds by name: the class that a name stands for, its configuration checked, and what of it results depend on."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import inspect
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+from pydantic import BaseModel, TypeAdapter
+
+from advnerf_core.plugins import PluginError, absolute_reference, is_file_reference, resolve
+from hardware.worlds import ENTRY_POINTS, WORLDS
+from hardware.worlds.world import World, WorldClass, members_of_a_world
+from nodes.runtime.config import Document, validate
+from nodes.runtime.errors import ConfigError
+
+_PAGE = "docs/worlds.md"
+
+
+@dataclass(frozen=True)
+class NamedWorld:
+    """A world that a file or a person has named. It is not open, and may be made often.
+
+    Attributes:
+        kind: Its name: built in, an entry point, or ``file.py:Class`` with the file's name alone.
+        world_class: What the name stands for.
+        config: Its checked configuration.
+        source_sha256: Hash of the file of a ``file.py:Class``; empty for other names.
+    """
+
+    kind: str
+    world_class: WorldClass
+    config: Any
+    source_sha256: str
+
+    def make(self) -> World:
+        """The world, not open yet.
+
+        Raises:
+            ConfigError: The class lacks something that a world must have.
+        """
+        world = self.world_class(self.config)
+        # Of a property only the class is asked: a world that is not open may not know its value.
+        known = (set(dir(type(world))), set(vars(world)) if hasattr(world, "__dict__") else set())
+        missing = [name for name in members_of_a_world() if not any(name in names for names in known)]
+        if missing:
+            raise ConfigError(
+                f"world {self.kind}: expected {', '.join(missing)}, which it lacks; {_PAGE} says what a world must have"
+            )
+        return world
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What results depend on, as JSON data: the configuration without fields that are excluded, and a hash of a world's own file."""
+        dumped = (
+            self.config.model_dump(mode="json")
+            if isinstance(self.config, BaseModel)
+            else TypeAdapter(type(self.config)).dump_python(self.config, mode="json")
+        )
+        source = {"source_sha256": self.source_sha256} if self.source_sha256 else {}
+        return {"kind": self.kind, **source, **dumped}
+
+
+def read_world(document: Document, folder: Path) -> NamedWorld:
+    """The world that a section ``{kind: ..., key: value, ...}`` names.
+
+    Args:
+        document: The section: ``kind``, and changes of the configuration of that world's class.
+        folder: What a relative ``file.py:Class`` is relative to.
+
+    Raises:
+        ConfigError: No such world, or something is wrong with its configuration; with file, line and the valid keys.
+    """
+    if not isinstance(document.data, dict) or not isinstance(document.data.get("kind"), str):
+        raise ConfigError(
+            f"{document.place(('kind',))}: expected kind: NAME, the world's name ({', '.join(WORLDS)}, or file.py:Class); got {document.data!r:.80}"
+        )
+    kind = document.data["kind"]
+    try:
+        world_class = find_world(kind, folder)
+    except PluginError as error:
+        raise ConfigError(f"{document.place(('kind',))}: {error}") from None
+    changes = {key: value for key, value in document.data.items() if key != "kind"}
+    config = validate(world_class.Config, Document(changes, document.source, document.places))
+    if not is_file_reference(kind):
+        return NamedWorld(kind, world_class, config, "")
+    file = Path(absolute_reference(kind, folder).rpartition(":")[0])
+    name = f"{file.name}:{kind.rpartition(':')[2]}"
+    return NamedWorld(name, world_class, config, hashlib.sha256(file.read_bytes()).hexdigest())
+
+
+def find_world(name: str, folder: Path) -> WorldClass:
+    """The class that a world's name stands for.
+
+    Raises:
+        PluginError: There is none, it cannot be loaded, or it is no class with a ``Config``.
+    """
+    found: Any = resolve(name, "world", WORLDS, ENTRY_POINTS, folder)
+    config = getattr(found, "Config", None)
+    if (
+        not inspect.isclass(found)
+        or not inspect.isclass(config)
+        or not (issubclass(config, BaseModel) or dataclasses.is_dataclass(config))
+    ):
+        raise PluginError(
+            f"world {name}: expected a class with an attribute Config, a pydantic model or a dataclass; got {found!r:.80}; see {_PAGE}"
+        )
+    return cast("WorldClass", found)
+
+
+def without(settings: Mapping[str, Any], keys: tuple[str, ...]) -> dict[str, Any]:
+    """Settings without some keys, which are written with dots: ``car.turn_rate_lag_s``."""
+    left = dict(settings)
+    for key in keys:
+        head, _, rest = key.partition(".")
+        if rest and isinstance(left.get(head), Mapping):
+            left[head] = without(left[head], (rest,))
+        elif not rest:
+            left.pop(head, None)
+    return left

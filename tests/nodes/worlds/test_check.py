@@ -1,0 +1,331 @@
+"""``advnerf world check``: good worlds pass, and each of the planted faults is found and named."""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from advnerf_core.geometry import OPENGL_FROM_OPENCV, VehicleState, camera_mount, invert_transform, planar_pose
+from hardware.worlds.paths import ReferencePath
+from hardware.worlds.world import Box, CarDescription, NotOpenError
+from nodes.lab.worlds.check import check_world
+from nodes.lab.worlds.named import NamedWorld, read_world
+from nodes.runtime.config import Document
+from tests.nodes.worlds.warehouse import EXAMPLES, Warehouse, small
+
+PARTS = [
+    "description", "pictures", "repeatable", "time", "reset", "car", "frames", "camera", "ground", "photographs", "coverage", "box", "paths",
+    "expert",
+]  # fmt: skip
+
+
+def named(kind: str) -> NamedWorld:
+    return read_world(Document({"kind": kind}, "test"), EXAMPLES)
+
+
+@pytest.mark.parametrize("kind", ["lab", "junction", "world_warehouse.py:Warehouse"])
+def test_good_worlds_pass(kind: str, tmp_path: Any) -> None:
+    findings = check_world(named(kind), tmp_path / "look")
+    assert [finding.name for finding in findings] == PARTS
+    assert [f"{finding.name}: {finding.text}" for finding in findings if not finding.met] == []
+    views = len(findings[0].text.split("paths ")[1].split("), "))
+    assert len(list((tmp_path / "look").glob("*.png"))) == 3 * views
+
+
+class Small(Warehouse):  # type: ignore[misc]
+    """The warehouse with small photographs too."""
+
+    def __init__(self, config: Any) -> None:
+        super().__init__(config)
+        p = self.photo_pinhole
+        self.photo_pinhole = p.resized(p.width // 2, p.height // 2)
+
+    def changed(self, **changes: Any) -> Any:
+        """The warehouse's own description with changes."""
+        return type(Warehouse.describe(self))(**{**vars(Warehouse.describe(self)), **changes})
+
+
+def test_the_small_warehouse_passes() -> None:
+    assert [f"{finding.name}: {finding.text}" for finding in check_world(small(Small)) if not finding.met] == []
+
+
+class Mirrored(Small):
+    def observe_at(self, *pose: float, depth: bool = True) -> Any:
+        rgb, z = super().observe_at(*pose)
+        return np.ascontiguousarray(rgb[:, ::-1]), np.ascontiguousarray(z[:, ::-1]) if depth else None
+
+
+class UpsideDown(Small):
+    def observe_at(self, *pose: float, depth: bool = True) -> Any:
+        rgb, z = super().observe_at(*pose)
+        return np.ascontiguousarray(rgb[::-1]), np.ascontiguousarray(z[::-1]) if depth else None
+
+
+class DepthAlongTheRay(Small):
+    def observe_at(self, *pose: float, depth: bool = True) -> Any:
+        rgb, z = super().observe_at(*pose)
+        return rgb, (z * np.linalg.norm(self.camera_pinhole.directions(), axis=-1)).astype(
+            np.float32
+        ) if depth else None
+
+
+class Millimetres(Small):
+    def observe_at(self, *pose: float, depth: bool = True) -> Any:
+        rgb, z = super().observe_at(*pose)
+        return rgb, 1000.0 * z if depth else None
+
+
+class LevelCamera(Small):
+    def observe_at(self, *pose: float, depth: bool = True) -> Any:
+        rgb, z = self._cast(planar_pose(*pose) @ camera_mount(0.4, 0.0, 0.5), self.camera_pinhole)
+        return rgb, z if depth else None
+
+
+class CameraOnTheRearAxle(Small):
+    def observe_at(self, *pose: float, depth: bool = True) -> Any:
+        T = camera_mount(-1.0, 0.0, 0.5, math.radians(10.0))
+        rgb, z = self._cast(planar_pose(*pose) @ T, self.camera_pinhole)
+        return rgb, z if depth else None
+
+
+class InverseMount(Small):
+    def __init__(self, config: Any) -> None:
+        super().__init__(config)
+        self._mount, self.T_car_from_camera = self.T_car_from_camera, invert_transform(self.T_car_from_camera)
+
+    def observe_at(self, *pose: float, depth: bool = True) -> Any:
+        rgb, z = self._cast(planar_pose(*pose) @ self._mount, self.camera_pinhole)
+        return rgb, z if depth else None
+
+
+class HigherThanDeclared(Small):
+    def observe_at(self, *pose: float, depth: bool = True) -> Any:
+        T = camera_mount(0.4, 0.0, 0.7, math.radians(10.0))
+        rgb, z = self._cast(planar_pose(*pose) @ T, self.camera_pinhole)
+        return rgb, z if depth else None
+
+
+class YawToTheRight(Small):
+    def observe_at(self, x: float, y: float, yaw: float, depth: bool = True) -> Any:
+        return super().observe_at(x, y, -yaw, depth)
+
+
+class BlueFirst(Small):
+    def photograph(self, T: Any) -> Any:
+        return np.ascontiguousarray(super().photograph(T)[..., ::-1])
+
+
+class PhotographsByTheInverse(Small):
+    def photograph(self, T: Any) -> Any:
+        return super().photograph(invert_transform(T))
+
+
+class Late(Small):
+    _shown: Any = None
+
+    def reset(self, *pose: float) -> VehicleState:
+        self._shown = tuple(pose)
+        return super().reset(*pose)
+
+    def step(self, *command: float) -> VehicleState:
+        self._shown = self._pose
+        return super().step(*command)
+
+    def observe(self, depth: bool = True) -> Any:
+        return super().observe_at(*self._shown, depth=depth)
+
+
+class SteersTheOtherWay(Small):
+    def step(self, wheel: float, speed: float, duration: float) -> VehicleState:
+        return super().step(-wheel, speed, duration)
+
+
+class KilometresPerHour(Small):
+    def step(self, wheel: float, speed: float, duration: float) -> VehicleState:
+        return super().step(wheel, speed / 3.6, duration)
+
+
+class WheelsInDegrees(Small):
+    def step(self, wheel: float, speed: float, duration: float) -> VehicleState:
+        return super().step(math.radians(wheel), speed, duration)
+
+
+class WrongWheelbase(Small):
+    def describe(self) -> Any:
+        return self.changed(car=CarDescription("ackermann", self.config.speed_mps, (-0.5, 0.5), 0.3))
+
+
+class StateInDegrees(Small):
+    @property
+    def state(self) -> VehicleState:
+        x, y, yaw = self._pose
+        return VehicleState(x, y, math.degrees(yaw), self._speed_mps)
+
+
+class BodysMiddle(Small):
+    @property
+    def state(self) -> VehicleState:
+        x, y, yaw = self._pose
+        return VehicleState(x + 0.3 * math.cos(yaw), y + 0.3 * math.sin(yaw), yaw, self._speed_mps)
+
+
+class DrivesByItsMiddle(BodysMiddle):
+    def reset(self, x: float, y: float, yaw: float) -> VehicleState:
+        super().reset(x - 0.3 * math.cos(yaw), y - 0.3 * math.sin(yaw), yaw)
+        return self.state
+
+
+class KeepsTheWheels(Small):
+    def reset(self, *pose: float) -> VehicleState:
+        wheel = getattr(self, "_wheel_rad", 0.0)
+        super().reset(*pose)
+        self._wheel_rad = wheel
+        return self.state
+
+
+class LookingTakesTime(Small):
+    def observe(self, depth: bool = True) -> Any:
+        seen = super().observe(depth)
+        if self._speed_mps:
+            self.step(0.0, self._speed_mps, 0.02)
+        return seen
+
+
+class LookingElsewhereGoesThere(Small):
+    def observe_at(self, *pose: float, depth: bool = True) -> Any:
+        self._pose = tuple(map(float, pose))
+        return super().observe_at(*pose, depth=depth)
+
+
+class Noisy(Small):
+    def observe_at(self, *pose: float, depth: bool = True) -> Any:
+        rgb, z = super().observe_at(*pose, depth=depth)
+        noise = np.random.default_rng().integers(0, 3, rgb.shape)
+        return np.clip(rgb + noise, 0, 255).astype(np.uint8), z
+
+
+class OneBuffer(Small):
+    _buffer: Any = None
+
+    def observe_at(self, *pose: float, depth: bool = True) -> Any:
+        rgb, z = super().observe_at(*pose, depth=depth)
+        self._buffer = rgb.copy() if self._buffer is None else self._buffer
+        np.copyto(self._buffer, rgb)
+        return self._buffer, z
+
+
+class DoubleDepth(Small):
+    def observe_at(self, *pose: float, depth: bool = True) -> Any:
+        rgb, z = super().observe_at(*pose)
+        return rgb, z.astype(np.float64) if depth else None
+
+
+class TightPath(Small):
+    def describe(self) -> Any:
+        tight = ReferencePath(
+            (-4.0, -3.0, 0.0), (("line", 3.0), ("arc", 0.6, 0.5 * math.pi), ("line", 0.3)), (1.0, 0.0)
+        )
+        return self.changed(paths={"tight": tight})
+
+
+class PathThroughAShelf(Small):
+    def describe(self) -> Any:
+        return self.changed(paths={"through": ReferencePath((-6.0, -1.0, 0.0), (("line", 7.0),), (1.0, 0.0))})
+
+
+class OneGoalForTwoPaths(Small):
+    def describe(self) -> Any:
+        paths = Warehouse.describe(self).paths
+        return self.changed(
+            paths={name: ReferencePath(p.start_pose, p.segments, (), p.closed) for name, p in paths.items()}
+        )
+
+
+class OpenGlPhotographs(Small):
+    def photo_poses(self, count: int, rng: np.random.Generator) -> Any:
+        return [pose @ OPENGL_FROM_OPENCV for pose in super().photo_poses(count, rng)]
+
+
+class PhotographsOfOneCorner(Small):
+    def photo_poses(self, count: int, rng: np.random.Generator) -> Any:
+        return [planar_pose(-5.0, 3.0, 3.0) @ self.T_car_from_camera] * count
+
+
+class SmallBox(Small):
+    def describe(self) -> Any:
+        return self.changed(box=Box((-4.0, -4.0, 0.0), (4.0, 4.0, 2.0)))
+
+
+class AnotherEveryTime(Small):
+    _asked = 0
+
+    def describe(self) -> Any:
+        self._asked += 1
+        return self.changed(facts={"asked": self._asked})
+
+
+class Raises(Small):
+    def photo_poses(self, count: int, rng: np.random.Generator) -> Any:
+        raise KeyError("poses")
+
+
+@pytest.mark.parametrize(
+    ("fault", "part", "told"),
+    [
+        (Mirrored, "camera", "mirrored left to right"),
+        (UpsideDown, "camera", "upside down"),
+        (DepthAlongTheRay, "camera", "distance along the ray"),
+        (Millimetres, "camera", "in millimetres"),
+        (LevelCamera, "camera", "the camera that draws is level"),
+        (CameraOnTheRearAxle, "camera", "compare T_car_from_camera"),
+        (InverseMount, "camera", "inverse of what is meant"),
+        (YawToTheRight, "camera", "yaw turns to the right"),
+        (HigherThanDeclared, "ground", "at z = 0; got a median of -0.2"),
+        (BlueFirst, "photographs", "is blue, green, red"),
+        (PhotographsByTheInverse, "photographs", "camera to world"),
+        (Late, "frames", "the picture is late"),
+        (SteersTheOtherWay, "car", "it turns right"),
+        (KilometresPerHour, "car", "0.28 times as fast; speeds are in m/s"),
+        (WheelsInDegrees, "car", "in degrees?"),
+        (WrongWheelbase, "car", "0.60 times as fast; correct kind"),
+        (StateInDegrees, "reset", "yaw is in radians"),
+        (BodysMiddle, "reset", "after reset"),
+        (DrivesByItsMiddle, "car", "not of the body's middle"),
+        (KeepsTheWheels, "reset", "forget commands under way"),
+        (LookingTakesTime, "time", "observe changes the car's state"),
+        (LookingElsewhereGoesThere, "time", "observe_at changes the car's state"),
+        (Noisy, "repeatable", "another picture"),
+        (OneBuffer, "pictures", "return a copy"),
+        (DoubleDepth, "pictures", "float32 in metres; got float64"),
+        (TightPath, "paths", "curves that the car can follow"),
+        (PathThroughAShelf, "paths", "the car is blocked at"),
+        (OneGoalForTwoPaths, "paths", "no policy can tell them apart"),
+        (OpenGlPhotographs, "coverage", "OpenGL"),
+        (PhotographsOfOneCorner, "coverage", "% of the paths are seen"),
+        (SmallBox, "box", "make it larger"),
+        (AnotherEveryTime, "description", "when it is asked again"),
+        (Raises, "coverage", "raised KeyError: 'poses'"),
+    ],
+)
+def test_a_planted_fault_is_found_and_named(fault: Callable[..., Any], part: str, told: str) -> None:
+    (finding,) = [each for each in check_world(small(fault)) if each.name == part]
+    assert not finding.met
+    assert told in finding.text
+
+
+def test_what_a_world_must_be_asked_for_is_asked_once_it_is_open() -> None:
+    class Asked(Small):
+        opened = False
+
+        def describe(self) -> Any:
+            if not self.opened:
+                raise NotOpenError("expected it to be open")
+            return super().describe()
+
+        def __enter__(self) -> Any:
+            self.opened = True
+            return self
+
+    assert all(finding.met for finding in check_world(small(Asked)))
