@@ -221,7 +221,9 @@ class CompositorNode(Node):
         try:
             showing = self._prepare(attack_from_bytes(received.content, f"the attack {received.name}"))
             if showing.subject != self._face_topic.removeprefix("/vicon/"):
-                raise ConfigError(f"expected an attack for the configured subject, got {received.name} for {showing.subject}")
+                raise ConfigError(
+                    f"expected an attack for the configured subject, got {received.name} for {showing.subject}"
+                )
         except (AdvnerfError, ValueError) as error:
             self._refuse(str(error))
             return []

@@ -63,7 +63,9 @@ class GatewayConfig(BaseModel):
         for name in (*self.exports, *self.imports):
             topic_row(name)
         if both := set(self.exports) & set(self.imports):
-            raise ValueError(f"{', '.join(sorted(both))} cannot be both exported and imported, because messages would go in circles; remove one")
+            raise ValueError(
+                f"{', '.join(sorted(both))} cannot be both exported and imported, because messages would go in circles; remove one"
+            )
         return self
 
     def link(self) -> LinkConfig:

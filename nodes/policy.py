@@ -111,7 +111,8 @@ class PolicyNode(Node):
             return []
         if captured_age_ns < -_CLOCK_TOLERANCE_S * NS_PER_S:
             self._drop(
-                "dropped_bad", "the image's stamp is in the future; synchronise the clocks of camera and policy computer"
+                "dropped_bad",
+                "the image's stamp is in the future; synchronise the clocks of camera and policy computer",
             )
             return []
         try:

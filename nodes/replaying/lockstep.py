@@ -178,7 +178,9 @@ class Lockstep:
                 made += new
                 waiting.extend((entry, 0) for entry in new)
             if len(made) > _CASCADE_LIMIT:
-                raise BagError(f"{', '.join(self._nodes)} answer each other endlessly on {message.topic}; replay fewer of them")
+                raise BagError(
+                    f"{', '.join(self._nodes)} answer each other endlessly on {message.topic}; replay fewer of them"
+                )
         return made
 
     def _ask(self, name: str, now: Now, call: Callable[..., list[Out]], *arguments: Any) -> list[Out]:

@@ -59,9 +59,13 @@ def build_nodes(bag: Path, choice: Choice, folder: Path, clock: Clock) -> dict[s
         clock: The clock of the replay.
     """
     if not choice.nodes:
-        raise BagError("expected at least one node to replay, got none; name them, for example --nodes compositor,policy")
+        raise BagError(
+            "expected at least one node to replay, got none; name them, for example --nodes compositor,policy"
+        )
     if unknown := [name for name in choice.replacements if name not in choice.nodes]:
-        raise BagError(f"cannot replace {', '.join(unknown)}, which is not replayed; replayed are {', '.join(choice.nodes)}")
+        raise BagError(
+            f"cannot replace {', '.join(unknown)}, which is not replayed; replayed are {', '.join(choice.nodes)}"
+        )
     plan = _plan(bag, choice, folder)
     built: dict[str, Node] = {}
     try:
@@ -99,7 +103,9 @@ def _launch_of_bag(bag: Path, choice: Choice, folder: Path) -> Path:
     """Write the launch file attached to a bag with the chosen nodes only. Its paths are replaced by those of the attachments."""
     attachments = read_attachments(bag)
     if RESOLVED_NAME not in attachments:
-        raise BagError(f"expected {RESOLVED_NAME} attached to {bag}, found none; give the launch file with --launch FILE")
+        raise BagError(
+            f"expected {RESOLVED_NAME} attached to {bag}, found none; give the launch file with --launch FILE"
+        )
     source = f"{bag}:{RESOLVED_NAME}"
     data = parse_yaml(attachments[RESOLVED_NAME].decode("utf-8", "replace"), source).data
     nodes = data.get("nodes") if isinstance(data, dict) else None
@@ -153,7 +159,9 @@ def _build(name: str, entry: NodeEntry, document: Document, choice: Choice, cont
     if node.inbox is not None or not node.publications:
         close_nodes({name: node})
         kind = "reads a device" if node.inbox is not None else "publishes nothing"
-        raise BagError(f"{name} cannot be replayed: it {kind}; only nodes that turn messages into messages can be replayed")
+        raise BagError(
+            f"{name} cannot be replayed: it {kind}; only nodes that turn messages into messages can be replayed"
+        )
     return node
 
 
@@ -188,5 +196,7 @@ def _builder(module: ModuleType, class_name: str) -> tuple[Callable[[Any, NodeCo
     hints = typing.get_type_hints(build)
     config_type = hints.get(next(iter(inspect.signature(build).parameters)))
     if not (inspect.isclass(config_type) and issubclass(config_type, BaseModel)):
-        raise BagError(f"expected build() of {module.__name__} to annotate its configuration with a pydantic model; add the annotation")
+        raise BagError(
+            f"expected build() of {module.__name__} to annotate its configuration with a pydantic model; add the annotation"
+        )
     return build, config_type

@@ -221,7 +221,10 @@ def test_wrong_choices_are_one_clear_error(tmp_path):
     for choice, words in [
         (Choice(()), "expected at least one node to replay"),
         (Choice(("viewer",)), "was recorded without a node viewer; it had compositor, policy, recorder"),
-        (Choice(("policy",), {"compositor": "x"}), "cannot replace compositor, which is not replayed; replayed are policy"),
+        (
+            Choice(("policy",), {"compositor": "x"}),
+            "cannot replace compositor, which is not replayed; replayed are policy",
+        ),
         (Choice(("policy",), {"policy": "no_such_thing"}), "found none called no_such_thing"),
         (Choice(("policy",), {"policy": "green_policy:Nothing"}), "name it as module:Class"),
         (Choice(("policy",), {"policy": "json"}), "expected json to have one node class"),
@@ -233,7 +236,9 @@ def test_wrong_choices_are_one_clear_error(tmp_path):
         with pytest.raises(Exception, match=words) as caught:
             Replay(CORNER, choice).close()
         assert type(caught.value).__module__ == "nodes.runtime.errors"
-    with pytest.raises(BagError, match="code that is not part of advnerf; if you trust it, give --replace policy=antig"):
+    with pytest.raises(
+        BagError, match="code that is not part of advnerf; if you trust it, give --replace policy=antig"
+    ):
         Replay(stranger, Choice(("policy",)))
     assert "antigravity" not in sys.modules
 
@@ -242,5 +247,7 @@ def test_a_bag_without_a_launch_file_needs_one(tmp_path):
     with BagWriter(tmp_path / "bag") as writer:
         message = pose(0)
         writer.write(message.topic, message.cdr, message.log_ns, message.publish_ns, 0)
-    with pytest.raises(BagError, match=r"expected launch.resolved.yaml attached to .*; give the launch file with --launch"):
+    with pytest.raises(
+        BagError, match=r"expected launch.resolved.yaml attached to .*; give the launch file with --launch"
+    ):
         Replay(tmp_path / "bag", GREEN)
