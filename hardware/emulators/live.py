@@ -220,7 +220,7 @@ class LiveLab:
     def _wait_until_ready(self, timeout_s: float) -> None:
         if not self._ready.wait(timeout_s):
             raise HardwareError(
-                f"expected the simulated lab to draw a picture within {timeout_s:g} s, got none: is EGL hanging?"
+                f"expected the simulated lab to render an image within {timeout_s:g} s, got none; does EGL hang? Run advnerf doctor"
             )
         self.check()
 

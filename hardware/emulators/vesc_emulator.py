@@ -111,7 +111,7 @@ class VescEmulator:
             if self._firmware.commanded or abs(speed) > 0.05:
                 raise HardwareError(
                     f"expected a car at rest, got {speed:.2f} m/s"
-                    f"{' and a motor command in force' if self._firmware.commanded else ''}: disarm first"
+                    f"{' and an active motor command' if self._firmware.commanded else ''}; disarm first"
                 )
             self.vehicle.reset(x_m, y_m, yaw_rad)
             self._note([WireEvent(time.monotonic_ns(), "PLACED")])

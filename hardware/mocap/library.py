@@ -134,7 +134,7 @@ def _connect(config: LibraryConfig) -> Any:
         library = importlib.import_module("motioncapture")
     except ImportError as error:
         raise DeviceNotFound(
-            f"expected the Python package motioncapture for {config.system}, it cannot be imported ({error}): pip install"
+            f"expected the Python package motioncapture for {config.system}, but it cannot be imported ({error}): pip install"
             " 'advnerf[mocap]' (Linux on x86), or use Tracker's UDP object stream, which needs no package"
         ) from error
     port = _TCP_PORTS.get(config.system)

@@ -246,7 +246,7 @@ def forget(video):
         (
             lambda video: video.controls.pop(GAIN),
             Controls(gain=3),
-            "no control gain: leave it out; it has .*brightness",
+            r"no control gain; remove it\. The device has .*brightness",
         ),
     ],
 )

@@ -41,7 +41,7 @@ def test_a_good_controller():
     assert list(vesc()) == [("VESC", OK), ("VESC time-out", OK), ("battery", OK)]
     found = vesc()["VESC", OK].found
     assert "TWIN firmware 5.02 at /dev/pts/" in found
-    assert vesc()["VESC time-out", OK].found == "250 ms with 20 A; at most 250 ms with 20 A wanted"
+    assert vesc()["VESC time-out", OK].found == "250 ms with 20 A; required is at most 250 ms with 20 A"
 
 
 def test_as_delivered_the_car_rolls_on_and_the_cure_is_a_command():

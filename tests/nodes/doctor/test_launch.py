@@ -189,7 +189,7 @@ def test_what_the_command_cannot_understand_is_exit_code_2(tmp_path, monkeypatch
     assert run(monkeypatch, capsys, tmp_path / "none.launch.yaml")[0] == 2
     assert run(monkeypatch, capsys, ROOT / "launch" / "two_hosts.launch.yaml")[0] == 2  # which host?
     code, _, errors = run(monkeypatch, capsys, "--set", "twin.if=false")
-    assert (code, "name one" in errors) == (2, True)
+    assert (code, "give one" in errors) == (2, True)
 
 
 def test_a_computer_without_a_launch_file_in_mind(tmp_path, monkeypatch, capsys):

@@ -22,7 +22,7 @@ def test_keys_are_shown_and_one_that_others_may_read_is_a_finding_with_its_cure(
     (tmp_path / "secret" / "robot.key").chmod(0o640)
     (found,) = machine.keys(tmp_path)
     assert found.state == WARNING
-    assert "make a new key" in found.found
+    assert "create a new key" in found.found
 
 
 def test_clock_is_judged_by_what_the_kernel_says(monkeypatch):
