@@ -18,7 +18,7 @@ from calibration.charuco import Detection
 
 @dataclass(frozen=True)
 class MountConfig:
-    """What is refused.
+    """Limits beyond which a fit is rejected.
 
     Attributes:
         min_views: Fewer agreeing views are refused.

@@ -1,4 +1,4 @@
-"""From an attack of known size to pixels of a monitor: the face is shown in true size, in the panel's centre square, or not at all."""
+"""Converts an attack of known size to pixels of a monitor. The face is shown in true size in the panel's centre square."""
 
 from __future__ import annotations
 
@@ -78,8 +78,8 @@ def make_panel(
     said = (edid_mm[0] / 1000.0, edid_mm[1] / 1000.0)
     if any(abs(m / s - 1.0) > _SIZE_TOLERANCE for m, s in zip(measured, said, strict=True)):
         raise CalibrationError(
-            f"the monitor says that its picture is {said[0]:.3f} x {said[1]:.3f} m, the corners of target {target.subject} say "
-            f"{measured[0]:.3f} x {measured[1]:.3f} m: measure the whole panel (advnerf room target), or give --size-mm to overrule"
+            f"the monitor reports a picture of {said[0]:.3f} x {said[1]:.3f} m, but the corners of target {target.subject} give "
+            f"{measured[0]:.3f} x {measured[1]:.3f} m; measure the whole panel (advnerf room target), or set size_mm to override"
         )
     return Panel(size_px, said)
 

@@ -1,4 +1,4 @@
-"""Photographs that structure from motion is given, and the model that it finds in them."""
+"""Input and result of structure from motion: photographs and their model."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MIN_IMAGES = 3
 
 
 class ReconstructionError(AdvnerfError):
-    """Photographs could not be put together; the message says how far it went and what to do."""
+    """Structure from motion failed. The message says how far it went and what to do."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Source:
 
 @dataclass(frozen=True)
 class SfmConfig:
-    """How photographs are put together.
+    """Settings of structure from motion.
 
     Attributes:
         max_features: Most local features of an image.
@@ -141,7 +141,7 @@ class LeftOut:
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """What structure from motion found.
+    """Result of structure from motion.
 
     Attributes:
         images: Images with poses, in the order they were given.

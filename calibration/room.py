@@ -1,4 +1,4 @@
-"""The room by motion capture: a fence from a walk around it, a start before a corner, and where a target's corners are.
+"""Measures the room with motion capture: the fence from a walk, the start before a corner, and the corners of a target.
 
 Everything is measured with what a lab has anyway: the car driven by hand, or a wand whose tip is known.
 """
