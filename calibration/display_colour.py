@@ -32,7 +32,7 @@ class DisplayCalibration(Calibration):
 
     Attributes:
         model: As `DisplayModel.to_dict` writes it.
-        conditions: What has to stay as it was: light, exposure, monitor settings.
+        conditions: Conditions that must not change: light, exposure, monitor settings.
     """
 
     kind: Literal["display"] = "display"

@@ -36,7 +36,7 @@ class IntrinsicsConfig:
         min_views: Fewer pictures with a board are refused.
         most_rms_px: A larger reprojection error is refused [px].
         least_coverage: A smaller share of the picture's 8 x 6 cells with a corner in it is refused.
-        outlier_factor: A picture with more than so many times the median error is left out.
+        outlier_factor: Multiple of the median error beyond which an image is excluded.
     """
 
     model: Model = "two-radial"

@@ -85,7 +85,7 @@ def make_panel(
 
 
 def require_fits(attack: AttackFile, panel: Panel, target: TargetCalibration) -> None:
-    """Refuse an attack that this panel cannot show as it was computed: another carrier, too large, or off the centre."""
+    """Refuse an attack that this panel cannot show as computed: another subject, too large, or off the centre."""
     if not attack.has_face or attack.subject != target.subject:
         what = f"for {attack.subject}" if attack.has_face else "without a face"
         raise CalibrationError(f"attack {attack.attack_id} is {what}, but this is {target.subject}: search one for it")
@@ -103,7 +103,7 @@ def require_fits(attack: AttackFile, panel: Panel, target: TargetCalibration) ->
 
 
 def centre_square(target: TargetCalibration) -> TargetCalibration:
-    """The largest centred square of a panel, as a target of its own: what an attack for a monitor may use."""
+    """Make a target from the largest centred square of a panel, which an attack on a monitor may use."""
     corners, (width, height) = target.corners, target_size(target)
     middle, half = corners.mean(axis=0), 0.5 * min(width, height)
     right, up = (corners[1] - corners[0]) / width, (corners[0] - corners[3]) / height

@@ -57,7 +57,7 @@ class SfmConfig:
     Attributes:
         max_features: Most local features of an image.
         peak_threshold: Contrast below which a spot is no feature; lower finds more in smooth rooms.
-        all_pairs_up_to: Up to so many images every pair is matched; beyond, neighbours and those that look alike.
+        all_pairs_up_to: Number of images up to which all pairs are matched. With more, neighbours and similar images are matched.
         overlap: Followers of an image in its video that it is matched with.
         look_alikes: Images that look like it that each is matched with.
         min_registered_share: With fewer images registered than this share the result is refused.

@@ -206,7 +206,7 @@ class TargetCalibration(Calibration):
     Attributes:
         subject: Name of the motion-capture subject it is fixed to.
         corners_in_subject_m: The face's corners in the subject's frame, where the texture's top left, top right, bottom right and
-            bottom left go, as seen by somebody who faces it [m].
+            bottom left go, as seen from the front [m].
     """
 
     kind: Literal["target"] = "target"
@@ -233,7 +233,7 @@ class TargetCalibration(Calibration):
 
     @property
     def outward_normal(self) -> Array:
-        """Unit vector ``[3]`` out of the face, toward somebody who faces it, in the subject's frame."""
+        """Unit vector ``[3]`` out of the face, towards a viewer in front of it, in the subject's frame."""
         points = self.corners
         normal = np.cross(points[3] - points[0], points[1] - points[0])
         return np.asarray(normal / np.linalg.norm(normal), dtype=np.float64)

@@ -212,7 +212,7 @@ class LiveLab:
         try:
             assert callable(run)
             run()
-        except Exception as error:  # reported to whoever owns the lab, by check()
+        except Exception as error:  # raised again by check()
             self._failure = error
             self._stop.set()
             self._ready.set()

@@ -36,7 +36,7 @@ class LibraryConfig:
         hostname: Computer of the system.
         subjects: Names to report; others are ignored.
         latency_s: From exposure to receipt, as measured in calibration [s].
-        frozen_frames: So many frames with the same bits make a subject lost.
+        frozen_frames: Number of bit-identical frames after which a subject counts as lost.
     """
 
     system: str

@@ -30,7 +30,7 @@ _MOST_DATAGRAMS = 200  # per read: a flood must not keep the reader in there
 # Frames that arrive this much late are reordered datagrams; anything further back is a restarted Tracker.
 _REORDER_WINDOW_FRAMES = 50
 _RESTART_SILENCE_S = 0.1
-# Strangers may send to the port too: so many of them are told apart.
+# Number of senders that are distinguished, because other programs may also send to the port.
 _MOST_STREAMS = 16
 _NO_SENDER: Address = ("", 0)
 _NUMBERS = struct.Struct("<6d")
@@ -64,7 +64,7 @@ class ViconConfig:
         host: Local address to bind; empty for all.
         port: UDP port of the object stream; 0 lets the system choose (tests).
         latency_s: From exposure to receipt, as measured in calibration [s].
-        frozen_frames: So many frames with the same bits make a subject lost.
+        frozen_frames: Number of bit-identical frames after which a subject counts as lost.
         source: Accept datagrams of this address only; None accepts all.
     """
 

@@ -12,7 +12,7 @@ Address = tuple[str, int]
 
 # Two senders within this time are two senders; a Tracker that is started again, with a new port, takes longer [s].
 HOLD_S = 1.0
-# Of so many frames the measurements are kept: as many as a datagram may be late.
+# Number of frames whose measurements are kept, which is the largest delay of a datagram.
 _REMEMBERED_FRAMES = 64
 _MOST_SENDERS = 8
 

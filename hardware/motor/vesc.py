@@ -151,7 +151,7 @@ class Vesc:
         return self._wait_for(AppConfiguration, timeout_s)
 
     def steer(self, steering_rad: float) -> Sent:
-        """Send steering alone, for a car that stands; the motor stays as it is."""
+        """Send only the steering, for a standing car. The motor command does not change."""
         servo = self.gains.servo(self.limiter.steer(steering_rad))
         self._write(encode_command(CommandId.SET_SERVO_POS, servo))
         self._servo = as_sent(CommandId.SET_SERVO_POS, servo)

@@ -3,7 +3,7 @@ older joystick devices (``/dev/input/js*``).
 
 Sources: ``linux/input.h`` (struct input_event, EVIOCGABS, EVIOCGKEY), ``linux/input-event-codes.h``, ``linux/joystick.h``
 (struct js_event). Buttons count as held whatever else is pressed; the MIT stack's exact match lets go when one more is.
-After SYN_DROPPED the kernel has thrown events away, a released button among them: the state is asked for anew.
+SYN_DROPPED means that the kernel has dropped events, possibly the release of a button, so the state is read again.
 """
 
 from __future__ import annotations

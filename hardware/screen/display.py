@@ -29,7 +29,7 @@ class Display(Protocol):
 
     Attributes:
         size_px: Width and height [px].
-        edid: What it says about itself; None if nobody knows.
+        edid: EDID of the screen; None if unknown.
     """
 
     size_px: tuple[int, int]

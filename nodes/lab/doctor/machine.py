@@ -151,7 +151,7 @@ def keys(folder: Path | None = None) -> list[Finding]:
     except (SecurityError, OSError) as error:
         return [Finding("keys", WARNING, str(error))]
     ours = ", ".join(row.name for row in rows if row.ours)
-    drivers = ", ".join(row.name for row in rows if DRIVE in row.rights) or "nobody"
+    drivers = ", ".join(row.name for row in rows if DRIVE in row.rights) or "no key"
     if not ours:
         return [Finding("keys", ABSENT, f"none in {folder}", "two hosts need them: advnerf keys new NAME")]
     return [Finding("keys", OK, f"ours: {ours}; {drivers} may drive over the network")]
