@@ -203,7 +203,7 @@ def test_a_process_of_colmap_that_is_killed_is_one_error(tmp_path):
         for child in psutil.Process().children():
             child.kill()
 
-    with pytest.raises(ReconstructionError, match=r"was ended by SIGKILL .* run the command again to go on"):
+    with pytest.raises(ReconstructionError, match=r"was ended by SIGKILL .* run the command again to resume"):
         reconstruct(tmp_path, [Source("photos", tuple(truth))], tmp_path / "work", report=kill)
 
 

@@ -72,7 +72,7 @@ def verify(port: VideoPort, fd: int, path: Path, expected: Mapping[str, int]) ->
     for name, value in expected.items():
         if (got := read(port, fd, path, name)) != value:
             raise ProtocolError(
-                f"{path} changed {name} from {value} to {got} when the stream started; use a value that the device keeps"
+                f"{path} changed {name} from {value} to {got} by itself when the stream started; use a value that the device keeps"
             )
 
 

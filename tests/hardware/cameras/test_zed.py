@@ -157,7 +157,7 @@ def test_messages_byte_by_byte():
 def test_register_that_does_not_take_its_value():
     registers = ZedRegisters()
     registers.stuck = {0x80181833}
-    with pytest.raises(ProtocolError, match=r"wrote 0xb1 to register 0x80181833 .*it has 0xb3"):
+    with pytest.raises(ProtocolError, match=r"expected register 0x80181833 .* to hold 0xb1, got 0xb3"):
         lock_exposure(unit_of(registers), ZedExposure(50.0), fps=30.0)
 
 

@@ -66,7 +66,7 @@ def test_errors_against_numpy():
     assert (e.mean_abs_rad, e.bias_rad) == (pytest.approx(np.abs(error).mean()), pytest.approx(error.mean()))
     assert e.rms_rad == pytest.approx(np.sqrt(error.var() + error.mean() ** 2))
     assert e.correlation == pytest.approx(np.corrcoef(predicted[known], true[known])[0, 1])
-    with pytest.raises(ConfigError, match="to compare with"):
+    with pytest.raises(ConfigError, match="recorded or labelled"):
         compare(predicted, np.full(200, np.nan))
 
 
