@@ -1,1 +1,1 @@
-"""Tools that measure, and the dated YAML files they write."""
+"""Calibration fits, and the dated YAML files that they write."""

@@ -1,4 +1,4 @@
-"""Calibration files of the simulated lab: nothing to measure there, its configuration is the truth.
+"""Calibration files of the simulated lab, made from its configuration instead of measurements.
 
 ``python -m calibration.by_construction calibration/twin`` writes the files of the default lab; an experiment with another
 `LabConfig` writes its own.
@@ -35,7 +35,7 @@ START_BEFORE_CORNER_M = 2.0
 
 
 def twin_calibrations(lab: LabConfig) -> dict[str, Calibration]:
-    """Calibration of a simulated lab by file name without suffix: camera, vehicle, board, monitor, room."""
+    """Make the calibrations of a simulated lab by file name without suffix: camera, vehicle, board, monitor, room."""
     return {
         "camera": _camera(lab),
         "vehicle": _vehicle(lab.car),
@@ -46,7 +46,7 @@ def twin_calibrations(lab: LabConfig) -> dict[str, Calibration]:
 
 
 def write_twin_calibrations(lab: LabConfig, folder: Path) -> dict[str, Path]:
-    """Write the files of a simulated lab into a folder; their paths by name."""
+    """Write the calibration files of a simulated lab to a folder. Returns their paths by name."""
     folder.mkdir(parents=True, exist_ok=True)
     paths = {}
     for name, calibration in twin_calibrations(lab).items():

@@ -1,4 +1,4 @@
-"""Where the camera sits on the car, from pictures of a ChArUco board and motion-capture poses.
+"""Calibrates the camera's pose on the car from images of a ChArUco board and motion-capture poses.
 
 With ``X = T_car_from_camera``, ``Y = T_base_from_pattern`` and, for view i, ``A_i = T_car_from_base`` by motion capture and
 ``B_i = T_camera_from_pattern`` in the picture, ``A_i Y = X B_i``. The base is the tracked board (best: where the print sits on it is
@@ -34,7 +34,7 @@ _CONTRADICTION = "did car and board stand still at the stamps, and is the subjec
 
 @dataclass(frozen=True, eq=False)
 class MountView:
-    """One moment at which board and car stood still.
+    """A view of the board while board and car stood still.
 
     Attributes:
         T_world_from_car: By motion capture ``[4, 4]``.
@@ -75,7 +75,7 @@ class MountFit:
         return float(np.sqrt(np.mean(self.view_rms_px[self.used] ** 2)))
 
     def calibration(self, camera: LensCalibration) -> CameraCalibration:
-        """The camera's file."""
+        """Make the camera calibration."""
         residuals = {
             "rms_px": self.rms_px, "views_left_out": float((~self.used).sum()),
             "rotation_stddev_deg": float(np.degrees(self.rotation_stddev_rad)), "translation_stddev_m": self.translation_stddev_m,

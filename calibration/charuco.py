@@ -1,4 +1,4 @@
-"""ChArUco boards: a chessboard whose white squares hold markers, so that every corner has a name and any part of it will do."""
+"""ChArUco boards: chessboards with markers in the white squares, so that every corner is identified, even in a partial view."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Board:
 
     @property
     def opencv(self) -> Any:
-        """The same for OpenCV."""
+        """The board as an OpenCV object."""
         size = (self.columns, self.rows)
         board = cv2.aruco.CharucoBoard(size, self.square_m, self.marker_m, self._dictionary)
         board.setLegacyPattern(self.legacy)
@@ -67,14 +67,14 @@ class Board:
         return self.columns * self.square_m, self.rows * self.square_m
 
     def picture(self, pixels_per_square: int = 100) -> NDArray[np.uint8]:
-        """What to print, ``[H, W]`` uint8, without margin."""
+        """Image of the board to print, ``[H, W]`` uint8, without margin."""
         size = (self.columns * pixels_per_square, self.rows * pixels_per_square)
         return np.asarray(self.opencv.generateImage(size, marginSize=0), np.uint8)
 
 
 @dataclass(frozen=True, eq=False)
 class Detection:
-    """The corners of a board in one picture.
+    """The corners of a board in one image.
 
     Attributes:
         board_m: Corners in the board's frame ``[n, 3]`` [m].
@@ -86,14 +86,14 @@ class Detection:
 
 
 class BoardDetector:
-    """Finds one board in pictures."""
+    """Detects a board in images."""
 
     def __init__(self, board: Board) -> None:
         self._board = board.opencv
         self._detector = cv2.aruco.CharucoDetector(self._board)
 
     def find(self, image: NDArray[np.uint8]) -> Detection | None:
-        """The board in a picture ``[H, W]`` or ``[H, W, 3]`` RGB; None if fewer than six corners, or only a line of them, are seen."""
+        """Detect the board in an image ``[H, W]`` or ``[H, W, 3]`` RGB; None with fewer than six corners, or only a line of them."""
         grey = image if image.ndim == 2 else cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY)
         corners, ids, _, _ = self._detector.detectBoard(np.ascontiguousarray(grey))
         if ids is None or len(ids) < MIN_CORNERS:

@@ -1,4 +1,4 @@
-"""What COLMAP keeps of photographs: cameras, features, matches, in one file that a stopped run goes on with."""
+"""COLMAP's database of cameras, features and matches, from which a stopped run resumes."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ _GUESSED_FOCAL_LENGTH = 0.9
 
 
 def threads() -> int:
-    """As many as this process may use."""
+    """Number of threads that this process may use."""
     return len(os.sched_getaffinity(0))
 
 
 @contextlib.contextmanager
 def quiet() -> Iterator[None]:
-    """Keep COLMAP's log to its errors: it writes several lines for each image."""
+    """Limit COLMAP's log to errors, because it writes several lines for each image."""
     import pycolmap
 
     before = pycolmap.logging.minloglevel
@@ -49,7 +49,7 @@ def quiet() -> Iterator[None]:
 
 
 def open_work(root: Path, work: Path, sources: Sequence[Source], config: Mapping[str, Any]) -> Path:
-    """The database in the work folder: that of a stopped run with the same inputs, else a new one with all cameras and images."""
+    """Open the database of a stopped run with the same inputs, or create a new one with all cameras and images."""
     key = _key(root, sources, config)
     file = work / _FILE
     if file.exists() and (work / _KEY).exists() and (work / _KEY).read_text() == key:
@@ -93,7 +93,7 @@ def _create(file: Path, root: Path, sources: Sequence[Source]) -> None:
 
 
 def exif(path: Path) -> tuple[str | None, float | None]:
-    """Camera and focal length [px] that a photograph's EXIF data name; None for what they do not."""
+    """Camera and focal length [px] in the EXIF data of a photograph; None if missing."""
     import pycolmap
 
     with path.open("rb") as stream:
@@ -118,7 +118,7 @@ def _params(source: Source, size: tuple[int, int], focal_px: float | None) -> li
 
 
 def exif_focal_lengths(file: Path) -> dict[int, float]:
-    """Focal lengths that the photographs name themselves [px], by COLMAP's number of the camera."""
+    """Focal lengths from EXIF data [px], by COLMAP's number of the camera."""
     import pycolmap
 
     with pycolmap.Database.open(file) as database:
@@ -161,7 +161,7 @@ def camera_names(file: Path, sources: Sequence[Source]) -> dict[int, str]:
 def extract_features(
     file: Path, root: Path, names: Sequence[str], max_features: int, peak_threshold: float, report: Report
 ) -> None:
-    """Local features (SIFT) of all images that have none yet."""
+    """Extract local features (SIFT) of all images that have none yet."""
     import pycolmap
 
     options = pycolmap.FeatureExtractionOptions()
@@ -201,7 +201,7 @@ def pairs_to_match(file: Path, sources: Sequence[Source], config: SfmConfig) -> 
 
 
 def match(file: Path, work: Path, pairs: Sequence[tuple[str, str]], seed: int, report: Report) -> None:
-    """Match features of pairs and verify them by two-view geometry; pairs of an earlier run are left as they are."""
+    """Match features of pairs and verify them by two-view geometry. Pairs of an earlier run are kept."""
     import pycolmap
 
     options = pycolmap.FeatureMatchingOptions()

@@ -1,4 +1,4 @@
-"""What the process that COLMAP runs in is told, and what it answers, as lines of JSON: a float keeps every bit of its value."""
+"""Messages to and from the COLMAP process, as lines of JSON. Floats keep their exact value."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ Job = tuple[Path, tuple[Source, ...], Path, SfmConfig]
 
 
 def pack_job(root: Path, sources: Sequence[Source], work: Path, config: SfmConfig) -> bytes:
-    """A job as one line."""
+    """Encode a job as one line."""
     return _line(
         {"root": str(root), "sources": [asdict(s) for s in sources], "work": str(work), "config": asdict(config)}
     )
 
 
 def unpack_job(line: bytes) -> Job:
-    """The arguments of `pack_job`."""
+    """Decode a job to the arguments of `pack_job`."""
     told = json.loads(line)
     sources = tuple(
         Source(
@@ -39,17 +39,17 @@ def unpack_job(line: bytes) -> Job:
 
 
 def pack_progress(share: float, text: str) -> bytes:
-    """Progress as one line."""
+    """Encode progress as one line."""
     return _line({"progress": [share, text]})
 
 
 def pack_error(error: AdvnerfError | OSError) -> bytes:
-    """An error for people as one line."""
+    """Encode an error as one line."""
     return _line({"error": str(error), "of_colmap": isinstance(error, ReconstructionError)})
 
 
 def pack_model(model: Model) -> bytes:
-    """A model as one line."""
+    """Encode a model as one line."""
     images = [{**asdict(i), "T_world_from_camera": i.T_world_from_camera.tolist()} for i in model.images]
     return _line({
         "images": images, "left_out": [asdict(i) for i in model.left_out], "points": model.points.tolist(),
@@ -58,7 +58,7 @@ def pack_model(model: Model) -> bytes:
 
 
 def unpack_answer(line: bytes) -> tuple[float, str] | Model:
-    """Progress, or the model.
+    """Decode progress or the model.
 
     Raises:
         AdvnerfError: The process could not do its job, for this reason.

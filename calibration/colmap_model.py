@@ -1,4 +1,4 @@
-"""COLMAP's part of structure from motion; runs in a process of its own, see `calibration.structure_from_motion`."""
+"""Structure from motion with COLMAP, in a separate process; see `calibration.structure_from_motion`."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _SHOWN_NAMES = 5
 
 
 def put_together(root: Path, sources: Sequence[Source], work: Path, config: SfmConfig, report: Report) -> Model:
-    """Put photographs together; see `calibration.structure_from_motion.reconstruct`."""
+    """Reconstruct a model from photographs; see `calibration.structure_from_motion.reconstruct`."""
     names = [name for source in sources for name in source.images]
     file = database.open_work(root, work, sources, asdict(config))
     cameras = database.camera_names(file, sources)
@@ -72,7 +72,7 @@ def _part(report: Report, low: float, high: float) -> Report:
 def _map(
     file: Path, root: Path, work: Path, held: set[int], total: int, config: SfmConfig, report: Report
 ) -> tuple[Any, int]:
-    """The largest of the models that COLMAP finds, and how many it finds."""
+    """Return the largest of COLMAP's models, and the number of models."""
     import pycolmap
 
     sparse, placed = work / "sparse", 0
@@ -96,8 +96,8 @@ def _map(
         found = pycolmap.incremental_mapping(file, root, sparse, options, next_image_callback=one_more)
     if not found:
         raise ReconstructionError(
-            f"expected {total} photographs of one scene, could not put any two together; they need overlap (every spot in three "
-            "photographs), texture, and movement of the camera between them, not only turning"
+            f"expected {total} photographs of one scene, but no two could be matched; take photographs with overlap (every spot in three "
+            "photographs) and texture, and move the camera between them instead of only turning it"
         )
     best = max(found, key=lambda number: (found[number].num_reg_images(), found[number].num_points3D()))
     return found[best], len(found)

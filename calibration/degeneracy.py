@@ -1,4 +1,4 @@
-"""What makes a set of measurements worthless however small its residuals are, and how that is told."""
+"""Errors and checks for measurements that do not determine a result, even if their residuals are small."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from calibration.schema import CalibrationError
 
 
 class DegenerateDataError(CalibrationError):
-    """The data do not fix what was asked for; the message says why and what to record instead."""
+    """The data do not determine the result. The message says why and what to record instead."""
 
 
 class PoorFitError(CalibrationError):
-    """The data fix the result, but it does not explain them well enough to be used."""
+    """The data determine the result, but the fit is too poor to be used."""
 
 
 def mean_rotation(rotations: ArrayLike) -> Array:
@@ -35,6 +35,6 @@ def rotation_spread(rotations: ArrayLike) -> Array:
 
 
 def require_count(found: int, needed: int, what: str, cure: str) -> None:
-    """Refuse too few of something."""
+    """Raise `DegenerateDataError` if there are too few measurements."""
     if found < needed:
         raise DegenerateDataError(f"expected at least {needed} {what}, got {found}: {cure}")

@@ -1,4 +1,4 @@
-"""What the camera sees of the monitor, measured with the camera in the loop: a sequence of colours, and the mean each leaves in the picture.
+"""Calibrates how the camera sees the monitor's colours, from the mean image colour of each shown colour.
 
 The model is `advnerf_core.display.DisplayModel`; all of its numbers are fitted together by least squares on the seen colours, each channel's
 curve as 17 rising levels. Exposure and white balance must be locked, the monitor's night light and dynamic contrast off.
@@ -28,11 +28,11 @@ _SMOOTH = 0.002  # against a change of the curve's slope by a factor e from leve
 
 
 class DisplayCalibration(Calibration):
-    """A monitor before a camera.
+    """A monitor in front of a camera.
 
     Attributes:
         model: As `DisplayModel.to_dict` writes it.
-        conditions: What has to stay as it was: light, exposure, monitor settings.
+        conditions: Conditions that must not change: light, exposure, monitor settings.
     """
 
     kind: Literal["display"] = "display"
@@ -47,13 +47,13 @@ class DisplayCalibration(Calibration):
 
     @property
     def display(self) -> DisplayModel:
-        """The model."""
+        """Return the colour model."""
         return DisplayModel.from_dict(self.model)
 
 
 @dataclass(frozen=True)
 class DisplayConfig:
-    """What is refused.
+    """Limits beyond which a fit is rejected.
 
     Attributes:
         min_colours: Fewer colours are refused.
@@ -99,7 +99,7 @@ class DisplayFit:
         return float(np.sqrt(np.mean((predicted - self.seen[rows]) ** 2)))
 
     def calibration(self, conditions: str = UNCHANGED) -> DisplayCalibration:
-        """The file."""
+        """Make the calibration."""
         residuals = {"held_out_rmse": self.rmse(True), "fitted_rmse": self.rmse(False), "drift": self.drift}
         model = self.model
         rounded = DisplayModel(
@@ -112,7 +112,7 @@ class DisplayFit:
 
 
 def colours_to_show(mixed: int = 48, seed: int = 0) -> NDArray[np.uint8]:
-    """The sequence ``[N, 3]``: black and white first, grey and primary ramps, mixed colours, black and white again at the end."""
+    """Make the colour sequence ``[N, 3]``: black and white, grey and primary ramps, mixed colours, black and white again."""
     ramp = np.round(np.linspace(0, 255, LEVELS)).astype(np.uint8)
     ends = np.array([[0, 0, 0], [255, 255, 255]], np.uint8)
     grey = np.repeat(ramp[1:-1, None], 3, axis=1)
@@ -127,12 +127,12 @@ def screen_region(black: NDArray[np.uint8], white: NDArray[np.uint8]) -> NDArray
     top = float(np.percentile(change, 99.9))
     if top < 20.0:
         raise DegenerateDataError(
-            f"expected a screen that brightens the picture by 20 of 255 or more from black to white, got {top:.0f}: is it on, full screen, in view?"
+            f"expected a screen that brightens the image by 20 of 255 or more from black to white, got {top:.0f}; is it on, full screen, in view?"
         )
     lit = (change > 0.6 * top).astype(np.uint8)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(lit, connectivity=4)
     if count < 2:
-        raise DegenerateDataError("expected one lit screen in view, got none")
+        raise DegenerateDataError("expected one lit screen in view, got none; point the camera at the screen")
     largest = 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))
     inside = cv2.erode((labels == largest).astype(np.uint8), np.ones((5, 5), np.uint8), borderValue=0) > 0
     if inside.sum() < 50:
@@ -217,7 +217,7 @@ def _require_usable(shown: Array, seen: Array, angles: Array, config: DisplayCon
 
 
 def _choose_held_out(shown: Array, config: DisplayConfig) -> NDArray[np.bool_]:
-    """Every third or so of the mixed colours; ramps and primaries carry the fit."""
+    """Select held-out colours among the mixed ones. The fit needs the ramps and primaries."""
     mixed = (np.ptp(shown, axis=1) > 1e-6) & ((shown > 1e-6).sum(axis=1) == 3)
     rows = np.flatnonzero(mixed)
     held_out: NDArray[np.bool_] = np.zeros(len(shown), np.bool_)

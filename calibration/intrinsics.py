@@ -1,4 +1,4 @@
-"""Focal length, principal point and distortion of a camera from pictures of a ChArUco board (Zhang 2000, by OpenCV)."""
+"""Calibrates focal length, principal point and distortion from images of a ChArUco board (Zhang 2000, with OpenCV)."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ _LEAST_TILT_RAD, _LEAST_TILTED = np.radians(12.0), 4
 
 @dataclass(frozen=True)
 class IntrinsicsConfig:
-    """What is fitted and what is refused.
+    """Settings of the fit, and limits beyond which it is rejected.
 
     Attributes:
         model: Distortion: none, k1 k2 p1 p2, or these and k3.
         min_views: Fewer pictures with a board are refused.
         most_rms_px: A larger reprojection error is refused [px].
         least_coverage: A smaller share of the picture's 8 x 6 cells with a corner in it is refused.
-        outlier_factor: A picture with more than so many times the median error is left out.
+        outlier_factor: Multiple of the median error beyond which an image is excluded.
     """
 
     model: Model = "two-radial"
@@ -68,7 +68,7 @@ class IntrinsicsFit:
 def calibrate_intrinsics(
     views: Sequence[Detection], size: tuple[int, int], config: IntrinsicsConfig | None = None
 ) -> IntrinsicsFit:
-    """Fit a camera to pictures of a board.
+    """Fit a camera to images of a board.
 
     Args:
         views: The board's corners in each picture.

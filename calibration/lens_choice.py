@@ -1,4 +1,4 @@
-"""Which lens the photographs support: the simplest one, unless a further parameter explains clearly more.
+"""Chooses the lens model of photographs: the simplest one, unless a further parameter improves the fit clearly.
 
 Structure from motion begins with one focal length and one radial term. Few photographs do not determine more: a lens with eight free
 parameters then takes up the errors of poses and points, and its values are absurd. Here the models of COLMAP are compared on the points
@@ -41,7 +41,7 @@ _MAX_REPROJECTION_PX, _MIN_ANGLE_DEG = 4.0, 1.5
 
 @dataclass(frozen=True)
 class Choice:
-    """The lens of one camera.
+    """The chosen lens of one camera.
 
     Attributes:
         model: COLMAP's name of the model.
@@ -55,7 +55,7 @@ class Choice:
 
 
 def intrinsics(camera: Any) -> tuple[Pinhole, Lens]:
-    """Our intrinsics of a COLMAP camera; both count pixel centres from +0.5."""
+    """Convert a COLMAP camera to intrinsics. Both have pixel centres at +0.5."""
     fx, fy = float(camera.focal_length_x), float(camera.focal_length_y)
     extra = [float(camera.params[index]) for index in camera.extra_params_idxs()]
     k1, k2, p1, p2 = (*extra, *[0.0] * (4 - len(extra)))
@@ -66,7 +66,7 @@ def intrinsics(camera: Any) -> tuple[Pinhole, Lens]:
 
 
 def nonsense(pinhole: Pinhole, lens: Lens) -> str | None:
-    """What no camera could have; None if the intrinsics are possible."""
+    """Describe why intrinsics are impossible; None if they are possible."""
     ratio = pinhole.fx / max(pinhole.width, pinhole.height)
     if not FOCAL_RATIOS[0] <= ratio <= FOCAL_RATIOS[1]:
         low, high = FOCAL_RATIOS

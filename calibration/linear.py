@@ -1,4 +1,4 @@
-"""Linear least squares with the standard deviations of what it finds."""
+"""Linear least squares with standard deviations of the coefficients."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def linear_fit(rows: Array, values: Array) -> tuple[tuple[float, ...], tuple[flo
     covariance = np.linalg.pinv(rows.T @ rows) * float(left @ left) / freedom
     if rank < rows.shape[1]:
         raise DegenerateDataError(
-            "expected commands that differ, got the same everywhere: gain and offset cannot be told apart"
+            "expected commands that differ, got the same everywhere, so gain and offset cannot be separated; vary the commands"
         )
     return tuple(float(v) for v in found), tuple(float(v) for v in np.sqrt(np.diag(covariance)))
 

@@ -1,4 +1,4 @@
-"""Files of what is measured besides camera, vehicle, target and room: lens, scene in the mocap world, time offset."""
+"""Calibration files of lens, scene pose in the motion-capture world, and time offset."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from calibration.schema import Calibration, Row4, require_rigid
 
 
 class LensCalibration(Calibration):
-    """A camera by itself, before anybody knows where it is mounted.
+    """A camera's lens, without its pose on the car.
 
     Attributes:
         width: Image width [px].
@@ -49,7 +49,7 @@ class LensCalibration(Calibration):
 
 
 class SceneCalibration(Calibration):
-    """Where a scene of arbitrary frame and scale lies in the motion-capture world: ``world = scale R scene + t``.
+    """Pose and scale of a scene in the motion-capture world: ``world = scale R scene + t``.
 
     Attributes:
         scale: Metres per unit of the scene.
@@ -72,7 +72,7 @@ class SceneCalibration(Calibration):
 
 
 class TimeOffsetCalibration(Calibration):
-    """How much later the camera stamps an instant than motion capture does.
+    """Delay of camera stamps relative to motion-capture stamps.
 
     Attributes:
         camera_minus_mocap_s: Camera stamp less mocap stamp of the same instant [s]; what ``latency_s`` of the camera takes off.

@@ -1,4 +1,4 @@
-"""Where a learned scene lies in the motion-capture world, from cameras whose poses are known in both.
+"""Calibrates pose and scale of a learned scene in the motion-capture world, from cameras with poses in both.
 
 Structure from motion leaves scale and frame open. Frames taken on the tracked car (or with a tracked phone) have poses in both worlds; the
 similarity is `advnerf_core.data.similarity.align_poses` (Umeyama 1991 with consensus). It is judged on cameras it was not fitted to.
@@ -20,7 +20,7 @@ from calibration.measured import SceneCalibration, rows_of
 
 @dataclass(frozen=True)
 class SceneConfig:
-    """What is refused.
+    """Limits beyond which a fit is rejected.
 
     Attributes:
         min_cameras: Fewer cameras with a pose in both worlds are refused.
@@ -61,7 +61,7 @@ class SceneFit:
 
     @property
     def calibration(self) -> SceneCalibration:
-        """The file."""
+        """Make the calibration."""
         a = self.alignment
         residuals = {
             "rms_position_m": a.rms_position_m, "rms_rotation_rad": a.rms_rotation_rad, "outliers": float((~a.inliers).sum()),

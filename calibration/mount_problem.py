@@ -18,12 +18,12 @@ from calibration.charuco import Detection
 
 @dataclass(frozen=True)
 class MountConfig:
-    """What is refused.
+    """Limits beyond which a fit is rejected.
 
     Attributes:
         min_views: Fewer agreeing views are refused.
         least_second_axis_rad: With an unknown pattern pose, the root mean square turn about the second axis must reach this [rad].
-        outlier_factor: Views farther from the mean than so many robust standard deviations are left out.
+        outlier_factor: Number of robust standard deviations from the mean beyond which a view is excluded.
         most_share_left_out: With a larger share left out the set is refused.
         most_rms_px: A larger reprojection error through the whole chain is refused [px].
         most_median_rad: With a larger median angle between the views' mounting poses and their mean the set is refused [rad].

@@ -1,4 +1,4 @@
-"""From an attack of known size to pixels of a monitor: the face is shown in true size, in the panel's centre square, or not at all."""
+"""Converts an attack of known size to pixels of a monitor. The face is shown in true size in the panel's centre square."""
 
 from __future__ import annotations
 
@@ -78,8 +78,8 @@ def make_panel(
     said = (edid_mm[0] / 1000.0, edid_mm[1] / 1000.0)
     if any(abs(m / s - 1.0) > _SIZE_TOLERANCE for m, s in zip(measured, said, strict=True)):
         raise CalibrationError(
-            f"the monitor says that its picture is {said[0]:.3f} x {said[1]:.3f} m, the corners of target {target.subject} say "
-            f"{measured[0]:.3f} x {measured[1]:.3f} m: measure the whole panel (advnerf room target), or give --size-mm to overrule"
+            f"the monitor reports a picture of {said[0]:.3f} x {said[1]:.3f} m, but the corners of target {target.subject} give "
+            f"{measured[0]:.3f} x {measured[1]:.3f} m; measure the whole panel (advnerf room target), or set size_mm to override"
         )
     return Panel(size_px, said)
 
@@ -104,7 +104,7 @@ def require_fits(attack: AttackFile, panel: Panel, target: TargetCalibration) ->
 
 
 def centre_square(target: TargetCalibration) -> TargetCalibration:
-    """The largest centred square of a panel, as a target of its own: what an attack for a monitor may use."""
+    """Make a target from the largest centred square of a panel, which an attack on a monitor may use."""
     corners, (width, height) = target.corners, target_size(target)
     middle, half = corners.mean(axis=0), 0.5 * min(width, height)
     right, up = (corners[1] - corners[0]) / width, (corners[0] - corners[3]) / height

@@ -1,4 +1,4 @@
-"""A reference path from a trace: what was driven, or drawn with a wand, as lines and circular arcs without kinks.
+"""Fits a reference path of lines and circular arcs without kinks to a trace of the car or a wand.
 
 The heading along such a path is piecewise linear in the distance, with slope zero on lines and one over the radius on arcs. So the
 trace's heading is cut into pieces by dynamic programming (least squares of a line in each piece, a price for every cut), pieces of
@@ -32,7 +32,7 @@ _POINTS = 600
 
 @dataclass(frozen=True)
 class PathFitConfig:
-    """How a trace is read.
+    """Settings of the path fit.
 
     Attributes:
         closed: Whether the path is a loop; None looks whether the trace comes back to its start.

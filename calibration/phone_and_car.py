@@ -1,4 +1,4 @@
-"""A model of a room from a phone and the driving camera together, put into the motion-capture world.
+"""Places a model from phone and driving-camera images in the motion-capture world.
 
 Structure from motion leaves scale and frame open. Frames of a driven bag in the same model have poses in both worlds: the model's, and
 the car's motion-capture pose at the capture stamp times the camera's mounting pose. The similarity between the two gives scale and frame.
@@ -52,7 +52,7 @@ class Placed:
     shared: tuple[str, ...]
 
     def summary(self) -> dict[str, Any]:
-        """What a report says."""
+        """Facts for the report."""
         a = self.alignment
         frames = [
             {"image": name, "used": bool(used), "position_error_m": float(far), "rotation_error_rad": float(angle)}

@@ -1,4 +1,4 @@
-"""Photographs that structure from motion is given, and the model that it finds in them."""
+"""Input and result of structure from motion: photographs and their model."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MIN_IMAGES = 3
 
 
 class ReconstructionError(AdvnerfError):
-    """Photographs could not be put together; the message says how far it went and what to do."""
+    """Structure from motion failed. The message says how far it went and what to do."""
 
 
 @dataclass(frozen=True)
@@ -52,12 +52,12 @@ class Source:
 
 @dataclass(frozen=True)
 class SfmConfig:
-    """How photographs are put together.
+    """Settings of structure from motion.
 
     Attributes:
         max_features: Most local features of an image.
         peak_threshold: Contrast below which a spot is no feature; lower finds more in smooth rooms.
-        all_pairs_up_to: Up to so many images every pair is matched; beyond, neighbours and those that look alike.
+        all_pairs_up_to: Number of images up to which all pairs are matched. With more, neighbours and similar images are matched.
         overlap: Followers of an image in its video that it is matched with.
         look_alikes: Images that look like it that each is matched with.
         min_registered_share: With fewer images registered than this share the result is refused.
@@ -141,7 +141,7 @@ class LeftOut:
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """What structure from motion found.
+    """Result of structure from motion.
 
     Attributes:
         images: Images with poses, in the order they were given.

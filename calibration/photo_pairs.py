@@ -1,4 +1,4 @@
-"""Which photographs to match with which: all with all while they are few, else neighbours in time and those that look alike.
+"""Selects the pairs of photographs to match: all pairs of few images, or else neighbours in time and similar images.
 
 Looking alike is measured by VLAD (Jegou et al. 2010) over the set's own local features: a vocabulary is learned from a sample of
 them, so that none has to be fetched.

@@ -1,4 +1,4 @@
-"""Whether the board or the monitor stands where its attack was computed, and what to do if it does not."""
+"""Compares the pose of the board or monitor with that of its attack, and says how to move it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from calibration.schema import CalibrationError, TargetCalibration
 
 @dataclass(frozen=True)
 class Misplacement:
-    """How far a face stands from where it should, as somebody who faces it sees it.
+    """Displacement of a face from its target pose, as seen from the front.
 
     Attributes:
         right_m: Too far right [m].
@@ -42,11 +42,11 @@ class Misplacement:
         return max(abs(self.turned_rad), abs(self.tilted_rad), abs(self.rolled_rad))
 
     def within(self, tolerance_m: float, tolerance_rad: float) -> bool:
-        """Whether it stands well enough."""
+        """Whether the displacement is within the limits."""
         return self.distance_m <= tolerance_m and self.angle_rad <= tolerance_rad
 
     def advice(self) -> list[tuple[str, str]]:
-        """What to do, a line for each direction: what is off, and how to move."""
+        """Instructions, one for each direction: the quantity, and how to move."""
         ways = (
             ("left / right", 100 * self.right_m, "cm", ("left", "right")),
             ("height", 100 * self.up_m, "cm", ("down", "up")),

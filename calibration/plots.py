@@ -1,4 +1,4 @@
-"""A picture beside every calibration file: what was seen against what the fit says. Drawn without a display."""
+"""Plots of calibration fits against their measurements, saved next to the calibration file. No display is needed."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _CHANNELS = ("tab:red", "tab:green", "tab:blue")
 
 
 def save_with_plot(calibration: Calibration, path: Path, draw: Callable[[Figure], None]) -> Path:
-    """Write a calibration file and its picture beside it, each whole or not at all; the picture's path."""
+    """Write a calibration file and its plot, each atomically. Returns the path of the plot."""
     figure = Figure(figsize=(9.0, 4.0), layout="constrained")
     draw(figure)
     buffer = BytesIO()

@@ -1,4 +1,4 @@
-"""The room by motion capture: a fence from a walk around it, a start before a corner, and where a target's corners are.
+"""Measures the room with motion capture: the fence from a walk, the start before a corner, and the corners of a target.
 
 Everything is measured with what a lab has anyway: the car driven by hand, or a wand whose tip is known.
 """
@@ -99,7 +99,7 @@ def target_of_size(
     """
     if min(size_m) <= 0.0:
         raise DegenerateDataError(f"expected a width and a height > 0, got {size_m[0]:g} x {size_m[1]:g} m")
-    # For somebody who faces it, left is the side of the negative y axis of its own frame.
+    # Seen from the front, left is the side of the negative y axis of the face's frame.
     right = np.array([-np.sin(normal_yaw_rad), np.cos(normal_yaw_rad), 0.0])
     up = np.array([0.0, 0.0, 1.0])
     half_w, half_h = 0.5 * size_m[0], 0.5 * size_m[1]
@@ -183,7 +183,7 @@ def target_of_touches(subject: str, touches: Touches) -> TargetCalibration:
         worst = CORNERS[int(off.argmax())]
         raise DegenerateDataError(
             f"expected four corners of a rectangle, the {worst} one is {1000 * off.max():.0f} mm off: touch them again in the order "
-            f"{', '.join(CORNERS)}, as seen by somebody who faces it"
+            f"{', '.join(CORNERS)}, as seen from the front"
         )
     residuals = {
         "rectangle_mm": round(1000.0 * float(off.max()), 3),

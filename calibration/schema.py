@@ -1,4 +1,4 @@
-"""What is measured about the lab: one small dated YAML file per thing, strict in what it accepts.
+"""Schemas of the calibration files: one small dated YAML file per object, strictly validated.
 
 Every file says what it is (``kind``), when and how it was measured. The twin's files have the method "by construction". Distances
 are in metres, angles in radians, transforms ``T_a_from_b`` as four rows.
@@ -33,7 +33,7 @@ class CalibrationError(AdvnerfError, ValueError):
 
 
 class Calibration(BaseModel):
-    """What all files have.
+    """Fields that all calibration files have.
 
     Attributes:
         kind: What is calibrated.
@@ -136,7 +136,7 @@ class LimitsSection(BaseModel):
 
 
 class ResponseSection(BaseModel):
-    """How late and how slowly the car obeys.
+    """Delay and lag of the car.
 
     Attributes:
         pipeline_delay_s: From the capture of an image to the command written for it, in the mean [s].
@@ -206,7 +206,7 @@ class TargetCalibration(Calibration):
     Attributes:
         subject: Name of the motion-capture subject it is fixed to.
         corners_in_subject_m: The face's corners in the subject's frame, where the texture's top left, top right, bottom right and
-            bottom left go, as seen by somebody who faces it [m].
+            bottom left go, as seen from the front [m].
     """
 
     kind: Literal["target"] = "target"
@@ -233,14 +233,14 @@ class TargetCalibration(Calibration):
 
     @property
     def outward_normal(self) -> Array:
-        """Unit vector ``[3]`` out of the face, toward somebody who faces it, in the subject's frame."""
+        """Unit vector ``[3]`` out of the face, towards a viewer in front of it, in the subject's frame."""
         points = self.corners
         normal = np.cross(points[3] - points[0], points[1] - points[0])
         return np.asarray(normal / np.linalg.norm(normal), dtype=np.float64)
 
 
 class RoomCalibration(Calibration):
-    """Where the car drives.
+    """The area and path of the car.
 
     Attributes:
         path: Reference path as `advnerf_core.driving.path.Path.to_dict` writes it.
@@ -271,7 +271,7 @@ C = TypeVar("C", bound=Calibration)
 
 
 def load_calibration(model: type[C], path: Path | str) -> C:
-    """Read one file; everything wrong with it is one `CalibrationError` that names the file and the key."""
+    """Read a calibration file. Errors are one `CalibrationError` that names the file and the key."""
     path = Path(path)
     try:
         data = yaml.safe_load(path.read_text(encoding="utf-8"))
@@ -289,7 +289,7 @@ def load_calibration(model: type[C], path: Path | str) -> C:
 
 
 def save_calibration(calibration: Calibration, path: Path | str) -> None:
-    """Write one file, whole or not at all."""
+    """Write a calibration file atomically."""
     path = Path(path)
     values = calibration.model_dump(mode="python")
     # Files that measured nothing stay as short as they were.

@@ -35,7 +35,7 @@ __all__ = [
 def reconstruct(
     root: Path, sources: Sequence[Source], work: Path, config: SfmConfig | None = None, report: Report | None = None
 ) -> Model:
-    """Put photographs together.
+    """Reconstruct a model from photographs.
 
     Args:
         root: Folder of all images.
@@ -107,5 +107,5 @@ def _ended_early(code: int, log: Path) -> Exception:
     last = words.splitlines()[-1] if words else "it left no message"
     return ReconstructionError(
         f"expected COLMAP to finish, but its process was ended by {signal.Signals(-code).name} ({last}); its log is {log}. If memory ran "
-        "out, give fewer or smaller images (--most); run the command again to go on"
+        "out, give fewer or smaller images (--most); run the command again to resume"
     )

@@ -1,4 +1,4 @@
-"""How much later the camera stamps an instant than motion capture: the camera's own turning against that of the car.
+"""Calibrates the delay of camera stamps relative to motion capture, by correlating the rotation of camera and car.
 
 Between two frames the camera turns by a rotation that follows from corners tracked from one to the other (as directions, by a
 robust Procrustes fit); about the car's vertical axis this is the image's yaw. Motion capture knows the car's yaw at any stamp. The shift
@@ -32,7 +32,7 @@ _SMOOTH_S = 0.05
 
 @dataclass(frozen=True)
 class OffsetConfig:
-    """What is searched and refused.
+    """Settings of the search, and limits beyond which a fit is rejected.
 
     Attributes:
         largest_s: The offset is searched between minus and plus this [s].
@@ -94,7 +94,7 @@ class OffsetFit:
 
     @property
     def calibration(self) -> TimeOffsetCalibration:
-        """The file."""
+        """Make the calibration."""
         residuals = {"rms_rad": self.rms_rad, "correlation": float(self.correlation.max()), "scale": self.scale}
         return TimeOffsetCalibration(
             date=datetime.date.today(), method="image yaw by tracked corners against motion-capture yaw, correlation peak refined by least squares",

@@ -1,4 +1,4 @@
-"""The car's gains from a drive with constant commands, by motion capture: speed, servo gain and offset, and where the rear axle is.
+"""Calibrates speed gain, servo gain and offset, and rear axle of the car, from a drive with constant commands and motion capture.
 
 While servo and motor command are constant the car moves with a constant twist: a circle or a straight line. Each such segment gives,
 by least squares over its poses, the yaw rate ``w`` and the velocity of the tracked point in the body's frame ``(vx, vy)``. Then:
@@ -47,7 +47,7 @@ class Drive:
 
 @dataclass(frozen=True)
 class GainsConfig:
-    """What counts as a segment, and what is refused.
+    """Definition of segments, and limits beyond which a fit is rejected.
 
     Attributes:
         settle_s: After a change of command so much is left out [s].
@@ -99,7 +99,7 @@ class Segment:
 
 @dataclass(frozen=True, eq=False)
 class GainsFit:
-    """What the segments say.
+    """Gains fitted to the segments.
 
     Attributes:
         segments: The segments.

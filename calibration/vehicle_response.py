@@ -1,4 +1,4 @@
-"""How late and how slowly the car obeys: delay, first-order lag and slew of the wheels, delay and lag of the speed.
+"""Calibrates delay, first-order lag and slew of the steering, and delay and lag of the speed.
 
 The commands of the drive go through the model of `advnerf_core.driving.actuated` (the wheel angle ``d`` follows a delayed command ``c`` by
 ``dd/dt = clip((c - d) / lag, -slew, slew)``), the yaw rate is ``v tan(d) / L`` with the measured speed, and what the model turns in 60 ms
@@ -30,7 +30,7 @@ _AFTER_STOP_S = 1.0
 
 @dataclass(frozen=True)
 class ResponseConfig:
-    """What is refused.
+    """Limits beyond which a fit is rejected.
 
     Attributes:
         min_changes: Fewer changes of the command are refused.
@@ -82,7 +82,7 @@ class ResponseFit:
 
     @property
     def section(self) -> ResponseSection:
-        """As the vehicle's file holds it."""
+        """Convert to the entry of the vehicle file."""
         slew = self.steering.slew
         return ResponseSection(
             pipeline_delay_s=round(self.pipeline_s, 5), steering_delay_s=round(self.steering.delay_s, 5),
@@ -155,7 +155,7 @@ def _after(value: Array | float, target: Array | float, dt_s: Array | float, lag
 
 
 def vehicle_calibration(gains: GainsFit, response: ResponseFit, before: VehicleCalibration) -> VehicleCalibration:
-    """The vehicle's file; servo range and limits are those of the file before."""
+    """Make the vehicle calibration, with servo range and limits of the given file."""
     g, steering, speed = before.gains, response.steering, response.speed
     residuals = {
         "steering_rms_rad": gains.steering_rms_rad, "speed_rms_mps": gains.speed_rms_mps,

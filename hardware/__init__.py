@@ -1,1 +1,1 @@
-"""One device per file, and the simulated lab that speaks their protocols."""
+"""Device drivers, one per file, and the simulated lab that uses the same protocols."""

@@ -1,4 +1,4 @@
-"""What can go wrong with a device: one short tree, each error also being the builtin a caller would expect."""
+"""Exceptions of devices. Each also derives from the matching builtin exception."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from advnerf_core.errors import AdvnerfError
 
 
 class HardwareError(AdvnerfError, RuntimeError):
-    """A device did something other than asked; the message says what was expected, what came, and what to do."""
+    """A device did not do what was requested. The message says what was expected, what came, and what to do."""
 
 
 class DeviceNotFound(HardwareError, FileNotFoundError):
-    """There is no such device, port or socket."""
+    """The device, port or socket does not exist."""
 
 
 class DeviceBusy(HardwareError, OSError):
@@ -18,11 +18,11 @@ class DeviceBusy(HardwareError, OSError):
 
 
 class LinkLost(HardwareError, ConnectionError):
-    """The device was there and went away: unplugged, hung up, or its server ended."""
+    """The connection to the device was lost: unplugged, closed, or its server ended."""
 
 
 class LinkTimeout(HardwareError, TimeoutError):
-    """The device is there and does not answer in time."""
+    """The device exists, but does not answer in time."""
 
 
 class ProtocolError(HardwareError, ValueError):

@@ -1,1 +1,1 @@
-"""Camera drivers behind one contract."""
+"""Camera drivers with a common interface."""

@@ -1,4 +1,4 @@
-"""Camera that plays recorded pictures: numbered image files, at a steady rate."""
+"""Camera that plays numbered image files at a constant rate."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ class FileCamera(Camera):
     """Delivers the images of a folder in the order of their names.
 
     Args:
-        folder: Where the images are.
-        rate_hz: Frames per second.
-        loop: Begin again after the last one; otherwise the device goes away, like a camera that is unplugged.
+        folder: Folder of the images.
+        rate_hz: Rate of frames [Hz].
+        loop: Start over after the last image. Otherwise the device is lost, like an unplugged camera.
     """
 
     def __init__(self, folder: Path | str, rate_hz: float = 10.0, loop: bool = True) -> None:
@@ -41,28 +41,28 @@ class FileCamera(Camera):
         self._sequence, self._next_s = 0, time.monotonic()
 
     def read(self, timeout_s: float) -> Frame | None:
-        """Next image when its time has come, or None after ``timeout_s``."""
+        """Return the next image when it is due, or None after ``timeout_s``."""
         if not self._files:
-            raise LinkLost(f"expected an open camera, {self.folder} is not open: call open() first")
+            raise LinkLost(f"expected an open camera, but {self.folder} is not open; call open() first")
         wait_s = self._next_s - time.monotonic()
         if wait_s > timeout_s:
             time.sleep(timeout_s)
             return None
         time.sleep(max(wait_s, 0.0))
         if self._sequence >= len(self._files) and not self._loop:
-            raise LinkLost(f"all {len(self._files)} images of {self.folder} were played")
+            raise LinkLost(f"all {len(self._files)} images of {self.folder} were played; set loop to repeat them")
         path = self._files[self._sequence % len(self._files)]
         bgr = cv2.imread(str(path), cv2.IMREAD_COLOR)
         if bgr is None:
-            raise LinkLost(f"expected an image, cannot decode {path}: remove or replace it")
+            raise LinkLost(f"expected an image, cannot decode {path}; remove or replace it")
         rgb = np.ascontiguousarray(bgr[:, :, ::-1], dtype=np.uint8)
         rgb.flags.writeable = False
         frame = Frame(rgb, time.time_ns(), time.monotonic_ns(), self._sequence)
         self._sequence += 1
-        # From now on, not from the plan: pictures are never delivered in a burst.
+        # Scheduled from the current time, so that images are never delivered in a burst.
         self._next_s = max(self._next_s + self._period_s, time.monotonic())
         return frame
 
     def close(self) -> None:
-        """Forget the images."""
+        """Close the camera."""
         self._files = []

@@ -1,7 +1,7 @@
-"""Frames on a Unix socket. Used by the twin's frame server and its client.
+"""Wire format of frames on a Unix socket, for the twin's frame server and its client.
 
-The client asks with one byte; the server answers with its newest frame, or the next one if the client has that already:
-a fixed head with both capture stamps, then raw RGB.
+The client sends one byte. The server answers with its newest frame, or with the next one if the client already has it: a fixed head
+with both capture stamps, then raw RGB.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ HEAD_BYTES = _HEAD.size
 
 
 def encode_head(frame: Frame) -> bytes:
-    """Head of a frame; the pixels follow as ``frame.rgb.tobytes()``."""
+    """Encode the head of a frame. The pixels follow as ``frame.rgb.tobytes()``."""
     height, width, channels = frame.rgb.shape
     if channels != 3 or frame.rgb.dtype != np.uint8:
         raise ValueError(f"expected uint8 pixels [H, W, 3], got {frame.rgb.dtype} {list(frame.rgb.shape)}")
@@ -34,14 +34,14 @@ def pixel_bytes(head: bytes) -> int:
     magic, version, height, width, *_ = _HEAD.unpack(head)
     if magic != MAGIC or version != VERSION or height == 0 or width == 0:
         raise ProtocolError(
-            f"expected a frame head {MAGIC!r} version {VERSION}, got {head[:6]!r}: is the socket that of a frame server"
+            f"expected a frame head {MAGIC!r} version {VERSION}, got {head[:6]!r}; is the socket that of a frame server"
             " of the same version?"
         )
     return int(height) * int(width) * 3
 
 
 def decode_frame(head: bytes, pixels: bytes | bytearray) -> Frame:
-    """Frame of a head and its pixel bytes."""
+    """Decode a frame from its head and pixel bytes."""
     if len(pixels) != pixel_bytes(head):
         raise ProtocolError(f"expected {pixel_bytes(head)} pixel bytes, got {len(pixels)}")
     _, _, height, width, sequence, real_ns, mono_ns = _HEAD.unpack(head)

@@ -1,4 +1,4 @@
-"""What every camera does, whatever it is made of."""
+"""The interface of all cameras."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from advnerf_core.geometry import Pinhole
 
 @dataclass(frozen=True)
 class Frame:
-    """One picture with its time of capture.
+    """An image with its capture time.
 
     Attributes:
-        rgb: Pixels ``[H, W, 3]`` uint8, not to be written to.
-        stamp_realtime_ns: Capture in real time, as near to the exposure as the device can say [ns].
-        stamp_mono_ns: The same instant in monotonic time [ns].
-        sequence: Counts the device's frames; a gap means frames that were never delivered.
+        rgb: Pixels ``[H, W, 3]`` uint8, read-only.
+        stamp_realtime_ns: Capture time in real time, as close to the exposure as the device can report [ns].
+        stamp_mono_ns: The same time on the monotonic clock [ns].
+        sequence: Frame number of the device. A gap means frames that were not delivered.
     """
 
     rgb: NDArray[np.uint8]
@@ -29,28 +29,28 @@ class Frame:
 
 
 class Camera(Protocol):
-    """A source of frames. `open` may be called again after an error; one thread at a time.
+    """A source of frames. `open` may be called again after an error. Only one thread at a time may use it.
 
-    Drivers derive from it and write `open`, `read` and `close`; the others have answers for a device that knows nothing more.
+    Drivers derive from it and implement `open`, `read` and `close`. The other members have defaults.
     """
 
     def open(self) -> None:
-        """Start the device; raises `hardware.errors.DeviceNotFound` if it is not there."""
+        """Start the device. Raises `hardware.errors.DeviceNotFound` if it does not exist."""
         ...
 
     def read(self, timeout_s: float) -> Frame | None:
-        """Newest frame not read yet; None if none came in time; raises `hardware.errors.LinkLost` if the device went away."""
+        """Return the newest unread frame; None on timeout. Raises `hardware.errors.LinkLost` if the device is lost."""
         ...
 
     def close(self) -> None:
-        """Stop the device; harmless when it is not open."""
+        """Stop the device. Does nothing if it is not open."""
         ...
 
     @property
     def pinhole(self) -> Pinhole | None:
-        """Intrinsics of the delivered pictures as the device itself knows them (factory calibration), once it is open."""
+        """Intrinsics of the delivered images from the device's factory calibration, once it is open; None if unknown."""
         return None
 
     def counters(self) -> dict[str, float]:
-        """What went wrong with frames since the beginning, by name; it survives `open` and `close`."""
+        """Error counters of frames by name, kept across `open` and `close`."""
         return {}

@@ -1,4 +1,4 @@
-"""OAK cameras (Luxonis, depthai 3): one picture stream, undistorted by the device, stamped on the host's steady clock."""
+"""Driver of OAK cameras (Luxonis, depthai 3): one image stream, undistorted by the device, stamped on the host's steady clock."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ _ISO_DEFAULT = 400
 
 @dataclass(frozen=True)
 class OakSettings:
-    """What an OAK is asked to deliver.
+    """Settings of an OAK.
 
     Attributes:
-        device: Its id, IP address or USB port; empty for the only one.
-        socket: Board socket of the camera, e.g. ``CAM_A``.
-        width: Columns [px].
-        height: Rows [px].
-        fps: Frames per second [Hz].
-        undistort: Let the device take the distortion out with its factory calibration.
+        device: Id, IP address or USB port of the device; empty for the only one.
+        socket: Board socket of the camera, for example ``CAM_A``.
+        width: Width [px].
+        height: Height [px].
+        fps: Frame rate [Hz].
+        undistort: Let the device remove the distortion with its factory calibration.
         exposure_us: Exposure time to fix [us]; None for automatic.
         iso: Sensitivity that goes with it.
         white_balance_k: Colour temperature to fix [K]; None for automatic.
@@ -50,7 +50,7 @@ class OakSettings:
                 f"expected a size and a rate above zero, got {self.width} x {self.height} at {self.fps} Hz"
             )
         if self.iso is not None and self.exposure_us is None:
-            raise ValueError("expected exposure_us with iso: the device fixes both or none")
+            raise ValueError("expected exposure_us and iso together, got one; give both or none")
         for name, value, low, high in (
             ("exposure_us", self.exposure_us, 1, 33_000_000),
             ("iso", self.iso, 100, 1600),
@@ -62,12 +62,12 @@ class OakSettings:
 
 @dataclass(frozen=True, eq=False)
 class OakStream:
-    """A pipeline that has not been started, and where its pictures come out.
+    """A pipeline that is not started yet, and its output queue.
 
     Attributes:
         pipeline: ``depthai.Pipeline``.
         queue: ``depthai.MessageQueue`` of ``ImgFrame``, of length 1 and not blocking.
-        pinhole: Intrinsics of the pictures by the factory calibration; None if there is none.
+        pinhole: Intrinsics of the images from the factory calibration; None without one.
         device: ``depthai.Device`` to close at the end; None for a pipeline on the host.
     """
 
@@ -81,9 +81,9 @@ class OakCamera(Camera):
     """One camera of an OAK.
 
     Args:
-        settings: What it must deliver; pictures of another size are an error.
-        build: Makes the pipeline out of the depthai module and the settings; that of a device, or one on the host that replays.
-        stamper: Believes or refuses its stamps.
+        settings: Settings of the camera. Images of another size are an error.
+        build: Makes the pipeline from the depthai module and the settings: that of a device, or a replay on the host.
+        stamper: Converts and checks the stamps.
     """
 
     def __init__(
@@ -100,11 +100,11 @@ class OakCamera(Camera):
 
     @property
     def pinhole(self) -> Pinhole | None:
-        """The factory calibration at this size, while the device is open; only of undistorted pictures."""
+        """Factory calibration at this size while the device is open; only for undistorted images."""
         return self._stream.pinhole if self._stream and self.settings.undistort else None
 
     def open(self) -> None:
-        """Find the device, load the pipeline into it, start."""
+        """Find the device, load the pipeline and start it."""
         self.close()
         self._depthai = _import_depthai()
         self._stream = self._build(self._depthai, self.settings)
@@ -113,12 +113,12 @@ class OakCamera(Camera):
             self._stream.pipeline.start()
         except RuntimeError as error:
             self.close()
-            raise LinkLost(f"cannot start the OAK: {error}") from error
+            raise LinkLost(f"cannot start the OAK: {error}; unplug it and plug it in again") from error
 
     def read(self, timeout_s: float) -> Frame | None:
-        """Newest frame not read yet, or None after ``timeout_s``."""
+        """Return the newest unread frame, or None after ``timeout_s``."""
         if self._stream is None:
-            raise LinkLost("expected an open camera, the OAK is not open: call open() first")
+            raise LinkLost("expected an open camera, but the OAK is not open; call open() first")
         try:
             message = self._stream.queue.get(datetime.timedelta(seconds=max(timeout_s, 0.0)))
         except (self._depthai.MessageQueue.QueueException, RuntimeError) as error:
@@ -131,7 +131,7 @@ class OakCamera(Camera):
         return Frame(self._pixels(message), *stamps, int(message.getSequenceNum()))
 
     def close(self) -> None:
-        """Stop the pipeline and let the device go."""
+        """Stop the pipeline and release the device."""
         stream, self._stream = self._stream, None
         if stream is None:
             return
@@ -144,7 +144,7 @@ class OakCamera(Camera):
                 stream.device.close()
 
     def counters(self) -> dict[str, float]:
-        """Stamps that were not believed."""
+        """Counts of rejected stamps."""
         return {"stamps_replaced": self._stamper.replaced, "stamps_refused": self._stamper.refused}
 
     def _stamp_ns(self, message: Any) -> int:
@@ -157,14 +157,14 @@ class OakCamera(Camera):
         expected = (self.settings.height, self.settings.width, 3)
         if bgr is None or bgr.shape != expected:
             got = None if bgr is None else list(bgr.shape)
-            raise ProtocolError(f"expected pictures {list(expected)} from the OAK, got {got}")
+            raise ProtocolError(f"expected images {list(expected)} from the OAK, got {got}")
         rgb = np.array(bgr[:, :, ::-1], dtype=np.uint8, order="C")
         rgb.flags.writeable = False
         return rgb
 
 
 def device_stream(depthai: Any, settings: OakSettings) -> OakStream:
-    """The pipeline of a real device: camera, undistortion, scaling, one queue of length 1."""
+    """Make the pipeline of a real device: camera, undistortion, scaling, and one queue of length 1."""
     info = find_device(depthai, settings.device)
     try:
         device = depthai.Device(info)
@@ -174,7 +174,7 @@ def device_stream(depthai: Any, settings: OakSettings) -> OakStream:
         board_socket = getattr(depthai.CameraBoardSocket, settings.socket, None)
         if board_socket is None or board_socket not in device.getConnectedCameras():
             has = ", ".join(socket.name for socket in device.getConnectedCameras())
-            raise HardwareError(f"expected a camera on socket {settings.socket} of the OAK, it has {has}")
+            raise HardwareError(f"expected a camera on socket {settings.socket} of the OAK, got {has}; correct socket")
         pipeline = depthai.Pipeline(device)
         camera = pipeline.create(depthai.node.Camera).build(board_socket)
         fix_controls(camera.initialControl, settings)
@@ -190,13 +190,13 @@ def device_stream(depthai: Any, settings: OakSettings) -> OakStream:
     except BaseException as error:
         device.close()
         if isinstance(error, RuntimeError) and not isinstance(error, HardwareError):
-            raise HardwareError(f"the OAK refused {settings}: {error}") from error
+            raise HardwareError(f"the OAK refused {settings}: {error}; change these settings") from error
         raise
     return OakStream(pipeline, queue, pinhole, device)
 
 
 def fix_controls(control: Any, settings: OakSettings) -> None:
-    """Put exposure and white balance into a ``depthai.CameraControl``."""
+    """Write exposure and white balance to a ``depthai.CameraControl``."""
     if settings.exposure_us is not None:
         control.setManualExposure(settings.exposure_us, settings.iso or _ISO_DEFAULT)
     if settings.white_balance_k is not None:
@@ -204,17 +204,17 @@ def fix_controls(control: Any, settings: OakSettings) -> None:
 
 
 def find_device(depthai: Any, name: str) -> Any:
-    """The device with this id or address, or the only one; `DeviceNotFound` names those that are there."""
-    # depthai's own error for a missing device comes after seconds and names nothing.
+    """Find the device with this id or address, or the only one. `DeviceNotFound` lists the existing devices."""
+    # depthai's own error for a missing device takes seconds and names no devices.
     found = depthai.Device.getAllAvailableDevices()
     chosen = [info for info in found if not name or name in (info.getDeviceId(), info.name)]
     there = ", ".join(f"{info.getDeviceId()} ({info.name})" for info in found) or "none"
     if len(chosen) == 1:
         return chosen[0]
     if chosen:
-        raise DeviceNotFound(f"expected one OAK, found {there}: name one by 'device'")
+        raise DeviceNotFound(f"expected one OAK, found {there}; select one with 'device'")
     if name.count(".") == 3:
-        # In another network segment an OAK PoE answers no broadcast, but opens by its address.
+        # An OAK PoE in another network segment does not answer broadcasts, but can be opened by its address.
         return depthai.DeviceInfo(name)
     wanted = f"the OAK {name}" if name else "an OAK"
     raise DeviceNotFound(

@@ -1,4 +1,4 @@
-"""From the bytes of a video buffer to RGB, for the pixel formats that cameras use."""
+"""Converts the bytes of a video buffer to RGB, for the pixel formats of cameras."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ Bytes = NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class Layout:
-    """How the bytes of a picture lie, as the driver confirmed it.
+    """Memory layout of an image, as confirmed by the driver.
 
     Attributes:
-        pixel_format: Four letters, e.g. ``YUYV``.
-        width: Columns [px].
-        height: Rows [px].
-        bytes_per_line: From one row to the next [bytes]; 0 for compressed formats.
-        columns: First and one past the last column to deliver; both eyes of a stereo camera lie side by side.
+        pixel_format: Four letters, for example ``YUYV``.
+        width: Width [px].
+        height: Height [px].
+        bytes_per_line: Offset from one row to the next [bytes]; 0 for compressed formats.
+        columns: First and one past the last column to deliver, because the images of a stereo camera are side by side.
     """
 
     pixel_format: str
@@ -32,7 +32,7 @@ class Layout:
 
     @property
     def size_bytes(self) -> int:
-        """Bytes of a whole picture; 1 for compressed formats."""
+        """Size of a complete image [bytes]; 1 for compressed formats."""
         rows = self.height + self.height // 2 if self.pixel_format == "NV12" else self.height
         return max(rows * self.bytes_per_line, 1)
 
@@ -77,7 +77,7 @@ def _jpeg(data: Bytes, layout: Layout) -> Bytes:
     return np.ascontiguousarray(bgr[:, slice(*layout.columns), ::-1])
 
 
-# YUV is taken as BT.601 with limited range, which is what USB cameras send.
+# YUV is interpreted as BT.601 with limited range, which USB cameras send.
 _CONVERT: dict[str, Callable[[Bytes, Layout], Bytes]] = {
     "YUYV": _packed_yuv(cv2.COLOR_YUV2RGB_YUYV),
     "UYVY": _packed_yuv(cv2.COLOR_YUV2RGB_UYVY),
@@ -95,14 +95,14 @@ _BYTES_PER_PIXEL = {"NV12": 1, "GREY": 1, "RGB3": 3, "BGR3": 3}
 
 
 def least_bytes_per_line(pixel_format: str, width: int) -> int:
-    """Bytes of a row without padding; 0 for compressed formats."""
+    """Size of a row without padding [bytes]; 0 for compressed formats."""
     return 0 if pixel_format in COMPRESSED else width * _BYTES_PER_PIXEL.get(pixel_format, 2)
 
 
 def to_rgb(data: Bytes, layout: Layout) -> Bytes:
-    """Pixels ``[H, W, 3]`` of a picture, in memory of their own; `ValueError` if the bytes are no such picture."""
+    """Convert an image to newly allocated pixels ``[H, W, 3]``. Raises `ValueError` for invalid bytes."""
     if data.size < layout.size_bytes:
-        raise ValueError(f"expected {layout.size_bytes} bytes, got {data.size}: the frame is cut short")
+        raise ValueError(f"expected {layout.size_bytes} bytes, got {data.size}; the frame is truncated")
     rgb = _CONVERT[layout.pixel_format](data, layout)
     rgb.flags.writeable = False
     return rgb

@@ -1,4 +1,4 @@
-"""Camera whose frames come over a Unix socket: the client of `hardware.emulators.frame_server`, or of any other frame server."""
+"""Camera that receives frames over a Unix socket, from `hardware.emulators.frame_server` or another frame server."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from hardware.cameras.frame_wire import HEAD_BYTES, REQUEST, decode_frame, pixel
 from hardware.cameras.interface import Camera, Frame
 from hardware.errors import DeviceNotFound, LinkLost, LinkTimeout
 
-# What a server on the same machine needs to answer when it has something to answer with.
+# Time that a server on the same machine needs to answer if it has a frame.
 _ANSWER_S = 0.01
 
 
 class SocketCamera(Camera):
-    """Reads frames that carry their capture stamps; nothing is stamped again here.
+    """Reads frames with their capture stamps, which are kept.
 
-    Each frame is asked for, so that none grows old in the socket while the reader does something else.
+    Each frame is requested, so that no frame waits in the socket while the reader is busy.
 
     Args:
         path: Path of the socket.
-        stall_s: A frame that has begun must be complete within this time [s].
+        stall_s: Longest time for receiving a frame [s].
     """
 
     def __init__(self, path: Path | str, stall_s: float = 1.0) -> None:
@@ -39,7 +39,7 @@ class SocketCamera(Camera):
         except OSError as error:
             client.close()
             raise DeviceNotFound(
-                f"expected a frame server at {self.path}, got: {error.strerror or error}; is the twin (or the camera's server) running?"
+                f"expected a frame server at {self.path}, got: {error.strerror or error}; is the twin, or the camera's server, running?"
             ) from error
         self._socket, self._asked = client, False
 
@@ -48,7 +48,7 @@ class SocketCamera(Camera):
         if not self._asked:
             self._ask()
         elif (frame := self._read_one(0.0)) is not None:
-            # It answers a call that gave up some time ago, so there may be a newer one by now.
+            # This answers a request that timed out earlier, so there may be a newer frame.
             self._ask()
             return self._read_one(_ANSWER_S) or frame
         return self._read_one(timeout_s)
@@ -68,11 +68,13 @@ class SocketCamera(Camera):
 
     def _ask(self) -> None:
         if self._socket is None:
-            raise LinkLost(f"expected an open camera, {self.path} is not connected: call open() first")
+            raise LinkLost(f"expected an open camera, but {self.path} is not connected; call open() first")
         try:
             self._socket.sendall(REQUEST)
         except OSError as error:
-            raise LinkLost(f"the frame server at {self.path} hung up: {error.strerror or error}") from error
+            raise LinkLost(
+                f"the frame server at {self.path} closed the connection: {error.strerror or error}"
+            ) from error
         self._asked = True
 
     def _read_one(self, timeout_s: float) -> Frame | None:
@@ -85,7 +87,7 @@ class SocketCamera(Camera):
         except OSError as error:
             raise LinkLost(f"lost the frame server at {self.path}: {error}") from error
         if not first:
-            raise LinkLost(f"the frame server at {self.path} hung up")
+            raise LinkLost(f"the frame server at {self.path} closed the connection")
         deadline = time.monotonic() + self._stall_s
         head = first + self._receive(HEAD_BYTES - 1, deadline)
         frame = decode_frame(head, self._receive(pixel_bytes(head), deadline))
@@ -102,11 +104,11 @@ class SocketCamera(Camera):
                 received = self._socket.recv_into(view[filled:])
             except TimeoutError as error:
                 raise LinkTimeout(
-                    f"expected a whole frame from {self.path} within {self._stall_s} s, got {filled} of {count} bytes"
+                    f"expected a complete frame from {self.path} within {self._stall_s} s, got {filled} of {count} bytes"
                 ) from error
             except OSError as error:
                 raise LinkLost(f"lost the frame server at {self.path}: {error}") from error
             if received == 0:
-                raise LinkLost(f"the frame server at {self.path} hung up in the middle of a frame")
+                raise LinkLost(f"the frame server at {self.path} closed the connection in the middle of a frame")
             filled += received
         return bytes(buffer)

@@ -1,4 +1,4 @@
-"""What a launch file may write under ``source`` of the camera node: one class for each kind of device. No node."""
+"""Configuration classes for ``source`` of the camera node, one for each kind of device."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ Positive = Annotated[int, Field(gt=0)]
 
 
 class _Source(BaseModel, ABC):
-    """What all sources have.
+    """Settings that all sources have.
 
     Attributes:
-        stall_s: Time without a frame after which the device is opened anew [s].
-        repeats: Identical pictures in a row that count as a stall; 0 for never.
+        stall_s: Time without a frame after which the device is reopened [s].
+        repeats: Number of identical images in a row that count as a stall; 0 for never.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -40,15 +40,15 @@ class _Source(BaseModel, ABC):
 
     @abstractmethod
     def camera(self) -> Camera:
-        """The device."""
+        """Make the camera."""
 
     def steady(self) -> SteadyCamera:
-        """The device, kept going."""
+        """Make the camera with automatic reconnection."""
         stall_s = max(self.stall_s, 3.0 * self.period_s())
         return SteadyCamera(self.camera(), stall_s, max(5.0, stall_s), self.repeats)
 
     def period_s(self) -> float:
-        """Time between two frames where the configuration says it; a slow one is no stall [s]."""
+        """Time between two frames if the configuration has a rate, so that a slow rate is not a stall [s]."""
         return 0.0
 
 
@@ -57,8 +57,8 @@ class _ControlledSource(_Source):
 
     Attributes:
         white_balance_k: Colour temperature to fix [K]; None for automatic.
-        power_line_hz: Mains frequency against which the device avoids flicker [Hz].
-        controls: More controls by name, in the device's own units (``advnerf camera list`` shows them).
+        power_line_hz: Mains frequency for the device's flicker compensation [Hz].
+        controls: Further controls by name, in the device's own units (``advnerf camera list`` shows them).
     """
 
     white_balance_k: int | None = None
@@ -75,12 +75,12 @@ class V4l2Source(_ControlledSource):
     Attributes:
         kind: ``v4l2``.
         device: Stable path, ``/dev/v4l/by-id/...-video-index0``.
-        width: Columns that the device delivers [px].
-        height: Rows that the device delivers [px].
+        width: Width of the device's images [px].
+        height: Height of the device's images [px].
         fps: Rate of the device [Hz].
         pixel_format: Four letters.
         rate_hz: Frames to deliver per second, chosen by their stamps [Hz]; None for all.
-        size: Width and height to scale the pictures to [px]; None keeps them.
+        size: Width and height to scale the images to [px]; None keeps their size.
         exposure_us: Exposure time to fix [us]; None for automatic.
         gain: Gain to fix, in the device's own units.
     """
@@ -99,7 +99,7 @@ class V4l2Source(_ControlledSource):
 
     @model_validator(mode="after")
     def _possible(self) -> V4l2Source:
-        self.camera()  # nothing is opened; the driver says what is impossible
+        self.camera()  # opens no device; the driver checks the settings
         return self
 
     def period_s(self) -> float:
@@ -107,7 +107,7 @@ class V4l2Source(_ControlledSource):
         return 1.0 / self.rate_hz if self.rate_hz else 0.0
 
     def camera(self) -> V4l2Camera:
-        """The device."""
+        """Make the camera."""
         mode = Mode(self.width, self.height, self.fps, self.pixel_format)
         controls = self._controls(self.exposure_us, self.gain)
         return V4l2Camera(self.device, mode, controls, self.rate_hz, size=self.size)
@@ -119,13 +119,13 @@ class ZedSource(_ControlledSource):
     Attributes:
         kind: ``zed``.
         device: Stable path, ``/dev/v4l/by-id/...ZED...-video-index0``.
-        factory: Its ``SN<serial>.conf``.
+        factory: Factory calibration, ``SN<serial>.conf``.
         mode: Resolution.
         fps: Rate of the device: 15, 30, 60 or 100 [Hz].
         rate_hz: Frames to deliver per second, chosen by their stamps [Hz]; None for all.
-        size: Width and height of the delivered pictures [px].
+        size: Width and height of the delivered images [px].
         exposure_percent: Exposure to fix [% of the longest at this rate]; None for automatic.
-        gain_raw: Gain to fix, as the sensor's register holds it; ``advnerf camera list`` shows the present one.
+        gain_raw: Gain to fix, as in the sensor's register; ``advnerf camera list`` shows the current value.
     """
 
     kind: Literal["zed"] = "zed"
@@ -156,7 +156,7 @@ class ZedSource(_ControlledSource):
         return 1.0 / self.rate_hz if self.rate_hz else 0.0
 
     def camera(self) -> ZedCamera:
-        """The device; reads its factory calibration."""
+        """Make the camera and read its factory calibration."""
         exposure = ZedExposure(self.exposure_percent, self.gain_raw)
         return ZedCamera(
             self.device, self.factory, self.mode, self.fps, self.rate_hz, self.size, exposure, self._controls()
@@ -201,12 +201,12 @@ class OakSource(_Source):
         return 1.0 / self.fps
 
     def camera(self) -> OakCamera:
-        """The device."""
+        """Make the camera."""
         return OakCamera(OakSettings(**self.model_dump(exclude={"kind", "stall_s", "repeats"})))
 
 
 class SocketSource(_Source):
-    """Frames from a Unix socket: the twin's, or those of a camera server of your own.
+    """Frames from a Unix socket, of the twin or of your own camera server.
 
     Attributes:
         kind: ``socket``.
@@ -217,7 +217,7 @@ class SocketSource(_Source):
     path: Path
 
     def camera(self) -> SocketCamera:
-        """The device."""
+        """Make the camera."""
         return SocketCamera(self.path)
 
 
@@ -227,8 +227,8 @@ class FileSource(_Source):
     Attributes:
         kind: ``file``.
         path: The video.
-        rate_hz: Frames per second; None for those of the video.
-        loop: Begin again after the last one.
+        rate_hz: Frame rate; None uses that of the video [Hz].
+        loop: Start over after the last frame.
     """
 
     kind: Literal["file"] = "file"
@@ -241,18 +241,18 @@ class FileSource(_Source):
         return 1.0 / self.rate_hz if self.rate_hz else 0.0
 
     def camera(self) -> VideoCamera:
-        """The device."""
+        """Make the camera."""
         return VideoCamera(self.path, self.rate_hz, self.loop)
 
 
 class FolderSource(_Source):
-    """Recorded pictures.
+    """Recorded images.
 
     Attributes:
         kind: ``folder``.
         folder: Folder of numbered images.
-        rate_hz: Frames per second.
-        loop: Begin again after the last one.
+        rate_hz: Frame rate [Hz].
+        loop: Start over after the last image.
     """
 
     kind: Literal["folder"] = "folder"
@@ -265,7 +265,7 @@ class FolderSource(_Source):
         return 1.0 / self.rate_hz
 
     def camera(self) -> FileCamera:
-        """The device."""
+        """Make the camera."""
         return FileCamera(self.folder, self.rate_hz, self.loop)
 
 

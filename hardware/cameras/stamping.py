@@ -1,4 +1,4 @@
-"""Turns the time stamps that devices give into real and monotonic time, and notices when they cannot be believed."""
+"""Converts the stamps of devices to real and monotonic time, and detects unreliable stamps."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ _PATIENCE = 10
 
 
 class Stamper:
-    """Converts stamps of one device; its results never go back.
+    """Converts the stamps of one device. The results never go back.
 
-    A stamp is believed if it lies within the last second on the monotonic clock (what V4L2 promises, and depthai's host clock is)
-    or on the real-time clock (what ``uvcvideo`` with ``clock=CLOCK_REALTIME`` gives). A device that never gave such a stamp has
-    its frames stamped on receipt. From one that did, a frame with another stamp is old until proven otherwise and is not
-    delivered; after ten of them in a row its clock has jumped, and frames are stamped on receipt until it is back.
+    A stamp is accepted if it lies within the last second on the monotonic clock (as V4L2 and depthai's host clock specify) or on the
+    real-time clock (as ``uvcvideo`` with ``clock=CLOCK_REALTIME`` delivers). If a device has never had such a stamp, its frames are
+    stamped on reception. If it has, a frame with another stamp is considered old and is not delivered. After ten of them in a row its
+    clock has jumped, and frames are stamped on reception until the stamps are valid again.
 
     Args:
         monotonic_ns: Monotonic time [ns].
         realtime_ns: Real time [ns].
 
     Attributes:
-        replaced: Frames stamped on receipt.
-        refused: Frames that were not delivered because of their stamp.
+        replaced: Number of frames stamped on reception.
+        refused: Number of frames that were not delivered because of their stamp.
     """
 
     def __init__(
@@ -41,14 +41,14 @@ class Stamper:
         self.replaced = self.refused = 0
 
     def restart(self) -> None:
-        """The device was opened anew: forget how far it could be believed; results still never go back."""
+        """Reset after the device was reopened. Results still never go back."""
         self._believed, self._in_a_row = False, 0
 
     def convert(self, stamp_ns: int | None) -> tuple[int, int] | None:
         """Real time and monotonic time [ns] of a frame with this stamp, or None if it must not be delivered.
 
         Args:
-            stamp_ns: What the device says [ns]; None if it says nothing.
+            stamp_ns: Stamp of the device [ns]; None without a stamp.
         """
         real_ns, mono_ns = self._now()
         captured_ns = None if stamp_ns is None else _captured(stamp_ns, real_ns, mono_ns)
@@ -65,7 +65,7 @@ class Stamper:
         return captured_ns + (real_ns - mono_ns), captured_ns
 
     def _now(self) -> tuple[int, int]:
-        # Monotonic time on both sides of the real time: an interruption in between would become an error of the stamp.
+        # Read the monotonic clock before and after the real-time clock, because an interruption between would shift the stamp.
         before_ns = self._monotonic_ns()
         real_ns = self._realtime_ns()
         return real_ns, (before_ns + self._monotonic_ns()) // 2
@@ -80,11 +80,11 @@ def _captured(stamp_ns: int, real_ns: int, mono_ns: int) -> int | None:
 
 
 class Decimator:
-    """Chooses frames for a lower rate by their stamps: one for each slot of a regular grid.
+    """Selects frames for a lower rate by their stamps: one for each slot of a regular grid.
 
     Args:
-        rate_hz: Frames per second to keep.
-        source_hz: Frames per second that come.
+        rate_hz: Rate of frames to keep [Hz].
+        source_hz: Rate of frames of the device [Hz].
     """
 
     def __init__(self, rate_hz: float, source_hz: float) -> None:
@@ -98,14 +98,14 @@ class Decimator:
         self._slot = -1
 
     def restart(self) -> None:
-        """Begin a new grid at the next frame."""
+        """Start a new grid at the next frame."""
         self._start_ns, self._slot = None, -1
 
     def slot(self, stamp_ns: int) -> int | None:
-        """Number of the slot that this frame fills, or None if it is not wanted; a missing number is a missing frame."""
+        """Number of the slot that this frame fills, or None if the frame is not selected. A skipped number means a missing frame."""
         if self._start_ns is None:
             self._start_ns = stamp_ns
-        # The frame nearest to the beginning of its slot: half a frame early is nearer than the next one.
+        # Select the frame closest to the start of its slot, which may be up to half a frame early.
         slot = int((stamp_ns - self._start_ns + self._half_source_ns) // self._period_ns)
         if slot <= self._slot:
             return None

@@ -1,4 +1,4 @@
-"""Keeps any camera going: opens it, notices when it stalls or repeats itself, and opens it again with growing pauses."""
+"""Keeps a camera running: opens it, detects stalls and repeated images, and reopens it with growing pauses."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from hardware.errors import HardwareError
 
 
 class SteadyCamera:
-    """Reads a camera that may not be there yet, or may go away and come back. Lives in one thread, the read thread.
+    """Reads a camera that may be absent at first, or disconnect and return. Used by one thread, the read thread.
 
     Args:
-        camera: The device.
-        stall_s: Time without a frame after which it is closed and opened anew [s].
-        first_frame_s: The same for the first frame after it was opened [s].
-        repeats: Identical pictures in a row that count as a stall, which the noise of a real sensor never makes; 0 for never.
-        pauses_s: First and longest pause before another try [s]; each is twice the one before.
-        now_s: Monotonic time [s].
-        sleep: Waits [s].
+        camera: The camera.
+        stall_s: Time without a frame after which it is reopened [s].
+        first_frame_s: The same time for the first frame after opening [s].
+        repeats: Number of identical images in a row that count as a stall; 0 for never. Sensor noise makes real images differ.
+        pauses_s: First and longest pause before another attempt, doubled each time [s].
+        now_s: Returns the monotonic time [s].
+        sleep: Sleeps for a time [s].
 
     Attributes:
-        error: What is wrong at present; empty while frames come.
+        error: Current error; empty while frames arrive.
     """
 
     def __init__(
@@ -48,7 +48,7 @@ class SteadyCamera:
         self._opened = self._stalls = 0
 
     def read(self, timeout_s: float) -> Frame | None:
-        """Newest frame, or None; what goes wrong is in `error` and is put right by a later call."""
+        """Return the newest frame, or None. After an error, `error` is set and a later call reconnects."""
         if (wait_s := self._try_s - self._now_s()) > 0.0:
             self._sleep(min(wait_s, timeout_s))
             return None
@@ -68,7 +68,7 @@ class SteadyCamera:
         self._is_open = False
 
     def counters(self) -> dict[str, float]:
-        """How often it was opened again, how often because it stalled, and what the driver counts."""
+        """Counts of reopenings and stalls, and the counters of the driver."""
         own = {"camera_reopened": max(self._opened - 1, 0), "camera_stalls": self._stalls}
         return {**own, **self.camera.counters()}
 
@@ -88,7 +88,7 @@ class SteadyCamera:
         elif now_s > self._deadline_s:
             self._stalls += 1
             waited_s = self._first_frame_s if self.error else self._stall_s
-            raise HardwareError(f"the camera is there but gave no frame for {waited_s:g} s; it is opened anew")
+            raise HardwareError(f"the camera is connected but gave no frame for {waited_s:g} s; reopening it")
 
     def _watch_repeats(self, frame: Frame) -> None:
         if self._repeats == 0:
@@ -99,8 +99,8 @@ class SteadyCamera:
         if self._same >= self._repeats:
             self._stalls += 1
             raise HardwareError(
-                f"the camera repeats one picture ({self._same + 1} identical frames); it is opened anew. If it looks into the"
-                " dark, or at a recording, switch this check off by repeats: 0"
+                f"the camera repeats one image ({self._same + 1} identical frames); reopening it. If the scene is dark, or a"
+                " recording, disable this check with repeats: 0"
             )
 
     def _give_up(self, error: str) -> None:

@@ -1,1 +1,1 @@
-"""Devices of the simulated lab that speak the real protocols."""
+"""Emulated devices of the simulated lab that use the real protocols."""

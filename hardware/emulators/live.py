@@ -212,7 +212,7 @@ class LiveLab:
         try:
             assert callable(run)
             run()
-        except Exception as error:  # reported to whoever owns the lab, by check()
+        except Exception as error:  # raised again by check()
             self._failure = error
             self._stop.set()
             self._ready.set()
@@ -220,7 +220,7 @@ class LiveLab:
     def _wait_until_ready(self, timeout_s: float) -> None:
         if not self._ready.wait(timeout_s):
             raise HardwareError(
-                f"expected the simulated lab to draw a picture within {timeout_s:g} s, got none: is EGL hanging?"
+                f"expected the simulated lab to render an image within {timeout_s:g} s, got none; does EGL hang? Run advnerf doctor"
             )
         self.check()
 

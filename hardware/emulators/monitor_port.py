@@ -105,7 +105,7 @@ class MonitorPort:
 
 
 def receive_exactly(source: socket.socket, count: int) -> bytes | None:
-    """So many bytes, or None if the other end hung up first."""
+    """Receive exactly ``count`` bytes, or None if the other end closes the connection first."""
     data = bytearray()
     while len(data) < count:
         piece = source.recv(min(count - len(data), 1 << 20))

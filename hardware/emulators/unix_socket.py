@@ -1,4 +1,4 @@
-"""Unix sockets on which the twin offers what a device has a plug for."""
+"""Unix sockets of the twin's emulated devices."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def listen(path: Path, who: str, backlog: int = 8) -> socket.socket:
             except OSError:
                 path.unlink()
             else:
-                raise DeviceBusy(f"expected {path} to be free, {who} answers there: stop the other twin first")
+                raise DeviceBusy(f"expected {path} to be free, but {who} answers there; stop the other twin first")
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
         listener.bind(str(path))
@@ -36,6 +36,6 @@ def listen(path: Path, who: str, backlog: int = 8) -> socket.socket:
     except OSError as error:
         listener.close()
         raise HardwareError(
-            f"cannot serve {who} at {path}: {error.strerror or error}; use a shorter --run-dir?"
+            f"cannot serve {who} at {path}: {error.strerror or error}; try a shorter --run-dir"
         ) from error
     return listener

@@ -30,7 +30,7 @@ LOG_HEADER = "mono_ns,event,value,speed_mps,odometer_m\n"
 
 
 class VescEmulator:
-    """The pty, the firmware behind it, and the car behind that. `advance` is called by whoever keeps the physics' time.
+    """The pty, the firmware behind it, and the car behind that. The physics loop calls `advance`.
 
     Args:
         config: Settings of the controller.
@@ -111,13 +111,13 @@ class VescEmulator:
             if self._firmware.commanded or abs(speed) > 0.05:
                 raise HardwareError(
                     f"expected a car at rest, got {speed:.2f} m/s"
-                    f"{' and a motor command in force' if self._firmware.commanded else ''}: disarm first"
+                    f"{' and an active motor command' if self._firmware.commanded else ''}; disarm first"
                 )
             self.vehicle.reset(x_m, y_m, yaw_rad)
             self._note([WireEvent(time.monotonic_ns(), "PLACED")])
 
     def jam(self, how: str | None) -> None:
-        """Hold the car where it is, as `TwinVehicle.jam` does; None lets it go."""
+        """Jam the car, as `TwinVehicle.jam` does; None releases it."""
         with self._lock:
             self.vehicle.jam(how)
 
@@ -192,7 +192,7 @@ class VescEmulator:
                 self._reply(chunk)
 
     def _reply(self, data: bytes) -> None:
-        # When nobody reads, the bytes are gone, as on a USB endpoint without a host.
+        # Without a reader the bytes are lost, as on a USB endpoint without a host.
         with contextlib.suppress(BlockingIOError):
             os.write(self._master, data)
 

@@ -100,7 +100,7 @@ class WireEvent:
 
 
 class VescFirmware:
-    """Decodes commands, drives the plant, answers, and takes over when nobody commands any more.
+    """Decodes commands, drives the plant, answers, and brakes after its time-out when commands stop.
 
     Args:
         config: Settings of the controller.
@@ -192,7 +192,7 @@ class VescFirmware:
             if self.config.servo_output:
                 self._plant.command(servo=min(max(value, 0.0), 1.0))
             return
-        # Whether somebody makes the car move by command: nobody may lift it off the floor meanwhile.
+        # Whether a command makes the car move. Meanwhile it must not be lifted.
         self.commanded = False
         if self.fault:
             self._plant.command(current_a=0.0)
@@ -219,7 +219,7 @@ class VescFirmware:
 
 
 def _app_configuration(config: VescEmulatorConfig) -> AppConfiguration:
-    """As the firmware of that version keeps it: the head, then everything that nobody here looks at."""
+    """Application configuration as stored by this firmware version: the head, then unused bytes."""
     if config.firmware < (3, 7):
         empty = AppConfiguration(bytes(9) + _TAIL, "scaled")
     elif config.firmware < (5, 0):

@@ -62,7 +62,7 @@ class ViconFrames:
         self.config = config
         self.frame_number = 0
         self._rng = np.random.default_rng(config.seed)
-        # Of its own, so that a bad network does not change the noise of the measurements.
+        # A separate generator, so that network faults do not change the noise of the measurements.
         self._network = np.random.default_rng([config.seed, 1])
         self._held_back: list[bytes] = []
         self._occluded: dict[str, str] = {}
@@ -129,7 +129,7 @@ class ViconFrames:
 
 
 class ViconEmulator:
-    """Sends frames from a thread of its own.
+    """Sends frames from a separate thread.
 
     Args:
         config: Rate, address and noise.
@@ -180,5 +180,5 @@ class ViconEmulator:
             with self._lock:
                 datagrams = self._frames.next(poses)
             for datagram in datagrams:
-                with contextlib.suppress(ConnectionRefusedError):  # nobody listens yet; UDP does not care
+                with contextlib.suppress(ConnectionRefusedError):  # there is no receiver yet
                     self._socket.sendto(datagram, (self.config.host, self.config.port))

@@ -49,7 +49,7 @@ class ZedRegisters:
     def _take(self, data: bytearray) -> None:
         (address,) = struct.unpack_from(">I", data, 5)
         registers = {0xA2: self.processor, 0xA3: self.sensors[0], 0xA5: self.sensors[1]}[data[1]]
-        # A message with the wrong width, device or page reaches nobody.
+        # A message with the wrong width, device or page is ignored.
         sensor = data[1] != 0xA2
         if (data[2], data[3], data[9]) != ((0x6C, 2, 0x90) if sensor else (0, 4, 0)) or (data[10], data[12]) != (1, 1):
             return

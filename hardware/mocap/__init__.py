@@ -1,1 +1,1 @@
-"""Motion capture: VICON's Tracker stream, and other systems by the library motioncapture."""
+"""Motion capture: VICON's Tracker stream, and other systems through the library motioncapture."""

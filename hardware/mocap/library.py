@@ -1,4 +1,4 @@
-"""Motion capture through the library ``motioncapture``: Vicon's DataStream, OptiTrack, Qualisys and others, one backend for all.
+"""Motion capture through the library ``motioncapture``, one backend for Vicon's DataStream, OptiTrack, Qualisys and others.
 
 The library is optional (``pip install 'advnerf[mocap]'``; Linux on x86 only) and is imported when it is used. It leaves subjects
 out that it does not see; whatever else means "lost" (zeros, not a number, the same bits again and again) is decided as for
@@ -29,14 +29,14 @@ _WAITING_FRAMES = 50
 
 @dataclass(frozen=True)
 class LibraryConfig:
-    """How to listen.
+    """Configuration of the receiver.
 
     Attributes:
         system: One of `SYSTEMS`.
         hostname: Computer of the system.
         subjects: Names to report; others are ignored.
         latency_s: From exposure to receipt, as measured in calibration [s].
-        frozen_frames: So many frames with the same bits make a subject lost.
+        frozen_frames: Number of bit-identical frames after which a subject counts as lost.
     """
 
     system: str
@@ -51,7 +51,7 @@ class LibraryConfig:
 
 
 class LibraryReceiver:
-    """The same seam as `hardware.mocap.vicon.ViconReceiver`: `read`, `counts`, `fault`, `close`."""
+    """Receiver with the interface of `hardware.mocap.vicon.ViconReceiver`: `read`, `counts`, `fault`, `close`."""
 
     def __init__(self, config: LibraryConfig) -> None:
         self.config = config
@@ -67,21 +67,21 @@ class LibraryReceiver:
 
     @property
     def counts(self) -> ViconCounts:
-        """What happened so far."""
+        """Counts of frames and poses so far."""
         return self._tracker.counts
 
     @property
     def source(self) -> str:
-        """Where poses come from, for a person."""
+        """Description of the source of poses."""
         return f"{self.config.system} at {self.config.hostname}"
 
     def fault(self, mono_ns: int) -> str:
-        """Always empty: the library talks to one system, and numbers its frames itself."""
+        """Always empty, because the library receives from one system and numbers its frames."""
         del mono_ns
         return ""
 
     def read(self, timeout_s: float) -> list[SubjectPose]:
-        """Trusted poses of the frames that have come, oldest first; empty if none came within ``timeout_s``."""
+        """Return the reliable poses of the received frames, oldest first; empty on timeout."""
         poses: list[SubjectPose] = []
         with contextlib.suppress(queue.Empty):
             poses += self._frames.get(timeout=timeout_s)
@@ -134,7 +134,7 @@ def _connect(config: LibraryConfig) -> Any:
         library = importlib.import_module("motioncapture")
     except ImportError as error:
         raise DeviceNotFound(
-            f"expected the Python package motioncapture for {config.system}, it cannot be imported ({error}): pip install"
+            f"expected the Python package motioncapture for {config.system}, but it cannot be imported ({error}): pip install"
             " 'advnerf[mocap]' (Linux on x86), or use Tracker's UDP object stream, which needs no package"
         ) from error
     port = _TCP_PORTS.get(config.system)

@@ -1,4 +1,4 @@
-"""Motion capture: receives Vicon Tracker's object stream and hands out poses that can be trusted.
+"""Receives Vicon Tracker's object stream and returns reliable poses.
 
 The stream has no time stamp and no documented sign of occlusion. Poses are therefore stamped on receipt (by the kernel where it
 can) and taken as lost in every form seen in the field: object missing, exact zeros, not a number, or the same bits over and over,
@@ -30,7 +30,7 @@ _MOST_DATAGRAMS = 200  # per read: a flood must not keep the reader in there
 # Frames that arrive this much late are reordered datagrams; anything further back is a restarted Tracker.
 _REORDER_WINDOW_FRAMES = 50
 _RESTART_SILENCE_S = 0.1
-# Strangers may send to the port too: so many of them are told apart.
+# Number of senders that are distinguished, because other programs may also send to the port.
 _MOST_STREAMS = 16
 _NO_SENDER: Address = ("", 0)
 _NUMBERS = struct.Struct("<6d")
@@ -38,7 +38,7 @@ _NUMBERS = struct.Struct("<6d")
 
 @dataclass(frozen=True)
 class SubjectPose:
-    """One trusted measurement.
+    """One reliable measurement.
 
     Attributes:
         name: Subject.
@@ -57,14 +57,14 @@ class SubjectPose:
 
 @dataclass(frozen=True)
 class ViconConfig:
-    """How to listen.
+    """Configuration of the receiver.
 
     Attributes:
         subjects: Names to report; others are ignored.
         host: Local address to bind; empty for all.
         port: UDP port of the object stream; 0 lets the system choose (tests).
         latency_s: From exposure to receipt, as measured in calibration [s].
-        frozen_frames: So many frames with the same bits make a subject lost.
+        frozen_frames: Number of bit-identical frames after which a subject counts as lost.
         source: Accept datagrams of this address only; None accepts all.
     """
 
@@ -78,7 +78,7 @@ class ViconConfig:
 
 @dataclass
 class ViconCounts:
-    """What happened to datagrams and poses."""
+    """Counts of datagrams and poses."""
 
     datagrams: int = 0
     refused: int = 0
@@ -103,7 +103,7 @@ class _Stream:
 
 
 class SubjectTracker:
-    """Decides which measurements are new, real, and of one system. Pure: time comes as an argument."""
+    """Selects measurements that are new, real, and from one system. Pure: time comes as an argument."""
 
     def __init__(self, config: ViconConfig) -> None:
         self.config = config
@@ -115,7 +115,7 @@ class SubjectTracker:
     def update(
         self, datagram: bytes, stamp_real_ns: int, mono_ns: int, sender: Address = _NO_SENDER
     ) -> list[SubjectPose]:
-        """Poses of one datagram that are fresh, not lost, and of subjects that only this sender measures."""
+        """Return the poses of a datagram that are fresh, not lost, and of subjects that only this sender measures."""
         self.counts.datagrams += 1
         try:
             block = decode_block(datagram)
@@ -161,7 +161,7 @@ class SubjectTracker:
         return True
 
     def is_real(self, frame_number: int, name: str, numbers: tuple[float, ...]) -> bool:
-        """Whether a measurement of a subject is new and no sign of occlusion; ``numbers``: translation, then rotation."""
+        """Whether a measurement of a subject is new and not occluded. ``numbers`` is the translation, then the rotation."""
         subject = self._subjects.get(name)
         if subject is None or subject.frame_number == frame_number:
             return False  # not asked for, or the same frame twice
@@ -175,7 +175,7 @@ class SubjectTracker:
 
 
 class ViconReceiver:
-    """The socket. Its owner reads it from a thread of its own, so that poses do not wait for anybody's work."""
+    """Receives the stream on a socket. Its owner reads it in a separate thread, so that other work does not delay poses."""
 
     def __init__(self, config: ViconConfig) -> None:
         self.config = config
@@ -184,25 +184,25 @@ class ViconReceiver:
 
     @property
     def port(self) -> int:
-        """Port it listens on."""
+        """UDP port on which the receiver listens."""
         return int(self._socket.getsockname()[1])
 
     @property
     def counts(self) -> ViconCounts:
-        """What happened so far."""
+        """Counts of datagrams and poses so far."""
         return self._tracker.counts
 
     @property
     def source(self) -> str:
-        """Where poses come from, for a person."""
+        """Description of the source of poses."""
         return f"UDP port {self.port}"
 
     def fault(self, mono_ns: int) -> str:
-        """Which subjects are not to be trusted now, and why; empty if all are. Any thread."""
+        """Describe which subjects are currently unreliable, and why; empty if none. Any thread."""
         return self._tracker.senders.faults(mono_ns)
 
     def read(self, timeout_s: float) -> list[SubjectPose]:
-        """Trusted poses of all datagrams that have come, oldest first; empty if none came within ``timeout_s``."""
+        """Return the reliable poses of all received datagrams, oldest first; empty on timeout."""
         if not select.select([self._socket], [], [], timeout_s)[0]:
             return []
         poses: list[SubjectPose] = []

@@ -81,13 +81,13 @@ def decode_block(datagram: bytes) -> ObjectBlock:
     for index in range(count):
         if offset + _ITEM_HEAD.size + 48 > len(datagram):
             raise ProtocolError(
-                f"expected {count} objects in VICON frame {frame_number}, the datagram of {len(datagram)} bytes ends in number"
-                f" {index}: is the receive buffer or the network's packet size too small?"
+                f"expected {count} objects in VICON frame {frame_number}, but the datagram of {len(datagram)} bytes ends in number"
+                f" {index}; is the receive buffer or the network's packet size too small?"
             )
         _, size, raw_name, *numbers = _ITEM.unpack_from(datagram, offset)
         if size < _ITEM_DATA_BYTES:
             raise ProtocolError(
-                f"expected objects of {_ITEM_DATA_BYTES} bytes, got {size}: is this Tracker's object stream?"
+                f"expected objects of {_ITEM_DATA_BYTES} bytes, got {size}; is this Tracker's object stream?"
             )
         name = raw_name.split(b"\0", 1)[0].decode("utf-8", "replace")
         objects.append(ObjectPose(name, tuple(numbers[:3]), tuple(numbers[3:])))

@@ -1,4 +1,4 @@
-"""Notices when the measurements of a subject cannot come from one motion capture system that runs through.
+"""Detects measurements of a subject that cannot come from one continuously running motion-capture system.
 
 Tracker's object stream names no system. Two computers that send the same subject, or two streams behind one address, make the
 subject jump between two places. Nobody can tell which of them is right, so neither is trusted while both are heard.
@@ -12,7 +12,7 @@ Address = tuple[str, int]
 
 # Two senders within this time are two senders; a Tracker that is started again, with a new port, takes longer [s].
 HOLD_S = 1.0
-# Of so many frames the measurements are kept: as many as a datagram may be late.
+# Number of frames whose measurements are kept, which is the largest delay of a datagram.
 _REMEMBERED_FRAMES = 64
 _MOST_SENDERS = 8
 
@@ -25,7 +25,7 @@ class _Subject:
 
 
 class SenderWatch:
-    """Remembers who sent what. Pure: time comes as an argument.
+    """Remembers the senders of each subject. Pure: time comes as an argument.
 
     Args:
         subjects: Names to watch.
@@ -70,12 +70,12 @@ class SenderWatch:
                 )  # fmt: skip
 
     def fault(self, name: str, mono_ns: int) -> str:
-        """Why a subject is not to be trusted; empty if it is."""
+        """Return why a subject is unreliable; empty if it is reliable."""
         text, since_ns = self._faults.get(name, ("", 0))
         return text if text and mono_ns - since_ns < self._hold_ns else ""
 
     def faults(self, mono_ns: int) -> str:
-        """All of them in one line; empty if there is none. Any thread."""
+        """Return all faults in one line; empty if there are none. Any thread."""
         texts = [text for text, since_ns in self._faults.values() if mono_ns - since_ns < self._hold_ns]
         return "; ".join(texts)
 

@@ -1,1 +1,1 @@
-"""The VESC motor controller: bytes, settings, limits, odometry."""
+"""The VESC motor controller: serial protocol, settings, limits, odometry."""

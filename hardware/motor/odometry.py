@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-# A pause longer than this is not driven through: nobody knows what happened in it [s].
+# Longest pause that is integrated, because the motion during longer pauses is unknown [s].
 LONGEST_STEP_S = 0.2
 # Variances of x, y [m^2] and yaw [rad^2], as the RACECAR stack reports them.
 POSITION_VARIANCE, YAW_VARIANCE = 0.2, 0.4

@@ -1,4 +1,4 @@
-"""The VESC motor controller on its serial port: speed and steering in, bytes out, telemetry back.
+"""Driver of the VESC motor controller on a serial port: sends speed and steering, and receives telemetry.
 
 One thread, no heartbeat: the controller's own time-out must see it when this process stops deciding, so nothing here sends
 anything by itself. The servo has no acknowledgement and no watchdog; every drive command therefore sends the servo first, then
@@ -33,7 +33,7 @@ R = TypeVar("R", Values, FirmwareVersion, AppConfiguration, Stored)
 
 
 class Vesc:
-    """Driver of one VESC. Use it as a context manager: leaving the block brakes the car, then lets the motor go.
+    """Driver of one VESC. Use it as a context manager: leaving the block brakes the car, then releases the motor.
 
     Args:
         port: Serial device, e.g. ``/dev/vesc``, or the pty of the twin.
@@ -72,15 +72,15 @@ class Vesc:
         except (serial.SerialException, OSError, ValueError) as error:
             if "exclusively lock" in str(error) or "Resource temporarily unavailable" in str(error):
                 raise DeviceBusy(
-                    f"expected {self.port} to be free, but another process holds it: stop that first"
+                    f"expected {self.port} to be free, but another process holds it; stop that process first"
                 ) from error
             raise DeviceNotFound(
-                f"expected a VESC at {self.port}, cannot open it ({error}): is it plugged in and its udev rule installed?"
+                f"expected a VESC at {self.port}, cannot open it ({error}); is it plugged in, and is its udev rule installed?"
             ) from error
         self._decoder = FrameDecoder()
 
     def close(self, brake_s: float = 1.0) -> None:
-        """Brake until the car stands (at most ``brake_s``), let the motor go, close the port. Never raises on a dead link."""
+        """Brake until the car stands (at most ``brake_s``), release the motor, and close the port. Never raises on a lost link."""
         if self._serial is None:
             return
         try:
@@ -92,7 +92,7 @@ class Vesc:
             self.abandon()
 
     def abandon(self) -> None:
-        """Close the port without a word, after the link broke."""
+        """Close the port without sending a command, after the link was lost."""
         if self._serial is not None:
             self._serial.close()
             self._serial = None
@@ -113,7 +113,7 @@ class Vesc:
         return self._serial is not None
 
     def identify(self, timeout_s: float = 0.5) -> FirmwareVersion:
-        """Ask for the firmware version and wait for the answer."""
+        """Request the firmware version and wait for the answer."""
         self._write(encode_command(CommandId.FW_VERSION))
         return self._wait_for(FirmwareVersion, timeout_s)
 
@@ -135,14 +135,14 @@ class Vesc:
         before = self._read_app_configuration(0.5)
         if abs(erpm := self.read_values().erpm) >= STANDSTILL_ERPM:
             raise ProtocolError(
-                f"expected a motor at rest before its settings change, got {erpm:.0f} erpm: stop the car"
+                f"expected a motor at rest before its settings change, got {erpm:.0f} erpm; stop the car"
             )
         wanted = before.with_timeout(settings)
         self._write(wanted.encode_set())
         self._wait_for(Stored, _STORE_S)
         if (after := self._read_app_configuration(0.5)).data != wanted.data:
             raise ProtocolError(
-                f"expected the controller to keep a time-out of {settings}, it reads back {after.timeout}: set it in VESC Tool"
+                f"expected the controller to keep a time-out of {settings}, read back {after.timeout}; set it in VESC Tool"
             )
         return after.timeout
 
@@ -151,7 +151,7 @@ class Vesc:
         return self._wait_for(AppConfiguration, timeout_s)
 
     def steer(self, steering_rad: float) -> Sent:
-        """Send steering alone, for a car that stands; the motor stays as it is."""
+        """Send only the steering, for a standing car. The motor command does not change."""
         servo = self.gains.servo(self.limiter.steer(steering_rad))
         self._write(encode_command(CommandId.SET_SERVO_POS, servo))
         self._servo = as_sent(CommandId.SET_SERVO_POS, servo)
@@ -188,11 +188,11 @@ class Vesc:
     def receive(self) -> list[Reply]:
         """Replies that have arrived, without waiting."""
         if self._serial is None:
-            raise LinkLost(f"expected an open port, {self.port} is closed")
+            raise LinkLost(f"expected an open port, but {self.port} is closed; call open() first")
         try:
             data = self._serial.read(self._serial.in_waiting)
         except OSError as error:  # pyserial's errors are OSErrors; a hang-up also raises the bare one
-            raise LinkLost(f"lost the VESC at {self.port} ({error}): check the USB cable") from error
+            raise LinkLost(f"lost the VESC at {self.port} ({error}); check the USB cable") from error
         replies = [reply for payload in self._frames(data) if (reply := self._decode(payload)) is not None]
         if replies:
             self.last_reply_mono_ns = time.monotonic_ns()
@@ -241,7 +241,7 @@ class Vesc:
                     return reply
             time.sleep(0.001)
         raise LinkTimeout(
-            f"expected {kind.__name__} from {self.port} within {timeout_s} s, got nothing: is this a VESC, and is it powered?"
+            f"expected {kind.__name__} from {self.port} within {timeout_s} s, got nothing; is this a VESC, and is it powered?"
         )
 
     def _brake_to_standstill(self, brake_s: float) -> None:
@@ -258,15 +258,15 @@ class Vesc:
 
     def _write(self, data: bytes) -> None:
         if self._serial is None:
-            raise LinkLost(f"expected an open port, {self.port} is closed")
+            raise LinkLost(f"expected an open port, but {self.port} is closed; call open() first")
         try:
             self._serial.write(data)
         except serial.SerialTimeoutException as error:
             raise LinkTimeout(
-                f"expected {self.port} to take {len(data)} bytes, it is blocked: the VESC hangs"
+                f"expected {self.port} to take {len(data)} bytes, but it is blocked; the VESC hangs. Restart it"
             ) from error
         except OSError as error:
-            raise LinkLost(f"lost the VESC at {self.port} ({error}): check the USB cable") from error
+            raise LinkLost(f"lost the VESC at {self.port} ({error}); check the USB cable") from error
 
     def _sent(self, erpm: float | None = None, brake_current_a: float | None = None) -> Sent:
         return Sent(

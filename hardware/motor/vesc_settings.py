@@ -27,7 +27,7 @@ _LONGEST_MS, _LARGEST_A, _SMALLEST_A = 600_000, 200.0, 1e-3
 
 @dataclass(frozen=True)
 class TimeoutSettings:
-    """What the controller does when nobody commands it.
+    """Behaviour of the controller when commands stop.
 
     Attributes:
         timeout_ms: Time without a motor command after which it takes over [ms]; 0: never.

@@ -1,1 +1,1 @@
-"""What a person holds: gamepad and keyboard."""
+"""Input devices of the operator: gamepad and keyboard."""

@@ -3,7 +3,7 @@ older joystick devices (``/dev/input/js*``).
 
 Sources: ``linux/input.h`` (struct input_event, EVIOCGABS, EVIOCGKEY), ``linux/input-event-codes.h``, ``linux/joystick.h``
 (struct js_event). Buttons count as held whatever else is pressed; the MIT stack's exact match lets go when one more is.
-After SYN_DROPPED the kernel has thrown events away, a released button among them: the state is asked for anew.
+SYN_DROPPED means that the kernel has dropped events, possibly the release of a button, so the state is read again.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ class _State:
 
 
 class Gamepad:
-    """One gamepad; opened at the first read, and again after it was unplugged.
+    """A gamepad, opened at the first read and reopened after it was unplugged.
 
     Args:
         path: Device file.
@@ -98,7 +98,7 @@ class Gamepad:
         self._state = _State()
 
     def read(self, timeout_s: float = 0.05) -> Hands:
-        """Wait for events, at most so long [s], and say what is held."""
+        """Wait for events for at most a timeout [s], and return the input."""
         if self._fd is None:
             self._open()
         if self._fd is None:
@@ -113,7 +113,7 @@ class Gamepad:
         return self._hands()
 
     def close(self) -> None:
-        """Let the device go."""
+        """Close the device."""
         if self._fd is not None:
             with contextlib.suppress(OSError):
                 os.close(self._fd)

@@ -1,4 +1,4 @@
-"""What a hand on a gamepad or keyboard wants: the same for every device."""
+"""The operator's input, in a form common to all devices."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Hands:
-    """One look at a device.
+    """Input of a device at one time.
 
     Attributes:
         human: The button that lets the hand drive is held.

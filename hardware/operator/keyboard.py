@@ -1,4 +1,4 @@
-"""A terminal's keyboard as a hand. Terminals send no key-up: a key is held while it repeats.
+"""Keyboard input from a terminal. Terminals send no key-up events, so a key counts as held while it repeats.
 
 So a tap never moves the car: holding begins with the second repeat in a row and ends when the next one is late. The hand drives
 with w (straight), a and d (left, right) and s (backwards); o lets the software drive; space is the e-stop, r re-arms.
@@ -33,7 +33,9 @@ class Keyboard:
 
     def __init__(self, fd: int, mono_ns: Callable[[], int], late_s: float = 0.15) -> None:
         if not os.isatty(fd):
-            raise HardwareError("expected a terminal to read keys from, got none; run it in one, or use a gamepad")
+            raise HardwareError(
+                "expected a terminal to read keys from, got none; run the command in a terminal, or use a gamepad"
+            )
         self._fd, self._mono_ns, self._late_ns = fd, mono_ns, round(late_s * 1e9)
         self._before: list[Any] | None = termios.tcgetattr(fd)
         tty.setcbreak(fd, termios.TCSANOW)
@@ -42,7 +44,7 @@ class Keyboard:
         self._lost = False
 
     def read(self, timeout_s: float = 0.05) -> Hands:
-        """Wait for keys, at most so long [s], and say what is held."""
+        """Wait for keys for at most a timeout [s], and return the input."""
         with contextlib.suppress(InterruptedError):
             if select.select([self._fd], [], [], timeout_s)[0] and not self._lost:
                 self._take()
@@ -55,7 +57,7 @@ class Keyboard:
         )  # fmt: skip
 
     def close(self) -> None:
-        """Give the terminal back as it was."""
+        """Restore the terminal."""
         if self._before is not None:
             with contextlib.suppress(termios.error):
                 termios.tcsetattr(self._fd, termios.TCSANOW, self._before)

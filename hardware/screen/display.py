@@ -1,4 +1,4 @@
-"""Displays: a picture goes onto a screen pixel by pixel, and what the screen holds can be read back.
+"""Displays: show an image pixel by pixel on a screen, and read the screen back.
 
 No scaling by the system, no colour management, no window border: the picture has exactly the size of the screen, or it is refused.
 `PygameDisplay` is a real screen (SDL); `TwinDisplay` is the simulated lab's monitor, which its cameras see.
@@ -29,7 +29,7 @@ class Display(Protocol):
 
     Attributes:
         size_px: Width and height [px].
-        edid: What it says about itself; None if nobody knows.
+        edid: EDID of the screen; None if unknown.
     """
 
     size_px: tuple[int, int]
@@ -39,17 +39,17 @@ class Display(Protocol):
         """Show a picture ``[height, width, 3]`` and return when it is shown; the time it took [s]."""
 
     def read_back(self) -> Rgb:
-        """What the screen holds now ``[height, width, 3]``."""
+        """Read back the pixels of the screen ``[height, width, 3]``."""
 
     def keep_alive(self) -> None:
-        """Answer the window system; raise `LinkLost` when the screen is gone."""
+        """Handle events of the window system. Raises `LinkLost` if the screen is lost."""
 
     def close(self) -> None:
-        """Show nothing of ours any more."""
+        """Close the display."""
 
 
 def check_picture(rgb: Rgb, size_px: tuple[int, int]) -> None:
-    """Refuse a picture that is not of the screen's size: nobody scales it on the way."""
+    """Refuse an image of another size than the screen's, because images are not scaled."""
     width, height = size_px
     if rgb.shape != (height, width, 3) or rgb.dtype != np.uint8:
         raise ValueError(f"expected a picture of [{height}, {width}, 3] uint8, got {list(rgb.shape)} {rgb.dtype}")
@@ -117,10 +117,10 @@ class PygameDisplay:
     def keep_alive(self) -> None:
         """Take the window system's events: a window that never does is greyed out as hung."""
         if any(event.type == self._pygame.QUIT for event in self._pygame.event.get()):
-            raise LinkLost("the window of the attack was closed by somebody at the monitor")
+            raise LinkLost("the window of the attack was closed at the monitor; restart the launch")
         now = self._pygame.display.get_window_size()
         if now != self.size_px:
-            raise LinkLost(f"expected the window to keep {self.size_px}, it has {now}: was the resolution changed?")
+            raise LinkLost(f"expected the window to keep {self.size_px}, got {now}; was the resolution changed?")
 
     def close(self) -> None:
         """Close the window."""
@@ -149,7 +149,7 @@ class TwinDisplay:
             self.edid: Edid | None = parse_edid(self._receive(BLOCK_BYTES))
         except LinkTimeout:
             self.close()
-            raise DeviceBusy(f"the simulated monitor at {path} has another picture source: stop that first") from None
+            raise DeviceBusy(f"the simulated monitor at {path} is used by another program; stop that first") from None
         except BaseException:
             self.close()
             raise
@@ -162,7 +162,7 @@ class TwinDisplay:
         began, pixels = time.perf_counter(), np.ascontiguousarray(rgb).tobytes()
         self._send(b"S" + pixels)
         if (shown := self._receive(32)) != hashlib.sha256(pixels).digest():
-            raise HardwareError(f"the simulated monitor shows something else than was sent: hash {shown.hex()[:12]}")
+            raise HardwareError(f"expected the simulated monitor to show the sent image, got hash {shown.hex()[:12]}")
         return time.perf_counter() - began
 
     def read_back(self) -> Rgb:
@@ -185,7 +185,9 @@ class TwinDisplay:
         try:
             self._socket.sendall(data)
         except TimeoutError as error:
-            raise LinkTimeout(f"the simulated monitor took nothing for {_TIMEOUT_S:g} s: is the twin hung?") from error
+            raise LinkTimeout(
+                f"the simulated monitor accepted no data for {_TIMEOUT_S:g} s; does the twin hang?"
+            ) from error
         except OSError as error:
             raise LinkLost(f"the simulated monitor at {self._path} is gone: {error.strerror}") from error
 
@@ -196,11 +198,11 @@ class TwinDisplay:
                 piece = self._socket.recv(min(count - len(data), 1 << 20))
             except TimeoutError as error:
                 raise LinkTimeout(
-                    f"the simulated monitor was silent for {_TIMEOUT_S:g} s: is the twin hung?"
+                    f"the simulated monitor sent no answer for {_TIMEOUT_S:g} s; does the twin hang?"
                 ) from error
             except OSError as error:
                 raise LinkLost(f"the simulated monitor at {self._path} is gone: {error.strerror}") from error
             if not piece:
-                raise LinkLost(f"the simulated monitor at {self._path} hung up")
+                raise LinkLost(f"the simulated monitor at {self._path} closed the connection")
             data += piece
         return bytes(data)

@@ -1,4 +1,4 @@
-"""EDID: what a monitor says about itself, above all how many pixels it has on how many millimetres.
+"""Parses the EDID of a monitor, above all its size in pixels and in millimetres.
 
 128 bytes (VESA E-EDID 1.4, section 3); extension blocks are not needed here. The size in centimetres at bytes 21 and 22 is too
 coarse for an attack of known size; the preferred timing at byte 54 gives millimetres. Some monitors write an aspect ratio or
@@ -25,7 +25,7 @@ _FULL_TURN = 256
 
 @dataclass(frozen=True)
 class Edid:
-    """What matters of an EDID.
+    """The used fields of an EDID.
 
     Attributes:
         maker: Three letters of the manufacturer.
@@ -53,7 +53,7 @@ def parse_edid(data: bytes) -> Edid:
     block = data[:BLOCK_BYTES]
     if rest := sum(block) % _FULL_TURN:
         raise ProtocolError(
-            f"expected an EDID whose bytes add up to 0, they add up to {rest}: damaged on its way (adapter, cable?)"
+            f"expected an EDID whose bytes add up to 0, got {rest}; it was damaged in transit (check adapter and cable)"
         )
     timing = block[54:72]
     if timing[:2] == b"\0\0":

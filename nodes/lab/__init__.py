@@ -1,1 +1,1 @@
-"""What a person at the lab does: import scenes, train policies, calibrate, run trials."""
+"""Tools for the lab: import scenes, train policies, calibrate, run trials."""

@@ -1,4 +1,4 @@
-"""What ``advnerf camera`` does: finds cameras, tries a source, makes a calibration file of a ZED's factory file. No node."""
+"""Implementation of ``advnerf camera``: finds cameras, tests a source, and converts a ZED's factory calibration."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ from nodes.runtime.errors import ConfigError
 
 
 class CameraToolError(AdvnerfError):
-    """A camera does not do what it should."""
+    """A camera does not work as expected."""
 
 
 def describe_devices(port: VideoPort | None = None) -> Iterator[str]:
-    """Lines about every video device: what it is, what it offers, and its controls with their ranges and present values."""
+    """Yield lines about every video device: its identity, its modes, and its controls with ranges and current values."""
     port = port or KernelPort()
     for name in port.names():
         path = Path(name)
@@ -58,7 +58,7 @@ def describe_devices(port: VideoPort | None = None) -> Iterator[str]:
 
 
 def describe_oaks() -> Iterator[str]:
-    """One line for each OAK; nothing where depthai is not installed."""
+    """Yield one line for each OAK; none if depthai is not installed."""
     try:
         import depthai
     except ImportError:
@@ -69,15 +69,15 @@ def describe_oaks() -> Iterator[str]:
 
 @dataclass(frozen=True)
 class Trial:
-    """What came out of a source.
+    """Measurements of a camera source.
 
     Attributes:
-        frames: How many frames came.
+        frames: Number of received frames.
         rate_hz: Frames per second.
-        missed: Frames that were never delivered, by their numbers.
+        missed: Number of missing frames, by frame numbers.
         age_ms: Age of the frames on arrival: median and worst [ms].
         brightness: Mean of all pixels of the last frame, 0 to 255.
-        counters: What device and driver counted.
+        counters: Counters of device and driver.
         picture: The last frame.
     """
 
@@ -91,7 +91,7 @@ class Trial:
 
 
 def parse_source(text: str) -> Any:
-    """A source as it stands in a launch file, in YAML."""
+    """Parse a camera source in YAML, as in a launch file."""
     try:
         return TypeAdapter(CameraSource).validate_python(yaml.safe_load(text))
     except yaml.YAMLError as error:
@@ -105,7 +105,7 @@ def parse_source(text: str) -> Any:
 
 
 def try_source(source: Any, frames: int = 50, timeout_s: float = 10.0) -> Trial:
-    """Read so many frames of a source, as the camera node would, and measure them."""
+    """Read a number of frames of a source, as the camera node does, and measure them."""
     device = source.steady()
     got: list[Frame] = []
     ages_ms = []
@@ -118,7 +118,9 @@ def try_source(source: Any, frames: int = 50, timeout_s: float = 10.0) -> Trial:
     finally:
         device.close()
     if len(got) < 2:
-        raise CameraToolError(f"expected frames, got {len(got)} in {timeout_s:g} s: {device.error or 'it is silent'}")
+        raise CameraToolError(
+            f"expected frames, got {len(got)} in {timeout_s:g} s: {device.error or 'the source sends no frames'}"
+        )
     span_s = (got[-1].stamp_mono_ns - got[0].stamp_mono_ns) / 1e9
     steps = np.diff([frame.sequence for frame in got])
     return Trial(
@@ -135,7 +137,7 @@ def try_source(source: Any, frames: int = 50, timeout_s: float = 10.0) -> Trial:
 def calibration_from_zed(
     factory: Path, mode: str, size: tuple[int, int], mount: Path, latency_s: float = 0.0
 ) -> CameraCalibration:
-    """Calibration of the rectified left eye; the pose on the car comes from another camera file."""
+    """Make the calibration of the rectified left eye, with the pose on the car from another camera file."""
     pinhole = Rectifier(load_factory_calibration(factory, mode), size).pinhole
     return CameraCalibration(
         date=datetime.date.today(),

@@ -1,4 +1,4 @@
-"""Whether a policy's view was made for the camera that it is to see through."""
+"""Checks that a policy was trained for the calibrated camera."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _TOLERANCE_PX = 1e-6
 
 
 def require_camera(view: PolicyView, camera: CameraCalibration, policy: str, file: Path) -> None:
-    """Refuse a policy that was made for another camera than the one calibrated in ``file``.
+    """Refuse a policy that was trained for another camera than the one calibrated in ``file``.
 
     Raises:
         ConfigError: Image size or intrinsics differ.
@@ -23,6 +23,6 @@ def require_camera(view: PolicyView, camera: CameraCalibration, policy: str, fil
     same_size = (trained.width, trained.height) == (mounted.width, mounted.height)
     if not same_size or np.abs(trained.matrix - mounted.matrix).max() > _TOLERANCE_PX:
         raise ConfigError(
-            f"{file}: expected the camera that the policy {policy} was trained with, {trained}, got {mounted}; use its "
+            f"{file}: expected the camera that the policy {policy} was trained with, {trained}; got {mounted}. Use its "
             "calibration, or train the policy again"
         )

@@ -1,4 +1,4 @@
-"""Does a policy drive? Closed-loop drives round a path, in a learned scene or in the simulated lab, without an attack."""
+"""Tests whether a policy drives, with closed-loop drives around a path in a learned scene or the simulated lab, without an attack."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from advnerf_core.driving.dynamics import Ackermann
 from advnerf_core.scene.surrogate import Rendered
 from calibration.schema import RoomCalibration, VehicleCalibration
 
-# Together the drives go once round a path of this many parts; each begins on the path.
+# Number of drives that together cover the path once. Each starts on the path.
 _STARTS = 4
 _SPEED_MPS, _PERIOD_S = 0.8, 0.1
 
@@ -26,7 +26,7 @@ See = Callable[[Tensor], Tensor]
 
 
 class _Seen:
-    """A sensor without objects, as a drive needs it."""
+    """A sensor without objects, for a drive."""
 
     theta_shape = (0, 3)
 
@@ -46,14 +46,14 @@ class _Seen:
 def drive_round(
     policy: Any, see: See, room: RoomCalibration, vehicle: VehicleCalibration, goal: tuple[float, ...] = ()
 ) -> CleanDrive:
-    """Drive once round the room's path, in parts that begin on it.
+    """Drive once around the room's path, in parts that each start on it.
 
     Args:
         policy: A policy in eval mode.
-        see: What it sees.
+        see: Renders the policy's images.
         room: Path, fence and off-track limit.
         vehicle: The car.
-        goal: Goal vector of a policy that has goals.
+        goal: Goal vector of a goal-conditioned policy.
     """
     path, count = room.reference_path, _STARTS
     starts = torch.from_numpy(path.pose_at(np.arange(count) / count * path.length_m))

@@ -1,4 +1,4 @@
-"""Reference frames for the conformance test: camera images with what the expert would steer there."""
+"""Reference frames for the conformance test: camera images with the expert's steering."""
 
 from __future__ import annotations
 
@@ -41,14 +41,14 @@ Drives = Callable[[Any, tuple[float, ...]], CleanDrive]
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """Frames of which the right steering is known.
+    """Frames with known steering.
 
     Attributes:
         images: Policy images ``[N, H, W, 3]`` uint8 RGB.
         steering_rad: The expert's steering ``[N]`` [rad], left positive.
-        source: Where they come from, for people.
-        drives: Drives a policy without an attack where the frames are from; None if that cannot be driven, as a bag cannot.
-        asked: Whether the user named this place: a policy that does not drive there fails.
+        source: Origin of the frames, as text.
+        drives: Drives a policy without an attack in the place of the frames; None if it cannot be driven, as for a bag.
+        asked: Whether the user named this place. If so, a policy that does not drive there fails.
     """
 
     images: NDArray[np.uint8]
@@ -59,7 +59,7 @@ class Reference:
 
 
 def from_twin(view: PolicyView, count: int = 48, seed: int = 0) -> Reference:
-    """Frames of the simulated lab around its path; needs no recording."""
+    """Make reference frames in the simulated lab around its path. No recording is needed."""
     os.environ.setdefault("MUJOCO_GL", "egl")
     from hardware.worlds.lab.config import LabConfig
     from hardware.worlds.lab.lab import Lab
@@ -85,7 +85,7 @@ def from_twin(view: PolicyView, count: int = 48, seed: int = 0) -> Reference:
 
 
 def from_bag(bag: Path, room: Path, view: PolicyView, count: int = 96) -> Reference:
-    """Frames of a driven bag, spread over it, labelled by the expert at the recorded poses."""
+    """Take reference frames spread over a bag, labelled by the expert at the recorded poses."""
     poses = PoseBuffer(keep_s=1e6)
     for message in read_messages(bag, [_CAR]):
         pose = decode(topic_row(_CAR).type, message.cdr)
@@ -106,16 +106,16 @@ def from_bag(bag: Path, room: Path, view: PolicyView, count: int = 96) -> Refere
         steering.append(float(expert.steer(T[0, 3], T[1, 3], np.arctan2(T[1, 0], T[0, 0]))))
     if len(images) < _FEWEST or np.ptp(steering) == 0.0:
         raise BagError(
-            f"expected at least {_FEWEST} frames with poses and varying steering in {bag}, got {len(images)}; drive further"
+            f"expected at least {_FEWEST} frames with poses and varying steering in {bag}, got {len(images)}; record a longer drive"
         )
     unchecked = ", unchecked" if read_info(bag).unchecked else ""
     return Reference(np.stack(images), np.array(steering), f"{len(images)} frames of {bag}{unchecked}", asked=True)
 
 
 def from_run(folder: Path, view: PolicyView) -> Reference:
-    """The driving camera's own frames of an experiment's capture, and drives in the scene that it learned.
+    """Take the camera frames of an experiment's capture, and drives in its learned scene.
 
-    The frames are whole camera images, so that the policy's own view crops and resizes them.
+    The frames are full camera images, which the policy's view crops and resizes.
     """
     capture = folder / "capture"
     calibration = capture / "calibration"
@@ -142,14 +142,14 @@ def from_run(folder: Path, view: PolicyView) -> Reference:
 
 
 def from_scene(scene: Path, calibration: Path, view: PolicyView, count: int = 48, seed: int = 0) -> Reference:
-    """Frames of a learned scene about the path of a room, and drives in it.
+    """Render reference frames of a learned scene around the path of a room, and drives in it.
 
     Args:
         scene: Scene file.
         calibration: Folder with ``camera.yaml``, ``room.yaml`` and ``vehicle.yaml``.
-        view: The policy's.
-        count: Frames.
-        seed: Of the offsets from the path.
+        view: The policy's view.
+        count: Number of frames.
+        seed: Random seed of the offsets from the path.
     """
     _camera(view, calibration)
     expert = Expert(load_calibration(RoomCalibration, calibration / "room.yaml").reference_path)
@@ -165,7 +165,7 @@ def _drives_in_scene(scene: Path, calibration: Path, view: PolicyView) -> Drives
 
 
 def _sight_of_scene(scene: Path, calibration: Path, view: PolicyView) -> See:
-    """What the policy sees of a learned scene, rendered with the intrinsics of its own view, crop included."""
+    """Renderer of the policy's images of a learned scene, with the intrinsics of its view, including the crop."""
     from advnerf_core.scene.render_field import FieldRenderer
     from advnerf_core.scene.surrogate import Surrogate
 
@@ -188,7 +188,7 @@ def _camera(view: PolicyView, calibration: Path) -> CameraCalibration:
 
 
 def _about_the_path(expert: Expert, count: int, seed: int) -> NDArray[np.float64]:
-    """Car states ``[count, 3]`` round the path, a little beside it and turned from it."""
+    """Car states ``[count, 3]`` around the path, with small offsets and rotations from it."""
     offsets = np.random.default_rng(seed).uniform(-1.0, 1.0, (count, 2)) * (_LATERAL_M, _HEADING_RAD)
     poses: NDArray[np.float64] = expert.path.pose_at(np.arange(count) / count * expert.path.length_m)
     poses[:, 0] -= np.sin(poses[:, 2]) * offsets[:, 0]
@@ -200,10 +200,10 @@ def _about_the_path(expert: Expert, count: int, seed: int) -> NDArray[np.float64
 def judged_by_drives(
     policy: AdaptedPolicy, reference: Reference, findings: list[Finding], goal: tuple[float, ...] | None = None
 ) -> list[Finding]:
-    """The findings of a policy's adapter with that of its drives; the adapter must be right before it is driven.
+    """Add the finding of test drives to those of a policy's adapter. The adapter must be right before it is driven.
 
-    A policy that does not drive where the user asked fails. Of a place that cannot be driven, such as a bag, the comparison
-    with the expert decides.
+    A policy that does not drive in the place that the user named fails. For a place that cannot be driven, such as a bag, the
+    comparison with the expert decides.
     """
     if any(finding.verdict == FAILURE for finding in findings):
         return findings
@@ -220,8 +220,8 @@ def _seen(view: PolicyView, rgb: NDArray[np.uint8], source: str) -> NDArray[np.u
     camera = view.camera
     if rgb.shape[:2] != (camera.height, camera.width):
         raise ConfigError(
-            f"expected images of {camera.width} x {camera.height}, for which the policy's view was made, got {rgb.shape[1]} x "
-            f"{rgb.shape[0]} from {source}; give frames of the policy's own camera with --bag"
+            f"expected images of {camera.width} x {camera.height}, as in the policy's view, got {rgb.shape[1]} x "
+            f"{rgb.shape[0]} from {source}; give frames of the policy's camera with --bag"
         )
     return view.image(rgb)
 

@@ -1,4 +1,4 @@
-"""What ``advnerf scene train|eval|render`` do: a data set in, a scene file, its figures and its pictures out."""
+"""Implementation of ``advnerf scene train|eval|render``: trains a scene on a data set, evaluates and renders it."""
 
 from __future__ import annotations
 
@@ -37,25 +37,25 @@ _VIDEO_FPS = 10
 
 @dataclass(frozen=True)
 class TrainingRequest:
-    """How a scene is to be trained.
+    """Settings of a scene training.
 
     Attributes:
         transforms: The data set: a ``transforms.json`` or its folder.
-        output: Folder of the results; a stopped training goes on there.
+        output: Folder of the results. A stopped training resumes there.
         steps: Optimisation steps; None with ``minutes``.
-        minutes: Time limit instead.
-        box_m: Low and high corner of what is learned, in the data set's unit; None is Instant-NGP's box of the file.
-        size: ``(width, height)`` to bring the images to; None keeps theirs.
-        open_scene: Rays may leave the box and colours may depend on the direction, as out of doors.
-        every: Every so-manieth image is held out, unless the data set splits itself.
-        near: Nothing nearer to a camera than this is learned, in the data set's unit.
-        seed: Of everything random.
-        checkpoint_every_s: A kill loses at most so much training [s].
-        unbounded: Whether the scene goes on outside the box, contracted; None: if the file's ``aabb_scale`` is more than 1.
-        preset: Sizes of the field: ``room``, ours, or ``instant-ngp``.
-        interval_px: Sample intervals in pixels of the training images; None: those of the rule, see `pixel_intervals`.
-        interval: Shortest and longest sample interval instead of the rule's, in the data set's unit.
-        interval_growth: Interval per distance instead of the rule's.
+        minutes: Time limit instead of steps [min].
+        box_m: Low and high corner of the scene box, in the data set's unit; None uses Instant-NGP's box of the file.
+        size: ``(width, height)`` to which images are resized; None keeps their size.
+        open_scene: Whether rays may leave the box and colours may depend on the direction, as outdoors.
+        every: Every N-th image is held out, unless the data set has a split.
+        near: Distance from a camera below which nothing is learned, in the data set's unit.
+        seed: Random seed.
+        checkpoint_every_s: Time between checkpoints, the most training that a kill loses [s].
+        unbounded: Whether the scene extends, contracted, outside the box; None: if the file's ``aabb_scale`` is more than 1.
+        preset: Sizes of the field: ``room`` or ``instant-ngp``.
+        interval_px: Sample intervals in pixels of the training images; None uses the default rule, see `pixel_intervals`.
+        interval: Shortest and longest sample interval, which override the rule, in the data set's unit.
+        interval_growth: Interval per distance, which overrides the rule.
     """
 
     transforms: Path
@@ -76,9 +76,9 @@ class TrainingRequest:
     interval_growth: float | None = None
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be trained."""
+        """Check the settings."""
         if (self.steps is None) == (self.minutes is None):
-            raise ConfigError("expected either a number of steps or a time limit")
+            raise ConfigError("expected either --steps or --minutes; give exactly one of them")
         if self.box_m is not None and not all(low < high for low, high in zip(*self.box_m, strict=True)):
             raise ConfigError(f"expected a box with low < high, got {self.box_m}")
         if self.preset not in PRESETS:
@@ -92,10 +92,10 @@ class TrainingRequest:
 
 
 def train(request: TrainingRequest, report: Report) -> dict[str, Any]:
-    """Train, write the scene file and the figures on held-out images; returns the figures."""
+    """Train, and write the scene file and the metrics on held-out images. Returns the metrics."""
     training, held_out = load_transforms(request.transforms).training_and_held_out(request.every)
     for path in training.missing:
-        print(f"missing, left out: {path}")
+        print(f"skipped, file not found: {path}")
     images = training.load(request.size)
     field = scene_field(request, training, transparent=_transparent(images))
     march = sample_intervals(request, field, images)
@@ -116,10 +116,10 @@ def train(request: TrainingRequest, report: Report) -> dict[str, Any]:
 
 
 def evaluate(renderer: FieldRenderer, listed: PosedImages, size: tuple[int, int] | None) -> dict[str, Any]:
-    """PSNR [dB] and SSIM on images that nothing was learned from, each and on average; masked pixels do not count for PSNR."""
+    """PSNR [dB] and SSIM on held-out images, per image and on average. Masked pixels are excluded from the PSNR."""
     views = listed.load(size)
     rows = []
-    # Pictures with alpha are compared before white, which the renderer takes, too.
+    # Images with alpha are compared over white, which the renderer uses too.
     for index, real in enumerate(views.on_background(_WHITE)):
         rendered = renderer.render(views.T_world_from_camera[index][None], views.pinholes[index])[0][0].numpy()
         usable = np.ones(real.shape[:2], dtype=bool) if views.valid is None else views.valid[index]
@@ -142,9 +142,9 @@ def render(
     video: Path | None,
     report: Report,
 ) -> int:
-    """Write what the field shows from every camera of a data set: colour, depth in millimetres (16 bit), and a video.
+    """Render a field from every camera of a data set: colour, depth in millimetres (16 bit), and a video.
 
-    Pictures of a scene that was learned with alpha have alpha; the video shows it before white.
+    Images of a scene that was learned with alpha have alpha. The video shows it over white.
 
     Returns:
         The number of views.
@@ -169,13 +169,13 @@ def render(
 
 
 def write_video(path: Path, frames: Sequence[NDArray[np.uint8]]) -> None:
-    """Write pictures ``[H, W, 3]`` as an H.264 video; the file appears when it is whole."""
+    """Write images ``[H, W, 3]`` as an H.264 video. The file appears when it is complete."""
     partial = path.with_name(path.name + ".part")
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
         with av.open(str(partial), "w", format="mp4") as container:
             stream = container.add_stream("libx264", rate=_VIDEO_FPS)
-            # The format wants even sides.
+            # H.264 needs even sizes.
             stream.height, stream.width = (side - side % 2 for side in frames[0].shape[:2])
             stream.pix_fmt = "yuv420p"
             for picture in frames:
@@ -188,15 +188,15 @@ def write_video(path: Path, frames: Sequence[NDArray[np.uint8]]) -> None:
 
 
 def scene_field(request: TrainingRequest, listed: PosedImages, transparent: bool = False) -> SceneFieldConfig:
-    """Sizes of the field that a request asks for.
+    """Make the field configuration of a request.
 
     Args:
-        request: What was asked for.
+        request: The request.
         listed: The training images.
-        transparent: Whether they have alpha.
+        transparent: Whether the images have alpha.
 
     Raises:
-        ConfigError: No box was given, and the file has none that holds its cameras.
+        ConfigError: No box was given, and the file has none that contains its cameras.
     """
     aabb_scale = listed.aabb_scale or 1.0
     unbounded = aabb_scale > 1.0 if request.unbounded is None else request.unbounded
@@ -210,21 +210,21 @@ def scene_field(request: TrainingRequest, listed: PosedImages, transparent: bool
     if request.box_m is None and listed.aabb_scale is None and not all(inside):
         raise ConfigError(
             f"expected a box: {request.transforms} has no aabb_scale, and {len(inside) - sum(inside)} of {len(inside)} cameras "
-            f"stand outside its unit cube; give --box-low and --box-high (cameras are at {_span(listed)}) or --unbounded"
+            f"are outside its unit cube; give --box-low and --box-high (cameras are at {_span(listed)}) or --unbounded"
         )
     common = {"contraction": unbounded, "learned_background": not transparent}
     if request.preset == "instant-ngp":
         # Müller et al. 2022, table 1 and section 5.4, and the sizes of its configs/nerf/base.json.
         grid = HashGridConfig(levels=16, features=2, log2_entries=19, coarsest=16, finest=round(2048 * aabb_scale))
         return SceneFieldConfig(_corner(low), _corner(high), grid, direction_bands=4, **common)
-    # The contracted cube is two inner regions wide: twice the cells keep its detail.
+    # The contracted cube is twice as wide as its inner region, so twice the cells keep the detail.
     grid = HashGridConfig(levels=8, features=4, finest=4096 if unbounded else 2048)
     bands = 3 if request.open_scene or unbounded else 1
     return SceneFieldConfig(_corner(low), _corner(high), grid, direction_bands=bands, **common)
 
 
 def sample_intervals(request: TrainingRequest, field: SceneFieldConfig, images: ImageSet) -> MarchConfig:
-    """How samples are placed, in training and rendering: by the rule, where the request does not say otherwise."""
+    """Sample placement for training and rendering: by the default rule, unless the request overrides it."""
     march = pixel_intervals(images.pinholes, images.T_world_from_camera, field, request.near, request.interval_px)
     if request.interval is not None:
         march = replace(march, smallest_step_m=request.interval[0], largest_step_m=request.interval[1])
@@ -241,15 +241,19 @@ def _train_config(request: TrainingRequest, field: SceneFieldConfig, march: Marc
 
 
 def _described(request: TrainingRequest, field: SceneFieldConfig, march: MarchConfig) -> str:
-    """What was decided for the user, and how to decide otherwise."""
+    """Describe the chosen settings and how to override them."""
     inside = "inner region" if field.contraction else "box"
     low, high = (np.round(corner, 2).tolist() for corner in (field.box_low_m, field.box_high_m))
     text = f"{inside} {low} .. {high}"
     if field.contraction:
-        why = "" if request.unbounded is not None else " since the file's aabb_scale is more than 1 (--bounded: not so)"
+        why = (
+            ""
+            if request.unbounded is not None
+            else " because the file's aabb_scale is more than 1 (--bounded overrides)"
+        )
         text += f", unbounded{why}"
     if not field.learned_background:
-        text += "; images have alpha: learned before random colours, transparent where they are"
+        text += "; images have alpha: trained over random colours, transparent areas stay transparent"
     intervals = (
         f"{march.smallest_step_m:.3g} .. {march.largest_step_m:.3g}, {march.step_growth:.3g} of the distance between"
     )
@@ -271,7 +275,7 @@ def _transparent(images: ImageSet) -> bool:
 
 
 def _with_alpha(over_white: NDArray[np.float32], alpha: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Pixels ``[H, W, 4]``, blue first, not premultiplied, of colours over white."""
+    """Convert colours over white to BGRA pixels ``[H, W, 4]``, not premultiplied."""
     opacity = alpha[..., None]
     own = np.clip((over_white - (1.0 - opacity)) / np.maximum(opacity, 1e-3), 0.0, 1.0)
     return np.rint(255 * np.concatenate([own[..., ::-1], opacity], axis=-1)).astype(np.uint8)

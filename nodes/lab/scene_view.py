@@ -1,7 +1,7 @@
-"""A scene in the browser: fly through the field, with cameras, objects and the reference path in place (viser).
+"""Shows a scene in the browser with viser: the field with cameras, objects and the reference path.
 
-Each browser has a thread of its own that renders what it looks at: small while it moves, in full when it rests. The depth goes
-along, so that what viser draws itself (cameras, path) disappears behind walls.
+Each browser has its own thread that renders its view: at low resolution while it moves, at full resolution when it rests. The depth is
+sent too, so that walls hide what viser draws (cameras, path).
 """
 
 from __future__ import annotations
@@ -41,10 +41,10 @@ class SceneView:
     Args:
         scene: Scene file.
         cameras: ``transforms.json`` whose cameras and images are shown, or None.
-        objects: Object files, put at the world's origin in their own colours.
+        objects: Object files, placed at the world's origin in their own colours.
         room: Room calibration whose path is drawn, or None.
         host: Address to listen on.
-        port: Wanted port; the next free one is taken.
+        port: Preferred port; the next free one is used.
     """
 
     def __init__(
@@ -73,11 +73,11 @@ class SceneView:
 
     @property
     def port(self) -> int:
-        """Where it listens."""
+        """Port on which the server listens."""
         return int(self._server.get_port())
 
     def serve(self) -> None:
-        """Until Ctrl-C."""
+        """Serve until Ctrl-C."""
         try:
             while True:
                 time.sleep(1.0)
@@ -95,7 +95,7 @@ class SceneView:
     def picture(
         self, T_world_from_camera: Array, pinhole: Pinhole, mode: str = "colour"
     ) -> tuple[NDArray[np.uint8], Array]:
-        """What the scene with its objects shows: pixels ``[H, W, 3]`` and planar depth ``[H, W]`` [m]."""
+        """Render the scene with its objects: pixels ``[H, W, 3]`` and planar depth ``[H, W]`` [m]."""
         with self._lock, torch.no_grad():
             rgb, depth_m, _ = self._renderer.render(T_world_from_camera[None], pinhole)
             image, depth = rgb[0].numpy(), np.nan_to_num(depth_m[0].numpy().astype(np.float64), posinf=_FAR_M)
@@ -112,7 +112,7 @@ class SceneView:
 
     @property
     def mode(self) -> str:
-        """What is shown: ``colour`` or ``depth``."""
+        """Display mode: ``colour`` or ``depth``."""
         return str(self._mode.value)
 
     def _connect(self, client: Any) -> None:
@@ -193,7 +193,7 @@ class _Viewer:
 
 
 def _stand_at(T: Array, event: Any) -> None:
-    """Put the camera of the browser that was clicked in where a photograph was taken."""
+    """Move the browser's camera to the pose of the clicked photograph."""
     client = event.client
     client.camera.wxyz, client.camera.position = _quaternion(T), T[:3, 3]
 
@@ -211,7 +211,7 @@ def _pose(wxyz: Array, position: Array) -> Array:
 
 
 def _coloured(depth_m: Array) -> NDArray[np.uint8]:
-    """Depth as colours: near is bright; the farthest twentieth sets the scale."""
+    """Convert depth to colours. Near is bright; the 95th percentile sets the scale."""
     seen = depth_m[depth_m < _FAR_M]
     far = float(np.quantile(seen, 0.95)) if seen.size else 1.0
     grey = np.rint(255 * (1.0 - np.clip(depth_m / max(far, 1e-6), 0.0, 1.0))).astype(np.uint8)

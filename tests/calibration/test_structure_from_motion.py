@@ -99,7 +99,7 @@ def test_photographs_without_overlap_are_refused_with_what_to_do(tmp_path):
     for k in range(4):
         blocks = rng.integers(0, 255, (30, 40, 3), np.uint8)
         cv2.imwrite(str(tmp_path / f"{k}.png"), cv2.resize(blocks, (400, 300), interpolation=cv2.INTER_NEAREST))
-    with pytest.raises(ReconstructionError, match=r"could not put any two together; they need overlap"):
+    with pytest.raises(ReconstructionError, match=r"but no two could be matched; take photographs with overlap"):
         reconstruct(tmp_path, [Source("phone", tuple(f"{k}.png" for k in range(4)))], tmp_path / "work")
 
 
@@ -203,7 +203,7 @@ def test_a_process_of_colmap_that_is_killed_is_one_error(tmp_path):
         for child in psutil.Process().children():
             child.kill()
 
-    with pytest.raises(ReconstructionError, match=r"was ended by SIGKILL .* run the command again to go on"):
+    with pytest.raises(ReconstructionError, match=r"was ended by SIGKILL .* run the command again to resume"):
         reconstruct(tmp_path, [Source("photos", tuple(truth))], tmp_path / "work", report=kill)
 
 

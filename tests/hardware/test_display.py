@@ -35,7 +35,7 @@ def test_a_real_sdl_window_holds_exactly_the_pixels_that_were_shown(offscreen):
         with pytest.raises(ValueError, match=r"\[1080, 1920, 3\]"):
             display.show(picture[:-1])
         display._pygame.event.post(display._pygame.event.Event(display._pygame.QUIT))
-        with pytest.raises(LinkLost, match="closed by somebody"):
+        with pytest.raises(LinkLost, match="was closed at the monitor"):
             display.keep_alive()
     finally:
         display.close()
@@ -90,7 +90,7 @@ def test_a_second_source_is_refused_and_a_lost_twin_noticed(tmp_path, monkeypatc
     monkeypatch.setattr("hardware.screen.display._TIMEOUT_S", 0.1)
     port = MonitorPort(tmp_path / "monitor", SIZE_M, (64, 36))
     display = TwinDisplay(tmp_path / "monitor")
-    with pytest.raises(DeviceBusy, match="another picture source"):
+    with pytest.raises(DeviceBusy, match="is used by another program"):
         TwinDisplay(tmp_path / "monitor")
     with pytest.raises(DeviceBusy, match="stop the other twin"):
         MonitorPort(tmp_path / "monitor", SIZE_M)

@@ -124,7 +124,7 @@ def test_every_kind_of_source_makes_its_driver(tmp_path):
         ({"kind": "zed", "device": PATH, "factory": "x", "fps": 10}, "a rate of 15, 30, 60, 100 Hz, got 10"),
         ({"kind": "zed", "device": PATH, "factory": "x", "size": [1344, 376]}, "at most 672 x 376 in mode VGA"),
         ({"kind": "zed", "device": PATH, "factory": "x", "gain_raw": 5}, "exposure_percent with gain_raw"),
-        ({"kind": "oak", "iso": 400}, "exposure_us with iso"),
+        ({"kind": "oak", "iso": 400}, "exposure_us and iso together"),
         ({"kind": "webcam"}, "v4l2.*zed.*oak.*socket.*file.*folder"),
         ({"kind": "file", "folder": "x"}, "path"),
     ],
@@ -275,7 +275,9 @@ def test_zed_with_its_own_calibration_publishes_the_rectified_pinhole(tmp_path):
 
 def test_calibration_of_another_camera_is_refused(tmp_path):
     made = node(config(), device=zed(tmp_path, 280.0))
-    with pytest.raises(RuntimeFault, match=r"fx 17\d.\d.*own\s+calibration fx 14\d.\d.*another camera or\s+mode"):
+    with pytest.raises(
+        RuntimeFault, match=r"fx 17\d.\d.*factory\s+calibration has fx 14\d.\d.*another camera or\s+mode"
+    ):
         made.receive(frame(), CLOCK.now())
 
 

@@ -149,7 +149,7 @@ def test_eval_and_render(command, trained, pictures, tmp_path):
     ("arguments", "message"),
     [
         (["--steps", "5"], "has no aabb_scale"),
-        (["--steps", "5", "--minutes", "1", *BOX], "either a number of steps or a time limit"),
+        (["--steps", "5", "--minutes", "1", *BOX], "either --steps or --minutes"),
         (["--steps", "5", *BOX[:4]], "both --box-low and --box-high"),
         (["--steps", "5", *BOX[:5], "-5", "-5", "-5"], "low < high"),
     ],

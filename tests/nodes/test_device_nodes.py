@@ -98,7 +98,7 @@ def test_camera_counts_gaps_drops_what_is_old_and_survives_a_restart_of_its_devi
 def test_camera_refuses_frames_it_is_not_calibrated_for(camera, tmp_path):
     with FrameServer(tmp_path / "frames") as server:
         connected(server).publish(frame(shape=(188, 366, 3)))
-        with pytest.raises(RuntimeFault, match=r"336 x 188.*got 366 x 188: calibrate"):
+        with pytest.raises(RuntimeFault, match=r"336 x 188.*got 366 x 188; calibrate"):
             take(camera)
 
 

@@ -189,7 +189,7 @@ def test_a_foreign_bag_is_played_in_our_types_and_under_our_names(tmp_path, writ
         (["--topics", "/chatter"], "unknown topic '/chatter'; known are /camera/image_raw"),
         (["--remap", "/vicon/car:=/odom"], "/vicon/car is geometry_msgs/msg/PoseStamped, expected nav_msgs/msg/Odometry"),
         (["--topics", "/vicon/car", "--offset", 0.45, "--duration", 0.01], "has no message of /vicon/car after 0.45 s within 0.01 s"),
-        (["--wait-for", "/arm"], "cannot wait for subscribers of /arm, it is not played"),
+        (["--wait-for", "/arm"], "cannot wait for subscribers of /arm, which is not played"),
     ],
 )  # fmt: skip
 def test_a_wrong_wish_of_the_player_is_one_line_and_exit_code_2(tmp_path, arguments, said):

@@ -185,7 +185,7 @@ def test_an_attack_that_does_not_fit_is_refused_at_the_start(screen, changes, me
 
 
 def test_a_monitor_that_is_not_the_measured_one_is_refused():
-    with pytest.raises(CalibrationError, match=r"0.527 x 0.297 m, the corners .* say 0.598 x 0.336"):
+    with pytest.raises(CalibrationError, match=r"0.527 x 0.297 m, but the corners .* give 0.598 x 0.336"):
         make_panel((1920, 1080), TARGET, (527.0, 297.0))
     assert make_panel((1920, 1080), TARGET, (598.0, 336.0)).size_m == (0.598, 0.336)
     require = partial(require_fits, panel=PANEL, target=TARGET)

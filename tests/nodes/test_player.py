@@ -130,7 +130,7 @@ def test_topics_that_nobody_here_knows_are_left_out_and_named(tmp_path):
 def test_wrong_choices_are_errors(bag, tmp_path):
     with pytest.raises(BagError, match="has no topic /camera/image_raw; it has /arm, /vicon/board, /vicon/car"):
         PlayerNode(PlayerConfig(bag=bag, topics=["/camera/image_raw"]), lambda topic: 0)
-    with pytest.raises(BagError, match="it is not played; played are /vicon/car"):
+    with pytest.raises(BagError, match="which is not played; played are /vicon/car"):
         PlayerNode(PlayerConfig(bag=bag, topics=["/vicon/car"], wait_for=["/arm"]), lambda topic: 0)
     with pytest.raises(BagError, match="expected a bag folder"):
         PlayerNode(PlayerConfig(bag=tmp_path / "nothing"), lambda topic: 0)

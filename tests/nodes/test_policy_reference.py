@@ -184,5 +184,5 @@ def test_the_twin_gives_left_and_right(monkeypatch):
     assert reference.images.shape == (8, 66, 200, 3)
     assert reference.images.std() > 10
     assert reference.steering_rad.min() < 0.0 < reference.steering_rad.max()
-    with pytest.raises(ConfigError, match="give frames of the policy's own camera"):
+    with pytest.raises(ConfigError, match="give frames of the policy's camera"):
         from_twin(PolicyView(Pinhole(640, 480, 400.0, 400.0, 320.0, 240.0)), count=1)

@@ -97,7 +97,7 @@ def test_nothing_is_placed_or_armed_before_every_node_is_ready():
 def test_a_real_car_is_never_armed():
     stage = Stage(peer="60_MK5 5.2")
     stage.nodes_are_ready()
-    with pytest.raises(TrialError, match=r"armed by a person"):
+    with pytest.raises(TrialError, match=r"only the operator may arm a real car"):
         stage.run_until(Phase.ARMING)
     assert "/arm" not in stage.sent
 

@@ -94,7 +94,7 @@ def test_attack_files_of_a_condition_take_turns_and_the_plan_is_kept(tmp_path):
 @pytest.mark.parametrize("changed", [{"seed": 1}, {"ticks": 40}, {"repeats": 4}, {"start_pose": (0.0, -2.0, 0.0)}])
 def test_a_folder_is_finished_as_it_was_begun(tmp_path, changed):
     series(tmp_path)
-    with pytest.raises(CampaignError, match="finished as it was begun"):
+    with pytest.raises(CampaignError, match="the settings of a series cannot change"):
         series(tmp_path, **changed)
 
 
@@ -134,9 +134,9 @@ def test_of_two_hosts_the_operators_drives_the_trials_and_waits_for_the_nodes_of
     [
         (None, [], "expected --host with one of"),
         ("tractor", [], "expected --host with one of"),
-        ("robot", [], "driven where people arm, on workstation, got --host robot"),
-        ("workstation", ["record.host=robot"], "but robot records, not workstation"),
-        ("workstation", ["record=false"], "give the launch file the key record"),
+        ("robot", [], "trials to run on the operator's host, workstation; got --host robot"),
+        ("workstation", ["record.host=robot"], "expected the bags of trials on workstation, but robot records"),
+        ("workstation", ["record=false"], "expected the key record"),
     ],
 )
 def test_a_host_from_which_no_trial_can_be_driven_is_refused(tmp_path, host, overrides, words):
@@ -231,9 +231,9 @@ def test_bags_without_a_drive_say_what_they_lack(tmp_path):
     writer = BagWriter(tmp_path / "empty", {}, {})
     writer.write("/vicon/car", encode(pose_message(np.eye(4), START_NS)), START_NS, START_NS, 1)
     writer.close()
-    with pytest.raises(BagError, match=r"carries no room.yaml"):
+    with pytest.raises(BagError, match=r"expected room.yaml attached to"):
         evaluate_bag(tmp_path / "empty", None)
-    with pytest.raises(BagError, match="lacks /safety/state"):
+    with pytest.raises(BagError, match="got no /safety/state"):
         find_drives(tmp_path / "empty")
 
 

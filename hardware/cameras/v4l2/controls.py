@@ -1,4 +1,4 @@
-"""Exposure, white balance and other controls of a video device: set, read back, and refused if the device did something else."""
+"""Sets exposure, white balance and other controls of a video device, and verifies them by reading them back."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ _EXPOSURE_UNIT_US = 100.0  # of V4L2_CID_EXPOSURE_ABSOLUTE
 
 @dataclass(frozen=True)
 class Controls:
-    """What to fix; None leaves the device as it is.
+    """Controls to fix; None does not change the device.
 
-    A learned policy and a colour calibration hold for one exposure and one white balance: fix both.
+    A learned policy and a colour calibration are valid for one exposure and white balance, so fix both.
 
     Attributes:
         exposure_us: Exposure time [us]; also turns the automatic off, and with it the freedom to lower the frame rate.
@@ -43,7 +43,7 @@ class Controls:
             raise ValueError(f"unknown controls {', '.join(sorted(unknown))}; known: {', '.join(abi.CONTROL_IDS)}")
 
     def settings(self) -> dict[str, int]:
-        """Values by control, in the order in which they must be set: an automatic goes off before its value is given."""
+        """Values by control, in the order of setting: automatic modes are disabled before their values are set."""
         wanted: dict[str, int] = {}
         if self.power_line_hz is not None:
             wanted["power_line_frequency"] = _POWER_LINE[self.power_line_hz]
@@ -59,23 +59,25 @@ class Controls:
 
 
 def apply(port: VideoPort, fd: int, path: Path, controls: Controls) -> dict[str, int]:
-    """Set controls and return what the device has then; `ProtocolError` if that is not what was asked for."""
+    """Set controls and return their values read back. Raises `ProtocolError` if they differ from the requested ones."""
     wanted = controls.settings()
     if "auto_exposure" in wanted and query(port, fd, "exposure_auto_priority") is not None:
-        # Where it exists it lets the device lengthen the frame period in the dark.
+        # If it exists, this control allows the device to lengthen the frame period in the dark.
         wanted = {"exposure_auto_priority": 0, **wanted}
     return {name: _set(port, fd, path, name, value) for name, value in wanted.items()}
 
 
 def verify(port: VideoPort, fd: int, path: Path, expected: Mapping[str, int]) -> None:
-    """Read controls again; some devices return to automatic when the stream starts."""
+    """Read controls again, because some devices return to automatic when the stream starts."""
     for name, value in expected.items():
         if (got := read(port, fd, path, name)) != value:
-            raise ProtocolError(f"{path} changed {name} from {value} to {got} by itself when the stream started")
+            raise ProtocolError(
+                f"{path} changed {name} from {value} to {got} by itself when the stream started; use a value that the device keeps"
+            )
 
 
 def query(port: VideoPort, fd: int, name: str) -> abi.QueryControl | None:
-    """Range of a control, or None if the device has no such control."""
+    """Return the range of a control, or None if the device lacks it."""
     found = abi.QueryControl(id=abi.CONTROL_IDS[name])
     try:
         port.ioctl(fd, abi.QUERYCTRL, found)
@@ -85,14 +87,14 @@ def query(port: VideoPort, fd: int, name: str) -> abi.QueryControl | None:
 
 
 def read(port: VideoPort, fd: int, path: Path, name: str) -> int:
-    """Present value of a control."""
+    """Read the current value of a control."""
     control = abi.Control(id=abi.CONTROL_IDS[name])
     request(port, fd, path, abi.G_CTRL, control, f"reading {name}")
     return int(control.value)
 
 
 def available(port: VideoPort, fd: int, path: Path) -> dict[str, tuple[int, int, int, int]]:
-    """Minimum, maximum, step and present value of every control that a device has."""
+    """Return minimum, maximum, step and current value of every control of a device."""
     ranges = ((name, query(port, fd, name)) for name in abi.CONTROL_IDS)
     return {n: (q.minimum, q.maximum, q.step, read(port, fd, path, n)) for n, q in ranges if q is not None}
 
@@ -101,12 +103,12 @@ def _set(port: VideoPort, fd: int, path: Path, name: str, value: int) -> int:
     limits = query(port, fd, name)
     if limits is None:
         has = ", ".join(n for n in abi.CONTROL_IDS if query(port, fd, n) is not None) or "none"
-        raise HardwareError(f"{path} has no control {name}: leave it out; it has {has}")
+        raise HardwareError(f"{path} has no control {name}; remove it. The device has {has}")
     if not limits.minimum <= value <= limits.maximum:
         raise HardwareError(f"expected {name} of {limits.minimum} to {limits.maximum} for {path}, got {value}")
     control = abi.Control(id=abi.CONTROL_IDS[name], value=value)
     request(port, fd, path, abi.S_CTRL, control, f"setting {name} to {value}")
     got = read(port, fd, path, name)
     if abs(got - value) >= max(limits.step, 1):
-        raise ProtocolError(f"asked {path} for {name} {value}, it has {got} afterwards; its step is {limits.step}")
+        raise ProtocolError(f"expected {path} to set {name} to {value}, got {got}; its step is {limits.step}")
     return got

@@ -1,7 +1,7 @@
-"""Cameras behind Linux's video interface (USB webcams, the ZED as a UVC device, vivid, v4l2loopback): no OpenCV capture.
+"""Driver of cameras with Linux's video interface (USB webcams, the ZED as a UVC device, vivid, v4l2loopback), without OpenCV capture.
 
-Buffers are mapped, frames carry the kernel's capture stamp and sequence number, and a reader gets the newest frame or none: what
-waited meanwhile goes back to the driver unseen.
+Buffers are mapped, and frames have the kernel's capture stamp and sequence number. A reader gets the newest frame or none; older
+waiting frames are returned to the driver.
 """
 
 from __future__ import annotations
@@ -32,22 +32,22 @@ _BUFFERS = 4
 
 
 class V4l2Camera(Camera):
-    """One video device.
+    """A video device.
 
     Args:
-        path: Device; ``/dev/v4l/by-id/...`` is still the same camera after it was plugged in again.
-        mode: What it must deliver; anything else is refused.
-        controls: What to fix.
-        rate_hz: Deliver so many frames per second, chosen by their stamps; None for all.
+        path: Device path. ``/dev/v4l/by-id/...`` stays the same when the camera is plugged in again.
+        mode: Mode that the device must deliver. Other modes are refused.
+        controls: Controls to fix.
+        rate_hz: Rate of delivered frames, chosen by their stamps; None for all [Hz].
         columns: First and one past the last column to deliver; None for all.
-        size: Width and height to which the pictures are scaled [px]; None keeps them.
-        skip_frames: First frames after the start, which many devices deliver damaged or badly exposed.
-        port: The system calls.
-        started: Called with the file descriptor when the stream runs, for what a device needs beyond the standard.
-        stamper: Believes or refuses the kernel's stamps.
+        size: Width and height to which the images are scaled [px]; None keeps their size.
+        skip_frames: Number of frames to skip after the start, which are damaged or badly exposed on many devices.
+        port: System calls.
+        started: Called with the file descriptor when the stream runs, for device-specific settings.
+        stamper: Converts and checks the kernel's stamps.
 
     Attributes:
-        identity: What it says about itself, once it is open.
+        identity: Identity reported by the device, once it is open.
     """
 
     def __init__(
@@ -82,7 +82,7 @@ class V4l2Camera(Camera):
         self._counts = {"frames_lost": 0, "frames_damaged": 0, "frames_passed_over": 0}
 
     def open(self) -> None:
-        """Agree on the mode, set the controls, start the stream."""
+        """Set the mode and the controls, and start the stream."""
         self.close()
         self._fd = open_device(self._port, self.path)
         try:
@@ -103,11 +103,11 @@ class V4l2Camera(Camera):
             self._decimator.restart()
 
     def read(self, timeout_s: float) -> Frame | None:
-        """Newest frame not read yet, or None after ``timeout_s``."""
+        """Return the newest unread frame, or None after ``timeout_s``."""
         deadline = time.monotonic() + timeout_s
         while True:
             if self._fd is None:
-                raise LinkLost(f"expected an open camera, {self.path} is not open: call open() first")
+                raise LinkLost(f"expected an open camera, but {self.path} is not open; call open() first")
             try:
                 ready = self._port.wait(self._fd, max(deadline - time.monotonic(), 0.0))
             except OSError as error:
@@ -120,11 +120,11 @@ class V4l2Camera(Camera):
                 return None
 
     def close(self) -> None:
-        """Stop the stream and let the device go."""
+        """Stop the stream and release the device."""
         if self._fd is None:
             return
         fd, self._fd = self._fd, None
-        # The device may be gone: whatever fails here, the descriptor must be given back.
+        # The device may be gone. After any failure, the descriptor must still be closed.
         with contextlib.suppress(OSError):
             self._port.ioctl(fd, abi.STREAMOFF, ctypes.c_int(abi.CAPTURE))
         for mapped in self._maps:
@@ -137,7 +137,7 @@ class V4l2Camera(Camera):
             self._port.close(fd)
 
     def counters(self) -> dict[str, float]:
-        """Frames that the driver lost, that came damaged, that were passed over for a newer one, and stamps not believed."""
+        """Counts of lost, damaged and skipped frames, and of rejected stamps."""
         stamps = {"stamps_replaced": self._stamper.replaced, "stamps_refused": self._stamper.refused}
         return {**self._counts, **stamps}
 
@@ -165,7 +165,7 @@ class V4l2Camera(Camera):
         return abi.Buffer(index=index, type=abi.CAPTURE, memory=abi.MEMORY_MMAP)
 
     def _newest(self) -> Frame | None:
-        """Take what is there, give back all but the newest, and make a frame of that."""
+        """Dequeue the waiting buffers, return all but the newest to the driver, and make a frame of the newest."""
         taken: list[abi.Buffer] = []
         while len(taken) < len(self._maps) and (buffer := self._dequeue()) is not None:
             self._count(buffer)
@@ -193,7 +193,7 @@ class V4l2Camera(Camera):
             return None
         except OSError as error:
             unplugged = error.errno in (errno.ENODEV, errno.EIO)
-            hint = "was it unplugged?" if unplugged else "it will be opened anew"
+            hint = "was it unplugged?" if unplugged else "reopening it"
             raise LinkLost(f"lost the camera {self.path}: {error.strerror or error}; {hint}") from error
         return buffer
 

@@ -1,4 +1,4 @@
-"""Agreeing with a video device on size, pixel format and rate: what it answers is compared with what was asked."""
+"""Sets size, pixel format and rate of a video device, and compares its answer with the request."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _MOST = 64  # of anything a device enumerates
 
 @dataclass(frozen=True)
 class Mode:
-    """What a video device is asked to deliver.
+    """Requested mode of a video device.
 
     Attributes:
         width: Columns [px].
@@ -44,12 +44,12 @@ class Mode:
 
 @dataclass(frozen=True)
 class Identity:
-    """What a device says about itself.
+    """Identity that a device reports.
 
     Attributes:
-        card: Name for people.
+        card: Product name.
         driver: Kernel module.
-        bus: Where it is plugged in.
+        bus: Bus position.
     """
 
     card: str
@@ -58,7 +58,7 @@ class Identity:
 
 
 def identify(port: VideoPort, fd: int, path: Path) -> Identity:
-    """Read who it is, and make sure that it delivers pictures by mapped buffers."""
+    """Read the identity of a device, and check that it delivers images by mapped buffers."""
     found = abi.Capability()
     request(port, fd, path, abi.QUERYCAP, found, "asking what it is")
     caps = found.device_caps if found.capabilities & abi.CAP_DEVICE_CAPS else found.capabilities
@@ -71,16 +71,18 @@ def identify(port: VideoPort, fd: int, path: Path) -> Identity:
             if caps & abi.CAP_META_CAPTURE
             else "its multi-planar interface is not supported; bring its frames to the socket source"
             if caps & abi.CAP_VIDEO_CAPTURE_MPLANE
-            else "it is no camera"
+            else "it is not a camera"
         )
         raise ProtocolError(f"expected a camera at {path}, found {identity.card}: {why}")
     if not caps & abi.CAP_STREAMING:
-        raise ProtocolError(f"{path} ({identity.card}) does not stream into mapped buffers, and only that is supported")
+        raise ProtocolError(
+            f"{path} ({identity.card}) does not stream into mapped buffers, which are required; use another camera"
+        )
     return identity
 
 
 def agree(port: VideoPort, fd: int, path: Path, mode: Mode, columns: tuple[int, int] | None = None) -> Layout:
-    """Set a mode, read it back, and return how its bytes lie; `ProtocolError` if the device chose anything else."""
+    """Set a mode, read it back, and return the memory layout. Raises `ProtocolError` if the device chose another mode."""
     asked = abi.Format(type=abi.CAPTURE)
     asked.fmt.pix = abi.PixelFormat(
         width=mode.width, height=mode.height, pixelformat=abi.fourcc(mode.pixel_format), field=abi.FIELD_NONE
@@ -92,7 +94,7 @@ def agree(port: VideoPort, fd: int, path: Path, mode: Mode, columns: tuple[int, 
     if (got.width, got.height, got.pixelformat) != (mode.width, mode.height, abi.fourcc(mode.pixel_format)):
         chosen = f"{got.width} x {got.height} {abi.fourcc_name(got.pixelformat)}"
         raise ProtocolError(
-            f"expected {mode.width} x {mode.height} {mode.pixel_format} from {path}, the device chose {chosen}; it offers"
+            f"expected {mode.width} x {mode.height} {mode.pixel_format} from {path}, got {chosen}; it offers"
             f" {describe(port, fd)}"
         )
     least = least_bytes_per_line(mode.pixel_format, mode.width)
@@ -113,18 +115,16 @@ def _agree_on_rate(port: VideoPort, fd: int, path: Path, mode: Mode) -> None:
     interval = answer.parm.capture.timeperframe
     got_hz = interval.denominator / interval.numerator if interval.numerator else 0.0
     if abs(got_hz - mode.fps) > _RATE_TOLERANCE * mode.fps:
-        raise ProtocolError(
-            f"expected {mode.fps:g} Hz from {path}, the device chose {got_hz:g} Hz; it offers {describe(port, fd)}"
-        )
+        raise ProtocolError(f"expected {mode.fps:g} Hz from {path}, got {got_hz:g} Hz; it offers {describe(port, fd)}")
 
 
 def describe(port: VideoPort, fd: int) -> str:
-    """Formats, sizes and rates that a device offers, in one line."""
-    return "; ".join(modes(port, fd)) or "nothing that it would name"
+    """List the formats, sizes and rates of a device in one line."""
+    return "; ".join(modes(port, fd)) or "no listed modes"
 
 
 def modes(port: VideoPort, fd: int) -> Iterator[str]:
-    """One text for each pixel format that a device offers."""
+    """Yield one text for each pixel format of a device."""
     for pixel_format in _formats(port, fd):
         sizes = []
         for width, height in _sizes(port, fd, pixel_format):

@@ -1,4 +1,4 @@
-"""The system calls behind a video device, as a protocol: the kernel answers them, or an emulator in the tests and the twin."""
+"""Interface of the system calls of a video device, implemented by the kernel, and by an emulator for tests and the twin."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ BY_ID = Path("/dev/v4l/by-id")
 
 
 class VideoPort(Protocol):
-    """What the drivers ask of the system; every failure is an `OSError` with the kernel's number."""
+    """System calls that the drivers need. Every failure is an `OSError` with the kernel's error number."""
 
     def open(self, path: Path) -> int:
         """Open a device for reading and writing, without blocking."""
@@ -85,7 +85,7 @@ class KernelPort:
 
 
 def open_device(port: VideoPort, path: Path) -> int:
-    """Open a device, or say in one sentence why it cannot be."""
+    """Open a device. Raises an error in one sentence if it cannot be opened."""
     try:
         return port.open(path)
     except OSError as error:
@@ -95,12 +95,14 @@ def open_device(port: VideoPort, path: Path) -> int:
                 f"expected a camera at {path}, found none; video devices here: {there}. Is it plugged in?"
             ) from error
         if error.errno in (errno.EACCES, errno.EPERM):
-            raise HardwareError(f"may not open {path}: add your user to the group 'video' and log in again") from error
+            raise HardwareError(
+                f"no permission to open {path}; add your user to the group 'video' and log in again"
+            ) from error
         raise _translated(error, path, "opening") from error
 
 
 def request(port: VideoPort, fd: int, path: Path, number: int, argument: Any, doing: str) -> None:
-    """One request whose failure is a `HardwareError` that names the device and what was being done."""
+    """Send a request. Raises a `HardwareError` that names the device and the action if it fails."""
     try:
         port.ioctl(fd, number, argument)
     except OSError as error:
@@ -114,7 +116,7 @@ def _translated(error: OSError, path: Path, doing: str) -> HardwareError:
             f"lost the camera {path} while {doing}: {reason}; unplugged, or not enough power or USB bandwidth?"
         )
     if error.errno == errno.EBUSY:
-        return DeviceBusy(f"{path} is in use by another program ({doing}): find it with 'fuser {path}' and close it")
+        return DeviceBusy(f"{path} is in use by another program ({doing}); find it with 'fuser {path}' and close it")
     if error.errno in (errno.EINVAL, errno.ENOTTY, errno.ERANGE, errno.EACCES, errno.EBADF):
         return ProtocolError(f"{path} does not do what was asked ({doing}): {reason}")
     if error.errno in (errno.ENOSPC, errno.ENOMEM):

@@ -1,7 +1,7 @@
-"""Factory calibration of a ZED, and the maps that make an ideal pinhole picture of its left eye.
+"""Factory calibration of a ZED, and the rectification of its left eye to an ideal pinhole camera.
 
-The file ``SN<serial>.conf`` is downloaded from ``calib.stereolabs.com/?SN=<serial>`` or lies in ``/usr/local/zed/settings``; it is an
-INI file with one section for each eye and resolution. Principal points in it are OpenCV's, with pixel centres at integers.
+The file ``SN<serial>.conf`` is downloaded from ``calib.stereolabs.com/?SN=<serial>`` or is in ``/usr/local/zed/settings``. It is an
+INI file with one section for each eye and resolution. Its principal points have pixel centres at integers, as in OpenCV.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def load_factory_calibration(path: Path | str, mode: str = "VGA", eye: str = "le
         eye: ``left`` or ``right``.
 
     Raises:
-        ZedCalibrationError: The file is missing, is no such file, or holds values that cannot be of this mode.
+        ZedCalibrationError: The file is missing or invalid, or has values that do not fit this mode.
     """
     path = Path(path)
     sections = _sections(path)
@@ -65,7 +65,9 @@ def load_factory_calibration(path: Path | str, mode: str = "VGA", eye: str = "le
         # Older files have no tangential terms and no k3.
         k1, k2, p1, p2, k3 = (float(values.get(key, "0")) for key in ("k1", "k2", "p1", "p2", "k3"))
     except KeyError as error:
-        raise ZedCalibrationError(f"{path}: [{name.upper()}] has no {error.args[0]}") from None
+        raise ZedCalibrationError(
+            f"{path}: [{name.upper()}] has no {error.args[0]}; download the file again from https://calib.stereolabs.com"
+        ) from None
     except ValueError as error:
         raise ZedCalibrationError(f"{path}: [{name.upper()}]: {error}") from None
     numbers = np.array([fx, fy, cx, cy, k1, k2, p1, p2, k3])
@@ -74,7 +76,7 @@ def load_factory_calibration(path: Path | str, mode: str = "VGA", eye: str = "le
     )
     if not (np.isfinite(numbers).all() and plausible and 0.9 < fy / fx < 1.1):
         raise ZedCalibrationError(
-            f"{path}: [{name.upper()}] has fx {fx:g}, fy {fy:g}, cx {cx:g}, cy {cy:g}, which cannot be of {width} x {height}"
+            f"{path}: [{name.upper()}] has fx {fx:g}, fy {fy:g}, cx {cx:g}, cy {cy:g}, which do not fit {width} x {height}; download the file again from https://calib.stereolabs.com"
         )
     return EyeCalibration(Pinhole(width, height, fx, fy, cx + 0.5, cy + 0.5), (k1, k2, p1, p2, k3))
 
@@ -85,7 +87,7 @@ def _sections(path: Path) -> dict[str, dict[str, str]]:
         parser.read_string(path.read_text(encoding="utf-8-sig"))
     except FileNotFoundError:
         raise ZedCalibrationError(
-            f"no such file: {path}; download it from https://calib.stereolabs.com/?SN=<serial number on the camera>"
+            f"expected a ZED calibration file at {path}, found none; download it from https://calib.stereolabs.com/?SN=<serial number on the camera>"
         ) from None
     except (OSError, UnicodeDecodeError, configparser.Error) as error:
         reason = " ".join(str(error).split())
@@ -95,9 +97,9 @@ def _sections(path: Path) -> dict[str, dict[str, str]]:
 
 
 class Rectifier:
-    """Takes the distortion out of pictures of one size and scales them down.
+    """Removes the distortion from images of one size and scales them down.
 
-    The ideal camera sees only what the real one saw everywhere: no black corners.
+    The field of view of the ideal camera lies within that of the real one, so there are no black corners.
 
     Args:
         calibration: The real camera.
@@ -122,7 +124,7 @@ class Rectifier:
         self.pinhole = whole.resized(*size)
 
     def __call__(self, rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Ideal picture ``[h, w, 3]`` of one as it was taken, ``[H, W, 3]``."""
+        """Rectify an image ``[H, W, 3]`` to ``[h, w, 3]``."""
         straight = cv2.remap(rgb, *self._maps, cv2.INTER_LINEAR)
         if straight.shape[1::-1] != self._size:
             straight = cv2.resize(straight, self._size, interpolation=cv2.INTER_AREA)

@@ -1,4 +1,4 @@
-"""The left eye of a ZED without its SDK: a UVC device that sends both eyes side by side."""
+"""Driver of the left eye of a ZED without its SDK. The UVC device sends both eyes side by side."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from hardware.cameras.zed.exposure import ExtensionUnit, ZedExposure, exposure_l
 
 
 class ZedCamera(Camera):
-    """Rectified, scaled-down pictures of the left eye.
+    """Delivers rectified, scaled-down images of the left eye.
 
     Args:
         path: Video device; the stable name under ``/dev/v4l/by-id``.
@@ -26,10 +26,10 @@ class ZedCamera(Camera):
         fps: Frames per second of the device: 15, 30, and up to 60 (HD720) or 100 (VGA) [Hz]; it has no 10.
         rate_hz: Frames per second to deliver, chosen by their stamps; None for all.
         size: Width and height of the delivered pictures [px].
-        exposure: What to fix of exposure and gain.
-        controls: Standard controls; its exposure and gain do nothing on a ZED and are refused.
-        port: The system calls.
-        stamper: Believes or refuses the kernel's stamps.
+        exposure: Exposure and gain to fix.
+        controls: Standard controls. Exposure and gain in them have no effect on a ZED and are refused.
+        port: System calls.
+        stamper: Converts and checks the kernel's stamps.
     """
 
     def __init__(
@@ -49,7 +49,9 @@ class ZedCamera(Camera):
         exposure_lines(100.0, fps)  # refuses rates that the device does not have
         controls = controls or Controls()
         if controls.exposure_us is not None or controls.gain is not None:
-            raise ValueError("a ZED takes exposure_percent and gain_raw instead of exposure_us and gain")
+            raise ValueError(
+                "expected exposure_percent and gain_raw, got exposure_us or gain, which a ZED ignores; replace them"
+            )
         self._fps = fps
         self._exposure = exposure or ZedExposure()
         self._port: VideoPort = port or KernelPort()
@@ -75,7 +77,7 @@ class ZedCamera(Camera):
         self._stream.open()
 
     def read(self, timeout_s: float) -> Frame | None:
-        """Newest frame not read yet, or None after ``timeout_s``."""
+        """Return the newest unread frame, or None after ``timeout_s``."""
         frame = self._stream.read(timeout_s)
         return None if frame is None else dataclasses.replace(frame, rgb=self._rectifier(frame.rgb))
 

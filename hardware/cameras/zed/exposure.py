@@ -1,4 +1,4 @@
-"""Exposure and gain of a ZED: registers behind a UVC extension unit, because the standard controls do not reach them.
+"""Exposure and gain of a ZED: registers accessed through a UVC extension unit, because the standard controls do not reach them.
 
 Facts (register numbers and the order of bytes) from stereolabs/zed-open-capture, ``videocapture.cpp`` and ``videocapture_def.hpp``:
 extension unit 4, selector 2. A message has the task in byte 0 (0x50 write, 0x51 read), the target in byte 1 (0xA2 the image
@@ -36,7 +36,7 @@ EYES = (0, 1)
 
 @dataclass(frozen=True)
 class ZedExposure:
-    """What to fix on both eyes.
+    """Exposure and gain to fix on both eyes.
 
     Attributes:
         exposure_percent: Exposure, in percent of the longest that the frame rate allows; None leaves the automatic on.
@@ -53,7 +53,9 @@ class ZedExposure:
         if self.gain_raw is not None and not 0 <= self.gain_raw <= _GAIN_MAX:
             raise ValueError(f"expected a gain of 0 to {_GAIN_MAX}, got {self.gain_raw}")
         if self.gain_raw is not None and self.exposure_percent is None:
-            raise ValueError("expected exposure_percent with gain_raw: exposure and gain have one automatic")
+            raise ValueError(
+                "expected exposure_percent with gain_raw, because exposure and gain share one automatic; give both"
+            )
 
 
 def exposure_lines(percent: float, fps: float) -> int:
@@ -124,7 +126,7 @@ class ExtensionUnit:
         length = int.from_bytes(data, "little")
         if length not in _LENGTHS:
             raise ProtocolError(
-                f"expected control messages of 64 or 384 bytes from {self._path}, got {length}: is it a ZED?"
+                f"expected control messages of 64 or 384 bytes from {self._path}, got {length}; is it a ZED?"
             )
         return length
 
@@ -135,7 +137,7 @@ class ExtensionUnit:
             self._port.ioctl(self._fd, abi.UVC_CTRL_QUERY, asked)
         except FileNotFoundError:
             raise HardwareError(
-                f"{self._path} has no extension unit {_UNIT}: it is no ZED, leave its exposure alone"
+                f"{self._path} has no extension unit {_UNIT}, so it is not a ZED; remove its exposure settings"
             ) from None
         except OSError:
             request(self._port, self._fd, self._path, abi.UVC_CTRL_QUERY, asked, "talking to the ZED's registers")
@@ -143,13 +145,13 @@ class ExtensionUnit:
     def _require(self, got: int, wanted: int, address: int) -> None:
         if got != wanted:
             raise ProtocolError(
-                f"wrote {wanted:#04x} to register {address:#x} of {self._path}, it has {got:#04x} afterwards; unplug it and"
+                f"expected register {address:#x} of {self._path} to hold {wanted:#04x}, got {got:#04x}; unplug the camera and"
                 " plug it in again"
             )
 
 
 def lock_exposure(unit: ExtensionUnit, exposure: ZedExposure, fps: float) -> None:
-    """Turn the automatic off and set exposure and gain of both eyes; nothing if nothing is to be fixed."""
+    """Disable the automatic and set exposure and gain of both eyes. Does nothing without an exposure to fix."""
     if exposure.exposure_percent is None:
         return
     lines = exposure_lines(exposure.exposure_percent, fps)

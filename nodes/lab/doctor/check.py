@@ -1,4 +1,4 @@
-"""Checks with a deadline each: whatever hangs - a driver, a vendor's library, a dead disk - costs its own time and no more."""
+"""Checks with deadlines, so that a hanging driver, library or disk delays only its own check."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from advnerf_core.errors import AdvnerfError
 
 OK, ABSENT, WARNING, FAILURE = "ok", "absent", "warning", "failure"
 STATES = (OK, ABSENT, WARNING, FAILURE)
-# Foreign libraries are slow to import; more at once would only make each of them later than its deadline.
+# Number of parallel checks. Third-party libraries are slow to import, and with more at once they would miss their deadlines.
 _AT_ONCE = 3
 CHILD_S = 60.0
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One line.
+    """The result of a check, printed as one line.
 
     Attributes:
-        check: What was looked at.
-        state: ``ok``; ``absent`` (not here, and only some need it); ``warning`` (something will not work as it should);
-            ``failure`` (what was asked for cannot work).
+        check: Name of the check.
+        state: ``ok``; ``absent`` (missing, but only some users need it); ``warning`` (something will not work as it should);
+            ``failure`` (the requested function cannot work).
         found: What was found.
-        do: What to do about it; empty where nothing has to be done.
+        do: What to do about it; empty if no action is needed.
     """
 
     check: str
@@ -38,34 +38,34 @@ class Finding:
     do: str = ""
 
     def to_dict(self) -> dict[str, str]:
-        """Plain data."""
+        """Convert to plain data."""
         return asdict(self)
 
 
 @dataclass(frozen=True)
 class Check:
-    """Something to look at.
+    """A check to run.
 
     Attributes:
-        name: What is looked at.
-        run: Looks; may hang.
-        deadline_s: Time after which it counts as hung [s].
-        cure: What to do when it hangs.
+        name: Name of the check.
+        run: Runs the check; may hang.
+        deadline_s: Time after which the check counts as hung [s].
+        cure: What to do if it hangs.
     """
 
     name: str
     run: Callable[[], Sequence[Finding]]
     deadline_s: float = 10.0
-    cure: str = "look for a process in state D (ps aux), unplug what it waits for, or start the computer again"
+    cure: str = "look for a process in state D (ps aux), unplug the device it waits for, or restart the computer"
 
 
 @dataclass(frozen=True)
 class Answer:
-    """What a probe in a process of its own said.
+    """The answer of a probe in a separate process.
 
     Attributes:
-        data: Its result; None if it has none.
-        trouble: Why it has none.
+        data: The result; None if the probe failed.
+        trouble: Why the probe failed.
     """
 
     data: Any
@@ -73,7 +73,7 @@ class Answer:
 
 
 def examine(checks: Sequence[Check]) -> Iterator[Finding]:
-    """Run checks, a few at once; their findings in the order of the checks, as they become known."""
+    """Run checks, a few in parallel. Yields their findings in the order of the checks."""
     with ThreadPoolExecutor(_AT_ONCE, "doctor") as pool:
         try:
             for findings in pool.map(_within_deadline, checks):
@@ -83,16 +83,16 @@ def examine(checks: Sequence[Check]) -> Iterator[Finding]:
 
 
 def worst(findings: Sequence[Finding]) -> str:
-    """The worst state among findings; ``ok`` without any."""
+    """Return the worst state of the findings; ``ok`` without findings."""
     return STATES[max((STATES.index(finding.state) for finding in findings), default=0)]
 
 
 def in_child(probe: str, *arguments: Any, timeout_s: float = CHILD_S) -> Answer:
-    """Run a probe of `nodes.lab.doctor.probes` in a process of its own: a broken library may end it, hang it, or fill its memory.
+    """Run a probe of `nodes.lab.doctor.probes` in a separate process, because a broken library may crash, hang, or use all memory.
 
     Args:
         probe: Name of the probe.
-        arguments: What it gets; must be plain data.
+        arguments: Arguments of the probe, as plain data.
         timeout_s: Time after which the process is killed [s].
     """
     command = [sys.executable, "-m", "nodes.lab.doctor.probes", probe, json.dumps(arguments)]
@@ -111,7 +111,7 @@ def in_child(probe: str, *arguments: Any, timeout_s: float = CHILD_S) -> Answer:
 
 
 def _within_deadline(check: Check) -> Sequence[Finding]:
-    """Findings of a check; it runs in a thread that nobody waits for beyond the deadline, nor at the end of the process."""
+    """Run a check in a daemon thread and return its findings, or a failure after the deadline."""
     found: list[Sequence[Finding]] = []
     thread = threading.Thread(target=lambda: found.append(_run(check)), name=f"doctor {check.name}", daemon=True)
     thread.start()
@@ -124,5 +124,5 @@ def _run(check: Check) -> Sequence[Finding]:
         return check.run()
     except (AdvnerfError, OSError, ValueError) as error:
         return [Finding(check.name, FAILURE, str(error) or type(error).__name__)]
-    except Exception as error:  # one check with a defect must not take the others with it
+    except Exception as error:  # a bug in one check must not prevent the others
         return [Finding(check.name, WARNING, f"the check itself failed: {type(error).__name__}: {error}", "report it")]

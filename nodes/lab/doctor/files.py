@@ -1,4 +1,4 @@
-"""The files that a launch file names: calibration, room, attack, policy, bag. Are they there, whole, and do they fit one another?"""
+"""Checks of the files that a launch file names: whether calibration, room, attack, policy and bag exist, load, and fit together."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from nodes.compositor import show
 from nodes.lab.doctor.check import FAILURE, OK, Finding
 from nodes.launching.launch_file import Plan
 
-_CURE = "advnerf calibrate, docs/calibration.md; params.calibration names the folder"
+_CURE = "run advnerf calibrate (docs/calibration.md), or set params.calibration to the right folder"
 _COMMON: dict[str, type[Calibration]] = {
     "camera": CameraCalibration, "target": TargetCalibration, "room": RoomCalibration, "vehicle": VehicleCalibration,
 }  # fmt: skip
-# The key that only says "calibration" means what its node is about.
+# The key "calibration" means the calibration of the node's own device.
 _OWN: dict[str, type[Calibration]] = {"nodes.camera": CameraCalibration, "nodes.motor": VehicleCalibration}
 _FILES = (".safetensors", ".onnx", ".pt2", ".conf", ".yaml", ".mcap", ".db3", ".bag")
 
@@ -40,7 +40,7 @@ def calibrations(plan: Plan) -> list[Finding]:
             rows.append(Finding("calibration", FAILURE, str(error), _CURE))
     if good:
         oldest = min(good, key=lambda item: item[1].date)
-        text = f"{', '.join(str(file) for file, _ in good)}; the oldest, {oldest[0].name}, is of {oldest[1].date}"
+        text = f"{', '.join(str(file) for file, _ in good)}; the oldest, {oldest[0].name}, is from {oldest[1].date}"
         rows.append(Finding("calibration", OK, text))
     return rows
 
@@ -55,21 +55,24 @@ def _calibration_files(plan: Plan) -> Iterator[tuple[Path, type[Calibration]]]:
 
 
 def named(plan: Plan) -> list[Finding]:
-    """Whether every other file is there, and whether attacks fit camera and face."""
+    """Check that every other file exists, and that attacks fit camera and face."""
     rows = []
     known = {str(file) for file, _ in _calibration_files(plan)}
     for name in plan.nodes:
         data = plan.documents[name].data
         rows += [
             Finding(
-                "files", FAILURE, f"{name}: no file {value}", "correct the path; it counts from the folder you are in"
+                "files",
+                FAILURE,
+                f"{name}: no file {value}",
+                "correct the path, which is relative to the current folder",
             )
             for value in _paths(data)
             if value not in known and not Path(value).exists()
         ]
         if isinstance(data, dict) and data.get("attack"):
             rows += _attack(name, data)
-    return rows or [Finding("files", OK, "all that the nodes name are there")]
+    return rows or [Finding("files", OK, "all files that the nodes name exist")]
 
 
 def _paths(value: Any) -> Iterator[str]:
@@ -98,6 +101,6 @@ def _attack(name: str, data: dict[str, Any]) -> list[Finding]:
     except CalibrationError:
         pass  # said under "calibration"
     except AdvnerfError as error:
-        return [Finding("attack", FAILURE, f"{name}: {error}", "name the target that it was made for")]
+        return [Finding("attack", FAILURE, f"{name}: {error}", "give the target that it was made for")]
     subject = "no subject" if attack.face is None else attack.face.subject
     return [Finding("attack", OK, f"{name}: {attack.attack_id}, {attack.method}, for {subject}")]

@@ -1,4 +1,4 @@
-"""Everything that the whole stack could need of a computer; what only a car needs may be absent."""
+"""The checks for the whole stack. Devices that only a car needs may be absent."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from nodes.lab.doctor.check import CHILD_S, Check
 from nodes.lab.doctor.recording import Pictures, bytes_per_s
 
 _CHILD_DEADLINE_S = CHILD_S + 5.0
-# What launch/green_screen.launch.yaml records.
+# The recorded topics of launch/green_screen.launch.yaml.
 _ROLES = ("camera", "vicon", "compositor", "policy", "safety", "motor")
 
 
 def checks(folder: Path, vicon_port: int, vesc_port: str | None = None) -> list[Check]:
-    """All checks of a computer.
+    """Return all checks of a computer.
 
     Args:
-        folder: Where results will be written.
+        folder: Folder for results.
         vicon_port: UDP port of the motion-capture stream.
-        vesc_port: Serial device of the VESC; None takes what looks like one.
+        vesc_port: Serial device of the VESC; None detects it.
     """
     vesc = partial(motor.vesc, vesc_port, required=vesc_port is not None)
     recorded = bytes_per_s(Pictures(), publishers=_ROLES)

@@ -1,4 +1,4 @@
-"""Graphics and compilers: off-screen rendering, graphics processors, LLVM, screens. Nothing of it is imported here."""
+"""Checks of graphics and compilers: off-screen rendering, GPUs, LLVM, screens. The libraries are imported in separate processes."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from hardware.screen.edid import connected_displays
 from nodes.lab.doctor.check import ABSENT, FAILURE, OK, WARNING, Answer, Finding, in_child
 
 _EGL_CURE = "apt-get install libegl1 libgl1-mesa-dri libegl-mesa0 libopengl0 (Debian, Ubuntu)"
-_SCREEN_CURE = "run it on the desktop of the computer with the screen (DISPLAY or WAYLAND_DISPLAY is set there)"
+_SCREEN_CURE = "run it in the desktop session of the computer with the screen, where DISPLAY or WAYLAND_DISPLAY is set"
 
 
-# SDL takes one of these when there is no window system, and then every picture is shown to nobody.
+# Drivers that SDL uses without a window system. They show no image.
 _NO_SCREEN = ("offscreen", "dummy")
 
 
@@ -22,7 +22,7 @@ def _missing(answer: Answer) -> bool:
 
 
 def egl(required: bool = False) -> list[Finding]:
-    """Whether the simulated lab can render."""
+    """Check whether the simulated lab can render."""
     answer = in_child("egl")
     if answer.data is not None:
         return [Finding("EGL", OK, f"MuJoCo {answer.data['version']} renders off-screen")]
@@ -34,7 +34,7 @@ def egl(required: bool = False) -> list[Finding]:
 
 
 def torch(required: bool = False) -> list[Finding]:
-    """Version of torch, and on what it computes."""
+    """Check the version of torch and its devices."""
     answer = in_child("torch")
     if answer.data is None:
         text = "is missing: no training, no attack, only ONNX policies" if _missing(answer) else answer.trouble
@@ -44,13 +44,13 @@ def torch(required: bool = False) -> list[Finding]:
     if gpus:
         return [Finding("torch", OK, f"{version}, CUDA {built_for}: {', '.join(gpus)}")]
     if built_for:
-        do = "nvidia-smi must work first: driver, container with --gpus all"
+        do = "make nvidia-smi work first: install the driver, or start the container with --gpus all"
         return [Finding("torch", WARNING, f"{version} is built for CUDA {built_for}, but sees no GPU", do)]
     return [Finding("torch", OK, f"{version}, CPU only")]
 
 
 def llvm() -> list[Finding]:
-    """Whether Mitsuba can compile, for attacks on meshes."""
+    """Check whether Mitsuba can compile, which attacks on meshes need."""
     answer = in_child("llvm")
     if answer.data is not None:
         return [Finding("LLVM", OK, f"{answer.data['llvm']} compiles for Mitsuba {answer.data['version']}")]
@@ -60,10 +60,10 @@ def llvm() -> list[Finding]:
 
 
 def screens(display: Any | None = None) -> list[Finding]:
-    """Screens of the window system, and what is plugged in.
+    """Check the screens of the window system and the connected monitors.
 
     Args:
-        display: ``display`` of the monitor node, of kind ``screen``; None where none is needed.
+        display: ``display`` of the monitor node, of kind ``screen``; None if no screen is needed.
     """
     answer, plugged = in_child("screens"), connected_displays()
     named = ", ".join(
@@ -95,7 +95,7 @@ def _fits(display: Any, sizes: Sequence[tuple[int, ...]], plugged: dict[str, Any
                 "screens",
                 FAILURE,
                 f"no screen with index {display.index}",
-                "monitor.display={kind: screen, index: ...}",
+                "set monitor.display={kind: screen, index: ...}",
             )
         ]
     if display.connector is None:
@@ -107,11 +107,11 @@ def _fits(display: Any, sizes: Sequence[tuple[int, ...]], plugged: dict[str, Any
                 "screens",
                 FAILURE,
                 f"no monitor at {display.connector}; there are {there}",
-                "cable, or monitor.display.connector",
+                "check the cable, or set monitor.display.connector",
             )
         ]
     native = plugged[display.connector].size_px
     if tuple(native) != tuple(sizes[display.index]):
         text = f"screen {display.index} is {sizes[display.index][0]} x {sizes[display.index][1]}, the panel {native[0]} x {native[1]}"
-        return [Finding("screens", FAILURE, text, "native resolution and 100 % scaling, or another index")]
+        return [Finding("screens", FAILURE, text, "use the native resolution and 100 % scaling, or another index")]
     return []

@@ -1,4 +1,4 @@
-"""What one launch file needs of this computer: its devices, files, ports and libraries, and nothing else."""
+"""The checks for one launch file: the devices, files, ports and libraries that it needs."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from nodes.viewer import ViewerConfig
 _CHILD_DEADLINE_S = CHILD_S + 5.0
 _NODES_S = 90.0
 _TWIN, _POLICY = "nodes.twin", "nodes.policy"
-# What the launch makes itself does not exist before it runs.
+# Devices that a node of the launch creates do not exist before it runs.
 _OF_THE_RUN = ("<run_dir>", "<socket_dir>")
 _POLICY_SLOW_MS = 60.0
 M = TypeVar("M", bound=BaseModel)
@@ -58,11 +58,11 @@ class _Asked:
 
 
 def checks_of(plan: Plan, folder: Path) -> list[Check]:
-    """Everything that a launch file needs here, as checks.
+    """Return the checks for a launch file on this host.
 
     Args:
         plan: The launch file for this host.
-        folder: Where its runs will be written.
+        folder: Folder for its runs.
     """
     checks = [
         Check("versions", machine.versions), Check("machine", machine.machine), Check("sockets", machine.sockets),
@@ -75,16 +75,16 @@ def checks_of(plan: Plan, folder: Path) -> list[Check]:
             try:
                 checks += make(asked)
             except (AdvnerfError, OSError):
-                continue  # the node itself says under "nodes" what is wrong with its configuration
+                continue  # the check "nodes" reports errors of the node's configuration
     if "recorder" in plan.documents:
         checks.append(Check("disk", partial(_disk, plan, folder)))
     return checks
 
 
 def policy_problems(plan: Plan) -> list[str]:
-    """What is wrong with the policies of a launch file: no such file, another image size than the camera's, another goal.
+    """Return the errors of the policies of a launch file: a missing file, an image size other than the camera's, a wrong goal.
 
-    Each policy is loaded in a process of its own; nodes and devices are left alone.
+    Each policy is loaded in a separate process. Nodes and devices are not used.
     """
     problems = []
     for name, entry in plan.nodes.items():
@@ -92,7 +92,9 @@ def policy_problems(plan: Plan) -> list[str]:
             continue
         asked = _Asked(plan, name)
         if (missing := _missing_policy(asked.config(PolicyConfig))) is not None:
-            problems.append(f"{name}: {missing} does not exist; --set params.policy=FILE names another")
+            problems.append(
+                f"{name}: expected a policy file at {missing}, found none; give another with --set params.policy=FILE"
+            )
             continue
         _, unfit = _try_policy(asked.config(PolicyConfig), _image_size(plan))
         problems += [f"{name}: {finding.found}; {finding.do}" for finding in unfit]
@@ -104,7 +106,7 @@ def _missing_policy(config: PolicyConfig) -> str | None:
 
 
 def _nodes(plan: Plan) -> list[Finding]:
-    """Whether every node accepts its configuration, asked of the nodes themselves."""
+    """Check whether every node accepts its configuration, by asking the nodes."""
     problems = check_nodes(plan)
     if problems:
         return [
@@ -141,8 +143,8 @@ def _calibration(file: Path) -> CameraCalibration | None:
 
 
 def _nobody(name: str, where: str) -> list[Finding]:
-    do = "give the real device, or switch the simulated lab on (twin.if=true)"
-    return [Finding(name, FAILURE, f"expected at {where}, but this launch has no node that makes it", do)]
+    do = "give the real device, or enable the simulated lab (twin.if=true)"
+    return [Finding(name, FAILURE, f"expected at {where}, but this launch has no node that provides it", do)]
 
 
 def _vicon(asked: _Asked) -> list[Check]:
@@ -152,7 +154,7 @@ def _vicon(asked: _Asked) -> list[Check]:
     if asked.on_twin:
         return [Check("VICON", partial(mocap.free_port, config.port, config.host))]
     listening = ViconConfig(config.subjects, config.host, config.port, source=config.source)
-    # Boards and wands come and go; without the car nothing can be armed.
+    # Boards and wands may be absent, but without the car nothing can be armed.
     return [Check("VICON", partial(mocap.listen, listening, True, mocap.LISTEN_S, ("car",)))]
 
 
@@ -197,31 +199,31 @@ def _policy_findings(config: PolicyConfig, size: tuple[int, int] | None) -> list
         return rows
     if data["ms"] > _POLICY_SLOW_MS:
         rows.append(
-            Finding("policy", FAILURE, f"{data['ms']:.0f} ms for one image", "another computer, or an ONNX policy")
+            Finding("policy", FAILURE, f"{data['ms']:.0f} ms for one image", "use a faster computer, or an ONNX policy")
         )
     return [Finding("policy", OK, f"{config.policy}, {data['sha256'][:12]}, {data['ms']:.1f} ms for one image"), *rows]
 
 
 def _try_policy(config: PolicyConfig, size: tuple[int, int] | None) -> tuple[dict[str, Any] | None, list[Finding]]:
-    """Load a policy in a process of its own.
+    """Load a policy in a separate process.
 
     Args:
-        config: Of the policy node.
+        config: Configuration of the policy node.
         size: Width and height of the camera's images [px], if known.
 
     Returns:
-        What the policy says of itself (None if it cannot be loaded), and a finding for each thing that does not fit.
+        The policy's declaration (None if it cannot be loaded), and a finding for each mismatch.
     """
     answer = in_child("policy", config.policy, config.sha256)
     if answer.data is None:
         trouble = answer.trouble.partition(": ")[2] or answer.trouble
-        return None, [Finding("policy", FAILURE, trouble, "params.policy names it")]
+        return None, [Finding("policy", FAILURE, trouble, "correct params.policy")]
     data, rows = answer.data, []
     if size is not None and tuple(data["size"]) != size:
         text = f"trained for {data['size'][0]} x {data['size'][1]}, the camera is calibrated for {size[0]} x {size[1]}"
         rows.append(Finding("policy", FAILURE, text, "train for this camera, or set the size of the source"))
     if data["goal_size"] != len(config.goal):
-        text = f"wants a goal of {data['goal_size']} numbers, got {len(config.goal)}"
+        text = f"expected a goal of {data['goal_size']} numbers, got {len(config.goal)}"
         rows.append(Finding("policy", FAILURE, text, "set policy.goal"))
     return data, rows
 
@@ -253,7 +255,7 @@ def _viewer(asked: _Asked) -> list[Check]:
 
 def _disk(plan: Plan, folder: Path) -> Sequence[Finding]:
     config = validate(RecorderConfig, plan.documents["recorder"])
-    # With two hosts everything that is recorded comes here, from wherever its publisher is.
+    # With two hosts, all recorded topics are sent to this host.
     roles = None
     if GATEWAY not in plan.nodes:
         roles = {role for name, entry in plan.nodes.items() for role in (name, entry.module.rsplit(".", 1)[-1])}
@@ -261,7 +263,7 @@ def _disk(plan: Plan, folder: Path) -> Sequence[Finding]:
 
 
 def pictures_of(plan: Plan) -> Pictures:
-    """Size and rate of the pictures of a launch file; the defaults where its camera is on another host."""
+    """Size and rate of the images of a launch file; defaults if its camera is on another host."""
     for name, entry in plan.nodes.items():
         if entry.module == "nodes.camera":
             try:

@@ -1,4 +1,4 @@
-"""The computer itself: versions, memory, disk, sockets, keys, clock, and what runs on it already."""
+"""Checks of the computer: versions, memory, disk, sockets, keys, clock, and running launches."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from nodes.runtime.paths import user_folder
 from nodes.safety import SafetyConfig
 
 _MEMORY_WARNING_GIB = 4
-# Of the age limits, which are about 0.2 s, nothing is lost to a clock that is off by less.
+# A smaller clock offset does not matter for the age limits, which are about 0.2 s.
 CLOCK_ERROR_S = 0.005
 _UNSYNCHRONISED = 0x0040
 _CHRONYC_S = 2.0
@@ -35,17 +35,17 @@ _NOT_OURS = ("all", "dev")
 
 
 def versions() -> list[Finding]:
-    """Python, ours, and whether what our base needs is there in versions that it accepts; which extras are."""
+    """Check Python, advnerf, the required packages and the extras."""
     found = platform.python_version()
     tested = (3, 10) <= sys.version_info[:2] <= (3, 12)
     text = f"{found}, advnerf {importlib.metadata.version('advnerf')}, Linux {platform.release()} {platform.machine()}"
-    do = "" if tested else "tested are 3.10, 3.11 and 3.12: make the environment with one of them"
+    do = "" if tested else "create the environment with Python 3.10, 3.11 or 3.12, which are tested"
     rows = [Finding("python", OK if tested else WARNING, text, do)]
     return rows + packages(importlib.metadata.requires("advnerf") or [])
 
 
 def packages(requirements: Iterable[str]) -> list[Finding]:
-    """Findings about a package's requirements: what is missing or too old or too new, and which extras are complete."""
+    """Check a package's requirements: missing, too old or too new packages, and complete extras."""
     wrong: dict[str, list[str]] = {}
     for requirement in requirements:
         match = _REQUIREMENT.match(requirement)
@@ -74,7 +74,7 @@ def _trouble(name: str, specifier: str) -> str:
 
 
 def satisfies(version: str, specifier: str) -> bool:
-    """Whether a release fits a specifier of the kinds that we use: ``>=``, ``<``, ``==``, joined by commas."""
+    """Whether a version satisfies a specifier of ``>=``, ``<`` and ``==``, joined by commas."""
     have = _release(version)
     for part in filter(None, specifier.replace(" ", "").split(",")):
         operator, wanted = re.match(r"(>=|<|==)?(.*)", part).groups()  # type: ignore[union-attr]
@@ -92,47 +92,55 @@ def _release(text: str) -> tuple[int, ...]:
 
 
 def machine() -> list[Finding]:
-    """Cores and memory."""
+    """Check cores and memory."""
     memory = memory_gib()
     text = f"{os.cpu_count()} cores, {memory:.0f} GiB memory"
     if memory < _MEMORY_WARNING_GIB:
-        do = f"train and attack elsewhere: that wants {_MEMORY_WARNING_GIB} GiB"
+        do = f"train and attack on another computer, which needs {_MEMORY_WARNING_GIB} GiB"
         return [Finding("machine", WARNING, text, do)]
     return [Finding("machine", OK, text)]
 
 
 def disk(folder: Path, bytes_per_s: float, minutes: float = 30.0) -> list[Finding]:
-    """Minutes of recording that fit at a rate.
+    """Check how many minutes of recording fit on the disk.
 
     Args:
-        folder: Where bags will be written; need not exist.
-        bytes_per_s: What a recording takes [bytes/s].
-        minutes: So many at least should fit.
+        folder: Folder for bags, which need not exist.
+        bytes_per_s: Data rate of a recording [bytes/s].
+        minutes: Shortest recording that should fit [min].
     """
     existing = next(path for path in (folder.resolve(), *folder.resolve().parents) if path.is_dir())
     if not os.access(existing, os.W_OK):
-        return [Finding("disk", FAILURE, f"{existing} cannot be written to", "choose another folder, or its rights")]
+        return [
+            Finding(
+                "disk", FAILURE, f"{existing} cannot be written to", "choose another folder, or change its permissions"
+            )
+        ]
     free = shutil.disk_usage(existing).free
     lasts = free / bytes_per_s / 60.0
     hourly = bytes_per_s * 3600.0 / 1e9
     text = f"{free / 2**30:.1f} GiB free in {existing}: {lasts:.0f} minutes of recording at {hourly:.1f} GB an hour"
     if lasts < 1.0:
-        return [Finding("disk", FAILURE, text, "free some, or name another --folder")]
+        return [Finding("disk", FAILURE, text, "free some space, or give another --folder")]
     if lasts < minutes:
-        return [Finding("disk", WARNING, text, "free some: advnerf bag info says what a bag holds")]
+        return [Finding("disk", WARNING, text, "free some space; advnerf bag info shows what a bag contains")]
     return [Finding("disk", OK, text)]
 
 
 def sockets() -> list[Finding]:
-    """Whether nodes can have their sockets."""
+    """Check whether nodes can create their sockets."""
     try:
         return [Finding("sockets", OK, f"in {user_folder()}")]
     except (BusError, OSError) as error:
-        return [Finding("sockets", FAILURE, str(error), "make that folder ours, or set XDG_RUNTIME_DIR")]
+        return [
+            Finding(
+                "sockets", FAILURE, str(error), "change the owner of that folder to your user, or set XDG_RUNTIME_DIR"
+            )
+        ]
 
 
 def keys(folder: Path | None = None) -> list[Finding]:
-    """Keys for a second host."""
+    """Check the keys for a second host."""
     folder = folder or default_folder()
     store = KeyFolder(folder)
     try:
@@ -143,26 +151,30 @@ def keys(folder: Path | None = None) -> list[Finding]:
     except (SecurityError, OSError) as error:
         return [Finding("keys", WARNING, str(error))]
     ours = ", ".join(row.name for row in rows if row.ours)
-    drivers = ", ".join(row.name for row in rows if DRIVE in row.rights) or "nobody"
+    drivers = ", ".join(row.name for row in rows if DRIVE in row.rights) or "no key"
     if not ours:
         return [Finding("keys", ABSENT, f"none in {folder}", "two hosts need them: advnerf keys new NAME")]
     return [Finding("keys", OK, f"ours: {ours}; {drivers} may drive over the network")]
 
 
 def clock() -> list[Finding]:
-    """Whether this computer's clock is kept by somebody: ages between hosts are no better than their clocks."""
+    """Check whether this computer's clock is synchronised. Ages across hosts are only as accurate as their clocks."""
     seconds, keeper = adjtimex_error_s(), _keeper()
     if seconds is None:
-        do = "with two hosts install chrony on both: sudo apt-get install chrony"
-        return [Finding("clock", WARNING, f"not synchronised, says the kernel; {keeper or 'nobody keeps it'}", do)]
+        do = "for two hosts, install chrony on both: sudo apt-get install chrony"
+        return [
+            Finding(
+                "clock", WARNING, f"not synchronised according to the kernel; {keeper or 'no time service found'}", do
+            )
+        ]
     text = f"off by at most {seconds * 1e3:.1f} ms{', ' + keeper if keeper else ''}"
     if seconds > CLOCK_ERROR_S:
-        return [Finding("clock", WARNING, text, "wait for chrony; chronyc sources says whom it hears")]
+        return [Finding("clock", WARNING, text, "wait for chrony; chronyc sources lists its time sources")]
     return [Finding("clock", OK, text)]
 
 
 def adjtimex_error_s() -> float | None:
-    """Estimated error of the clock [s] from adjtimex(2); None when the kernel calls it unsynchronised."""
+    """Estimated error of the clock [s] from adjtimex(2); None if the kernel reports it as unsynchronised."""
     # struct timex of 64-bit Linux: modes, offset, freq, maxerror, esterror, status, ...; 208 bytes in all.
     buffer = ctypes.create_string_buffer(208)
     state = ctypes.CDLL(None, use_errno=True).adjtimex(buffer)
@@ -171,33 +183,33 @@ def adjtimex_error_s() -> float | None:
 
 
 def _keeper() -> str:
-    """Who keeps the clock: chrony in its own words, or systemd's daemon."""
+    """Describe the time service: chrony or systemd-timesyncd."""
     if shutil.which("chronyc"):
         try:
             told = subprocess.run(
                 ["chronyc", "-n", "-c", "tracking"], capture_output=True, text=True, timeout=_CHRONYC_S, check=False
             )
         except (subprocess.TimeoutExpired, OSError):
-            return "chronyc does not answer"
+            return "no answer from chronyc"
         fields = told.stdout.strip().split(",")
         if told.returncode or len(fields) < 6:
-            return "chronyd does not run: sudo systemctl start chrony"
+            return "chronyd is not running: sudo systemctl start chrony"
         return f"chrony follows {fields[1] or fields[0]}, offset {float(fields[4]) * 1e3:+.2f} ms"
     return "kept by systemd-timesyncd" if Path("/run/systemd/timesync/synchronized").exists() else ""
 
 
 def launches() -> list[Finding]:
-    """What runs already: it holds ports and devices; with two hosts, how far the other one's clock is off."""
+    """Check for running launches, which hold ports and devices, and report the clock offset of a second host."""
     rows = []
     for launch in active_launches():
         text = f"running: {launch['name']} in {launch['run_dir']} (process {launch['pid']})"
-        rows.append(Finding("launches", WARNING, text, "its devices are taken; Ctrl-C in its terminal stops it"))
+        rows.append(Finding("launches", WARNING, text, "its devices are in use; stop it with Ctrl-C in its terminal"))
         rows += _offset(Path(launch["run_dir"]))
     return rows or [Finding("launches", OK, "none running")]
 
 
 def _offset(run_dir: Path) -> Sequence[Finding]:
-    """How far the other host's clock is off, if a gateway of this launch measures it."""
+    """Check the clock offset of the other host, if a gateway of this launch measures it."""
     with Bus(run_dir) as bus:
         bus.subscribe("/clock/offset")
         deadline = time.monotonic() + _OFFSET_WAIT_S
@@ -210,11 +222,11 @@ def _offset(run_dir: Path) -> Sequence[Finding]:
 
 
 def offset_finding(peer: str, offset_s: float, error_s: float) -> Finding:
-    """Judgement about the clock of another host; the limits are those of the safety node."""
+    """Compare the clock offset of another host with the limits of the safety node."""
     text = f"{peer} is {offset_s * 1e3:+.1f} +- {error_s * 1e3:.1f} ms off"
     limit_s = SafetyConfig.model_fields["clock_offset_limit_s"].default
     if abs(offset_s) > limit_s:
-        do = "the car cannot be armed: chrony on both hosts, then chronyc makestep"
+        do = "install chrony on both hosts, then run chronyc makestep; until then the car cannot be armed"
         return Finding("clock offset", FAILURE, text, do)
     near = abs(offset_s) <= CLOCK_ERROR_S
-    return Finding("clock offset", OK if near else WARNING, text, "" if near else "chrony on both hosts")
+    return Finding("clock offset", OK if near else WARNING, text, "" if near else "install chrony on both hosts")

@@ -1,4 +1,4 @@
-"""Motion capture: is the stream there, on our port, with the subjects that we follow?"""
+"""Motion-capture checks: whether the stream arrives on the configured port, with the configured subjects."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from nodes.lab.doctor.check import ABSENT, FAILURE, OK, WARNING, Finding
 
 LISTEN_S = 1.5
 _NAME = "VICON"
-_CURE = "Tracker: System, UDP Object Stream on, to this computer's address; firewall: sudo ufw allow {port}/udp"
+_CURE = "in Tracker, enable System > UDP Object Stream to this computer's address; firewall: sudo ufw allow {port}/udp"
 
 
 def free_port(port: int = DEFAULT_PORT, host: str = "") -> list[Finding]:
-    """Whether nobody else has the port."""
+    """Check that no other program uses the port."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.bind((host, port))
         except OSError as error:
-            do = f"stop what uses it (sudo ss -ulpn 'sport = {port}'), or choose another port here and in Tracker"
+            do = f"stop the program that uses it (sudo ss -ulpn 'sport = {port}'), or choose another port here and in Tracker"
             if error.errno == errno.EADDRNOTAVAIL:
                 do = "give an address of this computer, or 0.0.0.0 for all"
             return [Finding(_NAME, FAILURE, f"UDP {host or '*'}:{port}: {error.strerror}", do)]
@@ -33,13 +33,13 @@ def free_port(port: int = DEFAULT_PORT, host: str = "") -> list[Finding]:
 def listen(
     config: ViconConfig, required: bool = False, listen_s: float = LISTEN_S, needed: Sequence[str] | None = None
 ) -> list[Finding]:
-    """Listen for a moment: datagrams, who sends them, which subjects are seen and how often.
+    """Listen to the stream for a moment, and check datagrams, senders, subjects and rates.
 
     Args:
-        config: How to listen; without subjects every subject counts.
-        required: Whether silence is a failure.
-        listen_s: How long [s].
-        needed: Subjects whose absence is a failure; None means all of the configuration.
+        config: Configuration of the receiver. Without subjects, all are checked.
+        required: Whether a missing stream is a failure.
+        listen_s: Time to listen [s].
+        needed: Subjects whose absence is a failure; None means all configured subjects.
     """
     try:
         if not config.subjects:
@@ -60,7 +60,7 @@ def listen(
     rate_hz = counts.datagrams / listen_s
     rows = [Finding(_NAME, OK, f"{rate_hz:.0f} datagrams a second on {where}")]
     if counts.refused:
-        do = "who else sends there? vicon.source takes Tracker's address alone"
+        do = "find the other sender, or set vicon.source to Tracker's address"
         rows = [Finding(_NAME, WARNING, f"{counts.refused} of {counts.datagrams} datagrams are not Tracker's", do)]
     return rows + [
         _subject(name, number / listen_s, required and name in (needed or config.subjects))
@@ -71,12 +71,12 @@ def listen(
 def _subject(name: str, rate_hz: float, required: bool) -> Finding:
     if rate_hz:
         return Finding(_NAME, OK, f"{name}: {rate_hz:.0f} poses a second")
-    do = "the subject's name in Tracker, its tick mark, its markers"
+    do = "check the subject's name, tick mark and markers in Tracker"
     return Finding(_NAME, FAILURE if required else WARNING, f"{name} is not seen", do)
 
 
 def _names(config: ViconConfig, listen_s: float) -> tuple[str, ...]:
-    """Subjects that are in the stream."""
+    """Names of the subjects in the stream."""
     names: set[str] = set()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:

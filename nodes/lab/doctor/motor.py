@@ -1,4 +1,4 @@
-"""Serial ports and the motor controller behind one: may we open it, what is it, and does it stop the car by itself?"""
+"""Checks of serial ports and the motor controller: permissions, firmware, telemetry, and its own time-out."""
 
 from __future__ import annotations
 
@@ -19,30 +19,34 @@ from nodes.lab.doctor.check import ABSENT, FAILURE, OK, WARNING, Finding
 VESC_USB = (0x0483, 0x5740)
 FIXED_NAME = Path("/dev/vesc")
 BY_ID = Path("/dev/serial/by-id")
-# What docs/wiring.md asks for; a launch file may ask for something else.
+# The values of docs/wiring.md. A launch file may require others.
 WANTED = TimeoutSettings(250, 20.0)
 BATTERY_WARNING_V = 13.2
 _SERIAL_GROUP = "dialout"
 
 
 def ports() -> list[Any]:
-    """Serial ports with a USB device behind them."""
+    """Serial ports of USB devices."""
     from serial.tools import list_ports
 
-    # Ports without hardware behind them have no vendor; every board has a row of those.
+    # Ports without hardware have no vendor id. Every mainboard has several of them.
     return [port for port in list_ports.comports() if port.vid is not None]
 
 
 def serial_ports() -> list[Finding]:
-    """Serial devices on USB, by their stable names, and whether we may open them."""
+    """Check USB serial devices: stable names and permissions."""
     found = ports()
     if not found:
-        return [Finding("serial", ABSENT, "no USB serial device", "the twin brings its own; the car's VESC: its cable")]
+        return [
+            Finding(
+                "serial", ABSENT, "no USB serial device", "check the USB cable of the VESC; the twin does not need one"
+            )
+        ]
     rows = [_port(port) for port in found]
     if manager := _running("ModemManager"):
         do = 'ENV{ID_MM_DEVICE_IGNORE}="1" in the udev rule (docs/wiring.md), or: sudo apt-get purge modemmanager'
         rows.append(
-            Finding("serial", WARNING, f"ModemManager runs (process {manager}) and talks to serial devices unasked", do)
+            Finding("serial", WARNING, f"ModemManager is running (process {manager}) and writes to serial devices", do)
         )
     return rows
 
@@ -53,33 +57,33 @@ def _port(port: Any) -> Finding:
     if not os.access(port.device, os.R_OK | os.W_OK):
         return Finding("serial", WARNING, f"no permission for {text}", permission_cure(_SERIAL_GROUP))
     if (port.vid, port.pid) == VESC_USB and FIXED_NAME not in names:
-        do = f"install the udev rule of docs/wiring.md: {FIXED_NAME} stays the VESC whatever else is plugged in"
+        do = f"install the udev rule of docs/wiring.md, so that {FIXED_NAME} is always the VESC"
         return Finding("serial", WARNING, text, do)
     return Finding("serial", OK, text)
 
 
 def stable_names(device: Path, folders: Iterable[Path] = (BY_ID,), fixed: Path = FIXED_NAME) -> list[Path]:
-    """Names of a device that outlive its unplugging."""
+    """Names of a device that stay the same when it is plugged in again."""
     candidates = [fixed, *(link for folder in folders if folder.is_dir() for link in sorted(folder.iterdir()))]
     return [link for link in candidates if link.is_symlink() and link.resolve() == device.resolve()]
 
 
 def permission_cure(group: str) -> str:
-    """What to do when a device of a group cannot be opened."""
+    """Advice for a device of a group that cannot be opened."""
     try:
         entry = grp.getgrnam(group)
     except KeyError:
-        return f"this system has no group {group}; ls -l shows who may"
+        return f"this system has no group {group}; ls -l shows who may open the device"
     user = getpass.getuser()
     if entry.gr_gid in os.getgroups():
         return f"you are in the group {group}: ls -l shows who may open it; its udev rule sets GROUP and MODE"
     if user in entry.gr_mem:
-        return f"you are in the group {group}, but since after you logged in: log out and in again"
+        return f"you are in the group {group}, but only since your last login: log out and in again"
     return f"sudo usermod -aG {group} {user}, then log out and in again"
 
 
 def find_vesc() -> str | None:
-    """Port on which a VESC would be; None if nothing looks like one."""
+    """Port of the device that looks like a VESC; None if there is none."""
     if FIXED_NAME.exists():
         return str(FIXED_NAME)
     return next((str(port.device) for port in ports() if (port.vid, port.pid) == VESC_USB), None)
@@ -88,17 +92,19 @@ def find_vesc() -> str | None:
 def vesc(
     port: str | None, wanted: TimeoutSettings = WANTED, battery_v: float = BATTERY_WARNING_V, required: bool = False
 ) -> list[Finding]:
-    """What a motor controller is, and when it stops the car by itself. It is only asked, never commanded.
+    """Check a motor controller: firmware, telemetry, faults, battery and its own time-out. No motor command is sent.
 
     Args:
-        port: Serial device; None takes the one that looks like a VESC.
-        wanted: The latest and weakest stop of its own that is good enough.
+        port: Serial device; None detects a VESC.
+        wanted: Longest accepted time-out and smallest accepted brake current.
         battery_v: Supply voltage below which there is a warning [V].
         required: Whether its absence is a failure.
     """
     port = port or find_vesc()
     if port is None:
-        return [Finding("VESC", FAILURE if required else ABSENT, "none found", "its USB cable; docs/wiring.md")]
+        return [
+            Finding("VESC", FAILURE if required else ABSENT, "none found", "check its USB cable; see docs/wiring.md")
+        ]
     device = Vesc(port, VehicleGains(), DriveLimits())
     try:
         device.open()
@@ -106,14 +112,16 @@ def vesc(
         return [Finding("VESC", WARNING, str(error), "stop the launch, or close VESC Tool")]
     except DeviceNotFound as error:
         denied = os.path.exists(port) and not os.access(port, os.R_OK | os.W_OK)
-        do = permission_cure(_SERIAL_GROUP) if denied else "its USB cable and udev rule (docs/wiring.md)"
+        do = permission_cure(_SERIAL_GROUP) if denied else "check its USB cable and udev rule (docs/wiring.md)"
         return [Finding("VESC", FAILURE, str(error), do)]
     try:
         return _ask(device, wanted, battery_v)
     except LinkTimeout as error:
-        return [Finding("VESC", FAILURE, str(error), "motor battery in? right port? VESC Tool disconnected?")]
+        return [
+            Finding("VESC", FAILURE, str(error), "connect the motor battery, check the port, and disconnect VESC Tool")
+        ]
     except HardwareError as error:
-        return [Finding("VESC", FAILURE, str(error), "advnerf motor info; then cable and firmware")]
+        return [Finding("VESC", FAILURE, str(error), "run advnerf motor info, then check cable and firmware")]
     finally:
         device.abandon()
 
@@ -122,10 +130,10 @@ def _ask(device: Vesc, wanted: TimeoutSettings, battery_v: float) -> list[Findin
     firmware, values = device.identify(), device.read_values(0.5)
     rows = [Finding("VESC", OK, f"{firmware} at {device.port}, telemetry {values.generation}")]
     if values.fault:
-        rows.append(Finding("VESC", WARNING, f"reports a fault: {values.fault_name}", "docs/faults.md says why"))
+        rows.append(Finding("VESC", WARNING, f"reports a fault: {values.fault_name}", "see docs/faults.md"))
     rows.append(_time_out(device, wanted))
     low = values.v_in < battery_v
-    do = "charge, or connect the motor battery" if low else ""
+    do = "charge or connect the motor battery" if low else ""
     return [*rows, Finding("battery", WARNING if low else OK, f"{values.v_in:.1f} V at the VESC", do)]
 
 
@@ -134,18 +142,20 @@ def _time_out(device: Vesc, wanted: TimeoutSettings) -> Finding:
     try:
         found = device.read_timeout()
     except (LinkTimeout, ProtocolError) as error:
-        return Finding(name, WARNING, f"this firmware does not tell: {error}", "look at it in VESC Tool")
+        return Finding(name, WARNING, f"this firmware does not report it: {error}", "check it in VESC Tool")
     if found.at_least(wanted):
-        return Finding(name, OK, f"{found}; at most {wanted} wanted")
+        return Finding(name, OK, f"{found}; required is at most {wanted}")
     do = (
         f"advnerf motor set-timeout --port {device.port} --timeout-ms {wanted.timeout_ms} "
         f"--brake-current {wanted.brake_current_a:g}"
     )
-    return Finding(name, FAILURE, f"{found}, at most {wanted} wanted: the car rolls on when its computer is gone", do)
+    return Finding(
+        name, FAILURE, f"{found}; required is at most {wanted}: the car would keep rolling if its computer failed", do
+    )
 
 
 def _running(name: str) -> int | None:
-    """Process id of a program by its name."""
+    """Process id of a program, found by its name."""
     for folder in Path("/proc").iterdir():
         if folder.name.isdigit():
             try:
@@ -157,10 +167,10 @@ def _running(name: str) -> int | None:
 
 
 def gamepads(required: bool) -> Sequence[Finding]:
-    """Gamepads that the teleop node could read."""
+    """Check which gamepads the teleop node can read."""
     found = sorted(Path("/dev/input/by-id").glob("*-event-joystick")) or sorted(Path("/dev/input").glob("js*"))
     if not found:
-        do = "advnerf teleop with a keyboard; or plug one in (docs/driving.md)"
+        do = "use advnerf teleop with the keyboard, or plug in a gamepad (docs/driving.md)"
         return [Finding("gamepad", WARNING if required else ABSENT, "none", do)]
     denied = [str(path) for path in found if not os.access(path, os.R_OK)]
     if denied:

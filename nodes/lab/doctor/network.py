@@ -1,4 +1,4 @@
-"""Network: the other host of a launch file, its keys, the viewer's port, systems of the library ``motioncapture``."""
+"""Network checks: the other host of a launch file, keys, the viewer's port, systems of the library ``motioncapture``."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _CONNECT_S = 2.0
 
 
 def gateway(config: GatewayConfig) -> list[Finding]:
-    """Keys of this end, and whether the other one, or our own port, is there."""
+    """Check the keys of this end, and whether the other host answers or the own ports are free."""
     address = config.listen or config.connect or ""
     rows = _keys(config, address)
     for port in (config.watch_port, config.drive_port):
@@ -37,10 +37,17 @@ def _keys(config: GatewayConfig, address: str) -> list[Finding]:
             return [Finding("keys", OK, f"ours is {config.key}, the other host's {config.peer_key}")]
         drivers = ", ".join(store.allowed(DRIVE))
     except (SecurityError, OSError) as error:
-        return [Finding("keys", FAILURE, str(error), "docs/two_hosts.md: advnerf keys new, add, allow")]
+        return [
+            Finding(
+                "keys",
+                FAILURE,
+                str(error),
+                "create and allow keys with advnerf keys new, add, allow (docs/two_hosts.md)",
+            )
+        ]
     if not drivers:
         return [
-            Finding("keys", FAILURE, "nobody may drive over the network", "advnerf keys allow workstation --to drive")
+            Finding("keys", FAILURE, "no key may drive over the network", "advnerf keys allow workstation --to drive")
         ]
     return [Finding("keys", OK, f"ours is {config.key}; {drivers} may drive")]
 
@@ -53,9 +60,9 @@ def _own_port(address: str, port: int) -> list[Finding]:
         except OSError as error:
             mine = error.errno != errno.EADDRNOTAVAIL
             do = (
-                f"stop what uses it (sudo ss -tlpn 'sport = {port}')"
+                f"stop the program that uses it (sudo ss -tlpn 'sport = {port}')"
                 if mine
-                else "ip addr says which addresses this computer has"
+                else "use an address of this computer (ip addr lists them)"
             )
             return [Finding("network", FAILURE, f"cannot listen on {address}:{port}: {error.strerror}", do)]
     return [Finding("network", OK, f"TCP {address}:{port} is free")]
@@ -66,20 +73,20 @@ def _other_host(address: str, port: int) -> list[Finding]:
         socket.create_connection((address, port), timeout=_CONNECT_S).close()
     except OSError as error:
         why = error.strerror or str(error) or "no answer"
-        do = "start the launch there; then ping, and its firewall (sudo ufw allow from ... to any port ...)"
+        do = "start the launch there; then check ping and its firewall (sudo ufw allow from ... to any port ...)"
         return [Finding("network", WARNING, f"{address}:{port} does not answer: {why}", do)]
     return [Finding("network", OK, f"{address}:{port} answers")]
 
 
 def viewer(host: str, port: int) -> list[Finding]:
-    """Whether the viewer can listen."""
+    """Check whether the viewer can listen."""
     if importlib.util.find_spec("foxglove") is None:
         return [Finding("viewer", FAILURE, "foxglove-sdk is missing", "pip install 'advnerf[view]'")]
     return [] if port == 0 else _own_port(host, port)
 
 
 def mocap_library(system: str, hostname: str) -> list[Finding]:
-    """Whether the library is there and its host can be found."""
+    """Check whether the library is installed and its host can be resolved."""
     if importlib.util.find_spec("motioncapture") is None:
         return [
             Finding(
@@ -87,9 +94,11 @@ def mocap_library(system: str, hostname: str) -> list[Finding]:
             )
         ]
     if system not in SYSTEMS:
-        return [Finding("VICON", FAILURE, f"no system {system}", f"one of {', '.join(SYSTEMS)}")]
+        return [Finding("VICON", FAILURE, f"unknown system {system}", f"use one of {', '.join(SYSTEMS)}")]
     try:
         socket.getaddrinfo(hostname, None)
     except OSError as error:
-        return [Finding("VICON", FAILURE, f"{hostname}: {error.strerror or error}", "its IP address as vicon.hostname")]
-    return [Finding("VICON", OK, f"{system} at {hostname}; the node says what it sees")]
+        return [
+            Finding("VICON", FAILURE, f"{hostname}: {error.strerror or error}", "set vicon.hostname to its IP address")
+        ]
+    return [Finding("VICON", OK, f"{system} at {hostname}; the node reports the subjects")]

@@ -1,7 +1,7 @@
-"""What the doctor asks of foreign libraries, each in a process of its own: ``python -m nodes.lab.doctor.probes NAME ARGUMENTS``.
+"""Probes of third-party libraries, each in a separate process: ``python -m nodes.lab.doctor.probes NAME ARGUMENTS``.
 
-The last line of the output is the answer as JSON. SDL takes the EGL of its process with it when it ends, torch takes seconds and
-hundreds of megabytes, vendors' libraries may hang or crash: none of them is imported where the doctor lives.
+The last line of the output is the answer as JSON. The doctor's process does not import these libraries: SDL destroys the EGL context
+of its process when it ends, torch takes seconds and hundreds of megabytes, and vendors' libraries may hang or crash.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any
 
 
 def torch() -> dict[str, Any]:
-    """Version of torch, and the graphics processors that it can use."""
+    """Version of torch, and the GPUs that it can use."""
     import torch
 
     gpus = (
@@ -24,7 +24,7 @@ def torch() -> dict[str, Any]:
 
 
 def egl() -> dict[str, Any]:
-    """Version of MuJoCo, and who renders; draws into a context without a window."""
+    """Version of MuJoCo and its renderer, tested by rendering without a window."""
     os.environ.setdefault("MUJOCO_GL", "egl")
     import mujoco
 
@@ -34,7 +34,7 @@ def egl() -> dict[str, Any]:
 
 
 def llvm() -> dict[str, Any]:
-    """Version of Mitsuba, and of the LLVM that it compiles with."""
+    """Versions of Mitsuba and of its LLVM."""
     from advnerf_core.objects.mesh.engine import engine
 
     found = engine()
@@ -42,7 +42,7 @@ def llvm() -> dict[str, Any]:
 
 
 def oaks() -> list[str]:
-    """One line for each OAK; raises ImportError without depthai."""
+    """One line for each OAK. Raises ImportError without depthai."""
     import depthai
 
     return [
@@ -51,7 +51,7 @@ def oaks() -> list[str]:
 
 
 def screens() -> dict[str, Any]:
-    """Sizes of the screens [px] as the window system counts them, and its name."""
+    """Sizes of the screens [px] by index of the window system, and the name of the window system."""
     os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
     import pygame
 
@@ -60,7 +60,7 @@ def screens() -> dict[str, Any]:
 
 
 def policy(spec: str, sha256: str) -> dict[str, Any]:
-    """Camera and hash of a policy, and how long it takes to steer by one image [ms], when warm."""
+    """Camera and hash of a policy, and the duration of a warm inference [ms]."""
     import time
 
     import cv2
@@ -85,10 +85,10 @@ PROBES: dict[str, Callable[..., Any]] = {probe.__name__: probe for probe in (tor
 
 
 def main(arguments: list[str]) -> int:
-    """Run one probe; errors are one line."""
+    """Run one probe. Errors are printed as one line."""
     try:
         answer = PROBES[arguments[0]](*json.loads(arguments[1]))
-    except Exception as error:  # whatever a foreign library raises is the finding
+    except Exception as error:  # any exception of a third-party library is the finding
         text = " ".join(str(error).split())
         print(f"{type(error).__name__}: {text}" if text else type(error).__name__, file=sys.stderr)
         return 1
@@ -97,5 +97,5 @@ def main(arguments: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    # Without the teardown of the libraries: one that crashes there has answered already.
+    # Skip the teardown of the libraries, which may crash. The answer is already printed.
     os._exit(main(sys.argv[1:]))

@@ -1,4 +1,4 @@
-"""How much a recording takes: pictures by their size and rate, everything else by the topic table."""
+"""Estimates the data rate of a recording: images by size and rate, other topics by the topic table."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from nodes.runtime.topics import topic as topic_row
 
 _PICTURES = ("sensor_msgs/msg/Image",)
 _COMPRESSED = "sensor_msgs/msg/CompressedImage"
-# JPEG of quality 90 of a room, as a share of the raw picture; and what messages without pictures take with their frame in the bag.
+# Size of a JPEG of quality 90 of a room as a fraction of the raw image; and the size of other messages, with overhead in the bag.
 _JPEG_SHARE, _SMALL_BYTES = 0.17, 400
 _BY_CAMERA = ("camera", "compositor")
 
 
 @dataclass(frozen=True)
 class Pictures:
-    """What the camera delivers.
+    """Format of the camera's images.
 
     Attributes:
-        width: Columns [px].
-        height: Rows [px].
-        rate_hz: Pictures per second.
-        compressed: Whether it also publishes JPEG pictures.
+        width: Width [px].
+        height: Height [px].
+        rate_hz: Rate of images [Hz].
+        compressed: Whether JPEG images are also published.
     """
 
     width: int = 336
@@ -35,12 +35,12 @@ class Pictures:
 def bytes_per_s(
     pictures: Pictures, topics: Iterable[str] | None = None, publishers: Iterable[str] | None = None, statuses: int = 8
 ) -> float:
-    """What a bag grows by [bytes/s].
+    """Data rate of a bag [bytes/s].
 
     Args:
-        pictures: What the camera delivers.
-        topics: What is recorded; None means the whole topic table.
-        publishers: Roles that are there; None means all.
+        pictures: Format of the camera's images.
+        topics: Recorded topics; None means the whole topic table.
+        publishers: Roles of the running nodes; None means all.
         statuses: Nodes whose status is recorded.
     """
     roles = None if publishers is None else set(publishers)

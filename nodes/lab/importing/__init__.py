@@ -1,1 +1,1 @@
-"""Posed images out of what a person has recorded: videos, photographs, bags."""
+"""Makes posed images from recordings: videos, photographs, bags."""

@@ -1,4 +1,4 @@
-"""The map from the colours a scene was learned in to those of the camera that drives through it."""
+"""Fits the map from the colours of a learned scene to those of the driving camera."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from advnerf_core.scene.metrics import psnr
 from advnerf_core.scene.render_field import FieldRenderer
 from nodes.lab.importing.errors import ImportRecordingError
 
-# Where a ray got through, the scene has no colour to compare.
+# Rays with a higher transmittance have no scene colour to compare.
 _LEAST_ALPHA = 0.9
 _LEAST_SEEN = 0.05
 
 
 @dataclass(frozen=True)
 class ColourMatch:
-    """A fitted map.
+    """A fitted colour map.
 
     Attributes:
-        map: From learned to driving colours.
-        frames: How many frames it was fitted to.
-        before_db: PSNR of the learned colours against the frames [dB].
-        after_db: The same with the map.
+        map: Map from learned colours to those of the driving camera.
+        frames: Number of frames used for the fit.
+        before_db: PSNR against the frames without the map [dB].
+        after_db: PSNR against the frames with the map [dB].
     """
 
     map: ColourMap
@@ -38,28 +38,28 @@ class ColourMatch:
 
 
 def match_colours(scene: Path, images: Path, output: Path, most: int) -> ColourMatch:
-    """Fit the map on frames of the driving camera and store it with the scene.
+    """Fit the map to frames of the driving camera and store it in the scene file.
 
     Args:
         scene: Scene file.
         images: ``transforms.json`` of the driving camera, in the scene's world.
-        output: Scene file to write; may be the same.
-        most: At most so many frames, evenly spread.
+        output: Scene file to write, which may be the same.
+        most: Largest number of frames, evenly spread.
 
     Raises:
-        ImportRecordingError: The frames look at nothing of the scene.
+        ImportRecordingError: The frames do not show the scene.
     """
     listed = load_transforms(images)
     chosen = np.unique(np.linspace(0, len(listed.frames) - 1, min(most, len(listed.frames))).round().astype(int))
     frames = listed.with_frames([listed.frames[i] for i in chosen]).load()
     field, occupied, metadata = load_scene(scene)
-    # A map of an earlier fit must not be mapped again.
+    # Do not apply the map of an earlier fit.
     learned = seen_colours(FieldRenderer.from_file(scene, IDENTITY), frames)
     inside = np.isfinite(learned).all(axis=-1)
     if inside.mean() < _LEAST_SEEN:
         raise ImportRecordingError(
             f"expected frames that look into the scene of {scene}, got {100 * inside.mean():.1f} % of their pixels inside it; "
-            "are both in one world? make them by one: advnerf scene from-phone-and-car"
+            "make both in one world with advnerf scene from-phone-and-car"
         )
     found = fit_colour_map(learned[inside], frames.rgb[inside])
     real = frames.rgb[inside] / np.float32(255.0)
@@ -70,7 +70,7 @@ def match_colours(scene: Path, images: Path, output: Path, most: int) -> ColourM
 
 
 def seen_colours(renderer: FieldRenderer, views: ImageSet) -> NDArray[np.float32]:
-    """Rendered colours of every view ``[N, H, W, 3]`` in 0..1; NaN where the scene lets the ray through."""
+    """Render the colours of every view ``[N, H, W, 3]`` in 0..1; NaN where the scene is transparent."""
     images = []
     for pose, pinhole in zip(views.T_world_from_camera, views.pinholes, strict=True):
         rgb, _, alpha = renderer.render(pose[None], pinhole)

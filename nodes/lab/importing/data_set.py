@@ -1,4 +1,4 @@
-"""Images and recordings become data sets: a ``transforms.json`` and a report beside it."""
+"""Makes data sets from images and recordings: a ``transforms.json`` and a report."""
 
 from __future__ import annotations
 
@@ -32,38 +32,38 @@ from nodes.runtime.progress import Report
 
 _MEDIA_SHARE = 0.3
 _BOX_PERCENT, _BOX_MARGIN = 0.5, 0.05
-# Against the spread of the x axes: small, so that they decide as soon as the cameras have turned a little.
+# Weight against the spread of the x axes. It is small, so that the axes decide as soon as the cameras have turned a little.
 _LEVEL_WEIGHT = 0.005
 
 
 @dataclass(frozen=True, eq=False)
 class Imported:
-    """What an import made.
+    """Result of an import.
 
     Attributes:
-        transforms: The ``transforms.json`` files, the one with everything first.
-        report: Facts, as in the report file.
+        transforms: The ``transforms.json`` files, the complete one first.
+        report: Content of the report file.
     """
 
     transforms: tuple[Path, ...]
     report: dict[str, Any]
 
     def moved_to(self, folder: Path) -> Imported:
-        """The same in another folder."""
+        """Return the same result in another folder."""
         return replace(self, transforms=tuple(folder / path.name for path in self.transforms))
 
 
 def from_media(
     media: Sequence[Path], output: Path, media_config: MediaConfig, sfm: SfmConfig, extent_m: float, report: Report
 ) -> Imported:
-    """Videos and photographs to a data set, upright and centred, in a scale that is only as good as ``extent_m``.
+    """Make an upright, centred data set from videos and photographs. Its scale is only as accurate as ``extent_m``.
 
     Args:
         media: Videos and folders of photographs.
-        output: Folder of the data set; a run that was stopped goes on there.
-        media_config: Which frames.
-        sfm: How they are put together.
-        extent_m: Largest distance between two places the photographs were taken from [m].
+        output: Folder of the data set. A stopped run resumes there.
+        media_config: Selection of frames.
+        sfm: Settings of structure from motion.
+        extent_m: Largest distance between two camera positions [m].
         report: Progress callback.
     """
     imported = build_beside(
@@ -90,15 +90,15 @@ def _from_media(
 def from_bag(
     bag: Path, output: Path, config: BagConfig, margin_m: float, report: Report, calibration: Path | None = None
 ) -> Imported:
-    """Recorded frames with motion-capture poses to a data set; nothing is estimated.
+    """Make a data set from recorded frames with motion-capture poses. No pose is estimated.
 
     Args:
         bag: Bag folder or file.
         output: Folder of the data set.
-        config: Which frames.
-        margin_m: How far the scene reaches beyond the camera's way [m].
+        config: Selection of frames.
+        margin_m: Margin of the scene box around the camera's trajectory [m].
         report: Progress callback.
-        calibration: The camera's file; None takes the bag's.
+        calibration: Camera calibration file; None uses the one in the bag.
     """
     imported = build_beside(
         output, (), lambda folder: _from_bag(bag, folder, config, margin_m, report, calibration), resumes=False
@@ -122,10 +122,10 @@ def from_phone_and_car(
     media: Sequence[Path], bag: Path, output: Path, media_config: MediaConfig, bag_config: BagConfig, sfm: SfmConfig,
     placing: PlacingConfig, report: Report, calibration: Path | None = None,
 ) -> Imported:  # fmt: skip
-    """Phone media and frames of a driven bag in one model, metric and in the motion-capture world.
+    """Combine phone media and frames of a bag in one model, metric and in the motion-capture world.
 
-    ``transforms.json`` holds all registered images with the model's poses, ``transforms_phone.json`` only the phone's (to learn a
-    scene from), ``transforms_car.json`` all frames of the car with their motion-capture poses (to fit colours and to compare).
+    ``transforms.json`` has all registered images with the model's poses, ``transforms_phone.json`` only those of the phone (for
+    training), ``transforms_car.json`` all frames of the car with their motion-capture poses (to fit colours and to compare).
     """
     imported = build_beside(
         output, media,
@@ -146,7 +146,7 @@ def _from_phone_and_car(
     )
     if any(source.camera_id == CAR_CAMERA for source in sources):
         raise ImportRecordingError(
-            f"expected phone media under another name than {CAR_CAMERA!r}, the driving camera's; rename it"
+            f"expected phone media with another name than {CAR_CAMERA!r}, which is the driving camera's; rename it"
         )
     names = tuple(file.relative_to(output).as_posix() for file in frames.files)
     camera = frames.calibration
@@ -161,10 +161,10 @@ def _from_phone_and_car(
 
 
 def upright(model: Model, extent_m: float) -> Similarity:
-    """The similarity that makes z point up and puts the middle of the points at the origin.
+    """Compute the similarity that makes z point up and moves the centre of the points to the origin.
 
-    Up is where the cameras' own up points in the mean, drawn to what is square to all their x axes: people hold a camera level more
-    exactly than they look straight ahead.
+    Up is the mean up direction of the cameras, pulled towards the direction perpendicular to all their x axes, because people hold a
+    camera level more accurately than they point it straight ahead.
     """
     poses = model.poses
     sideways, up = poses[:, :3, 0], -poses[:, :3, 1].mean(axis=0)
@@ -175,7 +175,9 @@ def upright(model: Model, extent_m: float) -> Similarity:
     R = np.stack([x, np.cross(up, x), up])
     spread = extent(poses[:, :3, 3])
     if spread <= 0.0:
-        raise ImportRecordingError("expected photographs from different places, got all from one; move, not only turn")
+        raise ImportRecordingError(
+            "expected photographs from different places, got all from one; move the camera instead of only turning it"
+        )
     scale = extent_m / spread
     middle = np.median(model.points, axis=0) if len(model.points) else poses[:, :3, 3].mean(axis=0)
     return Similarity(scale, make_transform(R, -scale * R @ middle))
@@ -199,7 +201,7 @@ def _write_joint(output: Path, model: Model, placed: Placed, frames: DrivenFrame
     phone = [index for index in everything if model.images[index].camera_id != CAR_CAMERA]
     if not phone:
         raise ImportRecordingError(
-            "expected images of the phone in one model with the car's, got none; film at the car's height along its track too"
+            "expected images of the phone in one model with the car's, got none; also film along the track at the car's height"
         )
     paths = (output / TRANSFORMS, output / TRANSFORMS_PHONE, output / TRANSFORMS_CAR)
     _write_model(paths[0], output, model, poses, everything, extra)
@@ -236,13 +238,13 @@ def _bag_facts(frames: DrivenFrames) -> dict[str, Any]:
 
 
 def _box_of(points: Array, poses: Array) -> dict[str, Any]:
-    """The box of nearly all points and of all cameras; a few points of every model lie far outside."""
+    """Box around nearly all points and all cameras. A few points of every model lie far outside."""
     ends = np.percentile(points, [_BOX_PERCENT, 100.0 - _BOX_PERCENT], axis=0) if len(points) else np.zeros((0, 3))
     return _box(np.concatenate([ends, poses[:, :3, 3]]), _BOX_MARGIN)
 
 
 def _box(corners: Array, margin: float) -> dict[str, Any]:
-    """Instant-NGP's way to say which cube the scene is in: its unit cube is ``scale x + offset``."""
+    """Scene cube in the format of Instant-NGP, whose unit cube is ``scale x + offset``."""
     low, high = corners.min(axis=0), corners.max(axis=0)
     scale = 1.0 / (float((high - low).max()) * (1.0 + 2.0 * margin))
     return {"aabb_scale": 1, "scale": scale, "offset": (0.5 - scale * 0.5 * (low + high)).tolist()}

@@ -1,4 +1,4 @@
-"""Frames of a driven bag with the camera's pose at the moment each was taken, by motion capture and calibration."""
+"""Takes frames of a bag with the camera's pose at each capture stamp, from motion capture and calibration."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ _WHOLE_DRIVE_S = 1e6
 
 @dataclass(frozen=True)
 class BagConfig:
-    """Which frames of a bag are taken.
+    """Selection of frames of a bag.
 
     Attributes:
-        step_m: A new frame after the camera has moved so far [m].
-        step_rad: Or turned so far [rad].
-        max_gap_s: Frames in a longer gap of the motion capture have no pose [s].
-        most: At most so many, evenly thinned out.
+        step_m: Distance between two frames [m].
+        step_rad: Rotation after which the next frame is taken even without that distance [rad].
+        max_gap_s: Longest gap of the motion capture in which frames get a pose [s].
+        most: Largest number of frames, evenly thinned out.
     """
 
     step_m: float = 0.1
@@ -51,16 +51,16 @@ class BagConfig:
 
 @dataclass(frozen=True, eq=False)
 class DrivenFrames:
-    """Frames on disk with poses.
+    """Frames on disk with their poses.
 
     Attributes:
         files: Image files in order of time.
         stamps_ns: Capture stamps [ns since 1970].
         T_world_from_camera: ``[N, 4, 4]`` in the motion-capture world.
         calibration: The camera.
-        recorded: Frames in the bag.
-        without_pose: Frames that were left out because motion capture had a gap.
-        unchecked: Why the bag may be damaged without a sign of it; empty where checksums cover it.
+        recorded: Number of frames in the bag.
+        without_pose: Number of frames that were skipped because motion capture had a gap.
+        unchecked: Why damage to the bag may go unnoticed; empty if checksums cover it.
     """
 
     files: tuple[Path, ...]
@@ -75,18 +75,18 @@ class DrivenFrames:
 def take_frames(
     bag: Path, folder: Path, config: BagConfig, report: Report, calibration: Path | None = None
 ) -> DrivenFrames:
-    """Write frames of a bag as PNG files and find their poses.
+    """Write frames of a bag as PNG files and determine their poses.
 
     Args:
         bag: Bag folder or file.
-        folder: Where the files go, named by their capture stamps.
-        config: Which frames.
-        report: Told of the progress.
-        calibration: The camera's file; None takes the one that rides along in the bag.
+        folder: Folder for the files, which are named by their capture stamps.
+        config: Selection of frames.
+        report: Progress callback.
+        calibration: Camera calibration file; None uses the one attached to the bag.
 
     Raises:
-        BagError: The bag is unfinished or has not the topics.
-        ImportRecordingError: No calibration, another image size than calibrated, no poses for the frames.
+        BagError: The bag is unfinished or lacks the topics.
+        ImportRecordingError: There is no calibration, the image size differs from it, or the frames have no poses.
     """
     camera = _camera(bag, calibration)
     poses = _car_poses(bag, config)
@@ -95,8 +95,8 @@ def take_frames(
     placed = [(index, stamp, pose.T @ camera.mount) for index, stamp in enumerate(stamps) if (pose := poses.at(stamp))]
     if not placed:
         raise ImportRecordingError(
-            f"expected frames of {bag} with poses of {CAR_TOPIC} at their stamps, got {len(stamps)} frames and not one pose in time; "
-            "was the motion capture on, and were both clocks in step?"
+            f"expected frames of {bag} with poses of {CAR_TOPIC} at their stamps, got {len(stamps)} frames without any pose; "
+            "was the motion capture on, and were both clocks synchronised?"
         )
     chosen = choose_by_motion(np.stack([T for _, _, T in placed]), config)
     wanted = {placed[i][0]: placed[i] for i in chosen}
@@ -109,7 +109,7 @@ def take_frames(
 
 
 def choose_by_motion(T_world_from_camera: Array, config: BagConfig) -> list[int]:
-    """Indices of poses ``[N, 4, 4]`` that are a step apart in place or angle from the one before; at most ``config.most``."""
+    """Indices of poses ``[N, 4, 4]`` that are at least a step from the previous one in position or angle; at most ``config.most``."""
     chosen = [0]
     for index, pose in enumerate(T_world_from_camera):
         last = T_world_from_camera[chosen[-1]]
@@ -163,7 +163,7 @@ def _write_frames(
         if index not in wanted:
             continue
         file = folder / f"{wanted[index][1]}.png"
-        if not file.exists():  # whole or not there: it was written under another name first
+        if not file.exists():  # an existing file is complete, because it was written under another name first
             _write_png(file, _rgb(message, camera, f"{topic} in {bag}"))
         files.append(file)
     for stranger in set(folder.glob("*.png")) - set(files):

@@ -1,4 +1,4 @@
-"""What can be wrong with recordings."""
+"""Errors of recordings."""
 
 from __future__ import annotations
 
@@ -6,4 +6,4 @@ from advnerf_core.errors import AdvnerfError
 
 
 class ImportRecordingError(AdvnerfError):
-    """A recording cannot become a data set; the message says what was expected, what came and what to do."""
+    """A recording cannot be converted to a data set. The message says what was expected, what came and what to do."""

@@ -1,4 +1,4 @@
-"""Videos and folders of photographs become one folder of upright images, by camera."""
+"""Converts videos and folders of photographs to one folder of upright images, by camera."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ IMAGES = "images"
 
 @dataclass(frozen=True)
 class MediaConfig:
-    """How media become images.
+    """Settings for the conversion of media to images.
 
     Attributes:
-        keyframes: How frames of videos are chosen.
-        most: At most so many images of each video or folder.
-        one_camera: Whether all were taken by one camera, with one focal length.
+        keyframes: Selection of video frames.
+        most: Largest number of images of each video or folder.
+        one_camera: Whether all images are from one camera with one focal length.
     """
 
     keyframes: KeyframeConfig = field(default_factory=KeyframeConfig)
@@ -38,13 +38,13 @@ class MediaConfig:
 
 
 def gather(media: Sequence[Path], output: Path, config: MediaConfig, report: Report) -> list[Source]:
-    """Fill ``output/images`` from videos and folders of photographs; what an earlier run finished is left as it is.
+    """Fill ``output/images`` from videos and folders of photographs. Finished parts of an earlier run are kept.
 
     Args:
-        media: Video files, folders of photographs, or single photographs; single ones count as one folder.
+        media: Video files, folders of photographs, or single photographs. The single ones count as one folder.
         output: Folder of the data set.
-        config: How.
-        report: Told of the progress.
+        config: Settings.
+        report: Progress callback.
 
     Returns:
         One source for each video or folder, with paths relative to ``output``.
@@ -59,7 +59,9 @@ def gather(media: Sequence[Path], output: Path, config: MediaConfig, report: Rep
         elif path.is_file():
             entries.append((path.stem, [path], True))
         else:
-            raise ImportRecordingError(f"expected a video or a folder of photographs, got {path}, which does not exist")
+            raise ImportRecordingError(
+                f"expected a video or a folder of photographs at {path}, found none; correct the path"
+            )
     sources, names = [], set[str]()
     for index, (label, files, is_video) in enumerate(entries):
         name = _unique(label, names)
@@ -82,7 +84,7 @@ def _part_of(report: Report, index: int, parts: int) -> Report:
 
 
 def photographs_in(folder: Path) -> list[Path]:
-    """Image files of a folder, by name; numbers in names count as numbers."""
+    """Image files of a folder, sorted by name. Numbers in names are sorted by value."""
     files = [path for path in folder.iterdir() if path.suffix.lower() in image_files.SUFFIXES and path.is_file()]
     if not files:
         raise ImportRecordingError(
@@ -94,7 +96,7 @@ def photographs_in(folder: Path) -> list[Path]:
 
 
 def _unique(label: str, taken: set[str]) -> str:
-    # Spaces would break the list of pairs that is handed to COLMAP.
+    # Spaces would break the list of pairs for COLMAP.
     base = re.sub(r"[^A-Za-z0-9_-]+", "_", label).strip("_") or "camera"
     name, number = base, 2
     while name in taken:
@@ -119,22 +121,22 @@ def _copy_photographs(files: Sequence[Path], folder: Path, report: Report) -> li
             _copy(file, copy)
         copies.append(copy)
         report((index + 1) / len(files), f"{index + 1} of {len(files)} photographs copied")
-    for stranger in set(folder.iterdir()) - set(copies):  # of an earlier run with other photographs
+    for stranger in set(folder.iterdir()) - set(copies):  # from an earlier run with other photographs
         stranger.unlink() if stranger.is_file() else shutil.rmtree(stranger)
     return copies
 
 
 def _copy(file: Path, copy: Path) -> None:
-    """A copy that is whole, readable, and upright for readers that do not know EXIF too."""
+    """Make a complete, readable copy that is also upright for readers that ignore EXIF."""
     data = image_files.read_bytes(file)
-    image_files.read_image(file)  # a damaged one is an error that names it
+    image_files.read_image(file)  # raises an error that names a damaged file
     if data.startswith(b"\xff\xd8") and b"Exif" in data[:65536]:
         raw = np.frombuffer(data, np.uint8)
         as_stored = cv2.imdecode(raw, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
         upright = cv2.imdecode(raw, cv2.IMREAD_COLOR)
         if as_stored is not None and upright is not None and not np.array_equal(as_stored, upright):
             turned = cv2.imencode(".jpg", upright, [cv2.IMWRITE_JPEG_QUALITY, video.JPEG_QUALITY])[1].tobytes()
-            # The camera and its focal length are in the EXIF data, and structure from motion wants them.
+            # Keep the camera and focal length in the EXIF data for structure from motion.
             data = turned[:2] + image_files.upright_exif(data) + turned[2:]
     write_atomically(copy, data)
     now = file.stat()

@@ -1,4 +1,4 @@
-"""A data set is built beside its folder and moved there when it is whole: a failed import leaves nothing that looks like a scene."""
+"""Builds a data set in a separate folder and moves it when it is complete, so that a failed import leaves no incomplete data set."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from nodes.runtime.locks import HeldError, hold
 
 TRANSFORMS, REPORT_FILE, COLMAP = "transforms.json", "import.json", "colmap"
 TRANSFORMS_PHONE, TRANSFORMS_CAR = "transforms_phone.json", "transforms_car.json"
-# In the order in which they are moved; with the last one the folder is a data set.
+# In the order in which they are moved. After the last one, the folder is a data set.
 _ENTRIES = (IMAGES, COLMAP, REPORT_FILE, TRANSFORMS_PHONE, TRANSFORMS_CAR, TRANSFORMS)
 _CLAIM, _LOCK = ".made_by_advnerf", ".lock"
 
@@ -24,28 +24,28 @@ Built = TypeVar("Built")
 
 
 def work_folder(output: Path) -> Path:
-    """Where the data set of a folder is built: beside it, with ``.part`` added to its name."""
+    """Folder in which a data set is built: its name with ``.part`` appended."""
     output = output.resolve()
     return output.with_name(f"{output.name}.part")
 
 
 def build_beside(output: Path, media: Sequence[Path], build: Callable[[Path], Built], resumes: bool = True) -> Built:
-    """Build a data set in the work folder and move it to its place.
+    """Build a data set in the work folder and move it to its destination.
 
-    A stopped import keeps its work folder if structure from motion or the choice of a video's frames had begun, and the next one goes
-    on there. Files in ``output`` that no import makes are left alone; an earlier data set there stays whole until the new one is.
+    A stopped import keeps its work folder if structure from motion or the selection of video frames had started, and the next import
+    resumes there. Other files in ``output`` are not touched. An earlier data set there is kept until the new one is complete.
 
     Args:
         output: Folder of the data set.
-        media: What is read; must not lie in the folders that are replaced.
-        build: Makes the data set in the folder that it is given.
-        resumes: Whether an import that fails or is stopped may leave its work folder behind; otherwise it is always removed.
+        media: Input files, which must not be in the replaced folders.
+        build: Builds the data set in a given folder.
+        resumes: Whether a failed or stopped import may keep its work folder. Otherwise it is always removed.
 
     Returns:
-        What ``build`` returned.
+        The result of ``build``.
 
     Raises:
-        ImportRecordingError: A folder holds somebody's files, or another import is at work; or ``build`` failed and left work behind.
+        ImportRecordingError: A folder has other files, another import is running, or ``build`` failed and its work is kept.
     """
     work = work_folder(output)
     _require_ours(output, work, media)
@@ -55,7 +55,7 @@ def build_beside(output: Path, media: Sequence[Path], build: Callable[[Path], Bu
         lock = hold(work / _LOCK)
     except HeldError as error:
         raise ImportRecordingError(
-            f"expected no other import into {output}, but process {error.owner} is at work in {work}; wait for it, or stop it"
+            f"expected no other import into {output}, but process {error.owner} is using {work}; wait until it ends, or stop it"
         ) from None
     with lock:
         try:
@@ -70,7 +70,7 @@ def build_beside(output: Path, media: Sequence[Path], build: Callable[[Path], Bu
                 shutil.rmtree(work)
             elif isinstance(error, AdvnerfError):
                 raise ImportRecordingError(
-                    f"{error}. Finished work is kept in {work}: the same command goes on there"
+                    f"{error}. Finished work is kept in {work}: run the same command to resume"
                 ) from error
             raise
         _move(work, output)
@@ -78,31 +78,33 @@ def build_beside(output: Path, media: Sequence[Path], build: Callable[[Path], Bu
 
 
 def _require_ours(output: Path, work: Path, media: Sequence[Path]) -> None:
-    """Images there are replaced and removed, so they must be ours: photographs of a person are never touched."""
+    """Check that the images in a folder are from an earlier import, because they are replaced. A user's photographs are never touched."""
     for images in (output / IMAGES, work):
         inside = [path for path in media if path.resolve().is_relative_to(images.resolve())]
         if inside:
             raise ImportRecordingError(
-                f"expected media outside {images}, where the data set keeps its own copies, got {inside[0]}; give another --output"
+                f"expected media outside {images}, where the data set stores its copies; got {inside[0]}. Give another --output"
             )
     images = output / IMAGES
     if images.exists() and any(images.iterdir()) and not (images / _CLAIM).exists():
         raise ImportRecordingError(
-            f"expected a new folder or one of an earlier import, but {images} holds other files; give another --output"
+            f"expected a new folder or one of an earlier import, but {images} has other files; give another --output"
         )
     if work.exists() and any(work.iterdir()) and not ((work / IMAGES / _CLAIM).exists() or (work / _LOCK).exists()):
         raise ImportRecordingError(
-            f"expected to build the data set in {work}, but that folder holds other files; rename it, or give another --output"
+            f"expected to build the data set in {work}, but that folder has other files; rename it, or give another --output"
         )
 
 
 def _take_over(output: Path, work: Path) -> None:
-    """Begin with the images and the structure from motion of an earlier import, which may be most of the work."""
+    """Reuse the images and the structure from motion of an earlier import, which may be most of the work."""
     if not (output / IMAGES / _CLAIM).exists():
         return
     shutil.copytree(output / IMAGES, work / IMAGES, copy_function=_link_or_copy)
     if (output / COLMAP).exists():
-        shutil.copytree(output / COLMAP, work / COLMAP)  # no links: COLMAP writes into its database
+        shutil.copytree(
+            output / COLMAP, work / COLMAP
+        )  # copied instead of linked, because COLMAP writes to its database
 
 
 def _link_or_copy(source: str, target: str) -> None:
@@ -113,12 +115,12 @@ def _link_or_copy(source: str, target: str) -> None:
 
 
 def _is_worth_keeping(work: Path) -> bool:
-    # Copies of photographs are there again in seconds. Features and the frames of a video are not.
+    # Photographs can be copied again in seconds. Features and video frames take longer.
     return (work / COLMAP).exists() or any((work / IMAGES).glob("*/keyframes.json"))
 
 
 def _move(work: Path, output: Path) -> None:
-    """Put a finished data set in its place; stopped half-way, the folder holds no ``transforms.json``."""
+    """Move a finished data set to its destination. If this is interrupted, the folder has no ``transforms.json``."""
     output.mkdir(parents=True, exist_ok=True)
     for name in reversed(_ENTRIES):
         if (output / name).is_dir():

@@ -1,1 +1,1 @@
-"""Policies from recordings: frames of bags and of foreign logs, training on them, and how well a policy predicts them."""
+"""Policies from recordings: frames of bags and foreign logs, training on them, and evaluation of a policy on them."""

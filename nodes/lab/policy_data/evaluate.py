@@ -1,4 +1,4 @@
-"""How well a policy predicts a recording: error table, curve, and where in the image its steering comes from."""
+"""Evaluates a policy on a recording: error table, steering plot and saliency."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ _VIDEO_SCALE = 4
 
 @dataclass(frozen=True)
 class Errors:
-    """Predicted minus true steering.
+    """Statistics of predicted minus true steering.
 
     Attributes:
-        count: Frames compared.
+        count: Number of compared frames.
         mean_abs_rad: Mean absolute error [rad].
         rms_rad: Root mean square error [rad].
         worst_rad: Largest absolute error [rad].
-        bias_rad: Mean error; positive steers further left [rad].
-        correlation: Pearson's, NaN where one side is constant.
-        zero_rad: Mean absolute error of always steering straight on, to compare with [rad].
+        bias_rad: Mean error; positive means further left [rad].
+        correlation: Pearson correlation; NaN if one side is constant.
+        zero_rad: Mean absolute error of always steering straight, for comparison [rad].
     """
 
     count: int
@@ -44,11 +44,13 @@ class Errors:
 
 
 def compare(predicted_rad: NDArray[np.floating[Any]], true_rad: NDArray[np.floating[Any]]) -> Errors:
-    """Errors over the frames where both are known."""
+    """Compute the errors over the frames in which both are known."""
     known = np.isfinite(predicted_rad) & np.isfinite(true_rad)
     predicted, true = np.asarray(predicted_rad, float)[known], np.asarray(true_rad, float)[known]
     if not len(true):
-        raise ConfigError("expected frames with a steering angle to compare with, got none")
+        raise ConfigError(
+            "expected frames with a recorded or labelled steering angle, got none; use another recording or --labels"
+        )
     error = predicted - true
     varies = predicted.std() > 0.0 and true.std() > 0.0
     return Errors(
@@ -59,7 +61,7 @@ def compare(predicted_rad: NDArray[np.floating[Any]], true_rad: NDArray[np.float
 
 
 def predict(policy: Any, images: NDArray[np.uint8], goal: tuple[float, ...] = ()) -> NDArray[np.float64]:
-    """Steering ``[N]`` [rad] of a loaded policy on policy images ``[N, H, W, 3]`` uint8."""
+    """Compute the steering ``[N]`` [rad] of a loaded policy for policy images ``[N, H, W, 3]`` uint8."""
     parts = []
     with torch.no_grad():
         for start in range(0, len(images), _BATCH):
@@ -68,7 +70,7 @@ def predict(policy: Any, images: NDArray[np.uint8], goal: tuple[float, ...] = ()
 
 
 def saliency(policy: Any, images: NDArray[np.uint8], goal: tuple[float, ...] = ()) -> NDArray[np.float32]:
-    """Share ``[N, H, W]`` in 0..1 of each pixel: absolute gradient of the steering, summed over colours, smoothed.
+    """Compute the saliency ``[N, H, W]`` in 0..1: absolute gradient of the steering, summed over colours, smoothed.
 
     Gradient saliency after Simonyan et al., "Deep Inside Convolutional Networks", 2014, with a blur of 1.5 px.
     """
@@ -83,14 +85,14 @@ def saliency(policy: Any, images: NDArray[np.uint8], goal: tuple[float, ...] = (
 
 
 def overlay(image: NDArray[np.uint8], share: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """The image with its saliency in red, ``[H, W, 3]`` uint8 RGB."""
+    """Overlay the saliency in red on an image, ``[H, W, 3]`` uint8 RGB."""
     grey = cv2.cvtColor(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), cv2.COLOR_GRAY2RGB).astype(np.float32)
     red = np.array([255.0, 40.0, 0.0], np.float32)
     return np.asarray(grey + share[..., None] * (red - grey), dtype=np.float32).round().astype(np.uint8)
 
 
 def draw(recording: Recording, predicted_rad: NDArray[np.float64], title: str, out: Path) -> None:
-    """Predicted, recorded and labelled steering over time, as PNG."""
+    """Plot predicted, recorded and labelled steering over time as PNG."""
     import io
 
     from matplotlib.figure import Figure
@@ -119,7 +121,7 @@ def draw(recording: Recording, predicted_rad: NDArray[np.float64], title: str, o
 def write_saliency(
     policy: Any, recording: Recording, out: Path, count: int, video: bool, goal: tuple[float, ...] = ()
 ) -> list[Path]:
-    """PNG files of ``count`` frames spread over the recording, image above saliency; with ``video`` an MP4 of all frames."""
+    """Write PNG files of ``count`` frames spread over the recording, image above saliency, and with ``video`` an MP4 of all frames."""
     images = recording.frames.images
     chosen = np.unique(np.linspace(0, len(images) - 1, min(count, len(images))).round().astype(int))
     out.mkdir(parents=True, exist_ok=True)
@@ -139,7 +141,7 @@ def _write_video(policy: Any, images: NDArray[np.uint8], path: Path, goal: tuple
     size = (width * _VIDEO_SCALE, height * _VIDEO_SCALE)
     writer = cv2.VideoWriter(str(partial), cv2.VideoWriter.fourcc(*"mp4v"), 10.0, size)
     if not writer.isOpened():
-        raise ConfigError(f"this OpenCV cannot write {path}; leave --video out, the PNG files are there")
+        raise ConfigError(f"this OpenCV cannot write {path}; remove --video (the PNG files are written)")
     for start in range(0, len(images), _BATCH):
         batch = images[start : start + _BATCH]
         for image, share in zip(batch, saliency(policy, batch, goal), strict=True):

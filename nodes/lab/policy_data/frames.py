@@ -1,8 +1,8 @@
-"""Training frames from recordings: images joined with steering by capture stamp.
+"""Takes training frames from recordings: images joined with steering by capture stamp.
 
-Of a bag, only what was captured while the car was armed counts. The label is what the expert would steer at the measured pose
-(which makes every bag with poses a DAgger round, whoever drove), or what was sent to the motor controller. A disturbance that
-the expert added to its own steering is in neither place: it is not in the expert's law, and `recorded` leaves such frames out.
+Only images captured while the car was armed are used. The label is either the expert's steering at the measured pose (so every bag
+with poses is a DAgger round, no matter which driver recorded it), or the command sent to the motor controller. Disturbances that the
+expert added to its steering are in neither: they are not in the expert's control law, and ``recorded`` skips such frames.
 """
 
 from __future__ import annotations
@@ -43,11 +43,11 @@ class Recording:
     """Frames with their stamps.
 
     Attributes:
-        frames: Images, states (NaN where none was measured) and labels.
-        stamps_ns: Capture stamps ``[N]`` [ns]; row numbers for a log without any.
-        recorded_rad: Steering ``[N]`` that was sent [rad]; NaN where none was.
-        name: Where it comes from.
-        counts: Images that were left out, by reason.
+        frames: Images, states (NaN if not measured) and labels.
+        stamps_ns: Capture stamps ``[N]`` [ns]; row numbers for a log without stamps.
+        recorded_rad: Sent steering ``[N]`` [rad]; NaN without a command.
+        name: Origin of the frames.
+        counts: Number of skipped images, by reason.
     """
 
     frames: Frames
@@ -59,7 +59,7 @@ class Recording:
 
 @dataclass
 class _Track:
-    """Everything of a bag that images are joined with."""
+    """Data of a bag with which images are joined."""
 
     poses: PoseBuffer = field(default_factory=lambda: PoseBuffer(keep_s=1e6))
     armed: list[tuple[int, bool]] = field(default_factory=list)
@@ -67,14 +67,14 @@ class _Track:
     disturbed: list[tuple[int, bool]] = field(default_factory=list)
 
     def is_armed(self, stamp_ns: int) -> bool:
-        """Whether the car was armed; a bag without the safety node's word is taken as driven throughout."""
+        """Whether the car was armed. A bag without states of the safety node counts as armed throughout."""
         return not self.armed or bool(_last(self.armed, stamp_ns))
 
     def is_disturbed(self, stamp_ns: int) -> bool:
         return bool(self.disturbed) and bool(_last(self.disturbed, stamp_ns))
 
     def steering_rad(self, stamp_ns: int) -> float:
-        """Steering that was sent for an image: by its stamp, or the first one written after it."""
+        """Steering [rad] that was sent for an image, found by its stamp, or else the first command sent after it."""
         index = bisect_left(self.sent, (stamp_ns, -math.inf))
         if index == len(self.sent) or self.sent[index][0] - stamp_ns > _JOIN_S * NS_PER_S:
             return math.nan
@@ -84,14 +84,14 @@ class _Track:
 def frames_of_bag(
     bag: Path, view: PolicyView, expert: Expert | None, labels: Labels = "expert", images_on: str | None = None
 ) -> Recording:
-    """Frames of a driven bag.
+    """Take the frames of a bag.
 
     Args:
         bag: Bag folder or file.
-        view: How camera images become policy images.
-        expert: The teacher, at the policy's delay; may be None for recorded labels.
-        labels: Where they come from.
-        images_on: Topic of the images, raw or compressed; None takes the compositor's if there are any, else the camera's.
+        view: View that converts camera images to policy images.
+        expert: The teacher, at the policy's delay; None is allowed for recorded labels.
+        labels: Source of the labels.
+        images_on: Topic of the images, raw or compressed; None uses the compositor's, or else the camera's.
     """
     counts_of = {topic.name: topic.count for topic in read_info(bag).topics}
     topic = image_topic(bag, [images_on] if images_on else _IMAGES)
@@ -123,20 +123,22 @@ def frames_of_bag(
 def frames_of_log(
     log: Path, view: PolicyView | None, image_column: str, steering_column: str, rad_per_unit: float = 1.0
 ) -> tuple[Recording, PolicyView]:
-    """Frames of a foreign log: a CSV file with a header, one row per image; images lie relative to the file.
+    """Take the frames of a foreign log: a CSV file with a header and one row per image. Image paths are relative to the file.
 
     Args:
         log: The CSV file.
-        view: How its images become policy images; None takes the same part of the picture as for our own camera.
-        image_column: Name of the column with image files.
-        steering_column: Name of the column with the steering.
-        rad_per_unit: Factor from that column to radians, left positive (negative for logs that steer right).
+        view: View that converts its images to policy images; None uses the same crop fraction as for advnerf's camera.
+        image_column: Column with the image files.
+        steering_column: Column with the steering.
+        rad_per_unit: Factor from that column to radians, left positive (negative for logs in which right is positive).
     """
     images, steering = [], []
     for number, row in enumerate(_rows(log, (image_column, steering_column)), start=2):
         picture = cv2.imread(str(log.parent / row[image_column].strip()), cv2.IMREAD_COLOR)
         if picture is None:
-            raise ConfigError(f"{log}:{number}: expected an image, got {row[image_column]!r}, which cannot be read")
+            raise ConfigError(
+                f"{log}:{number}: expected a readable image, got {row[image_column]!r}; correct or remove the row"
+            )
         try:
             angle_rad = float(row[steering_column]) * rad_per_unit
         except ValueError:
@@ -152,22 +154,22 @@ def frames_of_log(
         images.append(view.image(rgb))
         steering.append(angle_rad)
     if len(images) < 4 or view is None:
-        raise ConfigError(f"expected at least 4 rows in {log}, got {len(images)}")
+        raise ConfigError(f"expected at least 4 rows in {log}, got {len(images)}; record more")
     nowhere = [(math.nan,) * 3] * len(images)
     return _recording(images, nowhere, steering, steering, list(range(len(images))), str(log), {}), view
 
 
 def view_for_size(width: int, height: int) -> PolicyView:
-    """View of a camera of which only the image size is known: the same share of the picture as for our own camera."""
+    """View for a camera with only a known image size, with the same crop fraction as for advnerf's camera."""
     camera = Pinhole(width, height, 0.52 * width, 0.52 * width, 0.5 * width, 0.5 * height)
     return PolicyView(camera, round(height * 24 / 188), round(height * 111 / 188))
 
 
 def first_image(log: Path, image_column: str) -> Path:
-    """The first image of a foreign log."""
+    """Path of the first image of a foreign log."""
     for row in _rows(log, (image_column,)):
         return log.parent / row[image_column].strip()
-    raise ConfigError(f"expected at least 4 rows in {log}, got none")
+    raise ConfigError(f"expected at least 4 rows in {log}, got none; give a log with images")
 
 
 def _rows(log: Path, columns: tuple[str, ...]) -> Iterator[dict[str, str]]:
@@ -201,7 +203,7 @@ def _read_track(bag: Path, topics: list[str]) -> _Track:
         elif message.topic == _EXPERT:
             track.disturbed.append((stamp_ns, decoded.disturbance_rad != 0.0))
         elif not decoded.braking:
-            # In a policy's drive the stamp is that of the image; in an expert's that of a pose just after it.
+            # In a drive of a policy, the stamp is that of the image. In a drive of the expert, it is that of a pose just after it.
             track.sent.append((stamp_ns, float(decoded.steering_rad)))
     for stream in (track.armed, track.sent, track.disturbed):
         stream.sort()

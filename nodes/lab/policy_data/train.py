@@ -1,4 +1,4 @@
-"""A policy from recordings: frames are cut once, training goes on where it was killed, the result appears whole."""
+"""Trains a policy on recordings. Frames are extracted once, a stopped training resumes, and the result is written atomically."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ POLICY = "policy.safetensors"
 
 @dataclass(frozen=True)
 class Part:
-    """One recording that is trained on.
+    """One recording of the training data.
 
     Attributes:
-        name: For people and for the policy's metadata.
-        files: What it is made of; other sizes or times make it another recording.
-        options: How it is cut and labelled.
-        cut: Makes its frames.
-        unchecked: Why its messages may be damaged without a sign of it; empty where checksums cover them.
+        name: Name for messages and for the policy's metadata.
+        files: Files of the recording. If their sizes or times change, it counts as another recording.
+        options: Options of extraction and labels.
+        cut: Extracts the frames.
+        unchecked: Why damage to messages may go unnoticed; empty if checksums cover them.
     """
 
     name: str
@@ -44,22 +44,22 @@ class Part:
 
     @property
     def digest(self) -> str:
-        """Changes with the content of the recording, and with how it is cut."""
+        """Digest of the recording's files and options."""
         files = [(file.name, file.stat().st_size, file.stat().st_mtime_ns) for file in self.files]
         return _digest([self.name, files, self.options])
 
 
 @dataclass(frozen=True)
 class Training:
-    """What came out.
+    """Result of a training.
 
     Attributes:
         path: Policy file.
-        sha256: Its hash.
+        sha256: Hash of the policy file.
         validation_mae_rad: Mean absolute steering error on held-out frames [rad].
-        frames: Frames of each recording, and of the surrogate.
-        left_out: Images of each recording that were not used, by reason.
-        unchecked: Recordings that no checksum covers, and why.
+        frames: Number of frames of each recording, and of the surrogate.
+        left_out: Number of skipped images of each recording, by reason.
+        unchecked: Recordings without checksums, and why.
     """
 
     path: Path
@@ -74,10 +74,10 @@ def train_from_recordings(
     parts: Sequence[Part], view: PolicyView, expert: Expert, config: ImitationConfig, out: Path,
     surrogate: SourcePlan | None = None, progress: Progress | None = None,
 ) -> Training:  # fmt: skip
-    """Train on recordings, and on the surrogate if there is one; writes ``policy.safetensors`` into ``out``.
+    """Train on recordings, and on the surrogate if given, and write ``policy.safetensors`` to ``out``.
 
-    Frames and checkpoints lie in ``out/work/<digest of everything>``: the same call again goes on, or returns at once; other
-    recordings or settings begin anew, and the work of before is removed when they are through.
+    Frames and checkpoints are in ``out/work/<digest of all inputs>``. The same call resumes, or returns at once if finished. Other
+    recordings or settings start a new training, and remove the earlier work when they are finished.
     """
     claim = {
         "parts": {part.name: part.digest for part in parts}, "view": view.to_dict(), "expert": expert.to_dict(),
@@ -107,7 +107,7 @@ def train_from_recordings(
 
 
 def _cut(part: Part, store: FrameStore, work: Path, report: Progress) -> dict[str, int]:
-    """Cut a recording into a shard, once; returns what was left out."""
+    """Extract the frames of a recording to a shard, once. Returns the numbers of skipped images."""
     record = work / f"{_shard(part)}.json"
     if _shard(part) not in store.names() or not record.is_file():
         report(0.0, f"cutting {part.name}")

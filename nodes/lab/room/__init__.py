@@ -1,1 +1,1 @@
-"""The room from bags and from the running launch: path, fence, targets, and where things stand now."""
+"""Measures the room from bags and the running launch: path, fence, targets, and the current poses of subjects."""

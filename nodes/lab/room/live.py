@@ -1,4 +1,4 @@
-"""Where a subject stands now: the middle of its poses over a moment, and nothing when motion capture has lost it."""
+"""Current pose of a standing subject: the mean of its poses over a short time, or None if motion capture has lost it."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ _LEAST_POSES = 5
 
 
 def standing_poses(run_dir: Path, topic: str, period_s: float, window_s: float = 0.5) -> Iterator[Array | None]:
-    """Mean pose ``[4, 4]`` over a moment, once per period, for ever; None while the subject is lost.
+    """Yield the mean pose ``[4, 4]`` over a window once per period, for ever; None while the subject is lost.
 
     Args:
         run_dir: Folder of the running launch.
         topic: The subject's topic.
-        period_s: Time between two answers [s].
-        window_s: Over how long poses are averaged [s].
+        period_s: Time between two results [s].
+        window_s: Averaging window [s].
     """
     recent: deque[tuple[float, Array]] = deque()
     with Bus(run_dir) as bus:

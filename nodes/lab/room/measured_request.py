@@ -1,4 +1,4 @@
-"""An attack request at the pose that was measured: the other way to bring face and attack together."""
+"""Writes an attack request for the measured pose of the face, as an alternative to moving the face."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ _POSE_KEYS = ("T_world_from_object", "x_m", "y_m", "z_m", "yaw_rad")
 
 
 def write_measured_request(request: Path, pose: dict[str, float]) -> Path:
-    """Write the request again, beside it, with the face's pose replaced.
+    """Write a copy of a request, in the same folder, with the measured pose of the face.
 
     Args:
         request: A ``*.attack.yaml`` file with one object of kind ``face``.
         pose: ``x_m``, ``y_m``, ``z_m`` and ``yaw_rad``.
 
     Returns:
-        The new file; its relative paths mean the same, because it is in the same folder.
+        The new file. Its relative paths stay valid, because it is in the same folder.
     """
     data = read_yaml(request).data
     objects = data.get("objects") if isinstance(data, dict) else None

@@ -1,4 +1,4 @@
-"""The live guide that brings board or monitor to where its attack was computed."""
+"""Live guide for moving the board or monitor to the pose for which its attack was computed."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ def guide(
     once: bool,
     timeout_s: float,
 ) -> tuple[Misplacement, Array] | None:
-    """Show what is off until it stands well, or the time is over.
+    """Show the displacement live until the target is in place, or until the timeout.
 
     Args:
         run_dir: Folder of the running launch.
-        attack: What should be shown where.
-        target: Corners of what shows it.
+        attack: The attack with its pose.
+        target: Corners of the target that shows it.
         limits: Tolerated distance [m] and angle [rad].
-        once: Look once.
-        timeout_s: Give up after so long [s].
+        once: Whether to measure only once.
+        timeout_s: Time after which it gives up [s].
 
     Returns:
-        What was off last, and the subject's pose ``[4, 4]``; None if it was never seen.
+        The last displacement and the subject's pose ``[4, 4]``; None if the subject was never seen.
     """
     found, deadline = None, time.monotonic() + timeout_s
     with Live(console=Console(stderr=True), refresh_per_second=4, transient=True) as live:
@@ -65,18 +65,18 @@ def _placement_table(off: Misplacement, limits: tuple[float, float]) -> Any:
 
 
 def in_short(off: Misplacement) -> str:
-    """Distance and angle, for a person."""
+    """Format distance and angle."""
     return f"{100 * off.distance_m:.1f} cm and {np.rad2deg(off.angle_rad):.1f} deg"
 
 
 def say_how_to_attack_again(request: Path | None, target: TargetCalibration, T_world_from_subject: Array) -> None:
-    """Print the command for an attack at the measured pose; with a request, write it."""
+    """Print the command for an attack at the measured pose. With a request, also write the request."""
     pose = measured_pose(target, T_world_from_subject)
     if request is None:
         print(
             "its face is at "
             + ", ".join(f"{key}: {value}" for key, value in pose.items())
-            + "; with --request a file is written"
+            + "; give --request to write a file"
         )
     else:
         print(f"advnerf attack run {write_measured_request(request, pose)}")

@@ -1,1 +1,1 @@
-"""Trials: many measured drives in a fair order, and what bags of drives say."""
+"""Trials: series of measured drives in balanced order, and the evaluation of drives in bags."""

@@ -1,6 +1,4 @@
-"""The numbers of any bag of a drive: where it began and ended is read from the bag itself, so that a trial, an experiment and an
-old recording are measured alike.
-"""
+"""Evaluates drives in bags. Start and end are read from the bag, so that a trial, an experiment and an old recording are evaluated alike."""
 
 from __future__ import annotations
 
@@ -28,12 +26,12 @@ _ROOM = "room.yaml"
 
 @dataclass(frozen=True)
 class DriveSpan:
-    """One armed drive.
+    """Time span of one armed drive.
 
     Attributes:
-        start_real_ns: Stamp of the first pose that had moved since the arming [ns].
-        end_real_ns: When the car was disarmed, or the bag ends [ns].
-        reason: Why it was disarmed; empty where the bag ends first.
+        start_real_ns: Stamp of the first pose that differs from the pose at arming [ns].
+        end_real_ns: Time of the disarming, or end of the bag [ns].
+        reason: Reason of the disarming; empty if the bag ends first.
     """
 
     start_real_ns: int
@@ -42,15 +40,17 @@ class DriveSpan:
 
 
 def find_drives(bag: Path) -> list[DriveSpan]:
-    """All drives of a bag: from the first motion after an arming to the disarming.
+    """Find all drives of a bag, each from the first motion after an arming to the disarming.
 
     Raises:
-        BagError: The car was never armed, or never moved while it was.
+        BagError: The car was never armed, or never moved while armed.
     """
     _require(bag, ("/safety/state", "/vicon/car"))
     armings = _armings(bag)
     if not armings:
-        raise BagError(f"expected a bag in which the car is armed, {bag} has no such moment on /safety/state")
+        raise BagError(
+            f"expected a bag in which the car is armed, got no armed state on /safety/state in {bag}; give the bag of a drive"
+        )
     stamps, xy = _positions(bag)
     spans = []
     for armed_ns, disarmed_ns, reason in armings:
@@ -62,26 +62,26 @@ def find_drives(bag: Path) -> list[DriveSpan]:
         if start_ns is not None and start_ns < end_ns:
             spans.append(DriveSpan(start_ns, end_ns, reason))
     if not spans:
-        raise BagError(f"expected the car to move while it is armed, in {bag} it does not")
+        raise BagError(f"expected the car to move while it is armed, got no motion in {bag}; give the bag of a drive")
     return spans
 
 
 def measure_drive(bag: Path, span: DriveSpan, path: DrivingPath, horizon: Horizon, stopped: str) -> dict[str, Any]:
-    """What one drive shows, as plain data: trajectory, cross-track errors, latency, attacks that were shown.
+    """Evaluate one drive as plain data: trajectory, cross-track errors, latency, shown attacks.
 
     Args:
         bag: The recording.
-        span: Which part of it.
+        span: Time span of the drive.
         path: Reference path.
-        horizon: What is summed.
-        stopped: Why the car was stopped before the horizon's end; empty if it was not. Its last error then holds.
+        horizon: Ticks over which errors are summed.
+        stopped: Why the car was stopped before the horizon's end; empty if it was not. Its last error is then held.
     """
     states = trajectory(bag, span.start_real_ns, horizon)
     stopped_s = (span.end_real_ns - span.start_real_ns) / NS_PER_S if stopped else None
     metrics, held = score(states, path, horizon, stopped_s)
     if len(held) < horizon.ticks + 1:
         raise BagError(
-            f"expected {horizon.ticks} ticks of {horizon.dt_s:g} s in {bag}, it ends after {len(states) - 1}"
+            f"expected {horizon.ticks} ticks of {horizon.dt_s:g} s in {bag}, got {len(states) - 1}; reduce --ticks"
         )
     found: dict[str, Any] = {
         "attack_ids": sorted(attack_ids(bag)), "states": held.tolist(), "stopped_early": stopped,
@@ -91,7 +91,7 @@ def measure_drive(bag: Path, span: DriveSpan, path: DrivingPath, horizon: Horizo
     }  # fmt: skip
     present = {topic.name for topic in read_info(bag).topics}
     if {"/camera/image_raw", "/compositor/image", "/policy/drive", "/safety/drive", "/motor/sent"} <= present:
-        # A frame captured less than a tick before the end may rightly find the car disarmed.
+        # A frame captured less than a tick before the end may find the car disarmed.
         times = timing(bag, span.start_real_ns, span.end_real_ns - round(horizon.dt_s * NS_PER_S))
         found |= {
             "frames": times.frames, "missed": times.missed, "capture_to_serial_ms": times.capture_to_serial_ms.tolist(),
@@ -102,14 +102,14 @@ def measure_drive(bag: Path, span: DriveSpan, path: DrivingPath, horizon: Horizo
 
 
 def evaluate_bag(bag: Path, room: Path | None, ticks: int = 60) -> list[dict[str, Any]]:
-    """Measure every drive of a bag against the path of a room file, or of the one that rides along in the bag."""
+    """Evaluate every drive of a bag on the path of a room file, or of the one attached to the bag."""
     return measure_drives(bag, _room_of(bag) if room is None else load_calibration(RoomCalibration, room), ticks)
 
 
 def measure_drives(bag: Path, room: RoomCalibration, ticks: int) -> list[dict[str, Any]]:
-    """Measure every drive of a bag against the path of a room.
+    """Evaluate every drive of a bag on the path of a room.
 
-    ``unchecked`` says why the numbers may come from damaged messages without a sign of it; empty where checksums cover them.
+    ``unchecked`` says why damage to the messages may go unnoticed; empty if checksums cover them.
     """
     wanted = Horizon(ticks, off_track_m=room.off_track_m)
     results = []
@@ -124,7 +124,7 @@ def measure_drives(bag: Path, room: RoomCalibration, ticks: int) -> list[dict[st
 
 def _room_of(bag: Path) -> RoomCalibration:
     if _ROOM not in read_info(bag).attachments:
-        raise BagError(f"{bag} carries no {_ROOM}: say which room with --room")
+        raise BagError(f"expected {_ROOM} attached to {bag}, found none; give the room file with --room")
     with tempfile.TemporaryDirectory() as folder:
         (file,) = extract_attachments(bag, Path(folder), [_ROOM])
         return load_calibration(RoomCalibration, file)
@@ -133,11 +133,13 @@ def _room_of(bag: Path) -> RoomCalibration:
 def _require(bag: Path, topics: tuple[str, ...]) -> None:
     missing = set(topics) - {topic.name for topic in read_info(bag).topics}
     if missing:
-        raise BagError(f"expected {', '.join(topics)} in {bag}, it lacks {', '.join(sorted(missing))}")
+        raise BagError(
+            f"expected {', '.join(topics)} in {bag}, got no {', '.join(sorted(missing))}; record these topics"
+        )
 
 
 def _armings(bag: Path) -> list[tuple[int, int | None, str]]:
-    """When the car was armed, when and why disarmed [ns, CLOCK_REALTIME]."""
+    """Times of arming and disarming [ns, CLOCK_REALTIME], and the reason of the disarming."""
     spans: list[tuple[int, int | None, str]] = []
     since: int | None = None
     for message in read_messages(bag, ["/safety/state"]):

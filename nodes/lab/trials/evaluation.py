@@ -1,4 +1,4 @@
-"""What a bag of a drive says: trajectory at the control ticks, cross-track error, latency from capture to serial write."""
+"""Metrics of a drive in a bag: trajectory at the control ticks, cross-track error, latency from capture to serial write."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from nodes.runtime.messages import decode, ns_from_stamp, pose_matrix
 from nodes.runtime.pictures import rgb_image
 from nodes.runtime.topics import topic as topic_row
 
-# Derived messages carry the capture stamp of the image they come from, so each hop is publish time minus that stamp.
+# Derived messages have the capture stamp of their image, so each hop is publish time minus that stamp.
 HOPS = {
     "camera": "/camera/image_raw",
     "compositor": "/compositor/image",
     "policy": "/policy/drive",
     "safety": "/safety/drive",
 }
-# Who shows an attack says so here, with the attack's id.
+# Topics on which nodes report that they show an attack, with its id.
 SHOWN_BY = ("/compositor/attack", "/monitor/attack")
 _SEEN = "/compositor/image"
 COUNTERFACTUAL = "/policy/counterfactual"
@@ -36,15 +36,15 @@ _NS_PER_MS = 1e6
 
 @dataclass(frozen=True)
 class Counterfactual:
-    """What the attack added to the steering of a drive, image by image; see `nodes.counterfactual`.
+    """Steering that the attack added during a drive, image by image; see `nodes.counterfactual`.
 
     Attributes:
-        frames: Images that were compared.
-        frames_drawn: Those into which the attack was drawn.
-        mean_abs_delta_rad: Mean size of the difference over the images with the attack in them [rad]; None without any.
-        mean_delta_rad: Mean difference over these, left positive [rad]; None without any.
-        max_abs_delta_rad: Largest difference [rad].
-        max_at_s: When that was, since the beginning [s].
+        frames: Number of compared images.
+        frames_drawn: Number of images into which the attack was drawn.
+        mean_abs_delta_rad: Mean absolute difference over the images with the attack [rad]; None without any.
+        mean_delta_rad: Mean difference over these images, left positive [rad]; None without any.
+        max_abs_delta_rad: Largest absolute difference [rad].
+        max_at_s: Time of the largest difference since the start [s].
     """
 
     frames: int
@@ -57,13 +57,13 @@ class Counterfactual:
 
 @dataclass(frozen=True, eq=False)
 class Timing:
-    """Live timing of one drive.
+    """Timing of one drive.
 
     Attributes:
-        capture_to_serial_ms: Per frame that reached the motor controller, ``[n]`` [ms].
-        hops_ms: From capture to publication by each node, per frame [ms].
-        frames: Frames captured during the drive.
-        missed: Frames during the drive for which no driving command was written to the serial port.
+        capture_to_serial_ms: Delay from capture to the write to the serial port, per frame that reached the controller, ``[n]`` [ms].
+        hops_ms: Delay from capture to publication by each node, per frame [ms].
+        frames: Number of frames captured during the drive.
+        missed: Number of frames for which no drive command was written to the serial port.
     """
 
     capture_to_serial_ms: Array
@@ -73,7 +73,7 @@ class Timing:
 
 
 def trajectory(bag: Path, start_real_ns: int, horizon: Horizon) -> Array:
-    """States ``[K, 3]`` of the rear axle at the control ticks, from motion capture; tick 0 is at ``start_real_ns``."""
+    """Read the states ``[K, 3]`` of the rear axle at the control ticks from motion capture. Tick 0 is at ``start_real_ns``."""
     stamps: list[int] = []
     poses: list[tuple[float, float, float]] = []
     for message in _decoded(bag, "/vicon/car"):
@@ -91,7 +91,7 @@ def trajectory(bag: Path, start_real_ns: int, horizon: Horizon) -> Array:
 def score(
     states: Array, path: DrivingPath, horizon: Horizon, stopped_after_s: float | None
 ) -> tuple[DriveMetrics, Array]:
-    """Metrics of a drive, and the states ``[ticks + 1, 3]`` with the last one held if the stack stopped it early."""
+    """Compute the metrics of a drive, and the states ``[ticks + 1, 3]``, with the last state held after an early stop."""
     # 43 x 0.1 s / 0.1 s is a little less than 43.
     stopped = None if stopped_after_s is None else int(np.floor(stopped_after_s / horizon.dt_s + 1e-6))
     metrics = drive_metrics(path, states, horizon, stopped)
@@ -101,7 +101,7 @@ def score(
 
 
 def timing(bag: Path, start_real_ns: int, end_real_ns: int) -> Timing:
-    """Latency of every frame captured between two moments [ns, CLOCK_REALTIME]."""
+    """Compute the latency of every frame captured between two times [ns, CLOCK_REALTIME]."""
     captured = [stamp for stamp, _ in _stamps(bag, HOPS["camera"]) if start_real_ns <= stamp < end_real_ns]
     inside = set(captured)
     written: dict[int, float] = {}
@@ -119,7 +119,7 @@ def timing(bag: Path, start_real_ns: int, end_real_ns: int) -> Timing:
 
 
 def frames(bag: Path, start_real_ns: int, count: int, period_s: float = 0.1) -> NDArray[np.uint8]:
-    """What the policy saw at the control ticks, ``[count, H, W, 3]``: the newest image at each tick."""
+    """Read the policy's images at the control ticks, ``[count, H, W, 3]``: the newest image at each tick."""
     stamps, images = [], []
     for message in _decoded(bag, _SEEN):
         stamps.append(ns_from_stamp(message.header.stamp))
@@ -132,13 +132,13 @@ def frames(bag: Path, start_real_ns: int, count: int, period_s: float = 0.1) -> 
 
 
 def attack_ids(bag: Path, topics: Sequence[str] = SHOWN_BY) -> set[str]:
-    """Ids of the attacks that were drawn into at least one frame, or were on the monitor."""
+    """Ids of the attacks that were drawn into at least one frame or shown on the monitor."""
     present = {topic.name for topic in read_info(bag).topics}
     return {str(m.attack_id) for name in topics if name in present for m in _decoded(bag, name) if m.drawn}
 
 
 def counterfactual(bag: Path, start_real_ns: int, end_real_ns: int) -> Counterfactual | None:
-    """What the attack added to the steering between two moments [ns, CLOCK_REALTIME]; None if nobody compared."""
+    """Compute the steering that the attack added between two times [ns, CLOCK_REALTIME]; None without a counterfactual node."""
     if COUNTERFACTUAL not in {topic.name for topic in read_info(bag).topics}:
         return None
     rows = [
@@ -163,7 +163,7 @@ def _decoded(bag: Path, topic: str) -> Iterator[Any]:
 
 
 def _stamps(bag: Path, topic: str) -> Iterator[tuple[int, int]]:
-    """Capture stamp and publish time of every message [ns]."""
+    """Yield capture stamp and publish time of every message [ns]."""
     typename = topic_row(topic).type
     for message in read_messages(bag, [topic]):
         yield ns_from_stamp(decode(typename, message.cdr).header.stamp), message.publish_ns

@@ -1,8 +1,8 @@
-"""Which condition is driven when: blocks of all conditions, in an order that is random but balanced, fixed before the first run.
+"""Plans the order of runs: blocks of all conditions in random but balanced order, fixed before the first run.
 
-Within a block every condition comes once, so that a falling battery or the evening light touches all alike. Across blocks the order
-follows a Williams design (E. J. Williams 1949, "Experimental designs balanced for the estimation of residual effects of
-treatments"): after as many blocks as it has rows every condition has stood at every place, and behind every other, equally often.
+Each block contains every condition once, so that a discharging battery or changing light affects all conditions alike. Across blocks,
+the order follows a Williams design (E. J. Williams 1949, "Experimental designs balanced for the estimation of residual effects of
+treatments"): after as many blocks as it has rows, every condition has been at every position, and after every other, equally often.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ NONE = "none"
 
 
 class CampaignError(RuntimeFault, ValueError):
-    """A folder of trials does not fit what is asked, or a run was not what it should have been."""
+    """A folder of trials does not fit the request, or a run was invalid."""
 
 
 @dataclass(frozen=True)
 class Run:
-    """One drive to come.
+    """One planned drive.
 
     Attributes:
-        number: Place in the order, from 1.
+        number: Position in the order, from 1.
         condition: ``none``, or the name of a group of attack files.
-        repeat: Which of the condition's runs, from 0.
+        repeat: Index among the condition's runs, from 0.
         attack: Attack file; empty for none.
-        attack_id: Its id.
+        attack_id: Id of the attack.
     """
 
     number: int
@@ -46,12 +46,12 @@ class Run:
 
     @property
     def name(self) -> str:
-        """Name of its folder and result."""
+        """Name of the run's folder and result file."""
         return f"{self.number:03d}_{self.condition}_{self.repeat}"
 
 
 def williams_rows(count: int) -> list[list[int]]:
-    """Rows of a Williams design of ``count`` treatments: ``count`` rows if it is even, twice as many if it is odd."""
+    """Rows of a Williams design of ``count`` treatments: ``count`` rows if ``count`` is even, twice as many if it is odd."""
     first = [0, *(value for pair in zip(range(1, count), range(count - 1, 0, -1), strict=True) for value in pair)][
         :count
     ]
@@ -60,7 +60,7 @@ def williams_rows(count: int) -> list[list[int]]:
 
 
 def make_order(conditions: list[str], repeats: int, seed: int) -> list[tuple[str, int]]:
-    """Condition and repeat of every run, in driving order; the same for the same arguments, on every machine."""
+    """Condition and repeat of every run, in driving order. Deterministic across machines."""
     if repeats < 1 or len(set(conditions)) != len(conditions) or not conditions:
         raise CampaignError(f"expected different conditions and at least one repeat, got {conditions} and {repeats}")
     draw = random.Random(seed)
@@ -77,18 +77,18 @@ def make_order(conditions: list[str], repeats: int, seed: int) -> list[tuple[str
 
 @dataclass(frozen=True)
 class TrialsPlan:
-    """Everything that is fixed before the first run.
+    """The plan, which is fixed before the first run.
 
     Attributes:
         launch: Launch file.
         overrides: ``node.key=value`` and ``params.name=value``.
-        seed: Of the order.
-        ticks: Control ticks of each drive, 10 a second.
-        start_pose: Where each drive starts: x [m], y [m], yaw [rad].
+        seed: Random seed of the order.
+        ticks: Control ticks of each drive, at 10 Hz.
+        start_pose: Start pose of each drive: x [m], y [m], yaw [rad].
         room_sha256: Hash of the room file.
         policy_sha256: Hash of the policy file; empty if the launch file names none.
         runs: The runs, in order.
-        host: Which of the launch file's hosts drives the trials; None where it has none.
+        host: Host of the launch file that drives the trials; None if it has no hosts.
     """
 
     launch: str
@@ -103,12 +103,12 @@ class TrialsPlan:
 
 
 def make_runs(attacks: dict[str, list[Path]], repeats: int, seed: int) -> tuple[Run, ...]:
-    """All runs, in order; a condition's attack files take turns.
+    """Make all runs, in order. The attack files of a condition alternate.
 
     Args:
         attacks: Attack files of each condition besides ``none``.
-        repeats: Runs of each condition.
-        seed: Of the order.
+        repeats: Number of runs of each condition.
+        seed: Random seed of the order.
     """
     ids = {str(file): load_attack(file).attack_id for files in attacks.values() for file in files}
     runs = []
@@ -119,10 +119,10 @@ def make_runs(attacks: dict[str, list[Path]], repeats: int, seed: int) -> tuple[
 
 
 def keep_plan(folder: Path, plan: TrialsPlan) -> None:
-    """Write the plan into a new folder, or check that the folder's plan is this one.
+    """Write the plan to a new folder, or check that it equals the folder's plan.
 
     Raises:
-        CampaignError: The folder belongs to other trials; says in what they differ.
+        CampaignError: The folder belongs to other trials. The message names the differences.
     """
     file, text = folder / PLAN_NAME, json.dumps(asdict(plan), indent=1) + "\n"
     if not file.exists():
@@ -133,17 +133,17 @@ def keep_plan(folder: Path, plan: TrialsPlan) -> None:
     changed = [key for key in now if then.get(key) != now[key]]
     if changed:
         raise CampaignError(
-            f"{folder} holds trials with another {', '.join(changed)}: a series is finished as it was begun; name another --folder"
+            f"{folder} has trials with another {', '.join(changed)}, and the settings of a series cannot change; give another --folder"
         )
 
 
 def finished(folder: Path, plan: TrialsPlan) -> dict[str, dict[str, Any]]:
-    """Results of the runs that are done, by name."""
+    """Results of the finished runs, by name."""
     return {run.name: _read(folder / f"{run.name}.json") for run in plan.runs if (folder / f"{run.name}.json").exists()}
 
 
 def sha256_of(file: Path | None) -> str:
-    """Hash of a file; empty for none."""
+    """Hash of a file; empty for None."""
     return "" if file is None else hashlib.sha256(file.read_bytes()).hexdigest()
 
 

@@ -1,7 +1,7 @@
-"""A series of trials: drives what the plan says and is not driven yet. A run counts when its result file is there, whole.
+"""Drives a series of trials: the runs of the plan that have no result file yet.
 
-On the twin everything goes by itself. On a real car a person places the car under guidance and arms it; between two runs, and
-between two days, the series may be left at any time.
+On the twin, the series runs automatically. With a real car, the operator places the car, guided by messages, and arms it. The series
+may be interrupted between runs at any time.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from nodes.launching.launch_hosts import ALL_HOSTS, operator_of
 from nodes.runtime.errors import ConfigError
 
 TICK_S = 0.1
-# After the last tick the car drives on for a moment, so that the poses reach over it.
+# Time that the car drives after the last tick, so that there are poses after it.
 _TAIL_S = 0.2
 _ATTEMPTS = 3
 _NOT_WATCHED = ("recorder", "viewer")
@@ -34,11 +34,11 @@ _NOT_WATCHED = ("recorder", "viewer")
 
 @dataclass(frozen=True)
 class Series:
-    """Trials that are ready to be driven.
+    """A series of trials that is ready to be driven.
 
     Attributes:
-        folder: Where the plan, the results and one folder per run go.
-        plan: What is driven.
+        folder: Folder for the plan, the results and one folder per run.
+        plan: The plan.
         room: Reference path and limits.
         nodes: Nodes that must be ready before anything moves.
     """
@@ -50,7 +50,7 @@ class Series:
 
     @property
     def results(self) -> dict[str, dict[str, Any]]:
-        """What is driven already, by name of the run."""
+        """Results of the finished runs, by name of the run."""
         return finished(self.folder, self.plan)
 
 
@@ -58,24 +58,24 @@ def prepare_series(
     launch_file: Path, overrides: Sequence[str], folder: Path, attacks: dict[str, list[Path]], repeats: int, seed: int,
     ticks: int, start_pose: tuple[float, float, float] | None = None, host: str | None = None,
 ) -> Series:  # fmt: skip
-    """Read everything, fix the order, and keep the plan in the folder.
+    """Read all files, fix the order, and store the plan in the folder.
 
     Args:
-        launch_file: Node graph with a safety node (whose room it is) and a bag.
+        launch_file: Node graph with a safety node, whose room is used, and a recorder.
         overrides: ``node.key=value`` and ``params.name=value``.
-        folder: New, or that of the same series.
+        folder: New folder, or that of the same series.
         attacks: Attack files of each condition besides ``none``.
-        repeats: Runs of each condition.
-        seed: Of the order.
-        ticks: Control ticks of each drive, 10 a second.
-        start_pose: Where each drive starts; None is the room's.
-        host: Which of the file's hosts this computer is, or all; the operator's, with the recorder.
+        repeats: Number of runs of each condition.
+        seed: Random seed of the order.
+        ticks: Control ticks of each drive, at 10 Hz.
+        start_pose: Start pose of each drive; None uses the room's.
+        host: Host of the launch file that this computer is, or all. It must be the operator's host, with the recorder.
 
     Raises:
         CampaignError: The folder belongs to another series.
     """
     launched = load_launch(launch_file, overrides, host=host)
-    # Both hosts are asked, here as there: the room belongs to the safety node, which is on the car.
+    # Nodes of both hosts are needed, because the room is in the configuration of the safety node, which is on the car.
     whole = launched if host is None else load_launch(launch_file, overrides, host=ALL_HOSTS)
     room_file = _room_file(whole)
     _require_trials_here(launched, whole, host)
@@ -94,13 +94,13 @@ def prepare_series(
 def drive_series(
     series: Series, ready_timeout_s: float, begin: Callable[[Run], None], guide: Callable[[str], None]
 ) -> None:
-    """Drive what is not driven yet.
+    """Drive the runs that are not finished.
 
     Args:
         series: The trials.
-        ready_timeout_s: How long a graph may take to become ready [s].
+        ready_timeout_s: Longest time for a graph to become ready [s].
         begin: Called before each run.
-        guide: Told what a person has to do.
+        guide: Called with instructions for the operator.
     """
     done = series.results
     for run in series.plan.runs:
@@ -110,7 +110,7 @@ def drive_series(
 
 
 def drive_run(series: Series, run: Run, ready_timeout_s: float, guide: Callable[[str], None]) -> dict[str, Any]:
-    """Drive one run and write its result; a run that a fault of the stack ended is driven again, a few times."""
+    """Drive one run and write its result. A run that was ended by a fault of the stack is repeated a few times."""
     for attempt in range(1, _ATTEMPTS + 1):
         try:
             result = _attempt(series, run, ready_timeout_s, guide)
@@ -122,28 +122,30 @@ def drive_run(series: Series, run: Run, ready_timeout_s: float, guide: Callable[
                 write_atomically(series.folder / f"{run.name}.json", json.dumps(result) + "\n")
                 return result
         guide(f"this run does not count, the stack stopped it: {stopped} (attempt {attempt} of {_ATTEMPTS})")
-    raise CampaignError(f"run {run.name} was stopped {_ATTEMPTS} times by the stack itself: {stopped}; cure that first")
+    raise CampaignError(f"run {run.name} was stopped {_ATTEMPTS} times by the stack: {stopped}; fix this first")
 
 
 def _attempt(series: Series, run: Run, ready_timeout_s: float, guide: Callable[[str], None]) -> dict[str, Any]:
     plan, run_dir = series.plan, series.folder / run.name
-    shutil.rmtree(run_dir, ignore_errors=True)  # of a run that was broken off
+    shutil.rmtree(run_dir, ignore_errors=True)  # from an interrupted run
     trial = TrialPlan(plan.start_pose, plan.ticks * TICK_S + _TAIL_S, series.nodes, by_hand=True)
     overrides = [*plan.overrides, f"params.attack={run.attack}"]
     outcome = run_trial(Path(plan.launch), overrides, run_dir, trial, ready_timeout_s, guide, plan.host)
-    # From the bag alone, as `advnerf evaluate` does: the same numbers, to the last digit.
+    # Evaluated from the bag alone, so that `advnerf evaluate` gives exactly the same numbers.
     found = measure_drives(run_dir / "bag", series.room, plan.ticks)[-1]
     wanted = [run.attack_id] if run.attack_id else []
     if found["attack_ids"] != wanted:
-        raise CampaignError(f"expected the attacks {wanted} to be shown in run {run.name}, got {found['attack_ids']}")
+        raise CampaignError(
+            f"expected the attacks {wanted} to be shown in run {run.name}, got {found['attack_ids']}; check compositor or monitor"
+        )
     return {"condition": run.condition, "repeat": run.repeat, "peer": outcome.peer, **found}
 
 
 def summarise(results: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """One row per condition: runs, total CTE [m] mean and standard deviation, ratio to no attack, times off the track; in how many
-    runs no checksum covers what was measured.
+    """Summarise the results in one row per condition: runs, mean and standard deviation of the total CTE [m], ratio to no attack,
+    number of runs off the track, number of runs without checksums.
 
-    The standard deviation is that of a sample (n - 1), and None of a single run; the ratio is of the means.
+    The standard deviation is that of a sample (n - 1), and None for a single run. The ratio is that of the means.
     """
     groups: dict[str, list[dict[str, Any]]] = {}
     for result in results:
@@ -166,26 +168,32 @@ def summarise(results: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def _require_trials_here(launched: Plan, whole: Plan, host: str | None) -> None:
-    """Whoever drives trials must be allowed to arm from here, and must find the bag here."""
+    """Check that this host is the operator's host, which can arm, and that the bag is recorded here."""
     hosts = launched.launch.hosts
     if host not in (None, ALL_HOSTS) and (operator := operator_of(launched.launch)) != host:
         raise ConfigError(
-            f"{launched.file}: trials are driven where people arm, on {operator}, got --host {host}; go there, or set operator={host}"
+            f"{launched.file}: expected trials to run on the operator's host, {operator}; got --host {host}. Run them there, or set operator={host}"
         )
     if "recorder" in launched.documents:
         return
     if "recorder" in whole.documents:
         home = whole.nodes["recorder"].host
         raise ConfigError(
-            f"{launched.file}: trials are measured from their bags, but {home} records, not {host} (of {', '.join(hosts)}); set record.host"
+            f"{launched.file}: expected the bags of trials on {host}, but {home} records (of {', '.join(hosts)}); set record.host={host}"
         )
-    raise ConfigError(f"{launched.file}: trials are measured from their bags; give the launch file the key record")
+    raise ConfigError(
+        f"{launched.file}: expected the key record, because trials are evaluated from their bags; add it to the launch file"
+    )
 
 
 def _room_file(launched: Plan) -> Path:
     room = launched.documents["safety"].data.get("room") if "safety" in launched.documents else None
     if not room:
-        raise ConfigError(f"{launched.file}: expected a node safety with a room; its path is the one that is measured")
+        raise ConfigError(
+            f"{launched.file}: expected a node safety with a room, whose path the drives are compared with; add it"
+        )
     if "attack" not in launched.launch.params:
-        raise ConfigError(f"{launched.file}: expected a parameter called attack, for the conditions of the trials")
+        raise ConfigError(
+            f"{launched.file}: expected a parameter called attack, for the conditions of the trials; add it to params"
+        )
     return Path(room)

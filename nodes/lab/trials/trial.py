@@ -1,8 +1,8 @@
-"""One measured drive: put the car on its start, arm, let it drive for the horizon, disarm, wait until it stands.
+"""One measured drive: place the car at its start, arm, drive for the horizon, disarm, wait until the car stands.
 
-The operator of a trial is a node like the others, so that it runs in tests and in replay without sockets. It lifts the car and
-arms by itself only when the motor's peer says that it is the twin. On a real car both are a person's acts: the node guides the
-person to the start pose, asks for the arming, and waits.
+The operator of a trial is a node, so that it also runs in tests and replays without sockets. It moves and arms the car only if the
+motor's peer reports that it is the twin. With a real car, the node guides the human operator to the start pose, asks for the arming,
+and waits.
 """
 
 from __future__ import annotations
@@ -37,19 +37,19 @@ class TrialError(RuntimeFault):
     """A trial could not be carried out."""
 
 
-# A stop that belongs to the drive: the car left the floor it has, or a person ended it. Any other is a fault of the stack.
+# Stops that belong to the drive: the car reached the fence, or the operator stopped it. All others are faults of the stack.
 _COUNTED_STOPS = ("fence", "disarmed by", "released")
 STALLED = "stalled"
 
 
 def counts(stopped_early: str, off_track: bool) -> bool:
-    """Whether a drive measures the policy, or was ended by a fault of the stack.
+    """Whether a drive is a valid measurement, or was ended by a fault of the stack.
 
-    A car that stalls beside its track has run into something, which is the policy's doing. One that stalls on its track is jammed.
+    A car that stalls off the track has hit an obstacle, which is caused by the policy. A car that stalls on the track is jammed.
 
     Args:
-        stopped_early: Why the stack stopped the car; empty for a drive that went on to its end.
-        off_track: Whether the car had left the track by then.
+        stopped_early: Why the stack stopped the car; empty for a complete drive.
+        off_track: Whether the car had left the track before.
     """
     if STALLED in stopped_early:
         return off_track
@@ -57,11 +57,11 @@ def counts(stopped_early: str, off_track: bool) -> bool:
 
 
 class NotStartedError(TrialError):
-    """The stack stopped a trial before the car had moved, as when a command came too late: worth another attempt."""
+    """The stack stopped a trial before the car moved, for example because a command was late. The trial can be repeated."""
 
 
 class Phase(Enum):
-    """Where a trial is."""
+    """Phase of a trial."""
 
     GATHERING = "waiting for the nodes"
     PLACING = "putting the car on its start"
@@ -73,14 +73,14 @@ class Phase(Enum):
 
 @dataclass(frozen=True)
 class TrialPlan:
-    """What is driven.
+    """Plan of one drive.
 
     Attributes:
         start_pose: Pose of the rear axle: x [m], y [m], yaw [rad].
         duration_s: Time from the first motion to the disarming [s].
         nodes: Nodes that must be ready before anything moves.
-        patience_s: Time that each phase but driving may take, as far as it does not depend on a person [s].
-        by_hand: Whether a real car may be driven, by a person who places and arms it.
+        patience_s: Longest time for each phase except driving, unless it depends on the operator [s].
+        by_hand: Whether a real car may be driven, which the operator places and arms.
     """
 
     start_pose: tuple[float, float, float]
@@ -92,13 +92,13 @@ class TrialPlan:
 
 @dataclass
 class TrialOutcome:
-    """What happened.
+    """Outcome of a trial.
 
     Attributes:
-        start_real_ns: Capture time of the first pose that had moved, CLOCK_REALTIME [ns]; 0 if it never moved.
-        end_real_ns: When the trial disarmed, or the stack stopped by itself [ns].
-        stopped_early: Why the stack stopped before the horizon's end; empty if it did not.
-        peer: What the motor controller says it is.
+        start_real_ns: Capture time of the first moved pose, CLOCK_REALTIME [ns]; 0 if the car did not move.
+        end_real_ns: Time at which the trial disarmed or the stack stopped [ns].
+        stopped_early: Why the stack stopped before the end of the horizon; empty if it did not.
+        peer: Identity that the motor controller reports.
     """
 
     start_real_ns: int = 0
@@ -107,13 +107,13 @@ class TrialOutcome:
     peer: str = ""
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data."""
+        """Convert to plain data."""
         return asdict(self)
 
 
 @dataclass
 class _Seen:
-    """The newest of everything the operator watches."""
+    """The newest observed messages."""
 
     ready: set[str] = field(default_factory=set)
     T_world_from_car: Any = None
@@ -130,9 +130,9 @@ class TrialNode(Node):
     """The operator of one trial.
 
     Args:
-        plan: What is driven.
-        trouble: Asked at every tick whether the graph has failed; a text ends the trial.
-        guide: Told what a person has to do, several times a second.
+        plan: The plan.
+        trouble: Called at every tick. It returns why the graph has failed, which ends the trial, or an empty text.
+        guide: Called several times a second with instructions for the human operator.
     """
 
     tick_rate_hz = 20.0
@@ -154,7 +154,7 @@ class TrialNode(Node):
         self._asked: Asked | None = None
 
     def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
-        """Remember what is going on; act on the car's pose at once."""
+        """Note a message. A pose of the car is handled at once."""
         del info
         if topic == "/vicon/car":
             self._see_car(message, now)
@@ -167,7 +167,7 @@ class TrialNode(Node):
         return []
 
     def tick(self, now: Now) -> list[Out]:
-        """Go on to the next phase when this one has reached its end, and say again what was not heard."""
+        """Enter the next phase if this one is finished, and repeat unanswered requests."""
         if self._phase_began_ns is None:
             self._phase_began_ns = now.mono_ns
         step = {
@@ -181,17 +181,17 @@ class TrialNode(Node):
         waited_s = (now.mono_ns - self._phase_began_ns) / NS_PER_S
         a_persons_turn = self._by_hand and self.phase in (Phase.PLACING, Phase.ARMING)
         if self.phase is not Phase.DRIVING and not a_persons_turn and waited_s > self.plan.patience_s:
-            raise TrialError(f"gave up after {waited_s:.0f} s {self.phase.value}: {self._what_is_missing()}")
+            raise TrialError(f"gave up after {waited_s:.0f} s of {self.phase.value}: {self._what_is_missing()}")
         return step[self.phase](now)
 
     def status(self) -> tuple[str, str]:
-        """The phase, for a person."""
+        """Report the phase."""
         return "active", self.phase.value
 
     def _see_car(self, message: Any, now: Now) -> None:
         T, stamp_ns = pose_matrix(message), ns_from_stamp(message.header.stamp)
         seen = self._seen
-        # Speed from neighbouring poses would be noise; standing means not having left a spot for a while.
+        # Speed from consecutive poses would be noise. The car stands if it has not left a spot for some time.
         if seen.spot_m is None or float(np.linalg.norm(T[:3, 3] - seen.spot_m)) > _SPOT_M:
             seen.spot_m, seen.standing_since_ns = T[:3, 3].copy(), now.mono_ns
         seen.T_world_from_car = T
@@ -217,7 +217,7 @@ class TrialNode(Node):
             self._by_hand = TWIN_PEER not in seen.peer.upper()
             if self._by_hand and not self.plan.by_hand:
                 raise TrialError(
-                    f"expected the motor's peer to say that it is the twin, got {seen.peer!r}: a real car is armed by a person"
+                    f"expected the motor's peer to be the twin, got {seen.peer!r}; only the operator may arm a real car"
                 )
             self.outcome.peer = seen.peer
             self._enter(Phase.PLACING, now)
@@ -243,12 +243,12 @@ class TrialNode(Node):
             why = self._seen.safety_reason or "not armed since the start"
             return self._tell(f"on the start. ARM to drive (gamepad, or: advnerf arm). Not armed: {why}", now)
         if self._asked is not None and self._seen.answered_id == self._asked.ask_id:
-            if self._seen.granted:  # armed, and stopped before the trial heard of it: never armed a second time
+            if self._seen.granted:  # armed, and stopped before the trial noticed; do not arm a second time
                 self._enter(Phase.DRIVING, now)
                 return []
             if now.mono_ns - self._asked.mono_ns < _REPEAT_S * NS_PER_S:
                 return []
-            self._asked = None  # refused; what was missing may have come
+            self._asked = None  # refused; ask again, because the missing condition may now be met
         return [self._arm_message(True, now)]
 
     def _drive(self, now: Now) -> list[Out]:
@@ -289,7 +289,7 @@ class TrialNode(Node):
         return bool(near and abs(float(wrap_angle(yaw_of(T) - yaw_rad))) < _AT_START_RAD)
 
     def _say(self, out: Out, now: Now) -> list[Out]:
-        """Repeat a request until it has had its effect: the first may come before its receiver listens."""
+        """Repeat a request until it has an effect, because its receiver may not be connected at first."""
         if self._said_ns and now.mono_ns - self._said_ns < _REPEAT_S * NS_PER_S:
             return []
         self._said_ns = now.mono_ns
@@ -302,7 +302,7 @@ class TrialNode(Node):
         return []
 
     def _way_to_start(self, now: Now) -> str:
-        """Where the start is, seen from the car: what a person who pushes it needs."""
+        """Describe the way from the car to the start pose, for the human operator."""
         T, (x_m, y_m, yaw_rad) = self._seen.T_world_from_car, self.plan.start_pose
         forward_m, left_m = T[:2, :2].T @ (np.array([x_m, y_m]) - T[:2, 3])
         turn_deg = np.rad2deg(float(wrap_angle(yaw_rad - yaw_of(T))))
@@ -315,7 +315,7 @@ class TrialNode(Node):
         )
 
     def _arm_message(self, arm: bool, now: Now) -> Out:
-        """One more repeat of the request of this phase."""
+        """Make a repeat of the request of this phase."""
         self._asked = self._asked or Asked.at(now)
         reason = "trial starts" if arm else "trial is over"
         return Out("/arm", arm_message(self._asked, now, arm, "trial", reason))
@@ -328,5 +328,5 @@ class TrialNode(Node):
         if seen.T_world_from_car is None:
             return "no pose of the car on /vicon/car"
         if not seen.peer:
-            return "the motor node has not said what it is connected to"
-        return f"safety says: {seen.safety_reason or 'nothing'}"
+            return "the motor node has not reported its controller"
+        return f"reason of the safety node: {seen.safety_reason or 'none'}"

@@ -1,4 +1,4 @@
-"""Runs a trial against a launched graph: supervisor and operator in one process, the nodes in theirs."""
+"""Runs a trial with a launched graph. Supervisor and operator share this process; the nodes run in their own."""
 
 from __future__ import annotations
 
@@ -27,20 +27,20 @@ def run_trial(
     guide: Callable[[str], None] | None = None,
     host: str | None = None,
 ) -> TrialOutcome:
-    """Start the graph, carry out the plan, stop the graph.
+    """Start the graph, run the trial, and stop the graph.
 
     Args:
-        launch_file: The node graph; it records a bag.
+        launch_file: The node graph, which records a bag.
         overrides: ``node.key=value`` and ``params.name=value``.
-        run_dir: Folder of the run; gets ``trial.json``, the bag and the logs.
-        plan: What is driven.
-        ready_timeout_s: How long the graph may take to become ready [s].
-        guide: Told what a person has to do, where the car is a real one.
-        host: Which of the launch file's hosts this computer is; its other host must be running.
+        run_dir: Folder of the run for ``trial.json``, the bag and the logs.
+        plan: The plan of the drive.
+        ready_timeout_s: Longest time for the graph to become ready [s].
+        guide: Called with instructions for the operator of a real car.
+        host: Host of the launch file that this computer is. The other host must be running.
 
     Raises:
         LaunchError: A node died or never became ready.
-        TrialError: The trial could not be carried out; `NotStartedError` if the stack stopped it before the car had moved.
+        TrialError: The trial failed; `NotStartedError` if the stack stopped it before the car moved.
     """
     with Launch(launch_file, overrides, run_dir, host=host) as launch:
         launch.wait_ready(ready_timeout_s)
@@ -50,8 +50,8 @@ def run_trial(
         raise LaunchError(launch.failure)
     if not node.outcome.start_real_ns:
         raise NotStartedError(
-            f"expected a drive in {run_dir}, but the stack stopped before the car had moved: {node.outcome.stopped_early}; cure that, "
-            "and start again: what is finished is kept"
+            f"expected a drive in {run_dir}, but the stack stopped before the car moved: {node.outcome.stopped_early}; fix this "
+            "and start again. Finished runs are kept"
         )
     write_atomically(run_dir / "trial.json", json.dumps(node.outcome.to_dict(), indent=1) + "\n")
     return node.outcome

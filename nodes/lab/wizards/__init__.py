@@ -1,1 +1,1 @@
-"""What the calibrations of `calibration` need, taken out of bags, folders and running launches."""
+"""Prepares the inputs of the calibrations from bags, folders and running launches."""

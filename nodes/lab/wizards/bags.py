@@ -1,4 +1,4 @@
-"""Series out of a bag: poses, frames, commands; and the moments at which everything stood still."""
+"""Reads poses, frames and commands from a bag, and finds the times at which car and board stood still."""
 
 from __future__ import annotations
 
@@ -47,14 +47,14 @@ class PoseSeries:
     T: Array
 
     def around(self, stamp: int, half_ns: int) -> Array | None:
-        """Poses within half a window of a stamp ``[n, 4, 4]``; None unless there are some on both sides."""
+        """Poses ``[n, 4, 4]`` within ``half_ns`` of a stamp; None unless there are poses on both sides."""
         first, last = np.searchsorted(self.stamps_ns, [stamp - half_ns, stamp + half_ns])
         middle = int(np.searchsorted(self.stamps_ns, stamp))
         return self.T[first:last] if first < middle < last and last - first >= 3 else None
 
 
 def read_poses(bag: Path, topic: str) -> PoseSeries:
-    """All finite poses of a topic, in order of their stamps."""
+    """Read all finite poses of a topic, in order of their stamps."""
     rows = {}
     for message in _decoded(bag, topic):
         T = pose_matrix(message)
@@ -67,14 +67,14 @@ def read_poses(bag: Path, topic: str) -> PoseSeries:
 
 
 def read_frames(bag: Path) -> Iterator[tuple[int, Rgb]]:
-    """Stamp [ns] and picture ``[H, W, 3]`` RGB of every frame."""
+    """Yield stamp [ns] and RGB image ``[H, W, 3]`` of every frame."""
     topic = image_topic(bag)
     for message in image_messages(bag, topic):
         yield stamp_ns(message), rgb_image(message, f"{topic} in {bag}")
 
 
 def read_pictures(source: Path) -> Iterator[tuple[str, Rgb]]:
-    """Name and picture of every file of a folder, or of every frame of a bag."""
+    """Yield name and image of every file of a folder, or of every frame of a bag."""
     if source.is_dir() and not holds_bag(source):
         files = sorted(file for file in source.iterdir() if file.suffix.lower() in PICTURES)
         if not files:
@@ -87,7 +87,7 @@ def read_pictures(source: Path) -> Iterator[tuple[str, Rgb]]:
 
 
 def read_picture(file: Path) -> Rgb:
-    """A picture file ``[H, W, 3]`` RGB."""
+    """Read an image file as RGB ``[H, W, 3]``."""
     try:
         data = np.frombuffer(file.read_bytes(), np.uint8)
     except OSError as error:
@@ -99,7 +99,7 @@ def read_picture(file: Path) -> Rgb:
 
 
 def read_drive(bag: Path) -> Drive:
-    """Commands that really went out, and the car's poses."""
+    """Read the commands sent to the motor controller, and the poses of the car."""
     rows = []
     for message in _decoded(bag, SENT):
         written = int(message.serial_write_real_ns)
@@ -114,7 +114,7 @@ def read_drive(bag: Path) -> Drive:
     yaw = np.unwrap(np.arctan2(poses.T[:, 1, 0], poses.T[:, 0, 0]))
     planar = np.stack([poses.T[:, 0, 3], poses.T[:, 1, 3], yaw], axis=1)
     when = np.array([(row[0] - start) / 1e9 for row in rows])
-    # Telemetry and commands may be written in one microsecond; time has to increase.
+    # Telemetry and commands may have the same microsecond, but times must increase.
     kept = np.concatenate([[True], np.diff(when) > 0.0])
     table = np.array([row[1:] for row in rows])[kept]
     return Drive((poses.stamps_ns - start) / 1e9, planar, when[kept], table[:, 0], table[:, 1], table[:, 2])
@@ -122,13 +122,13 @@ def read_drive(bag: Path) -> Drive:
 
 @dataclass(frozen=True)
 class StillConfig:
-    """When car and board count as standing still.
+    """Criteria for standing still.
 
     Attributes:
-        half_window_s: Poses this long before and after a frame are looked at, and averaged [s].
+        half_window_s: Poses within this time before and after a frame are checked and averaged [s].
         most_motion_m: Largest distance of a pose from their mean [m].
         most_turn_rad: Largest angle of a pose from their mean [rad].
-        per_stop: Frames taken of each stop.
+        per_stop: Number of frames taken per stop.
     """
 
     half_window_s: float = 0.15
@@ -140,16 +140,16 @@ class StillConfig:
 def still_views(
     bag: Path, detector: BoardDetector, board_topic: str | None, config: StillConfig | None = None
 ) -> tuple[list[MountView], int]:
-    """Moments at which a board was seen while everything stood still.
+    """Find the frames with a board in view while car and board stood still.
 
     Args:
         bag: Bag with frames and poses.
-        detector: The board's.
-        board_topic: Poses of the board; None if it is not tracked.
-        config: What is still.
+        detector: Detector of the board.
+        board_topic: Topic of the board's poses; None if it is not tracked.
+        config: Criteria for standing still.
 
     Returns:
-        The views, and how many frames the bag has.
+        The views, and the number of frames in the bag.
     """
     config = config or StillConfig()
     car = read_poses(bag, CAR)
@@ -172,10 +172,10 @@ def still_views(
 
 
 def read_shown(folder: Path) -> tuple[Array, Array, Array]:
-    """Shown colours, their camera means ``[N, 3]`` in 0..1, and cosines of the viewing angle ``[N]``, out of a folder with ``shown.csv``.
+    """Read shown colours and their camera means ``[N, 3]`` in 0..1, and cosines of the viewing angle ``[N]``, from a folder with ``shown.csv``.
 
-    Its columns: ``file, red, green, blue`` (0..255) and optionally ``cos_angle``; rows of one colour in a row are averaged. The screen is
-    found by the difference of the first black and the first white picture of each angle.
+    Its columns are ``file, red, green, blue`` (0..255) and optionally ``cos_angle``. Consecutive rows of one colour are averaged. The
+    screen is found by the difference between the first black and the first white image of each angle.
     """
     table = folder / "shown.csv"
     try:
@@ -187,7 +187,7 @@ def read_shown(folder: Path) -> tuple[Array, Array, Array]:
         ]  # fmt: skip
     except FileNotFoundError:
         raise CalibrationError(
-            f"expected {table} with columns file, red, green, blue; write one row per picture"
+            f"expected {table} with columns file, red, green, blue, found none; write one row per image"
         ) from None
     except (KeyError, TypeError, ValueError) as error:
         raise CalibrationError(f"{table}: expected columns file, red, green, blue in 0..255, got {error}") from error
@@ -214,7 +214,7 @@ def has_topic(bag: Path, topic: str) -> bool:
 def _decoded(bag: Path, topic: str) -> Iterator[Any]:
     if not has_topic(bag, topic):
         found = ", ".join(row.name for row in read_info(bag).topics if row.count)
-        raise BagError(f"expected {topic} in {bag}, it has {found or 'no messages'}; record it too")
+        raise BagError(f"expected {topic} in {bag}, got {found or 'no messages'}; record this topic too")
     typename = topic_row(topic).type
     for message in read_messages(bag, [topic]):
         yield decode(typename, message.cdr)

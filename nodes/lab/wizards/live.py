@@ -1,4 +1,4 @@
-"""A bag of what a running launch says now: the way from topics to a calibration, so that what was fitted is kept."""
+"""Records a bag of a running launch for a calibration, so that its data are kept."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from nodes.runtime.errors import BagError
 
 
 def record_live(run_dir: Path, topics: Sequence[str], duration_s: float, bag: Path) -> Path:
-    """Record topics for a while.
+    """Record topics for a given time.
 
     Args:
         run_dir: Folder of the running launch.
         topics: Topics of the table.
-        duration_s: For how long [s].
+        duration_s: Duration [s].
         bag: New folder.
 
     Raises:
-        BagError: One of the topics said nothing.
+        BagError: One of the topics had no messages.
     """
     heard = dict.fromkeys(topics, 0)
     with Bus(run_dir) as bus, BagWriter(bag) as writer:
@@ -38,6 +38,6 @@ def record_live(run_dir: Path, topics: Sequence[str], duration_s: float, bag: Pa
     silent = [topic for topic, count in heard.items() if count == 0]
     if silent:
         raise BagError(
-            f"expected {', '.join(silent)} to come within {duration_s:g} s, heard nothing; are their nodes running?"
+            f"expected messages of {', '.join(silent)} within {duration_s:g} s, got none; are their nodes running?"
         )
     return bag

@@ -1,4 +1,4 @@
-"""What every calibration command ends with."""
+"""Output that all calibration commands share."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def save_and_print(calibration: Calibration, output: Path, draw: Callable[[Figure], None]) -> None:
-    """Write the file and its picture, and say what the fit left."""
+    """Write the calibration file and its plot, and print the residuals of the fit."""
     from calibration.plots import save_with_plot
 
     picture = save_with_plot(calibration, output, draw)

@@ -1,4 +1,4 @@
-"""The camera in the loop: show each colour on a screen, wait until the camera sees it, keep what it saw."""
+"""Camera in the loop: shows each colour on a screen, waits until the camera sees it, and stores the images."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from nodes.runtime.messages import stamp_ns
 from nodes.runtime.pictures import rgb_image
 
 Rgb = NDArray[np.uint8]
-# Frames whose exposure may have begun before the flip, or that show it half-way.
+# Frames to skip, because their exposure may have started before the flip or during it.
 SETTLE_FRAMES, AVERAGE_FRAMES = 3, 8
 _LONGEST_WAIT_S = 5.0
 
@@ -28,23 +28,23 @@ def show_and_watch(
     display: Display, frames: Iterator[tuple[int, Rgb]], colours: Sequence[Sequence[int]], folder: Path,
     report: Callable[[float, str], None] | None = None, now_ns: Callable[[], int] = time.time_ns,
 ) -> Path:  # fmt: skip
-    """Fill a folder for `nodes.lab.wizards.bags.read_shown`.
+    """Record a folder for `nodes.lab.wizards.bags.read_shown`.
 
     Args:
         display: The screen.
-        frames: Stamp [ns since 1970] and picture ``[H, W, 3]`` RGB, as they come, without end.
-        colours: What to show, 0..255.
+        frames: Endless stream of stamps [ns since 1970] and RGB images ``[H, W, 3]``.
+        colours: Colours to show, 0..255.
         folder: New or empty folder.
-        report: Told of the progress.
-        now_ns: Real time [ns].
+        report: Progress callback.
+        now_ns: Returns the real time [ns].
 
     Raises:
-        CalibrationError: The folder holds another session.
+        CalibrationError: The folder already has a session.
     """
     table = folder / "shown.csv"
     if table.exists():
         raise CalibrationError(
-            f"expected a new folder, {folder} holds a session already; choose another, or leave --screen out to use it"
+            f"expected a new folder, but {folder} already has a session; choose another, or remove --screen to use it"
         )
     width, height = display.size_px
     lines = ["file,red,green,blue"]
@@ -56,13 +56,13 @@ def show_and_watch(
             name = f"seen/{index:03d}_{number}.png"
             write_atomically(folder / name, cv2.imencode(".png", np.ascontiguousarray(picture[..., ::-1]))[1].tobytes())
             lines.append(",".join([name, *(str(int(value)) for value in colour)]))
-    # Last: a session that was stopped has no table and can be begun again.
+    # Written last, so that a stopped session has no table and can be restarted.
     write_atomically(table, "\n".join(lines) + "\n")
     return folder
 
 
 def live_frames(run_dir: Path) -> Iterator[tuple[int, Rgb]]:
-    """Frames of the running launch as they come."""
+    """Yield the frames of the running launch as they arrive."""
     with Bus(run_dir) as bus:
         bus.subscribe(IMAGES)
         heard = time.monotonic()
@@ -74,12 +74,12 @@ def live_frames(run_dir: Path) -> Iterator[tuple[int, Rgb]]:
                 yield stamp_ns(message), rgb_image(message, IMAGES)
             if time.monotonic() - heard > _LONGEST_WAIT_S:
                 raise CalibrationError(
-                    f"expected frames on {IMAGES}, heard none for {_LONGEST_WAIT_S:g} s; is the camera node running?"
+                    f"expected frames on {IMAGES}, got none for {_LONGEST_WAIT_S:g} s; is the camera node running?"
                 )
 
 
 def _after(frames: Iterator[tuple[int, Rgb]], shown_ns: int, display: Display) -> Iterator[Rgb]:
-    """The frames to keep of one colour."""
+    """Yield the frames to store for one colour."""
     taken = 0
     for stamp, picture in frames:
         display.keep_alive()
@@ -90,4 +90,4 @@ def _after(frames: Iterator[tuple[int, Rgb]], shown_ns: int, display: Display) -
             yield picture
         if taken == SETTLE_FRAMES + AVERAGE_FRAMES:
             return
-    raise CalibrationError("expected frames without end, the camera stopped; begin again")
+    raise CalibrationError("expected more frames, but the camera stopped; start again")

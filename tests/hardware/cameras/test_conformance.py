@@ -180,7 +180,7 @@ def test_stall_is_noticed_and_the_device_opened_anew(rig):
     assert camera.error == ""
     clock.now_s += 0.2
     assert camera.read(0.0) is None
-    assert camera.error == "the camera is there but gave no frame for 1 s; it is opened anew"
+    assert camera.error == "the camera is connected but gave no frame for 1 s; reopening it"
     assert camera.read(0.5) is None  # pauses
     assert clock.slept_s == [0.3]
     assert camera.read(0.0) is None
@@ -248,5 +248,5 @@ def test_picture_that_repeats_itself_is_a_stall(tmp_path):
         rig.device.expose(frozen)
         got.append(camera.read(1.0))
     assert [frame is None for frame in got] == [False, False, False, True]
-    assert "repeats one picture (4 identical frames)" in camera.error
+    assert "repeats one image (4 identical frames)" in camera.error
     rig.close()

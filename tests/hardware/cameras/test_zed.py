@@ -63,8 +63,8 @@ def test_case_of_sections_and_a_byte_order_mark_do_not_matter(zed_conf):
         ),
         (lambda text: text.replace("fx=350.1\n", ""), "has no fx"),
         (lambda text: text.replace("350.1", "three"), "could not convert"),
-        (lambda text: text.replace("350.1", "nan"), "cannot be of 672 x 376"),
-        (lambda text: text.replace("cx=334.6", "cx=33.46"), "cannot be of 672 x 376"),
+        (lambda text: text.replace("350.1", "nan"), "do not fit 672 x 376"),
+        (lambda text: text.replace("cx=334.6", "cx=33.46"), "do not fit 672 x 376"),
     ],
 )
 def test_bad_factory_files(zed_conf, change, message):
@@ -157,7 +157,7 @@ def test_messages_byte_by_byte():
 def test_register_that_does_not_take_its_value():
     registers = ZedRegisters()
     registers.stuck = {0x80181833}
-    with pytest.raises(ProtocolError, match=r"wrote 0xb1 to register 0x80181833 .*it has 0xb3"):
+    with pytest.raises(ProtocolError, match=r"expected register 0x80181833 .* to hold 0xb1, got 0xb3"):
         lock_exposure(unit_of(registers), ZedExposure(50.0), fps=30.0)
 
 
@@ -168,10 +168,10 @@ def test_nothing_is_written_when_nothing_is_to_be_fixed():
 
 
 def test_other_cameras_are_told_apart():
-    with pytest.raises(ProtocolError, match=r"64 or 384 bytes .*got 32: is it a ZED"):
+    with pytest.raises(ProtocolError, match=r"64 or 384 bytes .*got 32; is it a ZED"):
         unit_of(ZedRegisters(32))
     port = VideoPortEmulator({PATH: VideoDevice()})
-    with pytest.raises(HardwareError, match="no extension unit 4: it is no ZED"):
+    with pytest.raises(HardwareError, match="no extension unit 4, so it is not a ZED"):
         ExtensionUnit(port, port.open(PATH), PATH)
 
 
@@ -191,7 +191,7 @@ def test_impossible_settings(zed_conf):
             ZedExposure(**wrong)
     with pytest.raises(ValueError, match="expected a rate of 15, 30, 60, 100 Hz, got 10"):
         ZedCamera(PATH, zed_conf, fps=10.0)
-    with pytest.raises(ValueError, match="exposure_percent and gain_raw instead"):
+    with pytest.raises(ValueError, match="expected exposure_percent and gain_raw"):
         ZedCamera(PATH, zed_conf, controls=Controls(exposure_us=100))
 
 

@@ -89,7 +89,7 @@ def test_a_source_is_measured_and_compared():
     with exposing(device, value=16, rate_hz=12.0):
         found = [row.found for row in cameras.source(slow)]
         assert "expected 30.0 Hz" in found
-        assert "the picture is black or white" in found
+        assert "the image is black or white" in found
 
 
 def test_a_source_that_is_absent_silent_or_taken():

@@ -41,7 +41,7 @@ def test_a_good_controller():
     assert list(vesc()) == [("VESC", OK), ("VESC time-out", OK), ("battery", OK)]
     found = vesc()["VESC", OK].found
     assert "TWIN firmware 5.02 at /dev/pts/" in found
-    assert vesc()["VESC time-out", OK].found == "250 ms with 20 A; at most 250 ms with 20 A wanted"
+    assert vesc()["VESC time-out", OK].found == "250 ms with 20 A; required is at most 250 ms with 20 A"
 
 
 def test_as_delivered_the_car_rolls_on_and_the_cure_is_a_command():
@@ -62,7 +62,7 @@ def test_battery_fault_and_a_firmware_that_does_not_tell():
 def test_a_line_without_a_sensible_word(wire):
     row = vesc(wire=wire)["VESC", FAILURE]
     assert "got nothing" in row.found
-    assert "right port" in row.do
+    assert "check the port" in row.do
 
 
 def test_absent_busy_and_something_else_at_the_port(tmp_path):
@@ -113,7 +113,7 @@ def test_a_serial_device_is_told_with_what_it_lacks(tmp_path, monkeypatch):
     monkeypatch.setattr(motor, "stable_names", lambda device: [motor.FIXED_NAME])
     assert [row.state for row in motor.serial_ports()] == [OK]
     monkeypatch.setattr(motor, "_running", lambda name: 4711)
-    assert "ModemManager runs (process 4711)" in motor.serial_ports()[1].found
+    assert "ModemManager is running (process 4711)" in motor.serial_ports()[1].found
     monkeypatch.setattr(os, "access", lambda path, mode: False)
     assert motor.serial_ports()[0].found.startswith("no permission for")
     monkeypatch.setattr(motor, "ports", list)
@@ -174,7 +174,7 @@ def test_silence_a_stranger_and_a_taken_port():
     port = free_port()
     (row,) = listen(port)
     assert row.state == FAILURE
-    assert "UDP Object Stream on" in row.do
+    assert "UDP Object Stream to" in row.do
     assert listen(port, required=False)[0].state == ABSENT
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as holder:
         holder.bind(("127.0.0.1", port))

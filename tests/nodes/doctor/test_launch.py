@@ -110,7 +110,7 @@ def test_devices_of_a_twin_that_is_switched_off_are_missed(tmp_path):
     rows = findings(plan_of("green_screen", "twin.if=false", "vicon.source=127.0.0.1"), tmp_path)
     for check in ("camera", "VESC"):
         (row,) = [row for row in rows if row.check == check]
-        assert (row.state, "this launch has no node that makes it" in row.found) == (FAILURE, True)
+        assert (row.state, "this launch has no node that provides it" in row.found) == (FAILURE, True)
     assert states(rows, "VICON") == [FAILURE]  # a real stream is wanted now
     assert states(rows, "EGL") == []
 
@@ -140,7 +140,7 @@ def test_each_host_has_its_own_needs(tmp_path):
     assert states(rows, "keys") == [OK]
     away = plan_of("two_hosts", *shared, "params.robot=203.0.113.7", host="robot")
     rows = findings(away, tmp_path, (*SLOW, "VICON", "camera", "VESC"))
-    assert "ip addr says" in next(row.do for row in rows if row.check == "network")
+    assert "(ip addr lists them)" in next(row.do for row in rows if row.check == "network")
 
 
 def test_it_runs_where_no_large_library_is_installed():
@@ -189,7 +189,7 @@ def test_what_the_command_cannot_understand_is_exit_code_2(tmp_path, monkeypatch
     assert run(monkeypatch, capsys, tmp_path / "none.launch.yaml")[0] == 2
     assert run(monkeypatch, capsys, ROOT / "launch" / "two_hosts.launch.yaml")[0] == 2  # which host?
     code, _, errors = run(monkeypatch, capsys, "--set", "twin.if=false")
-    assert (code, "need a launch file" in errors) == (2, True)
+    assert (code, "give one" in errors) == (2, True)
 
 
 def test_a_computer_without_a_launch_file_in_mind(tmp_path, monkeypatch, capsys):
@@ -229,7 +229,9 @@ def saved_policy(file, width, height):
 def test_launch_check_says_which_policy_does_not_fit_the_camera(tmp_path, monkeypatch, capsys):
     file = tmp_path / "policy.safetensors"
     missing = plan_of("green_screen", f"params.policy={file}")
-    assert launch.policy_problems(missing) == [f"policy: {file} does not exist; --set params.policy=FILE names another"]
+    assert launch.policy_problems(missing) == [
+        f"policy: expected a policy file at {file}, found none; give another with --set params.policy=FILE"
+    ]
     saved_policy(file, 400, 224)
     (problem,) = launch.policy_problems(plan_of("green_screen", f"params.policy={file}"))
     assert problem.startswith("policy: trained for 400 x 224, the camera is calibrated for 336 x 188; train for this")

@@ -22,7 +22,7 @@ def test_keys_are_shown_and_one_that_others_may_read_is_a_finding_with_its_cure(
     (tmp_path / "secret" / "robot.key").chmod(0o640)
     (found,) = machine.keys(tmp_path)
     assert found.state == WARNING
-    assert "make a new key" in found.found
+    assert "create a new key" in found.found
 
 
 def test_clock_is_judged_by_what_the_kernel_says(monkeypatch):
@@ -47,10 +47,10 @@ def test_chrony_says_whom_it_follows_and_one_that_hangs_costs_its_deadline_only(
         Finding("clock", OK, "off by at most 1.0 ms, chrony follows 192.168.10.1, offset +0.25 ms")
     ]
     chronyc(tmp_path, monkeypatch, "echo '506 Cannot talk to daemon' >&2; exit 1")
-    assert "chronyd does not run" in machine.clock()[0].found
+    assert "chronyd is not running" in machine.clock()[0].found
     monkeypatch.setattr(machine, "_CHRONYC_S", 0.1)
     chronyc(tmp_path, monkeypatch, "exec sleep 30")
-    assert "chronyc does not answer" in machine.clock()[0].found
+    assert "no answer from chronyc" in machine.clock()[0].found
 
 
 @pytest.mark.parametrize(
@@ -124,7 +124,7 @@ def test_permission_is_cured_by_the_group_or_by_logging_in_again(monkeypatch):
     monkeypatch.setattr(grp, "getgrnam", lambda name: entry(4711, []))
     assert motor.permission_cure("dialout") == "sudo usermod -aG dialout ann, then log out and in again"
     monkeypatch.setattr(grp, "getgrnam", lambda name: entry(4711, ["ann"]))
-    assert "since after you logged in" in motor.permission_cure("dialout")
+    assert "only since your last login" in motor.permission_cure("dialout")
     monkeypatch.setattr(os, "getgroups", lambda: [4711])
     assert "udev rule sets GROUP" in motor.permission_cure("dialout")
 

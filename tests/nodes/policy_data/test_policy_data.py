@@ -40,7 +40,7 @@ def test_a_foreign_log_becomes_frames_with_its_own_view(tmp_path):
     ("change", "reason"),
     [
         (lambda t: t.replace("angle", "wheel"), "expected columns frame, angle .* got frame, wheel"),
-        (lambda t: t.replace("3.png", "no.png"), r"csv:5: expected an image, got 'no\.png'"),
+        (lambda t: t.replace("3.png", "no.png"), r"csv:5: expected a readable image, got 'no\.png'"),
         (lambda t: t.replace("2.png, -0.25", "2.png, left"), r"csv:4: expected a steering angle"),
         (lambda t: t.replace("2.png, -0.25", "2.png, 25"), "--log-scale"),
         (lambda t: "\n".join(t.split("\n")[:3]), "at least 4 rows"),
@@ -66,7 +66,7 @@ def test_errors_against_numpy():
     assert (e.mean_abs_rad, e.bias_rad) == (pytest.approx(np.abs(error).mean()), pytest.approx(error.mean()))
     assert e.rms_rad == pytest.approx(np.sqrt(error.var() + error.mean() ** 2))
     assert e.correlation == pytest.approx(np.corrcoef(predicted[known], true[known])[0, 1])
-    with pytest.raises(ConfigError, match="to compare with"):
+    with pytest.raises(ConfigError, match="recorded or labelled"):
         compare(predicted, np.full(200, np.nan))
 
 

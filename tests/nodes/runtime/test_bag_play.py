@@ -169,7 +169,7 @@ def test_texts_that_mean_nothing_change_nothing(bag, text):
 
 def test_names_that_cannot_be_are_refused(bag):
     for remap, words in [
-        ({"/arm": "/vicon/car"}, "is not played; played are /vicon/car"),
+        ({"/arm": "/vicon/car"}, "/arm is not played; played are /vicon/car"),
         ({"/vicon/car": "/policy/drive"}, "/vicon/car is geometry_msgs/msg/PoseStamped, expected ackermann_msgs"),
     ]:
         with pytest.raises(BagError, match=words):

@@ -58,7 +58,7 @@ def test_pictures_of_a_person_are_never_touched(tmp_path):
     mine = tmp_path / "holiday" / "images" / "phone" / "000001.jpg"
     mine.parent.mkdir(parents=True)
     mine.write_bytes(b"precious")
-    for media, message in ((mine.parent, "outside"), (tmp_path / "other", "holds other files")):
+    for media, message in ((mine.parent, "outside"), (tmp_path / "other", "has other files")):
         media.mkdir(exist_ok=True)
         with pytest.raises(ImportRecordingError, match=message):
             from_media([media], tmp_path / "holiday", MediaConfig(), SfmConfig(), 4.0, lambda share, text="": None)

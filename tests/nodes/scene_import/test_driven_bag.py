@@ -77,7 +77,7 @@ def test_a_second_run_leaves_finished_files_and_removes_strangers(tmp_path, writ
     [
         ({"calibrated": False}, r"expected the camera's calibration: .*give its file with --calibration"),
         ({"size": (100, 50)}, r"expected frames of 336 x 188, as calibrated, got 100 x 50"),
-        ({"gap": [(-1.0, 10.0)]}, r"has no topic /vicon/car|not one pose in time"),
+        ({"gap": [(-1.0, 10.0)]}, r"has no topic /vicon/car|frames without any pose"),
     ],
 )
 def test_what_a_bag_lacks_is_one_error(tmp_path, write_bag, bag, message):

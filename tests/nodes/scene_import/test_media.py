@@ -80,5 +80,5 @@ def test_damaged_and_missing_media_are_named(tmp_path):
     (tmp_path / "empty").mkdir()
     with pytest.raises(ImportRecordingError, match=r"expected photographs .* in .*empty, got none"):
         photographs_in(tmp_path / "empty")
-    with pytest.raises(ImportRecordingError, match="does not exist"):
+    with pytest.raises(ImportRecordingError, match="found none"):
         gather([tmp_path / "nothing.mp4"], tmp_path / "out", MediaConfig(), quiet)

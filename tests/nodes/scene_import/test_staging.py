@@ -82,7 +82,9 @@ def test_work_worth_keeping_is_named_and_taken_up(tmp_path):
         raise AdvnerfError("no")
 
     output = tmp_path / "scene"
-    with pytest.raises(ImportRecordingError, match=r"no\. Finished work is kept in .*scene\.part: the same command"):
+    with pytest.raises(
+        ImportRecordingError, match=r"no\. Finished work is kept in .*scene\.part: run the same command"
+    ):
         build_beside(output, (), stop)
     assert not output.exists()
 
@@ -104,7 +106,7 @@ def test_work_worth_keeping_is_named_and_taken_up(tmp_path):
 def test_folders_of_others_are_refused(tmp_path):
     (tmp_path / "scene.part").mkdir()
     (tmp_path / "scene.part" / "mine.txt").write_text("mine")
-    with pytest.raises(ImportRecordingError, match="that folder holds other files"):
+    with pytest.raises(ImportRecordingError, match="that folder has other files"):
         build_beside(tmp_path / "scene", (), whole)
 
     def inside(folder):
