@@ -1,4 +1,4 @@
-"""What all tests share: which of them need the machine for themselves, and a process of its own for those that spoil theirs."""
+"""What all tests share: live tests run again after the host paused, and tests that spoil their process get one of their own."""
 
 from __future__ import annotations
 
@@ -12,32 +12,9 @@ from _pytest.runner import runtestprotocol
 
 from benchmarks.host_pauses import stolen
 
-# Where tests start processes, open sockets and terminals, or hold code to a clock; what lies below _COMPUTING only computes.
-_LIVE = (
-    "tests/nodes",
-    "tests/hardware",
-    "tests/docker",
-    "tests/test_docs_policies.py",
-)
-_COMPUTING = (
-    "tests/nodes/attacking", "tests/nodes/campaign", "tests/nodes/carla_tools", "tests/nodes/doctor/test_devices.py", "tests/nodes/doctor/test_launch.py",
-    "tests/nodes/experiment", "tests/nodes/intersection", "tests/nodes/policy_data", "tests/nodes/runtime/test_bag",
-    "tests/nodes/runtime/test_replay_attack.py", "tests/nodes/runtime/test_security.py", "tests/nodes/scene_import",
-    "tests/nodes/test_attack.py", "tests/nodes/test_attack_handover.py", "tests/nodes/test_calibration_drive.py", "tests/nodes/test_cli",
-    "tests/nodes/test_counterfactual.py", "tests/nodes/test_expert.py", "tests/nodes/test_policy_reference.py", "tests/nodes/test_scene_training.py",
-    "tests/nodes/test_trials.py", "tests/hardware/cameras/test_conformance.py", "tests/hardware/carla_scene",
-    "tests/hardware/twin", "tests/hardware/worlds", "tests/nodes/worlds",
-)  # fmt: skip
 # A live test that fails while this share of the processors was withheld by the host says nothing.
 _STOLEN_SHARE, _ATTEMPTS, _REST_S = 0.01, 5, 4.0
 _INSIDE = "ADVNERF_TEST_IN_ITS_OWN_PROCESS"
-
-
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark by folder what must not share its cores."""
-    for item in items:
-        if item.nodeid.startswith(_LIVE) and not item.nodeid.startswith(_COMPUTING):
-            item.add_marker(pytest.mark.live)
 
 
 @pytest.hookimpl(tryfirst=True)

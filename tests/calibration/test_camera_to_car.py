@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from boards import seen, turned
 from scipy.spatial.transform import Rotation
 
 from advnerf_core.data.similarity import rotation_angles
@@ -11,6 +10,7 @@ from calibration.camera_to_car import MountConfig, MountView, calibrate_mount
 from calibration.degeneracy import DegenerateDataError, PoorFitError
 from calibration.measured import LensCalibration
 from calibration.schema import CameraCalibration, load_calibration, save_calibration
+from tests.support.boards import seen, turned
 
 LENS = LensCalibration(
     date="2026-11-21", method="test", width=336, height=188, fx=174.0, fy=174.0, cx=168.0, cy=94.0, rms_px=0.1,

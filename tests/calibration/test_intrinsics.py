@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
-from boards import BOARD, board_views
 
 from calibration.charuco import Board, BoardDetector
 from calibration.degeneracy import DegenerateDataError, PoorFitError
 from calibration.intrinsics import IntrinsicsConfig, calibrate_intrinsics
 from calibration.measured import LensCalibration
 from calibration.schema import CalibrationError, load_calibration, save_calibration
+from tests.support.boards import BOARD, board_views
 
 SIZE = (672, 376)
 MATRIX = np.array([[350.0, 0.0, 338.2], [0.0, 351.5, 187.1], [0.0, 0.0, 1.0]])

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from boards import turned
 from scipy.spatial.transform import Rotation
 
 from advnerf_core.geometry import camera_mount, invert_transform, make_transform, planar_pose
@@ -10,6 +9,7 @@ from calibration.degeneracy import DegenerateDataError, PoorFitError
 from calibration.measured import SceneCalibration
 from calibration.mocap_to_scene import place_scene
 from calibration.schema import load_calibration, save_calibration
+from tests.support.boards import turned
 
 SCALE = 0.37
 T_WORLD_FROM_SCENE = make_transform(Rotation.from_euler("xyz", [0.4, -1.1, 2.0]).as_matrix(), [1.0, -2.0, 0.5])

@@ -5,7 +5,6 @@ import math
 import numpy as np
 import pytest
 import torch
-from drives import CAR, drive, program
 
 from advnerf_core.driving.actuated import ActuatedAckermann
 from calibration.by_construction import twin_calibrations
@@ -14,6 +13,7 @@ from calibration.schema import VehicleCalibration, load_calibration, save_calibr
 from calibration.vehicle import fit_gains, twist
 from calibration.vehicle_response import fit_response, follow, vehicle_calibration
 from hardware.worlds.lab.config import LabConfig
+from tests.support.drives import CAR, drive, program
 
 
 @pytest.fixture(scope="module")

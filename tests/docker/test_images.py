@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 import yaml
 
+pytestmark = pytest.mark.live
+
 REPOSITORY = Path(__file__).parents[2]
 DOCKER = REPOSITORY / "docker"
 # glibc 2.35 of JetPack 6 and 2.36 of python:3.11-slim take all of these; an older one would be a thin client only.

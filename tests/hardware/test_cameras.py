@@ -15,6 +15,8 @@ from hardware.cameras.socket import SocketCamera
 from hardware.emulators.frame_server import FrameServer
 from hardware.errors import DeviceBusy, DeviceNotFound, LinkLost, LinkTimeout, ProtocolError
 
+pytestmark = pytest.mark.live
+
 
 def frame(sequence, shape=(188, 336, 3)):
     rng = np.random.default_rng(sequence)

@@ -10,6 +10,8 @@ from hardware.emulators.monitor_port import MonitorPort
 from hardware.errors import DeviceBusy, DeviceNotFound, LinkLost
 from hardware.screen.display import PygameDisplay, TwinDisplay
 
+pytestmark = pytest.mark.live
+
 SIZE_M = (0.5977, 0.3362)
 
 

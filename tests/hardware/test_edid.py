@@ -3,6 +3,8 @@ import pytest
 from hardware.errors import DeviceNotFound, ProtocolError
 from hardware.screen.edid import connected_displays, edid_of, make_edid, parse_edid
 
+pytestmark = pytest.mark.live
+
 # Real monitors, from reports of their owners; the data sheet of the U2412M gives an active area of 518.4 x 324.0 mm.
 DELL_U2412M = bytes.fromhex(
     "00ffffffffffff0010ac79a0554130331c1b010380342078eaee95a3544c99260f5054a1080081408180a940b300d1c0010101010101283c80a070b023403020"

@@ -11,6 +11,8 @@ from hardware.errors import HardwareError
 from hardware.operator.gamepad import Gamepad
 from hardware.operator.keyboard import Keyboard
 
+pytestmark = pytest.mark.live
+
 KEY, ABS, SYN = 1, 3, 0
 
 

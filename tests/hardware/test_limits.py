@@ -8,6 +8,8 @@ from hypothesis import strategies as st
 
 from hardware.motor.limits import DriveLimiter, DriveLimits, VehicleGains
 
+pytestmark = pytest.mark.live
+
 LIMITS = DriveLimits()
 
 

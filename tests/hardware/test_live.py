@@ -16,6 +16,8 @@ from hardware.motor.limits import DriveLimits, VehicleGains
 from hardware.motor.vesc import Vesc
 from hardware.worlds.lab.lab import Lab
 
+pytestmark = pytest.mark.live
+
 
 @pytest.fixture(scope="module")
 def receiver():

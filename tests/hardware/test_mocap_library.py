@@ -13,6 +13,8 @@ from scipy.spatial.transform import Rotation
 from hardware.errors import DeviceNotFound, HardwareError
 from hardware.mocap.library import LibraryConfig, LibraryReceiver
 
+pytestmark = pytest.mark.live
+
 PLAYER = """
 import time
 from types import SimpleNamespace as Object

@@ -8,6 +8,8 @@ from hardware.motor.odometry import LONGEST_STEP_S, Odometry
 from hardware.worlds.lab.config import CarConfig
 from hardware.worlds.lab.vehicle import TwinVehicle
 
+pytestmark = pytest.mark.live
+
 
 def drive(odometry, speed, steering, duration_s, step_s):
     for step in range(round(duration_s / step_s) + 1):

@@ -20,6 +20,8 @@ from hardware.motor.vesc_replies import FirmwareVersion
 from hardware.worlds.lab.config import CarConfig
 from hardware.worlds.lab.vehicle import TwinVehicle
 
+pytestmark = pytest.mark.live
+
 
 def vehicle():
     return TwinVehicle(CarConfig())

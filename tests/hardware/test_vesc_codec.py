@@ -16,6 +16,8 @@ from hardware.motor.vesc_codec import (
     encode_frame,
 )
 
+pytestmark = pytest.mark.live
+
 GOLDEN = [
     (CommandId.FW_VERSION, None, "02 01 00 00 00 03"),
     (CommandId.GET_VALUES, None, "02 01 04 40 84 03"),

@@ -16,6 +16,8 @@ from hardware.motor.vesc_replies import (
     encode_values,
 )
 
+pytestmark = pytest.mark.live
+
 LENGTHS = {"A": 56, "B": 54, "C": 58, "D": 59, "E": 65, "F": 73, "G": 74}
 # Offsets of (erpm, v_in, tachometer, fault) in the payload, from the firmware sources.
 OFFSETS = {"A": (25, 29, 47, 55), **dict.fromkeys("BCDEFG", (23, 27, 45, 53))}

@@ -14,6 +14,8 @@ from hardware.motor.vesc_settings import TimeoutSettings, decode_app_configurati
 from hardware.worlds.lab.config import CarConfig
 from hardware.worlds.lab.vehicle import TwinVehicle
 
+pytestmark = pytest.mark.live
+
 # Controller id 7, 250 ms = 0x000000FA, 20 A (0x41A00000 as IEEE 754 single; 20000 mA = 0x00004E20), then other settings.
 TAIL = bytes.fromhex("00 01 f4 02 03 aa bb cc 02 03 00")
 GOLDEN = {

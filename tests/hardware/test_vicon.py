@@ -14,6 +14,8 @@ from hardware.errors import DeviceBusy, ProtocolError
 from hardware.mocap.vicon import SubjectTracker, ViconConfig, ViconReceiver
 from hardware.mocap.vicon_codec import ObjectPose, decode_block, encode_blocks, object_pose
 
+pytestmark = pytest.mark.live
+
 CONFIG = ViconConfig(subjects=("car", "board"), frozen_frames=4)
 
 

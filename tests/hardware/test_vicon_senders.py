@@ -13,6 +13,8 @@ from hardware.emulators.vicon_emulator import ViconEmulatorConfig, ViconFrames
 from hardware.mocap.vicon import SubjectTracker, ViconConfig, ViconReceiver
 from hardware.mocap.vicon_codec import encode_blocks, object_pose
 
+pytestmark = pytest.mark.live
+
 A, B = ("10.0.0.5", 51001), ("10.0.0.7", 40000)
 
 

@@ -19,6 +19,8 @@ from nodes.runtime.errors import LaunchError
 from nodes.runtime.messages import drive_message, header, pose_message, types
 from nodes.runtime.requests import Asked
 
+pytestmark = pytest.mark.live
+
 TWIN = Path(__file__).parents[2] / "calibration" / "twin"
 CLOCK = SystemClock()
 

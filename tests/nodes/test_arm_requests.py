@@ -10,6 +10,8 @@ from nodes.runtime.messages import header, types
 from nodes.runtime.requests import Answer, Answers, asked_mono_ns
 from nodes.runtime.wire import MessageInfo
 
+pytestmark = pytest.mark.live
+
 MS = 1_000_000
 REAL_NS = 1_700_000_000_000_000_000
 FENCE = ((-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0))

@@ -10,6 +10,8 @@ from nodes.control.arming import Arming, ArmingLimits
 from nodes.control.arming_gates import inside
 from nodes.runtime.wire import MessageInfo
 
+pytestmark = pytest.mark.live
+
 MS = 1_000_000
 REAL_NS = 1_700_000_000_000_000_000
 NODES = ("camera", "vicon", "compositor", "policy", "motor")

@@ -11,6 +11,8 @@ from nodes.control.arming_gates import ClockGate, HandGate, edge_distance_m, ins
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.wire import MessageInfo
 
+pytestmark = pytest.mark.live
+
 MS = 1_000_000
 REAL_NS = 1_700_000_000_000_000_000
 L_SHAPE = ((-3.0, -3.0), (3.0, -3.0), (3.0, 0.0), (0.0, 0.0), (0.0, 3.0), (-3.0, 3.0))

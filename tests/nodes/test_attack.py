@@ -1,5 +1,4 @@
 import hashlib
-import importlib.util
 import os
 import signal
 import subprocess
@@ -25,19 +24,10 @@ from nodes.runtime.messages import decode, encode, header, image_message, pose_m
 from nodes.runtime.node import MessageInfo, NodeContext
 from nodes.runtime.pictures import rgb_image
 from nodes.runtime.transfer import Assembler, chunk_messages
+from tests.support.tiny_request import tiny_request
 
 REPOSITORY = Path(__file__).parents[2]
 CALIBRATION = REPOSITORY / "calibration" / "twin"
-
-
-def _tiny():
-    spec = importlib.util.spec_from_file_location("tiny", Path(__file__).parent / "attacking" / "tiny.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module.tiny_request
-
-
-tiny_request = _tiny()
 
 
 @pytest.fixture(autouse=True)

@@ -30,6 +30,8 @@ from nodes.runtime.messages import ns_from_stamp, pinhole_from_camera_info
 from nodes.runtime.node import NodeContext
 from nodes.runtime.pictures import rgb_image
 
+pytestmark = pytest.mark.live
+
 TWIN = Path(__file__).parents[2] / "calibration" / "twin" / "camera.yaml"
 CLOCK = SystemClock()
 PATH = "/dev/v4l/by-id/usb-Camera-video-index0"

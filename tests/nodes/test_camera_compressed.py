@@ -18,6 +18,8 @@ from nodes.runtime.messages import decode, encode, image_message, stamp_ns, type
 from nodes.runtime.node import MessageInfo, NodeContext
 from nodes.runtime.pictures import COMPRESSED_TOPIC, compressed_image_message, rgb_image
 
+pytestmark = pytest.mark.live
+
 TWIN = Path(__file__).parents[2] / "calibration" / "twin"
 T0 = 1_700_000_000_000_000_000
 CLOCK = ManualClock(mono_ns=10**10, real_ns=T0 + 20_000_000)

@@ -16,6 +16,8 @@ from nodes.cli.camera import app
 from nodes.lab.camera_tools import CameraToolError, describe_devices, parse_source, try_source
 from nodes.runtime.errors import ConfigError
 
+pytestmark = pytest.mark.live
+
 TWIN = Path(__file__).parents[2] / "calibration" / "twin" / "camera.yaml"
 CONF = "[LEFT_CAM_VGA]\nfx=350\nfy=351\ncx=335\ncy=187\nk1=-0.17\nk2=0.02\n"
 

@@ -2,7 +2,6 @@
 
 import subprocess
 import sys
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -33,10 +32,8 @@ from nodes.lab.wizards.screen import show_and_watch
 from nodes.runtime.bus import Bus
 from nodes.runtime.errors import BagError
 from nodes.runtime.messages import encode, header, image_message, pose_message, types
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "calibration"))
-from boards import BOARD
-from drives import CAR, drive, program
+from tests.support.boards import BOARD
+from tests.support.drives import CAR, drive, program
 
 START_NS = 1_800_000_000_000_000_000
 PINHOLE = LabConfig().camera.pinhole

@@ -7,6 +7,8 @@ import pytest
 from nodes.control.command_gate import Brake, CommandGate, Drive, GateSettings, GateState
 from nodes.runtime.wire import MessageInfo
 
+pytestmark = pytest.mark.live
+
 SETTINGS = GateSettings(command_age_limit_s=0.22, brake_current_a=15.0, brake_ramp_s=0.1, brake_hold_s=1.0)
 MS = 1_000_000
 STOP = (0.0, 0.0)

@@ -20,6 +20,8 @@ from nodes.runtime.node import MessageInfo, NodeContext
 from nodes.runtime.pictures import rgb_image
 from nodes.runtime.transfer import chunk_messages
 
+pytestmark = pytest.mark.live
+
 CALIBRATION = Path(__file__).parents[2] / "calibration" / "twin"
 CAMERA = load_calibration(CameraCalibration, CALIBRATION / "camera.yaml")
 TARGET = load_calibration(TargetCalibration, CALIBRATION / "board.yaml")

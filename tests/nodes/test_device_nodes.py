@@ -21,6 +21,8 @@ from nodes.runtime.messages import ns_from_stamp, pinhole_from_camera_info, pose
 from nodes.runtime.pictures import rgb_image
 from nodes.vicon import ViconNode, ViconNodeConfig
 
+pytestmark = pytest.mark.live
+
 TWIN = Path(__file__).parents[2] / "calibration" / "twin"
 CLOCK = SystemClock()
 

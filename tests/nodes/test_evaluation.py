@@ -8,6 +8,8 @@ from nodes.bags.writer import BagWriter
 from nodes.lab.trials.evaluation import attack_ids, frames, score, timing, trajectory
 from nodes.runtime.messages import drive_message, encode, header, image_message, pose_message, types
 
+pytestmark = pytest.mark.live
+
 START_NS = 1_700_000_000_000_000_000
 TICK_NS = 100_000_000
 TRACK = Path.rounded_square(4.0, 1.1)

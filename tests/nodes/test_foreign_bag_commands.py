@@ -23,9 +23,9 @@ from nodes.replaying.replay import Replay
 from nodes.runtime.bus import Bus
 from nodes.runtime.errors import MessageError
 from nodes.runtime.messages import pose_matrix, stamp_ns
+from tests.support.foreign_samples import COMPRESSED, COUNT, START_NS, STEP_NS, WRITERS, rgb_at, state_at
 
-sys.path.insert(0, str(Path(__file__).parent / "runtime"))
-from foreign_samples import COMPRESSED, COUNT, START_NS, STEP_NS, WRITERS, rgb_at, state_at
+pytestmark = pytest.mark.live
 
 TWIN = Path(__file__).parents[2] / "calibration" / "twin"
 CAMERA, ROOM = TWIN / "camera.yaml", TWIN / "room.yaml"

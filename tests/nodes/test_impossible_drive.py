@@ -4,6 +4,8 @@ import pytest
 
 from benchmarks.fault_campaign import LIMIT_MS, SLOW_LIMITS_MS, Graph, suffer
 
+pytestmark = pytest.mark.live
+
 _SETTINGS = ("record=false", "policy.module=benchmarks.straight_policy")
 
 

@@ -3,10 +3,14 @@
 import importlib.util
 from pathlib import Path
 
+import pytest
+
 from nodes.compositor import CompositorNode, show
 from nodes.control.interlock import Interlock
 from nodes.runtime.messages import decode, encode, header, types
 from nodes.runtime.wire import MessageInfo
+
+pytestmark = pytest.mark.live
 
 # Import mode importlib: the bench of the compositor's own tests by its path.
 _SPEC = importlib.util.spec_from_file_location("compositor_bench", Path(__file__).with_name("test_compositor.py"))

@@ -7,6 +7,8 @@ import pytest
 from nodes.launching.launch_check import check_nodes
 from nodes.launching.launch_file import load_launch
 
+pytestmark = pytest.mark.live
+
 LAUNCH = Path(__file__).parents[2] / "launch"
 
 

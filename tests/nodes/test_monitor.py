@@ -19,6 +19,8 @@ from nodes.runtime.messages import decode, encode, header, type_name, types
 from nodes.runtime.node import MessageInfo, NodeContext
 from nodes.runtime.transfer import chunk_messages
 
+pytestmark = pytest.mark.live
+
 TARGET = load_calibration(TargetCalibration, Path(__file__).parents[2] / "calibration" / "twin" / "monitor.yaml")
 SQUARE = centre_square(TARGET)
 PANEL = make_panel((1920, 1080), TARGET)

@@ -16,6 +16,8 @@ from nodes.lab.trials.trial_runner import run_trial
 from nodes.runtime.messages import decode, ns_from_stamp
 from nodes.runtime.pictures import rgb_image
 
+pytestmark = pytest.mark.live
+
 ROOT = Path(__file__).parents[2]
 NODES = ("twin", "camera", "vicon", "compositor", "monitor", "policy", "safety", "motor")
 

@@ -22,6 +22,8 @@ from nodes.runtime.clock import Now, SystemClock
 from nodes.runtime.messages import decode, encode, header, pose_message, types
 from nodes.runtime.node import MessageInfo, NodeContext
 
+pytestmark = pytest.mark.live
+
 CLOCK = SystemClock()
 VEHICLE = Path(__file__).parents[2] / "calibration" / "twin" / "vehicle.yaml"
 

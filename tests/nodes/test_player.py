@@ -13,6 +13,8 @@ from nodes.runtime.clock import ManualClock
 from nodes.runtime.errors import BagError, NodeFinished
 from nodes.runtime.messages import decode, encode, header, pose_message, stamp_ns, types
 
+pytestmark = pytest.mark.live
+
 START_NS = 1_800_000_000_000_000_000
 
 

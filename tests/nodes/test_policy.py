@@ -25,6 +25,8 @@ from nodes.runtime.errors import ConfigError
 from nodes.runtime.messages import decode, encode, image_message, stamp_ns, type_name
 from nodes.runtime.node import MessageInfo, NodeContext
 
+pytestmark = pytest.mark.live
+
 VIEW = PolicyView(Pinhole(336, 188, 173.97, 173.97, 168.0, 94.0))
 T0 = 1_700_000_000_000_000_000
 MS = 1_000_000

@@ -4,6 +4,8 @@ import pytest
 from advnerf_core.geometry import make_transform, rotation_x, rotation_z, yaw_of
 from nodes.control.pose_buffer import PoseBuffer
 
+pytestmark = pytest.mark.live
+
 SPEED_MPS, RADIUS_M = 1.5, 1.0
 
 

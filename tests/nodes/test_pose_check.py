@@ -14,6 +14,8 @@ from hardware.worlds.lab.vehicle import TwinVehicle
 from nodes.control.pose_check import MotionBounds, PoseCheck, PoseGate
 from nodes.runtime.wire import MessageInfo
 
+pytestmark = pytest.mark.live
+
 BOUNDS = MotionBounds.of_car(DriveLimits(), 0.25, 1.25, 0.005, 0.01)
 CAR = CarConfig()
 

@@ -20,6 +20,8 @@ from nodes.runtime.errors import BagError
 from nodes.runtime.messages import encode, image_message, pose_message
 from nodes.runtime.node import MessageInfo, NodeContext
 
+pytestmark = pytest.mark.live
+
 
 def context(tmp_path):
     return NodeContext("recorder", tmp_path, SystemClock())

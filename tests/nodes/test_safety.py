@@ -18,6 +18,8 @@ from nodes.runtime.node import MessageInfo
 from nodes.runtime.requests import Asked
 from nodes.safety import SafetyConfig, SafetyNode
 
+pytestmark = pytest.mark.live
+
 TWIN = Path(__file__).parents[2] / "calibration" / "twin"
 
 

@@ -1,17 +1,12 @@
 """The live stack as real processes on the twin: what the VESC reads when a process dies, hangs, or wakes up again."""
 
-import importlib.util
 import signal
-import sys
-from pathlib import Path
 
 import pytest
 
-_SPEC = importlib.util.spec_from_file_location("stack", Path(__file__).with_name("stack.py"))
-stack_module = importlib.util.module_from_spec(_SPEC)
-sys.modules["stack"] = stack_module
-_SPEC.loader.exec_module(stack_module)
-Stack = stack_module.Stack
+from tests.support.stack import Stack
+
+pytestmark = pytest.mark.live
 
 MOVES = {"SET_RPM"}
 BRAKES = {"SET_CURRENT_BRAKE"}

@@ -11,6 +11,8 @@ from hardware.worlds.lab.config import CarConfig
 from hardware.worlds.lab.vehicle import TwinVehicle
 from nodes.control.stall_check import StallGate, StallLimits
 
+pytestmark = pytest.mark.live
+
 CAR = CarConfig()
 
 

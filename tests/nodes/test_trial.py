@@ -7,6 +7,8 @@ from nodes.runtime.clock import Now
 from nodes.runtime.errors import NodeFinished
 from nodes.runtime.messages import header, pose_message, types
 
+pytestmark = pytest.mark.live
+
 REAL_NS = 1_700_000_000_000_000_000
 START = (-1.1, -2.0, 0.0)
 

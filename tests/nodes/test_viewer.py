@@ -14,6 +14,8 @@ from nodes.runtime.pictures import rgb_image
 from nodes.runtime.topics import TOPICS
 from nodes.viewer import ViewerConfig, ViewerNode
 
+pytestmark = pytest.mark.live
+
 pytest.importorskip("foxglove")
 client = pytest.importorskip("websockets.sync.client")
 PIXELS = np.random.default_rng(2).integers(0, 256, (188, 336, 3), dtype=np.uint8)

@@ -38,7 +38,7 @@ from advnerf_core.plugins import PluginError
 from advnerf_core.report.conditions import order_of
 from advnerf_core.scene.surrogate import Surrogate
 from benchmarks.attack_toy import MOUNT, VIEW, painted_room, toy_problem
-from tests.strangers import install_method, spiral_code, spiral_theta, write_spiral
+from tests.support.strangers import install_method, spiral_code, spiral_theta, write_spiral
 
 ROOT = Path(__file__).parents[3]
 LESSONS = Distillation(warm_pairs=2)

@@ -1,7 +1,5 @@
 import dataclasses
 import json
-import sys
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -12,9 +10,7 @@ from advnerf_core.attack.adjoint import evaluate
 from advnerf_core.attack.pose_maps import PoseMapError, landscape, robustness_map
 from advnerf_core.attack.pose_plots import draw_landscape, draw_placements, draw_robustness
 from advnerf_core.attack.search.poses import placed
-
-sys.path.insert(0, str(Path(__file__).parent))
-from placed_toy import SQUARE, moving
+from tests.support.placed_toy import SQUARE, moving
 
 GRID = ([2.2, 2.7, 3.2], [-2.0, -1.4], [2.9])
 

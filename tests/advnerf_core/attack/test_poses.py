@@ -1,7 +1,5 @@
 import dataclasses
-import sys
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -34,9 +32,7 @@ from advnerf_core.fields.voxel_grid import cube_face_object
 from advnerf_core.geometry import planar_pose
 from advnerf_core.render.soft_pose import placement_of
 from benchmarks.attack_toy import T_WORLD_FROM_FACE, toy_problem
-
-sys.path.insert(0, str(Path(__file__).parent))
-from placed_toy import SQUARE, box, moving
+from tests.support.placed_toy import SQUARE, box, moving
 
 
 def untimed(history):

@@ -1,11 +1,6 @@
 """What several tests of cameras need."""
 
-import sys
-from pathlib import Path
-
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent))  # the helpers beside the tests: the tests are no package
 
 ZED_CONF = """\
 [LEFT_CAM_2K]

@@ -5,12 +5,12 @@ import time
 
 import numpy as np
 import pytest
-from rigs import RIGS
 
 from hardware.cameras.interface import Camera
 from hardware.cameras.steady import SteadyCamera
 from hardware.errors import DeviceNotFound, LinkLost
 from nodes.runtime.inbox import Inbox, ReaderThread
+from tests.support.camera_rigs import RIGS
 
 DRIVEN = [name for name, kind in RIGS.items() if kind.driven]
 SELF_TIMED = [name for name in RIGS if name not in DRIVEN]

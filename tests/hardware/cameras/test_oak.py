@@ -8,6 +8,8 @@ from hardware.cameras.oak import OakCamera, OakSettings, OakStream, device_strea
 from hardware.cameras.stamping import Stamper
 from hardware.errors import DeviceNotFound, HardwareError, LinkLost, ProtocolError
 
+pytestmark = pytest.mark.live
+
 dai = pytest.importorskip("depthai")
 
 

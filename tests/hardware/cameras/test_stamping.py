@@ -5,6 +5,8 @@ import pytest
 
 from hardware.cameras.stamping import Decimator, Stamper
 
+pytestmark = pytest.mark.live
+
 S = 1_000_000_000
 
 

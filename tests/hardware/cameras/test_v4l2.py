@@ -30,6 +30,8 @@ from hardware.emulators.v4l2_device import (
 from hardware.emulators.v4l2_emulator import VideoPortEmulator
 from hardware.errors import DeviceBusy, DeviceNotFound, HardwareError, LinkLost, ProtocolError
 
+pytestmark = pytest.mark.live
+
 PATH = "/dev/v4l/by-id/usb-Emulated_Camera-video-index0"
 MODE = Mode(32, 16, 30.0)
 

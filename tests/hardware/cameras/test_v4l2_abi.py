@@ -9,6 +9,8 @@ import pytest
 
 from hardware.cameras.v4l2 import abi
 
+pytestmark = pytest.mark.live
+
 # Printed by a C program with sizeof, offsetof and the macros themselves.
 SIZES = {
     "Capability": 104, "FormatDescription": 64, "Format": 208, "PixelFormat": 48, "RequestBuffers": 20, "Buffer": 88,

@@ -24,6 +24,8 @@ from hardware.emulators.v4l2_emulator import VideoPortEmulator
 from hardware.emulators.zed_emulator import ZedRegisters
 from hardware.errors import HardwareError, ProtocolError
 
+pytestmark = pytest.mark.live
+
 PATH = "/dev/v4l/by-id/usb-Technologies__Inc._ZED-video-index0"
 
 

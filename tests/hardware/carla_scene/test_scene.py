@@ -8,7 +8,7 @@ import pytest
 from advnerf_core.geometry import camera_mount, planar_pose, transform_points
 from hardware.worlds.carla.errors import CarlaError
 from hardware.worlds.world import NotOpenError, World
-from tests.hardware.carla_scene.scenes import carla_points, is_put_back, scene_of
+from tests.support.carla.scenes import carla_points, is_put_back, scene_of
 
 
 def test_is_a_world_and_owns_the_servers_while_open(library, settings):

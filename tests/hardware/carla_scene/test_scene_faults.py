@@ -8,7 +8,7 @@ import pytest
 
 from advnerf_core.geometry import camera_mount, planar_pose, transform_points
 from hardware.worlds.carla.errors import CarlaBusy, CarlaError, CarlaFrameError, CarlaMapError, CarlaUnreachable
-from tests.hardware.carla_scene.scenes import carla_points, drive, is_put_back, scene_of
+from tests.support.carla.scenes import carla_points, drive, is_put_back, scene_of
 
 
 def test_a_late_frame_is_waited_for(library, settings):

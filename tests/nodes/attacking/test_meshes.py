@@ -2,7 +2,6 @@
 
 import json
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,10 +18,8 @@ from nodes.experiment.request.request import load_request
 from nodes.experiment.request.search import run_attack
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import ProgressDisplay
-from tests.strangers import write_spiral
-
-sys.path.insert(0, str(Path(__file__).parent))
-from tiny import tiny_request
+from tests.support.strangers import write_spiral
+from tests.support.tiny_request import tiny_request
 
 HYDRANT = "{kind: mesh, x_m: 1.2, y_m: -1.7, z_m: 0.0, mesh: {generate: hydrant, texels: 8, height_m: 0.6}}"
 BALL = "{kind: mesh, x_m: 0.9, y_m: -1.9, z_m: 0.0, mesh: {generate: ball, texels: 8, height_m: 0.5}}"

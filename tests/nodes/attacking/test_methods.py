@@ -16,8 +16,8 @@ from nodes.experiment.request.search import run_attack
 from nodes.experiment.request.worker import work
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import ProgressDisplay
-from tests.nodes.attacking.tiny import tiny_request
-from tests.strangers import install_method, spiral_code, spiral_theta, write_spiral
+from tests.support.strangers import install_method, spiral_code, spiral_theta, write_spiral
+from tests.support.tiny_request import tiny_request
 
 FORGETFUL = """
 import torch

@@ -2,7 +2,6 @@
 
 import json
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,9 +13,7 @@ from nodes.experiment.request.prepare import prepare
 from nodes.experiment.request.request import load_request, request_text
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import ProgressDisplay
-
-sys.path.insert(0, str(Path(__file__).parent))
-from tiny import tiny_request
+from tests.support.tiny_request import tiny_request
 
 POSES = """\
 poses:

@@ -3,7 +3,6 @@
 import datetime
 import json
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -25,9 +24,7 @@ from nodes.experiment.request.request import load_request
 from nodes.experiment.request.search import attack_file, run_attack
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import ProgressDisplay
-
-sys.path.insert(0, str(Path(__file__).parent))
-from tiny import tiny_request
+from tests.support.tiny_request import tiny_request
 
 
 class StoppedError(Exception):

@@ -11,7 +11,7 @@ from nodes.experiment.campaign.config import load_campaign, select
 from nodes.experiment.campaign.run import Options, run_campaign, statuses
 from nodes.experiment.campaign.table import campaign_table
 from nodes.runtime.errors import ConfigError
-from tests.strangers import install_method, spiral_code, spiral_theta, write_spiral
+from tests.support.strangers import install_method, spiral_code, spiral_theta, write_spiral
 
 # Cells that really search, over a closed loop of two ticks.
 SEARCHES = """

@@ -16,6 +16,8 @@ from hardware.emulators.v4l2_emulator import VideoPortEmulator
 from nodes.lab.doctor import cameras, graphics
 from nodes.lab.doctor.check import ABSENT, FAILURE, OK, WARNING, Check, examine
 
+pytestmark = pytest.mark.live
+
 TWIN = Path(__file__).parents[3] / "calibration" / "twin"
 
 

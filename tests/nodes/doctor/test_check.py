@@ -9,6 +9,8 @@ from hardware.errors import LinkLost
 from nodes.lab.doctor import cameras, graphics
 from nodes.lab.doctor.check import ABSENT, FAILURE, OK, WARNING, Check, Finding, examine, in_child, worst
 
+pytestmark = pytest.mark.live
+
 
 def test_a_hung_check_costs_its_deadline_and_the_others_are_told_in_order():
     never = threading.Event()

@@ -11,6 +11,8 @@ from nodes.linking.keys import DRIVE, KeyFolder
 from nodes.runtime.bus import Bus
 from nodes.runtime.messages import header, types
 
+pytestmark = pytest.mark.live
+
 
 def test_keys_are_shown_and_one_that_others_may_read_is_a_finding_with_its_cure(tmp_path):
     (found,) = machine.keys(tmp_path)

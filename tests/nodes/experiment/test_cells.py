@@ -8,7 +8,7 @@ from advnerf_core.attack.methods import METHODS, load_method, method_name
 from nodes.experiment.attack import search_settings
 from nodes.experiment.cells import _cell, blocked_tick, cell_inputs
 from nodes.experiment.run import load_experiment
-from tests.strangers import write_spiral
+from tests.support.strangers import write_spiral
 
 LAUNCH = Path(__file__).parents[3] / "launch"
 

@@ -22,7 +22,7 @@ from nodes.experiment.junction.deploy import FrozenChangedError, check_frozen, d
 from nodes.experiment.junction.films import film_cell
 from nodes.experiment.junction.policy import NAIVE, victim_file
 from nodes.experiment.junction.spaces import colour_space
-from tests.strangers import spiral_code, spiral_theta, write_spiral
+from tests.support.strangers import spiral_code, spiral_theta, write_spiral
 
 PLACE = ("right", "hardened")
 GRADIENT = Cell("right", "hardened", "gradient", 0)

@@ -3,7 +3,6 @@ import hashlib
 import numpy as np
 import pytest
 import yaml
-from bag_samples import START_NS, write_all_topics
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 from mcap_ros2.decoder import DecoderFactory
@@ -31,6 +30,7 @@ from nodes.runtime.messages import (
     types,
 )
 from nodes.runtime.topics import TOPICS
+from tests.support.bag_samples import START_NS, write_all_topics
 
 
 def digest_by_topic(pairs):

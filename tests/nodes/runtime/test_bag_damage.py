@@ -11,7 +11,6 @@ import time
 import numpy as np
 import pytest
 import yaml
-from bag_samples import START_NS, write_all_topics
 from mcap.reader import make_reader
 from typer.testing import CliRunner
 
@@ -33,6 +32,7 @@ from nodes.bags.writer import BagWriter, SplitLimits
 from nodes.cli.main import app
 from nodes.runtime.errors import BagError
 from nodes.runtime.messages import encode, pose_message
+from tests.support.bag_samples import START_NS, write_all_topics
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,6 @@ import zlib
 
 import numpy as np
 import pytest
-from bag_samples import START_NS, sample, write_all_topics
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 from rosbags.highlevel import AnyReader
@@ -28,6 +27,7 @@ from nodes.bags.stamps import read_delays
 from nodes.bags.writer import BagWriter
 from nodes.runtime.errors import BagError
 from nodes.runtime.topics import TOPICS
+from tests.support.bag_samples import START_NS, sample, write_all_topics
 
 
 def test_a_summary_that_lies_is_an_error_and_takes_no_memory(tmp_path):

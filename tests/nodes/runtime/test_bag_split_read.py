@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
-from bag_samples import START_NS
 from rosbags.highlevel import AnyReader
-from split_samples import foreign_metadata, foreign_part
 
 from nodes.bags.merge import Source, merge_by_time
 from nodes.bags.reader import extract_attachments, read_attachment, read_attachments, read_info, read_messages
 from nodes.runtime.errors import BagError
+from tests.support.bag_samples import START_NS
+from tests.support.split_samples import foreign_metadata, foreign_part
 
 TOPICS = ("/vicon/car", "/arm", "/policy/drive")
 

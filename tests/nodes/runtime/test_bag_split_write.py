@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from bag_samples import START_NS, sample
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader
@@ -23,6 +22,7 @@ from nodes.bags.writer import BagWriter, SplitLimits
 from nodes.replaying.nodes import Choice
 from nodes.replaying.replay import Replay, write_replay
 from nodes.runtime.errors import BagError
+from tests.support.bag_samples import START_NS, sample
 
 POSE, IMAGE = "geometry_msgs/msg/PoseStamped", "sensor_msgs/msg/Image"
 CORNER = Path(__file__).parents[2] / "replay" / "corner.mcap"

@@ -13,6 +13,8 @@ from nodes.runtime.messages import stamp_ns as stamp_of
 from nodes.runtime.pictures import rgb_image
 from nodes.runtime.topics import topic
 
+pytestmark = pytest.mark.live
+
 
 def receive_for(bus, duration_s):
     out, end = [], time.monotonic() + duration_s

@@ -16,6 +16,8 @@ from nodes.runtime.config import (
 from nodes.runtime.errors import BusError, ConfigError
 from nodes.runtime.paths import bus_folder, private_folder, user_folder
 
+pytestmark = pytest.mark.live
+
 
 class Lens(BaseModel):
     model_config = ConfigDict(extra="forbid")

@@ -10,23 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from foreign_samples import (
-    COMPRESSED,
-    COUNT,
-    HUMBLE,
-    IMAGE,
-    ROS1_STORE,
-    START_NS,
-    STEP_NS,
-    WRITERS,
-    Make,
-    drive,
-    rgb_at,
-    state_at,
-    write_mcap,
-    write_ros1,
-    write_rosbag2,
-)
 from mcap.writer import Writer as McapWriter
 from rosbags import rosbag1
 from rosbags.rosbag2.writer import StoragePlugin
@@ -52,6 +35,25 @@ from nodes.runtime.messages import (
     types,
 )
 from nodes.runtime.pictures import rgb_image
+from tests.support.foreign_samples import (
+    COMPRESSED,
+    COUNT,
+    HUMBLE,
+    IMAGE,
+    ROS1_STORE,
+    START_NS,
+    STEP_NS,
+    WRITERS,
+    Make,
+    drive,
+    rgb_at,
+    state_at,
+    write_mcap,
+    write_ros1,
+    write_rosbag2,
+)
+
+pytestmark = pytest.mark.live
 
 LOGS = Path("/work/shared/data/logs/rosbag2")
 POSES = [f"geometry_msgs/msg/{name}" for name in ("PoseStamped", "TransformStamped", "PoseWithCovarianceStamped")]

@@ -9,6 +9,8 @@ from nodes.runtime.image_encodings import ENCODINGS
 from nodes.runtime.messages import decode, encode, header, image_message, types
 from nodes.runtime.pictures import rgb8_message, rgb_image
 
+pytestmark = pytest.mark.live
+
 RNG = np.random.default_rng(3)
 COLOUR = (200, 90, 30)
 

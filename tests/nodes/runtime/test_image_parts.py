@@ -8,6 +8,8 @@ from nodes.runtime.messages import decode, encode, image_message
 from nodes.runtime.messages import stamp_ns as stamp_of
 from nodes.runtime.pictures import rgb_image
 
+pytestmark = pytest.mark.live
+
 PIXELS = np.random.default_rng(1).integers(0, 256, (188, 366, 3), dtype=np.uint8)
 
 

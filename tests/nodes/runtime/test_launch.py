@@ -15,6 +15,8 @@ from nodes.launching.launch_file import load_launch
 from nodes.recorder import RecorderConfig
 from nodes.runtime.errors import ConfigError, LaunchError
 
+pytestmark = pytest.mark.live
+
 NODE = """
     import os, signal, subprocess, sys, time
     from pydantic import BaseModel, ConfigDict

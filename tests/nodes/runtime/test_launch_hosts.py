@@ -3,6 +3,8 @@ import pytest
 from nodes.launching.launch_file import load_launch
 from nodes.runtime.errors import ConfigError
 
+pytestmark = pytest.mark.live
+
 FILE = """
 name: pair
 hosts:

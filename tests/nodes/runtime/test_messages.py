@@ -29,6 +29,8 @@ from nodes.runtime.paths import socket_path
 from nodes.runtime.topics import TOPICS, status_topic, topic
 from nodes.runtime.wire import Meta, pack_meta, unpack
 
+pytestmark = pytest.mark.live
+
 DRIVE = "ackermann_msgs/msg/AckermannDriveStamped"
 
 

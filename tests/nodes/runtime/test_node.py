@@ -17,6 +17,8 @@ from nodes.runtime.messages import stamp_ns as stamp_of
 from nodes.runtime.node import Inbox, Node, Out, ReaderThread
 from nodes.runtime.process import run_node
 
+pytestmark = pytest.mark.live
+
 
 def test_schedule_stays_on_its_grid_and_skips_what_it_missed():
     schedule = Schedule(rate_hz=10.0, start_ns=0)

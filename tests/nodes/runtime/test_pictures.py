@@ -11,6 +11,8 @@ from nodes.runtime.errors import MessageError
 from nodes.runtime.messages import decode, encode, image_message, ns_from_stamp
 from nodes.runtime.pictures import compressed_image_message, jpeg_size, rgb8_message, rgb_image
 
+pytestmark = pytest.mark.live
+
 STAMP = 1_700_000_000_123_456_789
 TYPE = "sensor_msgs/msg/CompressedImage"
 

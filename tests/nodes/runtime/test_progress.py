@@ -6,6 +6,8 @@ from rich.console import Console
 from nodes.runtime import progress
 from nodes.runtime.progress import ProgressDisplay
 
+pytestmark = pytest.mark.live
+
 
 @pytest.fixture
 def moments(monkeypatch):

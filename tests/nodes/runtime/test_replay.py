@@ -17,6 +17,8 @@ from nodes.runtime.messages import decode, drive_message, encode, pose_message, 
 from nodes.runtime.node import Node, Out
 from nodes.runtime.topics import topic as topic_row
 
+pytestmark = pytest.mark.live
+
 START_NS = 1_800_000_000_000_000_000
 MS = 1_000_000
 GOLDEN_FOLDER = Path(__file__).parents[2] / "replay"

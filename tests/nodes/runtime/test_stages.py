@@ -6,6 +6,8 @@ from advnerf_core.files import write_atomically
 from nodes.experiment.stages import Stage, StageError, begun_with, digest_of, read_record, run_stages
 from nodes.runtime.locks import hold
 
+pytestmark = pytest.mark.live
+
 
 class Notes:
     def __init__(self):

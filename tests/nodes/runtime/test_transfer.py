@@ -7,6 +7,8 @@ import pytest
 from nodes.runtime.messages import decode, encode
 from nodes.runtime.transfer import CHUNK_BYTES, LARGEST_BYTES, Assembler, chunk_messages
 
+pytestmark = pytest.mark.live
+
 TYPE = "advnerf_msgs/msg/FileChunk"
 
 

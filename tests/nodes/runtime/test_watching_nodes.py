@@ -14,6 +14,8 @@ from nodes.runtime.bus import Bus
 from nodes.runtime.errors import MessageError
 from nodes.runtime.messages import pose_message
 
+pytestmark = pytest.mark.live
+
 
 def test_delay_of_a_topic_is_split_at_publication(tmp_path):
     stop = threading.Event()

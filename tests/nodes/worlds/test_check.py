@@ -13,7 +13,7 @@ from hardware.worlds.world import Box, CarDescription, NotOpenError
 from nodes.lab.worlds.check import check_world
 from nodes.lab.worlds.named import NamedWorld, read_world
 from nodes.runtime.config import Document
-from tests.nodes.worlds.warehouse import EXAMPLES, Warehouse, small
+from tests.support.warehouse import EXAMPLES, Warehouse, small
 
 PARTS = [
     "description", "pictures", "repeatable", "time", "reset", "car", "frames", "camera", "ground", "photographs", "coverage", "box", "paths",

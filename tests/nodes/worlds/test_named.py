@@ -11,7 +11,7 @@ from nodes.cli.main import app
 from nodes.lab.worlds.named import NamedWorld, read_world, without
 from nodes.runtime.config import parse_yaml
 from nodes.runtime.errors import ConfigError
-from tests.nodes.worlds.warehouse import EXAMPLES
+from tests.support.warehouse import EXAMPLES
 
 # A world in name only: what is asked of its class is answered, what is driven is not.
 BODY = """

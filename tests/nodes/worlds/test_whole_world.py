@@ -12,7 +12,7 @@ from advnerf_core.report.clips import read_clip
 from hardware.worlds.world import WorldDescription
 from nodes.cli.main import main
 from nodes.lab.worlds.expert_drive import as_path
-from tests.nodes.worlds.warehouse import EXAMPLES
+from tests.support.warehouse import EXAMPLES
 
 
 def advnerf(monkeypatch: pytest.MonkeyPatch, *words: str) -> None:

@@ -1,6 +1,5 @@
 """The commands `advnerf carla ...` as a person types them; behind some, the scripted server stands in for a real one."""
 
-import importlib.util
 import json
 import os
 import signal
@@ -17,14 +16,7 @@ from hardware.worlds.carla import CarlaMapError
 from nodes.cli.carla import app
 from nodes.runtime.errors import ConfigError
 
-ROOT = Path(__file__).parents[2]
-_SPEC = importlib.util.spec_from_file_location(
-    "carla_tools_conftest", Path(__file__).parent / "carla_tools" / "conftest.py"
-)
-_shared = importlib.util.module_from_spec(_SPEC)
-_SPEC.loader.exec_module(_shared)
-carla, TJunction, scripted, port = _shared.carla, _shared.TJunction, _shared.scripted, _shared.port
-written_map, library, settings, as_carla = _shared.written_map, _shared.library, _shared.settings, _shared.as_carla
+ROOT = Path(__file__).parents[3]
 
 
 def advnerf(*arguments):

@@ -13,7 +13,7 @@ from advnerf_core.policies.view import PolicyView
 from advnerf_core.scene.field import SceneField, SceneFieldConfig, save_scene
 from calibration.schema import CameraCalibration, load_calibration
 
-CALIBRATION = Path(__file__).parents[3] / "calibration" / "twin"
+CALIBRATION = Path(__file__).parents[2] / "calibration" / "twin"
 
 TEXT = """\
 name: tiny

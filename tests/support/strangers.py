@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-PAGE = Path(__file__).parents[1] / "docs" / "methods.md"
+PAGE = Path(__file__).parents[2] / "docs" / "methods.md"
 
 
 def spiral_code() -> str:

@@ -5,7 +5,7 @@ from typing import Any
 
 from nodes.lab.worlds.named import NamedWorld, find_world
 
-EXAMPLES = Path(__file__).parents[3] / "examples"
+EXAMPLES = Path(__file__).parents[2] / "examples"
 Warehouse: Any = find_world("world_warehouse.py:Warehouse", EXAMPLES)
 
 

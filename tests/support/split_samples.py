@@ -3,11 +3,11 @@
 from pathlib import Path
 
 import yaml
-from bag_samples import START_NS, sample
 from mcap.writer import CompressionType, Writer
 
 from nodes.runtime.messages import type_definition
 from nodes.runtime.topics import topic as topic_row
+from tests.support.bag_samples import START_NS, sample
 
 
 def foreign_part(path: Path, messages, attachments=(), chunked=True):
