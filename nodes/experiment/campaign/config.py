@@ -56,7 +56,7 @@ class ScenarioConfig(_NothingTwice):
 
     kind: str = Field(
         default="room", min_length=1,
-        description="room, room_search, intersection, carla, or a Python module that runs cells (see nodes/experiment/campaign/kinds.py).",
+        description="room, room_search, world, or a Python module that runs cells (see nodes/experiment/campaign/kinds.py).",
     )  # fmt: skip
     experiment: Path = Field(description="Experiment file; relative to the campaign file.")
     setting: str = Field(default="full", description="Which of its settings.")

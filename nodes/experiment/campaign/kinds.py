@@ -8,7 +8,7 @@ A module of cells has one function that it must have, and may have others::
     def load_experiment(file, setting, overrides, folder) -> experiment
     def prepare(experiment, report) -> None                                               # what all its cells need
     def cell_inputs(experiment, scenario, victim, method, seed) -> dict                   # what the result depends on, JSON
-    LIVE = True        # run_cell drives a live graph: such cells run alone, after all that may run beside others
+    def runs_alone(experiment) -> bool   # whether run_cell needs the machine, or the one server, for itself: such cells run after all others
     def has_learned_scene(experiment) -> bool   # whether there is a learned scene for the gate of the package's module fidelity; else there is
     def predictable(experiment) -> bool         # whether transfer can be predicted where the gate holds; else it can
     TAKEN_FROM = "deploy"    # stage of the experiment in whose folder such cells may be finished already
@@ -35,8 +35,7 @@ from nodes.runtime.progress import Report
 KINDS = {
     "room": "nodes.experiment.cells",
     "room_search": "nodes.experiment.search_cells",
-    "intersection": "nodes.experiment.junction.cells",
-    "carla": "nodes.experiment.junction.carla_cells",
+    "world": "nodes.experiment.junction.cells",
 }
 RunCell = Callable[[Any, str, str, str, int, Path, Report], dict[str, Any]]
 # The stages that a cell needs of its experiment; what comes after is the cell itself.
@@ -56,10 +55,10 @@ class Kind:
     name: str
     module: Any
 
-    @property
-    def live(self) -> bool:
+    def runs_alone(self, experiment: Any) -> bool:
         """Whether `run_cell` drives a live graph and so runs alone."""
-        return bool(getattr(self.module, "LIVE", False))
+        alone = getattr(self.module, "runs_alone", None)
+        return alone is not None and bool(alone(experiment))
 
     def predicts(self, experiment: Any) -> bool:
         """Whether transfer can be predicted from pictures."""

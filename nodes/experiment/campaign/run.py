@@ -90,7 +90,7 @@ def plan_cells(
             tuple(campaign.overrides(cell)), str(campaign.run_folder(cell)), inside, cell.scenario, cell.placement,
             cell.victim, method, cell.seed, digest, threads=1,
         )  # fmt: skip
-        planned.append(Planned(cell, job, kind.live, kind.search_cell is not None))
+        planned.append(Planned(cell, job, kind.runs_alone(experiments[key]), kind.search_cell is not None))
     return planned
 
 

@@ -205,7 +205,7 @@ def _run(job: Job, store: Store, work: Path, kind: Kind, experiment: Any) -> Non
         return
     taken = kind.finished(*arguments)
     if taken is None:
-        with _alone(kind):
+        with _alone(kind, experiment):
             taken = kind.run_cell(*arguments, work, report)
     found = taken
     ours = {
@@ -219,9 +219,9 @@ def _run(job: Job, store: Store, work: Path, kind: Kind, experiment: Any) -> Non
 
 
 @contextmanager
-def _alone(kind: Kind) -> Iterator[None]:
+def _alone(kind: Kind, experiment: Any) -> Iterator[None]:
     """A live graph measures time: of all campaigns on this machine only one cell at a time drives one."""
-    with _wait_for_live() if kind.live else nullcontext():
+    with _wait_for_live() if kind.runs_alone(experiment) else nullcontext():
         yield
 
 

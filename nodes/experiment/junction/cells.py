@@ -58,6 +58,11 @@ def cell_inputs(experiment: Experiment, scenario: str, victim: str, method: str,
     return {**inputs, "victim": load_policy(file).sha256 if file.exists() else None}
 
 
+def runs_alone(experiment: Experiment) -> bool:
+    """Whether the world can be open only once, as a server steps one world at a time."""
+    return experiment.traits.exclusive
+
+
 def predictable(experiment: Experiment) -> bool:
     """Whether transfer can be predicted: a prediction composes the objects into pictures where they were placed by hand."""
     return has_learned_scene(experiment) and not isinstance(experiment.config.space, PlacesConfig)

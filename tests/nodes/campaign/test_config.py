@@ -88,7 +88,7 @@ def test_a_bad_file_is_told_with_its_line(file, old, new, says):
 def test_an_unknown_kind_is_told_with_what_there_is():
     with pytest.raises(
         ConfigError,
-        match=r"\(room, room_search, intersection, carla\).*got 'moon'",
+        match=r"\(room, room_search, world\).*got 'moon'",
     ):
         load_kind("moon")
     with pytest.raises(ConfigError, match="function run_cell in json"):
@@ -98,8 +98,8 @@ def test_an_unknown_kind_is_told_with_what_there_is():
 TWICE = """name: twice
 seeds: [0]
 scenarios:
-  straight: {{kind: intersection, experiment: {file}, run_folder: {folder}}}
-  other: {{kind: intersection, as_scenario: straight, experiment: {file}, run_folder: {folder}, set: [{change}]}}
+  straight: {{kind: world, experiment: {file}, run_folder: {folder}}}
+  other: {{kind: world, as_scenario: straight, experiment: {file}, run_folder: {folder}, set: [{change}]}}
 """
 
 

@@ -90,8 +90,8 @@ def test_objects_are_held_against_the_lanes_once_these_are_known(as_carla, file,
 
 
 def test_the_servers_address_changes_no_cell_and_its_junction_does(as_carla, file, tmp_path):
-    kind = load_kind("carla")
-    assert kind.live
+    kind = load_kind("world")
+    assert kind.runs_alone(kind.load(file, "tiny", [], tmp_path / "run"))
     assert kind.search_cell is not None
 
     def of(*changes):

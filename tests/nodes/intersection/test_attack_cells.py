@@ -98,7 +98,7 @@ def test_a_method_of_a_file_runs_a_cell_and_appears_in_the_tables(fresh: Experim
         reference = f"{spiral_file}:Spiral"
         (stage,) = (each for each in run.stages_of(experiment) if each.name == "attack")
         assert stage.settings["attack"]["methods"] == ["Spiral", "gradient"]
-        return settings_hash(load_kind("intersection"), experiment, *PLACE, reference, 0), stage.settings
+        return settings_hash(load_kind("world"), experiment, *PLACE, reference, 0), stage.settings
 
     before = digests()
     spiral_file.write_text(spiral_code() + "# changed\n")

@@ -141,7 +141,7 @@ def test_places_alone_keep_the_plain_colours_and_are_filmed(
     alone = PlacesConfig(samples=1, steps=1, colours=False)
     experiment = replace(searching(trained, alone), folder=folder)
     (folder / "deploy" / "right_hardened_random_0.cell.json").write_text("{}")
-    assert load_kind("intersection").finished(experiment, *PLACES) is None
+    assert load_kind("world").finished(experiment, *PLACES) is None
     cell = run_cell(experiment, *PLACES, tmp_path / "moved", silent)
     plain = run_cell(experiment, "right", "hardened", "none", 0, tmp_path / "plain", silent)
     assert plain["deployed"]["total_cte_m"] == cell["deployed"]["none_total_cte_m"]
@@ -164,7 +164,7 @@ def test_places_alone_keep_the_plain_colours_and_are_filmed(
 
 
 def test_a_cell_depends_on_its_space_and_on_its_victim(trained: Experiment) -> None:
-    kind, experiment = load_kind("intersection"), searching(trained, ONE)
+    kind, experiment = load_kind("world"), searching(trained, ONE)
     same = settings_hash(kind, experiment, *PLACES)
     assert settings_hash(kind, searching(trained, ONE), *PLACES) == same
     others = [
@@ -186,7 +186,7 @@ def test_a_cell_depends_on_its_space_and_on_its_victim(trained: Experiment) -> N
 
 
 def test_a_cell_of_colours_depends_on_the_world_and_not_on_what_else_is_searched(trained: Experiment) -> None:
-    kind = load_kind("intersection")
+    kind = load_kind("world")
 
     def digest(*changes: str, victim: str = "hardened") -> str:
         experiment = kind.load(trained.file, "tiny", list(changes), trained.folder)
@@ -204,7 +204,7 @@ def test_a_cell_of_colours_depends_on_the_world_and_not_on_what_else_is_searched
 def test_the_gate_judges_learned_scenes_and_predictions_need_objects_where_they_were_placed(
     trained: Experiment,
 ) -> None:
-    kind = load_kind("intersection")
+    kind = load_kind("world")
     judged = {space.kind: kind.judges(searching(trained, space)) for space in (ColoursConfig(), ONE, *MESHES)}
     assert judged == {"colours": True, "places": True, "mesh_texture": False, "mesh_shape": False}
     predicted = {space.kind: kind.predicts(searching(trained, space)) for space in (ColoursConfig(), ONE, *MESHES)}
@@ -243,7 +243,7 @@ def test_a_wrong_space_is_one_clear_error(
 def test_the_retrained_victim_is_that_of_the_first_round(trained: Experiment, tmp_path: Path) -> None:
     folder = shutil.copytree(trained.folder, tmp_path / "run")
     experiment = replace(searching(trained, ONE, retrain=RetrainConfig()), folder=folder)
-    kind, asked = load_kind("intersection"), ("left", "retrained", "none", 0)
+    kind, asked = load_kind("world"), ("left", "retrained", "none", 0)
     unknown = settings_hash(kind, experiment, *asked)  # it is not trained yet
     (folder / "retrain" / "round0").mkdir(parents=True)
     shutil.copy(folder / "policy" / "naive.safetensors", folder / "retrain" / "round0" / "policy.safetensors")
