@@ -56,8 +56,15 @@ class DisplayModel:
                 f"expected curves [3, K >= 2], mixing [3, 3] and ambient [3], got {curves.shape}, {mixing.shape} and {ambient.shape}"
             )
         everything = np.concatenate([curves.ravel(), mixing.ravel(), ambient, [self.response, self.falloff]])
-        if not np.isfinite(everything).all() or ambient.min() < 0.0 or self.response <= 0.0 or self.falloff < 0.0:
-            raise DisplayModelError("expected finite numbers, ambient light and falloff >= 0 and a response > 0")
+        if (
+            not np.isfinite(everything).all()
+            or ambient.min() < 0.0
+            or self.response <= 0.0
+            or self.falloff < 0.0
+        ):
+            raise DisplayModelError(
+                "expected finite numbers, ambient light and falloff >= 0 and a response > 0"
+            )
         ends = np.abs(curves[:, [0, -1]] - [0.0, 1.0]).max()
         if (np.diff(curves, axis=1) <= 0.0).any() or ends > 1e-9:
             raise DisplayModelError("expected curves that rise from 0 to 1")
@@ -112,19 +119,27 @@ class DisplayModel:
     def to_dict(self) -> dict[str, Any]:
         """As JSON or YAML can hold it."""
         return {
-            "curves": self.curves.tolist(), "mixing": self.mixing.tolist(), "ambient": self.ambient.tolist(),
-            "response": float(self.response), "falloff": float(self.falloff),
-        }  # fmt: skip
+            "curves": self.curves.tolist(),
+            "mixing": self.mixing.tolist(),
+            "ambient": self.ambient.tolist(),
+            "response": float(self.response),
+            "falloff": float(self.falloff),
+        }
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> DisplayModel:
         """Inverse of :meth:`to_dict`."""
         try:
             return cls(
-                np.array(values["curves"], np.float64), np.array(values["mixing"], np.float64),
-                np.array(values["ambient"], np.float64), float(values["response"]), float(values["falloff"]),
-            )  # fmt: skip
+                np.array(values["curves"], np.float64),
+                np.array(values["mixing"], np.float64),
+                np.array(values["ambient"], np.float64),
+                float(values["response"]),
+                float(values["falloff"]),
+            )
         except (KeyError, TypeError, ValueError) as error:
             if isinstance(error, DisplayModelError):
                 raise
-            raise DisplayModelError(f"expected curves, mixing, ambient, response and falloff, got {error}") from error
+            raise DisplayModelError(
+                f"expected curves, mixing, ambient, response and falloff, got {error}"
+            ) from error

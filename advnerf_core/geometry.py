@@ -77,7 +77,9 @@ class Pinhole:
 
     def cropped(self, left_px: int, top_px: int, width: int, height: int) -> Pinhole:
         """Intrinsics of a window of the image; the window may not leave the image."""
-        inside = left_px >= 0 and top_px >= 0 and left_px + width <= self.width and top_px + height <= self.height
+        inside = (
+            left_px >= 0 and top_px >= 0 and left_px + width <= self.width and top_px + height <= self.height
+        )
         if not inside:
             raise ValueError(
                 f"expected a crop inside {self.width} x {self.height}, got {width} x {height} at ({left_px}, {top_px})"
@@ -168,7 +170,9 @@ def rotation_z(angle_rad: float) -> Array:
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-def camera_mount(x_m: float, y_m: float, z_m: float, pitch_down_rad: float = 0.0, yaw_rad: float = 0.0) -> Array:
+def camera_mount(
+    x_m: float, y_m: float, z_m: float, pitch_down_rad: float = 0.0, yaw_rad: float = 0.0
+) -> Array:
     """Transform ``T_parent_from_camera [4, 4]`` of a camera on a parent with x forward, y left, z up.
 
     Args:

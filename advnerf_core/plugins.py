@@ -23,7 +23,9 @@ class PluginError(AdvnerfError):
     """A name stands for nothing, or for code that cannot be loaded."""
 
 
-def resolve(name: str, what: str, built_in: Mapping[str, Callable[[], T]], group: str, folder: Path | None = None) -> T:
+def resolve(
+    name: str, what: str, built_in: Mapping[str, Callable[[], T]], group: str, folder: Path | None = None
+) -> T:
     """The object that a name stands for.
 
     Args:
@@ -46,7 +48,9 @@ def resolve(name: str, what: str, built_in: Mapping[str, Callable[[], T]], group
     raise PluginError(_stands_for_nothing(name, what, built_in, group))
 
 
-def require_known(name: str, what: str, built_in: Iterable[str], group: str, folder: Path | None = None) -> None:
+def require_known(
+    name: str, what: str, built_in: Iterable[str], group: str, folder: Path | None = None
+) -> None:
     """Refuse a name that stands for nothing. No code is loaded: what the name stands for may still be broken.
 
     Args:
@@ -123,7 +127,9 @@ def load_from_file(reference: str, what: str, folder: Path | None = None) -> Any
             spec.loader.exec_module(module)
         except Exception as error:
             del sys.modules[name]
-            raise PluginError(f"{what} {reference}: {file} cannot be loaded: {_in_one_line(error)}") from error
+            raise PluginError(
+                f"{what} {reference}: {file} cannot be loaded: {_in_one_line(error)}"
+            ) from error
     if not hasattr(module, attribute):
         public = [each for each in vars(module) if not each.startswith("_")]
         raise PluginError(f"{what} {reference}: " + unknown(attribute, f"name in {file.name}", public))
@@ -135,7 +141,9 @@ def _file_of(reference: str, what: str, folder: Path | None) -> tuple[Path, str]
     file_text, _, attribute = absolute_reference(reference, folder or Path.cwd()).rpartition(":")
     file = Path(file_text)
     if not file.is_file():
-        raise PluginError(f"{what} {reference}: expected a Python file at {file}, found none; correct the path")
+        raise PluginError(
+            f"{what} {reference}: expected a Python file at {file}, found none; correct the path"
+        )
     return file, attribute
 
 

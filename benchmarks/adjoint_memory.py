@@ -84,7 +84,9 @@ def gradient_by(way: str, problem: AttackProblem, theta: Tensor) -> tuple[float,
     return unrolled_gradient(problem, theta) if way == "backprop" else checkpointed_gradient(problem, theta)
 
 
-def peak_above_idle_mib(method: str, steps: int, time_batch: int = 8, warm: bool = False) -> tuple[float, float]:
+def peak_above_idle_mib(
+    method: str, steps: int, time_batch: int = 8, warm: bool = False
+) -> tuple[float, float]:
     """Peak [MiB] and time [s] of one gradient in this process, which must be fresh.
 
     Args:
@@ -95,7 +97,9 @@ def peak_above_idle_mib(method: str, steps: int, time_batch: int = 8, warm: bool
             threads, some tens of MiB that every way needs once, then count as idle.
     """
     cache_bytes = CACHE_MIB * 2**20 if method == "cached" else 0
-    problem = toy_problem(steps, resolution=16, dtype=torch.float32, cache_bytes=cache_bytes, time_batch=time_batch)
+    problem = toy_problem(
+        steps, resolution=16, dtype=torch.float32, cache_bytes=cache_bytes, time_batch=time_batch
+    )
     problem = AttackProblem(**{**vars(problem), "start_states": problem.start_states[:1]})
     theta = problem.sensor.initial_theta(torch.Generator().manual_seed(0))
     evaluate(AttackProblem(**{**vars(problem), "steps": 1}), theta)
@@ -122,9 +126,20 @@ def measure(horizons: list[int], repeats: int = 3) -> list[dict[str, Any]]:
 
 
 def _in_fresh_process(method: str, steps: int, *options: str) -> dict[str, float]:
-    command = [sys.executable, "-m", "benchmarks.adjoint_memory", "--child", method, "--horizons", str(steps), *options]
+    command = [
+        sys.executable,
+        "-m",
+        "benchmarks.adjoint_memory",
+        "--child",
+        method,
+        "--horizons",
+        str(steps),
+        *options,
+    ]
     environment = {**os.environ, **RETURNS_WHAT_IS_FREED}
-    done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True, cwd=REPOSITORY, env=environment)
+    done = subprocess.run(
+        command, check=True, stdout=subprocess.PIPE, text=True, cwd=REPOSITORY, env=environment
+    )
     measured: dict[str, float] = json.loads(done.stdout.splitlines()[-1])
     return measured
 
@@ -141,7 +156,8 @@ def compare(repeats: int, trial: bool, horizons: tuple[int, int, int] = (60, 200
     for way, steps in wanted:
         found[way, steps] = {key: median(run[key] for run in runs[way, steps]) for key in ("mib", "seconds")}
         print(
-            f"{way}, T = {steps}: {found[way, steps]['mib']:.1f} MiB, {found[way, steps]['seconds']:.2f} s", flush=True
+            f"{way}, T = {steps}: {found[way, steps]['mib']:.1f} MiB, {found[way, steps]['seconds']:.2f} s",
+            flush=True,
         )
     ours, cached, plain, steps = (found[way, middle] for way in WAYS)
     grown = found["adjoint", long]["mib"] / found["adjoint", short]["mib"]
@@ -149,16 +165,47 @@ def compare(repeats: int, trial: bool, horizons: tuple[int, int, int] = (60, 200
     faster = steps["seconds"] / cached["seconds"]
     above = found["cached", long]["mib"] - found["adjoint", long]["mib"]
     rows = [
-        ("memory at T = 200 against plain back-propagation", share, "x", "<= 0.1 x", share <= 0.1,
-         f"{ours['mib']:.1f} against {plain['mib']:.1f} MiB, time batch {LEAN_BATCH}, cache off"),
-        ("against one checkpoint per step, T = 200, time", faster, "x", "> 1 x", faster > 1.0,
-         f"{CACHE_MIB} MiB cache: {cached['seconds']:.2f} against {steps['seconds']:.2f} s at {more:.2f} x memory"),
-        ("against one checkpoint per step, T = 200, memory", more, "x", "<= 2 x", more <= 2.0, f"{CACHE_MIB} MiB cache"),
-        ("memory, T = 600 against T = 60, cache off", grown, "x", "<= 1.05 x", grown <= 1.05,
-         f"{found['adjoint', short]['mib']:.1f} and {found['adjoint', long]['mib']:.1f} MiB above idle"),
-        ("memory, T = 600, what the cache adds", above, "MiB", f"<= {CACHE_MIB} MiB, its budget", above <= CACHE_MIB,
-         "peak above idle with the cache less the one without"),
-    ]  # fmt: skip
+        (
+            "memory at T = 200 against plain back-propagation",
+            share,
+            "x",
+            "<= 0.1 x",
+            share <= 0.1,
+            f"{ours['mib']:.1f} against {plain['mib']:.1f} MiB, time batch {LEAN_BATCH}, cache off",
+        ),
+        (
+            "against one checkpoint per step, T = 200, time",
+            faster,
+            "x",
+            "> 1 x",
+            faster > 1.0,
+            f"{CACHE_MIB} MiB cache: {cached['seconds']:.2f} against {steps['seconds']:.2f} s at {more:.2f} x memory",
+        ),
+        (
+            "against one checkpoint per step, T = 200, memory",
+            more,
+            "x",
+            "<= 2 x",
+            more <= 2.0,
+            f"{CACHE_MIB} MiB cache",
+        ),
+        (
+            "memory, T = 600 against T = 60, cache off",
+            grown,
+            "x",
+            "<= 1.05 x",
+            grown <= 1.05,
+            f"{found['adjoint', short]['mib']:.1f} and {found['adjoint', long]['mib']:.1f} MiB above idle",
+        ),
+        (
+            "memory, T = 600, what the cache adds",
+            above,
+            "MiB",
+            f"<= {CACHE_MIB} MiB, its budget",
+            above <= CACHE_MIB,
+            "peak above idle with the cache less the one without",
+        ),
+    ]
     for line, value, unit, target, met, note in rows:
         print(f"{line}: {value:.3f} {unit} (target {target})")
         if not trial:
@@ -168,20 +215,30 @@ def compare(repeats: int, trial: bool, horizons: tuple[int, int, int] = (60, 200
 def main() -> None:
     """Measure, print, write the JSON and record."""
     parser = argparse.ArgumentParser(description=main.__doc__)
-    parser.add_argument("--horizons", type=int, nargs="+", default=[25, 50, 100, 200, 400], help="horizons [ticks]")
+    parser.add_argument(
+        "--horizons", type=int, nargs="+", default=[25, 50, 100, 200, 400], help="horizons [ticks]"
+    )
     parser.add_argument(
         "--output", type=Path, default=REPOSITORY / "docs" / "adjoint_memory.json", help="where rows go"
     )
-    parser.add_argument("--repeats", type=int, default=3, help="fresh processes per number, of which the median counts")
+    parser.add_argument(
+        "--repeats", type=int, default=3, help="fresh processes per number, of which the median counts"
+    )
     parser.add_argument("--no-record", action="store_true", help="leave the ledger alone")
-    parser.add_argument("--compare", action="store_true", help="T = 60, 200, 600: also with a cache and checkpoints")
-    parser.add_argument("--trial", action="store_true", help="with --compare: short horizons, and nothing is recorded")
+    parser.add_argument(
+        "--compare", action="store_true", help="T = 60, 200, 600: also with a cache and checkpoints"
+    )
+    parser.add_argument(
+        "--trial", action="store_true", help="with --compare: short horizons, and nothing is recorded"
+    )
     parser.add_argument("--time-batch", type=int, default=8, help=argparse.SUPPRESS)
     parser.add_argument("--warm", action="store_true", help=argparse.SUPPRESS)
     parser.add_argument("--child", choices=WAYS, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.child:
-        mib, seconds = peak_above_idle_mib(arguments.child, arguments.horizons[0], arguments.time_batch, arguments.warm)
+        mib, seconds = peak_above_idle_mib(
+            arguments.child, arguments.horizons[0], arguments.time_batch, arguments.warm
+        )
         print(json.dumps({"mib": mib, "seconds": seconds}))
         return
     if arguments.compare:
@@ -195,7 +252,9 @@ def main() -> None:
         ratio = long["adjoint_mib"] / short["adjoint_mib"]
         note = f"{short['adjoint_mib']:.1f} MiB at T = 50, {long['adjoint_mib']:.1f} MiB at T = 400"
         note += f"; plain back-propagation {short['backprop_mib']:.0f} and {long['backprop_mib']:.0f} MiB; one start, time batch 8"
-        record_row("#2 adjoint memory, T = 400 against T = 50", ratio, "x", "<= 1.1 x", ratio <= 1.1, COMMAND, note)
+        record_row(
+            "#2 adjoint memory, T = 400 against T = 50", ratio, "x", "<= 1.1 x", ratio <= 1.1, COMMAND, note
+        )
 
 
 if __name__ == "__main__":

@@ -78,13 +78,16 @@ def main() -> None:
     same, struck = kill_many(arguments)
     print(f"{same} of {struck} killed attacks ended with the bytes of an undisturbed one")
     if not arguments.trial:
-        note = (
-            f"{', '.join(arguments.methods)} in turns, SIGKILL at random moments of {arguments.evaluations} evaluations"
-        )
+        note = f"{', '.join(arguments.methods)} in turns, SIGKILL at random moments of {arguments.evaluations} evaluations"
         record_row(
-            "#3 kill -9 at a random moment: attack", f"{same}/{struck}", "same bytes", "20/20",
-            same == struck >= 20, COMMAND, note,
-        )  # fmt: skip
+            "#3 kill -9 at a random moment: attack",
+            f"{same}/{struck}",
+            "same bytes",
+            "20/20",
+            same == struck >= 20,
+            COMMAND,
+            note,
+        )
 
 
 def kill_many(arguments: argparse.Namespace) -> tuple[int, int]:
@@ -114,8 +117,11 @@ def kill_many(arguments: argparse.Namespace) -> tuple[int, int]:
             round_number += 1
             struck += hit
             same += hit and got == wanted[method]
-            print(f"{method} killed after {after_s:.2f} s{'' if hit else ' (had ended)'}: "
-                  f"{'same' if got == wanted[method] else 'OTHER'} bytes", flush=True)  # fmt: skip
+            print(
+                f"{method} killed after {after_s:.2f} s{'' if hit else ' (had ended)'}: "
+                f"{'same' if got == wanted[method] else 'OTHER'} bytes",
+                flush=True,
+            )
     return same, struck
 
 

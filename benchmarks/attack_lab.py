@@ -19,7 +19,9 @@ from calibration.schema import CameraCalibration, RoomCalibration, VehicleCalibr
 SPEED_MPS, PERIOD_S = 0.8, 0.1
 
 
-def lab_problem(folder: Path, objects: Sequence[VoxelGridObject], steps: int, **options: Any) -> AttackProblem:
+def lab_problem(
+    folder: Path, objects: Sequence[VoxelGridObject], steps: int, **options: Any
+) -> AttackProblem:
     """One start pose, the nominal one; ``options`` go to the problem.
 
     Args:

@@ -51,10 +51,14 @@ def face(resolution: int = 4) -> VoxelGridObject:
     return cube_face_object(0.80, resolution, T_world_from_object=T_WORLD_FROM_FACE)
 
 
-def toy_problem(steps: int, resolution: int = 4, dtype: torch.dtype = torch.float64, **options: Any) -> AttackProblem:
+def toy_problem(
+    steps: int, resolution: int = 4, dtype: torch.dtype = torch.float64, **options: Any
+) -> AttackProblem:
     """Two start poses off the line (away from the kink of |CTE|), facing the object; ``options`` go to the problem."""
     sensor = Surrogate(painted_room, VIEW, MOUNT, face(resolution), dtype=dtype)
     starts = torch.tensor([[-1.1, -1.75, 0.05], [-0.9, -2.3, -0.05]], dtype=torch.float64)
     settings = {"policy": random_policy(dtype=dtype), "start_states": starts, **options}
     dynamics = Ackermann(0.25, 0.8, 0.1)
-    return AttackProblem(sensor=sensor, dynamics=dynamics, path=Path.rounded_square(4.0, 1.1), steps=steps, **settings)
+    return AttackProblem(
+        sensor=sensor, dynamics=dynamics, path=Path.rounded_square(4.0, 1.1), steps=steps, **settings
+    )

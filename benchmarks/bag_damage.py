@@ -112,13 +112,21 @@ def _ours(path: Path) -> None:
 
 
 def _theirs(
-    compression: CompressionType = CompressionType.NONE, chunks: bool = True, crcs: bool = True, all_data: bool = False
+    compression: CompressionType = CompressionType.NONE,
+    chunks: bool = True,
+    crcs: bool = True,
+    all_data: bool = False,
 ) -> Callable[[Path], None]:
     def write(path: Path) -> None:
         with open(path, "wb") as file:
             writer = Writer(
-                file, chunk_size=2000, compression=compression, use_chunking=chunks, enable_crcs=crcs, enable_data_crcs=all_data
-            )  # fmt: skip
+                file,
+                chunk_size=2000,
+                compression=compression,
+                use_chunking=chunks,
+                enable_crcs=crcs,
+                enable_data_crcs=all_data,
+            )
             _fill(writer)
 
     return write
@@ -160,7 +168,9 @@ def _messages() -> list[tuple[str, bytes, int]]:
         T = np.eye(4)
         T[:2, 3] = 0.08 * index, 0.3 * np.sin(index)
         stamp_ns = START_NS + index * 20_000_000
-        rows.append((("/vicon/car", "/vicon/board")[index % 3 == 2], encode(pose_message(T, stamp_ns)), stamp_ns))
+        rows.append(
+            (("/vicon/car", "/vicon/board")[index % 3 == 2], encode(pose_message(T, stamp_ns)), stamp_ns)
+        )
     return rows
 
 
@@ -197,7 +207,9 @@ class Numbers:
 
 def messages_of(path: Path) -> list[Message]:
     """Messages as our reader gives them."""
-    return [(m.topic, m.log_ns, m.publish_ns, m.sequence, m.cdr) for m in read_messages(path, as_recorded=True)]
+    return [
+        (m.topic, m.log_ns, m.publish_ns, m.sequence, m.cdr) for m in read_messages(path, as_recorded=True)
+    ]
 
 
 def make_bags(folder: Path) -> dict[str, bytes]:
@@ -222,17 +234,25 @@ def cut_once(content: bytes, length: int, folder: Path, number: int) -> int:
     except BagError as error:
         # A file of which no message is left is not replaced by one without any.
         if expected or path.read_bytes() != cut:
-            raise SilentDamage(f"cut to {length} bytes, {len(expected)} messages, refused: {error}") from error
+            raise SilentDamage(
+                f"cut to {length} bytes, {len(expected)} messages, refused: {error}"
+            ) from error
         return 0
     before = path if done.was_whole else done.kept
     if before is None or before.read_bytes() != cut:
         raise SilentDamage(f"cut to {length} bytes: the file is not there any more as it was")
-    if reachable(path.read_bytes()) != expected or messages_of(path) != expected or not repair(path).was_whole:
+    if (
+        reachable(path.read_bytes()) != expected
+        or messages_of(path) != expected
+        or not repair(path).was_whole
+    ):
         raise SilentDamage(f"cut to {length} bytes: expected {len(expected)} messages, kept {done.messages}")
     return done.messages
 
 
-def flip_once(content: bytes, at: int, bit: int, good: Numbers, folder: Path, number: int) -> tuple[bool, int]:
+def flip_once(
+    content: bytes, at: int, bit: int, good: Numbers, folder: Path, number: int
+) -> tuple[bool, int]:
     """Flip a bit, read, repair; whether a reader noticed, and how many messages the repair kept."""
     path = folder / f"flip{number}" / "bag.mcap"
     path.parent.mkdir()
@@ -309,20 +329,36 @@ def _fast() -> str | None:
 
 def main() -> None:
     """Cut and flip, and record both rows."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--count", type=int, default=COUNT, help="cuts, and flips; another number is not recorded")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--count", type=int, default=COUNT, help="cuts, and flips; another number is not recorded"
+    )
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     rows = (
-        (cuts, "random truncations of bags with and without chunks", "kept other messages than an independent reader finds"),
+        (
+            cuts,
+            "random truncations of bags with and without chunks",
+            "kept other messages than an independent reader finds",
+        ),
         (flips, "random bit flips in bytes that a checksum covers", "changed a number silently"),
-    )  # fmt: skip
+    )
     for measure, what, value in rows:
         with contextlib.redirect_stderr(io.StringIO()):  # thousands of lines that say "unchecked"
             note = measure(options.count, options.seed)
         print(f"{options.count} {what}: 0 {value}; {note}", flush=True)
         if options.count == COUNT:
-            record_row(f"#15 {COUNT:,} {what}", 0, value, "0; the damaged file is kept as it was", True, COMMAND, note)
+            record_row(
+                f"#15 {COUNT:,} {what}",
+                0,
+                value,
+                "0; the damaged file is kept as it was",
+                True,
+                COMMAND,
+                note,
+            )
 
 
 if __name__ == "__main__":

@@ -101,7 +101,9 @@ def node_decoder(folder: Path) -> Path:
     if not (folder / "node_modules" / "@mcap" / "core").exists():
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "package.json").write_text('{"private": true}\n')
-        subprocess.run(["npm", "install", "--silent", "--no-audit", "--no-fund", *PACKAGES], cwd=folder, check=True)
+        subprocess.run(
+            ["npm", "install", "--silent", "--no-audit", "--no-fund", *PACKAGES], cwd=folder, check=True
+        )
     script.write_text(_SCRIPT)
     return script
 
@@ -122,9 +124,14 @@ def kill_once(seed: int, script: Path | None, settings: tuple[str, ...] = ()) ->
         _require_content(seed, found[0], counts, expected)
         lost = {topic: sent[topic] - counts[topic] for topic in counts}
         return {
-            "seed": seed, "sent": sum(sent.values()), "lost_images": lost[IMAGE], "lost_poses": lost[POSE],
-            "lost": sum(lost.values()), "readers": len(found), "files": len(files),
-        }  # fmt: skip
+            "seed": seed,
+            "sent": sum(sent.values()),
+            "lost_images": lost[IMAGE],
+            "lost_poses": lost[POSE],
+            "lost": sum(lost.values()),
+            "readers": len(found),
+            "files": len(files),
+        }
 
 
 def _record_and_kill(
@@ -166,7 +173,9 @@ def _record_and_kill(
 def _require_content(seed: int, found: Found, counts: dict[str, int], sums: dict[str, list[float]]) -> None:
     """The first messages that were sent, whole: nothing missing in between, nothing twice."""
     if found.pixels != sums[IMAGE][counts[IMAGE]] or found.x != sums[POSE][counts[POSE]]:
-        raise ReadersDisagree(f"kill {seed}: the bag does not hold the first {counts} messages that were sent")
+        raise ReadersDisagree(
+            f"kill {seed}: the bag does not hold the first {counts} messages that were sent"
+        )
 
 
 def _with_mcap(files: list[Path]) -> Found:
@@ -221,7 +230,8 @@ def measure(kills: int, folder: Path, splits: bool, save: bool) -> None:
     note = (
         f"{sum(row['sent'] for row in rows)} sent, {sum(row['lost'] for row in rows)} lost in all "
         f"({sum(row['lost_images'] for row in rows)} images); {min(files)} to {max(files)} files in a bag, {sum(files)} in all; "
-        f"each file read alike by {readers} readers" + ("" if readers == 3 else ": Foxglove's decoder was not there")
+        f"each file read alike by {readers} readers"
+        + ("" if readers == 3 else ": Foxglove's decoder was not there")
     )
     print(f"{kills} kills: at most {worst} lost; {note}")
     if not save:
@@ -229,20 +239,34 @@ def measure(kills: int, folder: Path, splits: bool, save: bool) -> None:
     target = f"<= {MOST_LOST} each; all repaired files open in mcap+mcap-ros2-support, rosbags, Foxglove's npm decoder"
     if splits:
         record_row(
-            f"#15 kill -9 of a recorder that begins a new file every 0.25 s, {kills} times at 30 Hz images + 50 Hz poses", worst,
-            "messages lost at most", target, worst <= MOST_LOST and readers == 3 and min(files) > 1, f"{COMMAND} --splits", note,
-        )  # fmt: skip
+            f"#15 kill -9 of a recorder that begins a new file every 0.25 s, {kills} times at 30 Hz images + 50 Hz poses",
+            worst,
+            "messages lost at most",
+            target,
+            worst <= MOST_LOST and readers == 3 and min(files) > 1,
+            f"{COMMAND} --splits",
+            note,
+        )
     else:
         record_row(
-            f"#4 kill -9 of the recorder, {kills} times at 30 Hz images + 50 Hz poses", worst, "messages lost at most", target,
-            worst <= MOST_LOST and readers == 3, COMMAND, note,
-        )  # fmt: skip
+            f"#4 kill -9 of the recorder, {kills} times at 30 Hz images + 50 Hz poses",
+            worst,
+            "messages lost at most",
+            target,
+            worst <= MOST_LOST and readers == 3,
+            COMMAND,
+            note,
+        )
 
 
 def main() -> None:
     """Command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--splits", action="store_true", help="kill a recorder that splits its bag all the time")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--splits", action="store_true", help="kill a recorder that splits its bag all the time"
+    )
     parser.add_argument("--count", type=int, default=KILLS, help="kills")
     parser.add_argument("--trial", action="store_true", help="three kills, nothing is recorded or kept")
     options = parser.parse_args()

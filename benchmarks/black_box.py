@@ -62,7 +62,9 @@ def make_problem(folder: Path, steps: int) -> AttackProblem:
     attack = load_attack(folder / "attack" / "hardened_gradient_0.attack.safetensors")
     plain = json.loads((folder / "manifest.json").read_text())["config"]["object"]["plain_rgb"]
     shown, carrier = attack.required_face(), attack.face_object
-    face = cube_face_object(shown.size_m[0], carrier.theta.shape[0], tuple(plain), carrier.T_world_from_object)
+    face = cube_face_object(
+        shown.size_m[0], carrier.theta.shape[0], tuple(plain), carrier.T_world_from_object
+    )
     problem = lab_problem(folder, [face], steps, time_batch=16, cache_bytes=512 * 2**20)
     nominal = tuple(problem.start_states[0].tolist())
     starts = draw_start_states((nominal[0], nominal[1], nominal[2]), STARTS, 0.1, 0)
@@ -83,7 +85,9 @@ class Search:
     def __init__(self, name: str, out: Path, per_evaluation: int) -> None:
         self.name, self.state_path = name, out / f"{name}.state.safetensors"
         self._curve_path, self._per_evaluation = out / f"{name}.json", per_evaluation
-        self.curve: list[list[float]] = json.loads(self._curve_path.read_text()) if self._curve_path.exists() else []
+        self.curve: list[list[float]] = (
+            json.loads(self._curve_path.read_text()) if self._curve_path.exists() else []
+        )
 
     def listen(self, first_calls: int, step_calls: int, end_s: float) -> OnEvaluation:
         """What writes the curve: of evaluation k, ``first + k * step + one drive`` calls had been made when its total was known."""
@@ -92,7 +96,10 @@ class Search:
             k = evaluation.iteration
             calls = (first_calls if k else 0) + k * step_calls + self._per_evaluation
             after_next = first_calls + (k + 2) * step_calls
-            self.curve = [*self.curve[:k], [calls, evaluation.predicted_total_cte_m, evaluation.seconds, after_next]]
+            self.curve = [
+                *self.curve[:k],
+                [calls, evaluation.predicted_total_cte_m, evaluation.seconds, after_next],
+            ]
             write_atomically(self._curve_path, json.dumps(self.curve))
             if time.monotonic() > end_s:
                 raise OutOfTimeError
@@ -105,7 +112,9 @@ class Search:
         return max(totals) if totals else None
 
 
-def runner(name: str, problem: AttackProblem, calls: int, lessons: Distillation) -> tuple[int, int, Callable[..., Any]]:
+def runner(
+    name: str, problem: AttackProblem, calls: int, lessons: Distillation
+) -> tuple[int, int, Callable[..., Any]]:
     """First calls, calls of a step, and the search of a method within a budget of calls."""
     each = calls_per_evaluation(problem)
     if name == "distilled" or name == "guided":
@@ -149,14 +158,18 @@ def about(folder: Path, steps: int) -> str:
     return hashlib.sha256(json.dumps(told).encode()).hexdigest()[:8]
 
 
-def shares(searches: list[Search], white_calls: int, none_m: float, white_m: float) -> dict[str, dict[str, float]]:
+def shares(
+    searches: list[Search], white_calls: int, none_m: float, white_m: float
+) -> dict[str, dict[str, float]]:
     """Share of the white box's effect by method and multiple of its calls, as far as each search has come."""
     table: dict[str, dict[str, float]] = {}
     for search in searches:
         # A budget is used up when the next step, which is whole or not at all, would exceed it.
         marks = [mark for mark in MARKS if search.curve and mark * white_calls < search.curve[-1][3]]
         best = {str(mark): search.best_m(mark * white_calls) for mark in marks}
-        table[search.name] = {mark: (m - none_m) / (white_m - none_m) for mark, m in best.items() if m is not None}
+        table[search.name] = {
+            mark: (m - none_m) / (white_m - none_m) for mark, m in best.items() if m is not None
+        }
     return table
 
 
@@ -175,14 +188,18 @@ def draw(searches: list[Search], white_calls: int, none_m: float, white_m: float
             axes.step(calls / white_calls, effect, where="post", label=search.name)
     axes.axhline(100, color="black", linewidth=1, label="white box, 50 iterations")
     axes.axhline(100 * TARGET_SHARE, color="grey", linestyle="--", linewidth=1, label="target")
-    axes.set(xscale="log", xlabel=f"policy calls / {white_calls}", ylabel="best effect so far / white box's [%]")
+    axes.set(
+        xscale="log", xlabel=f"policy calls / {white_calls}", ylabel="best effect so far / white box's [%]"
+    )
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
     figure.savefig(path, dpi=130)
     plt.close(figure)
 
 
-def record(table: dict[str, dict[str, float]], none_m: float, white_m: float, white_calls: int, steps: int) -> None:
+def record(
+    table: dict[str, dict[str, float]], none_m: float, white_m: float, white_calls: int, steps: int
+) -> None:
     """Rows of the ledger."""
     command = "python -m benchmarks.black_box " + " ".join(sys.argv[1:])
     base = f"{white_calls} calls = {ITERATIONS} iterations x {STARTS} starts x {steps} ticks; none {none_m:.2f} m, white box {white_m:.2f} m"
@@ -199,7 +216,13 @@ def record(table: dict[str, dict[str, float]], none_m: float, white_m: float, wh
         if int(last) < TARGET_MULTIPLE:
             note += f"; the search was ended at {last} x"
         record_row(
-            f"{LINE}, {name}", 100 * row[last], f"% of the white-box effect at {last} x", target, met, command, note
+            f"{LINE}, {name}",
+            100 * row[last],
+            f"% of the white-box effect at {last} x",
+            target,
+            met,
+            command,
+            note,
         )
 
 
@@ -209,14 +232,24 @@ def main() -> None:
     parser.add_argument("run_folder", type=Path)
     parser.add_argument("--out", type=Path, default=Path("runs/black_box"))
     parser.add_argument("--steps", type=int, default=40, help="ticks of a drive")
-    parser.add_argument("--multiple", type=float, default=50.0, help="calls of each method, in those of the white box")
+    parser.add_argument(
+        "--multiple", type=float, default=50.0, help="calls of each method, in those of the white box"
+    )
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS))
     parser.add_argument("--minutes", type=float, default=9.0, help="of this piece; call again to go on")
-    parser.add_argument("--record", action="store_true", help="record the rows although not all of them are through")
-    parser.add_argument("--trial", action="store_true", help="small: 4 ticks, equal calls, another folder, no rows")
+    parser.add_argument(
+        "--record", action="store_true", help="record the rows although not all of them are through"
+    )
+    parser.add_argument(
+        "--trial", action="store_true", help="small: 4 ticks, equal calls, another folder, no rows"
+    )
     options = parser.parse_args()
     if options.trial:
-        options.steps, options.multiple, options.out = 4, 1.0, options.out.with_name(options.out.name + "_trial")
+        options.steps, options.multiple, options.out = (
+            4,
+            1.0,
+            options.out.with_name(options.out.name + "_trial"),
+        )
     options.out = options.out / about(options.run_folder, options.steps)
     options.out.mkdir(parents=True, exist_ok=True)
     print(f"in {options.out}")

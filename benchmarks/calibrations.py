@@ -79,9 +79,15 @@ def measure_camera_to_car(lab: Lab, seed: int) -> tuple[float, float, int]:
     rng, detector = np.random.default_rng(seed), BoardDetector(BOARD)
     pinhole, truth = lab.camera_pinhole, lab.config.camera.T_car_from_camera
     lens = LensCalibration(
-        date="2026-11-21", method="twin", width=pinhole.width, height=pinhole.height, fx=pinhole.fx, fy=pinhole.fy, cx=pinhole.cx,
+        date="2026-11-21",
+        method="twin",
+        width=pinhole.width,
+        height=pinhole.height,
+        fx=pinhole.fx,
+        fy=pinhole.fy,
+        cx=pinhole.cx,
         cy=pinhole.cy,
-    )  # fmt: skip
+    )
     board = lab.config.board.T_world_from_face
     views: list[MountView] = []
     for _ in range(4 * VIEWS):
@@ -116,7 +122,9 @@ def recorded_drive(seed: int) -> Drive:
     servo = np.array([car.servo_from_steering(row[1]) for row in chosen])
     erpm = np.array([car.erpm_from_speed(row[2]) for row in chosen])
     vehicle, now, poses = TwinVehicle(car), 0.0, []
-    events = [(t + COMMAND_DELAY_S, 0, k) for k, t in enumerate(command_s)] + [(t, 1, k) for k, t in enumerate(pose_s)]
+    events = [(t + COMMAND_DELAY_S, 0, k) for k, t in enumerate(command_s)] + [
+        (t, 1, k) for k, t in enumerate(pose_s)
+    ]
     for when, kind, k in sorted(events):
         vehicle.advance(max(when - now, 0.0))
         now = when
@@ -137,9 +145,12 @@ def measure_vehicle(seed: int) -> tuple[float, float, float, float, float]:
     gains = fit_gains(drive, car.wheelbase_m)
     response = fit_response(drive, gains).steering
     errors = (
-        abs(gains.servo_per_rad / car.true_servo_gain - 1.0), abs(gains.servo_offset / car.true_servo_offset - 1.0),
-        abs(gains.erpm_per_mps / car.true_erpm_gain - 1.0), abs(response.delay_s - COMMAND_DELAY_S), abs(response.lag_s - car.steering_lag_s),
-    )  # fmt: skip
+        abs(gains.servo_per_rad / car.true_servo_gain - 1.0),
+        abs(gains.servo_offset / car.true_servo_offset - 1.0),
+        abs(gains.erpm_per_mps / car.true_erpm_gain - 1.0),
+        abs(response.delay_s - COMMAND_DELAY_S),
+        abs(response.lag_s - car.steering_lag_s),
+    )
     print(
         f"vehicle: gain {100 * errors[0]:.2f} %, offset {100 * errors[1]:.2f} %, speed {100 * errors[2]:.2f} %, "
         f"delay {1000 * errors[3]:.1f} ms, lag {1000 * errors[4]:.1f} ms",
@@ -170,7 +181,10 @@ def measure_time_offset(lab: Lab, seed: int) -> float:
     yaw = np.array([car_at(t)[2] for t in pose_s]) + rng.normal(0.0, MOCAP_RAD, len(pose_s))
     fit = fit_offset(image_turns(frames, camera), pose_s, yaw)
     error = abs(fit.camera_minus_mocap_s - OFFSET_S)
-    print(f"time offset: {1000 * error:.2f} ms (stated {1000 * fit.stddev_s:.2f}), scale {fit.scale:.3f}", flush=True)
+    print(
+        f"time offset: {1000 * error:.2f} ms (stated {1000 * fit.stddev_s:.2f}), scale {fit.scale:.3f}",
+        flush=True,
+    )
     return error
 
 
@@ -207,15 +221,28 @@ def main() -> None:
         displays = np.array([measure_display(lab, seed) for seed in seeds])
     if trial:
         return
-    noise = f"worst of {len(seeds)}; motion capture 0.5 mm, 1 mrad per axis; image noise {PIXEL_STDDEV} of 255"
+    noise = (
+        f"worst of {len(seeds)}; motion capture 0.5 mm, 1 mrad per axis; image noise {PIXEL_STDDEV} of 255"
+    )
     turn, distance = mounts.max(axis=0)
-    rendered = f"{noise}; board rendered, car held tilted before it, pattern pose solved jointly, {VIEWS} views"
+    rendered = (
+        f"{noise}; board rendered, car held tilted before it, pattern pose solved jointly, {VIEWS} views"
+    )
     record("camera-to-car rotation", float(turn), "degrees", "<= 0.1 degrees", bool(turn <= 0.1), rendered)
-    record("camera-to-car translation", 1000 * float(distance), "mm", "<= 2 mm", bool(distance <= 0.002), rendered)
+    record(
+        "camera-to-car translation",
+        1000 * float(distance),
+        "mm",
+        "<= 2 mm",
+        bool(distance <= 0.002),
+        rendered,
+    )
     gain, offset, speed, delay, lag = drives.max(axis=0)
     worst = max(gain, offset, speed)
     parts = f"servo gain {100 * gain:.2f} %, offset {100 * offset:.2f} %, speed gain {100 * speed:.2f} %; steering delay {1000 * delay:.1f} ms, lag {1000 * lag:.1f} ms off"
-    record("vehicle gain and offset", 100 * float(worst), "%", "<= 1 %", bool(worst <= 0.01), f"{parts}; {noise}")
+    record(
+        "vehicle gain and offset", 100 * float(worst), "%", "<= 1 %", bool(worst <= 0.01), f"{parts}; {noise}"
+    )
     late = max(offsets)
     record(
         "camera to motion-capture time offset",
@@ -226,7 +253,14 @@ def main() -> None:
         f"{noise}; rendered frames at 10 Hz, 20 s, true offset {1000 * OFFSET_S:.0f} ms",
     )
     rmse, ideal = displays.max(axis=0)
-    record("display model, held-out colours", 100 * float(rmse), "% RMSE", "<= 2 % RMSE", bool(rmse <= 0.02), f"{noise}; rendered from three angles; {100 * ideal:.0f} % if the monitor is taken for ideal")  # fmt: skip
+    record(
+        "display model, held-out colours",
+        100 * float(rmse),
+        "% RMSE",
+        "<= 2 % RMSE",
+        bool(rmse <= 0.02),
+        f"{noise}; rendered from three angles; {100 * ideal:.0f} % if the monitor is taken for ideal",
+    )
 
 
 if __name__ == "__main__":

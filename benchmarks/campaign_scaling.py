@@ -33,7 +33,9 @@ scenarios:
 """
 
 
-def measure(folder: Path, work: Path, jobs: int, threads: int, cells: int, iterations: int) -> tuple[float, float]:
+def measure(
+    folder: Path, work: Path, jobs: int, threads: int, cells: int, iterations: int
+) -> tuple[float, float]:
     """Wall time and processor time of a campaign of its own [s]; the second is what it costs also where others share the cores."""
     # The gate's verdict stays: it is judged once, before anything is timed.
     shutil.rmtree(work / "cells", ignore_errors=True)
@@ -41,7 +43,9 @@ def measure(folder: Path, work: Path, jobs: int, threads: int, cells: int, itera
     file = work / "scaling.campaign.yaml"
     experiment = Path("launch/room.experiment.yaml").resolve()
     seeds = ", ".join(str(100 + seed) for seed in range(cells))
-    file.write_text(_FILE.format(seeds=seeds, experiment=experiment, folder=folder.resolve(), iterations=iterations))
+    file.write_text(
+        _FILE.format(seeds=seeds, experiment=experiment, folder=folder.resolve(), iterations=iterations)
+    )
     campaign = load_campaign(file, work)
     began, before = time.monotonic(), resource.getrusage(resource.RUSAGE_CHILDREN)
     ended = run_campaign(campaign, campaign.cells, Options(jobs, threads, gate=False), print)
@@ -72,10 +76,13 @@ def main() -> None:
     for _ in range(arguments.repeats):  # in turns, so that other load on the machine hits all
         for (jobs, threads), taken in runs.items():
             taken.append(
-                measure(arguments.run_folder, arguments.work, jobs, threads, arguments.cells, arguments.iterations)
+                measure(
+                    arguments.run_folder, arguments.work, jobs, threads, arguments.cells, arguments.iterations
+                )
             )
     measured = {
-        key: (median(wall for wall, _ in taken), median(cpu for _, cpu in taken)) for key, taken in runs.items()
+        key: (median(wall for wall, _ in taken), median(cpu for _, cpu in taken))
+        for key, taken in runs.items()
     }
     for (jobs, threads), (wall_s, cpu_s) in measured.items():
         rate = 3600 * arguments.cells / wall_s

@@ -10,7 +10,14 @@ from benchmarks.fault_campaign import Graph
 from benchmarks.results import record_row
 
 COMMAND = "python -m benchmarks.car_nodes"
-LIMITS_MB = {"camera": 80.0, "vicon": 80.0, "safety": 80.0, "motor": 80.0, "recorder": 80.0, "compositor": 100.0}
+LIMITS_MB = {
+    "camera": 80.0,
+    "vicon": 80.0,
+    "safety": 80.0,
+    "motor": 80.0,
+    "recorder": 80.0,
+    "compositor": 100.0,
+}
 SETTINGS = ("record=true", "policy.module=benchmarks.straight_policy")
 DRIVE_S = 4.0
 
@@ -55,9 +62,14 @@ def main() -> None:
         return
     heaviest = max(sizes, key=lambda name: sizes[name] / LIMITS_MB[name])
     record_row(
-        "#4 car nodes: resident memory, none with torch", round(sizes[heaviest], 1), "MB", "<= 80 MB each, compositor 100",
-        all(sizes[name] <= limit for name, limit in LIMITS_MB.items()), COMMAND, f"nearest to its limit: {heaviest}; {text} MB",
-    )  # fmt: skip
+        "#4 car nodes: resident memory, none with torch",
+        round(sizes[heaviest], 1),
+        "MB",
+        "<= 80 MB each, compositor 100",
+        all(sizes[name] <= limit for name, limit in LIMITS_MB.items()),
+        COMMAND,
+        f"nearest to its limit: {heaviest}; {text} MB",
+    )
 
 
 if __name__ == "__main__":

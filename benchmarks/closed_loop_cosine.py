@@ -90,7 +90,9 @@ def main() -> None:
     parser.add_argument("run_folder", type=Path)
     parser.add_argument("--horizons", type=int, nargs="+", default=list(HORIZONS), help="ticks T")
     parser.add_argument("--count", type=int, default=4, help="random directions beside the gradient")
-    parser.add_argument("--folder", type=Path, default=Path("runs/closed_loop_cosine"), help="where results are kept")
+    parser.add_argument(
+        "--folder", type=Path, default=Path("runs/closed_loop_cosine"), help="where results are kept"
+    )
     options = parser.parse_args()
     for ticks in options.horizons:
         prepared = prepare(request_of(options.run_folder.resolve(), ticks))

@@ -29,7 +29,9 @@ def record_fidelity(data: ReportData, record: Record) -> None:
     for name, key in (("336x188", "psnr_full_db"), ("200x66", "psnr_policy_db")):
         value = data.fidelity.mean(key)
         assert value is not None
-        record(f"#2 surrogate on held-out lab views, {name}", value, "dB PSNR", ">= 27 dB", value >= 27.0, views)
+        record(
+            f"#2 surrogate on held-out lab views, {name}", value, "dB PSNR", ">= 27 dB", value >= 27.0, views
+        )
     difference = data.fidelity.steering_difference_rad
     assert difference is not None
     record(
@@ -49,16 +51,23 @@ def record_transfer(data: ReportData, record: Record) -> None:
     mean_abs = float(np.mean([run.mean_abs_cte_m for run in live]))
     gradient = _row(rows, "surrogate", "gradient")
     record(
-        "#2 total CTE, gradient, surrogate", gradient.ratio or 0.0, "x no attack", ">= 3.3 x",
-        (gradient.ratio or 0.0) >= 3.3, _spread(gradient),
-    )  # fmt: skip
+        "#2 total CTE, gradient, surrogate",
+        gradient.ratio or 0.0,
+        "x no attack",
+        ">= 3.3 x",
+        (gradient.ratio or 0.0) >= 3.3,
+        _spread(gradient),
+    )
     gradient = _row(rows, "deployed", "gradient")
     met = (gradient.ratio or 0.0) >= 3.0 and mean_abs >= 0.25 and off >= 2
     record(
-        "#2 total CTE, gradient, live green screen", gradient.ratio or 0.0, "x no attack",
-        ">= 3.0 x, mean |CTE| >= 0.25 m, off-track in >= 2 of 3", met,
+        "#2 total CTE, gradient, live green screen",
+        gradient.ratio or 0.0,
+        "x no attack",
+        ">= 3.0 x, mean |CTE| >= 0.25 m, off-track in >= 2 of 3",
+        met,
         f"mean |CTE| {mean_abs:.3f} m, off-track in {off} of {len(live)}; {_spread(gradient)}",
-    )  # fmt: skip
+    )
     for domain in ("surrogate", "deployed"):
         random = _row(rows, domain, "random")
         met = (random.ratio or 0.0) <= 1.5 and (domain == "surrogate" or random.off_track == 0)
@@ -77,16 +86,24 @@ def record_live(data: ReportData, record: Record) -> None:
     if data.laps is not None:
         met = drives(data.laps.mean_abs_cte_m, data.laps.off_track, data.settings.off_track_m)
         record(
-            "#2 policy, no attack, laps live", data.laps.mean_abs_cte_m, "m mean |CTE|", "<= 0.08 m, never off-track", met,
+            "#2 policy, no attack, laps live",
+            data.laps.mean_abs_cte_m,
+            "m mean |CTE|",
+            "<= 0.08 m, never off-track",
+            met,
             f"{data.laps.laps} laps, off-track: {data.laps.off_track}, worst {np.abs(data.laps.cte_m).max():.3f} m",
-        )  # fmt: skip
+        )
     assert data.latency is not None
     overall = data.latency.overall
     met = overall.p99_ms <= data.latency.camera_period_ms and data.latency.missed_ticks == 0
     record(
-        "#2 capture to serial write, live", overall.p99_ms, "ms p99", "<= 100 ms, no tick missed", met,
+        "#2 capture to serial write, live",
+        overall.p99_ms,
+        "ms p99",
+        "<= 100 ms, no tick missed",
+        met,
         f"{overall.count} frames, p50 {overall.p50_ms:.1f} ms, worst {overall.max_ms:.1f} ms, {data.latency.missed_ticks} ticks missed",
-    )  # fmt: skip
+    )
 
 
 def record_bags(folder: Path, record: Record) -> None:
@@ -125,7 +142,9 @@ def record_bags(folder: Path, record: Record) -> None:
 def _row(rows: tuple[TransferRow, ...], domain: str, condition: str) -> TransferRow:
     row = find_row(rows, domain, condition)  # type: ignore[arg-type]
     if row is None:
-        raise SystemExit(f"expected {domain} {condition} runs in the report, got none: run make experiment to its end")
+        raise SystemExit(
+            f"expected {domain} {condition} runs in the report, got none: run make experiment to its end"
+        )
     return row
 
 
@@ -138,7 +157,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("run_folder", type=Path)
     parser.add_argument("--command", default=COMMAND, help="the command that made the run")
-    parser.add_argument("--note", default="", help="what readers must know, such as a smaller number of seeds")
+    parser.add_argument(
+        "--note", default="", help="what readers must know, such as a smaller number of seeds"
+    )
     arguments = parser.parse_args()
     folder = arguments.run_folder
     data = read_results(folder / "report" / "results.json")
@@ -148,8 +169,12 @@ def main() -> None:
         )
 
     def record(line: str, value: float | str, unit: str, target: str, met: bool | None, note: str) -> None:
-        record_row(line, value, unit, target, met, arguments.command, "; ".join(filter(None, (note, arguments.note))))
-        print(f"{line}: {value if isinstance(value, str) else f'{value:.4g}'} {unit} (target {target}): {met}")
+        record_row(
+            line, value, unit, target, met, arguments.command, "; ".join(filter(None, (note, arguments.note)))
+        )
+        print(
+            f"{line}: {value if isinstance(value, str) else f'{value:.4g}'} {unit} (target {target}): {met}"
+        )
 
     record_fidelity(data, record)
     record_transfer(data, record)

@@ -82,7 +82,9 @@ class Graph:
         config.write_text(json.dumps({"vesc": CONFIGURED, "vicon": {"port": VICON_PORT}}), encoding="utf-8")
         self.log = (folder / "campaign.log").open("ab")
         arguments = ("--name", "twin", "--config", str(config), "--run-dir", str(folder))
-        self.twin = self._start("benchmarks.faulty_twin", *arguments, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+        self.twin = self._start(
+            "benchmarks.faulty_twin", *arguments, stdin=subprocess.PIPE, stdout=subprocess.PIPE
+        )
         self.operator = LiveOperator(folder, NODES)
         self.supervisor = self.launch()
 
@@ -96,7 +98,9 @@ class Graph:
         self, module: str, *arguments: str, stdin: int | None = None, stdout: Any = None
     ) -> subprocess.Popen[bytes]:
         command = [sys.executable, "-m", module, *arguments]
-        return subprocess.Popen(command, cwd=REPOSITORY, stdin=stdin, stdout=stdout or self.log, stderr=self.log)
+        return subprocess.Popen(
+            command, cwd=REPOSITORY, stdin=stdin, stdout=stdout or self.log, stderr=self.log
+        )
 
     def twin_says(self, line: str) -> None:
         """Have the lab do something; returns when it was done."""
@@ -190,15 +194,20 @@ def judge(fault: str, rows: list[Any], fault_ns: int, armed: bool) -> dict[str, 
     stop = next((row[0] for row in later if row[0].name in _STOPS), None)
     standing = next((row for row in later if row[0].name == "STANDSTILL"), None)
     if stop is None or standing is None:
-        raise BrokenPromise(f"{fault}: not stopped within {STOP_S + AFTER_S:g} s; it read {[r[0] for r in later[-5:]]}")
+        raise BrokenPromise(
+            f"{fault}: not stopped within {STOP_S + AFTER_S:g} s; it read {[r[0] for r in later[-5:]]}"
+        )
     moves = [row for row in later if row[0].mono_ns > stop.mono_ns and row[0].name in ("SET_RPM", "MOVING")]
     if moves or armed:
         raise BrokenPromise(f"{fault}: armed {armed}, {len(moves)} commands to move after it was stopped")
     rolled = at_fault[2] + at_fault[1] * (fault_ns - at_fault[0].mono_ns) / 1e9
     return {
-        "fault": fault, "by": stop.name, "stop_ms": (stop.mono_ns - fault_ns) / 1e6, "distance_m": standing[2] - rolled,
+        "fault": fault,
+        "by": stop.name,
+        "stop_ms": (stop.mono_ns - fault_ns) / 1e6,
+        "distance_m": standing[2] - rolled,
         "speed_mps": at_fault[1],
-    }  # fmt: skip
+    }
 
 
 def run(folder: Path, count: int) -> list[dict[str, Any]]:
@@ -240,23 +249,43 @@ def report(results: list[dict[str, Any]], record: bool) -> None:
     if not record:
         return
     record_row(
-        f"#4 fault campaign: stopped and stayed stopped, of {len(results)} random faults", len(good), f"of {len(results)}",
-        f"{len(results)}", not broken, COMMAND, "; ".join(r["broken"] for r in broken)[:300] or f"{len(FAULTS)} kinds of fault",
-    )  # fmt: skip
+        f"#4 fault campaign: stopped and stayed stopped, of {len(results)} random faults",
+        len(good),
+        f"of {len(results)}",
+        f"{len(results)}",
+        not broken,
+        COMMAND,
+        "; ".join(r["broken"] for r in broken)[:300] or f"{len(FAULTS)} kinds of fault",
+    )
     record_row(
-        "#4 fault campaign: worst time from fault to brake at the controller", round(slowest["stop_ms"]), "ms", f"<= {LIMIT_MS:g} ms",
-        slowest["stop_ms"] <= LIMIT_MS, COMMAND, f"{slowest['fault']}, by {slowest['by']}; without {', '.join(SLOW_LIMITS_MS)}",
-    )  # fmt: skip
+        "#4 fault campaign: worst time from fault to brake at the controller",
+        round(slowest["stop_ms"]),
+        "ms",
+        f"<= {LIMIT_MS:g} ms",
+        slowest["stop_ms"] <= LIMIT_MS,
+        COMMAND,
+        f"{slowest['fault']}, by {slowest['by']}; without {', '.join(SLOW_LIMITS_MS)}",
+    )
     for fault, limit_ms in SLOW_LIMITS_MS.items():
         if times := [r["stop_ms"] for r in good if r["fault"] == fault]:
             record_row(
-                f"#4 fault campaign: worst time from '{fault}' to brake at the controller", round(max(times)), "ms", f"<= {limit_ms:g} ms",
-                max(times) <= limit_ms, COMMAND, f"of {len(times)}; a stall is a second without motion",
-            )  # fmt: skip
+                f"#4 fault campaign: worst time from '{fault}' to brake at the controller",
+                round(max(times)),
+                "ms",
+                f"<= {limit_ms:g} ms",
+                max(times) <= limit_ms,
+                COMMAND,
+                f"of {len(times)}; a stall is a second without motion",
+            )
     record_row(
-        "#4 fault campaign: worst stopping distance at 0.8 m/s", round(longest["distance_m"], 2), "m", "-", None, COMMAND,
+        "#4 fault campaign: worst stopping distance at 0.8 m/s",
+        round(longest["distance_m"], 2),
+        "m",
+        "-",
+        None,
+        COMMAND,
         f"{longest['fault']}, by {longest['by']}",
-    )  # fmt: skip
+    )
 
 
 def main() -> None:

@@ -118,7 +118,9 @@ def _stop_on_the_wire(operator: LiveOperator, victim: str, fault_ns: int) -> Sto
     events = operator.commands_after(fault_ns)
     stop = next((e for e in events if e.name in ("SET_CURRENT_BRAKE", "TIMEOUT")), None)
     if stop is None:
-        raise BrokenPromise(f"{victim}: nothing told the controller to stop within {WATCH_S} s; it read {events[-5:]}")
+        raise BrokenPromise(
+            f"{victim}: nothing told the controller to stop within {WATCH_S} s; it read {events[-5:]}"
+        )
     _require_rest(victim, [e for e in events if e.mono_ns > stop.mono_ns], stop)
     return Stop((stop.mono_ns - fault_ns) / 1e6, standing[2] - distance_at_fault)
 
@@ -153,25 +155,36 @@ def measure_software_stops() -> None:
             )
     slowest = max(worst, key=lambda key: worst[key])
     record_row(
-        "#2 brake at the controller after kill -9 or SIGSTOP of camera, vicon, compositor, policy, safety", round(worst[slowest]),
-        "ms", f"<= {BRAKE_LIMIT_MS:g} ms, then zero, no motion until armed again", worst[slowest] <= BRAKE_LIMIT_MS, COMMAND,
+        "#2 brake at the controller after kill -9 or SIGSTOP of camera, vicon, compositor, policy, safety",
+        round(worst[slowest]),
+        "ms",
+        f"<= {BRAKE_LIMIT_MS:g} ms, then zero, no motion until armed again",
+        worst[slowest] <= BRAKE_LIMIT_MS,
+        COMMAND,
         f"slowest of {len(worst)}: {slowest}; then zero current and no command to move, also after SIGCONT",
-    )  # fmt: skip
+    )
 
 
 def measure_last_line() -> None:
     """Kill the motor node and the supervisor, with the controller as delivered and as configured."""
-    for name, controller in (("as delivered: 1000 ms, 0 A", STOCK), ("as configured: 250 ms, 20 A", CONFIGURED)):
+    for name, controller in (
+        ("as delivered: 1000 ms, 0 A", STOCK),
+        ("as configured: 250 ms, 20 A", CONFIGURED),
+    ):
         for victim in ("motor", "supervisor"):
             stop = stop_after(victim, signal.SIGKILL, controller)
             print(
                 f"{victim:10s} SIGKILL, controller {name}: {stop.brake_ms:.0f} ms, {stop.distance_m:.2f} m to standstill"
             )
             record_row(
-                f"#2 stopping distance after kill -9 of {victim}, controller {name}", round(stop.distance_m, 2), "m",
-                "the controller's time-out stops the car, no process left", True, COMMAND,
+                f"#2 stopping distance after kill -9 of {victim}, controller {name}",
+                round(stop.distance_m, 2),
+                "m",
+                "the controller's time-out stops the car, no process left",
+                True,
+                COMMAND,
                 f"time-out {stop.brake_ms:.0f} ms after the kill, at 0.8 m/s",
-            )  # fmt: skip
+            )
 
 
 if __name__ == "__main__":

@@ -55,7 +55,9 @@ class FaultyLab:
     def _disturb_vicon(self, fault: str | None) -> None:
         vicon = self._lab.vicon
         if fault == "two_senders":
-            self._second = ViconEmulator(self._lab.config.vicon.model_copy(update={"seed": 1}), self._poses_elsewhere)
+            self._second = ViconEmulator(
+                self._lab.config.vicon.model_copy(update={"seed": 1}), self._poses_elsewhere
+            )
             return
         if self._second is not None:
             self._second.close()

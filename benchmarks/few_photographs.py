@@ -60,7 +60,11 @@ def find(folder: Path, focal_px: dict[str, float]) -> Found:
     began = time.perf_counter()
     try:
         model = reconstruct(
-            folder, [Source("photos", tuple(focal_px))], folder / "work", SfmConfig(min_registered_share=0.3), say
+            folder,
+            [Source("photos", tuple(focal_px))],
+            folder / "work",
+            SfmConfig(min_registered_share=0.3),
+            say,
         )
     except ReconstructionError as error:
         return Found(len(focal_px), (), (str(error),), (), time.perf_counter() - began)
@@ -101,11 +105,20 @@ def fox(folder: Path, data: Path, step: int, ten_cameras: bool) -> Found:
 
 
 def record(
-    line: str, target: str, limit_percent: float, fewest: int, results: Sequence[Found], trial: bool, miss: str = ""
+    line: str,
+    target: str,
+    limit_percent: float,
+    fewest: int,
+    results: Sequence[Found],
+    trial: bool,
+    miss: str = "",
 ) -> None:
     """Print a row and, unless it is a trial, write it; ``miss`` is the reason to give if the target is missed."""
     largest = max(result.largest_percent for result in results)
-    placed, given = sum(len(result.errors_percent) for result in results), sum(result.given for result in results)
+    placed, given = (
+        sum(len(result.errors_percent) for result in results),
+        sum(result.given for result in results),
+    )
     met = all(len(r.errors_percent) >= fewest and r.largest_percent <= limit_percent for r in results)
     typical = float(np.median([abs(error) for result in results for error in result.errors_percent]))
     models = ", ".join(sorted({model for result in results for model in result.models}))
@@ -144,16 +157,31 @@ def main() -> None:
         target = "<= 5 %, or left out by name; >= 8 of 10 placed"
         record("#15 lenses of ten photographs by ten cameras", target, TEN_PERCENT, 8, sets, trial)
     if "eleven" in options.only:
-        sets = [generated(options.folder / f"eleven_{seed}", seed, cameras=1) for seed in range(options.count)]
-        record("#15 lens of eleven photographs by one camera", "all placed, <= 1 %", ELEVEN_PERCENT, 11, sets, trial)
+        sets = [
+            generated(options.folder / f"eleven_{seed}", seed, cameras=1) for seed in range(options.count)
+        ]
+        record(
+            "#15 lens of eleven photographs by one camera",
+            "all placed, <= 1 %",
+            ELEVEN_PERCENT,
+            11,
+            sets,
+            trial,
+        )
     if "fox" in options.only and (options.data / "transforms.json").exists():
         sets = [fox(options.folder / "fox_ten", options.data, 2, ten_cameras=True)]
         target = "<= 5 %, or left out by name; >= 8 of 10 placed"
-        record("#15 lenses of ten fox photographs, each cropped and scaled", target, TEN_PERCENT, 8, sets, trial)
+        record(
+            "#15 lenses of ten fox photographs, each cropped and scaled", target, TEN_PERCENT, 8, sets, trial
+        )
         for step, words in ((4, "all round the fox"), (1, "neighbours")):
             sets = [fox(options.folder / f"fox_eleven_{step}", options.data, step, ten_cameras=False)]
             line = f"#15 lens of eleven fox photographs, {words}"
-            miss = "on a short arc an error of the focal length is made up for by the distances" if step == 1 else ""
+            miss = (
+                "on a short arc an error of the focal length is made up for by the distances"
+                if step == 1
+                else ""
+            )
             record(line, "all placed, <= 1 %", ELEVEN_PERCENT, 11, sets, trial, miss)
     elif "fox" in options.only:
         print(f"left out: fox, whose photographs are not in {options.data}")

@@ -31,15 +31,21 @@ TARGETS_DB = {"#2 real photos: fox, held-out PSNR": 26.0, "#3 fox, 10 min on 2 c
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--data", type=Path, default=Path("../shared/data/fox"), help="folder with transforms.json")
-    parser.add_argument("--seconds", type=float, default=600.0, help="training time; only 600 is written to the ledger")
+    parser.add_argument(
+        "--data", type=Path, default=Path("../shared/data/fox"), help="folder with transforms.json"
+    )
+    parser.add_argument(
+        "--seconds", type=float, default=600.0, help="training time; only 600 is written to the ledger"
+    )
     parser.add_argument(
         "--steps", type=int, help="train so many steps instead, to compare settings; nothing is recorded"
     )
     parser.add_argument(
         "--opacity", type=float, default=TrainConfig.opacity, help="other than the default: not recorded"
     )
-    parser.add_argument("--refine-depth", type=float, default=REFINE_DEPTH, help="other than the default: not recorded")
+    parser.add_argument(
+        "--refine-depth", type=float, default=REFINE_DEPTH, help="other than the default: not recorded"
+    )
     parser.add_argument("--pictures", type=Path, help="folder for rendered and real held-out images")
     arguments = parser.parse_args()
 
@@ -51,9 +57,11 @@ def main() -> None:
     )
     low, high = listed.box()
     box = SceneFieldConfig(
-        (low[0], low[1], low[2]), (high[0], high[1], high[2]),
-        grid=HashGridConfig(levels=8, features=4, log2_entries=18, finest=2048), direction_bands=3,
-    )  # fmt: skip
+        (low[0], low[1], low[2]),
+        (high[0], high[1], high[2]),
+        grid=HashGridConfig(levels=8, features=4, log2_entries=18, finest=2048),
+        direction_bands=3,
+    )
     # Loading counts: the ten minutes are what a user waits.
     config = TrainConfig(
         steps=arguments.steps or 1_000_000,
@@ -82,7 +90,8 @@ def main() -> None:
 def report(at: Progress) -> None:
     if at.step % 250 == 0:
         print(
-            f"step {at.step}: {at.psnr_db:.2f} dB on training rays, {at.rays} rays, {at.eta_s:.0f} s left", flush=True
+            f"step {at.step}: {at.psnr_db:.2f} dB on training rays, {at.rays} rays, {at.eta_s:.0f} s left",
+            flush=True,
         )
 
 

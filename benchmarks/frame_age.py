@@ -41,7 +41,15 @@ def ages_ms(duration_s: float) -> list[float]:
     """Ages at use of all frames that the consumer took [ms]."""
     with tempfile.TemporaryDirectory(prefix="advnerf-age-") as name, Bus(Path(name)) as bus:
         bus.subscribe(TOPIC)
-        command = [sys.executable, "-m", "benchmarks.frame_age", "--publish", name, "--duration", str(duration_s)]
+        command = [
+            sys.executable,
+            "-m",
+            "benchmarks.frame_age",
+            "--publish",
+            name,
+            "--duration",
+            str(duration_s),
+        ]
         camera = subprocess.Popen(command)
         ages: list[float] = []
         try:
@@ -75,9 +83,14 @@ def main() -> None:
     print(f"p99 {p99:.1f} ms ({note})")
     if not options.trial:
         record_row(
-            "#4 frame age at a consumer of 50 ms per frame, 60 Hz source, p99", float(p99), "ms",
-            f"<= {LIMIT_MS:.1f} ms (one period + 5 ms)", bool(p99 <= LIMIT_MS), COMMAND, note,
-        )  # fmt: skip
+            "#4 frame age at a consumer of 50 ms per frame, 60 Hz source, p99",
+            float(p99),
+            "ms",
+            f"<= {LIMIT_MS:.1f} ms (one period + 5 ms)",
+            bool(p99 <= LIMIT_MS),
+            COMMAND,
+            note,
+        )
 
 
 if __name__ == "__main__":

@@ -31,12 +31,26 @@ from nodes.bags.writer import BagWriter
 from nodes.launching.launch_file import LaunchFile
 from nodes.runtime.config import parse_yaml, validate
 from nodes.runtime.image_parts import join_image, split_image
-from nodes.runtime.messages import decode, drive_message, encode, image_message, pose_message, type_hash_prefix
+from nodes.runtime.messages import (
+    decode,
+    drive_message,
+    encode,
+    image_message,
+    pose_message,
+    type_hash_prefix,
+)
 from nodes.runtime.topics import topic
 from nodes.runtime.wire import Meta, pack_meta, unpack
 
 COMMAND = "python -m benchmarks.fuzz"
-SHARES = {"vesc": 300_000, "vicon": 250_000, "bus": 320_000, "config": 40_000, "attack": 80_000, "bag": 10_000}
+SHARES = {
+    "vesc": 300_000,
+    "vicon": 250_000,
+    "bus": 320_000,
+    "config": 40_000,
+    "attack": 80_000,
+    "bag": 10_000,
+}
 _INPUT_LIMIT_S = 2
 _GROWTH_LIMIT_MIB = 200.0
 _HEADROOM_BYTES = 2 * 2**30
@@ -82,7 +96,9 @@ def mutate(random_: random.Random, good: bytes) -> bytes:
 def vesc_reader() -> tuple[Sequence[bytes], Callable[[bytes], None]]:
     """Frames off the serial line and what they carry, in one decoder for all inputs as on a real line."""
     decoder = FrameDecoder()
-    bodies = [bytes([4]) + bytes(range(n)) for n in (20, 55, 60, 73)] + [b"\x00\x06\x05CAR\0" + bytes(12) + b"\0"]
+    bodies = [bytes([4]) + bytes(range(n)) for n in (20, 55, 60, 73)] + [
+        b"\x00\x06\x05CAR\0" + bytes(12) + b"\0"
+    ]
     readers = (decode_values, decode_firmware_version, decode_command)
 
     def read(data: bytes) -> None:
@@ -151,11 +167,21 @@ def attack_reader(folder: Path) -> tuple[Sequence[bytes], Callable[[bytes], None
     theta = np.zeros((2, 2, 3), np.float32)
     corners = np.array([[0.0, 0.4, 0.4], [0.0, -0.4, 0.4], [0.0, -0.4, -0.4], [0.0, 0.4, -0.4]])
     attack = AttackFile.of_face(
-        method="gradient", theta=theta, texture=face_texture(theta, 4), size_m=(0.8, 0.8), T_world_from_object=np.eye(4),
-        subject="board", corners_in_subject=corners, camera=Pinhole(200, 66, 103.6, 103.4, 100, 32),
-        scene_sha256="a" * 64, policy_sha256="b" * 64, config_sha256="c" * 64, seed=3, predicted_total_cte_m=9.25,
+        method="gradient",
+        theta=theta,
+        texture=face_texture(theta, 4),
+        size_m=(0.8, 0.8),
+        T_world_from_object=np.eye(4),
+        subject="board",
+        corners_in_subject=corners,
+        camera=Pinhole(200, 66, 103.6, 103.4, 100, 32),
+        scene_sha256="a" * 64,
+        policy_sha256="b" * 64,
+        config_sha256="c" * 64,
+        seed=3,
+        predicted_total_cte_m=9.25,
         software_version="0.1.0",
-    )  # fmt: skip
+    )
     path = folder / "good.attack.safetensors"
     save_attack(path, attack)
     return [path.read_bytes()], lambda data: void(attack_from_bytes(data, "fuzz"))
@@ -186,9 +212,13 @@ def void(result: object) -> None:
 def run(name: str, count: int, seed: int, folder: Path) -> Outcome:
     """Feed one reader; raises on the first crash or hang, with the seed and the input in the message."""
     makers = {
-        "vesc": vesc_reader, "vicon": vicon_reader, "bus": bus_reader, "config": config_reader,
-        "attack": lambda: attack_reader(folder), "bag": lambda: bag_reader(folder),
-    }  # fmt: skip
+        "vesc": vesc_reader,
+        "vicon": vicon_reader,
+        "bus": bus_reader,
+        "config": config_reader,
+        "attack": lambda: attack_reader(folder),
+        "bag": lambda: bag_reader(folder),
+    }
     good, read = makers[name]()
     for data in good:  # a reader that refuses everything would be tested by nothing
         read(data)
@@ -227,7 +257,9 @@ def main() -> None:
 
     signal.signal(signal.SIGALRM, hang)
     in_use = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-    resource.setrlimit(resource.RLIMIT_AS, (in_use + _HEADROOM_BYTES, resource.getrlimit(resource.RLIMIT_AS)[1]))
+    resource.setrlimit(
+        resource.RLIMIT_AS, (in_use + _HEADROOM_BYTES, resource.getrlimit(resource.RLIMIT_AS)[1])
+    )
     before_mib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     total, worst_s = 0, 0.0
     with tempfile.TemporaryDirectory(prefix="advnerf-fuzz-") as folder:
@@ -244,9 +276,14 @@ def main() -> None:
     print(f"{total} inputs: no crash, no hang ({note})")
     if not (options.trial or options.only):
         record_row(
-            "#4 fuzz: VESC, VICON, bus, config, attack file, bag", total, "inputs", "10^6: no crash, hang or memory growth",
-            total >= 1_000_000 and growth_mib < _GROWTH_LIMIT_MIB, f"{COMMAND} --seed {options.seed}", note,
-        )  # fmt: skip
+            "#4 fuzz: VESC, VICON, bus, config, attack file, bag",
+            total,
+            "inputs",
+            "10^6: no crash, hang or memory growth",
+            total >= 1_000_000 and growth_mib < _GROWTH_LIMIT_MIB,
+            f"{COMMAND} --seed {options.seed}",
+            note,
+        )
 
 
 if __name__ == "__main__":

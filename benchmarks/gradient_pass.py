@@ -39,10 +39,15 @@ def dense_object(T_world_from_object: np.ndarray, resolution: int = 64) -> Voxel
     radius = np.sqrt(sum(part**2 for part in np.meshgrid(axis, axis, axis, indexing="ij")))
     half = 0.5 * _SIZE_M
     return VoxelGridObject(
-        np.arange(count, dtype=np.int32).reshape((resolution,) * 3), (count, 3), np.zeros((0, 3)),
-        np.full(3, -half), np.full(3, half), T_world_from_object, density=np.where(radius < 0.45, 60.0, 0.0),
+        np.arange(count, dtype=np.int32).reshape((resolution,) * 3),
+        (count, 3),
+        np.zeros((0, 3)),
+        np.full(3, -half),
+        np.full(3, half),
+        T_world_from_object,
+        density=np.where(radius < 0.45, 60.0, 0.0),
         step_units=_SIZE_M / resolution,
-    )  # fmt: skip
+    )
 
 
 def one_pass(problem: AttackProblem, theta: Tensor, way: str) -> tuple[float, Tensor]:
@@ -72,7 +77,9 @@ def in_turns(ways: dict[str, Callable[[], tuple[float, Tensor]]], repeats: int) 
 def main() -> None:
     """Measure, print and record."""
     parser = argparse.ArgumentParser(description=main.__doc__)
-    parser.add_argument("folder", type=Path, help="run folder of an experiment with scene, policy and calibration")
+    parser.add_argument(
+        "folder", type=Path, help="run folder of an experiment with scene, policy and calibration"
+    )
     parser.add_argument("--steps", type=int, default=60, help="horizon [ticks]")
     parser.add_argument("--resolution", type=int, default=64, help="voxels along an edge of the object")
     parser.add_argument("--repeats", type=int, default=3)
@@ -82,7 +89,9 @@ def main() -> None:
     problem = lab_problem(arguments.folder, [ball], arguments.steps, time_batch=16, cache_bytes=2**40)
     theta = problem.sensor.initial_theta(torch.Generator().manual_seed(0))
     adjoint_gradient(replace(problem, steps=2), theta)
-    seconds = in_turns({way: lambda way=way: one_pass(problem, theta, way) for way in WAYS}, arguments.repeats)
+    seconds = in_turns(
+        {way: lambda way=way: one_pass(problem, theta, way) for way in WAYS}, arguments.repeats
+    )
     frame_ms = {way: 1e3 * taken / arguments.steps for way, taken in seconds.items()}
     stepwise, rendering = (frame_ms[way] / frame_ms["batched"] for way in WAYS[1:])
     print("\n".join(f"{way}: {taken:.2f} ms a frame" for way, taken in frame_ms.items()))
@@ -93,8 +102,12 @@ def main() -> None:
     note = f"T = {arguments.steps}, one {arguments.resolution}^3 object, lab scene, {torch.get_num_threads()} threads"
     ours = frame_ms["batched"]
     record_row(f"{LINE}, per frame", ours, "ms", "<= 10 ms", ours <= 10.0, command, note)
-    record_row(f"{LINE} against step by step on the same kept frames", stepwise, "x", "printed", None, command, note)
-    record_row(f"{LINE} against rendering each step again", rendering, "x", ">= 5 x", rendering >= 5.0, command, note)
+    record_row(
+        f"{LINE} against step by step on the same kept frames", stepwise, "x", "printed", None, command, note
+    )
+    record_row(
+        f"{LINE} against rendering each step again", rendering, "x", ">= 5 x", rendering >= 5.0, command, note
+    )
 
 
 if __name__ == "__main__":

@@ -32,7 +32,9 @@ def main() -> None:
     runs = runs_in_turns(
         {
             "kernels": lambda: one_pass(lambda: grid(points), weights, grid),
-            "plain": lambda: one_pass(lambda: encode_reference(points, grid.table, grid.levels), weights, grid),
+            "plain": lambda: one_pass(
+                lambda: encode_reference(points, grid.table, grid.levels), weights, grid
+            ),
         },
         arguments.repeats,
     )
@@ -46,8 +48,13 @@ def main() -> None:
     if not arguments.dry_run:
         record_row(
             "#2 hash encoding forward + backward against plain torch indexing",
-            ratio, "x", ">= 20 x", ratio >= TARGET, "python -m benchmarks.hash_encoding", note,
-        )  # fmt: skip
+            ratio,
+            "x",
+            ">= 20 x",
+            ratio >= TARGET,
+            "python -m benchmarks.hash_encoding",
+            note,
+        )
 
 
 def one_pass(encode: Callable[[], torch.Tensor], weights: torch.Tensor, grid: HashGrid) -> None:

@@ -77,12 +77,17 @@ def skewed_clock(folder: Path, skew_s: float) -> dict[str, str]:
     subprocess.run(["gcc", "-O2", "-shared", "-fPIC", "-o", str(library), str(source)], check=True)
     environment = {"LD_PRELOAD": str(library), "SKEW_NS": str(round(skew_s * 1e9))}
     told = subprocess.run(
-        [sys.executable, "-c", "import time; print(time.time())"], env={**os.environ, **environment}, capture_output=True,
-        check=True, text=True,
-    )  # fmt: skip
+        [sys.executable, "-c", "import time; print(time.time())"],
+        env={**os.environ, **environment},
+        capture_output=True,
+        check=True,
+        text=True,
+    )
     # It must have taken hold: a test with the right clock would prove nothing.
     if abs(time.time() - float(told.stdout) + skew_s) > max(0.04, skew_s / 2):
-        raise BrokenPromise(f"expected a clock that is {skew_s} s ahead, it says {told.stdout} at {time.time()}")
+        raise BrokenPromise(
+            f"expected a clock that is {skew_s} s ahead, it says {told.stdout} at {time.time()}"
+        )
     return environment
 
 
@@ -252,15 +257,21 @@ def stop_of(rows: Sequence[Any], commands: Sequence[tuple[int, int]]) -> dict[st
         return None
     stop_ns, after = rows[stop][0].mono_ns, rows[stop + 1 :]
     if moves := [row[0] for row in after if row[0].name in MOVES]:
-        raise BrokenPromise(f"{len(moves)} commands to move came after it was stopped, the first of them {moves[0]}")
+        raise BrokenPromise(
+            f"{len(moves)} commands to move came after it was stopped, the first of them {moves[0]}"
+        )
     fresh = [sent for heard, sent in commands if heard <= stop_ns and heard - sent <= _FRESH_NS]
     if not fresh:
         raise BrokenPromise("it drove, and no command from the policy was heard")
     rolled = next((row for row in rows[first:] if row[0].mono_ns >= fresh[-1]), rows[stop])[2]
     standing = next((row for row in after if row[0].name == "STANDSTILL"), None)
     if standing is None:
-        raise BrokenPromise(f"it still rolls {(rows[-1][0].mono_ns - stop_ns) / 1e6:.0f} ms after it was told to stop")
+        raise BrokenPromise(
+            f"it still rolls {(rows[-1][0].mono_ns - stop_ns) / 1e6:.0f} ms after it was told to stop"
+        )
     return {
-        "by": rows[stop][0].name, "brake_ms": (stop_ns - fresh[-1]) / 1e6, "brake_mono_ns": stop_ns,
+        "by": rows[stop][0].name,
+        "brake_ms": (stop_ns - fresh[-1]) / 1e6,
+        "brake_mono_ns": stop_ns,
         "distance_m": standing[2] - rolled,
-    }  # fmt: skip
+    }

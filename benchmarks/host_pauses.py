@@ -92,7 +92,9 @@ class HostPauses:
 
 def stolen() -> tuple[int, int]:
     """Time stolen by the host, and all time, of all processors together since the start [jiffies]."""
-    numbers = [int(word) for word in Path("/proc/stat").read_text(encoding="ascii").splitlines()[0].split()[1:9]]
+    numbers = [
+        int(word) for word in Path("/proc/stat").read_text(encoding="ascii").splitlines()[0].split()[1:9]
+    ]
     return numbers[7], sum(numbers)
 
 

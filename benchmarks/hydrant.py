@@ -39,7 +39,13 @@ def main() -> None:
         argument = "" if options.mesh is None else f" {options.mesh}"
         command = f"python -m benchmarks.hydrant{argument}"
         record_row(
-            f"#3 {name} from its mesh, held-out views", psnr_db, "dB", ">= 30 dB", psnr_db >= TARGET_DB, command, note
+            f"#3 {name} from its mesh, held-out views",
+            psnr_db,
+            "dB",
+            ">= 30 dB",
+            psnr_db >= TARGET_DB,
+            command,
+            note,
         )
 
 

@@ -62,7 +62,9 @@ def record_drive(lab: Lab, bag: Path, laps: float = 1.0, seed: int = 0) -> Path:
                 sequence += 1
             rgb, _ = lab.observe_at(*car_state(config, index * FRAME_PERIOD_S), depth=False)
             stamp = START_NS + round(1e9 * index * FRAME_PERIOD_S)
-            writer.write("/camera/image_raw", encode(image_message(rgb, stamp, "camera")), stamp, stamp, index)
+            writer.write(
+                "/camera/image_raw", encode(image_message(rgb, stamp, "camera")), stamp, stamp, index
+            )
     return bag
 
 

@@ -34,7 +34,9 @@ def drive_after_launch(graph: Graph) -> float:
     while True:
         operator.say_arm()
         operator.watch(0.05)
-        moves = [row[0] for row in graph.wire(offset) if row[0].name == "SET_RPM" and row[0].mono_ns > began_ns]
+        moves = [
+            row[0] for row in graph.wire(offset) if row[0].name == "SET_RPM" and row[0].mono_ns > began_ns
+        ]
         if moves:
             return (moves[0].mono_ns - began_ns) / 1e9
         if time.monotonic_ns() - began_ns > 90e9:
@@ -58,7 +60,9 @@ def stop_after_ctrl_c(graph: Graph) -> tuple[float, int]:
 
 
 def _children(process: subprocess.Popen[bytes]) -> list[int]:
-    return [int(pid) for pid in Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()] or [
+    return [
+        int(pid) for pid in Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+    ] or [
         int(pid)
         for task in Path(f"/proc/{process.pid}/task").iterdir()
         for pid in (task / "children").read_text().split()
@@ -82,19 +86,32 @@ def main() -> None:
             took_s, left = stop_after_ctrl_c(graph)
             stops.append(took_s)
             orphans += left
-            print(f"driving after {starts[-1]:.2f} s, stopped after {took_s:.2f} s, {left} processes left", flush=True)
+            print(
+                f"driving after {starts[-1]:.2f} s, stopped after {took_s:.2f} s, {left} processes left",
+                flush=True,
+            )
     finally:
         graph.close()
     if options.trial:
         return
     record_row(
-        "#4 launch to driving", round(max(starts), 2), "s", f"<= {START_LIMIT_S:g} s", max(starts) <= START_LIMIT_S, COMMAND,
+        "#4 launch to driving",
+        round(max(starts), 2),
+        "s",
+        f"<= {START_LIMIT_S:g} s",
+        max(starts) <= START_LIMIT_S,
+        COMMAND,
         f"slowest of {len(starts)}; the car stands ready, a policy without torch, a recorder",
-    )  # fmt: skip
+    )
     record_row(
-        "#4 Ctrl-C to all stopped", round(max(stops), 2), "s", f"<= {STOP_LIMIT_S:g} s, no orphan",
-        max(stops) <= STOP_LIMIT_S and orphans == 0, COMMAND, f"slowest of {len(stops)}; {orphans} processes left",
-    )  # fmt: skip
+        "#4 Ctrl-C to all stopped",
+        round(max(stops), 2),
+        "s",
+        f"<= {STOP_LIMIT_S:g} s, no orphan",
+        max(stops) <= STOP_LIMIT_S and orphans == 0,
+        COMMAND,
+        f"slowest of {len(stops)}; {orphans} processes left",
+    )
 
 
 if __name__ == "__main__":

@@ -45,10 +45,21 @@ def make_bag(folder: Path, seconds: int) -> Path:
     T_world_from_board = make_transform(rotation_z(np.pi), [3.0, 0.0, 0.5])
     theta = np.random.default_rng(0).normal(size=(8, 8, 3)).astype(np.float32)
     attack = AttackFile.of_face(
-        method="gradient", theta=theta, texture=face_texture(theta, 256), size_m=(1.0, 1.0),
-        T_world_from_object=T_world_from_board, subject="board", corners_in_subject=target.corners, camera=camera.pinhole,
-        scene_sha256="", policy_sha256="", config_sha256="", seed=0, predicted_total_cte_m=1.0, software_version="0",
-    )  # fmt: skip
+        method="gradient",
+        theta=theta,
+        texture=face_texture(theta, 256),
+        size_m=(1.0, 1.0),
+        T_world_from_object=T_world_from_board,
+        subject="board",
+        corners_in_subject=target.corners,
+        camera=camera.pinhole,
+        scene_sha256="",
+        policy_sha256="",
+        config_sha256="",
+        seed=0,
+        predicted_total_cte_m=1.0,
+        software_version="0",
+    )
     save_attack(folder / "face.attack.safetensors", attack)
     nodes = {
         "compositor": {
@@ -94,16 +105,21 @@ def replay_once(bag: Path, choice: Choice) -> dict[str, object]:
         summary = replay.summary
     torch_loaded = any(name == "torch" or name.startswith("torch.") for name in sys.modules)
     return {
-        "digest": summary.digest, "speed": summary.duration_s / wall_s, "cpu_speed": summary.duration_s / cpu_s, "made": sum(summary.made.values()),
+        "digest": summary.digest,
+        "speed": summary.duration_s / wall_s,
+        "cpu_speed": summary.duration_s / cpu_s,
+        "made": sum(summary.made.values()),
         "torch": torch_loaded,
-    }  # fmt: skip
+    }
 
 
 def replay_in_process(bag: Path, hash_seed: int) -> dict[str, object]:
     """The same in a process of its own."""
     command = [sys.executable, "-m", "benchmarks.lockstep_replay", "--one", str(bag)]
     environment = {**os.environ, "PYTHONHASHSEED": str(hash_seed)}
-    result = subprocess.run(command, cwd=REPOSITORY, env=environment, capture_output=True, text=True, check=True)
+    result = subprocess.run(
+        command, cwd=REPOSITORY, env=environment, capture_output=True, text=True, check=True
+    )
     found: dict[str, object] = json.loads(result.stdout)
     return found
 
@@ -134,16 +150,25 @@ def measure(bag: Path, replays: int, record: bool) -> None:
         what,
     )
     record_row(
-        "#4 lockstep replay, speed without torch nodes", round(speed, 1), "x real time", f">= {SPEED_TARGET:g}",
-        speed >= SPEED_TARGET and without_torch, COMMAND, f"median of {replays}; every image of {what} is drawn on",
-    )  # fmt: skip
+        "#4 lockstep replay, speed without torch nodes",
+        round(speed, 1),
+        "x real time",
+        f">= {SPEED_TARGET:g}",
+        speed >= SPEED_TARGET and without_torch,
+        COMMAND,
+        f"median of {replays}; every image of {what} is drawn on",
+    )
 
 
 def main() -> None:
     """Command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--bag", type=Path, help="replay this bag, with the compositor alone")
-    parser.add_argument("--trial", action="store_true", help="ten seconds, three replays, nothing is recorded")
+    parser.add_argument(
+        "--trial", action="store_true", help="ten seconds, three replays, nothing is recorded"
+    )
     parser.add_argument("--one", type=Path, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.one is not None:

@@ -118,7 +118,9 @@ def vertex_error(field: MeshField, seeds: int) -> tuple[float, float]:
     vertices = torch.tensor(field.mesh.vertices)
     rng, got, expected = np.random.default_rng(0), [], []
     for _ in range(6):
-        along = torch.sin(vertices @ torch.tensor(rng.uniform(-6, 6, (3, 3))) + torch.tensor(rng.uniform(0, 6, 3)))
+        along = torch.sin(
+            vertices @ torch.tensor(rng.uniform(-6, 6, (3, 3))) + torch.tensor(rng.uniform(0, 6, 3))
+        )
         up, down = (fine.render(pose, (s * STEP_M * along).float()).images for s in (1, -1))
         expected.append(float(((up - down).double() * slopes).sum() / (2 * STEP_M)))
         got.append(float((mean * along).sum()))
@@ -163,7 +165,9 @@ def lab_trial(folder: Path, evaluations: int, ticks: int) -> list[tuple[str, flo
 def main() -> None:
     """Measure, print and record."""
     parser = argparse.ArgumentParser(description=main.__doc__)
-    parser.add_argument("--lab", type=Path, help="run folder of an experiment with scene, policy and calibration")
+    parser.add_argument(
+        "--lab", type=Path, help="run folder of an experiment with scene, policy and calibration"
+    )
     parser.add_argument("--frames", type=int, default=40)
     parser.add_argument("--seeds", type=int, default=16)
     parser.add_argument("--evaluations", type=int, default=15)
@@ -175,16 +179,24 @@ def main() -> None:
     scene, slopes = before_noise(textured), smooth_slopes()
     sensor = ShapeSensor(before_noise(ball))
     theta, latent = scene.plain_theta(), torch.zeros(sensor.theta_shape)
-    first, texture_ms, compiled = median_ms(lambda pose: scene.render(pose, theta).vjp(slopes), options.frames)
+    first, texture_ms, compiled = median_ms(
+        lambda pose: scene.render(pose, theta).vjp(slopes), options.frames
+    )
     first_shape, shape_ms, compiled_shape = median_ms(
         lambda pose: sensor.render(pose, latent).vjp(slopes), options.frames
     )
-    exact, (wrong, noise), steps = texture_error(textured), vertex_error(ball, options.seeds), glb_difference(textured)
+    exact, (wrong, noise), steps = (
+        texture_error(textured),
+        vertex_error(ball, options.seeds),
+        glb_difference(textured),
+    )
     threads = f"{engine().dr.thread_count()} thread(s)"
     print(
         f"texture {texture_ms:.1f} ms a frame (first {first:.0f}), vertices {shape_ms:.1f} ms (first {first_shape:.0f}), {threads}"
     )
-    print(f"compiled after the first two frames: {compiled} and {compiled_shape}; GLB within {steps:.2f} of 255")
+    print(
+        f"compiled after the first two frames: {compiled} and {compiled_shape}; GLB within {steps:.2f} of 255"
+    )
     print(f"texture gradient {exact:.1e}, vertex gradient {wrong:.1e}, noise of one estimate {noise:.2f}")
     trial = lab_trial(options.lab, options.evaluations, options.ticks) if options.lab else []
     if options.trial:
@@ -200,20 +212,60 @@ def main() -> None:
         size,
     )
     size = f"ball of {len(ball.mesh.faces)} triangles, {threads}, first frame {first_shape:.0f} ms, picture included"
-    record_row(f"{LINE}: vertex gradient, 200x66, 4 rays", shape_ms, "ms", "<= 50 ms", shape_ms <= 50.0, COMMAND, size)
-    record_row(f"{LINE}: kernels compiled after the first two frames", compiled + compiled_shape, "", "0",
-               compiled + compiled_shape == 0, COMMAND)  # fmt: skip
     record_row(
-        f"{LINE}: texture gradient against finite differences", exact, "", "<= 1e-6", exact <= 1e-6, COMMAND, "float64"
+        f"{LINE}: vertex gradient, 200x66, 4 rays",
+        shape_ms,
+        "ms",
+        "<= 50 ms",
+        shape_ms <= 50.0,
+        COMMAND,
+        size,
     )
-    record_row(f"{LINE}: vertex gradient against finite differences", wrong, "", "<= 0.05", wrong <= 0.05, COMMAND,
-               f"mean of {options.seeds} estimates of 16 + 16 samples; one of 4 + 1 has a noise of {noise:.2f}")  # fmt: skip
     record_row(
-        f"{LINE}: GLB read again", steps, "of 255", "<= 1", steps <= 1.0, COMMAND, "largest difference of a pixel"
+        f"{LINE}: kernels compiled after the first two frames",
+        compiled + compiled_shape,
+        "",
+        "0",
+        compiled + compiled_shape == 0,
+        COMMAND,
+    )
+    record_row(
+        f"{LINE}: texture gradient against finite differences",
+        exact,
+        "",
+        "<= 1e-6",
+        exact <= 1e-6,
+        COMMAND,
+        "float64",
+    )
+    record_row(
+        f"{LINE}: vertex gradient against finite differences",
+        wrong,
+        "",
+        "<= 0.05",
+        wrong <= 0.05,
+        COMMAND,
+        f"mean of {options.seeds} estimates of 16 + 16 samples; one of 4 + 1 has a noise of {noise:.2f}",
+    )
+    record_row(
+        f"{LINE}: GLB read again",
+        steps,
+        "of 255",
+        "<= 1",
+        steps <= 1.0,
+        COMMAND,
+        "largest difference of a pixel",
     )
     for name, start, best, seconds in trial:
-        record_row(f"{LINE}: {name} in the learned room", best / start, "x", "printed", None, f"{COMMAND} --lab {options.lab}",
-                   f"{start:.2f} to {best:.2f} m, {options.evaluations} evaluations of {options.ticks} ticks, {seconds:.1f} s each")  # fmt: skip
+        record_row(
+            f"{LINE}: {name} in the learned room",
+            best / start,
+            "x",
+            "printed",
+            None,
+            f"{COMMAND} --lab {options.lab}",
+            f"{start:.2f} to {best:.2f} m, {options.evaluations} evaluations of {options.ticks} ticks, {seconds:.1f} s each",
+        )
 
 
 if __name__ == "__main__":

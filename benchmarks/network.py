@@ -135,4 +135,6 @@ def _ip(*arguments: str) -> None:
 
 def available() -> bool:
     """Whether this computer lets us make namespaces and TUN devices."""
-    return os.geteuid() == 0 and os.access("/dev/net/tun", os.R_OK | os.W_OK) and Path("/usr/sbin/ip").exists()
+    return (
+        os.geteuid() == 0 and os.access("/dev/net/tun", os.R_OK | os.W_OK) and Path("/usr/sbin/ip").exists()
+    )

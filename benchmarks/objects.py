@@ -122,12 +122,18 @@ def leap_gain(model: ObjectModel, repeats: int) -> float:
     plodding = dataclasses.replace(field, density=field.density + 1e-30)
     poses, lens = dome(model.solid_box, 4), viewing_lens(128)
     seconds = seconds_in_turns(
-        {"leaps": lambda: cast_object(field, poses, lens), "plods": lambda: cast_object(plodding, poses, lens)}, repeats
+        {
+            "leaps": lambda: cast_object(field, poses, lens),
+            "plods": lambda: cast_object(plodding, poses, lens),
+        },
+        repeats,
     )
     return seconds["plods"] / seconds["leaps"]
 
 
-def fitted(field: VoxelGridObject, training: PosedRgba, held_out: PosedRgba, steps: int) -> tuple[float, float]:
+def fitted(
+    field: VoxelGridObject, training: PosedRgba, held_out: PosedRgba, steps: int
+) -> tuple[float, float]:
     """dB on held-out views and seconds of fitting the colours by Adam, from grey."""
     casts = [(view, cast) for view, cast in _casts(field, training)]
     theta = torch.zeros(field.theta_shape, requires_grad=True)
@@ -162,10 +168,14 @@ def _pictures(mesh: SurfaceMesh, count: int, phase: float) -> PosedRgba:
 def main() -> None:
     """Measure, print and record."""
     parser = argparse.ArgumentParser(description=main.__doc__)
-    parser.add_argument("folder", type=Path, help="run folder of an experiment with scene, policy and calibration")
+    parser.add_argument(
+        "folder", type=Path, help="run folder of an experiment with scene, policy and calibration"
+    )
     parser.add_argument("mesh", type=Path, nargs="?", help="a mesh; the hydrant that ships if none is given")
     parser.add_argument("--frames", type=int, default=30)
-    parser.add_argument("--resolution", type=int, default=64, help="voxels along the longest side of an object")
+    parser.add_argument(
+        "--resolution", type=int, default=64, help="voxels along the longest side of an object"
+    )
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--steps", type=int, default=240, help="of the fits that are compared")
     parser.add_argument("--trial", action="store_true", help="print, but record nothing")
@@ -193,14 +203,35 @@ def main() -> None:
     command = f"python -m benchmarks.objects {arguments.folder}"
     note = f"lab scene, {arguments.resolution}^3 each, {torch.get_num_threads()} threads"
     note_db = f"{note}; {below_db:.2f} dB below, and {difference_db:.1f} dB from exhaustive sampling, which makes {exhaustive:.1f} frames/s"
-    record_row(f"{LINE}: surrogate frame 200x66 with 5", rate, "frames/s",
-               ">= 12 at <= 0.3 dB below exhaustive sampling", rate >= 12.0 and below_db <= 0.3, command, note_db)  # fmt: skip
+    record_row(
+        f"{LINE}: surrogate frame 200x66 with 5",
+        rate,
+        "frames/s",
+        ">= 12 at <= 0.3 dB below exhaustive sampling",
+        rate >= 12.0 and below_db <= 0.3,
+        command,
+        note_db,
+    )
     for count, percent in growth.items():
-        record_row(f"{LINE}: iteration with {count} against 1, growth per object", percent, "%", "<= 15 %", percent <= 15.0,
-                   command, f"{note}; {taken[count]:.2f} s against {taken[1]:.2f} s for {arguments.frames} ticks")  # fmt: skip
+        record_row(
+            f"{LINE}: iteration with {count} against 1, growth per object",
+            percent,
+            "%",
+            "<= 15 %",
+            percent <= 15.0,
+            command,
+            f"{note}; {taken[count]:.2f} s against {taken[1]:.2f} s for {arguments.frames} ticks",
+        )
     record_row(f"{LINE}: leaping over empty space", gain, "x", "printed", None, command, note)
-    record_row(f"{LINE}: dense colours against summed levels", compared, "", "printed", None, command,
-               f"{arguments.steps} steps of Adam from grey, pictures drawn from the mesh")  # fmt: skip
+    record_row(
+        f"{LINE}: dense colours against summed levels",
+        compared,
+        "",
+        "printed",
+        None,
+        command,
+        f"{arguments.steps} steps of Adam from grey, pictures drawn from the mesh",
+    )
 
 
 def compare_levels(model: ObjectModel, mesh: SurfaceMesh, steps: int) -> str:

@@ -149,14 +149,21 @@ def main() -> None:
         return
     for kind, target in TARGETS.items():
         ours, raw, ratio = compare(kind, 3 if options.trial else 15, 200 if options.trial else 500)
-        note = f"{ours * 1e6:.0f} us decoded at both ends, {raw * 1e6:.0f} us raw; median of alternating blocks"
+        note = (
+            f"{ours * 1e6:.0f} us decoded at both ends, {raw * 1e6:.0f} us raw; median of alternating blocks"
+        )
         print(f"{kind}: {ratio:.2f} x ({note})")
         if not options.trial:
             size = f" {WIDTH}x{HEIGHT}" if kind == IMAGE else ""
             record_row(
-                f"#4 one hop, {kind}{size}, publish to decoded, round trip against raw pyzmq", ratio, "x",
-                f"<= {target:g} x", ratio <= target, COMMAND, note,
-            )  # fmt: skip
+                f"#4 one hop, {kind}{size}, publish to decoded, round trip against raw pyzmq",
+                ratio,
+                "x",
+                f"<= {target:g} x",
+                ratio <= target,
+                COMMAND,
+                note,
+            )
 
 
 if __name__ == "__main__":

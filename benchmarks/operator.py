@@ -92,7 +92,9 @@ class LiveOperator:
 
     def wait_ready(self, timeout_s: float = 40.0) -> None:
         """Wait for all nodes."""
-        self.wait_until(lambda: all(self.state_of(name) in _UP for name in self.nodes), timeout_s, "for the nodes")
+        self.wait_until(
+            lambda: all(self.state_of(name) in _UP for name in self.nodes), timeout_s, "for the nodes"
+        )
         self.bus.wait_for_subscribers(["/arm", "/twin/reset"], 10.0)
 
     def arm(self, timeout_s: float = 15.0) -> None:

@@ -36,7 +36,11 @@ def photograph(T_world_from_camera: Array, pinhole: Pinhole, lens: Lens) -> NDAr
     pixels = np.stack([columns, rows], axis=-1).reshape(-1, 1, 2)
     straight = cv2.undistortPoints(pixels, matrix, np.array(lens.coefficients)).reshape(-1, 2)
     directions = np.column_stack([straight, np.ones(len(straight))]) @ T_world_from_camera[:3, :3].T
-    origin, image, nearest = T_world_from_camera[:3, 3], np.zeros((len(straight), 3)), np.full(len(straight), np.inf)
+    origin, image, nearest = (
+        T_world_from_camera[:3, 3],
+        np.zeros((len(straight), 3)),
+        np.full(len(straight), np.inf),
+    )
     for axis in range(3):
         with np.errstate(divide="ignore"):
             distance = -origin[axis] / directions[:, axis]

@@ -42,9 +42,13 @@ TRAINING_SIZE = (640, 480)
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("run", type=Path, help="run folder of an experiment: its policy and held-out views are used")
+    parser.add_argument(
+        "run", type=Path, help="run folder of an experiment: its policy and held-out views are used"
+    )
     parser.add_argument("--scene", type=Path, help="measure this scene file instead of making one")
-    parser.add_argument("--folder", type=Path, default=Path("runs/phone_to_car"), help="working folder; goes on there")
+    parser.add_argument(
+        "--folder", type=Path, default=Path("runs/phone_to_car"), help="working folder; goes on there"
+    )
     parser.add_argument("--frames", type=int, default=150, help="frames of the phone's video")
     parser.add_argument("--steps", type=int, default=700, help="training iterations of the scene")
     parser.add_argument("--trial", action="store_true", help="print, but do not write the ledger")
@@ -54,7 +58,10 @@ def main() -> None:
     scene = arguments.scene
     if scene is None:
         scene, facts = make_scene(arguments.folder, arguments.frames, arguments.steps)
-    with_map, without = compare(arguments.run, scene, mapped=True), compare(arguments.run, scene, mapped=False)
+    with_map, without = (
+        compare(arguments.run, scene, mapped=True),
+        compare(arguments.run, scene, mapped=False),
+    )
     note = (
         f"{with_map['views']} held-out views; without the map {without['steering_rad']:.4f} rad; PSNR at 200x66 {with_map['psnr_db']:.1f} dB, "
         f"without {without['psnr_db']:.1f} dB{facts}"
@@ -62,9 +69,14 @@ def main() -> None:
     print(f"{with_map['steering_rad']:.4f} rad: {note}")
     if not arguments.trial and arguments.scene is None:
         record_row(
-            "#3 surrogate from the phone camera, seen by the car's camera, steering", with_map["steering_rad"], "rad mean abs",
-            "<= 0.04 rad", with_map["steering_rad"] <= TARGET_RAD, f"python -m benchmarks.phone_to_car {arguments.run}", note,
-        )  # fmt: skip
+            "#3 surrogate from the phone camera, seen by the car's camera, steering",
+            with_map["steering_rad"],
+            "rad mean abs",
+            "<= 0.04 rad",
+            with_map["steering_rad"] <= TARGET_RAD,
+            f"python -m benchmarks.phone_to_car {arguments.run}",
+            note,
+        )
 
 
 def make_scene(folder: Path, frames: int, steps: int) -> tuple[Path, str]:
@@ -77,15 +89,25 @@ def make_scene(folder: Path, frames: int, steps: int) -> tuple[Path, str]:
         if not (bag / "metadata.yaml").exists():
             record_drive(lab, bag)
     imported = from_phone_and_car(
-        [phone], bag, data, MediaConfig(KeyframeConfig()), BagConfig(0.15, math.radians(8.0)), SfmConfig(), PlacingConfig(), say
-    )  # fmt: skip
+        [phone],
+        bag,
+        data,
+        MediaConfig(KeyframeConfig()),
+        BagConfig(0.15, math.radians(8.0)),
+        SfmConfig(),
+        PlacingConfig(),
+        say,
+    )
     placing, model = imported.report["placing"], imported.report["structure_from_motion"]
     listed = load_transforms(data / "transforms_phone.json")
     low, high = (tuple(float(v) for v in corner) for corner in listed.box())
     trained = train_scene(
-        listed.load(TRAINING_SIZE), SceneFieldConfig(low, high), TrainConfig(steps=steps, seed=0),  # type: ignore[arg-type]
-        folder / "checkpoint.safetensors", lambda at: say(at.fraction, f"step {at.step}, {at.psnr_db:.1f} dB on training rays"),
-    )  # fmt: skip
+        listed.load(TRAINING_SIZE),
+        SceneFieldConfig(low, high),
+        TrainConfig(steps=steps, seed=0),  # type: ignore[arg-type]
+        folder / "checkpoint.safetensors",
+        lambda at: say(at.fraction, f"step {at.step}, {at.psnr_db:.1f} dB on training rays"),
+    )
     scene = folder / "scene.safetensors"
     save_scene(scene, trained.scene, trained.occupied, {"march": vars(trained.march), "steps": steps})
     match_colours(scene, data / "transforms_car.json", scene, 12)
@@ -109,7 +131,11 @@ def compare(run: Path, scene: Path, mapped: bool) -> dict[str, Any]:
             on_rendered = float(loaded.policy(rendered.permute(0, 3, 1, 2))[0])
         differences.append(abs(on_real - on_rendered))
         psnrs.append(psnr(rendered[0].numpy(), real / 255.0))
-    return {"views": len(differences), "steering_rad": float(np.mean(differences)), "psnr_db": float(np.mean(psnrs))}
+    return {
+        "views": len(differences),
+        "steering_rad": float(np.mean(differences)),
+        "psnr_db": float(np.mean(psnrs)),
+    }
 
 
 if __name__ == "__main__":

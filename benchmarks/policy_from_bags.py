@@ -62,7 +62,9 @@ def train(bags: list[Path], out: Path, steps: int) -> Training:
     room = load_calibration(RoomCalibration, _CALIBRATION / "room.yaml")
     view = PolicyView(camera.pinhole, distortion=camera.distortion)
     expert = Expert(room.reference_path, ExpertConfig(speed_mps=_SPEED_MPS))
-    parts = [Part(str(bag), read_info(bag).parts, {}, partial(frames_of_bag, bag, view, expert)) for bag in bags]
+    parts = [
+        Part(str(bag), read_info(bag).parts, {}, partial(frames_of_bag, bag, view, expert)) for bag in bags
+    ]
     return train_from_recordings(parts, view, expert, ImitationConfig(first_steps=steps), out, progress=_say)
 
 
@@ -73,9 +75,14 @@ def drive(policy: Path, run_dir: Path, laps: float) -> TrialOutcome:
     if not (run_dir / "trial.json").is_file():
         shutil.rmtree(run_dir, ignore_errors=True)
         overrides = [
-            *_common(), "policy.if=true", f"params.policy={policy}", "expert.if=false", "collect.if=false",
-            "safety.drivers=[policy]", f"safety.nodes={json.dumps([n for n in _NODES if n != 'safety'])}",
-        ]  # fmt: skip
+            *_common(),
+            "policy.if=true",
+            f"params.policy={policy}",
+            "expert.if=false",
+            "collect.if=false",
+            "safety.drivers=[policy]",
+            f"safety.nodes={json.dumps([n for n in _NODES if n != 'safety'])}",
+        ]
         run_trial(_LAUNCH, overrides, run_dir, TrialPlan(room.start_pose, duration_s + 0.2, _NODES), _READY_S)
     return TrialOutcome(**json.loads((run_dir / "trial.json").read_text()))
 
@@ -111,14 +118,19 @@ def main() -> None:
     outcome = drive(done.path, folder / "drive", laps)
     mean_m, max_m = mean_abs_cte_m(folder / "drive", outcome, laps)
     early = f", stopped early: {outcome.stopped_early}" if outcome.stopped_early else ""
-    print(f"{laps:g} laps: mean |CTE| {mean_m:.3f} m, worst {max_m:.3f} m{early}; {sum(done.frames.values())} frames")
+    print(
+        f"{laps:g} laps: mean |CTE| {mean_m:.3f} m, worst {max_m:.3f} m{early}; {sum(done.frames.values())} frames"
+    )
     if not trial:
         record_row(
-            "#4 policy trained only from bags of the expert driving the twin, 3 laps live, mean |CTE|", round(mean_m, 3), "m",
-            f"<= {_TARGET_M} m, 3 laps", mean_m <= _TARGET_M and not outcome.stopped_early,
+            "#4 policy trained only from bags of the expert driving the twin, 3 laps live, mean |CTE|",
+            round(mean_m, 3),
+            "m",
+            f"<= {_TARGET_M} m, 3 laps",
+            mean_m <= _TARGET_M and not outcome.stopped_early,
             "python -m benchmarks.policy_from_bags",
             f"worst {max_m:.2f} m, {sum(done.frames.values())} frames, one DAgger round by relabelling{early}",
-        )  # fmt: skip
+        )
 
 
 def _common() -> list[str]:

@@ -146,7 +146,9 @@ class SimulatedDrive:
         while self._arrivals and self._arrivals[0][0] <= self._mono_ns + round(STEP_S * NS_PER_S) - 1:
             arrival_ns, _, datagram = heapq.heappop(self._arrivals)
             now = self._now(arrival_ns)
-            for out in self._vicon.receive(self._tracker.update(datagram, now.real_ns, arrival_ns, _SENDER), now):
+            for out in self._vicon.receive(
+                self._tracker.update(datagram, now.real_ns, arrival_ns, _SENDER), now
+            ):
                 self._say(out.topic, out.message, now)
 
     def _next_command(self) -> tuple[float, float]:
@@ -154,25 +156,49 @@ class SimulatedDrive:
         if self.step_index >= self._command_until:
             self._command_until = self.step_index + int(self.rng.uniform(0.5, 4.0) / STEP_S)
             kind = self.rng.random()
-            speed = self.rng.uniform(0.2, 1.0) if kind < 0.8 else self.rng.uniform(-0.8, 0.0) if kind < 0.9 else 0.0
+            speed = (
+                self.rng.uniform(0.2, 1.0)
+                if kind < 0.8
+                else self.rng.uniform(-0.8, 0.0)
+                if kind < 0.9
+                else 0.0
+            )
             self._command = float(speed), float(self.rng.uniform(-0.3, 0.3))
         return self._command
 
     def _vicon_status(self, now: Now) -> Any:
         fault = self._tracker.senders.faults(now.mono_ns)
         return types.NodeStatus(
-            header=header(now.real_ns), node="vicon", pid=1, state="fault" if fault else "active", text=fault, subscriptions=[],
-            publications=[], subscribers=np.zeros(0, np.uint32), counter_names=[], counter_values=np.zeros(0),
-        )  # fmt: skip
+            header=header(now.real_ns),
+            node="vicon",
+            pid=1,
+            state="fault" if fault else "active",
+            text=fault,
+            subscriptions=[],
+            publications=[],
+            subscribers=np.zeros(0, np.uint32),
+            counter_names=[],
+            counter_values=np.zeros(0),
+        )
 
     def _telemetry(self, now: Now) -> Any:
         return types.VescState(
-            header=header(now.real_ns), speed_mps=self._gains.speed_mps(self._car.erpm), erpm=self._car.erpm, duty=0.0,
-            input_voltage_v=15.0, motor_current_a=0.0, input_current_a=0.0, mosfet_temperature_c=30.0, fault=0, fault_text="",
-        )  # fmt: skip
+            header=header(now.real_ns),
+            speed_mps=self._gains.speed_mps(self._car.erpm),
+            erpm=self._car.erpm,
+            duty=0.0,
+            input_voltage_v=15.0,
+            motor_current_a=0.0,
+            input_current_a=0.0,
+            mosfet_temperature_c=30.0,
+            fault=0,
+            fault_text="",
+        )
 
     def _say(self, topic: str, message: Any, now: Now) -> None:
-        self._obey(self.safety.handle(topic, message, MessageInfo(now.mono_ns, now.mono_ns, instance_id=1), now))
+        self._obey(
+            self.safety.handle(topic, message, MessageInfo(now.mono_ns, now.mono_ns, instance_id=1), now)
+        )
 
     def _obey(self, outs: list[Out]) -> None:
         for out in outs:
@@ -216,7 +242,9 @@ def plant(count: int, seed: int) -> Iterator[Jump]:
                 raise RuntimeError(f"expected a drive without a stop before the jump, got: {drive.reason}")
             size_m = float(np.exp(drive.rng.uniform(math.log(SMALLEST_M), math.log(LARGEST_M))))
             way_rad = float(drive.rng.uniform(-math.pi, math.pi))
-            T = make_transform(np.eye(3), T[:3, 3] + size_m * np.array([math.cos(way_rad), math.sin(way_rad), 0.0]))
+            T = make_transform(
+                np.eye(3), T[:3, 3] + size_m * np.array([math.cos(way_rad), math.sin(way_rad), 0.0])
+            )
             drive.frames.displace("car", T)
             for _ in range(_CAUGHT_STEPS):
                 drive.step()
@@ -258,7 +286,9 @@ def main() -> None:
     options = parser.parse_args()
     chunks = max(1, round(options.hours / CHUNK_H))
     with ProcessPoolExecutor(len(os.sched_getaffinity(0))) as pool:
-        planted = pool.map(_jumps, [(min(50, options.count - i), 1000 + i) for i in range(0, options.count, 50)])
+        planted = pool.map(
+            _jumps, [(min(50, options.count - i), 1000 + i) for i in range(0, options.count, 50)]
+        )
         jumps = [jump for some in planted for jump in some]
         driven = pool.map(_stops, [(options.hours / chunks, seed) for seed in range(chunks)])
         stops = [reason for some in driven for reason in some]
@@ -269,18 +299,26 @@ def main() -> None:
     print(f"{len(stops)} stops in {options.hours:g} h of ordinary driving {stops[:5]}")
     if options.trial:
         return
-    note = (
-        f"0.05 to 2.4 m in random directions, at 0.2 to 1.0 m/s, with noise, loss and delays; missed: {sizes or 'none'}"
-    )
+    note = f"0.05 to 2.4 m in random directions, at 0.2 to 1.0 m/s, with noise, loss and delays; missed: {sizes or 'none'}"
     record_row(
-        f"#15 jumps of the car's pose that disarm, of {len(jumps)} planted in simulated drives", caught, f"of {len(jumps)}",
-        f"{len(jumps)}", caught == len(jumps), COMMAND, note,
-    )  # fmt: skip
+        f"#15 jumps of the car's pose that disarm, of {len(jumps)} planted in simulated drives",
+        caught,
+        f"of {len(jumps)}",
+        f"{len(jumps)}",
+        caught == len(jumps),
+        COMMAND,
+        note,
+    )
     note = f"{len(stops) / options.hours:.2f} in an hour; noise 0.5 mm and 1 mrad, loss, late and repeated datagrams, occlusions"
     record_row(
-        f"#15 false stops by pose and stall checks in {options.hours:g} h of simulated driving", len(stops), "stops", "0",
-        not stops, COMMAND, "; ".join([note, *sorted(set(stops))[:2]]),
-    )  # fmt: skip
+        f"#15 false stops by pose and stall checks in {options.hours:g} h of simulated driving",
+        len(stops),
+        "stops",
+        "0",
+        not stops,
+        COMMAND,
+        "; ".join([note, *sorted(set(stops))[:2]]),
+    )
 
 
 if __name__ == "__main__":

@@ -90,7 +90,9 @@ def run(count: int) -> Tally:
                 graph.put_back(START)
             _pair(graph, tally, moments.uniform(0.0, 0.1))
             if tally.pairs % 50 == 0:
-                print(f"{tally.pairs} pairs, {len(tally.lost)} lost, {len(tally.refused)} refused", flush=True)
+                print(
+                    f"{tally.pairs} pairs, {len(tally.lost)} lost, {len(tally.refused)} refused", flush=True
+                )
     return tally
 
 
@@ -109,7 +111,9 @@ def _pair(graph: Graph, tally: Tally, drive_s: float) -> None:
     if moved is None:
         graph.operator.watch(_STATUS_S)
         stopped = not graph.operator.armed or graph.operator.state_of("motor") == "fault"
-        (tally.stopped if stopped else tally.lost).append(f"armed, but no command to move: {graph.operator.describe()}")
+        (tally.stopped if stopped else tally.lost).append(
+            f"armed, but no command to move: {graph.operator.describe()}"
+        )
         ask_to_disarm(graph.folder, "benchmark", _patience(time.monotonic_ns()))
         return
     graph.operator.watch(drive_s)
@@ -155,20 +159,35 @@ def report(tally: Tally) -> None:
     back_ms = max(tally.return_ms)
     answered = 2 * tally.pairs + len(tally.refused)
     record_row(
-        f"#15 requests lost, of {tally.pairs} to arm and {tally.pairs} to disarm", len(tally.lost), "requests", "0", not tally.lost,
-        COMMAND, "; ".join(tally.lost)[:300]
+        f"#15 requests lost, of {tally.pairs} to arm and {tally.pairs} to disarm",
+        len(tally.lost),
+        "requests",
+        "0",
+        not tally.lost,
+        COMMAND,
+        "; ".join(tally.lost)[:300]
         or f"under a recorder, a viewer and a busy core; {answered} answered, {len(tally.refused)} of them why not armed,"
         f" {len(tally.stopped)} drives stopped by the safety node first",
-    )  # fmt: skip
+    )
     record_row(
-        "#15 disarm to brake at the controller, p99", round(p99_ms), "ms", f"<= {BRAKE_LIMIT_MS:g} ms", p99_ms <= BRAKE_LIMIT_MS,
-        COMMAND, f"of {len(tally.brake_ms)}; median {np.median(tally.brake_ms):.0f} ms, worst {worst_ms:.0f} ms; from the request,"
+        "#15 disarm to brake at the controller, p99",
+        round(p99_ms),
+        "ms",
+        f"<= {BRAKE_LIMIT_MS:g} ms",
+        p99_ms <= BRAKE_LIMIT_MS,
+        COMMAND,
+        f"of {len(tally.brake_ms)}; median {np.median(tally.brake_ms):.0f} ms, worst {worst_ms:.0f} ms; from the request,"
         " with a bus opened for it, to the first brake command; the start of the command's process is not in it",
-    )  # fmt: skip
+    )
     record_row(
-        "#15 brake at the controller to the return of the disarm, worst", round(back_ms), "ms", f"<= {RETURN_LIMIT_MS:g} ms",
-        back_ms <= RETURN_LIMIT_MS, COMMAND, f"of {len(tally.return_ms)}",
-    )  # fmt: skip
+        "#15 brake at the controller to the return of the disarm, worst",
+        round(back_ms),
+        "ms",
+        f"<= {RETURN_LIMIT_MS:g} ms",
+        back_ms <= RETURN_LIMIT_MS,
+        COMMAND,
+        f"of {len(tally.return_ms)}",
+    )
 
 
 def main() -> None:

@@ -81,7 +81,9 @@ def record_row(
     with _locked(ledger):
         rows = [r for r in read_rows(ledger) if r["line"] != line]
         rows.append(row)
-        write_atomically(ledger, json.dumps(sorted(rows, key=lambda r: r["line"]), indent=1, ensure_ascii=False) + "\n")
+        write_atomically(
+            ledger, json.dumps(sorted(rows, key=lambda r: r["line"]), indent=1, ensure_ascii=False) + "\n"
+        )
         write_atomically(page, render_page(read_rows(ledger)))
 
 

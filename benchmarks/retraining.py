@@ -34,7 +34,10 @@ def rows_of(summary: dict[str, Any], allowed: int) -> list[tuple[str, float, str
         for name in each["surrogate"]:
             line = f"#5 attack -> retrain -> attack, round {number}, {name}, deployed"
             note = f"in the learned scene {each['surrogate'][name]:.2f} x; victim {each['victim'][:12]}, gradient, one seed"
-            if number == len(summary["rounds"]) - 1 and max(each["surrogate"].values()) >= summary["pays_ratio"]:
+            if (
+                number == len(summary["rounds"]) - 1
+                and max(each["surrogate"].values()) >= summary["pays_ratio"]
+            ):
                 ended = (
                     "the number of rounds ended the loop"
                     if number >= allowed
@@ -66,7 +69,9 @@ def main() -> None:
     parser.add_argument("folder", type=Path, help="run folder of the intersection's experiment")
     parser.add_argument("--dry", action="store_true", help="print only")
     options = parser.parse_args()
-    experiment = load_experiment(REPOSITORY / "launch" / "junction.experiment.yaml", "retrain", [], options.folder)
+    experiment = load_experiment(
+        REPOSITORY / "launch" / "junction.experiment.yaml", "retrain", [], options.folder
+    )
     found = experiment.stage_folder("retrain")
     summary = json.loads((found / "retrain.json").read_text())
     allowed = experiment.config.retrain.rounds if experiment.config.retrain else 0

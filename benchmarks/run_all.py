@@ -48,7 +48,9 @@ def main() -> int:
     for command in CAMPAIGN if options.campaign else commands(options.run_folder, options.quick):
         began = time.monotonic()
         module, *arguments = command.split()
-        code = subprocess.run([sys.executable, "-m", f"benchmarks.{module}", *arguments], cwd=REPOSITORY).returncode
+        code = subprocess.run(
+            [sys.executable, "-m", f"benchmarks.{module}", *arguments], cwd=REPOSITORY
+        ).returncode
         outcome = "done" if code == 0 else f"failed with {code}"
         print(f"{command}: {outcome} in {time.monotonic() - began:.0f} s", flush=True)
         if code != 0:

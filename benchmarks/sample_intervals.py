@@ -106,7 +106,9 @@ def room(data: Path) -> Case:
         "pixels": (pixel_intervals([view], images.T_world_from_camera, field),) * 2,
         "box": (before, before.coarser(2.0)),
     }
-    return Case(_some(images, ~held), _of_focal(_some(images, held), view.fx), field, rules, view, is_open=False)
+    return Case(
+        _some(images, ~held), _of_focal(_some(images, held), view.fx), field, rules, view, is_open=False
+    )
 
 
 CASES: dict[str, Callable[[Path], Case]] = {"fox": fox, "standing_back": standing_back, "room": room}
@@ -114,7 +116,9 @@ CASES: dict[str, Callable[[Path], Case]] = {"fox": fox, "standing_back": standin
 
 def main() -> None:
     """Train by both rules, compare, print and record."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--data", type=Path, default=Path("../shared/data/fox"), help="folder of the fox")
     parser.add_argument("--cases", nargs="+", choices=CASES, default=list(CASES))
     parser.add_argument("--count", type=int, default=1000, help="training steps; fewer are not recorded")
@@ -134,7 +138,13 @@ def main() -> None:
             record_row(f"{line}: PSNR gained", gain_db, "dB", ">= 0 dB", gain_db >= 0.0, command, note)
             target = slower <= 1.0 if name == "room" else None
             record_row(
-                f"{line}: rendering time", slower, "x", "<= 1 x" if name == "room" else "printed", target, command, note
+                f"{line}: rendering time",
+                slower,
+                "x",
+                "<= 1 x" if name == "room" else "printed",
+                target,
+                command,
+                note,
             )
 
 
@@ -143,16 +153,20 @@ def compare(case: Case, steps: int, repeats: int) -> tuple[dict[str, float], dic
     renderers = {}
     for name, (march, march_of_views) in case.rules.items():
         config = TrainConfig(
-            steps=steps, march=march, opacity=0.0 if case.is_open else TrainConfig.opacity,
+            steps=steps,
+            march=march,
+            opacity=0.0 if case.is_open else TrainConfig.opacity,
             distortion=2e-3 if case.is_open else TrainConfig.distortion,
             refine_depth=0.005 if case.is_open else TrainConfig.refine_depth,
             # In the warm-up intervals are longer: a run that ends in it would compare nothing.
             warmup_steps=min(TrainConfig.warmup_steps, steps // 4),
-        )  # fmt: skip
+        )
         trained = train_scene(case.training, case.field, config, progress=_report(name))
         renderers[name] = FieldRenderer(trained.scene, trained.occupied, march_of_views)
     pose = case.held_out.T_world_from_camera[:1]
-    ways = {name: (lambda renderer=each: renderer.render(pose, case.viewed)) for name, each in renderers.items()}
+    ways = {
+        name: (lambda renderer=each: renderer.render(pose, case.viewed)) for name, each in renderers.items()
+    }
     return {name: _held_out_db(each, case.held_out) for name, each in renderers.items()}, seconds_in_turns(
         ways, repeats
     )
@@ -167,7 +181,9 @@ def _held_out_db(renderer: FieldRenderer, views: ImageSet) -> float:
     return float(np.mean(scores))
 
 
-def _rules(images: ImageSet, field: SceneFieldConfig, near_m: float) -> dict[str, tuple[MarchConfig, MarchConfig]]:
+def _rules(
+    images: ImageSet, field: SceneFieldConfig, near_m: float
+) -> dict[str, tuple[MarchConfig, MarchConfig]]:
     before = MarchConfig(near_m, field.extent_m / 2048, field.extent_m / 160, 0.016)
     return {
         "pixels": (pixel_intervals(images.pinholes, images.T_world_from_camera, field, near_m),) * 2,
@@ -197,7 +213,10 @@ def _of_focal(images: ImageSet, focal_px: float) -> ImageSet:
 def _report(name: str) -> Callable[[Progress], None]:
     def told(at: Progress) -> None:
         if at.step % 250 == 0:
-            print(f"{name}, step {at.step}: {at.psnr_db:.2f} dB on training rays, {at.eta_s:.0f} s left", flush=True)
+            print(
+                f"{name}, step {at.step}: {at.psnr_db:.2f} dB on training rays, {at.eta_s:.0f} s left",
+                flush=True,
+            )
 
     return told
 

@@ -44,9 +44,12 @@ def photograph(path: Path, count: int) -> None:
     squares = images.rgb.reshape(n, height // REDUCE, REDUCE, width // REDUCE, REDUCE, 3)
     lens = images.pinholes[0]
     np.savez(
-        path, rgb=np.rint(squares.mean(axis=(2, 4))).astype(np.uint8), poses=images.T_world_from_camera,
-        lens=np.array([lens.fx, lens.fy, lens.cx, lens.cy]) / REDUCE, box=np.array([field.box_low_m, field.box_high_m]),
-    )  # fmt: skip
+        path,
+        rgb=np.rint(squares.mean(axis=(2, 4))).astype(np.uint8),
+        poses=images.T_world_from_camera,
+        lens=np.array([lens.fx, lens.fy, lens.cx, lens.cy]) / REDUCE,
+        box=np.array([field.box_low_m, field.box_high_m]),
+    )
 
 
 def load(path: Path) -> tuple[ImageSet, ImageSet, SceneFieldConfig]:
@@ -139,9 +142,14 @@ def main() -> None:
             f"moments of {arguments.steps} steps, a checkpoint every 0.2 s"
         )
         record_row(
-            "#3 kill -9 at a random moment: scene training", f"{good}/{struck}", "within 0.1 dB", "20/20",
-            good == struck >= 20, COMMAND, note,
-        )  # fmt: skip
+            "#3 kill -9 at a random moment: scene training",
+            f"{good}/{struck}",
+            "within 0.1 dB",
+            "20/20",
+            good == struck >= 20,
+            COMMAND,
+            note,
+        )
 
 
 def kill_many(arguments: argparse.Namespace) -> tuple[float, list[float]]:

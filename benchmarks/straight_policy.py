@@ -39,7 +39,9 @@ class StraightPolicy(Node):
     def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
         """Drive on."""
         stamp_ns = ns_from_stamp(message.header.stamp)
-        return [Out("/policy/drive", drive_message(self._config.speed_mps, self._config.steering_rad, stamp_ns))]
+        return [
+            Out("/policy/drive", drive_message(self._config.speed_mps, self._config.steering_rad, stamp_ns))
+        ]
 
 
 def build(config: StraightConfig, context: NodeContext) -> StraightPolicy:

@@ -62,9 +62,14 @@ def start_car(folder: Path) -> Car:
     ports = _free_ports()
     config = folder / "gateway.yaml"
     document = {
-        "listen": "127.0.0.1", "watch_port": ports[0], "drive_port": ports[1], "keys": str(keys.path), "key": "robot",
-        "imports": list(_COMMANDS), "exports": ["/vicon/car"],
-    }  # fmt: skip
+        "listen": "127.0.0.1",
+        "watch_port": ports[0],
+        "drive_port": ports[1],
+        "keys": str(keys.path),
+        "key": "robot",
+        "imports": list(_COMMANDS),
+        "exports": ["/vicon/car"],
+    }
     config.write_text(json.dumps(document), encoding="utf-8")
     bus = Bus(folder)
     for name in _COMMANDS:
@@ -88,7 +93,9 @@ def _free_ports() -> list[int]:
 def commands() -> list[list[bytes]]:
     """A command to drive and a request to arm, as they travel."""
     now_ns = time.time_ns()
-    arm = types.Arm(header=header(now_ns), arm=True, source="operator", reason="", ask_id="stranger", age_ns=0)
+    arm = types.Arm(
+        header=header(now_ns), arm=True, source="operator", reason="", ask_id="stranger", age_ns=0
+    )
     found = []
     for name, message in zip(_COMMANDS, (drive_message(0.8, 0.0, now_ns), arm), strict=True):
         meta = Meta(time.monotonic_ns(), now_ns, 0, type_hash_prefix(topic(name).type), 1)
@@ -101,10 +108,19 @@ def malformed() -> list[list[bytes]]:
     (name, meta, cdr), _ = commands()
     wrong_type = pack_meta(Meta(0, 0, 0, b"\0" * 8, 1))
     return [
-        [name], [name, meta], [name, b"", cdr], [name, meta, cdr[:-1]], [name, meta, b"\xff" * len(cdr)],
-        [name, wrong_type, cdr], [name, meta, bytes(2**20)], [name, meta, bytes(_OVERSIZED_BYTES)], [name, *[b""] * 999],
-        [b"/motor/sent", meta, cdr], [b"/policy/drive/../../arm", meta, cdr], [b"\xff" * 64, meta, cdr],
-    ]  # fmt: skip
+        [name],
+        [name, meta],
+        [name, b"", cdr],
+        [name, meta, cdr[:-1]],
+        [name, meta, b"\xff" * len(cdr)],
+        [name, wrong_type, cdr],
+        [name, meta, bytes(2**20)],
+        [name, meta, bytes(_OVERSIZED_BYTES)],
+        [name, *[b""] * 999],
+        [b"/motor/sent", meta, cdr],
+        [b"/policy/drive/../../arm", meta, cdr],
+        [b"\xff" * 64, meta, cdr],
+    ]
 
 
 def attempt(car: Car, key: str | None, bad: bool = False, patience_s: float = _TRY_S) -> int:
@@ -120,7 +136,9 @@ def attempt(car: Car, key: str | None, bad: bool = False, patience_s: float = _T
     door = context.socket(zmq.PUB)
     door.linger = 0
     if key is not None:
-        public, secret = (car.keys.public(key).encode(), car.keys.secret(key).encode()) if key else zmq.curve_keypair()
+        public, secret = (
+            (car.keys.public(key).encode(), car.keys.secret(key).encode()) if key else zmq.curve_keypair()
+        )
         door.curve_publickey, door.curve_secretkey, door.curve_serverkey = public, secret, car.public.encode()
     door.connect(f"tcp://127.0.0.1:{car.port}")
     deadline, reached = time.monotonic() + patience_s, 0
@@ -164,10 +182,14 @@ def main() -> None:
         print(log)
     if not options.trial:
         record_row(
-            "#4 strangers: no key, wrong key, watch-only key driving, oversized, malformed", sum(reached.values()),
-            "messages let in", "0: all refused and logged", met, COMMAND,
+            "#4 strangers: no key, wrong key, watch-only key driving, oversized, malformed",
+            sum(reached.values()),
+            "messages let in",
+            "0: all refused and logged",
+            met,
+            COMMAND,
             f"refusals in the log: {sum(logged)} of {len(logged)} kinds; an allowed workstation drives before and after",
-        )  # fmt: skip
+        )
 
 
 if __name__ == "__main__":

@@ -29,7 +29,10 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=150, help="frames of the video")
     parser.add_argument("--width", type=int, default=960, help="width of the phone's images [px]")
     parser.add_argument(
-        "--folder", type=Path, default=Path("runs/structure_from_motion"), help="working folder, emptied first"
+        "--folder",
+        type=Path,
+        default=Path("runs/structure_from_motion"),
+        help="working folder, emptied first",
     )
     parser.add_argument("--trial", action="store_true", help="print, but do not write the ledger")
     arguments = parser.parse_args()
@@ -44,13 +47,21 @@ def main() -> None:
     began = time.perf_counter()
     source = Source("phone", tuple(truth), ordered=True)
     model = reconstruct(
-        arguments.folder / "images", [source], arguments.folder / "colmap", SfmConfig(min_registered_share=0.1), say
-    )  # fmt: skip
+        arguments.folder / "images",
+        [source],
+        arguments.folder / "colmap",
+        SfmConfig(min_registered_share=0.1),
+        say,
+    )
     seconds = time.perf_counter() - began
 
     # Every placed image counts, however far off: nothing is thrown out here.
     aligned = align_poses(
-        model.poses, np.stack([truth[image.name] for image in model.images]), math.inf, math.inf, min_inlier_share=1.0
+        model.poses,
+        np.stack([truth[image.name] for image in model.images]),
+        math.inf,
+        math.inf,
+        min_inlier_share=1.0,
     )
     percent = 100.0 * aligned.rms_position_m / aligned.extent_m
     degrees = math.degrees(aligned.rms_rotation_rad)
@@ -64,9 +75,14 @@ def main() -> None:
     print(f"{percent:.3f} % of the extent: {note}")
     if not arguments.trial:
         record_row(
-            "#3 structure from motion on rendered lab images", percent, "% of the extent, rms",
-            "all placed, <= 0.3 %, <= 0.3 degrees", met, "python -m benchmarks.structure_from_motion", note,
-        )  # fmt: skip
+            "#3 structure from motion on rendered lab images",
+            percent,
+            "% of the extent, rms",
+            "all placed, <= 0.3 %, <= 0.3 degrees",
+            met,
+            "python -m benchmarks.structure_from_motion",
+            note,
+        )
 
 
 _last_s = 0.0

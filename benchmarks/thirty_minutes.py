@@ -98,7 +98,9 @@ class Stops:
     def describe(self) -> str:
         """The stops in words."""
         said = "; ".join(f"{t_s:.0f} s: {reason}" for t_s, reason in self.found[:5])
-        return f"{len(self.found)} stops, {self.by_host} of them while the host paused" + (f" ({said})" if said else "")
+        return f"{len(self.found)} stops, {self.by_host} of them while the host paused" + (
+            f" ({said})" if said else ""
+        )
 
 
 def live(graph: Graph, duration_s: float, pauses: HostPauses) -> tuple[list[dict[str, Any]], Stops]:
@@ -118,7 +120,9 @@ def live(graph: Graph, duration_s: float, pauses: HostPauses) -> tuple[list[dict
                     numbers.look()
                     if not graph.operator.armed:
                         now_s = time.monotonic()
-                        reason = str(graph.operator.seen["/safety/state"].reason).replace(f"{graph.folder}/", "")
+                        reason = str(graph.operator.seen["/safety/state"].reason).replace(
+                            f"{graph.folder}/", ""
+                        )
                         stops.found.append((now_s - began, reason))
                         stops.by_host += pauses.explain(now_s)
                         print(f"stopped: {stops.found[-1]}: {graph.operator.describe()}", flush=True)
@@ -176,7 +180,8 @@ def growth(samples: list[dict[str, Any]], warm_up_s: float) -> dict[str, float]:
     first = [s for s in samples if warm_up_s <= s["t_s"] <= warm_up_s + 60.0]
     last = [s for s in samples if s["t_s"] >= samples[-1]["t_s"] - 60.0]
     sizes = {
-        name: [statistics.median(s["nodes"][name]["rss_mb"] for s in part) for part in (first, last)] for name in NODES
+        name: [statistics.median(s["nodes"][name]["rss_mb"] for s in part) for part in (first, last)]
+        for name in NODES
     }
     return {name: after / before - 1.0 for name, (before, after) in sizes.items()}
 
@@ -207,40 +212,73 @@ def record(samples: list[dict[str, Any]], stops: Stops, note: str) -> None:
         missed(samples),
     )
     dropped = sum(
-        v for s in samples[-1]["nodes"].values() for k, v in s["counters"].items() if k.startswith(("dropped", "lost"))
+        v
+        for s in samples[-1]["nodes"].values()
+        for k, v in s["counters"].items()
+        if k.startswith(("dropped", "lost"))
     )
     unexplained = len(stops.found) - stops.by_host
     record_row(
-        "#15 half an hour live with the trained policy: unexplained stops", unexplained, "stops", "0", not unexplained, COMMAND, note,
-    )  # fmt: skip
+        "#15 half an hour live with the trained policy: unexplained stops",
+        unexplained,
+        "stops",
+        "0",
+        not unexplained,
+        COMMAND,
+        note,
+    )
     said = ", ".join(f"{name} {count}" for name, count in late.items() if count) or "no node missed any"
     record_row(
-        "#15 half an hour live with the trained policy: missed ticks", sum(late.values()), "ticks", "0", not any(late.values()),
-        COMMAND, f"{said}; {note}",
-    )  # fmt: skip
+        "#15 half an hour live with the trained policy: missed ticks",
+        sum(late.values()),
+        "ticks",
+        "0",
+        not any(late.values()),
+        COMMAND,
+        f"{said}; {note}",
+    )
     worst = max(trend, key=lambda name: trend[name])
     record_row(
-        "#4 half an hour live: missed ticks, last third less first", round(trend[worst], 3), "per 100 ticks",
-        f"no trend (<= {TREND_LIMIT:g})", trend[worst] <= TREND_LIMIT, COMMAND, f"worst: {worst}; {note}",
-    )  # fmt: skip
+        "#4 half an hour live: missed ticks, last third less first",
+        round(trend[worst], 3),
+        "per 100 ticks",
+        f"no trend (<= {TREND_LIMIT:g})",
+        trend[worst] <= TREND_LIMIT,
+        COMMAND,
+        f"worst: {worst}; {note}",
+    )
     fattest = max(grown, key=lambda name: grown[name])
     every = ", ".join(f"{name} {100 * share:+.2f} %" for name, share in grown.items())
     record_row(
-        "#4 half an hour live: growth of memory after warm-up", round(100.0 * grown[fattest], 2), "%", "<= 2 %",
-        grown[fattest] <= GROWTH_LIMIT, COMMAND, f"{every}; {note}",
-    )  # fmt: skip
+        "#4 half an hour live: growth of memory after warm-up",
+        round(100.0 * grown[fattest], 2),
+        "%",
+        "<= 2 %",
+        grown[fattest] <= GROWTH_LIMIT,
+        COMMAND,
+        f"{every}; {note}",
+    )
     record_row(
-        "#4 half an hour live: messages numbered and not counted", round(sum(missing.values())), "messages", "0",
-        not any(missing.values()), COMMAND, f"{len(missing)} subscriptions, {dropped:.0f} drops counted; {note}",
-    )  # fmt: skip
+        "#4 half an hour live: messages numbered and not counted",
+        round(sum(missing.values())),
+        "messages",
+        "0",
+        not any(missing.values()),
+        COMMAND,
+        f"{len(missing)} subscriptions, {dropped:.0f} drops counted; {note}",
+    )
 
 
 def main() -> None:
     """Measure and record."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--minutes", type=float, default=33.0)
     parser.add_argument("--policy", type=Path, default=POLICY, help="policy file that drives")
-    parser.add_argument("--trial", action="store_true", help="one minute without warm-up, nothing is recorded or kept")
+    parser.add_argument(
+        "--trial", action="store_true", help="one minute without warm-up, nothing is recorded or kept"
+    )
     options = parser.parse_args()
     if not options.policy.is_file():
         raise SystemExit(
@@ -248,7 +286,9 @@ def main() -> None:
             "--setting demo --run-folder runs/demo (about 17 minutes on 2 cores), or give one with --policy"
         )
     if not options.trial and options.minutes * 60.0 < WARM_UP_S + 120.0:
-        raise SystemExit(f"expected at least {WARM_UP_S / 60 + 2:g} minutes, got --minutes {options.minutes:g}")
+        raise SystemExit(
+            f"expected at least {WARM_UP_S / 60 + 2:g} minutes, got --minutes {options.minutes:g}"
+        )
     folder = Path(tempfile.mkdtemp(prefix="advnerf-")) if options.trial else FOLDER
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
@@ -265,7 +305,9 @@ def main() -> None:
         f"{samples[-1]['t_s'] / 60:.1f} minutes, policy {digest}, {stops.describe()}, {host}, "
         f"{describe_drive(folder / 'bag')}"
     )
-    print(f"{note}\nmissed ticks {missed(samples)}\ngrowth {growth(samples, 0.0 if options.trial else WARM_UP_S)}")
+    print(
+        f"{note}\nmissed ticks {missed(samples)}\ngrowth {growth(samples, 0.0 if options.trial else WARM_UP_S)}"
+    )
     print(f"unaccounted {unaccounted(samples)}")
     if options.trial:
         shutil.rmtree(folder)

@@ -90,9 +90,13 @@ def main() -> None:
     """Measure, print and record."""
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("--rays", type=int, default=1024)
-    parser.add_argument("--steps", type=int, default=300, help="steps of training that fill the occupancy grid")
+    parser.add_argument(
+        "--steps", type=int, default=300, help="steps of training that fill the occupancy grid"
+    )
     parser.add_argument("--photographs", type=int, default=40)
-    parser.add_argument("--repeats", type=int, default=5, help="timed runs of each way, in turns; medians count")
+    parser.add_argument(
+        "--repeats", type=int, default=5, help="timed runs of each way, in turns; medians count"
+    )
     parser.add_argument("--trial", action="store_true", help="print, but record nothing")
     arguments = parser.parse_args()
 
@@ -133,7 +137,9 @@ def photograph_lab(count: int) -> tuple[ImageSet, SceneFieldConfig]:
     return ImageSet(rgb, (config.phone.pinhole,) * count, np.stack(poses)), box
 
 
-def prepare(images: ImageSet, field: SceneFieldConfig, steps: int, rays: int) -> tuple[Batch, CpuStep, TorchStep]:
+def prepare(
+    images: ImageSet, field: SceneFieldConfig, steps: int, rays: int
+) -> tuple[Batch, CpuStep, TorchStep]:
     """A batch, and the two ways to take a step on it from the same state of training."""
     view = PolicyView(LabConfig().camera.pinhole).pinhole
     config = TrainConfig(

@@ -27,9 +27,7 @@ from nodes.experiment.campaign.run import gate_file, gate_key
 
 CAMPAIGN = Path("launch/paper.campaign.yaml")
 # Of targets that are missed: what was tried, and what it points to.
-_SMALL_BASE = (
-    "tried: the victim has learned from random textures; nothing was tuned after the first drive; points to the base: "
-)
+_SMALL_BASE = "tried: the victim has learned from random textures; nothing was tuned after the first drive; points to the base: "
 _SHAPES = (
     "tried: bounds of 0.5 and 1 m, balls as in the paper, 50 iterations (after 30 of them 5 to 9 % of the gain are to come); points to the start poses: those of "
     "seeds 1 and 2 are drawn and cost metres without any attack, so the ratio of seed 0, from the nominal start, is the largest"
@@ -69,7 +67,9 @@ def note_of(row: TableRow, cells: Sequence[CellResult] = ()) -> str:
     if len(cells) > 1:
         parts.append("by seed " + ", ".join(f"{each:.2f}" for each in ratios_of(cells, row.domain)) + " x")
     if len(cells) > 1 and len({cell.surrogate.none_total_cte_m for cell in cells}) == 1:
-        parts.append("all seeds have the same start, so they differ by the search's noise and live timing alone")
+        parts.append(
+            "all seeds have the same start, so they differ by the search's noise and live timing alone"
+        )
     elif len(cells) > 1 and row.domain == "deployed" and starts_differ(cells):
         parts.append("searched from several starts, driven from the first, which all seeds share")
     if row.missing:
@@ -81,7 +81,9 @@ def note_of(row: TableRow, cells: Sequence[CellResult] = ()) -> str:
         )
         parts.append(f"{what} {row.ratio_interval.low:.2f} to {row.ratio_interval.high:.2f}")
     if row.transfer is not None and row.method != "none":
-        parts.append(f"transfer ratio {row.transfer:.2f}" + (", from the same start" if starts_differ(cells) else ""))
+        parts.append(
+            f"transfer ratio {row.transfer:.2f}" + (", from the same start" if starts_differ(cells) else "")
+        )
     if row.paper_ratio is not None:
         parts.append(f"paper {row.paper_ratio:.2f} x its deployed drive without attack")
     return "; ".join(parts)
@@ -89,7 +91,9 @@ def note_of(row: TableRow, cells: Sequence[CellResult] = ()) -> str:
 
 def starts_differ(cells: Sequence[CellResult]) -> bool:
     """Whether a cell was searched from more starts than it was deployed from."""
-    return any(cell.deployed is not None and cell.shared_starts < len(cell.surrogate.total_cte_m) for cell in cells)
+    return any(
+        cell.deployed is not None and cell.shared_starts < len(cell.surrogate.total_cte_m) for cell in cells
+    )
 
 
 def build_text(cells: Sequence[CellResult]) -> str:
@@ -99,7 +103,9 @@ def build_text(cells: Sequence[CellResult]) -> str:
     stages = cells[0].stages if cells else {}
     if not stages:
         return "build of scene and policies not recorded (the first)"
-    return "build: " + ", ".join(f"{name} {stages[name][:8]}" for name in ("scene", "policy") if name in stages)
+    return "build: " + ", ".join(
+        f"{name} {stages[name][:8]}" for name in ("scene", "policy") if name in stages
+    )
 
 
 def measured_where(cells: Sequence[CellResult]) -> dict[str, str]:
@@ -166,7 +172,9 @@ def rows_of(table: TransferTable) -> list[tuple[TableRow, TableTarget | None]]:
     ]
 
 
-def gate_rows(folder: Path, judged: Sequence[str]) -> list[tuple[str, tuple[str, float, str, str, bool, str]]]:
+def gate_rows(
+    folder: Path, judged: Sequence[str]
+) -> list[tuple[str, tuple[str, float, str, str, bool, str]]]:
     """How alike the learned scene is, by what the gate judges: on held-out views, and on a drive without attack where it was looked at."""
     rows = []
     for key in sorted(judged):
@@ -225,19 +233,31 @@ def main() -> None:
     run = f"advnerf campaign run {arguments.campaign}"
 
     def record(
-        line: str, value: float, unit: str, target: str, met: bool | None, note: str, command: str = run,
+        line: str,
+        value: float,
+        unit: str,
+        target: str,
+        met: bool | None,
+        note: str,
+        command: str = run,
         cells: Sequence[CellResult] = (),
-    ) -> None:  # fmt: skip
+    ) -> None:
         print(f"{line}: {value:.3g} {unit} (target {target or '-'}): {met}; {note}")
         if not arguments.dry:
             record_row(line, value, unit, target, met, command, note, **measured_where(cells))
 
     for row, target in rows_of(table):
         record(
-            line_of(row, table.cells_of(row)), row.ratio or 0.0, "x no attack", f"{target.target} x" if target else "",
-            target.met if target else None, note_of(row, cells := table.cells_of(row))
-            + why_missed(target, row, cells) + (how_far(cells) if row.domain == "deployed" else ""), cells=cells,
-        )  # fmt: skip
+            line_of(row, table.cells_of(row)),
+            row.ratio or 0.0,
+            "x no attack",
+            f"{target.target} x" if target else "",
+            target.met if target else None,
+            note_of(row, cells := table.cells_of(row))
+            + why_missed(target, row, cells)
+            + (how_far(cells) if row.domain == "deployed" else ""),
+            cells=cells,
+        )
     for target in table_targets(table):
         if target.what != "ratio to no attack" and target.value is not None:
             line = f"#5 {target.scenario}, {style_of(target.method).title}, {target.domain}: {target.what}"

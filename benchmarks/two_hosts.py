@@ -97,9 +97,11 @@ def clean(pair: HostPair) -> Result:
     """A good link: it drives."""
     distance_m, stops = _drive(pair, DRIVE_S)
     return {
-        "distance_m": distance_m, "stops": stops, "met": not stops and distance_m >= 0.8 * SPEED_MPS * DRIVE_S,
+        "distance_m": distance_m,
+        "stops": stops,
+        "met": not stops and distance_m >= 0.8 * SPEED_MPS * DRIVE_S,
         "offset_ms": 1e3 * (_person(pair).offset_s or 0.0),
-    }  # fmt: skip
+    }
 
 
 def loss(pair: HostPair) -> Result:
@@ -157,7 +159,9 @@ def measure(name: str, policy: Path, settings: Sequence[str] = ()) -> Result:
         if name == "loss":
             resend_early(cable)
         try:
-            pair = HostPair(cable, folder, policy, skewed_clock(folder, SKEW_S) if name == "skew" else None, settings)
+            pair = HostPair(
+                cable, folder, policy, skewed_clock(folder, SKEW_S) if name == "skew" else None, settings
+            )
             try:
                 result = CONDITIONS[name](pair)
             finally:
@@ -189,24 +193,47 @@ def record(found: dict[str, Result]) -> None:
         "clean": ("clean link", "distance_m", "m", f"drives {DRIVE_S:g} s without a stop", how),
         "loss": (f"{lossy}, rto_min 20 ms", "distance_m", "m", drives, "as docs/two_hosts.md advises"),
         "loss_untuned": (
-            f"{lossy}, TCP as delivered", "distance_m", "m", drives,
+            f"{lossy}, TCP as delivered",
+            "distance_m",
+            "m",
+            drives,
             "the kernel waits 200 ms before it sends again; a command lives for 220 ms",
         ),
-        "delay": (f"{1e3 * DELAY_S:g} ms of delay each way while driving", "brake_ms", "ms", stop + "refuses to arm", ""),
-        "stall": (f"{STALL_S:g} s stall while driving", "brake_ms", "ms", stop + "drives when armed again", ""),
+        "delay": (
+            f"{1e3 * DELAY_S:g} ms of delay each way while driving",
+            "brake_ms",
+            "ms",
+            stop + "refuses to arm",
+            "",
+        ),
+        "stall": (
+            f"{STALL_S:g} s stall while driving",
+            "brake_ms",
+            "ms",
+            stop + "drives when armed again",
+            "",
+        ),
         "skew": (
-            f"{1e3 * SKEW_S:g} ms of clock skew", "moves", "commands to move", "0: refuses to arm",
+            f"{1e3 * SKEW_S:g} ms of clock skew",
+            "moves",
+            "commands to move",
+            "0: refuses to arm",
             "the workstation's processes get a moved CLOCK_REALTIME by LD_PRELOAD",
         ),
-    }  # fmt: skip
+    }
     for name, result in found.items():
         line, key, unit, target, note = rows[name]
         value = result.get(key)
         notes = [note, result.get("broken", ""), _words(result)]
         record_row(
-            f"#4 two hosts: {line}", "-" if value is None else round(value, 2 if unit == "m" else 0), unit, target,
-            result["met"], COMMAND, "; ".join(filter(None, notes))[:400],
-        )  # fmt: skip
+            f"#4 two hosts: {line}",
+            "-" if value is None else round(value, 2 if unit == "m" else 0),
+            unit,
+            target,
+            result["met"],
+            COMMAND,
+            "; ".join(filter(None, notes))[:400],
+        )
 
 
 def _words(result: Result) -> str:
@@ -215,7 +242,10 @@ def _words(result: Result) -> str:
     words = [] if stops is None else [f"{len(stops)} stops"]
     words += [f"after {stop['brake_ms']:.0f} ms: {stop['why']}" for stop in stops or []]
     if "again_m" in result:
-        words += [f"by: {result['why']}; {result['distance_m']:.2f} m to standstill", "drove again when a person armed"]
+        words += [
+            f"by: {result['why']}; {result['distance_m']:.2f} m to standstill",
+            "drove again when a person armed",
+        ]
     return "; ".join([*words, *result.get("refusals", [])[:2]])
 
 

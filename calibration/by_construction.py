@@ -58,24 +58,37 @@ def write_twin_calibrations(lab: LabConfig, folder: Path) -> dict[str, Path]:
 def _camera(lab: LabConfig) -> CameraCalibration:
     pinhole = lab.camera.pinhole
     return CameraCalibration(
-        date=LAB_DATE, method=METHOD, width=pinhole.width, height=pinhole.height, fx=pinhole.fx, fy=pinhole.fy,
-        cx=pinhole.cx, cy=pinhole.cy, T_car_from_camera=lab.camera.T_car_from_camera.tolist(),
-    )  # fmt: skip
+        date=LAB_DATE,
+        method=METHOD,
+        width=pinhole.width,
+        height=pinhole.height,
+        fx=pinhole.fx,
+        fy=pinhole.fy,
+        cx=pinhole.cx,
+        cy=pinhole.cy,
+        T_car_from_camera=lab.camera.T_car_from_camera.tolist(),
+    )
 
 
 def _vehicle(car: CarConfig) -> VehicleCalibration:
     gains = VehicleGains(
-        erpm_per_mps=car.nominal_erpm_gain, servo_per_rad=car.nominal_servo_gain, servo_offset=car.nominal_servo_offset,
-        servo_min=car.servo_min, servo_max=car.servo_max,
-    )  # fmt: skip
+        erpm_per_mps=car.nominal_erpm_gain,
+        servo_per_rad=car.nominal_servo_gain,
+        servo_offset=car.nominal_servo_offset,
+        servo_min=car.servo_min,
+        servo_max=car.servo_max,
+    )
     # The servo's range is what limits the wheels.
     right, left = sorted(gains.steering_rad(servo) for servo in (car.servo_min, car.servo_max))
     limits = DriveLimits(steering_min_rad=right, steering_max_rad=left)
     return VehicleCalibration(
-        date=LAB_DATE, method=METHOD, wheelbase_m=car.wheelbase_m,
+        date=LAB_DATE,
+        method=METHOD,
+        wheelbase_m=car.wheelbase_m,
         notes="nominal gains, as a careful person would measure them; the simulated car deviates by 2 to 3 %",
-        gains=GainsSection(**vars(gains)), limits=LimitsSection(**vars(limits)),
-    )  # fmt: skip
+        gains=GainsSection(**vars(gains)),
+        limits=LimitsSection(**vars(limits)),
+    )
 
 
 def _target(subject: str, panel: PanelConfig) -> TargetCalibration:
@@ -94,9 +107,13 @@ def _room(lab: LabConfig) -> RoomCalibration:
     start = (x - START_BEFORE_CORNER_M * math.cos(yaw), y - START_BEFORE_CORNER_M * math.sin(yaw), yaw)
     reach = 0.5 * lab.room.side_m - FENCE_MARGIN_M
     return RoomCalibration(
-        date=LAB_DATE, method=METHOD, path=path.to_dict(), off_track_m=OFF_TRACK_M, start_pose=start,
+        date=LAB_DATE,
+        method=METHOD,
+        path=path.to_dict(),
+        off_track_m=OFF_TRACK_M,
+        start_pose=start,
         fence_m=((-reach, -reach), (reach, -reach), (reach, reach), (-reach, reach)),
-    )  # fmt: skip
+    )
 
 
 if __name__ == "__main__":

@@ -24,7 +24,13 @@ from numpy.typing import ArrayLike, NDArray
 from advnerf_core.data.similarity import rotation_angles
 from advnerf_core.geometry import Array, invert_transform, make_transform
 from calibration.charuco import Detection, board_pose
-from calibration.degeneracy import DegenerateDataError, PoorFitError, mean_rotation, require_count, rotation_spread
+from calibration.degeneracy import (
+    DegenerateDataError,
+    PoorFitError,
+    mean_rotation,
+    require_count,
+    rotation_spread,
+)
 from calibration.measured import LensCalibration, rows_of
 from calibration.mount_problem import MountConfig, MountProblem
 from calibration.schema import CameraCalibration
@@ -77,21 +83,30 @@ class MountFit:
     def calibration(self, camera: LensCalibration) -> CameraCalibration:
         """Make the camera calibration."""
         residuals = {
-            "rms_px": self.rms_px, "views_left_out": float((~self.used).sum()),
-            "rotation_stddev_deg": float(np.degrees(self.rotation_stddev_rad)), "translation_stddev_m": self.translation_stddev_m,
-        }  # fmt: skip
+            "rms_px": self.rms_px,
+            "views_left_out": float((~self.used).sum()),
+            "rotation_stddev_deg": float(np.degrees(self.rotation_stddev_rad)),
+            "translation_stddev_m": self.translation_stddev_m,
+        }
         return CameraCalibration(
-            date=datetime.date.today(), method=self.method, views=int(self.used.sum()),
-            residuals={key: round(value, 6) for key, value in residuals.items()}, rms_px=camera.rms_px,
+            date=datetime.date.today(),
+            method=self.method,
+            views=int(self.used.sum()),
+            residuals={key: round(value, 6) for key, value in residuals.items()},
+            rms_px=camera.rms_px,
             T_car_from_camera=rows_of(self.T_car_from_camera),
-            **{key: getattr(camera, key) for key in ("width", "height", "fx", "fy", "cx", "cy", "distortion")},
-        )  # fmt: skip
+            **{
+                key: getattr(camera, key) for key in ("width", "height", "fx", "fy", "cx", "cy", "distortion")
+            },
+        )
 
 
 def calibrate_mount(
-    views: Sequence[MountView], camera: LensCalibration, T_board_from_pattern: ArrayLike | None = None,
+    views: Sequence[MountView],
+    camera: LensCalibration,
+    T_board_from_pattern: ArrayLike | None = None,
     config: MountConfig | None = None,
-) -> MountFit:  # fmt: skip
+) -> MountFit:
     """Find the mounting pose of the camera.
 
     Args:
@@ -122,7 +137,9 @@ def calibrate_mount(
     if known is None:
         _require_axes(T_base_from_car, tracked, config)
     X, Y, inside = _start(T_base_from_car, T_camera_from_pattern, known, config)
-    problem = MountProblem(T_base_from_car, [view.found for view in chosen], matrix, distortion, known, config)
+    problem = MountProblem(
+        T_base_from_car, [view.found for view in chosen], matrix, distortion, known, config
+    )
     X, Y, turn_stddev, move_stddev = problem.solve(X, Y, inside)
     rms = problem.view_rms(X, Y)
     used, all_rms = np.zeros(len(views), np.bool_), np.full(len(views), np.nan)
@@ -154,7 +171,9 @@ def _require_axes(T_base_from_car: Array, tracked: bool, config: MountConfig) ->
     if spread[1] < config.least_second_axis_rad:
         first, second = np.degrees(spread[:2])
         cure = (
-            "tilt the board into several directions, or give the pattern's pose on it" if tracked else "track the board"
+            "tilt the board into several directions, or give the pattern's pose on it"
+            if tracked
+            else "track the board"
         )
         raise DegenerateDataError(
             f"expected rotations about more than one axis, got planar ones: {first:.1f} degrees about the first and {second:.2f} about the "
@@ -195,9 +214,12 @@ def _start(
 def _closed_form(T_base_from_car: Array, T_camera_from_pattern: Array) -> Array:
     # The method goes by keyword: as the fifth positional argument it would be taken for an output and ignored.
     turn, move = cv2.calibrateHandEye(
-        list(T_base_from_car[:, :3, :3]), list(T_base_from_car[:, :3, 3]),
-        list(T_camera_from_pattern[:, :3, :3]), list(T_camera_from_pattern[:, :3, 3]), method=cv2.CALIB_HAND_EYE_PARK,
-    )  # fmt: skip
+        list(T_base_from_car[:, :3, :3]),
+        list(T_base_from_car[:, :3, 3]),
+        list(T_camera_from_pattern[:, :3, :3]),
+        list(T_camera_from_pattern[:, :3, 3]),
+        method=cv2.CALIB_HAND_EYE_PARK,
+    )
     return _mean_pose(T_base_from_car @ make_transform(turn, move.ravel()) @ T_camera_from_pattern)
 
 

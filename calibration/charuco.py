@@ -42,7 +42,9 @@ class Board:
                 f"squares of {self.square_m} m, markers of {self.marker_m} m"
             )
         if not hasattr(cv2.aruco, self.dictionary):
-            raise CalibrationError(f"expected a marker dictionary such as DICT_4X4_50, got {self.dictionary!r}")
+            raise CalibrationError(
+                f"expected a marker dictionary such as DICT_4X4_50, got {self.dictionary!r}"
+            )
         if len(self._dictionary.bytesList) < self.columns * self.rows // 2:
             raise CalibrationError(
                 f"expected a dictionary of at least {self.columns * self.rows // 2} markers for this board, {self.dictionary} "

@@ -68,7 +68,9 @@ def _key(root: Path, sources: Sequence[Source], config: Mapping[str, Any]) -> st
         digest.update(repr((source.camera_id, source.ordered, source.pinhole, source.lens)).encode())
         for name in source.images:
             digest.update(name.encode() + b"\0" + hashlib.sha256((root / name).read_bytes()).digest())
-    return json.dumps({"version": _VERSION, "config": dict(config), "images": digest.hexdigest()}, sort_keys=True)
+    return json.dumps(
+        {"version": _VERSION, "config": dict(config), "images": digest.hexdigest()}, sort_keys=True
+    )
 
 
 def _create(file: Path, root: Path, sources: Sequence[Source]) -> None:
@@ -168,7 +170,9 @@ def extract_features(
     options.use_gpu, options.num_threads = False, threads()
     options.sift.max_num_features, options.sift.peak_threshold = max_features, peak_threshold
     with pycolmap.Database.open(file) as database:
-        done = {image.name for image in database.read_all_images() if database.exists_descriptors(image.image_id)}
+        done = {
+            image.name for image in database.read_all_images() if database.exists_descriptors(image.image_id)
+        }
     todo = [name for name in names if name not in done]
     at_once = threads()
     for start in range(0, len(todo), at_once):

@@ -13,7 +13,15 @@ import numpy as np
 from advnerf_core.data.lens import Lens
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.geometry import Pinhole
-from calibration.photo_model import FoundCamera, LeftOut, Model, ReconstructionError, Registered, SfmConfig, Source
+from calibration.photo_model import (
+    FoundCamera,
+    LeftOut,
+    Model,
+    ReconstructionError,
+    Registered,
+    SfmConfig,
+    Source,
+)
 
 Job = tuple[Path, tuple[Source, ...], Path, SfmConfig]
 
@@ -21,7 +29,12 @@ Job = tuple[Path, tuple[Source, ...], Path, SfmConfig]
 def pack_job(root: Path, sources: Sequence[Source], work: Path, config: SfmConfig) -> bytes:
     """Encode a job as one line."""
     return _line(
-        {"root": str(root), "sources": [asdict(s) for s in sources], "work": str(work), "config": asdict(config)}
+        {
+            "root": str(root),
+            "sources": [asdict(s) for s in sources],
+            "work": str(work),
+            "config": asdict(config),
+        }
     )
 
 
@@ -30,11 +43,14 @@ def unpack_job(line: bytes) -> Job:
     told = json.loads(line)
     sources = tuple(
         Source(
-            s["camera_id"], tuple(s["images"]), s["ordered"],
-            None if s["pinhole"] is None else Pinhole(**s["pinhole"]), _lens(s["lens"]),
+            s["camera_id"],
+            tuple(s["images"]),
+            s["ordered"],
+            None if s["pinhole"] is None else Pinhole(**s["pinhole"]),
+            _lens(s["lens"]),
         )
         for s in told["sources"]
-    )  # fmt: skip
+    )
     return Path(told["root"]), sources, Path(told["work"]), SfmConfig(**told["config"])
 
 
@@ -51,10 +67,16 @@ def pack_error(error: AdvnerfError | OSError) -> bytes:
 def pack_model(model: Model) -> bytes:
     """Encode a model as one line."""
     images = [{**asdict(i), "T_world_from_camera": i.T_world_from_camera.tolist()} for i in model.images]
-    return _line({
-        "images": images, "left_out": [asdict(i) for i in model.left_out], "points": model.points.tolist(),
-        "reprojection_error_px": model.reprojection_error_px, "parts": model.parts, "cameras": [asdict(c) for c in model.cameras],
-    })  # fmt: skip
+    return _line(
+        {
+            "images": images,
+            "left_out": [asdict(i) for i in model.left_out],
+            "points": model.points.tolist(),
+            "reprojection_error_px": model.reprojection_error_px,
+            "parts": model.parts,
+            "cameras": [asdict(c) for c in model.cameras],
+        }
+    )
 
 
 def unpack_answer(line: bytes) -> tuple[float, str] | Model:
@@ -71,7 +93,9 @@ def unpack_answer(line: bytes) -> tuple[float, str] | Model:
         return float(share), str(text)
     return Model(
         images=tuple(
-            Registered(**{**_optics(i), "T_world_from_camera": np.array(i["T_world_from_camera"], dtype=np.float64)})
+            Registered(
+                **{**_optics(i), "T_world_from_camera": np.array(i["T_world_from_camera"], dtype=np.float64)}
+            )
             for i in told["images"]
         ),
         left_out=tuple(LeftOut(**i) for i in told["left_out"]),

@@ -34,7 +34,9 @@ _FINISHED = "finished.json"
 _SHOWN_NAMES = 5
 
 
-def put_together(root: Path, sources: Sequence[Source], work: Path, config: SfmConfig, report: Report) -> Model:
+def put_together(
+    root: Path, sources: Sequence[Source], work: Path, config: SfmConfig, report: Report
+) -> Model:
     """Reconstruct a model from photographs; see `calibration.structure_from_motion.reconstruct`."""
     names = [name for source in sources for name in source.images]
     file = database.open_work(root, work, sources, asdict(config))
@@ -47,8 +49,14 @@ def put_together(root: Path, sources: Sequence[Source], work: Path, config: SfmC
 
 
 def _find_model(
-    file: Path, root: Path, work: Path, sources: Sequence[Source], cameras: Mapping[int, str], config: SfmConfig, report: Report
-) -> Model:  # fmt: skip
+    file: Path,
+    root: Path,
+    work: Path,
+    sources: Sequence[Source],
+    cameras: Mapping[int, str],
+    config: SfmConfig,
+    report: Report,
+) -> Model:
     names = [name for source in sources for name in source.images]
     database.extract_features(
         file, root, names, config.max_features, config.peak_threshold, _part(report, 0.0, _FEATURES_UNTIL)
@@ -56,9 +64,13 @@ def _find_model(
     pairs = database.pairs_to_match(file, sources, config)
     database.match(file, work, pairs, config.seed, _part(report, _FEATURES_UNTIL, _MATCHES_UNTIL))
     held = database.held_cameras(file, sources)
-    best, parts = _map(file, root, work, held, len(names), config, _part(report, _MATCHES_UNTIL, _POSES_UNTIL))
+    best, parts = _map(
+        file, root, work, held, len(names), config, _part(report, _MATCHES_UNTIL, _POSES_UNTIL)
+    )
     placed = {image.name for image in best.images.values() if image.has_pose}
-    choices, why = choose_lenses(best, held, database.exif_focal_lengths(file), _part(report, _POSES_UNTIL, 1.0))
+    choices, why = choose_lenses(
+        best, held, database.exif_focal_lengths(file), _part(report, _POSES_UNTIL, 1.0)
+    )
     elsewhere = "it could not be placed: too little overlap with the others, or blur"
     why |= {name: elsewhere for name in names if name not in placed}
     _write_finished(work, best, parts, choices, why)
@@ -146,14 +158,18 @@ def _model(
         pinhole, lens = intrinsics(image.camera)
         registered.append(Registered(name, camera_ids[image.camera_id], T, pinhole, lens, image.num_points3D))
     points = [
-        p.xyz for _, p in sorted(reconstruction.points3D.items(), key=lambda item: item[0]) if p.track.length() >= 3
+        p.xyz
+        for _, p in sorted(reconstruction.points3D.items(), key=lambda item: item[0])
+        if p.track.length() >= 3
     ]
     cameras = []
     for number in dict.fromkeys(by_name[image.name].camera_id for image in registered):
         choice, images = choices[number], sum(image.camera_id == camera_ids[number] for image in registered)
         found = intrinsics(reconstruction.cameras[number])
         cameras.append(
-            FoundCamera(camera_ids[number], images, choice.model, choice.why, *found, choice.focal_error_percent)
+            FoundCamera(
+                camera_ids[number], images, choice.model, choice.why, *found, choice.focal_error_percent
+            )
         )
     left_out = tuple(LeftOut(name, why[name]) for name in names if name not in by_name)
     error_px = float(reconstruction.compute_mean_reprojection_error())

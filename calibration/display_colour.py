@@ -103,12 +103,20 @@ class DisplayFit:
         residuals = {"held_out_rmse": self.rmse(True), "fitted_rmse": self.rmse(False), "drift": self.drift}
         model = self.model
         rounded = DisplayModel(
-            np.round(model.curves, 8), np.round(model.mixing, 8), np.round(model.ambient, 8), round(model.response, 6), round(model.falloff, 6)
-        )  # fmt: skip
+            np.round(model.curves, 8),
+            np.round(model.mixing, 8),
+            np.round(model.ambient, 8),
+            round(model.response, 6),
+            round(model.falloff, 6),
+        )
         return DisplayCalibration(
-            date=datetime.date.today(), method="camera in the loop: ramps, primaries and mixed colours, least squares on the seen means",
-            views=len(self.shown), residuals={key: round(value, 6) for key, value in residuals.items()}, model=rounded.to_dict(), conditions=conditions,
-        )  # fmt: skip
+            date=datetime.date.today(),
+            method="camera in the loop: ramps, primaries and mixed colours, least squares on the seen means",
+            views=len(self.shown),
+            residuals={key: round(value, 6) for key, value in residuals.items()},
+            model=rounded.to_dict(),
+            conditions=conditions,
+        )
 
 
 def colours_to_show(mixed: int = 48, seed: int = 0) -> NDArray[np.uint8]:
@@ -166,8 +174,12 @@ def fit_display(
     shown, seen = np.asarray(shown, np.float64), np.asarray(seen, np.float64)
     angles = np.broadcast_to(np.asarray(cos_angle, np.float64), (len(shown),)).copy()
     if shown.shape != seen.shape or shown.shape[1:] != (3,):
-        raise DegenerateDataError(f"expected one seen for every shown colour, got {seen.shape} and {shown.shape}")
-    require_count(len(shown), config.min_colours, "colours", "show the whole sequence: ramps, primaries, mixed colours")
+        raise DegenerateDataError(
+            f"expected one seen for every shown colour, got {seen.shape} and {shown.shape}"
+        )
+    require_count(
+        len(shown), config.min_colours, "colours", "show the whole sequence: ramps, primaries, mixed colours"
+    )
     drift = _require_usable(shown, seen, angles, config)
     held_out = _choose_held_out(shown, config)
     fitted = ~held_out
@@ -186,7 +198,9 @@ def _require_usable(shown: Array, seen: Array, angles: Array, config: DisplayCon
     if free.mean() < config.least_free:
         over = float((seen >= 0.98).any(axis=1).mean())
         cure = (
-            "shorten the exposure or dim the monitor" if over > 0.5 * (1.0 - free.mean()) else "lengthen the exposure"
+            "shorten the exposure or dim the monitor"
+            if over > 0.5 * (1.0 - free.mean())
+            else "lengthen the exposure"
         )
         raise DegenerateDataError(
             f"expected at least {100 * config.least_free:.0f} % of the colours without a saturated channel, got {100 * free.mean():.0f} %: {cure}"
@@ -260,7 +274,9 @@ def _fit(shown: Array, seen: Array, angles: Array) -> DisplayModel:
     lower[at], upper[at] = np.log(0.4), np.log(4.0)
     if with_falloff:
         lower[at + 1], upper[at + 1] = 0.0, 8.0
-    found = least_squares(residuals, np.clip(start, lower + 1e-9, upper - 1e-9), bounds=(lower, upper), max_nfev=60)
+    found = least_squares(
+        residuals, np.clip(start, lower + 1e-9, upper - 1e-9), bounds=(lower, upper), max_nfev=60
+    )
     return _unpack(found.x, with_falloff)
 
 
@@ -274,6 +290,9 @@ def _unpack(p: Array, with_falloff: bool) -> DisplayModel:
     at = 3 * steps
     # The mixing takes the normalisation of the curves; that keeps the search's directions apart.
     return DisplayModel(
-        curves, p[at : at + 9].reshape(3, 3), p[at + 9 : at + 12] ** 2, float(np.exp(p[at + 12])),
+        curves,
+        p[at : at + 9].reshape(3, 3),
+        p[at + 9 : at + 12] ** 2,
+        float(np.exp(p[at + 12])),
         float(p[at + 13]) if with_falloff else 0.0,
-    )  # fmt: skip
+    )

@@ -80,7 +80,9 @@ def calibrate_intrinsics(
         PoorFitError: The reprojection error is too large.
     """
     config = config or IntrinsicsConfig()
-    require_count(len(views), config.min_views, "pictures with the board", "take more, from all distances and angles")
+    require_count(
+        len(views), config.min_views, "pictures with the board", "take more, from all distances and angles"
+    )
     _require_coverage(_coverage(views, size), config)
     used = np.ones(len(views), np.bool_)
     for _ in range(3):  # a blurred picture spoils the median little; two rounds find them all
@@ -90,7 +92,9 @@ def calibrate_intrinsics(
         if keep.all():
             break
         used[np.flatnonzero(used)[~keep]] = False
-        require_count(int(used.sum()), config.min_views, "sharp pictures with the board", "hold board and camera still")
+        require_count(
+            int(used.sum()), config.min_views, "sharp pictures with the board", "hold board and camera still"
+        )
     _require_tilt(fit.rotations)
     if fit.rms_px > config.most_rms_px:
         raise PoorFitError(
@@ -129,15 +133,25 @@ def _fit(views: Sequence[Detection], size: tuple[int, int], model: Model) -> _Fi
     five = np.zeros(5)
     five[: min(5, distortion.size)] = distortion.ravel()[:5]
     if not (np.isfinite(matrix).all() and np.isfinite(five).all()):
-        raise DegenerateDataError("expected pictures that fix a camera, the fit diverged; tilt the board more")
-    predicted = [cv2.projectPoints(o, r, t, matrix, distortion)[0].reshape(-1, 2) for o, r, t in zip(objects, turns, moves, strict=True)]  # fmt: skip
+        raise DegenerateDataError(
+            "expected pictures that fix a camera, the fit diverged; tilt the board more"
+        )
+    predicted = [
+        cv2.projectPoints(o, r, t, matrix, distortion)[0].reshape(-1, 2)
+        for o, r, t in zip(objects, turns, moves, strict=True)
+    ]
     errors = np.concatenate([p - q for p, q in zip(pixels, predicted, strict=True)])
     rotations = np.stack([cv2.Rodrigues(turn)[0] for turn in turns])
     f = np.float64
     return _Fit(
-        np.asarray(matrix, f), five, float(rms), np.asarray(view_rms, f).ravel(), np.asarray(stddev, f).ravel()[:4],
-        rotations.astype(f), errors.astype(f),
-    )  # fmt: skip
+        np.asarray(matrix, f),
+        five,
+        float(rms),
+        np.asarray(view_rms, f).ravel(),
+        np.asarray(stddev, f).ravel()[:4],
+        rotations.astype(f),
+        errors.astype(f),
+    )
 
 
 def _coverage(views: Sequence[Detection], size: tuple[int, int]) -> NDArray[np.int64]:
@@ -162,9 +176,11 @@ def _require_coverage(coverage: NDArray[np.int64], config: IntrinsicsConfig) -> 
 def _where_empty(coverage: NDArray[np.int64]) -> str:
     rows, columns = coverage.shape
     sides = {
-        "at the left edge": coverage[:, : columns // 4], "at the right edge": coverage[:, -(columns // 4) :],
-        "at the top": coverage[: rows // 3], "at the bottom": coverage[-(rows // 3) :],
-    }  # fmt: skip
+        "at the left edge": coverage[:, : columns // 4],
+        "at the right edge": coverage[:, -(columns // 4) :],
+        "at the top": coverage[: rows // 3],
+        "at the bottom": coverage[-(rows // 3) :],
+    }
     return min(sides, key=lambda name: float((sides[name] > 0).mean()))
 
 
@@ -182,14 +198,26 @@ def _calibration(
     fit: _Fit, size: tuple[int, int], config: IntrinsicsConfig, coverage: NDArray[np.int64]
 ) -> LensCalibration:
     residuals = {
-        "rms_px": fit.rms_px, "worst_view_rms_px": float(fit.view_rms_px.max()), "coverage": float((coverage > 0).mean()),
-        "fx_stddev_px": float(fit.stddev[0]), "fy_stddev_px": float(fit.stddev[1]),
-        "cx_stddev_px": float(fit.stddev[2]), "cy_stddev_px": float(fit.stddev[3]),
-    }  # fmt: skip
+        "rms_px": fit.rms_px,
+        "worst_view_rms_px": float(fit.view_rms_px.max()),
+        "coverage": float((coverage > 0).mean()),
+        "fx_stddev_px": float(fit.stddev[0]),
+        "fy_stddev_px": float(fit.stddev[1]),
+        "cx_stddev_px": float(fit.stddev[2]),
+        "cy_stddev_px": float(fit.stddev[3]),
+    }
     matrix, d = fit.matrix, [float(v) for v in fit.distortion]
     return LensCalibration(
-        date=datetime.date.today(), method=f"ChArUco board, {config.model} distortion", views=len(fit.view_rms_px),
-        residuals={key: round(value, 6) for key, value in residuals.items()}, width=size[0], height=size[1],
-        fx=float(matrix[0, 0]), fy=float(matrix[1, 1]), cx=float(matrix[0, 2]), cy=float(matrix[1, 2]),
-        distortion=(d[0], d[1], d[2], d[3], d[4]), rms_px=round(fit.rms_px, 6),
-    )  # fmt: skip
+        date=datetime.date.today(),
+        method=f"ChArUco board, {config.model} distortion",
+        views=len(fit.view_rms_px),
+        residuals={key: round(value, 6) for key, value in residuals.items()},
+        width=size[0],
+        height=size[1],
+        fx=float(matrix[0, 0]),
+        fy=float(matrix[1, 1]),
+        cx=float(matrix[0, 2]),
+        cy=float(matrix[1, 2]),
+        distortion=(d[0], d[1], d[2], d[3], d[4]),
+        rms_px=round(fit.rms_px, 6),
+    )

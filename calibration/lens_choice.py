@@ -60,7 +60,12 @@ def intrinsics(camera: Any) -> tuple[Pinhole, Lens]:
     extra = [float(camera.params[index]) for index in camera.extra_params_idxs()]
     k1, k2, p1, p2 = (*extra, *[0.0] * (4 - len(extra)))
     pinhole = Pinhole(
-        int(camera.width), int(camera.height), fx, fy, float(camera.principal_point_x), float(camera.principal_point_y)
+        int(camera.width),
+        int(camera.height),
+        fx,
+        fy,
+        float(camera.principal_point_x),
+        float(camera.principal_point_y),
     )
     return pinhole, Lens((k1, k2, p1, p2, 0.0))
 
@@ -116,13 +121,20 @@ def choose_lenses(
         for number, choice in chosen.items():
             _set_model(reconstruction.cameras[number], choice.model)
         errors = _adjust(reconstruction, constant, scale_px, with_errors=True)
-        problems = {number: why for number in chosen if (why := _problem(reconstruction, number, errors.get(number)))}
+        problems = {
+            number: why for number in chosen if (why := _problem(reconstruction, number, errors.get(number)))
+        }
         if not problems:
-            chosen = {number: replace(each, focal_error_percent=errors.get(number)) for number, each in chosen.items()}
+            chosen = {
+                number: replace(each, focal_error_percent=errors.get(number))
+                for number, each in chosen.items()
+            }
             break
         distorted = [number for number in problems if chosen[number].model != "SIMPLE_PINHOLE"]
         for number in distorted:
-            chosen[number] = Choice("SIMPLE_PINHOLE", f"no distortion, because with it the {problems[number]}")
+            chosen[number] = Choice(
+                "SIMPLE_PINHOLE", f"no distortion, because with it the {problems[number]}"
+            )
         if distorted:
             continue
         # One at a time: without the worst, the others may do.
@@ -143,7 +155,9 @@ def choose_lenses(
 def _images_of(reconstruction: Any) -> dict[int, list[Any]]:
     """Images that have a pose, by camera, both in order of their numbers."""
     found: dict[int, list[Any]] = {}
-    for image in sorted((i for i in reconstruction.images.values() if i.has_pose), key=lambda image: image.image_id):
+    for image in sorted(
+        (i for i in reconstruction.images.values() if i.has_pose), key=lambda image: image.image_id
+    ):
         found.setdefault(int(image.camera_id), []).append(image)
     return dict(sorted(found.items()))
 
@@ -224,7 +238,9 @@ def _set_model(camera: Any, model: str) -> None:
     if camera.model_name == model:
         return
     pinhole, lens = intrinsics(camera)
-    new = pycolmap.Camera.create_from_model_name(camera.camera_id, model, pinhole.fx, pinhole.width, pinhole.height)
+    new = pycolmap.Camera.create_from_model_name(
+        camera.camera_id, model, pinhole.fx, pinhole.width, pinhole.height
+    )
     params = np.array(new.params)
     params[new.focal_length_idxs()] = [pinhole.fx, pinhole.fy][: len(new.focal_length_idxs())]
     params[new.principal_point_idxs()] = [pinhole.cx, pinhole.cy]

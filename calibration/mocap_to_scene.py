@@ -64,20 +64,29 @@ class SceneFit:
         """Make the calibration."""
         a = self.alignment
         residuals = {
-            "rms_position_m": a.rms_position_m, "rms_rotation_rad": a.rms_rotation_rad, "outliers": float((~a.inliers).sum()),
-            "held_out_median_m": float(np.median(self.held_out_m)), "held_out_worst_m": float(self.held_out_m.max()),
-            "held_out_median_rad": float(np.median(self.held_out_rad)), "extent_m": a.extent_m,
-        }  # fmt: skip
+            "rms_position_m": a.rms_position_m,
+            "rms_rotation_rad": a.rms_rotation_rad,
+            "outliers": float((~a.inliers).sum()),
+            "held_out_median_m": float(np.median(self.held_out_m)),
+            "held_out_worst_m": float(self.held_out_m.max()),
+            "held_out_median_rad": float(np.median(self.held_out_rad)),
+            "extent_m": a.extent_m,
+        }
         return SceneCalibration(
-            date=datetime.date.today(), method="similarity of camera poses (Umeyama with consensus), judged on cameras left out in turn",
-            views=int(a.inliers.sum()), residuals={key: round(value, 6) for key, value in residuals.items()},
-            scale=float(a.similarity.scale), T_world_from_scene=rows_of(a.similarity.T_target_from_source),
-        )  # fmt: skip
+            date=datetime.date.today(),
+            method="similarity of camera poses (Umeyama with consensus), judged on cameras left out in turn",
+            views=int(a.inliers.sum()),
+            residuals={key: round(value, 6) for key, value in residuals.items()},
+            scale=float(a.similarity.scale),
+            T_world_from_scene=rows_of(a.similarity.T_target_from_source),
+        )
 
 
 def place_scene(
-    T_scene_from_camera: Mapping[str, Array], T_world_from_camera: Mapping[str, Array], config: SceneConfig | None = None
-) -> SceneFit:  # fmt: skip
+    T_scene_from_camera: Mapping[str, Array],
+    T_world_from_camera: Mapping[str, Array],
+    config: SceneConfig | None = None,
+) -> SceneFit:
     """Find the similarity from a scene to the motion-capture world.
 
     Args:
@@ -91,15 +100,15 @@ def place_scene(
     """
     config = config or SceneConfig()
     names = tuple(name for name in T_scene_from_camera if name in T_world_from_camera)
-    cure = (
-        "the images of both must have the same file names; take more frames of the car into the scene's reconstruction"
-    )
+    cure = "the images of both must have the same file names; take more frames of the car into the scene's reconstruction"
     require_count(len(names), config.min_cameras, "cameras with a pose in both worlds", cure)
     source = np.stack([np.asarray(T_scene_from_camera[name], np.float64) for name in names])
     target = np.stack([np.asarray(T_world_from_camera[name], np.float64) for name in names])
     alignment = _align(source, target, config, config.min_share)
     inside = np.flatnonzero(alignment.inliers)
-    require_count(len(inside), config.min_cameras, "cameras that agree", "take more frames on curves of the drive")
+    require_count(
+        len(inside), config.min_cameras, "cameras that agree", "take more frames on curves of the drive"
+    )
     far, angle = _held_out(source[inside], target[inside], config)
     if float(np.median(far)) > config.most_held_out_m:
         raise PoorFitError(

@@ -49,9 +49,14 @@ class MountProblem:
     """The whitened reprojection error of all corners as a function of X, and of Y where it is not known."""
 
     def __init__(
-        self, T_base_from_car: Array, found: Sequence[Detection], matrix: Array, distortion: Array, known: Array | None,
+        self,
+        T_base_from_car: Array,
+        found: Sequence[Detection],
+        matrix: Array,
+        distortion: Array,
+        known: Array | None,
         config: MountConfig,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self._T_base_from_car, self._found = T_base_from_car, found
         self._matrix, self._distortion, self._known, self._config = matrix, distortion, known, config
 
@@ -63,7 +68,9 @@ class MountProblem:
         def residuals(p: Array) -> Array:
             A, B = self._moved(X, Y, p)
             each = (self._errors(A, B, row).ravel() for row in rows)
-            return np.concatenate([solve_triangular(f, e, lower=True) for f, e in zip(factors, each, strict=True)])
+            return np.concatenate(
+                [solve_triangular(f, e, lower=True) for f, e in zip(factors, each, strict=True)]
+            )
 
         size = 6 if self._known is not None else 12
         found = least_squares(residuals, np.zeros(size), x_scale="jac")
@@ -76,7 +83,9 @@ class MountProblem:
     def view_rms(self, X: Array, Y: Array) -> Array:
         """Reprojection error of each view ``[N]`` [px]."""
         count = len(self._found)
-        return np.array([np.sqrt(np.mean(np.sum(self._errors(X, Y, row) ** 2, axis=1))) for row in range(count)])
+        return np.array(
+            [np.sqrt(np.mean(np.sum(self._errors(X, Y, row) ** 2, axis=1))) for row in range(count)]
+        )
 
     def _factor(self, X: Array, Y: Array, row: int) -> Array:
         """Lower Cholesky factor of the covariance of a view's corners ``[2n, 2n]``: their own noise and that of both bodies' poses."""

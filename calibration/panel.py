@@ -89,7 +89,9 @@ def require_fits(attack: AttackFile, panel: Panel, target: TargetCalibration) ->
     face = attack.face
     if face is None or face.subject != target.subject:
         what = f"for {face.subject}" if face is not None else "without a face"
-        raise CalibrationError(f"attack {attack.attack_id} is {what}, but this is {target.subject}: search one for it")
+        raise CalibrationError(
+            f"attack {attack.attack_id} is {what}, but this is {target.subject}: search one for it"
+        )
     if max(face.size_m) > panel.square_m * (1.0 + _FIT_TOLERANCE):
         raise CalibrationError(
             f"attack {attack.attack_id} is {face.size_m[0]:.3f} x {face.size_m[1]:.3f} m, more than the {panel.square_m:.3f} m of "

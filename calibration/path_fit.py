@@ -141,7 +141,9 @@ def _returns(points: Array, closing_m: float) -> list[int]:
         if not beyond.size:
             return back
         index += max(int(beyond[0]), left)
-        near = np.flatnonzero((away[index:] < closing_m) & (np.abs(wrap_angle(heading[index:] - heading[0])) < 0.8))
+        near = np.flatnonzero(
+            (away[index:] < closing_m) & (np.abs(wrap_angle(heading[index:] - heading[0])) < 0.8)
+        )
         if not near.size:
             return back
         first = index + int(near[0])
@@ -182,7 +184,10 @@ def _cut(heading: Array) -> list[int]:
     """Indices between which the heading is straight, first 0 and last N, by dynamic programming."""
     count, least = len(heading), round(_SHORTEST_PIECE_M / _STEP_M)
     s = np.arange(count + 1, dtype=np.float64)
-    sums = [np.concatenate([[0.0], np.cumsum(v)]) for v in (s[:-1], s[:-1] ** 2, heading, heading**2, s[:-1] * heading)]
+    sums = [
+        np.concatenate([[0.0], np.cumsum(v)])
+        for v in (s[:-1], s[:-1] ** 2, heading, heading**2, s[:-1] * heading)
+    ]
     best, back = np.full(count + 1, np.inf), np.zeros(count + 1, dtype=np.intp)
     best[0] = -_CUT_PRICE_RAD2
     for end in range(least, count + 1):
@@ -236,15 +241,21 @@ def _refined(start: Array, pieces: list[tuple[float, float]], points: Array, clo
         path = _path(pose, lengths, curvatures, closed=False)
         cte = path.project(chosen).cte_m
         # An end that slides along its own line or arc changes no distance: it is held at the trace's end instead.
-        ends = [] if closed else [path.pose_at(0.0)[:2] - chosen[0], path.pose_at(path.length_m)[:2] - chosen[-1]]
+        ends = (
+            []
+            if closed
+            else [path.pose_at(0.0)[:2] - chosen[0], path.pose_at(path.length_m)[:2] - chosen[-1]]
+        )
         closing = _CLOSING_WEIGHT * gap(p) if closed else 0.3 * np.concatenate(ends)
         return np.concatenate([cte, closing])
 
-    first = np.concatenate([
-        start, np.log([length for length, _ in pieces]), np.log(np.abs([pieces[k][1] for k in arcs]))
-    ])  # fmt: skip
+    first = np.concatenate(
+        [start, np.log([length for length, _ in pieces]), np.log(np.abs([pieces[k][1] for k in arcs]))]
+    )
     # Wide, but a search that runs away must not overflow.
-    reach = np.concatenate([np.full(3, 1e3), np.full(len(pieces), np.log(300.0)), np.full(len(arcs), np.log(50.0))])
+    reach = np.concatenate(
+        [np.full(3, 1e3), np.full(len(pieces), np.log(300.0)), np.full(len(arcs), np.log(50.0))]
+    )
     first = np.clip(first, -0.99 * reach, 0.99 * reach)
     p = least_squares(residual, first, x_scale="jac", max_nfev=100, bounds=(-reach, reach)).x
     if closed:

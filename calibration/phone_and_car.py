@@ -55,7 +55,12 @@ class Placed:
         """Facts for the report."""
         a = self.alignment
         frames = [
-            {"image": name, "used": bool(used), "position_error_m": float(far), "rotation_error_rad": float(angle)}
+            {
+                "image": name,
+                "used": bool(used),
+                "position_error_m": float(far),
+                "rotation_error_rad": float(angle),
+            }
             for name, used, far, angle in zip(
                 self.shared, a.inliers, a.position_error_m, a.rotation_error_rad, strict=True
             )
@@ -87,9 +92,14 @@ def place_in_mocap(
     alignment = align_poses(
         np.stack([image.T_world_from_camera for image in shared]),
         np.stack([T_world_from_camera[image.name] for image in shared]),
-        config.position_tolerance_m, config.rotation_tolerance_rad, config.min_share,
-    )  # fmt: skip
+        config.position_tolerance_m,
+        config.rotation_tolerance_rad,
+        config.min_share,
+    )
     similarity = alignment.similarity
     return Placed(
-        similarity.poses(model.poses), similarity.points(model.points), alignment, tuple(image.name for image in shared)
+        similarity.poses(model.poses),
+        similarity.points(model.points),
+        alignment,
+        tuple(image.name for image in shared),
     )

@@ -120,10 +120,18 @@ class FoundCamera:
         """The camera as the report of an import lists it."""
         p = self.pinhole
         return {
-            "model": self.model, "why": self.why, "registered": self.images, "width": p.width, "height": p.height,
-            "fl_x": p.fx, "fl_y": p.fy, "cx": p.cx, "cy": p.cy, "distortion": list(self.lens.coefficients),
+            "model": self.model,
+            "why": self.why,
+            "registered": self.images,
+            "width": p.width,
+            "height": p.height,
+            "fl_x": p.fx,
+            "fl_y": p.fy,
+            "cx": p.cx,
+            "cy": p.cy,
+            "distortion": list(self.lens.coefficients),
             "focal_error_percent": self.focal_error_percent,
-        }  # fmt: skip
+        }
 
 
 @dataclass(frozen=True)
@@ -172,7 +180,10 @@ class Model:
     def summary(self) -> dict[str, Any]:
         """The model as the report of an import lists it."""
         return {
-            "registered": len(self.images), "left_out": [asdict(image) for image in self.left_out],
-            "points": len(self.points), "reprojection_error_px": self.reprojection_error_px, "parts": self.parts,
+            "registered": len(self.images),
+            "left_out": [asdict(image) for image in self.left_out],
+            "points": len(self.points),
+            "reprojection_error_px": self.reprojection_error_px,
+            "parts": self.parts,
             "cameras": {camera.camera_id: camera.summary() for camera in self.cameras},
-        }  # fmt: skip
+        }

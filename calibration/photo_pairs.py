@@ -25,7 +25,11 @@ def every_pair(count: int) -> list[tuple[int, int]]:
 
 
 def chosen_pairs(
-    descriptors: Sequence[Descriptors], sequences: Sequence[Sequence[int]], overlap: int, look_alikes: int, seed: int
+    descriptors: Sequence[Descriptors],
+    sequences: Sequence[Sequence[int]],
+    overlap: int,
+    look_alikes: int,
+    seed: int,
 ) -> list[tuple[int, int]]:
     """Neighbours in time, at growing distances too, and for every image those that look most like it.
 

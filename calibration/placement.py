@@ -51,11 +51,19 @@ class Misplacement:
             ("left / right", 100 * self.right_m, "cm", ("left", "right")),
             ("height", 100 * self.up_m, "cm", ("down", "up")),
             ("distance", 100 * self.near_m, "cm", ("away from you", "towards you")),
-            ("turn", np.rad2deg(self.turned_rad), "deg", ("clockwise from above", "counter-clockwise from above")),
+            (
+                "turn",
+                np.rad2deg(self.turned_rad),
+                "deg",
+                ("clockwise from above", "counter-clockwise from above"),
+            ),
             ("tilt", np.rad2deg(self.tilted_rad), "deg", ("top towards you", "top away from you")),
             ("roll", np.rad2deg(self.rolled_rad), "deg", ("counter-clockwise", "clockwise")),
         )
-        return [(name, f"{abs(off):.1f} {unit} {less if off > 0 else more}") for name, off, unit, (less, more) in ways]
+        return [
+            (name, f"{abs(off):.1f} {unit} {less if off > 0 else more}")
+            for name, off, unit, (less, more) in ways
+        ]
 
 
 def face_frame(corners_m: Array) -> Array:
@@ -88,10 +96,13 @@ def misplacement(attack: AttackFile, target: TargetCalibration, T_world_from_sub
     off = invert_transform(np.asarray(attack.face_object.T_world_from_object)) @ now
     x_axis, z_axis = off[:3, 0], off[:3, 2]
     return Misplacement(
-        right_m=float(off[1, 3]), up_m=float(off[2, 3]), near_m=float(off[0, 3]),
-        turned_rad=float(np.arctan2(x_axis[1], x_axis[0])), tilted_rad=float(np.arctan2(-z_axis[0], z_axis[2])),
+        right_m=float(off[1, 3]),
+        up_m=float(off[2, 3]),
+        near_m=float(off[0, 3]),
+        turned_rad=float(np.arctan2(x_axis[1], x_axis[0])),
+        tilted_rad=float(np.arctan2(-z_axis[0], z_axis[2])),
         rolled_rad=float(np.arctan2(z_axis[1], z_axis[2])),
-    )  # fmt: skip
+    )
 
 
 def measured_pose(target: TargetCalibration, T_world_from_subject: Array) -> dict[str, float]:

@@ -40,7 +40,9 @@ def fence_from_trace(trace: ArrayLike, margin_m: float) -> tuple[tuple[float, fl
     canvas, origin = _canvas(xy, 0.2)
     pixels = _to_pixels(xy, origin)
     cv2.fillPoly(canvas, [pixels], 1)
-    inside = cv2.distanceTransform(np.pad(canvas, 1), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[1:-1, 1:-1] * _CELL_M
+    inside = (
+        cv2.distanceTransform(np.pad(canvas, 1), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[1:-1, 1:-1] * _CELL_M
+    )
     return _outline((inside > margin_m).astype(np.uint8), origin, f"inside of a margin of {margin_m:g} m")
 
 
@@ -75,7 +77,9 @@ def start_before_corner(path: Path, corner: int, before_m: float) -> tuple[float
     starts = np.concatenate([[0.0], np.cumsum([piece.length_m for piece in path.segments])])
     corners = [float(s) for s, piece in zip(starts, path.segments, strict=False) if isinstance(piece, Arc)]
     if not 1 <= corner <= len(corners):
-        raise DegenerateDataError(f"expected a corner from 1 to {len(corners)}, the arcs of the path, got {corner}")
+        raise DegenerateDataError(
+            f"expected a corner from 1 to {len(corners)}, the arcs of the path, got {corner}"
+        )
     s = corners[corner - 1] - before_m
     if not path.closed and s < 0.0:
         raise DegenerateDataError(
@@ -86,7 +90,11 @@ def start_before_corner(path: Path, corner: int, before_m: float) -> tuple[float
 
 
 def target_of_size(
-    subject: str, size_m: tuple[float, float], centre_m: tuple[float, float, float], normal_yaw_rad: float, method: str
+    subject: str,
+    size_m: tuple[float, float],
+    centre_m: tuple[float, float, float],
+    normal_yaw_rad: float,
+    method: str,
 ) -> TargetCalibration:
     """An upright rectangle in its subject's frame, from a ruler.
 
@@ -104,7 +112,8 @@ def target_of_size(
     up = np.array([0.0, 0.0, 1.0])
     half_w, half_h = 0.5 * size_m[0], 0.5 * size_m[1]
     corners = [
-        np.asarray(centre_m) + x * half_w * right + z * half_h * up for x, z in ((-1, 1), (1, 1), (1, -1), (-1, -1))
+        np.asarray(centre_m) + x * half_w * right + z * half_h * up
+        for x, z in ((-1, 1), (1, 1), (1, -1), (-1, -1))
     ]
     return _target(subject, np.array(corners), method, None, {})
 
@@ -123,7 +132,10 @@ class Touches:
 
 
 def find_touches(
-    stamps_ns: NDArray[np.int64], T_world_from_wand: Array, T_world_from_subject: Array, tip_in_wand_m: ArrayLike
+    stamps_ns: NDArray[np.int64],
+    T_world_from_wand: Array,
+    T_world_from_subject: Array,
+    tip_in_wand_m: ArrayLike,
 ) -> Touches:
     """Moments at which the wand's tip rested, in the subject's frame.
 
@@ -134,14 +146,19 @@ def find_touches(
         tip_in_wand_m: Where the wand touches, in its own frame ``[3]`` [m].
     """
     tip = np.asarray(tip_in_wand_m, dtype=np.float64)
-    tips = np.stack([
-        transform_points(invert_transform(subject) @ wand, tip)
-        for wand, subject in zip(T_world_from_wand, T_world_from_subject, strict=True)
-    ])  # fmt: skip
+    tips = np.stack(
+        [
+            transform_points(invert_transform(subject) @ wand, tip)
+            for wand, subject in zip(T_world_from_wand, T_world_from_subject, strict=True)
+        ]
+    )
     seconds = (stamps_ns - stamps_ns[0]) / 1e9
     points, spreads, begin = [], [], 0
     for index in range(1, len(tips) + 1):
-        moved = index == len(tips) or np.linalg.norm(tips[index] - np.median(tips[begin:index], axis=0)) > _STILL_M
+        moved = (
+            index == len(tips)
+            or np.linalg.norm(tips[index] - np.median(tips[begin:index], axis=0)) > _STILL_M
+        )
         if not moved:
             continue
         if seconds[index - 1] - seconds[begin] >= _STILL_S:
@@ -198,16 +215,22 @@ def _target(
     rows = tuple(tuple(round(float(v), 5) for v in corner) for corner in corners)
     return TargetCalibration.model_validate(
         {
-            "date": datetime.date.today(), "method": method, "subject": subject, "corners_in_subject_m": rows,
-            "views": views, "residuals": residuals,
+            "date": datetime.date.today(),
+            "method": method,
+            "subject": subject,
+            "corners_in_subject_m": rows,
+            "views": views,
+            "residuals": residuals,
         }
-    )  # fmt: skip
+    )
 
 
 def _finite(trace: ArrayLike) -> Array:
     xy = np.asarray(trace, dtype=np.float64)
     if xy.ndim != 2 or xy.shape[1] != 2 or len(xy) < 3 or not np.isfinite(xy).all():
-        raise DegenerateDataError(f"expected a trace of finite positions [N >= 3, 2], got shape {list(xy.shape)}")
+        raise DegenerateDataError(
+            f"expected a trace of finite positions [N >= 3, 2], got shape {list(xy.shape)}"
+        )
     return xy
 
 

@@ -60,7 +60,9 @@ def require_rigid(rows: tuple[Row4, ...]) -> tuple[Row4, ...]:
     R = T[:3, :3]
     error = max(np.abs(R @ R.T - np.eye(3)).max(), np.abs(T[3] - [0.0, 0.0, 0.0, 1.0]).max())
     if error > _RIGID_TOLERANCE or np.linalg.det(R) < 0.0:
-        raise ValueError(f"expected a rotation and a translation with last row 0 0 0 1, is off by {error:.1e}")
+        raise ValueError(
+            f"expected a rotation and a translation with last row 0 0 0 1, is off by {error:.1e}"
+        )
     return rows
 
 
@@ -163,7 +165,9 @@ class ResponseSection(BaseModel):
             "lag_s": round(self.steering_lag_s, 4),
         }
         return (
-            found if self.steering_slew_radps is None else {**found, "slew_radps": round(self.steering_slew_radps, 3)}
+            found
+            if self.steering_slew_radps is None
+            else {**found, "slew_radps": round(self.steering_slew_radps, 3)}
         )
 
 
@@ -223,7 +227,9 @@ class TargetCalibration(Calibration):
             raise ValueError("expected four corners that span a face, got a line or a point")
         off = float(abs((points[2] - points[0]) @ normal) / area)
         if off > _PLANAR_TOLERANCE_M:
-            raise ValueError(f"expected four corners in one plane, the third is {off * 1000:.1f} mm off: measure again")
+            raise ValueError(
+                f"expected four corners in one plane, the third is {off * 1000:.1f} mm off: measure again"
+            )
         return corners
 
     @property
@@ -285,7 +291,9 @@ def load_calibration(model: type[C], path: Path | str) -> C:
         first = error.errors(include_url=False)[0]
         key = ".".join(map(str, first["loc"])) or "the whole file"
         known = f"; known keys: {', '.join(model.model_fields)}" if first["type"] == "extra_forbidden" else ""
-        raise CalibrationError(f"{path}: {key}: {first['msg'].removeprefix('Value error, ')}{known}") from None
+        raise CalibrationError(
+            f"{path}: {key}: {first['msg'].removeprefix('Value error, ')}{known}"
+        ) from None
 
 
 def save_calibration(calibration: Calibration, path: Path | str) -> None:

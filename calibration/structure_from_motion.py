@@ -33,7 +33,11 @@ __all__ = [
 
 
 def reconstruct(
-    root: Path, sources: Sequence[Source], work: Path, config: SfmConfig | None = None, report: Report | None = None
+    root: Path,
+    sources: Sequence[Source],
+    work: Path,
+    config: SfmConfig | None = None,
+    report: Report | None = None,
 ) -> Model:
     """Reconstruct a model from photographs.
 
@@ -59,9 +63,12 @@ def reconstruct(
     log.parent.mkdir(parents=True, exist_ok=True)
     with log.open("wb") as stream:
         process = subprocess.Popen(
-            [sys.executable, "-m", "calibration.colmap_process", str(os.getpid())], stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE, stderr=stream, start_new_session=True,
-        )  # fmt: skip
+            [sys.executable, "-m", "calibration.colmap_process", str(os.getpid())],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=stream,
+            start_new_session=True,
+        )
         try:
             model = _converse(process, pack_job(root.absolute(), sources, work.absolute(), config), report)
         finally:

@@ -95,12 +95,19 @@ class OffsetFit:
     @property
     def calibration(self) -> TimeOffsetCalibration:
         """Make the calibration."""
-        residuals = {"rms_rad": self.rms_rad, "correlation": float(self.correlation.max()), "scale": self.scale}
+        residuals = {
+            "rms_rad": self.rms_rad,
+            "correlation": float(self.correlation.max()),
+            "scale": self.scale,
+        }
         return TimeOffsetCalibration(
-            date=datetime.date.today(), method="image yaw by tracked corners against motion-capture yaw, correlation peak refined by least squares",
-            views=len(self.turns.yaw_rad), residuals={key: round(value, 6) for key, value in residuals.items()},
-            camera_minus_mocap_s=round(self.camera_minus_mocap_s, 6), stddev_s=round(self.stddev_s, 6),
-        )  # fmt: skip
+            date=datetime.date.today(),
+            method="image yaw by tracked corners against motion-capture yaw, correlation peak refined by least squares",
+            views=len(self.turns.yaw_rad),
+            residuals={key: round(value, 6) for key, value in residuals.items()},
+            camera_minus_mocap_s=round(self.camera_minus_mocap_s, 6),
+            stddev_s=round(self.stddev_s, 6),
+        )
 
 
 def image_turns(frames: Iterable[tuple[float, NDArray[np.uint8]]], camera: CameraCalibration) -> Turns:
@@ -114,7 +121,8 @@ def image_turns(frames: Iterable[tuple[float, NDArray[np.uint8]]], camera: Camer
     rows = []
     for stamp, image in frames:
         grey = np.asarray(
-            image if image.ndim == 2 else cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY), np.uint8
+            image if image.ndim == 2 else cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY),
+            np.uint8,
         )
         if grey.shape != (camera.height, camera.width):
             raise DegenerateDataError(
@@ -158,13 +166,17 @@ def fit_offset(turns: Turns, pose_s: Array, yaw_rad: Array, config: OffsetConfig
     yaw = CubicSpline(pose_s, _smoothed(pose_s, yaw_rad))
     count = round(config.largest_s / config.step_s)
     shifts: Array = config.step_s * np.arange(-count, count + 1, dtype=np.float64)
-    correlation = np.array([_correlation(turns.yaw_rad, _car_turns(yaw, turns, float(shift))) for shift in shifts])
+    correlation = np.array(
+        [_correlation(turns.yaw_rad, _car_turns(yaw, turns, float(shift))) for shift in shifts]
+    )
     peak = _peak(shifts, correlation, config)
 
     def residuals(p: Array) -> Array:
         return p[1] * _car_turns(yaw, turns, float(p[0])) + p[2] - turns.yaw_rad
 
-    found = least_squares(residuals, [peak, 1.0, 0.0], loss="soft_l1", f_scale=0.003, x_scale=[0.01, 1.0, 0.01])
+    found = least_squares(
+        residuals, [peak, 1.0, 0.0], loss="soft_l1", f_scale=0.003, x_scale=[0.01, 1.0, 0.01]
+    )
     left = residuals(found.x)
     covariance = np.linalg.pinv(found.jac.T @ found.jac) * 2.0 * found.cost / max(len(left) - 3, 1)
     stddev = float(np.sqrt(covariance[0, 0]))
@@ -190,7 +202,11 @@ def _turn(first: NDArray[np.uint8], second: NDArray[np.uint8], camera: CameraCal
     back, ok_back, _ = cv2.calcOpticalFlowPyrLK(
         second, first, moved, np.zeros_like(corners), winSize=(15, 15), maxLevel=4
     )
-    kept = (ok.ravel() > 0) & (ok_back.ravel() > 0) & (np.linalg.norm((back - corners).reshape(-1, 2), axis=1) < 0.5)
+    kept = (
+        (ok.ravel() > 0)
+        & (ok_back.ravel() > 0)
+        & (np.linalg.norm((back - corners).reshape(-1, 2), axis=1) < 0.5)
+    )
     if kept.sum() < _LEAST_TRACKED:
         return None
     a, b = (_directions(points.reshape(-1, 2)[kept] + 0.5, camera) for points in (corners, moved))
@@ -269,7 +285,9 @@ def _peak(shifts: Array, correlation: Array, config: OffsetConfig) -> float:
         )
     inner = correlation[1:-1]
     tops = np.flatnonzero((inner >= correlation[:-2]) & (inner > correlation[2:])) + 1
-    second = max((float(correlation[top]) for top in tops if abs(top - best) * config.step_s > 0.05), default=-1.0)
+    second = max(
+        (float(correlation[top]) for top in tops if abs(top - best) * config.step_s > 0.05), default=-1.0
+    )
     if second > config.most_second_peak * correlation[best]:
         raise DegenerateDataError(
             f"expected one offset that fits, got two peaks of the correlation ({correlation[best]:.3f} and {second:.3f}): turn the car "

@@ -180,11 +180,19 @@ def fit_gains(drive: Drive, wheelbase_m: float, config: GainsConfig | None = Non
     # Near the middle of the data the line is known best; the offset's error is that of the line at angle zero.
     offset_sd = line_stddev(servo, steering, slope, at_zero, offset) * abs(gain)
     speed_gain, speed_offset, speed_sd = _speed_line(speed, erpm)
-    stddev = {
-        "servo_per_rad": slope_sd * gain**2, "servo_offset": offset_sd, "erpm_per_mps": speed_sd,
-    }  # fmt: skip
+    stddev = {"servo_per_rad": slope_sd * gain**2, "servo_offset": offset_sd, "erpm_per_mps": speed_sd}
     fit = GainsFit(
-        tuple(segments), wheelbase_m, gain, offset, speed_gain, speed_offset, ahead, turned, speed, steering, stddev
+        tuple(segments),
+        wheelbase_m,
+        gain,
+        offset,
+        speed_gain,
+        speed_offset,
+        ahead,
+        turned,
+        speed,
+        steering,
+        stddev,
     )
     _require_lines(fit, config)
     return fit
@@ -225,7 +233,9 @@ def twist(time_s: Array, poses: Array) -> tuple[float, float, float]:
     # x' = vx cos - vy sin, y' = vx sin + vy cos in the frame of the yaw at the middle.
     c, s = np.cos(yaw), np.sin(yaw)
     along, across = c * poses[:, 0] + s * poses[:, 1], c * poses[:, 1] - s * poses[:, 0]
-    rows = np.concatenate([np.stack([sine, -cosine, one, zero], axis=1), np.stack([cosine, sine, zero, one], axis=1)])
+    rows = np.concatenate(
+        [np.stack([sine, -cosine, one, zero], axis=1), np.stack([cosine, sine, zero, one], axis=1)]
+    )
     (vx, vy, _, _), _ = linear_fit(rows, np.concatenate([along, across]))
     return vx, vy, w
 
@@ -245,7 +255,9 @@ def _constant_stretches(drive: Drive, config: GainsConfig) -> list[tuple[float, 
         if np.isfinite(erpm[first]) and row - first > 1:
             run = slice(first, row)
             end = when[min(row, len(when) - 1)]
-            stretches.append((float(when[first]), float(end), float(servo[run].mean()), float(erpm[run].mean())))
+            stretches.append(
+                (float(when[first]), float(end), float(servo[run].mean()), float(erpm[run].mean()))
+            )
         first = row
     return stretches
 
@@ -253,16 +265,19 @@ def _constant_stretches(drive: Drive, config: GainsConfig) -> list[tuple[float, 
 def _require_variety(segments: list[Segment], config: GainsConfig) -> None:
     cure = f"hold each command for {config.settle_s + config.least_s:.1f} s or more: circles to both sides, straight runs, two speeds"
     require_count(len(segments), 6, "stretches with constant commands", cure)
-    curvature = np.array([s.yaw_rate_radps / np.hypot(s.vx_mps, s.vy_mps) * np.sign(s.vx_mps) for s in segments])
+    curvature = np.array(
+        [s.yaw_rate_radps / np.hypot(s.vx_mps, s.vy_mps) * np.sign(s.vx_mps) for s in segments]
+    )
     tight = config.least_curvature_1pm
     missing = [
         name
         for name, there in (
-            ("left circle", (curvature > tight).any()), ("right circle", (curvature < -tight).any()),
+            ("left circle", (curvature > tight).any()),
+            ("right circle", (curvature < -tight).any()),
             ("straight run", (np.abs(curvature) < config.straight_1pm).any()),
         )
         if not there
-    ]  # fmt: skip
+    ]
     if missing:
         raise DegenerateDataError(
             f"expected left circles, right circles and straight runs, got no {', no '.join(missing)} among {len(segments)} stretches "
@@ -282,7 +297,9 @@ def _speed_line(speed: Array, erpm: Array) -> tuple[float, float, float]:
         (slope,), (slope_sd,) = linear_fit(erpm[:, None], speed)
         at_zero = 0.0
     if abs(slope) < 1e-6:
-        raise PoorFitError("expected the speed to follow the command, got none; is the motor on, the car on the floor?")
+        raise PoorFitError(
+            "expected the speed to follow the command, got none; is the motor on, the car on the floor?"
+        )
     return 1.0 / slope, -at_zero / slope, slope_sd / slope**2
 
 

@@ -85,10 +85,13 @@ class ResponseFit:
         """Convert to the entry of the vehicle file."""
         slew = self.steering.slew
         return ResponseSection(
-            pipeline_delay_s=round(self.pipeline_s, 5), steering_delay_s=round(self.steering.delay_s, 5),
-            steering_lag_s=round(self.steering.lag_s, 5), steering_slew_radps=None if slew is None else round(slew, 4),
-            speed_delay_s=round(self.speed.delay_s, 5), speed_lag_s=round(self.speed.lag_s, 5),
-        )  # fmt: skip
+            pipeline_delay_s=round(self.pipeline_s, 5),
+            steering_delay_s=round(self.steering.delay_s, 5),
+            steering_lag_s=round(self.steering.lag_s, 5),
+            steering_slew_radps=None if slew is None else round(slew, 4),
+            speed_delay_s=round(self.speed.delay_s, 5),
+            speed_lag_s=round(self.speed.lag_s, 5),
+        )
 
 
 def fit_response(drive: Drive, gains: GainsFit, config: ResponseConfig | None = None) -> ResponseFit:
@@ -117,9 +120,10 @@ def fit_response(drive: Drive, gains: GainsFit, config: ResponseConfig | None = 
         return _integral(follow(drive.command_s + delay, speed, grid, lag, slew))
 
     return ResponseFit(
-        _fit(grid, yaw, turned, kept, True, "steering", config), _fit(grid, travelled, moved, kept, False, "speed", config),
+        _fit(grid, yaw, turned, kept, True, "steering", config),
+        _fit(grid, travelled, moved, kept, False, "speed", config),
         float(np.nanmedian(drive.pipeline_s)) if np.isfinite(drive.pipeline_s).any() else 0.0,
-    )  # fmt: skip
+    )
 
 
 def follow(command_s: Array, target: Array, at_s: Array, lag_s: float, slew: float = np.inf) -> Array:
@@ -142,10 +146,14 @@ def follow(command_s: Array, target: Array, at_s: Array, lag_s: float, slew: flo
         if k + 1 < len(target):
             value = float(_after(value, target[k], command_s[k + 1] - command_s[k], lag_s, slew))
     row = np.maximum(np.searchsorted(command_s, at_s, side="right") - 1, 0)
-    return np.asarray(_after(at_command[row], target[row], np.maximum(at_s - command_s[row], 0.0), lag_s, slew))
+    return np.asarray(
+        _after(at_command[row], target[row], np.maximum(at_s - command_s[row], 0.0), lag_s, slew)
+    )
 
 
-def _after(value: Array | float, target: Array | float, dt_s: Array | float, lag_s: float, slew: float) -> Array:
+def _after(
+    value: Array | float, target: Array | float, dt_s: Array | float, lag_s: float, slew: float
+) -> Array:
     """Closed form for a constant command: the limit until the error is ``slew * lag``, then an exponential."""
     error = np.subtract(target, value)
     size = np.abs(error)
@@ -154,27 +162,41 @@ def _after(value: Array | float, target: Array | float, dt_s: Array | float, lag
     return np.asarray(target - np.sign(error) * left)
 
 
-def vehicle_calibration(gains: GainsFit, response: ResponseFit, before: VehicleCalibration) -> VehicleCalibration:
+def vehicle_calibration(
+    gains: GainsFit, response: ResponseFit, before: VehicleCalibration
+) -> VehicleCalibration:
     """Make the vehicle calibration, with servo range and limits of the given file."""
     g, steering, speed = before.gains, response.steering, response.speed
     residuals = {
-        "steering_rms_rad": gains.steering_rms_rad, "speed_rms_mps": gains.speed_rms_mps,
-        "servo_per_rad_stddev": gains.stddev["servo_per_rad"], "servo_offset_stddev": gains.stddev["servo_offset"],
-        "erpm_per_mps_stddev": gains.stddev["erpm_per_mps"], "origin_ahead_of_axle_m": gains.origin_ahead_m,
-        "axis_turned_rad": gains.axis_turned_rad, "steering_delay_stddev_s": steering.delay_stddev_s,
-        "steering_lag_stddev_s": steering.lag_stddev_s, "steering_unexplained": steering.unexplained,
+        "steering_rms_rad": gains.steering_rms_rad,
+        "speed_rms_mps": gains.speed_rms_mps,
+        "servo_per_rad_stddev": gains.stddev["servo_per_rad"],
+        "servo_offset_stddev": gains.stddev["servo_offset"],
+        "erpm_per_mps_stddev": gains.stddev["erpm_per_mps"],
+        "origin_ahead_of_axle_m": gains.origin_ahead_m,
+        "axis_turned_rad": gains.axis_turned_rad,
+        "steering_delay_stddev_s": steering.delay_stddev_s,
+        "steering_lag_stddev_s": steering.lag_stddev_s,
+        "steering_unexplained": steering.unexplained,
         "speed_unexplained": speed.unexplained,
-    }  # fmt: skip
+    }
     return VehicleCalibration(
-        date=datetime.date.today(), views=len(gains.segments), wheelbase_m=gains.wheelbase_m, limits=before.limits,
+        date=datetime.date.today(),
+        views=len(gains.segments),
+        wheelbase_m=gains.wheelbase_m,
+        limits=before.limits,
         method="constant-command circles and straight runs by motion capture; delay and lag by least squares on its yaw and way",
-        residuals={key: round(float(value), 6) for key, value in residuals.items()}, response=response.section,
+        residuals={key: round(float(value), 6) for key, value in residuals.items()},
+        response=response.section,
         gains=GainsSection(
-            erpm_per_mps=round(gains.erpm_per_mps, 3), erpm_offset=round(gains.erpm_offset, 3) + 0.0,
-            servo_per_rad=round(gains.servo_per_rad, 6), servo_offset=round(gains.servo_offset, 6),
-            servo_min=g.servo_min, servo_max=g.servo_max,
+            erpm_per_mps=round(gains.erpm_per_mps, 3),
+            erpm_offset=round(gains.erpm_offset, 3) + 0.0,
+            servo_per_rad=round(gains.servo_per_rad, 6),
+            servo_offset=round(gains.servo_offset, 6),
+            servo_min=g.servo_min,
+            servo_max=g.servo_max,
         ),
-    )  # fmt: skip
+    )
 
 
 def _require_changes(values: Array, least: float, needed: int, what: str, unit: str) -> None:
@@ -218,9 +240,14 @@ def _integral(rate: Array) -> Array:
 
 
 def _fit(
-    grid: Array, seen: Array, model: Callable[[float, float, float], Array], kept: NDArray[np.bool_], with_slew: bool, what: str,
+    grid: Array,
+    seen: Array,
+    model: Callable[[float, float, float], Array],
+    kept: NDArray[np.bool_],
+    with_slew: bool,
+    what: str,
     config: ResponseConfig,
-) -> Followed:  # fmt: skip
+) -> Followed:
     change = _windows(seen)[kept]
     if len(change) < 100:
         raise DegenerateDataError(
@@ -237,7 +264,9 @@ def _fit(
     found, slew = plain, None
     if with_slew:
         bounds = ([*low, np.log(_SLEW_RANGE[0])], [*high, np.log(_SLEW_RANGE[1])])
-        limited = least_squares(residuals, _slew_start(residuals, plain.x), bounds=bounds, x_scale=[0.02, 0.05, 0.3])
+        limited = least_squares(
+            residuals, _slew_start(residuals, plain.x), bounds=bounds, x_scale=[0.02, 0.05, 0.3]
+        )
         if limited.cost < 0.98 * plain.cost and np.exp(limited.x[2]) < 0.95 * _SLEW_RANGE[1]:
             found, slew = limited, float(np.exp(limited.x[2]))
     unexplained = float(2.0 * found.cost / np.sum((change - change.mean()) ** 2))
@@ -251,9 +280,16 @@ def _fit(
     delay_sd, lag_sd = np.sqrt(np.diag(covariance))[:2]
     middles = grid[WINDOW // 2 : WINDOW // 2 + len(kept)][kept]
     return Followed(
-        max(float(found.x[0]), 0.0), float(found.x[1]), slew, float(delay_sd), float(lag_sd), unexplained, middles, change,
+        max(float(found.x[0]), 0.0),
+        float(found.x[1]),
+        slew,
+        float(delay_sd),
+        float(lag_sd),
+        unexplained,
+        middles,
+        change,
         change + residuals(found.x),
-    )  # fmt: skip
+    )
 
 
 def _slew_start(residuals: Callable[[Array], Array], plain: Array) -> Array:

@@ -84,9 +84,13 @@ def reduced(arrows: Mapping[str, frozenset[str]]) -> dict[str, set[str]]:
     reach = {name: set(found) for name, found in arrows.items()}
     for _ in reach:
         for name in reach:
-            reach[name] = reach[name].union(*(reach[other] for other in arrows[name])) if arrows[name] else set()
+            reach[name] = (
+                reach[name].union(*(reach[other] for other in arrows[name])) if arrows[name] else set()
+            )
     return {
-        name: {other for other in found if not any(other in reach[third] for third in found if third != other)}
+        name: {
+            other for other in found if not any(other in reach[third] for third in found if third != other)
+        }
         for name, found in arrows.items()
     }
 
@@ -104,7 +108,10 @@ def floors(arrows: Mapping[str, frozenset[str]]) -> list[list[str]]:
 
     for name in arrows:
         climb(name, ())
-    return [sorted(name for name in arrows if height[name] == level) for level in range(max(height.values()), -1, -1)]
+    return [
+        sorted(name for name in arrows if height[name] == level)
+        for level in range(max(height.values()), -1, -1)
+    ]
 
 
 def draw(house: House) -> str:

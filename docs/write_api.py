@@ -102,14 +102,18 @@ def entries(package: str) -> list[Entry]:
     names = [str(name) for name in ast.literal_eval(listed.value)]
     order = list(home)
     names.sort(key=lambda name: order.index(name) if name in home else -1)
-    return [Entry(package, name, module := home.get(name, package), *_definition(module, name)) for name in names]
+    return [
+        Entry(package, name, module := home.get(name, package), *_definition(module, name)) for name in names
+    ]
 
 
 def _imports_for_type_checkers(package: str) -> Iterator[tuple[str, str]]:
     for node in _tree(package).body:
         if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
             for statement in node.body:
-                assert isinstance(statement, ast.ImportFrom), f"{package} imports whole modules for type checkers"
+                assert isinstance(statement, ast.ImportFrom), (
+                    f"{package} imports whole modules for type checkers"
+                )
                 yield from ((str(statement.module), alias.name) for alias in statement.names)
 
 
@@ -247,7 +251,9 @@ def _parameters(node: ast.FunctionDef) -> list[str]:
         texts.append("*" + _parameter(given.vararg, None))
     elif given.kwonlyargs:
         texts.append("*")
-    texts += [_parameter(each, default) for each, default in zip(given.kwonlyargs, given.kw_defaults, strict=True)]
+    texts += [
+        _parameter(each, default) for each, default in zip(given.kwonlyargs, given.kw_defaults, strict=True)
+    ]
     return texts
 
 
@@ -258,7 +264,9 @@ def _parameter(each: ast.arg, default: ast.expr | None) -> str:
 
 def _is_dataclass(node: ast.ClassDef) -> bool:
     is_tuple = any(ast.unparse(base) == "NamedTuple" for base in node.bases)
-    return is_tuple or any(ast.unparse(decorator).startswith("dataclass") for decorator in node.decorator_list)
+    return is_tuple or any(
+        ast.unparse(decorator).startswith("dataclass") for decorator in node.decorator_list
+    )
 
 
 def _fields(node: ast.ClassDef) -> list[ast.AnnAssign]:

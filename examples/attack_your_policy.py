@@ -16,7 +16,12 @@ from torch import Tensor, nn
 import advnerf_core as adv
 
 CAMERA = adv.Pinhole(width=96, height=48, fx=60.0, fy=60.0, cx=48.0, cy=16.0)
-LINE_RGB, FLOOR_RGB, SKY_RGB, CARDBOARD_RGB = (0.9, 0.8, 0.1), (0.4, 0.4, 0.4), (0.6, 0.7, 0.9), (0.5, 0.4, 0.3)
+LINE_RGB, FLOOR_RGB, SKY_RGB, CARDBOARD_RGB = (
+    (0.9, 0.8, 0.1),
+    (0.4, 0.4, 0.4),
+    (0.6, 0.7, 0.9),
+    (0.5, 0.4, 0.3),
+)
 EVALUATIONS = 12
 
 
@@ -39,12 +44,16 @@ def road(T_world_from_camera: NDArray[np.float64], pinhole: adv.Pinhole) -> tupl
     y_m = pose[..., 1, 3] + to_floor_m * rays[..., 1]
     rgb = np.where((np.abs(y_m) < 0.05)[..., None], LINE_RGB, FLOOR_RGB)
     is_sky = rays[..., 2] >= 0.0
-    return torch.tensor(np.where(is_sky[..., None], SKY_RGB, rgb)), torch.tensor(np.where(is_sky, np.inf, to_floor_m))
+    return torch.tensor(np.where(is_sky[..., None], SKY_RGB, rgb)), torch.tensor(
+        np.where(is_sky, np.inf, to_floor_m)
+    )
 
 
 if __name__ == "__main__":
     view = adv.PolicyView(CAMERA, crop_top_px=0, crop_height_px=48, width=96, height=48)
-    contract = adv.PolicyContract(view, colour_space="BGR", value_max=255.0, output_unit="deg", positive="right")
+    contract = adv.PolicyContract(
+        view, colour_space="BGR", value_max=255.0, output_unit="deg", positive="right"
+    )
     # The x axis of the board leaves its face: it looks back along the road, 0.7 m to the left of the line.
     T_world_from_board = adv.make_transform(np.diag([-1.0, -1.0, 1.0]), [4.0, 0.7, 0.3])
     board = adv.cube_face_object(0.6, 4, CARDBOARD_RGB, T_world_from_board)

@@ -13,7 +13,17 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from nodes.runtime import MessageInfo, Node, NodeContext, Now, Out, drive_message, rgb_image, run_node_main, stamp_ns
+from nodes.runtime import (
+    MessageInfo,
+    Node,
+    NodeContext,
+    Now,
+    Out,
+    drive_message,
+    rgb_image,
+    run_node_main,
+    stamp_ns,
+)
 
 IMAGES, COMMANDS = "/camera/image_raw", "/policy/drive"
 

@@ -69,7 +69,9 @@ class Warehouse:
         rng = np.random.default_rng(config.seed)
         count = len(listed) + 1  # the last one is the hall
         self._base = rng.uniform(0.25, 0.95, (count, 3))
-        self._waves = rng.normal(0.0, 0.5, (count, 3, 3))  # of each colour channel: periods along x, y, z [1/m]
+        self._waves = rng.normal(
+            0.0, 0.5, (count, 3, 3)
+        )  # of each colour channel: periods along x, y, z [1/m]
         self._phase = rng.uniform(0.0, 1.0, (count, 3))
         self.reset(0.0, -3.0, 0.0)
 
@@ -88,13 +90,21 @@ class Warehouse:
                 "dock": path_through(dock, goal=(0.0, 1.0)),
             },
             off_track_m=HALF_LANE_M,
-            car=CarDescription("ackermann", self.config.speed_mps, (-WHEEL_LIMIT_RAD, WHEEL_LIMIT_RAD), WHEELBASE_M),
+            car=CarDescription(
+                "ackermann", self.config.speed_mps, (-WHEEL_LIMIT_RAD, WHEEL_LIMIT_RAD), WHEELBASE_M
+            ),
             camera=self.camera_pinhole,
             T_car_from_camera=self.T_car_from_camera,
             box=Box((-half_x, -half_y, 0.0), HALL_M),
             road_edge=(
                 np.array(
-                    [(-half_x, -half_y), (half_x, -half_y), (half_x, half_y), (-half_x, half_y), (-half_x, -half_y)]
+                    [
+                        (-half_x, -half_y),
+                        (half_x, -half_y),
+                        (half_x, half_y),
+                        (-half_x, half_y),
+                        (-half_x, -half_y),
+                    ]
                 ),
             ),
         )
@@ -107,12 +117,18 @@ class Warehouse:
             x, y, yaw = path.pose_at(float(rng.uniform(0.0, path.length_m)))
             if index % 5 == 4:
                 poses.append(
-                    look_at([x, y, rng.uniform(1.5, 3.0)], [rng.uniform(-6.0, 6.0), -y, rng.uniform(0.0, 1.0)])
+                    look_at(
+                        [x, y, rng.uniform(1.5, 3.0)], [rng.uniform(-6.0, 6.0), -y, rng.uniform(0.0, 1.0)]
+                    )
                 )
                 continue
             aside = float(rng.uniform(-0.6, 0.6))
-            car = planar_pose(x - aside * math.sin(yaw), y + aside * math.cos(yaw), yaw + float(rng.normal(0.0, 0.4)))
-            poses.append(car @ camera_mount(0.4, 0.0, 0.5 + float(rng.uniform(-0.1, 0.3)), math.radians(10.0)))
+            car = planar_pose(
+                x - aside * math.sin(yaw), y + aside * math.cos(yaw), yaw + float(rng.normal(0.0, 0.4))
+            )
+            poses.append(
+                car @ camera_mount(0.4, 0.0, 0.5 + float(rng.uniform(-0.1, 0.3)), math.radians(10.0))
+            )
         return poses
 
     @property
@@ -143,7 +159,11 @@ class Warehouse:
             turn = speed_mps * dt_s * math.tan(self._wheel_rad) / WHEELBASE_M
             x, y, yaw = self._pose
             course = yaw + 0.5 * turn
-            moved = (x + speed_mps * dt_s * math.cos(course), y + speed_mps * dt_s * math.sin(course), yaw + turn)
+            moved = (
+                x + speed_mps * dt_s * math.cos(course),
+                y + speed_mps * dt_s * math.sin(course),
+                yaw + turn,
+            )
             self._wanted = moved
             self._speed_mps = speed_mps if self._fits(*moved) else 0.0
             if not self._speed_mps:
@@ -155,9 +175,13 @@ class Warehouse:
         """What the driving camera sees: colours ``[H, W, 3]`` and planar depth ``[H, W]`` [m]."""
         return self.observe_at(*self._pose, depth=depth)
 
-    def observe_at(self, x_m: float, y_m: float, yaw_rad: float, depth: bool = True) -> tuple[Rgb, Depth | None]:
+    def observe_at(
+        self, x_m: float, y_m: float, yaw_rad: float, depth: bool = True
+    ) -> tuple[Rgb, Depth | None]:
         """The same from another pose of the car."""
-        rgb, depth_m = self._cast(planar_pose(x_m, y_m, yaw_rad) @ self.T_car_from_camera, self.camera_pinhole)
+        rgb, depth_m = self._cast(
+            planar_pose(x_m, y_m, yaw_rad) @ self.T_car_from_camera, self.camera_pinhole
+        )
         return rgb, depth_m if depth else None
 
     def photograph(self, T_world_from_camera: Array) -> Rgb:
@@ -181,7 +205,9 @@ class Warehouse:
     def _cast(self, T_world_from_camera: Array, pinhole: Pinhole) -> tuple[Rgb, Depth]:
         """Colours and planar depth of what each pixel's ray meets first."""
         eye, R = T_world_from_camera[:3, 3], T_world_from_camera[:3, :3]
-        rays = pinhole.directions() @ R.T  # of unit planar depth, so that the distance along them is planar depth
+        rays = (
+            pinhole.directions() @ R.T
+        )  # of unit planar depth, so that the distance along them is planar depth
         rays = np.where(np.abs(rays) < 1e-9, 1e-9, rays)
         hall = np.array([[-HALL_M[0], -HALL_M[1], 0.0], HALL_M])
         # Of the hall the inside is seen: the nearest of the walls ahead.

@@ -70,7 +70,9 @@ class AttackNode(Node):
     publications = (_PROGRESS, *_IMAGES.values(), _FILE)
     tick_rate_hz = 20.0
 
-    def __init__(self, config: AttackConfig, folder: Path, subscribers: Callable[[str], int] = lambda topic: 0) -> None:
+    def __init__(
+        self, config: AttackConfig, folder: Path, subscribers: Callable[[str], int] = lambda topic: 0
+    ) -> None:
         self.inbox: Inbox[Said] = Inbox(_INBOX)
         self._config, self._folder, self._subscribers = config, folder, subscribers
         self._job: Job | None = None
@@ -108,7 +110,9 @@ class AttackNode(Node):
             self._progress.pop("bytes", None)
         elif item.kind == "image":
             pixels = np.frombuffer(item.pixels, np.uint8).reshape(item.data["height"], item.data["width"], 3)
-            return [Out(_IMAGES[item.data["name"]], image_message(pixels, now.real_ns, self._request_id[:40]))]
+            return [
+                Out(_IMAGES[item.data["name"]], image_message(pixels, now.real_ns, self._request_id[:40]))
+            ]
         elif item.kind == "done":
             self._keep("done", file=item.data["file"])
             self._finish("done", f"{item.data['file']}", attack_id=item.data["attack_id"])
@@ -122,7 +126,10 @@ class AttackNode(Node):
     def tick(self, now: Now) -> list[Out]:
         """Say now and then how far it is, and send a piece of the file."""
         outs = [self._tell(now)] if now.mono_ns - self._told_ns >= _TELL_NS else []
-        if self._sender is not None and (piece := self._sender.next(now, self._subscribers(_FILE))) is not None:
+        if (
+            self._sender is not None
+            and (piece := self._sender.next(now, self._subscribers(_FILE))) is not None
+        ):
             outs.append(Out(_FILE, piece))
         return outs
 
@@ -157,7 +164,9 @@ class AttackNode(Node):
     def _accept(self, message: Any) -> None:
         request_id, text = str(message.request_id), str(message.request)
         if not _ID.fullmatch(request_id):
-            raise AdvnerfError(f"expected a request id of 1 to 40 letters, digits, - and _, got {request_id!r}")
+            raise AdvnerfError(
+                f"expected a request id of 1 to 40 letters, digits, - and _, got {request_id!r}"
+            )
         kept_text = request_text(parse_request(text, f"request {request_id}"))
         if self._job is not None and request_id != self._request_id:
             raise AdvnerfError(f"busy with {self._request_id}; wait for it, or cancel it")
@@ -202,7 +211,10 @@ class AttackNode(Node):
         if current["state"] == "running":
             self._start(current["request_id"])
             return
-        self._request_id, self._progress = current["request_id"], _fresh(current["state"], "before this start")
+        self._request_id, self._progress = (
+            current["request_id"],
+            _fresh(current["state"], "before this start"),
+        )
         if current["state"] == "done" and Path(current["file"]).is_file():
             attack = load_attack(current["file"])
             best = attack.predicted_total_cte_m or 0.0
@@ -217,9 +229,15 @@ class AttackNode(Node):
         return self._message(now, self._request_id, self._progress or _fresh("idle", ""))
 
     def _message(self, now: Now, request_id: str, progress: dict[str, Any]) -> Out:
-        return Out(_PROGRESS, types.AttackProgress(
-            header=header(now.real_ns), request_id=request_id, answered_id=self._answers.last.ask_id, **progress
-        ))  # fmt: skip
+        return Out(
+            _PROGRESS,
+            types.AttackProgress(
+                header=header(now.real_ns),
+                request_id=request_id,
+                answered_id=self._answers.last.ask_id,
+                **progress,
+            ),
+        )
 
 
 class Sender:
@@ -252,9 +270,19 @@ class Sender:
 
 def _fresh(state: str, text: str) -> dict[str, Any]:
     return {
-        "state": state, "text": text, "seed": 0, "evaluation": 0, "evaluations": 0, "loss_m": math.nan, "total_cte_m": 0.0,
-        "best_total_cte_m": 0.0, "clean_total_cte_m": math.nan, "clean_drives": False, "seconds": 0.0, "attack_id": "",
-    }  # fmt: skip
+        "state": state,
+        "text": text,
+        "seed": 0,
+        "evaluation": 0,
+        "evaluations": 0,
+        "loss_m": math.nan,
+        "total_cte_m": 0.0,
+        "best_total_cte_m": 0.0,
+        "clean_total_cte_m": math.nan,
+        "clean_drives": False,
+        "seconds": 0.0,
+        "attack_id": "",
+    }
 
 
 def main() -> int:

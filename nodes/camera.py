@@ -19,7 +19,18 @@ from hardware.cameras.steady import SteadyCamera
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import RuntimeFault
 from nodes.runtime.messages import camera_info_message, image_message
-from nodes.runtime.node import ACTIVE, FAULT, STARTING, Inbox, MessageInfo, Node, NodeContext, Now, Out, ReaderThread
+from nodes.runtime.node import (
+    ACTIVE,
+    FAULT,
+    STARTING,
+    Inbox,
+    MessageInfo,
+    Node,
+    NodeContext,
+    Now,
+    Out,
+    ReaderThread,
+)
 from nodes.runtime.pictures import COMPRESSED_TOPIC, RAW_TOPIC, compressed_image_message
 from nodes.runtime.process import run_node_main
 
@@ -80,7 +91,11 @@ class CameraNode(Node):
     ) -> None:
         self._config = config
         self._calibration = calibration
-        self.publications = (RAW_TOPIC, "/camera/camera_info", *((COMPRESSED_TOPIC,) if config.compressed else ()))
+        self.publications = (
+            RAW_TOPIC,
+            "/camera/camera_info",
+            *((COMPRESSED_TOPIC,) if config.compressed else ()),
+        )
         self._subscribers = subscribers
         self._grid = _grid(config.compressed)
         self._device = device or config.source.steady()
@@ -120,7 +135,9 @@ class CameraNode(Node):
         self._count_missed(item)
         self._arrived_ns = now.mono_ns
         stamp_ns = item.stamp_realtime_ns - round(self._calibration.latency_s * NS_PER_S)
-        info = camera_info_message(self._calibration.pinhole, stamp_ns, FRAME_ID, self._calibration.distortion)
+        info = camera_info_message(
+            self._calibration.pinhole, stamp_ns, FRAME_ID, self._calibration.distortion
+        )
         outs = [Out(RAW_TOPIC, image_message(item.rgb, stamp_ns, FRAME_ID)), Out("/camera/camera_info", info)]
         return outs + self._compressed(item, stamp_ns)
 
@@ -149,7 +166,9 @@ class CameraNode(Node):
             return []
         if self._grid.slot(stamp_ns) is None:
             return []
-        return [Out(COMPRESSED_TOPIC, compressed_image_message(frame.rgb, stamp_ns, FRAME_ID, wanted.quality))]
+        return [
+            Out(COMPRESSED_TOPIC, compressed_image_message(frame.rgb, stamp_ns, FRAME_ID, wanted.quality))
+        ]
 
     def _require_this_camera(self) -> None:
         """Compare the calibration with the device's factory calibration, if it has one, to detect the file of another camera."""

@@ -153,9 +153,15 @@ class CompositorNode(Node):
         prepare = partial(show, camera=camera, target=target, supersample=config.supersample)
         showing = None if config.attack is None else prepare(load_attack(config.attack))
         return cls(
-            showing, config.wait_s, config.extrapolation_limit_s, config.max_gap_s, target.subject, prepare,
-            config.image_topic, Interlock() if config.interlock else None,
-        )  # fmt: skip
+            showing,
+            config.wait_s,
+            config.extrapolation_limit_s,
+            config.max_gap_s,
+            target.subject,
+            prepare,
+            config.image_topic,
+            Interlock() if config.interlock else None,
+        )
 
     def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
         """Handle an image, a pose, a piece of an attack, or the state of the safety node."""
@@ -183,7 +189,11 @@ class CompositorNode(Node):
             self._trouble = refusal
             # A raw image is forwarded as the received bytes.
             out = (info.raw or message) if image is message else image
-            return [*before, Out("/compositor/image", out), self._label(image, False, refusal or "no attack file")]
+            return [
+                *before,
+                Out("/compositor/image", out),
+                self._label(image, False, refusal or "no attack file"),
+            ]
         self._waiting = _Waiting(image, stamp_ns(image), now.mono_ns + self._wait_ns)
         return before + self._release(now)
 
@@ -194,7 +204,9 @@ class CompositorNode(Node):
 
     def status(self) -> tuple[str, str]:
         """Report active while images arrive."""
-        shown = f"attack {self._showing.attack_id}" if self._showing else "no attack file, images pass through"
+        shown = (
+            f"attack {self._showing.attack_id}" if self._showing else "no attack file, images pass through"
+        )
         if self._last_image_ns is None or self._now_ns - self._last_image_ns > _ACTIVE_S * NS_PER_S:
             return READY, "; ".join(filter(None, (f"waiting for images; {shown}", self._transfer_trouble)))
         return ACTIVE, "; ".join(filter(None, (shown, self._trouble, self._transfer_trouble)))
@@ -202,7 +214,11 @@ class CompositorNode(Node):
     def counters(self) -> dict[str, float]:
         """Report images received, drawn on, drawn with extrapolated poses, and dropped; attacks accepted and refused."""
         counts = {key: float(value) for key, value in self._counts.items()}
-        transfers = {"attacks_taken": self._taken, "attacks_refused": self._refused, "takeover_ms": self._takeover_ms}
+        transfers = {
+            "attacks_taken": self._taken,
+            "attacks_refused": self._refused,
+            "takeover_ms": self._takeover_ms,
+        }
         return counts | transfers
 
     def _take_piece(self, chunk: Any, info: MessageInfo, now: Now) -> list[Out]:
@@ -259,7 +275,9 @@ class CompositorNode(Node):
             return []
         T_camera_from_face = invert_transform(car.T @ self._showing.T_car_from_camera) @ face.T
         # The received array is read-only; the overlay draws on a copy.
-        image, drawn = self._showing.overlay.draw(rgb_image(waiting.message, self._image_topic), T_camera_from_face)
+        image, drawn = self._showing.overlay.draw(
+            rgb_image(waiting.message, self._image_topic), T_camera_from_face
+        )
         ahead_s = max(car.extrapolated_s, face.extrapolated_s)
         self._counts["drawn"] += drawn
         self._counts["extrapolated"] += ahead_s > 0.0
@@ -276,12 +294,16 @@ class CompositorNode(Node):
         return Out("/compositor/attack", label)
 
 
-def show(attack: AttackFile, camera: CameraCalibration, target: TargetCalibration, supersample: int = 2) -> Showing:
+def show(
+    attack: AttackFile, camera: CameraCalibration, target: TargetCalibration, supersample: int = 2
+) -> Showing:
     """Prepare an attack for a camera and a face. An attack without a face, or of another size or subject, is refused."""
     face = attack.required_face()
     corners = target.corners
     size_m = (np.linalg.norm(corners[1] - corners[0]), np.linalg.norm(corners[3] - corners[0]))
-    wrong_size = any(abs(got / want - 1.0) > _SIZE_TOLERANCE for got, want in zip(size_m, face.size_m, strict=True))
+    wrong_size = any(
+        abs(got / want - 1.0) > _SIZE_TOLERANCE for got, want in zip(size_m, face.size_m, strict=True)
+    )
     if wrong_size or face.subject != target.subject:
         raise ConfigError(
             f"attack {attack.attack_id} was made for {face.subject}, {face.size_m[0]:.2f} x {face.size_m[1]:.2f} m, but the "

@@ -92,7 +92,9 @@ class CounterfactualNode(Node):
         max_age_s: float = 1.0,
     ) -> None:
         if clean.sha256 != attacked.sha256:
-            raise ConfigError(f"expected the same policy twice, got {clean.sha256[:12]} and {attacked.sha256[:12]}")
+            raise ConfigError(
+                f"expected the same policy twice, got {clean.sha256[:12]} and {attacked.sha256[:12]}"
+            )
         if len(goal) != clean.goal_size:
             raise ConfigError(
                 f"expected a goal of {clean.goal_size} numbers for this policy, got {len(goal)}; set 'goal'"
@@ -159,7 +161,9 @@ class CounterfactualNode(Node):
 
     def counters(self) -> dict[str, float]:
         """Report compared and skipped pairs."""
-        return {key: float(value) for key, value in self._counts.items()} | {"largest_delta_rad": self._largest_rad}
+        return {key: float(value) for key, value in self._counts.items()} | {
+            "largest_delta_rad": self._largest_rad
+        }
 
     def _seen(self, topic: str, message: Any) -> NDArray[np.uint8]:
         """Convert an image message to the policy's input."""
@@ -171,8 +175,13 @@ class CounterfactualNode(Node):
             )
         return self._clean.view.image(rgb)
 
-    def _compare(self, clean: NDArray[np.uint8], attacked: NDArray[np.uint8], label: Any, stamp: int) -> list[Out]:
-        clean_rad, attacked_rad = self._clean.steer(clean, self._goal), self._attacked.steer(attacked, self._goal)
+    def _compare(
+        self, clean: NDArray[np.uint8], attacked: NDArray[np.uint8], label: Any, stamp: int
+    ) -> list[Out]:
+        clean_rad, attacked_rad = (
+            self._clean.steer(clean, self._goal),
+            self._attacked.steer(attacked, self._goal),
+        )
         if not np.isfinite([clean_rad, attacked_rad]).all():
             self._counts["dropped_bad"] += 1
             self._trouble = "the policy's output is not finite"
@@ -180,10 +189,15 @@ class CounterfactualNode(Node):
         self._counts["pairs"] += 1
         self._largest_rad = max(self._largest_rad, abs(attacked_rad - clean_rad))
         message = types.Counterfactual(
-            header=header(stamp, label.header.frame_id), attack_id=label.attack_id, drawn=bool(label.drawn),
-            clean_rad=clean_rad, attacked_rad=attacked_rad, delta_rad=attacked_rad - clean_rad,
-            changed=float((clean != attacked).any(axis=-1).mean()), policy_sha256=self._clean.sha256,
-        )  # fmt: skip
+            header=header(stamp, label.header.frame_id),
+            attack_id=label.attack_id,
+            drawn=bool(label.drawn),
+            clean_rad=clean_rad,
+            attacked_rad=attacked_rad,
+            delta_rad=attacked_rad - clean_rad,
+            changed=float((clean != attacked).any(axis=-1).mean()),
+            policy_sha256=self._clean.sha256,
+        )
         return [Out(COUNTERFACTUAL_TOPIC, message)]
 
     def _warm_up(self) -> None:

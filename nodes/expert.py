@@ -141,9 +141,12 @@ class ExpertNode(Node):
         del context  # not needed
         car = load_calibration(VehicleCalibration, config.vehicle)
         settings = ExpertConfig(
-            wheelbase_m=car.wheelbase_m, speed_mps=config.speed_mps, delay_s=0.0, stiffness_1pm=config.stiffness_1pm,
+            wheelbase_m=car.wheelbase_m,
+            speed_mps=config.speed_mps,
+            delay_s=0.0,
+            stiffness_1pm=config.stiffness_1pm,
             steering_limits_rad=(car.limits.steering_min_rad, car.limits.steering_max_rad),
-        )  # fmt: skip
+        )
         return cls(Expert(load_calibration(RoomCalibration, config.room).reference_path, settings), config)
 
     def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
@@ -178,7 +181,10 @@ class ExpertNode(Node):
         if self._now_ns - self._commanded_ns > NS_PER_S or not self._commanded_ns:
             return READY, f"no fresh pose of the car on {_CAR}"
         laps = self._driven_m / self._expert.path.length_m
-        return ACTIVE, f"{100 * self._cte_m:+.0f} cm from the path, {self._driven_m:.1f} m driven, {laps:.1f} laps"
+        return (
+            ACTIVE,
+            f"{100 * self._cte_m:+.0f} cm from the path, {self._driven_m:.1f} m driven, {laps:.1f} laps",
+        )
 
     def counters(self) -> dict[str, float]:
         """Report unusable poses and the current trims."""
@@ -224,10 +230,15 @@ class ExpertNode(Node):
         self._steering_rad = steering
         speed = config.speed_mps * (1.0 + self._speed_trim)
         state = types.ExpertState(
-            header=header(capture_ns, "world"), cte_m=cte_m,
-            heading_error_rad=float(wrap_angle(pose[2] - float(at.heading_rad))), s_m=self._s_m, driven_m=self._driven_m,
-            speed_mps=speed_mps, steering_rad=wanted, disturbance_rad=steering - wanted if disturbance else 0.0,
-        )  # fmt: skip
+            header=header(capture_ns, "world"),
+            cte_m=cte_m,
+            heading_error_rad=float(wrap_angle(pose[2] - float(at.heading_rad))),
+            s_m=self._s_m,
+            driven_m=self._driven_m,
+            speed_mps=speed_mps,
+            steering_rad=wanted,
+            disturbance_rad=steering - wanted if disturbance else 0.0,
+        )
         return [Out("/expert/drive", drive_message(speed, steering, capture_ns)), Out("/expert/state", state)]
 
     def _ahead(self, pose: tuple[float, float, float], speed_mps: float) -> tuple[float, float, float]:

@@ -71,9 +71,16 @@ class GatewayConfig(BaseModel):
     def link(self) -> LinkConfig:
         """Configuration of the link."""
         return LinkConfig(
-            self.listen or self.connect or "", self.listen is not None, self.watch_port, self.drive_port,
-            None if self.keys is None else KeyFolder(self.keys), self.key, self.peer_key, self.imports, self.exports,
-        )  # fmt: skip
+            self.listen or self.connect or "",
+            self.listen is not None,
+            self.watch_port,
+            self.drive_port,
+            None if self.keys is None else KeyFolder(self.keys),
+            self.key,
+            self.peer_key,
+            self.imports,
+            self.exports,
+        )
 
 
 class GatewayNode(Node):
@@ -105,7 +112,9 @@ class GatewayNode(Node):
 
     def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
         """Send a message of this host to the other host."""
-        meta = Meta(info.publish_mono_ns, info.publish_real_ns, info.sequence, self._prefixes[topic], info.instance_id)
+        meta = Meta(
+            info.publish_mono_ns, info.publish_real_ns, info.sequence, self._prefixes[topic], info.instance_id
+        )
         self._link.send(topic, meta, info.raw)
         self._sent += 1
         return []
@@ -117,9 +126,12 @@ class GatewayNode(Node):
             return [Out(item.topic, item.message)]
         self._offset = item
         message = types.ClockOffset(
-            header=header(now.real_ns), peer=item.peer, offset_s=item.best.offset_s,
-            error_s=item.best.round_trip_s / 2, round_trip_s=item.newest.round_trip_s,
-        )  # fmt: skip
+            header=header(now.real_ns),
+            peer=item.peer,
+            offset_s=item.best.offset_s,
+            error_s=item.best.round_trip_s / 2,
+            round_trip_s=item.newest.round_trip_s,
+        )
         return [Out(OFFSET_TOPIC, message)]
 
     def tick(self, now: Now) -> list[Out]:
@@ -137,12 +149,18 @@ class GatewayNode(Node):
         silence_s = (time.monotonic_ns() - heard_ns) / NS_PER_S
         if silence_s > _SILENCE_S:
             return READY, f"the other host has been silent for {silence_s:.1f} s"
-        clock = "" if self._offset is None else f", its clock is {self._offset.best.offset_s * 1e3:+.1f} ms off"
+        clock = (
+            "" if self._offset is None else f", its clock is {self._offset.best.offset_s * 1e3:+.1f} ms off"
+        )
         return ACTIVE, f"{self._sent} messages sent, {self._taken} taken{clock}"
 
     def counters(self) -> dict[str, float]:
         """Report forwarded and refused messages."""
-        counters = {"sent": float(self._sent), "taken": float(self._taken), "refused": float(self._link.refused)}
+        counters = {
+            "sent": float(self._sent),
+            "taken": float(self._taken),
+            "refused": float(self._link.refused),
+        }
         if self._offset is not None:
             counters["clock_offset_s"] = self._offset.best.offset_s
             counters["round_trip_s"] = self._offset.newest.round_trip_s

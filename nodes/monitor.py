@@ -170,7 +170,14 @@ class MonitorNode(Node):
             if attack is not None:
                 check(attack)
             return cls(
-                display, panel, attack, check, config.plain_rgb, config.face_m, config.interlock, config.state_age_s
+                display,
+                panel,
+                attack,
+                check,
+                config.plain_rgb,
+                config.face_m,
+                config.interlock,
+                config.state_age_s,
             )
         except BaseException:
             display.close()
@@ -206,8 +213,11 @@ class MonitorNode(Node):
     def counters(self) -> dict[str, float]:
         """Report shown pictures, accepted and refused attacks, and the duration of the last change."""
         return {
-            "shown": self._changes, "attacks_taken": self._taken, "attacks_refused": self._refused, "show_ms": self._show_ms,
-        }  # fmt: skip
+            "shown": self._changes,
+            "attacks_taken": self._taken,
+            "attacks_refused": self._refused,
+            "show_ms": self._show_ms,
+        }
 
     def close(self) -> None:
         """Clear and close the screen."""
@@ -249,9 +259,15 @@ class MonitorNode(Node):
         attack_id, attacking = self._attack.attack_id if self._attack else "", bool(self._showing)
         head = header(now.real_ns, "monitor")
         shown = types.DisplayShown(
-            header=head, attack_id=attack_id, attacking=attacking, reason=self._reason, sha256=self._sha256,
-            width=self._panel.size_px[0], height=self._panel.size_px[1], show_ms=self._show_ms,
-        )  # fmt: skip
+            header=head,
+            attack_id=attack_id,
+            attacking=attacking,
+            reason=self._reason,
+            sha256=self._sha256,
+            width=self._panel.size_px[0],
+            height=self._panel.size_px[1],
+            show_ms=self._show_ms,
+        )
         label = types.AttackStamp(header=head, attack_id=attack_id, drawn=attacking, reason=self._reason)
         return [Out("/monitor/attack", label), Out("/monitor/shown", shown)]
 

@@ -90,7 +90,9 @@ class MotorNode(Node):
     publications = ("/motor/sent", "/motor/state", "/odom", "/diagnostics")
     tick_rate_hz = _TICK_RATE_HZ
 
-    def __init__(self, config: MotorConfig, make_vesc: Callable[[], Vesc], wheelbase_m: float, mono_ns: int) -> None:
+    def __init__(
+        self, config: MotorConfig, make_vesc: Callable[[], Vesc], wheelbase_m: float, mono_ns: int
+    ) -> None:
         self._config = config
         self._vesc = make_vesc()
         wanted = TimeoutSettings(config.controller_timeout_ms, config.controller_brake_current_a)
@@ -127,7 +129,9 @@ class MotorNode(Node):
         if topic == "/motor/check":
             busy = "the car drives; disarm first" if self._gate.state is GateState.DRIVING else ""
             self._watch.obey(
-                message, busy or ("" if self._vesc.is_open else f"no controller: {self._link_error}"), now.mono_ns
+                message,
+                busy or ("" if self._vesc.is_open else f"no controller: {self._link_error}"),
+                now.mono_ns,
             )
             return self._diagnostics(now, at_once=True)
         drive = message.drive
@@ -144,7 +148,9 @@ class MotorNode(Node):
         self._show_wheels(now)
         # Repeat the last command only until the limiter has reached it. Repeating it for ever would keep the car driving after a failure.
         action = self._gate.tick(now.mono_ns)
-        outs = [] if isinstance(action, Drive) and self._reached(action) else self._act(action, now, first=False)
+        outs = (
+            [] if isinstance(action, Drive) and self._reached(action) else self._act(action, now, first=False)
+        )
         return outs + self._telemetry(now) + self._diagnostics(now)
 
     def status(self) -> tuple[str, str]:
@@ -225,11 +231,18 @@ class MotorNode(Node):
         driving = self._gate.state is GateState.DRIVING
         stamp_ns = self._origin_stamp_ns if driving else sent.write_real_ns
         message = types.MotorSent(
-            header=header(stamp_ns, "car"), serial_write_mono_ns=sent.write_mono_ns, serial_write_real_ns=sent.write_real_ns,
-            speed_mps=sent.speed_mps, steering_rad=sent.steering_rad, erpm=sent.erpm, servo=sent.servo,
-            brake_current_a=sent.brake_current_a or 0.0, braking=not driving, reason=self._gate.reason,
+            header=header(stamp_ns, "car"),
+            serial_write_mono_ns=sent.write_mono_ns,
+            serial_write_real_ns=sent.write_real_ns,
+            speed_mps=sent.speed_mps,
+            steering_rad=sent.steering_rad,
+            erpm=sent.erpm,
+            servo=sent.servo,
+            brake_current_a=sent.brake_current_a or 0.0,
+            braking=not driving,
+            reason=self._gate.reason,
             peer=str(self._vesc.firmware),
-        )  # fmt: skip
+        )
         return Out("/motor/sent", message)
 
     def _telemetry(self, now: Now) -> list[Out]:
@@ -256,7 +269,9 @@ class MotorNode(Node):
         elif self._link_error:
             self._link_error = ""
             self._gate.brake_again(now.mono_ns)
-        states = [Out("/motor/state", self._state(reply, now)) for reply in replies if isinstance(reply, Values)]
+        states = [
+            Out("/motor/state", self._state(reply, now)) for reply in replies if isinstance(reply, Values)
+        ]
         return states + [out for reply in replies for out in self._watch.hear(reply, self._vesc, now)]
 
     def _diagnostics(self, now: Now, at_once: bool = False) -> list[Out]:
@@ -270,11 +285,17 @@ class MotorNode(Node):
         if values.fault:
             self._gate.latch(f"the VESC reports a fault: {values.fault_name}", now.mono_ns)
         return types.VescState(
-            header=header(now.real_ns, "car"), speed_mps=self._vesc.gains.speed_mps(values.erpm), erpm=values.erpm,
-            duty=values.duty, input_voltage_v=values.v_in, motor_current_a=values.motor_current_a,
-            input_current_a=values.input_current_a, mosfet_temperature_c=values.temp_fet_c or 0.0, fault=values.fault,
+            header=header(now.real_ns, "car"),
+            speed_mps=self._vesc.gains.speed_mps(values.erpm),
+            erpm=values.erpm,
+            duty=values.duty,
+            input_voltage_v=values.v_in,
+            motor_current_a=values.motor_current_a,
+            input_current_a=values.input_current_a,
+            mosfet_temperature_c=values.temp_fet_c or 0.0,
+            fault=values.fault,
             fault_text=values.fault_name if values.fault else "",
-        )  # fmt: skip
+        )
 
 
 def main() -> int:

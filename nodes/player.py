@@ -79,7 +79,9 @@ class PlayerNode(Node):
     subscriptions = (_CONTROL,)
     tick_rate_hz = _TICK_HZ
 
-    def __init__(self, config: PlayerConfig, subscribers: Callable[[str], int], terminal: int | None = None) -> None:
+    def __init__(
+        self, config: PlayerConfig, subscribers: Callable[[str], int], terminal: int | None = None
+    ) -> None:
         self._config = config
         self._subscribers = subscribers
         self._info = read_info(config.bag)
@@ -152,7 +154,11 @@ class PlayerNode(Node):
                 return []
             self._head = Playhead(self._begin_ns, now.mono_ns, self._config.rate, self._config.paused)
         due: list[Out] = []
-        while not self._head.paused and self._next is not None and self._next.log_ns <= self._head.time_ns(now.mono_ns):
+        while (
+            not self._head.paused
+            and self._next is not None
+            and self._next.log_ns <= self._head.time_ns(now.mono_ns)
+        ):
             due.append(self._take())
         if self._next is None and not due:
             if not self._config.loop:
@@ -198,10 +204,14 @@ class PlayerNode(Node):
     def _state(self, now: Now) -> Out:
         answer, head = self._answers.last, self._head
         message = types.PlayerState(
-            header=header(now.real_ns), answered_id=answer.ask_id, granted=answer.granted, answer=answer.text,
-            paused=self._config.paused if head is None else head.paused, rate=self._config.rate if head is None else head.rate,
+            header=header(now.real_ns),
+            answered_id=answer.ask_id,
+            granted=answer.granted,
+            answer=answer.text,
+            paused=self._config.paused if head is None else head.paused,
+            rate=self._config.rate if head is None else head.rate,
             playing=stamp_from_ns(0 if head is None else head.time_ns(now.mono_ns)),
-        )  # fmt: skip
+        )
         return Out(_STATE, message)
 
     def _step(self, count: int, now: Now) -> list[Out]:
@@ -234,18 +244,24 @@ class PlayerNode(Node):
             return []
         period_ns = round(NS_PER_S / self._config.clock_hz)
         late_ns = now.mono_ns - self._clock_due_ns
-        self._clock_due_ns = self._clock_due_ns + period_ns if late_ns < period_ns else now.mono_ns + period_ns
+        self._clock_due_ns = (
+            self._clock_due_ns + period_ns if late_ns < period_ns else now.mono_ns + period_ns
+        )
         return [Out(_CLOCK, types.Clock(clock=stamp_from_ns(self._head.time_ns(now.mono_ns))))]
 
     def _missing(self) -> list[str]:
         wanted = self._config.wait_for
         missing = [
-            topic for topic in (self._played_names if wanted is None else wanted) if self._subscribers(topic) == 0
+            topic
+            for topic in (self._played_names if wanted is None else wanted)
+            if self._subscribers(topic) == 0
         ]
         return [] if wanted is None and len(missing) < len(self._played_names) else missing
 
     def _rewind(self) -> None:
-        self._messages = read_messages(self._config.bag, self._topics, self._config.start_offset_s, self._types)
+        self._messages = read_messages(
+            self._config.bag, self._topics, self._config.start_offset_s, self._types
+        )
         self._advance()
         if self._next is None:
             span = f"{self._config.start_offset_s} s"
@@ -257,19 +273,25 @@ def _renamed(config: PlayerConfig, topics: list[str]) -> dict[str, str]:
     """Played name of each topic, by recorded name."""
     for old, new in config.remap.items():
         if old not in topics:
-            raise BagError(f"cannot play {old} as {new}, because {old} is not played; played are {', '.join(topics)}")
+            raise BagError(
+                f"cannot play {old} as {new}, because {old} is not played; played are {', '.join(topics)}"
+            )
     names = {topic: config.remap.get(topic, topic) for topic in topics}
     for name in names.values():
         topic_row(name)  # only topics of the table can be published
         if len(sources := [topic for topic, played in names.items() if played == name]) > 1:
-            raise BagError(f"{' and '.join(sources)} would both be played as {name}; select one with --topics")
+            raise BagError(
+                f"{' and '.join(sources)} would both be played as {name}; select one with --topics"
+            )
     return names
 
 
 def _choose_topics(config: PlayerConfig, recorded: list[str]) -> list[str]:
     if config.topics is None:
         stays = [name for name in recorded if name in _STAYS or name.startswith(STATUS_PREFIX)]
-        chosen = [name for name in recorded if name not in stays and (type_of_topic(name) or name in config.remap)]
+        chosen = [
+            name for name in recorded if name not in stays and (type_of_topic(name) or name in config.remap)
+        ]
     else:
         chosen = list(dict.fromkeys(config.topics))
         if unknown := [name for name in chosen if name not in recorded]:

@@ -124,7 +124,8 @@ class PolicyNode(Node):
         if rgb.shape[:2] != (camera.height, camera.width):
             got = f"{rgb.shape[1]} x {rgb.shape[0]}"
             self._drop(
-                "dropped_bad", f"expected images of {camera.width} x {camera.height}, got {got}; train for this camera"
+                "dropped_bad",
+                f"expected images of {camera.width} x {camera.height}, got {got}; train for this camera",
             )
             return []
         steering_rad = self._steer(rgb)

@@ -78,7 +78,9 @@ class RecorderNode(Node):
 
     def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
         """Write one message."""
-        self._writer.write(topic, info.raw, info.receive_real_ns, info.publish_real_ns, info.sequence, info.lost)
+        self._writer.write(
+            topic, info.raw, info.receive_real_ns, info.publish_real_ns, info.sequence, info.lost
+        )
         self._lost[topic] += info.lost
         return []
 
@@ -107,7 +109,16 @@ def provenance() -> dict[str, str]:
         facts["version"] = version("advnerf")
     except PackageNotFoundError:
         facts["version"] = "not installed"
-    command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
+    command = [
+        "git",
+        "-C",
+        str(Path(__file__).parent),
+        "describe",
+        "--always",
+        "--dirty",
+        "--abbrev=40",
+        "--exclude=*",
+    ]
     try:
         result = subprocess.run(command, capture_output=True, text=True, timeout=5, check=False)
         facts["git"] = result.stdout.strip() if result.returncode == 0 else "not a checkout"
@@ -122,11 +133,15 @@ def _read_attachments(paths: list[Path], must_exist: bool) -> dict[str, bytes]:
         if not must_exist and not path.exists():
             continue
         if path.name in contents:
-            raise BagError(f"expected attachments with different names, got two called {path.name}; rename one")
+            raise BagError(
+                f"expected attachments with different names, got two called {path.name}; rename one"
+            )
         try:
             contents[path.name] = path.read_bytes()
         except OSError as error:
-            raise BagError(f"cannot attach {path}: {error.strerror}; correct its path or permissions") from error
+            raise BagError(
+                f"cannot attach {path}: {error.strerror}; correct its path or permissions"
+            ) from error
     return contents
 
 

@@ -111,7 +111,9 @@ class SafetyConfig(BaseModel):
 
     def stall(self) -> StallGate:
         """Make the stall check."""
-        limits = StallLimits(self.stall_command_mps, self.stall_speed_mps, self.stall_time_s, self.stall_sources)
+        limits = StallLimits(
+            self.stall_command_mps, self.stall_speed_mps, self.stall_time_s, self.stall_sources
+        )
         return StallGate(limits)
 
     def limits(self, room: RoomCalibration) -> ArmingLimits:
@@ -122,10 +124,18 @@ class SafetyConfig(BaseModel):
                 f"expected start_pose inside fence_m in {self.room}, got {room.start_pose} outside; correct the room file"
             )
         return ArmingLimits(
-            nodes=self.nodes, fence_m=room.fence_m, drivers=self.drivers, fence_margin_m=self.fence_margin_m, drive_age_s=self.drive_age_limit_s, image_age_s=self.image_age_limit_s,
-            pose_age_s=self.pose_age_limit_s, status_age_s=self.status_age_limit_s, held_up_s=self.held_up_limit_s,
-            speed_mps=self.max_speed_mps, steering_rad=self.max_steering_rad,
-        )  # fmt: skip
+            nodes=self.nodes,
+            fence_m=room.fence_m,
+            drivers=self.drivers,
+            fence_margin_m=self.fence_margin_m,
+            drive_age_s=self.drive_age_limit_s,
+            image_age_s=self.image_age_limit_s,
+            pose_age_s=self.pose_age_limit_s,
+            status_age_s=self.status_age_limit_s,
+            held_up_s=self.held_up_limit_s,
+            speed_mps=self.max_speed_mps,
+            steering_rad=self.max_steering_rad,
+        )
 
 
 class SafetyNode(Node):
@@ -143,9 +153,13 @@ class SafetyNode(Node):
     tick_rate_hz = _TICK_RATE_HZ
 
     def __init__(
-        self, limits: ArmingLimits, poses: PoseGate, stall: StallGate, hand: HandGate | None = None,
+        self,
+        limits: ArmingLimits,
+        poses: PoseGate,
+        stall: StallGate,
+        hand: HandGate | None = None,
         clocks: ClockGate | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self._arming = Arming(limits, hand or HandGate(), clocks or ClockGate(), (poses, stall))
         self._requests = ArmRequests(self._arming)
         self._poses, self._stall = poses, stall
@@ -155,10 +169,16 @@ class SafetyNode(Node):
         self._stated_armed: bool | None = None
         self._stops = 0
         self.subscriptions = (
-            "/arm", "/teleop/state", "/clock/offset", "/camera/camera_info", "/vicon/car", "/motor/sent", "/motor/state",
+            "/arm",
+            "/teleop/state",
+            "/clock/offset",
+            "/camera/camera_info",
+            "/vicon/car",
+            "/motor/sent",
+            "/motor/state",
             *self._topic_of,
             *map(status_topic, limits.nodes),
-        )  # fmt: skip
+        )
 
     @classmethod
     def build(cls, config: SafetyConfig, context: NodeContext) -> SafetyNode:
@@ -190,7 +210,9 @@ class SafetyNode(Node):
         elif topic == "/motor/state":
             self._stall.motor(float(message.speed_mps), now.mono_ns)
         elif topic.startswith(STATUS_PREFIX):
-            arming.heard_status(topic.removeprefix(STATUS_PREFIX), str(message.state), str(message.text), info)
+            arming.heard_status(
+                topic.removeprefix(STATUS_PREFIX), str(message.state), str(message.text), info
+            )
         arming.check(now.mono_ns)
         return self._news(now)
 
@@ -207,7 +229,9 @@ class SafetyNode(Node):
     def status(self) -> tuple[str, str]:
         """Report active while armed."""
         arming = self._arming
-        return (ACTIVE, f"armed by {arming.source}") if arming.armed else (READY, f"disarmed: {arming.reason}")
+        return (
+            (ACTIVE, f"armed by {arming.source}") if arming.armed else (READY, f"disarmed: {arming.reason}")
+        )
 
     def counters(self) -> dict[str, float]:
         """Report how often it stopped the car."""
@@ -226,7 +250,7 @@ class SafetyNode(Node):
         speed, steering = float(message.speed_mps), float(message.steering_rad)
         passes = self._arming.heard_hand(
             str(message.mode), bool(message.estop), speed, steering, info, now.mono_ns
-        )  # fmt: skip
+        )
         return self._news(now) + ([self._go(speed, steering, now.real_ns, now)] if passes else [])
 
     def _pass_on(self, driver: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
@@ -272,11 +296,17 @@ class SafetyNode(Node):
         self._stated_ns, self._stated_armed = now.mono_ns, self._arming.armed
         arming, answer = self._arming, self._requests.last
         message = types.SafetyState(
-            header=header(now.real_ns), armed=arming.armed, stopping=not arming.armed, reason=arming.reason,
-            source=arming.source if arming.armed else "", answered_id=answer.ask_id, granted=answer.granted, answer=answer.text,
+            header=header(now.real_ns),
+            armed=arming.armed,
+            stopping=not arming.armed,
+            reason=arming.reason,
+            source=arming.source if arming.armed else "",
+            answered_id=answer.ask_id,
+            granted=answer.granted,
+            answer=answer.text,
             command_age_s=arming.drive_age_s(now.mono_ns),
             pose_age_s=arming.pose_age_s(now.mono_ns),
-        )  # fmt: skip
+        )
         return Out("/safety/state", message)
 
 

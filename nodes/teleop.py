@@ -21,7 +21,18 @@ from hardware.operator.keyboard import Keyboard
 from nodes.runtime.arm_requests import OPERATOR, arm_message
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.messages import header, types
-from nodes.runtime.node import ACTIVE, FAULT, READY, Inbox, MessageInfo, Node, NodeContext, Now, Out, ReaderThread
+from nodes.runtime.node import (
+    ACTIVE,
+    FAULT,
+    READY,
+    Inbox,
+    MessageInfo,
+    Node,
+    NodeContext,
+    Now,
+    Out,
+    ReaderThread,
+)
 from nodes.runtime.process import run_node_main
 from nodes.runtime.requests import Asked
 
@@ -60,7 +71,9 @@ class TeleopNode(Node):
     publications = ("/teleop/state", "/arm")
     tick_rate_hz = 20.0
 
-    def __init__(self, config: TeleopConfig, read: Callable[[], Hands | None], release: Callable[[], None]) -> None:
+    def __init__(
+        self, config: TeleopConfig, read: Callable[[], Hands | None], release: Callable[[], None]
+    ) -> None:
         self._config, self._release = config, release
         self.inbox: Inbox[Hands] = Inbox(capacity=4)
         self._hands, self._heard_ns = Hands(connected=False, text="not read yet"), 0
@@ -114,7 +127,9 @@ class TeleopNode(Node):
         if self._asked is not None and self._asked.age_ns(now) > _ARM_NS:
             self._asked = None
         if self._asked is not None:
-            outs.append(Out("/arm", arm_message(self._asked, now, True, OPERATOR, "re-armed by the operator")))
+            outs.append(
+                Out("/arm", arm_message(self._asked, now, True, OPERATOR, "re-armed by the operator"))
+            )
         return outs
 
     def status(self) -> tuple[str, str]:
@@ -134,13 +149,18 @@ class TeleopNode(Node):
         hands, config = self._hands, self._config
         # If the reader hangs, the button must count as released.
         fresh = hands.connected and now.mono_ns - self._heard_ns <= _STALE_S * NS_PER_S
-        self._mode = ("human" if hands.human else "autonomy" if hands.autonomy else "idle") if fresh else "idle"
+        self._mode = (
+            ("human" if hands.human else "autonomy" if hands.autonomy else "idle") if fresh else "idle"
+        )
         drives = self._mode == "human" and not self._estop
         message = types.Teleop(
-            header=header(now.real_ns), mode=self._mode, estop=self._estop,
+            header=header(now.real_ns),
+            mode=self._mode,
+            estop=self._estop,
             speed_mps=config.speed_mps * hands.throttle if drives else 0.0,
-            steering_rad=config.steering_rad * hands.steering if drives else 0.0, device=hands.text,
-        )  # fmt: skip
+            steering_rad=config.steering_rad * hands.steering if drives else 0.0,
+            device=hands.text,
+        )
         return Out("/teleop/state", message)
 
 

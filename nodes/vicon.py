@@ -12,7 +12,18 @@ from hardware.mocap.vicon import DEFAULT_PORT, SubjectPose, ViconConfig, ViconRe
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import TopicError
 from nodes.runtime.messages import pose_message
-from nodes.runtime.node import ACTIVE, FAULT, STARTING, Inbox, MessageInfo, Node, NodeContext, Now, Out, ReaderThread
+from nodes.runtime.node import (
+    ACTIVE,
+    FAULT,
+    STARTING,
+    Inbox,
+    MessageInfo,
+    Node,
+    NodeContext,
+    Now,
+    Out,
+    ReaderThread,
+)
 from nodes.runtime.process import run_node_main
 from nodes.runtime.topics import topic
 
@@ -109,7 +120,9 @@ class ViconNode(Node):
         now_ns, first = self._now_ns(), self._config.subjects[0]
         if fault := self._receiver.fault(now_ns):
             return FAULT, fault
-        lost = [name for name in self._config.subjects if self._silence_s(name, now_ns) > self._config.silence_s]
+        lost = [
+            name for name in self._config.subjects if self._silence_s(name, now_ns) > self._config.silence_s
+        ]
         text = f"not seen: {', '.join(lost)}" if lost else ""
         if first not in self._seen_ns:
             return (
@@ -122,9 +135,14 @@ class ViconNode(Node):
         """Report counts of datagrams and poses."""
         counts = self._receiver.counts
         totals: dict[str, float] = {
-            "datagrams": counts.datagrams, "refused": counts.refused, "late": counts.late, "stale": self._stale,
-            "frames_missed": counts.missed_frames, "restarts": counts.restarts, "disputed": counts.disputed,
-        }  # fmt: skip
+            "datagrams": counts.datagrams,
+            "refused": counts.refused,
+            "late": counts.late,
+            "stale": self._stale,
+            "frames_missed": counts.missed_frames,
+            "restarts": counts.restarts,
+            "disputed": counts.disputed,
+        }
         return totals | {f"lost {name}": float(count) for name, count in counts.lost.items()}
 
     def close(self) -> None:
@@ -146,11 +164,18 @@ def _receiver(config: ViconNodeConfig) -> ViconReceiver | LibraryReceiver:
     if config.library is None:
         return ViconReceiver(
             ViconConfig(
-                config.subjects, config.host, config.port, config.latency_s, config.frozen_frames, config.source
+                config.subjects,
+                config.host,
+                config.port,
+                config.latency_s,
+                config.frozen_frames,
+                config.source,
             )
         )
     return LibraryReceiver(
-        LibraryConfig(config.library, config.hostname, config.subjects, config.latency_s, config.frozen_frames)
+        LibraryConfig(
+            config.library, config.hostname, config.subjects, config.latency_s, config.frozen_frames
+        )
     )
 
 

@@ -70,9 +70,13 @@ class ViewerNode(Node):
         try:
             # No capabilities: clients may neither publish, nor call services, nor set parameters.
             self._server = foxglove.start_server(
-                name="advnerf", host=config.host, port=config.port, capabilities=[], context=context,
+                name="advnerf",
+                host=config.host,
+                port=config.port,
+                capabilities=[],
+                context=context,
                 message_backlog_size=_BACKLOG,
-            )  # fmt: skip
+            )
         except (OSError, RuntimeError) as error:
             raise BusError(f"cannot serve the viewer on {config.host}:{config.port}: {error}") from error
 

@@ -31,7 +31,9 @@ def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> 
         item.ihook.pytest_runtest_logstart(nodeid=item.nodeid, location=item.location)
         reports = runtestprotocol(item, nextitem=nextitem, log=False)
         share = (stolen()[0] - before[0]) / max(1, stolen()[1] - before[1])
-        again = any(report.failed for report in reports) and share >= _STOLEN_SHARE and attempt + 1 < _ATTEMPTS
+        again = (
+            any(report.failed for report in reports) and share >= _STOLEN_SHARE and attempt + 1 < _ATTEMPTS
+        )
         if again:
             print(
                 f"\n{item.nodeid} failed while the host withheld {share:.0%} of the processors; again",
@@ -64,9 +66,14 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
         "--override-ini=addopts=--import-mode=importlib",
     ]
     done = subprocess.run(
-        [*command, pyfuncitem.nodeid], cwd=pyfuncitem.config.rootpath, env={**os.environ, _INSIDE: "1"}, text=True,
-        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, timeout=100,
-    )  # fmt: skip
+        [*command, pyfuncitem.nodeid],
+        cwd=pyfuncitem.config.rootpath,
+        env={**os.environ, _INSIDE: "1"},
+        text=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        timeout=100,
+    )
     if done.returncode != 0:
         pytest.fail(f"in its own process:\n{done.stdout}", pytrace=False)
     return True

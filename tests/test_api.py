@@ -66,7 +66,9 @@ def test_every_public_name_is_the_one_its_module_defines(package):
     for entry in entries:
         home = importlib.import_module(entry.module)
         assert getattr(module, entry.name) is getattr(home, entry.name)
-        assert getattr(getattr(home, entry.name), "__module__", entry.module) == entry.module, "import it from its home"
+        assert getattr(getattr(home, entry.name), "__module__", entry.module) == entry.module, (
+            "import it from its home"
+        )
 
 
 def test_a_name_that_is_not_public_is_an_attribute_error_that_python_completes():
@@ -89,7 +91,15 @@ def test_a_type_checker_knows_the_types_of_public_names_and_no_others(tmp_path):
         "reveal_type(load_attack)\nreveal_type(read_info)\n"
     )
     environment = {**os.environ, "MYPYPATH": str(ROOT)}
-    command = [sys.executable, "-m", "mypy", "--strict", "--config-file", str(ROOT / "pyproject.toml"), "mine.py"]
+    command = [
+        sys.executable,
+        "-m",
+        "mypy",
+        "--strict",
+        "--config-file",
+        str(ROOT / "pyproject.toml"),
+        "mine.py",
+    ]
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=600)
     assert 'mine.py:1: error: Module "advnerf_core" has no attribute "Pth"' in done.stdout
     assert '-> advnerf_core.attack.artifact.AttackFile"' in done.stdout
@@ -110,7 +120,10 @@ def test_docstrings_give_shapes_and_units(package):
 @pytest.mark.parametrize(
     ("source", "gap"),
     [
-        ('def f(theta: Tensor) -> None:\n    """Do it."""', "expected the shape of theta (Tensor), found none"),
+        (
+            'def f(theta: Tensor) -> None:\n    """Do it."""',
+            "expected the shape of theta (Tensor), found none",
+        ),
         ('def f() -> Array:\n    """A pose."""', "expected the shape of what it returns (Array), found none"),
         (
             'def f(a: Tensor, b: int) -> None:\n    """Do it to ``[3]``.\n\n    Args:\n        b: Count.\n    """',
@@ -132,7 +145,11 @@ def test_docstrings_give_shapes_and_units(package):
 )
 def test_what_a_docstring_lacks_is_found(source, gap):
     node = ast.parse(source).body[0]
-    find = write_api._class_gaps if isinstance(node, ast.ClassDef) else lambda each: write_api._function_gaps(each, "")
+    find = (
+        write_api._class_gaps
+        if isinstance(node, ast.ClassDef)
+        else lambda each: write_api._function_gaps(each, "")
+    )
     assert list(find(node)) == ([] if gap is None else [gap])
 
 

@@ -10,7 +10,9 @@ ROOT = Path(__file__).parents[1]
 
 
 def test_the_architecture_page_is_drawn_from_the_code():
-    stale = [file.name for file, text in draw_rooms.written().items() if file.read_text(encoding="utf-8") != text]
+    stale = [
+        file.name for file, text in draw_rooms.written().items() if file.read_text(encoding="utf-8") != text
+    ]
     assert stale == [], "run `make rooms`"
 
 

@@ -29,7 +29,11 @@ def test_links_and_files_of_a_page_are_there(page):
     text = page.read_text()
     links = [target for target in re.findall(r"\]\(([^)#\s]+)(?:#[^)]*)?\)", text) if "://" not in target]
     missing = [target for target in links if not (page.parent / target).exists()]
-    named = [name for name in _FILE.findall(text) if not any(part.startswith(_NOT_OURS) for part in Path(name).parts)]
+    named = [
+        name
+        for name in _FILE.findall(text)
+        if not any(part.startswith(_NOT_OURS) for part in Path(name).parts)
+    ]
     missing += [name for name in named if not (ROOT / name).exists()]
     missing += [
         name
@@ -67,7 +71,9 @@ def is_a_command(command, line):
         if word not in here.commands:
             return word.startswith("-") or "|" in word  # an option of the group, or alternatives such as a|b
         here = here.commands[word]
-    known = {name for parameter in here.params for name in (*parameter.opts, *parameter.secondary_opts)} | {"--help"}
+    known = {name for parameter in here.params for name in (*parameter.opts, *parameter.secondary_opts)} | {
+        "--help"
+    }
     asked = {word.partition("=")[0] for word in words if word.startswith("--")}
     return asked <= known
 

@@ -34,7 +34,12 @@ def run(*arguments):
         command,
         capture_output=True,
         text=True,
-        env={"PYTHONPATH": str(REPOSITORY), "PATH": "/usr/bin:/bin", "MUJOCO_GL": "egl", "OMP_NUM_THREADS": "1"},
+        env={
+            "PYTHONPATH": str(REPOSITORY),
+            "PATH": "/usr/bin:/bin",
+            "MUJOCO_GL": "egl",
+            "OMP_NUM_THREADS": "1",
+        },
         timeout=110,
     )
 
@@ -42,7 +47,11 @@ def run(*arguments):
 def test_the_adapter_is_as_short_as_promised_and_loads(folder):
     from advnerf_core.policies.load import load_any_policy
 
-    code = [line for line in block("def factory").splitlines() if line.strip() and not line.lstrip().startswith("#")]
+    code = [
+        line
+        for line in block("def factory").splitlines()
+        if line.strip() and not line.lstrip().startswith("#")
+    ]
     assert len(code) <= 20
     loaded = load_any_policy("my_policy:factory")
     assert loaded.policy.stateless

@@ -36,7 +36,9 @@ def ancestors(name, classes):
 def test_every_exception_of_the_packages_is_an_advnerf_error():
     classes = exception_classes()
     system = {
-        name for name, value in vars(builtins).items() if isinstance(value, type) and issubclass(value, Exception)
+        name
+        for name, value in vars(builtins).items()
+        if isinstance(value, type) and issubclass(value, Exception)
     }
     exceptions = {name for name in classes if ancestors(name, classes) & system}
     assert len(exceptions) > 40

@@ -29,7 +29,12 @@ def run(*command):
     """What a command prints, run in the repository's folder."""
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     done = subprocess.run(
-        [sys.executable, *map(str, command)], capture_output=True, text=True, cwd=ROOT, env=environment, timeout=110
+        [sys.executable, *map(str, command)],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        env=environment,
+        timeout=110,
     )
     assert done.returncode == 0, done.stderr
     assert "Warning" not in done.stderr
@@ -109,7 +114,9 @@ def test_the_node_steers_by_every_image_of_a_recording(expected):
     with Replay(CORNER, Choice(("policy",), launch=LAUNCH)) as replay:
         made = [entry.message for entry in replay if entry.message.topic == DRIVE]
     commands = [decode(DRIVE_TYPE, message.cdr) for message in made]
-    assert {stamp_ns(command): command.drive.steering_angle for command in commands} == pytest.approx(expected)
+    assert {stamp_ns(command): command.drive.steering_angle for command in commands} == pytest.approx(
+        expected
+    )
     assert [command.drive.speed for command in commands] == pytest.approx([0.8] * 12)
 
 

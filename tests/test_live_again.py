@@ -38,9 +38,12 @@ def test_it():
 
 
 @pytest.mark.parametrize(
-    ("share", "failures", "outcome", "runs"), [(10, 2, "passed", 3), (0, 2, "failed", 1), (10, 99, "failed", 5)]
+    ("share", "failures", "outcome", "runs"),
+    [(10, 2, "passed", 3), (0, 2, "failed", 1), (10, 99, "failed", 5)],
 )
-def test_a_live_test_is_run_again_while_the_host_withholds_the_processors(pytester, share, failures, outcome, runs):
+def test_a_live_test_is_run_again_while_the_host_withholds_the_processors(
+    pytester, share, failures, outcome, runs
+):
     pytester.makeconftest(CONFTEST.format(share=share, root=str(ROOT)))
     pytester.makepyfile(TEST.format(failures=failures))
     result = pytester.runpytest_subprocess("-p", "no:cacheprovider")

@@ -89,7 +89,9 @@ class RenderCache:
         return rendered
 
 
-def roll_out(problem: AttackProblem, theta: Tensor, cache: RenderCache | None = None) -> tuple[Rollout, list[Tensor]]:
+def roll_out(
+    problem: AttackProblem, theta: Tensor, cache: RenderCache | None = None
+) -> tuple[Rollout, list[Tensor]]:
     """Drive the closed loop for ``theta``; also the memories ``[T + 1]`` of a policy that has one (else empty)."""
     step = 0
 
@@ -101,7 +103,11 @@ def roll_out(problem: AttackProblem, theta: Tensor, cache: RenderCache | None = 
         step += 1
         return rendered.images
 
-    policy = problem.policy if problem.policy.stateless else _Remembering(problem.policy, len(problem.start_states))
+    policy = (
+        problem.policy
+        if problem.policy.stateless
+        else _Remembering(problem.policy, len(problem.start_states))
+    )
     rollout = drive(policy, observe, problem.dynamics, problem.start_states, problem.steps, problem.goals)
     if not bool(torch.isfinite(rollout.states).all()):
         tick = int((~torch.isfinite(rollout.states)).flatten(1).any(1).nonzero()[0])
@@ -160,7 +166,11 @@ def adjoint_gradient(problem: AttackProblem, theta: Tensor) -> AdjointResult:
 
 
 def gradient_pass(
-    problem: AttackProblem, theta: Tensor, rollout: Rollout, cache: RenderCache, memories: Sequence[Tensor] = ()
+    problem: AttackProblem,
+    theta: Tensor,
+    rollout: Rollout,
+    cache: RenderCache,
+    memories: Sequence[Tensor] = (),
 ) -> AdjointResult:
     """The gradient of a rollout that was driven with ``theta``.
 
@@ -217,8 +227,14 @@ def adjoint_states(dynamics: Dynamics, rollout: Rollout, cost_slopes: Tensor) ->
 _Terms = Iterator[tuple[Tensor, int]]
 
 
-def _batched_terms(problem: AttackProblem, theta: Tensor, rollout: Rollout, control_slopes: Tensor,
-                   cache: RenderCache, memories: Sequence[Tensor]) -> _Terms:  # fmt: skip
+def _batched_terms(
+    problem: AttackProblem,
+    theta: Tensor,
+    rollout: Rollout,
+    control_slopes: Tensor,
+    cache: RenderCache,
+    memories: Sequence[Tensor],
+) -> _Terms:
     """Gradient terms of a stateless policy, one time batch after the other, each with its count of repeated renders."""
     del memories  # there are none
     steps, starts = control_slopes.shape
@@ -241,8 +257,9 @@ def _batched_terms(problem: AttackProblem, theta: Tensor, rollout: Rollout, cont
         yield total, again
 
 
-def _renders(problem: AttackProblem, theta: Tensor, rollout: Rollout, steps: range,
-             cache: RenderCache) -> tuple[list[Rendered], int]:  # fmt: skip
+def _renders(
+    problem: AttackProblem, theta: Tensor, rollout: Rollout, steps: range, cache: RenderCache
+) -> tuple[list[Rendered], int]:
     """Renders of consecutive steps in order: kept ones singly, runs of missing ones rendered together."""
     pieces: list[Rendered] = []
     missing: list[int] = []
@@ -265,8 +282,14 @@ def _renders(problem: AttackProblem, theta: Tensor, rollout: Rollout, steps: ran
     return pieces, again
 
 
-def _sequential_terms(problem: AttackProblem, theta: Tensor, rollout: Rollout, control_slopes: Tensor,
-                      cache: RenderCache, memories: Sequence[Tensor]) -> _Terms:  # fmt: skip
+def _sequential_terms(
+    problem: AttackProblem,
+    theta: Tensor,
+    rollout: Rollout,
+    control_slopes: Tensor,
+    cache: RenderCache,
+    memories: Sequence[Tensor],
+) -> _Terms:
     """Gradient terms of a policy with memory, last step first, carrying the adjoint of the memory.
 
     With ``(u_t, m_{t+1}) = pi(o_t, m_t)`` the memory has its own multiplier ``mu_t = (du/dm)^T (df/du)^T lambda_{t+1} +

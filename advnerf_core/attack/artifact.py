@@ -65,11 +65,17 @@ class AttackedObject:
 
     def __post_init__(self) -> None:
         if self.theta.ndim < 2 or self.theta.shape[-1] != 3 or self.theta.dtype != np.float32:
-            raise AttackFileError(f"expected theta [..., 3] float32, got {self.theta.shape} {self.theta.dtype}")
+            raise AttackFileError(
+                f"expected theta [..., 3] float32, got {self.theta.shape} {self.theta.dtype}"
+            )
         if np.shape(self.T_world_from_object) != (4, 4):
-            raise AttackFileError(f"expected a pose [4, 4] of {self.name}, got {np.shape(self.T_world_from_object)}")
+            raise AttackFileError(
+                f"expected a pose [4, 4] of {self.name}, got {np.shape(self.T_world_from_object)}"
+            )
         if not (np.isfinite(self.theta).all() and np.isfinite(self.T_world_from_object).all()):
-            raise AttackFileError(f"expected finite colours and a finite pose of {self.name}, got some that are not")
+            raise AttackFileError(
+                f"expected finite colours and a finite pose of {self.name}, got some that are not"
+            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +103,9 @@ class Face:
             or self.texture.dtype != np.uint8
             or not self.texture.size
         ):
-            raise AttackFileError(f"expected a texture [H, W, 3] uint8, got {self.texture.shape} {self.texture.dtype}")
+            raise AttackFileError(
+                f"expected a texture [H, W, 3] uint8, got {self.texture.shape} {self.texture.dtype}"
+            )
         if np.shape(self.corners_in_subject) != (4, 3) or not np.isfinite(self.corners_in_subject).all():
             raise AttackFileError("expected four finite corners [4, 3] of the face, got others")
 
@@ -149,7 +157,9 @@ class AttackFile:
                     f"expected a face of object 0 to {len(self.objects) - 1}, got {self.face.carried_by}"
                 )
             if self.face_object.theta.ndim != 3:
-                raise AttackFileError(f"expected theta [N, N, 3] of the face, got {self.face_object.theta.shape}")
+                raise AttackFileError(
+                    f"expected theta [N, N, 3] of the face, got {self.face_object.theta.shape}"
+                )
 
     @classmethod
     def of_face(
@@ -286,7 +296,9 @@ def load_attack(path: str | os.PathLike[str]) -> AttackFile:
     """
     source = Path(path)
     if not source.is_file():
-        raise AttackFileError(f"expected an attack file at {source}, found none; run the attack, or correct the path")
+        raise AttackFileError(
+            f"expected an attack file at {source}, found none; run the attack, or correct the path"
+        )
     try:
         with safe_open(source, framework="numpy") as handle:
             header = handle.metadata() or {}
@@ -310,7 +322,9 @@ def attack_from_bytes(content: bytes, source: str) -> AttackFile:
 
 def _checked(header: dict[str, Any], tensors: dict[str, NDArray[Any]], source: str) -> AttackFile:
     if header.get("format") != FILE_FORMAT:
-        raise AttackFileError(f"expected {source} to be of format {FILE_FORMAT}, got {header.get('format')!r}")
+        raise AttackFileError(
+            f"expected {source} to be of format {FILE_FORMAT}, got {header.get('format')!r}"
+        )
     try:
         attack = _from_parts(json.loads(header["metadata"]), tensors)
     except AttackFileError:

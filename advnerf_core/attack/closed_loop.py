@@ -85,7 +85,9 @@ class ClosedLoopCosine:
                 f"agree at steps {self.plateau[0]:g} to {self.plateau[-1]:g})"
             )
         if all(at.along == 0.0 and not any(at.beside) for at in self.at_steps):
-            return "cosine to the true closed loop CANNOT BE TOLD: the loop does not change along any direction"
+            return (
+                "cosine to the true closed loop CANNOT BE TOLD: the loop does not change along any direction"
+            )
         swept = ", ".join(f"{at.cosine:+.2f} at {at.step:g}" for at in self.at_steps)
         return (
             "cosine to the true closed loop CANNOT BE TOLD: its finite differences depend on their step, as of a loop that jumps "
@@ -127,7 +129,9 @@ def closed_loop_cosine(
     ordered = sorted(steps, reverse=True)
     frame = _frame(gradient, directions, seed)
     if frame is None:  # without a gradient there is no angle to it
-        return ClosedLoopCosine(tuple(CosineAtStep(s, 0.0, 0.0, 0.0, 0.0, ()) for s in ordered), None, theta.numel())
+        return ClosedLoopCosine(
+            tuple(CosineAtStep(s, 0.0, 0.0, 0.0, 0.0, ()) for s in ordered), None, theta.numel()
+        )
     found = []
     for number, step in enumerate(ordered):
         slopes = []
@@ -144,7 +148,9 @@ def _frame(gradient: Tensor, directions: int, seed: int) -> Tensor | None:
     if not float(flat.norm()) > 0.0:
         return None
     count = min(directions, flat.numel() - 1)
-    noise = torch.randn(flat.numel(), count, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    noise = torch.randn(
+        flat.numel(), count, generator=torch.Generator().manual_seed(seed), dtype=torch.float64
+    )
     # The first column of Q is the gradient's direction up to its sign; a Gaussian frame beside it is uniform.
     q, _ = torch.linalg.qr(torch.cat([flat[:, None], noise], dim=1))
     q[:, 0] = flat / flat.norm()
@@ -158,7 +164,10 @@ def _at_step(step: float, along: float, beside: Sequence[float], dimensions: int
     shares = [1.0, 1.0, 1.0]
     if count < rest:
         tail = (1.0 - CONFIDENCE) / 2.0
-        shares = [count / rest, *(float(beta.ppf(p, count / 2.0, (rest - count) / 2.0)) for p in (tail, 1.0 - tail))]
+        shares = [
+            count / rest,
+            *(float(beta.ppf(p, count / 2.0, (rest - count) / 2.0)) for p in (tail, 1.0 - tail)),
+        ]
     ends = [_ratio(along, size / share) for share in shares]
     return CosineAtStep(step, ends[0], min(ends), max(ends), along, tuple(beside))
 

@@ -16,7 +16,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from advnerf_core.attack.adjoint import AdjointResult, RenderCache, adjoint_gradient, evaluate, gradient_pass, roll_out
+from advnerf_core.attack.adjoint import (
+    AdjointResult,
+    RenderCache,
+    adjoint_gradient,
+    evaluate,
+    gradient_pass,
+    roll_out,
+)
 from advnerf_core.attack.problem import AttackProblem
 from advnerf_core.attack.spaces.displayed import DisplayedSensor
 from advnerf_core.driving.rollout import Rollout
@@ -92,7 +99,9 @@ def frozen_loss(problem: AttackProblem, theta: Tensor, rollout: Rollout) -> floa
 def closed_loss(problem: AttackProblem, theta: Tensor) -> float:
     """Loss of the true closed loop for ``theta``, under the same draws."""
     _, totals = evaluate(problem, theta)
-    return -float(totals.total_cte_m.mean()) + (0.0 if problem.regulariser is None else problem.regulariser(theta)[0])
+    return -float(totals.total_cte_m.mean()) + (
+        0.0 if problem.regulariser is None else problem.regulariser(theta)[0]
+    )
 
 
 def random_directions(theta: Tensor, count: int, seed: int = 0) -> Tensor:
@@ -152,9 +161,11 @@ def tick_health(problem: AttackProblem, result: AdjointResult) -> TickHealth:
         probe = torch.zeros(problem.sensor.theta_shape, dtype=problem.start_states.dtype)
         visible = tuple(_share_that_sees(problem, states, probe) for states in result.rollout.states[:-1])
     return TickHealth(
-        tuple(lambdas[:, :, :2].norm(dim=2).mean(1).tolist()), tuple(lambdas[:, :, 2].abs().mean(1).tolist()),
-        saturated_shares(problem, result.rollout.controls), visible,
-    )  # fmt: skip
+        tuple(lambdas[:, :, :2].norm(dim=2).mean(1).tolist()),
+        tuple(lambdas[:, :, 2].abs().mean(1).tolist()),
+        saturated_shares(problem, result.rollout.controls),
+        visible,
+    )
 
 
 def _share_that_sees(problem: AttackProblem, states: Tensor, probe: Tensor) -> float:
@@ -245,7 +256,10 @@ def time_split(problem: AttackProblem, theta: Tensor) -> tuple[TimeSplit, Adjoin
     result = gradient_pass(timed, theta, rollout, cache, memories)
     again_s, pass_s = sensor.render_s - rendered_s, time.perf_counter() - rolled
     split = TimeSplit(
-        sensor.render_s, rolled - began - rendered_s, pass_s - again_s - sensor.vjp_s, sensor.vjp_s,
+        sensor.render_s,
+        rolled - began - rendered_s,
+        pass_s - again_s - sensor.vjp_s,
+        sensor.vjp_s,
         problem.steps * len(problem.start_states),
-    )  # fmt: skip
+    )
     return split, result

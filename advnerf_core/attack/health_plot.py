@@ -43,7 +43,9 @@ def draw_health(
     axes[2].set_xlabel("tick")
     axes[2].legend()
     axes[3].set_title("share of the starts")
-    axes[3].step(range(len(ticks.saturated)), ticks.saturated, color=LIGHT["gradient"], label="steering saturated")
+    axes[3].step(
+        range(len(ticks.saturated)), ticks.saturated, color=LIGHT["gradient"], label="steering saturated"
+    )
     if ticks.visible:
         axes[3].step(range(len(ticks.visible)), ticks.visible, color=LIGHT["tape"], label="object seen")
     axes[3].set(ylim=(-0.05, 1.05), xlabel="tick")
@@ -80,8 +82,11 @@ def _cosines(axes: Axes, closed: ClosedLoopCosine) -> None:
 
 def _times(axes: Axes, split: TimeSplit) -> None:
     parts = {
-        "render": split.render_s, "policy, drive": split.drive_s, "policy, backward": split.backward_s, "vjp": split.vjp_s,
-    }  # fmt: skip
+        "render": split.render_s,
+        "policy, drive": split.drive_s,
+        "policy, backward": split.backward_s,
+        "vjp": split.vjp_s,
+    }
     axes.barh(list(parts), [1e3 * seconds / split.frames for seconds in parts.values()], color=LIGHT["none"])
     axes.invert_yaxis()
     axes.set(title="time a frame", xlabel="ms")

@@ -124,7 +124,9 @@ class Method:
 
     def __post_init__(self) -> None:
         own = self.Options
-        if own is None or (isinstance(own, type) and (dataclasses.is_dataclass(own) or issubclass(own, BaseModel))):
+        if own is None or (
+            isinstance(own, type) and (dataclasses.is_dataclass(own) or issubclass(own, BaseModel))
+        ):
             return
         raise MethodError(f"expected Options to be a dataclass or a pydantic model, got {own!r:.80}")
 
@@ -148,8 +150,13 @@ class Method:
             return TypeAdapter(self.Options).validate_python(dict(written))
         except ValidationError as error:
             first = error.errors(include_url=False)[0]
-            place, message = ".".join(map(str, (key, *first["loc"]))), str(first["msg"]).removeprefix("Value error, ")
-            raise MethodError(f"{place}: {message[:1].lower()}{message[1:]}, got {first['input']!r:.80}") from None
+            place, message = (
+                ".".join(map(str, (key, *first["loc"]))),
+                str(first["msg"]).removeprefix("Value error, "),
+            )
+            raise MethodError(
+                f"{place}: {message[:1].lower()}{message[1:]}, got {first['input']!r:.80}"
+            ) from None
 
 
 def _fields_of(options: type[Any] | None) -> tuple[str, ...]:
@@ -177,7 +184,9 @@ METHODS: Mapping[str, Method] = MappingProxyType(
         "evolution": Method(_late("evolution")),
         "gradient": Method(_late("gradient"), needs_gradient=True, reads_scale=True),
         "guided": Method(_late("guided"), single_images=True, evaluations=_late("guided", "evaluations")),
-        "distilled": Method(_late("distilled"), single_images=True, evaluations=_late("distilled", "evaluations")),
+        "distilled": Method(
+            _late("distilled"), single_images=True, evaluations=_late("distilled", "evaluations")
+        ),
     }
 )
 
@@ -246,7 +255,9 @@ def black_box_methods(stateless: bool = True) -> tuple[str, ...]:
         stateless: Whether the policy has no memory.
     """
     return tuple(
-        name for name, row in METHODS.items() if not row.needs_gradient and (stateless or not row.single_images)
+        name
+        for name, row in METHODS.items()
+        if not row.needs_gradient and (stateless or not row.single_images)
     )
 
 
@@ -261,4 +272,8 @@ def _row(name: str) -> Callable[[], Method]:
 
 
 def _described(found: Any) -> str:
-    return f"the class {found.__name__}" if isinstance(found, type) else f"an object of type {type(found).__name__}"
+    return (
+        f"the class {found.__name__}"
+        if isinstance(found, type)
+        else f"an object of type {type(found).__name__}"
+    )

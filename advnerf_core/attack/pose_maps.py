@@ -75,7 +75,8 @@ def places_over(space: PoseSpace, number: int, points: Sequence[int]) -> tuple[l
     """x [m] and y [m] of a grid over the bounds of one object; a single one where they leave no room."""
     low, high = (space.middle + sign * space.half for sign in (-1, 1))
     x_m, y_m = (
-        np.unique(np.linspace(float(low[number, k]), float(high[number, k]), n)).tolist() for k, n in enumerate(points)
+        np.unique(np.linspace(float(low[number, k]), float(high[number, k]), n)).tolist()
+        for k, n in enumerate(points)
     )
     return x_m, y_m
 
@@ -86,7 +87,9 @@ def starts_beside(
     """Starts to the left of a nominal one, each with each turn to the left: x [m], y [m], yaw [rad]."""
     x, y, yaw = nominal
     return [
-        (x - aside * np.sin(yaw), y + aside * np.cos(yaw), yaw + turn) for turn in turns_rad for aside in sideways_m
+        (x - aside * np.sin(yaw), y + aside * np.cos(yaw), yaw + turn)
+        for turn in turns_rad
+        for aside in sideways_m
     ]
 
 
@@ -130,7 +133,9 @@ def landscape(
     names = {"kind": "landscape", "object": number, "grid": [axis.tolist() for axis in axes]}
     cells = _cells(len(points), total, file, _fingerprint(problem, theta, settings_hash, names), on_cell)
     shape = (len(axes[0]), len(axes[1]), len(axes[2]))
-    return Landscape(number, axes[0], axes[1], axes[2], np.array([np.mean(cell) for cell in cells]).reshape(shape))
+    return Landscape(
+        number, axes[0], axes[1], axes[2], np.array([np.mean(cell) for cell in cells]).reshape(shape)
+    )
 
 
 def robustness_map(
@@ -177,7 +182,9 @@ def robustness_map(
         return [*_drive(wide, theta, placements), _drive(wide, theta, placements, plain)[0]]
 
     names = {"kind": "robustness", "object": number, "starts": begin.tolist(), "moves": shifts.tolist()}
-    cells = np.array(_cells(len(shifts), row, file, _fingerprint(wide, theta, settings_hash, names), on_cell), float)
+    cells = np.array(
+        _cells(len(shifts), row, file, _fingerprint(wide, theta, settings_hash, names), on_cell), float
+    )
     return RobustnessMap(begin, shifts, cells[:, 0], cells[:, 2], cells[:, 1])
 
 
@@ -196,8 +203,13 @@ def _drive(
     return totals.protocol_cte_m.tolist(), worst.tolist()
 
 
-def _cells(count: int, evaluate_cell: Callable[[int], Any], file: Path | None, fingerprint: str,
-           on_cell: OnCell | None) -> list[Any]:  # fmt: skip
+def _cells(
+    count: int,
+    evaluate_cell: Callable[[int], Any],
+    file: Path | None,
+    fingerprint: str,
+    on_cell: OnCell | None,
+) -> list[Any]:
     """All cells of a map, those of the file first."""
     done = {} if file is None or not file.exists() else _kept(file, fingerprint)
     for index in range(count):
@@ -236,5 +248,7 @@ def _fingerprint(problem: AttackProblem, theta: Tensor, settings_hash: str, name
 
 def _sensor(problem: AttackProblem) -> PlacedSensor:
     if not isinstance(problem.sensor, PlacedSensor):
-        raise TypeError(f"expected a problem with a PlacedSensor, got one with a {type(problem.sensor).__name__}")
+        raise TypeError(
+            f"expected a problem with a PlacedSensor, got one with a {type(problem.sensor).__name__}"
+        )
     return problem.sensor

@@ -36,18 +36,30 @@ def draw_landscape(
     figure = Figure(figsize=(1.5 + 4.2 * panels, 4.6), layout="constrained", facecolor=LIGHT["paper"])
     row = figure.subplots(1, panels, squeeze=False)[0]
     values = found.total_cte_m
-    low, high = (float(limit(values)) for limit in (np.nanmin, np.nanmax)) if np.isfinite(values).any() else (0.0, 1.0)
+    low, high = (
+        (float(limit(values)) for limit in (np.nanmin, np.nanmax))
+        if np.isfinite(values).any()
+        else (0.0, 1.0)
+    )
     for k, axes in enumerate(row):
         axes.set_facecolor(LIGHT["grid"])
         x, y = _edges(found.x_m), _edges(found.y_m)
-        picture = axes.pcolormesh(x, y, np.ma.masked_invalid(values[:, :, k].T), cmap=_COLOURS, vmin=low, vmax=high)
+        picture = axes.pcolormesh(
+            x, y, np.ma.masked_invalid(values[:, :, k].T), cmap=_COLOURS, vmin=low, vmax=high
+        )
         _draw_paths(axes, paths)
         for marker, (name, place) in zip("*oD^", (marked or {}).items(), strict=False):
             axes.plot(*place, marker, color="white", markeredgecolor="black", markersize=11, label=name)
         if marked:
             axes.legend(loc="upper right", fontsize=8)
-        axes.set(xlim=(x[0], x[-1]), ylim=(y[0], y[-1]), aspect="equal", xlabel="x [m]", ylabel="y [m]",
-                 title=f"yaw {np.rad2deg(found.yaw_rad[k]):.0f} deg")  # fmt: skip
+        axes.set(
+            xlim=(x[0], x[-1]),
+            ylim=(y[0], y[-1]),
+            aspect="equal",
+            xlabel="x [m]",
+            ylabel="y [m]",
+            title=f"yaw {np.rad2deg(found.yaw_rad[k]):.0f} deg",
+        )
     figure.colorbar(picture, ax=list(row), label="total CTE [m]")
     figure.suptitle(f"total CTE over the place of object {found.object}")
     return _png(figure)
@@ -56,11 +68,14 @@ def draw_landscape(
 def draw_robustness(found: RobustnessMap) -> bytes:
     """PNG of a robustness map: total CTE, its ratio to plain colours at the same poses, and the largest |CTE|."""
     count, starts = found.total_cte_m.shape
-    figure = Figure(figsize=(4.5 + 1.5 * starts, 2.4 + 0.35 * count), layout="constrained", facecolor=LIGHT["paper"])
+    figure = Figure(
+        figsize=(4.5 + 1.5 * starts, 2.4 + 0.35 * count), layout="constrained", facecolor=LIGHT["paper"]
+    )
     parts = {
-        "total CTE [m]": found.total_cte_m, "ratio to plain colours": found.total_cte_m / found.plain_cte_m,
+        "total CTE [m]": found.total_cte_m,
+        "ratio to plain colours": found.total_cte_m / found.plain_cte_m,
         "largest |CTE| [m]": found.worst_cte_m,
-    }  # fmt: skip
+    }
     rows = [f"{m[0]:+.2f}, {m[1]:+.2f} m, {np.rad2deg(m[2]):+.0f}°" for m in found.moves]
     columns = [f"{s[0]:.2f}\n{s[1]:.2f}\n{np.rad2deg(s[2]):.0f}°" for s in found.starts]
     for k, (axes, (name, values)) in enumerate(zip(figure.subplots(1, 3), parts.items(), strict=True)):
@@ -74,13 +89,22 @@ def draw_robustness(found: RobustnessMap) -> bytes:
         middle = 0.5 * (np.nanmin(values) + np.nanmax(values)) if np.isfinite(values).any() else 0.0
         for (i, j), value in np.ndenumerate(values):
             if np.isfinite(value):
-                axes.text(j, i, f"{value:.2g}", ha="center", va="center", fontsize=6,
-                          color="black" if value > middle else "white")  # fmt: skip
+                axes.text(
+                    j,
+                    i,
+                    f"{value:.2g}",
+                    ha="center",
+                    va="center",
+                    fontsize=6,
+                    color="black" if value > middle else "white",
+                )
     figure.axes[0].set_ylabel("object moved by")
     return _png(figure)
 
 
-def draw_placements(space: PoseSpace, placements: Tensor, paths: Sequence[Path], drives: dict[str, Array]) -> bytes:
+def draw_placements(
+    space: PoseSpace, placements: Tensor, paths: Sequence[Path], drives: dict[str, Array]
+) -> bytes:
     """PNG of where objects stand, seen from above: bounds, footprints before and after, paths and drives.
 
     Args:
@@ -102,7 +126,9 @@ def draw_placements(space: PoseSpace, placements: Tensor, paths: Sequence[Path],
             corners = scale * np.array([low, [high[0], low[1]], high, [low[0], high[1]]]) @ rotation_z(yaw)[
                 :2, :2
             ].T + [x, y]
-            axes.add_patch(Polygon(corners, closed=True, facecolor=colour, alpha=0.6, label=name if k == 0 else None))
+            axes.add_patch(
+                Polygon(corners, closed=True, facecolor=colour, alpha=0.6, label=name if k == 0 else None)
+            )
             axes.annotate(str(k), (x, y), color=LIGHT["ink"], fontsize=8)
         (x, y), (half_x, half_y) = space.middle[k, :2].tolist(), space.half[k, :2].tolist()
         box = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * [half_x, half_y] + [x, y]
@@ -110,7 +136,9 @@ def draw_placements(space: PoseSpace, placements: Tensor, paths: Sequence[Path],
     for name, xy in drives.items():
         colour = style_of(name).light
         axes.plot(xy[:, 0], xy[:, 1], color=colour, label=f"drive: {name}")
-    axes.set(aspect="equal", xlabel="x [m]", ylabel="y [m]", title="objects, their bounds (dotted) and the drives")
+    axes.set(
+        aspect="equal", xlabel="x [m]", ylabel="y [m]", title="objects, their bounds (dotted) and the drives"
+    )
     axes.legend(fontsize=8)
     return _png(figure)
 

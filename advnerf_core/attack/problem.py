@@ -119,7 +119,9 @@ class AttackProblem:
 
         moved = self.disturbances is not None and self.disturbances.moves_the_camera
         if moved and not isinstance(self.sensor, PosedSensor):
-            raise ValueError("expected a sensor with camera_poses and render for camera jitter, got one without")
+            raise ValueError(
+                "expected a sensor with camera_poses and render for camera jitter, got one without"
+            )
 
     @property
     def differentiable(self) -> bool:

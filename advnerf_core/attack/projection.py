@@ -102,7 +102,9 @@ class FaceOverlay:
             return None
         return (*rows, *columns)
 
-    def _composite(self, image: Image, corners: Array, window: tuple[int, int, int, int]) -> tuple[Image, bool]:
+    def _composite(
+        self, image: Image, corners: Array, window: tuple[int, int, int, int]
+    ) -> tuple[Image, bool]:
         top, bottom, left, right = window
         s = self._samples
         M = np.stack([corners[1] - corners[0], corners[3] - corners[0], corners[0]], axis=1)
@@ -181,5 +183,7 @@ def _sample_rays(
         x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
         return x[None].astype(np.float32), y[:, None].astype(np.float32)
     grid = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 1, 2)
-    rays = cv2.undistortPoints(grid, camera.matrix, np.asarray(distortion, dtype=np.float64)).reshape(len(v), len(u), 2)
+    rays = cv2.undistortPoints(grid, camera.matrix, np.asarray(distortion, dtype=np.float64)).reshape(
+        len(v), len(u), 2
+    )
     return np.ascontiguousarray(rays[..., 0], np.float32), np.ascontiguousarray(rays[..., 1], np.float32)

@@ -99,8 +99,12 @@ class Disturbances:
         )
 
     def _noise(self, images: Tensor, starts: int, draw: int, tick: int) -> Tensor:
-        generator = torch.Generator().manual_seed(int(self._generator(_FRAME, draw, tick).integers(2**63 - 1)))
-        return torch.randn((starts, *images.shape[1:]), generator=generator, dtype=torch.float32).to(images.dtype)
+        generator = torch.Generator().manual_seed(
+            int(self._generator(_FRAME, draw, tick).integers(2**63 - 1))
+        )
+        return torch.randn((starts, *images.shape[1:]), generator=generator, dtype=torch.float32).to(
+            images.dtype
+        )
 
     def _generator(self, stream: int, draw: int, tick: int) -> np.random.Generator:
         return np.random.default_rng([self.seed, stream, draw, tick])

@@ -66,15 +66,27 @@ class TransferPrediction:
         """JSON-ready values."""
         low, high = self.ratio_band
         return {
-            "ratio": self.ratio, "ratio_low": low, "ratio_high": high, "retained": self.retained, "draws": len(self.attacked_m),
-            "total_cte_m": float(np.mean(self.attacked_m)), "none_total_cte_m": float(np.mean(self.none_m)),
-        }  # fmt: skip
+            "ratio": self.ratio,
+            "ratio_low": low,
+            "ratio_high": high,
+            "retained": self.retained,
+            "draws": len(self.attacked_m),
+            "total_cte_m": float(np.mean(self.attacked_m)),
+            "none_total_cte_m": float(np.mean(self.none_m)),
+        }
 
 
 def predict_transfer(
-    problem: AttackProblem, images: Scene, clean: Agreement, effect: Effect, starts: Tensor, horizon: Horizon,
-    draws: int = 6, seed: int = 0, none_m: tuple[float, ...] | None = None,
-) -> TransferPrediction:  # fmt: skip
+    problem: AttackProblem,
+    images: Scene,
+    clean: Agreement,
+    effect: Effect,
+    starts: Tensor,
+    horizon: Horizon,
+    draws: int = 6,
+    seed: int = 0,
+    none_m: tuple[float, ...] | None = None,
+) -> TransferPrediction:
     """Predict deployed drives with and without an attack.
 
     Args:
@@ -123,7 +135,13 @@ class _AsDeployed:
     stateless = True
 
     def __init__(self, policy: Any, images: Scene, share: float, noise: Tensor, attacked: bool) -> None:
-        self._policy, self._images, self._share, self._noise, self._attacked = policy, images, share, noise, attacked
+        self._policy, self._images, self._share, self._noise, self._attacked = (
+            policy,
+            images,
+            share,
+            noise,
+            attacked,
+        )
         self._tick = 0
 
     def __call__(self, images: Tensor, goals: Tensor | None = None) -> Tensor:

@@ -42,11 +42,15 @@ def read_image(path: Path) -> tuple[Rgb, Grey | None]:
     flags = cv2.IMREAD_COLOR if data.startswith(_JPEG) else cv2.IMREAD_UNCHANGED
     pixels = None if is_cut_off(data) else cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     if pixels is None:
-        raise DatasetError(f"expected a readable image, got {path}: it is damaged or no image, so copy it again")
+        raise DatasetError(
+            f"expected a readable image, got {path}: it is damaged or no image, so copy it again"
+        )
     if pixels.dtype == np.uint16:
         pixels = np.round(pixels / 257.0).astype(np.uint8)
     if pixels.dtype != np.uint8:
-        raise DatasetError(f"expected an image of 8 or 16 bit, got {path} of {pixels.dtype}; convert it to PNG")
+        raise DatasetError(
+            f"expected an image of 8 or 16 bit, got {path} of {pixels.dtype}; convert it to PNG"
+        )
     if pixels.ndim == 2:
         pixels = np.repeat(pixels[..., None], 3, axis=-1)
     rgb = np.ascontiguousarray(pixels[..., 2::-1], dtype=np.uint8)
@@ -58,7 +62,9 @@ def read_mask(path: Path) -> Grey:
     data = read_bytes(path)
     pixels = None if is_cut_off(data) else cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
     if pixels is None:
-        raise DatasetError(f"expected a readable mask, got {path}: it is damaged or no image, so make it again")
+        raise DatasetError(
+            f"expected a readable mask, got {path}: it is damaged or no image, so make it again"
+        )
     return np.asarray(pixels, np.uint8)
 
 

@@ -105,7 +105,9 @@ class KeyframeSelector:
         """Median displacement since the last kept frame, as a share of the width; 1 when it cannot be followed."""
         if self._kept is None or len(self._corners) < _LEAST_CORNERS:
             # Nothing to follow on a bare wall: how different the pictures are stands in for it.
-            return 0.0 if self._kept is None else float(np.asarray(cv2.absdiff(self._kept, grey)).mean() / 255.0)
+            return (
+                0.0 if self._kept is None else float(np.asarray(cv2.absdiff(self._kept, grey)).mean() / 255.0)
+            )
         found, status = _follow(self._kept, grey, self._corners)
         back, status_back = _follow(grey, self._kept, found)
         # Flow finds something in any picture; what it finds is the same corner only if the way back ends where it began.
@@ -124,7 +126,9 @@ class KeyframeSelector:
     def _remember(self, frame: Candidate) -> None:
         grey = work_image(frame.rgb)
         corners = cv2.goodFeaturesToTrack(grey, _CORNERS, 0.01, 6)
-        self._corners = np.zeros((0, 1, 2), np.float32) if corners is None else np.asarray(corners, np.float32)
+        self._corners = (
+            np.zeros((0, 1, 2), np.float32) if corners is None else np.asarray(corners, np.float32)
+        )
         self._kept, self._kept_s = grey, frame.time_s
 
 
@@ -136,7 +140,9 @@ def work_image(rgb: Rgb) -> Grey:
     return np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
-def _follow(first: Grey, second: Grey, points: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+def _follow(
+    first: Grey, second: Grey, points: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     found, status, _ = cv2.calcOpticalFlowPyrLK(first, second, points, None, winSize=(21, 21), maxLevel=4)  # type: ignore[call-overload]
     return np.asarray(found, np.float32), np.asarray(status.reshape(-1) == 1)
 

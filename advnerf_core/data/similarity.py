@@ -85,10 +85,15 @@ class Alignment:
         """What a report says."""
         inside = self.inliers
         return {
-            "scale": self.similarity.scale, "cameras": len(inside), "inliers": int(inside.sum()), "extent_m": self.extent_m,
-            "rms_position_m": self.rms_position_m, "max_position_m": float(self.position_error_m[inside].max()),
-            "rms_rotation_rad": self.rms_rotation_rad, "max_rotation_rad": float(self.rotation_error_rad[inside].max()),
-        }  # fmt: skip
+            "scale": self.similarity.scale,
+            "cameras": len(inside),
+            "inliers": int(inside.sum()),
+            "extent_m": self.extent_m,
+            "rms_position_m": self.rms_position_m,
+            "max_position_m": float(self.position_error_m[inside].max()),
+            "rms_rotation_rad": self.rms_rotation_rad,
+            "max_rotation_rad": float(self.rotation_error_rad[inside].max()),
+        }
 
 
 def align_poses(
@@ -112,9 +117,14 @@ def align_poses(
     Raises:
         SimilarityError: Too few cameras, all at one place or on one line, or too few that agree.
     """
-    source, target = np.asarray(T_source_from_camera, np.float64), np.asarray(T_target_from_camera, np.float64)
+    source, target = (
+        np.asarray(T_source_from_camera, np.float64),
+        np.asarray(T_target_from_camera, np.float64),
+    )
     if source.shape != target.shape or source.shape[1:] != (4, 4):
-        raise ValueError(f"expected two sets of poses [N, 4, 4] of one length, got {source.shape} and {target.shape}")
+        raise ValueError(
+            f"expected two sets of poses [N, 4, 4] of one length, got {source.shape} and {target.shape}"
+        )
     if position_tolerance_m <= 0.0 or rotation_tolerance_rad <= 0.0:
         raise ValueError("expected positive tolerances")
     if not (np.isfinite(source).all() and np.isfinite(target).all()):
@@ -149,7 +159,9 @@ def extent(positions: ArrayLike) -> float:
 def rotation_angles(R: Array) -> Array:
     """Angles of rotations ``[..., 3, 3]`` [rad]; accurate for small ones too, where the arc cosine is not."""
     sine = np.linalg.norm(
-        np.stack([R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], axis=-1),
+        np.stack(
+            [R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], axis=-1
+        ),
         axis=-1,
     )
     return np.asarray(np.arctan2(sine, np.trace(R, axis1=-2, axis2=-1) - 1.0))

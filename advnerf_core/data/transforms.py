@@ -75,7 +75,9 @@ def _read_set(path: Path, split: str | None, require_all: bool) -> PosedImages:
             if image is None:
                 missing.append(path.parent / name)
                 continue
-            frames.append(_frame(path.parent, image, {**content, **entry}, split or split_of.get(_normal(name))))
+            frames.append(
+                _frame(path.parent, image, {**content, **entry}, split or split_of.get(_normal(name)))
+            )
         except ValueError as error:
             label = f" ({entry['file_path']})" if isinstance(entry, dict) and "file_path" in entry else ""
             raise DatasetError(f"{path}: frame {number}{label}: {error}") from error
@@ -106,7 +108,9 @@ def _listed_splits(path: Path, content: _Values) -> dict[str, str]:
     for split in _SPLITS:
         names = content.get(f"{split}_filenames", [])
         if not isinstance(names, list):
-            raise DatasetError(f"{path}: {split}_filenames: expected a list of files, got {type(names).__name__}")
+            raise DatasetError(
+                f"{path}: {split}_filenames: expected a list of files, got {type(names).__name__}"
+            )
         splits.update({_normal(str(name)): split for name in names})
     return splits
 
@@ -114,7 +118,11 @@ def _listed_splits(path: Path, content: _Values) -> dict[str, str]:
 def _ngp_box(path: Path, content: _Values) -> tuple[float, tuple[float, float, float], float | None]:
     try:
         scale = _number(content, "scale", NGP_SCALE, positive=True)
-        aabb = _number(content, "aabb_scale", 1.0, positive=True) if content.get("aabb_scale") is not None else None
+        aabb = (
+            _number(content, "aabb_scale", 1.0, positive=True)
+            if content.get("aabb_scale") is not None
+            else None
+        )
         raw = content.get("offset", NGP_OFFSET)
         x, y, z = (float(v) for v in (raw if isinstance(raw, list | tuple) else [raw] * 3))
         if not np.isfinite([x, y, z]).all():
@@ -126,7 +134,9 @@ def _ngp_box(path: Path, content: _Values) -> tuple[float, tuple[float, float, f
 
 def _name_of(entry: Any) -> str:
     if not isinstance(entry, dict):
-        raise _FieldError(f"expected an object with file_path and transform_matrix, got {type(entry).__name__}")
+        raise _FieldError(
+            f"expected an object with file_path and transform_matrix, got {type(entry).__name__}"
+        )
     name = entry.get("file_path")
     if not isinstance(name, str) or not name:
         raise _FieldError(f"file_path: expected the name of an image file, got {name!r}")
@@ -151,7 +161,13 @@ def _frame(folder: Path, image: Path, values: _Values, split: str | None) -> Pos
             f"mask_path: expected a mask at {mask_file}, it is missing; put it there or take the entry out"
         )
     return PosedImage(
-        image, _pinhole(image, values), _lens(values), _pose(values), mask_file, str(values.get("camera_id", "")), split
+        image,
+        _pinhole(image, values),
+        _lens(values),
+        _pose(values),
+        mask_file,
+        str(values.get("camera_id", "")),
+        split,
     )
 
 
@@ -161,13 +177,17 @@ def _pose(values: _Values) -> Array:
     try:
         matrix = np.array(values["transform_matrix"], np.float64)
     except (ValueError, TypeError):
-        raise _FieldError(f"transform_matrix: expected 4 x 4 numbers, got {values['transform_matrix']!r:.80}") from None
+        raise _FieldError(
+            f"transform_matrix: expected 4 x 4 numbers, got {values['transform_matrix']!r:.80}"
+        ) from None
     if matrix.shape == (3, 4):
         matrix = np.vstack([matrix, [0.0, 0.0, 0.0, 1.0]])
     if matrix.shape != (4, 4):
         raise _FieldError(f"transform_matrix: expected 4 x 4 numbers, got shape {list(matrix.shape)}")
     if not np.isfinite(matrix).all():
-        raise _FieldError("transform_matrix: expected finite numbers, got NaN or infinity; leave this frame out")
+        raise _FieldError(
+            "transform_matrix: expected finite numbers, got NaN or infinity; leave this frame out"
+        )
     if np.abs(matrix[3] - [0.0, 0.0, 0.0, 1.0]).max() > _RIGID_TOLERANCE:
         raise _FieldError(
             f"transform_matrix: expected the last row 0 0 0 1, got {matrix[3].tolist()}; is it transposed?"
@@ -220,8 +240,13 @@ def _pinhole(image: Path, values: _Values) -> Pinhole:
     if fx is None and fy is None:
         raise _FieldError("fl_x: expected fl_x, camera_angle_x or x_fov, none is there")
     return Pinhole(
-        width, height, fx or fy or 0.0, fy or fx or 0.0, _number(values, "cx", 0.5 * width), _number(values, "cy", 0.5 * height)
-    )  # fmt: skip
+        width,
+        height,
+        fx or fy or 0.0,
+        fy or fx or 0.0,
+        _number(values, "cx", 0.5 * width),
+        _number(values, "cy", 0.5 * height),
+    )
 
 
 def _focal_length(values: _Values, axis: str, size: int) -> float | None:

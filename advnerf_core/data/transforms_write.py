@@ -74,7 +74,11 @@ def _each(value: Any, kind: type[T], count: int) -> list[T]:
 
 def _relative(image: Path, folder: Path) -> str:
     """Relative to the file's folder even where the image lies outside, so that both can move together."""
-    return Path(os.path.relpath(image, folder.absolute())).as_posix() if image.is_absolute() else image.as_posix()
+    return (
+        Path(os.path.relpath(image, folder.absolute())).as_posix()
+        if image.is_absolute()
+        else image.as_posix()
+    )
 
 
 def _intrinsics(p: Pinhole, lens: Lens) -> dict[str, Any]:

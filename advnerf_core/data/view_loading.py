@@ -91,7 +91,12 @@ def _read_valid(frame: PosedImage, file: Path, width: int, height: int) -> NDArr
 
 
 def _straightened(
-    frame: PosedImage, rgb: Rgb, alpha: Grey | None, valid: NDArray[np.bool_] | None, pinhole: Pinhole, keep_all: bool
+    frame: PosedImage,
+    rgb: Rgb,
+    alpha: Grey | None,
+    valid: NDArray[np.bool_] | None,
+    pinhole: Pinhole,
+    keep_all: bool,
 ) -> tuple[Rgb, Grey | None, NDArray[np.bool_] | None, Pinhole]:
     try:
         lens = straightening(pinhole, frame.lens, keep_all)
@@ -117,7 +122,9 @@ def _resized(rgb: Rgb, alpha: Grey | None, size: tuple[int, int]) -> tuple[Rgb, 
 
 def _resize(image: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
     shrinks = size[0] <= image.shape[1] and size[1] <= image.shape[0]
-    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR), np.uint8)
+    return np.asarray(
+        cv2.resize(image, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR), np.uint8
+    )
 
 
 def _premultiplied(rgb: Rgb, alpha: Grey) -> tuple[Rgb, Grey]:

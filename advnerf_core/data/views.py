@@ -182,12 +182,15 @@ class PosedImages:
         opaque, whole = np.full(shape, OPAQUE, np.uint8), np.ones(shape, np.bool_)
         alphas, valids = [view.alpha for view in views], [view.valid for view in views]
         return ImageSet(
-            np.stack([view.rgb for view in views]), tuple(view.pinhole for view in views),
+            np.stack([view.rgb for view in views]),
+            tuple(view.pinhole for view in views),
             np.stack([frame.T_world_from_camera for frame in self.frames]),
-            None if all(a is None for a in alphas) else np.stack([opaque if a is None else a for a in alphas]),
+            None
+            if all(a is None for a in alphas)
+            else np.stack([opaque if a is None else a for a in alphas]),
             None if all(v is None for v in valids) else np.stack([whole if v is None else v for v in valids]),
             tuple(frame.camera_id for frame in self.frames),
-        )  # fmt: skip
+        )
 
     def box(self) -> tuple[Array, Array]:
         """Low and high corner ``[3]`` of Instant-NGP's box for this file, in its world units."""

@@ -100,7 +100,10 @@ class ActuatedAckermann:
             yaw_rate = self._yaw_rate(mean)
             dpose_dpose, dpose_dyaw_rate = _arc_jacobians(pose, yaw_rate, self.speed_mps, duration_s)
             dyaw_rate_dmean = self.speed_mps / self.wheelbase_m * (1.0 + torch.tan(mean) ** 2)
-            d_pose = dpose_dpose @ d_pose + dpose_dyaw_rate[:, :, None] * (dyaw_rate_dmean[:, None] * d_mean)[:, None]
+            d_pose = (
+                dpose_dpose @ d_pose
+                + dpose_dyaw_rate[:, :, None] * (dyaw_rate_dmean[:, None] * d_mean)[:, None]
+            )
             pose, wheel = _arc_step(pose, yaw_rate, self.speed_mps, duration_s), end
         everything = states.new_zeros(batch, size, size + 1)
         everything[:, :_POSE], everything[:, _WHEEL] = d_pose, d_wheel

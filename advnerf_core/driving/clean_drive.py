@@ -34,18 +34,25 @@ class CleanDrive:
     def __post_init__(self) -> None:
         lists = (self.total_cte_m, self.mean_cte_m, self.max_cte_m, self.off_track)
         if not self.total_cte_m or len({len(each) for each in lists}) != 1:
-            raise ValueError(f"expected one number of each kind for every start, got {[len(each) for each in lists]}")
+            raise ValueError(
+                f"expected one number of each kind for every start, got {[len(each) for each in lists]}"
+            )
         if not np.isfinite([*self.total_cte_m, *self.mean_cte_m, *self.max_cte_m]).all():
-            raise ValueError("expected finite cross-track errors of the drive without an attack, got some that are not")
+            raise ValueError(
+                "expected finite cross-track errors of the drive without an attack, got some that are not"
+            )
 
     @classmethod
     def of(cls, metrics: Sequence[DriveMetrics], horizon: Horizon) -> CleanDrive:
         """From the metrics of each drive and what they were taken over."""
         return cls(
-            tuple(each.total_cte_m for each in metrics), tuple(each.mean_cte_m for each in metrics),
-            tuple(each.max_cte_m for each in metrics), tuple(bool(each.off_track) for each in metrics),
-            horizon.ticks, horizon.off_track_m,
-        )  # fmt: skip
+            tuple(each.total_cte_m for each in metrics),
+            tuple(each.mean_cte_m for each in metrics),
+            tuple(each.max_cte_m for each in metrics),
+            tuple(bool(each.off_track) for each in metrics),
+            horizon.ticks,
+            horizon.off_track_m,
+        )
 
     @property
     def mean_total_cte_m(self) -> float:
@@ -94,7 +101,9 @@ class CleanDrive:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data from which `from_dict` makes the same."""
-        return {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(self).items()}
+        return {
+            name: list(value) if isinstance(value, tuple) else value for name, value in asdict(self).items()
+        }
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> CleanDrive:

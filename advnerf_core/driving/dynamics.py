@@ -132,7 +132,9 @@ class AckermannServoLag:
     steering_limits_rad: tuple[float, float] = STEERING_LIMITS_RAD
 
     def __post_init__(self) -> None:
-        _require_positive(wheelbase_m=self.wheelbase_m, speed_mps=self.speed_mps, dt_s=self.dt_s, lag_s=self.lag_s)
+        _require_positive(
+            wheelbase_m=self.wheelbase_m, speed_mps=self.speed_mps, dt_s=self.dt_s, lag_s=self.lag_s
+        )
         _require_limits(self.steering_limits_rad)
 
     @property
@@ -164,7 +166,9 @@ class AckermannServoLag:
         df_dx[:, :3, :3] = pose_dx
         df_dx[:, :3, 3] = pose_dmean * left_on_average
         df_dx[:, 3, 3] = left_at_end
-        df_du = torch.cat([pose_dmean * (1.0 - left_on_average), torch.full_like(states[:, :1], 1.0 - left_at_end)], 1)
+        df_du = torch.cat(
+            [pose_dmean * (1.0 - left_on_average), torch.full_like(states[:, :1], 1.0 - left_at_end)], 1
+        )
         return df_dx, df_du * inside[:, None]
 
     def _remaining(self) -> tuple[float, float]:
@@ -178,7 +182,8 @@ def _arc_step(states: Tensor, yaw_rate: Tensor, speed_mps: float, dt_s: float) -
     chord = speed_mps * dt_s * _sinc(half)
     course = states[:, 2] + half
     return torch.stack(
-        [states[:, 0] + chord * torch.cos(course), states[:, 1] + chord * torch.sin(course), course + half], dim=1
+        [states[:, 0] + chord * torch.cos(course), states[:, 1] + chord * torch.sin(course), course + half],
+        dim=1,
     )
 
 
@@ -191,7 +196,12 @@ def _arc_jacobians(states: Tensor, yaw_rate: Tensor, speed_mps: float, dt_s: flo
     df_dx[:, 0, 2] = -chord * sine
     df_dx[:, 1, 2] = chord * cosine
     df_dhalf = torch.stack(
-        [chord_slope * cosine - chord * sine, chord_slope * sine + chord * cosine, torch.full_like(half, 2.0)], dim=1
+        [
+            chord_slope * cosine - chord * sine,
+            chord_slope * sine + chord * cosine,
+            torch.full_like(half, 2.0),
+        ],
+        dim=1,
     )
     return df_dx, df_dhalf * (0.5 * dt_s)
 

@@ -45,10 +45,17 @@ class ExpertConfig:
 
     def __post_init__(self) -> None:
         positive = (
-            self.wheelbase_m, self.speed_mps, self.stiffness_1pm, self.damping, self.max_approach_rad, self.smoothing_m
-        )  # fmt: skip
+            self.wheelbase_m,
+            self.speed_mps,
+            self.stiffness_1pm,
+            self.damping,
+            self.max_approach_rad,
+            self.smoothing_m,
+        )
         if not (min(positive) > 0.0 and self.delay_s >= 0.0 and 0.0 <= self.feed_forward <= 1.0):
-            raise ValueError(f"expected positive expert settings, a delay >= 0 and a feed-forward of 0..1, got {self}")
+            raise ValueError(
+                f"expected positive expert settings, a delay >= 0 and a feed-forward of 0..1, got {self}"
+            )
         if self.output not in ("wheel_angle", "turn_rate"):
             raise ValueError(f"expected an output of wheel_angle or turn_rate, got {self.output!r}")
 
@@ -79,10 +86,16 @@ class Expert:
         ahead = c.speed_mps * c.delay_s
         heading_error = wrap_angle(yaw - at.heading_rad)
         error = at.cte_m + ahead * np.sin(heading_error)
-        wanted = -c.max_approach_rad * np.tanh(c.stiffness_1pm / (2.0 * c.damping) * error / c.max_approach_rad)
-        feed_forward = c.feed_forward * self._parallel_curvature(at.s_m + ahead * np.cos(heading_error), at.cte_m)
+        wanted = -c.max_approach_rad * np.tanh(
+            c.stiffness_1pm / (2.0 * c.damping) * error / c.max_approach_rad
+        )
+        feed_forward = c.feed_forward * self._parallel_curvature(
+            at.s_m + ahead * np.cos(heading_error), at.cte_m
+        )
         curvature = feed_forward - 2.0 * c.damping * c.stiffness_1pm * (heading_error - wanted)
-        control = np.arctan(c.wheelbase_m * curvature) if c.output == "wheel_angle" else c.speed_mps * curvature
+        control = (
+            np.arctan(c.wheelbase_m * curvature) if c.output == "wheel_angle" else c.speed_mps * curvature
+        )
         return np.clip(control, *c.steering_limits_rad)
 
     def steer_states(self, states: ArrayLike) -> Array:

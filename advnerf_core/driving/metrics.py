@@ -129,7 +129,11 @@ def first_still_tick(states: ArrayLike, tolerance_m: float = 0.005, at_least_tic
 
 
 def states_at_ticks(
-    stamps_ns: ArrayLike, poses: ArrayLike, start_ns: int, horizon: Horizon | None = None, max_gap_s: float = 0.5
+    stamps_ns: ArrayLike,
+    poses: ArrayLike,
+    start_ns: int,
+    horizon: Horizon | None = None,
+    max_gap_s: float = 0.5,
 ) -> Array:
     """Resample a pose stream (motion capture) at the control ticks.
 
@@ -146,14 +150,21 @@ def states_at_ticks(
     """
     limits = horizon or Horizon()
     stamps, values = np.asarray(stamps_ns, dtype=np.int64), np.array(poses, dtype=np.float64)
-    if stamps.ndim != 1 or values.shape != (len(stamps), 3) or len(stamps) < 2 or (np.diff(stamps) <= 0).any():
+    if (
+        stamps.ndim != 1
+        or values.shape != (len(stamps), 3)
+        or len(stamps) < 2
+        or (np.diff(stamps) <= 0).any()
+    ):
         raise ValueError(
             f"expected >= 2 strictly increasing stamps [N] and poses [N, 3], got {list(stamps.shape)} and {list(values.shape)}"
         )
     ticks_ns = start_ns + np.round(np.arange(limits.ticks + 1) * limits.dt_s * 1e9).astype(np.int64)
     ticks_ns = ticks_ns[ticks_ns <= stamps[-1]]
     if start_ns < stamps[0] or len(ticks_ns) < 2:
-        raise ValueError(f"expected a stream that covers the start {start_ns}, got {stamps[0]}..{stamps[-1]} ns")
+        raise ValueError(
+            f"expected a stream that covers the start {start_ns}, got {stamps[0]}..{stamps[-1]} ns"
+        )
     _require_no_gap(stamps, ticks_ns, max_gap_s)
     values[:, 2] = np.unwrap(values[:, 2])
     seconds, wanted = (stamps - start_ns) * 1e-9, (ticks_ns - start_ns) * 1e-9

@@ -95,7 +95,9 @@ class Path:
         length_m: Total length [m].
     """
 
-    def __init__(self, start_pose: tuple[float, float, float], segments: Sequence[Line | Arc], closed: bool) -> None:
+    def __init__(
+        self, start_pose: tuple[float, float, float], segments: Sequence[Line | Arc], closed: bool
+    ) -> None:
         if not segments:
             raise ValueError("expected at least one line or arc, got none")
         self.start_pose = (float(start_pose[0]), float(start_pose[1]), float(start_pose[2]))
@@ -175,7 +177,9 @@ class Path:
         """Rebuild a path from :meth:`to_dict`."""
         try:
             pieces: list[Line | Arc] = [
-                Line(piece["line_m"]) if "line_m" in piece else Arc(piece["arc_radius_m"], piece["arc_angle_rad"])
+                Line(piece["line_m"])
+                if "line_m" in piece
+                else Arc(piece["arc_radius_m"], piece["arc_angle_rad"])
                 for piece in data["segments"]
             ]
             x, y, yaw = data["start_pose"]

@@ -30,7 +30,12 @@ class Rollout:
 
 @torch.no_grad()
 def drive(
-    policy: Policy, observe: Observe, dynamics: Dynamics, start_states: Tensor, steps: int, goals: Tensor | None = None
+    policy: Policy,
+    observe: Observe,
+    dynamics: Dynamics,
+    start_states: Tensor,
+    steps: int,
+    goals: Tensor | None = None,
 ) -> Rollout:
     """Drive ``steps`` ticks from ``start_states [B, n]``; nothing is recorded for differentiation.
 

@@ -38,7 +38,9 @@ class HashGridConfig:
 
     def __post_init__(self) -> None:
         if not (1 <= self.levels <= 64 and self.features in (2, 4, 8, 16) and 4 <= self.log2_entries <= 24):
-            raise ValueError(f"expected 1..64 levels, 2, 4, 8 or 16 features and 2^4..2^24 entries, got {self}")
+            raise ValueError(
+                f"expected 1..64 levels, 2, 4, 8 or 16 features and 2^4..2^24 entries, got {self}"
+            )
         if not 1 <= self.coarsest <= self.finest:
             raise ValueError(f"expected 1 <= coarsest <= finest cells, got {self.coarsest} and {self.finest}")
 
@@ -73,7 +75,9 @@ class HashGrid(nn.Module):
     everywhere.
     """
 
-    def __init__(self, config: HashGridConfig | None = None, generator: torch.Generator | None = None) -> None:
+    def __init__(
+        self, config: HashGridConfig | None = None, generator: torch.Generator | None = None
+    ) -> None:
         super().__init__()
         self.config = config or HashGridConfig()
         self.levels = self.config.level_table()
@@ -144,7 +148,11 @@ def encode(points: Array32, count: int, table: Array32, levels: NDArray[np.int64
     run_slots(lambda slot: encode_level(points, count, table, last - slot, levels, out), levels.shape[0])
 
 
-def scatter(points: Array32, count: int, grad_out: Array32, levels: NDArray[np.int64], grad_table: Array32) -> None:
+def scatter(
+    points: Array32, count: int, grad_out: Array32, levels: NDArray[np.int64], grad_table: Array32
+) -> None:
     """``scatter_level`` at all levels, in parallel over levels (no two write the same rows)."""
     last = levels.shape[0] - 1
-    run_slots(lambda slot: scatter_level(points, count, grad_out, last - slot, levels, grad_table), levels.shape[0])
+    run_slots(
+        lambda slot: scatter_level(points, count, grad_out, last - slot, levels, grad_table), levels.shape[0]
+    )

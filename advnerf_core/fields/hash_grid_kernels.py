@@ -63,7 +63,9 @@ def _weights(fx, fy, fz):  # type: ignore[no-untyped-def]
 
 
 @njit(**KERNEL_OPTIONS)
-def encode_level(points: Array32, count: int, table: Array32, level: int, levels: Array64i, out: Array32) -> None:
+def encode_level(
+    points: Array32, count: int, table: Array32, level: int, levels: Array64i, out: Array32
+) -> None:
     """Encode the first ``count`` points at one level; levels may run in parallel.
 
     Args:

@@ -36,7 +36,12 @@ def dense(weight: Array32, bias: Array32, x: Array32, y: Array32, relu: bool) ->
             y[j + 1, n] = bias[j + 1]
         for k in range(0, weight.shape[1], 4):
             v0, v1, v2, v3 = weight[j, k], weight[j, k + 1], weight[j, k + 2], weight[j, k + 3]
-            w0, w1, w2, w3 = weight[j + 1, k], weight[j + 1, k + 1], weight[j + 1, k + 2], weight[j + 1, k + 3]
+            w0, w1, w2, w3 = (
+                weight[j + 1, k],
+                weight[j + 1, k + 1],
+                weight[j + 1, k + 2],
+                weight[j + 1, k + 3],
+            )
             for n in range(TILE):
                 a, b, c, d = x[k, n], x[k + 1, n], x[k + 2, n], x[k + 3, n]
                 y[j, n] += a * v0 + b * v1 + c * v2 + d * v3
@@ -64,7 +69,12 @@ def dense_transposed(weight_t: Array32, grad: Array32, mask: Array32, grad_x: Ar
             grad_x[k + 1, n] = _ZERO
         for j in range(0, weight_t.shape[1], 4):
             v0, v1, v2, v3 = weight_t[k, j], weight_t[k, j + 1], weight_t[k, j + 2], weight_t[k, j + 3]
-            w0, w1, w2, w3 = weight_t[k + 1, j], weight_t[k + 1, j + 1], weight_t[k + 1, j + 2], weight_t[k + 1, j + 3]
+            w0, w1, w2, w3 = (
+                weight_t[k + 1, j],
+                weight_t[k + 1, j + 1],
+                weight_t[k + 1, j + 2],
+                weight_t[k + 1, j + 3],
+            )
             for n in range(TILE):
                 a, b, c, d = grad[j, n], grad[j + 1, n], grad[j + 2, n], grad[j + 3, n]
                 grad_x[k, n] += a * v0 + b * v1 + c * v2 + d * v3

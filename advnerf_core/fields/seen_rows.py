@@ -67,5 +67,7 @@ def compact(weights: sparse.csr_matrix, field: ColouredObject) -> tuple[sparse.c
     rows = np.flatnonzero(used)
     place = np.empty(len(used), np.int32)
     place[rows] = np.arange(len(rows), dtype=np.int32)
-    packed = sparse.csr_matrix((weights.data, place[weights.indices], weights.indptr), (weights.shape[0], len(rows)))
+    packed = sparse.csr_matrix(
+        (weights.data, place[weights.indices], weights.indptr), (weights.shape[0], len(rows))
+    )
     return packed, SeenRows(field, rows)

@@ -58,9 +58,13 @@ def _sheet(field: VoxelGridObject, width: float, pitch: Array) -> VoxelGridObjec
     low, high = np.asarray(field.box_min, np.float64) - margin, np.asarray(field.box_max, np.float64) + margin
     low[0], high[0] = field.box_max[0] - (_LAYERS + 1) * pitch[0], field.box_max[0] + pitch[0]
     return replace(
-        field, slots=np.ascontiguousarray(np.repeat(front[None], _LAYERS + 2, axis=0)), box_min=low, box_max=high,
-        density=np.pad(np.repeat(density[None], _LAYERS, axis=0), [(1, 1), (0, 0), (0, 0)]), step_units=width / _STEPS,
-    )  # fmt: skip
+        field,
+        slots=np.ascontiguousarray(np.repeat(front[None], _LAYERS + 2, axis=0)),
+        box_min=low,
+        box_max=high,
+        density=np.pad(np.repeat(density[None], _LAYERS, axis=0), [(1, 1), (0, 0), (0, 0)]),
+        step_units=width / _STEPS,
+    )
 
 
 def _body(field: VoxelGridObject, width: float, pitch: Array) -> VoxelGridObject:
@@ -80,9 +84,13 @@ def _body(field: VoxelGridObject, width: float, pitch: Array) -> VoxelGridObject
     nearest = ndimage.distance_transform_edt(~inside, pitch, return_distances=False, return_indices=True)
     slots = np.pad(field.slots, around)[tuple(nearest)]
     return replace(
-        field, slots=np.ascontiguousarray(slots, np.int32), density=density, box_min=field.box_min - border * pitch,
-        box_max=field.box_max + border * pitch, step_units=min(width / _STEPS, float(pitch.max())),
-    )  # fmt: skip
+        field,
+        slots=np.ascontiguousarray(slots, np.int32),
+        density=density,
+        box_min=field.box_min - border * pitch,
+        box_max=field.box_max + border * pitch,
+        step_units=min(width / _STEPS, float(pitch.max())),
+    )
 
 
 def _border(width: float, pitch: Array) -> NDArray[np.int64]:

@@ -45,7 +45,9 @@ def with_summed_levels(
     parameters = int(sum(n**3 for n in sizes))
     # The plain colours are those of the rows, whatever gives them.
     plain = field.plain_colours
-    changed = replace(field, theta_shape=(parameters, 3), mixing=sparse.csr_matrix(mean @ mixing), plain_colours=plain)
+    changed = replace(
+        field, theta_shape=(parameters, 3), mixing=sparse.csr_matrix(mean @ mixing), plain_colours=plain
+    )
     object.__setattr__(changed, "derived", field.derived)
     return changed
 

@@ -72,15 +72,21 @@ class VoxelGridObject:
     def __post_init__(self) -> None:
         """Check shapes and ranges, so that the casting kernel may index without looking."""
         if self.slots.ndim != 3 or self.slots.dtype != np.int32:
-            raise ValueError(f"expected slots [nx, ny, nz] of int32, got {self.slots.shape} of {self.slots.dtype}")
+            raise ValueError(
+                f"expected slots [nx, ny, nz] of int32, got {self.slots.shape} of {self.slots.dtype}"
+            )
         if self.theta_shape[-1] != 3:
             raise ValueError(f"expected theta_shape to end in 3 colour channels, got {self.theta_shape}")
         if self.slots.min() < 0 or self.slots.max() >= self.slot_count:
-            raise ValueError(f"expected slots in 0..{self.slot_count - 1}, got {self.slots.min()}..{self.slots.max()}")
+            raise ValueError(
+                f"expected slots in 0..{self.slot_count - 1}, got {self.slots.min()}..{self.slots.max()}"
+            )
         if not (np.asarray(self.box_max) > np.asarray(self.box_min)).all():
             raise ValueError(f"expected box_max above box_min, got {self.box_min} and {self.box_max}")
         if self.density is not None and (self.density.shape != self.slots.shape or (self.density < 0).any()):
-            raise ValueError(f"expected a density >= 0 of shape {self.slots.shape}, got shape {self.density.shape}")
+            raise ValueError(
+                f"expected a density >= 0 of shape {self.slots.shape}, got shape {self.density.shape}"
+            )
         if self.mixing is not None and self.mixing.shape[1] != self.parameter_count:
             raise ValueError(f"expected mixing of {self.parameter_count} parameters, got {self.mixing.shape}")
         if self.plain_colours is not None and self.plain_colours.shape != (self.free_count, 3):
@@ -115,7 +121,8 @@ class VoxelGridObject:
         if self.mixing is None:
             return values
         return np.stack(
-            [lsqr(self.mixing, values[:, k], atol=1e-6, btol=1e-6, iter_lim=200)[0] for k in range(3)], axis=-1
+            [lsqr(self.mixing, values[:, k], atol=1e-6, btol=1e-6, iter_lim=200)[0] for k in range(3)],
+            axis=-1,
         )
 
     def check_theta(self, theta: Tensor) -> None:
@@ -165,10 +172,18 @@ def _check_pose(T_world_from_object: Array, scale: float) -> None:
     """Raise ``ValueError`` unless the pose is rigid and finite: lengths are taken from the scale alone."""
     T = np.asarray(T_world_from_object)
     if T.shape != (4, 4) or not (np.isfinite(T).all() and np.isfinite(scale)):
-        raise ValueError(f"expected a finite pose [4, 4] and scale of an object, got {T.tolist()} and {scale}")
+        raise ValueError(
+            f"expected a finite pose [4, 4] and scale of an object, got {T.tolist()} and {scale}"
+        )
     R = T[:3, :3]
-    if not np.allclose(R @ R.T, np.eye(3), atol=1e-4) or np.linalg.det(R) < 0 or not np.allclose(T[3], [0, 0, 0, 1]):
-        raise ValueError(f"expected a rigid pose of an object (its size goes into the scale), got {T.tolist()}")
+    if (
+        not np.allclose(R @ R.T, np.eye(3), atol=1e-4)
+        or np.linalg.det(R) < 0
+        or not np.allclose(T[3], [0, 0, 0, 1])
+    ):
+        raise ValueError(
+            f"expected a rigid pose of an object (its size goes into the scale), got {T.tolist()}"
+        )
 
 
 def squash(theta: Tensor) -> Tensor:
@@ -210,7 +225,9 @@ def cube_face_object(
         one_sided: See :class:`VoxelGridObject`.
     """
     if size_m <= 0 or depth_m <= 0 or resolution < 1:
-        raise ValueError(f"expected positive sizes, got size {size_m} m, depth {depth_m} m, {resolution} cells")
+        raise ValueError(
+            f"expected positive sizes, got size {size_m} m, depth {depth_m} m, {resolution} cells"
+        )
     layers = max(3, round(resolution * depth_m / size_m))
     free = resolution * resolution
     slots = np.full((layers, resolution, resolution), free, dtype=np.int32)

@@ -38,13 +38,17 @@ class AugmentConfig:
     shift_px: int = 1
 
 
-def augment(images: NDArray[np.uint8], config: AugmentConfig, rng: np.random.Generator) -> NDArray[np.float32]:
+def augment(
+    images: NDArray[np.uint8], config: AugmentConfig, rng: np.random.Generator
+) -> NDArray[np.float32]:
     """Changed copies ``[B, H, W, 3]`` float32 0..1 of RGB images ``[B, H, W, 3]``; the same ``rng`` gives the same result."""
     count, height, width, _ = images.shape
     tables = _tone_tables(count, config, rng)
     blurred = rng.random(count) < config.blur_share
     shifts = (
-        rng.integers(-config.shift_px, config.shift_px + 1, (count, 2)) if config.shift_px else np.zeros((count, 2))
+        rng.integers(-config.shift_px, config.shift_px + 1, (count, 2))
+        if config.shift_px
+        else np.zeros((count, 2))
     )
     result = np.empty(images.shape, np.float32)
     for index in range(count):

@@ -70,7 +70,9 @@ def fit(
         report: Told the step and the running mean square error [rad^2].
     """
     if len(frames.training) == 0:
-        raise FrameStoreError("expected training frames, got none: collect frames, or lower the share that is held out")
+        raise FrameStoreError(
+            "expected training frames, got none: collect frames, or lower the share that is held out"
+        )
     policy.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     optimiser = torch.optim.AdamW(
         policy.parameters(), config.learning_rate, weight_decay=config.weight_decay, fused=True
@@ -125,7 +127,9 @@ def _learning_rate(config: FitConfig, step: int) -> float:
     return config.learning_rate * (0.01 + 0.99 * 0.5 * (1.0 + cos(pi * share)))
 
 
-def _write(path: Path, policy: PilotNet, optimiser: torch.optim.Optimizer, step: int, config: FitConfig) -> None:
+def _write(
+    path: Path, policy: PilotNet, optimiser: torch.optim.Optimizer, step: int, config: FitConfig
+) -> None:
     tensors = {f"weight.{name}": value.detach() for name, value in policy.state_dict().items()}
     for name, parameter in policy.named_parameters():
         moments = optimiser.state[parameter]
@@ -148,8 +152,12 @@ def _resume(path: Path, policy: PilotNet, optimiser: torch.optim.Optimizer, conf
             f"expected a training checkpoint at {path}, got {error}; delete it to start again"
         ) from error
     if header.get("config") != repr(asdict(config)):
-        raise FrameStoreError(f"expected a checkpoint of the same settings at {path}; delete it to start again")
-    policy.load_state_dict({k.removeprefix("weight."): v for k, v in tensors.items() if k.startswith("weight.")})
+        raise FrameStoreError(
+            f"expected a checkpoint of the same settings at {path}; delete it to start again"
+        )
+    policy.load_state_dict(
+        {k.removeprefix("weight."): v for k, v in tensors.items() if k.startswith("weight.")}
+    )
     policy.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     step = int(header["step"])
     for name, parameter in policy.named_parameters():

@@ -82,7 +82,9 @@ class FrameStore:
         """Add a shard; it appears complete or not at all. A shard of the same name must not exist."""
         target = self.folder / name
         if target.exists():
-            raise FrameStoreError(f"expected a new shard name, got {name!r} which is already in {self.folder}")
+            raise FrameStoreError(
+                f"expected a new shard name, got {name!r} which is already in {self.folder}"
+            )
         partial = self.folder / f".{name}.{os.getpid()}.tmp"
         shutil.rmtree(partial, ignore_errors=True)
         partial.mkdir(parents=True)
@@ -119,7 +121,9 @@ class FrameSet:
             neighbours show the same pose in several textures, or the next moment of the same drive.
     """
 
-    def __init__(self, shards: Sequence[Frames], include_textured: bool = True, holdout_every: int = 0) -> None:
+    def __init__(
+        self, shards: Sequence[Frames], include_textured: bool = True, holdout_every: int = 0
+    ) -> None:
         if not shards or len({shard.goals.shape[1] for shard in shards}) != 1:
             raise FrameStoreError(
                 f"expected shards with one goal size, got {len(shards)} shards of different or no goals"
@@ -128,7 +132,9 @@ class FrameSet:
         training: list[tuple[int, int]] = []
         held_out: list[tuple[int, int]] = []
         for index, shard in enumerate(shards):
-            chosen = np.flatnonzero(np.ones(len(shard), bool) if include_textured else ~np.asarray(shard.textured))
+            chosen = np.flatnonzero(
+                np.ones(len(shard), bool) if include_textured else ~np.asarray(shard.textured)
+            )
             for order, row in enumerate(chosen):
                 target = (
                     held_out
@@ -140,7 +146,9 @@ class FrameSet:
         self.held_out = np.array(held_out, dtype=np.int64).reshape(-1, 2)
         self.goal_size = int(shards[0].goals.shape[1])
 
-    def batch(self, rows: NDArray[np.int64]) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.float32]]:
+    def batch(
+        self, rows: NDArray[np.int64]
+    ) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.float32]]:
         """Images ``[B, 66, 200, 3]``, labels ``[B]`` and goals ``[B, G]`` of rows of ``training`` or ``held_out``."""
         images = np.stack([self._shards[shard].images[row] for shard, row in rows])
         labels = np.array([self._shards[shard].steering_rad[row] for shard, row in rows], dtype=np.float32)

@@ -94,7 +94,9 @@ class _Recipe:
         for turn in range(config.dagger_rounds):
             for number, plan in enumerate(self.plans):
                 name = f"drive{turn}-{plan.source.name}"
-                self._collect(name, plan, plan.drives * plan.drive_steps, self._drives(plan, policy, turn, number))
+                self._collect(
+                    name, plan, plan.drives * plan.drive_steps, self._drives(plan, policy, turn, number)
+                )
             self._train(policy, f"dagger{turn}", config.round_steps, 0.5 * config.learning_rate)
         frames = self._frames(textured=True)
         mae = mean_absolute_error(policy, frames)
@@ -117,7 +119,11 @@ class _Recipe:
         policy = PilotNet(self._goal_size, self.config.max_steering_rad, self.config.hidden)
         self._train(policy, "naive", self.config.naive_steps, self.config.learning_rate, textured=False)
         mae = mean_absolute_error(policy, self._frames(textured=False))
-        return self.out_dir / "naive.safetensors", self._save("naive.safetensors", policy, mae, textured=False), mae
+        return (
+            self.out_dir / "naive.safetensors",
+            self._save("naive.safetensors", policy, mae, textured=False),
+            mae,
+        )
 
     def _stills(self, plan: SourcePlan, number: int) -> Callable[[], list[Seen]]:
         def collect() -> list[Seen]:
@@ -130,7 +136,9 @@ class _Recipe:
             for start in range(0, plan.stills, plan.source.batch_size):
                 batch = states[start : start + plan.source.batch_size]
                 parts.append(plan.source.look(batch, rng))
-                self._advance(0.02 * len(batch), f"looking: {plan.source.name} {start + len(batch)}/{plan.stills}")
+                self._advance(
+                    0.02 * len(batch), f"looking: {plan.source.name} {start + len(batch)}/{plan.stills}"
+                )
             return parts
 
         return collect
@@ -188,7 +196,9 @@ class _Recipe:
         shards = [self.store.load(name) for name in self.store.names()]
         return FrameSet(shards, textured, self.config.holdout_every)
 
-    def _train(self, policy: PilotNet, stage: str, steps: int, learning_rate: float, textured: bool = True) -> None:
+    def _train(
+        self, policy: PilotNet, stage: str, steps: int, learning_rate: float, textured: bool = True
+    ) -> None:
         start = time.perf_counter()
         config = self.config
         settings = FitConfig(
@@ -222,9 +232,12 @@ class _Recipe:
 
     def _save(self, name: str, policy: PilotNet, mae: float, textured: bool) -> str:
         metadata = {
-            "settings": self._settings(), "expert": self.expert.to_dict(), "random_textures": textured,
-            "validation_mae_rad": mae, "shards": self.store.names(),
-        }  # fmt: skip
+            "settings": self._settings(),
+            "expert": self.expert.to_dict(),
+            "random_textures": textured,
+            "validation_mae_rad": mae,
+            "shards": self.store.names(),
+        }
         return save_policy(self.out_dir / name, policy, self.view, metadata)
 
     def _settings(self) -> dict[str, Any]:

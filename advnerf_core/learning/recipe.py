@@ -47,9 +47,11 @@ class SourcePlan:
             "drive_steps": self.drive_steps,
         }
         special = {
-            "goal": list(self.goal), "expert": None if self.expert is None else self.expert.to_dict(),
-            "driven_m": self.driven_m, "drives_from_m": self.drives_from_m,
-        }  # fmt: skip
+            "goal": list(self.goal),
+            "expert": None if self.expert is None else self.expert.to_dict(),
+            "driven_m": self.driven_m,
+            "drives_from_m": self.drives_from_m,
+        }
         return values | {name: value for name, value in special.items() if value}
 
 
@@ -128,7 +130,11 @@ def recovery_states(
     driven_m: float | None = None,
 ) -> Array:
     """Poses ``[count, 3]`` about the path, or its first ``driven_m`` [m], evenly along it: half spread over the full range, half near the path."""
-    s = (np.arange(count) + rng.random(count)) / max(count, 1) * (path.length_m if driven_m is None else driven_m)
+    s = (
+        (np.arange(count) + rng.random(count))
+        / max(count, 1)
+        * (path.length_m if driven_m is None else driven_m)
+    )
     pose = path.pose_at(rng.permutation(s))
     spread = np.where(np.arange(count)[:, None] % 2 == 0, 1.0, 0.35)
     lateral, heading = (rng.uniform(-1.0, 1.0, (count, 2)) * spread * [lateral_m, heading_rad]).T

@@ -79,7 +79,9 @@ class MixedFrames(FrameSet):
         self, old: Sequence[Frames], new: Sequence[Frames], new_share: float | None, holdout_every: int
     ) -> None:
         if not old or not new:
-            raise FrameStoreError(f"expected old and new frames, got {len(old)} old and {len(new)} new shards")
+            raise FrameStoreError(
+                f"expected old and new frames, got {len(old)} old and {len(new)} new shards"
+            )
         super().__init__([*old, *new], True, holdout_every)
         self._first_new = len(old)
         if new_share is not None:
@@ -130,13 +132,19 @@ def fine_tune(
     network = PilotNet(settings["goal_size"], settings["max_steering_rad"], tuple(settings["hidden"]))
     network.load_state_dict(policy.policy.state_dict())
     before = _errors(network, frames)
-    fitting = FitConfig(config.steps, config.batch_size, config.learning_rate, seed=config.seed, augment=config.augment)
+    fitting = FitConfig(
+        config.steps, config.batch_size, config.learning_rate, seed=config.seed, augment=config.augment
+    )
     fit(network, frames, fitting, out_file.with_suffix(".checkpoint.safetensors"), report)
     after = _errors(network, frames)
     metadata = {
-        "fine_tuned_from": policy.sha256, "settings": json.loads(json.dumps(asdict(config))),
-        "old_mae_rad": _finite(after[0]), "new_mae_rad": _finite(after[1]), "old_frames": sum(map(len, old)), "new_frames": sum(map(len, new)),
-    }  # fmt: skip
+        "fine_tuned_from": policy.sha256,
+        "settings": json.loads(json.dumps(asdict(config))),
+        "old_mae_rad": _finite(after[0]),
+        "new_mae_rad": _finite(after[1]),
+        "old_frames": sum(map(len, old)),
+        "new_frames": sum(map(len, new)),
+    }
     digest = save_policy(out_file, network, policy.view, metadata)
     return Retrained(out_file, digest, (before[0], after[0]), (before[1], after[1]))
 

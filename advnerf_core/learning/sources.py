@@ -145,20 +145,16 @@ class SceneSource:
             state = np.asarray(start, dtype=np.float64)
             for _ in range(steps):
                 parts.append(self._seen(self._scene.observe(depth=False)[0], state, rng, held))
-                steering = float(steer(parts[-1].images[-1:] if held is not None else parts[-1].images[:1])[0])
+                steering = float(
+                    steer(parts[-1].images[-1:] if held is not None else parts[-1].images[:1])[0]
+                )
                 moved = self._scene.step(steering, self._speed_mps, self._dt_s)
                 state = np.array([moved.x_m, moved.y_m, moved.yaw_rad])
                 if not keep_driving(state[None])[0]:
                     break
         return Seen.join(parts)
 
-    def _seen(
-        self,
-        rgb: Image,
-        state: Array,
-        rng: np.random.Generator,
-        held: Texture | None = None,
-    ) -> Seen:
+    def _seen(self, rgb: Image, state: Array, rng: np.random.Generator, held: Texture | None = None) -> Seen:
         """The plain view first, the textured ones after it, a held texture last."""
         images = [self._view.image(rgb)]
         if self._overlay is not None:
@@ -197,7 +193,12 @@ class RenderedSource:
         batch_size: int = 8,
     ) -> None:
         self.name, self.batch_size = name, batch_size
-        self._prepare, self._dynamics, self._sample, self._variants = prepare, dynamics, sample_texture, variants
+        self._prepare, self._dynamics, self._sample, self._variants = (
+            prepare,
+            dynamics,
+            sample_texture,
+            variants,
+        )
 
     def look(self, states: Array, rng: np.random.Generator) -> Seen:
         """What is seen from the states ``[B, 3]``."""

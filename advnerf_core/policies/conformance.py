@@ -86,7 +86,9 @@ def check_policy(
 class _Examined:
     """A policy and its goal, called on plain images."""
 
-    def __init__(self, policy: AdaptedPolicy, goal: tuple[float, ...] | None, methods: Sequence[str] = ()) -> None:
+    def __init__(
+        self, policy: AdaptedPolicy, goal: tuple[float, ...] | None, methods: Sequence[str] = ()
+    ) -> None:
         self.policy, self.methods = policy, methods
         size = policy.contract.goal_size
         self.goal = None if size == 0 else np.array(goal if goal is not None else (0.0,) * size)
@@ -95,7 +97,9 @@ class _Examined:
         return steering_of(self.policy, self.policy.contract, images, self.goal)
 
     def __call__(self, images: Tensor) -> Tensor:
-        goals = None if self.goal is None else torch.tensor(self.goal, dtype=images.dtype).expand(len(images), -1)
+        goals = (
+            None if self.goal is None else torch.tensor(self.goal, dtype=images.dtype).expand(len(images), -1)
+        )
         if self.policy.stateless:
             steering: Tensor = self.policy(images, goals)
         else:
@@ -126,7 +130,9 @@ def _runs(examined: _Examined, images: NDArray[np.uint8]) -> Finding:
     except Exception as error:  # whatever a stranger's network raises
         reason = " ".join(traceback.format_exception_only(error)[-1].split())
         return Finding(
-            "input", FAILURE, f"fails on images [B, 3, {height}, {width}]: {reason:.160}; {_remedy(examined, batch)}"
+            "input",
+            FAILURE,
+            f"fails on images [B, 3, {height}, {width}]: {reason:.160}; {_remedy(examined, batch)}",
         )
     return Finding("input", OK, f"takes images [B, 3, {height}, {width}], returns steering [B]")
 
@@ -145,7 +151,9 @@ def _remedy(examined: _Examined, batch: Tensor) -> str:
         attempts.append(("set colour_space = 'GRAY'", given[:, :1]))
     for height, width in ((66, 200), (160, 320), (120, 160), (224, 224), (128, 128), (64, 64), (480, 640)):
         if contract.layout == "NCHW" and (height, width) != contract.size:
-            attempts.append((f"set width = {width} and height = {height} in the view", _resized(given, height, width)))
+            attempts.append(
+                (f"set width = {width} and height = {height} in the view", _resized(given, height, width))
+            )
     for advice, images in attempts:
         if _accepts(examined, images):
             return advice
@@ -158,7 +166,9 @@ def _resized(images: Tensor, height: int, width: int) -> Tensor:
 
 def _accepts(examined: _Examined, given: Tensor) -> bool:
     policy, goal = examined.policy, examined.goal
-    extra: list[Any] = [] if goal is None else [torch.tensor(goal, dtype=torch.float32).expand(len(given), -1)]
+    extra: list[Any] = (
+        [] if goal is None else [torch.tensor(goal, dtype=torch.float32).expand(len(given), -1)]
+    )
     try:
         with torch.no_grad():
             raw = policy.network(given.contiguous(), *extra)
@@ -241,7 +251,9 @@ def _gradient(examined: _Examined, images: NDArray[np.uint8]) -> Finding:
         )
         return Finding("gradient", FAILURE, text)
     if not bool(torch.isfinite(slopes).all()):
-        return Finding("gradient", FAILURE, "the gradient is NaN or infinite; look for sqrt, norm or division at zero")
+        return Finding(
+            "gradient", FAILURE, "the gradient is NaN or infinite; look for sqrt, norm or division at zero"
+        )
     return _slope(examined, batch.detach(), slopes)
 
 
@@ -249,7 +261,9 @@ def _slope(examined: _Examined, batch: Tensor, slopes: Tensor, step: float = 2e-
     """The gradient against the difference of two evaluations along it."""
     direction = slopes.sign()
     with torch.no_grad():
-        difference = (examined(batch + step * direction) - examined(batch - step * direction)).double() / (2 * step)
+        difference = (examined(batch + step * direction) - examined(batch - step * direction)).double() / (
+            2 * step
+        )
     expected = (slopes * direction).double().sum(dim=(1, 2, 3))
     error = float((difference - expected).abs().sum() / expected.abs().sum())
     if error > 0.3:

@@ -84,7 +84,9 @@ class PolicyContract:
     def __post_init__(self) -> None:
         for name, choices in _CHOICES.items():
             if getattr(self, name) not in choices:
-                raise PolicyContractError(f"{name}: expected {' or '.join(choices)}, got {getattr(self, name)!r}")
+                raise PolicyContractError(
+                    f"{name}: expected {' or '.join(choices)}, got {getattr(self, name)!r}"
+                )
         self._check_input()
         self._check_output()
         if not isinstance(self.goal_size, int) or self.goal_size < 0:
@@ -111,7 +113,9 @@ class PolicyContract:
             if self.output_unit != unit and value is not None:
                 raise PolicyContractError(f"{name}: expected it with output_unit = {unit!r} only; remove it")
             if self.output_unit == unit and not (value is not None and np.isfinite(value) and value > 0.0):
-                raise PolicyContractError(f"{name}: expected a number > 0 with output_unit = {unit!r}, got {value}")
+                raise PolicyContractError(
+                    f"{name}: expected a number > 0 with output_unit = {unit!r}, got {value}"
+                )
         if self.output_unit in ("normalised", "1/m") and self.steering_ratio != 1.0:
             raise PolicyContractError(
                 f"steering_ratio: expected it with output_unit = 'rad' or 'deg' only, got {self.output_unit!r}"
@@ -142,7 +146,9 @@ class PolicyContract:
         if any(value != 1.0 for value in self.std):
             images = images / _channels(images, self.std)
         if self.layout == "NHWC":
-            images = images.permute(0, 2, 3, 1) if hasattr(images, "permute") else images.transpose(0, 2, 3, 1)
+            images = (
+                images.permute(0, 2, 3, 1) if hasattr(images, "permute") else images.transpose(0, 2, 3, 1)
+            )
         return images
 
     def _in_colour_space(self, images: Any) -> Any:
@@ -196,7 +202,9 @@ class PolicyContract:
             for name in ("mean", "std"):
                 if name in values:
                     given = values[name]
-                    values[name] = tuple(float(v) for v in ([given] if isinstance(given, int | float) else given))
+                    values[name] = tuple(
+                        float(v) for v in ([given] if isinstance(given, int | float) else given)
+                    )
             return cls(**values)
         except (TypeError, ValueError) as error:
             raise PolicyContractError(f"{source}: {error}") from error
@@ -216,7 +224,9 @@ def declaration_beside(path: Path, embedded: str | None) -> PolicyContract:
         if embedded:
             return PolicyContract.from_dict(json.loads(embedded), str(path))
     except (yaml.YAMLError, json.JSONDecodeError) as error:
-        raise PolicyContractError(f"cannot read the declaration of {path}: {' '.join(str(error).split())}") from error
+        raise PolicyContractError(
+            f"cannot read the declaration of {path}: {' '.join(str(error).split())}"
+        ) from error
     raise PolicyContractError(
         f"{path} says nothing about its colours, range and unit; write {beside.name} beside it (see docs/policies.md)"
     )

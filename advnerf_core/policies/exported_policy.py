@@ -53,7 +53,9 @@ def load_program(path: Path) -> tuple[Callable[..., Tensor], PolicyContract, str
 def export_program(network: Any, contract: PolicyContract, path: Path) -> None:
     """Write a stateless network with its declaration as an exported program, whole or not at all."""
     if not contract.stateless:
-        raise PolicyContractError("expected a stateless policy, got one with memory: write a factory for it instead")
+        raise PolicyContractError(
+            "expected a stateless policy, got one with memory: write a factory for it instead"
+        )
     examples, _ = example_inputs(contract)
     batch = torch.export.Dim("batch", min=1, max=_LARGEST_BATCH)
     try:
@@ -90,7 +92,9 @@ def _unsafe(name: str, content: bytes) -> str:
     """What in a member of the archive could run code; empty if nothing."""
     if name.endswith(("weights_config.json", "constants_config.json")):
         entries = json.loads(content).get("config", {})
-        return next((f"the pickled value {key}" for key, entry in entries.items() if entry.get("use_pickle")), "")
+        return next(
+            (f"the pickled value {key}" for key, entry in entries.items() if entry.get("use_pickle")), ""
+        )
     if "custom_obj" in name or "opaque_obj" in name:
         return f"the object {name}"
     if name.endswith(".pt"):

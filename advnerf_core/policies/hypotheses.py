@@ -65,7 +65,9 @@ class Judgement:
     @property
     def believed(self) -> bool:
         """Whether the declaration is taken to be wrong in the way the hypothesis says."""
-        better = self.best_error < BELIEVED_SHARE * self.declared_error and self.deviations > BELIEVED_DEVIATIONS
+        better = (
+            self.best_error < BELIEVED_SHARE * self.declared_error and self.deviations > BELIEVED_DEVIATIONS
+        )
         return bool(self.best.found) and better and self.best_error < USEFUL_ERROR
 
 

@@ -46,9 +46,13 @@ def load_any_policy(spec: str | os.PathLike[str], expected_sha256: str | None = 
         return load_policy(spec, expected_sha256)
     policy, sha256 = load_adapted(spec)
     if policy.training:
-        raise PolicyContractError(f"{spec} is in training mode; call .eval() on the network before it is adapted")
+        raise PolicyContractError(
+            f"{spec} is in training mode; call .eval() on the network before it is adapted"
+        )
     if expected_sha256 is not None and sha256 != expected_sha256:
-        raise PolicyContractError(f"expected the policy {expected_sha256}, got {sha256} from {spec}; correct the hash")
+        raise PolicyContractError(
+            f"expected the policy {expected_sha256}, got {sha256} from {spec}; correct the hash"
+        )
     policy.requires_grad_(False)
     return LoadedPolicy(policy, policy.contract.view, {"origin": str(spec)}, sha256)
 
@@ -77,7 +81,9 @@ def load_adapted(spec: str | os.PathLike[str]) -> tuple[AdaptedPolicy, str]:
         return AdaptedPolicy(
             loaded.policy, PolicyContract(loaded.view, goal_size=loaded.policy.goal_size)
         ), loaded.sha256
-    raise PolicyContractError(f"expected a file of {', '.join(_SUFFIXES)} or package.module:factory, got {spec}")
+    raise PolicyContractError(
+        f"expected a file of {', '.join(_SUFFIXES)} or package.module:factory, got {spec}"
+    )
 
 
 def _from_factory(spec: str) -> tuple[AdaptedPolicy, str]:
@@ -90,7 +96,9 @@ def _from_factory(spec: str) -> tuple[AdaptedPolicy, str]:
         module = importlib.import_module(module_name)
         factory = getattr(module, name)
     except (ImportError, AttributeError) as error:
-        raise PolicyContractError(f"cannot find {spec}: {error}; start in the folder that holds it") from error
+        raise PolicyContractError(
+            f"cannot find {spec}: {error}; start in the folder that holds it"
+        ) from error
     try:
         policy = factory()
     except Exception as error:
@@ -137,7 +145,9 @@ def load_driver(spec: str | os.PathLike[str], expected_sha256: str | None = None
 
         driver = OnnxDriver(OnnxNetwork(Path(spec)))
         if expected_sha256 not in (None, driver.sha256):
-            raise PolicyContractError(f"expected the policy {expected_sha256}, got {driver.sha256} from {spec}")
+            raise PolicyContractError(
+                f"expected the policy {expected_sha256}, got {driver.sha256} from {spec}"
+            )
         return driver
     import torch
 

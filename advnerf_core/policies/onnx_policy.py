@@ -47,20 +47,26 @@ class OnnxNetwork:
             raise PolicyContractError(
                 f"expected an ONNX model in {path}, got {reason:.200}; export it again"
             ) from error
-        declared = declaration_beside(path, self._session.get_modelmeta().custom_metadata_map.get(METADATA_KEY))
+        declared = declaration_beside(
+            path, self._session.get_modelmeta().custom_metadata_map.get(METADATA_KEY)
+        )
         self.contract = _black_box(declared, path)
         self.sha256 = hashlib.sha256(content + self.contract.to_json().encode()).hexdigest()
         self._inputs = self._session.get_inputs()
         wanted = 1 + (self.contract.goal_size > 0)
         if len(self._inputs) != wanted:
-            raise PolicyContractError(f"expected {wanted} inputs (images, goals) in {path}, got {self._inputs_text()}")
+            raise PolicyContractError(
+                f"expected {wanted} inputs (images, goals) in {path}, got {self._inputs_text()}"
+            )
         self._one_by_one = self._inputs[0].shape[:1] == [1]
 
     def __call__(self, images: NDArray[Any], goals: NDArray[Any] | None = None) -> NDArray[Any]:
         """Raw output of the network for its own kind of images ``[B, ...]``."""
         feeds = [images] if goals is None else [images, goals]
         if self._one_by_one and len(images) != 1:
-            return np.concatenate([self._run([feed[k : k + 1] for feed in feeds]) for k in range(len(images))])
+            return np.concatenate(
+                [self._run([feed[k : k + 1] for feed in feeds]) for k in range(len(images))]
+            )
         return self._run(feeds)
 
     def steering_rad(self, images: NDArray[Any], goals: NDArray[Any] | None = None) -> NDArray[Any]:
@@ -69,7 +75,9 @@ class OnnxNetwork:
         return np.asarray(self.contract.to_steering_rad(raw, len(images)))
 
     def _run(self, feeds: list[NDArray[Any]]) -> NDArray[Any]:
-        arrays = {each.name: _as_type(feed, each.type) for each, feed in zip(self._inputs, feeds, strict=True)}
+        arrays = {
+            each.name: _as_type(feed, each.type) for each, feed in zip(self._inputs, feeds, strict=True)
+        }
         try:
             return np.asarray(self._session.run(None, arrays)[0])
         except Exception as error:
@@ -123,9 +131,15 @@ def export_onnx(network: Any, contract: PolicyContract, path: Path) -> None:
         warnings.simplefilter("ignore")
         try:
             torch.onnx.export(
-                network, examples, buffer, dynamo=False, opset_version=_OPSET, input_names=names, output_names=["steering"],
+                network,
+                examples,
+                buffer,
+                dynamo=False,
+                opset_version=_OPSET,
+                input_names=names,
+                output_names=["steering"],
                 dynamic_axes={name: {0: "B"} for name in [*names, "steering"]},
-            )  # fmt: skip
+            )
         except Exception as error:  # the exporter and the network raise what they like
             reason = " ".join(str(error).split())
             raise PolicyContractError(

@@ -70,7 +70,9 @@ class PilotNet(nn.Module):
     ) -> None:
         super().__init__()
         if goal_size < 0 or not max_steering_rad > 0.0:
-            raise ValueError(f"expected goal_size >= 0 and max_steering_rad > 0, got {goal_size}, {max_steering_rad}")
+            raise ValueError(
+                f"expected goal_size >= 0 and max_steering_rad > 0, got {goal_size}, {max_steering_rad}"
+            )
         self.goal_size = goal_size
         self.max_steering_rad = max_steering_rad
         self.hidden = (int(hidden[0]), int(hidden[1]), int(hidden[2]))
@@ -97,7 +99,9 @@ class PilotNet(nn.Module):
             goals: ``[B, goal_size]``; must be given exactly if ``goal_size > 0``.
         """
         if images.ndim != 4 or images.shape[1:] != (3, IMAGE_HEIGHT, IMAGE_WIDTH):
-            raise ValueError(f"expected images [B, 3, {IMAGE_HEIGHT}, {IMAGE_WIDTH}], got {list(images.shape)}")
+            raise ValueError(
+                f"expected images [B, 3, {IMAGE_HEIGHT}, {IMAGE_WIDTH}], got {list(images.shape)}"
+            )
         features = self.features(images * 2.0 - 1.0)
         if self.goal_size > 0 or goals is not None:
             shape = None if goals is None else list(goals.shape)
@@ -109,7 +113,11 @@ class PilotNet(nn.Module):
 
     def settings(self) -> dict[str, Any]:
         """Constructor arguments, as plain data."""
-        return {"goal_size": self.goal_size, "max_steering_rad": self.max_steering_rad, "hidden": list(self.hidden)}
+        return {
+            "goal_size": self.goal_size,
+            "max_steering_rad": self.max_steering_rad,
+            "hidden": list(self.hidden),
+        }
 
 
 @dataclass(frozen=True)
@@ -139,7 +147,9 @@ def images_to_tensor(images: NDArray[np.uint8], dtype: torch.dtype = torch.float
     return torch.from_numpy(batch).permute(0, 3, 1, 2).to(dtype).div(255.0)
 
 
-def save_policy(path: str | os.PathLike[str], policy: PilotNet, view: PolicyView, metadata: Mapping[str, Any]) -> str:
+def save_policy(
+    path: str | os.PathLike[str], policy: PilotNet, view: PolicyView, metadata: Mapping[str, Any]
+) -> str:
     """Write a policy file atomically and return its hash.
 
     Args:
@@ -166,7 +176,9 @@ def load_policy(path: str | os.PathLike[str], expected_sha256: str | None = None
     stored = header.pop("sha256")
     digest = _digest(weights, header)
     if digest != stored:
-        raise PolicyFileError(f"expected content with hash {stored} in {path}, got {digest}: the file is damaged")
+        raise PolicyFileError(
+            f"expected content with hash {stored} in {path}, got {digest}: the file is damaged"
+        )
     if expected_sha256 is not None and digest != expected_sha256:
         raise PolicyFileError(
             f"expected the policy {expected_sha256} in {path}, got {digest}: retrain it or correct the configured hash"
@@ -187,14 +199,18 @@ def _read(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
             header = dict(file.metadata() or {})
             weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
     except FileNotFoundError as error:
-        raise PolicyFileError(f"expected a policy file at {path}, found none: train a policy first") from error
+        raise PolicyFileError(
+            f"expected a policy file at {path}, found none: train a policy first"
+        ) from error
     except (SafetensorError, OSError) as error:
         raise PolicyFileError(
             f"expected a policy file at {path}, got an unreadable one ({error}): train again"
         ) from error
     missing = {"network", "view", "metadata", "sha256"} - header.keys()
     if header.get("format") != FILE_FORMAT or missing:
-        raise PolicyFileError(f"expected a file of format {FILE_FORMAT} at {path}, got {header.get('format')!r}")
+        raise PolicyFileError(
+            f"expected a file of format {FILE_FORMAT} at {path}, got {header.get('format')!r}"
+        )
     return header, weights
 
 

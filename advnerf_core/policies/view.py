@@ -71,9 +71,13 @@ class PolicyView:
         """Policy image ``[height, width, 3]`` uint8 of a camera image ``[camera.height, camera.width, 3]`` uint8 RGB."""
         expected = (self.camera.height, self.camera.width, 3)
         if rgb.shape != expected or rgb.dtype != np.uint8:
-            raise ValueError(f"expected a uint8 image of shape {list(expected)}, got {rgb.dtype} {list(rgb.shape)}")
+            raise ValueError(
+                f"expected a uint8 image of shape {list(expected)}, got {rgb.dtype} {list(rgb.shape)}"
+            )
         if self._undistortion is not None:
-            rgb = np.asarray(cv2.remap(rgb, *self._undistortion, interpolation=cv2.INTER_LINEAR), dtype=np.uint8)
+            rgb = np.asarray(
+                cv2.remap(rgb, *self._undistortion, interpolation=cv2.INTER_LINEAR), dtype=np.uint8
+            )
         resized = cv2.resize(rgb[self.window], (self.width, self.height), interpolation=cv2.INTER_AREA)
         return np.asarray(resized, dtype=np.uint8)
 
@@ -85,10 +89,16 @@ class PolicyView:
     def from_dict(cls, data: Mapping[str, Any]) -> PolicyView:
         """Rebuild a view from :meth:`to_dict`."""
         try:
-            values = {**data, "camera": Pinhole(**data["camera"]), "distortion": tuple(data.get("distortion", ()))}
+            values = {
+                **data,
+                "camera": Pinhole(**data["camera"]),
+                "distortion": tuple(data.get("distortion", ())),
+            }
             return cls(**values)
         except (KeyError, TypeError) as error:
-            raise ValueError(f"expected a policy view as written by PolicyView.to_dict, got {data!r}") from error
+            raise ValueError(
+                f"expected a policy view as written by PolicyView.to_dict, got {data!r}"
+            ) from error
 
     @cached_property
     def _undistortion(self) -> tuple[NDArray[Any], NDArray[Any]] | None:
@@ -97,5 +107,7 @@ class PolicyView:
         # OpenCV puts pixel centres at whole numbers, we put them at one half.
         matrix = self.camera.matrix - np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
         size = (self.camera.width, self.camera.height)
-        maps = cv2.initUndistortRectifyMap(matrix, np.array(self.distortion), np.eye(3), matrix, size, cv2.CV_32FC1)
+        maps = cv2.initUndistortRectifyMap(
+            matrix, np.array(self.distortion), np.eye(3), matrix, size, cv2.CV_32FC1
+        )
         return maps[0], maps[1]

@@ -82,7 +82,9 @@ def _march(o: Any, d: Any, edges: Any, t_in: float, t_out: float, slots: Any, de
         if not solid and clear[cx, cy, cz] > 0:
             reach = int(clear[cx, cy, cz])
             leap = min(
-                steps_to_leap(x, sx, cx, reach), steps_to_leap(y, sy, cy, reach), steps_to_leap(z, sz, cz, reach)
+                steps_to_leap(x, sx, cx, reach),
+                steps_to_leap(y, sy, cy, reach),
+                steps_to_leap(z, sz, cz, reach),
             )
             i += max(leap, 1)
             continue
@@ -102,7 +104,12 @@ def _march(o: Any, d: Any, edges: Any, t_in: float, t_out: float, slots: Any, de
             alpha += weight
             alpha_depth += weight * (t_in if solid else begin + i * dt)
             for k in range(8):
-                part = (fx if k & 1 else 1.0 - fx) * (fy if k & 2 else 1.0 - fy) * (fz if k & 4 else 1.0 - fz) * weight
+                part = (
+                    (fx if k & 1 else 1.0 - fx)
+                    * (fy if k & 2 else 1.0 - fy)
+                    * (fz if k & 4 else 1.0 - fz)
+                    * weight
+                )
                 if part > 0.0:
                     slot = slots[ax if k & 1 else cx, ay if k & 2 else cy, az if k & 4 else cz]
                     if row[slot] == 0.0:

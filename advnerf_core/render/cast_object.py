@@ -112,13 +112,26 @@ def _cast_grids(
 ) -> dict[int, ObjectCast]:
     bands = max(1, -(-_LEAST_PARTS // max(1, len(poses))))
     jobs = [
-        (k, _Part(prepared(field, dtype), field, T, pinhole, supersample, window, b * pinhole.width * pinhole.height))
+        (
+            k,
+            _Part(
+                prepared(field, dtype),
+                field,
+                T,
+                pinhole,
+                supersample,
+                window,
+                b * pinhole.width * pinhole.height,
+            ),
+        )
         for k, field in fields.items()
         for b, T, whole in zip(range(len(poses)), poses, windows(field, poses, pinhole), strict=True)
         for window in _bands(whole, bands)
     ]
     run_slots(lambda slot: jobs[slot][1].cast(), len(jobs))
-    return {k: _joined([part for owner, part in jobs if owner == k], field, dtype) for k, field in fields.items()}
+    return {
+        k: _joined([part for owner, part in jobs if owner == k], field, dtype) for k, field in fields.items()
+    }
 
 
 def made_opaque(cast: ObjectCast) -> ObjectCast:
@@ -180,8 +193,16 @@ def cells_with_density(density: NDArray[Any]) -> NDArray[np.bool_]:
 class _Part:
     """The cast of one object into rows of one image."""
 
-    def __init__(self, grids: KernelGrids, field: VoxelGridObject, T_world_from_camera: Array, pinhole: Pinhole,
-                 supersample: int, window: NDArray[np.int64], offset: int) -> None:  # fmt: skip
+    def __init__(
+        self,
+        grids: KernelGrids,
+        field: VoxelGridObject,
+        T_world_from_camera: Array,
+        pinhole: Pinhole,
+        supersample: int,
+        window: NDArray[np.int64],
+        offset: int,
+    ) -> None:
         self._grids, self._field, self._T, self._pinhole = grids, field, T_world_from_camera, pinhole
         self._supersample, self._window, self._offset = supersample, window, offset
 
@@ -204,10 +225,30 @@ class _Part:
         row, touched = _scratch_rows(field.slot_count, grids.density.dtype)
         progress = np.zeros(3, np.int64)
         while not cast_window(
-            R, o, edges, window, np.array([lens.fx, lens.fy, lens.cx, lens.cy]), lens.width, self._supersample,
-            grids.slots, grids.density, grids.clear, field.density is None, field.one_sided, float(field.step_units),
-            row, touched, np.empty(3), progress, pixels, alpha, depth_m, ends, indices, values,
-        ):  # fmt: skip
+            R,
+            o,
+            edges,
+            window,
+            np.array([lens.fx, lens.fy, lens.cx, lens.cy]),
+            lens.width,
+            self._supersample,
+            grids.slots,
+            grids.density,
+            grids.clear,
+            field.density is None,
+            field.one_sided,
+            float(field.step_units),
+            row,
+            touched,
+            np.empty(3),
+            progress,
+            pixels,
+            alpha,
+            depth_m,
+            ends,
+            indices,
+            values,
+        ):
             indices, values = (
                 np.concatenate([part, np.empty(3 * len(part), part.dtype)]) for part in (indices, values)
             )
@@ -223,11 +264,17 @@ def _joined(parts: Sequence[_Part], field: VoxelGridObject, dtype: Any) -> Objec
     pixels, alpha, depth_m, values, indices = (
         np.concatenate([getattr(part, name) for part in parts] or [np.zeros(0, kind)])
         for name, kind in (
-            ("pixels", np.int64), ("alpha", np.float64), ("depth_m", np.float64), ("values", dtype), ("indices", np.int32),
+            ("pixels", np.int64),
+            ("alpha", np.float64),
+            ("depth_m", np.float64),
+            ("values", dtype),
+            ("indices", np.int32),
         )
-    )  # fmt: skip
+    )
     shape = (len(pixels), field.slot_count)
-    return ObjectCast(pixels, alpha, depth_m, sparse.csr_matrix((values, indices, np.concatenate(starts)), shape))
+    return ObjectCast(
+        pixels, alpha, depth_m, sparse.csr_matrix((values, indices, np.concatenate(starts)), shape)
+    )
 
 
 def _scratch_rows(count: int, dtype: Any) -> tuple[NDArray[Any], NDArray[np.int32]]:

@@ -41,7 +41,11 @@ def visible_shares(alphas: Tensor, depths_m: Tensor) -> Tensor:
         share = torch.ones_like(alphas[behind])
         for front in range(len(alphas)):
             if front != behind:
-                nearer = depths_m[front] < depths_m[behind] if front > behind else depths_m[front] <= depths_m[behind]
+                nearer = (
+                    depths_m[front] < depths_m[behind]
+                    if front > behind
+                    else depths_m[front] <= depths_m[behind]
+                )
                 share = share * torch.where(nearer, 1.0 - alphas[front], 1.0)
         shares.append(share)
     return torch.stack(shares) if shares else torch.ones_like(alphas)
@@ -67,7 +71,10 @@ def composite(premultiplied: Tensor, alphas: Tensor, depths_m: Tensor) -> tuple[
 
 
 def sparse_shares(
-    pixels: Sequence[NDArray[np.int64]], alphas: Sequence[Array], depths_m: Sequence[Array], background_depth_m: Array
+    pixels: Sequence[NDArray[np.int64]],
+    alphas: Sequence[Array],
+    depths_m: Sequence[Array],
+    background_depth_m: Array,
 ) -> tuple[Array, list[Array]]:
     """:func:`visible_shares` of layers that cover few pixels each, before an opaque background that covers all.
 
@@ -103,7 +110,9 @@ def _layer_shares(
     where: Any, alpha: Any, depth: Any, behind: Any, ends: Any, order: Any, background: Any, shares: Any
 ) -> None:
     """Sort the entries into pixels, and those of a pixel by depth; ``ends`` is used up."""
-    for n in range(len(where) - 1, -1, -1):  # backwards, so that entries of a pixel keep the order of the layers
+    for n in range(
+        len(where) - 1, -1, -1
+    ):  # backwards, so that entries of a pixel keep the order of the layers
         ends[where[n]] -= 1
         order[ends[where[n]]] = n
     first = 0

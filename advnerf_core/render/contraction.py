@@ -75,7 +75,9 @@ def bounded_distances(t: Array32, widths: Array32) -> tuple[Array32, Array32]:
     The distortion loss compares these: two metres of fog matter near a camera, and not on the horizon.
     """
     far = np.maximum(t, _ONE)
-    return np.where(t <= _ONE, t, _TWO - _ONE / far).astype(np.float32), (widths / (far * far)).astype(np.float32)
+    return np.where(t <= _ONE, t, _TWO - _ONE / far).astype(np.float32), (widths / (far * far)).astype(
+        np.float32
+    )
 
 
 @njit(**KERNEL_OPTIONS)

@@ -34,7 +34,9 @@ class MarchConfig:
 
     def __post_init__(self) -> None:
         if not 0.0 < self.smallest_step_m <= self.largest_step_m or self.max_samples < 1 or self.near_m < 0.0:
-            raise ValueError(f"expected 0 < smallest_step_m <= largest_step_m and max_samples >= 1, got {self}")
+            raise ValueError(
+                f"expected 0 < smallest_step_m <= largest_step_m and max_samples >= 1, got {self}"
+            )
 
     def coarser(self, scale: float) -> MarchConfig:
         """The same with intervals ``scale`` times as long."""
@@ -47,7 +49,9 @@ class MarchConfig:
 
     def steps(self, scale: float = 1.0) -> Array32:
         """Smallest and largest interval [m] and growth ``[3]``, as the kernels read them."""
-        return np.array([self.smallest_step_m, self.largest_step_m, self.step_growth], np.float32) * np.float32(scale)
+        return np.array(
+            [self.smallest_step_m, self.largest_step_m, self.step_growth], np.float32
+        ) * np.float32(scale)
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +86,9 @@ class Marcher:
         contracted: Whether the field is contracted: rays then go on outside the box.
     """
 
-    def __init__(self, capacity: int, config: MarchConfig, box_high: Array32, contracted: bool = False) -> None:
+    def __init__(
+        self, capacity: int, config: MarchConfig, box_high: Array32, contracted: bool = False
+    ) -> None:
         self.config, self.box_high, self.contracted = config, box_high, contracted
         # A ray is only begun where the longest one fits: without that reserve, many short rays would be left out.
         room = capacity // SLOTS + config.max_samples
@@ -101,9 +107,22 @@ class Marcher:
         def work(slot: int) -> None:
             start, stop = bounds[slot]
             fitted[slot] = march(
-                rays, jitter, start, stop, self.box_high, near, steps, leaps.distance, leaps.cells, self._points[slot],
-                self._t[slot], self._widths[slot], begins[slot], self.config.max_samples, self.contracted,
-            )  # fmt: skip
+                rays,
+                jitter,
+                start,
+                stop,
+                self.box_high,
+                near,
+                steps,
+                leaps.distance,
+                leaps.cells,
+                self._points[slot],
+                self._t[slot],
+                self._widths[slot],
+                begins[slot],
+                self.config.max_samples,
+                self.contracted,
+            )
 
         run_slots(work, SLOTS)
         counts = [int(begins[slot][fitted[slot]]) for slot in range(SLOTS)]
@@ -115,5 +134,7 @@ class Marcher:
             np.concatenate([self._widths[slot, : counts[slot]] for slot in range(SLOTS)]),
             np.concatenate([*packed, offsets[-1:]]),
         )
-        kept = np.concatenate([np.arange(bounds[slot][0], bounds[slot][0] + fitted[slot]) for slot in range(SLOTS)])
+        kept = np.concatenate(
+            [np.arange(bounds[slot][0], bounds[slot][0] + fitted[slot]) for slot in range(SLOTS)]
+        )
         return samples, kept

@@ -74,7 +74,9 @@ def next_sample(ray: Array32, t: np.float32, end: np.float32, distance: Array8, 
             return t
         step = min(_leap(x, ray[3], i, cells[0], reach), _leap(y, ray[4], j, cells[1], reach))
         step = min(step, _leap(z, ray[5], k, cells[2], reach))
-        t += max(step, _f(0.0)) + _f(1e-4)  # 0.1 mm into the next cell, so that rounding cannot trap a ray on an edge
+        t += max(step, _f(0.0)) + _f(
+            1e-4
+        )  # 0.1 mm into the next cell, so that rounding cannot trap a ray on an edge
     return t
 
 

@@ -43,7 +43,9 @@ class OccupancyGrid:
             estimate counts by how long its cell is: thin haze in a large cell hides as much as dense fog in a small one.
     """
 
-    def __init__(self, box_high: Array32, resolution: int = 128, seed: int = 0, contracted: bool = False) -> None:
+    def __init__(
+        self, box_high: Array32, resolution: int = 128, seed: int = 0, contracted: bool = False
+    ) -> None:
         self.box_high = np.asarray(box_high, np.float32)
         if contracted:
             resolution = -(-resolution // 4) * 4
@@ -86,7 +88,9 @@ class OccupancyGrid:
         if self._stretch is None:
             return np.asarray(self.density > least)
         # Cells that no place is mapped to have no length.
-        return np.asarray((self._stretch > 0.0) & (np.minimum(self.density, np.float32(1e30)) * self._stretch > least))
+        return np.asarray(
+            (self._stretch > 0.0) & (np.minimum(self.density, np.float32(1e30)) * self._stretch > least)
+        )
 
 
 def refine_occupied(
@@ -118,7 +122,9 @@ def refine_occupied(
     rng = np.random.Generator(np.random.Philox(key=[seed, 1]))
     cells = np.array(fine.shape) / np.asarray(box_high)
     least = least_depth * cells.max()
-    stretch = radial_stretch((fine.shape[0], fine.shape[1], fine.shape[2])).reshape(-1) if contracted else None
+    stretch = (
+        radial_stretch((fine.shape[0], fine.shape[1], fine.shape[2])).reshape(-1) if contracted else None
+    )
     kept = np.zeros(fine.size, np.bool_)
     for part in np.array_split(np.flatnonzero(fine), max(1, int(fine.sum()) // 262144)):
         index = np.stack(np.unravel_index(part, fine.shape), axis=-1)

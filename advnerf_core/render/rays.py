@@ -34,7 +34,9 @@ def poses_in_box(T_world_from_camera: ArrayLike, box_low_m: ArrayLike, extent_m:
 
 
 @njit(**KERNEL_OPTIONS)
-def write_ray(pose: Array32, intrinsics: Array32, column: np.float32, row: np.float32, ray: Array32) -> np.float32:
+def write_ray(
+    pose: Array32, intrinsics: Array32, column: np.float32, row: np.float32, ray: Array32
+) -> np.float32:
     """Write origin and direction ``[6]`` of the ray through a pixel position; returns its planar depth per metre of ray."""
     f = np.float32
     x, y = (column - intrinsics[2]) / intrinsics[0], (row - intrinsics[3]) / intrinsics[1]
@@ -47,9 +49,13 @@ def write_ray(pose: Array32, intrinsics: Array32, column: np.float32, row: np.fl
 
 @njit(**KERNEL_OPTIONS)
 def pixel_rays(
-    pixels: NDArray[np.int64], images: NDArray[np.uint8], poses: Array32, intrinsics: Array32, rays: Array32,
+    pixels: NDArray[np.int64],
+    images: NDArray[np.uint8],
+    poses: Array32,
+    intrinsics: Array32,
+    rays: Array32,
     colours: NDArray[np.uint8],
-) -> None:  # fmt: skip
+) -> None:
     """Rays and colours of single pixels.
 
     Args:

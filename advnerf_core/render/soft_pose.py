@@ -37,12 +37,14 @@ def placement_of(field: VoxelGridObject) -> Tensor:
 
 def pose_of(field: VoxelGridObject, placement: Tensor) -> tuple[Tensor, Tensor]:
     """Rotation ``[3, 3]`` and position ``[3]`` of an object placed at ``(x_m, y_m, yaw_rad, scale)``; it keeps height and tilt."""
-    tilt = torch.tensor(rotation_z(-yaw_of(field.T_world_from_object)) @ field.T_world_from_object[:3, :3]).to(
-        placement
-    )
+    tilt = torch.tensor(
+        rotation_z(-yaw_of(field.T_world_from_object)) @ field.T_world_from_object[:3, :3]
+    ).to(placement)
     x, y, yaw = placement[0], placement[1], placement[2]
     zero, one = torch.zeros_like(x), torch.ones_like(x)
-    turn = torch.stack([yaw.cos(), -yaw.sin(), zero, yaw.sin(), yaw.cos(), zero, zero, zero, one]).reshape(3, 3)
+    turn = torch.stack([yaw.cos(), -yaw.sin(), zero, yaw.sin(), yaw.cos(), zero, zero, zero, one]).reshape(
+        3, 3
+    )
     return turn @ tilt, torch.stack([x, y, zero + float(field.T_world_from_object[2, 3])])
 
 
@@ -114,14 +116,25 @@ def soft_layer(
         ValueError: No density, or a placement that is none.
     """
     if field.density is None:
-        raise ValueError("expected an object with a density, got an opaque solid: its edges have no derivative")
+        raise ValueError(
+            "expected an object with a density, got an opaque solid: its edges have no derivative"
+        )
     place = torch.as_tensor(placement, dtype=torch.float64).detach()
     if place.shape != (4,) or not bool(torch.isfinite(place).all()) or float(place[3]) <= 0:
-        raise ValueError(f"expected a finite placement (x, y, yaw, scale) with scale > 0, got {place.tolist()}")
+        raise ValueError(
+            f"expected a finite placement (x, y, yaw, scale) with scale > 0, got {place.tolist()}"
+        )
     poses = np.asarray(T_world_from_camera, dtype=np.float64).reshape(-1, 4, 4)
     placed = placed_at(field, place)
-    walk = _Walk.of(placed, field, np.ascontiguousarray(colours, np.float64), poses, pinhole, supersample,
-                    least_transmittance)  # fmt: skip
+    walk = _Walk.of(
+        placed,
+        field,
+        np.ascontiguousarray(colours, np.float64),
+        poses,
+        pinhole,
+        supersample,
+        least_transmittance,
+    )
     pixels = _window_pixels(placed, poses, pinhole)
     shown = walk.shade(pixels)
     kept = shown[:, 3] > 0.0
@@ -162,15 +175,26 @@ class _RenderSoft(torch.autograd.Function):
     """`soft_layer` as dense layers."""
 
     @staticmethod
-    def forward(ctx: Any, placement: Tensor, colours: Tensor, settings: tuple[Any, ...]) -> tuple[Tensor, ...]:
+    def forward(
+        ctx: Any, placement: Tensor, colours: Tensor, settings: tuple[Any, ...]
+    ) -> tuple[Tensor, ...]:
         field, poses, pinhole, supersample, least = settings
-        layer = soft_layer(field, placement.detach(), colours.detach().numpy(), poses, pinhole, supersample, least)
+        layer = soft_layer(
+            field, placement.detach(), colours.detach().numpy(), poses, pinhole, supersample, least
+        )
         ctx.layer, ctx.types = layer, (placement.dtype, colours.dtype)
         shape = (np.asarray(poses).reshape(-1, 4, 4).shape[0], pinhole.height, pinhole.width)
         colour, alpha = np.zeros((int(np.prod(shape)), 3)), np.zeros(int(np.prod(shape)))
         depth_m = np.full(len(alpha), np.inf)
-        colour[layer.pixels], alpha[layer.pixels], depth_m[layer.pixels] = layer.colour, layer.alpha, layer.depth_m
-        out = tuple(torch.from_numpy(part) for part in (colour.reshape(*shape, 3), alpha.reshape(shape), depth_m.reshape(shape)))  # fmt: skip
+        colour[layer.pixels], alpha[layer.pixels], depth_m[layer.pixels] = (
+            layer.colour,
+            layer.alpha,
+            layer.depth_m,
+        )
+        out = tuple(
+            torch.from_numpy(part)
+            for part in (colour.reshape(*shape, 3), alpha.reshape(shape), depth_m.reshape(shape))
+        )
         ctx.mark_non_differentiable(out[2])
         return out
 
@@ -199,8 +223,16 @@ class _Walk:
     least: float
 
     @classmethod
-    def of(cls, placed: VoxelGridObject, nominal: VoxelGridObject, colours: Array, poses: Array, lens: Pinhole,
-           supersample: int, least: float) -> _Walk:  # fmt: skip
+    def of(
+        cls,
+        placed: VoxelGridObject,
+        nominal: VoxelGridObject,
+        colours: Array,
+        poses: Array,
+        lens: Pinhole,
+        supersample: int,
+        least: float,
+    ) -> _Walk:
         grids = prepared(placed, np.float64)
         edges = (np.asarray(placed.box_max, np.float64) - placed.box_min) / grids.slots.shape
         T = invert_transform(placed.T_world_from_object) @ poses
@@ -222,7 +254,10 @@ class _Walk:
         rows = np.zeros((_SLOTS, len(self.colours) if with_colours else 0, 3))
         sums, low = np.zeros((_SLOTS, SUMS)), np.asarray(self.field.box_min, np.float64)
         run_slots(
-            lambda k: pull_pixels(*bounds[k], *self._common(pixels), slopes, low, self.edges, rows[k], sums[k]), _SLOTS
+            lambda k: pull_pixels(
+                *bounds[k], *self._common(pixels), slopes, low, self.edges, rows[k], sums[k]
+            ),
+            _SLOTS,
         )
         return self._by_placement(sums.sum(axis=0)), rows.sum(axis=0)
 
@@ -238,10 +273,23 @@ class _Walk:
         extent_m = float(np.linalg.norm(np.asarray(field.box_max, np.float64) - field.box_min)) * field.scale
         room = int(extent_m / self.step_m) + 4
         return (
-            pixels, self.R, self.o, np.array([lens.fx, lens.fy, lens.cx, lens.cy]), np.array([lens.height, lens.width]),
-            self.supersample, grids.slots, grids.density, grids.clear, field.one_sided, self.step_m, float(field.scale),
-            self.least, self.colours, np.empty(room), np.empty(room),
-        )  # fmt: skip
+            pixels,
+            self.R,
+            self.o,
+            np.array([lens.fx, lens.fy, lens.cx, lens.cy]),
+            np.array([lens.height, lens.width]),
+            self.supersample,
+            grids.slots,
+            grids.density,
+            grids.clear,
+            field.one_sided,
+            self.step_m,
+            float(field.scale),
+            self.least,
+            self.colours,
+            np.empty(room),
+            np.empty(room),
+        )
 
 
 def _window_pixels(field: VoxelGridObject, poses: Array, pinhole: Pinhole) -> NDArray[np.int64]:

@@ -60,7 +60,11 @@ class ClipTrack:
 
 
 def write_clip(
-    path: Path, tracks: Sequence[ClipTrack], rate_hz: float = 10.0, off_track_m: float = 0.4, max_bytes: int = MAX_BYTES
+    path: Path,
+    tracks: Sequence[ClipTrack],
+    rate_hz: float = 10.0,
+    off_track_m: float = 0.4,
+    max_bytes: int = MAX_BYTES,
 ) -> Path:
     """Write drives side by side as one video, atomically, as fine as the size limit allows.
 
@@ -111,7 +115,9 @@ def compose(tracks: Sequence[ClipTrack], rate_hz: float = 10.0, off_track_m: flo
 def read_clip(path: Path) -> Frames:
     """Decode a whole clip to RGB, ``[N, height, width, 3]``."""
     with av.open(str(path)) as container:
-        return np.stack([np.asarray(f.to_ndarray(format="rgb24"), dtype=np.uint8) for f in container.decode(video=0)])
+        return np.stack(
+            [np.asarray(f.to_ndarray(format="rgb24"), dtype=np.uint8) for f in container.decode(video=0)]
+        )
 
 
 def data_uri(path: Path) -> str:
@@ -163,7 +169,9 @@ def _encode(path: Path, codec: str, quality: int, rate_hz: float, frames: Iterat
 def _panel(track: ClipTrack, step: int, rate_hz: float, off_track_m: float) -> Frames:
     index = min(step, len(track.frames) - 1)
     image = np.asarray(track.frames[index], dtype=np.uint8)
-    scale = max(1, -(-_MIN_WIDTH_PX // image.shape[1]))  # the policy's 200-pixel views are doubled to hold the caption
+    scale = max(
+        1, -(-_MIN_WIDTH_PX // image.shape[1])
+    )  # the policy's 200-pixel views are doubled to hold the caption
     image = np.repeat(np.repeat(image, scale, axis=0), scale, axis=1)
     height, width = image.shape[:2]
     canvas = Image.new("RGB", (width, _TITLE_PX + height + _STATUS_PX), _rgb("paper"))
@@ -181,7 +189,11 @@ def _draw_title(canvas: Image.Image, track: ClipTrack) -> None:
     draw.text((11, _TITLE_PX / 2 - 1), track.title, fill=_rgb("ink"), font=_font(13, bold=True), anchor="lm")
     if track.attack_id:
         draw.text(
-            (canvas.width - 2, _TITLE_PX / 2 - 1), track.attack_id, fill=_rgb("muted"), font=_font(11), anchor="rm"
+            (canvas.width - 2, _TITLE_PX / 2 - 1),
+            track.attack_id,
+            fill=_rgb("muted"),
+            font=_font(11),
+            anchor="rm",
         )
 
 
@@ -197,7 +209,8 @@ def _draw_status(canvas: Image.Image, time_s: float, cte_m: float, off_track_m: 
     centre, metre = (left + right) / 2, (right - left) / 4 / off_track_m
     draw.rectangle((left, middle - 4, right, middle + 4), fill=_rgb("grid"))
     draw.rectangle(
-        (centre - off_track_m * metre, middle - 4, centre + off_track_m * metre, middle + 4), fill=_rgb("tape")
+        (centre - off_track_m * metre, middle - 4, centre + off_track_m * metre, middle + 4),
+        fill=_rgb("tape"),
     )
     at = float(np.clip(centre - cte_m * metre, left + 1, right - 1))
     draw.rectangle((at - 1.5, middle - 7, at + 1.5, middle + 7), fill=_rgb("ink"))

@@ -300,10 +300,14 @@ class ReportData(Record):
         super().__post_init__()
         known = {f.name for f in fields(self)}
         if unknown := sorted(set(self.not_measured) - known):
-            raise ValueError(f"expected ReportData.not_measured keys among {', '.join(sorted(known))}, got {unknown}")
+            raise ValueError(
+                f"expected ReportData.not_measured keys among {', '.join(sorted(known))}, got {unknown}"
+            )
 
     def select(self, where: Callable[[Run], bool] | None = None, **equal: object) -> tuple[Run, ...]:
         """Runs whose fields equal the given values, such as ``domain="deployed"``, and for which ``where`` holds."""
         return tuple(
-            r for r in self.runs if all(getattr(r, k) == v for k, v in equal.items()) and (where is None or where(r))
+            r
+            for r in self.runs
+            if all(getattr(r, k) == v for k, v in equal.items()) and (where is None or where(r))
         )

@@ -52,7 +52,9 @@ def band_outline(scene: Scene) -> Outline:
     if scene.closed and np.allclose(xy[0], xy[-1]):
         xy = xy[:-1]
     tangent = np.roll(xy, -1, axis=0) - np.roll(xy, 1, axis=0) if scene.closed else np.gradient(xy, axis=0)
-    normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1) / np.linalg.norm(tangent, axis=1, keepdims=True)
+    normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1) / np.linalg.norm(
+        tangent, axis=1, keepdims=True
+    )
     left, right = xy + scene.off_track_m * normal, (xy - scene.off_track_m * normal)[::-1]
     if not scene.closed:
         return Outline(np.concatenate([left, right]), closed=False)
@@ -66,9 +68,13 @@ def _draw_scene(ax: Any, scene: Scene) -> None:
     x_min, y_min, x_max, y_max = scene.room_m
     ax.grid(False)
     ax.add_patch(PathPatch(band_outline(scene), fc=LIGHT["band"], ec="none", zorder=0.5))
-    ax.add_patch(Rectangle((x_min, y_min), x_max - x_min, y_max - y_min, fill=False, ec=LIGHT["ink"], lw=1.6, zorder=1))
+    ax.add_patch(
+        Rectangle((x_min, y_min), x_max - x_min, y_max - y_min, fill=False, ec=LIGHT["ink"], lw=1.6, zorder=1)
+    )
     path = np.concatenate([scene.path_xy_m, scene.path_xy_m[:1]]) if scene.closed else scene.path_xy_m
-    ax.plot(path[:, 0], path[:, 1], color=LIGHT["tape"], lw=2.6, alpha=0.55, zorder=1.1, solid_joinstyle="round")
+    ax.plot(
+        path[:, 0], path[:, 1], color=LIGHT["tape"], lw=2.6, alpha=0.55, zorder=1.1, solid_joinstyle="round"
+    )
     _note(ax, path[len(path) * 5 // 8], "tape, on-track band", (0, 12))
     if scene.fence_m is not None:
         ax.add_patch(Polygon(scene.fence_m, fill=False, ec=LIGHT["muted"], lw=1.0, ls=(0, (1, 2)), zorder=1))
@@ -87,25 +93,52 @@ def _draw_face(ax: Any, segment: Floats, name: str) -> None:
     front = np.array([along[1], -along[0]]) / np.linalg.norm(along)
     ax.plot(*segment.T, color=LIGHT["ink"], lw=4.0, solid_capstyle="butt", zorder=2.5)
     middle = segment.mean(axis=0)
-    ax.annotate("", middle + 0.34 * front, middle, arrowprops={"arrowstyle": "-|>", "color": LIGHT["ink"], "lw": 1.0})
+    ax.annotate(
+        "", middle + 0.34 * front, middle, arrowprops={"arrowstyle": "-|>", "color": LIGHT["ink"], "lw": 1.0}
+    )
     away = -11.0 * front
-    ax.annotate(name, middle, xytext=tuple(away), textcoords="offset points", ha="center", va="center", size=8.5,
-                rotation=float(np.degrees(np.arctan2(along[1], along[0]))), rotation_mode="anchor", annotation_clip=True)  # fmt: skip
+    ax.annotate(
+        name,
+        middle,
+        xytext=tuple(away),
+        textcoords="offset points",
+        ha="center",
+        va="center",
+        size=8.5,
+        rotation=float(np.degrees(np.arctan2(along[1], along[0]))),
+        rotation_mode="anchor",
+        annotation_clip=True,
+    )
 
 
 def _draw_starts(ax: Any, runs: Sequence[Run]) -> None:
     """An arrow along the first heading of every start."""
     for start in sorted({r.start for r in runs}):
         x, y, yaw = next(r.states[0] for r in runs if r.start == start)
-        ax.annotate("", (x, y), (x - 0.3 * np.cos(yaw), y - 0.3 * np.sin(yaw)), zorder=3.5, annotation_clip=True,
-                    arrowprops={"arrowstyle": "-|>", "color": LIGHT["ink"], "lw": 1.2})  # fmt: skip
+        ax.annotate(
+            "",
+            (x, y),
+            (x - 0.3 * np.cos(yaw), y - 0.3 * np.sin(yaw)),
+            zorder=3.5,
+            annotation_clip=True,
+            arrowprops={"arrowstyle": "-|>", "color": LIGHT["ink"], "lw": 1.2},
+        )
     if runs:
         _note(ax, runs[0].states[0, :2], "start", (-14, 9), ha="center")
 
 
 def _note(ax: Any, at: Floats, text: str, offset_pt: tuple[float, float], ha: str = "center") -> None:
-    ax.annotate(text, tuple(at), xytext=offset_pt, textcoords="offset points", ha=ha, size=8, color=LIGHT["muted"],
-                annotation_clip=True, zorder=4)  # fmt: skip
+    ax.annotate(
+        text,
+        tuple(at),
+        xytext=offset_pt,
+        textcoords="offset points",
+        ha=ha,
+        size=8,
+        color=LIGHT["muted"],
+        annotation_clip=True,
+        zorder=4,
+    )
 
 
 def _driven_box(scene: Scene, runs: Sequence[Run]) -> Floats:

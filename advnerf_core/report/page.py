@@ -88,14 +88,20 @@ def _figures(data: ReportData) -> dict[str, Any]:
             figures["victims"].append((victim, _run_figures(data, victim)))
     if data.laps is not None:
         s = data.settings
-        figures["laps_map"] = _svg(maps.laps_map(data.laps, data.scene), "The drive without attack from above")
+        figures["laps_map"] = _svg(
+            maps.laps_map(data.laps, data.scene), "The drive without attack from above"
+        )
         figures["laps_cte"] = _svg(
             plots.laps_cte(data.laps, s.control_period_s, s.off_track_m), "Its cross-track error over time"
         )
     if data.fidelity is not None and len(data.fidelity.steering_rad):
-        figures["steering"] = _svg(plots.steering_agreement(data.fidelity), "Steering on surrogate against real images")
+        figures["steering"] = _svg(
+            plots.steering_agreement(data.fidelity), "Steering on surrogate against real images"
+        )
     if data.latency is not None:
-        figures["latency"] = _svg(plots.latency_histogram(data.latency), "Histogram of capture-to-serial latency")
+        figures["latency"] = _svg(
+            plots.latency_histogram(data.latency), "Histogram of capture-to-serial latency"
+        )
     if data.memory:
         figures["memory"] = _svg(plots.memory_against_horizon(data.memory), "Peak memory against the horizon")
     return figures
@@ -104,17 +110,23 @@ def _figures(data: ReportData) -> dict[str, Any]:
 def _run_figures(data: ReportData, victim: Victim) -> dict[str, Markup]:
     out = {
         "room": _svg(
-            maps.trajectory_map(data, victim=victim), f"The room from above with all drives of the {victim} policy"
+            maps.trajectory_map(data, victim=victim),
+            f"The room from above with all drives of the {victim} policy",
         ),
         "zoom": _svg(
-            maps.trajectory_map(data, zoom=True, victim=victim), f"The drives of the {victim} policy, enlarged"
+            maps.trajectory_map(data, zoom=True, victim=victim),
+            f"The drives of the {victim} policy, enlarged",
         ),
     }
     for domain in ("surrogate", "deployed"):
         if data.select(victim=victim, domain=domain):
-            out[domain] = _svg(plots.cte_over_time(data, domain, victim), f"Cross-track error over time, {domain}")
+            out[domain] = _svg(
+                plots.cte_over_time(data, domain, victim), f"Cross-track error over time, {domain}"
+            )
     if any(c.victim == victim for c in data.curves):
-        out["curves"] = _svg(plots.loss_curves(data, victim), "Total cross-track error per evaluation of the searches")
+        out["curves"] = _svg(
+            plots.loss_curves(data, victim), "Total cross-track error per evaluation of the searches"
+        )
     return out
 
 
@@ -177,7 +189,9 @@ def _views(data: ReportData) -> list[dict[str, Any]]:
 
 
 def _difference(a: Frames, b: Frames) -> Frames:
-    difference = np.abs(a.astype(np.int16) - b.astype(np.int16)).mean(axis=2, keepdims=True) * _DIFFERENCE_GAIN
+    difference = (
+        np.abs(a.astype(np.int16) - b.astype(np.int16)).mean(axis=2, keepdims=True) * _DIFFERENCE_GAIN
+    )
     return np.repeat(np.clip(difference, 0, 255).astype(np.uint8), 3, axis=2)
 
 
@@ -188,7 +202,13 @@ def _fidelity_numbers(data: ReportData) -> Markup:
     number = tables.number
     difference = number(f.steering_difference_rad, 4)
     rows = (
-        ("camera size", str(len(f.views)), number(f.mean("psnr_full_db"), 2), number(f.mean("ssim_full"), 3), "–"),  # noqa: RUF001
+        (
+            "camera size",
+            str(len(f.views)),
+            number(f.mean("psnr_full_db"), 2),
+            number(f.mean("ssim_full"), 3),
+            "–",  # noqa: RUF001 (typography for readers)
+        ),
         (
             "policy's view, 200x66",
             str(len(f.views)),

@@ -75,8 +75,17 @@ def cte_over_time(data: ReportData, domain: Domain, victim: Victim = "hardened")
             ax.plot((len(run.cte_m) - 1) * period, run.cte_m[-1], **end_style(run))
         ax.set(xlabel="time [s]", ylabel="cross-track error, left + [m]", ylim=(-limit, limit), title=domain)
         ax.set_xlim(left=0.0)
-        ax.annotate("on track", (1, data.settings.off_track_m), xycoords=("axes fraction", "data"), xytext=(-4, -4),
-                    textcoords="offset points", ha="right", va="top", color=LIGHT["muted"], size=8)  # fmt: skip
+        ax.annotate(
+            "on track",
+            (1, data.settings.off_track_m),
+            xycoords=("axes fraction", "data"),
+            xytext=(-4, -4),
+            textcoords="offset points",
+            ha="right",
+            va="top",
+            color=LIGHT["muted"],
+            size=8,
+        )
         add_run_legend(ax, runs)
     return ax.figure
 
@@ -94,16 +103,22 @@ def loss_curves(data: ReportData, victim: Victim = "hardened") -> Figure:
                 ax.plot(x[-1], curve.total_cte_m[-1], style.marker, ms=5, color=style.light)
             else:
                 ax.plot(x, curve.total_cte_m, style.marker, ms=2.4, alpha=0.55, mew=0, color=style.light)
-                ax.plot(x, np.maximum.accumulate(curve.total_cte_m), drawstyle="steps-post", color=style.light)
+                ax.plot(
+                    x, np.maximum.accumulate(curve.total_cte_m), drawstyle="steps-post", color=style.light
+                )
         # Lines before dots.
-        for method in sorted({c.method for c in curves}, key=lambda name: (not style_of(name).climbs, order_of(name))):
+        for method in sorted(
+            {c.method for c in curves}, key=lambda name: (not style_of(name).climbs, order_of(name))
+        ):
             style = style_of(method)
             text = f"{method}, one line per seed" if style.climbs else f"{method}: each texture, best so far"
             marker = None if style.climbs else style.marker
             handles.append(Line2D([], [], color=style.light, label=text, marker=marker, ms=2.4))
         if clean:
             handles.append(
-                ax.axhline(float(np.mean(clean)), color=LIGHT[NONE], ls="--", lw=1.2, label="no attack, surrogate")
+                ax.axhline(
+                    float(np.mean(clean)), color=LIGHT[NONE], ls="--", lw=1.2, label="no attack, surrogate"
+                )
             )
         ax.set(xlabel="evaluation", ylabel="total CTE, surrogate [m]")
         ax.set_ylim(bottom=0.0)
@@ -216,14 +231,7 @@ def end_style(run: Run) -> dict[str, Any]:
     """The mark at the end of a drive: shape by condition, filled if deployed."""
     style = style_of(run.condition)
     fill = style.light if run.domain == "deployed" else LIGHT["paper"]
-    return {
-        "marker": style.marker,
-        "ms": 5,
-        "color": style.light,
-        "mfc": fill,
-        "ls": "none",
-        "zorder": 3,
-    }
+    return {"marker": style.marker, "ms": 5, "color": style.light, "mfc": fill, "ls": "none", "zorder": 3}
 
 
 def add_run_legend(ax: Any, runs: Iterable[Run]) -> None:
@@ -233,7 +241,10 @@ def add_run_legend(ax: Any, runs: Iterable[Run]) -> None:
     for condition in sorted({condition for condition, _ in cells}, key=order_of):
         for domain in LINE_STYLES:
             if run := cells.get((condition, domain)):
-                style = {**run_style(run), **{k: v for k, v in end_style(run).items() if k in ("marker", "ms", "mfc")}}
+                style = {
+                    **run_style(run),
+                    **{k: v for k, v in end_style(run).items() if k in ("marker", "ms", "mfc")},
+                }
                 handles.append(Line2D([], [], label=f"{style_of(condition).title}, {domain}", **style))
     _legend_above(ax, handles)
 

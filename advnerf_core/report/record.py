@@ -33,10 +33,14 @@ class Record:
     def set_floats(self, name: str, *shape: int | None) -> None:
         """Store field ``name`` as finite float64 of ``shape`` (None: any length)."""
         a = as_floats(getattr(self, name))
-        fits = a.ndim == len(shape) and all(want in (None, got) for want, got in zip(shape, a.shape, strict=True))
+        fits = a.ndim == len(shape) and all(
+            want in (None, got) for want, got in zip(shape, a.shape, strict=True)
+        )
         if not fits or not np.isfinite(a).all():
             wanted = ", ".join("n" if n is None else str(n) for n in shape)
-            raise ValueError(f"expected {type(self).__name__}.{name} as finite numbers [{wanted}], got shape {a.shape}")
+            raise ValueError(
+                f"expected {type(self).__name__}.{name} as finite numbers [{wanted}], got shape {a.shape}"
+            )
         object.__setattr__(self, name, a)
 
     def check_choice(self, name: str, choices: Sequence[str]) -> None:
@@ -49,7 +53,9 @@ class Record:
     def check_named(self, name: str) -> None:
         """Raise unless field ``name`` is a name."""
         if not getattr(self, name):
-            raise ValueError(f"expected {type(self).__name__}.{name} to be a name, got {getattr(self, name)!r}")
+            raise ValueError(
+                f"expected {type(self).__name__}.{name} to be a name, got {getattr(self, name)!r}"
+            )
 
     def check_image(self, name: str) -> None:
         """Raise unless field ``name`` is None or an RGB image."""

@@ -29,7 +29,9 @@ def results_dict(data: ReportData) -> dict[str, Any]:
 
 def write_results(data: ReportData, path: Path) -> Path:
     """Write `results.json` atomically."""
-    write_text_atomic(path, json.dumps(results_dict(data), indent=1, allow_nan=False, ensure_ascii=False) + "\n")
+    write_text_atomic(
+        path, json.dumps(results_dict(data), indent=1, allow_nan=False, ensure_ascii=False) + "\n"
+    )
     return path
 
 
@@ -45,7 +47,9 @@ def read_results(path: Path) -> ReportData:
     try:
         return _ADAPTER.validate_python(content["data"])
     except (KeyError, ValidationError) as e:
-        raise ValueError(f"expected the records of a report in {path}, got: {e}; run the report stage again") from e
+        raise ValueError(
+            f"expected the records of a report in {path}, got: {e}; run the report stage again"
+        ) from e
 
 
 def write_text_atomic(path: Path, text: str) -> None:

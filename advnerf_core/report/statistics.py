@@ -51,7 +51,11 @@ def ratio_of_sums(numerator: ArrayLike, denominator: ArrayLike) -> float | None:
 
 
 def bootstrap(
-    statistic: Callable[[Indices], Floats], count: int, level: float = LEVEL, resamples: int = _RESAMPLES, seed: int = 0
+    statistic: Callable[[Indices], Floats],
+    count: int,
+    level: float = LEVEL,
+    resamples: int = _RESAMPLES,
+    seed: int = 0,
 ) -> Interval | None:
     """Percentile interval of a statistic over ``count`` independent units.
 
@@ -66,7 +70,9 @@ def bootstrap(
         The interval; None of fewer than two units, which say nothing about spread, or where a resample has no value.
     """
     if not 0.0 < level < 1.0 or resamples < 1:
-        raise ValueError(f"expected a level within 0..1 and at least one resample, got {level} and {resamples}")
+        raise ValueError(
+            f"expected a level within 0..1 and at least one resample, got {level} and {resamples}"
+        )
     if count < 2:
         return None
     values = np.sort(np.asarray(statistic(_resamples(count, resamples, seed)), dtype=np.float64))
@@ -128,4 +134,6 @@ def _divide(above: Floats, below: Floats) -> Floats:
 
 def _require_pairs(*parts: Floats) -> None:
     if any(part.ndim != 1 or part.shape != parts[0].shape for part in parts):
-        raise ValueError(f"expected one number per seed in each, got shapes {[list(part.shape) for part in parts]}")
+        raise ValueError(
+            f"expected one number per seed in each, got shapes {[list(part.shape) for part in parts]}"
+        )

@@ -80,7 +80,9 @@ def _what_was_done(data: ReportData) -> str:
     s = data.settings
     starts, seeds = len(s.start_poses), len(s.seeds)
     live = any(r.domain == "deployed" and r.condition == "gradient" for r in data.runs)
-    shown = " Both were then shown to the driving car, frame by frame, by the live node graph." if live else ""
+    shown = (
+        " Both were then shown to the driving car, frame by frame, by the live node graph." if live else ""
+    )
     return (
         f"A texture for one flat board was searched for in a learned copy of the room: {s.iterations} gradient steps over "
         f"{s.horizon_steps} control ticks ({s.horizon_steps * s.control_period_s:g} s) from {_count(starts, 'start pose')} with "
@@ -90,7 +92,9 @@ def _what_was_done(data: ReportData) -> str:
 
 def _what_it_did(data: ReportData) -> str:
     rows = transfer_rows(data)
-    surrogate, deployed = (_effect(rows, domain, data.settings.off_track_m) for domain in ("surrogate", "deployed"))
+    surrogate, deployed = (
+        _effect(rows, domain, data.settings.off_track_m) for domain in ("surrogate", "deployed")
+    )
     return (
         f"In the surrogate the total cross-track error (total CTE, the summed distance from the tape) {surrogate}. "
         f"On the live drive it {deployed}."

@@ -71,7 +71,9 @@ def transfer_rows(data: ReportData) -> tuple[TransferRow, ...]:
             clean = data.select(victim=victim, domain=domain, condition=NONE)
             met = {run.condition for run in data.select(victim=victim, domain=domain)}
             for condition in sorted(met, key=order_of):
-                rows.append(_transfer_row(data.select(victim=victim, domain=domain, condition=condition), clean))
+                rows.append(
+                    _transfer_row(data.select(victim=victim, domain=domain, condition=condition), clean)
+                )
     return tuple(rows)
 
 
@@ -155,14 +157,16 @@ class Table:
             Markup('<th scope="col"{}>{}</th>').format(self._align(i), c) for i, c in enumerate(self.columns)
         )
         body = Markup("").join(self._html_row(i, row) for i, row in enumerate(self.rows))
-        return Markup('<div class="scroll"><table><thead><tr>{}</tr></thead><tbody>{}</tbody></table></div>').format(
-            head, body
-        )
+        return Markup(
+            '<div class="scroll"><table><thead><tr>{}</tr></thead><tbody>{}</tbody></table></div>'
+        ).format(head, body)
 
     def _html_row(self, index: int, row: Sequence[str]) -> Markup:
         names = [self.classes[index]] if index < len(self.classes) and self.classes[index] else []
         names += ["group"] if index in self.groups else []
-        cells = Markup("").join(Markup("<td{}>{}</td>").format(self._align(i), cell) for i, cell in enumerate(row))
+        cells = Markup("").join(
+            Markup("<td{}>{}</td>").format(self._align(i), cell) for i, cell in enumerate(row)
+        )
         return (
             Markup('<tr class="{}">{}</tr>').format(" ".join(names), cells)
             if names
@@ -232,7 +236,8 @@ def hop_table(data: ReportData) -> Table:
     """Latency per hop, the whole path last."""
     hops = () if data.latency is None else (*data.latency.hops, data.latency.overall)
     cells = tuple(
-        (h.name, str(h.count), *(number(v, 1) for v in (h.p50_ms, h.p95_ms, h.p99_ms, h.max_ms))) for h in hops
+        (h.name, str(h.count), *(number(v, 1) for v in (h.p50_ms, h.p95_ms, h.p99_ms, h.max_ms)))
+        for h in hops
     )
     columns = ("hop", "frames", "p50 [ms]", "p95 [ms]", "p99 [ms]", "max [ms]")
     return Table("Live latency", columns, cells, (False, *[True] * 5), (len(cells) - 1,))
@@ -240,8 +245,12 @@ def hop_table(data: ReportData) -> Table:
 
 def memory_table(data: ReportData) -> Table:
     """Peak memory against the horizon."""
-    cells = tuple((str(m.horizon_steps), number(m.adjoint_mib, 1), number(m.backprop_mib, 1)) for m in data.memory)
-    return Table("Peak memory above idle", ("T", "adjoint [MiB]", "back-propagation [MiB]"), cells, (True, True, True))
+    cells = tuple(
+        (str(m.horizon_steps), number(m.adjoint_mib, 1), number(m.backprop_mib, 1)) for m in data.memory
+    )
+    return Table(
+        "Peak memory above idle", ("T", "adjoint [MiB]", "back-propagation [MiB]"), cells, (True, True, True)
+    )
 
 
 def timing_table(data: ReportData) -> Table:
@@ -249,4 +258,6 @@ def timing_table(data: ReportData) -> Table:
     cells = [(t.name, number(t.wall_s, 1), "from cache" if t.cached else "") for t in data.timings]
     if cells:
         cells.append(("all stages", number(sum(t.wall_s for t in data.timings), 1), ""))
-    return Table("Stages", ("stage", "wall time [s]", ""), tuple(cells), (False, True, False), (len(cells) - 1,))
+    return Table(
+        "Stages", ("stage", "wall time [s]", ""), tuple(cells), (False, True, False), (len(cells) - 1,)
+    )

@@ -55,7 +55,9 @@ def targets_table(targets: Sequence[Target]) -> Table:
     """The targets as text."""
     cells = tuple((t.what, t.target, t.measured, t.verdict, t.paper) for t in targets)
     classes = tuple({True: "met", False: "missed", None: "unmeasured"}[t.met] for t in targets)
-    return Table("Targets", ("what", "target", "measured", "verdict", "paper"), cells, (False,) * 5, classes=classes)
+    return Table(
+        "Targets", ("what", "target", "measured", "verdict", "paper"), cells, (False,) * 5, classes=classes
+    )
 
 
 def _bound(
@@ -120,7 +122,9 @@ def _deployed_targets(data: ReportData, row: TransferRow | None) -> tuple[Target
 def _random_target(rows: Sequence[TransferRow], domain: Domain, paper: str) -> Target:
     row = find_row(rows, domain, "random")
     place = "live" if domain == "deployed" else domain
-    what = f"best random texture, {place}: total CTE" + (" and drives that left" if domain == "deployed" else "")
+    what = f"best random texture, {place}: total CTE" + (
+        " and drives that left" if domain == "deployed" else ""
+    )
     target = "≤ 1.5 × no attack" + (", never off-track" if domain == "deployed" else "")
     if row is None or row.ratio is None:
         return Target(what, target, _NOT_MEASURED, None, paper)
@@ -144,10 +148,14 @@ def _drive_targets(data: ReportData) -> tuple[Target, ...]:
     if latency is None:
         return drive, Target(what, target, _NOT_MEASURED, None, "10 Hz")
     p99 = latency.overall.p99_ms
-    missed = "missed ticks not counted" if latency.missed_ticks is None else f"{latency.missed_ticks} ticks missed"
+    missed = (
+        "missed ticks not counted" if latency.missed_ticks is None else f"{latency.missed_ticks} ticks missed"
+    )
     # Not counting missed ticks can disprove the target, never prove it.
     met_or_unknown = (
-        False if p99 > latency.camera_period_ms or latency.missed_ticks else (latency.missed_ticks is not None or None)
+        False
+        if p99 > latency.camera_period_ms or latency.missed_ticks
+        else (latency.missed_ticks is not None or None)
     )
     measured = f"p99 {p99:.1f} ms of {latency.camera_period_ms:g} ms, {missed}"
     return drive, Target(what, target, measured, met_or_unknown, "10 Hz")

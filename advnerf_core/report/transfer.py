@@ -13,7 +13,13 @@ from typing import Any, Literal
 
 from advnerf_core.report.cells import CellResult, Drives
 from advnerf_core.report.conditions import NONE
-from advnerf_core.report.statistics import Interval, mean_and_std, ratio_interval, ratio_of_sums, transfer_interval
+from advnerf_core.report.statistics import (
+    Interval,
+    mean_and_std,
+    ratio_interval,
+    ratio_of_sums,
+    transfer_interval,
+)
 
 Domain = Literal["surrogate", "deployed"]
 DOMAINS: tuple[Domain, ...] = ("surrogate", "deployed")
@@ -117,10 +123,14 @@ class TransferTable:
     cells: dict[str, CellResult] = field(default_factory=dict)
     name: str = ""
 
-    def find(self, scenario: str, victim: str, method: str, domain: Domain, placement: str = "") -> TableRow | None:
+    def find(
+        self, scenario: str, victim: str, method: str, domain: Domain, placement: str = ""
+    ) -> TableRow | None:
         """One line; None where it was not asked for."""
         key = (scenario, placement, victim, method, domain)
-        return next((r for r in self.rows if (r.scenario, r.placement, r.victim, r.method, r.domain) == key), None)
+        return next(
+            (r for r in self.rows if (r.scenario, r.placement, r.victim, r.method, r.domain) == key), None
+        )
 
     def cells_of(self, row: TableRow) -> list[CellResult]:
         """The cells that a line sums up."""
@@ -158,19 +168,32 @@ def _row(want: Wanted, cells: Sequence[CellResult], domain: Domain) -> TableRow:
     have = [(cell, drives) for cell in cells if (drives := drives_in(cell, domain)) is not None]
     seeds = tuple(cell.seed for cell, _ in have)
     empty = TableRow(
-        want.scenario, want.placement, want.victim, want.method, domain, seeds, tuple(s for s in want.seeds if s not in seeds),
-        paper_m=paper_m, paper_std_m=paper_std_m, paper_ratio=paper_m / paper_none_m if paper_m and paper_none_m else None,
-    )  # fmt: skip
+        want.scenario,
+        want.placement,
+        want.victim,
+        want.method,
+        domain,
+        seeds,
+        tuple(s for s in want.seeds if s not in seeds),
+        paper_m=paper_m,
+        paper_std_m=paper_std_m,
+        paper_ratio=paper_m / paper_none_m if paper_m and paper_none_m else None,
+    )
     if not have:
         return empty
     mean_m, std_m = mean_and_std([drives.mean_m for _, drives in have])
     sums, none_sums = _sums([(drives, None) for _, drives in have])
     transfer, its_interval = _transfer(cells) if domain == "deployed" else (None, None)
     found = {
-        "drives": sum(len(drives.total_cte_m) for _, drives in have), "mean_m": mean_m, "std_m": std_m,
-        "ratio": ratio_of_sums(sums, none_sums), "ratio_interval": ratio_interval(sums, none_sums),
-        "transfer": transfer, "transfer_interval": its_interval, "off_track": sum(sum(drives.off_track) for _, drives in have),
-    }  # fmt: skip
+        "drives": sum(len(drives.total_cte_m) for _, drives in have),
+        "mean_m": mean_m,
+        "std_m": std_m,
+        "ratio": ratio_of_sums(sums, none_sums),
+        "ratio_interval": ratio_interval(sums, none_sums),
+        "transfer": transfer,
+        "transfer_interval": its_interval,
+        "off_track": sum(sum(drives.off_track) for _, drives in have),
+    }
     return TableRow(**{**{name: getattr(empty, name) for name in empty.__dataclass_fields__}, **found})
 
 
@@ -186,8 +209,13 @@ def _sums(drives: Sequence[tuple[Drives, int | None]]) -> tuple[list[float], lis
 
 def _transfer(cells: Sequence[CellResult]) -> tuple[float | None, Interval | None]:
     # A live drive begins at the first of the starts that a search may have had: the others are no part of the comparison.
-    both = [(cell.surrogate, cell.deployed, cell.shared_starts) for cell in cells if cell.deployed is not None]
-    surrogate, deployed = _sums([(here, n) for here, _, n in both]), _sums([(there, n) for _, there, n in both])
+    both = [
+        (cell.surrogate, cell.deployed, cell.shared_starts) for cell in cells if cell.deployed is not None
+    ]
+    surrogate, deployed = (
+        _sums([(here, n) for here, _, n in both]),
+        _sums([(there, n) for _, there, n in both]),
+    )
     there, here = ratio_of_sums(*deployed), ratio_of_sums(*surrogate)
     if not there or not here:
         return None, None

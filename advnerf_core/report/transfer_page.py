@@ -27,7 +27,12 @@ from advnerf_core.report.transfer_targets import TableTarget, table_targets
 
 SCHEMA = "advnerf-transfer/1"
 STRAYED_FROM = 1.5
-OUTCOMES = (LEFT, RAN_INTO, STRAYED, HELD) = ("left the track", "ran into something", "strayed", "held its course")
+OUTCOMES = (LEFT, RAN_INTO, STRAYED, HELD) = (
+    "left the track",
+    "ran into something",
+    "strayed",
+    "held its course",
+)
 _EXPLAINED = {
     LEFT: "The drive left its track at least once.",
     RAN_INTO: "The drive ended at an obstacle, on the track as the protocol counts it.",
@@ -61,7 +66,9 @@ class ShownClip:
     def caption(self) -> str:
         """What is seen."""
         drives = self.cell.deployed or self.cell.surrogate
-        return f"total CTE {sum(drives.total_cte_m):.2f} m, without attack {sum(drives.none_total_cte_m):.2f} m"
+        return (
+            f"total CTE {sum(drives.total_cte_m):.2f} m, without attack {sum(drives.none_total_cte_m):.2f} m"
+        )
 
 
 def outcome_of(cell: CellResult) -> str:
@@ -83,9 +90,20 @@ def ran_into_something(cell: CellResult) -> bool:
 def text_table(table: TransferTable) -> Table:
     """All lines as text."""
     columns = (
-        "scenario", "victim", "object shows", "domain", "seeds", "total CTE", "× no attack", "95 %", "transfer", "95 %", "off-track",
-        "paper", "paper ×",
-    )  # fmt: skip
+        "scenario",
+        "victim",
+        "object shows",
+        "domain",
+        "seeds",
+        "total CTE",
+        "× no attack",
+        "95 %",
+        "transfer",
+        "95 %",
+        "off-track",
+        "paper",
+        "paper ×",
+    )
     cells, groups, classes = [], [], []
     for index, row in enumerate(table.rows):
         last = table.rows[index - 1] if index else None
@@ -117,11 +135,17 @@ def _numbers(row: TableRow) -> tuple[str, ...]:
             number(row.paper_ratio),
         )
     return (
-        row.domain, seeds, spread(row.mean_m, row.std_m), number(row.ratio), _interval(row.ratio_interval),
+        row.domain,
+        seeds,
+        spread(row.mean_m, row.std_m),
+        number(row.ratio),
+        _interval(row.ratio_interval),
         "" if row.domain == "surrogate" or row.method == NONE else number(row.transfer),
         "" if row.method == NONE else _interval(row.transfer_interval),
-        f"{row.off_track} of {row.drives}", spread(row.paper_m, row.paper_std_m, 0), number(row.paper_ratio),
-    )  # fmt: skip
+        f"{row.off_track} of {row.drives}",
+        spread(row.paper_m, row.paper_std_m, 0),
+        number(row.paper_ratio),
+    )
 
 
 def _interval(interval: Interval | None) -> str:
@@ -131,21 +155,34 @@ def _interval(interval: Interval | None) -> str:
 def target_table(targets: Sequence[TableTarget]) -> Table:
     """The targets as text."""
     cells = tuple(
-        (t.scenario, style_of(t.method).title, t.domain, t.what, t.target, number(t.value), str(t.seeds), t.verdict)
+        (
+            t.scenario,
+            style_of(t.method).title,
+            t.domain,
+            t.what,
+            t.target,
+            number(t.value),
+            str(t.seeds),
+            t.verdict,
+        )
         for t in targets
     )
     classes = tuple({True: "met", False: "missed", None: "unmeasured"}[t.met] for t in targets)
     columns = ("scenario", "object shows", "domain", "what", "target", "measured", "seeds", "verdict")
-    return Table("Targets", columns, cells, (False, False, False, False, True, True, True, False), classes=classes)
+    return Table(
+        "Targets", columns, cells, (False, False, False, False, True, True, True, False), classes=classes
+    )
 
 
 def as_json(table: TransferTable) -> dict[str, Any]:
     """Lines, targets and cells as JSON-ready values."""
     return {
-        "schema": SCHEMA, "name": table.name, "rows": [row.record() for row in table.rows],
+        "schema": SCHEMA,
+        "name": table.name,
+        "rows": [row.record() for row in table.rows],
         "targets": [target.record() for target in table_targets(table)],
         "cells": {name: cell.model_dump(mode="json") for name, cell in table.cells.items()},
-    }  # fmt: skip
+    }
 
 
 def as_csv(table: TransferTable) -> str:
@@ -236,10 +273,17 @@ def render_transfer_page(
     template = environment.from_string(resources.joinpath("transfer.html").read_text(encoding="utf-8"))
     groups = [(name, _EXPLAINED[name], [clip for clip in clips if clip.outcome == name]) for name in OUTCOMES]
     return template.render(
-        name=table.name or "Transfer table", legend=LEGEND,
+        name=table.name or "Transfer table",
+        legend=LEGEND,
         style=Markup(resources.joinpath("page.css").read_text(encoding="utf-8")),
-        light=Markup(css_variables(LIGHT)), dark=Markup(css_variables(DARK)),
-        table=text_table(table).html(), targets=target_table(table_targets(table)).html(),
-        missing=sum(len(row.missing) for row in table.rows if row.domain == "surrogate"), cells=len(table.cells),
-        machines=sorted({cell.machine for cell in table.cells.values()}), groups=groups, sections=sections, style_of=style_of,
-    )  # fmt: skip
+        light=Markup(css_variables(LIGHT)),
+        dark=Markup(css_variables(DARK)),
+        table=text_table(table).html(),
+        targets=target_table(table_targets(table)).html(),
+        missing=sum(len(row.missing) for row in table.rows if row.domain == "surrogate"),
+        cells=len(table.cells),
+        machines=sorted({cell.machine for cell in table.cells.values()}),
+        groups=groups,
+        sections=sections,
+        style_of=style_of,
+    )

@@ -86,13 +86,17 @@ def skill_of(pairs: Sequence[Predicted]) -> Skill:
     if not pairs:
         return Skill(0, None, None, None, 0)
     ratios, measured = (np.array([getattr(pair, name) for pair in pairs]) for name in ("ratio", "measured"))
-    totals, measured_m = (np.array([getattr(pair, name) for pair in pairs]) for name in ("total_m", "measured_m"))
+    totals, measured_m = (
+        np.array([getattr(pair, name) for pair in pairs]) for name in ("total_m", "measured_m")
+    )
     ranked = len(pairs) >= 3 and np.ptp(ratios) > 0.0 and np.ptp(measured) > 0.0
     return Skill(
-        len(pairs), _median_factor(ratios, measured), _median_factor(totals, measured_m),
+        len(pairs),
+        _median_factor(ratios, measured),
+        _median_factor(totals, measured_m),
         float(spearmanr(ratios, measured).statistic) if ranked else None,
         int(np.sum((ratios >= WORKS_FROM) == (measured >= WORKS_FROM))),
-    )  # fmt: skip
+    )
 
 
 def _median_factor(expected: Any, measured: Any) -> float:
@@ -105,13 +109,28 @@ def prediction_table(pairs: Sequence[Predicted]) -> Table:
     """Expected and measured, one line per attack."""
     cells = tuple(
         (
-            pair.name, f"{pair.ratio:.2f}", f"{pair.low:.2f} – {pair.high:.2f}", f"{pair.measured:.2f}", f"{pair.total_m:.2f}",
-            f"{pair.measured_m:.2f}", f"{100 * pair.retained:.0f} %",
+            pair.name,
+            f"{pair.ratio:.2f}",
+            f"{pair.low:.2f} – {pair.high:.2f}",
+            f"{pair.measured:.2f}",
+            f"{pair.total_m:.2f}",
+            f"{pair.measured_m:.2f}",
+            f"{100 * pair.retained:.0f} %",
         )
         for pair in pairs
-    )  # fmt: skip
-    columns = ("attack", "expected ×", "80 % of draws", "measured ×", "expected [m]", "measured [m]", "effect retained")
-    return Table("Transfer, predicted without any drive with the attack", columns, cells, (False, *[True] * 6))
+    )
+    columns = (
+        "attack",
+        "expected ×",
+        "80 % of draws",
+        "measured ×",
+        "expected [m]",
+        "measured [m]",
+        "effect retained",
+    )
+    return Table(
+        "Transfer, predicted without any drive with the attack", columns, cells, (False, *[True] * 6)
+    )
 
 
 def skill_text(pairs: Sequence[Predicted]) -> str:
@@ -144,9 +163,15 @@ def prediction_plot(pairs: Sequence[Predicted]) -> Figure:
             expected = np.array([pair.ratio for pair in chosen])
             bars = np.abs(np.array([[pair.low, pair.high] for pair in chosen]).T - expected)
             ax.errorbar(
-                expected, [pair.measured for pair in chosen], xerr=bars, fmt=style.marker, ms=6, lw=1.2,
-                color=style.light, label=style.title,
-            )  # fmt: skip
+                expected,
+                [pair.measured for pair in chosen],
+                xerr=bars,
+                fmt=style.marker,
+                ms=6,
+                lw=1.2,
+                color=style.light,
+                label=style.title,
+            )
         ax.set(xscale="log", yscale="log", xlim=(low, high), ylim=(low, high))
         ax.set(xlabel="expected ratio to no attack", ylabel="measured ratio to no attack")
         ax.legend(loc="upper left")

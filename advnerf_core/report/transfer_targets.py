@@ -76,20 +76,28 @@ def table_targets(table: TransferTable, victim: str = VICTIM) -> list[TableTarge
     for scenario, (here, there) in AT_LEAST.items():
         if scenario not in present:
             continue
-        gradient = {domain: table.find(scenario, victim, "gradient", domain) for domain in ("surrogate", "deployed")}
+        gradient = {
+            domain: table.find(scenario, victim, "gradient", domain) for domain in ("surrogate", "deployed")
+        }
         found += [
             _at_least(scenario, "gradient", "surrogate", gradient["surrogate"], here),
             _at_least(scenario, "gradient", "deployed", gradient["deployed"], there),
         ]
         if scenario == "green_screen":
-            found.append(_limit(scenario, "gradient", "std / mean", _SPREAD, gradient["deployed"], _relative_spread))
+            found.append(
+                _limit(scenario, "gradient", "std / mean", _SPREAD, gradient["deployed"], _relative_spread)
+            )
         if scenario == "monitor":
             found.append(_left_often(scenario, gradient["deployed"]))
         random = table.find(scenario, victim, "random", "deployed")
-        found.append(_limit(scenario, "random", "ratio to no attack", RANDOM_AT_MOST, random, lambda row: row.ratio))
+        found.append(
+            _limit(scenario, "random", "ratio to no attack", RANDOM_AT_MOST, random, lambda row: row.ratio)
+        )
         if scenario in LIVE:
             found.append(
-                _limit(scenario, "random", "drives off the track", 0.0, random, lambda row: float(row.off_track))
+                _limit(
+                    scenario, "random", "drives off the track", 0.0, random, lambda row: float(row.off_track)
+                )
             )
     meshes = [(name, limit) for name, limit in MESHES_AT_LEAST.items() if name in present]
     found += [
@@ -97,14 +105,18 @@ def table_targets(table: TransferTable, victim: str = VICTIM) -> list[TableTarge
         for name, limit in meshes
     ]
     found += [_beats_random(table, name) for name in PLACES if name in present]
-    return [each for each in found if table.find(each.scenario, each.victim, each.method, each.domain) is not None]
+    return [
+        each for each in found if table.find(each.scenario, each.victim, each.method, each.domain) is not None
+    ]
 
 
 def _value(row: TableRow | None, of: Callable[[TableRow], float | None]) -> float | None:
     return of(row) if row is not None and row.seeds else None
 
 
-def _verdict(row: TableRow | None, value: float | None, limit: float, at_least: bool) -> tuple[bool | None, float]:
+def _verdict(
+    row: TableRow | None, value: float | None, limit: float, at_least: bool
+) -> tuple[bool | None, float]:
     """Whether a limit is kept, None while seeds are missing, and what is lacking as a share of it."""
     if row is None or row.missing or value is None:
         return None, 0.0
@@ -117,7 +129,9 @@ def _at_least(scenario: str, method: str, domain: Domain, row: TableRow | None, 
     value = _value(row, lambda r: r.ratio)
     met, short = _verdict(row, value, limit, at_least=True)
     seeds = len(row.seeds) if row else 0
-    return TableTarget(scenario, method, domain, "ratio to no attack", f">= {limit:g}", value, met, seeds, short)
+    return TableTarget(
+        scenario, method, domain, "ratio to no attack", f">= {limit:g}", value, met, seeds, short
+    )
 
 
 def _beats_random(table: TransferTable, scenario: str) -> TableTarget:
@@ -125,7 +139,9 @@ def _beats_random(table: TransferTable, scenario: str) -> TableTarget:
     row, random = (table.find(scenario, RETRAINED, method, "deployed") for method in ("gradient", "random"))
     value, limit = (_value(each, lambda r: r.ratio) for each in (row, random))
     met, short = (
-        (None, 0.0) if limit is None or random is None or random.missing else _verdict(row, value, limit, at_least=True)
+        (None, 0.0)
+        if limit is None or random is None or random.missing
+        else _verdict(row, value, limit, at_least=True)
     )
     if met and value == limit:  # as good as random is not better
         met = False
@@ -137,7 +153,12 @@ def _beats_random(table: TransferTable, scenario: str) -> TableTarget:
 
 
 def _limit(
-    scenario: str, method: str, what: str, limit: float, row: TableRow | None, of: Callable[[TableRow], float | None]
+    scenario: str,
+    method: str,
+    what: str,
+    limit: float,
+    row: TableRow | None,
+    of: Callable[[TableRow], float | None],
 ) -> TableTarget:
     value = _value(row, of)
     met, short = _verdict(row, value, limit, at_least=False)
@@ -154,5 +175,13 @@ def _left_often(scenario: str, row: TableRow | None) -> TableTarget:
     met, short = _verdict(row, value, _LEFT_SHARE, at_least=True)
     seeds = len(row.seeds) if row else 0
     return TableTarget(
-        scenario, "gradient", "deployed", "share of drives off the track", ">= 4 of 5", value, met, seeds, short
+        scenario,
+        "gradient",
+        "deployed",
+        "share of drives off the track",
+        ">= 4 of 5",
+        value,
+        met,
+        seeds,
+        short,
     )

@@ -43,7 +43,11 @@ class ColourMap:
 
     def to_dict(self) -> dict[str, Any]:
         """As JSON can hold it."""
-        return {"matrix": [list(row) for row in self.matrix], "offset": list(self.offset), "power": self.power}
+        return {
+            "matrix": [list(row) for row in self.matrix],
+            "offset": list(self.offset),
+            "power": self.power,
+        }
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> ColourMap:

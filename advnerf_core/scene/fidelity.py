@@ -59,10 +59,14 @@ class Agreement:
     def summary(self) -> dict[str, float | int]:
         """Numbers for a page."""
         return {
-            "views": len(self.real), "psnr_db": float(self.psnr_db.mean()), "ssim": float(self.ssim.mean()),
-            "steering": float(np.abs(self.difference).mean()), "steering_worst": float(np.abs(self.difference).max()),
-            "steering_bias": float(self.difference.mean()), "correlation": self.correlation,
-        }  # fmt: skip
+            "views": len(self.real),
+            "psnr_db": float(self.psnr_db.mean()),
+            "ssim": float(self.ssim.mean()),
+            "steering": float(np.abs(self.difference).mean()),
+            "steering_worst": float(np.abs(self.difference).max()),
+            "steering_bias": float(self.difference.mean()),
+            "correlation": self.correlation,
+        }
 
 
 def agreement(
@@ -77,12 +81,16 @@ def agreement(
         steer_learned: The same on the learned ones.
     """
     if len(real) != len(learned) or not len(real):
-        raise ValueError(f"expected as many learned as real pictures, and some, got {len(learned)} and {len(real)}")
+        raise ValueError(
+            f"expected as many learned as real pictures, and some, got {len(learned)} and {len(real)}"
+        )
     pairs = list(zip(learned, real, strict=True))
     return Agreement(
-        np.array([psnr(a, b) for a, b in pairs]), np.array([ssim(a, b) for a, b in pairs]),
-        np.asarray(steer_real, np.float64), np.asarray(steer_learned, np.float64),
-    )  # fmt: skip
+        np.array([psnr(a, b) for a, b in pairs]),
+        np.array([ssim(a, b) for a, b in pairs]),
+        np.asarray(steer_real, np.float64),
+        np.asarray(steer_learned, np.float64),
+    )
 
 
 @dataclass(frozen=True)
@@ -115,11 +123,20 @@ def judge(found: Agreement, limits: GateLimits, of: str = "held-out views") -> V
     n = found.summary()
     checks = (
         (n["views"] >= limits.views, f"{n['views']} pictures, at least {limits.views} needed"),
-        (n["psnr_db"] >= limits.psnr_db, f"PSNR {n['psnr_db']:.2f} dB, at least {limits.psnr_db:g} needed: train the scene longer, or take more pictures"),
+        (
+            n["psnr_db"] >= limits.psnr_db,
+            f"PSNR {n['psnr_db']:.2f} dB, at least {limits.psnr_db:g} needed: train the scene longer, or take more pictures",
+        ),
         (n["ssim"] >= limits.ssim, f"SSIM {n['ssim']:.3f}, at least {limits.ssim:g} needed"),
-        (n["steering"] <= limits.steering, f"mean steering difference {n['steering']:.4f}, at most {limits.steering:g} allowed: train the policy on learned pictures too"),
-        (n["correlation"] >= limits.correlation, f"correlation of the steering {n['correlation']:.3f}, at least {limits.correlation:g} needed"),
-    )  # fmt: skip
+        (
+            n["steering"] <= limits.steering,
+            f"mean steering difference {n['steering']:.4f}, at most {limits.steering:g} allowed: train the policy on learned pictures too",
+        ),
+        (
+            n["correlation"] >= limits.correlation,
+            f"correlation of the steering {n['correlation']:.3f}, at least {limits.correlation:g} needed",
+        ),
+    )
     reasons = tuple(f"{of}: {text}" for good, text in checks if not good)
     return Verdict(not reasons, reasons, n)
 

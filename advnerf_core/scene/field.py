@@ -85,7 +85,9 @@ class SceneFieldConfig:
         if not self.contraction:
             return self.box_low_m
         half = 0.5 * self.extent_m
-        x, y, z = (0.5 * (low + high) - half for low, high in zip(self.box_low_m, self.box_high_m, strict=True))
+        x, y, z = (
+            0.5 * (low + high) - half for low, high in zip(self.box_low_m, self.box_high_m, strict=True)
+        )
         return x, y, z
 
     @property
@@ -109,7 +111,9 @@ class SceneFieldConfig:
     def from_dict(cls, values: dict[str, Any]) -> SceneFieldConfig:
         """Inverse of ``to_dict``, from JSON."""
         low, high = tuple(values["box_low_m"]), tuple(values["box_high_m"])
-        return cls(**{**values, "box_low_m": low, "box_high_m": high, "grid": HashGridConfig(**values["grid"])})
+        return cls(
+            **{**values, "box_low_m": low, "box_high_m": high, "grid": HashGridConfig(**values["grid"])}
+        )
 
 
 class SceneField(nn.Module):
@@ -123,7 +127,9 @@ class SceneField(nn.Module):
         self.density_1 = _linear(config.grid.width, config.hidden, generator)
         self.density_2 = _linear(config.hidden, 1 + config.features, generator)
         self.colour_1 = _linear(config.colour_inputs, config.hidden, generator)
-        self.colour_2 = _linear(config.hidden, 4, generator)  # red, green, blue, unused: kernels take outputs in fours
+        self.colour_2 = _linear(
+            config.hidden, 4, generator
+        )  # red, green, blue, unused: kernels take outputs in fours
         self.background = nn.Parameter(torch.zeros(config.features), requires_grad=config.learned_background)
 
     def to_box(self, points_in_world: Tensor) -> Tensor:
@@ -215,17 +221,25 @@ def load_scene(path: Path) -> tuple[SceneField, NDArray[np.bool_], dict[str, Any
             header = file.metadata() or {}
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a dict
     except (OSError, SafetensorError) as error:
-        raise SceneFileError(f"expected a scene file at {path}, got: {error}; train the scene again") from error
+        raise SceneFileError(
+            f"expected a scene file at {path}, got: {error}; train the scene again"
+        ) from error
     if header.get("format") != FORMAT:
-        raise SceneFileError(f"expected format {FORMAT} in {path}, got {header.get('format')}; train the scene again")
+        raise SceneFileError(
+            f"expected format {FORMAT} in {path}, got {header.get('format')}; train the scene again"
+        )
     scene = SceneField(SceneFieldConfig.from_dict(json.loads(header["config"])))
     shape = tuple(json.loads(header["occupancy_shape"]))
     occupancy = (
-        np.unpackbits(tensors.pop("occupancy_bits").numpy(), count=int(np.prod(shape))).reshape(shape).astype(bool)
+        np.unpackbits(tensors.pop("occupancy_bits").numpy(), count=int(np.prod(shape)))
+        .reshape(shape)
+        .astype(bool)
     )
     try:
         scene.load_state_dict(tensors)
     except RuntimeError as error:
-        raise SceneFileError(f"expected weights that fit the configuration in {path}, got: {error}") from error
+        raise SceneFileError(
+            f"expected weights that fit the configuration in {path}, got: {error}"
+        ) from error
     metadata = {**json.loads(header["metadata"]), "scene_hash": header["scene_hash"]}
     return scene, occupancy, metadata

@@ -62,13 +62,7 @@ def two_layers_backward(
 
 @njit(**KERNEL_OPTIONS)
 def complete_colour_inputs(
-    inputs: Array32,
-    rays: Array32,
-    alpha: Array32,
-    background: Array32,
-    bands: int,
-    first: int,
-    stop: int,
+    inputs: Array32, rays: Array32, alpha: Array32, background: Array32, bands: int, first: int, stop: int
 ) -> None:
     """Fill up accumulated features to colour network inputs: background behind what let light through, then directions.
 

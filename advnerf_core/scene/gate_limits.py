@@ -25,4 +25,6 @@ class GateLimits(BaseModel):
     correlation: Annotated[float, Field(ge=-1.0, le=1.0)] = Field(
         default=0.8, description="Least correlation of the steering on learned and real pictures."
     )
-    views: Annotated[int, Field(ge=3)] = Field(default=10, description="Fewer pictures than this decide nothing.")
+    views: Annotated[int, Field(ge=3)] = Field(
+        default=10, description="Fewer pictures than this decide nothing."
+    )

@@ -76,15 +76,21 @@ class ManyTextures:
         values: list[list[Tensor]] = []
         for k in range(self.count):
             parts = split_theta([seen.field for seen in frames.seen], theta[k])
-            values.append([seen.values(part.to(flat.dtype)) for seen, part in zip(frames.seen, parts, strict=True)])
+            values.append(
+                [seen.values(part.to(flat.dtype)) for seen, part in zip(frames.seen, parts, strict=True)]
+            )
             for seen, W, share, value in zip(frames.seen, frames.weights, shares, values[k], strict=True):
                 colours = W[share[k].rows] @ seen.colours(value).numpy()
                 flat.index_add_(0, share[k].pixels, torch.from_numpy(colours))
         images = flat.reshape(frames.background.shape).permute(0, 3, 1, 2).contiguous()
-        kept = sum(value.nbytes for each in values for value in each) + sum(seen.nbytes for seen in frames.seen)
+        kept = sum(value.nbytes for each in values for value in each) + sum(
+            seen.nbytes for seen in frames.seen
+        )
         rows = sum(share.rows.nbytes + share.pixels.nbytes for each in shares for share in each)
         weights = sum(W.data.nbytes + W.indices.nbytes + W.indptr.nbytes for W in frames.weights)
-        return Rendered(images, _vjp(frames, shares, values, theta), int(images.nbytes + kept + rows + weights))
+        return Rendered(
+            images, _vjp(frames, shares, values, theta), int(images.nbytes + kept + rows + weights)
+        )
 
     def _shares(self, pixels: Tensor, shape: Sequence[int]) -> list[_Share]:
         """Which of an object's pixels show which texture."""

@@ -45,7 +45,9 @@ class FieldRenderer:
         self.config, self.march, self.colour_map = scene.config, march or MarchConfig(), colour_map
         self.least_transmittance, self.behind = least_transmittance, behind
         self.samples = 0  # evaluated by the last call, for benchmarks
-        self._weights = {name: value.detach().cpu().numpy().copy() for name, value in scene.named_parameters()}
+        self._weights = {
+            name: value.detach().cpu().numpy().copy() for name, value in scene.named_parameters()
+        }
         self._levels = scene.grid.levels
         cells = (np.array(occupied.shape) / self.config.box_high).astype(np.float32)
         self._leaps = leap_distances(occupied, cells)
@@ -73,7 +75,9 @@ class FieldRenderer:
         march = (march or MarchConfig()).coarser(interval_scale)
         return cls(scene, occupied, march, colour_map, behind=behind)
 
-    def render(self, T_world_from_camera: ArrayLike | Tensor, pinhole: Pinhole) -> tuple[Tensor, Tensor, Tensor]:
+    def render(
+        self, T_world_from_camera: ArrayLike | Tensor, pinhole: Pinhole
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Render a batch of views.
 
         Args:
@@ -100,7 +104,9 @@ class FieldRenderer:
         in_box = poses_in_box(poses, self.config.origin_m, self.config.extent_m)
 
         def work(slot: int) -> None:
-            samples[slot] = self._render_tiles(in_box, intrinsics_row(pinhole), bounds[slot], rgb, depth_m, alpha)
+            samples[slot] = self._render_tiles(
+                in_box, intrinsics_row(pinhole), bounds[slot], rgb, depth_m, alpha
+            )
 
         run_slots(work, _SLOTS)
         self.samples = int(samples.sum())
@@ -113,17 +119,42 @@ class FieldRenderer:
     __call__ = render
 
     def _render_tiles(
-        self, poses: NDArray[np.float32], intrinsics: NDArray[np.float32], bounds: tuple[int, int],
-        rgb: NDArray[np.float32], depth_m: NDArray[np.float32], alpha: NDArray[np.float32],
-    ) -> int:  # fmt: skip
+        self,
+        poses: NDArray[np.float32],
+        intrinsics: NDArray[np.float32],
+        bounds: tuple[int, int],
+        rgb: NDArray[np.float32],
+        depth_m: NDArray[np.float32],
+        alpha: NDArray[np.float32],
+    ) -> int:
         w = self._weights
         return int(
             render_tiles(
-                poses, intrinsics, *bounds, self.config.box_high, np.float32(self.march.near_m), self.march.steps(),
-                self._leaps.distance, self._leaps.cells, w["grid.table"], self._levels,
-                w["density_1.weight"], w["density_1.bias"], w["density_2.weight"], w["density_2.bias"],
-                w["colour_1.weight"], w["colour_1.bias"], w["colour_2.weight"], w["colour_2.bias"], w["background"],
-                self.config.direction_bands, np.float32(self.least_transmittance), self.march.max_samples,
-                rgb, depth_m, alpha, self.config.contraction,
+                poses,
+                intrinsics,
+                *bounds,
+                self.config.box_high,
+                np.float32(self.march.near_m),
+                self.march.steps(),
+                self._leaps.distance,
+                self._leaps.cells,
+                w["grid.table"],
+                self._levels,
+                w["density_1.weight"],
+                w["density_1.bias"],
+                w["density_2.weight"],
+                w["density_2.bias"],
+                w["colour_1.weight"],
+                w["colour_1.bias"],
+                w["colour_2.weight"],
+                w["colour_2.bias"],
+                w["background"],
+                self.config.direction_bands,
+                np.float32(self.least_transmittance),
+                self.march.max_samples,
+                rgb,
+                depth_m,
+                alpha,
+                self.config.contraction,
             )
-        )  # fmt: skip
+        )

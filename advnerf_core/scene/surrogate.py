@@ -214,10 +214,15 @@ class Surrogate:
             [cast.depth_m - self.depth_tolerance_m for cast in casts],
             depth_m.reshape(-1).double().numpy(),
         )
-        seen = [_seen(cast, share, field) for cast, share, field in zip(casts, shares, self.objects, strict=True)]
+        seen = [
+            _seen(cast, share, field) for cast, share, field in zip(casts, shares, self.objects, strict=True)
+        ]
         dimmed = rgb * torch.from_numpy(background).to(rgb.dtype).reshape(depth_m.shape)[..., None]
         return Frames(
-            dimmed, tuple(part[1] for part in seen), tuple(part[0] for part in seen), tuple(part[2] for part in seen)
+            dimmed,
+            tuple(part[1] for part in seen),
+            tuple(part[0] for part in seen),
+            tuple(part[2] for part in seen),
         )
 
     def render(self, T_world_from_camera: ArrayLike, theta: Tensor | None) -> Rendered:
@@ -277,13 +282,17 @@ class Surrogate:
             raise ValueError(f"expected a background of shapes {(*size, 3)} and {size}, got {got}")
 
 
-def _seen(cast: ObjectCast, share: Array, field: ColouredObject) -> tuple[Tensor, sparse.csr_matrix, SeenRows]:
+def _seen(
+    cast: ObjectCast, share: Array, field: ColouredObject
+) -> tuple[Tensor, sparse.csr_matrix, SeenRows]:
     """Pixels, weights and colours of what is seen of a cast whose pixels keep ``share [P]`` of their light."""
     W, kept = cast.weights, share > 0.0
     if not kept.all():
         W, share = W[np.flatnonzero(kept)], share[kept]
     data = W.data * np.repeat(share.astype(W.dtype), np.diff(W.indptr))
-    return torch.from_numpy(cast.pixels[kept]), *compact(sparse.csr_matrix((data, W.indices, W.indptr), W.shape), field)
+    return torch.from_numpy(cast.pixels[kept]), *compact(
+        sparse.csr_matrix((data, W.indices, W.indptr), W.shape), field
+    )
 
 
 def split_theta(objects: Sequence[ColouredObject], theta: Tensor | None) -> list[Tensor]:

@@ -29,7 +29,9 @@ class TorchStep:
         opacity: Weight of the mean transmittance of rays in the loss.
     """
 
-    def __init__(self, scene: SceneField, huber: float = 0.1, distortion: float = 0.0, opacity: float = 0.0) -> None:
+    def __init__(
+        self, scene: SceneField, huber: float = 0.1, distortion: float = 0.0, opacity: float = 0.0
+    ) -> None:
         self.scene, self.huber = scene, huber
         self.distortion, self.opacity = distortion, opacity
         self.values = dict(scene.named_parameters())
@@ -54,7 +56,9 @@ class TorchStep:
             weights, _, through = _weights(density * self._tensor(samples.widths), samples)
             keep = ((weights >= least_weight) & (through >= MIN_TRANSMITTANCE)).cpu().numpy()
         kept, before = np.flatnonzero(keep), np.concatenate([[0], np.cumsum(keep)])
-        return Samples(samples.points[kept], samples.t_mid_m[kept], samples.widths[kept], before[samples.begins])
+        return Samples(
+            samples.points[kept], samples.t_mid_m[kept], samples.widths[kept], before[samples.begins]
+        )
 
     def gradients(
         self, rays: Array32, targets: NDArray[np.uint8], samples: Samples, matte: Matte | None = None
@@ -114,8 +118,14 @@ class TorchStep:
             tensor.copy_(torch.from_numpy(np.ascontiguousarray(state[name])))
 
     def _state(self) -> dict[str, Tensor]:
-        kinds: dict[str, dict[str, Tensor]] = {"value": {**self.values}, "mean": self.means, "square": self.squares}
-        return {f"{kind}.{name}": tensor for kind, tensors in kinds.items() for name, tensor in tensors.items()}
+        kinds: dict[str, dict[str, Tensor]] = {
+            "value": {**self.values},
+            "mean": self.means,
+            "square": self.squares,
+        }
+        return {
+            f"{kind}.{name}": tensor for kind, tensors in kinds.items() for name, tensor in tensors.items()
+        }
 
     def log_density(self, points: Array32) -> Array32:
         """Logarithm of density per box side ``[N]`` at points ``[N, 3]`` in box coordinates."""

@@ -49,14 +49,21 @@ class Trainer:
         march: How samples are placed, in training and for rendering.
     """
 
-    def __init__(self, images: ImageSet, field_config: SceneFieldConfig, config: TrainConfig | None = None) -> None:
+    def __init__(
+        self, images: ImageSet, field_config: SceneFieldConfig, config: TrainConfig | None = None
+    ) -> None:
         self.images, self.config = images, config or TrainConfig()
         if images.alpha is None and not field_config.learned_background:
-            raise AdvnerfError("expected images with alpha for a field without a learned background, got opaque ones")
+            raise AdvnerfError(
+                "expected images with alpha for a field without a learned background, got opaque ones"
+            )
         self.scene = SceneField(field_config, seed=self.config.seed)
         self.stepper = _stepper(self.scene, self.config)
         self.occupancy = OccupancyGrid(
-            field_config.box_high, self.config.occupancy_resolution, self.config.seed, field_config.contraction
+            field_config.box_high,
+            self.config.occupancy_resolution,
+            self.config.seed,
+            field_config.contraction,
         )
         self.step, self.elapsed_s = 0, 0.0
         self.rays_per_step = min(self.config.max_rays, 2048)
@@ -64,14 +71,20 @@ class Trainer:
         self._poses = poses_in_box(images.T_world_from_camera, field_config.origin_m, field_config.extent_m)
         self._intrinsics = np.stack([intrinsics_row(p) for p in images.pinholes])
         self.march = self.config.march or pixel_intervals(
-            images.pinholes, images.T_world_from_camera, field_config, self.config.near_m, self.config.interval_px
+            images.pinholes,
+            images.T_world_from_camera,
+            field_config,
+            self.config.near_m,
+            self.config.interval_px,
         )
         capacity = int(1.25 * self.config.samples_per_step)
         self._marcher = Marcher(capacity, self.march, field_config.box_high, field_config.contraction)
         # Pixels to learn from, where a mask or an undistortion leaves some out.
         self._usable = None if images.valid is None else np.flatnonzero(images.valid)
         if self._usable is not None and not len(self._usable):
-            raise AdvnerfError("expected pixels to learn from, the masks leave none: are they the right way round?")
+            raise AdvnerfError(
+                "expected pixels to learn from, the masks leave none: are they the right way round?"
+            )
         self._leaps: Leaps | None = None
         self._recent: list[StepResult] = []
 
@@ -113,9 +126,12 @@ class Trainer:
         if checkpoint is not None:
             self.save(checkpoint)
         occupied = refine_occupied(
-            self.occupied(), self.occupancy.box_high, self.stepper.log_density, self.config.refine_depth,
+            self.occupied(),
+            self.occupancy.box_high,
+            self.stepper.log_density,
+            self.config.refine_depth,
             contracted=self.scene.config.contraction,
-        )  # fmt: skip
+        )
         return TrainedScene(self.scene.cpu(), occupied, self.march, self.history)
 
     def train_step(self) -> StepResult:
@@ -131,7 +147,9 @@ class Trainer:
         rays = np.empty((self.rays_per_step, 6), np.float32)
         colours = np.empty((self.rays_per_step, 3), np.uint8)
         pixel_rays(pixels, self.images.rgb, self._poses, self._intrinsics, rays, colours)
-        samples, kept = self._marcher(rays, rng.random(len(rays), dtype=np.float32), self._leaps, self._step_scale())
+        samples, kept = self._marcher(
+            rays, rng.random(len(rays), dtype=np.float32), self._leaps, self._step_scale()
+        )
         result = self._optimise(rays[kept], colours[kept], samples, self._matte(pixels, kept, rng))
         per_ray = max(len(samples.points) / max(len(kept), 1), 1.0)
         wanted = config.samples_per_step / per_ray
@@ -184,14 +202,18 @@ class Trainer:
         # The grid in use is the one of the last update, which the saved densities are.
         self._leaps = leap_distances(self.occupied(), self.occupancy.cells) if self.step else None
 
-    def _matte(self, pixels: NDArray[np.int64], kept: NDArray[np.int64], rng: np.random.Generator) -> Matte | None:
+    def _matte(
+        self, pixels: NDArray[np.int64], kept: NDArray[np.int64], rng: np.random.Generator
+    ) -> Matte | None:
         """Opacities of pixels, and a random colour behind each; None where the background is learned."""
         if self.images.alpha is None or self.scene.config.learned_background:
             return None
         behind = rng.random((len(pixels), 3), dtype=np.float32)
         return Matte(self.images.alpha.reshape(-1)[pixels[kept]], behind[kept])
 
-    def _optimise(self, rays: Array32, colours: NDArray[np.uint8], samples: Samples, matte: Matte | None) -> StepResult:
+    def _optimise(
+        self, rays: Array32, colours: NDArray[np.uint8], samples: Samples, matte: Matte | None
+    ) -> StepResult:
         # Only once geometry is found: earlier, pulling weights together freezes surfaces at wrong depths.
         self.stepper.distortion = self.config.distortion * min(1.0, max(0.0, 4.0 * self.fraction - 2.0))
         result = self.stepper.step(rays, colours, samples, matte)
@@ -225,7 +247,9 @@ class Trainer:
         left = self.elapsed_s * (1.0 - self.fraction) / max(self.fraction, 1e-6)
         rays, samples = sum(r.rays for r in recent), sum(r.samples for r in recent)
         loss = float(np.mean([r.loss for r in recent]))
-        progress(Progress(self.step, self.fraction, loss, psnr_db, left, recent[-1].rays, samples / max(rays, 1)))
+        progress(
+            Progress(self.step, self.fraction, loss, psnr_db, left, recent[-1].rays, samples / max(rays, 1))
+        )
 
     def _fingerprint(self) -> str:
         # The intervals as they were chosen: they also depend on the cameras and on the rule.

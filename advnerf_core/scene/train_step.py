@@ -22,7 +22,7 @@ from advnerf_core.render.volume_kernels import (
     add_distortion_gradient,
     gather_columns,
     mark_visible,
-)  # fmt: skip
+)
 from advnerf_core.scene.field import SceneField, SceneFieldConfig
 from advnerf_core.scene.field_kernels import (
     adam,
@@ -33,7 +33,7 @@ from advnerf_core.scene.field_kernels import (
     matte_loss,
     two_layers,
     two_layers_backward,
-)  # fmt: skip
+)
 
 Array32 = NDArray[np.float32]
 
@@ -78,7 +78,9 @@ class CpuStep:
         opacity: Weight of the mean transmittance of rays in the loss.
     """
 
-    def __init__(self, scene: SceneField, huber: float = 0.1, distortion: float = 0.0, opacity: float = 0.0) -> None:
+    def __init__(
+        self, scene: SceneField, huber: float = 0.1, distortion: float = 0.0, opacity: float = 0.0
+    ) -> None:
         self.scene, self.huber = scene, np.float32(huber)
         self.distortion, self.opacity = distortion, opacity
         self.values = scene.arrays()
@@ -104,24 +106,36 @@ class CpuStep:
         encoded, logs = self._buffer("encoded_all", tiles, rows), self._buffer("log_density", tiles, 2)
         _clear_tail(encoded, n)
         encode(samples.points, n, v["grid.table"], self.scene.grid.levels, encoded)
-        w2, b2 = np.ascontiguousarray(v["density_2.weight"][:2]), np.ascontiguousarray(v["density_2.bias"][:2])
+        w2, b2 = (
+            np.ascontiguousarray(v["density_2.weight"][:2]),
+            np.ascontiguousarray(v["density_2.bias"][:2]),
+        )
         bounds, ray_bounds = slot_bounds(tiles, SLOTS), slot_bounds(samples.rays, SLOTS)
         w1, b1 = v["density_1.weight"], v["density_1.bias"]
         run_slots(lambda s: two_layers(w1, b1, w2, b2, encoded, logs, *bounds[s]), SLOTS)
         keep, least = np.empty(n, np.bool_), np.float32(least_weight)
-        run_slots(lambda s: mark_visible(logs, samples.widths, samples.begins, *ray_bounds[s], least, keep), SLOTS)
+        run_slots(
+            lambda s: mark_visible(logs, samples.widths, samples.begins, *ray_bounds[s], least, keep), SLOTS
+        )
         kept = np.flatnonzero(keep)
         compact = self._buffer("encoded", -(-len(kept) // TILE), rows)
         columns = slot_bounds(len(kept), SLOTS, TILE)
         run_slots(lambda s: gather_columns(encoded, kept, *columns[s], compact), SLOTS)
         before = np.concatenate([[0], np.cumsum(keep)])
         return (
-            Samples(samples.points[kept], samples.t_mid_m[kept], samples.widths[kept], before[samples.begins]),
+            Samples(
+                samples.points[kept], samples.t_mid_m[kept], samples.widths[kept], before[samples.begins]
+            ),
             compact,
         )
 
     def gradients(
-        self, rays: Array32, targets: NDArray[np.uint8], samples: Samples, encoded: Array32, matte: Matte | None = None
+        self,
+        rays: Array32,
+        targets: NDArray[np.uint8],
+        samples: Samples,
+        encoded: Array32,
+        matte: Matte | None = None,
     ) -> StepResult:
         """Add the gradient of the mean Huber loss of a batch to ``grads``.
 
@@ -157,9 +171,18 @@ class CpuStep:
                 slot_grads[slot], rays, targets, inputs, colours, alpha, grad_alpha, ray_slots[slot], matte
             )
             if self.distortion > 0.0:
-                add_distortion_gradient(weights, middles, lengths, samples.begins, *ray_slots[slot], pull, grad_weights)
+                add_distortion_gradient(
+                    weights, middles, lengths, samples.begins, *ray_slots[slot], pull, grad_weights
+                )
             accumulate_backward(
-                field, samples.widths, samples.begins, *ray_slots[slot], weights, inputs, grad_alpha, grad_weights
+                field,
+                samples.widths,
+                samples.begins,
+                *ray_slots[slot],
+                weights,
+                inputs,
+                grad_alpha,
+                grad_weights,
             )
 
         run_slots(shade, SLOTS)
@@ -178,9 +201,17 @@ class CpuStep:
         def work(slot: int) -> None:
             g = slot_grads[slot]
             two_layers_backward(
-                v["density_1.weight"], v["density_1.bias"], v["density_2.weight"], encoded, grad_field, *bounds[slot],
-                g["density_1.weight"], g["density_1.bias"], g["density_2.weight"], g["density_2.bias"],
-            )  # fmt: skip
+                v["density_1.weight"],
+                v["density_1.bias"],
+                v["density_2.weight"],
+                encoded,
+                grad_field,
+                *bounds[slot],
+                g["density_1.weight"],
+                g["density_1.bias"],
+                g["density_2.weight"],
+                g["density_2.bias"],
+            )
 
         run_slots(work, SLOTS)
         scatter(samples.points, n, encoded, self.scene.grid.levels, self.grads["grid.table"])
@@ -189,13 +220,23 @@ class CpuStep:
                 self.grads[name] += g[name]
 
     def _shade(
-        self, grads: dict[str, Array32], rays: Array32, targets: NDArray[np.uint8], inputs: Array32,
-        colours: Array32, alpha: Array32, grad_alpha: Array32, bounds: tuple[int, int], matte: Matte | None,
-    ) -> tuple[float, float]:  # fmt: skip
+        self,
+        grads: dict[str, Array32],
+        rays: Array32,
+        targets: NDArray[np.uint8],
+        inputs: Array32,
+        colours: Array32,
+        alpha: Array32,
+        grad_alpha: Array32,
+        bounds: tuple[int, int],
+        matte: Matte | None,
+    ) -> tuple[float, float]:
         """Decode, compare and differentiate the rays of a slot; ``inputs`` become their gradient."""
         v, (start, stop) = self.values, bounds
         tiles = (start // TILE, -(-stop // TILE))
-        complete_colour_inputs(inputs, rays, alpha, v["background"], self.scene.config.direction_bands, start, stop)
+        complete_colour_inputs(
+            inputs, rays, alpha, v["background"], self.scene.config.direction_bands, start, stop
+        )
         w1, b1, w2, b2 = v["colour_1.weight"], v["colour_1.bias"], v["colour_2.weight"], v["colour_2.bias"]
         two_layers(w1, b1, w2, b2, inputs, colours, *tiles)
         scale = np.float32(1.0 / (3.0 * len(rays)))
@@ -209,11 +250,21 @@ class CpuStep:
                 colours, targets, matte.opacities, matte.behind, alpha, start, stop, self.huber, scale, mixed
             )
         two_layers_backward(
-            w1, b1, w2, inputs, colours, *tiles,
-            grads["colour_1.weight"], grads["colour_1.bias"], grads["colour_2.weight"], grads["colour_2.bias"],
-        )  # fmt: skip
+            w1,
+            b1,
+            w2,
+            inputs,
+            colours,
+            *tiles,
+            grads["colour_1.weight"],
+            grads["colour_1.bias"],
+            grads["colour_2.weight"],
+            grads["colour_2.bias"],
+        )
         pull = np.float32(self.opacity / max(len(rays), 1))
-        background_backward(inputs, alpha, v["background"], start, stop, grad_alpha, grads["background"], pull)
+        background_backward(
+            inputs, alpha, v["background"], start, stop, grad_alpha, grads["background"], pull
+        )
         if matte is not None:
             grad_alpha[start:stop] += mixed[start:stop]
         if not self.scene.config.learned_background:
@@ -222,12 +273,17 @@ class CpuStep:
 
     def update(self, step: int, rate: float) -> None:
         """Adam with the gradients gathered since the last update; ``step`` counts from 0."""
-        mean_scale, square_scale = np.float32(1 / (1 - 0.9 ** (step + 1))), np.float32(1 / (1 - 0.99 ** (step + 1)))
+        mean_scale, square_scale = (
+            np.float32(1 / (1 - 0.9 ** (step + 1))),
+            np.float32(1 / (1 - 0.99 ** (step + 1))),
+        )
         for name, value in self.values.items():
             flat = [a.reshape(-1) for a in (value, self.grads[name], self.means[name], self.squares[name])]
             bounds = slot_bounds(len(flat[0]), SLOTS if name == "grid.table" else 1, 16)
 
-            def work(slot: int, flat: Any = flat, bounds: Any = bounds, table: bool = name == "grid.table") -> None:
+            def work(
+                slot: int, flat: Any = flat, bounds: Any = bounds, table: bool = name == "grid.table"
+            ) -> None:
                 part = slice(*bounds[slot])
                 adam(*(a[part] for a in flat), np.float32(rate), mean_scale, square_scale, table)
 
@@ -275,7 +331,10 @@ def log_density(scene: SceneField, points: Array32) -> Array32:
     encode(np.ascontiguousarray(points, np.float32), n, v["grid.table"], scene.grid.levels, encoded)
     w2, b2 = np.ascontiguousarray(v["density_2.weight"][:2]), np.ascontiguousarray(v["density_2.bias"][:2])
     bounds = slot_bounds(tiles, SLOTS)
-    run_slots(lambda s: two_layers(v["density_1.weight"], v["density_1.bias"], w2, b2, encoded, out, *bounds[s]), SLOTS)
+    run_slots(
+        lambda s: two_layers(v["density_1.weight"], v["density_1.bias"], w2, b2, encoded, out, *bounds[s]),
+        SLOTS,
+    )
     return np.ascontiguousarray(out[:, 0]).reshape(-1)[:n]
 
 

@@ -37,7 +37,9 @@ class FileCamera(Camera):
         """List the images."""
         self._files = sorted(p for p in self.folder.glob("*") if p.suffix.lower() in IMAGE_SUFFIXES)
         if not self._files:
-            raise DeviceNotFound(f"expected images ({', '.join(IMAGE_SUFFIXES)}) in {self.folder}, found none")
+            raise DeviceNotFound(
+                f"expected images ({', '.join(IMAGE_SUFFIXES)}) in {self.folder}, found none"
+            )
         self._sequence, self._next_s = 0, time.monotonic()
 
     def read(self, timeout_s: float) -> Frame | None:
@@ -50,7 +52,9 @@ class FileCamera(Camera):
             return None
         time.sleep(max(wait_s, 0.0))
         if self._sequence >= len(self._files) and not self._loop:
-            raise LinkLost(f"all {len(self._files)} images of {self.folder} were played; set loop to repeat them")
+            raise LinkLost(
+                f"all {len(self._files)} images of {self.folder} were played; set loop to repeat them"
+            )
         path = self._files[self._sequence % len(self._files)]
         bgr = cv2.imread(str(path), cv2.IMREAD_COLOR)
         if bgr is None:

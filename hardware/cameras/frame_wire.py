@@ -26,7 +26,9 @@ def encode_head(frame: Frame) -> bytes:
     height, width, channels = frame.rgb.shape
     if channels != 3 or frame.rgb.dtype != np.uint8:
         raise ValueError(f"expected uint8 pixels [H, W, 3], got {frame.rgb.dtype} {list(frame.rgb.shape)}")
-    return _HEAD.pack(MAGIC, VERSION, height, width, frame.sequence, frame.stamp_realtime_ns, frame.stamp_mono_ns)
+    return _HEAD.pack(
+        MAGIC, VERSION, height, width, frame.sequence, frame.stamp_realtime_ns, frame.stamp_mono_ns
+    )
 
 
 def pixel_bytes(head: bytes) -> int:

@@ -174,7 +174,9 @@ def device_stream(depthai: Any, settings: OakSettings) -> OakStream:
         board_socket = getattr(depthai.CameraBoardSocket, settings.socket, None)
         if board_socket is None or board_socket not in device.getConnectedCameras():
             has = ", ".join(socket.name for socket in device.getConnectedCameras())
-            raise HardwareError(f"expected a camera on socket {settings.socket} of the OAK, got {has}; correct socket")
+            raise HardwareError(
+                f"expected a camera on socket {settings.socket} of the OAK, got {has}; correct socket"
+            )
         pipeline = depthai.Pipeline(device)
         camera = pipeline.create(depthai.node.Camera).build(board_socket)
         fix_controls(camera.initialControl, settings)

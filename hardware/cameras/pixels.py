@@ -43,7 +43,9 @@ def _coloured(pixels: Bytes, code: int) -> Bytes:
 
 def _packed_yuv(code: int) -> Callable[[Bytes, Layout], Bytes]:
     def convert(data: Bytes, layout: Layout) -> Bytes:
-        pixels = _rows(data, layout, layout.height)[:, : 2 * layout.width].reshape(layout.height, layout.width, 2)
+        pixels = _rows(data, layout, layout.height)[:, : 2 * layout.width].reshape(
+            layout.height, layout.width, 2
+        )
         return _coloured(pixels[:, slice(*layout.columns)], code)
 
     return convert
@@ -51,7 +53,9 @@ def _packed_yuv(code: int) -> Callable[[Bytes, Layout], Bytes]:
 
 def _packed_three(swap: bool) -> Callable[[Bytes, Layout], Bytes]:
     def convert(data: Bytes, layout: Layout) -> Bytes:
-        pixels = _rows(data, layout, layout.height)[:, : 3 * layout.width].reshape(layout.height, layout.width, 3)
+        pixels = _rows(data, layout, layout.height)[:, : 3 * layout.width].reshape(
+            layout.height, layout.width, 3
+        )
         part = pixels[:, slice(*layout.columns)]
         return np.array(part[:, :, ::-1] if swap else part, order="C")
 
@@ -73,7 +77,9 @@ def _jpeg(data: Bytes, layout: Layout) -> Bytes:
     if bgr is None:
         raise ValueError("the JPEG data of a frame are damaged")
     if bgr.shape[:2] != (layout.height, layout.width):
-        raise ValueError(f"expected {layout.width} x {layout.height}, got a JPEG of {bgr.shape[1]} x {bgr.shape[0]}")
+        raise ValueError(
+            f"expected {layout.width} x {layout.height}, got a JPEG of {bgr.shape[1]} x {bgr.shape[0]}"
+        )
     return np.ascontiguousarray(bgr[:, slice(*layout.columns), ::-1])
 
 

@@ -109,6 +109,8 @@ class SocketCamera(Camera):
             except OSError as error:
                 raise LinkLost(f"lost the frame server at {self.path}: {error}") from error
             if received == 0:
-                raise LinkLost(f"the frame server at {self.path} closed the connection in the middle of a frame")
+                raise LinkLost(
+                    f"the frame server at {self.path} closed the connection in the middle of a frame"
+                )
             filled += received
         return bytes(buffer)

@@ -146,7 +146,9 @@ class ZedSource(_ControlledSource):
         exposure_lines(100.0, self.fps)
         width, height = EYE_SIZES[self.mode]
         if self.size[0] > width or self.size[1] > height:
-            raise ValueError(f"expected a size of at most {width} x {height} in mode {self.mode}, got {self.size}")
+            raise ValueError(
+                f"expected a size of at most {width} x {height} in mode {self.mode}, got {self.size}"
+            )
         if self.rate_hz is not None and self.rate_hz > self.fps:
             raise ValueError(f"expected rate_hz of at most fps, {self.fps:g}, got {self.rate_hz:g}")
         return self
@@ -159,7 +161,14 @@ class ZedSource(_ControlledSource):
         """Make the camera and read its factory calibration."""
         exposure = ZedExposure(self.exposure_percent, self.gain_raw)
         return ZedCamera(
-            self.device, self.factory, self.mode, self.fps, self.rate_hz, self.size, exposure, self._controls()
+            self.device,
+            self.factory,
+            self.mode,
+            self.fps,
+            self.rate_hz,
+            self.size,
+            exposure,
+            self._controls(),
         )
 
 

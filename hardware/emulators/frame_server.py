@@ -72,7 +72,9 @@ class FrameServer:
                 self._clients.add(client)
                 # A client that has just come waits for the next frame: the last one may be old.
                 last = self._newest
-            threading.Thread(target=self._serve, args=(client, last), name="frame client", daemon=True).start()
+            threading.Thread(
+                target=self._serve, args=(client, last), name="frame client", daemon=True
+            ).start()
 
     def _serve(self, client: socket.socket, last: Frame | None) -> None:
         try:

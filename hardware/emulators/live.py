@@ -94,9 +94,12 @@ def _between(a: tuple[int, VehicleState], b: tuple[int, VehicleState], mono_ns: 
     w, p, q = (mono_ns - a[0]) / (b[0] - a[0]), a[1], b[1]
     turn = math.remainder(q.yaw_rad - p.yaw_rad, 2.0 * math.pi)
     return VehicleState(
-        p.x_m + w * (q.x_m - p.x_m), p.y_m + w * (q.y_m - p.y_m), p.yaw_rad + w * turn,
-        p.speed_mps + w * (q.speed_mps - p.speed_mps), p.steering_rad + w * (q.steering_rad - p.steering_rad),
-    )  # fmt: skip
+        p.x_m + w * (q.x_m - p.x_m),
+        p.y_m + w * (q.y_m - p.y_m),
+        p.yaw_rad + w * turn,
+        p.speed_mps + w * (q.speed_mps - p.speed_mps),
+        p.steering_rad + w * (q.steering_rad - p.steering_rad),
+    )
 
 
 class LiveLab:
@@ -112,7 +115,11 @@ class LiveLab:
     """
 
     def __init__(
-        self, config: LiveLabConfig, run_dir: Path, socket_dir: Path | None = None, ready_timeout_s: float = 60.0
+        self,
+        config: LiveLabConfig,
+        run_dir: Path,
+        socket_dir: Path | None = None,
+        ready_timeout_s: float = 60.0,
     ) -> None:
         self.config = config
         self.vesc_port = run_dir / "vesc"
@@ -247,7 +254,9 @@ class LiveLab:
                     self._frames.publish(last := frame)
                     sequence += 1
                 elif self._camera_fault == "repeated" and last is not None:
-                    self._frames.publish(replace(last))  # another object: the server tells frames apart by that
+                    self._frames.publish(
+                        replace(last)
+                    )  # another object: the server tells frames apart by that
 
     def _light_monitor(self, lab: Lab) -> None:
         assert self._monitor is not None

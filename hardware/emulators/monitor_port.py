@@ -34,7 +34,9 @@ class MonitorPort:
         size_px: Native width and height [px].
     """
 
-    def __init__(self, path: Path | str, size_m: tuple[float, float], size_px: tuple[int, int] = NATIVE_PX) -> None:
+    def __init__(
+        self, path: Path | str, size_m: tuple[float, float], size_px: tuple[int, int] = NATIVE_PX
+    ) -> None:
         self.path, self.size_px = Path(path), size_px
         width_mm, height_mm = (round(1000.0 * side) for side in size_m)
         self._edid = make_edid("ADV", 1, "twin monitor", size_px, (width_mm, height_mm))

@@ -27,7 +27,9 @@ def listen(path: Path, who: str, backlog: int = 8) -> socket.socket:
             except OSError:
                 path.unlink()
             else:
-                raise DeviceBusy(f"expected {path} to be free, but {who} answers there; stop the other twin first")
+                raise DeviceBusy(
+                    f"expected {path} to be free, but {who} answers there; stop the other twin first"
+                )
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
         listener.bind(str(path))

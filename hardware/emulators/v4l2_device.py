@@ -72,7 +72,9 @@ class VideoDevice:
         card: Its name.
     """
 
-    formats: dict[str, list[tuple[int, int]]] = field(default_factory=lambda: {"YUYV": [(640, 480), (320, 240)]})
+    formats: dict[str, list[tuple[int, int]]] = field(
+        default_factory=lambda: {"YUYV": [(640, 480), (320, 240)]}
+    )
     rates: tuple[float, ...] = (30.0, 15.0)
     controls: dict[int, ControlState] = field(default_factory=webcam_controls)
     metadata_only: bool = False

@@ -79,9 +79,17 @@ def _pick(values: Iterable[Any], index: int) -> Any:
 
 def _get_format(device: VideoDevice, fd: int, view: memoryview) -> None:
     struct.pack_into(
-        "<II4sIIII", view, 8, device.width, device.height, _fourcc(device.pixel_format), 1, device.row_bytes,
-        device.picture_bytes, 8,
-    )  # fmt: skip
+        "<II4sIIII",
+        view,
+        8,
+        device.width,
+        device.height,
+        _fourcc(device.pixel_format),
+        1,
+        device.row_bytes,
+        device.picture_bytes,
+        8,
+    )
 
 
 def _set_format(device: VideoDevice, fd: int, view: memoryview) -> None:

@@ -40,7 +40,11 @@ class VescEmulator:
     """
 
     def __init__(
-        self, config: VescEmulatorConfig, vehicle: TwinVehicle, link: Path | None = None, log: Path | None = None
+        self,
+        config: VescEmulatorConfig,
+        vehicle: TwinVehicle,
+        link: Path | None = None,
+        log: Path | None = None,
     ) -> None:
         self.vehicle = vehicle
         self._firmware = VescFirmware(config, vehicle, vehicle.params.true_erpm_gain)

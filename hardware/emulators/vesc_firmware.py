@@ -212,10 +212,23 @@ class VescFirmware:
     def _values(self) -> Values:
         counts = int(self._plant.odometer_m * self._counts_per_m)
         return Values(
-            self.config.generation, erpm=self._plant.erpm, duty=0.0, v_in=self.config.supply_v, motor_current_a=0.0,
-            input_current_a=0.0, tachometer=counts, tachometer_abs=abs(counts), fault=self.fault, used_ah=0.0, charged_ah=0.0,
-            used_wh=0.0, charged_wh=0.0, temp_fet_c=25.0, temp_motor_c=25.0, status=int(self.timed_out),
-        )  # fmt: skip
+            self.config.generation,
+            erpm=self._plant.erpm,
+            duty=0.0,
+            v_in=self.config.supply_v,
+            motor_current_a=0.0,
+            input_current_a=0.0,
+            tachometer=counts,
+            tachometer_abs=abs(counts),
+            fault=self.fault,
+            used_ah=0.0,
+            charged_ah=0.0,
+            used_wh=0.0,
+            charged_wh=0.0,
+            temp_fet_c=25.0,
+            temp_motor_c=25.0,
+            status=int(self.timed_out),
+        )
 
 
 def _app_configuration(config: VescEmulatorConfig) -> AppConfiguration:

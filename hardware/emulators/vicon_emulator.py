@@ -121,7 +121,8 @@ class ViconFrames:
             return self._last[name]
         rx, ry, rz = self._rng.normal(0.0, self.config.noise_rad, 3) if self.config.noise_rad else np.zeros(3)
         noise = make_transform(
-            rotation_z(rz) @ rotation_y(ry) @ rotation_x(rx), self._rng.normal(0.0, 1.0, 3) * self.config.noise_m
+            rotation_z(rz) @ rotation_y(ry) @ rotation_x(rx),
+            self._rng.normal(0.0, 1.0, 3) * self.config.noise_m,
         )
         noisy = T @ make_transform(noise[:3, :3], np.zeros(3))
         noisy[:3, 3] += noise[:3, 3]

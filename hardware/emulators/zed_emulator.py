@@ -51,7 +51,10 @@ class ZedRegisters:
         registers = {0xA2: self.processor, 0xA3: self.sensors[0], 0xA5: self.sensors[1]}[data[1]]
         # A message with the wrong width, device or page is ignored.
         sensor = data[1] != 0xA2
-        if (data[2], data[3], data[9]) != ((0x6C, 2, 0x90) if sensor else (0, 4, 0)) or (data[10], data[12]) != (1, 1):
+        if (data[2], data[3], data[9]) != ((0x6C, 2, 0x90) if sensor else (0, 4, 0)) or (
+            data[10],
+            data[12],
+        ) != (1, 1):
             return
         if data[0] == 0x50 and address not in self.stuck:
             registers[address] = data[16]

@@ -88,7 +88,9 @@ class LibraryReceiver:
             while True:
                 poses += self._frames.get_nowait()
         if self._failure is not None and not poses:
-            raise HardwareError(f"lost the motion capture system {self.source}: {self._failure}") from self._failure
+            raise HardwareError(
+                f"lost the motion capture system {self.source}: {self._failure}"
+            ) from self._failure
         return poses
 
     def close(self) -> None:
@@ -118,7 +120,10 @@ class LibraryReceiver:
         poses = []
         for name, body in dict(self._connection.rigidBodies).items():
             q = body.rotation
-            position, rotation = tuple(map(float, body.position)), (float(q.x), float(q.y), float(q.z), float(q.w))
+            position, rotation = (
+                tuple(map(float, body.position)),
+                (float(q.x), float(q.y), float(q.z), float(q.w)),
+            )
             if self._tracker.is_real(number, name, (*position, *rotation)) and any(rotation):
                 T = make_transform(rotation_from_quaternion(rotation), position)
                 poses.append(SubjectPose(name, T, number, stamp_ns, mono_ns))

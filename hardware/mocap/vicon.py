@@ -138,7 +138,8 @@ class SubjectTracker:
         trusted = [item for item in seen if not self.senders.fault(item.name, mono_ns)]
         self.counts.disputed += len(seen) - len(trusted)
         return [
-            SubjectPose(item.name, item.T_world_from_subject, block.frame_number, stamp, mono_ns) for item in trusted
+            SubjectPose(item.name, item.T_world_from_subject, block.frame_number, stamp, mono_ns)
+            for item in trusted
         ]
 
     def _accept_frame(self, frame_number: int, mono_ns: int, sender: Address) -> bool:

@@ -75,7 +75,9 @@ def euler_from_rotation(R: NDArray[np.float64]) -> tuple[float, float, float]:
 def decode_block(datagram: bytes) -> ObjectBlock:
     """Read one datagram; padding after the counted items is ignored, and so is what newer versions add to an item."""
     if len(datagram) < _HEADER.size:
-        raise ProtocolError(f"expected a VICON object block of at least {_HEADER.size} bytes, got {len(datagram)}")
+        raise ProtocolError(
+            f"expected a VICON object block of at least {_HEADER.size} bytes, got {len(datagram)}"
+        )
     frame_number, count = _HEADER.unpack_from(datagram)
     offset, objects = _HEADER.size, []
     for index in range(count):

@@ -51,9 +51,11 @@ class SenderWatch:
         known = subject.frames.setdefault(frame_number, numbers)
         if known != numbers:
             self._blame(
-                name, f"two different measurements of subject {name} in frame {frame_number} of {_text(sender)}: do two streams"
-                " come by this address?", mono_ns,
-            )  # fmt: skip
+                name,
+                f"two different measurements of subject {name} in frame {frame_number} of {_text(sender)}: do two streams"
+                " come by this address?",
+                mono_ns,
+            )
         while len(subject.frames) > _REMEMBERED_FRAMES:
             del subject.frames[next(iter(subject.frames))]
 
@@ -65,9 +67,11 @@ class SenderWatch:
             subject.frames.clear()
             if silence_s < self._hold_ns / 1e9:
                 self._blame(
-                    name, f"the frame numbers of {_text(sender)}, which sends subject {name}, went from {last} to {frame_number}"
-                    f" within {silence_s:.2f} s", mono_ns,
-                )  # fmt: skip
+                    name,
+                    f"the frame numbers of {_text(sender)}, which sends subject {name}, went from {last} to {frame_number}"
+                    f" within {silence_s:.2f} s",
+                    mono_ns,
+                )
 
     def fault(self, name: str, mono_ns: int) -> str:
         """Return why a subject is unreliable; empty if it is reliable."""
@@ -88,7 +92,9 @@ class SenderWatch:
         if len(subject.senders) > 1:
             count = {2: "two"}.get(len(subject.senders), str(len(subject.senders)))
             self._blame(
-                name, f"{count} senders of subject {name}: {' and '.join(map(_text, subject.senders))}", mono_ns
+                name,
+                f"{count} senders of subject {name}: {' and '.join(map(_text, subject.senders))}",
+                mono_ns,
             )
 
     def _blame(self, name: str, text: str, mono_ns: int) -> None:

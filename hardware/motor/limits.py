@@ -36,10 +36,17 @@ class DriveLimits:
     current_max_a: float = 60.0
 
     def __post_init__(self) -> None:
-        ordered = self.speed_min_mps <= 0.0 < self.speed_max_mps and self.steering_min_rad < 0.0 < self.steering_max_rad
-        positive = self.acceleration_mps2 > 0.0 and self.steering_rate_radps > 0.0 and self.current_max_a > 0.0
+        ordered = (
+            self.speed_min_mps <= 0.0 < self.speed_max_mps
+            and self.steering_min_rad < 0.0 < self.steering_max_rad
+        )
+        positive = (
+            self.acceleration_mps2 > 0.0 and self.steering_rate_radps > 0.0 and self.current_max_a > 0.0
+        )
         if not (ordered and positive):
-            raise ValueError(f"expected limits around zero, positive rates and a positive current, got {self}")
+            raise ValueError(
+                f"expected limits around zero, positive rates and a positive current, got {self}"
+            )
 
 
 @dataclass(frozen=True)
@@ -63,7 +70,11 @@ class VehicleGains:
     servo_max: float = 0.85
 
     def __post_init__(self) -> None:
-        if self.erpm_per_mps == 0.0 or self.servo_per_rad == 0.0 or not 0.0 <= self.servo_min < self.servo_max <= 1.0:
+        if (
+            self.erpm_per_mps == 0.0
+            or self.servo_per_rad == 0.0
+            or not 0.0 <= self.servo_min < self.servo_max <= 1.0
+        ):
             raise ValueError(f"expected gains that are not zero and servo limits in 0..1, got {self}")
 
     def erpm(self, speed_mps: float) -> float:
@@ -138,7 +149,9 @@ class DriveLimiter:
             self.stop()
             return None
         limits = self.limits
-        step_s = MAX_SLEW_STEP_S if self._last_s is None else min(max(now_s - self._last_s, 0.0), MAX_SLEW_STEP_S)
+        step_s = (
+            MAX_SLEW_STEP_S if self._last_s is None else min(max(now_s - self._last_s, 0.0), MAX_SLEW_STEP_S)
+        )
         speed = min(max(speed_mps, limits.speed_min_mps), limits.speed_max_mps)
         steering = min(max(steering_rad, limits.steering_min_rad), limits.steering_max_rad)
         self._last = Setpoint(

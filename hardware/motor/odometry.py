@@ -52,14 +52,19 @@ class Odometry:
         """Speed [m/s] and front wheel angle [rad] since the last update, measured now [ns]."""
         if not (math.isfinite(speed_mps) and math.isfinite(steering_rad)):
             return self.state
-        step_s = 0.0 if self._last_ns is None else min(max((mono_ns - self._last_ns) / 1e9, 0.0), LONGEST_STEP_S)
+        step_s = (
+            0.0 if self._last_ns is None else min(max((mono_ns - self._last_ns) / 1e9, 0.0), LONGEST_STEP_S)
+        )
         self._last_ns = mono_ns
         rate = speed_mps * math.tan(steering_rad) / self._wheelbase_m
         half = 0.5 * rate * step_s
         chord = speed_mps * step_s * (math.sin(half) / half if abs(half) > 1e-9 else 1.0)
         old = self.state
         self.state = OdometryState(
-            old.x_m + chord * math.cos(old.yaw_rad + half), old.y_m + chord * math.sin(old.yaw_rad + half),
-            math.remainder(old.yaw_rad + 2.0 * half, 2.0 * math.pi), speed_mps, rate,
-        )  # fmt: skip
+            old.x_m + chord * math.cos(old.yaw_rad + half),
+            old.y_m + chord * math.sin(old.yaw_rad + half),
+            math.remainder(old.yaw_rad + 2.0 * half, 2.0 * math.pi),
+            speed_mps,
+            rate,
+        )
         return self.state

@@ -170,7 +170,9 @@ class Vesc:
 
     def brake(self, current_a: float) -> Sent:
         """Brake with a motor current [A]; steering stays where it is."""
-        current_a = self.limiter.current(abs(current_a) if math.isfinite(current_a) else self._stop_brake_current_a)
+        current_a = self.limiter.current(
+            abs(current_a) if math.isfinite(current_a) else self._stop_brake_current_a
+        )
         self.limiter.stop()
         self._write(encode_command(CommandId.SET_CURRENT_BRAKE, current_a))
         return self._sent(brake_current_a=as_sent(CommandId.SET_CURRENT_BRAKE, current_a))

@@ -116,7 +116,9 @@ def decode_values(payload: bytes) -> Values:
         )
     raw = struct.unpack(_FORMATS[generation], payload)[1:]
     items = zip(LAYOUTS[generation], raw, strict=True)
-    return Values(generation, **{name: value if name in _WHOLE else value / scale for (name, _, scale), value in items})
+    return Values(
+        generation, **{name: value if name in _WHOLE else value / scale for (name, _, scale), value in items}
+    )
 
 
 def encode_values(values: Values) -> bytes:
@@ -149,7 +151,9 @@ class FirmwareVersion:
 def decode_firmware_version(payload: bytes) -> FirmwareVersion:
     """Decode an FW_VERSION reply, as far as it goes: 3 bytes up to firmware 2.18, then a name, a UUID, and ever more flags."""
     if len(payload) < 3 or payload[0] != CommandId.FW_VERSION:
-        raise ProtocolError(f"expected an FW_VERSION reply of at least 3 bytes, got {payload.hex(' ') or 'nothing'}")
+        raise ProtocolError(
+            f"expected an FW_VERSION reply of at least 3 bytes, got {payload.hex(' ') or 'nothing'}"
+        )
     rest = payload[3:]
     if b"\0" not in rest:
         return FirmwareVersion(payload[1], payload[2])
@@ -166,11 +170,15 @@ def encode_firmware_version(version: FirmwareVersion) -> bytes:
         return head
     payload = head + version.hardware_name.encode("ascii") + b"\0" + (version.uuid or bytes(12))
     payload += b"\0" if release >= (4, 2) else b""  # pairing done
-    payload += b"\0\0\0" if release >= (5, 2) else b""  # test version, hardware type VESC, custom configurations
+    payload += (
+        b"\0\0\0" if release >= (5, 2) else b""
+    )  # test version, hardware type VESC, custom configurations
     payload += b"\0\0\0" if release >= (5, 3) else b""  # phase filters, two user interface flags
     payload += b"\0\0" if release >= (6, 0) else b""  # NRF flags, empty firmware name
     return payload
 
 
 # A layout may name only fields that `Values` has.
-assert {name for layout in LAYOUTS.values() for name, _, _ in layout} <= {field.name for field in fields(Values)}
+assert {name for layout in LAYOUTS.values() for name, _, _ in layout} <= {
+    field.name for field in fields(Values)
+}

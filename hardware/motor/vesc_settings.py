@@ -49,7 +49,9 @@ class TimeoutSettings:
 
     def at_least(self, other: TimeoutSettings) -> bool:
         """Whether it stops a car as early and as hard as another."""
-        return 0 < self.timeout_ms <= other.timeout_ms and self.brake_current_a >= other.brake_current_a - 1e-3
+        return (
+            0 < self.timeout_ms <= other.timeout_ms and self.brake_current_a >= other.brake_current_a - 1e-3
+        )
 
 
 @dataclass(frozen=True)
@@ -74,8 +76,12 @@ class AppConfiguration:
         """The same configuration with other settings; not one byte else changes."""
         head = _HEADS[self.layout]
         *kept, _, _ = head.unpack_from(self.data)
-        brake = round(settings.brake_current_a * 1000) if self.layout == "scaled" else settings.brake_current_a
-        return AppConfiguration(head.pack(*kept, settings.timeout_ms, brake) + self.data[head.size :], self.layout)
+        brake = (
+            round(settings.brake_current_a * 1000) if self.layout == "scaled" else settings.brake_current_a
+        )
+        return AppConfiguration(
+            head.pack(*kept, settings.timeout_ms, brake) + self.data[head.size :], self.layout
+        )
 
     def encode_set(self) -> bytes:
         """Frame that makes it the controller's configuration, and stores it there."""

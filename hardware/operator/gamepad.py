@@ -84,8 +84,12 @@ class Gamepad:
     """
 
     def __init__(
-        self, path: Path, mono_ns: Callable[[], int], layout: Layout | None = None, ioctl: Callable[..., Any] = fcntl.ioctl
-    ) -> None:  # fmt: skip
+        self,
+        path: Path,
+        mono_ns: Callable[[], int],
+        layout: Layout | None = None,
+        ioctl: Callable[..., Any] = fcntl.ioctl,
+    ) -> None:
         self.path = path
         self._js = path.name.startswith("js") or os.path.basename(os.path.realpath(path)).startswith("js")
         self._layout = layout or (JS_LAYOUT if self._js else EVENT_LAYOUT)
@@ -128,10 +132,14 @@ class Gamepad:
             self._fd = os.open(self.path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
             self._rest, self._state.held, self._state.axes = b"", set(), {}
             if not self._js:
-                self._ranges = {axis: self._range(axis) for axis in (self._layout.throttle, self._layout.steering)}
+                self._ranges = {
+                    axis: self._range(axis) for axis in (self._layout.throttle, self._layout.steering)
+                }
                 self._ask()
         except OSError as error:
-            cure = "; add yourself to the group input" if error.errno == errno.EACCES else "; is it plugged in?"
+            cure = (
+                "; add yourself to the group input" if error.errno == errno.EACCES else "; is it plugged in?"
+            )
             self._lose(f"cannot use {self.path} as a gamepad: {error.strerror}{cure}")
 
     def _lose(self, trouble: str) -> None:
@@ -200,10 +208,14 @@ class Gamepad:
         if self._fd is None:
             return nothing
         return replace(
-            nothing, human=layout.human in state.held, autonomy=layout.autonomy in state.held,
-            throttle=_beyond(-state.axes.get(layout.throttle, 0.0)), steering=_beyond(-state.axes.get(layout.steering, 0.0)),
-            connected=True, text=str(self.path),
-        )  # fmt: skip
+            nothing,
+            human=layout.human in state.held,
+            autonomy=layout.autonomy in state.held,
+            throttle=_beyond(-state.axes.get(layout.throttle, 0.0)),
+            steering=_beyond(-state.axes.get(layout.steering, 0.0)),
+            connected=True,
+            text=str(self.path),
+        )
 
 
 def _beyond(value: float) -> float:

@@ -52,9 +52,15 @@ class Keyboard:
         held = self._key if self._repeats >= 2 and now_ns - self._key_ns <= self._late_ns else ""
         throttle, steering = _DRIVE.get(held, (0.0, 0.0))
         return Hands(
-            held in _DRIVE, held == _AUTONOMY, throttle, steering, self._stops, self._rearms, not self._lost,
+            held in _DRIVE,
+            held == _AUTONOMY,
+            throttle,
+            steering,
+            self._stops,
+            self._rearms,
+            not self._lost,
             "the terminal is gone" if self._lost else "keyboard",
-        )  # fmt: skip
+        )
 
     def close(self) -> None:
         """Restore the terminal."""

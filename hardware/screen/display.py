@@ -52,7 +52,9 @@ def check_picture(rgb: Rgb, size_px: tuple[int, int]) -> None:
     """Refuse an image of another size than the screen's, because images are not scaled."""
     width, height = size_px
     if rgb.shape != (height, width, 3) or rgb.dtype != np.uint8:
-        raise ValueError(f"expected a picture of [{height}, {width}, 3] uint8, got {list(rgb.shape)} {rgb.dtype}")
+        raise ValueError(
+            f"expected a picture of [{height}, {width}, 3] uint8, got {list(rgb.shape)} {rgb.dtype}"
+        )
 
 
 class PygameDisplay:
@@ -68,7 +70,9 @@ class PygameDisplay:
         HardwareError: The window did not get the size that was asked for (scaling, another resolution).
     """
 
-    def __init__(self, index: int = 0, size_px: tuple[int, int] | None = None, edid: Edid | None = None) -> None:
+    def __init__(
+        self, index: int = 0, size_px: tuple[int, int] | None = None, edid: Edid | None = None
+    ) -> None:
         os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
         try:
             import pygame
@@ -120,7 +124,9 @@ class PygameDisplay:
             raise LinkLost("the window of the attack was closed at the monitor; restart the launch")
         now = self._pygame.display.get_window_size()
         if now != self.size_px:
-            raise LinkLost(f"expected the window to keep {self.size_px}, got {now}; was the resolution changed?")
+            raise LinkLost(
+                f"expected the window to keep {self.size_px}, got {now}; was the resolution changed?"
+            )
 
     def close(self) -> None:
         """Close the window."""
@@ -149,7 +155,9 @@ class TwinDisplay:
             self.edid: Edid | None = parse_edid(self._receive(BLOCK_BYTES))
         except LinkTimeout:
             self.close()
-            raise DeviceBusy(f"the simulated monitor at {path} is used by another program; stop that first") from None
+            raise DeviceBusy(
+                f"the simulated monitor at {path} is used by another program; stop that first"
+            ) from None
         except BaseException:
             self.close()
             raise
@@ -162,7 +170,9 @@ class TwinDisplay:
         began, pixels = time.perf_counter(), np.ascontiguousarray(rgb).tobytes()
         self._send(b"S" + pixels)
         if (shown := self._receive(32)) != hashlib.sha256(pixels).digest():
-            raise HardwareError(f"expected the simulated monitor to show the sent image, got hash {shown.hex()[:12]}")
+            raise HardwareError(
+                f"expected the simulated monitor to show the sent image, got hash {shown.hex()[:12]}"
+            )
         return time.perf_counter() - began
 
     def read_back(self) -> Rgb:

@@ -49,7 +49,9 @@ def parse_edid(data: bytes) -> Edid:
         ProtocolError: The bytes are not an EDID, are damaged, or name no preferred mode.
     """
     if len(data) < BLOCK_BYTES or data[:8] != _HEADER:
-        raise ProtocolError(f"expected an EDID of 128 bytes that begins with {_HEADER.hex()}, got {data[:8].hex()!r}")
+        raise ProtocolError(
+            f"expected an EDID of 128 bytes that begins with {_HEADER.hex()}, got {data[:8].hex()!r}"
+        )
     block = data[:BLOCK_BYTES]
     if rest := sum(block) % _FULL_TURN:
         raise ProtocolError(
@@ -57,22 +59,30 @@ def parse_edid(data: bytes) -> Edid:
         )
     timing = block[54:72]
     if timing[:2] == b"\0\0":
-        raise ProtocolError("expected a preferred mode in the EDID, got none; give the size in pixels instead")
+        raise ProtocolError(
+            "expected a preferred mode in the EDID, got none; give the size in pixels instead"
+        )
     width_px, height_px = timing[2] | (timing[4] & 0xF0) << 4, timing[5] | (timing[7] & 0xF0) << 4
     if width_px == 0 or height_px == 0:
-        raise ProtocolError(f"expected a preferred mode with pixels in the EDID, got {width_px} x {height_px}")
+        raise ProtocolError(
+            f"expected a preferred mode with pixels in the EDID, got {width_px} x {height_px}"
+        )
     fine = (float(timing[12] | (timing[14] & 0xF0) << 4), float(timing[13] | (timing[14] & 0x0F) << 8))
     coarse = (10.0 * block[21], 10.0 * block[22])
-    return Edid(_maker(block), block[10] | block[11] << 8, _name(block), (width_px, height_px), _size(fine, coarse))
+    return Edid(
+        _maker(block), block[10] | block[11] << 8, _name(block), (width_px, height_px), _size(fine, coarse)
+    )
 
 
-def make_edid(maker: str, product: int, name: str, size_px: tuple[int, int], size_mm: tuple[int, int]) -> bytes:
+def make_edid(
+    maker: str, product: int, name: str, size_px: tuple[int, int], size_mm: tuple[int, int]
+) -> bytes:
     """EDID of a monitor that exists only here (the twin's): the fields that `parse_edid` reads, 60 Hz, version 1.4."""
     block = bytearray(BLOCK_BYTES)
     block[:8] = _HEADER
-    block[8:10] = sum((ord(letter) - 64) << shift for letter, shift in zip(maker, (10, 5, 0), strict=True)).to_bytes(
-        2, "big"
-    )
+    block[8:10] = sum(
+        (ord(letter) - 64) << shift for letter, shift in zip(maker, (10, 5, 0), strict=True)
+    ).to_bytes(2, "big")
     block[10:12] = product.to_bytes(2, "little")
     block[17:20] = bytes((36, 1, 4))  # made in 2026
     block[20:23] = bytes((0xA5, round(size_mm[0] / 10), round(size_mm[1] / 10)))

@@ -35,7 +35,9 @@ def fit_lines_and_arcs(poses: ArrayLike, tolerance_m: float = 0.02) -> tuple[Seg
     """
     listed = np.asarray(poses, dtype=np.float64)
     if listed.ndim != 2 or listed.shape[1] != 3 or len(listed) < 2 or not np.isfinite(listed).all():
-        raise ValueError(f"expected at least two finite poses [N, 3], got an array of shape {list(listed.shape)}")
+        raise ValueError(
+            f"expected at least two finite poses [N, 3], got an array of shape {list(listed.shape)}"
+        )
     here, done, segments = listed[0], 0, []
     while done < len(listed) - 1:
         reach, pieces = _farthest(here, listed[done + 1 :], tolerance_m)
@@ -63,12 +65,18 @@ def path_through(
     """
     points = np.asarray(points_m, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 2 or len(points) < 3 or not np.isfinite(points).all():
-        raise ValueError(f"expected at least three finite points [N, 2], got an array of shape {list(points.shape)}")
+        raise ValueError(
+            f"expected at least three finite points [N, 2], got an array of shape {list(points.shape)}"
+        )
     if (
-        not np.linalg.norm(np.diff(points, axis=0, append=points[:1] if closed else points[-1:] + 1.0), axis=1).min()
+        not np.linalg.norm(
+            np.diff(points, axis=0, append=points[:1] if closed else points[-1:] + 1.0), axis=1
+        ).min()
         > 0
     ):
-        raise ValueError("expected points that differ from their neighbours, got one twice; leave out the second")
+        raise ValueError(
+            "expected points that differ from their neighbours, got one twice; leave out the second"
+        )
     poses = np.column_stack([points, _headings(points, closed)])
     start = (float(poses[0, 0]), float(poses[0, 1]), float(poses[0, 2]))
     segments = list(fit_lines_and_arcs(poses, tolerance_m))
@@ -114,7 +122,9 @@ def advance(pose: ArrayLike, segment: Segment) -> Array:
     x, y, yaw = np.asarray(pose, dtype=np.float64)
     turn = segment[2] if segment[0] == "arc" else 0.0
     chord = segment[1] if segment[0] == "line" else 2.0 * segment[1] * math.sin(0.5 * abs(turn))
-    return np.array([x + chord * math.cos(yaw + 0.5 * turn), y + chord * math.sin(yaw + 0.5 * turn), yaw + turn])
+    return np.array(
+        [x + chord * math.cos(yaw + 0.5 * turn), y + chord * math.sin(yaw + 0.5 * turn), yaw + turn]
+    )
 
 
 def _farthest(here: Array, ahead: Array, tolerance_m: float) -> tuple[int, list[Segment]]:
@@ -161,8 +171,13 @@ def _biarc(along: float, aside: float, turn: float, max_radius_m: float = _MAX_R
     # a d^2 + b d - c = 0, its positive root in the form that also holds for a = 0.
     d = 2.0 * c / (b + math.sqrt(b * b + 4.0 * a * c))
     joint = 0.5 * (v + d * (t0 - t1))
-    middle = 2.0 * math.atan2(joint[1], joint[0])  # heading where the arcs meet: a chord is half-way through its turn
-    return [*_arc(joint, middle, max_radius_m), *_arc(v - joint, float(wrap_angle(turn - middle)), max_radius_m)]
+    middle = 2.0 * math.atan2(
+        joint[1], joint[0]
+    )  # heading where the arcs meet: a chord is half-way through its turn
+    return [
+        *_arc(joint, middle, max_radius_m),
+        *_arc(v - joint, float(wrap_angle(turn - middle)), max_radius_m),
+    ]
 
 
 def _arc(chord: Array, turn: float, max_radius_m: float) -> list[Segment]:

@@ -33,7 +33,12 @@ class ReferencePath:
         """Refuse what is no path."""
         numbers = [*self.start_pose, *(value for segment in self.segments for value in segment[1:])]
         positive = [segment[1] for segment in self.segments]
-        if len(self.start_pose) != 3 or not self.segments or not all(map(math.isfinite, numbers)) or min(positive) <= 0:
+        if (
+            len(self.start_pose) != 3
+            or not self.segments
+            or not all(map(math.isfinite, numbers))
+            or min(positive) <= 0
+        ):
             raise ValueError(
                 "expected a finite start pose (x, y, yaw) and at least one line or arc of positive length or radius, got "
                 f"{self.start_pose} and {self.segments}"

@@ -60,7 +60,9 @@ class CarDescription:
                 f"expected a dubins or ackermann car, a speed above 0 m/s, and limits right < left; got {self}"
             )
         if (self.kind == "ackermann") != (self.wheelbase_m is not None and self.wheelbase_m > 0.0):
-            raise WorldError(f"expected wheelbase_m > 0 for an ackermann car, and none for a dubins car; got {self}")
+            raise WorldError(
+                f"expected wheelbase_m > 0 for an ackermann car, and none for a dubins car; got {self}"
+            )
 
     @property
     def largest_control(self) -> float:
@@ -150,7 +152,11 @@ class WorldDescription:
             "car": {**asdict(self.car), "control_limits": list(self.car.control_limits)},
             "camera": asdict(self.camera),
             "T_car_from_camera": np.asarray(self.T_car_from_camera, dtype=np.float64).tolist(),
-            "box": {"min_m": list(self.box.min_m), "max_m": list(self.box.max_m), "contraction": self.box.contraction},
+            "box": {
+                "min_m": list(self.box.min_m),
+                "max_m": list(self.box.max_m),
+                "contraction": self.box.contraction,
+            },
             "lanes": [lane.to_dict() for lane in self.lanes],
             "road_edge": [np.asarray(line, dtype=np.float64).tolist() for line in self.road_edge],
             "facts": dict(self.facts),
@@ -173,7 +179,9 @@ class WorldDescription:
                 T_car_from_camera=np.array(data["T_car_from_camera"], dtype=np.float64),
                 box=Box(tuple(box["min_m"]), tuple(box["max_m"]), bool(box["contraction"])),
                 lanes=tuple(map(ReferencePath.from_dict, data["lanes"])),
-                road_edge=tuple(np.array(line, dtype=np.float64).reshape(-1, 2) for line in data["road_edge"]),
+                road_edge=tuple(
+                    np.array(line, dtype=np.float64).reshape(-1, 2) for line in data["road_edge"]
+                ),
                 facts=dict(data["facts"]),
             )
         except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
@@ -250,10 +258,16 @@ class World(Protocol):
         ...
 
     @overload
-    def observe_at(self, x_m: float, y_m: float, yaw_rad: float, depth: Literal[True] = True) -> tuple[Rgb, Depth]: ...
+    def observe_at(
+        self, x_m: float, y_m: float, yaw_rad: float, depth: Literal[True] = True
+    ) -> tuple[Rgb, Depth]: ...
     @overload
-    def observe_at(self, x_m: float, y_m: float, yaw_rad: float, depth: Literal[False]) -> tuple[Rgb, None]: ...
-    def observe_at(self, x_m: float, y_m: float, yaw_rad: float, depth: bool = True) -> tuple[Rgb, Depth | None]:
+    def observe_at(
+        self, x_m: float, y_m: float, yaw_rad: float, depth: Literal[False]
+    ) -> tuple[Rgb, None]: ...
+    def observe_at(
+        self, x_m: float, y_m: float, yaw_rad: float, depth: bool = True
+    ) -> tuple[Rgb, Depth | None]:
         """What the driving camera would see from another pose of the car (see :meth:`observe`); the car stays where it is."""
         ...
 

@@ -61,7 +61,9 @@ def contents_of(scan: Scan) -> Contents:
     contents = Contents(start_ns=scan.start_ns, end_ns=scan.end_ns)
     for channel in scan.channels.values():
         schema = scan.schemas.get(channel.schema_id)
-        contents.add_topic(channel.topic, schema.name if schema else "", channel.metadata.get("topic_type_hash", ""))
+        contents.add_topic(
+            channel.topic, schema.name if schema else "", channel.metadata.get("topic_type_hash", "")
+        )
         contents.counts[channel.topic] += scan.counts.get(channel.id, 0)
     return contents
 
@@ -100,7 +102,9 @@ def _with_what_is_missing(scan: Scan) -> list[Piece]:
     if scan.lost_definitions and scan.insert_at is not None:
         pieces.insert(scan.insert_at, Piece(0, 0, content=b"".join(map(_bytes_of, scan.lost_definitions))))
     if scan.header is None:
-        profile = PROFILE if any(channel.message_encoding == "cdr" for channel in scan.channels.values()) else ""
+        profile = (
+            PROFILE if any(channel.message_encoding == "cdr" for channel in scan.channels.values()) else ""
+        )
         pieces.insert(0, Piece(0, 0, content=_bytes_of(Header(profile, LIBRARY + " repair"))))
     return pieces
 
@@ -135,7 +139,9 @@ def _metadata(scan: Scan, file_name: str, notes: dict[str, str], at: int, entrie
         topics = {channel.topic for channel in scan.channels.values()}
         records.append(Metadata(ENDS, {f"lost {topic}": str(lost.get(topic, 0)) for topic in sorted(topics)}))
     if "rosbag2" not in present:
-        records.append(Metadata("rosbag2", {"serialized_metadata": rosbag2_metadata(file_name, contents_of(scan))}))
+        records.append(
+            Metadata("rosbag2", {"serialized_metadata": rosbag2_metadata(file_name, contents_of(scan))})
+        )
     records.append(Metadata(REPAIRS, notes))
     content = b""
     for record in records:
@@ -148,7 +154,11 @@ def _metadata(scan: Scan, file_name: str, notes: dict[str, str], at: int, entrie
 def _ending(scan: Scan, entries: Sequence[Any], start: int) -> bytes:
     """Bytes of the summary section that begins at ``start``, the footer and the magic."""
     summary, offsets_start = _summary(scan, entries, start)
-    head = RECORD_HEAD.pack(Opcode.FOOTER, 20) + start.to_bytes(8, "little") + offsets_start.to_bytes(8, "little")
+    head = (
+        RECORD_HEAD.pack(Opcode.FOOTER, 20)
+        + start.to_bytes(8, "little")
+        + offsets_start.to_bytes(8, "little")
+    )
     return summary + _bytes_of(Footer(start, offsets_start, zlib.crc32(head, zlib.crc32(summary)))) + MAGIC
 
 
@@ -156,11 +166,16 @@ def _summary(scan: Scan, entries: Sequence[Any], start: int) -> tuple[bytes, int
     """Bytes of the summary section that begins at ``start``, and the offset of its table of offsets."""
     kinds = {kind: [entry for entry in entries if isinstance(entry, kind)] for kind in _KINDS}
     statistics = Statistics(
-        attachment_count=len(kinds[AttachmentIndex]), channel_count=len(scan.channels),
-        channel_message_counts=dict(scan.counts), chunk_count=len(kinds[ChunkIndex]), message_count=scan.messages,
-        message_end_time=scan.end_ns, message_start_time=scan.start_ns, metadata_count=len(kinds[MetadataIndex]),
+        attachment_count=len(kinds[AttachmentIndex]),
+        channel_count=len(scan.channels),
+        channel_message_counts=dict(scan.counts),
+        chunk_count=len(kinds[ChunkIndex]),
+        message_count=scan.messages,
+        message_end_time=scan.end_ns,
+        message_start_time=scan.start_ns,
+        metadata_count=len(kinds[MetadataIndex]),
         schema_count=len(scan.schemas),
-    )  # fmt: skip
+    )
     groups: list[tuple[int, list[Any]]] = [
         (Opcode.SCHEMA, list(scan.schemas.values())),
         (Opcode.CHANNEL, list(scan.channels.values())),

@@ -75,7 +75,11 @@ def messages_in_order(
         if block.end_ns < start_ns or (block.channels and wanted.isdisjoint(block.channels)):
             continue
         try:
-            data = _run_data(file, block.source) if isinstance(block.source, Run) else _chunk_data(file, block.source)
+            data = (
+                _run_data(file, block.source)
+                if isinstance(block.source, Run)
+                else _chunk_data(file, block.source)
+            )
             for message in _messages(data, wanted, block.offset):
                 if message.log_ns >= start_ns:
                     heappush(waiting, message)
@@ -105,7 +109,10 @@ def _damaged(file: Any, summary: Summary, block: _Block, error: Damaged) -> BagE
     path = getattr(file, "name", "the bag")
     first_ns = summary.statistics.message_start_time if summary.statistics is not None else block.start_ns
     since, until = ((moment - first_ns) / NS_PER_S for moment in (block.start_ns, block.end_ns))
-    topics = [c.topic if isinstance(c := summary.channels.get(i), Channel) else f"channel {i}" for i in block.channels]
+    topics = [
+        c.topic if isinstance(c := summary.channels.get(i), Channel) else f"channel {i}"
+        for i in block.channels
+    ]
     return BagError(
         f"{path} is damaged: the chunk at byte {block.offset} (log times {block.start_ns} to {block.end_ns} ns, {since:.3f} to "
         f"{until:.3f} s after the first message; {', '.join(sorted(topics)) or 'topics unknown'}): {error}; advnerf bag info {path} "
@@ -172,5 +179,7 @@ def read_metadata_at(file: Any, index: MetadataIndex) -> Metadata:
     try:
         found: Metadata = parse(Metadata, _record(file, index.offset, index.length, Opcode.METADATA))
     except Damaged as error:
-        raise BagError(f"{file.name} is damaged: its metadata {index.name} at byte {index.offset}: {error}") from error
+        raise BagError(
+            f"{file.name} is damaged: its metadata {index.name} at byte {index.offset}: {error}"
+        ) from error
     return found

@@ -18,7 +18,10 @@ def describe(scan: Scan, loss: Loss) -> str:
         )
     if loss.counts:
         known = dict(scan.known.channels if scan.known is not None else {}) | scan.channels
-        topics = [f"{count} of {known[i].topic if i in known else f'channel {i}'}" for i, count in loss.counts.items()]
+        topics = [
+            f"{count} of {known[i].topic if i in known else f'channel {i}'}"
+            for i, count in loss.counts.items()
+        ]
         details.append(f"about {', '.join(topics[:8])}{' ...' if len(topics) > 8 else ''}")
     if details:
         words.append(f"({'; '.join(details)})")

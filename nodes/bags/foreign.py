@@ -63,7 +63,9 @@ def read_stored(path: Path, form: Format) -> Stored:
         return Stored(reader.start_time, reader.end_time - 1, count, topics)
 
 
-def stored_messages(path: Path, form: Format, numbers: Collection[int], start_ns: int) -> Iterator[StoredMessage]:
+def stored_messages(
+    path: Path, form: Format, numbers: Collection[int], start_ns: int
+) -> Iterator[StoredMessage]:
     """Yield messages in order of their log time.
 
     Args:
@@ -83,9 +85,13 @@ def _topic(connection: Any, form: Format) -> StoredTopic:
     language = _LANGUAGES.get(connection.msgdef.format, "")
     serialization = ROS1 if form is Format.ROS1 else connection.ext.serialization_format or CDR
     recorded = RecordedTopic(
-        connection.topic, full_type_name(connection.msgtype), "" if form is Format.ROS1 else connection.digest,
-        connection.msgdef.data if language else "", language or MSG, serialization,
-    )  # fmt: skip
+        connection.topic,
+        full_type_name(connection.msgtype),
+        "" if form is Format.ROS1 else connection.digest,
+        connection.msgdef.data if language else "",
+        language or MSG,
+        serialization,
+    )
     return StoredTopic(connection.id, recorded, connection.msgcount)
 
 
@@ -104,7 +110,9 @@ def _opened(path: Path, form: Format) -> Iterator[Any]:
         raise
     except _NONSENSE as error:
         said = " ".join(str(error).split())
-        raise BagError(f"{path} is {form.value}, and cannot be read: {type(error).__name__} {said:.160}") from error
+        raise BagError(
+            f"{path} is {form.value}, and cannot be read: {type(error).__name__} {said:.160}"
+        ) from error
 
 
 def _reader(path: Path, form: Format) -> Any:

@@ -82,7 +82,9 @@ def _kind(head: bytes) -> tuple[str, str]:
             return kind, advice
     if not any(head):
         return "full of zeros: its disk was full or lost power before anything was written", ""
-    return ("a text file" if _is_text(head) else f"a file of unknown format (it begins with {head[:8].hex(' ')})"), ""
+    return (
+        "a text file" if _is_text(head) else f"a file of unknown format (it begins with {head[:8].hex(' ')})"
+    ), ""
 
 
 def _is_text(head: bytes) -> bool:

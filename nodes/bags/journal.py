@@ -57,7 +57,9 @@ class Journal:
         """Append a message."""
         topic = entry.topic.encode()
         lengths = len(topic), len(entry.cdr)
-        head = _ENTRY.pack(0, entry.log_ns, entry.publish_ns, entry.sequence & 0xFFFFFFFF, *lengths)[_CRC_BYTES:]
+        head = _ENTRY.pack(0, entry.log_ns, entry.publish_ns, entry.sequence & 0xFFFFFFFF, *lengths)[
+            _CRC_BYTES:
+        ]
         body = head + topic + entry.cdr
         _write_all(self._descriptor, zlib.crc32(body).to_bytes(_CRC_BYTES, "little") + body)
 

@@ -47,7 +47,10 @@ def merge_by_time(sources: Sequence[Source[T]], time_ns: Callable[[T], int]) -> 
 
 
 def _wait(
-    waiting: list[tuple[int, int, T, Iterator[T]]], number: int, messages: Iterator[T], time_ns: Callable[[T], int]
+    waiting: list[tuple[int, int, T, Iterator[T]]],
+    number: int,
+    messages: Iterator[T],
+    time_ns: Callable[[T], int],
 ) -> None:
     for message in messages:
         heappush(waiting, (time_ns(message), number, message, messages))

@@ -112,7 +112,9 @@ class Definition:
         if typename in self._types:
             return self._types[typename]
         if (fields := fields_of(typename)) is None:
-            raise MessageError(f"the definition of {self.typename} needs {typename}, which the bag does not define")
+            raise MessageError(
+                f"the definition of {self.typename} needs {typename}, which the bag does not define"
+            )
         return fields
 
     def _same(self, typename: str, seen: set[str]) -> bool:
@@ -129,7 +131,9 @@ class Definition:
         if not fields and not reader.ros1:
             reader.number("u1")
         return {
-            name.lower(): self._value(kind, reader) for name, kind in fields if name != _PLACEHOLDER or not reader.ros1
+            name.lower(): self._value(kind, reader)
+            for name, kind in fields
+            if name != _PLACEHOLDER or not reader.ros1
         }
 
     def _value(self, kind: Any, reader: _Reader) -> Any:
@@ -191,7 +195,9 @@ def as_our_message(fields: Mapping[str, Any], typename: str) -> Any:
         typename: The advnerf type.
     """
     ours = fields_of(typename) or []
-    return message_class(typename)(**{name: _as_ours(fields.get(name.lower(), 0), kind) for name, kind in ours})
+    return message_class(typename)(
+        **{name: _as_ours(fields.get(name.lower(), 0), kind) for name, kind in ours}
+    )
 
 
 def _as_ours(value: Any, kind: Any) -> Any:
@@ -202,7 +208,11 @@ def _as_ours(value: Any, kind: Any) -> Any:
         return [as_our_message(item, inner) for item in value]
     if isinstance(value, np.ndarray):
         node, what = kind
-        if node in (Nodetype.ARRAY, Nodetype.SEQUENCE) and what[0][0] == Nodetype.BASE and what[0][1][0] != "string":
+        if (
+            node in (Nodetype.ARRAY, Nodetype.SEQUENCE)
+            and what[0][0] == Nodetype.BASE
+            and what[0][1][0] != "string"
+        ):
             return value.astype(np.dtype(_NUMBERS[what[0][1][0]]).newbyteorder("="), copy=False)
     return value
 
@@ -229,7 +239,9 @@ class _Reader:
         self._order, self._at = "<", 0
         if not ros1:
             if len(data) < 4 or data[0] != 0 or data[1] > 1:
-                raise ValueError(f"they begin with {bytes(data[:4]).hex()}, not with the encapsulation of CDR")
+                raise ValueError(
+                    f"they begin with {bytes(data[:4]).hex()}, not with the encapsulation of CDR"
+                )
             self._order = "<" if data[1] else ">"
             data = data[4:]  # alignment counts from after the encapsulation
         self._data = data

@@ -86,29 +86,45 @@ def rosbag2_metadata(file_name: str, contents: Contents, files: Sequence[FileEnt
     topics = [
         {
             "topic_metadata": {
-                "name": topic, "type": typename, "serialization_format": "cdr",
-                "offered_qos_profiles": [], "type_description_hash": contents.hashes[topic],
+                "name": topic,
+                "type": typename,
+                "serialization_format": "cdr",
+                "offered_qos_profiles": [],
+                "type_description_hash": contents.hashes[topic],
             },
             "message_count": contents.counts[topic],
         }
         for topic, typename in contents.types.items()
-    ]  # fmt: skip
+    ]
     information = {
-        "version": 9, "storage_identifier": "mcap", **_times(contents.start_ns, contents.end_ns),
-        "message_count": contents.messages, "topics_with_message_count": topics, "compression_format": "", "compression_mode": "",
+        "version": 9,
+        "storage_identifier": "mcap",
+        **_times(contents.start_ns, contents.end_ns),
+        "message_count": contents.messages,
+        "topics_with_message_count": topics,
+        "compression_format": "",
+        "compression_mode": "",
         "relative_file_paths": [entry.name for entry in files],
         "files": [
-            {"path": entry.name, **dict(reversed(_times(entry.start_ns, entry.end_ns).items())), "message_count": entry.messages}
+            {
+                "path": entry.name,
+                **dict(reversed(_times(entry.start_ns, entry.end_ns).items())),
+                "message_count": entry.messages,
+            }
             for entry in files
         ],
-        "custom_data": None, "ros_distro": ROS_DISTRO,
-    }  # fmt: skip
+        "custom_data": None,
+        "ros_distro": ROS_DISTRO,
+    }
     # No YAML aliases, because rosbag2's reader does not support them.
     return str(yaml.dump({"rosbag2_bagfile_information": information}, Dumper=_PlainDumper, sort_keys=False))
 
 
 def _times(start_ns: int, end_ns: int) -> dict[str, dict[str, int]]:
-    return {"duration": {"nanoseconds": end_ns - start_ns}, "starting_time": {"nanoseconds_since_epoch": start_ns}}
+    return {
+        "duration": {"nanoseconds": end_ns - start_ns},
+        "starting_time": {"nanoseconds_since_epoch": start_ns},
+    }
 
 
 class _PlainDumper(_DUMPER):

@@ -41,7 +41,11 @@ class PartWriter:
     """
 
     def __init__(
-        self, path: Path, attachments: Mapping[str, bytes], metadata: Mapping[str, str], attached_ns: int | None = None
+        self,
+        path: Path,
+        attachments: Mapping[str, bytes],
+        metadata: Mapping[str, str],
+        attached_ns: int | None = None,
     ) -> None:
         self.path = path
         self.contents = Contents()

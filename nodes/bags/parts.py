@@ -68,7 +68,9 @@ def _parts_with(file: Path) -> tuple[Path, ...]:
     if not _is_named_after_folder(file):
         return (file,)
     name = file.absolute().parent.name
-    numbered = [each for each in _files(file.parent) if _numbered(each)[0] == name and each.suffix == file.suffix]
+    numbered = [
+        each for each in _files(file.parent) if _numbered(each)[0] == name and each.suffix == file.suffix
+    ]
     return _by_number(file.parent, numbered)
 
 
@@ -77,7 +79,9 @@ def _files(folder: Path) -> list[Path]:
     if not folder.is_dir():
         return []
     for suffix in SUFFIXES:
-        files = sorted(file for file in folder.glob(f"*{suffix}") if not file.name.startswith(".") and file.is_file())
+        files = sorted(
+            file for file in folder.glob(f"*{suffix}") if not file.name.startswith(".") and file.is_file()
+        )
         if files:
             return files
     return []
@@ -123,7 +127,9 @@ def _names_in(path: Path, mtime_ns: int, size_bytes: int) -> tuple[str, ...]:
             f"{path}: expected the metadata of a rosbag2 bag, got an unreadable file ({said:.120}); {advice}"
         ) from error
     if not all(names):
-        raise BagError(f"{path}: expected names of files under relative_file_paths, got an empty one; {advice}")
+        raise BagError(
+            f"{path}: expected names of files under relative_file_paths, got an empty one; {advice}"
+        )
     return names
 
 
@@ -136,7 +142,9 @@ def _with_unlisted(folder: Path, listed: tuple[str, ...]) -> tuple[Path, ...]:
     bag_name, last = _numbered(parts[-1])
     if last < 0:
         return tuple(parts)
-    later = {number: file for file in _files(folder) for name, number in [_numbered(file)] if name == bag_name}
+    later = {
+        number: file for file in _files(folder) for name, number in [_numbered(file)] if name == bag_name
+    }
     for number in range(last + 1, max(later, default=last) + 1):
         if number not in later:
             raise _missing(folder, f"{bag_name}_{number}{parts[-1].suffix}", "but a later one exists")
@@ -162,7 +170,9 @@ def _by_number(folder: Path, files: list[Path]) -> tuple[Path, ...]:
 
 def _no_bag(folder: Path) -> BagError:
     """Error about a folder without a bag, or a missing folder."""
-    expected = f"expected a bag folder with {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]} files, or one such file"
+    expected = (
+        f"expected a bag folder with {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]} files, or one such file"
+    )
     if not folder.is_dir():
         return BagError(f"{folder} does not exist; {expected}")
     names = sorted(file.name + ("/" if file.is_dir() else "") for file in folder.iterdir())

@@ -126,13 +126,16 @@ def read_info(bag: Path) -> BagInfo:
     for topic in (topic for part in parts for topic in part.topics):
         topics[topic.name] = _sum(topics[topic.name], topic) if topic.name in topics else topic
     return BagInfo(
-        parts[0].path if len(parts) == 1 else parts[0].path.parent, tuple(part.path for part in parts),
-        sum(part.size_bytes for part in parts), min((part.start_ns for part in filled), default=0),
-        max((part.end_ns for part in filled), default=0), tuple(topics[name] for name in sorted(topics)),
+        parts[0].path if len(parts) == 1 else parts[0].path.parent,
+        tuple(part.path for part in parts),
+        sum(part.size_bytes for part in parts),
+        min((part.start_ns for part in filled), default=0),
+        max((part.end_ns for part in filled), default=0),
+        tuple(topics[name] for name in sorted(topics)),
         tuple(dict.fromkeys(name for part in parts for name in part.attachments)),
         next((part.metadata for part in parts if part.metadata), {}),
         next((part.unchecked for part in parts if part.unchecked), ""),
-    )  # fmt: skip
+    )
 
 
 def read_attachment(bag: Path, name: str) -> bytes:
@@ -157,7 +160,9 @@ def read_attachments(bag: Path) -> dict[str, bytes]:
 def _attachments(path: Path, names: Sequence[str]) -> dict[str, bytes]:
     summary, _ = _whole_file(path)
     with open_bag(path) as file:
-        found = [read_attachment_at(file, index) for index in summary.attachment_indexes if index.name in names]
+        found = [
+            read_attachment_at(file, index) for index in summary.attachment_indexes if index.name in names
+        ]
     return {attachment.name: bytes(attachment.data) for attachment in found}
 
 
@@ -171,7 +176,9 @@ def extract_attachments(bag: Path, folder: Path, names: Sequence[str] = ()) -> l
     """
     contents = read_attachments(bag)
     if unknown := [name for name in names if name not in contents]:
-        raise BagError(f"{bag} has no attachment {', '.join(unknown)}; it has {', '.join(contents) or 'none'}")
+        raise BagError(
+            f"{bag} has no attachment {', '.join(unknown)}; it has {', '.join(contents) or 'none'}"
+        )
     targets = {name: Path(folder) / plain_name(bag, name) for name in names or contents}
     for target in targets.values():
         if target.exists():
@@ -184,14 +191,19 @@ def extract_attachments(bag: Path, folder: Path, names: Sequence[str] = ()) -> l
 def plain_name(bag: Path, name: str) -> str:
     """Check that the name of an attachment is a plain file name, so that a foreign bag cannot write to other folders."""
     if name in ("", ".", "..") or Path(name).name != name or "\0" in name:
-        raise BagError(f"{bag}: expected attachments with plain file names, got {name!r}; it is not extracted")
+        raise BagError(
+            f"{bag}: expected attachments with plain file names, got {name!r}; it is not extracted"
+        )
     return name
 
 
 def read_messages(
-    bag: Path, topics: Sequence[str] | None = None, start_offset_s: float = 0.0, types: Mapping[str, str] | None = None,
+    bag: Path,
+    topics: Sequence[str] | None = None,
+    start_offset_s: float = 0.0,
+    types: Mapping[str, str] | None = None,
     as_recorded: bool = False,
-) -> Iterator[BagMessage]:  # fmt: skip
+) -> Iterator[BagMessage]:
     """Yield messages in order of their log time.
 
     Messages on topics of the topic table have the table's type. If a bag has another definition of the type, or an equivalent type
@@ -225,7 +237,9 @@ def read_messages(
     sources = [
         Source(part.start_ns, partial(_messages_of, part, wanted, start_ns, converters))
         for part in _parts(bag)
-        if part.messages and part.end_ns >= start_ns and not wanted.isdisjoint(topic.name for topic in part.topics)
+        if part.messages
+        and part.end_ns >= start_ns
+        and not wanted.isdisjoint(topic.name for topic in part.topics)
         for converters in [{} if as_recorded else _converters(part, wanted, types or {})]
     ]
     yield from merge_by_time(sources, lambda message: message.log_ns)
@@ -252,7 +266,9 @@ def _mcap_messages(part: _Part, names: Mapping[int, str], start_ns: int) -> Iter
             yield raw.channel_id, BagMessage(names[raw.channel_id], raw.data, *times)
 
 
-def _stored_messages(part: _Part, names: Mapping[int, str], start_ns: int) -> Iterator[tuple[int, BagMessage]]:
+def _stored_messages(
+    part: _Part, names: Mapping[int, str], start_ns: int
+) -> Iterator[tuple[int, BagMessage]]:
     """Yield the messages of a file in another format than MCAP. Publish times and sequence numbers are generated."""
     counts = dict.fromkeys(names.values(), 0)
     for number, log_ns, data in stored_messages(part.path, part.format, names, start_ns):
@@ -277,7 +293,11 @@ def _converters(part: _Part, topics: frozenset[str], types: Mapping[str, str]) -
     found = {}
     for number, recorded in part.recorded.items():
         expected = types.get(recorded.topic) or type_of_topic(recorded.topic)
-        if recorded.topic in topics and expected and (convert := converter(recorded, expected, str(part.path))):
+        if (
+            recorded.topic in topics
+            and expected
+            and (convert := converter(recorded, expected, str(part.path)))
+        ):
             found[number] = convert
     return found
 
@@ -326,11 +346,18 @@ def _part_of(path: Path, mtime_ns: int, size_bytes: int) -> _Part | None:
         topic = TopicInfo(channel.topic, type_of(summary, channel), count, lost)
         topics[channel.topic] = _sum(topics[channel.topic], topic) if channel.topic in topics else topic
     return _Part(
-        path, form, size_bytes, statistics.message_start_time, statistics.message_end_time, statistics.message_count,
-        tuple(topics.values()), {channel.id: _recorded(summary, channel) for channel in summary.channels.values()},
-        tuple(index.name for index in summary.attachment_indexes), records.get("advnerf", {}),
+        path,
+        form,
+        size_bytes,
+        statistics.message_start_time,
+        statistics.message_end_time,
+        statistics.message_count,
+        tuple(topics.values()),
+        {channel.id: _recorded(summary, channel) for channel in summary.channels.values()},
+        tuple(index.name for index in summary.attachment_indexes),
+        records.get("advnerf", {}),
         summary.unchecked,
-    )  # fmt: skip
+    )
 
 
 def _stored_part(path: Path, form: Format, size_bytes: int) -> _Part:
@@ -340,18 +367,30 @@ def _stored_part(path: Path, form: Format, size_bytes: int) -> _Part:
         topic = TopicInfo(recorded.topic, recorded.type, count, None)
         topics[topic.name] = _sum(topics[topic.name], topic) if topic.name in topics else topic
     return _Part(
-        path, form, size_bytes, stored.start_ns, stored.end_ns, stored.messages, tuple(topics.values()),
-        {number: recorded for number, recorded, _ in stored.topics}, (), {}, no_checksums(form),
-    )  # fmt: skip
+        path,
+        form,
+        size_bytes,
+        stored.start_ns,
+        stored.end_ns,
+        stored.messages,
+        tuple(topics.values()),
+        {number: recorded for number, recorded, _ in stored.topics},
+        (),
+        {},
+        no_checksums(form),
+    )
 
 
 def _recorded(summary: Summary, channel: Channel) -> RecordedTopic:
     schema = summary.schemas.get(channel.schema_id)
     return RecordedTopic(
-        channel.topic, type_of(summary, channel), channel.metadata.get("topic_type_hash", ""),
-        "" if schema is None else schema.data.decode("utf-8", "replace"), "" if schema is None else schema.encoding,
+        channel.topic,
+        type_of(summary, channel),
+        channel.metadata.get("topic_type_hash", ""),
+        "" if schema is None else schema.data.decode("utf-8", "replace"),
+        "" if schema is None else schema.encoding,
         channel.message_encoding,
-    )  # fmt: skip
+    )
 
 
 def _whole_file(path: Path) -> tuple[FileSummary, Statistics]:

@@ -88,7 +88,9 @@ def chunk_head(buffer: Any, body: int, length: int | None) -> ChunkHead:
     except (struct.error, UnicodeDecodeError) as error:
         raise Damaged("its head is invalid") from error
     if length is not None and data_length != length - CHUNK_HEAD_BYTES - name_length:
-        raise Damaged(f"its two lengths do not agree: {length} bytes for the record, {data_length} for the data in it")
+        raise Damaged(
+            f"its two lengths do not agree: {length} bytes for the record, {data_length} for the data in it"
+        )
     return ChunkHead(start_ns, end_ns, size, crc, compression, at + 8, data_length)
 
 
@@ -160,7 +162,9 @@ def checked_attachment(body: bytes) -> tuple[Attachment, bool]:
     record = parse(Attachment, body)
     crc = int.from_bytes(body[-4:], "little")
     if crc and (found := zlib.crc32(memoryview(body)[:-4])) != crc:
-        raise Damaged(f"the checksum of the attachment {record.name} is {crc:08x}, that of its content {found:08x}")
+        raise Damaged(
+            f"the checksum of the attachment {record.name} is {crc:08x}, that of its content {found:08x}"
+        )
     return record, bool(crc)
 
 

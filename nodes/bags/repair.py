@@ -126,9 +126,13 @@ def repair(bag: Path, force: bool = False, keep_original: bool = True, in_place:
         TopicRepair(name, known.get(name), after) for name, after in sorted(contents_of(scan).counts.items())
     )
     gone = tuple(
-        TopicRepair(name, count, 0) for name, count in sorted(known.items()) if name not in {t.name for t in topics}
+        TopicRepair(name, count, 0)
+        for name, count in sorted(known.items())
+        if name not in {t.name for t in topics}
     )
-    return Repaired(path, scan.messages, cut, False, kept, topics + gone, losses, tuple(scan.fixes), scan.unchecked)
+    return Repaired(
+        path, scan.messages, cut, False, kept, topics + gone, losses, tuple(scan.fixes), scan.unchecked
+    )
 
 
 def examine(path: Path) -> Scan:
@@ -346,10 +350,16 @@ def _chunk_piece(data: bytes, entries: list[Entry], indexes: dict[int, list[tupl
         offsets[channel_id] = builder.count
         MessageIndex(channel_id, rows).write(builder)
     record = ChunkIndex(
-        chunk_length=length, chunk_start_offset=0, compression="", compressed_size=len(data), message_end_time=end_ns,
-        message_index_length=builder.count - length, message_index_offsets=offsets, message_start_time=start_ns,
+        chunk_length=length,
+        chunk_start_offset=0,
+        compression="",
+        compressed_size=len(data),
+        message_end_time=end_ns,
+        message_index_length=builder.count - length,
+        message_index_offsets=offsets,
+        message_start_time=start_ns,
         uncompressed_size=len(data),
-    )  # fmt: skip
+    )
     return Piece(0, 0, record, bytes(builder.end()))
 
 
@@ -358,7 +368,9 @@ def _introduce(builder: RecordBuilder, scan: Scan, topic: str, channel_id: int) 
     typename = topic_row(topic).type
     known = {schema.name: schema.id for schema in scan.schemas.values()}
     if typename not in known:
-        schema = Schema(max(scan.schemas, default=0) + 1, type_definition(typename).encode(), "ros2msg", typename)
+        schema = Schema(
+            max(scan.schemas, default=0) + 1, type_definition(typename).encode(), "ros2msg", typename
+        )
         scan.schemas[schema.id] = schema
         schema.write(builder)
         known[typename] = schema.id

@@ -13,7 +13,9 @@ from nodes.bags.whole import read_summary
 from nodes.runtime.errors import BagError
 
 
-def repair_bag(bag: Path, force: bool = False, keep_original: bool = True, in_place: bool = False) -> list[Repaired]:
+def repair_bag(
+    bag: Path, force: bool = False, keep_original: bool = True, in_place: bool = False
+) -> list[Repaired]:
     """Repair every part of a bag.
 
     Args:
@@ -66,7 +68,9 @@ def _contents(part: Path) -> Contents:
     """Contents of an intact file according to its summary."""
     found = read_summary(part)
     if found is None:
-        raise BagError(f"{part}: expected a summary with statistics after the repair, got none; repair it again")
+        raise BagError(
+            f"{part}: expected a summary with statistics after the repair, got none; repair it again"
+        )
     summary, statistics = found
     contents = Contents(start_ns=statistics.message_start_time, end_ns=statistics.message_end_time)
     for channel in summary.channels.values():

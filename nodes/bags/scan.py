@@ -170,7 +170,9 @@ class Scan:
     @property
     def whole(self) -> bool:
         """Whether the file is intact."""
-        wrong = self.losses or self.fixes or self.lost_definitions or self.summary_damage or self.data_crc_wrong
+        wrong = (
+            self.losses or self.fixes or self.lost_definitions or self.summary_damage or self.data_crc_wrong
+        )
         return self.complete and not wrong
 
     @property
@@ -190,9 +192,10 @@ class Scan:
         last = max((piece.offset for piece in self.pieces if piece.length), default=0)
         tail_is_fine = self.ending is None and self.data_end is None
         return [
-            loss for loss in self.losses
+            loss
+            for loss in self.losses
             if not loss.harmless and (not tail_is_fine or loss.offset < last or loss.kind == JUNK)
-        ]  # fmt: skip
+        ]
 
 
 def scan_file(path: Path) -> Scan:
@@ -255,7 +258,9 @@ class _Scanner:
             opcode, body, end = record_at(buffer, at, self._limit)
             parse(Header, buffer[body:end] if opcode == Opcode.HEADER else b"")
         except Damaged:
-            raise BagError(f"{self._path}: expected an MCAP file, got another beginning; give an MCAP file") from None
+            raise BagError(
+                f"{self._path}: expected an MCAP file, got another beginning; give an MCAP file"
+            ) from None
         self.found.fixes.append("its first eight bytes were damaged")
         return at
 
@@ -273,11 +278,15 @@ class _Scanner:
             self._take_message(at, body, end)
         elif opcode == Opcode.ATTACHMENT:
             a, _ = checked_attachment(self._buffer[body:end])
-            index = AttachmentIndex(at, end - at, a.log_time, a.create_time, len(a.data), a.name, a.media_type)
+            index = AttachmentIndex(
+                at, end - at, a.log_time, a.create_time, len(a.data), a.name, a.media_type
+            )
             self.found.pieces.append(Piece(at, end - at, index))
         elif opcode == Opcode.METADATA:
             name = parse(Metadata, self._buffer[body:end]).name
-            self.found.pieces.append(Piece(at, end - at, MetadataIndex(offset=at, length=end - at, name=name)))
+            self.found.pieces.append(
+                Piece(at, end - at, MetadataIndex(offset=at, length=end - at, name=name))
+            )
         elif opcode == Opcode.DATA_END:
             self._take_data_end(at, body, end)
         elif opcode in _SUMMARY_ONLY or opcode in (Opcode.ATTACHMENT_INDEX, Opcode.METADATA_INDEX):
@@ -343,9 +352,14 @@ class _Scanner:
             self._lose_chunk(at, end, head, str(error))
 
     def _commit(
-        self, at: int, end: int, head: ChunkHead, records: bytes,
-        definitions: list[Schema | Channel], messages: list[tuple[int, int, int, int]],
-    ) -> None:  # fmt: skip
+        self,
+        at: int,
+        end: int,
+        head: ChunkHead,
+        records: bytes,
+        definitions: list[Schema | Channel],
+        messages: list[tuple[int, int, int, int]],
+    ) -> None:
         for definition in definitions:
             if isinstance(definition, Schema):
                 self.found.schemas[definition.id] = definition
@@ -358,16 +372,32 @@ class _Scanner:
         self.found.unchecked_chunks += head.crc == 0 and bool(messages)
         times = [log_ns for _, _, log_ns, _ in messages] or [head.start_ns, head.end_ns]
         index = ChunkIndex(
-            chunk_length=end - at, chunk_start_offset=at, compression=head.compression, compressed_size=head.data_length,
-            message_end_time=max(times), message_index_length=0, message_index_offsets={}, message_start_time=min(times),
+            chunk_length=end - at,
+            chunk_start_offset=at,
+            compression=head.compression,
+            compressed_size=head.data_length,
+            message_end_time=max(times),
+            message_index_length=0,
+            message_index_offsets={},
+            message_start_time=min(times),
             uncompressed_size=len(records),
-        )  # fmt: skip
-        self._chunk, self._entries, self._indexed, self._index_wrong = Piece(at, end - at, index), entries, {}, False
-        fits = RECORD_HEAD.pack(Opcode.CHUNK, end - at - RECORD_HEAD.size) == self._buffer[at : at + RECORD_HEAD.size]
+        )
+        self._chunk, self._entries, self._indexed, self._index_wrong = (
+            Piece(at, end - at, index),
+            entries,
+            {},
+            False,
+        )
+        fits = (
+            RECORD_HEAD.pack(Opcode.CHUNK, end - at - RECORD_HEAD.size)
+            == self._buffer[at : at + RECORD_HEAD.size]
+        )
         if not fits or (head.start_ns, head.end_ns, head.size) != (min(times), max(times), len(records)):
             self.found.fixes.append(f"the head of the chunk at byte {at} did not agree with its content")
             data = self._buffer[head.data_at : end]
-            self._chunk.content = _record(Chunk(head.compression, data, max(times), min(times), head.crc, len(records)))
+            self._chunk.content = _record(
+                Chunk(head.compression, data, max(times), min(times), head.crc, len(records))
+            )
 
     def _chunk_in_disguise(self, at: int) -> tuple[int, ChunkHead, bytes] | None:
         """End, head and records of a chunk that certainly begins here, even if opcode and length of its record are damaged."""
@@ -401,7 +431,9 @@ class _Scanner:
             self._note_harmless(at, end, "a message index belongs to no chunk")
         else:
             # Some writers also list channels without messages.
-            wrong = sorted(entries) != sorted(self._entries.get(channel_id, [])) or channel_id in self._indexed
+            wrong = (
+                sorted(entries) != sorted(self._entries.get(channel_id, [])) or channel_id in self._indexed
+            )
             self._index_wrong |= wrong
             self._indexed[channel_id] = at
             self._chunk.length += end - at
@@ -463,14 +495,18 @@ class _Scanner:
         buffer, limit, found = self._buffer, self._limit, self.found
         opcode = buffer[at]
         if only_zeros(buffer, at):
-            found.losses.append(Loss(at, limit - at, f"{limit - at} zeros", "nothing was written there", ZEROS))
+            found.losses.append(
+                Loss(at, limit - at, f"{limit - at} zeros", "nothing was written there", ZEROS)
+            )
             return limit
         if found.known is not None and limit - at <= DATA_END_BYTES:
             self._note_harmless(at, limit, "the end of the data is damaged")
             return limit
         bad, self._bad_chunk = self._bad_chunk, None
         if self._is_cut(at):
-            found.losses.append(Loss(at, limit - at, _KINDS.get(opcode, "a record"), "the file ends in it", CUT))
+            found.losses.append(
+                Loss(at, limit - at, _KINDS.get(opcode, "a record"), "the file ends in it", CUT)
+            )
             return limit
         after = self._next(at, opcode)
         end = limit if after is None else after
@@ -506,7 +542,9 @@ class _Scanner:
         inside = [index for index in indexes if at <= index.chunk_start_offset < end]
         if not inside:
             return None
-        return min(index.message_start_time for index in inside), max(index.message_end_time for index in inside)
+        return min(index.message_start_time for index in inside), max(
+            index.message_end_time for index in inside
+        )
 
     def _runs_over(self, at: int) -> bool:
         """Whether the record that begins here would end after the end of the file."""
@@ -540,7 +578,12 @@ class _Scanner:
             end = record_at(self._buffer, at, self._limit)[2]
             if end < self._limit and makes_sense(self._buffer, end, self._limit, channels, messages=True):
                 return end  # only the content of this record is damaged, not its length
-        if known is not None and known.statistics is not None and known.statistics.chunk_count and not found.runs:
+        if (
+            known is not None
+            and known.statistics is not None
+            and known.statistics.chunk_count
+            and not found.runs
+        ):
             places = sorted(
                 [index.chunk_start_offset for index in known.chunk_indexes]
                 + [attachment.offset for attachment in known.attachment_indexes]
@@ -577,7 +620,9 @@ class _Scanner:
         found = self.found
         known = found.known if found.known is not None else Summary()
         for channel_id in sorted(found.counts.keys() - found.channels.keys()):
-            channel = known.channels.get(channel_id) or Channel(channel_id, f"/unnamed_channel_{channel_id}", "", {}, 0)
+            channel = known.channels.get(channel_id) or Channel(
+                channel_id, f"/unnamed_channel_{channel_id}", "", {}, 0
+            )
             found.channels[channel_id] = channel
             found.lost_definitions.append(channel)
         for channel in list(found.channels.values()):
@@ -607,7 +652,10 @@ class _Scanner:
             for piece in found.pieces
             if isinstance(piece.record, ChunkIndex)
         }
-        if known.chunk_indexes and {(i.chunk_start_offset, i.chunk_length) for i in known.chunk_indexes} != chunks:
+        if (
+            known.chunk_indexes
+            and {(i.chunk_start_offset, i.chunk_length) for i in known.chunk_indexes} != chunks
+        ):
             return "its summary lists other chunks than it has"
         return ""
 

@@ -58,10 +58,11 @@ def _delays(times_ns: list[tuple[int, int, int]]) -> Delays:
     return Delays(
         float(np.median(published)) if published else None,
         max(published, default=None),
-        float(np.median(received)), max(received),
+        float(np.median(received)),
+        max(received),
         sum(after[0] < before[0] for before, after in pairwise(stamped)),
         sum(stamp > log for stamp, _, log in stamped),
-    )  # fmt: skip
+    )
 
 
 def _begins_with_stamp(topic: str, typename: str) -> bool:

@@ -61,9 +61,13 @@ def converter(recorded: RecordedTopic, expected: str, source: str) -> Convert | 
         if reshape is None:
             others = _ACCEPTED.get(expected)
             also = f" (or {', '.join(others)})" if others else ""
-            raise BagError(f"{source}: {recorded.topic} is {recorded.type or 'of no type'}, expected {expected}{also}")
+            raise BagError(
+                f"{source}: {recorded.topic} is {recorded.type or 'of no type'}, expected {expected}{also}"
+            )
     if recorded.serialization not in (CDR, ROS1):
-        raise BagError(f"{source}: {recorded.topic} is stored as {recorded.serialization!r}, expected {CDR} or {ROS1}")
+        raise BagError(
+            f"{source}: {recorded.topic} is stored as {recorded.serialization!r}, expected {CDR} or {ROS1}"
+        )
     ros1 = recorded.serialization == ROS1
     definition = _foreign_definition(recorded, source)
     if definition is None and reshape is None:

@@ -58,7 +58,9 @@ def read_summary_section(buffer: Any, ending: Ending) -> Summary:
     end = ending.footer_at + FOOTER_BYTES - _CRC_BYTES
     content = bytes(buffer[ending.summary_start : end])
     if ending.summary_crc and (found := zlib.crc32(content)) != ending.summary_crc:
-        raise Damaged(f"the checksum of its summary is {ending.summary_crc:08x}, that of its content {found:08x}")
+        raise Damaged(
+            f"the checksum of its summary is {ending.summary_crc:08x}, that of its content {found:08x}"
+        )
     summary, at, limit = Summary(), 0, ending.footer_at - ending.summary_start
     while at < limit:
         opcode, body, at = record_at(content, at, limit)

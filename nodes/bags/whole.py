@@ -90,7 +90,9 @@ def _lists_everything(buffer: Any, ending: Ending, summary: Summary) -> bool:
 
 def _from_data(path: Path) -> tuple[FileSummary, Statistics]:
     scan = scan_file(path)
-    advice = f"advnerf bag info {path} lists what is damaged, advnerf bag repair {path} keeps what can be kept"
+    advice = (
+        f"advnerf bag info {path} lists what is damaged, advnerf bag repair {path} keeps what can be kept"
+    )
     if scan.summary_damage:
         raise BagError(f"{path} is damaged: {scan.summary_damage}; {advice}")
     if scan.losses:
@@ -115,9 +117,14 @@ def summary_of(scan: Scan) -> tuple[FileSummary, Statistics]:
         elif piece.record is not None:
             summary.metadata_indexes.append(piece.record)
     summary.statistics = statistics = Statistics(
-        attachment_count=len(summary.attachment_indexes), channel_count=len(scan.channels),
-        channel_message_counts=dict(scan.counts), chunk_count=len(summary.chunk_indexes), message_count=scan.messages,
-        message_end_time=scan.end_ns, message_start_time=scan.start_ns, metadata_count=len(summary.metadata_indexes),
+        attachment_count=len(summary.attachment_indexes),
+        channel_count=len(scan.channels),
+        channel_message_counts=dict(scan.counts),
+        chunk_count=len(summary.chunk_indexes),
+        message_count=scan.messages,
+        message_end_time=scan.end_ns,
+        message_start_time=scan.start_ns,
+        metadata_count=len(summary.metadata_indexes),
         schema_count=len(scan.schemas),
-    )  # fmt: skip
+    )
     return summary, statistics

@@ -202,9 +202,7 @@ class BagWriter:
             messages = sum(part.messages for part in repair_bag(self.folder, in_place=True))
             saved = f"{messages} messages up to that point are readable"
         except (BagError, OSError) as second:
-            saved = (
-                f"and it could not be finished ({second}); free some space and run: advnerf bag repair {self.folder}"
-            )
+            saved = f"and it could not be finished ({second}); free some space and run: advnerf bag repair {self.folder}"
         raise BagError(f"cannot continue recording to {self.folder}: {error.strerror}; {saved}") from error
 
     def _hold_reserve(self) -> None:

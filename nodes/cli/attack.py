@@ -10,7 +10,8 @@ import typer
 from nodes.runtime.terminal import Overrides, print_table, table
 
 app = typer.Typer(
-    no_args_is_help=True, help="Search for textures and poses, go on with a search, look at and examine attacks."
+    no_args_is_help=True,
+    help="Search for textures and poses, go on with a search, look at and examine attacks.",
 )
 
 RequestFile = Annotated[Path, typer.Argument(help="A *.attack.yaml file.", exists=True, dir_okay=False)]
@@ -32,7 +33,9 @@ def attack_run(
 
 
 @app.command("resume")
-def attack_resume(folder: Annotated[Path, typer.Argument(help="Folder of 'advnerf attack run'.", exists=True)]) -> None:
+def attack_resume(
+    folder: Annotated[Path, typer.Argument(help="Folder of 'advnerf attack run'.", exists=True)],
+) -> None:
     """Go on with a search that was stopped or killed; on a CPU to the bit."""
     from nodes.experiment.request.search import kept_request
 
@@ -82,8 +85,14 @@ def attack_show(
         "drive without attack": "not driven"
         if clean is None
         else clean.in_words.removeprefix("drive without attack: "),
-        **({} if clean is None else {"of each start": ", ".join(f"{value:.2f} m" for value in clean.total_cte_m)}),
-        "face": "none" if face is None else f"{face.size_m[0]:.3f} x {face.size_m[1]:.3f} m on {face.subject}",
+        **(
+            {}
+            if clean is None
+            else {"of each start": ", ".join(f"{value:.2f} m" for value in clean.total_cte_m)}
+        ),
+        "face": "none"
+        if face is None
+        else f"{face.size_m[0]:.3f} x {face.size_m[1]:.3f} m on {face.subject}",
         "camera": f"{attack.camera.width} x {attack.camera.height}",
         "scene": attack.scene_sha256,
         "policy": attack.policy_sha256,
@@ -97,7 +106,9 @@ def attack_show(
     for each in attack.objects:
         x_m, y_m, yaw_rad, scale = each.placement
         place = (x_m, y_m, float(each.T_world_from_object[2, 3]), yaw_rad, scale)
-        things.add_row(each.name, " x ".join(map(str, each.theta.shape)), *(f"{value:.3f}" for value in place))
+        things.add_row(
+            each.name, " x ".join(map(str, each.theta.shape)), *(f"{value:.3f}" for value in place)
+        )
     print_table(things)
     if clean is not None and clean.warning:
         print(clean.warning)
@@ -110,9 +121,13 @@ def attack_check(
     file: RequestFile,
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", help="Folder of check.json and check.png.", show_default="runs/<name>"),
+        typer.Option(
+            "--output", "-o", help="Folder of check.json and check.png.", show_default="runs/<name>"
+        ),
     ] = None,
-    directions: Annotated[int, typer.Option("--directions", min=2, help="Random directions of each comparison.")] = 8,
+    directions: Annotated[
+        int, typer.Option("--directions", min=2, help="Random directions of each comparison.")
+    ] = 8,
     memory: Annotated[bool, typer.Option(help="Also measure peak memory against the horizon.")] = True,
     overrides: Overrides = None,
 ) -> None:

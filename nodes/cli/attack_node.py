@@ -23,7 +23,10 @@ def attack_request(
     file: Annotated[Path, typer.Argument(help="A *.attack.yaml file.", exists=True, dir_okay=False)],
     run_dir: RunDir = None,
     request_id: Annotated[
-        str, typer.Option("--id", help="Name of the request; the same again goes on.", show_default="<name>-<time>")
+        str,
+        typer.Option(
+            "--id", help="Name of the request; the same again goes on.", show_default="<name>-<time>"
+        ),
     ] = "",
     follow: Annotated[bool, typer.Option(help="Wait for the end; Ctrl-C only stops waiting.")] = True,
     overrides: Overrides = None,
@@ -51,7 +54,9 @@ def attack_request(
 
 def attack_cancel(
     run_dir: RunDir = None,
-    request_id: Annotated[str, typer.Option("--id", help="Only this request.", show_default="whichever it is")] = "",
+    request_id: Annotated[
+        str, typer.Option("--id", help="Only this request.", show_default="whichever it is")
+    ] = "",
     reason: Annotated[str, typer.Option("--reason", help="Why, for the record.")] = "",
 ) -> None:
     """End the search of a running attack node; what was found so far stays in its folder."""

@@ -17,9 +17,13 @@ Output = Annotated[
 ]
 FoundAttack = Annotated[
     Path | None,
-    typer.Option("--attack", help="An attack file that gives poses and colours; without it, those of the request.",
-                 exists=True, dir_okay=False),
-]  # fmt: skip
+    typer.Option(
+        "--attack",
+        help="An attack file that gives poses and colours; without it, those of the request.",
+        exists=True,
+        dir_okay=False,
+    ),
+]
 
 
 def attack_poses(file: RequestFile, output: Output = None, overrides: Overrides = None) -> None:
@@ -39,7 +43,9 @@ def attack_poses(file: RequestFile, output: Output = None, overrides: Overrides 
         attack = load_attack(each)
         for k, found in enumerate(attack.objects):
             total = f"{attack.predicted_total_cte_m:.1f}" if k == 0 else ""
-            rows.add_row(attack.attack_id if k == 0 else "", str(k), *(f"{v:.3f}" for v in found.placement), total)
+            rows.add_row(
+                attack.attack_id if k == 0 else "", str(k), *(f"{v:.3f}" for v in found.placement), total
+            )
     print_table(rows)
     print_attacks(files)
 
@@ -86,9 +92,13 @@ def attack_robustness(
         found, picture = make_robustness(request, folder, attack, display.start("robustness"))
     ratios = found.total_cte_m / found.plain_cte_m
     clear = ratios[np.isfinite(ratios)]
-    text = "no move leaves the lane clear" if not len(clear) else (
-        f"ratio to plain colours: median {np.median(clear):.2f}, {clear.min():.2f} to {clear.max():.2f} over {len(clear)} cells"
-    )  # fmt: skip
+    text = (
+        "no move leaves the lane clear"
+        if not len(clear)
+        else (
+            f"ratio to plain colours: median {np.median(clear):.2f}, {clear.min():.2f} to {clear.max():.2f} over {len(clear)} cells"
+        )
+    )
     print(f"{text}: {picture}")
 
 

@@ -16,7 +16,9 @@ if TYPE_CHECKING:
 
 _DAMAGED_EXIT = 2  # as for every bag that cannot be read
 
-app = typer.Typer(no_args_is_help=True, help="Record, inspect, play and repair bags (MCAP, as rosbag2 writes them).")
+app = typer.Typer(
+    no_args_is_help=True, help="Record, inspect, play and repair bags (MCAP, as rosbag2 writes them)."
+)
 
 
 @app.command("info")
@@ -55,8 +57,12 @@ def bag_info(
     print(checked_line(info, quick))
     rows = table("topic", "type", "messages", "rate", "lost")
     for topic in info.topics:
-        rate = f"{(topic.count - 1) / info.duration_s:.1f} Hz" if topic.count > 1 and info.duration_s > 0 else ""
-        rows.add_row(topic.name, topic.type, str(topic.count), rate, "?" if topic.lost is None else str(topic.lost))
+        rate = (
+            f"{(topic.count - 1) / info.duration_s:.1f} Hz" if topic.count > 1 and info.duration_s > 0 else ""
+        )
+        rows.add_row(
+            topic.name, topic.type, str(topic.count), rate, "?" if topic.lost is None else str(topic.lost)
+        )
     print_table(rows)
     if stamps:
         _print_delays(bag)
@@ -73,7 +79,13 @@ def _print_delays(bag: Path) -> None:
     from nodes.bags.stamps import read_delays
 
     rows = table(
-        "topic", "capture to publish [ms]", "worst", "to reception [ms]", "worst", "stamps that go back", "in future"
+        "topic",
+        "capture to publish [ms]",
+        "worst",
+        "to reception [ms]",
+        "worst",
+        "stamps that go back",
+        "in future",
     )
     for topic, delays in sorted(read_delays(bag).items()):
         published, worst = (
@@ -87,7 +99,9 @@ def _print_delays(bag: Path) -> None:
 @app.command("extract")
 def bag_extract(
     bag: Annotated[Path, typer.Argument(help="Bag folder, or a .mcap, .db3 or .bag file.", exists=True)],
-    names: Annotated[list[str] | None, typer.Argument(help="Attachments to extract.", show_default="all")] = None,
+    names: Annotated[
+        list[str] | None, typer.Argument(help="Attachments to extract.", show_default="all")
+    ] = None,
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the extracted files.")] = Path(),
 ) -> None:
     """Extract the attachments of a bag: the launch file of the run, the calibration and the attack."""
@@ -116,7 +130,11 @@ def bag_record(
     max_bag_size_mb: Annotated[
         float | None,
         typer.Option(
-            "--max-bag-size", metavar="MIB", min=0.1, help="Start a new file after this many MiB.", show_default="256"
+            "--max-bag-size",
+            metavar="MIB",
+            min=0.1,
+            help="Start a new file after this many MiB.",
+            show_default="256",
         ),
     ] = None,
     run_dir: RunDir = None,
@@ -142,7 +160,8 @@ def bag_play(
     rate: Annotated[float, typer.Option("--rate", min=0.001, help="Speed relative to the recording.")] = 1.0,
     loop: Annotated[bool, typer.Option("--loop", help="Start over at the end.")] = False,
     offset_s: Annotated[
-        float, typer.Option("--offset", "--start-offset", min=0.0, help="Skip this many seconds at the start.")
+        float,
+        typer.Option("--offset", "--start-offset", min=0.0, help="Skip this many seconds at the start."),
     ] = 0.0,
     duration_s: Annotated[
         float | None, typer.Option("--duration", min=0.001, help="Play this many seconds of the recording.")
@@ -155,15 +174,22 @@ def bag_play(
     paused: Annotated[bool, typer.Option("--paused", help="Start paused.")] = False,
     clock_hz: Annotated[
         float | None,
-        typer.Option("--clock", metavar="HZ", min=0.1, max=200.0, help="Publish the recorded time on /clock."),
+        typer.Option(
+            "--clock", metavar="HZ", min=0.1, max=200.0, help="Publish the recorded time on /clock."
+        ),
     ] = None,
     wait_for: Annotated[
         list[str] | None,
         typer.Option(
-            "--wait-for", metavar="TOPIC", help="Wait until this topic has a subscriber.", show_default="any topic"
+            "--wait-for",
+            metavar="TOPIC",
+            help="Wait until this topic has a subscriber.",
+            show_default="any topic",
         ),
     ] = None,
-    no_wait: Annotated[bool, typer.Option("--no-wait", help="Start at once, with or without subscribers.")] = False,
+    no_wait: Annotated[
+        bool, typer.Option("--no-wait", help="Start at once, with or without subscribers.")
+    ] = False,
     run_dir: RunDir = None,
 ) -> None:
     """Play a bag to the nodes of a run folder. Status and request topics are played only if --topics names them.
@@ -180,16 +206,26 @@ def bag_play(
 
     waiting = [] if no_wait else wait_for or None
     config = PlayerConfig(
-        bag=bag, rate=rate, loop=loop, start_offset_s=offset_s, duration_s=duration_s, topics=topics or None,
-        remap=_pairs(remap or []), paused=paused, clock_hz=clock_hz, wait_for=waiting,
-    )  # fmt: skip
+        bag=bag,
+        rate=rate,
+        loop=loop,
+        start_offset_s=offset_s,
+        duration_s=duration_s,
+        topics=topics or None,
+        remap=_pairs(remap or []),
+        paused=paused,
+        clock_hz=clock_hz,
+        wait_for=waiting,
+    )
     if run_dir is not None:
         run_dir.mkdir(parents=True, exist_ok=True)
     run = find_run_dir(run_dir)
     terminal = sys.stdin.fileno() if sys.stdin.isatty() else None
     if terminal is not None:
         print(HELP, flush=True)
-    raise typer.Exit(run_node(lambda context: PlayerNode(config, context.subscribers, terminal), "bag_play", run))
+    raise typer.Exit(
+        run_node(lambda context: PlayerNode(config, context.subscribers, terminal), "bag_play", run)
+    )
 
 
 def _pairs(texts: list[str]) -> dict[str, str]:
@@ -199,7 +235,9 @@ def _pairs(texts: list[str]) -> dict[str, str]:
     for text in texts:
         old, separator, new = text.partition(":=")
         if not separator or not old or not new:
-            raise BagError(f"--remap {text}: expected OLD:=NEW, for example /camera/image_raw:=/compositor/image")
+            raise BagError(
+                f"--remap {text}: expected OLD:=NEW, for example /camera/image_raw:=/compositor/image"
+            )
         if old in pairs:
             raise BagError(
                 f"--remap {text}: expected one new name per topic; {old} is already remapped to {pairs[old]}. Remove one of the two"
@@ -232,7 +270,8 @@ def bag_repair(
     force: Annotated[
         bool,
         typer.Option(
-            "--force", help="Repair even if this loses messages that are not at the end of an unfinished file."
+            "--force",
+            help="Repair even if this loses messages that are not at the end of an unfinished file.",
         ),
     ] = False,
     discard_original: Annotated[

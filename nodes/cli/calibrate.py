@@ -24,17 +24,25 @@ app = typer.Typer(
 
 cli_calibrate_display.add_to(app)
 
-Output = Annotated[Path, typer.Option("--output", "-o", help="YAML file to write. The plot is saved next to it.")]
+Output = Annotated[
+    Path, typer.Option("--output", "-o", help="YAML file to write. The plot is saved next to it.")
+]
 Source = Annotated[
-    Path | None, typer.Argument(help="Bag folder, or a .mcap, .db3 or .bag file.", exists=True, show_default="--live")
+    Path | None,
+    typer.Argument(help="Bag folder, or a .mcap, .db3 or .bag file.", exists=True, show_default="--live"),
 ]
 Live = Annotated[
     float,
     typer.Option(
-        "--live", min=0.0, metavar="SECONDS", help="Record the running launch for this many seconds and use that bag."
+        "--live",
+        min=0.0,
+        metavar="SECONDS",
+        help="Record the running launch for this many seconds and use that bag.",
     ),
 ]
-Lens = Annotated[Path, typer.Option("--lens", help="Lens file (calibrate intrinsics) or camera file.", exists=True)]
+Lens = Annotated[
+    Path, typer.Option("--lens", help="Lens file (calibrate intrinsics) or camera file.", exists=True)
+]
 Columns = Annotated[int, typer.Option("--columns", help="Squares per row of the ChArUco board.")]
 Rows = Annotated[int, typer.Option("--rows", help="Squares per column of the board.")]
 SquareM = Annotated[float, typer.Option("--square", help="Side of one square, measured on the print [m].")]
@@ -47,9 +55,14 @@ Legacy = Annotated[bool, typer.Option("--legacy", help="The board was generated 
 
 @app.command("board")
 def board(
-    output: Annotated[Path, typer.Option("--output", "-o", help="PNG file to print.")], columns: Columns = 6, rows: Rows = 6,
-    square_m: SquareM = 0.16, marker_m: MarkerM = None, dictionary: Dictionary = "DICT_4X4_50", legacy: Legacy = False,
-) -> None:  # fmt: skip
+    output: Annotated[Path, typer.Option("--output", "-o", help="PNG file to print.")],
+    columns: Columns = 6,
+    rows: Rows = 6,
+    square_m: SquareM = 0.16,
+    marker_m: MarkerM = None,
+    dictionary: Dictionary = "DICT_4X4_50",
+    legacy: Legacy = False,
+) -> None:
     """Draw a ChArUco board to print. Measure a square on the print and pass its size to the other commands."""
     import cv2
 
@@ -65,13 +78,26 @@ def board(
 
 @app.command("intrinsics")
 def intrinsics(
-    output: Output, source: Annotated[Path | None, typer.Argument(help="Bag, or folder of images.", exists=True, show_default="--live")] = None,
-    columns: Columns = 6, rows: Rows = 6, square_m: SquareM = 0.16, marker_m: MarkerM = None, dictionary: Dictionary = "DICT_4X4_50",
-    legacy: Legacy = False, every: Annotated[int, typer.Option("--every", min=1, help="Use only every N-th frame.")] = 1,
-    most: Annotated[int, typer.Option("--most", min=20, help="Use at most this many images, evenly spread.")] = 80,
-    model: Annotated[str, typer.Option("--model", help="Distortion model: none, two-radial (k1 k2 p1 p2) or three-radial.")] = "two-radial",
-    live_s: Live = 0.0, run_dir: RunDir = None,
-) -> None:  # fmt: skip
+    output: Output,
+    source: Annotated[
+        Path | None, typer.Argument(help="Bag, or folder of images.", exists=True, show_default="--live")
+    ] = None,
+    columns: Columns = 6,
+    rows: Rows = 6,
+    square_m: SquareM = 0.16,
+    marker_m: MarkerM = None,
+    dictionary: Dictionary = "DICT_4X4_50",
+    legacy: Legacy = False,
+    every: Annotated[int, typer.Option("--every", min=1, help="Use only every N-th frame.")] = 1,
+    most: Annotated[
+        int, typer.Option("--most", min=20, help="Use at most this many images, evenly spread.")
+    ] = 80,
+    model: Annotated[
+        str, typer.Option("--model", help="Distortion model: none, two-radial (k1 k2 p1 p2) or three-radial.")
+    ] = "two-radial",
+    live_s: Live = 0.0,
+    run_dir: RunDir = None,
+) -> None:
     """Calibrate focal length, principal point and distortion from images of a ChArUco board."""
     from calibration.charuco import BoardDetector
     from calibration.intrinsics import IntrinsicsConfig, calibrate_intrinsics
@@ -99,15 +125,37 @@ def intrinsics(
 
 @app.command("camera-to-car")
 def camera_to_car(
-    output: Output, lens: Lens, source: Source = None, columns: Columns = 6, rows: Rows = 6, square_m: SquareM = 0.16,
-    marker_m: MarkerM = None, dictionary: Dictionary = "DICT_4X4_50", legacy: Legacy = False,
-    board_topic: Annotated[str, typer.Option("--board-topic", help="Topic with the poses of the tracked board.")] = "/vicon/board",
-    untracked: Annotated[bool, typer.Option("--untracked", help="The board is not tracked and stands still. Tilt the car by hand (hand-eye calibration).")] = False,
+    output: Output,
+    lens: Lens,
+    source: Source = None,
+    columns: Columns = 6,
+    rows: Rows = 6,
+    square_m: SquareM = 0.16,
+    marker_m: MarkerM = None,
+    dictionary: Dictionary = "DICT_4X4_50",
+    legacy: Legacy = False,
+    board_topic: Annotated[
+        str, typer.Option("--board-topic", help="Topic with the poses of the tracked board.")
+    ] = "/vicon/board",
+    untracked: Annotated[
+        bool,
+        typer.Option(
+            "--untracked",
+            help="The board is not tracked and stands still. Tilt the car by hand (hand-eye calibration).",
+        ),
+    ] = False,
     pattern: Annotated[
-        Path | None, typer.Option("--pattern", exists=True, help="Text file with four rows: the pose of the print on the tracked board.", show_default="estimated")
+        Path | None,
+        typer.Option(
+            "--pattern",
+            exists=True,
+            help="Text file with four rows: the pose of the print on the tracked board.",
+            show_default="estimated",
+        ),
     ] = None,
-    live_s: Live = 0.0, run_dir: RunDir = None,
-) -> None:  # fmt: skip
+    live_s: Live = 0.0,
+    run_dir: RunDir = None,
+) -> None:
     """Calibrate the camera's pose on the car from stops in front of a ChArUco board."""
     from calibration.camera_to_car import calibrate_mount
     from calibration.charuco import BoardDetector
@@ -127,9 +175,20 @@ def camera_to_car(
 @app.command("mocap-to-scene")
 def mocap_to_scene(
     output: Output,
-    scene: Annotated[Path, typer.Argument(help="transforms.json of the scene with poses from structure from motion.", exists=True)],
-    mocap: Annotated[Path, typer.Argument(help="transforms.json of the same images with motion-capture poses (advnerf scene from-bag).", exists=True)],
-) -> None:  # fmt: skip
+    scene: Annotated[
+        Path,
+        typer.Argument(
+            help="transforms.json of the scene with poses from structure from motion.", exists=True
+        ),
+    ],
+    mocap: Annotated[
+        Path,
+        typer.Argument(
+            help="transforms.json of the same images with motion-capture poses (advnerf scene from-bag).",
+            exists=True,
+        ),
+    ],
+) -> None:
     """Calibrate scale and pose of a scene in the motion-capture world, from images with poses in both frames."""
     from advnerf_core.data.dataset import load_transforms
     from calibration.mocap_to_scene import place_scene
@@ -146,11 +205,19 @@ def mocap_to_scene(
 @app.command("vehicle")
 def vehicle(
     output: Output,
-    before: Annotated[Path, typer.Option("--before", exists=True, help="Vehicle file with the servo range and limits, which are kept.")],
+    before: Annotated[
+        Path,
+        typer.Option(
+            "--before", exists=True, help="Vehicle file with the servo range and limits, which are kept."
+        ),
+    ],
     source: Source = None,
-    wheelbase_m: Annotated[float | None, typer.Option("--wheelbase", min=0.05, help="By ruler [m].", show_default="of --before")] = None,
-    live_s: Live = 0.0, run_dir: RunDir = None,
-) -> None:  # fmt: skip
+    wheelbase_m: Annotated[
+        float | None, typer.Option("--wheelbase", min=0.05, help="By ruler [m].", show_default="of --before")
+    ] = None,
+    live_s: Live = 0.0,
+    run_dir: RunDir = None,
+) -> None:
     """Calibrate speed gain, servo gain and offset, rear axle, delay and lag from circles, straight runs and steps."""
     from calibration.plots import vehicle_plot
     from calibration.schema import VehicleCalibration, load_calibration
@@ -165,7 +232,9 @@ def vehicle(
     new = vehicle_calibration(gains, response, old)
     save_and_print(new, output, vehicle_plot(gains, response))
     g, ahead = new.gains, 1000.0 * gains.origin_ahead_m
-    print(f"servo {g.servo_per_rad:.4f} per rad, offset {g.servo_offset:.4f}; {g.erpm_per_mps:.1f} erpm per m/s")
+    print(
+        f"servo {g.servo_per_rad:.4f} per rad, offset {g.servo_offset:.4f}; {g.erpm_per_mps:.1f} erpm per m/s"
+    )
     if abs(ahead) > 10.0:
         print(
             f"the subject's origin is {ahead:.0f} mm ahead of the rear axle. Move it to the rear axle in Tracker, or every cross-track error is wrong"
@@ -177,10 +246,15 @@ def vehicle(
 
 @app.command("time-offset")
 def time_offset(
-    output: Output, camera: Annotated[Path, typer.Option("--camera", exists=True, help="Camera file.")], source: Source = None,
-    update: Annotated[bool, typer.Option("--update", help="Add the offset to latency_s in the camera file.")] = False,
-    live_s: Live = 0.0, run_dir: RunDir = None,
-) -> None:  # fmt: skip
+    output: Output,
+    camera: Annotated[Path, typer.Option("--camera", exists=True, help="Camera file.")],
+    source: Source = None,
+    update: Annotated[
+        bool, typer.Option("--update", help="Add the offset to latency_s in the camera file.")
+    ] = False,
+    live_s: Live = 0.0,
+    run_dir: RunDir = None,
+) -> None:
     """Calibrate the delay of camera stamps relative to motion capture, by turning the car back and forth."""
     import numpy as np
 
@@ -208,17 +282,25 @@ def time_offset(
     )
 
 
-def _board(columns: int, rows: int, square_m: float, marker_m: float | None, dictionary: str, legacy: bool) -> Board:
+def _board(
+    columns: int, rows: int, square_m: float, marker_m: float | None, dictionary: str, legacy: bool
+) -> Board:
     from calibration.charuco import Board
 
-    return Board(columns, rows, square_m, 0.75 * square_m if marker_m is None else marker_m, dictionary, legacy)
+    return Board(
+        columns, rows, square_m, 0.75 * square_m if marker_m is None else marker_m, dictionary, legacy
+    )
 
 
-def _source(source: Path | None, live_s: float, run_dir: Path | None, topics: tuple[str, ...], output: Path) -> Path:
+def _source(
+    source: Path | None, live_s: float, run_dir: Path | None, topics: tuple[str, ...], output: Path
+) -> Path:
     from calibration.schema import CalibrationError
 
     if (source is None) == (live_s == 0.0):
-        raise CalibrationError("expected either a bag or --live SECONDS; got both or neither. Give one of them")
+        raise CalibrationError(
+            "expected either a bag or --live SECONDS; got both or neither. Give one of them"
+        )
     if source is not None:
         return source
     from nodes.lab.wizards.live import record_live

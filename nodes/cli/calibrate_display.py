@@ -18,11 +18,16 @@ def add_to(app: typer.Typer) -> None:
 
 
 def display_colours(
-    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the images to show and for shown.csv, which you complete.")],
+    output: Annotated[
+        Path,
+        typer.Option(
+            "--output", "-o", help="Folder for the images to show and for shown.csv, which you complete."
+        ),
+    ],
     width: Annotated[int, typer.Option("--width", min=16, help="Width of the monitor [px].")] = 1920,
     height: Annotated[int, typer.Option("--height", min=16, help="Height of the monitor [px].")] = 1080,
     seed: Annotated[int, typer.Option("--seed", help="Random seed of the mixed colours.")] = 0,
-) -> None:  # fmt: skip
+) -> None:
     """Write the sequence of plain-colour images to show full-screen for ``calibrate display``."""
     import cv2
     import numpy as np
@@ -43,13 +48,35 @@ def display_colours(
 
 
 def display(
-    output: Annotated[Path, typer.Option("--output", "-o", help="YAML file to write. The plot is saved next to it.")],
-    folder: Annotated[Path, typer.Argument(help="Folder with shown.csv and the camera images. --screen and --twin create it.", file_okay=False)],
-    screen: Annotated[int | None, typer.Option("--screen", min=0, help="Show the colours on this screen and take the camera images from the running launch.")] = None,
-    twin: Annotated[Path | None, typer.Option("--twin", exists=True, help="Socket of the simulated lab: show the colours on its monitor.")] = None,
-    conditions: Annotated[str, typer.Option("--conditions", help="Lighting, exposure and monitor settings, stored in the file.")] = "exposure and white balance locked",
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="YAML file to write. The plot is saved next to it.")
+    ],
+    folder: Annotated[
+        Path,
+        typer.Argument(
+            help="Folder with shown.csv and the camera images. --screen and --twin create it.",
+            file_okay=False,
+        ),
+    ],
+    screen: Annotated[
+        int | None,
+        typer.Option(
+            "--screen",
+            min=0,
+            help="Show the colours on this screen and take the camera images from the running launch.",
+        ),
+    ] = None,
+    twin: Annotated[
+        Path | None,
+        typer.Option(
+            "--twin", exists=True, help="Socket of the simulated lab: show the colours on its monitor."
+        ),
+    ] = None,
+    conditions: Annotated[
+        str, typer.Option("--conditions", help="Lighting, exposure and monitor settings, stored in the file.")
+    ] = "exposure and white balance locked",
     run_dir: RunDir = None,
-) -> None:  # fmt: skip
+) -> None:
     """Calibrate how the camera sees the monitor's colours: tone curves, mixing, ambient light, response."""
     from calibration.display_colour import fit_display
     from calibration.plots import display_plot
@@ -72,6 +99,8 @@ def _show_colours(folder: Path, screen: int | None, twin: Path | None, run_dir: 
     shown_on: Display = PygameDisplay(screen or 0) if twin is None else TwinDisplay(twin)
     try:
         with ProgressDisplay() as progress:
-            show_and_watch(shown_on, live_frames(run), colours_to_show().tolist(), folder, progress.start("display"))
+            show_and_watch(
+                shown_on, live_frames(run), colours_to_show().tolist(), folder, progress.start("display")
+            )
     finally:
         shown_on.close()

@@ -7,7 +7,9 @@ from typing import Annotated
 
 import typer
 
-app = typer.Typer(no_args_is_help=True, help="Find cameras, test them, and import the factory calibration of a ZED.")
+app = typer.Typer(
+    no_args_is_help=True, help="Find cameras, test them, and import the factory calibration of a ZED."
+)
 
 
 @app.command("list")
@@ -22,11 +24,16 @@ def camera_list() -> None:
 @app.command("try")
 def camera_try(
     source: Annotated[
-        str, typer.Argument(help="Source as in a launch file, for example '{kind: v4l2, device: /dev/v4l/by-id/...}'.")
+        str,
+        typer.Argument(
+            help="Source as in a launch file, for example '{kind: v4l2, device: /dev/v4l/by-id/...}'."
+        ),
     ],
     frames: Annotated[int, typer.Option("--frames", min=2, help="Number of frames to read.")] = 50,
     out: Annotated[Path | None, typer.Option("--out", help="Save the last image here (.png, .jpg).")] = None,
-    timeout_s: Annotated[float, typer.Option("--timeout", min=0.5, help="Give up after this many seconds.")] = 15.0,
+    timeout_s: Annotated[
+        float, typer.Option("--timeout", min=0.5, help="Give up after this many seconds.")
+    ] = 15.0,
 ) -> None:
     """Read a source as the camera node does; print rate, missed frames, age of the stamps and brightness."""
     import cv2
@@ -55,11 +62,15 @@ def camera_try(
 @app.command("factory")
 def camera_factory(
     factory: Annotated[Path, typer.Argument(help="Factory calibration of the ZED, SN<serial>.conf.")],
-    mount: Annotated[Path, typer.Option("--mount", help="Camera file from which the pose on the car is copied.")],
+    mount: Annotated[
+        Path, typer.Option("--mount", help="Camera file from which the pose on the car is copied.")
+    ],
     out: Annotated[Path, typer.Option("--out", help="Path of the camera.yaml to write.")],
     mode: Annotated[str, typer.Option("--mode", help="Camera mode: 2K, HD1080, HD720 or VGA.")] = "VGA",
     width: Annotated[int, typer.Option("--width", min=1, help="Width of the delivered images [px].")] = 336,
-    height: Annotated[int, typer.Option("--height", min=1, help="Height of the delivered images [px].")] = 188,
+    height: Annotated[
+        int, typer.Option("--height", min=1, help="Height of the delivered images [px].")
+    ] = 188,
 ) -> None:
     """Write the calibration file of a ZED's rectified left eye from its factory calibration."""
     from calibration.schema import save_calibration

@@ -26,12 +26,16 @@ app = typer.Typer(
 File = Annotated[Path, typer.Argument(help="A *.campaign.yaml file.", exists=True, dir_okay=False)]
 Folder = Annotated[
     Path | None,
-    typer.Option("--folder", help="Folder of the cells.", show_default="the file's, or runs/campaigns/<name>"),
+    typer.Option(
+        "--folder", help="Folder of the cells.", show_default="the file's, or runs/campaigns/<name>"
+    ),
 ]
 Only = Annotated[
     str,
     typer.Option(
-        "--only", metavar="KEY=VALUE,...", help="Only these cells, e.g. scenario=straight+left,method=gradient."
+        "--only",
+        metavar="KEY=VALUE,...",
+        help="Only these cells, e.g. scenario=straight+left,method=gradient.",
     ),
 ]
 _COLOURS = {
@@ -45,7 +49,9 @@ _COLOURS = {
 _FAILURE_EXIT = 1
 
 
-def _load(file: Path, folder: Path | None, overrides: list[str] | None, only: str) -> tuple[Campaign, list[Cell]]:
+def _load(
+    file: Path, folder: Path | None, overrides: list[str] | None, only: str
+) -> tuple[Campaign, list[Cell]]:
     from nodes.experiment.campaign.config import load_campaign, select
 
     campaign = load_campaign(file, folder, tuple(overrides or ()))
@@ -62,22 +68,31 @@ def run(
     ] = None,
     threads: Annotated[
         int | None,
-        typer.Option("--threads", min=1, help="Threads per cell.", show_default="cores shared among the jobs"),
+        typer.Option(
+            "--threads", min=1, help="Threads per cell.", show_default="cores shared among the jobs"
+        ),
     ] = None,
     backend: Annotated[
         str, typer.Option("--backend", help="local: the cores of this machine; ray: a cluster.")
     ] = "local",
     address: Annotated[
         str,
-        typer.Option("--address", help="Of a running Ray cluster.", show_default="RAY_ADDRESS, or one started here"),
+        typer.Option(
+            "--address", help="Of a running Ray cluster.", show_default="RAY_ADDRESS, or one started here"
+        ),
     ] = "",
     retry: Annotated[bool, typer.Option("--retry", help="Also run cells that failed before.")] = False,
     gate: Annotated[
-        bool, typer.Option("--gate/--no-gate", help="Leave out scenarios whose surrogate the fidelity gate refuses.")
+        bool,
+        typer.Option(
+            "--gate/--no-gate", help="Leave out scenarios whose surrogate the fidelity gate refuses."
+        ),
     ] = True,
     search_only: Annotated[
         bool,
-        typer.Option("--search-only", help="Search and deploy nothing yet, so that transfer can be predicted first."),
+        typer.Option(
+            "--search-only", help="Search and deploy nothing yet, so that transfer can be predicted first."
+        ),
     ] = False,
     overrides: Overrides = None,
 ) -> None:
@@ -128,19 +143,22 @@ def table_command(
     output: Annotated[
         Path | None,
         typer.Option(
-            "--output", "-o", help="Folder of the page.",
+            "--output",
+            "-o",
+            help="Folder of the page.",
             show_default="table in the campaign's folder; with --only or --from, no page is written",
         ),
     ] = None,
     source: Annotated[
         Path | None,
         typer.Option(
-            "--from", help="Show the cells that were published there, e.g. in docs/results, wherever they were run.",
+            "--from",
+            help="Show the cells that were published there, e.g. in docs/results, wherever they were run.",
             show_default="the campaign's own cells",
         ),
     ] = None,
     overrides: Overrides = None,
-) -> None:  # fmt: skip
+) -> None:
     """Print the transfer table and the targets, and write them as JSON, CSV, Markdown and a page with the clips by outcome."""
     campaign, cells = _load(file, folder, overrides, only)
     if source is not None:
@@ -175,7 +193,9 @@ def _show_published(campaign: Campaign, cells: list[Cell], output: Path | None, 
     _say_where(full, cells, _write_and_print(full, folder, folder, output))
 
 
-def _write_and_print(full: TransferTable, folder: Path, clips_folder: Path, output: Path | None) -> Path | None:
+def _write_and_print(
+    full: TransferTable, folder: Path, clips_folder: Path, output: Path | None
+) -> Path | None:
     """Table, targets and the predictions in ``folder`` to the terminal, and the page into ``output`` if it is asked for."""
     from rich.console import Console
 
@@ -206,7 +226,8 @@ def _write_and_print(full: TransferTable, folder: Path, clips_folder: Path, outp
 
 def _say_where(full: TransferTable, cells: list[Cell], page: Path | None) -> None:
     print(
-        f"{len(full.cells)} of {len(cells)} cells; " + (f"page: {page}" if page else "-o FOLDER writes a page of them")
+        f"{len(full.cells)} of {len(cells)} cells; "
+        + (f"page: {page}" if page else "-o FOLDER writes a page of them")
     )
 
 
@@ -250,8 +271,12 @@ def publish(
     file: File,
     folder: Folder = None,
     only: Only = "",
-    to: Annotated[Path, typer.Option("--to", help="Gets a folder with the campaign's name.")] = Path("docs/results"),
-    prune: Annotated[bool, typer.Option("--prune", help="Remove cells there that other settings have made.")] = False,
+    to: Annotated[Path, typer.Option("--to", help="Gets a folder with the campaign's name.")] = Path(
+        "docs/results"
+    ),
+    prune: Annotated[
+        bool, typer.Option("--prune", help="Remove cells there that other settings have made.")
+    ] = False,
     overrides: Overrides = None,
 ) -> None:
     """Copy the finished cells to where they are kept with the code."""
@@ -265,7 +290,9 @@ def publish(
     unfinished = len(cells) - len(found.written) - len(found.same)
     print(f"{len(found.written)} cells written, {len(found.same)} were there, {unfinished} are not finished")
     if found.stale:
-        what = "were made with other settings and " + ("are removed" if prune else "stay, until --prune removes them")
+        what = "were made with other settings and " + (
+            "are removed" if prune else "stay, until --prune removes them"
+        )
         print(f"{len(found.stale)} of those there {what}: {', '.join(found.stale)}")
 
 

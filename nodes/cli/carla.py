@@ -13,15 +13,21 @@ from nodes.runtime.termination import ends_in_order
 if TYPE_CHECKING:
     from hardware.worlds.carla.config import CarlaConfig
 
-app = typer.Typer(no_args_is_help=True, help="CARLA as a deployment scene; docs/carla.md says how to start a server.")
+app = typer.Typer(
+    no_args_is_help=True, help="CARLA as a deployment scene; docs/carla.md says how to start a server."
+)
 
 Host = Annotated[
     str | None, typer.Argument(help="Computer of the server.", show_default="of the configuration: 127.0.0.1")
 ]
-Port = Annotated[int | None, typer.Option("--port", min=1, max=65534, show_default="of the configuration: 2000")]
+Port = Annotated[
+    int | None, typer.Option("--port", min=1, max=65534, show_default="of the configuration: 2000")
+]
 ConfigFile = Annotated[
     Path | None,
-    typer.Option("--config", help="YAML file of a CarlaConfig; values not in it have their defaults.", exists=True),
+    typer.Option(
+        "--config", help="YAML file of a CarlaConfig; values not in it have their defaults.", exists=True
+    ),
 ]
 FAILURE_EXIT = 1
 
@@ -57,7 +63,9 @@ def carla_junctions(
     port: Port = None,
     opendrive: Annotated[
         Path | None,
-        typer.Option("--opendrive", help="Read this OpenDRIVE file (.xodr) instead of asking a server.", exists=True),
+        typer.Option(
+            "--opendrive", help="Read this OpenDRIVE file (.xodr) instead of asking a server.", exists=True
+        ),
     ] = None,
 ) -> None:
     """List a map's junctions: id, place, roads, and how many sets of drives straight, right and left they have."""
@@ -99,7 +107,9 @@ def carla_capture(
 
     request = CaptureRequest(photos, held_out, seed)
     with ends_in_order(), ProgressDisplay() as display:
-        taken, there = capture(_config(config, overrides, host, port), request, output, display.start("capture"))
+        taken, there = capture(
+            _config(config, overrides, host, port), request, output, display.start("capture")
+        )
     print(f"{taken} pictures taken, {there} were there: {output}")
 
 
@@ -112,7 +122,8 @@ def carla_drive(
     path: Annotated[Literal["straight", "right", "left"], typer.Option("--path")] = "straight",
     seconds: Annotated[float, typer.Option("--seconds", min=0.1, help="How long to drive.")] = 6.0,
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="JSON file for states, turn rates and cross-track errors.")
+        Path | None,
+        typer.Option("--output", "-o", help="JSON file for states, turn rates and cross-track errors."),
     ] = None,
 ) -> None:
     """Let the expert, who knows the true state, follow a reference path; says how well it did."""
@@ -153,7 +164,9 @@ def carla_release(host: Host = None, port: Port = None) -> None:
     print("the world ticks by itself again" if freed else "nothing to do: the world ticks by itself")
 
 
-def _config(file: Path | None, overrides: list[str] | None, host: str | None, port: int | None) -> CarlaConfig:
+def _config(
+    file: Path | None, overrides: list[str] | None, host: str | None, port: int | None
+) -> CarlaConfig:
     from hardware.worlds.carla.config import CarlaConfig
     from nodes.runtime.config import Document, apply_overrides, read_yaml, validate
 

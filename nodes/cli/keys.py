@@ -12,11 +12,15 @@ from nodes.runtime.terminal import print_table, table
 if TYPE_CHECKING:
     from nodes.linking.keys import KeyFolder
 
-app = typer.Typer(no_args_is_help=True, help="Manage the keys that may watch or drive this host over the network.")
+app = typer.Typer(
+    no_args_is_help=True, help="Manage the keys that may watch or drive this host over the network."
+)
 
 Folder = Annotated[
     Path | None,
-    typer.Option("--keys", help="Key folder.", show_default="advnerf/keys in the user's configuration folder"),
+    typer.Option(
+        "--keys", help="Key folder.", show_default="advnerf/keys in the user's configuration folder"
+    ),
 ]
 Name = Annotated[str, typer.Argument(help="Name of the key, such as a host or a person.")]
 

@@ -44,14 +44,26 @@ OUR_PACKAGES = ("advnerf_core", "hardware", "calibration", "nodes")
 ERROR_EXIT, FAILURE_EXIT = 2, 1
 # The extra that installs each package which a base installation, such as the car's, does not have.
 _EXTRA_OF = dict.fromkeys(("torch", "numba", "scipy", "matplotlib", "jinja2", "av"), "core") | {
-    "mujoco": "twin", "pycolmap": "sfm", "trimesh": "mesh", "viser": "view", "onnxruntime": "onnx", "onnx": "onnx",
-    "mitsuba": "mesh", "drjit": "mesh", "joblib": "cluster", "ray": "cluster", "carla": "carla",
-}  # fmt: skip
+    "mujoco": "twin",
+    "pycolmap": "sfm",
+    "trimesh": "mesh",
+    "viser": "view",
+    "onnxruntime": "onnx",
+    "onnx": "onnx",
+    "mitsuba": "mesh",
+    "drjit": "mesh",
+    "joblib": "cluster",
+    "ray": "cluster",
+    "carla": "carla",
+}
 
 app = typer.Typer(
-    name="advnerf", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
+    name="advnerf",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
     help="Find objects that drive a self-driving policy off its path, and prove it on the car or on its simulated lab.",
-)  # fmt: skip
+)
 app.add_typer(cli_topic.app, name="topic")
 app.add_typer(cli_bag.app, name="bag")
 app.add_typer(cli_keys.app, name="keys")
@@ -109,7 +121,9 @@ def launch(
     overrides: Overrides = None,
     run_dir: Annotated[
         Path | None,
-        typer.Option("--run-dir", help="Folder for logs, sockets and bag.", show_default="runs/<name>-<time>"),
+        typer.Option(
+            "--run-dir", help="Folder for logs, sockets and bag.", show_default="runs/<name>-<time>"
+        ),
     ] = None,
     duration_s: Annotated[
         float | None, typer.Option("--duration", min=0.0, help="Stop after this many seconds.")
@@ -118,7 +132,10 @@ def launch(
         str | None, typer.Option("--host", help="Host of the launch file that this computer is, or all.")
     ] = None,
     check: Annotated[
-        bool, typer.Option("--check", help="Start nothing; list the nodes that would start and the problems found.")
+        bool,
+        typer.Option(
+            "--check", help="Start nothing; list the nodes that would start and the problems found."
+        ),
     ] = False,
 ) -> None:
     """Start the nodes of a launch file and supervise them. Ctrl-C stops them; a second Ctrl-C kills them."""
@@ -181,9 +198,12 @@ def experiment(
     file: Annotated[Path, typer.Argument(help="A *.experiment.yaml file.", exists=True, dir_okay=False)],
     setting: Annotated[str, typer.Option("--setting", help="Which of the file's settings.")] = "demo",
     run_folder: Annotated[
-        Path | None, typer.Option("--run-folder", help="Folder of all results.", show_default="runs/<setting>")
+        Path | None,
+        typer.Option("--run-folder", help="Folder of all results.", show_default="runs/<setting>"),
     ] = None,
-    until: Annotated[str | None, typer.Option("--until", metavar="STAGE", help="Stop after this stage.")] = None,
+    until: Annotated[
+        str | None, typer.Option("--until", metavar="STAGE", help="Stop after this stage.")
+    ] = None,
     overrides: Overrides = None,
 ) -> None:
     """Run an experiment: every stage that is not there yet, from the photographs to the report."""
@@ -214,7 +234,9 @@ def _add_stage(name: str, what: str) -> None:
     def command(
         file: Annotated[Path, typer.Argument(help="A *.experiment.yaml file.", exists=True, dir_okay=False)],
         setting: Annotated[str, typer.Option("--setting", help="Which of the file's settings.")] = "demo",
-        run_folder: Annotated[Path | None, typer.Option("--run-folder", show_default="runs/<setting>")] = None,
+        run_folder: Annotated[
+            Path | None, typer.Option("--run-folder", show_default="runs/<setting>")
+        ] = None,
         overrides: Overrides = None,
     ) -> None:
         _run_experiment(file, setting, run_folder, name, overrides)
@@ -292,7 +314,9 @@ def main() -> None:
         missing = (error.name or "").split(".")[0]
         if _debug or missing in OUR_PACKAGES or missing not in _EXTRA_OF:
             raise
-        say_error(f"this command needs {missing}, which is not installed: pip install 'advnerf[{_EXTRA_OF[missing]}]'")
+        say_error(
+            f"this command needs {missing}, which is not installed: pip install 'advnerf[{_EXTRA_OF[missing]}]'"
+        )
         raise SystemExit(ERROR_EXIT) from None
     except Exception as error:  # any other exception is a bug and keeps its traceback
         if _debug or not _is_for_people(error):

@@ -14,7 +14,9 @@ if TYPE_CHECKING:
     from nodes.runtime.clock import Now
     from nodes.runtime.requests import Asked
 
-app = typer.Typer(no_args_is_help=True, help="Inspect the motor controller, set its timeout, check the steering.")
+app = typer.Typer(
+    no_args_is_help=True, help="Inspect the motor controller, set its timeout, check the steering."
+)
 Port = Annotated[str, typer.Option("--port", help="Serial device. Stop the launch that uses it first.")]
 _CHECK_S, _ANSWER_S = 75.0, 3.0
 
@@ -38,10 +40,14 @@ def info(port: Port = "/dev/vesc") -> None:
         vesc.abandon()  # this command sent no motor command, so there is nothing to stop
     rows = table("what", "value")
     for what, value in (
-        ("controller", str(firmware)), ("telemetry", f"generation {values.generation}"), ("timeout", timeout),
-        ("supply", f"{values.v_in:.1f} V"), ("motor", f"{values.erpm:.0f} erpm, {values.motor_current_a:.2f} A"),
-        ("used", f"{values.used_ah:.3f} Ah, {values.used_wh:.2f} Wh"), ("fault", values.fault_name),
-    ):  # fmt: skip
+        ("controller", str(firmware)),
+        ("telemetry", f"generation {values.generation}"),
+        ("timeout", timeout),
+        ("supply", f"{values.v_in:.1f} V"),
+        ("motor", f"{values.erpm:.0f} erpm, {values.motor_current_a:.2f} A"),
+        ("used", f"{values.used_ah:.3f} Ah, {values.used_wh:.2f} Wh"),
+        ("fault", values.fault_name),
+    ):
         rows.add_row(what, value)
     print_table(rows)
 
@@ -51,10 +57,15 @@ def set_timeout(
     timeout_ms: Annotated[
         int,
         typer.Option(
-            "--timeout-ms", min=50, max=2000, help="Time without commands after which the controller brakes [ms]."
+            "--timeout-ms",
+            min=50,
+            max=2000,
+            help="Time without commands after which the controller brakes [ms].",
         ),
     ] = 250,
-    brake_current_a: Annotated[float, typer.Option("--brake-current", min=0.0, max=60.0, help="Amperes.")] = 20.0,
+    brake_current_a: Annotated[
+        float, typer.Option("--brake-current", min=0.0, max=60.0, help="Amperes.")
+    ] = 20.0,
     port: Port = "/dev/vesc",
 ) -> None:
     """Store timeout and brake current in the controller and read them back. The motor must stand still."""
@@ -113,7 +124,9 @@ def _ask_motor(bus: Bus, action: str) -> None:
     from nodes.runtime.messages import header, types
 
     def make(asked: Asked, now: Now) -> Any:
-        return types.SteeringCheck(header=header(asked.real_ns), action=action, source="operator", ask_id=asked.ask_id)
+        return types.SteeringCheck(
+            header=header(asked.real_ns), action=action, source="operator", ask_id=asked.ask_id
+        )
 
     def read(ask_id: str, received: Received) -> dict[str, str] | None:
         row = _steering_row(received)

@@ -61,10 +61,17 @@ def _watch(run_dir: Path, period_s: float, count: int | None) -> None:
 
 
 def _print(found: list[NodeRow]) -> None:
-    rows = table("node", "state", "CPU %", "MiB", "rate Hz", "dropped", "missed", "queue drops", "restarts", "text")
+    rows = table(
+        "node", "state", "CPU %", "MiB", "rate Hz", "dropped", "missed", "queue drops", "restarts", "text"
+    )
     for row in found:
         cpu = "-" if row.cpu_percent is None else f"{row.cpu_percent:.0f}"
         memory = "-" if row.memory_mib is None else f"{row.memory_mib:.0f}"
-        numbers = (cpu, memory, f"{row.rate_hz:.0f}", *map(str, (row.dropped, row.missed, row.queue, row.restarts)))
+        numbers = (
+            cpu,
+            memory,
+            f"{row.rate_hz:.0f}",
+            *map(str, (row.dropped, row.missed, row.queue, row.restarts)),
+        )
         rows.add_row(row.name, row.state, *numbers, row.text)
     print_table(rows)

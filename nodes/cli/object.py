@@ -14,7 +14,9 @@ if TYPE_CHECKING:
     from advnerf_core.objects.voxel.model import ObjectModel
     from nodes.runtime.progress import Report
 
-app = typer.Typer(no_args_is_help=True, help="Build objects from meshes, photographs or generators, and inspect them.")
+app = typer.Typer(
+    no_args_is_help=True, help="Build objects from meshes, photographs or generators, and inspect them."
+)
 
 ObjectPath = Annotated[Path, typer.Argument(help="An object file (*.object.safetensors).", dir_okay=False)]
 _TURNTABLE_VIEWS, _TURNTABLE_PIXELS = 8, 240
@@ -24,18 +26,23 @@ _DEFAULT_STEPS, _NO_STEP_LIMIT = 600, 1_000_000
 
 @app.command("build")
 def object_build(
-    file: Annotated[Path | None, typer.Argument(help="Mesh file: GLB, OBJ, PLY or STL.", dir_okay=False)] = None,
+    file: Annotated[
+        Path | None, typer.Argument(help="Mesh file: GLB, OBJ, PLY or STL.", dir_okay=False)
+    ] = None,
     generate: Annotated[
-        str | None, typer.Option("--generate", help="Generate an object instead of reading FILE: hydrant or car.")
+        str | None,
+        typer.Option("--generate", help="Generate an object instead of reading FILE: hydrant or car."),
     ] = None,
     images: Annotated[
         Path | None,
         typer.Option(
-            "--images", help="Learn from images with an alpha channel instead of reading FILE: their transforms.json."
+            "--images",
+            help="Learn from images with an alpha channel instead of reading FILE: their transforms.json.",
         ),
     ] = None,
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="Object file.", show_default="<name>.object.safetensors")
+        Path | None,
+        typer.Option("--output", "-o", help="Object file.", show_default="<name>.object.safetensors"),
     ] = None,
     resolution: Annotated[
         int, typer.Option("--resolution", min=8, max=128, help="Voxels along the longest side.")
@@ -45,12 +52,17 @@ def object_build(
     steps: Annotated[
         int | None,
         typer.Option(
-            "--steps", min=0, help="Optimiser steps of the fit.", show_default="400 for a mesh, 600 for images"
+            "--steps",
+            min=0,
+            help="Optimiser steps of the fit.",
+            show_default="400 for a mesh, 600 for images",
         ),
     ] = None,
     minutes: Annotated[
         float | None,
-        typer.Option("--minutes", min=0.01, help="With --images: fit for this many minutes instead of --steps."),
+        typer.Option(
+            "--minutes", min=0.01, help="With --images: fit for this many minutes instead of --steps."
+        ),
     ] = None,
     size: Annotated[
         tuple[int, int] | None,
@@ -94,7 +106,9 @@ def object_build(
 @app.command("show")
 def object_show(
     file: ObjectPath,
-    output: Annotated[Path | None, typer.Option("--output", "-o", help="PNG.", show_default="beside FILE")] = None,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="PNG.", show_default="beside FILE")
+    ] = None,
 ) -> None:
     """Render an object from eight sides."""
     import cv2
@@ -126,7 +140,9 @@ def object_info(file: ObjectPath) -> None:
     rows = table("what", "value")
     rows.add_row("name", model.name)
     rows.add_row("size", " x ".join(f"{side:.3f}" for side in model.size_m) + " m")
-    rows.add_row("voxels", " x ".join(map(str, model.grids.density.shape)) + f" of {1e3 * model.grids.voxel:.1f} mm")
+    rows.add_row(
+        "voxels", " x ".join(map(str, model.grids.density.shape)) + f" of {1e3 * model.grids.voxel:.1f} mm"
+    )
     rows.add_row("free colours", str(int(model.slots.max())))
     for key, value in model.about.items():
         rows.add_row(key, str(value))
@@ -155,9 +171,14 @@ def _name(source: Path) -> str:
 
 
 def _from_images(
-    transforms: Path, name: str, resolution: int, steps: int | None, minutes: float | None, size: tuple[int, int] | None,
+    transforms: Path,
+    name: str,
+    resolution: int,
+    steps: int | None,
+    minutes: float | None,
+    size: tuple[int, int] | None,
     report: Report,
-) -> ObjectModel:  # fmt: skip
+) -> ObjectModel:
     from advnerf_core.data.dataset import load_transforms
     from advnerf_core.objects.voxel.build import build_from_images
     from advnerf_core.objects.voxel.pictures import load_pictures
@@ -167,14 +188,20 @@ def _from_images(
         print(f"skipped, file not found: {path}")
     training, held_out = _split(listed)
     rule = "split of the data set" if listed.splits else f"every {_HELD_OUT_EVERY}th is held out"
-    counts = f"{len(training.frames)} training, {0 if held_out is None else len(held_out.frames)} held-out images"
+    counts = (
+        f"{len(training.frames)} training, {0 if held_out is None else len(held_out.frames)} held-out images"
+    )
     print(f"{counts} ({rule})" if held_out is not None else f"{counts} (with 16 or more images, {rule})")
     return build_from_images(
-        load_pictures(training, size), name, resolution,
-        (_DEFAULT_STEPS if minutes is None else _NO_STEP_LIMIT) if steps is None else steps, {"images": str(transforms)},
-        report, None if held_out is None else load_pictures(_spread(held_out), size),
+        load_pictures(training, size),
+        name,
+        resolution,
+        (_DEFAULT_STEPS if minutes is None else _NO_STEP_LIMIT) if steps is None else steps,
+        {"images": str(transforms)},
+        report,
+        None if held_out is None else load_pictures(_spread(held_out), size),
         None if minutes is None else 60.0 * minutes,
-    )  # fmt: skip
+    )
 
 
 def _split(listed: PosedImages) -> tuple[PosedImages, PosedImages | None]:
@@ -192,7 +219,9 @@ def _spread(listed: PosedImages) -> PosedImages:
     from advnerf_core.objects.voxel.build import HELD_OUT_VIEWS
 
     frames, most = listed.frames, HELD_OUT_VIEWS
-    return listed.with_frames(frames if len(frames) <= most else [frames[k * len(frames) // most] for k in range(most)])
+    return listed.with_frames(
+        frames if len(frames) <= most else [frames[k * len(frames) // most] for k in range(most)]
+    )
 
 
 def _print_quality(path: Path, model: ObjectModel) -> None:

@@ -19,7 +19,10 @@ app = typer.Typer(
     help="Train a policy from recordings; evaluate, check, export and inspect any policy.",
 )
 Spec = Annotated[
-    str, typer.Argument(metavar="POLICY", help="Policy: a .safetensors, .onnx or .pt2 file, or package.module:factory.")
+    str,
+    typer.Argument(
+        metavar="POLICY", help="Policy: a .safetensors, .onnx or .pt2 file, or package.module:factory."
+    ),
 ]
 cli_policy_train.add_to(app)
 _COLOURS = {"ok": "green", "warning": "yellow", "failure": "red"}
@@ -38,18 +41,26 @@ def policy_check(
     ] = None,
     scene: Annotated[
         Path | None,
-        typer.Option("--scene", help="Learned scene: check on its views and on drives in it. Needs --calibration."),
+        typer.Option(
+            "--scene", help="Learned scene: check on its views and on drives in it. Needs --calibration."
+        ),
     ] = None,
     calibration: Annotated[
         Path | None,
-        typer.Option("--calibration", help="Folder with camera.yaml, room.yaml and vehicle.yaml of the scene."),
+        typer.Option(
+            "--calibration", help="Folder with camera.yaml, room.yaml and vehicle.yaml of the scene."
+        ),
     ] = None,
-    bag: Annotated[Path | None, typer.Option("--bag", help="Bag of a drive: check on its frames and poses.")] = None,
+    bag: Annotated[
+        Path | None, typer.Option("--bag", help="Bag of a drive: check on its frames and poses.")
+    ] = None,
     room: Annotated[
-        Path, typer.Option("--room", help="Room calibration with the path that the expert follows in the bag.")
+        Path,
+        typer.Option("--room", help="Room calibration with the path that the expert follows in the bag."),
     ] = Path("calibration/twin/room.yaml"),
     goal: Annotated[
-        list[float] | None, typer.Option("--goal", help="One number of the goal vector. Repeat for each number.")
+        list[float] | None,
+        typer.Option("--goal", help="One number of the goal vector. Repeat for each number."),
     ] = None,
 ) -> None:
     """Check a policy's adapter and whether the policy drives. Without a source option, the simulated lab is used.
@@ -71,7 +82,9 @@ def policy_check(
     rows = table("check", "state", "found")
     for finding in findings:
         rows.add_row(
-            finding.name, f"[{_COLOURS[finding.verdict]}]{finding.verdict}[/]", finding.text.replace("[", r"\[")
+            finding.name,
+            f"[{_COLOURS[finding.verdict]}]{finding.verdict}[/]",
+            finding.text.replace("[", r"\["),
         )
     print_table(rows)
     if any(finding.verdict == FAILURE for finding in findings):
@@ -103,7 +116,9 @@ def _reference(
 @app.command("export")
 def policy_export(
     policy: Spec,
-    onnx: Annotated[Path | None, typer.Option("--onnx", help="Write an ONNX file, which runs without torch.")] = None,
+    onnx: Annotated[
+        Path | None, typer.Option("--onnx", help="Write an ONNX file, which runs without torch.")
+    ] = None,
     pt2: Annotated[
         Path | None, typer.Option("--pt2", help="Write a torch.export program, which keeps the gradient.")
     ] = None,

@@ -21,7 +21,9 @@ Camera = Annotated[
 ]
 Room = Annotated[
     Path | None,
-    typer.Option("--room", help="Room calibration with the reference path.", show_default="the one in the first bag"),
+    typer.Option(
+        "--room", help="Room calibration with the reference path.", show_default="the one in the first bag"
+    ),
 ]
 Stiffness = Annotated[
     float, typer.Option("--stiffness", min=0.1, help="Gain with which the expert returns to the path [1/m].")
@@ -29,7 +31,9 @@ Stiffness = Annotated[
 Delay = Annotated[
     float,
     typer.Option(
-        "--delay", min=0.0, help="Delay from an image to the resulting wheel angle that the labels account for [s]."
+        "--delay",
+        min=0.0,
+        help="Delay from an image to the resulting wheel angle that the labels account for [s].",
     ),
 ]
 Speed = Annotated[float, typer.Option("--speed", min=0.1, help="Speed at which the policy will drive [m/s].")]
@@ -38,28 +42,51 @@ LogColumns = Annotated[
 ]
 LogScale = Annotated[
     float,
-    typer.Option("--log-scale", help="Factor from the logs' steering to radians, left positive; for example -0.26."),
+    typer.Option(
+        "--log-scale", help="Factor from the logs' steering to radians, left positive; for example -0.26."
+    ),
 ]
 
 
 def train(
-    out: Annotated[Path, typer.Option("--out", help="Folder of the policy. Run the same command again to resume a stopped training.")],
+    out: Annotated[
+        Path,
+        typer.Option(
+            "--out", help="Folder of the policy. Run the same command again to resume a stopped training."
+        ),
+    ],
     bags: Annotated[
-        list[Path] | None, typer.Option("--bags", help="Bag of a drive; may be repeated. The expert labels it, no matter which driver recorded it.")
+        list[Path] | None,
+        typer.Option(
+            "--bags",
+            help="Bag of a drive; may be repeated. The expert labels it, no matter which driver recorded it.",
+        ),
     ] = None,
-    logs: Annotated[list[Path] | None, typer.Option("--log", help="CSV file of a log from another car; may be repeated.")] = None,
+    logs: Annotated[
+        list[Path] | None, typer.Option("--log", help="CSV file of a log from another car; may be repeated.")
+    ] = None,
     labels: Annotated[
-        Literal["expert", "recorded"], typer.Option("--labels", help="Source of the labels: the expert at the measured pose, or the recorded commands.")
+        Literal["expert", "recorded"],
+        typer.Option(
+            "--labels",
+            help="Source of the labels: the expert at the measured pose, or the recorded commands.",
+        ),
     ] = "expert",
-    image_topic: Annotated[str | None, typer.Option("--image-topic", show_default="the compositor's, else the camera's")] = None,
+    image_topic: Annotated[
+        str | None, typer.Option("--image-topic", show_default="the compositor's, else the camera's")
+    ] = None,
     camera: Camera = None,
     room: Room = None,
     surrogate: Annotated[
-        Path | None, typer.Option("--surrogate", help="Run folder of an experiment. Views of its learned room are added to the training data.")
+        Path | None,
+        typer.Option(
+            "--surrogate",
+            help="Run folder of an experiment. Views of its learned room are added to the training data.",
+        ),
     ] = None,
-    experiment: Annotated[
-        Path, typer.Option("--experiment", help="Experiment file of that run.")
-    ] = Path("launch/room.experiment.yaml"),
+    experiment: Annotated[Path, typer.Option("--experiment", help="Experiment file of that run.")] = Path(
+        "launch/room.experiment.yaml"
+    ),
     setting: Annotated[str, typer.Option("--setting", help="Setting of that run.")] = "demo",
     steps: Annotated[int, typer.Option("--steps", min=1, help="Optimiser steps.")] = 800,
     seed: Annotated[int, typer.Option("--seed")] = 0,
@@ -68,7 +95,7 @@ def train(
     stiffness_1pm: Stiffness = 1.0,
     log_columns: LogColumns = ("image", "steering"),
     log_scale: LogScale = 1.0,
-) -> None:  # fmt: skip
+) -> None:
     """Train a policy on recordings: laps of the expert, relabelled drives of the policy (DAgger), logs of other cars."""
     from advnerf_core.learning.imitation import ImitationConfig
     from nodes.lab.policy_data.train import train_from_recordings
@@ -102,23 +129,43 @@ def train(
 
 
 def evaluate(
-    policy: Annotated[str, typer.Argument(metavar="POLICY", help="Policy: a .safetensors, .onnx or .pt2 file, or package.module:factory.")],
-    recording: Annotated[Path, typer.Argument(metavar="BAG", help="Bag of a drive, or CSV file of a log from another car.")],
-    out: Annotated[Path | None, typer.Option("--out", help="Folder for the plot and the saliency maps.")] = None,
+    policy: Annotated[
+        str,
+        typer.Argument(
+            metavar="POLICY", help="Policy: a .safetensors, .onnx or .pt2 file, or package.module:factory."
+        ),
+    ],
+    recording: Annotated[
+        Path, typer.Argument(metavar="BAG", help="Bag of a drive, or CSV file of a log from another car.")
+    ],
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Folder for the plot and the saliency maps.")
+    ] = None,
     labels: Annotated[
-        Literal["expert", "recorded"], typer.Option("--labels", help="Source of the reference steering: the expert at the measured pose, or the recorded commands.")
+        Literal["expert", "recorded"],
+        typer.Option(
+            "--labels",
+            help="Source of the reference steering: the expert at the measured pose, or the recorded commands.",
+        ),
     ] = "recorded",
-    image_topic: Annotated[str | None, typer.Option("--image-topic", show_default="the compositor's, else the camera's")] = None,
+    image_topic: Annotated[
+        str | None, typer.Option("--image-topic", show_default="the compositor's, else the camera's")
+    ] = None,
     room: Room = None,
-    maps: Annotated[int, typer.Option("--saliency", min=0, help="Number of frames for which a saliency map is drawn.")] = 8,
+    maps: Annotated[
+        int, typer.Option("--saliency", min=0, help="Number of frames for which a saliency map is drawn.")
+    ] = 8,
     video: Annotated[bool, typer.Option("--video", help="Also write all saliency maps as a video.")] = False,
-    goal: Annotated[list[float] | None, typer.Option("--goal", help="One number of the goal vector. Repeat for each number.")] = None,
+    goal: Annotated[
+        list[float] | None,
+        typer.Option("--goal", help="One number of the goal vector. Repeat for each number."),
+    ] = None,
     speed_mps: Speed = 0.8,
     delay_s: Delay = 0.16,
     stiffness_1pm: Stiffness = 1.0,
     log_columns: LogColumns = ("image", "steering"),
     log_scale: LogScale = 1.0,
-) -> None:  # fmt: skip
+) -> None:
     """Compare the steering of a policy with a recording: table, plot and saliency maps."""
     import numpy as np
 
@@ -141,7 +188,10 @@ def evaluate(
     for name, true in pairs:
         e = measure.compare(predicted, true)
         angles = (e.mean_abs_rad, e.rms_rad, e.worst_rad, e.bias_rad)
-        numbers = [f"{1e3 * v:.1f} mrad" for v in angles] + [f"{e.correlation:.3f}", f"{1e3 * e.zero_rad:.1f} mrad"]
+        numbers = [f"{1e3 * v:.1f} mrad" for v in angles] + [
+            f"{e.correlation:.3f}",
+            f"{1e3 * e.zero_rad:.1f} mrad",
+        ]
         rows.add_row(name, str(e.count), *numbers)
     print_table(rows)
     folder = out or Path("runs") / f"eval_{recording.resolve().parent.name}_{recording.stem}"
@@ -158,9 +208,15 @@ def add_to(app: typer.Typer) -> None:
 
 
 def _parts(
-    view: PolicyView, expert: Expert, bags: list[Path], logs: list[Path], labels: Any, image_topic: str | None,
-    columns: tuple[str, str], scale: float,
-) -> list[Part]:  # fmt: skip
+    view: PolicyView,
+    expert: Expert,
+    bags: list[Path],
+    logs: list[Path],
+    labels: Any,
+    image_topic: str | None,
+    columns: tuple[str, str],
+    scale: float,
+) -> list[Part]:
     from nodes.bags.reader import read_info
     from nodes.lab.policy_data.frames import frames_of_bag, frames_of_log
     from nodes.lab.policy_data.train import Part
@@ -169,10 +225,14 @@ def _parts(
     for bag in bags:
         cut = partial(frames_of_bag, bag, view, expert, labels, image_topic)
         info = read_info(bag)
-        parts.append(Part(str(bag), info.parts, {"labels": labels, "images": image_topic}, cut, info.unchecked))
+        parts.append(
+            Part(str(bag), info.parts, {"labels": labels, "images": image_topic}, cut, info.unchecked)
+        )
     for log in logs:
         options = {"columns": columns, "scale": scale}
-        parts.append(Part(str(log), (log,), options, partial(_own_view, frames_of_log, log, view, columns, scale)))
+        parts.append(
+            Part(str(log), (log,), options, partial(_own_view, frames_of_log, log, view, columns, scale))
+        )
     return parts
 
 
@@ -209,7 +269,9 @@ def _expert(
 
     config = ExpertConfig(speed_mps=speed_mps, delay_s=delay_s, stiffness_1pm=stiffness_1pm)
     if not needed and room is None:
-        return Expert(DrivingPath.rounded_square(4.0, 1.1), config)  # not used for labels: the labels are recorded
+        return Expert(
+            DrivingPath.rounded_square(4.0, 1.1), config
+        )  # not used for labels: the labels are recorded
     return Expert(_calibration(RoomCalibration, room, bags, "room").reference_path, config)
 
 
@@ -245,4 +307,6 @@ def _surrogate(folder: Path, file: Path, setting: str, view: PolicyView) -> Sour
             f"expected the run in {folder} to have the camera of the recordings, got another; use bags of that run and its --camera"
         )
     config = run.config.policy
-    return SourcePlan(surrogate_source(run), config.surrogate_stills, config.surrogate_drives, config.drive_steps)
+    return SourcePlan(
+        surrogate_source(run), config.surrogate_stills, config.surrogate_drives, config.drive_steps
+    )

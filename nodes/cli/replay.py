@@ -29,14 +29,20 @@ def add_to(app: typer.Typer) -> None:
 def replay(
     bag: Annotated[Path, typer.Argument(help="Bag folder, or a .mcap, .db3 or .bag file.", exists=True)],
     nodes: Annotated[
-        str, typer.Option("--nodes", metavar="NAME,...", help="Nodes of the recorded launch to run, comma-separated.")
+        str,
+        typer.Option(
+            "--nodes", metavar="NAME,...", help="Nodes of the recorded launch to run, comma-separated."
+        ),
     ] = "",
     replace: Annotated[
         list[str] | None,
-        typer.Option("--replace", metavar="NODE=MODULE[:CLASS]", help="Run a node with other code. May be repeated."),
+        typer.Option(
+            "--replace", metavar="NODE=MODULE[:CLASS]", help="Run a node with other code. May be repeated."
+        ),
     ] = None,
     launch: Annotated[
-        Path | None, typer.Option("--launch", help="Launch file to use instead of the one in the bag.", exists=True)
+        Path | None,
+        typer.Option("--launch", help="Launch file to use instead of the one in the bag.", exists=True),
     ] = None,
     overrides: Overrides = None,
     attack: Annotated[
@@ -44,20 +50,30 @@ def replay(
         typer.Option("--attack", help="Attack file to apply to the recording.", exists=True, dir_okay=False),
     ] = None,
     policy: Annotated[str, typer.Option("--policy", help="Policy to use instead of the recorded one.")] = "",
-    golden: Annotated[Path | None, typer.Option("--golden", help="Golden bag (.mcap) to compare with.")] = None,
+    golden: Annotated[
+        Path | None, typer.Option("--golden", help="Golden bag (.mcap) to compare with.")
+    ] = None,
     update_golden: Annotated[
         bool, typer.Option("--update-golden", help="Write the golden bag instead of comparing with it.")
     ] = False,
     tolerance: Annotated[
         list[str] | None,
         typer.Option(
-            "--tolerance", metavar="[TOPIC:FIELD=]VALUE", help="Allow differences up to VALUE. May be repeated."
+            "--tolerance",
+            metavar="[TOPIC:FIELD=]VALUE",
+            help="Allow differences up to VALUE. May be repeated.",
         ),
     ] = None,
     topics: Topics = None,
-    output: Annotated[Path | None, typer.Option("--output", "-o", help="Write the replay to a new bag.")] = None,
-    json_file: Annotated[Path | None, typer.Option("--json", help="With --attack: write the result as JSON.")] = None,
-    plot: Annotated[Path | None, typer.Option("--plot", help="With --attack: plot the steering (.png).")] = None,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="Write the replay to a new bag.")
+    ] = None,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", help="With --attack: write the result as JSON.")
+    ] = None,
+    plot: Annotated[
+        Path | None, typer.Option("--plot", help="With --attack: plot the steering (.png).")
+    ] = None,
 ) -> None:
     """Replay a bag through nodes in lockstep. The same bag gives the same bytes. With --attack, compare the steering."""
     from nodes.runtime.errors import BagError
@@ -65,12 +81,20 @@ def replay(
     if attack is None and (json_file or plot):
         raise BagError("expected --json and --plot only with --attack FILE; add --attack or remove them")
     if update_golden and golden is None:
-        raise BagError("expected --golden FILE.mcap with --update-golden, got none; name the golden bag to write")
+        raise BagError(
+            "expected --golden FILE.mcap with --update-golden, got none; name the golden bag to write"
+        )
     if [golden is not None, output is not None, attack is not None].count(True) > 1:
-        raise BagError("expected one of --golden, --output and --attack, got several; run the replay once for each")
+        raise BagError(
+            "expected one of --golden, --output and --attack, got several; run the replay once for each"
+        )
     if (topics or tolerance) and golden is None:
-        raise BagError("expected --topics and --tolerance only with --golden FILE; add --golden or remove them")
-    choice = _choice(nodes or (_RETRO_NODES if attack else ""), replace or [], launch, policy, overrides or [])
+        raise BagError(
+            "expected --topics and --tolerance only with --golden FILE; add --golden or remove them"
+        )
+    choice = _choice(
+        nodes or (_RETRO_NODES if attack else ""), replace or [], launch, policy, overrides or []
+    )
     if attack is not None:
         _retro(bag, attack, choice, json_file, plot)
     elif golden is not None:

@@ -31,8 +31,12 @@ def room_path(
     bag: BagFile,
     output: Output = Path("room.yaml"),
     topic: Topic = "/vicon/car",
-    closed: Annotated[bool | None, typer.Option("--closed/--open", help="A loop or not.", show_default="looks")] = None,
-    corner: Annotated[int, typer.Option("--corner", help="Corner of the attack: number of the arc, from 1.")] = 1,
+    closed: Annotated[
+        bool | None, typer.Option("--closed/--open", help="A loop or not.", show_default="looks")
+    ] = None,
+    corner: Annotated[
+        int, typer.Option("--corner", help="Corner of the attack: number of the arc, from 1.")
+    ] = 1,
     before_m: Annotated[
         float, typer.Option("--before", help="Distance of the start pose before that corner [m].")
     ] = 2.0,
@@ -41,7 +45,9 @@ def room_path(
     ] = 0.4,
     fence_margin_m: Annotated[
         float,
-        typer.Option("--fence-margin", help="For a new file: distance of the provisional fence from the path [m]."),
+        typer.Option(
+            "--fence-margin", help="For a new file: distance of the provisional fence from the path [m]."
+        ),
     ] = 0.8,
 ) -> None:
     """Fit the reference path to a trace of the car or the wand. The fence of an existing file is kept."""
@@ -54,15 +60,22 @@ def room_path(
     old = _old_room(output)
     fence = old.fence_m if old else fence_around(fit.path, fence_margin_m)
     room = _room(
-        fit.path.to_dict(), fence, old.off_track_m if old else off_track_m,
-        start_before_corner(fit.path, corner, before_m), f"path fitted to {topic}",
-        {"path_rms_mm": round(1e3 * fit.rms_m, 2), "path_worst_mm": round(1e3 * fit.worst_m, 2)}, len(fit.trace),
-    )  # fmt: skip
+        fit.path.to_dict(),
+        fence,
+        old.off_track_m if old else off_track_m,
+        start_before_corner(fit.path, corner, before_m),
+        f"path fitted to {topic}",
+        {"path_rms_mm": round(1e3 * fit.rms_m, 2), "path_worst_mm": round(1e3 * fit.worst_m, 2)},
+        len(fit.trace),
+    )
     _require_clearance(clearance(fit.path, fence))
     picture = save_with_plot(room, output, lambda figure: _draw(figure, room, fit.trace, fit))
     _print_fit(fit)
     print(f"start {before_m:g} m before corner {corner}: {room.start_pose}")
-    print(f"{output} and {picture}" + ("" if old else "; the fence is provisional, measure it with advnerf room fence"))
+    print(
+        f"{output} and {picture}"
+        + ("" if old else "; the fence is provisional, measure it with advnerf room fence")
+    )
 
 
 @app.command("fence")
@@ -89,8 +102,14 @@ def room_fence(
     least_m = clearance(old.reference_path, fence)
     _require_clearance(least_m)
     room = _room(
-        old.path, fence, old.off_track_m, old.start_pose, f"{old.method}; fence walked with {topic}", old.residuals, old.views
-    )  # fmt: skip
+        old.path,
+        fence,
+        old.off_track_m,
+        old.start_pose,
+        f"{old.method}; fence walked with {topic}",
+        old.residuals,
+        old.views,
+    )
     picture = save_with_plot(room, output, lambda figure: _draw(figure, room, trace))
     print(f"fence of {len(fence)} corners, at least {least_m:.2f} m from the path; {output} and {picture}")
 
@@ -99,7 +118,9 @@ def room_fence(
 def room_target(
     output: Annotated[Path, typer.Option("--output", "-o", help="YAML file to write.")],
     subject: Annotated[str, typer.Option("--subject", help="Motion-capture subject: board or monitor.")],
-    bag: Annotated[Path | None, typer.Argument(help="Bag in which a wand touches the corners.", exists=True)] = None,
+    bag: Annotated[
+        Path | None, typer.Argument(help="Bag in which a wand touches the corners.", exists=True)
+    ] = None,
     size: Annotated[
         str | None, typer.Option("--size", metavar="WxH", help="Width x height instead of a bag [m].")
     ] = None,
@@ -132,7 +153,11 @@ def room_target(
     if size is not None:
         width, height = _numbers(size.replace("x", ","), 2, "--size")
         target = target_of_size(
-            subject, (width, height), _point(centre, "--centre"), float(np.deg2rad(yaw_deg)), "measured with a ruler"
+            subject,
+            (width, height),
+            _point(centre, "--centre"),
+            float(np.deg2rad(yaw_deg)),
+            "measured with a ruler",
         )
     else:
         assert bag is not None
@@ -147,12 +172,17 @@ def room_target(
 def room_place(
     attack_file: Annotated[Path, typer.Argument(help="Attack file.", exists=True, dir_okay=False)],
     target_file: Annotated[
-        Path, typer.Option("--target", help="Target file of the board or monitor that shows the attack.", exists=True)
+        Path,
+        typer.Option(
+            "--target", help="Target file of the board or monitor that shows the attack.", exists=True
+        ),
     ],
     request: Annotated[
         Path | None,
         typer.Option(
-            "--request", help="The attack's *.attack.yaml. A copy for the measured pose is written.", exists=True
+            "--request",
+            help="The attack's *.attack.yaml. A copy for the measured pose is written.",
+            exists=True,
         ),
     ] = None,
     tolerance_cm: Annotated[float, typer.Option("--tolerance-cm", min=0.1)] = 2.0,
@@ -160,7 +190,9 @@ def room_place(
     once: Annotated[
         bool, typer.Option("--once", help="Measure once. Exit code 1 if the target is out of place.")
     ] = False,
-    timeout_s: Annotated[float, typer.Option("--timeout", min=1.0, help="Give up after this time [s].")] = 600.0,
+    timeout_s: Annotated[
+        float, typer.Option("--timeout", min=1.0, help="Give up after this time [s].")
+    ] = 600.0,
     run_dir: RunDir = None,
 ) -> None:
     """Guide the board or monitor to the pose for which its attack was computed, live. Exit code 1 if it is off."""
@@ -231,10 +263,16 @@ def _room(
 
     return RoomCalibration.model_validate(
         {
-            "date": datetime.date.today(), "method": method, "path": path, "off_track_m": off_track_m, "fence_m": fence,
-            "start_pose": start, "residuals": residuals, "views": views,
+            "date": datetime.date.today(),
+            "method": method,
+            "path": path,
+            "off_track_m": off_track_m,
+            "fence_m": fence,
+            "start_pose": start,
+            "residuals": residuals,
+            "views": views,
         }
-    )  # fmt: skip
+    )
 
 
 def _require_clearance(least_m: float) -> None:
@@ -254,7 +292,9 @@ def _print_fit(fit: PathFit) -> None:
         if isinstance(piece, Line):
             rows.add_row("line", f"{piece.length_m:.3f}", "", "")
         else:
-            rows.add_row("arc", f"{piece.length_m:.3f}", f"{piece.radius_m:.3f}", f"{57.29578 * piece.angle_rad:+.1f}")
+            rows.add_row(
+                "arc", f"{piece.length_m:.3f}", f"{piece.radius_m:.3f}", f"{57.29578 * piece.angle_rad:+.1f}"
+            )
     print_table(rows)
     kind = (
         f"closed, {fit.path.length_m:.2f} m, {fit.laps:.1f} laps"
@@ -279,7 +319,9 @@ def _draw(figure: Figure, room: RoomCalibration, trace: Array, fit: PathFit | No
     axes[0].legend(fontsize="small")
     if fit:
         axes[1].plot(path.project(fit.trace).s_m, 1e3 * fit.residuals_m, ".", markersize=2)
-        axes[1].set(xlabel="along the path [m]", ylabel="distance from it [mm]", title=f"rms {1e3 * fit.rms_m:.1f} mm")
+        axes[1].set(
+            xlabel="along the path [m]", ylabel="distance from it [mm]", title=f"rms {1e3 * fit.rms_m:.1f} mm"
+        )
 
 
 def _numbers(text: str, count: int, option: str) -> tuple[float, ...]:

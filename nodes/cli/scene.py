@@ -44,21 +44,32 @@ def scene_train(
     output: Annotated[
         Path, typer.Option("--output", "-o", help="Folder of the results. A stopped training resumes there.")
     ],
-    steps: Annotated[int | None, typer.Option("--steps", min=1, show_default="1000 without --minutes")] = None,
+    steps: Annotated[
+        int | None, typer.Option("--steps", min=1, show_default="1000 without --minutes")
+    ] = None,
     minutes: Annotated[
-        float | None, typer.Option("--minutes", min=0.01, help="Train for this many minutes instead of --steps.")
+        float | None,
+        typer.Option("--minutes", min=0.01, help="Train for this many minutes instead of --steps."),
     ] = None,
     box_low: Corner = None,
     box_high: Corner = None,
     size: Size = None,
-    open_scene: Annotated[bool, typer.Option("--open", help="Outdoor scene: rays may leave the box.")] = False,
-    every: Annotated[int, typer.Option("--every", min=2, help="Hold out every N-th image.")] = _HELD_OUT_EVERY,
-    near: Annotated[float, typer.Option("--near", min=0.0, help="Learn nothing closer to a camera than this.")] = 0.05,
+    open_scene: Annotated[
+        bool, typer.Option("--open", help="Outdoor scene: rays may leave the box.")
+    ] = False,
+    every: Annotated[
+        int, typer.Option("--every", min=2, help="Hold out every N-th image.")
+    ] = _HELD_OUT_EVERY,
+    near: Annotated[
+        float, typer.Option("--near", min=0.0, help="Learn nothing closer to a camera than this.")
+    ] = 0.05,
     seed: Annotated[int, typer.Option("--seed")] = 0,
     checkpoint_every_s: Annotated[
         float,
         typer.Option(
-            "--checkpoint-every", min=0.0, help="Time between checkpoints; the most training that a kill loses [s]."
+            "--checkpoint-every",
+            min=0.0,
+            help="Time between checkpoints; the most training that a kill loses [s].",
         ),
     ] = 30.0,
     unbounded: Annotated[
@@ -97,7 +108,9 @@ def scene_train(
     interval_growth: Annotated[
         float | None,
         typer.Option(
-            "--interval-growth", help="Sample interval per distance.", show_default="--interval-px / focal length"
+            "--interval-growth",
+            help="Sample interval per distance.",
+            show_default="--interval-px / focal length",
         ),
     ] = None,
 ) -> None:
@@ -135,7 +148,9 @@ def scene_train(
     try:
         lock = hold(output / ".lock")
     except HeldError as error:
-        raise ConfigError(f"{output} is in use by process {error.owner}; wait until it ends, or stop it") from None
+        raise ConfigError(
+            f"{output} is in use by process {error.owner}; wait until it ends, or stop it"
+        ) from None
     with lock, ProgressDisplay() as display:
         figures = train(request, display.start("scene"))
     _print_figures(figures)
@@ -164,9 +179,13 @@ def scene_render(
     scene: SceneFile,
     transforms: DataSet,
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the rendered images.")],
-    video: Annotated[Path | None, typer.Option("--video", help="Also write a video (MP4) through all views.")] = None,
+    video: Annotated[
+        Path | None, typer.Option("--video", help="Also write a video (MP4) through all views.")
+    ] = None,
     size: Size = None,
-    held_out: Annotated[bool, typer.Option("--held-out", help="Render only the cameras of held-out images.")] = False,
+    held_out: Annotated[
+        bool, typer.Option("--held-out", help="Render only the cameras of held-out images.")
+    ] = False,
     every: int = _HELD_OUT_EVERY,
     interval_scale: IntervalScale = 1.0,
 ) -> None:
@@ -190,13 +209,18 @@ def scene_view(
     transforms: Annotated[
         Path | None, typer.Option("--cameras", help="A transforms.json whose cameras are shown.", exists=True)
     ] = None,
-    objects: Annotated[list[Path] | None, typer.Option("--object", help="Object file to place at the origin.")] = None,
+    objects: Annotated[
+        list[Path] | None, typer.Option("--object", help="Object file to place at the origin.")
+    ] = None,
     room: Annotated[
         Path | None, typer.Option("--room", help="Room calibration whose path is drawn.", exists=True)
     ] = None,
     port: Annotated[int, typer.Option("--port", min=1, max=65535)] = 8080,
     host: Annotated[
-        str, typer.Option("--host", help="Address to serve on. 0.0.0.0 lets other computers on the network connect.")
+        str,
+        typer.Option(
+            "--host", help="Address to serve on. 0.0.0.0 lets other computers on the network connect."
+        ),
     ] = "127.0.0.1",
 ) -> None:
     """Fly through a scene in the browser."""

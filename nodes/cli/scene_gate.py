@@ -31,16 +31,19 @@ def gate(
     ] = "straight",
     victim: Annotated[str, typer.Option("--victim", help="Victim: hardened or naive.")] = "hardened",
     bag: Annotated[
-        Path | None, typer.Option("--bag", help="Bag of a drive without an attack, to compare as well.", exists=True)
+        Path | None,
+        typer.Option("--bag", help="Bag of a drive without an attack, to compare as well.", exists=True),
     ] = None,
     psnr_db: Annotated[
-        float | None, typer.Option("--psnr", help="Lowest accepted mean PSNR at the policy's image size [dB].")
+        float | None,
+        typer.Option("--psnr", help="Lowest accepted mean PSNR at the policy's image size [dB]."),
     ] = None,
     ssim: Annotated[
         float | None, typer.Option("--ssim", help="Lowest accepted mean SSIM at the policy's image size.")
     ] = None,
     steering: Annotated[
-        float | None, typer.Option("--steering", help="Largest accepted mean steering difference [rad or rad/s].")
+        float | None,
+        typer.Option("--steering", help="Largest accepted mean steering difference [rad or rad/s]."),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print everything as JSON.")] = False,
     overrides: Overrides = None,
@@ -59,13 +62,21 @@ def gate(
     if as_json:
         print(json.dumps({of: verdict.record() for of, verdict in verdicts}))
     else:
-        rows = table("pictures", "views", "PSNR [dB]", "SSIM", "steering difference", "worst", "correlation", "verdict")
+        rows = table(
+            "pictures", "views", "PSNR [dB]", "SSIM", "steering difference", "worst", "correlation", "verdict"
+        )
         for of, verdict in verdicts:
             n = verdict.numbers
             rows.add_row(
-                of, str(n["views"]), f"{n['psnr_db']:.2f}", f"{n['ssim']:.3f}", f"{n['steering']:.4f}", f"{n['steering_worst']:.4f}",
-                f"{n['correlation']:.4f}", "[green]pass[/]" if verdict.passed else "[red]refused[/]",
-            )  # fmt: skip
+                of,
+                str(n["views"]),
+                f"{n['psnr_db']:.2f}",
+                f"{n['ssim']:.3f}",
+                f"{n['steering']:.4f}",
+                f"{n['steering_worst']:.4f}",
+                f"{n['correlation']:.4f}",
+                "[green]pass[/]" if verdict.passed else "[red]refused[/]",
+            )
         print_table(rows)
         for reason in [reason for _, verdict in verdicts for reason in verdict.reasons]:
             print(reason)

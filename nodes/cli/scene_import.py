@@ -25,21 +25,30 @@ Output = Annotated[
     ),
 ]
 Media = Annotated[list[Path], typer.Argument(help="Videos and folders of photographs.", exists=True)]
-Bag = Annotated[Path, typer.Argument(help="Bag folder, or a .mcap, .db3 or .bag file of a drive.", exists=True)]
-Most = Annotated[int, typer.Option("--most", min=3, help="Use at most this many images of each video, folder or bag.")]
+Bag = Annotated[
+    Path, typer.Argument(help="Bag folder, or a .mcap, .db3 or .bag file of a drive.", exists=True)
+]
+Most = Annotated[
+    int, typer.Option("--most", min=3, help="Use at most this many images of each video, folder or bag.")
+]
 OneCamera = Annotated[
     bool, typer.Option("--one-camera", help="All images are from one camera with one focal length (no zoom).")
 ]
 Movement = Annotated[
     float,
     typer.Option(
-        "--movement", min=0.005, max=0.9, help="Keep a frame when the image has moved by this fraction of its width."
+        "--movement",
+        min=0.005,
+        max=0.9,
+        help="Keep a frame when the image has moved by this fraction of its width.",
     ),
 ]
 ExtentM = Annotated[
     float,
     typer.Option(
-        "--extent", min=0.001, help="Distance between the two camera positions farthest apart [m]; sets the scale."
+        "--extent",
+        min=0.001,
+        help="Distance between the two camera positions farthest apart [m]; sets the scale.",
     ),
 ]
 Seed = Annotated[int, typer.Option("--seed", help="Random seed.")]
@@ -57,24 +66,36 @@ StepM = Annotated[float, typer.Option("--step", min=0.0, help="Distance between 
 StepDeg = Annotated[
     float,
     typer.Option(
-        "--step-angle", min=0.0, help="Rotation after which the next frame is used even without that distance [deg]."
+        "--step-angle",
+        min=0.0,
+        help="Rotation after which the next frame is used even without that distance [deg].",
     ),
 ]
 
 
 @app.command("from-video")
 def from_video(
-    media: Media, output: Output, movement: Movement = 0.06, most: Most = 300, one_camera: OneCamera = False,
-    extent_m: ExtentM = 4.0, seed: Seed = 0,
-) -> None:  # fmt: skip
+    media: Media,
+    output: Output,
+    movement: Movement = 0.06,
+    most: Most = 300,
+    one_camera: OneCamera = False,
+    extent_m: ExtentM = 4.0,
+    seed: Seed = 0,
+) -> None:
     """Estimate poses and lenses of the sharpest frames of videos. Several videos and cameras go into one model."""
     _from_media(media, output, movement, most, one_camera, extent_m, seed)
 
 
 @app.command("from-images")
 def from_images(
-    media: Media, output: Output, most: Most = 300, one_camera: OneCamera = False, extent_m: ExtentM = 4.0, seed: Seed = 0
-) -> None:  # fmt: skip
+    media: Media,
+    output: Output,
+    most: Most = 300,
+    one_camera: OneCamera = False,
+    extent_m: ExtentM = 4.0,
+    seed: Seed = 0,
+) -> None:
     """Estimate poses and lenses of photographs, optionally with videos.
 
     The images of a folder share a camera unless their sizes or EXIF data differ.
@@ -84,11 +105,17 @@ def from_images(
 
 @app.command("from-bag")
 def from_bag(
-    bag: Bag, output: Output, calibration: Calibration = None, step_m: StepM = 0.1, step_deg: StepDeg = 5.0, most: Most = 300,
+    bag: Bag,
+    output: Output,
+    calibration: Calibration = None,
+    step_m: StepM = 0.1,
+    step_deg: StepDeg = 5.0,
+    most: Most = 300,
     margin_m: Annotated[
-        float, typer.Option("--margin", min=0.0, help="Margin of the scene box around the car's trajectory [m].")
+        float,
+        typer.Option("--margin", min=0.0, help="Margin of the scene box around the car's trajectory [m]."),
     ] = 3.0,
-) -> None:  # fmt: skip
+) -> None:
     """Use recorded frames with their motion-capture poses. No pose is estimated."""
     from nodes.lab.importing.data_set import from_bag as run
     from nodes.lab.importing.driven_bag import BagConfig
@@ -99,14 +126,25 @@ def from_bag(
 
 @app.command("from-phone-and-car")
 def from_phone_and_car(
-    media: Media, output: Output,
+    media: Media,
+    output: Output,
     bag: Annotated[Path, typer.Option("--bag", help="Bag of a drive through the same room.", exists=True)],
-    calibration: Calibration = None, movement: Movement = 0.06, step_m: StepM = 0.15, step_deg: StepDeg = 8.0,
-    most: Most = 200, one_camera: OneCamera = False, seed: Seed = 0,
+    calibration: Calibration = None,
+    movement: Movement = 0.06,
+    step_m: StepM = 0.15,
+    step_deg: StepDeg = 8.0,
+    most: Most = 200,
+    one_camera: OneCamera = False,
+    seed: Seed = 0,
     tolerance_m: Annotated[
-        float, typer.Option("--tolerance", min=0.001, help="Largest accepted distance of a frame from its motion-capture pose [m].")
+        float,
+        typer.Option(
+            "--tolerance",
+            min=0.001,
+            help="Largest accepted distance of a frame from its motion-capture pose [m].",
+        ),
     ] = 0.08,
-) -> None:  # fmt: skip
+) -> None:
     """Combine phone media and the frames of a bag into one model, metric and in the motion-capture world."""
     from advnerf_core.data.keyframes import KeyframeConfig
     from calibration.phone_and_car import PlacingConfig
@@ -118,20 +156,35 @@ def from_phone_and_car(
     media_config = MediaConfig(KeyframeConfig(movement), most, one_camera)
     bag_config, placing = BagConfig(step_m, math.radians(step_deg), most=most), PlacingConfig(tolerance_m)
     _run(
-        "from-phone-and-car", output,
-        lambda report: run(media, bag, output, media_config, bag_config, SfmConfig(seed=seed), placing, report, calibration),
-    )  # fmt: skip
+        "from-phone-and-car",
+        output,
+        lambda report: run(
+            media, bag, output, media_config, bag_config, SfmConfig(seed=seed), placing, report, calibration
+        ),
+    )
 
 
 @app.command("match-colours")
 def match_colours(
-    scene: Annotated[Path, typer.Argument(help="Scene file learned from the phone's images.", exists=True, dir_okay=False)],
-    images: Annotated[Path, typer.Argument(help="transforms_car.json with frames of the driving camera in the same world.", exists=True)],
+    scene: Annotated[
+        Path, typer.Argument(help="Scene file learned from the phone's images.", exists=True, dir_okay=False)
+    ],
+    images: Annotated[
+        Path,
+        typer.Argument(
+            help="transforms_car.json with frames of the driving camera in the same world.", exists=True
+        ),
+    ],
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="Scene file to write, with the colour map.", show_default="the scene file")
+        Path | None,
+        typer.Option(
+            "--output", "-o", help="Scene file to write, with the colour map.", show_default="the scene file"
+        ),
     ] = None,
-    most: Annotated[int, typer.Option("--most", min=1, help="Use at most this many frames, evenly spread.")] = 16,
-) -> None:  # fmt: skip
+    most: Annotated[
+        int, typer.Option("--most", min=1, help="Use at most this many frames, evenly spread.")
+    ] = 16,
+) -> None:
     """Fit the map from the colours of a scene to those of the driving camera, and store it in the scene file."""
     from nodes.lab.importing.colours import match_colours as run
 
@@ -150,7 +203,11 @@ def _from_media(
     from nodes.lab.importing.media import MediaConfig
 
     config = MediaConfig(KeyframeConfig(movement), most, one_camera)
-    _run("from-media", output, lambda report: run(media, output, config, SfmConfig(seed=seed), extent_m, report))
+    _run(
+        "from-media",
+        output,
+        lambda report: run(media, output, config, SfmConfig(seed=seed), extent_m, report),
+    )
 
 
 def _run(name: str, output: Path, work: Any) -> None:

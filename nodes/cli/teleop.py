@@ -9,10 +9,19 @@ import typer
 
 
 def teleop(
-    device: Annotated[str, typer.Option("--device", help="keyboard, or the path of a gamepad: /dev/input/by-id/...-event-joystick.")] = "keyboard",
-    run_dir: Annotated[Path | None, typer.Option("--run-dir", show_default="the launch that is running")] = None,
-    speed_mps: Annotated[float, typer.Option("--speed", min=0.05, max=2.0, help="Speed at full throttle [m/s].")] = 0.8,
-) -> None:  # fmt: skip
+    device: Annotated[
+        str,
+        typer.Option(
+            "--device", help="keyboard, or the path of a gamepad: /dev/input/by-id/...-event-joystick."
+        ),
+    ] = "keyboard",
+    run_dir: Annotated[
+        Path | None, typer.Option("--run-dir", show_default="the launch that is running")
+    ] = None,
+    speed_mps: Annotated[
+        float, typer.Option("--speed", min=0.05, max=2.0, help="Speed at full throttle [m/s].")
+    ] = 0.8,
+) -> None:
     """Drive the car of a running launch while a button is held. Releasing the button stops it."""
     import sys
 

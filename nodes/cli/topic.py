@@ -22,7 +22,11 @@ def topic_list(run_dir: RunDir = None) -> None:
     for row in list_topics(find_run_dir(run_dir)):
         rate_hz = topic(row.name).rate_hz
         rows.add_row(
-            row.name, row.type, f"{rate_hz:g} Hz" if rate_hz else "", row.publisher or "-", str(row.subscribers)
+            row.name,
+            row.type,
+            f"{rate_hz:g} Hz" if rate_hz else "",
+            row.publisher or "-",
+            str(row.subscribers),
         )
     print_table(rows)
 
@@ -40,13 +44,17 @@ def topic_hz(
     print(f"{topic}: {report.rate_hz:.2f} Hz, {report.messages} messages, {report.lost} lost")
     print(f"gaps: {report.shortest_s * 1e3:.1f} to {report.longest_s * 1e3:.1f} ms")
     if report.age_median_s is not None and report.age_worst_s is not None:
-        print(f"age of the stamp: median {report.age_median_s * 1e3:.1f} ms, worst {report.age_worst_s * 1e3:.1f} ms")
+        print(
+            f"age of the stamp: median {report.age_median_s * 1e3:.1f} ms, worst {report.age_worst_s * 1e3:.1f} ms"
+        )
 
 
 @app.command("echo")
 def topic_echo(
     topic: str,
-    count: Annotated[int | None, typer.Option("--count", min=1, help="Stop after this many messages.")] = None,
+    count: Annotated[
+        int | None, typer.Option("--count", min=1, help="Stop after this many messages.")
+    ] = None,
     duration_s: Annotated[
         float | None, typer.Option("--duration", min=0.1, help="Stop after this many seconds.")
     ] = None,
@@ -74,7 +82,10 @@ def topic_delay(
 
     report = measure_delay(find_run_dir(run_dir), topic, duration_s)
     rows = table("way", "median", "99 %", "worst")
-    ways = (("capture to publish", report.capture_to_publish), ("publish to receive", report.publish_to_receive))
+    ways = (
+        ("capture to publish", report.capture_to_publish),
+        ("publish to receive", report.publish_to_receive),
+    )
     for name, delay in ways:
         if delay is not None:
             times = (delay.median_s, delay.p99_s, delay.worst_s)

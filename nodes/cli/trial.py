@@ -25,25 +25,32 @@ def trial(
     file: Annotated[Path, typer.Argument(help="A *.launch.yaml file.", exists=True, dir_okay=False)],
     attack: Annotated[
         list[str] | None,
-        typer.Option("--attack", metavar="CONDITION=FILE", help="Attack file of a condition. May be repeated."),
+        typer.Option(
+            "--attack", metavar="CONDITION=FILE", help="Attack file of a condition. May be repeated."
+        ),
     ] = None,
     folder: Annotated[
-        Path, typer.Option("--folder", help="Folder of plan, results and bags. The same folder resumes the trial.")
+        Path,
+        typer.Option("--folder", help="Folder of plan, results and bags. The same folder resumes the trial."),
     ] = Path("runs/trials"),
     repeats: Annotated[int, typer.Option("--repeats", min=1, help="Number of runs per condition.")] = 5,
     seed: Annotated[int, typer.Option("--seed", help="Random seed of the order of runs.")] = 0,
     ticks: Annotated[int, typer.Option("--ticks", min=1, help="Control ticks per drive, at 10 Hz.")] = 60,
     start: Annotated[
-        str | None, typer.Option("--start", metavar="X,Y,YAW", help="Start pose [m, rad].", show_default="the room's")
+        str | None,
+        typer.Option("--start", metavar="X,Y,YAW", help="Start pose [m, rad].", show_default="the room's"),
     ] = None,
     ready_timeout_s: Annotated[float, typer.Option("--ready-timeout", min=1.0)] = 60.0,
     host: Annotated[
         str | None,
         typer.Option(
-            "--host", help="Host of the launch file that this computer is, or all. The other host must be running."
+            "--host",
+            help="Host of the launch file that this computer is, or all. The other host must be running.",
         ),
     ] = None,
-    show: Annotated[bool, typer.Option("--show", help="Only print the order of runs and which are done.")] = False,
+    show: Annotated[
+        bool, typer.Option("--show", help="Only print the order of runs and which are done.")
+    ] = False,
     overrides: Overrides = None,
 ) -> None:
     """Drive the conditions none, random and gradient in balanced order from the same start. Resumes a stopped trial."""
@@ -51,8 +58,16 @@ def trial(
 
     attacks = _attacks(attack or [])
     series = prepare_series(
-        file, overrides or [], folder, attacks, repeats, seed, ticks, None if start is None else _pose(start), host,
-    )  # fmt: skip
+        file,
+        overrides or [],
+        folder,
+        attacks,
+        repeats,
+        seed,
+        ticks,
+        None if start is None else _pose(start),
+        host,
+    )
     count = len(series.plan.runs)
     if show:
         done = series.results
@@ -73,20 +88,34 @@ def trial(
 
 
 def evaluate(
-    bags: Annotated[list[Path], typer.Argument(help="Bag folders, or .mcap, .db3 or .bag files.", exists=True)],
+    bags: Annotated[
+        list[Path], typer.Argument(help="Bag folders, or .mcap, .db3 or .bag files.", exists=True)
+    ],
     room: Annotated[
         Path | None, typer.Option("--room", help="Room file.", show_default="the one in the bag", exists=True)
     ] = None,
-    ticks: Annotated[int, typer.Option("--ticks", min=1, help="Number of control ticks to evaluate, at 10 Hz.")] = 60,
-    as_json: Annotated[bool, typer.Option("--json", help="Print everything as JSON, one line per drive.")] = False,
+    ticks: Annotated[
+        int, typer.Option("--ticks", min=1, help="Number of control ticks to evaluate, at 10 Hz.")
+    ] = 60,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print everything as JSON, one line per drive.")
+    ] = False,
 ) -> None:
     """Compute how far the car left its path in a bag, with the metrics of a trial."""
     from nodes.lab.trials.bags import evaluate_bag
 
     rows = table(
-        "bag", "attack", "total CTE \\[m]", "mean \\[m]", "max \\[m]", "off track", "left after", "attack adds",
-        "stopped early", "checksums",
-    )  # fmt: skip
+        "bag",
+        "attack",
+        "total CTE \\[m]",
+        "mean \\[m]",
+        "max \\[m]",
+        "off track",
+        "left after",
+        "attack adds",
+        "stopped early",
+        "checksums",
+    )
     for bag in bags:
         for found in evaluate_bag(bag, room, ticks):
             if as_json:
@@ -94,11 +123,17 @@ def evaluate(
                 continue
             leaving = found["time_to_leave_s"]
             rows.add_row(
-                str(bag), " ".join(found["attack_ids"]) or "none", f"{found['total_cte_m']:.3f}",
-                f"{found['mean_abs_cte_m']:.3f}", f"{found['max_abs_cte_m']:.3f}", "yes" if found["off_track"] else "no",
-                "" if leaving is None else f"{leaving:.1f} s", _added(found.get("counterfactual")), found["stopped_early"],
+                str(bag),
+                " ".join(found["attack_ids"]) or "none",
+                f"{found['total_cte_m']:.3f}",
+                f"{found['mean_abs_cte_m']:.3f}",
+                f"{found['max_abs_cte_m']:.3f}",
+                "yes" if found["off_track"] else "no",
+                "" if leaving is None else f"{leaving:.1f} s",
+                _added(found.get("counterfactual")),
+                found["stopped_early"],
                 "unchecked" if found["unchecked"] else "agree",
-            )  # fmt: skip
+            )
     if not as_json:
         print_table(rows)
 
@@ -119,7 +154,9 @@ def _attacks(texts: list[str]) -> dict[str, list[Path]]:
     for text in texts:
         condition, separator, file = text.partition("=")
         if not separator or not condition.replace("_", "").isalnum() or condition == NONE or not file:
-            raise CampaignError(f"--attack {text}: expected CONDITION=FILE, for example gradient=runs/g.safetensors")
+            raise CampaignError(
+                f"--attack {text}: expected CONDITION=FILE, for example gradient=runs/g.safetensors"
+            )
         attacks.setdefault(condition, []).append(Path(file).resolve())
     return attacks
 
@@ -152,11 +189,15 @@ def _print_summary(results: list[dict[str, Any]]) -> None:
     for row in summarise(results):
         spread = "" if row["std_m"] is None else f" +- {row['std_m']:.3f}"
         rows.add_row(
-            row["condition"], str(row["runs"]), f"{row['mean_m']:.3f}{spread}",
-            "" if row["ratio"] is None else f"{row['ratio']:.2f}", f"{row['off_track']} of {row['runs']}",
-            str(row["stopped_early"]), "" if row["latency_p50_ms"] is None else f"{row['latency_p50_ms']:.1f} ms",
+            row["condition"],
+            str(row["runs"]),
+            f"{row['mean_m']:.3f}{spread}",
+            "" if row["ratio"] is None else f"{row['ratio']:.2f}",
+            f"{row['off_track']} of {row['runs']}",
+            str(row["stopped_early"]),
+            "" if row["latency_p50_ms"] is None else f"{row['latency_p50_ms']:.1f} ms",
             f"unchecked in {row['unchecked']}" if row["unchecked"] else "agree",
-        )  # fmt: skip
+        )
     print_table(rows)
 
 

@@ -14,7 +14,8 @@ app = typer.Typer(
     no_args_is_help=True, help="Places that are driven: which there are, and whether one keeps the contract."
 )
 Name = Annotated[
-    str, typer.Argument(metavar="WORLD", help="A world of `advnerf world list`, or file.py:Class of your own.")
+    str,
+    typer.Argument(metavar="WORLD", help="A world of `advnerf world list`, or file.py:Class of your own."),
 ]
 _FAILURE_EXIT = 1
 

@@ -145,9 +145,15 @@ class Arming:
             node.state, node.text = state, text
 
     def heard_drive(
-        self, speed_mps: float, steering_rad: float, capture_real_ns: int, info: MessageInfo, mono_ns: int, real_ns: int,
+        self,
+        speed_mps: float,
+        steering_rad: float,
+        capture_real_ns: int,
+        info: MessageInfo,
+        mono_ns: int,
+        real_ns: int,
         driver: str = "policy",
-    ) -> bool:  # fmt: skip
+    ) -> bool:
         """Note a command of a driver. Returns whether the command may pass."""
         self._check_held_up(mono_ns)
         fault = self._command_fault(speed_mps, steering_rad) or self._capture_fault(capture_real_ns, real_ns)
@@ -169,7 +175,13 @@ class Arming:
         return not fault and self.check(mono_ns)
 
     def heard_hand(
-        self, mode: str, pressed_stop: bool, speed_mps: float, steering_rad: float, info: MessageInfo, mono_ns: int
+        self,
+        mode: str,
+        pressed_stop: bool,
+        speed_mps: float,
+        steering_rad: float,
+        info: MessageInfo,
+        mono_ns: int,
     ) -> bool:
         """Note a message of the teleop node. Returns whether its own command may pass.
 
@@ -239,7 +251,12 @@ class Arming:
 
     def problem(self, mono_ns: int) -> str:
         """Return the first failed check, causes before effects; empty if all pass."""
-        return self._estop or self.hand.problem(mono_ns) or self._restart_problem() or self._passing_fault(mono_ns)
+        return (
+            self._estop
+            or self.hand.problem(mono_ns)
+            or self._restart_problem()
+            or self._passing_fault(mono_ns)
+        )
 
     def _restart_problem(self) -> str:
         """Name a source that was restarted since the arming. The next arming accepts the new process."""
@@ -269,7 +286,9 @@ class Arming:
         if "camera" in limits.nodes:
             sources.insert(0, ("no camera image", self._camera, limits.image_age_s))
         if not self.hand.drives:
-            sources.append((f"no command from the {self.driver}", self._drivers[self.driver], limits.drive_age_s))
+            sources.append(
+                (f"no command from the {self.driver}", self._drivers[self.driver], limits.drive_age_s)
+            )
         return sources
 
     def drive_age_s(self, mono_ns: int) -> float:
@@ -333,7 +352,9 @@ class Arming:
 
     def _capture_fault(self, capture_real_ns: int, real_ns: int) -> str:
         age_s = (real_ns - capture_real_ns) / NS_PER_S
-        return "" if -0.05 <= age_s <= self.limits.image_age_s else f"a command from an image {age_s:.2f} s old"
+        return (
+            "" if -0.05 <= age_s <= self.limits.image_age_s else f"a command from an image {age_s:.2f} s old"
+        )
 
     def _check_held_up(self, mono_ns: int) -> None:
         if self._last_ns is None:

@@ -63,7 +63,9 @@ class HandGate:
             return f"no message from the teleop node for {age_s:.2f} s"
         if self.mode == IDLE:
             return "the button is not held"
-        return "" if self.mode in (HUMAN, AUTONOMY) else f"the button is held as {self.mode}; release it first"
+        return (
+            "" if self.mode in (HUMAN, AUTONOMY) else f"the button is held as {self.mode}; release it first"
+        )
 
     @property
     def drives(self) -> bool:

@@ -76,7 +76,9 @@ class CommandGate:
         self.reason = "waiting for the safety node"
         self.refused = 0
 
-    def command(self, speed_mps: float, steering_rad: float, info: MessageInfo, mono_ns: int) -> Drive | Brake | None:
+    def command(
+        self, speed_mps: float, steering_rad: float, info: MessageInfo, mono_ns: int
+    ) -> Drive | Brake | None:
         """Handle a drive command. Returns what to send to the controller."""
         self._notice_silence(mono_ns)
         known, self._instance_id = self._instance_id, info.instance_id

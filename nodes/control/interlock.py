@@ -28,7 +28,11 @@ class Interlock:
 
     def heard(self, message: Any, info: MessageInfo) -> None:
         """Note a ``SafetyState``."""
-        self._armed, self._reason, self._publish_ns = bool(message.armed), str(message.reason), info.publish_mono_ns
+        self._armed, self._reason, self._publish_ns = (
+            bool(message.armed),
+            str(message.reason),
+            info.publish_mono_ns,
+        )
 
     def refusal(self, mono_ns: int) -> str:
         """Return why the attack may not be shown; empty if it may."""

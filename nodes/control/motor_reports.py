@@ -31,10 +31,11 @@ def odometry_message(state: OdometryState, stamp_ns: int) -> Any:
     covariance = np.zeros(36)
     covariance[[0, 7, 35]] = POSITION_VARIANCE, POSITION_VARIANCE, YAW_VARIANCE
     return types.Odometry(
-        header=header(stamp_ns, "odom"), child_frame_id="car",
+        header=header(stamp_ns, "odom"),
+        child_frame_id="car",
         pose=types.PoseWithCovariance(pose=pose, covariance=covariance),
         twist=types.TwistWithCovariance(twist=twist, covariance=np.zeros(36)),
-    )  # fmt: skip
+    )
 
 
 @dataclass(frozen=True)
@@ -97,9 +98,12 @@ def _controller(report: ControllerReport) -> _Row:
     if values is None:
         return "controller", ERROR, report.link or "no telemetry yet", numbers
     numbers |= {
-        "telemetry generation": values.generation, "erpm": f"{values.erpm:.0f}", "motor current [A]": f"{values.motor_current_a:.2f}",
-        "fault code": str(values.fault), "telemetry age [s]": f"{report.values_age_s:.2f}",
-    }  # fmt: skip
+        "telemetry generation": values.generation,
+        "erpm": f"{values.erpm:.0f}",
+        "motor current [A]": f"{values.motor_current_a:.2f}",
+        "fault code": str(values.fault),
+        "telemetry age [s]": f"{report.values_age_s:.2f}",
+    }
     if report.link:
         return "controller", ERROR, report.link, numbers
     if values.fault:
@@ -107,7 +111,12 @@ def _controller(report: ControllerReport) -> _Row:
     temperatures = [t for t in (values.temp_fet_c, values.temp_motor_c, values.temp_pcb_c) if t is not None]
     hottest = max(temperatures, default=0.0)
     numbers["hottest [degC]"] = f"{hottest:.1f}"
-    return "controller", WARN if hottest > _HOT_C else OK, f"{hottest:.0f} degC" if hottest > _HOT_C else "", numbers
+    return (
+        "controller",
+        WARN if hottest > _HOT_C else OK,
+        f"{hottest:.0f} degC" if hottest > _HOT_C else "",
+        numbers,
+    )
 
 
 def _battery(report: ControllerReport) -> _Row:
@@ -115,17 +124,29 @@ def _battery(report: ControllerReport) -> _Row:
     if values is None:
         return "battery", STALE, "no telemetry yet", {}
     numbers = {
-        "voltage [V]": f"{values.v_in:.1f}", "current [A]": f"{values.input_current_a:.2f}", "used [Ah]": f"{values.used_ah:.3f}",
+        "voltage [V]": f"{values.v_in:.1f}",
+        "current [A]": f"{values.input_current_a:.2f}",
+        "used [Ah]": f"{values.used_ah:.3f}",
         "used [Wh]": f"{values.used_wh:.2f}",
-    }  # fmt: skip
+    }
     low = values.v_in < report.battery_warning_v
-    return "battery", WARN if low else OK, f"{values.v_in:.1f} V, charge it" if low else f"{values.v_in:.1f} V", numbers
+    return (
+        "battery",
+        WARN if low else OK,
+        f"{values.v_in:.1f} V, charge it" if low else f"{values.v_in:.1f} V",
+        numbers,
+    )
 
 
 def _timeout(report: ControllerReport) -> _Row:
     wanted = {"expected at most": str(report.wanted_timeout)}
     if report.timeout is None:
-        return "time-out", WARN, "not read back: this firmware does not report it; check it in VESC Tool", wanted
+        return (
+            "time-out",
+            WARN,
+            "not read back: this firmware does not report it; check it in VESC Tool",
+            wanted,
+        )
     good = report.timeout.at_least(report.wanted_timeout)
     return "time-out", OK if good else ERROR, str(report.timeout), wanted
 
@@ -133,6 +154,8 @@ def _timeout(report: ControllerReport) -> _Row:
 def _steering(report: ControllerReport) -> _Row:
     answer = report.answer
     answered = (
-        {"answered": answer.ask_id, "granted": str(answer.granted), "answer": answer.text} if answer.ask_id else {}
+        {"answered": answer.ask_id, "granted": str(answer.granted), "answer": answer.text}
+        if answer.ask_id
+        else {}
     )
     return "steering", OK if report.steering_good else WARN, report.steering, answered

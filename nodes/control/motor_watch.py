@@ -145,6 +145,15 @@ class ControllerWatch:
         """Collect the report for the diagnostics."""
         age_s = (now.mono_ns - vesc.last_reply_mono_ns) / NS_PER_S
         return ControllerReport(
-            self.values, age_s, self._firmware, self.timeout, self._wanted, vesc.skipped_bytes, link, self.check.text,
-            self.steering_good, battery_warning_v, self.answers.last,
-        )  # fmt: skip
+            self.values,
+            age_s,
+            self._firmware,
+            self.timeout,
+            self._wanted,
+            vesc.skipped_bytes,
+            link,
+            self.check.text,
+            self.steering_good,
+            battery_warning_v,
+            self.answers.last,
+        )

@@ -64,9 +64,13 @@ class MotionBounds:
         # A backward limit of 0 means that no backward motion is commanded. A stopped car still rolls back a little.
         backward_mps = max(-limits.speed_min_mps, 0.1 * limits.speed_max_mps)
         return cls(
-            margin * limits.speed_max_mps, margin * backward_mps, margin * turn_radps, reach_m=wheelbase_m,
-            noise_m=noise_m, noise_rad=noise_rad,
-        )  # fmt: skip
+            margin * limits.speed_max_mps,
+            margin * backward_mps,
+            margin * turn_radps,
+            reach_m=wheelbase_m,
+            noise_m=noise_m,
+            noise_rad=noise_rad,
+        )
 
 
 @dataclass
@@ -96,7 +100,9 @@ class PoseCheck:
         gap_s = (stamp_ns - last_ns) / NS_PER_S
         if gap_s > self.bounds.longest_gap_s:
             self._begin(stamp_ns, T)
-            self._gaps.append((stamp_ns, self.bounds.longest_gap_s))  # for the poses that were delayed with it
+            self._gaps.append(
+                (stamp_ns, self.bounds.longest_gap_s)
+            )  # for the poses that were delayed with it
             return ""
         if gap_s < -_GAP_WINDOW_S:
             self._begin(stamp_ns, T)
@@ -126,7 +132,9 @@ class PoseCheck:
             self._gaps.popleft()
         return max(0.0, *(gap for _, gap in self._gaps))
 
-    def _impossible(self, A: NDArray[np.float64], B: NDArray[np.float64], allowed_s: float, dt_s: float) -> str:
+    def _impossible(
+        self, A: NDArray[np.float64], B: NDArray[np.float64], allowed_s: float, dt_s: float
+    ) -> str:
         bounds = self.bounds
         turned_rad = _angle(A[:3, :3].T @ B[:3, :3])
         if turned_rad > bounds.turn_radps * allowed_s + bounds.noise_rad:

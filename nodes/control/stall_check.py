@@ -88,7 +88,9 @@ class StallGate:
         rest_s = max((self._rest_s(name, mono_ns) for name in limits.sources), default=0.0)
         if rest_s < limits.time_s:
             return ""
-        return f"stalled for {rest_s:.1f} s: commanded {self._commanded_mps:.2f} m/s, {self._finding(mono_ns)}"
+        return (
+            f"stalled for {rest_s:.1f} s: commanded {self._commanded_mps:.2f} m/s, {self._finding(mono_ns)}"
+        )
 
     def _measured(self, name: str, speed_mps: float, mono_ns: int) -> None:
         # Everything except rest counts as motion, including NaN. Another check reports a broken measurement.

@@ -133,8 +133,9 @@ class SteeringCheck:
             driven = arc.turned_rad / arc.driven_m
             if abs(driven - told) > self._settings.agreement * abs(told):
                 self._end(
-                    False, f"with wheels turned {name}, expected a curvature of {told:+.2f} 1/m, measured {driven:+.2f} 1/m; check: {_CAUSES}",
-                )  # fmt: skip
+                    False,
+                    f"with wheels turned {name}, expected a curvature of {told:+.2f} 1/m, measured {driven:+.2f} 1/m; check: {_CAUSES}",
+                )
                 return
         self._end(True, "steering seen by motion capture")
 
@@ -152,6 +153,4 @@ class SteeringCheck:
         return (mono_ns - self._began_ns) / NS_PER_S % self._settings.hold_s >= _SETTLE_S
 
 
-_CAUSES = (
-    "servo output off in the controller's firmware or application settings, servo unplugged, or gains of another car"
-)
+_CAUSES = "servo output off in the controller's firmware or application settings, servo unplugged, or gains of another car"

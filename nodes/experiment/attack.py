@@ -78,7 +78,9 @@ def start_states(experiment: Experiment, seed: int) -> torch.Tensor:
 
 def frozen_hashes(experiment: Experiment) -> dict[str, str]:
     """What is fixed before the first attack: scene, victims, placement, starts and seeds."""
-    policies = {f"policy_{name}": load_policy(victim_file(experiment, name)).sha256 for name in victims(experiment)}
+    policies = {
+        f"policy_{name}": load_policy(victim_file(experiment, name)).sha256 for name in victims(experiment)
+    }
     placement = np.asarray(attacked_object(experiment).T_world_from_object).tolist()
     starts = {str(seed): start_states(experiment, seed).tolist() for seed in experiment.config.attack.seeds}
     return {
@@ -105,7 +107,9 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
             continue
 
         def progress(fraction: float, text: str = "", index: int = index, search: Search = search) -> None:
-            report((index + fraction) / len(plan), f"{search.victim} {search.method} seed {search.seed}: {text}")
+            report(
+                (index + fraction) / len(plan), f"{search.victim} {search.method} seed {search.seed}: {text}"
+            )
 
         run_search(experiment, attacked, search, folder, progress)
 
@@ -123,10 +127,17 @@ def attack_problem(
     attack = experiment.config.attack
     fence = np.abs(np.array(experiment.room.fence_m)).min()
     return AttackProblem(
-        policy.policy, surrogate, experiment.dynamics, experiment.path, start_states(experiment, seed), attack.horizon,
-        time_batch=attack.time_batch, cache_bytes=int(attack.cache_mib * 2**20), fence_m=float(fence),
+        policy.policy,
+        surrogate,
+        experiment.dynamics,
+        experiment.path,
+        start_states(experiment, seed),
+        attack.horizon,
+        time_batch=attack.time_batch,
+        cache_bytes=int(attack.cache_mib * 2**20),
+        fence_m=float(fence),
         off_track_m=experiment.room.off_track_m,
-    )  # fmt: skip
+    )
 
 
 def measured(experiment: Experiment, problem: AttackProblem) -> AttackProblem:
@@ -134,12 +145,17 @@ def measured(experiment: Experiment, problem: AttackProblem) -> AttackProblem:
     return replace(problem, steps=experiment.config.horizon)
 
 
-def drive_without_attack(experiment: Experiment, bare: Surrogate, victim: str, seed: int, folder: Path) -> None:
+def drive_without_attack(
+    experiment: Experiment, bare: Surrogate, victim: str, seed: int, folder: Path
+) -> None:
     """Drive in the learned scene without attack; leaves a JSON of the drives."""
     policy = load_policy(victim_file(experiment, victim))
     problem = measured(experiment, attack_problem(experiment, bare, policy, seed))
     rollout, totals = evaluate(problem, torch.zeros(bare.theta_shape))
-    drives = {"states": rollout.states.transpose(0, 1).tolist(), "total_cte_m": totals.protocol_cte_m.tolist()}
+    drives = {
+        "states": rollout.states.transpose(0, 1).tolist(),
+        "total_cte_m": totals.protocol_cte_m.tolist(),
+    }
     write_atomically(folder / f"{victim}_none_{seed}.json", json.dumps(drives) + "\n")
 
 
@@ -160,7 +176,9 @@ def run_search(
     searching = SearchRun(search.seed, state_path, told, hash_of(frozen_hashes(experiment)))
     result = method.search(problem, settings, searching)
     clean = clean_drive(problem, plain_theta(surrogate))
-    attack_id = save_attack(attack_path(folder, search), _attack_file(experiment, policy, search, result, clean))
+    attack_id = save_attack(
+        attack_path(folder, search), _attack_file(experiment, policy, search, result, clean)
+    )
     rollout, totals = evaluate(measured(experiment, problem), result.theta)
     drives = {
         "attack_id": attack_id,
@@ -202,11 +220,20 @@ def _attack_file(
 ) -> AttackFile:
     theta, field = result.theta.numpy().astype(np.float32), attacked_object(experiment)
     return AttackFile.of_face(
-        method=search.method, theta=theta, size_m=(experiment.face_m, experiment.face_m),
-        T_world_from_object=np.asarray(field.T_world_from_object), sha256=object_sha256(field),
-        subject=experiment.target.subject, corners_in_subject=experiment.target.corners,
-        camera=experiment.view.pinhole, scene_sha256=scene_sha256(experiment), policy_sha256=policy.sha256,
-        config_sha256=hash_of(experiment.config.model_dump(mode="json")), seed=search.seed,
-        predicted_total_cte_m=result.best.predicted_total_cte_m, software_version=version("advnerf"),
-        extra={"victim": search.victim, "horizon": experiment.config.attack.horizon}, clean_drive=clean,
-    )  # fmt: skip
+        method=search.method,
+        theta=theta,
+        size_m=(experiment.face_m, experiment.face_m),
+        T_world_from_object=np.asarray(field.T_world_from_object),
+        sha256=object_sha256(field),
+        subject=experiment.target.subject,
+        corners_in_subject=experiment.target.corners,
+        camera=experiment.view.pinhole,
+        scene_sha256=scene_sha256(experiment),
+        policy_sha256=policy.sha256,
+        config_sha256=hash_of(experiment.config.model_dump(mode="json")),
+        seed=search.seed,
+        predicted_total_cte_m=result.best.predicted_total_cte_m,
+        software_version=version("advnerf"),
+        extra={"victim": search.victim, "horizon": experiment.config.attack.horizon},
+        clean_drive=clean,
+    )

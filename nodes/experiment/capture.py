@@ -42,12 +42,18 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
             save_calibration(fit.calibration(), folder / CALIBRATION / f"{DISPLAY}.yaml")
             lab.set_monitor_image(plain_picture(experiment))
 
-        def photograph(name: str, poses: list[Array], take: Callable[[int], NDArray[np.uint8]], done: int) -> None:
+        def photograph(
+            name: str, poses: list[Array], take: Callable[[int], NDArray[np.uint8]], done: int
+        ) -> None:
             phone = name == PHONE
             write_posed_images(
-                folder / name, poses, (lab_config.phone if phone else lab_config.camera).pinhole, take, "jpg" if phone else "png",
+                folder / name,
+                poses,
+                (lab_config.phone if phone else lab_config.camera).pinhole,
+                take,
+                "jpg" if phone else "png",
                 told=counted(report, name, len(poses), done, total),
-            )  # fmt: skip
+            )
 
         photograph(PHONE, phone_poses, lambda i: lab.photograph(phone_poses[i]), 0)
         # Interleaved, so that both sets cover the whole track.

@@ -91,7 +91,11 @@ class _Cell:
         if condition != NONE:
             return self.folder / "live"  # a search and a live drive of one cell leave files of one name
         inputs = hash_of(cell_inputs(self.experiment, "", self.victim, NONE, self.seed))
-        return self.folder.parent / "shared" / f"{self.experiment.config.name}_{self.live('none').name}_{inputs[:12]}"
+        return (
+            self.folder.parent
+            / "shared"
+            / f"{self.experiment.config.name}_{self.live('none').name}_{inputs[:12]}"
+        )
 
     def _is_driven_in(self, folder: Path, condition: str) -> bool:
         """Whether the run folder has this very drive: through this graph, past this attack, ended by no fault."""
@@ -104,7 +108,9 @@ class _Cell:
         shown = []
         if condition != NONE:
             shown = [load_attack(attack.attack_path(self.searched_in(condition), self.search)).attack_id]
-        return driven["attack_ids"] == shown and counts(driven["outcome"]["stopped_early"], driven["off_track"])
+        return driven["attack_ids"] == shown and counts(
+            driven["outcome"]["stopped_early"], driven["off_track"]
+        )
 
 
 def runs_alone(experiment: Experiment) -> bool:
@@ -139,12 +145,15 @@ def cell_inputs(experiment: Experiment, scenario: str, victim: str, method: str,
     other = set(_SPENT) - set(_SPENT_BY.get(method, _SPENT))
     records = {stage: read_record(experiment.stage_folder(stage)) for stage in _NEEDED}
     return {
-        "version": _VERSION, "horizon": config.horizon, "lab": experiment.lab_config.model_dump(mode="json"),
+        "version": _VERSION,
+        "horizon": config.horizon,
+        "lab": experiment.lab_config.model_dump(mode="json"),
         "object": config.object.model_dump(mode="json"),
         "attack": {key: value for key, value in searched.items() if key not in {*other, "seeds"}},
-        "launch_file": config.deploy.launch_file, "nodes": list(config.deploy.nodes),
+        "launch_file": config.deploy.launch_file,
+        "nodes": list(config.deploy.nodes),
         "stages": {stage: record.digest if record else None for stage, record in records.items()},
-    }  # fmt: skip
+    }
 
 
 def search_cell(
@@ -153,7 +162,11 @@ def search_cell(
     """The part of a cell that needs no live graph: drives without attack in the learned room, and the search."""
     cell = _cell(experiment, scenario, victim, method, seed, folder)
     method = cell.method
-    wanted = [each for each in (NONE, method) if not (cell.searched_in(each) / f"{victim}_{each}_{seed}.json").exists()]
+    wanted = [
+        each
+        for each in (NONE, method)
+        if not (cell.searched_in(each) / f"{victim}_{each}_{seed}.json").exists()
+    ]
     if not wanted:
         return
     background = load_background(cell.experiment)
@@ -162,7 +175,9 @@ def search_cell(
         attack.drive_without_attack(cell.experiment, bare, victim, seed, folder)
     if method in wanted and method != NONE:
         surrogate = surrogate_of(cell.experiment, [attacked_object(cell.experiment)], background)
-        attack.run_search(cell.experiment, attack.sensor_of(cell.experiment, surrogate), cell.search, folder, report)
+        attack.run_search(
+            cell.experiment, attack.sensor_of(cell.experiment, surrogate), cell.search, folder, report
+        )
 
 
 def searched_part(
@@ -188,14 +203,22 @@ def run_cell(
     none = _drive(cell, NONE, tell)
     driven = none if method == NONE else _drive(cell, cell.method, tell)
     deployed = {
-        "total_cte_m": [driven["total_cte_m"]], "off_track": [driven["off_track"]], "none_total_cte_m": [none["total_cte_m"]],
-    }  # fmt: skip
+        "total_cte_m": [driven["total_cte_m"]],
+        "off_track": [driven["off_track"]],
+        "none_total_cte_m": [none["total_cte_m"]],
+    }
     where = cell.driven_in(cell.method)
     extra: dict[str, Any] = {
-        "clip": _clip(cell, driven, where), "stopped_early": driven["outcome"]["stopped_early"],
-        "missed_frames": driven["missed"], "mean_abs_cte_m": driven["mean_abs_cte_m"], "time_to_leave_s": driven["time_to_leave_s"],
-        "horizon": experiment.config.horizon, "max_abs_cte_m": driven["max_abs_cte_m"], "off_track_m": experiment.room.off_track_m, "blocked_tick": [blocked_tick(driven)],
-    }  # fmt: skip
+        "clip": _clip(cell, driven, where),
+        "stopped_early": driven["outcome"]["stopped_early"],
+        "missed_frames": driven["missed"],
+        "mean_abs_cte_m": driven["mean_abs_cte_m"],
+        "time_to_leave_s": driven["time_to_leave_s"],
+        "horizon": experiment.config.horizon,
+        "max_abs_cte_m": driven["max_abs_cte_m"],
+        "off_track_m": experiment.room.off_track_m,
+        "blocked_tick": [blocked_tick(driven)],
+    }
     result = {**found, "deployed": deployed, "extra": extra}
     if where == experiment.stage_folder("deploy"):
         driven_at = (where / f"{cell.live(cell.method).name}.json").stat().st_mtime
@@ -237,12 +260,15 @@ def _surrogate(cell: _Cell) -> dict[str, Any]:
     found = {
         "attack_id": drives.get("attack_id"),
         "surrogate": {
-            "total_cte_m": drives["total_cte_m"], "off_track": _off_track(cell.experiment, drives["states"]),
+            "total_cte_m": drives["total_cte_m"],
+            "off_track": _off_track(cell.experiment, drives["states"]),
             "none_total_cte_m": none["total_cte_m"],
         },
-    }  # fmt: skip
+    }
     return found | (
-        {"seconds": drives["seconds"]} if cell.searched_in(cell.method) != cell.folder and "seconds" in drives else {}
+        {"seconds": drives["seconds"]}
+        if cell.searched_in(cell.method) != cell.folder and "seconds" in drives
+        else {}
     )
 
 
@@ -274,7 +300,9 @@ def _clip(cell: _Cell, driven: dict[str, Any], where: Path) -> str | None:
     bag = where / cell.live(cell.method).name / "bag"
     if not bag.exists():
         return None
-    frames = evaluation.frames(bag, driven["outcome"]["start_real_ns"], len(driven["cte_m"]), CONTROL_PERIOD_S)
+    frames = evaluation.frames(
+        bag, driven["outcome"]["start_real_ns"], len(driven["cte_m"]), CONTROL_PERIOD_S
+    )
     title = f"{style_of(cell.method).title}, {cell.victim}, seed {cell.seed}"
     shown = "".join(driven["attack_ids"])
     track = ClipTrack(
@@ -285,7 +313,9 @@ def _clip(cell: _Cell, driven: dict[str, Any], where: Path) -> str | None:
         shown,
         driven["outcome"]["stopped_early"] or "ended",
     )
-    path = write_clip(cell.folder / "clip.mp4", [track], 1.0 / CONTROL_PERIOD_S, cell.experiment.room.off_track_m)
+    path = write_clip(
+        cell.folder / "clip.mp4", [track], 1.0 / CONTROL_PERIOD_S, cell.experiment.room.off_track_m
+    )
     return f"{cell.folder.name}/{path.name}"
 
 

@@ -45,7 +45,8 @@ class PolicyConfig(_Section):
         default=0.75, description="How firmly the expert returns to the path [1/m]; see ExpertConfig."
     )
     feed_forward: Annotated[float, Field(ge=0, le=1)] = Field(
-        default=0.97, description="Share of the path's curvature that the expert steers ahead; see ExpertConfig."
+        default=0.97,
+        description="Share of the path's curvature that the expert steers ahead; see ExpertConfig.",
     )
     lab_stills: Positive = Field(
         default=900, description="Lab poses around the path, each seen plain and with random textures."
@@ -81,7 +82,9 @@ class ObjectConfig(_Section):
 class AttackConfig(_Section):
     """The adversary, and what it may spend."""
 
-    starts: Positive = Field(default=1, description="Start poses optimised together; the first is the nominal one.")
+    starts: Positive = Field(
+        default=1, description="Start poses optimised together; the first is the nominal one."
+    )
     start_sigma: Annotated[float, Field(ge=0)] = Field(
         default=0.1, description="Spread of the other starts [m and rad]."
     )
@@ -94,7 +97,9 @@ class AttackConfig(_Section):
     )
     seeds: tuple[int, ...] = Field(default=(0,), min_length=1, description="One attack per seed.")
     time_batch: Positive = Field(default=16, description="Frames per gradient batch.")
-    cache_mib: Annotated[float, Field(ge=0)] = Field(default=512.0, description="Budget of the frame cache [MiB].")
+    cache_mib: Annotated[float, Field(ge=0)] = Field(
+        default=512.0, description="Budget of the frame cache [MiB]."
+    )
     display_model: bool = Field(
         default=True,
         description="On a monitor: search with its measured colours in the loop; false takes it for ideal.",
@@ -104,13 +109,17 @@ class AttackConfig(_Section):
 class DeployConfig(_Section):
     """The live runs through the node graph."""
 
-    launch_file: str = Field(default="green_screen.launch.yaml", description="Node graph, beside the experiment file.")
+    launch_file: str = Field(
+        default="green_screen.launch.yaml", description="Node graph, beside the experiment file."
+    )
     nodes: tuple[str, ...] = Field(
         default=("twin", "camera", "vicon", "compositor", "policy", "safety", "motor", "recorder"),
         description="Nodes that must be ready before the car moves.",
     )
     laps: Count = Field(default=0, description="Laps driven live without attack before the runs.")
-    empty_scene: bool = Field(default=False, description="Also drive with the board, or the monitor, taken away.")
+    empty_scene: bool = Field(
+        default=False, description="Also drive with the board, or the monitor, taken away."
+    )
     ready_timeout_s: Annotated[float, Field(gt=0)] = Field(
         default=60.0, description="Time for the graph to become ready [s]."
     )

@@ -99,7 +99,9 @@ def drive_until_it_counts(
         shutil.rmtree(folder / live.name, ignore_errors=True)  # of a drive that was broken off
         if not (stopped := _fault_of(experiment, live, folder, attack)):
             return
-        tell(f"{live.name} does not count, the stack stopped it: {stopped} (attempt {attempt} of {_ATTEMPTS})")
+        tell(
+            f"{live.name} does not count, the stack stopped it: {stopped} (attempt {attempt} of {_ATTEMPTS})"
+        )
     raise DriveFault(
         f"the stack stopped the live drive {live.name} {_ATTEMPTS} times, at last: {stopped}; cure that (advnerf doctor, another load on this machine), "
         "and give the command again, which goes on here"
@@ -108,14 +110,18 @@ def drive_until_it_counts(
 
 def _check_frozen(experiment: Experiment) -> None:
     then = json.loads((experiment.stage_folder("attack") / "frozen.json").read_text())
-    changed = [name for name, value in frozen_hashes(experiment).items() if name != "config" and then[name] != value]
+    changed = [
+        name for name, value in frozen_hashes(experiment).items() if name != "config" and then[name] != value
+    ]
     if changed:
         raise FrozenChangedError(
             f"expected {', '.join(changed)} as frozen before the first attack, got another; run the attack stage again"
         )
 
 
-def drive_live(experiment: Experiment, live: LiveRun, folder: Path, attack: Path | None, compare: bool = False) -> None:
+def drive_live(
+    experiment: Experiment, live: LiveRun, folder: Path, attack: Path | None, compare: bool = False
+) -> None:
     """Drive one run through the node graph, with an attack file or none; leaves its bag and a JSON of what was measured in it.
 
     Args:
@@ -143,14 +149,23 @@ def drive_live(experiment: Experiment, live: LiveRun, folder: Path, attack: Path
     drawn = sorted(attack_ids(bag))
     _check_drawn(live, drawn, attack)
     result: dict[str, Any] = {
-        "victim": live.victim, "condition": live.condition, "seed": live.seed, "attack_ids": drawn,
-        "outcome": outcome.to_dict(), "states": held.tolist(),
-        "cte_m": experiment.path.project(held[:, :2]).cte_m.tolist(), "total_cte_m": metrics.total_cte_m,
-        "mean_abs_cte_m": metrics.mean_cte_m, "max_abs_cte_m": metrics.max_cte_m, "off_track": metrics.off_track,
-        "time_to_leave_s": metrics.time_to_leaving_s, "frames": times.frames, "missed": times.missed,
+        "victim": live.victim,
+        "condition": live.condition,
+        "seed": live.seed,
+        "attack_ids": drawn,
+        "outcome": outcome.to_dict(),
+        "states": held.tolist(),
+        "cte_m": experiment.path.project(held[:, :2]).cte_m.tolist(),
+        "total_cte_m": metrics.total_cte_m,
+        "mean_abs_cte_m": metrics.mean_cte_m,
+        "max_abs_cte_m": metrics.max_cte_m,
+        "off_track": metrics.off_track,
+        "time_to_leave_s": metrics.time_to_leaving_s,
+        "frames": times.frames,
+        "missed": times.missed,
         "capture_to_serial_ms": times.capture_to_serial_ms.tolist(),
         "hops_ms": {name: values.tolist() for name, values in times.hops_ms.items()},
-    }  # fmt: skip
+    }
     if compare and (found := counterfactual(bag, outcome.start_real_ns, last_frame_ns)) is not None:
         result["counterfactual"] = asdict(found)
     write_atomically(folder / f"{live.name}.json", json.dumps(result) + "\n")

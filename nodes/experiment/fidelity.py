@@ -54,7 +54,9 @@ def held_out(experiment: Experiment, scenario: str) -> Pictures:
     views = load_transforms(experiment.stage_folder("capture") / capture.HELD_OUT, require_all=True).load()
     real = np.stack([experiment.view.image(rgb) for rgb in views.rgb])
     return Pictures(
-        "held-out views", real, _learned(surrogate_of(experiment, []), np.stack(list(views.T_world_from_camera)), None)
+        "held-out views",
+        real,
+        _learned(surrogate_of(experiment, []), np.stack(list(views.T_world_from_camera)), None),
     )
 
 
@@ -89,7 +91,9 @@ def lacks(experiment: Experiment, scenario: str, victim: str, method: str, seed:
     return ""
 
 
-def attacked(experiment: Experiment, scenario: str, victim: str, method: str, seed: int, folder: Path) -> Pictures:
+def attacked(
+    experiment: Experiment, scenario: str, victim: str, method: str, seed: int, folder: Path
+) -> Pictures:
     """The same drive, frame by frame, with the face of a finished search drawn in; nothing here was deployed with it."""
     del scenario
     found = attack_file(experiment, victim, method, seed, folder)
@@ -103,7 +107,9 @@ def attacked(experiment: Experiment, scenario: str, victim: str, method: str, se
         real.append(experiment.view.image(drawn))
     sensor = attack.sensor_of(experiment, surrogate_of(experiment, [attacked_object(experiment)]))
     theta = torch.from_numpy(np.array(found.face_object.theta))
-    return Pictures("driven bag, attacked", np.stack(real), _learned(sensor, cars @ experiment.camera.mount, theta))
+    return Pictures(
+        "driven bag, attacked", np.stack(real), _learned(sensor, cars @ experiment.camera.mount, theta)
+    )
 
 
 def loop(
@@ -111,7 +117,9 @@ def loop(
 ) -> tuple[AttackProblem, Callable[[torch.Tensor, bool], torch.Tensor], torch.Tensor, Horizon]:
     """What a prediction drives: the problem, pictures with or without the attack, the deployed starts ``[S, n]`` and the horizon."""
     del scenario
-    theta = torch.from_numpy(np.array(attack_file(experiment, victim, method, seed, folder).face_object.theta))
+    theta = torch.from_numpy(
+        np.array(attack_file(experiment, victim, method, seed, folder).face_object.theta)
+    )
     background = load_background(experiment)
     bare = surrogate_of(experiment, [], background)
     sensor = attack.sensor_of(experiment, surrogate_of(experiment, [attacked_object(experiment)], background))
@@ -121,7 +129,12 @@ def loop(
         return sensor.sense(states, theta).images if with_attack else bare.sense(states, None).images
 
     starts = torch.tensor([experiment.room.start_pose], dtype=problem.start_states.dtype)
-    return problem, images, starts, Horizon(experiment.config.horizon, CONTROL_PERIOD_S, experiment.room.off_track_m)
+    return (
+        problem,
+        images,
+        starts,
+        Horizon(experiment.config.horizon, CONTROL_PERIOD_S, experiment.room.off_track_m),
+    )
 
 
 def _overlay(experiment: Experiment, found: AttackFile) -> FaceOverlay:
@@ -129,7 +142,9 @@ def _overlay(experiment: Experiment, found: AttackFile) -> FaceOverlay:
     if experiment.shown_on_monitor:
         sensor = shown(experiment, surrogate_of(experiment, [attacked_object(experiment)]))
         texture = face_texture(sensor.seen_theta(torch.from_numpy(np.array(found.face_object.theta))).numpy())
-    return FaceOverlay(texture, experiment.target.corners, experiment.camera.pinhole, experiment.camera.distortion)
+    return FaceOverlay(
+        texture, experiment.target.corners, experiment.camera.pinhole, experiment.camera.distortion
+    )
 
 
 def _learned(sensor: Any, poses: Array, theta: torch.Tensor | None) -> Rgb:
@@ -155,6 +170,8 @@ def _posed_frames(bag: Path) -> tuple[list[Rgb], Array]:
             frames.append(rgb_image(image, f"{_IMAGE} in {bag}").copy())
             states.append((pose.T[0, 3], pose.T[1, 3], yaw_of(pose.T)))
     if not frames:
-        raise BagError(f"expected images on {_IMAGE} with poses on {_CAR} while the car was armed in {bag}, got none")
+        raise BagError(
+            f"expected images on {_IMAGE} with poses on {_CAR} while the car was armed in {bag}, got none"
+        )
     step = -(-len(frames) // _MOST_FRAMES)  # neighbouring frames of a long drive say no more
     return frames[::step], np.array(states)[::step]

@@ -34,7 +34,9 @@ def has_same_attacks(experiment: Experiment) -> bool:
         return False
     now_attack = experiment.config.attack
     changed = _changed(now_attack, settings.get(type(now_attack).__name__), "attack")
-    return settings["horizon"] == experiment.config.horizon and set(changed) <= {f"attack.{name}" for name in _FREE}
+    return settings["horizon"] == experiment.config.horizon and set(changed) <= {
+        f"attack.{name}" for name in _FREE
+    }
 
 
 def has_same_graph(experiment: Experiment) -> bool:
@@ -55,7 +57,9 @@ def changed_settings(experiment: Experiment) -> list[str]:
         if stage.name not in _MADE:
             continue
         settings = _settings_of(experiment.stage_folder(stage.name))
-        if settings is None:  # of before settings were kept: the key says whether they are the same, not which differ
+        if (
+            settings is None
+        ):  # of before settings were kept: the key says whether they are the same, not which differ
             found += [] if is_current(stages, experiment.folder, stage.name) else [stage.name]
             continue
         if not fits_what_is_there(stage, experiment.folder):

@@ -56,10 +56,12 @@ def compare_views(experiment: RunFolder[Any], view: PolicyView, begin: float, re
         small = renderer.render(pose[None], view.pinhole)[0][0].numpy()
         seen = view.image(real)
         row: dict[str, Any] = {
-            "label": listed.frames[index].path.name, "psnr_full_db": psnr(full, real / 255.0),
-            "psnr_policy_db": psnr(small, seen / 255.0), "ssim_full": ssim(full, real / 255.0),
+            "label": listed.frames[index].path.name,
+            "psnr_full_db": psnr(full, real / 255.0),
+            "psnr_policy_db": psnr(small, seen / 255.0),
+            "ssim_full": ssim(full, real / 255.0),
             "ssim_policy": ssim(small, seen / 255.0),
-        }  # fmt: skip
+        }
         for name, image in (("real", real), ("surrogate", np.round(255 * full).astype(np.uint8))):
             path = folder / "views" / f"{index:03d}_{name}.png"
             write_image(path, image)

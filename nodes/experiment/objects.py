@@ -27,7 +27,9 @@ FACE_OFFSET_M = 0.01
 def attacked_object(experiment: Experiment) -> VoxelGridObject:
     """The cube's deployed face on the lab's board or monitor, plain."""
     wanted = experiment.config.object
-    T_world_from_object = experiment.panel.T_world_from_face @ make_transform(np.eye(3), [FACE_OFFSET_M, 0.0, 0.0])
+    T_world_from_object = experiment.panel.T_world_from_face @ make_transform(
+        np.eye(3), [FACE_OFFSET_M, 0.0, 0.0]
+    )
     return cube_face_object(experiment.face_m, wanted.resolution, wanted.plain_rgb, T_world_from_object)
 
 

@@ -69,7 +69,10 @@ def in_a_lane(objects: Sequence[PlacedObject], world: WorldDescription) -> tuple
         ]
     )
     for index, thing in enumerate(objects):
-        turned, half = rotation_z(thing.yaw_rad)[:2, :2], 0.5 * thing.scale * np.array(OBJECT_SIZES_M[thing.kind])
+        turned, half = (
+            rotation_z(thing.yaw_rad)[:2, :2],
+            0.5 * thing.scale * np.array(OBJECT_SIZES_M[thing.kind]),
+        )
         seen_from_it = (middles - [thing.x_m, thing.y_m]) @ turned
         nearest = np.clip(seen_from_it, -half, half)  # of the ground that it covers
         distance_m = np.linalg.norm(seen_from_it - nearest, axis=1)

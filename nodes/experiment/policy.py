@@ -37,22 +37,32 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
     """Train the victims, then compare their steering on held-out lab views and the surrogate's image of them."""
     config = experiment.config.policy
     settings = ImitationConfig(
-        seed=config.seed, dagger_rounds=config.dagger_rounds, first_steps=config.first_steps,
-        round_steps=config.round_steps, naive_steps=config.naive_steps,
-    )  # fmt: skip
+        seed=config.seed,
+        dagger_rounds=config.dagger_rounds,
+        first_steps=config.first_steps,
+        round_steps=config.round_steps,
+        naive_steps=config.naive_steps,
+    )
     expert = Expert(
         experiment.path,
         ExpertConfig(
-            speed_mps=experiment.speed_mps, stiffness_1pm=config.stiffness_1pm, feed_forward=config.feed_forward
+            speed_mps=experiment.speed_mps,
+            stiffness_1pm=config.stiffness_1pm,
+            feed_forward=config.feed_forward,
         ),
     )
     with Lab(experiment.lab_config) as lab:
         if experiment.shown_on_monitor:
             lab.set_monitor_image(plain_picture(experiment))
         plans = [
-            SourcePlan(_lab_source(experiment, lab), config.lab_stills, config.lab_drives, config.drive_steps),
             SourcePlan(
-                surrogate_source(experiment), config.surrogate_stills, config.surrogate_drives, config.drive_steps
+                _lab_source(experiment, lab), config.lab_stills, config.lab_drives, config.drive_steps
+            ),
+            SourcePlan(
+                surrogate_source(experiment),
+                config.surrogate_stills,
+                config.surrogate_drives,
+                config.drive_steps,
             ),
         ]
         trained = train_policy(
@@ -60,10 +70,13 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
         )
     report(0.98, "comparing steering on real and learned views")
     summary = {
-        "sha256": trained.sha256, "naive_sha256": trained.naive_sha256, "frames": trained.frames,
-        "validation_mae_rad": trained.validation_mae_rad, "naive_validation_mae_rad": trained.naive_validation_mae_rad,
+        "sha256": trained.sha256,
+        "naive_sha256": trained.naive_sha256,
+        "frames": trained.frames,
+        "validation_mae_rad": trained.validation_mae_rad,
+        "naive_validation_mae_rad": trained.naive_validation_mae_rad,
         "steering_on_held_out_views": steering_on_held_out_views(experiment),
-    }  # fmt: skip
+    }
     write_atomically(folder / "policy.json", json.dumps(summary, indent=1) + "\n")
 
 
@@ -90,9 +103,14 @@ def steering_on_held_out_views(experiment: Experiment) -> list[dict[str, float]]
 def _lab_source(experiment: Experiment, lab: Lab) -> SceneSource:
     overlay = _monitor_overlay(experiment, lab) if experiment.shown_on_monitor else _board_overlay(experiment)
     return SceneSource(
-        "lab", lab, experiment.view, experiment.speed_mps, CONTROL_PERIOD_S, overlay,
+        "lab",
+        lab,
+        experiment.view,
+        experiment.speed_mps,
+        CONTROL_PERIOD_S,
+        overlay,
         experiment.config.object.resolution,
-    )  # fmt: skip
+    )
 
 
 def _monitor_overlay(experiment: Experiment, lab: Lab) -> Overlay:
@@ -101,7 +119,9 @@ def _monitor_overlay(experiment: Experiment, lab: Lab) -> Overlay:
 
     def overlay(rgb: NDArray[np.uint8], state: Array, texture: Texture) -> NDArray[np.uint8]:
         del rgb  # the screen is seen again, not drawn over
-        lab.set_monitor_image(face_picture(experiment, face_texture(inverse_squash(texture), _TRAINING_TEXTURE_PX)))
+        lab.set_monitor_image(
+            face_picture(experiment, face_texture(inverse_squash(texture), _TRAINING_TEXTURE_PX))
+        )
         x, y, yaw = map(float, state[:3])
         painted, _ = lab.observe_at(x, y, yaw, depth=False)
         lab.set_monitor_image(plain)

@@ -64,28 +64,49 @@ def _report_data(
     live = {run.name: _live_result(experiment, run) for run in live_runs(experiment)}
     laps = next((live[run.name] for run in live_runs(experiment) if run.condition == "laps"), None)
     return rd.ReportData(
-        settings=_settings(experiment), scene=_scene(experiment),
+        settings=_settings(experiment),
+        scene=_scene(experiment),
         runs=(*_surrogate_runs(experiment), *_deployed_runs(experiment, live)),
-        manifest=_manifest(experiment), curves=tuple(_curves(experiment)), textures=tuple(_textures(experiment)),
-        clips=clips, fidelity=_fidelity(experiment), latency=_latency(live), memory=memory_rows,
+        manifest=_manifest(experiment),
+        curves=tuple(_curves(experiment)),
+        textures=tuple(_textures(experiment)),
+        clips=clips,
+        fidelity=_fidelity(experiment),
+        latency=_latency(live),
+        memory=memory_rows,
         timings=tuple(_timings(experiment)),
-        laps=None if laps is None else rd.Laps(
-            experiment.config.deploy.laps, np.array(laps["states"]), np.array(laps["cte_m"]), laps["mean_abs_cte_m"],
+        laps=None
+        if laps is None
+        else rd.Laps(
+            experiment.config.deploy.laps,
+            np.array(laps["states"]),
+            np.array(laps["cte_m"]),
+            laps["mean_abs_cte_m"],
             laps["off_track"],
         ),
         not_measured={} if laps else {"laps": "this setting drives no laps; make experiment does"},
-    )  # fmt: skip
+    )
 
 
 def _settings(experiment: Experiment) -> rd.Settings:
     attack = experiment.config.attack
     return rd.Settings(
-        name="full" if experiment.setting == "full" else "small", horizon_steps=experiment.config.horizon, control_period_s=CONTROL_PERIOD_S, iterations=attack.iterations,
-        random_evaluations=attack.random_evaluations, start_poses=start_states(experiment, attack.seeds[0]).numpy(),
-        seeds=attack.seeds, speed_mps=experiment.speed_mps, learning_rate=attack.learning_rate,
+        name="full" if experiment.setting == "full" else "small",
+        horizon_steps=experiment.config.horizon,
+        control_period_s=CONTROL_PERIOD_S,
+        iterations=attack.iterations,
+        random_evaluations=attack.random_evaluations,
+        start_poses=start_states(experiment, attack.seeds[0]).numpy(),
+        seeds=attack.seeds,
+        speed_mps=experiment.speed_mps,
+        learning_rate=attack.learning_rate,
         off_track_m=experiment.room.off_track_m,
-        extra={"optimised ticks (T)": attack.horizon, "face cells": experiment.config.object.resolution, "time batch": attack.time_batch},
-    )  # fmt: skip
+        extra={
+            "optimised ticks (T)": attack.horizon,
+            "face cells": experiment.config.object.resolution,
+            "time batch": attack.time_batch,
+        },
+    )
 
 
 def _scene(experiment: Experiment) -> rd.Scene:
@@ -93,12 +114,13 @@ def _scene(experiment: Experiment) -> rd.Scene:
     half = lab.room.side_m / 2
     return rd.Scene(
         path_xy_m=path.pose_at(np.linspace(0.0, path.length_m, _PATH_POINTS))[:, :2],
-        off_track_m=experiment.room.off_track_m, room_m=(-half, -half, half, half),
+        off_track_m=experiment.room.off_track_m,
+        room_m=(-half, -half, half, half),
         fence_m=np.array(experiment.room.fence_m),
         board_m=rd.face_segment(lab.board.T_world_from_face, lab.board.width_m),
         monitor_m=rd.face_segment(lab.monitor.T_world_from_face, lab.monitor.width_m),
         tape_width_m=lab.track.tape_width_m,
-    )  # fmt: skip
+    )
 
 
 def _surrogate_runs(experiment: Experiment) -> Iterator[rd.Run]:
@@ -114,11 +136,20 @@ def _surrogate_runs(experiment: Experiment) -> Iterator[rd.Run]:
             stopped_s = float(outside[0]) * CONTROL_PERIOD_S if outside.size else None
             metrics, held = evaluation.score(np.array(states)[:, :3], path, horizon, stopped_s)
             yield rd.Run(
-                "surrogate", condition, victim, seed, start, held, path.project(held[:, :2]).cte_m,  # type: ignore[arg-type]
-                metrics.total_cte_m, metrics.mean_cte_m, metrics.off_track, metrics.time_to_leaving_s,
+                "surrogate",
+                condition,
+                victim,
+                seed,
+                start,
+                held,
+                path.project(held[:, :2]).cte_m,  # type: ignore[arg-type]
+                metrics.total_cte_m,
+                metrics.mean_cte_m,
+                metrics.off_track,
+                metrics.time_to_leaving_s,
                 attack_id=result.get("attack_id", ""),
                 note="" if stopped_s is None else f"crosses the fence at {stopped_s:.1f} s",
-            )  # fmt: skip
+            )
 
 
 def _live_result(experiment: Experiment, live: LiveRun) -> dict[str, Any]:
@@ -133,11 +164,22 @@ def _deployed_runs(experiment: Experiment, live: dict[str, dict[str, Any]]) -> I
         outcome = result["outcome"]
         stopped_s = (outcome["end_real_ns"] - outcome["start_real_ns"]) * 1e-9
         yield rd.Run(
-            "deployed", result["condition"], result["victim"], result["seed"], 0, np.array(result["states"]),
-            np.array(result["cte_m"]), result["total_cte_m"], result["mean_abs_cte_m"], result["off_track"],
-            result["time_to_leave_s"], attack_id="".join(result["attack_ids"]),
-            note=f"stopped at {stopped_s:.1f} s: {outcome['stopped_early']}" if outcome["stopped_early"] else "",
-        )  # fmt: skip
+            "deployed",
+            result["condition"],
+            result["victim"],
+            result["seed"],
+            0,
+            np.array(result["states"]),
+            np.array(result["cte_m"]),
+            result["total_cte_m"],
+            result["mean_abs_cte_m"],
+            result["off_track"],
+            result["time_to_leave_s"],
+            attack_id="".join(result["attack_ids"]),
+            note=f"stopped at {stopped_s:.1f} s: {outcome['stopped_early']}"
+            if outcome["stopped_early"]
+            else "",
+        )
 
 
 def _curves(experiment: Experiment) -> Iterator[rd.LossCurve]:
@@ -158,7 +200,9 @@ def _textures(experiment: Experiment) -> Iterator[rd.Texture]:
 
 def _fidelity(experiment: Experiment) -> rd.Fidelity:
     scene = json.loads((experiment.stage_folder("scene") / "fidelity.json").read_text())
-    steering = json.loads((experiment.stage_folder("policy") / "policy.json").read_text())["steering_on_held_out_views"]
+    steering = json.loads((experiment.stage_folder("policy") / "policy.json").read_text())[
+        "steering_on_held_out_views"
+    ]
     shown = {int(i) for i in np.linspace(0, len(scene["views"]) - 1, SHOWN_VIEWS).round()}
     views = []
     for index, (view, angles) in enumerate(zip(scene["views"], steering, strict=True)):
@@ -202,9 +246,11 @@ def _manifest(experiment: Experiment) -> rd.Manifest:
     manifest = json.loads((experiment.folder / "manifest.json").read_text())
     frozen = json.loads((experiment.stage_folder("attack") / "frozen.json").read_text())
     machine = {
-        "processor": processor_name(), "cores": str(len(os.sched_getaffinity(0))), "memory": f"{memory_gib():.0f} GiB",
+        "processor": processor_name(),
+        "cores": str(len(os.sched_getaffinity(0))),
+        "memory": f"{memory_gib():.0f} GiB",
         "system": platform.platform(),
-    }  # fmt: skip
+    }
     # The wall time from a clean clone is not known here: benchmarks/newcomer measures it.
     return rd.Manifest(
         manifest["command"],
@@ -229,7 +275,9 @@ def _clips(experiment: Experiment, folder: Path) -> tuple[rd.Clip, ...]:
 
 
 def _surrogate_track(experiment: Experiment, seed: int) -> ClipTrack:
-    search = next(s for s in searches(experiment) if (s.victim, s.method, s.seed) == (HARDENED, METHODS[1], seed))
+    search = next(
+        s for s in searches(experiment) if (s.victim, s.method, s.seed) == (HARDENED, METHODS[1], seed)
+    )
     folder = experiment.stage_folder("attack")
     states = np.array(json.loads((folder / f"{search.name}.json").read_text())["states"][0])
     attack = load_attack(attack_path(folder, search))
@@ -237,7 +285,9 @@ def _surrogate_track(experiment: Experiment, seed: int) -> ClipTrack:
     surrogate.camera = experiment.camera.pinhole
     sensor = sensor_of(experiment, surrogate)
     poses = planar_poses(states) @ experiment.camera.mount
-    images = [sensor.render(pose[None], torch.from_numpy(attack.face_object.theta)).images[0] for pose in poses]
+    images = [
+        sensor.render(pose[None], torch.from_numpy(attack.face_object.theta)).images[0] for pose in poses
+    ]
     frames = [as_uint8(image) for image in images]
     cte_m = experiment.path.project(states[:, :2]).cte_m
     return ClipTrack("learned scene, attacked", "gradient", frames, cte_m, attack.attack_id)
@@ -247,10 +297,14 @@ def _deployed_track(experiment: Experiment, condition: str, seed: int) -> ClipTr
     live = LiveRun(HARDENED, condition, seed)
     result = _live_result(experiment, live)
     bag = experiment.stage_folder("deploy") / live.name / "bag"
-    frames = evaluation.frames(bag, result["outcome"]["start_real_ns"], len(result["cte_m"]), CONTROL_PERIOD_S)
+    frames = evaluation.frames(
+        bag, result["outcome"]["start_real_ns"], len(result["cte_m"]), CONTROL_PERIOD_S
+    )
     title = "live, no attack" if condition == NONE else "live, attacked"
     note = result["outcome"]["stopped_early"] or "ended"
-    return ClipTrack(title, condition, list(frames), np.array(result["cte_m"]), "".join(result["attack_ids"]), note)
+    return ClipTrack(
+        title, condition, list(frames), np.array(result["cte_m"]), "".join(result["attack_ids"]), note
+    )
 
 
 def _read_rgb(path: Path) -> Any:

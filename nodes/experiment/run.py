@@ -21,7 +21,16 @@ from nodes.runtime.config import Document, apply_overrides, read_yaml, validate
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import Report
 
-_LIBRARIES = ("torch", "numpy", "numba", "opencv-contrib-python-headless", "mujoco", "pyzmq", "rosbags", "mcap")
+_LIBRARIES = (
+    "torch",
+    "numpy",
+    "numba",
+    "opencv-contrib-python-headless",
+    "mujoco",
+    "pyzmq",
+    "rosbags",
+    "mcap",
+)
 STAGES = ("capture", "scene", "policy", "object", "attack", "deploy", "report")
 
 
@@ -95,14 +104,21 @@ def stages_of(experiment: Experiment) -> list[Stage]:
         stage("policy", policy, [config.policy, config.object], ("capture", "scene")),
         stage("object", objects, [config.object], ("capture", "scene")),
         stage(
-            "attack", attack, [config.policy, config.object, config.attack], ("capture", "scene", "policy", "object")
+            "attack",
+            attack,
+            [config.policy, config.object, config.attack],
+            ("capture", "scene", "policy", "object"),
         ),
-        stage("deploy", deploy, [config.policy, config.deploy, config.attack], ("capture", "policy", "attack")),
+        stage(
+            "deploy", deploy, [config.policy, config.deploy, config.attack], ("capture", "policy", "attack")
+        ),
         stage("report", report, [config], ("capture", "scene", "policy", "object", "attack", "deploy")),
     ]
 
 
-def _lay_over(document: Document, values: dict[str, Any], origin: tuple[str, ...], key: tuple[str, ...]) -> None:
+def _lay_over(
+    document: Document, values: dict[str, Any], origin: tuple[str, ...], key: tuple[str, ...]
+) -> None:
     """Merge a setting into the document, keeping for each value the place where it stands in the file."""
     target = document.data
     for step in key:

@@ -75,7 +75,9 @@ def run_to_end(
         records = run_stages(stages, experiment.folder, display, until)
     if "report" in records:
         summarise(console)
-    console.print(f"{experiment.config.name} ({experiment.setting}): {time.monotonic() - began:.0f} s", highlight=False)
+    console.print(
+        f"{experiment.config.name} ({experiment.setting}): {time.monotonic() - began:.0f} s", highlight=False
+    )
     return records
 
 

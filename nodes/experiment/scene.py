@@ -42,9 +42,12 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
     bare = FieldRenderer(trained.scene, trained.occupied, trained.march)
     colour_map = fit_colour_map(render_like(bare, pairs), pairs.rgb)
     metadata = {
-        "march": vars(trained.march), "colour_map": colour_map.to_dict(), "steps": config.steps, "seed": config.seed,
+        "march": vars(trained.march),
+        "colour_map": colour_map.to_dict(),
+        "steps": config.steps,
+        "seed": config.seed,
         "photographs": len(photographs.rgb),
-    }  # fmt: skip
+    }
     save_scene(scene_file(experiment), trained.scene, trained.occupied, metadata)
     compare_views(experiment, experiment.view, _TRAINING_SHARE, report)
     (folder / "checkpoint.safetensors").unlink(missing_ok=True)

@@ -35,7 +35,9 @@ def plain_picture(experiment: Experiment) -> Rgb:
     return face_picture(experiment, np.full((8, 8, 3), plain, np.uint8))
 
 
-def measure_display(lab: Lab, seed: int = 0, frames_of: Callable[[Rgb], Sequence[Rgb]] | None = None) -> DisplayFit:
+def measure_display(
+    lab: Lab, seed: int = 0, frames_of: Callable[[Rgb], Sequence[Rgb]] | None = None
+) -> DisplayFit:
     """Show the calibration's colours on the lab's monitor, look at them from three places, fit the display model.
 
     Args:
@@ -67,7 +69,9 @@ def _car_before_screen(lab: Lab, angle_rad: float) -> Array:
     place = face @ np.array([_DISTANCE_M * math.cos(angle_rad), _DISTANCE_M * math.sin(angle_rad), 0.0, 1.0])
     towards = face[:3, 3] - place[:3]
     heading = math.atan2(towards[1], towards[0])
-    x_m, y_m = (float(place[i] - camera.x_m * side) for i, side in enumerate((math.cos(heading), math.sin(heading))))
+    x_m, y_m = (
+        float(place[i] - camera.x_m * side) for i, side in enumerate((math.cos(heading), math.sin(heading)))
+    )
     return planar_pose(x_m, y_m, heading)
 
 

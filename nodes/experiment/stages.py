@@ -100,7 +100,9 @@ def read_record(folder: Path) -> StageRecord | None:
     """The record in a stage's folder; None if there is none that can be read."""
     try:
         fields = json.loads((folder / _RECORD).read_text())
-        return StageRecord(str(fields["key"]), fields["digest"], float(fields["seconds"]), fields.get("settings"))
+        return StageRecord(
+            str(fields["key"]), fields["digest"], float(fields["seconds"]), fields.get("settings")
+        )
     except (FileNotFoundError, ValueError, KeyError, TypeError):
         # An unreadable record means unknown contents: the stage is run again from nothing.
         return None
@@ -140,7 +142,9 @@ def begun_with(stages: Sequence[Stage], folder: Path, name: str) -> Mapping[str,
     if record is None or any(earlier not in records for earlier in stage.after):
         return None
     known = (stage.settings, *stage.goes_on_from)
-    return next((each for each in known if record.key == _key_of(replace(stage, settings=each), records)), None)
+    return next(
+        (each for each in known if record.key == _key_of(replace(stage, settings=each), records)), None
+    )
 
 
 def hash_of(value: Any) -> str:
@@ -159,7 +163,9 @@ def digest_of(folder: Path) -> str:
     return digest.hexdigest()
 
 
-def _run_or_reuse(stage: Stage, folder: Path, records: Mapping[str, StageRecord], display: Display) -> StageRecord:
+def _run_or_reuse(
+    stage: Stage, folder: Path, records: Mapping[str, StageRecord], display: Display
+) -> StageRecord:
     missing = [name for name in stage.after if name not in records]
     if missing:
         raise StageError(f"stage '{stage.name}' needs {', '.join(missing)} to run before it")
@@ -213,7 +219,9 @@ def _go_on_or_begin(
 
 def _key_of(stage: Stage, records: Mapping[str, StageRecord]) -> str:
     inputs = {name: records[name].digest for name in stage.after}
-    return hash_of({"name": stage.name, "version": stage.version, "settings": stage.settings, "inputs": inputs})
+    return hash_of(
+        {"name": stage.name, "version": stage.version, "settings": stage.settings, "inputs": inputs}
+    )
 
 
 def _run(stage: Stage, folder: Path, key: str, earlier_s: float, display: Display) -> StageRecord:

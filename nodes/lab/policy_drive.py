@@ -60,8 +60,14 @@ def drive_round(
     limits = (vehicle.limits.steering_min_rad, vehicle.limits.steering_max_rad)
     goals = torch.tensor([goal] * count, dtype=torch.float32) if goal else None
     problem = AttackProblem(
-        policy, _Seen(see), Ackermann(vehicle.wheelbase_m, _SPEED_MPS, _PERIOD_S, limits), path, starts,
-        math.ceil(path.length_m / count / (_SPEED_MPS * _PERIOD_S)), goals,
-        fence_m=float(np.abs(np.array(room.fence_m)).min()), off_track_m=room.off_track_m,
-    )  # fmt: skip
+        policy,
+        _Seen(see),
+        Ackermann(vehicle.wheelbase_m, _SPEED_MPS, _PERIOD_S, limits),
+        path,
+        starts,
+        math.ceil(path.length_m / count / (_SPEED_MPS * _PERIOD_S)),
+        goals,
+        fence_m=float(np.abs(np.array(room.fence_m)).min()),
+        off_track_m=room.off_track_m,
+    )
     return clean_drive(problem, torch.zeros(_Seen.theta_shape))

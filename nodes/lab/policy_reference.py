@@ -109,7 +109,9 @@ def from_bag(bag: Path, room: Path, view: PolicyView, count: int = 96) -> Refere
             f"expected at least {_FEWEST} frames with poses and varying steering in {bag}, got {len(images)}; record a longer drive"
         )
     unchecked = ", unchecked" if read_info(bag).unchecked else ""
-    return Reference(np.stack(images), np.array(steering), f"{len(images)} frames of {bag}{unchecked}", asked=True)
+    return Reference(
+        np.stack(images), np.array(steering), f"{len(images)} frames of {bag}{unchecked}", asked=True
+    )
 
 
 def from_run(folder: Path, view: PolicyView) -> Reference:
@@ -135,10 +137,14 @@ def from_run(folder: Path, view: PolicyView) -> Reference:
             images.append(_seen(view, load_image(frame)[0], str(folder)))
             steering.append(float(expert.steer(car[0, 3], car[1, 3], yaw_of(car))))
     if len(images) < _FEWEST or np.ptp(steering) == 0.0:
-        raise ConfigError(f"expected at least {_FEWEST} frames of varying steering in {capture}, got {len(images)}")
+        raise ConfigError(
+            f"expected at least {_FEWEST} frames of varying steering in {capture}, got {len(images)}"
+        )
     scene = folder / "scene" / "scene.safetensors"
     drives = _drives_in_scene(scene, calibration, view) if scene.is_file() else None
-    return Reference(np.stack(images), np.array(steering), f"{len(images)} camera frames of {folder}", drives, True)
+    return Reference(
+        np.stack(images), np.array(steering), f"{len(images)} camera frames of {folder}", drives, True
+    )
 
 
 def from_scene(scene: Path, calibration: Path, view: PolicyView, count: int = 48, seed: int = 0) -> Reference:
@@ -157,7 +163,9 @@ def from_scene(scene: Path, calibration: Path, view: PolicyView, count: int = 48
     seen = _sight_of_scene(scene, calibration, view)(torch.from_numpy(poses))
     images = np.round(255.0 * seen.permute(0, 2, 3, 1).clamp(0.0, 1.0).numpy()).astype(np.uint8)
     drives = _drives_in_scene(scene, calibration, view)
-    return Reference(images, np.asarray(expert.steer_states(poses)), f"{count} frames of {scene}", drives, True)
+    return Reference(
+        images, np.asarray(expert.steer_states(poses)), f"{count} frames of {scene}", drives, True
+    )
 
 
 def _drives_in_scene(scene: Path, calibration: Path, view: PolicyView) -> Drives:
@@ -198,7 +206,10 @@ def _about_the_path(expert: Expert, count: int, seed: int) -> NDArray[np.float64
 
 
 def judged_by_drives(
-    policy: AdaptedPolicy, reference: Reference, findings: list[Finding], goal: tuple[float, ...] | None = None
+    policy: AdaptedPolicy,
+    reference: Reference,
+    findings: list[Finding],
+    goal: tuple[float, ...] | None = None,
 ) -> list[Finding]:
     """Add the finding of test drives to those of a policy's adapter. The adapter must be right before it is driven.
 
@@ -208,7 +219,10 @@ def judged_by_drives(
     if any(finding.verdict == FAILURE for finding in findings):
         return findings
     if reference.drives is None:
-        return [replace(f, verdict=FAILURE) if f.name == "expert" and f.verdict == WARNING else f for f in findings]
+        return [
+            replace(f, verdict=FAILURE) if f.name == "expert" and f.verdict == WARNING else f
+            for f in findings
+        ]
     size = policy.contract.goal_size
     clean = reference.drives(policy, goal if goal is not None else (0.0,) * size)
     text = clean.warning or f"drives without attack: {clean.in_words.removeprefix('drive without attack: ')}"

@@ -104,11 +104,16 @@ def train(request: TrainingRequest, report: Report) -> dict[str, Any]:
     def progress(at: Progress) -> None:
         report(0.95 * at.fraction, f"step {at.step}, {at.psnr_db:.1f} dB on training rays")
 
-    trained = train_scene(images, field, _train_config(request, field, march), request.output / CHECKPOINT, progress)
+    trained = train_scene(
+        images, field, _train_config(request, field, march), request.output / CHECKPOINT, progress
+    )
     metadata = {
-        "march": vars(trained.march), "steps": trained.history[-1][0], "seed": request.seed, "photographs": len(images.rgb),
+        "march": vars(trained.march),
+        "steps": trained.history[-1][0],
+        "seed": request.seed,
+        "photographs": len(images.rgb),
         "dataset": str(request.transforms),
-    }  # fmt: skip
+    }
     save_scene(request.output / SCENE, trained.scene, trained.occupied, metadata)
     figures = evaluate(FieldRenderer.from_file(request.output / SCENE), held_out, request.size)
     write_atomically(request.output / FIGURES, json.dumps(figures, indent=1) + "\n")
@@ -121,7 +126,9 @@ def evaluate(renderer: FieldRenderer, listed: PosedImages, size: tuple[int, int]
     rows = []
     # Images with alpha are compared over white, which the renderer uses too.
     for index, real in enumerate(views.on_background(_WHITE)):
-        rendered = renderer.render(views.T_world_from_camera[index][None], views.pinholes[index])[0][0].numpy()
+        rendered = renderer.render(views.T_world_from_camera[index][None], views.pinholes[index])[0][
+            0
+        ].numpy()
         usable = np.ones(real.shape[:2], dtype=bool) if views.valid is None else views.valid[index]
         rows.append(
             {
@@ -205,7 +212,8 @@ def scene_field(request: TrainingRequest, listed: PosedImages, transparent: bool
     else:
         low, high = listed.inner_box() if unbounded else listed.box()
     inside = [
-        np.all((low <= f.T_world_from_camera[:3, 3]) & (f.T_world_from_camera[:3, 3] <= high)) for f in listed.frames
+        np.all((low <= f.T_world_from_camera[:3, 3]) & (f.T_world_from_camera[:3, 3] <= high))
+        for f in listed.frames
     ]
     if request.box_m is None and listed.aabb_scale is None and not all(inside):
         raise ConfigError(
@@ -215,7 +223,9 @@ def scene_field(request: TrainingRequest, listed: PosedImages, transparent: bool
     common = {"contraction": unbounded, "learned_background": not transparent}
     if request.preset == "instant-ngp":
         # Müller et al. 2022, table 1 and section 5.4, and the sizes of its configs/nerf/base.json.
-        grid = HashGridConfig(levels=16, features=2, log2_entries=19, coarsest=16, finest=round(2048 * aabb_scale))
+        grid = HashGridConfig(
+            levels=16, features=2, log2_entries=19, coarsest=16, finest=round(2048 * aabb_scale)
+        )
         return SceneFieldConfig(_corner(low), _corner(high), grid, direction_bands=4, **common)
     # The contracted cube is twice as wide as its inner region, so twice the cells keep the detail.
     grid = HashGridConfig(levels=8, features=4, finest=4096 if unbounded else 2048)
@@ -225,7 +235,9 @@ def scene_field(request: TrainingRequest, listed: PosedImages, transparent: bool
 
 def sample_intervals(request: TrainingRequest, field: SceneFieldConfig, images: ImageSet) -> MarchConfig:
     """Sample placement for training and rendering: by the default rule, unless the request overrides it."""
-    march = pixel_intervals(images.pinholes, images.T_world_from_camera, field, request.near, request.interval_px)
+    march = pixel_intervals(
+        images.pinholes, images.T_world_from_camera, field, request.near, request.interval_px
+    )
     if request.interval is not None:
         march = replace(march, smallest_step_m=request.interval[0], largest_step_m=request.interval[1])
     return march if request.interval_growth is None else replace(march, step_growth=request.interval_growth)
@@ -234,10 +246,14 @@ def sample_intervals(request: TrainingRequest, field: SceneFieldConfig, images: 
 def _train_config(request: TrainingRequest, field: SceneFieldConfig, march: MarchConfig) -> TrainConfig:
     is_open = request.open_scene or field.contraction
     return TrainConfig(
-        steps=request.steps or _NO_TIME_LIMIT_STEPS, seed=request.seed, checkpoint_every_s=request.checkpoint_every_s,
-        max_seconds=None if request.minutes is None else 60.0 * request.minutes, march=march,
-        opacity=0.0 if is_open else TrainConfig.opacity, distortion=2e-3 if is_open else TrainConfig.distortion,
-    )  # fmt: skip
+        steps=request.steps or _NO_TIME_LIMIT_STEPS,
+        seed=request.seed,
+        checkpoint_every_s=request.checkpoint_every_s,
+        max_seconds=None if request.minutes is None else 60.0 * request.minutes,
+        march=march,
+        opacity=0.0 if is_open else TrainConfig.opacity,
+        distortion=2e-3 if is_open else TrainConfig.distortion,
+    )
 
 
 def _described(request: TrainingRequest, field: SceneFieldConfig, march: MarchConfig) -> str:
@@ -254,9 +270,7 @@ def _described(request: TrainingRequest, field: SceneFieldConfig, march: MarchCo
         text += f", unbounded{why}"
     if not field.learned_background:
         text += "; images have alpha: trained over random colours, transparent areas stay transparent"
-    intervals = (
-        f"{march.smallest_step_m:.3g} .. {march.largest_step_m:.3g}, {march.step_growth:.3g} of the distance between"
-    )
+    intervals = f"{march.smallest_step_m:.3g} .. {march.largest_step_m:.3g}, {march.step_growth:.3g} of the distance between"
     return f"{text}; preset {request.preset}; sample intervals {intervals}"
 
 

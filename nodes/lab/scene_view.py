@@ -48,9 +48,14 @@ class SceneView:
     """
 
     def __init__(
-        self, scene: Path, cameras: Path | None = None, objects: Sequence[Path] = (), room: Path | None = None,
-        host: str = "127.0.0.1", port: int = 8080,
-    ) -> None:  # fmt: skip
+        self,
+        scene: Path,
+        cameras: Path | None = None,
+        objects: Sequence[Path] = (),
+        room: Path | None = None,
+        host: str = "127.0.0.1",
+        port: int = 8080,
+    ) -> None:
         self._renderer = FieldRenderer.from_file(scene)
         self._objects = [load_object(path).placed(np.eye(4)) for path in objects]
         self._lock = threading.Lock()  # the renderer's threads are shared
@@ -116,7 +121,9 @@ class SceneView:
         return str(self._mode.value)
 
     def _connect(self, client: Any) -> None:
-        low, high = (np.array(corner) for corner in (self._renderer.config.box_low_m, self._renderer.config.box_high_m))
+        low, high = (
+            np.array(corner) for corner in (self._renderer.config.box_low_m, self._renderer.config.box_high_m)
+        )
         client.camera.position = 0.5 * (low + high) + np.array([-0.25, -0.25, 0.1]) * (high - low)
         client.camera.look_at = 0.5 * (low + high)
         self._viewers[client.client_id] = _Viewer(self, client)
@@ -140,9 +147,14 @@ class SceneView:
             lens, T = views.pinholes[k], views.T_world_from_camera[k]
             small = cv2.resize(views.rgb[k], (_THUMBNAIL_PX, _THUMBNAIL_PX * lens.height // lens.width))
             frustum = self._server.scene.add_camera_frustum(
-                f"/cameras/{names[k]}", 2 * float(np.arctan(0.5 * lens.height / lens.fy)), lens.width / lens.height,
-                scale=0.02 * self._renderer.config.extent_m, image=small, wxyz=_quaternion(T), position=T[:3, 3],
-            )  # fmt: skip
+                f"/cameras/{names[k]}",
+                2 * float(np.arctan(0.5 * lens.height / lens.fy)),
+                lens.width / lens.height,
+                scale=0.02 * self._renderer.config.extent_m,
+                image=small,
+                wxyz=_quaternion(T),
+                position=T[:3, 3],
+            )
             frustum.on_click(functools.partial(_stand_at, T))
             self._frustums.append(frustum)
 
@@ -188,7 +200,9 @@ class _Viewer:
         T = _pose(np.asarray(camera.wxyz, dtype=np.float64), np.asarray(camera.position, dtype=np.float64))
         if not np.isfinite(T).all():
             return
-        picture, depth = self._view.picture(T, Pinhole(width, height, f, f, 0.5 * width, 0.5 * height), self._view.mode)
+        picture, depth = self._view.picture(
+            T, Pinhole(width, height, f, f, 0.5 * width, 0.5 * height), self._view.mode
+        )
         self._client.scene.set_background_image(picture, depth=depth.astype(np.float32))
 
 

@@ -107,7 +107,9 @@ class Launch:
             if self._done.is_set():
                 raise LaunchError(self.failure or "the launch was stopped before it was ready")
             if time.monotonic() > deadline:
-                raise LaunchError(f"expected the launch to be ready within {timeout_s:g} s: {self._what_is_missing()}")
+                raise LaunchError(
+                    f"expected the launch to be ready within {timeout_s:g} s: {self._what_is_missing()}"
+                )
 
     def wait(self, timeout_s: float | None = None) -> int | None:
         """Wait until the launch ends. Returns the exit code, or None on timeout."""
@@ -212,7 +214,9 @@ class Launch:
                 continue
             status = child.status
             if status is None or status.state not in _UP:
-                missing.append(f"{child.name} is {status.state + ' ' + status.text if status else 'silent'}".strip())
+                missing.append(
+                    f"{child.name} is {status.state + ' ' + status.text if status else 'silent'}".strip()
+                )
                 continue
             for topic in status.subscriptions:
                 wanted[topic] = wanted.get(topic, 0) + 1
@@ -225,7 +229,9 @@ class Launch:
     def _take_down(self) -> None:
         try:
             for last in (False, True):
-                self._stop_children([c for c in self._children.values() if c.entry.stop_last is last and c.running])
+                self._stop_children(
+                    [c for c in self._children.values() if c.entry.stop_last is last and c.running]
+                )
         finally:
             for child in self._children.values():
                 if child.running:

@@ -23,13 +23,18 @@ def check_nodes(plan: Plan) -> dict[str, str]:
     Each node's module is run with ``--check``: it reads its configuration, prints errors and exits. Files that a node reads when it
     starts, such as a policy or an attack, are not opened.
     """
-    with tempfile.TemporaryDirectory(prefix="advnerf-check-") as folder, _processes(plan, Path(folder)) as processes:
+    with (
+        tempfile.TemporaryDirectory(prefix="advnerf-check-") as folder,
+        _processes(plan, Path(folder)) as processes,
+    ):
         problems: dict[str, str] = {}
         for name, process in processes.items():
             try:
                 _, errors = process.communicate(timeout=_TIMEOUT_S)
             except subprocess.TimeoutExpired:
-                problems[name] = f"{name}: expected the check to end within {_TIMEOUT_S:g} s, but it is still running"
+                problems[name] = (
+                    f"{name}: expected the check to end within {_TIMEOUT_S:g} s, but it is still running"
+                )
                 continue
             if process.returncode:
                 lines = errors.strip().splitlines()
@@ -43,12 +48,17 @@ def _processes(plan: Plan, folder: Path) -> Iterator[dict[str, subprocess.Popen[
     try:
         for name, entry in plan.nodes.items():
             config = folder / f"{name}.yaml"
-            config.write_text(yaml.safe_dump(node_document(plan.documents[name]), sort_keys=False), encoding="utf-8")
+            config.write_text(
+                yaml.safe_dump(node_document(plan.documents[name]), sort_keys=False), encoding="utf-8"
+            )
             command = [sys.executable, "-m", entry.module, "--check", "--config", str(config)]
             processes[name] = subprocess.Popen(
                 [*command, "--run-dir", str(folder), "--name", name],
-                stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
-            )  # fmt: skip
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.PIPE,
+                text=True,
+            )
         yield processes
     finally:
         for process in processes.values():

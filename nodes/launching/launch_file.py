@@ -190,7 +190,9 @@ def _read_with_includes(file: Path, above: tuple[Path, ...]) -> Document:
         raise ConfigError(f"{file}:1: expected a launch file with keys name and nodes")
     includes = document.data.pop("include", None) or []
     if not isinstance(includes, list) or not all(isinstance(entry, str) for entry in includes):
-        raise ConfigError(f"{document.place(('include',))}: expected a list of launch files, got {includes!r:.80}")
+        raise ConfigError(
+            f"{document.place(('include',))}: expected a list of launch files, got {includes!r:.80}"
+        )
     base = Document({}, str(file))
     for entry in includes:
         included = _read_with_includes(file.parent / entry, (*above, file.resolve()))
@@ -229,7 +231,9 @@ def _apply_override(document: Document, override: str) -> None:
         apply_overrides(document, [f"{'.'.join((*prefix, rest))}={value}"], ("nodes",))
         document.places[("nodes", *prefix, *rest.split("."))] = f"--set {override}"
     else:
-        raise ConfigError(f"--set {override}: no node called {head!r}; known are {', '.join(nodes)}, and params")
+        raise ConfigError(
+            f"--set {override}: no node called {head!r}; known are {', '.join(nodes)}, and params"
+        )
 
 
 def _is_about_the_process(key: str, value: str, document: Document, override: str) -> bool:
@@ -250,11 +254,17 @@ def _is_about_the_process(key: str, value: str, document: Document, override: st
 
 
 def _substitute(
-    value: Any, params: dict[str, Any], document: Document, key: tuple[str | int, ...], above: tuple[str, ...] = ()
+    value: Any,
+    params: dict[str, Any],
+    document: Document,
+    key: tuple[str | int, ...],
+    above: tuple[str, ...] = (),
 ) -> Any:
     """Substitute parameters, whose values may use other parameters. ``above`` are the parameters being substituted."""
     if isinstance(value, dict):
-        return {name: _substitute(item, params, document, (*key, name), above) for name, item in value.items()}
+        return {
+            name: _substitute(item, params, document, (*key, name), above) for name, item in value.items()
+        }
     if isinstance(value, list):
         return [_substitute(item, params, document, (*key, index), above) for index, item in enumerate(value)]
     if not isinstance(value, str):
@@ -262,10 +272,14 @@ def _substitute(
 
     def lookup(name: str) -> Any:
         if name not in params:
-            raise ConfigError(f"{document.place(key)}: unknown parameter ${{{name}}}; known are {', '.join(params)}")
+            raise ConfigError(
+                f"{document.place(key)}: unknown parameter ${{{name}}}; known are {', '.join(params)}"
+            )
         if name in above:
             circle = " -> ".join((*above, name))
-            raise ConfigError(f"{document.place(key)}: parameter {name} uses itself: {circle}; remove the cycle")
+            raise ConfigError(
+                f"{document.place(key)}: parameter {name} uses itself: {circle}; remove the cycle"
+            )
         return _substitute(params[name], params, document, ("params", name), (*above, name))
 
     if whole := _REFERENCE.fullmatch(value):
@@ -284,12 +298,19 @@ def _add_recorder(document: Document, launch: LaunchFile) -> None:
     attachments = [file for file in record.attachments if file]
     limits = record.model_dump(include={"max_bag_duration_s", "max_bag_size_mb"}, exclude_none=True)
     config = {
-        "output": record.output, "topics": record.topics, "attachments": attachments, "statuses_of": others, **limits,
-    }  # fmt: skip
+        "output": record.output,
+        "topics": record.topics,
+        "attachments": attachments,
+        "statuses_of": others,
+        **limits,
+    }
     home = record.host or next((name for name, entry in launch.hosts.items() if entry.address is None), None)
     document.data["nodes"][RECORDER] = {
-        "module": "nodes.recorder", "stop_last": True, "config": config, "host": home,
-    }  # fmt: skip
+        "module": "nodes.recorder",
+        "stop_last": True,
+        "config": config,
+        "host": home,
+    }
     document.data["record"] = False
     document.places[("nodes", RECORDER)] = document.place(("record",))
 
@@ -301,7 +322,9 @@ def _check(name: str, entry: NodeEntry, document: Document) -> None:
     except TopicError as error:
         raise ConfigError(f"{place}: {error}") from None
     if name in ("params", "record", "hosts", "keys", "operator"):
-        raise ConfigError(f"{place}: expected another node name than {name}, which --set uses; rename the node")
+        raise ConfigError(
+            f"{place}: expected another node name than {name}, which --set uses; rename the node"
+        )
     if entry.required and entry.respawn is not None:
         raise ConfigError(f"{place}: node {name} has respawn, so it must also have required: false")
     # The node's process is started by `python -m` in this folder, and finds its modules there.

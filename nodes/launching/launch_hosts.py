@@ -70,7 +70,12 @@ def choose_host(document: Document, launch: LaunchFile, host: str | None) -> Non
         name: entry for name, entry in document.data["nodes"].items() if launch.nodes[name].host == host
     }
     config = _gateway_config(launch, host, exports, imports)
-    document.data["nodes"][GATEWAY] = {"module": "nodes.gateway", "host": host, "stop_last": True, "config": config}
+    document.data["nodes"][GATEWAY] = {
+        "module": "nodes.gateway",
+        "host": host,
+        "stop_last": True,
+        "config": config,
+    }
     document.places[("nodes", GATEWAY)] = document.place(("hosts",))
     if host == _listener(launch) and not set(_COMMANDS).isdisjoint(imports):
         _require_clock(document, launch, host)
@@ -146,11 +151,16 @@ def _gateway_config(launch: LaunchFile, host: str, exports: list[str], imports: 
     entry = launch.hosts[listener]
     end = {"listen": entry.address} if host == listener else {"connect": entry.address}
     return {
-        **end, "watch_port": entry.watch_port, "drive_port": entry.drive_port, "keys": launch.keys,
-        "key": launch.hosts[host].key or host, "peer_key": entry.key or listener, "imports": imports,
+        **end,
+        "watch_port": entry.watch_port,
+        "drive_port": entry.drive_port,
+        "keys": launch.keys,
+        "key": launch.hosts[host].key or host,
+        "peer_key": entry.key or listener,
+        "imports": imports,
         # The gateway itself measures the clock offset and publishes it on its own bus.
         "exports": exports,
-    }  # fmt: skip
+    }
 
 
 def _check(document: Document, launch: LaunchFile, host: str | None) -> None:

@@ -58,7 +58,9 @@ def find_run_dir(given: Path | None) -> Path:
     launches = active_launches()
     if len(launches) != 1:
         found = ", ".join(str(launch["run_dir"]) for launch in launches) or "none"
-        raise LaunchError(f"expected one running launch, found {len(launches)} ({found}); select one with --run-dir")
+        raise LaunchError(
+            f"expected one running launch, found {len(launches)} ({found}); select one with --run-dir"
+        )
     return Path(launches[0]["run_dir"])
 
 
@@ -134,9 +136,14 @@ def measure_rate(run_dir: Path, topic: str, duration_s: float) -> RateReport:
         )
     gaps = [(b - a) / NS_PER_S for a, b in pairwise(times)]
     return RateReport(
-        len(times), lost, len(gaps) / sum(gaps), min(gaps), max(gaps),
-        statistics.median(ages) if ages else None, max(ages) if ages else None,
-    )  # fmt: skip
+        len(times),
+        lost,
+        len(gaps) / sum(gaps),
+        min(gaps),
+        max(gaps),
+        statistics.median(ages) if ages else None,
+        max(ages) if ages else None,
+    )
 
 
 def describe(message: Any, indent: str = "") -> str:

@@ -107,7 +107,8 @@ def describe_silence(run_dir: Path, name: str) -> Silence:
     except psutil.Error:
         stopped = False
     return Silence(
-        owner, f"last status {age_s:.1f} s ago; its process is {'stopped by a signal' if stopped else 'alive'}"
+        owner,
+        f"last status {age_s:.1f} s ago; its process is {'stopped by a signal' if stopped else 'alive'}",
     )
 
 
@@ -130,7 +131,9 @@ def measure_delay(run_dir: Path, topic: str, duration_s: float) -> DelayReport:
         if hasattr(message, "header"):
             capture.append((info.publish_real_ns - stamp_ns(message)) / NS_PER_S)
     if not way:
-        raise MessageError(f"expected a message of {topic} within {duration_s:g} s, got none; is its node running?")
+        raise MessageError(
+            f"expected a message of {topic} within {duration_s:g} s, got none; is its node running?"
+        )
     return DelayReport(len(way), _delay(capture) if capture else None, _delay(way))
 
 
@@ -173,7 +176,8 @@ class NodeWatch:
                 name = received.topic.removeprefix(STATUS_PREFIX)
                 self._note(name, received.message())
         return [
-            self._row(name) if name in self._first else self._silent(name) for name in sorted({*names, *self._first})
+            self._row(name) if name in self._first else self._silent(name)
+            for name in sorted({*names, *self._first})
         ]
 
     def _note(self, name: str, status: Any) -> None:
@@ -197,7 +201,9 @@ class NodeWatch:
     def _usage(self, process: psutil.Process | None) -> tuple[float | None, float | None]:
         """CPU load [% of one core] and memory [MiB]; None for a process on another host."""
         try:
-            return (None, None) if process is None else (process.cpu_percent(), process.memory_info().rss / _MIB)
+            return (
+                (None, None) if process is None else (process.cpu_percent(), process.memory_info().rss / _MIB)
+            )
         except psutil.Error:
             return None, None
 
@@ -210,16 +216,32 @@ class NodeWatch:
     def _row(self, name: str) -> NodeRow:
         (began, first), (ended, last) = self._first[name], self._last[name]
         before, after = _counters(first), _counters(last)
-        work = sum(after[key] - before.get(key, 0.0) for key in after if key == "ticks" or key.startswith("received "))
+        work = sum(
+            after[key] - before.get(key, 0.0)
+            for key in after
+            if key == "ticks" or key.startswith("received ")
+        )
         process = self._process(name, int(last.pid))
         cpu, memory = self._usage(process)
         return NodeRow(
-            name, 0 if memory is None else int(last.pid), str(last.state), str(last.text), cpu, memory,
+            name,
+            0 if memory is None else int(last.pid),
+            str(last.state),
+            str(last.text),
+            cpu,
+            memory,
             work / (ended - began) if ended > began else 0.0,
-            int(sum(v for k, v in after.items() if k.split(" ")[0] in ("dropped", "lost", "refused") and " " in k)),
-            int(after.get("ticks_missed", 0)), self._restarts.get(name, 0),
+            int(
+                sum(
+                    v
+                    for k, v in after.items()
+                    if k.split(" ")[0] in ("dropped", "lost", "refused") and " " in k
+                )
+            ),
+            int(after.get("ticks_missed", 0)),
+            self._restarts.get(name, 0),
             int(sum(after.get(word, 0) for word in _QUEUE_WORDS)),
-        )  # fmt: skip
+        )
 
 
 def _counters(status: Any) -> dict[str, float]:

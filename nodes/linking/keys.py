@@ -22,9 +22,7 @@ from nodes.runtime.errors import SecurityError
 
 WATCH, DRIVE = "watch", "drive"
 RIGHTS = (WATCH, DRIVE)
-_MAKE_KEYS = (
-    "Create keys with advnerf keys new, allow the other host with advnerf keys allow, and set keys to the folder"
-)
+_MAKE_KEYS = "Create keys with advnerf keys new, allow the other host with advnerf keys allow, and set keys to the folder"
 _NAME = re.compile(r"[a-z][a-z0-9_-]{0,31}")
 _KEY = re.compile(r"[0-9a-zA-Z.\-:+=^!/*?&<>()\[\]{}@%$#]{40}")
 
@@ -86,7 +84,9 @@ class KeyFolder:
         if not _KEY.fullmatch(public):
             raise SecurityError(f"expected a public key of 40 Z85 characters for {name}, got {public!r:.60}")
         if known.exists() and _read_key(known) != public:
-            raise SecurityError(f"{name} has another key in {known}; revoke {name} and remove that file first")
+            raise SecurityError(
+                f"{name} has another key in {known}; revoke {name} and remove that file first"
+            )
         write_atomically(known, public + "\n")
 
     def allow(self, name: str, right: str) -> None:
@@ -187,7 +187,9 @@ def require_keys(address: str, keys: KeyFolder | None, commands: Sequence[str] =
             f"{address} can be reached from other computers, and no keys are given, so any computer could connect. {_MAKE_KEYS}; or use 127.0.0.1"
         )
     if commands:
-        shown = ", ".join(sorted(commands)[:4]) + (f" and {len(commands) - 4} more" if len(commands) > 4 else "")
+        shown = ", ".join(sorted(commands)[:4]) + (
+            f" and {len(commands) - 4} more" if len(commands) > 4 else ""
+        )
         raise SecurityError(
             f"without keys a link can only be used to watch, but this one would carry {shown} to the listening host, so any process on "
             f"{address} could drive the car. {_MAKE_KEYS}; or run all nodes on one computer with --host all"

@@ -200,7 +200,9 @@ class Link:
         limit = MOST_BYTES if typename in _LARGE else _SMALL_BYTES
         if len(parts) != 3 or len(parts[2]) > limit:
             sizes = [len(part) for part in parts[:8]]
-            raise MessageError(f"expected three frames and at most {limit} bytes of {typename} on {topic}, got {sizes}")
+            raise MessageError(
+                f"expected three frames and at most {limit} bytes of {typename} on {topic}, got {sizes}"
+            )
         meta, cdr = unpack(topic, [part.bytes for part in parts])
         decode(typename, cdr)  # refuses messages that cannot be decoded
         self._inbox.put(Inbound(topic, Relayed(on_our_clock(meta, time.time_ns(), time.monotonic_ns()), cdr)))
@@ -215,7 +217,9 @@ class Link:
             asked_ns, received_ns, answered_ns = _PONG.unpack(body)
             newest = Exchange(asked_ns, received_ns, answered_ns, heard_ns)
             if not 0.0 <= newest.round_trip_s < 60.0:
-                raise MessageError(f"expected a clock exchange with a valid round trip, got {newest.round_trip_s:g} s")
+                raise MessageError(
+                    f"expected a clock exchange with a valid round trip, got {newest.round_trip_s:g} s"
+                )
             peer = str(
                 parts[1].get("User-Id")
             )  # the name that the doorkeeper found for the key; the drive door is never open without keys

@@ -121,7 +121,9 @@ class Doors:
         socket.setsockopt(zmq.IPV6, ":" in config.address)
         if config.keys is not None:
             self._arm_curve(socket, right)
-        monitor = socket.get_monitor_socket(zmq.EVENT_HANDSHAKE_SUCCEEDED | zmq.EVENT_DISCONNECTED | sum(_FAILURES))
+        monitor = socket.get_monitor_socket(
+            zmq.EVENT_HANDSHAKE_SUCCEEDED | zmq.EVENT_DISCONNECTED | sum(_FAILURES)
+        )
         self._sockets[right], self._monitors[right] = socket, monitor
         self._poller.register(monitor, zmq.POLLIN)
         if right == self._in:

@@ -102,13 +102,24 @@ class RetroAttack:
 
     def rows(self) -> Iterator[dict[str, Any]]:
         """One row per image."""
-        columns = (self.stamps_ns, self.time_s, self.recorded_rad, self.clean_rad, self.attacked_rad, self.drawn)
+        columns = (
+            self.stamps_ns,
+            self.time_s,
+            self.recorded_rad,
+            self.clean_rad,
+            self.attacked_rad,
+            self.drawn,
+        )
         for stamp, time_s, recorded, clean, attacked, drawn in zip(*columns, strict=True):
             yield {
-                "stamp_ns": int(stamp), "time_s": round(float(time_s), 6), "drawn": bool(drawn),
-                "recorded_rad": None if np.isnan(recorded) else float(recorded), "clean_rad": float(clean),
-                "attacked_rad": float(attacked), "delta_rad": float(attacked - clean),
-            }  # fmt: skip
+                "stamp_ns": int(stamp),
+                "time_s": round(float(time_s), 6),
+                "drawn": bool(drawn),
+                "recorded_rad": None if np.isnan(recorded) else float(recorded),
+                "clean_rad": float(clean),
+                "attacked_rad": float(attacked),
+                "delta_rad": float(attacked - clean),
+            }
 
     def write_json(self, path: Path) -> None:
         """Write summary and rows."""
@@ -124,7 +135,9 @@ def retro_attack(bag: Path, attack: Path, choice: Choice) -> RetroAttack:
         choice: Nodes to run. ``compositor`` gets the attack; overrides select the policy.
     """
     clean, _, clean_digest = _steering(bag, choice, "compositor.attack=null")
-    attacked, labels, digest = _steering(bag, choice, f"compositor.attack={json.dumps(str(attack.resolve()))}")
+    attacked, labels, digest = _steering(
+        bag, choice, f"compositor.attack={json.dumps(str(attack.resolve()))}"
+    )
     stamps = sorted(clean.keys() & attacked.keys())
     if not stamps:
         raise BagError(
@@ -172,11 +185,15 @@ def plot_retro_attack(result: RetroAttack, path: Path) -> None:
     plt.close(figure)
 
 
-def _steering(bag: Path, choice: Choice, setting: str) -> tuple[dict[int, float], dict[int, tuple[bool, str]], str]:
+def _steering(
+    bag: Path, choice: Choice, setting: str
+) -> tuple[dict[int, float], dict[int, tuple[bool, str]], str]:
     """Run one replay. Returns steering [rad] and compositor labels (drawn, attack id) by capture stamp, and the digest."""
     steering: dict[int, float] = {}
     labels: dict[int, tuple[bool, str]] = {}
-    with Replay(bag, Choice(choice.nodes, choice.replacements, choice.launch, (*choice.overrides, setting))) as replay:
+    with Replay(
+        bag, Choice(choice.nodes, choice.replacements, choice.launch, (*choice.overrides, setting))
+    ) as replay:
         for entry in replay:
             if entry.message.topic not in (_DRIVE, _LABEL):
                 continue

@@ -49,7 +49,9 @@ class Tolerances:
                 number = float(value)
             except ValueError:
                 number = -1.0
-            if not 0.0 <= number < float("inf") or (separator and not (colon and name and topic.startswith("/"))):
+            if not 0.0 <= number < float("inf") or (
+                separator and not (colon and name and topic.startswith("/"))
+            ):
                 raise BagError(
                     f"--tolerance {text}: expected VALUE or TOPIC:FIELD=VALUE with a number >= 0, "
                     "for example 1e-6 or /policy/drive:drive.steering_angle=1e-4"
@@ -94,9 +96,7 @@ class Difference:
     def text(self, start_ns: int) -> str:
         """Describe the difference in a sentence. ``start_ns`` is the start of the recording [ns since 1970]."""
         stamp = "" if self.stamp_ns is None else f", captured at {self.stamp_ns} ns"
-        where = (
-            f"{self.topic} message {self.index}, {(self.log_ns - start_ns) / NS_PER_S:.3f} s into the recording{stamp}"
-        )
+        where = f"{self.topic} message {self.index}, {(self.log_ns - start_ns) / NS_PER_S:.3f} s into the recording{stamp}"
         much = "" if self.by is None else f": differs by {self.by:.6g}, tolerance {self.tolerance:.6g}"
         return f"{where}: {self.name} was {self.golden}, is {self.got}{much}"
 
@@ -110,14 +110,18 @@ class Golden:
         topics: Topics to compare; none means all.
     """
 
-    def __init__(self, path: Path, tolerances: Tolerances | None = None, topics: Sequence[str] | None = None) -> None:
+    def __init__(
+        self, path: Path, tolerances: Tolerances | None = None, topics: Sequence[str] | None = None
+    ) -> None:
         self._tolerances = tolerances or Tolerances()
         recorded = [topic.name for topic in read_info(path).topics]
         if topics and (missing := [name for name in topics if name not in recorded]):
             raise BagError(f"{path} has no topic {', '.join(missing)}; it has {', '.join(recorded)}")
         self._only = set(topics) if topics else None
         compared = [name for name in recorded if self._only is None or name in self._only]
-        self._expected: dict[str, Iterator[BagMessage]] = {name: read_messages(path, [name]) for name in compared}
+        self._expected: dict[str, Iterator[BagMessage]] = {
+            name: read_messages(path, [name]) for name in compared
+        }
         self._indices: dict[str, int] = dict.fromkeys(compared, 0)
         self._differences: dict[str, Difference] = {}
         self.compared = 0
@@ -167,7 +171,9 @@ def compare(golden: BagMessage, got: BagMessage, index: int, tolerances: Toleran
         allowed = tolerances.of(golden.topic, "time")
         if by_s > allowed:
             was_ns, now_ns = f"{golden.log_ns} ns", f"{got.log_ns} ns"
-            return Difference(golden.topic, index, golden.log_ns, stamp, "time", was_ns, now_ns, by_s, allowed)
+            return Difference(
+                golden.topic, index, golden.log_ns, stamp, "time", was_ns, now_ns, by_s, allowed
+            )
     return None
 
 
@@ -183,12 +189,16 @@ def update_golden(path: Path, replay: Replay, topics: Sequence[str] | None = Non
     count = 0
     with tempfile.TemporaryDirectory(prefix=".golden-", dir=path.parent) as folder:
         metadata = {"golden": ", ".join(replay.names)}
-        with BagWriter(Path(folder) / path.stem, metadata=metadata, attached_ns=replay.info.start_ns) as writer:
+        with BagWriter(
+            Path(folder) / path.stem, metadata=metadata, attached_ns=replay.info.start_ns
+        ) as writer:
             for entry in replay:
                 message = entry.message
                 wanted = not topics or message.topic in topics
                 if entry.made and wanted and not message.topic.startswith(STATUS_PREFIX):
-                    writer.write(message.topic, message.cdr, message.log_ns, message.publish_ns, message.sequence)
+                    writer.write(
+                        message.topic, message.cdr, message.log_ns, message.publish_ns, message.sequence
+                    )
                     count += 1
             writer.close({"digest": replay.summary.digest})
         if count == 0:

@@ -142,7 +142,11 @@ class Lockstep:
             if node is None:
                 self._timers.remove(timer)
                 continue
-            outs = [self._status(timer.node, node, now)] if timer.is_status else self._ask(timer.node, now, node.tick)
+            outs = (
+                [self._status(timer.node, node, now)]
+                if timer.is_status
+                else self._ask(timer.node, now, node.tick)
+            )
             made += self._publish(timer.node, outs, now)
         return made
 
@@ -198,10 +202,14 @@ class Lockstep:
     def _message(self, name: str, out: Out, now: Now) -> BagMessage:
         topic, content = out
         if topic not in self.made_topics:
-            raise MessageError(f"{name} sends {topic}, but declares only {', '.join(self._nodes[name].publications)}")
+            raise MessageError(
+                f"{name} sends {topic}, but declares only {', '.join(self._nodes[name].publications)}"
+            )
         if not isinstance(content, bytes | memoryview):
             if type_name(content) != topic_row(topic).type:
-                raise MessageError(f"expected {topic_row(topic).type} on {topic}, got {type_name(content)} from {name}")
+                raise MessageError(
+                    f"expected {topic_row(topic).type} on {topic}, got {type_name(content)} from {name}"
+                )
             content = encode(content)
         message = BagMessage(topic, bytes(content), now.real_ns, now.real_ns, self._sequences[topic])
         self._sequences[topic] += 1
@@ -214,17 +222,29 @@ class Lockstep:
     def _info(self, message: BagMessage, lost: int, now: Now) -> MessageInfo:
         stream = self._streams.get(message.topic)
         return MessageInfo(
-            publish_mono_ns=message.publish_ns, receive_mono_ns=now.mono_ns, sequence=message.sequence, raw=message.cdr,
-            publish_real_ns=message.publish_ns, receive_real_ns=now.real_ns, lost=lost,
+            publish_mono_ns=message.publish_ns,
+            receive_mono_ns=now.mono_ns,
+            sequence=message.sequence,
+            raw=message.cdr,
+            publish_real_ns=message.publish_ns,
+            receive_real_ns=now.real_ns,
+            lost=lost,
             instance_id=stream.instance_id if stream else 1,
-        )  # fmt: skip
+        )
 
     def _status(self, name: str, node: Node, now: Now) -> Out:
         # Without counters, because some depend on the speed of this machine.
         state, text = node.status()
         status = types.NodeStatus(
-            header=header(now.real_ns), node=name, pid=0, state=state, text=text, subscriptions=list(node.subscriptions),
-            publications=list(node.publications), subscribers=np.zeros(len(node.publications), np.uint32),
-            counter_names=[], counter_values=np.zeros(0),
-        )  # fmt: skip
+            header=header(now.real_ns),
+            node=name,
+            pid=0,
+            state=state,
+            text=text,
+            subscriptions=list(node.subscriptions),
+            publications=list(node.publications),
+            subscribers=np.zeros(len(node.publications), np.uint32),
+            counter_names=[],
+            counter_values=np.zeros(0),
+        )
         return Out(status_topic(name), status)

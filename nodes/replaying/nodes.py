@@ -177,7 +177,9 @@ def _known_keys(document: Document, config_type: type[BaseModel]) -> Document:
     return Document(data, document.source, document.places)
 
 
-def _builder(module: ModuleType, class_name: str) -> tuple[Callable[[Any, NodeContext], Node], type[BaseModel]]:
+def _builder(
+    module: ModuleType, class_name: str
+) -> tuple[Callable[[Any, NodeContext], Node], type[BaseModel]]:
     """Find the build function of a module's node, and the type of its configuration."""
     candidates: Sequence[Any]
     if class_name:
@@ -186,7 +188,9 @@ def _builder(module: ModuleType, class_name: str) -> tuple[Callable[[Any, NodeCo
         candidates = [module]
     else:
         own = [value for value in vars(module).values() if inspect.isclass(value) and issubclass(value, Node)]
-        candidates = [value for value in own if value.__module__ == module.__name__ and hasattr(value, "build")]
+        candidates = [
+            value for value in own if value.__module__ == module.__name__ and hasattr(value, "build")
+        ]
     build = getattr(candidates[0], "build", None) if len(candidates) == 1 else None
     if build is None:
         raise BagError(

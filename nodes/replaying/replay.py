@@ -58,7 +58,9 @@ class Replay:
             self._lockstep = Lockstep(self._nodes, self._clock, self.info.start_ns)
             recorded = [topic.name for topic in self.info.topics]
             self.left_out = [topic for topic in recorded if type_of_topic(topic) is None]
-            self._heard = [topic for topic in recorded if topic in self._lockstep.heard_topics - self.made_topics]
+            self._heard = [
+                topic for topic in recorded if topic in self._lockstep.heard_topics - self.made_topics
+            ]
             require_readable(bag, {topic: topic_row(topic).type for topic in self._heard})
             if not self._heard:
                 raise BagError(

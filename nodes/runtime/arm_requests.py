@@ -42,8 +42,13 @@ class ArmAnswer:
 def arm_message(asked: Asked, now: Now, arm: bool, source: str, reason: str) -> Any:
     """Make the message for one repeat of a request to arm or to disarm."""
     return types.Arm(
-        header=header(asked.real_ns), arm=arm, source=source, reason=reason, ask_id=asked.ask_id, age_ns=asked.age_ns(now)
-    )  # fmt: skip
+        header=header(asked.real_ns),
+        arm=arm,
+        source=source,
+        reason=reason,
+        ask_id=asked.ask_id,
+        age_ns=asked.age_ns(now),
+    )
 
 
 def ask_to_arm(run_dir: Path, reason: str) -> ArmAnswer:
@@ -81,7 +86,9 @@ def ask_to_disarm(run_dir: Path, reason: str, silent: Callable[[float], None]) -
     return ArmAnswer(bool(state.granted), bool(state.armed), str(state.reason), braked)
 
 
-def _ask(bus: Bus, wanted: bool, reason: str, patience_s: float | None, silent: Callable[[float], None]) -> Received:
+def _ask(
+    bus: Bus, wanted: bool, reason: str, patience_s: float | None, silent: Callable[[float], None]
+) -> Received:
     def make(asked: Asked, now: Now) -> Any:
         return arm_message(asked, now, wanted, OPERATOR, reason)
 
@@ -107,6 +114,10 @@ def _wait_for_brake(bus: Bus, since_mono_ns: int) -> bool:
     while (left_s := deadline - time.monotonic()) > 0.0:
         bus.wait(left_s)
         for received in bus.receive():
-            if received.topic == SENT and received.info.publish_mono_ns >= since_mono_ns and received.message().braking:
+            if (
+                received.topic == SENT
+                and received.info.publish_mono_ns >= since_mono_ns
+                and received.message().braking
+            ):
                 return True
     return False

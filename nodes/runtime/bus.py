@@ -72,7 +72,9 @@ class Counts:
 class Publisher:
     """Publishes one topic. Each run folder allows as many publishers of a topic as the topic has senders, usually one."""
 
-    def __init__(self, context: zmq.Context[Any], run_dir: Path, topic: Topic, instance_id: int, clock: Clock) -> None:
+    def __init__(
+        self, context: zmq.Context[Any], run_dir: Path, topic: Topic, instance_id: int, clock: Clock
+    ) -> None:
         self.topic = topic
         self._clock = clock
         self._instance_id = instance_id
@@ -92,7 +94,9 @@ class Publisher:
         except zmq.ZMQError as error:
             self._socket.close()
             self._lock.close()
-            raise BusError(f"cannot publish {topic.name} at {path}: {error.strerror}; check the run folder") from error
+            raise BusError(
+                f"cannot publish {topic.name} at {path}: {error.strerror}; check the run folder"
+            ) from error
 
     def publish(self, message: Any) -> None:
         """Send a message, or CDR bytes of the topic's type, without blocking."""
@@ -186,7 +190,9 @@ class Bus:
         """Return the publisher of a topic, which is opened on first use."""
         if topic not in self._publishers:
             row = topic_row(topic)
-            self._publishers[topic] = Publisher(self._context, self._run_dir, row, self.instance_id, self._clock)
+            self._publishers[topic] = Publisher(
+                self._context, self._run_dir, row, self.instance_id, self._clock
+            )
         return self._publishers[topic]
 
     def publish(self, topic: str, message: Any) -> None:
@@ -274,9 +280,15 @@ class Bus:
         in_two = len(parts) == 2 and subscription.topic.type == IMAGE_TYPE
         raw = b"" if in_two else parts[0] if len(parts) == 1 else b"".join(parts)
         info = MessageInfo(
-            publish_mono_ns=meta.publish_mono_ns, receive_mono_ns=now.mono_ns, sequence=meta.sequence, raw=raw,
-            publish_real_ns=meta.publish_real_ns, receive_real_ns=now.real_ns, instance_id=meta.instance_id, lost=lost,
-        )  # fmt: skip
+            publish_mono_ns=meta.publish_mono_ns,
+            receive_mono_ns=now.mono_ns,
+            sequence=meta.sequence,
+            raw=raw,
+            publish_real_ns=meta.publish_real_ns,
+            receive_real_ns=now.real_ns,
+            instance_id=meta.instance_id,
+            lost=lost,
+        )
         return with_parts(info, (parts[0], parts[1])) if in_two else info
 
     def refuse(self, topic: str, reason: str) -> None:

@@ -72,7 +72,9 @@ def parse_yaml(text: str, source: str) -> Document:
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         line = f":{mark.line + 1}" if mark is not None else ""
-        raise ConfigError(f"{source}{line}: expected valid YAML: {getattr(error, 'problem', None) or error}") from error
+        raise ConfigError(
+            f"{source}{line}: expected valid YAML: {getattr(error, 'problem', None) or error}"
+        ) from error
     document = Document({} if data is None else data, source)
     if root is not None:
         _note_places(root, (), document)
@@ -135,7 +137,9 @@ def validate(model: type[M], document: Document, folder: Path | None = None) -> 
         folder: What ``file.py:Name`` in it is relative to; the working folder if it is not given.
     """
     if not isinstance(document.data, dict):
-        raise ConfigError(f"{document.place(())}: expected keys and values, got {type(document.data).__name__}")
+        raise ConfigError(
+            f"{document.place(())}: expected keys and values, got {type(document.data).__name__}"
+        )
     _refuse_unknown(model, document, ())
     try:
         return TypeAdapter(model).validate_python(document.data, context={"folder": folder})
@@ -158,7 +162,9 @@ def load_node_config(model: type[M], node: str, path: Path | None, overrides: Se
     """
     document = Document({}, f"defaults of {node}") if path is None else read_yaml(path)
     if isinstance(document.data, dict) and set(document.data) == {"config", "places"}:
-        places = {tuple(name.split(".")) if name else (): place for name, place in document.data["places"].items()}
+        places = {
+            tuple(name.split(".")) if name else (): place for name, place in document.data["places"].items()
+        }
         document = Document(document.data["config"], document.source, typing.cast("dict[Key, str]", places))
     apply_overrides(document, overrides)
     return validate(model, document)
@@ -204,13 +210,17 @@ def _hints(model: Any) -> dict[str, Any]:
 
 def _explain(model: Any, document: Document, error: ValidationError) -> str:
     # A misspelt key is often the reason for a missing one, so it is reported first.
-    problems = sorted(error.errors(include_url=False), key=lambda problem: problem["type"] != "extra_forbidden")
+    problems = sorted(
+        error.errors(include_url=False), key=lambda problem: problem["type"] != "extra_forbidden"
+    )
     first = problems[0]
     location = tuple(first["loc"])
     key = _as_written(document.data, location)
     name = ".".join(map(str, key)) or "the whole"
     if first["type"] == "extra_forbidden":
-        what = f"unknown key {name}; valid keys here: {', '.join(_valid_keys(model, location[:-1])) or 'none'}"
+        what = (
+            f"unknown key {name}; valid keys here: {', '.join(_valid_keys(model, location[:-1])) or 'none'}"
+        )
     elif first["type"] == "missing":
         what = f"{name} is missing; add it"
     else:
@@ -219,7 +229,9 @@ def _explain(model: Any, document: Document, error: ValidationError) -> str:
         # A check of several keys together, or of a name, says itself what it got; all of a file would not help.
         complete = not key or first["type"] == COMPLETE
         what = (
-            (f"{name}: {message}" if key else message) if complete else f"{name}: {message}, got {first['input']!r:.80}"
+            (f"{name}: {message}" if key else message)
+            if complete
+            else f"{name}: {message}, got {first['input']!r:.80}"
         )
     more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
     return f"{document.place(key)}: {what}{more}"
@@ -232,7 +244,9 @@ def _as_written(data: Any, location: Key) -> Key:
         if isinstance(data, dict) and part not in data and data.get("kind") == part:
             continue
         key.append(part)
-        inside = isinstance(data, dict) or (isinstance(data, list) and isinstance(part, int) and part < len(data))
+        inside = isinstance(data, dict) or (
+            isinstance(data, list) and isinstance(part, int) and part < len(data)
+        )
         data = (data.get(part) if isinstance(data, dict) else data[part]) if inside else None
     return tuple(key)
 

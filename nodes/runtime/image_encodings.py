@@ -100,7 +100,9 @@ def _eight_bits(samples: NDArray[Any]) -> NDArray[np.uint8]:
     return ((samples.astype(np.uint32) + 128) // 257).astype(np.uint8)
 
 
-def _rows(message: Any, source: str, pixel_bytes: int, even: bool = False, planes: bool = False) -> NDArray[np.uint8]:
+def _rows(
+    message: Any, source: str, pixel_bytes: int, even: bool = False, planes: bool = False
+) -> NDArray[np.uint8]:
     """Rows of an image without padding, ``[H, W * pixel_bytes]``. With ``planes``, half as many rows follow."""
     height, width, step = int(message.height), int(message.width), int(message.step)
     count = height * 3 // 2 if planes else height

@@ -35,12 +35,22 @@ def split_image(message: Any) -> tuple[bytes, memoryview] | None:
     ):
         return None
     rest = _rest(
-        message.header.frame_id, message.height, message.width, message.encoding, message.is_bigendian, message.step
+        message.header.frame_id,
+        message.height,
+        message.width,
+        message.encoding,
+        message.is_bigendian,
+        message.step,
     )
     stamp = message.header.stamp
     try:
         prefix = b"".join(
-            (rest[:_STAMP_AT], _STAMP.pack(stamp.sec, stamp.nanosec), rest[_REST_AT:], _LENGTH.pack(data.nbytes))
+            (
+                rest[:_STAMP_AT],
+                _STAMP.pack(stamp.sec, stamp.nanosec),
+                rest[_REST_AT:],
+                _LENGTH.pack(data.nbytes),
+            )
         )
     except struct.error as error:
         raise MessageError(f"a stamp of {IMAGE_TYPE} is out of range: {error}") from error
@@ -50,14 +60,20 @@ def split_image(message: Any) -> tuple[bytes, memoryview] | None:
 def join_image(prefix: bytes, pixels: bytes) -> Any:
     """Join two parts to an image message whose data is a read-only view of ``pixels``."""
     if len(prefix) < _REST_AT + _LENGTH.size or _LENGTH.unpack(prefix[-_LENGTH.size :])[0] != len(pixels):
-        raise MessageError(f"expected the two parts of {IMAGE_TYPE}, got {len(prefix)} and {len(pixels)} bytes")
+        raise MessageError(
+            f"expected the two parts of {IMAGE_TYPE}, got {len(prefix)} and {len(pixels)} bytes"
+        )
     sample = _sample(prefix[:_STAMP_AT], prefix[_REST_AT : -_LENGTH.size])
     sec, nanosec = _STAMP.unpack_from(prefix, _STAMP_AT)
     return types.Image(
         header=types.Header(stamp=types.Time(sec=sec, nanosec=nanosec), frame_id=sample.header.frame_id),
-        height=sample.height, width=sample.width, encoding=sample.encoding, is_bigendian=sample.is_bigendian,
-        step=sample.step, data=np.frombuffer(pixels, dtype=np.uint8),
-    )  # fmt: skip
+        height=sample.height,
+        width=sample.width,
+        encoding=sample.encoding,
+        is_bigendian=sample.is_bigendian,
+        step=sample.step,
+        data=np.frombuffer(pixels, dtype=np.uint8),
+    )
 
 
 class PartedInfo(MessageInfo):
@@ -83,9 +99,14 @@ def with_parts(info: MessageInfo, parts: tuple[bytes, bytes]) -> PartedInfo:
 def _rest(frame_id: str, height: int, width: int, encoding: str, is_bigendian: int, step: int) -> bytes:
     """CDR bytes of an image between its stamp and its pixel data."""
     empty = types.Image(
-        header=header(0, frame_id), height=height, width=width, encoding=encoding, is_bigendian=is_bigendian, step=step,
+        header=header(0, frame_id),
+        height=height,
+        width=width,
+        encoding=encoding,
+        is_bigendian=is_bigendian,
+        step=step,
         data=np.empty(0, np.uint8),
-    )  # fmt: skip
+    )
     return encode(empty)[: -_LENGTH.size]
 
 

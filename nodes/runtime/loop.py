@@ -122,11 +122,17 @@ class NodeLoop:
         counters = self._counters()
         publications = list(self._node.publications)
         status = types.NodeStatus(
-            header=header(now.real_ns), node=self.name, pid=os.getpid(), state=state, text=text,
-            subscriptions=list(self._node.subscriptions), publications=publications,
+            header=header(now.real_ns),
+            node=self.name,
+            pid=os.getpid(),
+            state=state,
+            text=text,
+            subscriptions=list(self._node.subscriptions),
+            publications=publications,
             subscribers=np.array([self._bus.subscribers(t) for t in publications], dtype=np.uint32),
-            counter_names=list(counters), counter_values=np.array(list(counters.values()), dtype=np.float64),
-        )  # fmt: skip
+            counter_names=list(counters),
+            counter_values=np.array(list(counters.values()), dtype=np.float64),
+        )
         self._bus.publish(status_topic(self.name), status)
 
     def _time_to_next_s(self) -> float:
@@ -158,7 +164,9 @@ class NodeLoop:
     def _publish(self, outs: list[Out]) -> None:
         for topic, message in outs:
             if topic not in self._node.publications:
-                raise MessageError(f"{self.name} sends {topic}, but declares only {', '.join(self._node.publications)}")
+                raise MessageError(
+                    f"{self.name} sends {topic}, but declares only {', '.join(self._node.publications)}"
+                )
             self._bus.publish(topic, message)
 
     def _counters(self) -> dict[str, float]:

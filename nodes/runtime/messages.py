@@ -161,9 +161,14 @@ def image_message(image: NDArray[np.uint8], stamp_ns: int, frame_id: str, encodi
         raise MessageError(f"expected a uint8 image for {encoding}, got {image.dtype} {list(image.shape)}")
     height, width = image.shape[:2]
     return types.Image(
-        header=header(stamp_ns, frame_id), height=height, width=width, encoding=encoding, is_bigendian=0,
-        step=width * channels, data=np.ascontiguousarray(image).reshape(-1),
-    )  # fmt: skip
+        header=header(stamp_ns, frame_id),
+        height=height,
+        width=width,
+        encoding=encoding,
+        is_bigendian=0,
+        step=width * channels,
+        data=np.ascontiguousarray(image).reshape(-1),
+    )
 
 
 def pose_message(T_frame_from_body: ArrayLike, stamp_ns: int, frame_id: str = "world") -> Any:
@@ -209,10 +214,18 @@ def camera_info_message(
     P = np.hstack([K, np.zeros((3, 1))])
     window = types.RegionOfInterest(x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
     return types.CameraInfo(
-        header=header(stamp_ns, frame_id), height=pinhole.height, width=pinhole.width, distortion_model="plumb_bob",
-        d=np.asarray(distortion, dtype=np.float64), k=K.reshape(-1), r=np.eye(3).reshape(-1), p=P.reshape(-1),
-        binning_x=0, binning_y=0, roi=window,
-    )  # fmt: skip
+        header=header(stamp_ns, frame_id),
+        height=pinhole.height,
+        width=pinhole.width,
+        distortion_model="plumb_bob",
+        d=np.asarray(distortion, dtype=np.float64),
+        k=K.reshape(-1),
+        r=np.eye(3).reshape(-1),
+        p=P.reshape(-1),
+        binning_x=0,
+        binning_y=0,
+        roi=window,
+    )
 
 
 def pinhole_from_camera_info(message: Any) -> Pinhole:

@@ -45,7 +45,9 @@ def compressed_image_message(rgb: NDArray[np.uint8], stamp_ns: int, frame_id: st
     bgr = cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)
     done, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])
     if not done:
-        raise MessageError(f"cannot compress an image of {rgb.shape[1]} x {rgb.shape[0]} to JPEG; reduce its size")
+        raise MessageError(
+            f"cannot compress an image of {rgb.shape[1]} x {rgb.shape[0]} to JPEG; reduce its size"
+        )
     return types.CompressedImage(header=header(stamp_ns, frame_id), format=_FORMAT, data=data.reshape(-1))
 
 
@@ -84,7 +86,9 @@ def _decompressed(message: Any, source: str) -> NDArray[np.uint8]:
     data = np.asarray(message.data, dtype=np.uint8)
     width, height = _compressed_size(data.tobytes(), str(message.format), source)
     if width * height > MAX_PIXELS:
-        raise MessageError(f"{source}: expected an image of at most {MAX_PIXELS} pixels, got {width} x {height}")
+        raise MessageError(
+            f"{source}: expected an image of at most {MAX_PIXELS} pixels, got {width} x {height}"
+        )
     try:
         # IMREAD_UNCHANGED keeps 16 bits and single channels, and ignores a rotation in the EXIF data.
         samples = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
@@ -106,9 +110,14 @@ def _layout(picture_format: str, samples: NDArray[Any]) -> str:
     if channels == 1:
         return encoding.rstrip("0123456789") if is_bayer(encoding) else "grey"
     swapped = (
-        separator and "compressed" in rest and "compressed bgr" not in rest and encoding.startswith(("rgb", "bgr"))
+        separator
+        and "compressed" in rest
+        and "compressed bgr" not in rest
+        and encoding.startswith(("rgb", "bgr"))
     )
-    return {(3, False): "bgr", (3, True): "rgb", (4, False): "bgra", (4, True): "rgba"}[channels, bool(swapped)]
+    return {(3, False): "bgr", (3, True): "rgb", (4, False): "bgra", (4, True): "rgba"}[
+        channels, bool(swapped)
+    ]
 
 
 def _compressed_size(data: bytes, picture_format: str, source: str) -> tuple[int, int]:

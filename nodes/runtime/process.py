@@ -34,7 +34,9 @@ class _Signals:
 
     def __init__(self) -> None:
         self._loop: NodeLoop | None = None
-        self._previous = {number: signal.signal(number, self._handle) for number in (signal.SIGINT, signal.SIGTERM)}
+        self._previous = {
+            number: signal.signal(number, self._handle) for number in (signal.SIGINT, signal.SIGTERM)
+        }
 
     def attach(self, loop: NodeLoop) -> None:
         self._loop = loop
@@ -177,7 +179,9 @@ def run_node_main(config_type: type[C], build: Callable[[C, NodeContext], Node])
     role = module.name.rsplit(".", 1)[-1] if module is not None else Path(sys.argv[0]).stem
     parser = argparse.ArgumentParser(prog=f"python -m nodes.{role}", description=f"The {role} node.")
     parser.add_argument(
-        "--config", type=Path, help="YAML or JSON file with the configuration of the node (default: default values)"
+        "--config",
+        type=Path,
+        help="YAML or JSON file with the configuration of the node (default: default values)",
     )
     parser.add_argument("--run-dir", type=Path, required=True, help="folder of the run, for sockets and logs")
     parser.add_argument("--name", default=role, help="name of the node (default: %(default)s)")

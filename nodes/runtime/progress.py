@@ -53,9 +53,14 @@ class ProgressDisplay:
     def __init__(self, console: Console | None = None) -> None:
         self._console = console or Console()
         columns = (
-            TextColumn("{task.fields[stage]:<8}"), BarColumn(bar_width=24), TextColumn("{task.percentage:>3.0f} %"),
-            TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(), TextColumn("{task.fields[text]}"),
-        )  # fmt: skip
+            TextColumn("{task.fields[stage]:<8}"),
+            BarColumn(bar_width=24),
+            TextColumn("{task.percentage:>3.0f} %"),
+            TimeElapsedColumn(),
+            TextColumn("left"),
+            TimeRemainingColumn(),
+            TextColumn("{task.fields[text]}"),
+        )
         self._progress = Progress(*columns, console=self._console) if self._console.is_terminal else None
 
     def __enter__(self) -> ProgressDisplay:
@@ -102,4 +107,6 @@ class _LogReport:
         self._printed_s = now_s
         left = (now_s - self._begin_s) * (1.0 / fraction - 1.0) if fraction > 0.01 else float("nan")
         remaining = "" if left != left else f", about {left:.0f} s left"
-        self._console.print(f"{self._stage}: {100 * fraction:.0f} % {text}{remaining}", highlight=False, soft_wrap=True)
+        self._console.print(
+            f"{self._stage}: {100 * fraction:.0f} % {text}{remaining}", highlight=False, soft_wrap=True
+        )

@@ -12,7 +12,8 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 Overrides = Annotated[
-    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a value of the file. May be repeated.")
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="Override a value of the file. May be repeated."),
 ]
 RunDir = Annotated[
     Path | None, typer.Option("--run-dir", help="Folder of the run.", show_default="the only running launch")

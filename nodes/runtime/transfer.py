@@ -27,11 +27,16 @@ def chunk_messages(content: bytes, name: str, stamp_ns: int) -> list[Any]:
     starts = range(0, len(content), CHUNK_BYTES)
     return [
         types.FileChunk(
-            header=header(stamp_ns), name=name, sha256=sha256, size_bytes=len(content), index=index, count=len(starts),
+            header=header(stamp_ns),
+            name=name,
+            sha256=sha256,
+            size_bytes=len(content),
+            index=index,
+            count=len(starts),
             data=np.frombuffer(content[start : start + CHUNK_BYTES], dtype=np.uint8),
         )
         for index, start in enumerate(starts)
-    ]  # fmt: skip
+    ]
 
 
 @dataclass(frozen=True)
@@ -97,7 +102,10 @@ class Assembler:
         data = bytes(chunk.data)
         if len(data) != expected:
             self._forget()
-            return None, f"expected {expected} bytes in piece {int(chunk.index) + 1} of {name}, got {len(data)}"
+            return (
+                None,
+                f"expected {expected} bytes in piece {int(chunk.index) + 1} of {name}, got {len(data)}",
+            )
         self._parts.append(data)
         if len(self._parts) < count:
             return None, trouble

@@ -63,7 +63,7 @@ def pack_meta(meta: Meta) -> bytes:
     """Pack the second frame."""
     return _META.pack(
         meta.publish_mono_ns, meta.publish_real_ns, meta.sequence, meta.type_prefix, meta.instance_id
-    )  # fmt: skip
+    )
 
 
 def unpack(topic: str, frames: Sequence[bytes]) -> tuple[Meta, bytes]:

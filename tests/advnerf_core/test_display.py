@@ -13,8 +13,11 @@ from advnerf_core.scene.surrogate import Rendered
 LEVELS = np.linspace(0.0, 1.0, 17)
 MODEL = DisplayModel(
     np.stack([LEVELS**2.2, LEVELS**1.8, LEVELS**2.5]),
-    np.array([[0.7, 0.1, 0.02], [0.05, 0.8, 0.06], [0.01, 0.1, 0.75]]), np.array([0.01, 0.02, 0.015]), 2.1, 1.3,
-)  # fmt: skip
+    np.array([[0.7, 0.1, 0.02], [0.05, 0.8, 0.06], [0.01, 0.1, 0.75]]),
+    np.array([0.01, 0.02, 0.015]),
+    2.1,
+    1.3,
+)
 
 
 def test_at_the_levels_it_is_the_closed_form():
@@ -99,7 +102,13 @@ def test_the_displayed_sensor_shows_what_is_seen_and_differentiates_through_it()
 def test_impossible_displays_are_refused(change, words):
     values = {**{key: np.array(value) for key, value in MODEL.to_dict().items()}, **change}
     with pytest.raises(DisplayModelError, match=words):
-        DisplayModel(values["curves"], values["mixing"], values["ambient"], float(values["response"]), float(values["falloff"]))  # fmt: skip
+        DisplayModel(
+            values["curves"],
+            values["mixing"],
+            values["ambient"],
+            float(values["response"]),
+            float(values["falloff"]),
+        )
 
 
 def test_round_trip_through_plain_numbers():

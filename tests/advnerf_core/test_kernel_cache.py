@@ -12,9 +12,7 @@ import pytest
 from advnerf_core.kernel_cache import sources_digest, use_own_folder
 
 CALLED = "from numba import njit\n\n@njit(cache=True)\ndef number():\n    return {value}\n"
-CALLER = (
-    "from numba import njit\nfrom pack.called import number\n\n@njit(cache=True)\ndef asked():\n    return number()\n"
-)
+CALLER = "from numba import njit\nfrom pack.called import number\n\n@njit(cache=True)\ndef asked():\n    return number()\n"
 ASK = "{before}from pack.caller import asked\nprint(asked())\n"
 OWN = "from pathlib import Path\nfrom advnerf_core.kernel_cache import use_own_folder\nuse_own_folder(Path('pack'))\n"
 
@@ -26,8 +24,12 @@ def ask(folder: Path, value: int, before: str) -> int:
     environment["PYTHONPATH"] = os.pathsep.join([str(folder), str(Path(__file__).parents[2])])
     done = subprocess.run(
         [sys.executable, "-c", ASK.format(before=before)],
-        cwd=folder, env=environment, check=True, stdout=subprocess.PIPE, text=True,
-    )  # fmt: skip
+        cwd=folder,
+        env=environment,
+        check=True,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
     return int(done.stdout)
 
 

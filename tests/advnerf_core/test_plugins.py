@@ -30,7 +30,8 @@ def test_a_built_in_name_wins(tmp_path: Path) -> None:
 
 def test_an_unknown_name_gets_the_valid_ones_and_the_nearest() -> None:
     with pytest.raises(
-        PluginError, match=r"expected an attack method of gradient, random; got 'gradiant' \(did you mean gradient\?\)"
+        PluginError,
+        match=r"expected an attack method of gradient, random; got 'gradiant' \(did you mean gradient\?\)",
     ):
         resolve("gradiant", "attack method", BUILT_IN, GROUP)
 
@@ -45,7 +46,8 @@ def test_a_broken_package_harms_only_its_own_name(tmp_path: Path, monkeypatch: p
     install(tmp_path, monkeypatch, "stranger_things:SPIRAL", "import a_package_that_is_not_there\n")
     assert resolve("random", "attack method", BUILT_IN, GROUP) == "the random one"
     with pytest.raises(
-        PluginError, match=r"spiral: stranger_things:SPIRAL of stranger-things cannot be loaded: ModuleNotFoundError"
+        PluginError,
+        match=r"spiral: stranger_things:SPIRAL of stranger-things cannot be loaded: ModuleNotFoundError",
     ):
         resolve("spiral", "attack method", BUILT_IN, GROUP)
 
@@ -64,10 +66,16 @@ def test_a_file_is_loaded_from_its_folder_and_again_when_it_changes(tmp_path: Pa
     [
         (None, "mine.py:Mine", "expected a Python file at"),
         ("x = 1 / 0\n", "mine.py:Mine", "cannot be loaded: ZeroDivisionError: division by zero"),
-        ("Mime = 1\n", "mine.py:Mine", r"expected a name in mine.py of Mime; got 'Mine' \(did you mean Mime\?\)"),
+        (
+            "Mime = 1\n",
+            "mine.py:Mine",
+            r"expected a name in mine.py of Mime; got 'Mine' \(did you mean Mime\?\)",
+        ),
     ],
 )
-def test_a_file_that_does_not_do_is_one_line(tmp_path: Path, body: str | None, name: str, message: str) -> None:
+def test_a_file_that_does_not_do_is_one_line(
+    tmp_path: Path, body: str | None, name: str, message: str
+) -> None:
     if body is not None:
         (tmp_path / "mine.py").write_text(body)
     with pytest.raises(PluginError, match=message) as caught:

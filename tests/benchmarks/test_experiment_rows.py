@@ -14,9 +14,18 @@ from benchmarks.black_box import Search
 def cell(seed, method, deployed_m, none_m=2.0):
     drives = {"total_cte_m": [deployed_m], "none_total_cte_m": [none_m], "off_track": [False]}
     return {
-        "scenario": "right", "victim": "hardened", "method": method, "seed": seed, "attack_id": None, "settings_hash": "h",
-        "seconds": 1.0, "machine": f"machine {seed}", "date": "2026-11-21", "surrogate": drives, "deployed": drives,
-    }  # fmt: skip
+        "scenario": "right",
+        "victim": "hardened",
+        "method": method,
+        "seed": seed,
+        "attack_id": None,
+        "settings_hash": "h",
+        "seconds": 1.0,
+        "machine": f"machine {seed}",
+        "date": "2026-11-21",
+        "surrogate": drives,
+        "deployed": drives,
+    }
 
 
 def test_a_retrained_policy_is_held_against_the_original_undisturbed():
@@ -77,7 +86,9 @@ def test_a_miss_says_by_how_much_and_what_that_is_on_the_road():
     extra = {"extra": {"horizon": 60}}
     cells = [CellResult.model_validate({**cell(seed, "random", 3.0), **extra}) for seed in (0, 1)]
     cells += [CellResult.model_validate({**cell(seed, "none", 2.0), **extra}) for seed in (0, 1)]
-    table = make_table([Wanted("right", "", "hardened", method, (0, 1)) for method in ("none", "random")], cells)
+    table = make_table(
+        [Wanted("right", "", "hardened", method, (0, 1)) for method in ("none", "random")], cells
+    )
     rows = dict((row.domain, (row, target)) for row, target in transfer_table.rows_of(table))
     row, target = rows["deployed"]
     why = transfer_table.why_missed(target, row, table.cells_of(row))
@@ -96,7 +107,8 @@ def test_shares_of_the_white_box_are_of_what_it_adds(tmp_path):
 
 def test_a_missed_target_says_by_how_much_and_what_it_points_to():
     cells = [
-        CellResult.model_validate({**cell(seed, "gradient", 6.0), "scenario": "straight_shape_1m"}) for seed in (0, 1)
+        CellResult.model_validate({**cell(seed, "gradient", 6.0), "scenario": "straight_shape_1m"})
+        for seed in (0, 1)
     ]
     table = make_table([Wanted("straight_shape_1m", "", "hardened", "gradient", (0, 1))], cells)
     ((row, target),) = [pair for pair in transfer_table.rows_of(table) if pair[0].domain == "deployed"]
@@ -116,7 +128,10 @@ def test_places_must_beat_random_ones_on_the_retrained_victim():
         table = make_table(wanted, [places("random", 4.0), places("gradient", gradient_m)])
         found = {(row.method, row.domain): target for row, target in transfer_table.rows_of(table)}
         assert found["random", "deployed"] is found["gradient", "surrogate"] is None
-        assert (found["gradient", "deployed"].target, found["gradient", "deployed"].met) == ("> random 2.00", met)
+        assert (found["gradient", "deployed"].target, found["gradient", "deployed"].met) == (
+            "> random 2.00",
+            met,
+        )
     assert [target.met for target in table_targets(make_table(wanted, []))] == [None]
     alone = make_table(wanted, [places("gradient", 9.0)])
     assert [target.met for row, target in transfer_table.rows_of(alone) if row.domain == "deployed"] == [None]
@@ -124,18 +139,34 @@ def test_places_must_beat_random_ones_on_the_retrained_victim():
 
 def test_rows_of_gate_and_predictions_come_from_what_was_published(tmp_path):
     (tmp_path / "gate").mkdir()
-    numbers = {"views": 12, "psnr_db": 27.5, "ssim": 0.9, "steering": 0.1, "steering_worst": 0.2, "correlation": 0.99}
+    numbers = {
+        "views": 12,
+        "psnr_db": 27.5,
+        "ssim": 0.9,
+        "steering": 0.1,
+        "steering_worst": 0.2,
+        "correlation": 0.99,
+    }
     verdict = {"key": "k", "passed": False, "reasons": ["steering too far off"], "numbers": numbers}
     (tmp_path / "gate" / "right_hardened.json").write_text(json.dumps(verdict))
-    (tmp_path / "gate" / "right_hardened.drive.json").write_text(json.dumps({**verdict, "passed": True, "reasons": []}))
-    (_, (line, value, unit, _, met, note)), (key, drive) = transfer_table.gate_rows(tmp_path, ["right_hardened"])
+    (tmp_path / "gate" / "right_hardened.drive.json").write_text(
+        json.dumps({**verdict, "passed": True, "reasons": []})
+    )
+    (_, (line, value, unit, _, met, note)), (key, drive) = transfer_table.gate_rows(
+        tmp_path, ["right_hardened"]
+    )
     assert transfer_table.gate_rows(tmp_path, ["left_hardened"]) == []
     assert (key, drive[0], drive[4]) == (
         "right_hardened",
         "#5 fidelity gate, right_hardened, drive without attack",
         True,
     )
-    assert (line, value, unit, met) == ("#5 fidelity gate, right_hardened, held-out views", 27.5, "dB PSNR", False)
+    assert (line, value, unit, met) == (
+        "#5 fidelity gate, right_hardened, held-out views",
+        27.5,
+        "dB PSNR",
+        False,
+    )
     assert "steering too far off" in note
     deployed = CellResult.model_validate(cell(0, "gradient", 6.0))
     assert transfer_table.skill_rows(tmp_path, [deployed], "file") == []

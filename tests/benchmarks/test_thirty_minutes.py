@@ -12,7 +12,9 @@ def samples(grows_mb=0.0, misses=0):
     """Half an hour in which the recorder grows steadily and the motor misses ticks at the end."""
     made = []
     for t_s in range(10, 1801, 10):
-        nodes = {name: {"rss_mb": 60.0, "counters": {"ticks": 50.0 * t_s, "ticks_missed": 1.0}} for name in NODES}
+        nodes = {
+            name: {"rss_mb": 60.0, "counters": {"ticks": 50.0 * t_s, "ticks_missed": 1.0}} for name in NODES
+        }
         nodes["recorder"]["rss_mb"] += grows_mb * t_s / 1800
         nodes["motor"]["counters"]["ticks_missed"] += misses if t_s == 1800 else 0
         made.append({"t_s": float(t_s), "nodes": nodes, "numbers": {}})
@@ -38,7 +40,9 @@ def test_the_drive_is_described_from_all_files_of_its_bag(tmp_path):
             T[:2, 3] = -0.9 + i * 0.005, -1.95
             t_ns = 1_800_000_000_000_000_000 + i * 10_000_000
             writer.write("/vicon/car", encode(pose_message(T, t_ns)), t_ns, t_ns, i)
-    assert describe_drive(tmp_path / "bag").startswith("1 m driven, mean |CTE| 0.050 m, largest 0.05 m, bag of ")
+    assert describe_drive(tmp_path / "bag").startswith(
+        "1 m driven, mean |CTE| 0.050 m, largest 0.05 m, bag of "
+    )
     assert (
         Stops([(12.3, "no image for 0.3 s")]).describe()
         == "1 stops, 0 of them while the host paused (12 s: no image for 0.3 s)"

@@ -53,7 +53,9 @@ def test_rolling_on_breaks_the_promise():
 def test_the_moved_clock_moves_real_time_only(tmp_path):
     environment = {**os.environ, **host_pair.skewed_clock(tmp_path, 5.0)}
     asked = "import time, datetime; print(time.time(), time.monotonic(), datetime.datetime.now().timestamp())"
-    told = subprocess.run([sys.executable, "-c", asked], env=environment, capture_output=True, check=True, text=True)
+    told = subprocess.run(
+        [sys.executable, "-c", asked], env=environment, capture_output=True, check=True, text=True
+    )
     real, monotonic, date = map(float, told.stdout.split())
     assert real - time.time() == pytest.approx(5.0, abs=1.0)
     assert date - time.time() == pytest.approx(5.0, abs=1.0)

@@ -13,9 +13,17 @@ from calibration.schema import CameraCalibration, load_calibration, save_calibra
 from tests.support.boards import seen, turned
 
 LENS = LensCalibration(
-    date="2026-11-21", method="test", width=336, height=188, fx=174.0, fy=174.0, cx=168.0, cy=94.0, rms_px=0.1,
+    date="2026-11-21",
+    method="test",
+    width=336,
+    height=188,
+    fx=174.0,
+    fy=174.0,
+    cx=168.0,
+    cy=94.0,
+    rms_px=0.1,
     distortion=(-0.1, 0.01, 0.0, 0.0, 0.0),
-)  # fmt: skip
+)
 MOUNT = camera_mount(0.30, 0.01, 0.20, np.radians(10.0), np.radians(1.5))
 # The print on the board: its z axis into the board, which is the board's -x.
 PATTERN = make_transform(np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), [0.002, -0.4, 0.3])
@@ -32,7 +40,9 @@ def views(rng, count=30, tilt_rad=0.35, tracked=True, mocap=(0.0005, 0.001), noi
             board = make_transform(np.eye(3), [0.0, 0.0, 0.2])
         angle = rng.uniform(-0.5, 0.5)
         away = rng.uniform(0.8, 1.6)
-        place = planar_pose(away * np.cos(angle), away * np.sin(angle), angle + np.pi + rng.uniform(-0.3, 0.3))
+        place = planar_pose(
+            away * np.cos(angle), away * np.sin(angle), angle + np.pi + rng.uniform(-0.3, 0.3)
+        )
         if not tracked:
             place = place @ make_transform(
                 Rotation.from_euler("xy", rng.uniform(-tilt_rad, tilt_rad, 2)).as_matrix(), [0.0, 0.0, 0.0]
@@ -107,7 +117,10 @@ def test_views_in_motion_are_left_out():
 
 def test_contradictory_views_are_refused():
     rng = np.random.default_rng(7)
-    some = [MountView(turned(v.T_world_from_car, rng, 0.3, 0.3), v.T_world_from_board, v.found) for v in views(rng)]
+    some = [
+        MountView(turned(v.T_world_from_car, rng, 0.3, 0.3), v.T_world_from_board, v.found)
+        for v in views(rng)
+    ]
     with pytest.raises(PoorFitError, match="agree on one mounting pose"):
         calibrate_mount(some, LENS)
 

@@ -5,24 +5,44 @@ from advnerf_core.data.lens import Lens
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.geometry import Pinhole
 from calibration import colmap_messages as messages
-from calibration.photo_model import FoundCamera, LeftOut, Model, ReconstructionError, Registered, SfmConfig, Source
+from calibration.photo_model import (
+    FoundCamera,
+    LeftOut,
+    Model,
+    ReconstructionError,
+    Registered,
+    SfmConfig,
+    Source,
+)
 
 PINHOLE = Pinhole(640, 480, 601.1 / 3.0, 599.9, 320.0, 240.1)
 LENS = Lens((0.1 / 3.0, -0.02, 0.0, 1e-9, 0.0))
 
 
 def test_a_job_arrives_as_it_was_sent(tmp_path):
-    sources = (Source("phone", ("a.jpg", "b.jpg"), True), Source("car", ("c.png",), pinhole=PINHOLE, lens=LENS))
+    sources = (
+        Source("phone", ("a.jpg", "b.jpg"), True),
+        Source("car", ("c.png",), pinhole=PINHOLE, lens=LENS),
+    )
     job = messages.pack_job(tmp_path, sources, tmp_path / "work", SfmConfig(max_features=77, seed=3))
     assert job.count(b"\n") == 1
-    assert messages.unpack_job(job) == (tmp_path, sources, tmp_path / "work", SfmConfig(max_features=77, seed=3))
+    assert messages.unpack_job(job) == (
+        tmp_path,
+        sources,
+        tmp_path / "work",
+        SfmConfig(max_features=77, seed=3),
+    )
 
 
 def test_a_model_arrives_to_the_bit():
     rng = np.random.default_rng(0)
-    images = tuple(Registered(f"{k}.jpg", "phone", rng.normal(size=(4, 4)), PINHOLE, LENS, k) for k in range(3))
+    images = tuple(
+        Registered(f"{k}.jpg", "phone", rng.normal(size=(4, 4)), PINHOLE, LENS, k) for k in range(3)
+    )
     camera = FoundCamera("phone", 3, "RADIAL", "5 images", PINHOLE, LENS, None)
-    model = Model(images, (LeftOut("d.jpg", "no matches"),), rng.normal(size=(50, 3)) * 1e7, 0.31, 2, (camera,))
+    model = Model(
+        images, (LeftOut("d.jpg", "no matches"),), rng.normal(size=(50, 3)) * 1e7, 0.31, 2, (camera,)
+    )
     got = messages.unpack_answer(messages.pack_model(model))
     assert isinstance(got, Model)
     assert got.points.tobytes() == model.points.tobytes()
@@ -35,7 +55,12 @@ def test_a_model_arrives_to_the_bit():
             LENS,
             b.observations,
         )
-    assert (got.left_out, got.cameras, got.parts, got.reprojection_error_px) == (model.left_out, (camera,), 2, 0.31)
+    assert (got.left_out, got.cameras, got.parts, got.reprojection_error_px) == (
+        model.left_out,
+        (camera,),
+        2,
+        0.31,
+    )
 
 
 def test_progress_and_errors_arrive():

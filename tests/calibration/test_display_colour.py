@@ -63,7 +63,9 @@ def test_falloff_is_learned_from_several_angles():
 
 
 def test_saturated_sets_are_refused():
-    with pytest.raises(DegenerateDataError, match=r"without a saturated channel, got \d+ %: shorten the exposure"):
+    with pytest.raises(
+        DegenerateDataError, match=r"without a saturated channel, got \d+ %: shorten the exposure"
+    ):
         fit_display(SHOWN, monitor(SHOWN, gain=8.0))
     with pytest.raises(DegenerateDataError, match="lengthen the exposure"):
         fit_display(SHOWN, 0.01 * monitor(SHOWN))
@@ -81,7 +83,9 @@ def test_greys_only_a_drift_too_few_and_another_screen_are_refused():
         fit_display(SHOWN[:20], monitor(SHOWN[:20]))
     with pytest.raises(DegenerateDataError, match="is this the screen"):
         fit_display(SHOWN, np.full_like(SHOWN, 0.4))
-    order = np.concatenate([[0, 1], rng.permutation(np.arange(2, len(SHOWN) - 2)), [len(SHOWN) - 2, len(SHOWN) - 1]])
+    order = np.concatenate(
+        [[0, 1], rng.permutation(np.arange(2, len(SHOWN) - 2)), [len(SHOWN) - 2, len(SHOWN) - 1]]
+    )
     with pytest.raises(PoorFitError, match="held-out colours within"):
         fit_display(SHOWN, monitor(SHOWN)[order])
 

@@ -117,7 +117,12 @@ def test_files_that_measured_nothing_stay_as_short_as_they_were(tmp_path):
 @pytest.mark.parametrize(
     ("model", "old", "new", "words"),
     [
-        (SceneCalibration, "[0.0, 0.0, 1.0, 0.25]", "[0.0, 0.0, 1.1, 0.25]", "T_world_from_scene: expected a rotation"),
+        (
+            SceneCalibration,
+            "[0.0, 0.0, 1.0, 0.25]",
+            "[0.0, 0.0, 1.1, 0.25]",
+            "T_world_from_scene: expected a rotation",
+        ),
         (TimeOffsetCalibration, "stddev_s: 0.0004", "stddev_s: -0.1", "stddev_s"),
         (VehicleCalibration, "steering_lag_s: 0.06", "steering_lag_s: .nan", "steering_lag_s"),
         (LensCalibration, "views: 31", "vues: 31", "known keys: kind"),

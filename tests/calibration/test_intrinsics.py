@@ -37,7 +37,9 @@ def test_known_camera_is_found_within_its_own_standard_deviations(views):
 def test_a_blurred_view_is_left_out(views):
     rng = np.random.default_rng(2)
     spoiled = list(views)
-    spoiled[4] = type(views[4])(views[4].board_m, views[4].pixels + rng.normal(0.0, 3.0, views[4].pixels.shape))
+    spoiled[4] = type(views[4])(
+        views[4].board_m, views[4].pixels + rng.normal(0.0, 3.0, views[4].pixels.shape)
+    )
     fit = calibrate_intrinsics(spoiled, SIZE)
     assert np.flatnonzero(~fit.used).tolist() == [4]
     assert fit.calibration.fx == pytest.approx(350.0, abs=1.0)
@@ -51,7 +53,9 @@ def test_too_few_views_are_refused(views):
 def test_a_board_always_in_one_corner_is_refused(views):
     half = [type(v)(v.board_m[v.pixels[:, 0] < 330], v.pixels[v.pixels[:, 0] < 330]) for v in views]
     with pytest.raises(DegenerateDataError, match="at the right edge"):
-        calibrate_intrinsics([v for v in half if len(v.pixels) >= 6][:25], SIZE, IntrinsicsConfig(min_views=8))
+        calibrate_intrinsics(
+            [v for v in half if len(v.pixels) >= 6][:25], SIZE, IntrinsicsConfig(min_views=8)
+        )
 
 
 def test_a_board_seen_face_on_only_is_refused():

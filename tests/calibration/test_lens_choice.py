@@ -13,7 +13,9 @@ def camera(f=1300.0, fy=None, k=(0.0, 0.0), width=1200, height=800):
 def test_lenses_that_exist_are_accepted():
     assert nonsense(*camera()) is None
     assert nonsense(*camera(f=700.0, k=(-0.2, 0.05))) is None, "a wide camera of a phone"
-    assert nonsense(*camera(f=8000.0, k=(1.5, 0.0))) is None, "far from the axis in focal lengths is what counts"
+    assert nonsense(*camera(f=8000.0, k=(1.5, 0.0))) is None, (
+        "far from the axis in focal lengths is what counts"
+    )
 
 
 @pytest.mark.parametrize(
@@ -36,7 +38,9 @@ def test_what_is_accepted_can_be_learned_from():
 
     rng, accepted = np.random.default_rng(0), 0
     for _ in range(150):
-        candidate = camera(f=rng.uniform(500.0, 3000.0) / 4, k=tuple(rng.uniform(-0.6, 0.6, 2)), width=300, height=200)
+        candidate = camera(
+            f=rng.uniform(500.0, 3000.0) / 4, k=tuple(rng.uniform(-0.6, 0.6, 2)), width=300, height=200
+        )
         if nonsense(*candidate) is None:
             straightening(*candidate)
             accepted += 1

@@ -12,7 +12,9 @@ from calibration.schema import load_calibration, save_calibration
 from tests.support.boards import turned
 
 SCALE = 0.37
-T_WORLD_FROM_SCENE = make_transform(Rotation.from_euler("xyz", [0.4, -1.1, 2.0]).as_matrix(), [1.0, -2.0, 0.5])
+T_WORLD_FROM_SCENE = make_transform(
+    Rotation.from_euler("xyz", [0.4, -1.1, 2.0]).as_matrix(), [1.0, -2.0, 0.5]
+)
 
 
 def cameras(rng, count=40, noise=(0.003, 0.002), straight=False):
@@ -57,7 +59,8 @@ def test_a_straight_drive_is_refused():
 def test_too_few_shared_names_are_refused():
     scene, world = cameras(np.random.default_rng(2))
     with pytest.raises(
-        DegenerateDataError, match=r"at least 12 cameras with a pose in both worlds, got 5: .* same file names"
+        DegenerateDataError,
+        match=r"at least 12 cameras with a pose in both worlds, got 5: .* same file names",
     ):
         place_scene({name: scene[name] for name in list(scene)[:5]}, world)
 

@@ -41,7 +41,10 @@ def test_the_track_comes_back_wherever_the_trace_begins(laps, start_s):
 def test_standing_still_before_and_after_changes_nothing():
     rng = np.random.default_rng(1)
     trace = driven(SQUARE, 1.05)
-    still = [np.repeat(point[None], 300, axis=0) + rng.normal(0, 0.001, (300, 2)) for point in (trace[0], trace[-1])]
+    still = [
+        np.repeat(point[None], 300, axis=0) + rng.normal(0, 0.001, (300, 2))
+        for point in (trace[0], trace[-1])
+    ]
     fit = fit_path(np.concatenate([still[0], trace, still[1]]))
     assert distance(fit.path, SQUARE) < 0.01
 

@@ -27,7 +27,8 @@ def area(polygon):
 
 def walk(corners, noise_m=0.003):
     pieces = [
-        np.linspace(a, b, 300, endpoint=False) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)
+        np.linspace(a, b, 300, endpoint=False)
+        for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)
     ]
     trace = np.concatenate(pieces)
     return trace + np.random.default_rng(0).normal(0.0, noise_m, trace.shape)
@@ -80,7 +81,9 @@ def test_a_target_by_ruler_has_its_corners_where_the_viewer_sees_them():
         target_of_size("board", (1.0, 0.0), (0.0, 0.0, 0.0), 0.0, "ruler")
 
 
-TRUE_CORNERS = np.array([[0.02, -0.299, 0.31], [0.02, 0.299, 0.31], [0.02, 0.299, -0.026], [0.02, -0.299, -0.026]])
+TRUE_CORNERS = np.array(
+    [[0.02, -0.299, 0.31], [0.02, 0.299, 0.31], [0.02, 0.299, -0.026], [0.02, -0.299, -0.026]]
+)
 
 
 def touch(order=(0, 1, 2, 3), noise_m=0.0005, tip=(0.0, 0.02, -0.35)):
@@ -90,14 +93,22 @@ def touch(order=(0, 1, 2, 3), noise_m=0.0005, tip=(0.0, 0.02, -0.35)):
     corners = transform_points(T_world_from_subject, TRUE_CORNERS)
     away, stops = np.array([0.0, 2.0, 1.0]), []
     for index in order:
-        stops += [(away, corners[index], 80), (corners[index], corners[index], 110), (corners[index], away, 80)]
+        stops += [
+            (away, corners[index], 80),
+            (corners[index], corners[index], 110),
+            (corners[index], away, 80),
+        ]
     places = np.concatenate([np.linspace(a, b, count) for a, b, count in stops])
     wands = []
     for k, place in enumerate(places):
-        rotation = rotation_z(0.3 * np.sin(k / 300.0)) @ np.array([[1, 0, 0], [0, 0.96, -0.28], [0, 0.28, 0.96]])
+        rotation = rotation_z(0.3 * np.sin(k / 300.0)) @ np.array(
+            [[1, 0, 0], [0, 0.96, -0.28], [0, 0.28, 0.96]]
+        )
         wands.append(make_transform(rotation, place - rotation @ np.array(tip) + rng.normal(0.0, noise_m, 3)))
     stamps = np.arange(len(places), dtype=np.int64) * 10_000_000
-    return find_touches(stamps, np.array(wands), np.repeat(T_world_from_subject[None], len(places), axis=0), tip)
+    return find_touches(
+        stamps, np.array(wands), np.repeat(T_world_from_subject[None], len(places), axis=0), tip
+    )
 
 
 def test_a_wand_finds_the_corners_of_a_panel():
@@ -117,10 +128,21 @@ def test_wrong_touches_are_refused_with_what_to_do():
 def attack(T, size=1.0, subject="board"):
     theta = np.zeros((4, 4, 3), np.float32)
     return AttackFile.of_face(
-        method="random", theta=theta, texture=face_texture(theta, 8), size_m=(size, size), T_world_from_object=T,
-        subject=subject, corners_in_subject=np.zeros((4, 3)), camera=Pinhole(200, 66, 103.6, 103.4, 100, 32),
-        scene_sha256="", policy_sha256="", config_sha256="", seed=0, predicted_total_cte_m=None, software_version="0",
-    )  # fmt: skip
+        method="random",
+        theta=theta,
+        texture=face_texture(theta, 8),
+        size_m=(size, size),
+        T_world_from_object=T,
+        subject=subject,
+        corners_in_subject=np.zeros((4, 3)),
+        camera=Pinhole(200, 66, 103.6, 103.4, 100, 32),
+        scene_sha256="",
+        policy_sha256="",
+        config_sha256="",
+        seed=0,
+        predicted_total_cte_m=None,
+        software_version="0",
+    )
 
 
 BOARD = target_of_size("board", (1.0, 1.0), (0.03, 0.0, 0.2), 0.0, "ruler")
@@ -145,12 +167,22 @@ def test_a_face_in_its_place_is_in_its_place():
         ((0.0, 0.0, -0.03), np.eye(3), "up_m", -0.03, "3.0 cm up"),
         ((0.04, 0.0, 0.0), np.eye(3), "near_m", 0.04, "4.0 cm away from you"),
         ((0.0, 0.0, 0.0), rotation_z(0.1), "turned_rad", 0.1, "5.7 deg clockwise from above"),
-        ((0.0, 0.0, 0.0), np.array([[np.cos(0.1), 0, -np.sin(0.1)], [0, 1, 0], [np.sin(0.1), 0, np.cos(0.1)]]),
-         "tilted_rad", 0.1, "5.7 deg top towards you"),
-        ((0.0, 0.0, 0.0), np.array([[1, 0, 0], [0, np.cos(0.1), np.sin(0.1)], [0, -np.sin(0.1), np.cos(0.1)]]),
-         "rolled_rad", 0.1, "5.7 deg counter-clockwise"),
+        (
+            (0.0, 0.0, 0.0),
+            np.array([[np.cos(0.1), 0, -np.sin(0.1)], [0, 1, 0], [np.sin(0.1), 0, np.cos(0.1)]]),
+            "tilted_rad",
+            0.1,
+            "5.7 deg top towards you",
+        ),
+        (
+            (0.0, 0.0, 0.0),
+            np.array([[1, 0, 0], [0, np.cos(0.1), np.sin(0.1)], [0, -np.sin(0.1), np.cos(0.1)]]),
+            "rolled_rad",
+            0.1,
+            "5.7 deg counter-clockwise",
+        ),
     ],
-)  # fmt: skip
+)
 def test_each_direction_is_named_as_the_viewer_sees_it(moved, turned, name, expected, text):
     off = misplacement(attack(T_FACE), BOARD, subject_for(T_FACE @ make_transform(turned, moved)))
     assert getattr(off, name) == pytest.approx(expected, abs=1e-9)

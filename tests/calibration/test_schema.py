@@ -88,10 +88,18 @@ def edited(tmp_path, name, **changes):
         ("camera", {"fx": float("nan")}, "fx"),
         ("camera", {"date": ...}, "date"),
         ("camera", {"kind": "vehicle"}, "kind"),
-        ("camera", {"T_car_from_camera": np.diag([1.0, 1.0, -1.0, 1.0]).tolist()}, "T_car_from_camera.*rotation"),
+        (
+            "camera",
+            {"T_car_from_camera": np.diag([1.0, 1.0, -1.0, 1.0]).tolist()},
+            "T_car_from_camera.*rotation",
+        ),
         ("camera", {"T_car_from_camera": np.diag([2.0, 1.0, 1.0, 1.0]).tolist()}, "off by"),
         ("board", {"corners_in_subject_m": [[0, 0, 0]] * 4}, "span a face"),
-        ("board", {"corners_in_subject_m": [[0, -1, 1], [0, 1, 1], [0.1, 1, -1], [0, -1, -1]]}, "100.0 mm off"),
+        (
+            "board",
+            {"corners_in_subject_m": [[0, -1, 1], [0, 1, 1], [0.1, 1, -1], [0, -1, -1]]},
+            "100.0 mm off",
+        ),
         ("room", {"fence_m": [[0, 0], [1, 1]]}, "fence_m"),
         ("room", {"path": {"segments": []}}, "path"),
     ],
@@ -123,9 +131,11 @@ def test_missing_and_unreadable_files(tmp_path):
 
 def test_nothing_is_left_half_written(tmp_path):
     target = TargetCalibration(
-        date=datetime.date(2026, 1, 2), method="ruler", subject="sign",
+        date=datetime.date(2026, 1, 2),
+        method="ruler",
+        subject="sign",
         corners_in_subject_m=((0, 0, 1), (0, 1, 1), (0, 1, 0), (0, 0, 0)),
-    )  # fmt: skip
+    )
     save_calibration(target, tmp_path / "sign.yaml")
     assert load_calibration(TargetCalibration, tmp_path / "sign.yaml") == target
     with pytest.raises(CalibrationError, match="cannot write"):

@@ -98,8 +98,12 @@ def test_photographs_without_overlap_are_refused_with_what_to_do(tmp_path):
     rng = np.random.default_rng(0)
     for k in range(4):
         blocks = rng.integers(0, 255, (30, 40, 3), np.uint8)
-        cv2.imwrite(str(tmp_path / f"{k}.png"), cv2.resize(blocks, (400, 300), interpolation=cv2.INTER_NEAREST))
-    with pytest.raises(ReconstructionError, match=r"but no two could be matched; take photographs with overlap"):
+        cv2.imwrite(
+            str(tmp_path / f"{k}.png"), cv2.resize(blocks, (400, 300), interpolation=cv2.INTER_NEAREST)
+        )
+    with pytest.raises(
+        ReconstructionError, match=r"but no two could be matched; take photographs with overlap"
+    ):
         reconstruct(tmp_path, [Source("phone", tuple(f"{k}.png" for k in range(4)))], tmp_path / "work")
 
 

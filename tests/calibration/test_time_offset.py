@@ -11,9 +11,16 @@ from calibration.schema import CameraCalibration, load_calibration, save_calibra
 from calibration.time_offset import Turns, fit_offset, image_turns
 
 CAMERA = CameraCalibration(
-    date="2026-11-21", method="test", width=336, height=188, fx=174.0, fy=174.0, cx=168.0, cy=94.0,
+    date="2026-11-21",
+    method="test",
+    width=336,
+    height=188,
+    fx=174.0,
+    fy=174.0,
+    cx=168.0,
+    cy=94.0,
     T_car_from_camera=camera_mount(0.3, 0.0, 0.2, 0.17).tolist(),
-)  # fmt: skip
+)
 POSE_S = np.arange(0.0, 24.0, 0.01)
 FRAME_S = np.arange(1.0, 23.0, 0.1)
 
@@ -48,11 +55,18 @@ def test_pictures_of_a_far_wall_turn_as_the_camera_did():
     for t in times:
         yaw = 0.5 * yaw_at(t)
         c, s = np.cos(yaw), np.sin(yaw)
-        rays = CAMERA.pinhole.directions() @ (np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ R_mount).T
+        rays = (
+            CAMERA.pinhole.directions() @ (np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ R_mount).T
+        )
         u = 700.0 - 400.0 * np.arctan2(rays[..., 1], rays[..., 0])
         v = 300.0 - 400.0 * rays[..., 2] / np.hypot(rays[..., 0], rays[..., 1])
         frames.append(
-            (t, cv2.remap(grey, u.astype(np.float32), v.astype(np.float32), cv2.INTER_LINEAR).astype(np.uint8))
+            (
+                t,
+                cv2.remap(grey, u.astype(np.float32), v.astype(np.float32), cv2.INTER_LINEAR).astype(
+                    np.uint8
+                ),
+            )
         )
     found = image_turns(frames, CAMERA)
     truth = 0.5 * (yaw_at(found.end_s) - yaw_at(found.start_s))

@@ -86,7 +86,11 @@ def test_twist_of_an_exact_arc():
 
 @pytest.mark.parametrize(
     ("angles", "missing"),
-    [((0.0, 0.25, 0.12), "right circle"), ((0.0, -0.25, -0.12), "left circle"), ((0.2, 0.25, -0.2), "straight run")],
+    [
+        ((0.0, 0.25, 0.12), "right circle"),
+        ((0.0, -0.25, -0.12), "left circle"),
+        ((0.2, 0.25, -0.2), "straight run"),
+    ],
 )
 def test_one_sided_drives_are_refused(angles, missing):
     recorded = drive(np.random.default_rng(2), program(angles=angles, steps=0))
@@ -119,7 +123,10 @@ def test_unrelated_commands_are_refused(good):
     order = np.concatenate([np.arange(40 * k, min(40 * k + 40, len(good.servo))) for k in shuffled])
     with pytest.raises((PoorFitError, DegenerateDataError)):
         fit_gains(
-            type(good)(good.pose_s, good.poses, good.command_s, good.servo[order], good.erpm, good.pipeline_s), 0.25
+            type(good)(
+                good.pose_s, good.poses, good.command_s, good.servo[order], good.erpm, good.pipeline_s
+            ),
+            0.25,
         )
 
 
@@ -132,7 +139,9 @@ def test_a_stop_on_the_way_does_no_harm(gains):
 
 
 def test_the_file_round_trip_and_what_the_attack_takes_from_it(good, gains, tmp_path):
-    calibration = vehicle_calibration(gains, fit_response(good, gains), twin_calibrations(LabConfig())["vehicle"])
+    calibration = vehicle_calibration(
+        gains, fit_response(good, gains), twin_calibrations(LabConfig())["vehicle"]
+    )
     save_calibration(calibration, tmp_path / "vehicle.yaml")
     loaded = load_calibration(VehicleCalibration, tmp_path / "vehicle.yaml")
     assert loaded == calibration

@@ -13,7 +13,12 @@ pytestmark = pytest.mark.live
 REPOSITORY = Path(__file__).parents[2]
 DOCKER = REPOSITORY / "docker"
 # glibc 2.35 of JetPack 6 and 2.36 of python:3.11-slim take all of these; an older one would be a thin client only.
-PLATFORMS = ("manylinux_2_28_aarch64", "manylinux_2_27_aarch64", "manylinux_2_17_aarch64", "manylinux2014_aarch64")
+PLATFORMS = (
+    "manylinux_2_28_aarch64",
+    "manylinux_2_27_aarch64",
+    "manylinux_2_17_aarch64",
+    "manylinux2014_aarch64",
+)
 FOREIGN = ("torch", "scipy", "numba", "mujoco", "nvidia", "triton", "matplotlib")
 
 
@@ -39,7 +44,9 @@ def resolve(tmp_path, wanted, python, constraints):
     command += ["--target", str(tmp_path / "target"), "--only-binary=:all:", "--python-version", python]
     command += [part for platform in PLATFORMS for part in ("--platform", platform)]
     command += ["-c", str(REPOSITORY / "constraints.txt")] if constraints else []
-    done = subprocess.run([*command, "-r", str(tmp_path / "wanted.txt")], capture_output=True, text=True, timeout=280)
+    done = subprocess.run(
+        [*command, "-r", str(tmp_path / "wanted.txt")], capture_output=True, text=True, timeout=280
+    )
     if "Temporary failure in name resolution" in done.stderr or "Connection refused" in done.stderr:
         pytest.skip("no package index")
     assert done.returncode == 0, done.stderr[-2000:]
@@ -79,5 +86,8 @@ def test_compose_names_files_and_settings_that_exist():
         assert (DOCKER / service["build"]["context"] / service["build"]["dockerfile"]).is_file()
     command = services["green_screen"]["command"]
     settings = [command[i + 1] for i, part in enumerate(command) if part == "--set"]
-    settings = [s.replace("${POLICY:-", "").replace("${ATTACK:-", "").rstrip("}") if "${" in s else s for s in settings]
+    settings = [
+        s.replace("${POLICY:-", "").replace("${ATTACK:-", "").rstrip("}") if "${" in s else s
+        for s in settings
+    ]
     assert load_launch(REPOSITORY / command[2], settings).nodes["motor"].module == "nodes.motor"

@@ -20,7 +20,9 @@ pytestmark = pytest.mark.live
 
 def frame(sequence, shape=(188, 336, 3)):
     rng = np.random.default_rng(sequence)
-    return Frame(rng.integers(0, 255, shape, dtype=np.uint8), 10**18 + sequence, 5 * 10**9 + sequence, sequence)
+    return Frame(
+        rng.integers(0, 255, shape, dtype=np.uint8), 10**18 + sequence, 5 * 10**9 + sequence, sequence
+    )
 
 
 def wait_for(condition):
@@ -101,7 +103,8 @@ def test_a_dead_socket_file_is_replaced(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("sent", "error"), [(b"HTTP/1.1 200 OK" + bytes(40), ProtocolError), (encode_head(frame(0)) + b"abc", LinkTimeout)]
+    ("sent", "error"),
+    [(b"HTTP/1.1 200 OK" + bytes(40), ProtocolError), (encode_head(frame(0)) + b"abc", LinkTimeout)],
 )
 def test_a_server_that_talks_nonsense_or_stalls(tmp_path, sent, error):
     path = str(tmp_path / "frames")

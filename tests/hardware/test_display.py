@@ -57,7 +57,9 @@ def test_a_driver_that_gives_another_size_is_refused():
         "from hardware.screen.display import PygameDisplay; PygameDisplay(0, (1920, 1080))"
     )
     environment = {**os.environ, "SDL_VIDEODRIVER": "offscreen"}
-    done = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, timeout=60)
+    done = subprocess.run(
+        [sys.executable, "-c", script], env=environment, capture_output=True, text=True, timeout=60
+    )
     assert "HardwareError: expected a window of 1920 x 1080 px, got (1024, 768)" in done.stderr
 
 
@@ -115,6 +117,7 @@ def test_a_picture_cut_off_in_the_middle_is_not_shown(tmp_path):
         again = TwinDisplay(tmp_path / "monitor")  # and the port goes on
         again.show(noise(64, 36, 1))
         assert (
-            hashlib.sha256(wait_for(port)[1].tobytes()).digest() == hashlib.sha256(noise(64, 36, 1).tobytes()).digest()
+            hashlib.sha256(wait_for(port)[1].tobytes()).digest()
+            == hashlib.sha256(noise(64, 36, 1).tobytes()).digest()
         )
         again.close()

@@ -18,7 +18,12 @@ DELL_E193FP = bytes.fromhex(
 
 def test_real_monitors_say_what_their_data_sheets_say():
     wide = parse_edid(DELL_U2412M)
-    assert (wide.maker, wide.name, wide.size_px, wide.size_mm) == ("DEL", "DELL U2412M", (1920, 1200), (518.0, 324.0))
+    assert (wide.maker, wide.name, wide.size_px, wide.size_mm) == (
+        "DEL",
+        "DELL U2412M",
+        (1920, 1200),
+        (518.0, 324.0),
+    )
     old = parse_edid(DELL_E193FP)
     assert (old.maker, old.name, old.size_px) == ("DEL", "Dell E193FP", (1280, 1024))
     assert old.size_mm is None  # 338 x 270 mm in its mode, 38 x 30 cm in its head: the panel has 376 x 301
@@ -59,7 +64,11 @@ def test_a_made_edid_reads_as_it_was_meant():
 
 
 def test_connectors_with_a_monitor_are_found_and_others_named(tmp_path):
-    for connector, data in {"card0-HDMI-A-1": DELL_U2412M, "card0-DP-1": b"", "card1-DP-2": b"\xff" * 128}.items():
+    for connector, data in {
+        "card0-HDMI-A-1": DELL_U2412M,
+        "card0-DP-1": b"",
+        "card1-DP-2": b"\xff" * 128,
+    }.items():
         (tmp_path / connector).mkdir()
         (tmp_path / connector / "edid").write_bytes(data)
     assert list(connected_displays(tmp_path)) == ["HDMI-A-1"]

@@ -56,7 +56,9 @@ def test_not_finite_is_stop(speed):
 
 
 @example([(0.0, 0.0, 0.0), (0.0, 1.0, 0.01171875), (0.0, -1.0, 0.5)])  # ended a last bit beyond the limit
-@given(st.lists(st.tuples(st.floats(-100, 100), st.floats(-10, 10), st.floats(0, 0.5)), min_size=1, max_size=30))
+@given(
+    st.lists(st.tuples(st.floats(-100, 100), st.floats(-10, 10), st.floats(0, 0.5)), min_size=1, max_size=30)
+)
 def test_no_sequence_of_commands_breaks_a_limit(commands):
     limiter, now, last = DriveLimiter(LIMITS), 0.0, None
     for speed, steering, wait in commands:
@@ -71,7 +73,9 @@ def test_no_sequence_of_commands_breaks_a_limit(commands):
         last = setpoint
 
 
-@pytest.mark.parametrize("wrong", [{"speed_max_mps": 0.0}, {"steering_min_rad": 0.1}, {"acceleration_mps2": 0.0}])
+@pytest.mark.parametrize(
+    "wrong", [{"speed_max_mps": 0.0}, {"steering_min_rad": 0.1}, {"acceleration_mps2": 0.0}]
+)
 def test_impossible_limits(wrong):
     with pytest.raises(ValueError, match="around zero"):
         DriveLimits(**wrong)

@@ -98,7 +98,10 @@ def test_frames_come_at_their_rate_with_true_stamps(lab):
 
 def test_driving_moves_what_is_measured_and_seen(lab, receiver):
     lab.place(-1.1, -2.0, 0.0)
-    with Vesc(str(lab.vesc_port), VehicleGains(), DriveLimits()) as vesc, SocketCamera(lab.frames_path) as camera:
+    with (
+        Vesc(str(lab.vesc_port), VehicleGains(), DriveLimits()) as vesc,
+        SocketCamera(lab.frames_path) as camera,
+    ):
         assert vesc.identify().hardware_name == "TWIN"
         before = camera.read(timeout_s=1.0)
         for _ in range(20):
@@ -116,7 +119,9 @@ def test_driving_moves_what_is_measured_and_seen(lab, receiver):
     lab.check()
     assert pose[0, 3] > -0.8
     assert yaw_of(pose) > 0.05
-    assert after.stamp_mono_ns - before.stamp_mono_ns > 0.9e9  # a reader away for a second gets what is seen now
+    assert (
+        after.stamp_mono_ns - before.stamp_mono_ns > 0.9e9
+    )  # a reader away for a second gets what is seen now
     assert cv2.PSNR(before.rgb, after.rgb) < 30.0
     time.sleep(0.05)  # the last bytes are on their way
     names = [event.name for event in lab.vesc.events() if event.name != "GET_VALUES"]

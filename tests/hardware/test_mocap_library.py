@@ -73,13 +73,21 @@ def test_poses_in_metres_with_their_rotation(player):
         (pose,) = everything(receiver)
     assert player.CONNECTED == [("optitrack", {"hostname": "10.0.0.7"})]
     assert pose.name == "car"
-    np.testing.assert_allclose(pose.T_world_from_subject[:3, :3], Rotation.from_quat(q).as_matrix(), atol=1e-12)
+    np.testing.assert_allclose(
+        pose.T_world_from_subject[:3, :3], Rotation.from_quat(q).as_matrix(), atol=1e-12
+    )
     np.testing.assert_allclose(pose.T_world_from_subject[:3, 3], [1.0, 2.0, 0.1])
 
 
 def test_every_form_of_lost(player):
     good, same = {"car": ((1.0, 2.0, 0.1), UP)}, {"car": ((3.0, 2.0, 0.1), UP)}
-    player.FRAMES += [good, {}, {"car": ((0.0, 0.0, 0.0), UP)}, {"car": ((math.nan, 1.0, 1.0), UP)}, *[same] * 6]
+    player.FRAMES += [
+        good,
+        {},
+        {"car": ((0.0, 0.0, 0.0), UP)},
+        {"car": ((math.nan, 1.0, 1.0), UP)},
+        *[same] * 6,
+    ]
     player.FRAMES += [{"car": ((3.1, 2.0, 0.1), (0.0, 0.0, 0.0, 0.0))}]
     with LibraryReceiver(CONFIG) as receiver:
         poses = everything(receiver)

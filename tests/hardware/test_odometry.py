@@ -22,7 +22,9 @@ def test_a_circle_closes_whatever_the_rate(step_s):
     wheelbase, steering = 0.25, 0.2
     radius = wheelbase / math.tan(steering)
     quarter = drive(Odometry(wheelbase), radius * math.pi / 2 / 2.0, steering, 2.0, step_s)
-    assert (quarter.x_m, quarter.y_m, quarter.yaw_rad) == pytest.approx((radius, radius, math.pi / 2), abs=1e-9)
+    assert (quarter.x_m, quarter.y_m, quarter.yaw_rad) == pytest.approx(
+        (radius, radius, math.pi / 2), abs=1e-9
+    )
     back = drive(Odometry(wheelbase), -radius * math.pi / 2 / 2.0, steering, 2.0, step_s)
     assert (back.x_m, back.y_m, back.yaw_rad) == pytest.approx((-radius, radius, -math.pi / 2), abs=1e-9)
 

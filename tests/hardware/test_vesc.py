@@ -255,14 +255,20 @@ def test_what_commands_do(command, value, expected):
 
 def test_servo_gate_of_stock_firmware_swallows_the_command():
     plant = Plant()
-    replies, events = send(VescFirmware(VescEmulatorConfig(servo_output=False), plant), CommandId.SET_SERVO_POS, 0.3)
+    replies, events = send(
+        VescFirmware(VescEmulatorConfig(servo_output=False), plant), CommandId.SET_SERVO_POS, 0.3
+    )
     assert (plant.commands, replies) == ([], b"")
     assert events[0].name == "SET_SERVO_POS"
 
 
 @pytest.mark.parametrize(
     ("command", "value", "feeds"),
-    [(CommandId.ALIVE, None, True), (CommandId.SET_SERVO_POS, 0.5, False), (CommandId.GET_VALUES, None, False)],
+    [
+        (CommandId.ALIVE, None, True),
+        (CommandId.SET_SERVO_POS, 0.5, False),
+        (CommandId.GET_VALUES, None, False),
+    ],
 )
 def test_what_feeds_the_watchdog(command, value, feeds):
     firmware = VescFirmware(VescEmulatorConfig(timeout_ms=100.0), Plant())

@@ -103,6 +103,8 @@ def test_not_a_version_reply(payload):
 
 
 def test_values_round_trip():
-    values = Values("F", 100, 0.5, 12.0, 1.5, 0.5, 6, 6, 0, 0.0, 0.0, 0.0, 0.0, temp_fet_c=30.0, controller_id=3)
+    values = Values(
+        "F", 100, 0.5, 12.0, 1.5, 0.5, 6, 6, 0, 0.0, 0.0, 0.0, 0.0, temp_fet_c=30.0, controller_id=3
+    )
     again = decode_values(encode_values(values))
     assert (again.erpm, again.duty, again.temp_fet_c, again.controller_id) == (100, 0.5, 30.0, 3)

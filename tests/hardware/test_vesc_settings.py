@@ -36,9 +36,9 @@ def test_time_out_of_every_layout_and_nothing_else_changes(release):
     read = decode_app_configuration(payload(release), FirmwareVersion(*release))
     assert read.timeout == TimeoutSettings(250, 20.0)
     changed = read.with_timeout(TimeoutSettings(1000, 0.0))
-    assert decode_app_configuration(b"\x11" + changed.data, FirmwareVersion(*release)).timeout == TimeoutSettings(
-        1000, 0.0
-    )
+    assert decode_app_configuration(
+        b"\x11" + changed.data, FirmwareVersion(*release)
+    ).timeout == TimeoutSettings(1000, 0.0)
     assert changed.with_timeout(TimeoutSettings(250, 20.0)).data == payload(release)[1:]
     kept = len(payload(release)) - len(TAIL) - 1 - 8
     assert changed.data[:kept] == read.data[:kept]
@@ -55,7 +55,8 @@ def test_as_delivered(release):
 
 
 @pytest.mark.parametrize(
-    "data", [b"", b"\x11", b"\x11\x00\x00", b"\x04" + bytes(73), b"\x11" + b"\xff" * 40, b"\x11" + b"\x41" * 40]
+    "data",
+    [b"", b"\x11", b"\x11\x00\x00", b"\x04" + bytes(73), b"\x11" + b"\xff" * 40, b"\x11" + b"\x41" * 40],
 )
 def test_what_is_no_configuration_is_not_guessed_at(data):
     with pytest.raises(ProtocolError, match="expected"):

@@ -19,7 +19,15 @@ from hardware.worlds.lab.vehicle import TwinVehicle
 pytestmark = pytest.mark.live
 
 # Which telemetry a firmware sends, over the whole range of both.
-PAIRS = [("A", (2, 18)), ("B", (3, 33)), ("C", (3, 38)), ("D", (3, 40)), ("E", (3, 48)), ("F", (5, 2)), ("G", (6, 2))]
+PAIRS = [
+    ("A", (2, 18)),
+    ("B", (3, 33)),
+    ("C", (3, 38)),
+    ("D", (3, 40)),
+    ("E", (3, 48)),
+    ("F", (5, 2)),
+    ("G", (6, 2)),
+]
 FRAMES = encode_frame(bytes([4, 2, 3, 2, 3])) + encode_frame(bytes(300)) + encode_frame(b"\x00\x05\x02")
 
 

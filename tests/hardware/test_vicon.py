@@ -43,7 +43,10 @@ class Feed:
 
 @pytest.mark.parametrize("block", [256, 512, 1024])
 def test_layout(block):
-    items = [("car", (1.5, -2.5, 3.5, 0.1, -0.2, 0.3)), ("a_name_of_24_characters_", (0.0, 1.0, 2.0, 0.0, 0.0, 0.0))]
+    items = [
+        ("car", (1.5, -2.5, 3.5, 0.1, -0.2, 0.3)),
+        ("a_name_of_24_characters_", (0.0, 1.0, 2.0, 0.0, 0.0, 0.0)),
+    ]
     datagram = by_hand(7, items, block)
     objects = [ObjectPose(name, tuple(n[:3]), tuple(n[3:])) for name, n in items]
     assert decode_block(datagram).objects == tuple(objects)
@@ -81,7 +84,8 @@ def test_gimbal_lock_keeps_the_rotation(pitch):
 
 
 @pytest.mark.parametrize(
-    "datagram", [b"", b"\0\0\0", by_hand(1, [("car", (0.0,) * 6)])[:60], struct.pack("<IB", 1, 3).ljust(256, b"\0")]
+    "datagram",
+    [b"", b"\0\0\0", by_hand(1, [("car", (0.0,) * 6)])[:60], struct.pack("<IB", 1, 3).ljust(256, b"\0")],
 )
 def test_cut_or_foreign_datagrams(datagram):
     with pytest.raises(ProtocolError):
@@ -193,7 +197,9 @@ def through_the_network(frames=2000, **network):
     poses = []
     for frame in range(frames):
         true = planar_pose(0.001 * frame, 1.0, 0.2)
-        for datagram in emulator.next({"stranger": true, "car": true, "a_name_of_24_characters_": true, "other": true}):
+        for datagram in emulator.next(
+            {"stranger": true, "car": true, "a_name_of_24_characters_": true, "other": true}
+        ):
             poses += feed(datagram, after_s=0.005)
     return feed, poses
 
@@ -222,7 +228,11 @@ def test_a_bad_network_costs_poses_and_never_gives_a_wrong_or_an_old_one():
 def test_an_occluded_subject_is_lost_and_the_other_is_not(form):
     from hardware.emulators.vicon_emulator import ViconEmulatorConfig, ViconFrames
 
-    emulator, feed, seen = ViconFrames(ViconEmulatorConfig()), Feed(ViconConfig(("car", "board"), frozen_frames=5)), []
+    emulator, feed, seen = (
+        ViconFrames(ViconEmulatorConfig()),
+        Feed(ViconConfig(("car", "board"), frozen_frames=5)),
+        [],
+    )
     for frame in range(60):
         if frame in (20, 40):
             emulator.occlude("car", form if frame == 20 else None)

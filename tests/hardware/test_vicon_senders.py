@@ -117,15 +117,24 @@ def test_a_restarted_tracker_is_a_fault_only_without_a_pause():
 
 @settings(deadline=None, max_examples=30)
 @given(
-    seed=st.integers(0, 2**32 - 1), loss=st.floats(0.0, 0.3), duplication=st.floats(0.0, 0.3),
-    reordering=st.floats(0.0, 0.3), form=st.sampled_from([None, "missing", "zeros", "nan", "frozen"]),
+    seed=st.integers(0, 2**32 - 1),
+    loss=st.floats(0.0, 0.3),
+    duplication=st.floats(0.0, 0.3),
+    reordering=st.floats(0.0, 0.3),
+    form=st.sampled_from([None, "missing", "zeros", "nan", "frozen"]),
     block=st.sampled_from([256, 1024]),
-)  # fmt: skip
-def test_no_network_and_no_occlusion_looks_like_a_second_sender(seed, loss, duplication, reordering, form, block):
+)
+def test_no_network_and_no_occlusion_looks_like_a_second_sender(
+    seed, loss, duplication, reordering, form, block
+):
     config = ViconEmulatorConfig(
         seed=seed, loss=loss, duplication=duplication, reordering=reordering, shuffle=True, block_bytes=block
     )
-    frames, tracker, mono_ns = ViconFrames(config), SubjectTracker(ViconConfig(subjects=("car", "board"))), 10**12
+    frames, tracker, mono_ns = (
+        ViconFrames(config),
+        SubjectTracker(ViconConfig(subjects=("car", "board"))),
+        10**12,
+    )
     subjects = {name: planar_pose(1.0, 2.0, 0.3) for name in ("a", "b", "c", "car", "board")}
     for k in range(150):
         if k in (50, 100):

@@ -95,9 +95,18 @@ class Lab:
 
 def sent(speed_mps, stamp_ns):
     return types.MotorSent(
-        header=header(stamp_ns), serial_write_mono_ns=0, serial_write_real_ns=0, speed_mps=speed_mps, steering_rad=0.0, erpm=0.0,
-        servo=0.5, brake_current_a=0.0, braking=speed_mps == 0.0, reason="", peer="TWIN",
-    )  # fmt: skip
+        header=header(stamp_ns),
+        serial_write_mono_ns=0,
+        serial_write_real_ns=0,
+        speed_mps=speed_mps,
+        steering_rad=0.0,
+        erpm=0.0,
+        servo=0.5,
+        brake_current_a=0.0,
+        braking=speed_mps == 0.0,
+        reason="",
+        peer="TWIN",
+    )
 
 
 @pytest.fixture

@@ -104,7 +104,10 @@ def test_an_id_is_decided_once_even_when_it_claims_to_be_asked_now(car):
     assert car.ask("a").granted  # the answer of then
     assert not car.arming.armed
     for no_id in ("", "x" * 65):
-        assert car.ask(no_id).text == f"expected an ask_id of 1 to 64 characters, got {len(no_id)}; use advnerf arm"
+        assert (
+            car.ask(no_id).text
+            == f"expected an ask_id of 1 to 64 characters, got {len(no_id)}; use advnerf arm"
+        )
         assert not car.arming.armed
         assert car.ask(no_id, arm=False).granted
 
@@ -158,7 +161,13 @@ def test_clocks_of_two_hosts_make_a_request_older_never_younger(car):
 
 @pytest.mark.parametrize(
     ("published_ms", "stamp_ms", "age_ms", "asked_ms"),
-    [(500, 400, 100, 400), (500, 480, 100, 400), (500, 300, 100, 300), (500, 9000, 100, 400), (500, 100, 0, 100)],
+    [
+        (500, 400, 100, 400),
+        (500, 480, 100, 400),
+        (500, 300, 100, 300),
+        (500, 9000, 100, 400),
+        (500, 100, 0, 100),
+    ],
 )
 def test_the_older_of_the_senders_clocks_counts(published_ms, stamp_ms, age_ms, asked_ms):
     message = types.Arm(
@@ -192,7 +201,11 @@ ACTS = st.one_of(
 def test_armed_only_by_a_young_request_that_nothing_came_after(acts):
     """Armed means: by a request first asked less than a second before, never decided before, after the last stop of any kind."""
     car = Car()
-    asked, decided, stopped_ms = [], set(), car.ms - 110  # (id, when it was first asked); the start of the node
+    asked, decided, stopped_ms = (
+        [],
+        set(),
+        car.ms - 110,
+    )  # (id, when it was first asked); the start of the node
     for what, number in acts:
         was_armed = car.arming.armed
         if what in ("arm", "repeat"):

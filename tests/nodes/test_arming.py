@@ -41,7 +41,9 @@ class World:
 
     def drive(self, capture_age_ms=50):
         capture = (self.capture_frozen_at or self.ms) * MS + REAL_NS - capture_age_ms * MS
-        passed = self.arming.heard_drive(*self.command, capture, self.info("policy"), self.ms * MS, self.real_ns())
+        passed = self.arming.heard_drive(
+            *self.command, capture, self.info("policy"), self.ms * MS, self.real_ns()
+        )
         self.passed.append(passed)
         return passed
 
@@ -217,7 +219,10 @@ def test_a_program_arms_only_the_twin(world, peer, allowed):
 
 @settings(max_examples=60, deadline=None)
 @given(
-    st.lists(st.sampled_from(["camera", "vicon", "policy", "compositor", "motor", "talk", "pause", "run"]), max_size=12)
+    st.lists(
+        st.sampled_from(["camera", "vicon", "policy", "compositor", "motor", "talk", "pause", "run"]),
+        max_size=12,
+    )
 )
 def test_without_a_request_to_arm_no_history_ever_arms(events):
     world = World()

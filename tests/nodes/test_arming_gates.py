@@ -52,7 +52,9 @@ class World:
             if (
                 self.ms % 50 == 20
                 and "teleop" in self.talking
-                and arming.heard_hand(self.mode, self.estop, self.hand_speed, 0.1, self.info("teleop"), mono_ns)
+                and arming.heard_hand(
+                    self.mode, self.estop, self.hand_speed, 0.1, self.info("teleop"), mono_ns
+                )
             ):
                 self.passed.append("hand")
             arming.check(mono_ns)

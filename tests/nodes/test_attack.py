@@ -49,7 +49,9 @@ class Bench:
         began = time.monotonic()
         raw = encode(message)
         self._take(
-            self.node.handle(topic, decode(type_name(message), raw), MessageInfo(0, 0, raw=raw), self.clock.now())
+            self.node.handle(
+                topic, decode(type_name(message), raw), MessageInfo(0, 0, raw=raw), self.clock.now()
+            )
         )
         return time.monotonic() - began
 
@@ -61,7 +63,8 @@ class Bench:
 
     def cancel(self, request_id=""):
         return self.send(
-            "/attack/cancel", types.AttackCancel(header=header(0), request_id=request_id, reason="enough", ask_id="")
+            "/attack/cancel",
+            types.AttackCancel(header=header(0), request_id=request_id, reason="enough", ask_id=""),
         )
 
     def run_until(self, condition, timeout_s=40.0):
@@ -104,7 +107,9 @@ def test_a_request_ends_in_the_attack_file_that_the_command_would_have_written(b
     bench.request(request_text(request))
     assert bench.state() == "preparing"
     bench.run_until(
-        lambda: bench.of("/attack/file") and len(bench.of("/attack/file")) >= bench.of("/attack/file")[0].count
+        lambda: (
+            bench.of("/attack/file") and len(bench.of("/attack/file")) >= bench.of("/attack/file")[0].count
+        )
     )
     states = [message.state for message in bench.progress()]
     assert states[0] == "preparing"
@@ -248,10 +253,13 @@ class Car:
             self.bus.publish("/vicon/board", pose_message(board, stamp))
             self.bus.publish("/vicon/car", pose_message(planar_pose(0.5, -2.0, 0.0), stamp))
         self.bus.publish(
-            "/camera/image_raw", image_message(np.full((188, 336, 3), 90, np.uint8), now - 10_000_000, "camera")
+            "/camera/image_raw",
+            image_message(np.full((188, 336, 3), 90, np.uint8), now - 10_000_000, "camera"),
         )
         self.bus.wait(0.05)
-        self.labels += [received.message() for received in self.bus.receive() if received.topic == "/compositor/attack"]
+        self.labels += [
+            received.message() for received in self.bus.receive() if received.topic == "/compositor/attack"
+        ]
 
 
 @pytest.mark.slow
@@ -319,7 +327,9 @@ def test_without_a_node_the_commands_say_so_whoever_else_listens(tmp_path, monke
 
 def test_a_repeated_request_is_decided_once_and_answered_every_time(bench):
     def ask(ask_id, text):
-        message = types.AttackRequest(header=header(0), request_id="a", request=text, source="", ask_id=ask_id)
+        message = types.AttackRequest(
+            header=header(0), request_id="a", request=text, source="", ask_id=ask_id
+        )
         bench.send("/attack/request", message)
         return bench.progress()[-1]
 

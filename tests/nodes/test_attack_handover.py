@@ -29,10 +29,21 @@ INPUTS = ("/camera/image_raw", "/vicon/car", "/vicon/board", "/attack/file")
 def attack(folder, seed):
     theta = np.random.default_rng(seed).normal(size=(8, 8, 3)).astype(np.float32)
     made = AttackFile.of_face(
-        method="gradient", theta=theta, texture=face_texture(theta), size_m=(1.0, 1.0), T_world_from_object=BOARD,
-        subject="board", corners_in_subject=TARGET.corners, camera=Pinhole(200, 66, 103.6, 103.4, 100, 32),
-        scene_sha256="", policy_sha256="", config_sha256="", seed=seed, predicted_total_cte_m=1.0, software_version="0",
-    )  # fmt: skip
+        method="gradient",
+        theta=theta,
+        texture=face_texture(theta),
+        size_m=(1.0, 1.0),
+        T_world_from_object=BOARD,
+        subject="board",
+        corners_in_subject=TARGET.corners,
+        camera=Pinhole(200, 66, 103.6, 103.4, 100, 32),
+        scene_sha256="",
+        policy_sha256="",
+        config_sha256="",
+        seed=seed,
+        predicted_total_cte_m=1.0,
+        software_version="0",
+    )
     file = folder / f"{seed}.safetensors"
     return file, save_attack(file, made)
 
@@ -49,7 +60,15 @@ class Drive:
             "target": str(CALIBRATION / "board.yaml"),
         }
         config.write_text(yaml.safe_dump(files))
-        command = [sys.executable, "-m", "nodes.compositor", "--config", str(config), "--run-dir", str(run_dir)]
+        command = [
+            sys.executable,
+            "-m",
+            "nodes.compositor",
+            "--config",
+            str(config),
+            "--run-dir",
+            str(run_dir),
+        ]
         self.process = subprocess.Popen(command, cwd=REPOSITORY)
         for topic in INPUTS:
             self.bus.publisher(topic)
@@ -64,7 +83,9 @@ class Drive:
             self.bus.publish("/vicon/board", pose_message(BOARD, stamp))
             self.bus.publish("/vicon/car", pose_message(planar_pose(0.5, -2.0, 0.0), stamp))
         stamp = now - 10_000_000
-        self.bus.publish("/camera/image_raw", image_message(np.full((188, 336, 3), 90, np.uint8), stamp, "camera"))
+        self.bus.publish(
+            "/camera/image_raw", image_message(np.full((188, 336, 3), 90, np.uint8), stamp, "camera")
+        )
         self.listen(0.1, lambda: self.labels and self.labels[-1].header.stamp.nanosec == stamp % 10**9)
 
     def listen(self, seconds, until):
@@ -107,7 +128,9 @@ def drive(tmp_path):
 
 def test_only_a_whole_and_verified_attack_replaces_the_old_one_while_images_flow(drive, tmp_path):
     old, (file, new) = attack(tmp_path, 1)[1], attack(tmp_path, 2)
-    chunks = [decode("advnerf_msgs/msg/FileChunk", encode(c)) for c in chunk_messages(file.read_bytes(), new, 0)]
+    chunks = [
+        decode("advnerf_msgs/msg/FileChunk", encode(c)) for c in chunk_messages(file.read_bytes(), new, 0)
+    ]
     assert len(chunks) >= 3
     drive.frame()
     broken = [*chunks[:2], replace(chunks[2], data=chunks[2].data ^ 1), *chunks[3:]]

@@ -17,8 +17,17 @@ PIXEL = np.zeros((1, 1, 3), np.uint8)
 
 def state(armed, stopping=False):
     return types.SafetyState(
-        header=header(0), armed=armed, stopping=stopping, reason="", source="operator", command_age_s=0.0, pose_age_s=0.0, answered_id="", granted=False, answer=""
-    )  # fmt: skip
+        header=header(0),
+        armed=armed,
+        stopping=stopping,
+        reason="",
+        source="operator",
+        command_age_s=0.0,
+        pose_age_s=0.0,
+        answered_id="",
+        granted=False,
+        answer="",
+    )
 
 
 def say(node, armed, t, stopping=False):
@@ -37,7 +46,11 @@ def command(node, t):
 @pytest.fixture(scope="module")
 def driven():
     """Poses at 100 Hz with noise and the commands at 10 Hz, until the node is done."""
-    node, vehicle, rng = CalibrationDrive(program(CalibrationDriveConfig())), TwinVehicle(CAR), np.random.default_rng(0)
+    node, vehicle, rng = (
+        CalibrationDrive(program(CalibrationDriveConfig())),
+        TwinVehicle(CAR),
+        np.random.default_rng(0),
+    )
     say(node, True, 0.0)
     poses, commands, t = [], [], 0.0
     while "done" not in node.status()[1]:

@@ -41,7 +41,9 @@ SOURCE = TypeAdapter(CameraSource)
 def frame(sequence=0, stamp_s=0.0):
     now = CLOCK.now()
     ns = round(stamp_s * 1e9)
-    return Frame(np.full((188, 336, 3), 50 + sequence, np.uint8), now.real_ns + ns, now.mono_ns + ns, sequence)
+    return Frame(
+        np.full((188, 336, 3), 50 + sequence, np.uint8), now.real_ns + ns, now.mono_ns + ns, sequence
+    )
 
 
 def config(source=None, **options):
@@ -101,7 +103,14 @@ def test_every_kind_of_source_makes_its_driver(tmp_path):
     conf = tmp_path / "SN1.conf"
     conf.write_text("[LEFT_CAM_VGA]\nfx=350\nfy=350\ncx=335\ncy=187\n", encoding="utf-8")
     sources = [
-        {"kind": "v4l2", "device": PATH, "width": 640, "height": 360, "size": [336, 188], "exposure_us": 8000},
+        {
+            "kind": "v4l2",
+            "device": PATH,
+            "width": 640,
+            "height": 360,
+            "size": [336, 188],
+            "exposure_us": 8000,
+        },
         {"kind": "zed", "device": PATH, "factory": str(conf), "exposure_percent": 40},
         {"kind": "oak", "exposure_us": 8000, "iso": 400},
         {"kind": "socket", "path": "s"},
@@ -122,9 +131,15 @@ def test_every_kind_of_source_makes_its_driver(tmp_path):
             {"kind": "v4l2", "device": PATH, "width": 64, "height": 48, "rate_hz": 60},
             "at most that of the device, 30 Hz",
         ),
-        ({"kind": "v4l2", "device": PATH, "width": 64, "height": 48, "controls": {"zoom": 2}}, "unknown controls zoom"),
+        (
+            {"kind": "v4l2", "device": PATH, "width": 64, "height": 48, "controls": {"zoom": 2}},
+            "unknown controls zoom",
+        ),
         ({"kind": "zed", "device": PATH, "factory": "x", "fps": 10}, "a rate of 15, 30, 60, 100 Hz, got 10"),
-        ({"kind": "zed", "device": PATH, "factory": "x", "size": [1344, 376]}, "at most 672 x 376 in mode VGA"),
+        (
+            {"kind": "zed", "device": PATH, "factory": "x", "size": [1344, 376]},
+            "at most 672 x 376 in mode VGA",
+        ),
         ({"kind": "zed", "device": PATH, "factory": "x", "gain_raw": 5}, "exposure_percent with gain_raw"),
         ({"kind": "oak", "iso": 400}, "exposure_us and iso together"),
         ({"kind": "webcam"}, "v4l2.*zed.*oak.*socket.*file.*folder"),
@@ -138,7 +153,12 @@ def test_wrong_source(source, message):
 
 def test_node_process_says_what_is_wrong_in_one_line(tmp_path):
     command = [sys.executable, "-m", "nodes.camera", "--run-dir", str(tmp_path), "--check"]
-    command += ["--set", "source={kind: zed, device: /dev/video0, factory: x, fps: 12}", "--set", f"calibration={TWIN}"]
+    command += [
+        "--set",
+        "source={kind: zed, device: /dev/video0, factory: x, fps: 12}",
+        "--set",
+        f"calibration={TWIN}",
+    ]
     result = subprocess.run(command, capture_output=True, text=True, check=False)
     assert result.returncode == 2
     assert "expected a rate of 15, 30, 60, 100 Hz, got 12" in result.stderr
@@ -173,7 +193,15 @@ def test_folder_and_video_through_the_whole_node(tmp_path):
 def test_camera_process_sends_both_kinds_of_picture_over_the_bus(tmp_path):
     for k in range(4):
         cv2.imwrite(str(tmp_path / f"{k}.png"), np.full((188, 336, 3), 30 * k + 20, np.uint8))
-    command = [sys.executable, "-m", "nodes.camera", "--run-dir", str(tmp_path), "--set", f"calibration={TWIN}"]
+    command = [
+        sys.executable,
+        "-m",
+        "nodes.camera",
+        "--run-dir",
+        str(tmp_path),
+        "--set",
+        f"calibration={TWIN}",
+    ]
     command += [
         "--set",
         f"source={{kind: folder, folder: {tmp_path}, rate_hz: 50}}",

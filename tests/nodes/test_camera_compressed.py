@@ -44,7 +44,9 @@ def damaged():
 
 @pytest.fixture
 def compositor(tmp_path):
-    config = CompositorConfig(camera=TWIN / "camera.yaml", target=TWIN / "board.yaml", image_topic=COMPRESSED_TOPIC)
+    config = CompositorConfig(
+        camera=TWIN / "camera.yaml", target=TWIN / "board.yaml", image_topic=COMPRESSED_TOPIC
+    )
     return CompositorNode.build(config, NodeContext("compositor", tmp_path, CLOCK))
 
 
@@ -68,13 +70,17 @@ def test_compositor_drops_a_damaged_picture_and_says_so(compositor):
 
 def test_compositor_listens_to_cameras_only():
     with pytest.raises(ValidationError, match="image_raw/compressed"):
-        CompositorConfig(camera=TWIN / "camera.yaml", target=TWIN / "board.yaml", image_topic="/compositor/image")
+        CompositorConfig(
+            camera=TWIN / "camera.yaml", target=TWIN / "board.yaml", image_topic="/compositor/image"
+        )
 
 
 def test_policy_steers_nearly_as_with_the_raw_picture():
     torch.manual_seed(0)
     view = PolicyView(Pinhole(336, 188, 173.97, 173.97, 168.0, 94.0))
-    node = PolicyNode(TorchDriver(LoadedPolicy(PilotNet(0).eval().requires_grad_(False), view, {}, "ab" * 32)))
+    node = PolicyNode(
+        TorchDriver(LoadedPolicy(PilotNet(0).eval().requires_grad_(False), view, {}, "ab" * 32))
+    )
     (raw,) = hand_over(node, image_message(picture(), T0, "camera"))
     (small,) = hand_over(node, compressed_image_message(picture(), T0, "camera", 95))
     assert stamp_ns(small.message) == T0

@@ -36,7 +36,9 @@ def pictures(tmp_path):
 
 
 def test_devices_are_described_with_what_can_be_set():
-    zed = VideoDevice(formats={"YUYV": [(1344, 376)]}, rates=(30.0,), controls={}, extension=ZedRegisters(), card="ZED")
+    zed = VideoDevice(
+        formats={"YUYV": [(1344, 376)]}, rates=(30.0,), controls={}, extension=ZedRegisters(), card="ZED"
+    )
     webcam = VideoDevice(formats={"YUYV": [(640, 480)], "MJPG": [(1280, 720)]})
     metadata = VideoDevice(metadata_only=True)
     port = VideoPortEmulator({"/dev/a": webcam, "/dev/b": metadata, "/dev/c": zed})
@@ -58,7 +60,9 @@ def test_trial_measures_a_source(pictures, tmp_path):
     assert "0 missed" in result.output
     assert "mean brightness 100 of 255" in result.output
     assert cv2.imread(str(out)).shape == (188, 336, 3)
-    assert 30 < try_source(parse_source(f"{{kind: folder, folder: {pictures}, rate_hz: 50}}"), 12).rate_hz < 52
+    assert (
+        30 < try_source(parse_source(f"{{kind: folder, folder: {pictures}, rate_hz: 50}}"), 12).rate_hz < 52
+    )
 
 
 def test_trial_of_what_is_not_there(tmp_path):
@@ -76,7 +80,14 @@ def test_wrong_source(text, message):
 
 def test_picture_format_that_nobody_knows(pictures, tmp_path):
     with pytest.raises(CameraToolError, match=r"ends in .png or .jpg"):
-        run("try", f"{{kind: folder, folder: {pictures}, rate_hz: 100}}", "--frames", 2, "--out", tmp_path / "p.xyz")
+        run(
+            "try",
+            f"{{kind: folder, folder: {pictures}, rate_hz: 100}}",
+            "--frames",
+            2,
+            "--out",
+            tmp_path / "p.xyz",
+        )
 
 
 def test_factory_file_becomes_a_camera_file(tmp_path):
@@ -92,7 +103,8 @@ def test_factory_file_becomes_a_camera_file(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("options", "message"), [(("--mode", "4K"), "expected --mode 2K"), (("--width", 1344), "at most 672 x 376")]
+    ("options", "message"),
+    [(("--mode", "4K"), "expected --mode 2K"), (("--width", 1344), "at most 672 x 376")],
 )
 def test_wrong_factory_options(tmp_path, options, message):
     with pytest.raises(CameraToolError, match=message):

@@ -63,7 +63,12 @@ def environment(folder):
 def start(folder, *arguments):
     command = [sys.executable, "-m", "nodes.cli", "launch", str(folder / "little.launch.yaml"), *arguments]
     return subprocess.Popen(
-        command, env=environment(folder), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=os.getcwd()
+        command,
+        env=environment(folder),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=os.getcwd(),
     )
 
 
@@ -115,10 +120,14 @@ def test_a_node_that_hangs_is_listed_as_silent_with_its_age(running, command):
         _, top, _ = command("top", "--period", "0.5", "--count", "1", "--run-dir", running)
     finally:
         os.kill(pid, signal.SIGCONT)
-    silent = rf"(?m)^sender +silent +{pid} +last status (\d+\.\d) s ago; its process is stopped by a signal *$"
+    silent = (
+        rf"(?m)^sender +silent +{pid} +last status (\d+\.\d) s ago; its process is stopped by a signal *$"
+    )
     assert code == 0
     assert 1.0 <= float(re.search(silent, output)[1]) <= 4.0
-    assert re.search(r"(?m)^sender +silent .*last status \d+\.\d s ago; its process is stopped by a signal", top)
+    assert re.search(
+        r"(?m)^sender +silent .*last status \d+\.\d s ago; its process is stopped by a signal", top
+    )
     assert rows["sender"] == command("node", "list", "--run-dir", running)[1].splitlines()[1].split()
 
 
@@ -208,9 +217,7 @@ def test_dead_node_is_one_line_and_exit_code_1(folder):
     _, errors = process.communicate(timeout=20)
     assert process.returncode == 1
     assert errors.count("\n") == 1
-    expected = (
-        "required node sender ended with exit code 2: --set sender.speed=3: unknown key speed; valid keys here: rate_hz"
-    )
+    expected = "required node sender ended with exit code 2: --set sender.speed=3: unknown key speed; valid keys here: rate_hz"
     assert expected in errors
 
 
@@ -265,7 +272,9 @@ def test_a_full_disk_is_told_with_the_way_out(monkeypatch, capsys):
     monkeypatch.setattr(cli, "app", lambda: Path("/dev/full").write_bytes(bytes(10)))
     with pytest.raises(SystemExit, match="2"):
         cli.main()
-    assert capsys.readouterr().err.startswith("error: the disk is full: free some space or choose another folder")
+    assert capsys.readouterr().err.startswith(
+        "error: the disk is full: free some space or choose another folder"
+    )
 
 
 def test_mistake_in_an_option_is_told_by_the_option(command, tmp_path):
@@ -295,7 +304,9 @@ def test_defect_of_ours_keeps_its_traceback(monkeypatch):
 def test_play_refuses_what_is_not_there(command, tmp_path):
     with BagWriter(tmp_path / "bag") as writer:
         writer.write("/vicon/car", encode(pose_message(np.eye(4), 1)), 1, 1, 0)
-    code, _, errors = command("bag", "play", tmp_path / "bag", "--topics", "/arm", "--run-dir", tmp_path / "run")
+    code, _, errors = command(
+        "bag", "play", tmp_path / "bag", "--topics", "/arm", "--run-dir", tmp_path / "run"
+    )
     assert code == 2
     assert "has no topic /arm; it has /vicon/car" in errors
     assert "traceback" not in errors

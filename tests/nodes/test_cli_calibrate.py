@@ -66,10 +66,18 @@ def drive_bag(folder, recorded):
         write_poses(writer, "/vicon/car", recorded.pose_s, [planar_pose(*row) for row in recorded.poses])
         for k, t in enumerate(recorded.command_s):
             sent = types.MotorSent(
-                header=header(ns(t - recorded.pipeline_s[k]), "car"), serial_write_mono_ns=1, serial_write_real_ns=ns(t), speed_mps=0.0,
-                steering_rad=0.0, erpm=float(recorded.erpm[k]), servo=float(recorded.servo[k]), brake_current_a=0.0, braking=False,
-                reason="", peer="twin",
-            )  # fmt: skip
+                header=header(ns(t - recorded.pipeline_s[k]), "car"),
+                serial_write_mono_ns=1,
+                serial_write_real_ns=ns(t),
+                speed_mps=0.0,
+                steering_rad=0.0,
+                erpm=float(recorded.erpm[k]),
+                servo=float(recorded.servo[k]),
+                brake_current_a=0.0,
+                braking=False,
+                reason="",
+                peer="twin",
+            )
             writer.write("/motor/sent", encode(sent), ns(t), ns(t), k)
     return folder
 
@@ -78,7 +86,15 @@ def test_vehicle_from_a_bag(tmp_path, capsys):
     save_calibration(twin_calibrations(LabConfig())["vehicle"], tmp_path / "before.yaml")
     bag = drive_bag(tmp_path / "bag", drive(np.random.default_rng(0), program(hold_s=1.6, steps=8)))
     assert (
-        run("calibrate", "vehicle", bag, "--before", tmp_path / "before.yaml", "-o", tmp_path / "new" / "vehicle.yaml")
+        run(
+            "calibrate",
+            "vehicle",
+            bag,
+            "--before",
+            tmp_path / "before.yaml",
+            "-o",
+            tmp_path / "new" / "vehicle.yaml",
+        )
         == 0
     )
     found = load_calibration(VehicleCalibration, tmp_path / "new" / "vehicle.yaml")
@@ -140,7 +156,9 @@ def test_intrinsics_from_a_folder_then_refused_with_half_of_it(tmp_path, capsys)
         wide = Board(10, 8, BOARD.square_m, BOARD.marker_m, "DICT_4X4_100")
         cv2.imwrite(str(folder / f"{k:02d}.png"), view_of(picture, T, wide))
     board = ("--columns", 8, "--rows", 6, "--square", 0.1, "--marker", 0.075)
-    assert run("calibrate", "intrinsics", folder, *board, "--model", "none", "-o", tmp_path / "lens.yaml") == 0
+    assert (
+        run("calibrate", "intrinsics", folder, *board, "--model", "none", "-o", tmp_path / "lens.yaml") == 0
+    )
     found = load_calibration(LensCalibration, tmp_path / "lens.yaml")
     assert found.fx == pytest.approx(PINHOLE.fx, rel=0.01)
     assert found.cx == pytest.approx(168.0, abs=1.5)
@@ -152,7 +170,10 @@ def test_intrinsics_from_a_folder_then_refused_with_half_of_it(tmp_path, capsys)
     error = capsys.readouterr().err
     assert "expected at least 20 pictures with the board" in error
     assert error.count("\n") == 1
-    assert run("calibrate", "intrinsics", tmp_path / "pictures", "--model", "seven", "-o", tmp_path / "no.yaml") == 2
+    assert (
+        run("calibrate", "intrinsics", tmp_path / "pictures", "--model", "seven", "-o", tmp_path / "no.yaml")
+        == 2
+    )
 
 
 def test_camera_to_car_from_a_bag_of_stops(tmp_path, capsys):
@@ -163,11 +184,23 @@ def test_camera_to_car_from_a_bag_of_stops(tmp_path, capsys):
     wide = Board(8, 7, 0.12, 0.09)
     edge = make_transform(np.eye(3), np.array([-0.12, -0.12, 0.0]))
     mount = camera_mount(0.3, 0.0, 0.2, np.radians(10.0))
-    pattern = make_transform(np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), [0.0, -0.36, 0.3])
+    pattern = make_transform(
+        np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), [0.0, -0.36, 0.3]
+    )
     save_calibration(
-        LensCalibration(date="2026-11-21", method="test", width=336, height=188, fx=PINHOLE.fx, fy=PINHOLE.fy, cx=168.0, cy=94.0, rms_px=0.1),
+        LensCalibration(
+            date="2026-11-21",
+            method="test",
+            width=336,
+            height=188,
+            fx=PINHOLE.fx,
+            fy=PINHOLE.fy,
+            cx=168.0,
+            cy=94.0,
+            rms_px=0.1,
+        ),
         tmp_path / "lens.yaml",
-    )  # fmt: skip
+    )
     stops, move_s, stop_s = 16, 0.3, 0.5
     places = [(1.0 + 0.5 * rng.random(), rng.uniform(-0.35, 0.35), tilt(rng, 0.3)) for _ in range(stops + 1)]
 
@@ -189,19 +222,45 @@ def test_camera_to_car_from_a_bag_of_stops(tmp_path, capsys):
             T = np.linalg.inv(car @ mount) @ held @ pattern @ edge
             stamp = ns(t)
             writer.write(
-                "/camera/image_raw", encode(image_message(view_of(picture, T, wide), stamp, "camera")), stamp, stamp, k
+                "/camera/image_raw",
+                encode(image_message(view_of(picture, T, wide), stamp, "camera")),
+                stamp,
+                stamp,
+                k,
             )
     views, frames = still_views(tmp_path / "bag", BoardDetector(board), "/vicon/board", StillConfig())
     assert frames > 50
     assert 12 <= len(views) <= stops
-    options = ("--columns", 6, "--rows", 5, "--square", 0.12, "--marker", 0.09, "--lens", tmp_path / "lens.yaml")
+    options = (
+        "--columns",
+        6,
+        "--rows",
+        5,
+        "--square",
+        0.12,
+        "--marker",
+        0.09,
+        "--lens",
+        tmp_path / "lens.yaml",
+    )
     assert run("calibrate", "camera-to-car", tmp_path / "bag", *options, "-o", tmp_path / "camera.yaml") == 0
     found = load_calibration(CameraCalibration, tmp_path / "camera.yaml")
     np.testing.assert_allclose(found.mount[:3, 3], mount[:3, 3], atol=0.004)
     assert (tmp_path / "camera.png").exists()
     capsys.readouterr()
     # The car itself only drove on the floor: without the board's poses the same bag fixes nothing.
-    assert run("calibrate", "camera-to-car", tmp_path / "bag", *options, "--untracked", "-o", tmp_path / "no.yaml") == 2
+    assert (
+        run(
+            "calibrate",
+            "camera-to-car",
+            tmp_path / "bag",
+            *options,
+            "--untracked",
+            "-o",
+            tmp_path / "no.yaml",
+        )
+        == 2
+    )
     assert "planar" in capsys.readouterr().err
     assert not (tmp_path / "no.yaml").exists()
 
@@ -214,7 +273,9 @@ def test_mocap_to_scene_from_two_transforms_files(tmp_path):
         path = tmp_path / f"{k:02d}.png"
         cv2.imwrite(str(path), np.zeros((188, 336, 3), np.uint8))
         angle = 0.3 * k
-        world = planar_pose(2.0 * np.cos(angle), 1.5 * np.sin(angle), angle) @ camera_mount(0.3, 0.0, 0.2, 0.17)
+        world = planar_pose(2.0 * np.cos(angle), 1.5 * np.sin(angle), angle) @ camera_mount(
+            0.3, 0.0, 0.2, 0.17
+        )
         inside = np.linalg.inv(shift) @ world
         inside[:3, 3] = inside[:3, 3] / 0.5 + rng.normal(0.0, 0.002, 3)
         paths.append(path)
@@ -251,15 +312,27 @@ def test_display_from_a_folder(tmp_path, capsys):
         image[10:50, 20:80] = 255.0 * (0.02 + light) ** (1.0 / 2.2)
         noisy = np.clip(image + rng.normal(0.0, 2.0, image.shape), 0, 255).round().astype(np.uint8)
         cv2.imwrite(str(tmp_path / "seen" / f"{k:03d}.png"), noisy[..., ::-1])
-    assert run("calibrate", "display", tmp_path, "--conditions", "lamps on", "-o", tmp_path / "display.yaml") == 0
+    assert (
+        run("calibrate", "display", tmp_path, "--conditions", "lamps on", "-o", tmp_path / "display.yaml")
+        == 0
+    )
     found = load_calibration(DisplayCalibration, tmp_path / "display.yaml")
     assert found.residuals["held_out_rmse"] < 0.01
     assert yaml.safe_load((tmp_path / "display.yaml").read_text())["conditions"] == "lamps on"
     capsys.readouterr()
     cv2.imwrite(str(tmp_path / "seen" / "005.png"), np.zeros((4, 4, 3), np.uint8))
     (tmp_path / "seen" / "006.png").write_bytes(b"no picture")
-    for name, words in (("005", "pictures of 90 x 60"), ("006", "cannot decode its 10 bytes"), ("666", "No such file")):
-        rows = ["file,red,green,blue", "seen/000.png,0,0,0", "seen/001.png,255,255,255", f"seen/{name}.png,9,9,9"]
+    for name, words in (
+        ("005", "pictures of 90 x 60"),
+        ("006", "cannot decode its 10 bytes"),
+        ("666", "No such file"),
+    ):
+        rows = [
+            "file,red,green,blue",
+            "seen/000.png,0,0,0",
+            "seen/001.png,255,255,255",
+            f"seen/{name}.png,9,9,9",
+        ]
         (tmp_path / "shown.csv").write_text("\n".join(rows))
         assert run("calibrate", "display", tmp_path, "-o", tmp_path / "no.yaml") == 2
         assert words in capsys.readouterr().err
@@ -292,7 +365,9 @@ def test_a_session_on_a_real_sdl_screen_keeps_only_frames_of_the_colour_that_is_
         with pytest.raises(CalibrationError, match="already has a session"):
             show_and_watch(display, camera(), colours, folder)
         with pytest.raises(CalibrationError, match="the camera stopped"):
-            show_and_watch(display, iter([(2**62, np.zeros((60, 80, 3), np.uint8))]), colours, tmp_path / "short")
+            show_and_watch(
+                display, iter([(2**62, np.zeros((60, 80, 3), np.uint8))]), colours, tmp_path / "short"
+            )
     finally:
         display.close()
     np.testing.assert_allclose(shown, np.array(colours) / 255.0)
@@ -335,7 +410,10 @@ def test_live_topics_become_a_bag_and_silence_is_told(tmp_path):
 
 
 def test_a_board_to_print(tmp_path, capsys):
-    assert run("calibrate", "board", "-o", tmp_path / "board.png", "--columns", 7, "--rows", 5, "--square", 0.04) == 0
+    assert (
+        run("calibrate", "board", "-o", tmp_path / "board.png", "--columns", 7, "--rows", 5, "--square", 0.04)
+        == 0
+    )
     printed = cv2.imread(str(tmp_path / "board.png"), cv2.IMREAD_GRAYSCALE)
     assert printed.shape == (1000, 1400)
     found = BoardDetector(Board(7, 5, 0.04, 0.03)).find(np.pad(printed, 100, constant_values=255))

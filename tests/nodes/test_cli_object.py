@@ -27,7 +27,9 @@ def command(monkeypatch, capsys):
 
 def test_build_show_and_info(command, tmp_path):
     path = tmp_path / "hydrant.object.safetensors"
-    code, output, _ = command("object", "build", "--generate", "hydrant", "--resolution", 16, "--steps", 2, "-o", path)
+    code, output, _ = command(
+        "object", "build", "--generate", "hydrant", "--resolution", 16, "--steps", 2, "-o", path
+    )
     assert code == 0
     assert "on held-out views" in output
     assert load_object(path).about["source"] == {"generator": "hydrant"}
@@ -96,7 +98,19 @@ def test_sixteen_pictures_hold_out_two_and_can_be_made_smaller(command, tmp_path
     path = tmp_path / "o.object.safetensors"
     write_pictures(tmp_path, 16, pixels=64)
     code, output, errors = command(
-        "object", "build", "--images", tmp_path, "--resolution", 16, "--minutes", 0.01, "--size", 32, 32, "-o", path
+        "object",
+        "build",
+        "--images",
+        tmp_path,
+        "--resolution",
+        16,
+        "--minutes",
+        0.01,
+        "--size",
+        32,
+        32,
+        "-o",
+        path,
     )
     assert (code, errors) == (0, "")
     assert "14 training, 2 held-out images" in output

@@ -58,7 +58,9 @@ def test_path_and_fence_make_a_room_file_that_the_stack_reads(tmp_path):
     assert np.abs(SQUARE.project(grid).cte_m).max() < 0.01
     assert (tmp_path / "room.png").stat().st_size > 5000
     corners = np.array([[-3.8, -3.8], [3.8, -3.8], [3.8, 3.8], [-3.8, 3.8]])
-    walk = np.concatenate([np.linspace(a, b, 200) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)])
+    walk = np.concatenate(
+        [np.linspace(a, b, 200) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)]
+    )
     wand = write_trace(tmp_path / "walk", "/vicon/wand", np.column_stack([walk, np.zeros(len(walk))]))
     done = advnerf("room", "fence", wand, "-o", tmp_path / "room.yaml")
     assert done.returncode == 0, done.stderr
@@ -77,7 +79,15 @@ T_FACE = make_transform(rotation_z(np.deg2rad(188.0)), [3.04, -1.80, 0.52])
 REQUEST = {
     "name": "corner",
     "objects": [
-        {"kind": "face", "target": "board.yaml", "x_m": 3.04, "y_m": -1.8, "z_m": 0.52, "yaw_rad": 3.28, "size_m": 1.0}
+        {
+            "kind": "face",
+            "target": "board.yaml",
+            "x_m": 3.04,
+            "y_m": -1.8,
+            "z_m": 0.52,
+            "yaw_rad": 3.28,
+            "size_m": 1.0,
+        }
     ],
 }
 
@@ -85,10 +95,21 @@ REQUEST = {
 def save_attack_at(folder, T):
     theta = np.zeros((4, 4, 3), np.float32)
     attack = AttackFile.of_face(
-        method="random", theta=theta, texture=face_texture(theta, 8), size_m=(1.0, 1.0), T_world_from_object=T,
-        subject="board", corners_in_subject=FACE.corners, camera=Pinhole(200, 66, 103.6, 103.4, 100, 32), scene_sha256="",
-        policy_sha256="", config_sha256="", seed=0, predicted_total_cte_m=None, software_version="0",
-    )  # fmt: skip
+        method="random",
+        theta=theta,
+        texture=face_texture(theta, 8),
+        size_m=(1.0, 1.0),
+        T_world_from_object=T,
+        subject="board",
+        corners_in_subject=FACE.corners,
+        camera=Pinhole(200, 66, 103.6, 103.4, 100, 32),
+        scene_sha256="",
+        policy_sha256="",
+        config_sha256="",
+        seed=0,
+        predicted_total_cte_m=None,
+        software_version="0",
+    )
     save_attack(folder / "a.safetensors", attack)
     return folder / "a.safetensors"
 
@@ -121,14 +142,24 @@ def test_the_guide_accepts_the_right_place_and_refuses_a_wrong_one(tmp_path):
     (tmp_path / "corner.attack.yaml").write_text(yaml.safe_dump(REQUEST))
     file = save_attack_at(tmp_path, T_FACE)
     with Board(tmp_path / "right", T_FACE @ make_transform(np.eye(3), [0.0, 0.005, 0.0])):
-        done = advnerf("room", "place", file, "--target", tmp_path / "board.yaml", "--run-dir", tmp_path / "right")
+        done = advnerf(
+            "room", "place", file, "--target", tmp_path / "board.yaml", "--run-dir", tmp_path / "right"
+        )
     assert done.returncode == 0, done.stderr
     assert "0.5 cm and 0.0 deg" in done.stdout
     with Board(tmp_path / "wrong", T_FACE @ make_transform(rotation_z(0.1), [0.0, 0.06, 0.0])):
         done = advnerf(
-            "room", "place", file, "--target", tmp_path / "board.yaml", "--run-dir", tmp_path / "wrong", "--once",
-            "--request", tmp_path / "corner.attack.yaml",
-        )  # fmt: skip
+            "room",
+            "place",
+            file,
+            "--target",
+            tmp_path / "board.yaml",
+            "--run-dir",
+            tmp_path / "wrong",
+            "--once",
+            "--request",
+            tmp_path / "corner.attack.yaml",
+        )
     assert done.returncode == 1
     assert "6.0 cm and 5.7 deg" in done.stderr
     measured = tmp_path / "corner.measured.attack.yaml"
@@ -146,7 +177,9 @@ def test_a_request_without_one_face_is_refused(tmp_path):
 
 
 def test_targets_by_ruler_and_bad_options(tmp_path):
-    done = advnerf("room", "target", "-o", tmp_path / "m.yaml", "--subject", "monitor", "--size", "0.598x0.336")
+    done = advnerf(
+        "room", "target", "-o", tmp_path / "m.yaml", "--subject", "monitor", "--size", "0.598x0.336"
+    )
     assert done.returncode == 0, done.stderr
     assert "size_m: 0.3360" in done.stdout
     target = load_calibration(TargetCalibration, tmp_path / "m.yaml")

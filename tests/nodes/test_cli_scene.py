@@ -133,7 +133,14 @@ def test_eval_and_render(command, trained, pictures, tmp_path):
     assert code == 0
     assert "08.png" in output
     code, output, _ = command(
-        "render", trained / "scene.safetensors", pictures, "--held-out", "-o", tmp_path, "--video", tmp_path / "v.mp4"
+        "render",
+        trained / "scene.safetensors",
+        pictures,
+        "--held-out",
+        "-o",
+        tmp_path,
+        "--video",
+        tmp_path / "v.mp4",
     )
     assert code == 0
     figures = json.loads((trained / "held_out.json").read_text())["images"]
@@ -191,7 +198,9 @@ def view(trained, pictures, tmp_path):
     from advnerf_core.objects.voxel.model import save_object
 
     save_object(tmp_path / "h.object.safetensors", build_from_mesh(hydrant(3.0), "hydrant", 16, 0))
-    shown = SceneView(trained / "scene.safetensors", pictures, [tmp_path / "h.object.safetensors"], port=18080)
+    shown = SceneView(
+        trained / "scene.safetensors", pictures, [tmp_path / "h.object.safetensors"], port=18080
+    )
     yield shown
     shown.close()
 
@@ -223,8 +232,11 @@ def test_a_browser_gets_pictures(view, tmp_path):
         "--window-size=800,600",
     ]
     subprocess.run(
-        ["chromium", *flags, "--virtual-time-budget=12000", f"--screenshot={shot}", url], check=True, timeout=90,
-        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-    )  # fmt: skip
+        ["chromium", *flags, "--virtual-time-budget=12000", f"--screenshot={shot}", url],
+        check=True,
+        timeout=90,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
     assert view.rendered >= 2  # a small one while it moved, a full one when it rested
     assert cv2.imread(str(shot)).std() > 10.0

@@ -33,11 +33,21 @@ MS = 1_000_000
 def attack(**changes):
     theta = np.random.default_rng(0).normal(size=(8, 8, 3)).astype(np.float32)
     values = {
-        "method": "gradient", "theta": theta, "texture": face_texture(theta, 128), "size_m": (1.0, 1.0),
-        "T_world_from_object": T_WORLD_FROM_BOARD, "subject": "board", "corners_in_subject": TARGET.corners,
-        "camera": Pinhole(200, 66, 103.6, 103.4, 100, 32), "scene_sha256": "", "policy_sha256": "", "config_sha256": "",
-        "seed": 0, "predicted_total_cte_m": 1.0, "software_version": "0",
-    }  # fmt: skip
+        "method": "gradient",
+        "theta": theta,
+        "texture": face_texture(theta, 128),
+        "size_m": (1.0, 1.0),
+        "T_world_from_object": T_WORLD_FROM_BOARD,
+        "subject": "board",
+        "corners_in_subject": TARGET.corners,
+        "camera": Pinhole(200, 66, 103.6, 103.4, 100, 32),
+        "scene_sha256": "",
+        "policy_sha256": "",
+        "config_sha256": "",
+        "seed": 0,
+        "predicted_total_cte_m": 1.0,
+        "software_version": "0",
+    }
     return AttackFile.of_face(**{**values, **changes})
 
 
@@ -77,11 +87,15 @@ class Bench:
             self.out.append((topic, data))
 
     def images(self):
-        return [decode("sensor_msgs/msg/Image", data) for topic, data in self.out if topic == "/compositor/image"]
+        return [
+            decode("sensor_msgs/msg/Image", data) for topic, data in self.out if topic == "/compositor/image"
+        ]
 
     def labels(self):
         return [
-            decode("advnerf_msgs/msg/AttackStamp", data) for topic, data in self.out if topic == "/compositor/attack"
+            decode("advnerf_msgs/msg/AttackStamp", data)
+            for topic, data in self.out
+            if topic == "/compositor/attack"
         ]
 
 
@@ -210,7 +224,11 @@ def test_build_reads_the_files_and_refuses_wrong_ones(tmp_path):
     node = CompositorNode.build(CompositorConfig(attack=path, **files), context)
     assert node.subscriptions == ("/camera/image_raw", "/vicon/car", "/vicon/board", "/attack/file")
     assert "passes through" not in node.status()[1]
-    assert CompositorNode.build(CompositorConfig(attack="", **files), context).status()[1].endswith("pass through")
+    assert (
+        CompositorNode.build(CompositorConfig(attack="", **files), context)
+        .status()[1]
+        .endswith("pass through")
+    )
     path.write_bytes(b"garbage")
     with pytest.raises(AttackFileError, match="cannot read"):
         CompositorNode.build(CompositorConfig(attack=path, **files), context)
@@ -264,12 +282,17 @@ def test_without_an_attack_the_first_one_is_shown_when_it_comes(tmp_path):
     for chunk in chunk_messages(file_of(tmp_path), "new", T0):
         bench.send("/attack/file", chunk)
     drive_by(bench, 0.2)
-    assert [(label.attack_id, label.drawn) for label in bench.labels()] == [("", False), (attack().attack_id, True)]
+    assert [(label.attack_id, label.drawn) for label in bench.labels()] == [
+        ("", False),
+        (attack().attack_id, True),
+    ]
     assert (rgb_image(bench.images()[1], "test") != 90).any()
 
 
 def broken(case, tmp_path):
-    chunks = [decode("advnerf_msgs/msg/FileChunk", encode(c)) for c in chunk_messages(file_of(tmp_path), "new", T0)]
+    chunks = [
+        decode("advnerf_msgs/msg/FileChunk", encode(c)) for c in chunk_messages(file_of(tmp_path), "new", T0)
+    ]
     if case == "garbage":
         return chunk_messages(b"garbage", "new", T0)
     if case == "changed":

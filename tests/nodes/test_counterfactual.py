@@ -34,7 +34,12 @@ ROOT = Path(__file__).parents[2]
 TWIN = ROOT / "calibration" / "twin"
 CAMERA = Pinhole(336, 188, 173.97, 173.97, 168.0, 94.0)
 START_NS, MS = 1_800_000_000_000_000_000, 1_000_000
-CLEAN, ATTACKED, LABEL, OUT = "/camera/image_raw", "/compositor/image", "/compositor/attack", "/policy/counterfactual"
+CLEAN, ATTACKED, LABEL, OUT = (
+    "/camera/image_raw",
+    "/compositor/image",
+    "/compositor/attack",
+    "/policy/counterfactual",
+)
 
 
 @pytest.fixture(scope="module")
@@ -159,7 +164,9 @@ def test_one_policy_its_goal_and_a_compositor(drivers, policy):
     with pytest.raises(ConfigError, match="there is no clean image to compare with"):
         validate(CounterfactualConfig, parse_yaml(f"policy: {policy}\nshown_by: monitor", "a.yaml"))
     context = NodeContext("counterfactual", policy.parent, None)
-    node = CounterfactualNode.build(CounterfactualConfig(policy=str(policy), sha256=drivers[0].sha256), context)
+    node = CounterfactualNode.build(
+        CounterfactualConfig(policy=str(policy), sha256=drivers[0].sha256), context
+    )
     assert node.subscriptions == (CLEAN, ATTACKED, LABEL)
 
 
@@ -183,7 +190,10 @@ def drive(folder, policy):
         "name": "drive",
         "nodes": {"counterfactual": {"module": "nodes.counterfactual", "config": {"policy": str(policy)}}},
     }
-    attachments = {"room.yaml": (TWIN / "room.yaml").read_bytes(), "launch.resolved.yaml": json.dumps(launch).encode()}
+    attachments = {
+        "room.yaml": (TWIN / "room.yaml").read_bytes(),
+        "launch.resolved.yaml": json.dumps(launch).encode(),
+    }
     counts = {}
     with BagWriter(folder, attachments=attachments) as writer:
 
@@ -194,9 +204,17 @@ def drive(folder, policy):
         for ms in range(0, 2500, 20):
             armed = 100 <= ms < 2400
             state = types.SafetyState(
-                header=header(START_NS + ms * MS), armed=armed, stopping=not armed, reason="", source="", command_age_s=0.0,
-                pose_age_s=0.0, answered_id="", granted=False, answer="",
-            )  # fmt: skip
+                header=header(START_NS + ms * MS),
+                armed=armed,
+                stopping=not armed,
+                reason="",
+                source="",
+                command_age_s=0.0,
+                pose_age_s=0.0,
+                answered_id="",
+                granted=False,
+                answer="",
+            )
             put("/safety/state", state, ms)
             put(
                 "/vicon/car",
@@ -248,7 +266,9 @@ def test_evaluate_says_what_the_attack_added(replayed, tmp_path, policy):
     mean, largest = np.rad2deg(added["mean_abs_delta_rad"]), np.rad2deg(added["max_abs_delta_rad"])
     text = f"mean {mean:.2f}, max {largest:.2f} deg ({added['frames_drawn']} of {added['frames']} images)"
     assert text in " ".join(result.output.split())
-    without = CliRunner().invoke(app, ["evaluate", str(drive(tmp_path / "plain", policy)), "--ticks", "15", "--json"])
+    without = CliRunner().invoke(
+        app, ["evaluate", str(drive(tmp_path / "plain", policy)), "--ticks", "15", "--json"]
+    )
     assert "counterfactual" not in json.loads(without.output)
 
 
@@ -258,7 +278,9 @@ def test_it_is_an_option_of_the_green_screen_and_refused_before_a_monitor():
         return set(load_launch(ROOT / "launch" / f"{file}.launch.yaml", (*keys, *overrides), host=host).nodes)
 
     for file, host in (("green_screen", None), ("workstation", None), ("two_hosts", "workstation")):
-        assert names(file, "params.counterfactual=true", host=host) - names(file, host=host) == {"counterfactual"}
+        assert names(file, "params.counterfactual=true", host=host) - names(file, host=host) == {
+            "counterfactual"
+        }
     assert "counterfactual" not in names("two_hosts", "params.counterfactual=true", host="robot")
     assert "counterfactual" not in names("monitor")
 

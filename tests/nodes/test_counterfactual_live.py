@@ -67,7 +67,9 @@ def untrained(folder: Path) -> Path:
     with torch.no_grad():
         for parameter in network.parameters():
             parameter.mul_(1.5)  # as it is, it answers everything with nearly the same
-    save_policy(folder / "policy.safetensors", network, PolicyView(camera.pinhole, distortion=camera.distortion), {})
+    save_policy(
+        folder / "policy.safetensors", network, PolicyView(camera.pinhole, distortion=camera.distortion), {}
+    )
     return folder / "policy.safetensors"
 
 
@@ -75,11 +77,21 @@ def red_board(folder: Path) -> AttackFile:
     """The attack: all of the board is red."""
     target = load_calibration(TargetCalibration, TWIN / "board.yaml")
     attack = AttackFile.of_face(
-        method="random", theta=np.zeros((4, 4, 3), np.float32), texture=np.full((64, 64, 3), (250, 0, 0), np.uint8),
-        size_m=(1.0, 1.0), T_world_from_object=np.eye(4), subject="board", corners_in_subject=target.corners,
-        camera=Pinhole(200, 66, 103.6, 103.4, 100, 32), scene_sha256="", policy_sha256="", config_sha256="", seed=0,
-        predicted_total_cte_m=None, software_version="0",
-    )  # fmt: skip
+        method="random",
+        theta=np.zeros((4, 4, 3), np.float32),
+        texture=np.full((64, 64, 3), (250, 0, 0), np.uint8),
+        size_m=(1.0, 1.0),
+        T_world_from_object=np.eye(4),
+        subject="board",
+        corners_in_subject=target.corners,
+        camera=Pinhole(200, 66, 103.6, 103.4, 100, 32),
+        scene_sha256="",
+        policy_sha256="",
+        config_sha256="",
+        seed=0,
+        predicted_total_cte_m=None,
+        software_version="0",
+    )
     save_attack(folder / "red.attack.safetensors", attack)
     return attack
 
@@ -95,13 +107,19 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
     folder = tmp_path_factory.mktemp("counterfactual")
     policy, attack = untrained(folder), red_board(folder)
     overrides = [
-        "params.counterfactual=true", f"params.calibration={TWIN}", f"params.policy={policy}", "policy.speed_mps=0.5",
-        f"params.attack={folder / 'red.attack.safetensors'}", f"params.vicon_port={free_port()}",
-    ]  # fmt: skip
+        "params.counterfactual=true",
+        f"params.calibration={TWIN}",
+        f"params.policy={policy}",
+        "policy.speed_mps=0.5",
+        f"params.attack={folder / 'red.attack.safetensors'}",
+        f"params.vicon_port={free_port()}",
+    ]
     start = load_calibration(RoomCalibration, TWIN / "room.yaml").start_pose
     plan = TrialPlan(start, SECONDS, NODES)
     for attempt in ("first", "second"):
-        outcome = run_trial(ROOT / "launch" / "green_screen.launch.yaml", overrides, folder / attempt, plan, 120.0)
+        outcome = run_trial(
+            ROOT / "launch" / "green_screen.launch.yaml", overrides, folder / attempt, plan, 120.0
+        )
         # A computer that is too busy to answer in time stops the car, as it should; such a drive proves nothing here.
         if outcome.stopped_early == "":
             return Recorded(folder / attempt / "bag", outcome, attack.attack_id, policy)
@@ -120,10 +138,14 @@ def test_every_command_of_the_drive_has_its_comparison_or_is_counted(recorded: R
     said, commands = recorded.messages(SAID), recorded.messages(COMMAND)
     driven = {stamp for stamp in commands if recorded.driving(stamp)}
     assert len(driven) >= 0.8 * 10 * SECONDS
-    *_, last = (decode(topic_row(STATUS).type, message.cdr) for message in read_messages(recorded.bag, [STATUS]))
+    *_, last = (
+        decode(topic_row(STATUS).type, message.cdr) for message in read_messages(recorded.bag, [STATUS])
+    )
     counted = dict(zip(last.counter_names, last.counter_values, strict=True))
     left_out = sum(
-        count for name, count in counted.items() if name.startswith(("dropped", "lost", "without_partner", "inbox"))
+        count
+        for name, count in counted.items()
+        if name.startswith(("dropped", "lost", "without_partner", "inbox"))
     )
     assert len(driven - said.keys()) <= left_out
     assert len(driven & said.keys()) >= 10
@@ -147,12 +169,17 @@ def test_the_attack_adds_something_while_it_is_drawn_and_nothing_else_ever(recor
     assert all(said[stamp].drawn is bool(labels[stamp].drawn) for stamp in said)
     for stamp, word in said.items():
         assert word.delta_rad == word.attacked_rad - word.clean_rad
-        assert np.array_equal(rgb_image(clean[stamp], "test"), rgb_image(attacked[stamp], "test")) is not word.drawn
+        assert (
+            np.array_equal(rgb_image(clean[stamp], "test"), rgb_image(attacked[stamp], "test"))
+            is not word.drawn
+        )
     assert all(said[stamp].delta_rad == said[stamp].changed == 0.0 for stamp in plain)
     # A red board changes the steering by a degree or so, once to the left and once to the right, and some of what the policy sees.
     assert all(said[stamp].delta_rad != 0.0 for stamp in drawn)
     assert np.abs([said[stamp].delta_rad for stamp in drawn]).mean() > 0.005
-    assert all(0.02 < said[stamp].changed < 0.5 and said[stamp].attack_id == recorded.attack_id for stamp in drawn)
+    assert all(
+        0.02 < said[stamp].changed < 0.5 and said[stamp].attack_id == recorded.attack_id for stamp in drawn
+    )
     # Before the car is armed and after it is disarmed the interlock leaves the images alone.
     before = [stamp for stamp in plain if stamp < recorded.outcome.start_real_ns]
     assert before
@@ -164,7 +191,9 @@ def test_the_attack_adds_something_while_it_is_drawn_and_nothing_else_ever(recor
 
 def test_the_car_drives_by_the_attacked_image(recorded: Recorded) -> None:
     said, attacked = recorded.messages(SAID), recorded.messages(ATTACKED)
-    commands = {stamp: m.drive.steering_angle for stamp, m in recorded.messages(COMMAND).items() if stamp in attacked}
+    commands = {
+        stamp: m.drive.steering_angle for stamp, m in recorded.messages(COMMAND).items() if stamp in attacked
+    }
     assert len(commands) >= 10
     expected = steering(recorded.policy, [attacked[stamp] for stamp in commands])
     assert list(commands.values()) == pytest.approx(expected, abs=1e-5)

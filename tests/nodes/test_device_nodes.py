@@ -43,7 +43,9 @@ def take(node, timeout_s=2.0):
 def frame(sequence=0, age_s=0.0, shape=(188, 336, 3)):
     now = CLOCK.now()
     age_ns = round(age_s * 1e9)
-    return Frame(np.full(shape, sequence, dtype=np.uint8), now.real_ns - age_ns, now.mono_ns - age_ns, sequence)
+    return Frame(
+        np.full(shape, sequence, dtype=np.uint8), now.real_ns - age_ns, now.mono_ns - age_ns, sequence
+    )
 
 
 @pytest.fixture
@@ -72,7 +74,9 @@ def test_camera_publishes_frames_with_their_own_stamps(camera, tmp_path):
         image, info = take(camera)
     assert (image.topic, info.topic) == ("/camera/image_raw", "/camera/camera_info")
     assert (
-        ns_from_stamp(image.message.header.stamp) == ns_from_stamp(info.message.header.stamp) == sent.stamp_realtime_ns
+        ns_from_stamp(image.message.header.stamp)
+        == ns_from_stamp(info.message.header.stamp)
+        == sent.stamp_realtime_ns
     )
     np.testing.assert_array_equal(rgb_image(image.message, "test"), sent.rgb)
     assert pinhole_from_camera_info(info.message).cx == 168.0
@@ -105,7 +109,9 @@ def test_camera_refuses_frames_it_is_not_calibrated_for(camera, tmp_path):
 
 
 def test_camera_subtracts_the_measured_latency(tmp_path):
-    calibration = load_calibration(CameraCalibration, TWIN / "camera.yaml").model_copy(update={"latency_s": 0.03})
+    calibration = load_calibration(CameraCalibration, TWIN / "camera.yaml").model_copy(
+        update={"latency_s": 0.03}
+    )
     config = CameraConfig.model_validate(
         {"source": {"kind": "socket", "path": tmp_path / "f"}, "calibration": TWIN / "camera.yaml"}
     )

@@ -39,9 +39,18 @@ def write_drive(folder, lost_frame=None, speed_mps=0.8):
         put("/policy/drive", drive_message(0.8, 0.1, stamp), stamp + 20_000_000)
         put("/safety/drive", drive_message(0.8, 0.1, stamp), stamp + 21_000_000)
         sent = types.MotorSent(
-            header=header(stamp), serial_write_mono_ns=0, serial_write_real_ns=stamp + 23_000_000, speed_mps=0.8,
-            steering_rad=0.1, erpm=0.0, servo=0.5, brake_current_a=0.0, braking=k == lost_frame, reason="", peer="TWIN",
-        )  # fmt: skip
+            header=header(stamp),
+            serial_write_mono_ns=0,
+            serial_write_real_ns=stamp + 23_000_000,
+            speed_mps=0.8,
+            steering_rad=0.1,
+            erpm=0.0,
+            servo=0.5,
+            brake_current_a=0.0,
+            braking=k == lost_frame,
+            reason="",
+            peer="TWIN",
+        )
         put("/motor/sent", sent, stamp + 23_000_000)
     writer.close()
     return folder / "bag"
@@ -79,8 +88,11 @@ def test_latency_is_from_capture_to_serial_write_and_braking_is_a_missed_frame(t
     np.testing.assert_allclose(times.capture_to_serial_ms, 23.0)
     assert (times.frames, times.missed) == (10, 1)
     assert {name: float(np.median(ms)) for name, ms in times.hops_ms.items()} == {
-        "camera": 10.0, "compositor": 12.0, "policy": 20.0, "safety": 21.0,
-    }  # fmt: skip
+        "camera": 10.0,
+        "compositor": 12.0,
+        "policy": 20.0,
+        "safety": 21.0,
+    }
 
 
 def test_frames_and_attacks_are_those_the_policy_saw(tmp_path):

@@ -26,7 +26,9 @@ class Car:
 
     def __init__(self, start, delay_s=0.1, wheels_off_rad=0.0, slow=1.0, armed=True, **config):
         config = ExpertNodeConfig(room="r", vehicle="v", **config)
-        self.node = ExpertNode(Expert(PATH, ExpertConfig(delay_s=0.0, stiffness_1pm=config.stiffness_1pm)), config)
+        self.node = ExpertNode(
+            Expert(PATH, ExpertConfig(delay_s=0.0, stiffness_1pm=config.stiffness_1pm)), config
+        )
         self.clock = ManualClock(mono_ns=10**10, real_ns=T0)
         self.x, self.y, self.yaw = start
         self.pipe = deque([(0.0, 0.0)] * round(delay_s / 0.01))
@@ -40,9 +42,17 @@ class Car:
             info = MessageInfo(now.mono_ns, now.mono_ns, instance_id=1)
             if step % 10 == 0:
                 state = types.SafetyState(
-                    header=header(0), armed=self.armed, stopping=False, reason="", source="", command_age_s=0.0,
-                    pose_age_s=0.0, answered_id="", granted=False, answer="",
-                )  # fmt: skip
+                    header=header(0),
+                    armed=self.armed,
+                    stopping=False,
+                    reason="",
+                    source="",
+                    command_age_s=0.0,
+                    pose_age_s=0.0,
+                    answered_id="",
+                    granted=False,
+                    answer="",
+                )
                 self.node.handle("/safety/state", state, info, now)
             pose = pose_message(planar_pose(self.x, self.y, self.yaw), now.real_ns)
             for topic, message in self.node.handle("/vicon/car", pose, info, now):
@@ -129,9 +139,17 @@ class Hand:
 
     def answer(self, ask_id):
         state = types.SafetyState(
-            header=header(0), armed=True, stopping=False, reason="", source="operator", command_age_s=0.0, pose_age_s=0.0,
-            answered_id=ask_id, granted=True, answer="armed",
-        )  # fmt: skip
+            header=header(0),
+            armed=True,
+            stopping=False,
+            reason="",
+            source="operator",
+            command_age_s=0.0,
+            pose_age_s=0.0,
+            answered_id=ask_id,
+            granted=True,
+            answer="armed",
+        )
         self.node.handle("/safety/state", state, MessageInfo(0, 0), self.clock.now())
 
 
@@ -144,7 +162,11 @@ def hand():
 
 def test_the_hand_goes_before_the_software_and_silence_is_letting_go(hand):
     ((_, state),) = hand.does(human=True, autonomy=True, throttle=0.5, steering=-1.0)
-    assert (state.mode, state.speed_mps, state.steering_rad) == ("human", pytest.approx(0.4), pytest.approx(-0.25))
+    assert (state.mode, state.speed_mps, state.steering_rad) == (
+        "human",
+        pytest.approx(0.4),
+        pytest.approx(-0.25),
+    )
     assert hand.tick()[0].message.mode == "human"
     assert hand.tick(0.15)[0].message.mode == "idle"
     ((_, state),) = hand.does(autonomy=True, throttle=1.0)

@@ -52,7 +52,9 @@ def test_a_policy_learns_from_foreign_pictures_in_their_colours(tmp_path, writer
     for index, image in enumerate(recording.frames.images):
         np.testing.assert_array_equal(image, VIEW.image(rgb_at(index)))
     assert recording.stamps_ns.tolist() == [START_NS + k * STEP_NS - 5_000_000 for k in range(COUNT)]
-    np.testing.assert_allclose(recording.frames.states[:, 0], [state_at(k)[0][0] for k in range(COUNT)], atol=1e-9)
+    np.testing.assert_allclose(
+        recording.frames.states[:, 0], [state_at(k)[0][0] for k in range(COUNT)], atol=1e-9
+    )
 
 
 def test_grey_pictures_train_and_other_encodings_are_one_line(tmp_path):
@@ -72,11 +74,32 @@ def test_grey_pictures_train_and_other_encodings_are_one_line(tmp_path):
 def test_the_commands_to_train_and_to_make_a_data_set_take_a_foreign_bag(tmp_path):
     bag = WRITERS["rosbags-sqlite3"](tmp_path / "drive", encoding="bgr8", pose_type=TRANSFORM)
     trained = advnerf(
-        "policy", "train", "--bags", bag, "--camera", CAMERA, "--room", ROOM, "--steps", 2, "--out", tmp_path / "policy"
+        "policy",
+        "train",
+        "--bags",
+        bag,
+        "--camera",
+        CAMERA,
+        "--room",
+        ROOM,
+        "--steps",
+        2,
+        "--out",
+        tmp_path / "policy",
     )
     assert trained.exit_code == 0, trained.output
     made = advnerf(
-        "scene", "from-bag", bag, "-o", tmp_path / "set", "--calibration", CAMERA, "--step", 0.01, "--margin", 2
+        "scene",
+        "from-bag",
+        bag,
+        "-o",
+        tmp_path / "set",
+        "--calibration",
+        CAMERA,
+        "--step",
+        0.01,
+        "--margin",
+        2,
     )
     assert made.exit_code == 0, made.output
     pictures = sorted((tmp_path / "set" / "images").rglob("*.png"))
@@ -93,7 +116,9 @@ def test_reference_frames_and_calibration_read_foreign_bags(tmp_path):
     pictures = list(read_pictures(bag.parent))
     assert [int(name) for name, _ in pictures] == [START_NS + k * STEP_NS - 5_000_000 for k in range(COUNT)]
     np.testing.assert_array_equal(pictures[1][1], rgb_at(1))
-    np.testing.assert_allclose(read_poses(bag, "/vicon/car").T[:, 1, 3], [state_at(k)[0][1] for k in range(COUNT)])
+    np.testing.assert_allclose(
+        read_poses(bag, "/vicon/car").T[:, 1, 3], [state_at(k)[0][1] for k in range(COUNT)]
+    )
 
 
 @pytest.mark.parametrize("writer", WRITERS)
@@ -122,7 +147,9 @@ def test_one_drive_in_four_formats_replays_to_the_same_bytes(tmp_path):
     digests = set()
     for writer, write in WRITERS.items():
         with Replay(write(tmp_path / writer, encoding="bgr8", pose_type=TRANSFORM), choice) as replay:
-            made = [entry for entry in replay if entry.made and not entry.message.topic.startswith("/status/")]
+            made = [
+                entry for entry in replay if entry.made and not entry.message.topic.startswith("/status/")
+            ]
         assert len(made) == 2 * COUNT
         digests.add(replay.summary.digest)
     assert len(digests) == 1
@@ -131,7 +158,14 @@ def test_one_drive_in_four_formats_replays_to_the_same_bytes(tmp_path):
 def test_a_whole_replay_of_a_foreign_bag_says_what_it_leaves_out(tmp_path):
     (tmp_path / "foreign.launch.yaml").write_text(REPLAYED)
     bag = WRITERS["rosbags-sqlite3"](tmp_path / "drive", pose_type=TRANSFORM)
-    arguments = ("--nodes", "compositor", "--launch", tmp_path / "foreign.launch.yaml", "-o", tmp_path / "again")
+    arguments = (
+        "--nodes",
+        "compositor",
+        "--launch",
+        tmp_path / "foreign.launch.yaml",
+        "-o",
+        tmp_path / "again",
+    )
     done = advnerf("replay", bag, *arguments)
     assert done.exit_code == 0, done.output
     assert "without /chatter (not in the topic table)" in " ".join(done.output.split())
@@ -159,7 +193,9 @@ def player(bag, run_dir, *arguments):
 
 @pytest.mark.parametrize("writer", ["rosbags-sqlite3", "ros1"])
 def test_a_foreign_bag_is_played_in_our_types_and_under_our_names(tmp_path, writer):
-    bag = WRITERS[writer](tmp_path / "drive", pose_type=TRANSFORM, image_type=COMPRESSED, image_topic="/front/image")
+    bag = WRITERS[writer](
+        tmp_path / "drive", pose_type=TRANSFORM, image_type=COMPRESSED, image_topic="/front/image"
+    )
     with Bus(tmp_path / "run") as bus:
         bus.subscribe("/vicon/car")
         bus.subscribe("/camera/image_raw", queue=50)
@@ -187,11 +223,17 @@ def test_a_foreign_bag_is_played_in_our_types_and_under_our_names(tmp_path, writ
         (["--offset", 99], "expected a start offset between 0 and 0.5 s"),
         (["--topics", "/nothing"], "has no topic /nothing; it has /camera/image_raw, /chatter, /vicon/car"),
         (["--topics", "/chatter"], "unknown topic '/chatter'; known are /camera/image_raw"),
-        (["--remap", "/vicon/car:=/odom"], "/vicon/car is geometry_msgs/msg/PoseStamped, expected nav_msgs/msg/Odometry"),
-        (["--topics", "/vicon/car", "--offset", 0.45, "--duration", 0.01], "has no message of /vicon/car after 0.45 s within 0.01 s"),
+        (
+            ["--remap", "/vicon/car:=/odom"],
+            "/vicon/car is geometry_msgs/msg/PoseStamped, expected nav_msgs/msg/Odometry",
+        ),
+        (
+            ["--topics", "/vicon/car", "--offset", 0.45, "--duration", 0.01],
+            "has no message of /vicon/car after 0.45 s within 0.01 s",
+        ),
         (["--wait-for", "/arm"], "cannot wait for subscribers of /arm, which is not played"),
     ],
-)  # fmt: skip
+)
 def test_a_wrong_wish_of_the_player_is_one_line_and_exit_code_2(tmp_path, arguments, said):
     process = player(WRITERS["mcap"](tmp_path / "drive"), tmp_path / "run", *arguments)
     _, errors = process.communicate(timeout=30)

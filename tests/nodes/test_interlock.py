@@ -13,16 +13,26 @@ from nodes.runtime.wire import MessageInfo
 pytestmark = pytest.mark.live
 
 # Import mode importlib: the bench of the compositor's own tests by its path.
-_SPEC = importlib.util.spec_from_file_location("compositor_bench", Path(__file__).with_name("test_compositor.py"))
+_SPEC = importlib.util.spec_from_file_location(
+    "compositor_bench", Path(__file__).with_name("test_compositor.py")
+)
 bench_of = importlib.util.module_from_spec(_SPEC)
 _SPEC.loader.exec_module(bench_of)
 
 
 def say(bench, armed):
     state = types.SafetyState(
-        header=header(0), armed=armed, stopping=not armed, reason="" if armed else "the car is outside the fence",
-        source="", command_age_s=0.0, pose_age_s=0.0, answered_id="", granted=False, answer="",
-    )  # fmt: skip
+        header=header(0),
+        armed=armed,
+        stopping=not armed,
+        reason="" if armed else "the car is outside the fence",
+        source="",
+        command_age_s=0.0,
+        pose_age_s=0.0,
+        answered_id="",
+        granted=False,
+        answer="",
+    )
     now = bench.clock.now()
     info = MessageInfo(now.mono_ns, now.mono_ns, instance_id=1)
     message = decode("advnerf_msgs/msg/SafetyState", encode(state))

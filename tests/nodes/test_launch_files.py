@@ -42,7 +42,11 @@ def test_a_real_screen_and_no_twin_are_two_options():
     screen = "monitor.display={kind: screen, index: 1, connector: HDMI-A-1}"
     plan = load_launch(LAUNCH / "monitor.launch.yaml", ["twin.if=false", screen])
     assert "twin" not in plan.nodes
-    assert plan.documents["monitor"].data["display"] == {"kind": "screen", "index": 1, "connector": "HDMI-A-1"}
+    assert plan.documents["monitor"].data["display"] == {
+        "kind": "screen",
+        "index": 1,
+        "connector": "HDMI-A-1",
+    }
 
 
 @pytest.mark.slow

@@ -21,7 +21,9 @@ from nodes.runtime.transfer import chunk_messages
 
 pytestmark = pytest.mark.live
 
-TARGET = load_calibration(TargetCalibration, Path(__file__).parents[2] / "calibration" / "twin" / "monitor.yaml")
+TARGET = load_calibration(
+    TargetCalibration, Path(__file__).parents[2] / "calibration" / "twin" / "monitor.yaml"
+)
 SQUARE = centre_square(TARGET)
 PANEL = make_panel((1920, 1080), TARGET)
 
@@ -29,11 +31,21 @@ PANEL = make_panel((1920, 1080), TARGET)
 def attack(seed=0, **changes):
     theta = np.random.default_rng(seed).normal(size=(8, 8, 3)).astype(np.float32)
     values = {
-        "method": "gradient", "theta": theta, "texture": face_texture(theta, 128), "size_m": (0.3362, 0.3362),
-        "T_world_from_object": np.eye(4), "subject": "monitor", "corners_in_subject": SQUARE.corners,
-        "camera": Pinhole(200, 66, 103.6, 103.4, 100, 32), "scene_sha256": "", "policy_sha256": "", "config_sha256": "",
-        "seed": seed, "predicted_total_cte_m": 1.0, "software_version": "0",
-    }  # fmt: skip
+        "method": "gradient",
+        "theta": theta,
+        "texture": face_texture(theta, 128),
+        "size_m": (0.3362, 0.3362),
+        "T_world_from_object": np.eye(4),
+        "subject": "monitor",
+        "corners_in_subject": SQUARE.corners,
+        "camera": Pinhole(200, 66, 103.6, 103.4, 100, 32),
+        "scene_sha256": "",
+        "policy_sha256": "",
+        "config_sha256": "",
+        "seed": seed,
+        "predicted_total_cte_m": 1.0,
+        "software_version": "0",
+    }
     return AttackFile.of_face(**{**values, **changes})
 
 
@@ -66,9 +78,21 @@ class Screen:
         self._note(self.node.handle(topic, decode(type_name(message), raw), info, self.clock.now()))
 
     def safety(self, armed, reason=""):
-        self.hear("/safety/state", types.SafetyState(
-            header=header(0), armed=armed, stopping=not armed, reason=reason, source="", command_age_s=0.0, pose_age_s=0.0, answered_id="", granted=False, answer="",
-        ))  # fmt: skip
+        self.hear(
+            "/safety/state",
+            types.SafetyState(
+                header=header(0),
+                armed=armed,
+                stopping=not armed,
+                reason=reason,
+                source="",
+                command_age_s=0.0,
+                pose_age_s=0.0,
+                answered_id="",
+                granted=False,
+                answer="",
+            ),
+        )
 
     def pass_time(self, ms):
         self.clock.advance(ms / 1e3)
@@ -178,9 +202,12 @@ def test_a_screen_that_changes_the_colours_ends_the_node(screen):
 
 @pytest.mark.parametrize(
     ("changes", "message"),
-    [({"subject": "board"}, "for board"), ({"size_m": (0.4, 0.4)}, "more than the 0.336 m"),
-     ({"corners_in_subject": SQUARE.corners + np.array([0.0, 0.1, 0.0])}, "10.0 cm from the middle")],
-)  # fmt: skip
+    [
+        ({"subject": "board"}, "for board"),
+        ({"size_m": (0.4, 0.4)}, "more than the 0.336 m"),
+        ({"corners_in_subject": SQUARE.corners + np.array([0.0, 0.1, 0.0])}, "10.0 cm from the middle"),
+    ],
+)
 def test_an_attack_that_does_not_fit_is_refused_at_the_start(screen, changes, message):
     with pytest.raises(CalibrationError, match=message):
         screen(attack(**changes))
@@ -197,7 +224,9 @@ def test_a_monitor_that_is_not_the_measured_one_is_refused():
 def test_the_centre_square_is_square_centred_and_in_the_panel():
     corners = SQUARE.corners
     np.testing.assert_allclose(corners.mean(axis=0), TARGET.corners.mean(axis=0), atol=1e-9)
-    np.testing.assert_allclose(np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1), 0.3362, atol=1e-6)
+    np.testing.assert_allclose(
+        np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1), 0.3362, atol=1e-6
+    )
     np.testing.assert_allclose(SQUARE.outward_normal, TARGET.outward_normal)
 
 

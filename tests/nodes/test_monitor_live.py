@@ -25,11 +25,21 @@ NODES = ("twin", "camera", "vicon", "compositor", "monitor", "policy", "safety",
 def red_attack(folder):
     target = load_calibration(TargetCalibration, ROOT / "calibration" / "twin" / "monitor.yaml")
     attack = AttackFile.of_face(
-        method="random", theta=np.zeros((4, 4, 3), np.float32), texture=np.full((64, 64, 3), (250, 0, 0), np.uint8),
-        size_m=(0.3362, 0.3362), T_world_from_object=np.eye(4), subject="monitor",
-        corners_in_subject=centre_square(target).corners, camera=Pinhole(200, 66, 103.6, 103.4, 100, 32), scene_sha256="",
-        policy_sha256="", config_sha256="", seed=0, predicted_total_cte_m=None, software_version="0",
-    )  # fmt: skip
+        method="random",
+        theta=np.zeros((4, 4, 3), np.float32),
+        texture=np.full((64, 64, 3), (250, 0, 0), np.uint8),
+        size_m=(0.3362, 0.3362),
+        T_world_from_object=np.eye(4),
+        subject="monitor",
+        corners_in_subject=centre_square(target).corners,
+        camera=Pinhole(200, 66, 103.6, 103.4, 100, 32),
+        scene_sha256="",
+        policy_sha256="",
+        config_sha256="",
+        seed=0,
+        predicted_total_cte_m=None,
+        software_version="0",
+    )
     save_attack(folder / "red.attack.safetensors", attack)
     return attack.attack_id, folder / "red.attack.safetensors"
 
@@ -46,7 +56,11 @@ def test_the_lab_camera_sees_the_attack_while_armed_and_not_before(tmp_path):
     ]
     start = (1.95, -0.5, 0.5 * np.pi)
     outcome = run_trial(
-        ROOT / "launch" / "monitor.launch.yaml", overrides, tmp_path / "run", TrialPlan(start, 1.5, NODES), 60.0
+        ROOT / "launch" / "monitor.launch.yaml",
+        overrides,
+        tmp_path / "run",
+        TrialPlan(start, 1.5, NODES),
+        60.0,
     )
     bag = tmp_path / "run" / "bag"
     before, armed = [], []

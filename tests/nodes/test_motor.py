@@ -50,7 +50,11 @@ class Drives:
         return outs
 
     def names(self):
-        return [e.name for e in self.emulator.events() if e.name not in ("GET_VALUES", "FW_VERSION", "GET_APPCONF")]
+        return [
+            e.name
+            for e in self.emulator.events()
+            if e.name not in ("GET_VALUES", "FW_VERSION", "GET_APPCONF")
+        ]
 
 
 @pytest.fixture

@@ -88,7 +88,9 @@ def test_a_car_nobody_has_seen_steering_is_not_ready(make):
     assert car.node.status()[0] == "starting"
 
 
-@pytest.mark.parametrize(("config", "vesc"), [({"steering_check": "never"}, {}), ({}, {"hardware_name": "TWIN"})])
+@pytest.mark.parametrize(
+    ("config", "vesc"), [({"steering_check": "never"}, {}), ({}, {"hardware_name": "TWIN"})]
+)
 def test_who_is_exempt(make, config, vesc):
     car = make(config, **vesc)
     car.settle(lambda: car.node.status()[1] == "latched: waiting for the safety node")
@@ -137,17 +139,23 @@ def drive(car, speed):
             steering_angle=0.0, steering_angle_velocity=0.0, speed=speed, acceleration=0.0, jerk=0.0
         ),
     )
-    return car.node.handle("/safety/drive", message, MessageInfo(now.mono_ns, now.mono_ns, instance_id=1), now)
+    return car.node.handle(
+        "/safety/drive", message, MessageInfo(now.mono_ns, now.mono_ns, instance_id=1), now
+    )
 
 
 def test_diagnostics_and_odometry_are_standard_messages(make):
     car = make({"battery_warning_v": 16.0})
     car.emulator.report_fault(3)
     car.settle(lambda: any(o.topic == "/odom" for o in car.outs))
-    car.settle(lambda: any(o.topic == "/diagnostics" and o.message.status[1].message for o in car.outs[-3:]), 3.0)
+    car.settle(
+        lambda: any(o.topic == "/diagnostics" and o.message.status[1].message for o in car.outs[-3:]), 3.0
+    )
     rows = car.rows()
     assert set(rows) == {"motor: controller", "motor: battery", "motor: time-out", "motor: steering"}
-    odometry = decode("nav_msgs/msg/Odometry", encode([o.message for o in car.outs if o.topic == "/odom"][-1]))
+    odometry = decode(
+        "nav_msgs/msg/Odometry", encode([o.message for o in car.outs if o.topic == "/odom"][-1])
+    )
     assert (odometry.header.frame_id, odometry.child_frame_id) == ("odom", "car")
     assert list(odometry.pose.covariance[[0, 7, 35]]) == [0.2, 0.2, 0.4]
 
@@ -286,7 +294,9 @@ def test_a_person_confirms_over_the_bus(tmp_path, answer, code, text):
             while not any(event.name == "GET_VALUES" for event in emulator.events()):
                 assert time.monotonic() < deadline
                 time.sleep(0.05)
-            done = CliRunner().invoke(app, ["motor", "check-steering", "--run-dir", str(tmp_path)], input=answer + "\n")
+            done = CliRunner().invoke(
+                app, ["motor", "check-steering", "--run-dir", str(tmp_path)], input=answer + "\n"
+            )
         finally:
             node.terminate()
             node.wait(10.0)

@@ -21,7 +21,9 @@ START_NS = 1_800_000_000_000_000_000
 @pytest.fixture
 def bag(tmp_path):
     """Two seconds: poses of the car at 50 Hz, of the board at 10 Hz, one request to arm, one status."""
-    arm = encode(types.Arm(header=header(START_NS), arm=True, source="person", reason="", ask_id="", age_ns=0))
+    arm = encode(
+        types.Arm(header=header(START_NS), arm=True, source="person", reason="", ask_id="", age_ns=0)
+    )
     with BagWriter(tmp_path / "bag") as writer:
         writer.write("/arm", arm, START_NS, START_NS, 0)
         for i in range(100):
@@ -96,7 +98,9 @@ def test_any_subscriber_will_do_when_none_is_named(bag):
 
 def test_a_recording_does_not_ask_for_an_attack(tmp_path):
     with BagWriter(tmp_path / "bag") as writer:
-        request = encode(types.AttackRequest(header=header(START_NS), request_id="a", request="", source="", ask_id=""))
+        request = encode(
+            types.AttackRequest(header=header(START_NS), request_id="a", request="", source="", ask_id="")
+        )
         cancel = encode(types.AttackCancel(header=header(START_NS), request_id="a", reason="", ask_id=""))
         for topic, data in (("/attack/request", request), ("/attack/cancel", cancel)):
             writer.write(topic, data, START_NS, START_NS, 0)
@@ -110,14 +114,20 @@ def test_a_recording_does_not_ask_for_an_attack(tmp_path):
 
 
 def test_requests_to_arm_are_played_only_when_asked_for(bag):
-    assert PlayerNode(PlayerConfig(bag=bag, topics=["/arm"]), lambda topic: 0).publications == ("/arm", "/player/state")
+    assert PlayerNode(PlayerConfig(bag=bag, topics=["/arm"]), lambda topic: 0).publications == (
+        "/arm",
+        "/player/state",
+    )
 
 
 def test_topics_that_nobody_here_knows_are_left_out_and_named(tmp_path):
     path = tmp_path / "a.mcap"
     writer = McapWriter(str(path))
     writer.start()
-    for topic, typename in (("/chatter", "std_msgs/msg/String"), ("/vicon/car", "geometry_msgs/msg/PoseStamped")):
+    for topic, typename in (
+        ("/chatter", "std_msgs/msg/String"),
+        ("/vicon/car", "geometry_msgs/msg/PoseStamped"),
+    ):
         channel = writer.register_channel(topic, "cdr", writer.register_schema(typename, "ros2msg", b""))
         cdr = encode(types.String(data="x") if topic == "/chatter" else pose_message(np.eye(4), START_NS))
         writer.add_message(channel, START_NS, cdr, START_NS)
@@ -130,7 +140,9 @@ def test_topics_that_nobody_here_knows_are_left_out_and_named(tmp_path):
 
 
 def test_wrong_choices_are_errors(bag, tmp_path):
-    with pytest.raises(BagError, match="has no topic /camera/image_raw; it has /arm, /vicon/board, /vicon/car"):
+    with pytest.raises(
+        BagError, match="has no topic /camera/image_raw; it has /arm, /vicon/board, /vicon/car"
+    ):
         PlayerNode(PlayerConfig(bag=bag, topics=["/camera/image_raw"]), lambda topic: 0)
     with pytest.raises(BagError, match="which is not played; played are /vicon/car"):
         PlayerNode(PlayerConfig(bag=bag, topics=["/vicon/car"], wait_for=["/arm"]), lambda topic: 0)

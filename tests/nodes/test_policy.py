@@ -148,7 +148,9 @@ clock = ManualClock(mono_ns=10**10, real_ns={T0} + 10**7)
 (out,) = node.handle("/compositor/image", image_message(np.load({str(tmp_path / "rgb.npy")!r}), {T0}, "c"), MessageInfo(10**10, 10**10), clock.now())
 print(out.message.drive.steering_angle)
 """
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=Path(__file__).parents[2])
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=Path(__file__).parents[2]
+    )
     assert done.returncode == 0, done.stderr
     goal = torch.tensor([[0.5, -1.0]])
     expected = float(_loaded(goal_size=2).policy(images_to_tensor(VIEW.image(_rgb())), goal)[0])

@@ -42,7 +42,9 @@ def write_bag(folder, poses, size=(188, 336)):
             if i % 5 == 0:
                 image = np.full((*size, 3), i, np.uint8)
                 stamp = t + 7 * MS
-                writer.write("/camera/image_raw", encode(image_message(image, stamp, "camera")), stamp, stamp, i // 5)
+                writer.write(
+                    "/camera/image_raw", encode(image_message(image, stamp, "camera")), stamp, stamp, i // 5
+                )
     return folder
 
 
@@ -87,7 +89,9 @@ def run_folder(folder, steer_path=None):
     states = about(room.reference_path)
     ramp = np.repeat(np.arange(188, dtype=np.uint8)[:, None, None], 336, 1).repeat(3, 2)
     poses = [planar_pose(*state) @ camera.mount for state in states]
-    write_posed_images(folder / "capture" / "held_out", poses, camera.pinhole, lambda i: ramp + np.uint8(i), "png")
+    write_posed_images(
+        folder / "capture" / "held_out", poses, camera.pinhole, lambda i: ramp + np.uint8(i), "png"
+    )
     grid = HashGridConfig(levels=2, features=2, log2_entries=8, coarsest=4, finest=8)
     scene = SceneField(SceneFieldConfig((-4.0, -4.0, 0.0), (4.0, 4.0, 2.5), grid=grid, hidden=16))
     (folder / "scene").mkdir()
@@ -151,7 +155,9 @@ def test_a_policy_is_driven_round_the_path_in_the_scene(tmp_path):
 
 
 def test_a_scene_gives_views_of_the_policys_own_size_and_drives(tmp_path):
-    folder = run_folder(tmp_path / "run", ReferencePath.from_segments((0.0, -2.0, 0.0), [Arc(2.0, np.pi / 2)] * 4))
+    folder = run_folder(
+        tmp_path / "run", ReferencePath.from_segments((0.0, -2.0, 0.0), [Arc(2.0, np.pi / 2)] * 4)
+    )
     calibration = folder / "capture" / "calibration"
     narrow = replace(VIEW, width=100)
     reference = from_scene(folder / "scene" / "scene.safetensors", calibration, narrow, count=6)
@@ -165,15 +171,19 @@ def test_the_command_fails_for_a_policy_that_does_not_drive_where_it_was_asked_t
     circle = ReferencePath.from_segments((0.0, -2.0, 0.0), [Arc(2.0, np.pi / 2)] * 4)
     folder = run_folder(tmp_path / "run", circle)
     for name, steering_rad in (("good", 0.1244), ("bad", -0.1)):
-        source = (
-            f"from test_policy_reference import circling\n\n\ndef factory():\n    return circling({steering_rad})\n"
-        )
+        source = f"from test_policy_reference import circling\n\n\ndef factory():\n    return circling({steering_rad})\n"
         (tmp_path / f"{name}.py").write_text(source)
-    for name, place, code in (("bad", ["--run-folder", str(folder)], 1), ("good", ["--run-folder", str(folder)], 0)):
+    for name, place, code in (
+        ("bad", ["--run-folder", str(folder)], 1),
+        ("good", ["--run-folder", str(folder)], 0),
+    ):
         done = subprocess.run(
-            [sys.executable, "-m", "nodes.cli", "policy", "check", f"{name}:factory", *place], cwd=tmp_path, text=True,
-            capture_output=True, env={**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{Path(__file__).parent}", "COLUMNS": "300"},
-        )  # fmt: skip
+            [sys.executable, "-m", "nodes.cli", "policy", "check", f"{name}:factory", *place],
+            cwd=tmp_path,
+            text=True,
+            capture_output=True,
+            env={**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{Path(__file__).parent}", "COLUMNS": "300"},
+        )
         assert done.returncode == code, done.stdout + done.stderr
         assert ("NO DRIVE" in done.stdout) == (code == 1)
 

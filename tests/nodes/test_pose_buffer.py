@@ -12,7 +12,9 @@ SPEED_MPS, RADIUS_M = 1.5, 1.0
 def on_circle(t_s):
     """A car at 1.5 m/s on a circle of 1 m."""
     angle = SPEED_MPS / RADIUS_M * t_s
-    T = make_transform(rotation_z(angle + np.pi / 2), [RADIUS_M * np.cos(angle), RADIUS_M * np.sin(angle), 0.0])
+    T = make_transform(
+        rotation_z(angle + np.pi / 2), [RADIUS_M * np.cos(angle), RADIUS_M * np.sin(angle), 0.0]
+    )
     return T @ make_transform(rotation_x(0.05), [0, 0, 0])
 
 
@@ -37,7 +39,9 @@ def test_interpolation_on_a_circle_is_off_by_the_sagitta_only():
     assert position.max() <= sagitta * 1.01  # 0.11 mm
     assert heading.max() < 1e-4
     # The newest pose instead would be off by millimetres.
-    newest = np.array([np.linalg.norm(on_circle(np.floor(t * 50) / 50)[:3, 3] - on_circle(t)[:3, 3]) for t in times])
+    newest = np.array(
+        [np.linalg.norm(on_circle(np.floor(t * 50) / 50)[:3, 3] - on_circle(t)[:3, 3]) for t in times]
+    )
     assert np.median(newest) > 100 * np.median(position)
 
 

@@ -26,7 +26,9 @@ def poses_of_drive(rng, count, period_s=0.01):
     for k in range(count):
         if k % 40 == 0:
             speed = rng.uniform(limits.speed_min_mps, limits.speed_max_mps)
-            car.command(servo=CAR.servo_from_steering(rng.uniform(limits.steering_min_rad, limits.steering_max_rad)))
+            car.command(
+                servo=CAR.servo_from_steering(rng.uniform(limits.steering_min_rad, limits.steering_max_rad))
+            )
             if rng.random() < 0.2:
                 car.command(brake_current_a=20.0)
             else:
@@ -54,9 +56,11 @@ def arrivals(rng, count, period_s, loss, hold_up_s):
 
 @settings(deadline=None, max_examples=25)
 @given(
-    seed=st.integers(0, 2**32 - 1), rate_hz=st.sampled_from([25.0, 50.0, 100.0, 250.0]), loss=st.floats(0.0, 0.3),
+    seed=st.integers(0, 2**32 - 1),
+    rate_hz=st.sampled_from([25.0, 50.0, 100.0, 250.0]),
+    loss=st.floats(0.0, 0.3),
     hold_up_s=st.floats(0.0, 0.08),
-)  # fmt: skip
+)
 def test_no_drive_is_impossible_whatever_the_network_does(seed, rate_hz, loss, hold_up_s):
     rng, check = np.random.default_rng(seed), PoseCheck(BOUNDS)
     truth = list(poses_of_drive(rng, 600, 1.0 / rate_hz))
@@ -68,9 +72,11 @@ def test_no_drive_is_impossible_whatever_the_network_does(seed, rate_hz, loss, h
 
 @settings(deadline=None, max_examples=60)
 @given(
-    seed=st.integers(0, 2**32 - 1), size_m=st.floats(0.05, 2.4), way_rad=st.floats(-math.pi, math.pi),
+    seed=st.integers(0, 2**32 - 1),
+    size_m=st.floats(0.05, 2.4),
+    way_rad=st.floats(-math.pi, math.pi),
     loss=st.floats(0.0, 0.02),
-)  # fmt: skip
+)
 def test_every_jump_is_caught_at_once(seed, size_m, way_rad, loss):
     rng, check = np.random.default_rng(seed), PoseCheck(BOUNDS)
     moment = int(rng.integers(50, 300))
@@ -113,7 +119,10 @@ def test_after_a_gap_nothing_is_known_and_a_gap_allows_what_can_happen_in_it():
     assert check.judge(10**9, planar_pose(2.0, 1.0, 2.0)) == ""  # occluded for a second
     assert check.judge(10**9 + 10_000_000, planar_pose(2.0, 1.0, 2.0)) == ""
     assert (
-        check.judge(10**9 + 160_000_000, planar_pose(2.0 + 0.15 * math.cos(2.0), 1.0 + 0.15 * math.sin(2.0), 2.0)) == ""
+        check.judge(
+            10**9 + 160_000_000, planar_pose(2.0 + 0.15 * math.cos(2.0), 1.0 + 0.15 * math.sin(2.0), 2.0)
+        )
+        == ""
     )
     assert "jumped" in check.judge(10**9 + 310_000_000, planar_pose(1.0, 1.0, 2.0))
 
@@ -128,7 +137,10 @@ def test_a_clock_that_goes_back():
 
 
 @settings(deadline=None, max_examples=50)
-@given(stamps=st.lists(st.integers(-(10**10), 10**10), max_size=30), xs=st.lists(st.floats(), min_size=30, max_size=30))
+@given(
+    stamps=st.lists(st.integers(-(10**10), 10**10), max_size=30),
+    xs=st.lists(st.floats(), min_size=30, max_size=30),
+)
 def test_nothing_makes_the_check_fail(stamps, xs):
     check = PoseCheck(BOUNDS)
     for stamp_ns, x in zip(stamps, xs, strict=False):

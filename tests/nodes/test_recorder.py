@@ -30,7 +30,9 @@ def context(tmp_path):
 def test_wire_bytes_and_all_times_go_into_the_bag_with_what_rides_along(tmp_path):
     (tmp_path / "launch.resolved.yaml").write_text("name: x\n")
     (tmp_path / "camera.yaml").write_text("fx: 1\n")
-    config = RecorderConfig(topics=["/vicon/car"], statuses_of=["camera"], attachments=[tmp_path / "camera.yaml"])
+    config = RecorderConfig(
+        topics=["/vicon/car"], statuses_of=["camera"], attachments=[tmp_path / "camera.yaml"]
+    )
     node = RecorderNode.build(config, context(tmp_path))
     assert node.subscriptions == ("/vicon/car", "/status/camera")
     cdr = encode(pose_message(np.eye(4), 5))

@@ -49,20 +49,45 @@ class Guard:
         stamp = self.now.real_ns
         for name in ("camera", "motor"):
             status = types.NodeStatus(
-                header=header(stamp), node=name, pid=1, state="ready", text="", subscriptions=[], publications=[],
-                subscribers=np.zeros(0, np.uint32), counter_names=[], counter_values=np.zeros(0),
-            )  # fmt: skip
+                header=header(stamp),
+                node=name,
+                pid=1,
+                state="ready",
+                text="",
+                subscriptions=[],
+                publications=[],
+                subscribers=np.zeros(0, np.uint32),
+                counter_names=[],
+                counter_values=np.zeros(0),
+            )
             self.say(f"/status/{name}", status)
         sent = types.MotorSent(
-            header=header(stamp), serial_write_mono_ns=0, serial_write_real_ns=0, speed_mps=0.0, steering_rad=0.0, erpm=0.0,
-            servo=0.5, brake_current_a=0.0, braking=True, reason="", peer=peer,
-        )  # fmt: skip
+            header=header(stamp),
+            serial_write_mono_ns=0,
+            serial_write_real_ns=0,
+            speed_mps=0.0,
+            steering_rad=0.0,
+            erpm=0.0,
+            servo=0.5,
+            brake_current_a=0.0,
+            braking=True,
+            reason="",
+            peer=peer,
+        )
         self.say("/motor/sent", sent)
         info = types.CameraInfo(
-            header=header(stamp), height=1, width=1, distortion_model="", d=np.zeros(5), k=np.zeros(9), r=np.zeros(9),
-            p=np.zeros(12), binning_x=0, binning_y=0,
+            header=header(stamp),
+            height=1,
+            width=1,
+            distortion_model="",
+            d=np.zeros(5),
+            k=np.zeros(9),
+            r=np.zeros(9),
+            p=np.zeros(12),
+            binning_x=0,
+            binning_y=0,
             roi=types.RegionOfInterest(x_offset=0, y_offset=0, height=0, width=0, do_rectify=False),
-        )  # fmt: skip
+        )
         self.say("/camera/camera_info", info)
         self.see_car()
         return self.say("/policy/drive", drive_message(speed, 0.1, stamp))
@@ -76,7 +101,9 @@ class Guard:
 
 
 def drives_of(outs):
-    return [(o.message.drive.speed, o.message.drive.steering_angle) for o in outs if o.topic == "/safety/drive"]
+    return [
+        (o.message.drive.speed, o.message.drive.steering_angle) for o in outs if o.topic == "/safety/drive"
+    ]
 
 
 def states_of(outs):
@@ -160,9 +187,17 @@ class Drive(Guard):
 
     def telemetry(self):
         return types.VescState(
-            header=header(self.now.real_ns), speed_mps=self.wheels, erpm=0.0, duty=0.0, input_voltage_v=15.0, motor_current_a=0.0,
-            input_current_a=0.0, mosfet_temperature_c=30.0, fault=0, fault_text="",
-        )  # fmt: skip
+            header=header(self.now.real_ns),
+            speed_mps=self.wheels,
+            erpm=0.0,
+            duty=0.0,
+            input_voltage_v=15.0,
+            motor_current_a=0.0,
+            input_current_a=0.0,
+            mosfet_temperature_c=30.0,
+            fault=0,
+            fault_text="",
+        )
 
     def everything_but_the_car(self, command):
         self.see_car = lambda *pose: None

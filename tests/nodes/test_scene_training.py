@@ -37,7 +37,9 @@ def ball(T: Array) -> NDArray[np.uint8]:
     under = b * b - o @ o + RADIUS**2
     hit = o + (-b - np.sqrt(np.maximum(under, 0.0)))[..., None] * d
     colour = (0.5 + 0.4 * np.sin(6.0 * hit)) * (under > 0.0)[..., None]
-    sums = np.concatenate([colour, (under > 0.0)[..., None]], axis=-1).reshape(40, 3, 40, 3, 4).mean(axis=(1, 3))
+    sums = (
+        np.concatenate([colour, (under > 0.0)[..., None]], axis=-1).reshape(40, 3, 40, 3, 4).mean(axis=(1, 3))
+    )
     sums[..., :3] /= np.maximum(sums[..., 3:], 1e-9)
     return np.rint(255 * sums).astype(np.uint8)
 
@@ -77,7 +79,10 @@ def test_a_box_larger_than_the_unit_cube_means_unbounded_unless_told_otherwise(t
     np.testing.assert_allclose(bounded.box_high_m, 4 * 0.5 / 0.33)
     assert not scene_field(request_for(tmp_path), dataclasses.replace(listed, aabb_scale=1.0)).contraction
     # Cameras outside the unit cube make the inner region larger.
-    far = [dataclasses.replace(f, T_world_from_camera=look_at([5.0, 0.0, 1.0], [0.0, 0.0, 0.0])) for f in listed.frames]
+    far = [
+        dataclasses.replace(f, T_world_from_camera=look_at([5.0, 0.0, 1.0], [0.0, 0.0, 0.0]))
+        for f in listed.frames
+    ]
     np.testing.assert_allclose(scene_field(request_for(tmp_path), listed.with_frames(far)).box_high_m, 5.0)
 
 
@@ -92,11 +97,14 @@ def test_unbounded_needs_no_box(tmp_path: Path) -> None:
     assert (given.box_low_m, given.box_high_m) == own
 
 
-@pytest.mark.parametrize(("preset", "aabb_scale", "sizes"), [
-    ("room", 1, (8, 4, 17, 16, 2048, 1)),
-    ("instant-ngp", 1, (16, 2, 19, 16, 2048, 4)),
-    ("instant-ngp", 2, (16, 2, 19, 16, 4096, 4)),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("preset", "aabb_scale", "sizes"),
+    [
+        ("room", 1, (8, 4, 17, 16, 2048, 1)),
+        ("instant-ngp", 1, (16, 2, 19, 16, 2048, 4)),
+        ("instant-ngp", 2, (16, 2, 19, 16, 4096, 4)),
+    ],
+)
 def test_presets_have_their_sizes_train_and_render(
     pictures: Path, preset: str, aabb_scale: int, sizes: tuple[int, ...]
 ) -> None:
@@ -106,7 +114,9 @@ def test_presets_have_their_sizes_train_and_render(
     grid = field.grid
     got = (grid.levels, grid.features, grid.log2_entries, grid.coarsest, grid.finest, field.direction_bands)
     assert got == sizes
-    march = MarchConfig(near_m=0.3, smallest_step_m=0.02, largest_step_m=0.1, step_growth=0.03, max_samples=200)
+    march = MarchConfig(
+        near_m=0.3, smallest_step_m=0.02, largest_step_m=0.1, step_growth=0.03, max_samples=200
+    )
     config = TrainConfig(steps=3, samples_per_step=2048, max_rays=256, occupancy_resolution=8, march=march)
     trained = train_scene(images, field, config)
     rgb, depth_m, alpha = FieldRenderer(trained.scene, trained.occupied, trained.march).render(
@@ -131,7 +141,9 @@ def test_alpha_that_is_opaque_everywhere_is_none(pictures: Path) -> None:
     assert not scene_training._transparent(opaque)
 
 
-def test_help_says_what_presets_are_for(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_help_says_what_presets_are_for(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(sys, "argv", ["advnerf", "scene", "train", "--help"])
     monkeypatch.setenv("COLUMNS", "200")
     with pytest.raises(SystemExit):
@@ -149,7 +161,18 @@ def test_pictures_with_alpha_are_learned_with_it_end_to_end(
 ) -> None:
     out = tmp_path / "learned"
     for arguments in (
-        ["train", pictures, "-o", out, "--steps", "200", "--box-low", *["-0.8"] * 3, "--box-high", *["0.8"] * 3],
+        [
+            "train",
+            pictures,
+            "-o",
+            out,
+            "--steps",
+            "200",
+            "--box-low",
+            *["-0.8"] * 3,
+            "--box-high",
+            *["0.8"] * 3,
+        ],
         ["render", out / "scene.safetensors", pictures, "--held-out", "-o", tmp_path / "views"],
     ):
         monkeypatch.setattr(sys, "argv", ["advnerf", "scene", *map(str, arguments)])
@@ -208,7 +231,9 @@ def test_options_of_intervals_reach_training_and_renderer(
     save_scene(scene, field, np.ones_like(occupied), metadata)
     small = (scene, pictures, "--size", 16, 16)
     assert (
-        run("eval", *small) == run("eval", *small, "--interval-scale", 1) != run("eval", *small, "--interval-scale", 20)
+        run("eval", *small)
+        == run("eval", *small, "--interval-scale", 1)
+        != run("eval", *small, "--interval-scale", 20)
     )
     run("render", *small, "--held-out", "-o", tmp_path / "fine")
     run("render", *small, "--held-out", "-o", tmp_path / "coarse", "--interval-scale", 20)

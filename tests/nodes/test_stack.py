@@ -48,7 +48,9 @@ def test_drive_reports_and_latency(stack):
     stack.drive(1.5)
     driving = [m for m in stack.sent if not m.braking]
     assert len(driving) >= 12
-    latencies = [m.serial_write_real_ns - (m.header.stamp.sec * 10**9 + m.header.stamp.nanosec) for m in driving]
+    latencies = [
+        m.serial_write_real_ns - (m.header.stamp.sec * 10**9 + m.header.stamp.nanosec) for m in driving
+    ]
     assert min(latencies) > 0
     assert sorted(latencies)[len(latencies) // 2] < 100e6
     assert driving[-1].speed_mps == pytest.approx(0.8, abs=0.01)

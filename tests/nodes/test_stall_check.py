@@ -48,7 +48,9 @@ def drive(seconds, command, jams=(), gate=None, dead_s=0.0, blind=(), seed=0):
     return None
 
 
-@pytest.mark.parametrize(("how", "words"), [("locked", "the car does not move"), ("spinning", "the wheels spin")])
+@pytest.mark.parametrize(
+    ("how", "words"), [("locked", "the car does not move"), ("spinning", "the wheels spin")]
+)
 @pytest.mark.parametrize("speed", [0.3, 0.8, -0.8, 1.3])
 def test_a_jam_is_found_in_its_time(how, words, speed):
     found_s, problem = drive(6.0, lambda t: speed, jams=[(3.0, how)])
@@ -59,9 +61,11 @@ def test_a_jam_is_found_in_its_time(how, words, speed):
 
 @settings(deadline=None, max_examples=20)
 @given(
-    speed=st.one_of(st.floats(0.0, 1.3), st.floats(-0.87, 0.0)), dead_s=st.floats(0.0, 0.6), seed=st.integers(0, 1000),
+    speed=st.one_of(st.floats(0.0, 1.3), st.floats(-0.87, 0.0)),
+    dead_s=st.floats(0.0, 0.6),
+    seed=st.integers(0, 1000),
     blind_s=st.floats(0.0, 0.25),
-)  # fmt: skip
+)
 def test_no_drive_is_a_stall(speed, dead_s, seed, blind_s):
     blind = [(2.0, 2.0 + blind_s), (2.4, 2.4 + blind_s)]
 

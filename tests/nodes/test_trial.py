@@ -18,7 +18,13 @@ class Stage:
 
     def __init__(self, peer="TWIN v1", moves=True, **plan):
         self.node = TrialNode(TrialPlan(START, 1.0, ("camera", "motor"), **plan))
-        self.t_s, self.pose, self.armed, self.reason, self.sent = 0.0, np.array([0.0, 0.0, 1.0]), False, "", []
+        self.t_s, self.pose, self.armed, self.reason, self.sent = (
+            0.0,
+            np.array([0.0, 0.0, 1.0]),
+            False,
+            "",
+            [],
+        )
         self.peer, self.moves, self.requests = peer, moves, []
         self.answered_id, self.granted, self.grants, self.hears = "", False, True, True
 
@@ -37,9 +43,17 @@ class Stage:
         T = planar_pose(self.pose[0] + jitter, self.pose[1], self.pose[2])
         self.hear("/vicon/car", pose_message(T, self.now.real_ns))
         state = types.SafetyState(
-            header=header(self.now.real_ns), armed=self.armed, stopping=not self.armed, reason=self.reason, source="",
-            command_age_s=0.0, pose_age_s=0.0, answered_id=self.answered_id, granted=self.granted, answer="",
-        )  # fmt: skip
+            header=header(self.now.real_ns),
+            armed=self.armed,
+            stopping=not self.armed,
+            reason=self.reason,
+            source="",
+            command_age_s=0.0,
+            pose_age_s=0.0,
+            answered_id=self.answered_id,
+            granted=self.granted,
+            answer="",
+        )
         self.hear("/safety/state", state)
         for topic, message in self.node.tick(self.now):
             self.sent.append(topic)
@@ -54,9 +68,18 @@ class Stage:
         for name in ("camera", "motor"):
             self.hear(f"/status/{name}", status(name, "active"))
         sent = types.MotorSent(
-            header=header(0), serial_write_mono_ns=0, serial_write_real_ns=0, speed_mps=0.0, steering_rad=0.0, erpm=0.0,
-            servo=0.5, brake_current_a=0.0, braking=True, reason="", peer=self.peer,
-        )  # fmt: skip
+            header=header(0),
+            serial_write_mono_ns=0,
+            serial_write_real_ns=0,
+            speed_mps=0.0,
+            steering_rad=0.0,
+            erpm=0.0,
+            servo=0.5,
+            brake_current_a=0.0,
+            braking=True,
+            reason="",
+            peer=self.peer,
+        )
         self.hear("/motor/sent", sent)
 
     def run_until(self, phase, limit_s=30.0):
@@ -68,9 +91,17 @@ class Stage:
 def status(node, state):
     none = np.zeros(0)
     return types.NodeStatus(
-        header=header(0), node=node, pid=1, state=state, text="", subscriptions=[], publications=[],
-        subscribers=none.astype(np.uint32), counter_names=[], counter_values=none,
-    )  # fmt: skip
+        header=header(0),
+        node=node,
+        pid=1,
+        state=state,
+        text="",
+        subscriptions=[],
+        publications=[],
+        subscribers=none.astype(np.uint32),
+        counter_names=[],
+        counter_values=none,
+    )
 
 
 def test_a_trial_places_arms_drives_for_its_time_and_disarms():

@@ -62,10 +62,21 @@ def attack_file(folder, seed):
     theta = np.random.default_rng(seed).normal(size=(4, 4, 3)).astype(np.float32)
     corners = [[0.0, y, z] for y, z in ((-0.5, 0.5), (0.5, 0.5), (0.5, -0.5), (-0.5, -0.5))]
     attack = AttackFile.of_face(
-        method="random", theta=theta, texture=face_texture(theta, 16), size_m=(1.0, 1.0), T_world_from_object=np.eye(4),
-        subject="board", corners_in_subject=np.array(corners), camera=Pinhole(200, 66, 103.6, 103.4, 100, 32),
-        scene_sha256="", policy_sha256="", config_sha256="", seed=seed, predicted_total_cte_m=None, software_version="0",
-    )  # fmt: skip
+        method="random",
+        theta=theta,
+        texture=face_texture(theta, 16),
+        size_m=(1.0, 1.0),
+        T_world_from_object=np.eye(4),
+        subject="board",
+        corners_in_subject=np.array(corners),
+        camera=Pinhole(200, 66, 103.6, 103.4, 100, 32),
+        scene_sha256="",
+        policy_sha256="",
+        config_sha256="",
+        seed=seed,
+        predicted_total_cte_m=None,
+        software_version="0",
+    )
     save_attack(folder / f"{seed}.safetensors", attack)
     return folder / f"{seed}.safetensors", attack.attack_id
 
@@ -73,10 +84,16 @@ def attack_file(folder, seed):
 def series(tmp_path, folder="trials", **changes):
     files = [attack_file(tmp_path, seed)[0] for seed in range(3)]
     arguments = {
-        "attacks": {"random": files[:1], "gradient": files[1:]}, "repeats": 3, "seed": 0, "ticks": 60, **changes,
-    }  # fmt: skip
+        "attacks": {"random": files[:1], "gradient": files[1:]},
+        "repeats": 3,
+        "seed": 0,
+        "ticks": 60,
+        **changes,
+    }
     calibration = [f"params.calibration={ROOT / 'calibration' / 'twin'}"]
-    return prepare_series(ROOT / "launch" / "green_screen.launch.yaml", calibration, tmp_path / folder, **arguments)
+    return prepare_series(
+        ROOT / "launch" / "green_screen.launch.yaml", calibration, tmp_path / folder, **arguments
+    )
 
 
 def test_attack_files_of_a_condition_take_turns_and_the_plan_is_kept(tmp_path):
@@ -91,7 +108,9 @@ def test_attack_files_of_a_condition_take_turns_and_the_plan_is_kept(tmp_path):
     assert made.plan.start_pose == (-1.1, -2.0, 0.0)
 
 
-@pytest.mark.parametrize("changed", [{"seed": 1}, {"ticks": 40}, {"repeats": 4}, {"start_pose": (0.0, -2.0, 0.0)}])
+@pytest.mark.parametrize(
+    "changed", [{"seed": 1}, {"ticks": 40}, {"repeats": 4}, {"start_pose": (0.0, -2.0, 0.0)}]
+)
 def test_a_folder_is_finished_as_it_was_begun(tmp_path, changed):
     series(tmp_path)
     with pytest.raises(CampaignError, match="the settings of a series cannot change"):
@@ -116,7 +135,9 @@ def test_a_launch_file_that_cannot_be_measured_is_refused(tmp_path):
 
 def two_hosts(tmp_path, host, *overrides):
     settings = [f"params.calibration={ROOT / 'calibration' / 'twin'}", "keys=keys", *overrides]
-    return prepare_series(ROOT / "launch" / "two_hosts.launch.yaml", settings, tmp_path / "t", {}, 2, 0, 60, None, host)
+    return prepare_series(
+        ROOT / "launch" / "two_hosts.launch.yaml", settings, tmp_path / "t", {}, 2, 0, 60, None, host
+    )
 
 
 def test_of_two_hosts_the_operators_drives_the_trials_and_waits_for_the_nodes_of_both(tmp_path):
@@ -135,7 +156,11 @@ def test_of_two_hosts_the_operators_drives_the_trials_and_waits_for_the_nodes_of
         (None, [], "expected --host with one of"),
         ("tractor", [], "expected --host with one of"),
         ("robot", [], "trials to run on the operator's host, workstation; got --host robot"),
-        ("workstation", ["record.host=robot"], "expected the bags of trials on workstation, but robot records"),
+        (
+            "workstation",
+            ["record.host=robot"],
+            "expected the bags of trials on workstation, but robot records",
+        ),
         ("workstation", ["record=false"], "expected the key record"),
     ],
 )
@@ -148,7 +173,9 @@ def test_the_table_divides_by_no_attack():
     def result(condition, total):
         return {"condition": condition, "total_cte_m": total, "off_track": total > 9, "stopped_early": ""}
 
-    rows = summarise([result("gradient", 10.0), result("none", 2.0), result("gradient", 14.0), result("none", 4.0)])
+    rows = summarise(
+        [result("gradient", 10.0), result("none", 2.0), result("gradient", 14.0), result("none", 4.0)]
+    )
     assert [row["condition"] for row in rows] == ["none", "gradient"]
     assert rows[1]["mean_m"] == 12.0
     assert rows[1]["std_m"] == pytest.approx(np.sqrt(8.0))
@@ -170,9 +197,21 @@ def write_bag(folder, drives, offset_m=0.1, rate_hz=100):
 
     def state(armed, reason=""):
         stamp = START_NS + round(t * 1e9)
-        put("/safety/state", types.SafetyState(
-            header=header(stamp), armed=armed, stopping=not armed, reason=reason, source="", command_age_s=0.0, pose_age_s=0.0, answered_id="", granted=False, answer="",
-        ))  # fmt: skip
+        put(
+            "/safety/state",
+            types.SafetyState(
+                header=header(stamp),
+                armed=armed,
+                stopping=not armed,
+                reason=reason,
+                source="",
+                command_age_s=0.0,
+                pose_age_s=0.0,
+                answered_id="",
+                granted=False,
+                answer="",
+            ),
+        )
 
     for stand_s, drive_s, reason in drives:
         state(False, "not armed since the start")
@@ -191,7 +230,9 @@ def write_bag(folder, drives, offset_m=0.1, rate_hz=100):
 
 
 def test_the_numbers_of_a_bag_follow_from_the_bag_alone(tmp_path):
-    bag = write_bag(tmp_path, [(1.0, 2.2, "disarmed by trial: trial is over"), (0.5, 1.0, "outside the fence")])
+    bag = write_bag(
+        tmp_path, [(1.0, 2.2, "disarmed by trial: trial is over"), (0.5, 1.0, "outside the fence")]
+    )
     whole, broken = evaluate_bag(bag, None, ticks=20)
     # On the straight the error is the offset at each of the 20 ticks, and the held one after an early stop too.
     assert whole["total_cte_m"] == pytest.approx(20 * 0.1, abs=1e-6)
@@ -203,7 +244,9 @@ def test_the_numbers_of_a_bag_follow_from_the_bag_alone(tmp_path):
     assert (first.start_real_ns - START_NS) / 1e9 == pytest.approx(1.02, abs=0.011)
     np.testing.assert_allclose(np.array(whole["states"])[:, 1], -1.9, atol=1e-9)
     path = DrivingPath.rounded_square(4.0, 1.1)
-    np.testing.assert_allclose(whole["cte_m"], path.project(np.array(whole["states"])[:, :2]).cte_m, atol=1e-9)
+    np.testing.assert_allclose(
+        whole["cte_m"], path.project(np.array(whole["states"])[:, :2]).cte_m, atol=1e-9
+    )
 
 
 def test_numbers_of_a_bag_without_checksums_are_unchecked(tmp_path):
@@ -244,9 +287,14 @@ def test_a_series_on_the_twin_counts_what_its_bags_say_and_goes_on(tmp_path):
     calibration = [f"params.calibration={ROOT / 'calibration' / 'twin'}", "params.vicon_port=52871"]
     stands_in = ["policy.module=benchmarks.straight_policy", "policy.speed_mps=0.5"]
     made = prepare_series(
-        ROOT / "launch" / "green_screen.launch.yaml", calibration + stands_in, tmp_path / "t",
-        {"random": [attack_file(tmp_path, 0)[0]]}, 1, 0, 10,
-    )  # fmt: skip
+        ROOT / "launch" / "green_screen.launch.yaml",
+        calibration + stands_in,
+        tmp_path / "t",
+        {"random": [attack_file(tmp_path, 0)[0]]},
+        1,
+        0,
+        10,
+    )
     begun = []
     drive_series(made, 60.0, lambda run: begun.append(run.name), print)
     assert len(begun) == 2
@@ -265,13 +313,19 @@ def test_trials_from_the_workstation_drive_the_car_of_the_other_host(tmp_path):
     watch, drive = free_ports(2)
     keys = {host: f"keys={folder}" for host, folder in exchange_keys(tmp_path).items()}
     shared = [
-        f"params.calibration={ROOT / 'calibration' / 'twin'}", "params.image_topic=/camera/image_raw",
-        f"params.vicon_port={vicon}", "policy.module=benchmarks.straight_policy", "policy.speed_mps=0.6",
-        f"hosts.robot.watch_port={watch}", f"hosts.robot.drive_port={drive}",
-    ]  # fmt: skip
+        f"params.calibration={ROOT / 'calibration' / 'twin'}",
+        "params.image_topic=/camera/image_raw",
+        f"params.vicon_port={vicon}",
+        "policy.module=benchmarks.straight_policy",
+        "policy.speed_mps=0.6",
+        f"hosts.robot.watch_port={watch}",
+        f"hosts.robot.drive_port={drive}",
+    ]
     car = [
-        "twin.if=true", "camera.source={kind: socket, path: '${socket_dir}/frames'}", "motor.port=${run_dir}/vesc",
-    ]  # fmt: skip
+        "twin.if=true",
+        "camera.source={kind: socket, path: '${socket_dir}/frames'}",
+        "motor.port=${run_dir}/vesc",
+    ]
     ready = ["safety.nodes=[camera, vicon, policy, motor]"]
     with Launch(file, [*shared, *car, *ready, keys["robot"]], tmp_path / "car", host="robot"):
         series = prepare_series(

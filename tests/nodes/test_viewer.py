@@ -58,7 +58,9 @@ def test_a_real_client_gets_the_published_bytes_and_the_schema(tmp_path):
             opcode, number, _ = struct.unpack_from("<BIQ", data)
             assert (opcode, number) == (MESSAGE_DATA, 5)
             assert data[13:] == encode(message)
-            np.testing.assert_array_equal(rgb_image(decode("sensor_msgs/msg/Image", data[13:]), "test"), PIXELS)
+            np.testing.assert_array_equal(
+                rgb_image(decode("sensor_msgs/msg/Image", data[13:]), "test"), PIXELS
+            )
             assert node.status()[0] == "active"
     finally:
         node.close()

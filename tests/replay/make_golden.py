@@ -68,11 +68,21 @@ def attack_bytes(folder: Path) -> bytes:
     texture[:, ::4] = (200, 40, 120)
     texture[:, :16, 1] += 150
     attack = AttackFile.of_face(
-        method="gradient", theta=np.zeros((4, 4, 3), np.float32), texture=texture, size_m=(1.0, 1.0),
-        T_world_from_object=board_pose(), subject="board", corners_in_subject=np.array(CORNERS_M),
-        camera=Pinhole(WIDTH, HEIGHT, 24.0, 24.0, 24.0, 13.5), scene_sha256="", policy_sha256="", config_sha256="", seed=0,
-        predicted_total_cte_m=1.0, software_version="0",
-    )  # fmt: skip
+        method="gradient",
+        theta=np.zeros((4, 4, 3), np.float32),
+        texture=texture,
+        size_m=(1.0, 1.0),
+        T_world_from_object=board_pose(),
+        subject="board",
+        corners_in_subject=np.array(CORNERS_M),
+        camera=Pinhole(WIDTH, HEIGHT, 24.0, 24.0, 24.0, 13.5),
+        scene_sha256="",
+        policy_sha256="",
+        config_sha256="",
+        seed=0,
+        predicted_total_cte_m=1.0,
+        software_version="0",
+    )
     path = folder / "corner.attack.safetensors"
     save_attack(path, attack)
     return path.read_bytes()
@@ -101,7 +111,9 @@ def _fill(writer: BagWriter) -> None:
         if ms % 20 == 0:
             for topic, T in (("/vicon/car", car_pose(ms)), ("/vicon/board", board_pose())):
                 pose_ns = START_NS + ms * MS
-                writer.write(topic, encode(pose_message(T, pose_ns)), pose_ns + 2 * MS, pose_ns + MS, ms // 20)
+                writer.write(
+                    topic, encode(pose_message(T, pose_ns)), pose_ns + 2 * MS, pose_ns + MS, ms // 20
+                )
         if ms % 100 == 35:
             # Captured 10 ms between two poses, received 15 ms after its capture.
             capture_ns = START_NS + (ms - 5) * MS

@@ -26,39 +26,93 @@ def sample(typename, stamp_ns):
     image = np.random.default_rng(stamp_ns % 1000).integers(0, 255, (20, 30, 3), np.uint8)
     made = {
         "sensor_msgs/msg/Image": lambda: image_message(image, stamp_ns, "camera"),
-        "sensor_msgs/msg/CameraInfo": lambda: camera_info_message(Pinhole(30, 20, 9, 9, 15, 10), stamp_ns, "camera"),
+        "sensor_msgs/msg/CameraInfo": lambda: camera_info_message(
+            Pinhole(30, 20, 9, 9, 15, 10), stamp_ns, "camera"
+        ),
         "geometry_msgs/msg/PoseStamped": lambda: pose_message(np.eye(4), stamp_ns),
         "ackermann_msgs/msg/AckermannDriveStamped": lambda: drive_message(0.8, 0.1, stamp_ns),
-        "advnerf_msgs/msg/AttackStamp": lambda: types.AttackStamp(header=h, attack_id="abc", drawn=True, reason=""),
-        "advnerf_msgs/msg/Arm": lambda: types.Arm(header=h, arm=True, source="test", reason="because", ask_id="a", age_ns=1),
+        "advnerf_msgs/msg/AttackStamp": lambda: types.AttackStamp(
+            header=h, attack_id="abc", drawn=True, reason=""
+        ),
+        "advnerf_msgs/msg/Arm": lambda: types.Arm(
+            header=h, arm=True, source="test", reason="because", ask_id="a", age_ns=1
+        ),
         "advnerf_msgs/msg/SafetyState": lambda: types.SafetyState(
-            header=h, armed=True, stopping=False, reason="", source="test", command_age_s=0.1, pose_age_s=0.01, answered_id="", granted=False, answer=""
+            header=h,
+            armed=True,
+            stopping=False,
+            reason="",
+            source="test",
+            command_age_s=0.1,
+            pose_age_s=0.01,
+            answered_id="",
+            granted=False,
+            answer="",
         ),
         "advnerf_msgs/msg/MotorSent": lambda: types.MotorSent(
-            header=h, serial_write_mono_ns=1, serial_write_real_ns=2, speed_mps=0.8, steering_rad=0.1, erpm=3691.0,
-            servo=0.5, brake_current_a=0.0, braking=False, reason="", peer="twin",
+            header=h,
+            serial_write_mono_ns=1,
+            serial_write_real_ns=2,
+            speed_mps=0.8,
+            steering_rad=0.1,
+            erpm=3691.0,
+            servo=0.5,
+            brake_current_a=0.0,
+            braking=False,
+            reason="",
+            peer="twin",
         ),
         "advnerf_msgs/msg/VescState": lambda: types.VescState(
-            header=h, speed_mps=0.8, erpm=3691.0, duty=0.1, input_voltage_v=12.0, motor_current_a=1.0,
-            input_current_a=0.5, mosfet_temperature_c=30.0, fault=0, fault_text="",
+            header=h,
+            speed_mps=0.8,
+            erpm=3691.0,
+            duty=0.1,
+            input_voltage_v=12.0,
+            motor_current_a=1.0,
+            input_current_a=0.5,
+            mosfet_temperature_c=30.0,
+            fault=0,
+            fault_text="",
         ),
         "advnerf_msgs/msg/AttackRequest": lambda: types.AttackRequest(
             header=h, request_id="a", request="horizon: 1", source="", ask_id="x"
         ),
-        "advnerf_msgs/msg/AttackCancel": lambda: types.AttackCancel(header=h, request_id="", reason="enough", ask_id="x"),
+        "advnerf_msgs/msg/AttackCancel": lambda: types.AttackCancel(
+            header=h, request_id="", reason="enough", ask_id="x"
+        ),
         "advnerf_msgs/msg/AttackProgress": lambda: types.AttackProgress(
-            header=h, request_id="a", state="searching", text="", seed=0, evaluation=1, evaluations=2, loss_m=-1.0,
-            total_cte_m=1.0, best_total_cte_m=1.0, clean_total_cte_m=0.5, clean_drives=True, seconds=0.1, attack_id="",
+            header=h,
+            request_id="a",
+            state="searching",
+            text="",
+            seed=0,
+            evaluation=1,
+            evaluations=2,
+            loss_m=-1.0,
+            total_cte_m=1.0,
+            best_total_cte_m=1.0,
+            clean_total_cte_m=0.5,
+            clean_drives=True,
+            seconds=0.1,
+            attack_id="",
             answered_id="x",
         ),
         "advnerf_msgs/msg/FileChunk": lambda: types.FileChunk(
             header=h, name="a", sha256="ab", size_bytes=3, index=0, count=1, data=np.arange(3, dtype=np.uint8)
         ),
         "advnerf_msgs/msg/NodeStatus": lambda: types.NodeStatus(
-            header=h, node="x", pid=1, state="active", text="", subscriptions=["/arm"], publications=[],
-            subscribers=np.zeros(0, np.uint32), counter_names=["n"], counter_values=np.array([1.0]),
+            header=h,
+            node="x",
+            pid=1,
+            state="active",
+            text="",
+            subscriptions=["/arm"],
+            publications=[],
+            subscribers=np.zeros(0, np.uint32),
+            counter_names=["n"],
+            counter_values=np.array([1.0]),
         ),
-    }  # fmt: skip
+    }
     return encode(made[typename]() if typename in made else nothing(typename))
 
 

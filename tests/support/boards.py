@@ -18,7 +18,9 @@ def corners(board=BOARD):
 def seen(T_camera_from_board, matrix, distortion, size, rng, noise_px=0.1, board=BOARD):
     points = corners(board)
     inside = points @ T_camera_from_board[:3, :3].T + T_camera_from_board[:3, 3]
-    pixels = cv2.projectPoints(inside, np.zeros(3), np.zeros(3), matrix, np.asarray(distortion))[0].reshape(-1, 2)
+    pixels = cv2.projectPoints(inside, np.zeros(3), np.zeros(3), matrix, np.asarray(distortion))[0].reshape(
+        -1, 2
+    )
     pixels += rng.normal(0.0, noise_px, pixels.shape)
     keep = (inside[:, 2] > 0.1) & (pixels > 1.0).all(axis=1) & (pixels < np.array(size) - 1.0).all(axis=1)
     return Detection(points[keep], pixels[keep]) if keep.sum() >= 6 else None
@@ -39,8 +41,10 @@ def board_views(rng, count, matrix, distortion, size, tilt_rad=0.5, noise_px=0.1
         pixel = rng.uniform([0.1, 0.1], [0.9, 0.9]) * size
         ray = np.array(
             [(pixel[0] - matrix[0, 2]) / matrix[0, 0], (pixel[1] - matrix[1, 2]) / matrix[1, 1], 1.0]
-        )  # fmt: skip
-        R = Rotation.from_euler("xyz", [*rng.uniform(-tilt_rad, tilt_rad, 2), rng.uniform(-0.3, 0.3)]).as_matrix()
+        )
+        R = Rotation.from_euler(
+            "xyz", [*rng.uniform(-tilt_rad, tilt_rad, 2), rng.uniform(-0.3, 0.3)]
+        ).as_matrix()
         found = seen(make_transform(R, ray * depth - R @ middle), matrix, distortion, size, rng, noise_px)
         if found is not None and len(found.pixels) >= 12:
             views.append(found)

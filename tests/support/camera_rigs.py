@@ -71,7 +71,9 @@ class ZedRig(V4l2Rig):
     def __init__(self, tmp_path):
         self.format = "YUYV"
         self.conf = tmp_path / "SN1.conf"
-        self.conf.write_text("[LEFT_CAM_VGA]\nfx=350\nfy=350\ncx=335\ncy=187\nk1=-0.17\nk2=0.02\n", encoding="utf-8")
+        self.conf.write_text(
+            "[LEFT_CAM_VGA]\nfx=350\nfy=350\ncx=335\ncy=187\nk1=-0.17\nk2=0.02\n", encoding="utf-8"
+        )
         self.device = VideoDevice(formats={"YUYV": [(1344, 376)]}, controls={}, extension=ZedRegisters())
         self.port = VideoPortEmulator({PATH: self.device})
         self.camera = ZedCamera(PATH, self.conf, rate_hz=None, port=self.port)

@@ -25,7 +25,7 @@ def program(car=CAR, speeds=(0.6, 1.0), angles=(0.0, 0.25, -0.22, 0.12, -0.12), 
 
 def drive(
     rng, rows=None, car=CAR, delay_s=0.03, mocap=(0.0005, 0.001), ahead_m=0.0, turned_rad=0.0, pipeline_s=0.04
-):  # fmt: skip
+):
     """The commands reach the actuators ``delay_s`` after they were written; the subject's origin is ``ahead_m`` before the axle."""
     rows = program(car) if rows is None else rows
     ends = np.cumsum([row[0] for row in rows])
@@ -33,7 +33,10 @@ def drive(
     which = np.searchsorted(ends, command_s, side="right")
     servo, erpm = (np.array([rows[k][column] for k in which], float) for column in (1, 2))
     vehicle, poses = TwinVehicle(car), []
-    events = sorted([(t + delay_s, 0, k) for k, t in enumerate(command_s)] + [(t, 1, 0) for t in np.arange(0.0, ends[-1], POSE_PERIOD_S)])  # fmt: skip
+    events = sorted(
+        [(t + delay_s, 0, k) for k, t in enumerate(command_s)]
+        + [(t, 1, 0) for t in np.arange(0.0, ends[-1], POSE_PERIOD_S)]
+    )
     now = 0.0
     for when, kind, k in events:
         vehicle.advance(max(when - now, 0.0))
@@ -48,5 +51,7 @@ def drive(
     seen = np.array(poses)
     yaw = np.unwrap(seen[:, 3])
     x, y = seen[:, 1] + ahead_m * np.cos(yaw), seen[:, 2] + ahead_m * np.sin(yaw)
-    noisy = np.stack([x, y, yaw + turned_rad], axis=1) + rng.normal(0.0, [mocap[0], mocap[0], mocap[1]], (len(yaw), 3))
+    noisy = np.stack([x, y, yaw + turned_rad], axis=1) + rng.normal(
+        0.0, [mocap[0], mocap[0], mocap[1]], (len(yaw), 3)
+    )
     return Drive(seen[:, 0], noisy, command_s, servo, erpm, np.full(len(servo), pipeline_s))

@@ -19,13 +19,20 @@ ROS1_STORE, HUMBLE = get_typestore(Stores.ROS1_NOETIC), get_typestore(Stores.ROS
 def rgb_at(index, height=188, width=336):
     """A picture without symmetry in its colours."""
     rows, columns = np.mgrid[0:height, 0:width]
-    return np.stack([(rows + 7 * index) % 256, columns * 255 // width, 200 - rows // 2], axis=2).astype(np.uint8)
+    return np.stack([(rows + 7 * index) % 256, columns * 255 // width, 200 - rows // 2], axis=2).astype(
+        np.uint8
+    )
 
 
 def state_at(index):
     """Position and quaternion (x, y, z, w) of the car, near the path of the simulated lab."""
     angle = 0.05 * index
-    return (0.2 * index - 0.5, 0.03 * index - 2.0, 0.02), (0.0, 0.0, float(np.sin(angle / 2)), float(np.cos(angle / 2)))
+    return (0.2 * index - 0.5, 0.03 * index - 2.0, 0.02), (
+        0.0,
+        0.0,
+        float(np.sin(angle / 2)),
+        float(np.cos(angle / 2)),
+    )
 
 
 class Make:
@@ -49,13 +56,20 @@ class Make:
         rows = pixels.reshape(len(rgb), -1)
         rows = np.hstack([rows, np.full((len(rows), padding), 99, np.uint8)])
         return self.type(IMAGE)(
-            header=self.header(index, "camera"), height=rgb.shape[0], width=rgb.shape[1], encoding=encoding, is_bigendian=0,
-            step=rows.shape[1], data=np.ascontiguousarray(rows).reshape(-1),
-        )  # fmt: skip
+            header=self.header(index, "camera"),
+            height=rgb.shape[0],
+            width=rgb.shape[1],
+            encoding=encoding,
+            is_bigendian=0,
+            step=rows.shape[1],
+            data=np.ascontiguousarray(rows).reshape(-1),
+        )
 
     def compressed(self, index):
         data = cv2.imencode(".png", np.ascontiguousarray(rgb_at(index)[..., ::-1]))[1].reshape(-1)
-        return self.type(COMPRESSED)(header=self.header(index, "camera"), format="bgr8; png compressed bgr8", data=data)
+        return self.type(COMPRESSED)(
+            header=self.header(index, "camera"), format="bgr8; png compressed bgr8", data=data
+        )
 
     def pose(self, index, typename="geometry_msgs/msg/PoseStamped"):
         (x, y, z), q = state_at(index)
@@ -81,12 +95,20 @@ class Make:
 
 
 def drive(
-    make, image_type=IMAGE, pose_type="geometry_msgs/msg/PoseStamped", encoding="rgb8", image_topic="/camera/image_raw"
+    make,
+    image_type=IMAGE,
+    pose_type="geometry_msgs/msg/PoseStamped",
+    encoding="rgb8",
+    image_topic="/camera/image_raw",
 ):
     """Rows of topic, type, message and log time."""
     for index in range(COUNT):
         log_ns = START_NS + index * STEP_NS
-        image = make.compressed(index) if image_type == COMPRESSED else make.image(index, encoding, padding=index % 2)
+        image = (
+            make.compressed(index)
+            if image_type == COMPRESSED
+            else make.image(index, encoding, padding=index % 2)
+        )
         yield "/vicon/car", pose_type, make.pose(index, pose_type), log_ns
         yield image_topic, image_type, image, log_ns + 1_000_000
         yield "/chatter", "std_msgs/msg/String", make.text(f"word {index}"), log_ns + 2_000_000
@@ -132,9 +154,11 @@ def plain(message):
     """A message without a class of ``rosbags``, as another encoder takes it."""
     if hasattr(message, "__msgtype__"):
         return SimpleNamespace(**{k: plain(v) for k, v in vars(message).items() if not k.startswith("__")})
-    return message.tolist() if isinstance(message, np.ndarray) and message.dtype != np.uint8 else (
-        message.tobytes() if isinstance(message, np.ndarray) else message
-    )  # fmt: skip
+    return (
+        message.tolist()
+        if isinstance(message, np.ndarray) and message.dtype != np.uint8
+        else (message.tobytes() if isinstance(message, np.ndarray) else message)
+    )
 
 
 WRITERS = {

@@ -29,13 +29,27 @@ def foreign_part(path: Path, messages, attachments=(), chunked=True):
 def foreign_metadata(folder: Path, names, counts):
     """``metadata.yaml`` as rosbag2 writes it for some files."""
     topics = [
-        {"topic_metadata": {"name": topic, "type": topic_row(topic).type, "serialization_format": "cdr", "offered_qos_profiles": ""},
-         "message_count": count}
+        {
+            "topic_metadata": {
+                "name": topic,
+                "type": topic_row(topic).type,
+                "serialization_format": "cdr",
+                "offered_qos_profiles": "",
+            },
+            "message_count": count,
+        }
         for topic, count in counts.items()
-    ]  # fmt: skip
+    ]
     information = {
-        "version": 5, "storage_identifier": "mcap", "duration": {"nanoseconds": 10**9}, "message_count": sum(counts.values()),
-        "starting_time": {"nanoseconds_since_epoch": START_NS}, "topics_with_message_count": topics, "compression_format": "",
-        "compression_mode": "", "relative_file_paths": list(names), "files": [],
-    }  # fmt: skip
+        "version": 5,
+        "storage_identifier": "mcap",
+        "duration": {"nanoseconds": 10**9},
+        "message_count": sum(counts.values()),
+        "starting_time": {"nanoseconds_since_epoch": START_NS},
+        "topics_with_message_count": topics,
+        "compression_format": "",
+        "compression_mode": "",
+        "relative_file_paths": list(names),
+        "files": [],
+    }
     (folder / "metadata.yaml").write_text(yaml.safe_dump({"rosbag2_bagfile_information": information}))

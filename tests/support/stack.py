@@ -45,7 +45,10 @@ class Stack(LiveOperator):
                 "calibration": str(CALIBRATION / "camera.yaml"),
             },
             "vicon": {"port": port, "subjects": ["car", "board"]},
-            "compositor": {"camera": str(CALIBRATION / "camera.yaml"), "target": str(CALIBRATION / "board.yaml")},
+            "compositor": {
+                "camera": str(CALIBRATION / "camera.yaml"),
+                "target": str(CALIBRATION / "board.yaml"),
+            },
             "policy": {"speed_mps": 0.8},
             "safety": {"room": str(CALIBRATION / "room.yaml"), "vehicle": str(CALIBRATION / "vehicle.yaml")},
             "motor": {"port": str(run_dir / "vesc"), "calibration": str(CALIBRATION / "vehicle.yaml")},

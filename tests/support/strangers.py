@@ -26,7 +26,9 @@ def write_spiral(folder: Path) -> Path:
     return file
 
 
-def spiral_theta(shape: tuple[int, ...], number: int, seed: int = 0, turns: float = 0.1, growth: float = 0.2) -> Tensor:
+def spiral_theta(
+    shape: tuple[int, ...], number: int, seed: int = 0, turns: float = 0.1, growth: float = 0.2
+) -> Tensor:
     """What the method of the page evaluates, by complex numbers."""
     across, up = torch.randn((2, *shape), generator=torch.Generator().manual_seed(seed), dtype=torch.float32)
     turned = torch.complex(across, -up) * torch.exp(torch.tensor(2j * torch.pi * turns * number))

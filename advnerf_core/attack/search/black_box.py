@@ -32,7 +32,14 @@ from torch import Tensor
 from advnerf_core.attack.adjoint import AdjointResult, gradient_pass
 from advnerf_core.attack.methods import SearchRun, SearchSettings
 from advnerf_core.attack.problem import AttackProblem
-from advnerf_core.attack.search.distil import Distillation, Lessons, Student, StudentFactory, pilotnet_student, to_bytes
+from advnerf_core.attack.search.distil import (
+    Distillation,
+    Lessons,
+    Student,
+    StudentFactory,
+    pilotnet_student,
+    to_bytes,
+)
 from advnerf_core.attack.search.population import Coarse
 from advnerf_core.attack.search.query_count import CountedPolicy, calls_per_evaluation
 from advnerf_core.attack.search.search import (
@@ -167,7 +174,9 @@ def black_box_attack(
     return state.result()
 
 
-def search_as(method: Method, problem: AttackProblem, settings: SearchSettings, run: SearchRun) -> SearchResult:
+def search_as(
+    method: Method, problem: AttackProblem, settings: SearchSettings, run: SearchRun
+) -> SearchResult:
     """`black_box_attack` with the settings of a method; see there for what it raises."""
     return black_box_attack(
         problem,
@@ -211,7 +220,12 @@ class _Loop:
     """One step: drive, ask, learn, estimate, move."""
 
     def __init__(
-        self, problem: AttackProblem, search: BlackBoxSearch, state: SearchState, generator: torch.Generator, seed: int
+        self,
+        problem: AttackProblem,
+        search: BlackBoxSearch,
+        state: SearchState,
+        generator: torch.Generator,
+        seed: int,
     ) -> None:
         self._problem, self._search, self._state = problem, search, state
         self._generator, self._seed = generator, seed
@@ -230,7 +244,9 @@ class _Loop:
                 f"expected finite states at evaluation {number}, got some that are not; check the policy and the scene for NaN"
             )
         if self._student is None:
-            lessons = _first_lessons(problem, driven, theta, self._coarse, self._search.distillation, self._generator)
+            lessons = _first_lessons(
+                problem, driven, theta, self._coarse, self._search.distillation, self._generator
+            )
             self._student = Student(lessons, self._search.distillation, self._seed, self._search.student)
             self._student.begin(self._generator)
         blind = replace(problem, policy=self._student, regulariser=None)
@@ -245,7 +261,9 @@ class _Loop:
             extra, slope = problem.regulariser(theta)
             loss_m, gradient = loss_m + extra, gradient + slope
         if not (math.isfinite(loss_m) and bool(torch.isfinite(gradient).all())):
-            raise SearchDivergedError(f"expected a finite loss and gradient at evaluation {number}, got loss {loss_m}")
+            raise SearchDivergedError(
+                f"expected a finite loss and gradient at evaluation {number}, got loss {loss_m}"
+            )
         self._student.go_on(self._generator)
         evaluation = self._state.record(theta, loss_m, result.totals, time.perf_counter() - began)
         moved = _adam_step(theta, gradient, known["m"], known["v"], number + 1, self._search.learning_rate)
@@ -256,7 +274,10 @@ class _Loop:
     def _directions(self, gradient: Tensor, mean: Tensor) -> Tensor:
         """Orthonormal directions ``[probes, theta]`` in float64."""
         count = min(self._search.probes, gradient.numel())
-        drawn = [self._coarse.expand(torch.randn(self._coarse.shape, generator=self._generator)) for _ in range(count)]
+        drawn = [
+            self._coarse.expand(torch.randn(self._coarse.shape, generator=self._generator))
+            for _ in range(count)
+        ]
         if self._search.method == "distilled":
             rows = drawn
         else:
@@ -266,7 +287,12 @@ class _Loop:
         return Q.T.contiguous()
 
     def _ask(
-        self, problem: AttackProblem, driven: VisitedDrive, theta: Tensor, directions: Tensor, result: AdjointResult
+        self,
+        problem: AttackProblem,
+        driven: VisitedDrive,
+        theta: Tensor,
+        directions: Tensor,
+        result: AdjointResult,
     ) -> Tensor:
         """The victim's slopes ``[probes]`` of the loss along directions; what it said becomes a lesson."""
         assert self._student is not None
@@ -278,7 +304,9 @@ class _Loop:
         # As many questions as were announced, also where theta has fewer values than there are probes.
         for k in range(self._search.probes):
             direction = directions[k % len(directions)]
-            size = self._search.probe_sigma * min(len(direction) ** 0.5, _STEEPEST / float(direction.abs().max()))
+            size = self._search.probe_sigma * min(
+                len(direction) ** 0.5, _STEEPEST / float(direction.abs().max())
+            )
             move = (size * direction).reshape(theta.shape).to(theta.dtype)
             images = [driven.images(theta + sign * move).flatten(0, 1) for sign in (1.0, -1.0)]
             answers = torch.stack([problem.policy(each, goals) for each in images], dim=1)
@@ -293,9 +321,13 @@ class _Loop:
 
 
 def _first_lessons(
-    problem: AttackProblem, driven: VisitedDrive, theta: Tensor, coarse: Coarse, settings: Distillation,
+    problem: AttackProblem,
+    driven: VisitedDrive,
+    theta: Tensor,
+    coarse: Coarse,
+    settings: Distillation,
     generator: torch.Generator,
-) -> Lessons:  # fmt: skip
+) -> Lessons:
     """Places about the first drive, each in two random textures about the first one."""
     places = driven.rollout.states[:-1].flatten(0, 1)
     chosen = torch.randint(len(places), (settings.warm_pairs,), generator=generator)

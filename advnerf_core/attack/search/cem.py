@@ -42,7 +42,9 @@ class CrossEntropy:
 
     def ask(self, known: dict[str, Tensor], population: int, generator: torch.Generator) -> Tensor:
         """Draw from the distribution."""
-        return known["mean"] + known["spread"] * torch.randn((population, *known["mean"].shape), generator=generator)
+        return known["mean"] + known["spread"] * torch.randn(
+            (population, *known["mean"].shape), generator=generator
+        )
 
     def tell(self, known: dict[str, Tensor], candidates: Tensor, losses: Tensor) -> dict[str, Tensor]:
         """Move toward mean and spread of the best."""

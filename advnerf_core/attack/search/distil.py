@@ -51,9 +51,23 @@ class Distillation:
     texture_sigma: float = 2.0
 
     def __post_init__(self) -> None:
-        counts = (self.warm_pairs, self.warm_passes, self.fresh_pairs, self.steps, self.memory_pairs, self.batch_pairs)
-        if min(counts) < 1 or self.learning_rate <= 0.0 or self.difference_weight < 0.0 or self.place_sigma < 0.0:
-            raise ValueError(f"expected counts >= 1, a learning rate > 0 and no negative weight or spread, got {self}")
+        counts = (
+            self.warm_pairs,
+            self.warm_passes,
+            self.fresh_pairs,
+            self.steps,
+            self.memory_pairs,
+            self.batch_pairs,
+        )
+        if (
+            min(counts) < 1
+            or self.learning_rate <= 0.0
+            or self.difference_weight < 0.0
+            or self.place_sigma < 0.0
+        ):
+            raise ValueError(
+                f"expected counts >= 1, a learning rate > 0 and no negative weight or spread, got {self}"
+            )
 
 
 class Resized(nn.Module):
@@ -138,9 +152,13 @@ class Student:
     training = False
 
     def __init__(
-        self, lessons: Lessons, settings: Distillation, seed: int, factory: StudentFactory = pilotnet_student,
+        self,
+        lessons: Lessons,
+        settings: Distillation,
+        seed: int,
+        factory: StudentFactory = pilotnet_student,
         bound_rad: float | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.lessons, self.settings = lessons, settings
         self.bound_rad = bound_rad or max(_LEAST_BOUND_RAD, 2.0 * float(lessons.answers.abs().max()))
         self.goal_size = lessons.goals.shape[1]
@@ -204,7 +222,11 @@ class Student:
         cls, tensors: dict[str, Tensor], settings: Distillation, factory: StudentFactory = pilotnet_student
     ) -> Student:
         """The student that `tensors` described."""
-        kept = {key.removeprefix("student."): value for key, value in tensors.items() if key.startswith("student.")}
+        kept = {
+            key.removeprefix("student."): value
+            for key, value in tensors.items()
+            if key.startswith("student.")
+        }
         lessons = Lessons(kept["images"], kept["goals"], kept["answers"])
         student = cls(lessons, settings, 0, factory, float(kept["bound_rad"]))
         for name, value in student.network.named_parameters():

@@ -41,7 +41,12 @@ class Evolution:
 
     def fresh(self, shape: tuple[int, ...]) -> dict[str, Tensor]:
         """Grey, and Adam's moments."""
-        return {"mean": torch.zeros(shape), "m": torch.zeros(shape), "v": torch.zeros(shape), "steps": torch.zeros(())}
+        return {
+            "mean": torch.zeros(shape),
+            "m": torch.zeros(shape),
+            "v": torch.zeros(shape),
+            "steps": torch.zeros(()),
+        }
 
     def ask(self, known: dict[str, Tensor], population: int, generator: torch.Generator) -> Tensor:
         """Pairs on opposite sides of the mean; of an odd number the last is alone."""

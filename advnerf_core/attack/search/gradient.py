@@ -96,4 +96,7 @@ def _adam(state: SearchState, learning_rate: float) -> tuple[Tensor, torch.optim
 
 
 def _tensors(theta: Tensor, adam: torch.optim.Adam) -> dict[str, Tensor]:
-    return {"theta": theta.detach().clone(), **{key: value.clone() for key, value in adam.state[theta].items()}}
+    return {
+        "theta": theta.detach().clone(),
+        **{key: value.clone() for key, value in adam.state[theta].items()},
+    }

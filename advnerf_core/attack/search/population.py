@@ -44,7 +44,9 @@ class Coarse:
     def shape(self) -> tuple[int, ...]:
         """Shape of what is searched."""
         face = len(self.theta_shape) == 3 and self.theta_shape[0] == self.theta_shape[1]
-        return (self.cells, self.cells, 3) if face and 0 < self.cells < self.theta_shape[0] else self.theta_shape
+        return (
+            (self.cells, self.cells, 3) if face and 0 < self.cells < self.theta_shape[0] else self.theta_shape
+        )
 
     def expand(self, coarse: Tensor) -> Tensor:
         """Theta of a coarse texture."""
@@ -97,12 +99,19 @@ def population_search(
         settings_hash: Hash of scene, policy and configuration; a state file of another one is refused.
     """
     if evaluations < 1 or population < 4:
-        raise ValueError(f"expected evaluations >= 1 and a population >= 4, got {evaluations} and {population}")
+        raise ValueError(
+            f"expected evaluations >= 1 and a population >= 4, got {evaluations} and {population}"
+        )
     coarse = Coarse(tuple(problem.sensor.theta_shape), cells)
     fingerprint = search_fingerprint(
-        problem, coarse.theta_shape, method=repr(strategy), seed=seed, population=population, cells=cells,
+        problem,
+        coarse.theta_shape,
+        method=repr(strategy),
+        seed=seed,
+        population=population,
+        cells=cells,
         hash=settings_hash,
-    )  # fmt: skip
+    )
     generator = torch.Generator().manual_seed(seed)
 
     def generation(known: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -123,7 +132,9 @@ def population_search(
     return state.result()
 
 
-def search_with(strategy: Strategy, problem: AttackProblem, settings: SearchSettings, run: SearchRun) -> SearchResult:
+def search_with(
+    strategy: Strategy, problem: AttackProblem, settings: SearchSettings, run: SearchRun
+) -> SearchResult:
     """`population_search` with the settings of a method."""
     return population_search(
         problem,

@@ -99,8 +99,14 @@ def multi_start(
     """
     budget = budget or MultiStart()
     sensor = _sensor(problem)
-    fingerprint = _fingerprint(problem, "multi-start", seed=seed, steps=budget.steps, hash=settings_hash,
-                               rates=[budget.pose_rate, budget.colour_rate])  # fmt: skip
+    fingerprint = _fingerprint(
+        problem,
+        "multi-start",
+        seed=seed,
+        steps=budget.steps,
+        hash=settings_hash,
+        rates=[budget.pose_rate, budget.colour_rate],
+    )
     generator = torch.Generator().manual_seed(seed)
     state = begin(state_path, fingerprint, lambda: {"generator": generator.get_state()})
     generator.set_state(state.tensors["generator"])
@@ -162,7 +168,9 @@ def random_poses(
         unit = sensor.space.draw(generator)
         colours = torch.zeros(0, dtype=torch.float64)
         if sensor.free_colours:
-            colours = sigma * torch.randn(sensor.fixed_colours.shape, generator=generator, dtype=torch.float64)
+            colours = sigma * torch.randn(
+                sensor.fixed_colours.shape, generator=generator, dtype=torch.float64
+            )
         theta = sensor.join(unit, colours)
         sharp, shown = placed_problem(problem, theta)
         loss_m, totals = without_gradient(sharp, shown, len(state.history))
@@ -174,7 +182,9 @@ def random_poses(
     return state.result()
 
 
-def placed_problem(problem: AttackProblem, theta: Tensor, opaque: bool | None = None) -> tuple[AttackProblem, Tensor]:
+def placed_problem(
+    problem: AttackProblem, theta: Tensor, opaque: bool | None = None
+) -> tuple[AttackProblem, Tensor]:
     """The problem with the objects at the places of ``theta``, with true edges, and its theta: the colours.
 
     Args:
@@ -209,7 +219,9 @@ class _Climb:
         self._sensor = sensor
         self._parts = {"unit": unit.clone().requires_grad_(), "colours": colours.clone().requires_grad_()}
         rates = {"unit": budget.pose_rate, "colours": budget.colour_rate}
-        self._adam = torch.optim.Adam([{"params": [part], "lr": rates[name]} for name, part in self._parts.items()])
+        self._adam = torch.optim.Adam(
+            [{"params": [part], "lr": rates[name]} for name, part in self._parts.items()]
+        )
 
     @classmethod
     def fresh(cls, sensor: PlacedSensor, budget: MultiStart, generator: torch.Generator) -> _Climb:
@@ -225,7 +237,9 @@ class _Climb:
         climb = cls(sensor, budget, tensors["unit"], tensors["colours"])
         for name, part in climb._parts.items():
             moments = {
-                key.partition(".")[2]: value.clone() for key, value in tensors.items() if key.startswith(name + ".")
+                key.partition(".")[2]: value.clone()
+                for key, value in tensors.items()
+                if key.startswith(name + ".")
             }
             if moments:
                 climb._adam.state[part] = moments
@@ -257,7 +271,9 @@ class _Climb:
 
 def _sensor(problem: AttackProblem) -> PlacedSensor:
     if not isinstance(problem.sensor, PlacedSensor):
-        raise TypeError(f"expected a problem with a PlacedSensor, got one with a {type(problem.sensor).__name__}")
+        raise TypeError(
+            f"expected a problem with a PlacedSensor, got one with a {type(problem.sensor).__name__}"
+        )
     if problem.regulariser is not None:
         raise ValueError("expected no regulariser: those of colours do not know placements")
     return problem.sensor
@@ -270,7 +286,12 @@ def _fingerprint(problem: AttackProblem, method: str, **settings: Any) -> str:
     lane = None if keep_out is None else [keep_out.clearance_m, *(path.to_dict() for path in keep_out.paths)]
     limits: Iterable[Tensor] = (sensor.space.middle, sensor.space.half)
     return search_fingerprint(
-        problem, sensor.theta_shape, method=method, lane=lane, limits=[part.tolist() for part in limits], **settings
+        problem,
+        sensor.theta_shape,
+        method=method,
+        lane=lane,
+        limits=[part.tolist() for part in limits],
+        **settings,
     )
 
 

@@ -54,7 +54,9 @@ def random_search(
     if evaluations < 1:
         raise ValueError(f"expected at least one evaluation, got {evaluations}")
     shape = problem.sensor.theta_shape
-    fingerprint = search_fingerprint(problem, shape, method="random", seed=seed, sigma=sigma, hash=settings_hash)
+    fingerprint = search_fingerprint(
+        problem, shape, method="random", seed=seed, sigma=sigma, hash=settings_hash
+    )
     generator = torch.Generator().manual_seed(seed)
     state = begin(state_path, fingerprint, lambda: {"generator": generator.get_state()})
     generator.set_state(state.tensors["generator"])

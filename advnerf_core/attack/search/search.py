@@ -145,7 +145,9 @@ def load_state(path: Path, fingerprint: str) -> SearchState:
             raise
         raise SearchStateError(f"cannot resume from {path} ({error}); delete it to start afresh") from error
     if header.get("fingerprint") != fingerprint:
-        raise SearchStateError(f"{path} belongs to a search with other settings; delete it, or use another folder")
+        raise SearchStateError(
+            f"{path} belongs to a search with other settings; delete it, or use another folder"
+        )
     return SearchState(tensors, best_theta, history)
 
 
@@ -202,7 +204,9 @@ def gradient_step(problem: AttackProblem, settings: SearchSettings) -> float:
     """Step of Adam along a gradient: as asked, or as the sensor says, or the usual one of colours."""
     if settings.learning_rate is not None:
         return settings.learning_rate
-    return problem.sensor.learning_rate if isinstance(problem.sensor, ScaledSensor) else settings.gradient_rate
+    return (
+        problem.sensor.learning_rate if isinstance(problem.sensor, ScaledSensor) else settings.gradient_rate
+    )
 
 
 def random_spread(problem: AttackProblem, settings: SearchSettings) -> float:
@@ -214,7 +218,9 @@ def random_spread(problem: AttackProblem, settings: SearchSettings) -> float:
 
 def evaluation_from_json(entry: dict[str, Any]) -> Evaluation:
     """The evaluation that ``dataclasses.asdict`` and JSON made this of."""
-    values: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in entry.items()}
+    values: dict[str, Any] = {
+        key: tuple(value) if isinstance(value, list) else value for key, value in entry.items()
+    }
     return Evaluation(**values)
 
 
@@ -228,7 +234,9 @@ def search_fingerprint(problem: AttackProblem, theta_shape: tuple[int, ...], **s
     return digest.hexdigest()
 
 
-def draw_start_states(nominal: tuple[float, float, float], count: int, sigma: float = 0.1, seed: int = 0) -> Tensor:
+def draw_start_states(
+    nominal: tuple[float, float, float], count: int, sigma: float = 0.1, seed: int = 0
+) -> Tensor:
     """Start poses ``[count, 3]`` float64 optimised together: the nominal one, then normal around it.
 
     Args:

@@ -61,14 +61,21 @@ class _Batch:
                 "expected problems that differ in seed and start poses only, got other numbers of starts or steps"
             )
         if not isinstance(first.sensor, Surrogate):
-            raise TypeError(f"expected problems with a Surrogate as sensor, got {type(first.sensor).__name__}")
+            raise TypeError(
+                f"expected problems with a Surrogate as sensor, got {type(first.sensor).__name__}"
+            )
         if not first.policy.stateless:
-            raise ValueError("expected a stateless policy; search the seeds of one with memory one after the other")
+            raise ValueError(
+                "expected a stateless policy; search the seeds of one with memory one after the other"
+            )
         goals = None if first.goals is None else torch.cat([p.goals for p in problems if p.goals is not None])
         together = replace(
-            first, sensor=ManyTextures(first.sensor, len(problems), starts), goals=goals, regulariser=None,
+            first,
+            sensor=ManyTextures(first.sensor, len(problems), starts),
+            goals=goals,
+            regulariser=None,
             start_states=torch.cat([p.start_states for p in problems]),
-        )  # fmt: skip
+        )
         return cls(together, tuple(problems), starts)
 
 
@@ -103,9 +110,13 @@ def gradient_attacks(
         )
     batch = _Batch.of(problems)
     fingerprint = search_fingerprint(
-        batch.problem, batch.problem.sensor.theta_shape, method="gradients", seeds=list(seeds),
-        learning_rate=learning_rate, hash=settings_hash,
-    )  # fmt: skip
+        batch.problem,
+        batch.problem.sensor.theta_shape,
+        method="gradients",
+        seeds=list(seeds),
+        learning_rate=learning_rate,
+        hash=settings_hash,
+    )
     states, tensors = _begin(batch, seeds, state_path, fingerprint)
     theta, adam = _adam(tensors, learning_rate)
     while len(states[0].history) < iterations:
@@ -182,6 +193,8 @@ def _load(path: Path, fingerprint: str, count: int) -> tuple[list[SearchState], 
     except (SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
         raise SearchStateError(f"cannot resume from {path} ({error!r}); delete it to start afresh") from error
     if header.get("format") != _FORMAT or header.get("fingerprint") != fingerprint or len(histories) != count:
-        raise SearchStateError(f"{path} belongs to a search with other settings; delete it, or use another folder")
+        raise SearchStateError(
+            f"{path} belongs to a search with other settings; delete it, or use another folder"
+        )
     states = [SearchState({}, theta, history) for theta, history in zip(best, histories, strict=True)]
     return states, tensors

@@ -53,7 +53,9 @@ class Visited:
         if self._frames is None:
             return 0
         weights = sum(W.data.nbytes + W.indices.nbytes + W.indptr.nbytes for W in self._frames.weights)
-        return int(self._frames.background.nbytes + weights + sum(pixels.nbytes for pixels in self._frames.pixels))
+        return int(
+            self._frames.background.nbytes + weights + sum(pixels.nbytes for pixels in self._frames.pixels)
+        )
 
     def render(self, theta: Tensor) -> Rendered:
         """What is seen with this theta."""

@@ -79,7 +79,9 @@ class DisplayedSensor:
     @property
     def _posed(self) -> PosedSensor:
         if not isinstance(self.sensor, PosedSensor):
-            raise TypeError(f"expected a sensor with camera_poses and render, got {type(self.sensor).__name__}")
+            raise TypeError(
+                f"expected a sensor with camera_poses and render, got {type(self.sensor).__name__}"
+            )
         return self.sensor
 
     def _shown(self, render: Callable[[Tensor], Rendered], theta: Tensor) -> Rendered:

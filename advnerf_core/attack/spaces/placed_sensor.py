@@ -61,9 +61,13 @@ class PlacedSensor:
                 f"{sum(same)} of which are the surrogate's"
             )
         self.surrogate, self.space, self.free_colours = surrogate, space, free_colours
-        self.fixed_colours = surrogate.plain_theta(torch.float64) if colours is None else colours.detach().double()
+        self.fixed_colours = (
+            surrogate.plain_theta(torch.float64) if colours is None else colours.detach().double()
+        )
         if self.fixed_colours.shape != surrogate.theta_shape:
-            raise ValueError(f"expected colours {surrogate.theta_shape}, got {tuple(self.fixed_colours.shape)}")
+            raise ValueError(
+                f"expected colours {surrogate.theta_shape}, got {tuple(self.fixed_colours.shape)}"
+            )
         self._soft = tuple(with_soft_edges(each, edge_width) for each in space.objects)
         self._last: tuple[Tensor, int, _Parts] | None = None
 
@@ -108,7 +112,9 @@ class PlacedSensor:
             opaque: True composes as a deployment does that cannot blend; None as the surrogate does.
         """
         objects = placed(self.space.objects, self.placements(theta.detach()))
-        return self.surrogate.with_objects(objects, opaque), self.colours(theta.detach()).to(self.surrogate.dtype)
+        return self.surrogate.with_objects(objects, opaque), self.colours(theta.detach()).to(
+            self.surrogate.dtype
+        )
 
     def camera_poses(self, states: Tensor) -> Array:
         """``T_world_from_camera [B, 4, 4]`` at car states ``[B, n]``, detached."""

@@ -115,7 +115,9 @@ def footprint(field: VoxelGridObject) -> tuple[Array, Array]:
     """
     grids = prepared(field, np.float32)
     T = field.T_world_from_object
-    corners = np.array(np.meshgrid(*np.stack([grids.low, grids.high], axis=1), indexing="ij")).reshape(3, -1).T
+    corners = (
+        np.array(np.meshgrid(*np.stack([grids.low, grids.high], axis=1), indexing="ij")).reshape(3, -1).T
+    )
     xy = (corners @ (rotation_z(-yaw_of(T)) @ T[:3, :3]).T)[:, :2]
     return xy.min(axis=0), xy.max(axis=0)
 
@@ -140,7 +142,10 @@ class PoseSpace:
     """
 
     def __init__(
-        self, objects: Sequence[VoxelGridObject], bounds: Sequence[PoseBounds], keep_out: KeepOut | None = None
+        self,
+        objects: Sequence[VoxelGridObject],
+        bounds: Sequence[PoseBounds],
+        keep_out: KeepOut | None = None,
     ) -> None:
         if len(bounds) != len(objects) or not objects:
             raise PoseBoundsError(f"expected bounds for each of {len(objects)} object(s), got {len(bounds)}")
@@ -152,7 +157,10 @@ class PoseSpace:
             for axis, name in enumerate(AXES):
                 limits[k, axis] = getattr(bound, name) or (self.nominal[k, axis], self.nominal[k, axis])
         self.middle = torch.from_numpy(limits.mean(axis=2))
-        self._lowest, self._highest = torch.from_numpy(limits[..., 0].copy()), torch.from_numpy(limits[..., 1].copy())
+        self._lowest, self._highest = (
+            torch.from_numpy(limits[..., 0].copy()),
+            torch.from_numpy(limits[..., 1].copy()),
+        )
         self.half = torch.from_numpy(0.5 * (limits[..., 1] - limits[..., 0]))
         self._turns = self.half[:, 2] >= np.pi
         self.half[:, 2] = self.half[:, 2].clamp(max=np.pi)
@@ -169,7 +177,9 @@ class PoseSpace:
             PoseBoundsError: A placement out of bounds, or on the lane.
         """
         offset = placements.double() - self.middle
-        offset[:, 2] = torch.where(self._turns, torch.remainder(offset[:, 2] + np.pi, 2 * np.pi) - np.pi, offset[:, 2])
+        offset[:, 2] = torch.where(
+            self._turns, torch.remainder(offset[:, 2] + np.pi, 2 * np.pi) - np.pi, offset[:, 2]
+        )
         unit = torch.where(self.half > 0.0, offset / self.half.clamp_min(1e-300), torch.zeros_like(offset))
         # A search ends on its bounds, from where division leads one bit beyond.
         within = unit.clamp(-1.0, 1.0)
@@ -250,7 +260,9 @@ class PoseSpace:
                 break
             away = torch.from_numpy(self.keep_out.away(self._placement(k, unit)[:2].numpy()))
             unit = unit.clone()
-            unit[:2] += torch.where(free, 1.001 * (missing + 1e-6) * away / self.half[k, :2].clamp_min(1e-300), 0.0)
+            unit[:2] += torch.where(
+                free, 1.001 * (missing + 1e-6) * away / self.half[k, :2].clamp_min(1e-300), 0.0
+            )
             unit = self._boxed(k, unit)
         return unit
 

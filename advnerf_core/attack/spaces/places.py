@@ -63,21 +63,27 @@ class PlaceSpace:
             raise SpaceError(
                 "expected objects made of voxels, got a mesh: only voxels are differentiable in their pose"
             )
-        self.sensor = PlacedSensor(surrogate, PoseSpace(self._fields, limits.bounds, limits.keep_out), limits.colours)
+        self.sensor = PlacedSensor(
+            surrogate, PoseSpace(self._fields, limits.bounds, limits.keep_out), limits.colours
+        )
 
     @property
     def plain(self) -> Shown:
         """The objects where they stand without an attack, in their own colours."""
         return Shown(self.surrogate.objects, self.surrogate.plain_theta())
 
-    def search(self, method: str, problem: AttackProblem, settings: SearchSettings, run: SearchRun) -> SearchResult:
+    def search(
+        self, method: str, problem: AttackProblem, settings: SearchSettings, run: SearchRun
+    ) -> SearchResult:
         """Search places; see `Space.search`. The budget is that of the space."""
         if method not in METHODS:
             raise SpaceError(f"expected a method that searches places, {' or '.join(METHODS)}, got {method}")
         common = (run.seed, run.state_path, run.on_evaluation, run.settings_hash)
         if method == "gradient":
             return multi_start(problem, self._budget, *common)
-        return random_poses(problem, self._budget.evaluations, settings.sigma or settings.random_sigma, *common)
+        return random_poses(
+            problem, self._budget.evaluations, settings.sigma or settings.random_sigma, *common
+        )
 
     def attacked(self, theta: Tensor) -> tuple[AttackedObject, ...]:
         """Each object at its place, with its colours."""

@@ -86,7 +86,9 @@ class Space(Protocol):
     def plain(self) -> Shown:
         """The objects without an attack."""
 
-    def search(self, method: str, problem: AttackProblem, settings: SearchSettings, run: SearchRun) -> SearchResult:
+    def search(
+        self, method: str, problem: AttackProblem, settings: SearchSettings, run: SearchRun
+    ) -> SearchResult:
         """Search with a method for the theta of the problem's sensor, which is this space's.
 
         Raises:
@@ -134,7 +136,9 @@ class ColourSpace:
 
     def __init__(self, surrogate: Surrogate, named: Sequence[NamedObject]) -> None:
         self.surrogate, self._named = surrogate, tuple(named)
-        self.name = MESH_TEXTURE if all(isinstance(each, MeshField) for each in surrogate.objects) else COLOURS
+        self.name = (
+            MESH_TEXTURE if all(isinstance(each, MeshField) for each in surrogate.objects) else COLOURS
+        )
 
     @property
     def sensor(self) -> Surrogate:
@@ -146,13 +150,17 @@ class ColourSpace:
         """The objects in their own colours."""
         return Shown(self.surrogate.objects, self.surrogate.plain_theta())
 
-    def search(self, method: str, problem: AttackProblem, settings: SearchSettings, run: SearchRun) -> SearchResult:
+    def search(
+        self, method: str, problem: AttackProblem, settings: SearchSettings, run: SearchRun
+    ) -> SearchResult:
         """Search with any method; see `Space.search`."""
         return load_method(method).search(problem, settings, run)
 
     def attacked(self, theta: Tensor) -> tuple[AttackedObject, ...]:
         """Colours of each object; of a mesh also the mesh with the found texture."""
-        rows = zip(self._named, self.surrogate.objects, split_theta(self.surrogate.objects, theta), strict=True)
+        rows = zip(
+            self._named, self.surrogate.objects, split_theta(self.surrogate.objects, theta), strict=True
+        )
         return tuple(_attacked(named, field, part, _textured_glb(field, part)) for named, field, part in rows)
 
     def restored(self, attack: AttackFile) -> Shown:
@@ -181,7 +189,9 @@ class ShapeSpace:
         """The meshes in their own shape."""
         return Shown(self.surrogate.objects, self.sensor.colours)
 
-    def search(self, method: str, problem: AttackProblem, settings: SearchSettings, run: SearchRun) -> SearchResult:
+    def search(
+        self, method: str, problem: AttackProblem, settings: SearchSettings, run: SearchRun
+    ) -> SearchResult:
         """Search with a method that asks for the scale of theta; see `Space.search`."""
         found = load_method(method)
         if not found.reads_scale:
@@ -195,7 +205,9 @@ class ShapeSpace:
         parts = theta.detach().split([len(each.mesh.vertices) for each in self.sensor.meshes])
         colours = split_theta(self.surrogate.objects, self.sensor.colours)
         rows = zip(self._named, self.sensor.shaped(theta), parts, colours, strict=True)
-        return tuple(_attacked(named, field, part, _textured_glb(field, colour)) for named, field, part, colour in rows)
+        return tuple(
+            _attacked(named, field, part, _textured_glb(field, colour)) for named, field, part, colour in rows
+        )
 
     def restored(self, attack: AttackFile) -> Shown:
         """The meshes in the shapes of the file; see `Space.restored`."""

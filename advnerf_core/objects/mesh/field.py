@@ -43,10 +43,14 @@ class MeshField:
     def __post_init__(self) -> None:
         T = np.asarray(self.T_world_from_object, dtype=np.float64)
         rigid = (
-            T.shape == (4, 4) and np.isfinite(T).all() and np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-4)
+            T.shape == (4, 4)
+            and np.isfinite(T).all()
+            and np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-4)
         )
         if not rigid or not (np.isfinite(self.scale) and self.scale > 0):
-            raise ValueError(f"expected a rigid pose [4, 4] and a scale above zero, got {T.tolist()} and {self.scale}")
+            raise ValueError(
+                f"expected a rigid pose [4, 4] and a scale above zero, got {T.tolist()} and {self.scale}"
+            )
 
     @property
     def theta_shape(self) -> tuple[int, ...]:
@@ -119,7 +123,9 @@ class MeshField:
         rays = [self._rays(pose, pinhole, supersample) for pose in poses]
         area = pinhole.height * pinhole.width
         pixels = np.concatenate([np.zeros(0, np.int64), *(part[0] + b * area for b, part in enumerate(rays))])
-        origins, directions = (np.concatenate([np.zeros((0, 3)), *(part[k] for part in rays)]) for k in (1, 2))
+        origins, directions = (
+            np.concatenate([np.zeros((0, 3)), *(part[k] for part in rays)]) for k in (1, 2)
+        )
         if "rays" not in self.derived:
             self.derived["rays"] = RayCaster(self.mesh)
         hits = self.derived["rays"].cast(origins, directions)
@@ -152,7 +158,10 @@ class MeshField:
         if not (seen[:, 2] > NEAR_M).all():
             return 0, pinhole.height, 0, pinhole.width
         uv = pinhole.project(seen)
-        (left, top), (right, bottom) = np.floor(uv.min(axis=0)).astype(int), np.ceil(uv.max(axis=0)).astype(int)
+        (left, top), (right, bottom) = (
+            np.floor(uv.min(axis=0)).astype(int),
+            np.ceil(uv.max(axis=0)).astype(int),
+        )
         top, bottom = max(top, 0), min(bottom, pinhole.height)
         left, right = max(left, 0), min(right, pinhole.width)
         return (top, bottom, left, right) if bottom > top and right > left else None
@@ -166,7 +175,10 @@ class MeshField:
         shape = (len(pixels), self.slot_count)
         depth = np.add.reduceat(hits.t, first) / counts if len(pixels) else np.zeros(0)
         return ObjectCast(
-            pixels, counts / rays_per_pixel, depth, sparse.csr_matrix((data, texel.reshape(-1), indptr), shape)
+            pixels,
+            counts / rays_per_pixel,
+            depth,
+            sparse.csr_matrix((data, texel.reshape(-1), indptr), shape),
         )
 
     def _bilinear(self, hits: Hits) -> tuple[NDArray[np.int32], Array]:

@@ -65,7 +65,9 @@ def mesh_from_glb(content: bytes, source: str) -> TexturedMesh:
     import trimesh
 
     try:
-        parts = list(trimesh.load_scene(io.BytesIO(content), file_type="glb", process=False).geometry.values())
+        parts = list(
+            trimesh.load_scene(io.BytesIO(content), file_type="glb", process=False).geometry.values()
+        )
         (part,) = parts
         uv = np.asarray(part.visual.uv, dtype=np.float64)
         pixels = np.asarray(part.visual.material.baseColorTexture.convert("RGB"))

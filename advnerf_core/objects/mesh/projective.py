@@ -43,7 +43,9 @@ class OverBackground(PSIntegrator):
         """Set texture ``[H, W, 3]`` and where the faces' corners lie in it ``[F, 3, 2]``."""
         uv = np.asarray(corner_texels, np.float32) / np.array(texture.shape[1::-1], np.float32)
         self._corners = [floats(mi, uv[:, k]) for k in range(3)]
-        self._texture = mi.Texture2f(mi.TensorXf(np.asarray(texture, np.float32)), wrap_mode=dr.WrapMode.Clamp)
+        self._texture = mi.Texture2f(
+            mi.TensorXf(np.asarray(texture, np.float32)), wrap_mode=dr.WrapMode.Clamp
+        )
 
     def stand_before(self, rgb: NDArray[np.float32], depth_m: NDArray[np.float32]) -> None:
         """Set what is behind ``[H, W, 3]``, and the depth ``[H, W]`` [m] beyond which it hides the mesh."""
@@ -51,7 +53,15 @@ class OverBackground(PSIntegrator):
         self._depth = floats(mi, np.where(np.isnan(depth_m), np.inf, depth_m))
 
     def sample(
-        self, mode: Any, scene: Any, sampler: Any, ray: Any, depth: Any, *rest: Any, active: Any = True, **more: Any
+        self,
+        mode: Any,
+        scene: Any,
+        sampler: Any,
+        ray: Any,
+        depth: Any,
+        *rest: Any,
+        active: Any = True,
+        **more: Any,
     ) -> Any:
         """Colour along a camera ray; see ``PSIntegrator.sample``."""
         del sampler, depth, rest, more
@@ -101,9 +111,15 @@ class ProjectiveRenderer:
     """
 
     def __init__(
-        self, vertex_count: int, faces: NDArray[np.int32], corner_texels: Array, texture: NDArray[np.float32], pinhole: Pinhole,
-        samples: int = 4, boundary_samples: int = 1,
-    ) -> None:  # fmt: skip
+        self,
+        vertex_count: int,
+        faces: NDArray[np.int32],
+        corner_texels: Array,
+        texture: NDArray[np.float32],
+        pinhole: Pinhole,
+        samples: int = 4,
+        boundary_samples: int = 1,
+    ) -> None:
         self._pinhole = pinhole
         self._square = np.array(
             [1.0, pinhole.fy / pinhole.fx, 1.0]
@@ -117,7 +133,12 @@ class ProjectiveRenderer:
         self._parameters.keep([_VERTICES])
 
     def image(
-        self, vertices: Array, rgb: NDArray[np.float32], depth_m: NDArray[np.float32], samples: int, seed: int = 0
+        self,
+        vertices: Array,
+        rgb: NDArray[np.float32],
+        depth_m: NDArray[np.float32],
+        samples: int,
+        seed: int = 0,
     ) -> NDArray[np.float32]:
         """The picture ``[H, W, 3]`` itself, with random rays; arguments as for :meth:`gradient`."""
         self._place(vertices, rgb, depth_m)
@@ -125,8 +146,13 @@ class ProjectiveRenderer:
         return np.array(mi.render(self._scene, integrator=self._integrator, spp=samples, seed=_seed(seed)))
 
     def gradient(
-        self, vertices: Array, rgb: NDArray[np.float32], depth_m: NDArray[np.float32], grad_image: NDArray[np.float32], seed: int
-    ) -> Array:  # fmt: skip
+        self,
+        vertices: Array,
+        rgb: NDArray[np.float32],
+        depth_m: NDArray[np.float32],
+        grad_image: NDArray[np.float32],
+        seed: int,
+    ) -> Array:
         """Gradient with respect to the vertices ``[V, 3]`` of a scalar with gradient ``grad_image`` with respect to the picture.
 
         Args:
@@ -159,16 +185,26 @@ def _sensor(pinhole: Pinhole) -> dict[str, Any]:
     """A camera in the origin that looks along z, y down."""
     up_is_up = mi.ScalarTransform4f().look_at(origin=[0, 0, 0], target=[0, 0, 1], up=[0, -1, 0])
     film = {
-        "type": "hdrfilm", "width": pinhole.width, "height": pinhole.height, "rfilter": {"type": "box"},
-        "pixel_format": "rgb", "component_format": "float32", "sample_border": False,
-    }  # fmt: skip
+        "type": "hdrfilm",
+        "width": pinhole.width,
+        "height": pinhole.height,
+        "rfilter": {"type": "box"},
+        "pixel_format": "rgb",
+        "component_format": "float32",
+        "sample_border": False,
+    }
     return {
-        "type": "perspective", "to_world": up_is_up, "fov_axis": "x", "near_clip": 1e-3, "far_clip": 1e4, "film": film,
+        "type": "perspective",
+        "to_world": up_is_up,
+        "fov_axis": "x",
+        "near_clip": 1e-3,
+        "far_clip": 1e4,
+        "film": film,
         "fov": float(2.0 * np.degrees(np.arctan(0.5 * pinhole.width / pinhole.fx))),
         "principal_point_offset_x": 0.5 - pinhole.cx / pinhole.width,
         "principal_point_offset_y": 0.5 - pinhole.cy / pinhole.height,
         "sampler": {"type": "independent", "sample_count": 4},
-    }  # fmt: skip
+    }
 
 
 def _opaque(value: float) -> Any:

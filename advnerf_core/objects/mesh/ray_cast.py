@@ -58,11 +58,18 @@ class RayCaster:
         dr.eval(found.t, found.prim_index, found.prim_uv)
         t = np.array(found.t)
         rays = np.flatnonzero(np.isfinite(t))
-        b = np.stack([np.array(part)[rays] for part in found.prim_uv], axis=-1).astype(np.float64).clip(0.0, 1.0)
+        b = (
+            np.stack([np.array(part)[rays] for part in found.prim_uv], axis=-1)
+            .astype(np.float64)
+            .clip(0.0, 1.0)
+        )
         b /= np.maximum(b.sum(axis=1, keepdims=True), 1.0)
         weights = np.stack([1.0 - b.sum(axis=1), b[:, 0], b[:, 1]], axis=-1)
         return Hits(
-            rays, t[rays].astype(np.float64) + _NEAR, np.array(found.prim_index)[rays].astype(np.int64), weights
+            rays,
+            t[rays].astype(np.float64) + _NEAR,
+            np.array(found.prim_index)[rays].astype(np.int64),
+            weights,
         )
 
 

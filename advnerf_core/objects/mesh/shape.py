@@ -47,7 +47,10 @@ class ShapeLimits:
 
     def __post_init__(self) -> None:
         if not (
-            np.isfinite(self.bound_m) and self.bound_m > 0 and np.isfinite(self.smoothness) and self.smoothness >= 0
+            np.isfinite(self.bound_m)
+            and self.bound_m > 0
+            and np.isfinite(self.smoothness)
+            and self.smoothness >= 0
         ):
             raise ValueError(f"expected a bound above zero and a smoothness of at least zero, got {self}")
         if self.samples < 1 or self.boundary_samples < 1:
@@ -68,13 +71,19 @@ class ShapeSensor:
         colours: Colours of the meshes, of ``surrogate.theta_shape``; their plain ones if not given.
     """
 
-    def __init__(self, surrogate: Surrogate, limits: ShapeLimits | None = None, colours: Tensor | None = None) -> None:
+    def __init__(
+        self, surrogate: Surrogate, limits: ShapeLimits | None = None, colours: Tensor | None = None
+    ) -> None:
         self.surrogate, self.limits = surrogate, limits or ShapeLimits()
         self.colours = surrogate.plain_theta() if colours is None else colours.detach()
         self.meshes: list[MeshField] = [field for field in surrogate.objects if isinstance(field, MeshField)]
         if not self.meshes or len(self.meshes) != len(surrogate.objects):
-            raise ValueError(f"expected one or more meshes and nothing else, got {len(surrogate.objects)} object(s)")
-        self._steps = [LargeSteps(len(f.mesh.vertices), f.mesh.faces, self.limits.smoothness) for f in self.meshes]
+            raise ValueError(
+                f"expected one or more meshes and nothing else, got {len(surrogate.objects)} object(s)"
+            )
+        self._steps = [
+            LargeSteps(len(f.mesh.vertices), f.mesh.faces, self.limits.smoothness) for f in self.meshes
+        ]
         self._counts = [len(field.mesh.vertices) for field in self.meshes]
         self._shaped: tuple[bytes, list[MeshField]] = (b"", [])
         self._renderer: Any = None
@@ -136,7 +145,9 @@ class ShapeSensor:
         rgb, depth_m = self.surrogate.coloured_background(poses)
         fields, theta = self.shaped(theta), theta.detach().clone()
         images = self.surrogate.with_objects(fields).overlay(rgb, depth_m, poses, self.colours)
-        seen = [any(field.window(pose, self.surrogate.camera) is not None for field in fields) for pose in poses]
+        seen = [
+            any(field.window(pose, self.surrogate.camera) is not None for field in fields) for pose in poses
+        ]
 
         def vjp(grad_images: Tensor) -> Tensor:
             total = torch.zeros(self.theta_shape, dtype=torch.float64)
@@ -144,14 +155,20 @@ class ShapeSensor:
             for b in np.flatnonzero(seen):
                 seed = zlib.crc32(poses[b].tobytes(), zlib.crc32(theta.numpy().tobytes()))
                 slopes = grad_images[b].detach().permute(1, 2, 0).numpy()
-                total += self._vertex_slopes(vertices, poses[b], rgb[b].numpy(), depth_m[b].numpy(), slopes, seed)
+                total += self._vertex_slopes(
+                    vertices, poses[b], rgb[b].numpy(), depth_m[b].numpy(), slopes, seed
+                )
             return self._pulled_back(theta, total).to(theta.dtype)
 
         return Rendered(images, vjp, images.nbytes + rgb.nbytes + depth_m.nbytes)
 
-    def overlay(self, rgb: ArrayLike, depth_m: ArrayLike, T_world_from_camera: ArrayLike, theta: Tensor) -> Tensor:
+    def overlay(
+        self, rgb: ArrayLike, depth_m: ArrayLike, T_world_from_camera: ArrayLike, theta: Tensor
+    ) -> Tensor:
         """Put the shaped meshes into given images; see ``Surrogate.overlay``."""
-        return self.surrogate.with_objects(self.shaped(theta)).overlay(rgb, depth_m, T_world_from_camera, self.colours)
+        return self.surrogate.with_objects(self.shaped(theta)).overlay(
+            rgb, depth_m, T_world_from_camera, self.colours
+        )
 
     def _displaced(self, k: int, part: Tensor) -> Tensor:
         return torch.from_numpy(self._steps[k].solve(part.numpy()))
@@ -175,8 +192,14 @@ class ShapeSensor:
         return torch.cat(out)
 
     def _vertex_slopes(
-        self, vertices: Sequence[Tensor], pose: Array, rgb: NDArray[Any], depth_m: NDArray[Any], slopes: NDArray[Any], seed: int
-    ) -> Tensor:  # fmt: skip
+        self,
+        vertices: Sequence[Tensor],
+        pose: Array,
+        rgb: NDArray[Any],
+        depth_m: NDArray[Any],
+        slopes: NDArray[Any],
+        seed: int,
+    ) -> Tensor:
         """Gradient ``[sum V, 3]`` with respect to the vertices in the meshes' frames, of one picture."""
         T = [invert_transform(pose) @ field.T_world_from_object for field in self.meshes]
         seen = [
@@ -186,7 +209,9 @@ class ShapeSensor:
         limit = depth_m.astype(np.float64) + self.surrogate.depth_tolerance_m
         found = self._projective().gradient(np.concatenate(seen), rgb, limit, slopes, seed)
         parts = np.split(found, np.cumsum(self._counts)[:-1])
-        turned = [field.scale * part @ t[:3, :3] for field, part, t in zip(self.meshes, parts, T, strict=True)]
+        turned = [
+            field.scale * part @ t[:3, :3] for field, part, t in zip(self.meshes, parts, T, strict=True)
+        ]
         return torch.from_numpy(np.concatenate(turned))
 
     def _projective(self) -> Any:
@@ -199,14 +224,23 @@ class ShapeSensor:
                 for field, part in zip(self.meshes, split_theta(self.meshes, self.colours), strict=True)
             ]
             firsts = np.cumsum([0, *self._counts])[:-1]
-            faces = np.concatenate([f.mesh.faces + first for f, first in zip(self.meshes, firsts, strict=True)])
+            faces = np.concatenate(
+                [f.mesh.faces + first for f, first in zip(self.meshes, firsts, strict=True)]
+            )
             rows = np.cumsum([0, *(len(texture) for texture in textures)])
-            texels = [f.mesh.texels + np.array([0.0, row]) for f, row in zip(self.meshes, rows[:-1], strict=True)]
+            texels = [
+                f.mesh.texels + np.array([0.0, row]) for f, row in zip(self.meshes, rows[:-1], strict=True)
+            ]
             atlas = np.zeros((rows[-1], max(texture.shape[1] for texture in textures), 3), np.float32)
             for texture, row in zip(textures, rows[:-1], strict=True):
                 atlas[row : row + len(texture), : texture.shape[1]] = texture
             self._renderer = ProjectiveRenderer(
-                sum(self._counts), faces, np.concatenate(texels), atlas, self.surrogate.camera,
-                self.limits.samples, self.limits.boundary_samples,
-            )  # fmt: skip
+                sum(self._counts),
+                faces,
+                np.concatenate(texels),
+                atlas,
+                self.surrogate.camera,
+                self.limits.samples,
+                self.limits.boundary_samples,
+            )
         return self._renderer

@@ -112,10 +112,14 @@ def sphere(radius_m: float, rgb: tuple[float, float, float], subdivisions: int =
     import trimesh
 
     if not (np.isfinite(radius_m) and radius_m > 0 and 0 <= subdivisions <= 6):
-        raise MeshError(f"expected a radius above zero and 0 to 6 subdivisions, got {radius_m} and {subdivisions}")
+        raise MeshError(
+            f"expected a radius above zero and 0 to 6 subdivisions, got {radius_m} and {subdivisions}"
+        )
     ball = trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius_m)
     triangles = np.asarray(ball.triangles, dtype=np.float64) + np.array([0.0, 0.0, radius_m])
-    return SurfaceMesh((part_from_colours(triangles, np.tile(np.asarray(rgb, np.float64), (len(triangles), 1))),))
+    return SurfaceMesh(
+        (part_from_colours(triangles, np.tile(np.asarray(rgb, np.float64), (len(triangles), 1))),)
+    )
 
 
 def _welded(triangles: Array, tolerance: float) -> tuple[Array, NDArray[np.int32]]:
@@ -152,9 +156,14 @@ def _layout(corners: Array, view: NDArray[np.int64], texel: float) -> tuple[Arra
 
 
 def _baked(
-    mesh: SurfaceMesh, solid: NDArray[np.bool_], corners: Array, texels: Array, view: NDArray[np.int64],
-    charts: NDArray[np.int16], texel: float,
-) -> NDArray[np.float32]:  # fmt: skip
+    mesh: SurfaceMesh,
+    solid: NDArray[np.bool_],
+    corners: Array,
+    texels: Array,
+    view: NDArray[np.int64],
+    charts: NDArray[np.int16],
+    texel: float,
+) -> NDArray[np.float32]:
     """Mean colour of the outermost layer in each texel; texels that no triangle touches take the nearest one's."""
     face, weights = _spread(corners, texel)
     colours = _colours(mesh, np.flatnonzero(solid)[face], weights)
@@ -162,7 +171,9 @@ def _baked(
     where = np.clip(where, 0, np.array(charts.shape[::-1]) - 1)
     flat = where[:, 1] * charts.shape[1] + where[:, 0]
     points, axis = np.einsum("nk,nkc->nc", weights, corners[face]), view[face] // 2
-    height = np.take_along_axis(points, axis[:, None], axis=1)[:, 0] * np.where(view[face] % 2 == 0, 1.0, -1.0)
+    height = np.take_along_axis(points, axis[:, None], axis=1)[:, 0] * np.where(
+        view[face] % 2 == 0, 1.0, -1.0
+    )
     top = np.full(charts.size, -np.inf)
     np.maximum.at(top, flat, height)
     outer = height >= top[flat] - _OUTER * texel

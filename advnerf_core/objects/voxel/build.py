@@ -53,14 +53,20 @@ def build_from_mesh(
     told(0.0, "voxelising")
     start = voxelise(mesh, resolution)
     grids = (
-        start if steps == 0 else fit_grids(mesh_views(mesh, FIT_VIEWS, FIT_PIXELS), start, steps, progress=told).grids
+        start
+        if steps == 0
+        else fit_grids(mesh_views(mesh, FIT_VIEWS, FIT_PIXELS), start, steps, progress=told).grids
     )
     model = ObjectModel(name, grids)
     held_out = mesh_views(mesh, HELD_OUT_VIEWS, FIT_PIXELS, _HELD_OUT_PHASE)
     about = {
-        "source": source or {}, "resolution": resolution, "steps": steps, "triangles": mesh.triangle_count,
-        "held_out_psnr_db": round(agreement_db(model, held_out), 2), "software_version": version("advnerf"),
-    }  # fmt: skip
+        "source": source or {},
+        "resolution": resolution,
+        "steps": steps,
+        "triangles": mesh.triangle_count,
+        "held_out_psnr_db": round(agreement_db(model, held_out), 2),
+        "software_version": version("advnerf"),
+    }
     return ObjectModel(name, model.grids, about)
 
 
@@ -95,9 +101,13 @@ def build_from_images(
     fit = fit_grids(views, visual_hull(views, resolution), steps, progress=told, max_seconds=max_seconds)
     model = ObjectModel(name, fit.grids)
     about: dict[str, Any] = {
-        "source": source or {}, "resolution": resolution, "steps": fit.steps, "pictures": len(views.images),
-        "gain_db": round(fit.gain_db, 2), "software_version": version("advnerf"),
-    }  # fmt: skip
+        "source": source or {},
+        "resolution": resolution,
+        "steps": fit.steps,
+        "pictures": len(views.images),
+        "gain_db": round(fit.gain_db, 2),
+        "software_version": version("advnerf"),
+    }
     for which, pictures in (("train", views), ("held_out", held_out)):
         if pictures is None:
             continue
@@ -149,7 +159,9 @@ def mesh_views(mesh: SurfaceMesh, count: int, pixels: int, phase: float = 0.0) -
     return PosedRgba(draw_mesh(mesh, poses, lens), poses, (lens,) * count)
 
 
-def draw_object(model: ObjectModel, T_object_from_camera: Array, pinhole: Pinhole, supersample: int = 2) -> Array:
+def draw_object(
+    model: ObjectModel, T_object_from_camera: Array, pinhole: Pinhole, supersample: int = 2
+) -> Array:
     """Premultiplied pictures ``[B, H, W, 4]`` of an object in its own colours."""
     field = model.placed(np.eye(4))
     assert field.plain_colours is not None

@@ -84,7 +84,10 @@ def fit_grids(
 
 
 def _step(
-    field: _Field, optimiser: torch.optim.Optimizer, batch: tuple[Tensor, Tensor, Tensor], torch_rng: torch.Generator
+    field: _Field,
+    optimiser: torch.optim.Optimizer,
+    batch: tuple[Tensor, Tensor, Tensor],
+    torch_rng: torch.Generator,
 ) -> float:
     """One step on a batch of rays; returns the mean squared error before it."""
     target, origins, directions = batch

@@ -41,27 +41,41 @@ def hydrant(height_m: float = 0.75) -> SurfaceMesh:
     ]
     pumper = [(1.35 * r, 0.95 * z) for r, z in hose]
     parts = [
-        _turned(barrel, 8, _RED), _turned(bonnet, 8, _RED), _turned(nut, 5, _DARK),
+        _turned(barrel, 8, _RED),
+        _turned(bonnet, 8, _RED),
+        _turned(nut, 5, _DARK),
         _moved(_turned(pumper, 12, _YELLOW), _along((1, 0, 0)), (0.09, 0.0, 0.40)),
         _moved(_turned(hose, 12, _YELLOW), _along((0, 1, 0)), (0.0, 0.09, 0.43)),
         _moved(_turned(hose, 12, _YELLOW), _along((0, -1, 0)), (0.0, -0.09, 0.43)),
-    ]  # fmt: skip
+    ]
     return _scaled(parts, height_m / 0.75)
 
 
 def small_car(length_m: float = 3.6) -> SurfaceMesh:
     """A small car that looks along x: body, cabin with windows, four wheels, lamps; wheels on z = 0."""
     half = 0.80
-    body = [(-1.75, 0.32), (1.70, 0.32), (1.80, 0.45), (1.72, 0.78), (0.95, 0.92), (-1.72, 0.98), (-1.80, 0.50)]
+    body = [
+        (-1.75, 0.32),
+        (1.70, 0.32),
+        (1.80, 0.45),
+        (1.72, 0.78),
+        (0.95, 0.92),
+        (-1.72, 0.98),
+        (-1.80, 0.50),
+    ]
     cabin = [(1.00, 0.88), (0.30, 1.42), (-1.20, 1.46), (-1.70, 0.95)]
     glass = [(0.86, 0.93), (0.27, 1.36), (-1.17, 1.39), (-1.55, 0.98)]
     windscreen = [(1.01, 0.90), (0.36, 1.385), (0.33, 1.36), (0.94, 0.89)]
     rear_window = [(-1.66, 1.00), (-1.70, 1.00), (-1.28, 1.41), (-1.24, 1.41)]
     parts = [
-        _extruded(body, half, _PAINT), _extruded(cabin, 0.68, _PAINT), _extruded(glass, 0.69, _GLASS),
-        _extruded(windscreen, 0.60, _GLASS), _extruded(rear_window, 0.58, _GLASS),
-        _box((1.77, 0.0, 0.42), (0.10, 1.50, 0.14), _BUMPER), _box((-1.77, 0.0, 0.42), (0.10, 1.50, 0.14), _BUMPER),
-    ]  # fmt: skip
+        _extruded(body, half, _PAINT),
+        _extruded(cabin, 0.68, _PAINT),
+        _extruded(glass, 0.69, _GLASS),
+        _extruded(windscreen, 0.60, _GLASS),
+        _extruded(rear_window, 0.58, _GLASS),
+        _box((1.77, 0.0, 0.42), (0.10, 1.50, 0.14), _BUMPER),
+        _box((-1.77, 0.0, 0.42), (0.10, 1.50, 0.14), _BUMPER),
+    ]
     for side in (-1.0, 1.0):
         parts.append(_box((1.74, side * 0.62, 0.68), (0.08, 0.26, 0.12), _LAMP))
         parts.append(_box((-1.755, side * 0.66, 0.78), (0.06, 0.18, 0.16), _BRAKE_LAMP))
@@ -85,7 +99,9 @@ def _turned(profile: list[tuple[float, float]], sides: int, rgb: ArrayLike) -> M
     """The surface that a profile of radius and height sweeps around the z axis."""
     angle = 2.0 * np.pi * np.arange(sides + 1) / sides
     r, z = np.array(profile).T
-    rings = np.stack([r[:, None] * np.cos(angle), r[:, None] * np.sin(angle), np.repeat(z[:, None], sides + 1, 1)], -1)
+    rings = np.stack(
+        [r[:, None] * np.cos(angle), r[:, None] * np.sin(angle), np.repeat(z[:, None], sides + 1, 1)], -1
+    )
     return part_from_colours(*_painted(_strip(rings), rgb))
 
 
@@ -93,7 +109,9 @@ def _extruded(outline: list[tuple[float, float]], half_width: float, rgb: ArrayL
     """A convex outline in x and z, as wide as twice ``half_width`` along y, closed at both sides."""
     x, z = np.array([*outline, outline[0]]).T
     left, right = (np.stack([x, np.full_like(x, side * half_width), z], axis=-1) for side in (1.0, -1.0))
-    sides = [np.stack([edge[[0] * (len(edge) - 3)], edge[1:-2], edge[2:-1]], axis=1) for edge in (left, right)]
+    sides = [
+        np.stack([edge[[0] * (len(edge) - 3)], edge[1:-2], edge[2:-1]], axis=1) for edge in (left, right)
+    ]
     return part_from_colours(*_painted(np.concatenate([_strip(np.stack([left, right])), *sides]), rgb))
 
 

@@ -82,11 +82,15 @@ def load_mesh(path: Path, up: str = "z", height_m: float | None = None) -> Surfa
     _check_height(height_m)
     parts = [_part(geometry, path) for geometry in _geometries(path)]
     if not parts or sum(len(part.triangles) for part in parts) == 0:
-        raise MeshError(f"expected a mesh with triangles in {path}, got none: is it a point cloud or an empty scene?")
+        raise MeshError(
+            f"expected a mesh with triangles in {path}, got none: is it a point cloud or an empty scene?"
+        )
     return stand(SurfaceMesh(tuple(parts)), up, height_m, str(path))
 
 
-def stand(mesh: SurfaceMesh, up: str = "z", height_m: float | None = None, name: str = "the mesh") -> SurfaceMesh:
+def stand(
+    mesh: SurfaceMesh, up: str = "z", height_m: float | None = None, name: str = "the mesh"
+) -> SurfaceMesh:
     """Turn a mesh upright, put its base on z = 0 and the middle of its box over the origin, and scale it."""
     _check_height(height_m)
     turn = _Z_UP_FROM_Y_UP if up == "y" else np.eye(3)
@@ -135,7 +139,9 @@ def _geometries(path: Path) -> list[Any]:
         scene = trimesh.load_scene(path)
         dumped = scene.dump(concatenate=False)
     except Exception as error:  # trimesh's readers raise whatever they stumble over
-        raise MeshError(f"cannot read {path} as a mesh ({type(error).__name__}: {error}); export it again") from error
+        raise MeshError(
+            f"cannot read {path} as a mesh ({type(error).__name__}: {error}); export it again"
+        ) from error
     return [geometry for geometry in dumped if isinstance(geometry, trimesh.Trimesh) and len(geometry.faces)]
 
 
@@ -166,7 +172,10 @@ def _texture(material: Any, path: Path) -> NDArray[np.float32]:
     rgb = np.ones(3) if factor is None else np.asarray(factor, dtype=np.float64)[:3] / 255.0
     if image is None:
         if factor is None:
-            rgb = np.asarray(getattr(material, "main_color", [255 * c for c in _GREY]), dtype=np.float64)[:3] / 255.0
+            rgb = (
+                np.asarray(getattr(material, "main_color", [255 * c for c in _GREY]), dtype=np.float64)[:3]
+                / 255.0
+            )
         return rgb.astype(np.float32).reshape(1, 1, 3)
     try:
         pixels = np.asarray(image.convert("RGB"), dtype=np.float32) / 255.0

@@ -77,14 +77,22 @@ class ObjectModel:
         """The object at a pose ``[4, 4]``, with ``scale`` world metres per metre of its own."""
         pose = np.asarray(T_world_from_object, dtype=np.float64)
         if pose.shape != (4, 4) or not np.isfinite(pose).all():
-            raise ObjectFileError(f"expected a finite pose [4, 4] for {self.name}, got shape {list(pose.shape)}")
+            raise ObjectFileError(
+                f"expected a finite pose [4, 4] for {self.name}, got shape {list(pose.shape)}"
+            )
         count = int(self.slots.max())
         return VoxelGridObject(
-            slots=self.slots, theta_shape=(count, 3), fixed_colours=np.array([_HIDDEN_RGB]),
-            box_min=self.grids.box_min, box_max=self.grids.box_max, T_world_from_object=pose, scale=scale,
-            density=np.asarray(self.grids.density, dtype=np.float64), step_units=self.grids.voxel / _STEPS_PER_VOXEL,
+            slots=self.slots,
+            theta_shape=(count, 3),
+            fixed_colours=np.array([_HIDDEN_RGB]),
+            box_min=self.grids.box_min,
+            box_max=self.grids.box_max,
+            T_world_from_object=pose,
+            scale=scale,
+            density=np.asarray(self.grids.density, dtype=np.float64),
+            step_units=self.grids.voxel / _STEPS_PER_VOXEL,
             plain_colours=np.asarray(self.grids.colours[self.slots < count], dtype=np.float64),
-        )  # fmt: skip
+        )
 
     def with_colours(self, rows: ArrayLike) -> ObjectModel:
         """The same object with other colours in the rows of theta, ``[K, 3]`` in 0..1."""
@@ -98,9 +106,10 @@ def save_object(path: Path, model: ObjectModel) -> None:
     """Write an object file, whole or not at all."""
     grids = model.grids
     tensors: dict[str, NDArray[Any]] = {
-        "density": np.ascontiguousarray(grids.density), "colours": np.ascontiguousarray(grids.colours),
+        "density": np.ascontiguousarray(grids.density),
+        "colours": np.ascontiguousarray(grids.colours),
         "box": np.stack([grids.box_min, grids.box_max]),
-    }  # fmt: skip
+    }
     metadata = {"format": FILE_FORMAT, "name": model.name, "about": json.dumps(model.about, sort_keys=True)}
     write_atomically(path, with_sorted_header(save(tensors, metadata)))
 
@@ -112,7 +121,9 @@ def load_object(path: Path) -> ObjectModel:
         ObjectFileError: No file, not an object file, or values that no object has.
     """
     if not path.is_file():
-        raise ObjectFileError(f"expected an object file at {path}, found none: make one with `advnerf object build`")
+        raise ObjectFileError(
+            f"expected an object file at {path}, found none: make one with `advnerf object build`"
+        )
     try:
         with safe_open(path, framework="numpy") as stream:
             metadata = stream.metadata() or {}

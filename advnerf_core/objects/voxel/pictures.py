@@ -199,7 +199,9 @@ class RayBatches:
         return torch.from_numpy(pixels), origins[meets], directions[meets]
 
 
-def _window(T_object_from_camera: Array, pinhole: Pinhole, low: Array, high: Array) -> tuple[int, int, int, int]:
+def _window(
+    T_object_from_camera: Array, pinhole: Pinhole, low: Array, high: Array
+) -> tuple[int, int, int, int]:
     """Left, top, right and bottom of the pixels that may show the box; the whole picture for a camera near or in the box."""
     corners = np.stack(np.meshgrid(*zip(low, high, strict=True)), axis=-1).reshape(-1, 3)
     x, y, z = transform_points(invert_transform(T_object_from_camera), corners).T
@@ -221,4 +223,6 @@ def crossing(origins: Tensor, directions: Tensor, low: Tensor, high: Tensor) -> 
 
 
 def _looks_elsewhere() -> FitError:
-    return FitError("expected the pictures to look at the object's box, none of them does: are box and poses right?")
+    return FitError(
+        "expected the pictures to look at the object's box, none of them does: are box and poses right?"
+    )

@@ -48,7 +48,15 @@ def draw_mesh(
 
 
 def _draw(
-    corners: Any, uv: Any, part_of: Any, texels: Any, shapes: Any, firsts: Any, lens: Any, depth: Any, image: Any
+    corners: Any,
+    uv: Any,
+    part_of: Any,
+    texels: Any,
+    shapes: Any,
+    firsts: Any,
+    lens: Any,
+    depth: Any,
+    image: Any,
 ) -> None:
     bands = slot_bounds(len(depth), _BANDS)
 
@@ -73,9 +81,18 @@ def _edge(a: Any, b: Any, x: float, y: float) -> float:
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _draw_band(
-    corners: Any, uv: Any, part_of: Any, texels: Any, shapes: Any, firsts: Any, lens: Any, depth: Any, image: Any,
-    top: int, bottom: int,
-) -> None:  # fmt: skip
+    corners: Any,
+    uv: Any,
+    part_of: Any,
+    texels: Any,
+    shapes: Any,
+    firsts: Any,
+    lens: Any,
+    depth: Any,
+    image: Any,
+    top: int,
+    bottom: int,
+) -> None:
     """Rows from ``top`` to before ``bottom``."""
     width = depth.shape[1]
     p = np.empty((3, 2))

@@ -35,7 +35,11 @@ def ring(box: tuple[Array, Array], count: int, elevation_rad: float = 0.25, phas
 
 
 def dome(
-    box: tuple[Array, Array], count: int, lowest_rad: float = -0.1, highest_rad: float = 1.1, phase: float = 0.0
+    box: tuple[Array, Array],
+    count: int,
+    lowest_rad: float = -0.1,
+    highest_rad: float = 1.1,
+    phase: float = 0.0,
 ) -> Array:
     """Poses ``[count, 4, 4]`` spread evenly over the part of a sphere that a car's camera and a person's see (a golden spiral)."""
     k = (np.arange(count) + 0.5) / count

@@ -76,7 +76,9 @@ def voxelise(mesh: SurfaceMesh, resolution: int = 64) -> ObjectGrids:
     return ObjectGrids(density, _spread_colours(sums, hits), box_min, box_min + voxel * counts)
 
 
-def _drawn_surface(mesh: SurfaceMesh, box_min: Array, voxel: float, counts: Array, fine: int) -> tuple[Any, Any, Any]:
+def _drawn_surface(
+    mesh: SurfaceMesh, box_min: Array, voxel: float, counts: Array, fine: int
+) -> tuple[Any, Any, Any]:
     """Fine cells that the surface crosses, and per coarse voxel the sum and number of the colours in it."""
     surface = np.zeros(tuple(counts * fine), dtype=np.bool_)
     sums, hits = np.zeros((*counts, 3)), np.zeros(tuple(counts))
@@ -120,7 +122,15 @@ def _spread_colours(sums: Array, hits: Array) -> NDArray[np.float32]:
 
 @njit(cache=True, error_model="numpy")
 def _draw(
-    triangles: Any, uv: Any, texture: Any, box_min: Any, cell: float, fine: int, surface: Any, sums: Any, hits: Any
+    triangles: Any,
+    uv: Any,
+    texture: Any,
+    box_min: Any,
+    cell: float,
+    fine: int,
+    surface: Any,
+    sums: Any,
+    hits: Any,
 ) -> None:
     """Walk each triangle on a lattice finer than half a cell along its two shorter edges."""
     nx, ny, nz = surface.shape

@@ -48,28 +48,47 @@ class Capability(Structure):
     """``v4l2_capability``."""
 
     _fields_ = (
-        ("driver", c_char * 16), ("card", c_char * 32), ("bus_info", c_char * 32), ("version", c_uint32),
-        ("capabilities", c_uint32), ("device_caps", c_uint32), ("reserved", c_uint32 * 3),
-    )  # fmt: skip
+        ("driver", c_char * 16),
+        ("card", c_char * 32),
+        ("bus_info", c_char * 32),
+        ("version", c_uint32),
+        ("capabilities", c_uint32),
+        ("device_caps", c_uint32),
+        ("reserved", c_uint32 * 3),
+    )
 
 
 class FormatDescription(Structure):
     """``v4l2_fmtdesc``."""
 
     _fields_ = (
-        ("index", c_uint32), ("type", c_uint32), ("flags", c_uint32), ("description", c_char * 32),
-        ("pixelformat", c_uint32), ("mbus_code", c_uint32), ("reserved", c_uint32 * 3),
-    )  # fmt: skip
+        ("index", c_uint32),
+        ("type", c_uint32),
+        ("flags", c_uint32),
+        ("description", c_char * 32),
+        ("pixelformat", c_uint32),
+        ("mbus_code", c_uint32),
+        ("reserved", c_uint32 * 3),
+    )
 
 
 class PixelFormat(Structure):
     """``v4l2_pix_format``."""
 
     _fields_ = (
-        ("width", c_uint32), ("height", c_uint32), ("pixelformat", c_uint32), ("field", c_uint32),
-        ("bytesperline", c_uint32), ("sizeimage", c_uint32), ("colorspace", c_uint32), ("priv", c_uint32),
-        ("flags", c_uint32), ("ycbcr_enc", c_uint32), ("quantization", c_uint32), ("xfer_func", c_uint32),
-    )  # fmt: skip
+        ("width", c_uint32),
+        ("height", c_uint32),
+        ("pixelformat", c_uint32),
+        ("field", c_uint32),
+        ("bytesperline", c_uint32),
+        ("sizeimage", c_uint32),
+        ("colorspace", c_uint32),
+        ("priv", c_uint32),
+        ("flags", c_uint32),
+        ("ycbcr_enc", c_uint32),
+        ("quantization", c_uint32),
+        ("xfer_func", c_uint32),
+    )
 
 
 class _FormatUnion(Union):
@@ -92,25 +111,40 @@ class FrameSize(Structure):
     """``v4l2_frmsizeenum``; ``discrete`` is its first alternative, the others are not read."""
 
     _fields_ = (
-        ("index", c_uint32), ("pixel_format", c_uint32), ("type", c_uint32), ("width", c_uint32), ("height", c_uint32),
-        ("rest", c_uint32 * 4), ("reserved", c_uint32 * 2),
-    )  # fmt: skip
+        ("index", c_uint32),
+        ("pixel_format", c_uint32),
+        ("type", c_uint32),
+        ("width", c_uint32),
+        ("height", c_uint32),
+        ("rest", c_uint32 * 4),
+        ("reserved", c_uint32 * 2),
+    )
 
 
 class FrameInterval(Structure):
     """``v4l2_frmivalenum``; ``discrete`` is its first alternative, the others are not read."""
 
     _fields_ = (
-        ("index", c_uint32), ("pixel_format", c_uint32), ("width", c_uint32), ("height", c_uint32), ("type", c_uint32),
-        ("discrete", Fraction), ("rest", c_uint32 * 4), ("reserved", c_uint32 * 2),
-    )  # fmt: skip
+        ("index", c_uint32),
+        ("pixel_format", c_uint32),
+        ("width", c_uint32),
+        ("height", c_uint32),
+        ("type", c_uint32),
+        ("discrete", Fraction),
+        ("rest", c_uint32 * 4),
+        ("reserved", c_uint32 * 2),
+    )
 
 
 class _CaptureParameters(Structure):
     _fields_ = (
-        ("capability", c_uint32), ("capturemode", c_uint32), ("timeperframe", Fraction), ("extendedmode", c_uint32),
-        ("readbuffers", c_uint32), ("reserved", c_uint32 * 4),
-    )  # fmt: skip
+        ("capability", c_uint32),
+        ("capturemode", c_uint32),
+        ("timeperframe", Fraction),
+        ("extendedmode", c_uint32),
+        ("readbuffers", c_uint32),
+        ("reserved", c_uint32 * 4),
+    )
 
 
 class _ParametersUnion(Union):
@@ -127,9 +161,13 @@ class RequestBuffers(Structure):
     """``v4l2_requestbuffers``."""
 
     _fields_ = (
-        ("count", c_uint32), ("type", c_uint32), ("memory", c_uint32), ("capabilities", c_uint32),
-        ("flags", c_uint8), ("reserved", c_uint8 * 3),
-    )  # fmt: skip
+        ("count", c_uint32),
+        ("type", c_uint32),
+        ("memory", c_uint32),
+        ("capabilities", c_uint32),
+        ("flags", c_uint8),
+        ("reserved", c_uint8 * 3),
+    )
 
 
 class TimeValue(Structure):
@@ -152,10 +190,20 @@ class Buffer(Structure):
     """``v4l2_buffer``."""
 
     _fields_ = (
-        ("index", c_uint32), ("type", c_uint32), ("bytesused", c_uint32), ("flags", c_uint32), ("field", c_uint32),
-        ("timestamp", TimeValue), ("timecode", TimeCode), ("sequence", c_uint32), ("memory", c_uint32),
-        ("m", _MemoryUnion), ("length", c_uint32), ("reserved2", c_uint32), ("request_fd", c_int32),
-    )  # fmt: skip
+        ("index", c_uint32),
+        ("type", c_uint32),
+        ("bytesused", c_uint32),
+        ("flags", c_uint32),
+        ("field", c_uint32),
+        ("timestamp", TimeValue),
+        ("timecode", TimeCode),
+        ("sequence", c_uint32),
+        ("memory", c_uint32),
+        ("m", _MemoryUnion),
+        ("length", c_uint32),
+        ("reserved2", c_uint32),
+        ("request_fd", c_int32),
+    )
 
 
 class Control(Structure):
@@ -168,15 +216,28 @@ class QueryControl(Structure):
     """``v4l2_queryctrl``."""
 
     _fields_ = (
-        ("id", c_uint32), ("type", c_uint32), ("name", c_char * 32), ("minimum", c_int32), ("maximum", c_int32),
-        ("step", c_int32), ("default_value", c_int32), ("flags", c_uint32), ("reserved", c_uint32 * 2),
-    )  # fmt: skip
+        ("id", c_uint32),
+        ("type", c_uint32),
+        ("name", c_char * 32),
+        ("minimum", c_int32),
+        ("maximum", c_int32),
+        ("step", c_int32),
+        ("default_value", c_int32),
+        ("flags", c_uint32),
+        ("reserved", c_uint32 * 2),
+    )
 
 
 class ExtensionQuery(Structure):
     """``uvc_xu_control_query``."""
 
-    _fields_ = (("unit", c_uint8), ("selector", c_uint8), ("query", c_uint8), ("size", c_uint16), ("data", c_uint64))
+    _fields_ = (
+        ("unit", c_uint8),
+        ("selector", c_uint8),
+        ("query", c_uint8),
+        ("size", c_uint16),
+        ("data", c_uint64),
+    )
 
 
 def _request(direction: int, group: str, number: int, size: int) -> int:

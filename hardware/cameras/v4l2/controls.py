@@ -40,7 +40,9 @@ class Controls:
         if self.power_line_hz not in (None, *_POWER_LINE):
             raise ValueError(f"expected a mains frequency of 0, 50 or 60 Hz, got {self.power_line_hz}")
         if unknown := set(self.others) - set(abi.CONTROL_IDS):
-            raise ValueError(f"unknown controls {', '.join(sorted(unknown))}; known: {', '.join(abi.CONTROL_IDS)}")
+            raise ValueError(
+                f"unknown controls {', '.join(sorted(unknown))}; known: {', '.join(abi.CONTROL_IDS)}"
+            )
 
     def settings(self) -> dict[str, int]:
         """Values by control, in the order of setting: automatic modes are disabled before their values are set."""
@@ -105,7 +107,9 @@ def _set(port: VideoPort, fd: int, path: Path, name: str, value: int) -> int:
         has = ", ".join(n for n in abi.CONTROL_IDS if query(port, fd, n) is not None) or "none"
         raise HardwareError(f"{path} has no control {name}; remove it. The device has {has}")
     if not limits.minimum <= value <= limits.maximum:
-        raise HardwareError(f"expected {name} of {limits.minimum} to {limits.maximum} for {path}, got {value}")
+        raise HardwareError(
+            f"expected {name} of {limits.minimum} to {limits.maximum} for {path}, got {value}"
+        )
     control = abi.Control(id=abi.CONTROL_IDS[name], value=value)
     request(port, fd, path, abi.S_CTRL, control, f"setting {name} to {value}")
     got = read(port, fd, path, name)

@@ -111,7 +111,9 @@ class V4l2Camera(Camera):
             try:
                 ready = self._port.wait(self._fd, max(deadline - time.monotonic(), 0.0))
             except OSError as error:
-                raise LinkLost(f"lost the camera {self.path}: {error.strerror or error}; was it unplugged?") from error
+                raise LinkLost(
+                    f"lost the camera {self.path}: {error.strerror or error}; was it unplugged?"
+                ) from error
             if not ready:
                 return None
             if (frame := self._newest()) is not None:
@@ -157,7 +159,9 @@ class V4l2Camera(Camera):
             try:
                 self._maps.append(self._port.map(self._fd, buffer.length, buffer.m.offset))
             except OSError as error:
-                raise ProtocolError(f"cannot map a buffer of {self.path}: {error.strerror or error}") from error
+                raise ProtocolError(
+                    f"cannot map a buffer of {self.path}: {error.strerror or error}"
+                ) from error
             self._request(abi.QBUF, self._buffer(index), "handing it a buffer")
 
     @staticmethod

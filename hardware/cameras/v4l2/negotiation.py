@@ -36,7 +36,9 @@ class Mode:
         if self.width <= 0 or self.height <= 0 or not self.fps > 0.0:
             raise ValueError(f"expected a size and a rate above zero, got {self}")
         if self.pixel_format not in PIXEL_FORMATS:
-            raise ValueError(f"expected a pixel format of {', '.join(PIXEL_FORMATS)}, got {self.pixel_format!r}")
+            raise ValueError(
+                f"expected a pixel format of {', '.join(PIXEL_FORMATS)}, got {self.pixel_format!r}"
+            )
 
     def __str__(self) -> str:
         return f"{self.width} x {self.height} {self.pixel_format} at {self.fps:g} Hz"
@@ -102,7 +104,11 @@ def agree(port: VideoPort, fd: int, path: Path, mode: Mode, columns: tuple[int, 
         raise ProtocolError(f"expected rows of at least {least} bytes from {path}, got {got.bytesperline}")
     _agree_on_rate(port, fd, path, mode)
     return Layout(
-        mode.pixel_format, mode.width, mode.height, got.bytesperline if least else 0, columns or (0, mode.width)
+        mode.pixel_format,
+        mode.width,
+        mode.height,
+        got.bytesperline if least else 0,
+        columns or (0, mode.width),
     )
 
 
@@ -115,7 +121,9 @@ def _agree_on_rate(port: VideoPort, fd: int, path: Path, mode: Mode) -> None:
     interval = answer.parm.capture.timeperframe
     got_hz = interval.denominator / interval.numerator if interval.numerator else 0.0
     if abs(got_hz - mode.fps) > _RATE_TOLERANCE * mode.fps:
-        raise ProtocolError(f"expected {mode.fps:g} Hz from {path}, got {got_hz:g} Hz; it offers {describe(port, fd)}")
+        raise ProtocolError(
+            f"expected {mode.fps:g} Hz from {path}, got {got_hz:g} Hz; it offers {describe(port, fd)}"
+        )
 
 
 def describe(port: VideoPort, fd: int) -> str:
@@ -157,7 +165,13 @@ def _sizes(port: VideoPort, fd: int, pixel_format: int) -> list[tuple[int, int]]
 
 def _rates(port: VideoPort, fd: int, pixel_format: int, width: int, height: int) -> list[float]:
     found = _enumerated(
-        port, fd, abi.ENUM_FRAMEINTERVALS, abi.FrameInterval, pixel_format=pixel_format, width=width, height=height
+        port,
+        fd,
+        abi.ENUM_FRAMEINTERVALS,
+        abi.FrameInterval,
+        pixel_format=pixel_format,
+        width=width,
+        height=height,
     )
     intervals = [entry.discrete for entry in found if entry.type == 1]
     return [round(i.denominator / i.numerator, 2) for i in intervals if i.numerator]

@@ -116,7 +116,9 @@ def _translated(error: OSError, path: Path, doing: str) -> HardwareError:
             f"lost the camera {path} while {doing}: {reason}; unplugged, or not enough power or USB bandwidth?"
         )
     if error.errno == errno.EBUSY:
-        return DeviceBusy(f"{path} is in use by another program ({doing}); find it with 'fuser {path}' and close it")
+        return DeviceBusy(
+            f"{path} is in use by another program ({doing}); find it with 'fuser {path}' and close it"
+        )
     if error.errno in (errno.EINVAL, errno.ENOTTY, errno.ERANGE, errno.EACCES, errno.EBADF):
         return ProtocolError(f"{path} does not do what was asked ({doing}): {reason}")
     if error.errno in (errno.ENOSPC, errno.ENOMEM):

@@ -72,7 +72,9 @@ def load_factory_calibration(path: Path | str, mode: str = "VGA", eye: str = "le
         raise ZedCalibrationError(f"{path}: [{name.upper()}]: {error}") from None
     numbers = np.array([fx, fy, cx, cy, k1, k2, p1, p2, k3])
     plausible = (
-        0.2 * width < fx < 3.0 * width and 0.25 * width < cx < 0.75 * width and 0.25 * height < cy < 0.75 * height
+        0.2 * width < fx < 3.0 * width
+        and 0.25 * width < cx < 0.75 * width
+        and 0.25 * height < cy < 0.75 * height
     )
     if not (np.isfinite(numbers).all() and plausible and 0.9 < fy / fx < 1.1):
         raise ZedCalibrationError(
@@ -91,7 +93,9 @@ def _sections(path: Path) -> dict[str, dict[str, str]]:
         ) from None
     except (OSError, UnicodeDecodeError, configparser.Error) as error:
         reason = " ".join(str(error).split())
-        raise ZedCalibrationError(f"expected a ZED calibration file at {path}, cannot read it: {reason}") from None
+        raise ZedCalibrationError(
+            f"expected a ZED calibration file at {path}, cannot read it: {reason}"
+        ) from None
     # The C++ readers ignore case in section names; keys are lowered by the parser.
     return {name.lower(): dict(parser[name]) for name in parser.sections()}
 

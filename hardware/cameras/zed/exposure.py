@@ -76,7 +76,9 @@ class ExtensionUnit:
         sleep: Waits [s].
     """
 
-    def __init__(self, port: VideoPort, fd: int, path: Path, sleep: Callable[[float], None] = time.sleep) -> None:
+    def __init__(
+        self, port: VideoPort, fd: int, path: Path, sleep: Callable[[float], None] = time.sleep
+    ) -> None:
         self._port, self._fd, self._path, self._sleep = port, fd, path, sleep
         self._length = self._read_length()
 
@@ -140,7 +142,9 @@ class ExtensionUnit:
                 f"{self._path} has no extension unit {_UNIT}, so it is not a ZED; remove its exposure settings"
             ) from None
         except OSError:
-            request(self._port, self._fd, self._path, abi.UVC_CTRL_QUERY, asked, "talking to the ZED's registers")
+            request(
+                self._port, self._fd, self._path, abi.UVC_CTRL_QUERY, asked, "talking to the ZED's registers"
+            )
 
     def _require(self, got: int, wanted: int, address: int) -> None:
         if got != wanted:
@@ -174,7 +178,9 @@ def read_gain(unit: ExtensionUnit, eye: int = 0) -> int:
 
 def read_exposure_lines(unit: ExtensionUnit, eye: int = 0) -> int:
     """Present exposure of an eye [lines]."""
-    return int.from_bytes(bytes(unit.read_sensor(eye, address) for address in _EXPOSURE_REGISTERS), "big") >> 4
+    return (
+        int.from_bytes(bytes(unit.read_sensor(eye, address) for address in _EXPOSURE_REGISTERS), "big") >> 4
+    )
 
 
 def automatic_is_on(unit: ExtensionUnit, eye: int = 0) -> bool:

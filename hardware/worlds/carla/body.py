@@ -36,7 +36,13 @@ class CarlaCar:
     """
 
     def __init__(self, world: Any, library: Any, frame: SceneFrame, config: CarlaConfig, undo: Undo) -> None:
-        self._world, self._library, self._frame, self._config, self._undo = world, library, frame, config, undo
+        self._world, self._library, self._frame, self._config, self._undo = (
+            world,
+            library,
+            frame,
+            config,
+            undo,
+        )
         self._solid = {_label(library, name) for name in config.body.solid}
         reach = config.junction.reach_m
         self._car = DubinsCar(config.car, lambda x, y, yaw: max(abs(x), abs(y)) <= reach)
@@ -106,7 +112,9 @@ class CarlaCar:
         away[2, 3] = _AWAY_M
         try:
             blueprint = self._world.get_blueprint_library().find(name)
-            self._actor = self._world.spawn_actor(blueprint, self._frame.body_pose(away).to_transform(self._library))
+            self._actor = self._world.spawn_actor(
+                blueprint, self._frame.body_pose(away).to_transform(self._library)
+            )
         except (RuntimeError, IndexError) as error:
             raise CarlaError(
                 f"expected to put the vehicle {name} into CARLA's world, got: {error}; name another one in body.blueprint, or null for "
@@ -121,7 +129,9 @@ class CarlaCar:
             return False
         starts, ends = self._bumper(before, -_INSIDE_M), self._bumper(after, 0.0)
         for start, end in zip(starts, ends, strict=True):
-            hits = self._world.cast_ray(*(self._library.Location(*self._frame.carla_point(at)) for at in (start, end)))
+            hits = self._world.cast_ray(
+                *(self._library.Location(*self._frame.carla_point(at)) for at in (start, end))
+            )
             if any(hit.label in self._solid for hit in hits):
                 return True
         return False

@@ -49,7 +49,9 @@ class Mailbox:
             came = f"frame {newest}: the server left this one out"
         else:
             came = f"nothing after frame {newest}: the server is too slow, or stands; raise server.frame_timeout_s if it is slow"
-        raise CarlaFrameError(f"expected the picture of frame {frame} within {timeout_s:g} s of its tick, got {came}")
+        raise CarlaFrameError(
+            f"expected the picture of frame {frame} within {timeout_s:g} s of its tick, got {came}"
+        )
 
 
 class Camera:
@@ -76,7 +78,14 @@ class Camera:
     """
 
     def __init__(
-        self, world: Any, library: Any, kind: str, pinhole: Pinhole, pose: CarlaPose, render: RenderConfig, undo: Undo
+        self,
+        world: Any,
+        library: Any,
+        kind: str,
+        pinhole: Pinhole,
+        pose: CarlaPose,
+        render: RenderConfig,
+        undo: Undo,
     ) -> None:
         self.pinhole, self._library = pinhole, library
         self._mailbox = Mailbox()

@@ -119,7 +119,15 @@ class BodyConfig(_Frozen):
     origin_ahead_m: float = 1.4
     half_length_m: float = Field(default=2.45, gt=0.0)
     half_width_m: float = Field(default=0.9, gt=0.0)
-    solid: tuple[str, ...] = ("Buildings", "Walls", "Fences", "Poles", "GuardRail", "TrafficLight", "TrafficSigns")
+    solid: tuple[str, ...] = (
+        "Buildings",
+        "Walls",
+        "Fences",
+        "Poles",
+        "GuardRail",
+        "TrafficLight",
+        "TrafficSigns",
+    )
 
 
 class CarlaConfig(_Frozen):

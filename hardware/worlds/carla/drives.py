@@ -62,7 +62,9 @@ class Drives:
             paths: dict[PathName, ReferencePath] = {
                 name: ReferencePath.from_dict(data["paths"][name]) for name in EXIT_OF
             }
-            rest = {name: data[name] for name in ("junction_id", "lane_width_m", "height_range_m", "right_hand")}
+            rest = {
+                name: data[name] for name in ("junction_id", "lane_width_m", "height_range_m", "right_hand")
+            }
             return cls(frame=SceneFrame(**data["frame"]), paths=paths, **rest)
         except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
             raise CarlaMapError(

@@ -82,7 +82,9 @@ class CarlaPose:
     def matrix(self) -> Array:
         """Right-handed transform ``[4, 4]`` of the body, in CARLA's world with y mirrored."""
         yaw, pitch, roll = (math.radians(angle) for angle in (self.yaw_deg, self.pitch_deg, self.roll_deg))
-        return make_transform(rotation_z(-yaw) @ rotation_y(-pitch) @ rotation_x(roll), [self.x_m, -self.y_m, self.z_m])
+        return make_transform(
+            rotation_z(-yaw) @ rotation_y(-pitch) @ rotation_x(roll), [self.x_m, -self.y_m, self.z_m]
+        )
 
     def to_transform(self, library: Any) -> Any:
         """As a ``carla.Transform`` of the given library (single precision)."""
@@ -120,7 +122,9 @@ class SceneFrame:
 
     def body_pose(self, T_world_from_body: ArrayLike) -> CarlaPose:
         """Where CARLA must put an actor whose pose ``[4, 4]`` in our world is given (its axes: forward, left, up)."""
-        return CarlaPose.from_matrix(self.T_mirrored_from_world @ np.asarray(T_world_from_body, dtype=np.float64))
+        return CarlaPose.from_matrix(
+            self.T_mirrored_from_world @ np.asarray(T_world_from_body, dtype=np.float64)
+        )
 
     def camera_pose(self, T_world_from_camera: ArrayLike) -> CarlaPose:
         """Where CARLA must put a camera whose pose ``[4, 4]`` in our world is given (OpenCV axes)."""

@@ -140,13 +140,17 @@ def _drives_at(
     three = sets[choice]
     frame, waypoints = _frame_of(three), {}
     for name, crossing in three.items():
-        waypoints[name] = _along(crossing, frame, approach_m, beyond_m, f"the drive {name} of junction {junction.id}")
+        waypoints[name] = _along(
+            crossing, frame, approach_m, beyond_m, f"the drive {name} of junction {junction.id}"
+        )
     heights = np.array([point.transform.location.z for points in waypoints.values() for point in points])
     x, y = (float(value) for value in frame.T_mirrored_from_world[:2, 3])
     frame = SceneFrame(x, y, float(np.median(heights)), frame.yaw_rad)
     paths = {name: _path(name, points, frame, tolerance_m) for name, points in waypoints.items()}
     width = min(point.lane_width for points in waypoints.values() for point in points)
-    return Drives(junction.id, frame, paths, float(width), float(np.ptp(heights)), bool(three["straight"].begin.is_rht))
+    return Drives(
+        junction.id, frame, paths, float(width), float(np.ptp(heights)), bool(three["straight"].begin.is_rht)
+    )
 
 
 def _junctions(carla_map: Any) -> dict[int, Any]:
@@ -191,13 +195,18 @@ def _sets_of_three(crossings: Sequence[Crossing]) -> list[dict[PathName, Crossin
         if abs(straight.turn_rad) > _STRAIGHT_RAD:
             continue
         rights = [
-            c for c in crossings if -highest < c.turn_rad < -lowest and _apart(c.entry, straight.entry) < _SAME_LANE_M
+            c
+            for c in crossings
+            if -highest < c.turn_rad < -lowest and _apart(c.entry, straight.entry) < _SAME_LANE_M
         ]
         for right in rights[:1]:
             lefts = [
-                c for c in crossings
-                if lowest < c.turn_rad < highest and _opposite(c.entry, right.exit) and _opposite(c.exit, straight.entry)
-            ]  # fmt: skip
+                c
+                for c in crossings
+                if lowest < c.turn_rad < highest
+                and _opposite(c.entry, right.exit)
+                and _opposite(c.exit, straight.entry)
+            ]
             if lefts:
                 left = min(lefts, key=_nearness(right.exit, straight.entry))
                 sets.append({"straight": straight, "right": right, "left": left})
@@ -229,7 +238,9 @@ def _along(crossing: Crossing, frame: SceneFrame, approach_m: float, beyond_m: f
         )
     before = _walk(crossing.begin, approach_m - to_middle, backwards=True, what=what)
     inside = [
-        point for point in crossing.begin.next_until_lane_end(_SAMPLE_M) if _distance_m(point, crossing.end) > 0.3
+        point
+        for point in crossing.begin.next_until_lane_end(_SAMPLE_M)
+        if _distance_m(point, crossing.end) > 0.3
     ]
     after = _walk(crossing.end, beyond_m, backwards=False, what=what)
     return [*reversed(before), crossing.begin, *inside, crossing.end, *after]
@@ -264,7 +275,9 @@ def _path(name: PathName, waypoints: Sequence[Any], frame: SceneFrame, tolerance
     try:
         segments = fit_lines_and_arcs(poses, tolerance_m)
     except ValueError as error:
-        raise CarlaMapError(f"the lanes of the drive {name} do not join: {error}; take another junction") from error
+        raise CarlaMapError(
+            f"the lanes of the drive {name} do not join: {error}; take another junction"
+        ) from error
     return ReferencePath(start, segments, goal_of(name))
 
 

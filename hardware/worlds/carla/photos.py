@@ -56,7 +56,9 @@ def held_out_states(drives: Drives, count: int, rng: np.random.Generator) -> lis
         path = paths[index % len(paths)]
         x, y, yaw = path.pose_at(float(rng.uniform(0.0, min(36.0, path.length_m))))
         aside = float(rng.uniform(-0.3, 0.3)) * drives.lane_width_m
-        states.append((x - aside * math.sin(yaw), y + aside * math.cos(yaw), yaw + float(rng.uniform(-0.2, 0.2))))
+        states.append(
+            (x - aside * math.sin(yaw), y + aside * math.cos(yaw), yaw + float(rng.uniform(-0.2, 0.2)))
+        )
     return states
 
 

@@ -105,7 +105,9 @@ class CarlaScene:
         self._world = open_world(self._client, config.server)
         check_nobody_else(self._world, config.server)
         self._drives = drives_in(self._world.get_map(), library, config)
-        self._ticked = TickedWorld(self._world, config.render.fixed_delta_s, config.server.timeout_s, self._undo)
+        self._ticked = TickedWorld(
+            self._world, config.render.fixed_delta_s, config.server.timeout_s, self._undo
+        )
         set_scenery(self._world, library, config.render, self._undo)
         self._car = CarlaCar(self._world, library, self._drives.frame, config, self._undo)
         self._opened = True
@@ -220,10 +222,16 @@ class CarlaScene:
         return self._see(self.state.T_world_from_car, depth)
 
     @overload
-    def observe_at(self, x_m: float, y_m: float, yaw_rad: float, depth: Literal[True] = True) -> tuple[Rgb, Depth]: ...
+    def observe_at(
+        self, x_m: float, y_m: float, yaw_rad: float, depth: Literal[True] = True
+    ) -> tuple[Rgb, Depth]: ...
     @overload
-    def observe_at(self, x_m: float, y_m: float, yaw_rad: float, depth: Literal[False]) -> tuple[Rgb, None]: ...
-    def observe_at(self, x_m: float, y_m: float, yaw_rad: float, depth: bool = True) -> tuple[Rgb, Depth | None]:
+    def observe_at(
+        self, x_m: float, y_m: float, yaw_rad: float, depth: Literal[False]
+    ) -> tuple[Rgb, None]: ...
+    def observe_at(
+        self, x_m: float, y_m: float, yaw_rad: float, depth: bool = True
+    ) -> tuple[Rgb, Depth | None]:
         """What the driving camera would see from another pose of the car (see :meth:`observe`); the car stays where it is, and out of sight."""
         with server_answers("looking from elsewhere"), self._without_car():
             return self._see(planar_pose(x_m, y_m, yaw_rad), depth)

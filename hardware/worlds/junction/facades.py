@@ -15,7 +15,12 @@ STOREY_M = 2.9
 _PIXELS_PER_M = 16.0
 _FRAME: Colour = (0.90, 0.89, 0.85)
 _DOORS: tuple[Colour, ...] = ((0.40, 0.20, 0.16), (0.16, 0.34, 0.30), (0.18, 0.26, 0.46), (0.44, 0.32, 0.20))
-_ACCENTS: tuple[Colour, ...] = ((0.72, 0.22, 0.18), (0.14, 0.42, 0.40), (0.84, 0.58, 0.16), (0.24, 0.32, 0.56))
+_ACCENTS: tuple[Colour, ...] = (
+    (0.72, 0.22, 0.18),
+    (0.14, 0.42, 0.40),
+    (0.84, 0.58, 0.16),
+    (0.24, 0.32, 0.56),
+)
 
 
 def facade(
@@ -48,7 +53,11 @@ def facade(
     for storey in range(ground, storeys):
         if storey > 0:
             canvas.rect(
-                0.0, STOREY_M * storey + 0.1, width_m, 0.14, _scaled(wall_rgb, 1.14 if style != "house" else 0.9)
+                0.0,
+                STOREY_M * storey + 0.1,
+                width_m,
+                0.14,
+                _scaled(wall_rgb, 1.14 if style != "house" else 0.9),
             )
         for column in range(columns):
             middle = (column + 0.5) * width_m / columns

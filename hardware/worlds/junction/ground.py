@@ -57,7 +57,8 @@ def markings(road: RoadConfig) -> list[Array]:
     for sign in (-1.0, 1.0):  # centre line of the main road: unbroken near the junction, then dashes
         pieces.append(_along_x(sign * (mouth + 4.2), sign * (mouth + 13.2), 0.0, 0.15))
         pieces += [
-            _along_x(sign * s, sign * (s + 3.0), 0.0, 0.15) for s in np.arange(mouth + 15.7, half - 1.0, 6.0).tolist()
+            _along_x(sign * s, sign * (s + 3.0), 0.0, 0.15)
+            for s in np.arange(mouth + 15.7, half - 1.0, 6.0).tolist()
         ]
     pieces.append(_along_y(-mouth - 4.4, -mouth - 14.4, 0.0, 0.15))
     pieces += [_along_y(-s, -s - 3.0, 0.0, 0.15) for s in np.arange(mouth + 16.9, half - 1.0, 6.0).tolist()]
@@ -65,8 +66,12 @@ def markings(road: RoadConfig) -> list[Array]:
     pieces += [_along_x(x, x + 0.6, -width + 0.05, 0.25) for x in dashes]  # give-way line
     pieces.append(_along_y(-mouth - 4.2, -mouth - 4.6, 0.5 * width, width - 0.3))  # stop line
     stripes = np.arange(-width + 0.45, width - 0.3, 1.0).tolist()
-    pieces += [_along_y(-mouth - 0.6, -mouth - 3.4, x + 0.05, 0.5) for x in stripes]  # zebra over the side road
-    pieces += [_along_x(-mouth - 0.6, -mouth - 3.4, y + 0.05, 0.5) for y in stripes]  # zebra over the west arm
+    pieces += [
+        _along_y(-mouth - 0.6, -mouth - 3.4, x + 0.05, 0.5) for x in stripes
+    ]  # zebra over the side road
+    pieces += [
+        _along_x(-mouth - 0.6, -mouth - 3.4, y + 0.05, 0.5) for y in stripes
+    ]  # zebra over the west arm
     for x, y, yaw in ((-mouth - 10.0, -0.5 * width, 0.0), (0.5 * width, -mouth - 10.5, 0.5 * math.pi)):
         pieces += _arrow(x, y, yaw)
     return pieces

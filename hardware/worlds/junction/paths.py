@@ -37,11 +37,15 @@ def junction_paths(
     """
     middle, quarter = 0.5 * lane_m, 0.5 * math.pi
     right: tuple[Segment, ...] = (
-        ("line", approach_m - middle - right_radius_m), ("arc", right_radius_m, -quarter), ("line", beyond_m),
-    )  # fmt: skip
+        ("line", approach_m - middle - right_radius_m),
+        ("arc", right_radius_m, -quarter),
+        ("line", beyond_m),
+    )
     left: tuple[Segment, ...] = (
-        ("line", approach_m + middle - left_radius_m), ("arc", left_radius_m, quarter), ("line", beyond_m),
-    )  # fmt: skip
+        ("line", approach_m + middle - left_radius_m),
+        ("arc", left_radius_m, quarter),
+        ("line", beyond_m),
+    )
     west, south = (-approach_m, -middle, 0.0), (middle, -approach_m, quarter)
     longest = max(sum(map(segment_length_m, segments)) for segments in (right, left))
     return {

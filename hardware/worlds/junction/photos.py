@@ -52,7 +52,9 @@ def _pose(config: IntersectionConfig, path: ReferencePath, kind: int, rng: np.ra
         return _raised(x, y, rng)
     offset, turn = (1.6, 0.5) if kind in (3, 8) else (0.6, 0.12)
     aside = float(rng.normal(0.0, offset))
-    car = planar_pose(x - aside * math.sin(yaw), y + aside * math.cos(yaw), yaw + float(rng.normal(0.0, turn)))
+    car = planar_pose(
+        x - aside * math.sin(yaw), y + aside * math.cos(yaw), yaw + float(rng.normal(0.0, turn))
+    )
     height = config.camera.z_m + float(rng.uniform(-0.2, 0.4))
     pitch = config.camera.pitch_down_rad + float(rng.normal(0.0, math.radians(3.0)))
     return car @ camera_mount(config.camera.x_m, config.camera.y_m, height, pitch)

@@ -45,7 +45,9 @@ def slow(like: Image, waves: float, rng: np.random.Generator, spread: float) -> 
     height, width = like.shape[:2]
     scale = waves / max(height, width)
     coarse = rng.standard_normal((max(round(height * scale), 2) + 2, max(round(width * scale), 2) + 2))
-    fine = cv2.resize(np.clip(coarse, -2.0, 2.0).astype(np.float32), (width, height), interpolation=cv2.INTER_CUBIC)
+    fine = cv2.resize(
+        np.clip(coarse, -2.0, 2.0).astype(np.float32), (width, height), interpolation=cv2.INTER_CUBIC
+    )
     return np.asarray(1.0 + spread * fine[..., None], dtype=np.float32)
 
 
@@ -82,7 +84,15 @@ def asphalt(road: RoadConfig, rng: np.random.Generator, pixels_per_m: float = 12
         _patch(plan, *_on_a_road(road, rng), rng)
     for _ in range(22):
         _crack(plan, *_on_a_road(road, rng), rng)
-    for x, y in ((-17.0, -1.2), (-4.2, 1.4), (9.5, -2.4), (19.0, 1.9), (1.1, -16.5), (-2.3, -26.0), (-31.0, 1.0)):
+    for x, y in (
+        (-17.0, -1.2),
+        (-4.2, 1.4),
+        (9.5, -2.4),
+        (19.0, 1.9),
+        (1.1, -16.5),
+        (-2.3, -26.0),
+        (-31.0, 1.0),
+    ):
         plan.disc(x, y, 0.42, (0.27, 0.27, 0.28))
         plan.disc(x, y, 0.33, (0.33, 0.32, 0.32))
     plan.image *= slow(plan.image, 16.0, rng, 0.035)
@@ -132,9 +142,11 @@ def pavement(road: RoadConfig, rng: np.random.Generator, pixels_per_m: float = 1
     plan.image *= np.asarray(slabs[..., None], dtype=np.float32)
     reach, ends = road.pavement_width_m + 0.1, width + road.corner_radius_m
     for x, y, wide, deep in (  # tactile slabs where the zebras begin
-        (-width - reach, -ends - 3.2, reach, 2.4), (width, -ends - 3.2, reach, 2.4),
-        (-ends - 3.2, width, 2.4, reach), (-ends - 3.2, -width - reach, 2.4, reach),
-    ):  # fmt: skip
+        (-width - reach, -ends - 3.2, reach, 2.4),
+        (width, -ends - 3.2, reach, 2.4),
+        (-ends - 3.2, width, 2.4, reach),
+        (-ends - 3.2, -width - reach, 2.4, reach),
+    ):
         plan.rect(x, y, wide, deep, (0.74, 0.66, 0.42))
     plan.image *= slow(plan.image, 24.0, rng, 0.04)
     return _shadowed(plan.image, road, pixels_per_m)
@@ -151,8 +163,10 @@ def garden(road: RoadConfig, rng: np.random.Generator, pixels_per_m: float = 8.0
     plan.line([(6.0, -8.0), (9.5, -11.8), (14.0, -12.6), (21.6, -12.4)], 1.5, path)  # through the park
     plan.line([(6.0, -18.0), (10.5, -17.4), (13.2, -12.7)], 1.3, path)
     for x, y, radius, rgb in (
-        (9.0, -8.2, 0.9, (0.72, 0.34, 0.36)), (17.0, -18.0, 1.5, (0.74, 0.60, 0.28)), (8.2, -22.2, 0.8, (0.58, 0.40, 0.58)),
-    ):  # fmt: skip
+        (9.0, -8.2, 0.9, (0.72, 0.34, 0.36)),
+        (17.0, -18.0, 1.5, (0.74, 0.60, 0.28)),
+        (8.2, -22.2, 0.8, (0.58, 0.40, 0.58)),
+    ):
         plan.disc(x, y, radius, rgb)
     return _shadowed(plan.image, road, pixels_per_m)
 
@@ -179,8 +193,12 @@ def _front_garden(plan: Plan, house: House, rng: np.random.Generator) -> None:
         rgb = [(0.66, 0.36, 0.40), (0.72, 0.62, 0.30), (0.46, 0.36, 0.26)][int(rng.integers(3))]
         x, y = path[0] + 0.5 * path[2], path[1] + 0.5 * path[3]
         along_x = house.front in ("north", "south")
-        near = {"south": (0.0, 1.5), "north": (0.0, -1.5), "east": (-1.5, 0.0), "west": (1.5, 0.0)}[house.front]
-        plan.disc(x + near[0] + (aside if along_x else 0.0), y + near[1] + (0.0 if along_x else aside), 0.6, rgb)
+        near = {"south": (0.0, 1.5), "north": (0.0, -1.5), "east": (-1.5, 0.0), "west": (1.5, 0.0)}[
+            house.front
+        ]
+        plan.disc(
+            x + near[0] + (aside if along_x else 0.0), y + near[1] + (0.0 if along_x else aside), 0.6, rgb
+        )
 
 
 def _shadowed(image: Image, road: RoadConfig, pixels_per_m: float) -> Image:

@@ -118,10 +118,16 @@ class Intersection:
         return self._see(self.state.T_world_from_car, depth)
 
     @overload
-    def observe_at(self, x_m: float, y_m: float, yaw_rad: float, depth: Literal[True] = True) -> tuple[Rgb, Depth]: ...
+    def observe_at(
+        self, x_m: float, y_m: float, yaw_rad: float, depth: Literal[True] = True
+    ) -> tuple[Rgb, Depth]: ...
     @overload
-    def observe_at(self, x_m: float, y_m: float, yaw_rad: float, depth: Literal[False]) -> tuple[Rgb, None]: ...
-    def observe_at(self, x_m: float, y_m: float, yaw_rad: float, depth: bool = True) -> tuple[Rgb, Depth | None]:
+    def observe_at(
+        self, x_m: float, y_m: float, yaw_rad: float, depth: Literal[False]
+    ) -> tuple[Rgb, None]: ...
+    def observe_at(
+        self, x_m: float, y_m: float, yaw_rad: float, depth: bool = True
+    ) -> tuple[Rgb, Depth | None]:
         """What the driving camera would see from another pose of the car (see :meth:`observe`); the car stays where it is."""
         return self._see(planar_pose(x_m, y_m, yaw_rad), depth)
 

@@ -49,9 +49,9 @@ def joined(solids: Sequence[Solid]) -> Solid:
     firsts = np.cumsum([0, *(len(solid.vertices) for solid in solids)])
     return Solid(
         np.concatenate([solid.vertices for solid in solids]),
-        np.concatenate([solid.faces + first for solid, first in zip(solids, firsts[:-1], strict=True)]).astype(
-            np.int32
-        ),
+        np.concatenate(
+            [solid.faces + first for solid, first in zip(solids, firsts[:-1], strict=True)]
+        ).astype(np.int32),
         np.concatenate([solid.uv for solid in solids]),
     )
 
@@ -66,7 +66,9 @@ def strip(left: Array, right: Array, z_m: float, half_m: float) -> Solid:
     count = len(left)
     i = np.arange(count - 1)
     vertices = np.c_[np.concatenate([left, right]), np.full(2 * count, z_m)]
-    faces = np.concatenate([np.c_[i, i + count, i + count + 1], np.c_[i, i + count + 1, i + 1]]).astype(np.int32)
+    faces = np.concatenate([np.c_[i, i + count, i + count + 1], np.c_[i, i + count + 1, i + 1]]).astype(
+        np.int32
+    )
     return Solid(vertices, faces, plan_uv(vertices, half_m))
 
 
@@ -100,7 +102,9 @@ def block(x: tuple[float, float], y: tuple[float, float], z: tuple[float, float]
     """A box without its floor."""
     (x0, x1), (y0, y1), (z0, z1) = x, y, z
     around = np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1), (x0, y0)])
-    top = polygon([(x0, y0, z1), (x1, y0, z1), (x1, y1, z1), (x0, y1, z1)], (u, float(shade([0, 0, 1])) / BRIGHTEST))
+    top = polygon(
+        [(x0, y0, z1), (x1, y0, z1), (x1, y1, z1), (x0, y1, z1)], (u, float(shade([0, 0, 1])) / BRIGHTEST)
+    )
     return joined([wall(around, z0, z1, u), top])
 
 
@@ -111,15 +115,19 @@ def post(x_m: float, y_m: float, z: tuple[float, float], radius_m: float, u: flo
     return wall(around, *z, u)
 
 
-def crown(centre: tuple[float, float, float], radii: tuple[float, float], u: float, rng: np.random.Generator) -> Solid:
+def crown(
+    centre: tuple[float, float, float], radii: tuple[float, float], u: float, rng: np.random.Generator
+) -> Solid:
     """A tree's crown: an uneven ellipsoid (radius across, radius up), light where the sun is, blotched like leaves."""
     rings, sides = 9, 14
     latitude, longitude = np.meshgrid(
-        np.linspace(-0.5 * math.pi, 0.5 * math.pi, rings), np.linspace(0.0, 2.0 * math.pi, sides, endpoint=False),
+        np.linspace(-0.5 * math.pi, 0.5 * math.pi, rings),
+        np.linspace(0.0, 2.0 * math.pi, sides, endpoint=False),
         indexing="ij",
-    )  # fmt: skip
+    )
     normal = np.stack(
-        [np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)], axis=-1
+        [np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)],
+        axis=-1,
     ).reshape(-1, 3)
     bumps = 1.0 + 0.09 * rng.standard_normal(len(normal))
     vertices = np.asarray(centre) + normal * (radii[0], radii[0], radii[1]) * bumps[:, None]
@@ -153,11 +161,15 @@ def gable(
         along_x: Whether the ridge runs along x, else along y.
     """
     over, (x0, x1), (y0, y1) = 0.35, x, y
-    corners = [(x0, y0), (x1, y0), (x1, y1), (x0, y1)] if along_x else [(x1, y0), (x1, y1), (x0, y1), (x0, y0)]
+    corners = (
+        [(x0, y0), (x1, y0), (x1, y1), (x0, y1)] if along_x else [(x1, y0), (x1, y1), (x0, y1), (x0, y0)]
+    )
     middle = 0.5 * (y0 + y1) if along_x else 0.5 * (x0 + x1)
     half = 0.5 * (y1 - y0) if along_x else 0.5 * (x1 - x0)
     ridge = (
-        [(x1, middle, ridge_m), (x0, middle, ridge_m)] if along_x else [(middle, y1, ridge_m), (middle, y0, ridge_m)]
+        [(x1, middle, ridge_m), (x0, middle, ridge_m)]
+        if along_x
+        else [(middle, y1, ridge_m), (middle, y0, ridge_m)]
     )
     slope = (ridge_m - eaves_m) / half
     low = eaves_m - slope * over

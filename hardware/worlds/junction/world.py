@@ -41,7 +41,9 @@ def build_model(config: IntersectionConfig) -> Any:
     mujoco = load_mujoco()
     spec = mujoco.MjSpec()
     spec.visual.headlight.active = 0
-    spec.visual.quality.offsamples = 0  # the renderer averages a larger image instead, which also filters textures
+    spec.visual.quality.offsamples = (
+        0  # the renderer averages a larger image instead, which also filters textures
+    )
     surfaces, solids, plans = _painted(config.road)
     # Drawn in this order, so from what hides others (trees, houses) to what is hidden (the road, the sky behind it).
     for name in ("swatches", "pavement", "garden"):
@@ -101,7 +103,12 @@ def _furniture(road: RoadConfig, rng: np.random.Generator) -> list[Solid]:
             solids += gable(house.x, house.y, top, top + house.ridge_m, u, swatch_u(house.wall), along_x)
         else:
             solids.append(
-                block((house.x[0] - 0.2, house.x[1] + 0.2), (house.y[0] - 0.2, house.y[1] + 0.2), (top, top + 0.4), u)
+                block(
+                    (house.x[0] - 0.2, house.x[1] + 0.2),
+                    (house.y[0] - 0.2, house.y[1] + 0.2),
+                    (top, top + 0.4),
+                    u,
+                )
             )
     for tree in TREES:
         middle = kerb + tree.height_m - tree.radius_m * 1.15

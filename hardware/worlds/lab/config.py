@@ -49,7 +49,9 @@ class TrackConfig(_Frozen):
     @model_validator(mode="after")
     def _corners_fit(self) -> TrackConfig:
         if 2.0 * self.corner_radius_m > self.side_m:
-            raise ValueError(f"expected corner_radius_m <= side_m / 2 = {self.side_m / 2}, got {self.corner_radius_m}")
+            raise ValueError(
+                f"expected corner_radius_m <= side_m / 2 = {self.side_m / 2}, got {self.corner_radius_m}"
+            )
         return self
 
 
@@ -170,9 +172,12 @@ class MonitorOpticsConfig(_Frozen):
     def office(cls) -> MonitorOpticsConfig:
         """An ordinary IPS monitor under ceiling lamps before a camera with sRGB-like response."""
         return cls(
-            gamma=(2.30, 2.16, 2.42), mixing=((0.66, 0.10, 0.02), (0.06, 0.72, 0.07), (0.01, 0.09, 0.68)),
-            glare=(0.015, 0.016, 0.019), falloff=1.4, response=2.2,
-        )  # fmt: skip
+            gamma=(2.30, 2.16, 2.42),
+            mixing=((0.66, 0.10, 0.02), (0.06, 0.72, 0.07), (0.01, 0.09, 0.68)),
+            glare=(0.015, 0.016, 0.019),
+            falloff=1.4,
+            response=2.2,
+        )
 
 
 class CarConfig(_Frozen):
@@ -258,14 +263,26 @@ class LabConfig(_Frozen):
     phone: PhoneConfig = PhoneConfig()
     # Facing back down the bottom straight, turned 8 degrees towards its start.
     board: PanelConfig = PanelConfig(
-        x_m=3.05, y_m=-1.80, z_m=0.52, yaw_rad=math.pi + math.radians(8.0),
-        width_m=1.0, height_m=1.0, thickness_m=0.05, rgb=(0.20, 0.62, 0.28),
-    )  # fmt: skip
+        x_m=3.05,
+        y_m=-1.80,
+        z_m=0.52,
+        yaw_rad=math.pi + math.radians(8.0),
+        width_m=1.0,
+        height_m=1.0,
+        thickness_m=0.05,
+        rgb=(0.20, 0.62, 0.28),
+    )
     # The same place relative to the next corner, so that it faces back down the right-hand straight.
     monitor: PanelConfig = PanelConfig(
-        x_m=1.75, y_m=3.15, z_m=0.38, yaw_rad=1.5 * math.pi + math.radians(8.0),
-        width_m=0.5977, height_m=0.3362, thickness_m=0.04, rgb=(0.09, 0.10, 0.12),
-    )  # fmt: skip
+        x_m=1.75,
+        y_m=3.15,
+        z_m=0.38,
+        yaw_rad=1.5 * math.pi + math.radians(8.0),
+        width_m=0.5977,
+        height_m=0.3362,
+        thickness_m=0.04,
+        rgb=(0.09, 0.10, 0.12),
+    )
     monitor_optics: MonitorOpticsConfig = MonitorOpticsConfig()
     car: CarConfig = CarConfig()
     shadows: bool = True

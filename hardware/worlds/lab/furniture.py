@@ -50,12 +50,16 @@ class _Place:
         self._x, self._y, self._yaw = x_m, y_m, yaw_rad
         self.solids: list[Solid] = []
 
-    def add(self, kind: Literal["box", "cylinder", "ellipsoid"], centre: Point, half: Point, rgb: Colour) -> None:
+    def add(
+        self, kind: Literal["box", "cylinder", "ellipsoid"], centre: Point, half: Point, rgb: Colour
+    ) -> None:
         c, s = math.cos(self._yaw), math.sin(self._yaw)
         x, y = self._x + c * centre[0] - s * centre[1], self._y + s * centre[0] + c * centre[1]
         self.solids.append(Solid(kind, (x, y, centre[2]), half, rgb, self._yaw))
 
-    def box(self, x: float, y: float, bottom: float, width: float, depth: float, height: float, rgb: Colour) -> None:
+    def box(
+        self, x: float, y: float, bottom: float, width: float, depth: float, height: float, rgb: Colour
+    ) -> None:
         self.add("box", (x, y, bottom + 0.5 * height), (0.5 * width, 0.5 * depth, 0.5 * height), rgb)
 
     def cylinder(self, x: float, y: float, bottom: float, radius: float, height: float, rgb: Colour) -> None:
@@ -125,7 +129,11 @@ def _bookshelf(x: float, y: float, yaw: float) -> _Place:
     # Wide blocks of books in distinct colours instead of single spines: texture, not noise.
     rows: list[list[tuple[float, float, float, Colour]]] = [
         [(-0.45, 0.50, 0.30, (0.66, 0.20, 0.18)), (0.20, 0.55, 0.26, (0.20, 0.32, 0.52))],
-        [(-0.50, 0.36, 0.28, (0.85, 0.66, 0.25)), (0.05, 0.44, 0.33, (0.34, 0.47, 0.40)), (0.5, 0.3, 0.22, WHITE)],
+        [
+            (-0.50, 0.36, 0.28, (0.85, 0.66, 0.25)),
+            (0.05, 0.44, 0.33, (0.34, 0.47, 0.40)),
+            (0.5, 0.3, 0.22, WHITE),
+        ],
         [(-0.30, 0.70, 0.25, (0.50, 0.36, 0.55)), (0.45, 0.40, 0.32, (0.82, 0.45, 0.22))],
         [(-0.52, 0.30, 0.32, (0.24, 0.48, 0.58)), (0.25, 0.60, 0.24, (0.72, 0.62, 0.50))],
     ]
@@ -245,7 +253,15 @@ def _cartons(x: float, y: float) -> _Place:
     p = _Place(x, y, -0.2 if y < 0 else 0.25)
     p.box(0.0, 0.0, 0.0, 0.60, 0.50, 0.40 if y < 0 else 0.62, (0.71, 0.56, 0.38))
     p.box(0.0, 0.0, 0.40 if y < 0 else 0.62, 0.10, 0.50, 0.004, (0.82, 0.74, 0.60))
-    p.box(0.06, -0.03, 0.404 if y < 0 else 0.624, 0.40, 0.36, 0.26, (0.60, 0.46, 0.30) if y < 0 else (0.46, 0.56, 0.36))
+    p.box(
+        0.06,
+        -0.03,
+        0.404 if y < 0 else 0.624,
+        0.40,
+        0.36,
+        0.26,
+        (0.60, 0.46, 0.30) if y < 0 else (0.46, 0.56, 0.36),
+    )
     return p
 
 

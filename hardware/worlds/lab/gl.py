@@ -34,7 +34,9 @@ def load_mujoco() -> Any:
         raise TwinUnavailable(
             "the simulated lab needs MuJoCo, which is not installed: pip install 'advnerf[twin]'"
         ) from error
-    except Exception as error:  # PyOpenGL raises AttributeError, ImportError or its own types when libEGL is absent
+    except (
+        Exception
+    ) as error:  # PyOpenGL raises AttributeError, ImportError or its own types when libEGL is absent
         raise TwinUnavailable(f"{EGL_HELP} (importing mujoco failed: {error!r})") from error
 
 

@@ -43,7 +43,9 @@ class Lab:
         self._vehicle = vehicle_in_room(self.config)
         self._pending: list[tuple[float, float, float]] = []  # due time [s], servo, erpm
         self._time_s = 0.0
-        self._renderer = Renderer(build_model(self.config), self.config.supersampling, hidden_groups=(CAR_GROUP,))
+        self._renderer = Renderer(
+            build_model(self.config), self.config.supersampling, hidden_groups=(CAR_GROUP,)
+        )
         # None where colours are seen as they are shown: nothing to compute from frame to frame.
         self._optics: ScreenOptics | None = None
         if self.config.monitor_optics != MonitorOpticsConfig():
@@ -126,10 +128,16 @@ class Lab:
         return self._see(planar_pose(*self._pose()), depth)
 
     @overload
-    def observe_at(self, x_m: float, y_m: float, yaw_rad: float, depth: Literal[True] = True) -> tuple[Rgb, Depth]: ...
+    def observe_at(
+        self, x_m: float, y_m: float, yaw_rad: float, depth: Literal[True] = True
+    ) -> tuple[Rgb, Depth]: ...
     @overload
-    def observe_at(self, x_m: float, y_m: float, yaw_rad: float, depth: Literal[False]) -> tuple[Rgb, None]: ...
-    def observe_at(self, x_m: float, y_m: float, yaw_rad: float, depth: bool = True) -> tuple[Rgb, Depth | None]:
+    def observe_at(
+        self, x_m: float, y_m: float, yaw_rad: float, depth: Literal[False]
+    ) -> tuple[Rgb, None]: ...
+    def observe_at(
+        self, x_m: float, y_m: float, yaw_rad: float, depth: bool = True
+    ) -> tuple[Rgb, Depth | None]:
         """What the driving camera would see from another pose of the car (see :meth:`observe`); the car stays where it is."""
         return self._see(planar_pose(x_m, y_m, yaw_rad), depth)
 
@@ -150,7 +158,9 @@ class Lab:
         side = self.config.room.side_m
         self._renderer.place("car", planar_pose(*self._pose()), hidden_groups=(CEILING_GROUP,))
         try:
-            return self._renderer.render_rgb(look_at([0.0, -1.12 * side, 1.12 * side], [0.0, -0.3, 0.0]), pinhole)
+            return self._renderer.render_rgb(
+                look_at([0.0, -1.12 * side, 1.12 * side], [0.0, -0.3, 0.0]), pinhole
+            )
         finally:
             self._renderer.place("car", np.eye(4), hidden_groups=(CAR_GROUP,))
 

@@ -50,7 +50,10 @@ class LabWorld:
         track, room, car = self.config.track, self.config.room, self.config.car
         straight: Segment = ("line", track.side_m - 2.0 * track.corner_radius_m)
         corner: Segment = ("arc", track.corner_radius_m, 0.5 * math.pi)
-        ends = [(servo - car.nominal_servo_offset) / car.nominal_servo_gain for servo in (car.servo_min, car.servo_max)]
+        ends = [
+            (servo - car.nominal_servo_offset) / car.nominal_servo_gain
+            for servo in (car.servo_min, car.servo_max)
+        ]
         half = 0.5 * room.side_m
         return WorldDescription(
             paths={"track": ReferencePath(track_pose(track, 0.0), (straight, corner) * 4, closed=True)},
@@ -59,7 +62,9 @@ class LabWorld:
             camera=self.camera_pinhole,
             T_car_from_camera=self.T_car_from_camera,
             box=Box((-half, -half, 0.0), (half, half, room.height_m)),
-            road_edge=(np.array([(-half, -half), (half, -half), (half, half), (-half, half), (-half, -half)]),),
+            road_edge=(
+                np.array([(-half, -half), (half, -half), (half, half), (-half, half), (-half, -half)]),
+            ),
         )
 
     def photo_poses(self, count: int, rng: np.random.Generator) -> list[Array]:
@@ -97,10 +102,16 @@ class LabWorld:
         return self._open().observe(depth)  # type: ignore[call-overload]
 
     @overload
-    def observe_at(self, x_m: float, y_m: float, yaw_rad: float, depth: Literal[True] = True) -> tuple[Rgb, Depth]: ...
+    def observe_at(
+        self, x_m: float, y_m: float, yaw_rad: float, depth: Literal[True] = True
+    ) -> tuple[Rgb, Depth]: ...
     @overload
-    def observe_at(self, x_m: float, y_m: float, yaw_rad: float, depth: Literal[False]) -> tuple[Rgb, None]: ...
-    def observe_at(self, x_m: float, y_m: float, yaw_rad: float, depth: bool = True) -> tuple[Rgb, Depth | None]:
+    def observe_at(
+        self, x_m: float, y_m: float, yaw_rad: float, depth: Literal[False]
+    ) -> tuple[Rgb, None]: ...
+    def observe_at(
+        self, x_m: float, y_m: float, yaw_rad: float, depth: bool = True
+    ) -> tuple[Rgb, Depth | None]:
         """What the driving camera would see from another pose of the car."""
         return self._open().observe_at(x_m, y_m, yaw_rad, depth)  # type: ignore[call-overload]
 

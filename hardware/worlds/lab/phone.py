@@ -22,7 +22,9 @@ def apply_colours(rgb: NDArray[np.uint8], phone: PhoneConfig) -> NDArray[np.uint
         rgb: Image ``[H, W, 3]``.
         phone: Colour matrix ``M`` and gamma.
     """
-    mixed = cv2.transform(rgb.astype(np.float32) / np.float32(255.0), np.asarray(phone.colour_matrix, np.float32))
+    mixed = cv2.transform(
+        rgb.astype(np.float32) / np.float32(255.0), np.asarray(phone.colour_matrix, np.float32)
+    )
     toned = cv2.pow(np.clip(mixed, 0.0, 1.0), phone.gamma)
     return np.asarray(np.rint(toned * 255.0), dtype=np.uint8)
 
@@ -65,7 +67,9 @@ def walk_around_poses(config: LabConfig, count: int, rng: np.random.Generator) -
             if not any(_inside(position, solid, margin_m=0.2) for solid in solids):
                 break
         else:
-            raise ValueError("expected free space to walk in, found none; is the room too small for its furniture?")
+            raise ValueError(
+                "expected free space to walk in, found none; is the room too small for its furniture?"
+            )
         T = look_at(position, _subject(position, bearing, half, inwards, rng))
         T[:3, :3] = T[:3, :3] @ rotation_z(float(rng.normal(0.0, math.radians(2.0))))  # a hand is not level
         poses.append(T)
@@ -97,7 +101,9 @@ def video_poses(config: LabConfig, count: int) -> list[Array]:
         # Nobody walks straight or holds a phone still; periods without a common multiple, so that no two laps are alike.
         sway_m, bob_m = 0.12 * math.sin(2.3 * index), 0.06 * math.sin(1.7 * index)
         pose = planar_pose(*track_pose(config.track, length * (along % 1.0)))
-        poses.append(pose @ camera_mount(0.0, sway_m, height + bob_m, pitch, yaw + 0.08 * math.sin(0.9 * index)))
+        poses.append(
+            pose @ camera_mount(0.0, sway_m, height + bob_m, pitch, yaw + 0.08 * math.sin(0.9 * index))
+        )
     return poses
 
 
@@ -124,22 +130,30 @@ def car_mounted_poses(config: LabConfig, count: int, rng: np.random.Generator) -
             if probe.fits(*pose):
                 break
         else:
-            raise ValueError("expected free space beside the track, found none; is the track too close to the walls?")
+            raise ValueError(
+                "expected free space beside the track, found none; is the track too close to the walls?"
+            )
         height = rng.uniform(*phone.mount_height_m)
         pitch = camera.pitch_down_rad + rng.normal(0.0, math.radians(3.0))
         poses.append(planar_pose(*pose) @ camera_mount(camera.x_m, camera.y_m, height, pitch))
     return poses
 
 
-def _held_position(bearing: float, half_m: float, inwards: bool, phone: PhoneConfig, rng: np.random.Generator) -> Array:
+def _held_position(
+    bearing: float, half_m: float, inwards: bool, phone: PhoneConfig, rng: np.random.Generator
+) -> Array:
     # A ray from the middle comes within 0.5 m of the square's wall at this distance.
     reach = (half_m - 0.5) / max(abs(math.cos(bearing)), abs(math.sin(bearing)))
     # Who looks in steps back to the wall, who looks at the wall steps back to the middle.
     radius = rng.uniform(0.6 * reach, reach) if inwards else rng.uniform(0.8, 0.6 * reach)
-    return np.array([radius * math.cos(bearing), radius * math.sin(bearing), rng.uniform(*phone.walk_height_m)])
+    return np.array(
+        [radius * math.cos(bearing), radius * math.sin(bearing), rng.uniform(*phone.walk_height_m)]
+    )
 
 
-def _subject(position: Array, bearing: float, half_m: float, inwards: bool, rng: np.random.Generator) -> Array:
+def _subject(
+    position: Array, bearing: float, half_m: float, inwards: bool, rng: np.random.Generator
+) -> Array:
     if inwards:
         # Across the middle to the other side: the floor, the island and the far furniture.
         away = bearing + math.pi + rng.normal(0.0, 0.5)
@@ -148,7 +162,11 @@ def _subject(position: Array, bearing: float, half_m: float, inwards: bool, rng:
     outward = bearing + rng.normal(0.0, 0.8)
     reach = 2.0 * half_m
     return np.array(
-        [position[0] + reach * math.cos(outward), position[1] + reach * math.sin(outward), rng.uniform(-1.6, 1.8)]
+        [
+            position[0] + reach * math.cos(outward),
+            position[1] + reach * math.sin(outward),
+            rng.uniform(-1.6, 1.8),
+        ]
     )
 
 
@@ -159,7 +177,9 @@ def _inside(point: Array, solid: Solid, margin_m: float) -> bool:
     return all(abs(value) <= half + margin_m for value, half in zip(local, solid.half_m, strict=True))
 
 
-def _driven_pose(track: TrackConfig, s_m: float, index: int, rng: np.random.Generator) -> tuple[float, float, float]:
+def _driven_pose(
+    track: TrackConfig, s_m: float, index: int, rng: np.random.Generator
+) -> tuple[float, float, float]:
     x, y, yaw = track_pose(track, s_m)
     if index % 4 == 3:
         # Where a car ends up that misses a corner: on from the end of the straight before this point.

@@ -95,7 +95,11 @@ class Renderer:
         index = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_TEXTURE, name)
         if index < 0:
             raise ValueError(f"expected the name of a texture of the model, got {name!r}")
-        width, height, start = int(model.tex_width[index]), int(model.tex_height[index]), int(model.tex_adr[index])
+        width, height, start = (
+            int(model.tex_width[index]),
+            int(model.tex_height[index]),
+            int(model.tex_adr[index]),
+        )
         model.tex_data[start : start + 3 * width * height] = textures.fit(rgb, width, height).ravel()
         self._gl.make_current()
         mujoco.mjr_uploadTexture(model, self._context, index)
@@ -104,7 +108,9 @@ class Renderer:
         """Move a mocap body and choose which geom groups are hidden from now on."""
         index = int(self._model.body(body).mocapid[0])
         self._data.mocap_pos[index] = T_world_from_body[:3, 3]
-        self._mujoco.mju_mat2Quat(self._data.mocap_quat[index], np.ascontiguousarray(T_world_from_body[:3, :3]).ravel())
+        self._mujoco.mju_mat2Quat(
+            self._data.mocap_quat[index], np.ascontiguousarray(T_world_from_body[:3, :3]).ravel()
+        )
         self._update_scene(hidden_groups)
 
     def close(self) -> None:
@@ -126,7 +132,9 @@ class Renderer:
         option.geomgroup[:] = [0 if group in hidden_groups else 1 for group in range(len(option.geomgroup))]
         mujoco.mj_forward(self._model, self._data)
         everything = mujoco.mjtCatBit.mjCAT_ALL
-        mujoco.mjv_updateScene(self._model, self._data, option, None, mujoco.MjvCamera(), everything, self._scene)
+        mujoco.mjv_updateScene(
+            self._model, self._data, option, None, mujoco.MjvCamera(), everything, self._scene
+        )
 
     def _draw(
         self,

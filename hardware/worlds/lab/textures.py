@@ -33,7 +33,9 @@ def smooth_waves(like: Image, size_m: tuple[float, float], rng: np.random.Genera
     """A sum of ``count`` random plane waves of 1.2 to 6 m, about -1..1, ``[H, W, 1]``: variation without noise."""
     height, width = like.shape[:2]
     coarse = (height // 8, width // 8)  # the shortest wave is metres long, an eighth of the pixels carries it
-    y, x = np.meshgrid(np.linspace(0.0, size_m[0], coarse[0]), np.linspace(0.0, size_m[1], coarse[1]), indexing="ij")
+    y, x = np.meshgrid(
+        np.linspace(0.0, size_m[0], coarse[0]), np.linspace(0.0, size_m[1], coarse[1]), indexing="ij"
+    )
     total = np.zeros(coarse)
     for _ in range(count):
         angle, phase = rng.uniform(0.0, 2.0 * np.pi, 2)
@@ -56,7 +58,10 @@ class Canvas:
         """Fill a polygon of points (right, up) [m], edges smoothed."""
         shift = 4  # fixed-point bits: sub-pixel corners
         pixels = [
-            (round((x * self._scale - 0.5) * 2**shift), round(((self._height_m - y) * self._scale - 0.5) * 2**shift))
+            (
+                round((x * self._scale - 0.5) * 2**shift),
+                round(((self._height_m - y) * self._scale - 0.5) * 2**shift),
+            )
             for x, y in points_m
         ]
         _fill(self.image, np.array(pixels, dtype=np.int32), rgb, shift)
@@ -73,7 +78,10 @@ class Canvas:
     def gradient(self, x: float, y: float, width: float, height: float, bottom: Colour, top: Colour) -> None:
         """Fill a rectangle [m] with a vertical gradient."""
         left, right = round(x * self._scale), round((x + width) * self._scale)
-        low, high = round((self._height_m - y) * self._scale), round((self._height_m - y - height) * self._scale)
+        low, high = (
+            round((self._height_m - y) * self._scale),
+            round((self._height_m - y - height) * self._scale),
+        )
         blend = np.linspace(1.0, 0.0, low - high, dtype=np.float32)[:, None, None]
         self.image[high:low, left:right] = blend * np.array(top, np.float32) + (1.0 - blend) * np.array(
             bottom, np.float32
@@ -157,7 +165,9 @@ def wall_images(
     return images
 
 
-def _frame(canvas: Canvas, x: float, y: float, width: float, height: float, frame: Colour, inside: Colour) -> None:
+def _frame(
+    canvas: Canvas, x: float, y: float, width: float, height: float, frame: Colour, inside: Colour
+) -> None:
     canvas.rect(x - 0.05, y - 0.05, width + 0.1, height + 0.1, frame)
     canvas.rect(x, y, width, height, inside)
 
@@ -166,9 +176,16 @@ def _window(canvas: Canvas, x: float, y: float, width: float, height: float) -> 
     canvas.rect(x - 0.08, y - 0.08, width + 0.16, height + 0.16, (0.90, 0.89, 0.86))
     canvas.gradient(x, y, width, height, (0.86, 0.90, 0.92), (0.52, 0.70, 0.90))
     canvas.polygon(
-        [(x, y), (x + width, y), (x + width, y + 0.22), (x + 0.6 * width, y + 0.38), (x + 0.3 * width, y + 0.20), (x, y + 0.30)],
+        [
+            (x, y),
+            (x + width, y),
+            (x + width, y + 0.22),
+            (x + 0.6 * width, y + 0.38),
+            (x + 0.3 * width, y + 0.20),
+            (x, y + 0.30),
+        ],
         (0.42, 0.54, 0.40),
-    )  # fmt: skip
+    )
     canvas.rect(x + 0.5 * width - 0.03, y, 0.06, height, (0.90, 0.89, 0.86))
 
 

@@ -38,7 +38,9 @@ class Footprint:
     def overlaps(self, other: Footprint) -> bool:
         """Whether two rectangles share area (separating axis theorem)."""
         dx, dy = other.x_m - self.x_m, other.y_m - self.y_m
-        reach = math.hypot(self.half_length_m, self.half_width_m) + math.hypot(other.half_length_m, other.half_width_m)
+        reach = math.hypot(self.half_length_m, self.half_width_m) + math.hypot(
+            other.half_length_m, other.half_width_m
+        )
         if dx * dx + dy * dy > reach * reach:
             return False
         c, s = math.cos(other.yaw_rad - self.yaw_rad), math.sin(other.yaw_rad - self.yaw_rad)
@@ -227,7 +229,9 @@ class TwinVehicle:
     def _blocked(self, x_m: float, y_m: float, yaw_rad: float) -> bool:
         body = self._body(x_m, y_m, yaw_rad)
         # Cheap test first: in the middle of the room no corner can reach a wall.
-        if max(abs(body.x_m), abs(body.y_m)) + body.half_length_m + body.half_width_m > self._room_half_m and any(
+        if max(
+            abs(body.x_m), abs(body.y_m)
+        ) + body.half_length_m + body.half_width_m > self._room_half_m and any(
             max(abs(x), abs(y)) > self._room_half_m for x, y in body.corners()
         ):
             return True

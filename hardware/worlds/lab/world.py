@@ -36,7 +36,9 @@ def build_model(config: LabConfig) -> Any:
     mujoco = load_mujoco()
     spec = mujoco.MjSpec()
     spec.visual.headlight.active = 0
-    spec.visual.quality.offsamples = 0  # the renderer averages a larger image instead, which also filters textures
+    spec.visual.quality.offsamples = (
+        0  # the renderer averages a larger image instead, which also filters textures
+    )
     _add_lights(mujoco, spec)
     surfaces, tape = paint_room(config)
     for name, surface in surfaces.items():
@@ -45,8 +47,12 @@ def build_model(config: LabConfig) -> Any:
     _add_tape(mujoco, spec, config, tape)
     for solid in furnish(config):
         _add_solid(mujoco, spec.worldbody, solid)
-    _add_panel(mujoco, spec, "board", config.board, BOARD_PIXELS, np.full((8, 8, 3), config.board.rgb, np.float32))
-    _add_panel(mujoco, spec, "monitor", config.monitor, MONITOR_PIXELS, textures.screen_image(*MONITOR_PIXELS))
+    _add_panel(
+        mujoco, spec, "board", config.board, BOARD_PIXELS, np.full((8, 8, 3), config.board.rgb, np.float32)
+    )
+    _add_panel(
+        mujoco, spec, "monitor", config.monitor, MONITOR_PIXELS, textures.screen_image(*MONITOR_PIXELS)
+    )
     _add_car(mujoco, spec, config)
     return spec.compile()
 
@@ -127,13 +133,17 @@ def _add_solid(mujoco: Any, body: Any, solid: Solid) -> Any:
     return geom
 
 
-def _add_panel(mujoco: Any, spec: Any, name: str, panel: PanelConfig, pixels: tuple[int, int], image: Image) -> None:
+def _add_panel(
+    mujoco: Any, spec: Any, name: str, panel: PanelConfig, pixels: tuple[int, int], image: Image
+) -> None:
     T = panel.T_world_from_face
     full = textures.fit(textures.to_uint8(image), *pixels)
     add_texture(mujoco, spec, name, full)
     material = add_material(mujoco, spec, name)
     material.emission = max(1.0 - shading(T[:3, 0]), 0.0)
-    geom = add_geom(spec.worldbody, mujoco.mjtGeom.mjGEOM_PLANE, (0.5 * panel.width_m, 0.5 * panel.height_m, 0.1))
+    geom = add_geom(
+        spec.worldbody, mujoco.mjtGeom.mjGEOM_PLANE, (0.5 * panel.width_m, 0.5 * panel.height_m, 0.1)
+    )
     geom.pos = T[:3, 3]
     # A MuJoCo plane faces its z; its x is to the viewer's right, which is the panel's +y.
     geom.quat = wxyz(T[:3, [1, 2, 0]])
@@ -148,7 +158,9 @@ def _add_tape(mujoco: Any, spec: Any, config: LabConfig, picture: Image) -> None
     inner, outer = tape_edges(config)
     count = len(inner)
     flat = np.concatenate([inner, outer])
-    vertices = np.concatenate([np.c_[flat, np.full(2 * count, TAPE_HEIGHT_M)], np.c_[flat, np.zeros(2 * count)]])
+    vertices = np.concatenate(
+        [np.c_[flat, np.full(2 * count, TAPE_HEIGHT_M)], np.c_[flat, np.zeros(2 * count)]]
+    )
     i = np.arange(count)
     j = (i + 1) % count
     top = [np.c_[i, i + count, j + count], np.c_[i, j + count, j]]

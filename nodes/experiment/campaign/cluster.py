@@ -30,14 +30,18 @@ def ray_session(address: str, cores: int) -> Iterator[int]:
     try:
         import ray
     except ModuleNotFoundError:
-        raise ConfigError("--backend ray needs ray, which is not installed: pip install 'advnerf[cluster]'") from None
+        raise ConfigError(
+            "--backend ray needs ray, which is not installed: pip install 'advnerf[cluster]'"
+        ) from None
     joining = address or os.environ.get("RAY_ADDRESS", "")
     _require_reachable(joining)
     try:
         if joining:
             ray.init(address=joining, log_to_driver=False, logging_level=logging.ERROR)
         else:
-            ray.init(num_cpus=cores, include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR)
+            ray.init(
+                num_cpus=cores, include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR
+            )
     except (ConnectionError, RuntimeError, ValueError, TimeoutError) as error:
         raise ConfigError(
             f"expected a Ray cluster at {joining or 'this machine'}, got {' '.join(str(error).split())}; start one with ray start --head"

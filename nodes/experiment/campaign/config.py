@@ -55,9 +55,10 @@ class ScenarioConfig(_NothingTwice):
     """One scenario: an experiment, and how it is read."""
 
     kind: str = Field(
-        default="room", min_length=1,
+        default="room",
+        min_length=1,
         description="room, room_search, world, or a Python module that runs cells (see nodes/experiment/campaign/kinds.py).",
-    )  # fmt: skip
+    )
     experiment: Path = Field(description="Experiment file; relative to the campaign file.")
     setting: str = Field(default="full", description="Which of its settings.")
     run_folder: Path = Field(description="Run folder of the experiment; relative to the working folder.")
@@ -65,9 +66,15 @@ class ScenarioConfig(_NothingTwice):
     as_scenario: str = Field(
         default="", description="What the experiment calls it, where the name here is another; else the name."
     )
-    placements: dict[Name, PlacementConfig] = Field(default_factory=dict, description="Other places of the objects.")
-    seeds: tuple[int, ...] | None = Field(default=None, min_length=1, description="Instead of the campaign's.")
-    victims: tuple[Victim, ...] | None = Field(default=None, min_length=1, description="Instead of the campaign's.")
+    placements: dict[Name, PlacementConfig] = Field(
+        default_factory=dict, description="Other places of the objects."
+    )
+    seeds: tuple[int, ...] | None = Field(
+        default=None, min_length=1, description="Instead of the campaign's."
+    )
+    victims: tuple[Victim, ...] | None = Field(
+        default=None, min_length=1, description="Instead of the campaign's."
+    )
     methods: tuple[ConditionReference, ...] | None = Field(
         default=None, min_length=1, description="Instead of the campaign's."
     )
@@ -199,7 +206,11 @@ def select(cells: list[Cell], only: str) -> list[Cell]:
                 f"--only {only}: expected KEY=VALUE with KEY one of {', '.join(Cell.__dataclass_fields__)}, got {part!r}"
             )
         wanted[key.strip()] = {each.strip() for each in value.split("+")}
-    chosen = [cell for cell in cells if all(str(getattr(cell, key)) in values for key, values in wanted.items())]
+    chosen = [
+        cell for cell in cells if all(str(getattr(cell, key)) in values for key, values in wanted.items())
+    ]
     if not chosen:
-        raise ConfigError(f"--only {only}: expected some cells of the campaign, got none; see advnerf campaign status")
+        raise ConfigError(
+            f"--only {only}: expected some cells of the campaign, got none; see advnerf campaign status"
+        )
     return chosen

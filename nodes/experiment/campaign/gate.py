@@ -55,7 +55,9 @@ def judge_scene(
     """
     module = kind.fidelity
     if module is None:
-        raise GateError(f"expected a module fidelity beside the cells of kind {kind.name}, got none; it has no gate")
+        raise GateError(
+            f"expected a module fidelity beside the cells of kind {kind.name}, got none; it has no gate"
+        )
     policy, goal = module.policy_of(experiment, victim, scenario)
     sets = [module.held_out(experiment, scenario)]
     if bag is not None:
@@ -64,9 +66,14 @@ def judge_scene(
 
 
 def cached_verdict(
-    kind: Kind, experiment: Any, scenario: str, victim: str, limits: GateLimits, file: Path,
+    kind: Kind,
+    experiment: Any,
+    scenario: str,
+    victim: str,
+    limits: GateLimits,
+    file: Path,
     drive: tuple[int, Path] | None = None,
-) -> Verdict | None:  # fmt: skip
+) -> Verdict | None:
     """The verdict on held-out views, or on a drive; judged again only if scene, policy or limits changed; None where the kind has no gate.
 
     Args:
@@ -86,14 +93,20 @@ def cached_verdict(
         return None
     policy, goal = module.policy_of(experiment, victim, scenario)
     which = [scenario, victim, *(["drive", drive[0]] if drive else [])]
-    key = hash_of([stage_digests(experiment.folder), _weights_sha256(policy), limits.model_dump(mode="json"), *which])
+    key = hash_of(
+        [stage_digests(experiment.folder), _weights_sha256(policy), limits.model_dump(mode="json"), *which]
+    )
     try:
         kept = json.loads(file.read_text(encoding="utf-8"))
         if kept["key"] == key:
             return Verdict(kept["passed"], tuple(kept["reasons"]), kept["numbers"])
     except (OSError, ValueError, KeyError, TypeError):
         pass  # an unreadable verdict is judged again
-    pictures = module.driven(experiment, scenario, victim, *drive) if drive else module.held_out(experiment, scenario)
+    pictures = (
+        module.driven(experiment, scenario, victim, *drive)
+        if drive
+        else module.held_out(experiment, scenario)
+    )
     verdict = judge(agreement_on(policy, goal, pictures), limits, pictures.of)
     write_atomically(file, json.dumps({"key": key, **verdict.record()}, indent=1) + "\n")
     return verdict
@@ -108,9 +121,16 @@ def _weights_sha256(policy: Any) -> str:
 
 
 def predict_cell(
-    kind: Kind, experiment: Any, scenario: str, victim: str, method: str, seed: int, folder: Path, draws: int = 6,
+    kind: Kind,
+    experiment: Any,
+    scenario: str,
+    victim: str,
+    method: str,
+    seed: int,
+    folder: Path,
+    draws: int = 6,
     clean: CleanDrive | None = None,
-) -> tuple[TransferPrediction, CleanDrive]:  # fmt: skip
+) -> tuple[TransferPrediction, CleanDrive]:
     """Predict the deployed drives of a cell whose search is finished, from pictures and the surrogate alone.
 
     Args:
@@ -138,7 +158,9 @@ def predict_cell(
         if clean
         else agreement_on(policy, goal, module.driven(experiment, scenario, victim, seed, folder))
     )
-    with_attack = agreement_on(policy, goal, module.attacked(experiment, scenario, victim, method, seed, folder))
+    with_attack = agreement_on(
+        policy, goal, module.attacked(experiment, scenario, victim, method, seed, folder)
+    )
     effect = Effect(with_attack.learned - without.learned, with_attack.real - without.real)
     problem, images, starts, horizon = module.loop(experiment, scenario, victim, method, seed, folder)
     none_m = clean.none_m if clean else None

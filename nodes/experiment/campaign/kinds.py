@@ -82,7 +82,9 @@ class Kind:
         found: Callable[..., None] | None = getattr(self.module, "search_cell", None)
         return found
 
-    def finished(self, experiment: Any, scenario: str, victim: str, method: str, seed: int) -> dict[str, Any] | None:
+    def finished(
+        self, experiment: Any, scenario: str, victim: str, method: str, seed: int
+    ) -> dict[str, Any] | None:
         """The cell as the experiment itself has run it, with these settings; None where it has not, or where the kind keeps none."""
         stage = getattr(self.module, "TAKEN_FROM", "")
         file = experiment.folder / stage / f"{scenario}_{victim}_{method_name(method)}_{seed}.cell.json"
@@ -112,7 +114,9 @@ class Kind:
         if prepare := getattr(self.module, "prepare", None):
             prepare(experiment, report)
         else:
-            self._run_module().run_experiment(experiment, until=getattr(self.module, "PREPARED_AT", _LAST_NEEDED))
+            self._run_module().run_experiment(
+                experiment, until=getattr(self.module, "PREPARED_AT", _LAST_NEEDED)
+            )
 
     def needed_settings(self, experiment: Any) -> dict[str, Any]:
         """Settings of the stages that a cell needs, by name; none where the kind's package has no stages."""
@@ -154,7 +158,9 @@ def load_kind(name: str) -> Kind:
         )
     module = importlib.import_module(path)
     if not callable(getattr(module, "run_cell", None)):
-        raise ConfigError(f"expected a function run_cell in {path}, got none; see nodes/experiment/campaign/kinds.py")
+        raise ConfigError(
+            f"expected a function run_cell in {path}, got none; see nodes/experiment/campaign/kinds.py"
+        )
     return Kind(name, module)
 
 
@@ -167,7 +173,13 @@ def stage_digests(folder: Path) -> dict[str, str]:
 def settings_hash(kind: Kind, experiment: Any, scenario: str, victim: str, method: str, seed: int) -> str:
     """Hash of everything that the result of a cell depends on; a change of it makes the cell run again."""
     inputs = kind.inputs(experiment, scenario, victim, method, seed)
-    named = {"scenario": scenario, "victim": victim, "method": method_name(method), "seed": seed, "inputs": inputs}
+    named = {
+        "scenario": scenario,
+        "victim": victim,
+        "method": method_name(method),
+        "seed": seed,
+        "inputs": inputs,
+    }
     if code := method_digest(method):
         named["code"] = code
     # Through JSON, so that tuples and lists, or paths that a module forgot to turn into text, cannot change the hash between processes.

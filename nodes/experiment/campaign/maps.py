@@ -37,9 +37,15 @@ def map_cells(campaign: Campaign, cells: Sequence[Cell], number: int) -> list[Pa
         experiment = experiments[cell.scenario, cell.placement]
         with ProgressDisplay() as display:
             pictures += draw(
-                experiment, planned.job.scenario, cell.victim, cell.seed, cell.method, number, store.work(cell.name),
+                experiment,
+                planned.job.scenario,
+                cell.victim,
+                cell.seed,
+                cell.method,
+                number,
+                store.work(cell.name),
                 display.start(cell.name),
-            )  # fmt: skip
+            )
     if not pictures:
         raise ConfigError(
             f"expected finished cells that have placed objects (space.kind=places), got none of {len(cells)}; run them first, "

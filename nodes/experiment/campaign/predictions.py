@@ -23,7 +23,9 @@ from nodes.experiment.campaign.store import store_of
 _KEYS = {"ratio", "ratio_low", "ratio_high", "retained", "total_cte_m", "clean_drive"}
 
 
-def predict_campaign(campaign: Campaign, cells: Sequence[Cell], say: Callable[[str], None], draws: int = 6) -> int:
+def predict_campaign(
+    campaign: Campaign, cells: Sequence[Cell], say: Callable[[str], None], draws: int = 6
+) -> int:
     """Predict every attacked cell that has been searched and is not predicted yet; returns how many were.
 
     A prediction needs the finished search (``campaign run --search-only`` makes no more than that) and the drive without attack. It reads
@@ -58,7 +60,9 @@ def predict_campaign(campaign: Campaign, cells: Sequence[Cell], say: Callable[[s
         summary = clean[drive].agreement.summary()
         record = {"settings_hash": planned.job.settings_hash, **found.record(), "clean_drive": summary}
         write_atomically(file, json.dumps(record, indent=1) + "\n")
-        say(f"{cell.name}: {found.ratio:.2f} × no attack expected, {100 * found.retained:.0f} % of the effect survives")
+        say(
+            f"{cell.name}: {found.ratio:.2f} × no attack expected, {100 * found.retained:.0f} % of the effect survives"
+        )
         made += 1
     return made
 
@@ -83,10 +87,21 @@ def predicted(folder: Path, results: Sequence[CellResult]) -> list[Predicted]:
         learned, learned_none = (
             sum(each[:starts]) for each in (cell.surrogate.total_cte_m, cell.surrogate.none_total_cte_m)
         )
-        pairs.append(Predicted(
-            cell.name, cell.method, kept["ratio"], kept["ratio_low"], kept["ratio_high"], measured, kept["retained"],
-            kept["total_cte_m"], cell.deployed.mean_m, learned / learned_none if learned_none > 0.0 else math.nan, learned / starts,
-        ))  # fmt: skip
+        pairs.append(
+            Predicted(
+                cell.name,
+                cell.method,
+                kept["ratio"],
+                kept["ratio_low"],
+                kept["ratio_high"],
+                measured,
+                kept["retained"],
+                kept["total_cte_m"],
+                cell.deployed.mean_m,
+                learned / learned_none if learned_none > 0.0 else math.nan,
+                learned / starts,
+            )
+        )
     return [pair for pair in pairs if math.isfinite(pair.measured) and math.isfinite(pair.surrogate)]
 
 

@@ -86,7 +86,11 @@ def publish(campaign: Campaign, found: Sequence[CellStatus], folder: Path, prune
 
 def _is_of(published: Path, result: CellResult | None) -> bool:
     """Whether a published cell is that result, and not one of newer settings from elsewhere."""
-    return result is not None and published.exists() and read_cell(published).settings_hash == result.settings_hash
+    return (
+        result is not None
+        and published.exists()
+        and read_cell(published).settings_hash == result.settings_hash
+    )
 
 
 def _publish_beside(campaign: Campaign, done: Sequence[CellStatus], folder: Path) -> None:
@@ -115,7 +119,9 @@ def published_table(folder: Path, campaign: Campaign, cells: Sequence[Cell] | No
     found = read_cells(folder)
     if not found:
         raise ConfigError(f"expected published cells in {folder}, got none; run advnerf campaign publish")
-    return make_table(wanted_rows(campaign, campaign.cells if cells is None else cells), found, campaign.config.name)
+    return make_table(
+        wanted_rows(campaign, campaign.cells if cells is None else cells), found, campaign.config.name
+    )
 
 
 def restore(campaign: Campaign, cells: Sequence[Cell], folder: Path) -> Restored:

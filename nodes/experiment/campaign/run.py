@@ -86,10 +86,22 @@ def plan_cells(
         inside, method = _inside(scenario, cell), campaign.method(cell)
         digest = settings_hash(kind, experiments[key], inside, cell.victim, method, cell.seed)
         job = Job(
-            str(campaign.folder), cell.name, scenario.kind, str(campaign.experiment_file(cell)), scenario.setting,
-            tuple(campaign.overrides(cell)), str(campaign.run_folder(cell)), inside, cell.scenario, cell.placement,
-            cell.victim, method, cell.seed, digest, threads=1,
-        )  # fmt: skip
+            str(campaign.folder),
+            cell.name,
+            scenario.kind,
+            str(campaign.experiment_file(cell)),
+            scenario.setting,
+            tuple(campaign.overrides(cell)),
+            str(campaign.run_folder(cell)),
+            inside,
+            cell.scenario,
+            cell.placement,
+            cell.victim,
+            method,
+            cell.seed,
+            digest,
+            threads=1,
+        )
         planned.append(Planned(cell, job, kind.runs_alone(experiments[key]), kind.search_cell is not None))
     return planned
 
@@ -143,7 +155,9 @@ def run_campaign(campaign: Campaign, cells: Sequence[Cell], options: Options, sa
     wanted = [each for each in plan if each.cell in judged and _is_wanted(store, each, options, say)]
     if not wanted:
         there = sum(store.status(each.cell, each.job.settings_hash).state == "done" for each in plan)
-        say(f"nothing to do: {'every cell is' if there == len(plan) else f'{there} of {len(plan)} cells are'} there")
+        say(
+            f"nothing to do: {'every cell is' if there == len(plan) else f'{there} of {len(plan)} cells are'} there"
+        )
         return []
     _require_positive(options)
     jobs, threads = _shares(options)
@@ -151,7 +165,9 @@ def run_campaign(campaign: Campaign, cells: Sequence[Cell], options: Options, sa
         return _search(wanted, jobs, threads, options, say)
     say(f"{len(wanted)} of {len(cells)} cells to run, {_at_a_time(jobs, threads)}")
     beside = [replace(each.job, threads=threads) for each in wanted if not each.live]
-    beside += [replace(each.job, threads=threads, phase="search") for each in wanted if each.live and each.searches]
+    beside += [
+        replace(each.job, threads=threads, phase="search") for each in wanted if each.live and each.searches
+    ]
     ended = _run_beside(beside, jobs, options, say)
     lost = {end.name for end in ended if end.how != "done"}
     searched = {job.name for job in beside if job.phase == "search"}
@@ -252,7 +268,9 @@ def _judge(campaign: Campaign, cell: Cell, options: Options, say: Say) -> bool:
         drive = first, store_of(campaign).work(without.name)
         found.append(cached_verdict(*which, limits, gate_file(campaign.folder, key, drive=True), drive))
     except RuntimeFault as fault:
-        say(f"fidelity gate, {key}: only held-out views are judged, as there is no drive without attack yet: {fault}")
+        say(
+            f"fidelity gate, {key}: only held-out views are judged, as there is no drive without attack yet: {fault}"
+        )
     may = not options.gate or all(verdict is None or verdict.passed for verdict in found)
     for reason in [reason for verdict in found if verdict is not None for reason in verdict.reasons]:
         left_out = "" if may else "; its cells are left out (--no-gate runs them all the same)"
@@ -344,7 +362,9 @@ def _cores() -> int:
 
 def _require_positive(options: Options) -> None:
     if options.jobs < 0 or options.threads < 0:
-        raise ConfigError(f"expected --jobs and --threads of at least 1, got {options.jobs} and {options.threads}")
+        raise ConfigError(
+            f"expected --jobs and --threads of at least 1, got {options.jobs} and {options.threads}"
+        )
 
 
 def _shares(options: Options) -> tuple[int, int]:

@@ -133,7 +133,9 @@ class Store:
 
     def _last_line(self, name: str) -> str:
         try:
-            lines = (self.work(name) / LOG).read_bytes()[-2000:].decode("utf-8", "replace").strip().splitlines()
+            lines = (
+                (self.work(name) / LOG).read_bytes()[-2000:].decode("utf-8", "replace").strip().splitlines()
+            )
         except OSError:
             return ""
         return lines[-1][:200] if lines else ""

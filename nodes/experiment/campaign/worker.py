@@ -106,12 +106,19 @@ def run_in_process(job: Job) -> Ended:
     """Run a cell in a process of its own and wait for it; called in a thread here, or in a worker of a cluster."""
     began = time.monotonic()
     store = Store(Path(job.campaign_folder))
-    environment = {**os.environ, "PYTHONUNBUFFERED": "1", **dict.fromkeys(_THREAD_VARIABLES, str(job.threads))}
+    environment = {
+        **os.environ,
+        "PYTHONUNBUFFERED": "1",
+        **dict.fromkeys(_THREAD_VARIABLES, str(job.threads)),
+    }
     environment.setdefault("MUJOCO_GL", "egl")
     process = subprocess.Popen(
-        [sys.executable, "-m", "nodes.experiment.campaign.worker", str(os.getpid())], stdin=subprocess.PIPE, stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE, env=environment,
-    )  # fmt: skip
+        [sys.executable, "-m", "nodes.experiment.campaign.worker", str(os.getpid())],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        env=environment,
+    )
     try:
         _, errors = process.communicate(json.dumps(asdict(job)).encode())
     except BaseException:
@@ -132,7 +139,9 @@ def run_in_process(job: Job) -> Ended:
     # One that was asked to end closed what it had open, and says so by the shell's exit code.
     if code < 0 or code == _ASKED_TO_END:
         by = signal.Signals(-code) if code < 0 else signal.SIGTERM
-        return Ended(job.name, "lost", f"killed by {by.name}; it goes on when the campaign is run again", seconds)
+        return Ended(
+            job.name, "lost", f"killed by {by.name}; it goes on when the campaign is run again", seconds
+        )
     error = store.error(job.name, job.settings_hash)
     if error:
         return Ended(job.name, "failed", error, seconds)
@@ -161,7 +170,9 @@ def _run_job() -> None:
                 _run(job, store, work, kind, experiment)
             except Exception as error:
                 traceback.print_exc(file=log)
-                store.keep_error(job.name, job.settings_hash, f"{type(error).__name__}: {' '.join(str(error).split())}")
+                store.keep_error(
+                    job.name, job.settings_hash, f"{type(error).__name__}: {' '.join(str(error).split())}"
+                )
                 raise SystemExit(_FAILED) from None
 
 
@@ -184,12 +195,17 @@ def _checked(job: Job, store: Store) -> tuple[Kind, Any]:
         kind = load_kind(job.kind)
         _use_threads(job.threads)
         experiment = kind.load(Path(job.experiment), job.setting, job.overrides, Path(job.run_folder))
-        if settings_hash(kind, experiment, job.scenario, job.victim, job.method, job.seed) != job.settings_hash:
+        if (
+            settings_hash(kind, experiment, job.scenario, job.victim, job.method, job.seed)
+            != job.settings_hash
+        ):
             raise ChangedError(
                 f"{job.name}: its settings or inputs changed after the campaign was started; run the campaign again"
             )
     except Exception as error:
-        store.keep_error(job.name, job.settings_hash, f"{type(error).__name__}: {' '.join(str(error).split())}")
+        store.keep_error(
+            job.name, job.settings_hash, f"{type(error).__name__}: {' '.join(str(error).split())}"
+        )
         raise SystemExit(_FAILED) from None
     return kind, experiment
 
@@ -209,10 +225,16 @@ def _run(job: Job, store: Store, work: Path, kind: Kind, experiment: Any) -> Non
             taken = kind.run_cell(*arguments, work, report)
     found = taken
     ours = {
-        "scenario": job.shown_scenario, "placement": job.placement, "victim": job.victim, "method": method_name(job.method), "seed": job.seed,
-        "settings_hash": job.settings_hash, "stages": stage_digests(Path(job.run_folder)), "machine": found.get("machine") or machine_name(),
+        "scenario": job.shown_scenario,
+        "placement": job.placement,
+        "victim": job.victim,
+        "method": method_name(job.method),
+        "seed": job.seed,
+        "settings_hash": job.settings_hash,
+        "stages": stage_digests(Path(job.run_folder)),
+        "machine": found.get("machine") or machine_name(),
         "date": found.get("date") or datetime.now(timezone.utc).isoformat(timespec="seconds"),
-    }  # fmt: skip
+    }
     spent = _add_seconds(work, time.monotonic() - began)
     seconds = found["seconds"] if found.get("seconds") is not None else spent
     store.keep_result(job.name, {**found, **ours, "seconds": round(float(seconds), 1)})

@@ -71,7 +71,11 @@ class Cell:
 def cells(experiment: Experiment) -> list[Cell]:
     """All cells in order: every seed against the hardened victim, the first also against the naive one; quick ones first."""
     seeds, methods = experiment.config.attack.seeds, experiment.config.attack.methods
-    rows = [(victim, seed) for victim in victims(experiment) for seed in (seeds if victim == HARDENED else seeds[:1])]
+    rows = [
+        (victim, seed)
+        for victim in victims(experiment)
+        for seed in (seeds if victim == HARDENED else seeds[:1])
+    ]
     return [
         Cell.of(scenario, victim, condition, seed)
         for victim, seed in rows
@@ -82,7 +86,9 @@ def cells(experiment: Experiment) -> list[Cell]:
 
 def frozen_hashes(experiment: Experiment) -> dict[str, str]:
     """What is fixed before the first attack: scene, victims, objects and their places, starts and seeds."""
-    policies = {f"policy_{name}": load_policy(victim_file(experiment, name)).sha256 for name in victims(experiment)}
+    policies = {
+        f"policy_{name}": load_policy(victim_file(experiment, name)).sha256 for name in victims(experiment)
+    }
     starts = {
         f"{scenario} {seed}": experiment.start_states(scenario, seed).tolist()
         for scenario in experiment.config.scenarios
@@ -115,7 +121,8 @@ def _search_all(experiment: Experiment, space: Space, folder: Path, report: Repo
 
         def progress(fraction: float, text: str = "", index: int = index, cell: Cell = cell) -> None:
             report(
-                (index + fraction) / len(plan), f"{cell.scenario} {cell.victim} {cell.method} seed {cell.seed}: {text}"
+                (index + fraction) / len(plan),
+                f"{cell.scenario} {cell.victim} {cell.method} seed {cell.seed}: {text}",
             )
 
         surrogate_part(experiment, space, cell, folder, progress)
@@ -205,7 +212,9 @@ def search_settings(experiment: Experiment, method: Method) -> SearchSettings:
     attack, space = experiment.config.attack, experiment.config.space
     return SearchSettings(
         evaluations=planned_evaluations(experiment),
-        learning_rate=space.learning_rate if isinstance(space, (MeshTextureConfig, MeshShapeConfig)) else None,
+        learning_rate=space.learning_rate
+        if isinstance(space, (MeshTextureConfig, MeshShapeConfig))
+        else None,
         population=attack.cem_population,
         cells=0,  # objects that are no face have no coarse texture: every colour is searched
         gradient_rate=attack.learning_rate,
@@ -217,7 +226,11 @@ def search_settings(experiment: Experiment, method: Method) -> SearchSettings:
 def planned_evaluations(experiment: Experiment) -> int:
     """Drives of each search."""
     space = experiment.config.space
-    return space.samples * space.steps if isinstance(space, PlacesConfig) else experiment.config.attack.evaluations
+    return (
+        space.samples * space.steps
+        if isinstance(space, PlacesConfig)
+        else experiment.config.attack.evaluations
+    )
 
 
 def _search(
@@ -229,7 +242,9 @@ def _search(
     report: Callable[..., None],
 ) -> SearchResult:
     frozen = {
-        key: value for key, value in frozen_hashes(experiment).items() if key not in ("config", "starts_and_seeds")
+        key: value
+        for key, value in frozen_hashes(experiment).items()
+        if key not in ("config", "starts_and_seeds")
     }
     wanted = experiment.config.space.model_dump(mode="json")
     settings_hash = hash_of({**frozen, "victim": cell.victim, "scenario": cell.scenario, "space": wanted})
@@ -265,7 +280,9 @@ def _attack_file(
         objects=space.attacked(result.theta),
         face=None,
         camera=experiment.view.pinhole,
-        scene_sha256=hash_of(experiment.world_settings) if over_the_world(experiment) else scene_sha256(experiment),
+        scene_sha256=hash_of(experiment.world_settings)
+        if over_the_world(experiment)
+        else scene_sha256(experiment),
         policy_sha256=policy.sha256,
         config_sha256=hash_of(experiment.config.model_dump(mode="json")),
         seed=cell.seed,

@@ -34,12 +34,23 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
             return scene.observe_at(x, y, yaw, depth=False)[0]
 
         write_posed_images(
-            folder / PHOTOS, poses, scene.photo_pinhole, lambda index: scene.photograph(poses[index]), "jpg", keep=True, told=counted(report, PHOTOS, len(poses), 0, total)
-        )  # fmt: skip
+            folder / PHOTOS,
+            poses,
+            scene.photo_pinhole,
+            lambda index: scene.photograph(poses[index]),
+            "jpg",
+            keep=True,
+            told=counted(report, PHOTOS, len(poses), 0, total),
+        )
         write_posed_images(
-            folder / HELD_OUT, [planar_pose(*state) @ experiment.mount for state in states], experiment.camera, observed, "png",
-            keep=True, told=counted(report, HELD_OUT, len(states), len(poses), total),
-        )  # fmt: skip
+            folder / HELD_OUT,
+            [planar_pose(*state) @ experiment.mount for state in states],
+            experiment.camera,
+            observed,
+            "png",
+            keep=True,
+            told=counted(report, HELD_OUT, len(states), len(poses), total),
+        )
 
 
 def held_out_states(experiment: Experiment, rng: np.random.Generator) -> Array:

@@ -51,7 +51,11 @@ def cell_inputs(experiment: Experiment, scenario: str, victim: str, method: str,
     del seed
     require_known(experiment, scenario, victim, method)
     config = experiment.config.model_dump(mode="json", exclude=_FREE)
-    inputs = {"config": config, "world": experiment.world_settings, "stages": stage_digests(experiment.folder)}
+    inputs = {
+        "config": config,
+        "world": experiment.world_settings,
+        "stages": stage_digests(experiment.folder),
+    }
     if victim != RETRAINED:
         return inputs
     file = victim_file(experiment, victim)
@@ -118,7 +122,9 @@ def search_cell(
     """
     require_known(experiment, scenario, victim, method)
     if not over_the_world(experiment):
-        _search(experiment, make_space(experiment, None), Cell.of(scenario, victim, method, seed), folder, report)
+        _search(
+            experiment, make_space(experiment, None), Cell.of(scenario, victim, method, seed), folder, report
+        )
 
 
 def _search(experiment: Experiment, space: Space, cell: Cell, folder: Path, report: Report) -> None:

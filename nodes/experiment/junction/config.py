@@ -35,16 +35,21 @@ class SceneConfig(_Section):
 
     steps: Positive = Field(default=1500, description="Training iterations.")
     levels: Annotated[int, Field(ge=1, le=20)] = Field(default=8, description="Levels of the hash grid.")
-    finest: Positive = Field(default=2048, description="Cells of its finest level along the box's longest side.")
+    finest: Positive = Field(
+        default=2048, description="Cells of its finest level along the box's longest side."
+    )
     log2_entries: Annotated[int, Field(ge=10, le=24)] = Field(
         default=18, description="Entries of a level of the hash grid, as a power of two."
     )
-    occupancy: Positive = Field(default=128, description="Cells of the occupancy grid along the box's longest side.")
+    occupancy: Positive = Field(
+        default=128, description="Cells of the occupancy grid along the box's longest side."
+    )
     refine_depth: PositiveNumber = Field(
         default=0.005, description="Optical depth from which rendering looks into a cell; see TrainConfig."
     )
     margin_m: Annotated[float, Field(ge=0)] = Field(
-        default=0.5, description="The learned box reaches so far beyond the world's, if that is not contracted [m]."
+        default=0.5,
+        description="The learned box reaches so far beyond the world's, if that is not contracted [m].",
     )
     near_m: PositiveNumber = Field(default=0.3, description="Nothing stands nearer to the cameras [m].")
     interval_px: PositiveNumber | None = Field(
@@ -75,7 +80,8 @@ class PolicyConfig(_Section):
         default=1.0, description="Share of the path's curvature that the expert steers ahead."
     )
     delay_s: Annotated[float, Field(ge=0)] = Field(
-        default=0.1, description="What the expert looks ahead by: half a tick and part of the deployed car's lag [s]."
+        default=0.1,
+        description="What the expert looks ahead by: half a tick and part of the deployed car's lag [s].",
     )
     driven_m: PositiveNumber = Field(default=44.0, description="Frames are taken so far along each path [m].")
     drives_from_m: PositiveNumber = Field(
@@ -88,14 +94,18 @@ class PolicyConfig(_Section):
         default=3, description="Drives on each path in the deployment scene, per DAgger round."
     )
     surrogate_drives: Count = Field(default=3, description="The same in the surrogate.")
-    drive_steps: Positive = Field(default=60, description="Control ticks of such a drive; finer ticks need more.")
+    drive_steps: Positive = Field(
+        default=60, description="Control ticks of such a drive; finer ticks need more."
+    )
     dagger_rounds: Count = Field(default=2, description="Rounds of DAgger.")
     first_steps: Positive = Field(default=800, description="Optimiser steps of behaviour cloning.")
     round_steps: Positive = Field(default=300, description="Optimiser steps after each round.")
     naive_steps: Count = Field(
         default=800, description="Optimiser steps of the victim that never sees a random texture; 0: none."
     )
-    hidden: tuple[int, int, int] = Field(default=(200, 100, 20), description="Widths of the policy's linear layers.")
+    hidden: tuple[int, int, int] = Field(
+        default=(200, 100, 20), description="Widths of the policy's linear layers."
+    )
     seed: int = 0
 
 
@@ -105,7 +115,9 @@ class ObjectConfig(_Section):
     car_resolution: Annotated[int, Field(ge=8, le=128)] = Field(
         default=64, description="Voxels along a car's longest side."
     )
-    hydrant_resolution: Annotated[int, Field(ge=8, le=128)] = Field(default=48, description="The same of a hydrant.")
+    hydrant_resolution: Annotated[int, Field(ge=8, le=128)] = Field(
+        default=48, description="The same of a hydrant."
+    )
     fit_steps: Count = Field(default=300, description="Steps that refine the voxels on pictures of the mesh.")
 
 
@@ -127,9 +139,13 @@ class AttackConfig(_Section):
     learning_rate: PositiveNumber = 0.1
     random_sigma: PositiveNumber = Field(default=5.0, description="Spread of the random textures' theta.")
     cem_population: Annotated[int, Field(ge=4)] = Field(default=10, description="Candidates of a generation.")
-    seeds: tuple[int, ...] = Field(default=(0,), min_length=1, description="One search of each method per seed.")
+    seeds: tuple[int, ...] = Field(
+        default=(0,), min_length=1, description="One search of each method per seed."
+    )
     time_batch: Positive = Field(default=16, description="Frames per gradient batch.")
-    cache_mib: Annotated[float, Field(ge=0)] = Field(default=512.0, description="Budget of the frame cache [MiB].")
+    cache_mib: Annotated[float, Field(ge=0)] = Field(
+        default=512.0, description="Budget of the frame cache [MiB]."
+    )
 
     @property
     def method_names(self) -> tuple[str, ...]:
@@ -158,7 +174,9 @@ class RetrainConfig(_Section):
         default=2,
         description="Pairs of the victim's drives on each path, per domain: past plain objects and past a found texture.",
     )
-    drive_steps: Positive = Field(default=60, description="Control ticks of such a drive; finer ticks need more.")
+    drive_steps: Positive = Field(
+        default=60, description="Control ticks of such a drive; finer ticks need more."
+    )
     placements: Count = Field(
         default=0,
         description="Random places of all objects in random colours that the victim also learns from; see poses.py.",
@@ -175,7 +193,10 @@ class IntersectionExperimentConfig(_Section):
 
     @model_validator(mode="after")
     def _different_names(self) -> IntersectionExperimentConfig:
-        for what, names in (("scenarios", self.scenarios), ("names of objects", [each.name for each in self.objects])):
+        for what, names in (
+            ("scenarios", self.scenarios),
+            ("names of objects", [each.name for each in self.objects]),
+        ):
             if len(set(names)) != len(names):
                 raise ValueError(f"expected different {what}, got {', '.join(names)}")
         return self
@@ -210,7 +231,8 @@ class IntersectionExperimentConfig(_Section):
     )
     scenarios: tuple[str, ...] = Field(min_length=1, description="Which of the world's paths are driven.")
     objects: tuple[PlacedObject, ...] = Field(
-        default=(), description="Where the objects of the attack stand; composed by depth, not part of the world."
+        default=(),
+        description="Where the objects of the attack stand; composed by depth, not part of the world.",
     )
     horizon: Positive = Field(default=60, description="Control ticks of every drive (T).")
     dt_s: PositiveNumber = Field(

@@ -241,7 +241,9 @@ class Experiment(RunFolder[IntersectionExperimentConfig]):
         A seed that changed only the search's first noise would repeat one drive: gradients end in the same colours from everywhere.
         """
         wanted, nominal = self.config.attack, self.references[scenario].start_pose
-        noise = np.random.default_rng([seed, self.config.scenarios.index(scenario)]).standard_normal((wanted.starts, 3))
+        noise = np.random.default_rng([seed, self.config.scenarios.index(scenario)]).standard_normal(
+            (wanted.starts, 3)
+        )
         if seed == 0:
             noise[0] = 0.0
         # A tenth of a radian at the start would be 2.4 m of error at the junction.

@@ -43,10 +43,20 @@ class DressedScene:
     def __init__(self, scene: World, view: PolicyView, objects: Sequence[ColouredObject]) -> None:
         self.scene, self.view = scene, view
         self._window = Surrogate(
-            self._observed, view.window_pinhole, scene.T_car_from_camera, objects, supersample=_SUPERSAMPLE, opaque=True
+            self._observed,
+            view.window_pinhole,
+            scene.T_car_from_camera,
+            objects,
+            supersample=_SUPERSAMPLE,
+            opaque=True,
         )
         self._whole = Surrogate(
-            self._observed, view.camera, scene.T_car_from_camera, objects, supersample=_SUPERSAMPLE, opaque=True
+            self._observed,
+            view.camera,
+            scene.T_car_from_camera,
+            objects,
+            supersample=_SUPERSAMPLE,
+            opaque=True,
         )
 
     @property
@@ -60,7 +70,9 @@ class DressedScene:
 
     def prepare(self, states: Array) -> Frames:
         """What does not depend on colours, of the policy's window from car states ``[B, 3]``; time does not pass."""
-        return self._window.prepare(self._window.camera_poses(torch.from_numpy(np.asarray(states, dtype=np.float64))))
+        return self._window.prepare(
+            self._window.camera_poses(torch.from_numpy(np.asarray(states, dtype=np.float64)))
+        )
 
     def policy_images(self, frames: Frames, theta: Tensor | None) -> NDArray[np.uint8]:
         """Policy images ``[B, 66, 200, 3]`` of prepared windows."""
@@ -73,7 +85,9 @@ class DressedScene:
         window = self.view.window
         state = self.scene.state
         pose = planar_poses(np.array([[state.x_m, state.y_m, state.yaw_rad]])) @ self.scene.T_car_from_camera
-        image = self._window.overlay(rgb[window][None] / np.float32(255.0), depth_m[window][None], pose, theta)
+        image = self._window.overlay(
+            rgb[window][None] / np.float32(255.0), depth_m[window][None], pose, theta
+        )
         return self._resized(as_uint8(image[0]))
 
     def camera_image(self, state: Array, theta: Tensor | None) -> NDArray[np.uint8]:
@@ -125,7 +139,9 @@ class SelfDriving:
 
     def jacobians(self, states: Tensor, controls: Tensor) -> tuple[Tensor, Tensor]:
         """A scene has none."""
-        raise NotImplementedError("a deployment scene has no Jacobians: attacks are searched in the surrogate")
+        raise NotImplementedError(
+            "a deployment scene has no Jacobians: attacks are searched in the surrogate"
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,12 +188,7 @@ def drive_deployed(
     goals = torch.tensor([tuple(goal)], dtype=torch.float32)
     first = torch.from_numpy(np.array(start, dtype=np.float64))[None]
     rollout = drive(
-        policy,
-        lambda _: images_to_tensor(dressed.seen_now(theta)),
-        car,
-        first,
-        limits.ticks,
-        goals,
+        policy, lambda _: images_to_tensor(dressed.seen_now(theta)), car, first, limits.ticks, goals
     )
     states = rollout.states[:, 0].numpy().copy()
     states[:, 2] = np.unwrap(states[:, 2])

@@ -16,7 +16,9 @@ from nodes.experiment.junction.context import Experiment
 from nodes.experiment.junction.deployed import DeployedDrive, DressedScene, drive_deployed
 
 
-def learned_drives(experiment: Experiment, problem: AttackProblem, theta: Tensor) -> tuple[Array, list[DriveMetrics]]:
+def learned_drives(
+    experiment: Experiment, problem: AttackProblem, theta: Tensor
+) -> tuple[Array, list[DriveMetrics]]:
     """States ``[B, T + 1, n]`` of the drives from all starts of a problem in its own scene, and their metrics."""
     rollout, _ = evaluate(problem, theta)
     states = rollout.states.transpose(0, 1).numpy()
@@ -24,16 +26,27 @@ def learned_drives(experiment: Experiment, problem: AttackProblem, theta: Tensor
 
 
 def deployed_drives(
-    experiment: Experiment, dressed: DressedScene, policy: Policy, scenario: str, starts: Tensor, theta: Tensor
+    experiment: Experiment,
+    dressed: DressedScene,
+    policy: Policy,
+    scenario: str,
+    starts: Tensor,
+    theta: Tensor,
 ) -> list[DeployedDrive]:
     """Drives of the deployment scene's own car from starts ``[B, 3]``."""
     return [
         drive_deployed(
-            dressed, policy, experiment.goal(scenario), np.asarray(start), experiment.paths[scenario], experiment.limits,
-            experiment.car.speed_mps, theta,
+            dressed,
+            policy,
+            experiment.goal(scenario),
+            np.asarray(start),
+            experiment.paths[scenario],
+            experiment.limits,
+            experiment.car.speed_mps,
+            theta,
         )
         for start in starts.numpy()
-    ]  # fmt: skip
+    ]
 
 
 def totals(scores: Sequence[DriveMetrics]) -> dict[str, Any]:

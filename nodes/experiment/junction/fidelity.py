@@ -46,7 +46,9 @@ def held_out(experiment: Experiment, scenario: str) -> Pictures:
     views = load_transforms(experiment.stage_folder("capture") / capture.HELD_OUT, require_all=True).load()
     surrogate = surrogate_of(experiment, [])
     learned = [as_uint8(surrogate.render(pose[None], None).images[0]) for pose in views.T_world_from_camera]
-    return Pictures("held-out views", np.stack([experiment.view.image(rgb) for rgb in views.rgb]), np.stack(learned))
+    return Pictures(
+        "held-out views", np.stack([experiment.view.image(rgb) for rgb in views.rgb]), np.stack(learned)
+    )
 
 
 def driven(
@@ -55,7 +57,9 @@ def driven(
     """What the camera sees on the deployed drive past the plain objects; the scene is asked for it, there is no bag."""
     del folder
     if bag is not None:
-        raise RuntimeFault("expected no bag for a junction, whose drives are asked of the scene; leave --bag out")
+        raise RuntimeFault(
+            "expected no bag for a junction, whose drives are asked of the scene; leave --bag out"
+        )
     return _along_the_drive(experiment, scenario, victim, seed, None, "drive past the plain objects")
 
 
@@ -65,7 +69,9 @@ def lacks(experiment: Experiment, scenario: str, victim: str, method: str, seed:
     return "" if found is not None else "its search"
 
 
-def attacked(experiment: Experiment, scenario: str, victim: str, method: str, seed: int, folder: Path) -> Pictures:
+def attacked(
+    experiment: Experiment, scenario: str, victim: str, method: str, seed: int, folder: Path
+) -> Pictures:
     """The same places with the colours of a finished search."""
     theta = _theta(experiment, scenario, victim, method, seed, folder)
     return _along_the_drive(experiment, scenario, victim, seed, theta, "the same drive, attacked")
@@ -94,9 +100,13 @@ def _searched_in(experiment: Experiment, cell: Cell, folder: Path) -> Path | Non
     return next((at for at in places if attack_path(at, cell).exists()), None)
 
 
-def _theta(experiment: Experiment, scenario: str, victim: str, method: str, seed: int, folder: Path) -> torch.Tensor:
+def _theta(
+    experiment: Experiment, scenario: str, victim: str, method: str, seed: int, folder: Path
+) -> torch.Tensor:
     cell = Cell.of(scenario, victim, method, seed)
-    return load_shown(colour_space(experiment), _searched_in(experiment, cell, folder) or folder, cell).colours
+    return load_shown(
+        colour_space(experiment), _searched_in(experiment, cell, folder) or folder, cell
+    ).colours
 
 
 def _along_the_drive(
@@ -109,10 +119,14 @@ def _along_the_drive(
         start = experiment.start_states(scenario, seed)[:1]
         (drive,) = deployed_drives(experiment, dressed, policy, scenario, start, dressed.plain_theta())
         states = drive.states[:-1]
-        real = dressed.policy_images(dressed.prepare(states), dressed.plain_theta() if theta is None else theta)
+        real = dressed.policy_images(
+            dressed.prepare(states), dressed.plain_theta() if theta is None else theta
+        )
     surrogate = surrogate_of(experiment, objects)
     shown = surrogate.plain_theta() if theta is None else theta
     learned = [
-        as_uint8(image) for state in states for image in surrogate.sense(torch.from_numpy(state)[None], shown).images
+        as_uint8(image)
+        for state in states
+        for image in surrogate.sense(torch.from_numpy(state)[None], shown).images
     ]
     return Pictures(of, real, np.stack(learned))

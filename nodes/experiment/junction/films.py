@@ -80,7 +80,12 @@ def filmed(dt_s: float) -> tuple[int, float]:
 
 
 def _track(
-    experiment: Experiment, scenario: str, title: str, method: str, frames: list[NDArray[np.uint8]], states: Array
+    experiment: Experiment,
+    scenario: str,
+    title: str,
+    method: str,
+    frames: list[NDArray[np.uint8]],
+    states: Array,
 ) -> ClipTrack:
     cte_m = experiment.paths[scenario].project(np.asarray(states)[:, :2]).cte_m
     return ClipTrack(title, method, frames, cte_m)

@@ -55,14 +55,21 @@ def write(
     style = files("advnerf_core.report").joinpath("page.css").read_text(encoding="utf-8")
     parts = [
         Markup(_HEAD).format(
-            title=title, light=Markup(css_variables(LIGHT)), dark=Markup(css_variables(DARK)), style=Markup(style)
+            title=title,
+            light=Markup(css_variables(LIGHT)),
+            dark=Markup(css_variables(DARK)),
+            style=Markup(style),
         ),
         Markup("<h1>{}</h1><p>{}</p>").format(title, opening(experiment)),
         Markup("<h2>Total cross-track error</h2>{}").format(table.html()),
-        Markup("<h2>The world</h2>"), _picture(overview, "Paths of the drives, and the places of the objects"),
-    ]  # fmt: skip
+        Markup("<h2>The world</h2>"),
+        _picture(overview, "Paths of the drives, and the places of the objects"),
+    ]
     for name, clip in zip(experiment.config.scenarios, clips, strict=True):
-        parts += [Markup("<h2>{}</h2>").format(name.capitalize()), *_drive(experiment, name, clip, seen[name])]
+        parts += [
+            Markup("<h2>{}</h2>").format(name.capitalize()),
+            *_drive(experiment, name, clip, seen[name]),
+        ]
     parts += [*_fidelity(experiment), *_how(experiment), Markup("</main></body></html>\n")]
     path = folder / "report.html"
     write_atomically(path, str(Markup("\n").join(parts)))
@@ -89,12 +96,16 @@ def _picture(image: NDArray[np.uint8], caption: str) -> Markup:
     )
 
 
-def _drive(experiment: Experiment, name: str, clip: Path, seen: Mapping[str, NDArray[np.uint8]]) -> list[Markup]:
+def _drive(
+    experiment: Experiment, name: str, clip: Path, seen: Mapping[str, NDArray[np.uint8]]
+) -> list[Markup]:
     text = f"Drives ({name}) from above: dashed in the learned scene, solid deployed"
     parts = [
-        Markup("<figure>{}<figcaption>{}</figcaption></figure>").format(Markup(svg(trajectories(experiment, name), text)), text),
+        Markup("<figure>{}<figcaption>{}</figcaption></figure>").format(
+            Markup(svg(trajectories(experiment, name), text)), text
+        ),
         Markup('<video controls loop muted src="{}"></video>').format(data_uri(clip)),
-    ]  # fmt: skip
+    ]
     return [*parts, *(_picture(image, f"Objects seen: {style_of(key).title}") for key, image in seen.items())]
 
 
@@ -103,8 +114,12 @@ def trajectories(experiment: Experiment, name: str) -> Figure:
     path = experiment.paths[name]
     line = path.pose_at(np.linspace(0.0, path.length_m, 300))[:, :2]
     found = [cell for cell in cells(experiment) if cell.scenario == name and cell.victim == HARDENED]
-    drives = [(cell, domain, states) for cell in found for domain in films.DOMAINS
-              for states in films.drives_of(experiment, domain, cell)]  # fmt: skip
+    drives = [
+        (cell, domain, states)
+        for cell in found
+        for domain in films.DOMAINS
+        for states in films.drives_of(experiment, domain, cell)
+    ]
     every = np.concatenate([states[:, :2] for _, _, states in drives])
     low, high = every.min(axis=0) - _MARGIN_M, every.max(axis=0) + _MARGIN_M
     with new_axes(6.4, float(np.clip(5.6 * (high - low)[1] / (high - low)[0], 2.2, 6.0)) + 0.9) as ax:
@@ -114,7 +129,9 @@ def trajectories(experiment: Experiment, name: str) -> Figure:
             drawn = {"color": style_of(cell.method).light, "ls": LINE_STYLES[domain], "lw": 1.2, "zorder": 2}
             ax.plot(*states[:, :2].T, label=_label(cell, domain), **drawn)
         entries = dict(zip(*reversed(ax.get_legend_handles_labels()), strict=True))
-        ax.figure.legend(entries.values(), entries.keys(), loc="outside upper left", ncols=3, columnspacing=1.4)
+        ax.figure.legend(
+            entries.values(), entries.keys(), loc="outside upper left", ncols=3, columnspacing=1.4
+        )
         ax.set(xlabel="x [m]", ylabel="y [m]", xlim=(low[0], high[0]), ylim=(low[1], high[1]))
         ax.set_aspect("equal")
     return ax.figure
@@ -132,12 +149,16 @@ def _ground(ax: Any, experiment: Experiment) -> None:
     for edge in experiment.world.road_edge:
         ax.plot(*edge.T, color=LIGHT["muted"], lw=1.0, zorder=0.5)
     for thing in experiment.objects:
-        ax.add_patch(Polygon(thing.corners_m(), closed=True, fc=LIGHT["grid"], ec=LIGHT["ink"], lw=1.0, zorder=1.5))
+        ax.add_patch(
+            Polygon(thing.corners_m(), closed=True, fc=LIGHT["grid"], ec=LIGHT["ink"], lw=1.0, zorder=1.5)
+        )
 
 
 def _fidelity(experiment: Experiment) -> list[Markup]:
     scene = json.loads((experiment.stage_folder("scene") / "fidelity.json").read_text())
-    controls = json.loads((experiment.stage_folder("policy") / "policy.json").read_text())["on_held_out_views"]
+    controls = json.loads((experiment.stage_folder("policy") / "policy.json").read_text())[
+        "on_held_out_views"
+    ]
     difference = float(np.mean([abs(row["real"] - row["surrogate"]) for row in controls]))
     mean, views = scene["mean"], scene["views"]
     text = (
@@ -158,13 +179,15 @@ def _how(experiment: Experiment) -> list[Markup]:
         name: read_record(experiment.stage_folder(name))
         for name in ("capture", "scene", "object", "policy", "attack", "deploy")
     }
-    times = ", ".join(f"{name} {record.seconds:.0f} s" for name, record in records.items() if record is not None)
+    times = ", ".join(
+        f"{name} {record.seconds:.0f} s" for name, record in records.items() if record is not None
+    )
     hashes = ", ".join(f"{name} {value[:12]}" for name, value in frozen.items())
     return [
-        Markup("<h2>How it was made</h2><p><code>{}</code></p><p>Stages: {}.</p><p>Fixed before the first attack: {}.</p>").format(
-            manifest["command"], times, hashes
-        )
-    ]  # fmt: skip
+        Markup(
+            "<h2>How it was made</h2><p><code>{}</code></p><p>Stages: {}.</p><p>Fixed before the first attack: {}.</p>"
+        ).format(manifest["command"], times, hashes)
+    ]
 
 
 def _read(path: Path) -> NDArray[np.uint8]:

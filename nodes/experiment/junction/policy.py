@@ -41,25 +41,39 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
     """Train the victims, then compare their controls on held-out views and on the surrogate's image of them."""
     config = experiment.config.policy
     settings = ImitationConfig(
-        seed=config.seed, dagger_rounds=config.dagger_rounds, first_steps=config.first_steps,
-        round_steps=config.round_steps, naive_steps=config.naive_steps, hidden=config.hidden,
-        lateral_m=experiment.across_m(_STILLS[0]), heading_rad=_STILLS[1],
-        drive_lateral_m=experiment.across_m(_DRIVES[0]), drive_heading_rad=_DRIVES[1],
-        give_up_m=experiment.across_m(_GIVE_UP_M), max_steering_rad=experiment.car.largest_control,
-    )  # fmt: skip
+        seed=config.seed,
+        dagger_rounds=config.dagger_rounds,
+        first_steps=config.first_steps,
+        round_steps=config.round_steps,
+        naive_steps=config.naive_steps,
+        hidden=config.hidden,
+        lateral_m=experiment.across_m(_STILLS[0]),
+        heading_rad=_STILLS[1],
+        drive_lateral_m=experiment.across_m(_DRIVES[0]),
+        drive_heading_rad=_DRIVES[1],
+        give_up_m=experiment.across_m(_GIVE_UP_M),
+        max_steering_rad=experiment.car.largest_control,
+    )
     write_placement(experiment, folder)
     with experiment.open_world() as scene:
         trained = train_policy(
-            settings, plans(experiment, scene), experiment.expert(experiment.config.scenarios[0]), experiment.view,
-            folder, lambda part, text: report(0.98 * part, text),
-        )  # fmt: skip
+            settings,
+            plans(experiment, scene),
+            experiment.expert(experiment.config.scenarios[0]),
+            experiment.view,
+            folder,
+            lambda part, text: report(0.98 * part, text),
+        )
     report(0.98, "comparing controls on true and learned views")
     summary = {
-        "sha256": trained.sha256, "naive_sha256": trained.naive_sha256, "frames": trained.frames,
-        "validation_mae": trained.validation_mae_rad, "naive_validation_mae": trained.naive_validation_mae_rad,
+        "sha256": trained.sha256,
+        "naive_sha256": trained.naive_sha256,
+        "frames": trained.frames,
+        "validation_mae": trained.validation_mae_rad,
+        "naive_validation_mae": trained.naive_validation_mae_rad,
         "control_unit": experiment.car.control_unit,
         "on_held_out_views": agreement(experiment),
-    }  # fmt: skip
+    }
     write_atomically(folder / "policy.json", json.dumps(summary, indent=1) + "\n")
 
 
@@ -81,9 +95,12 @@ def victim_file(experiment: Experiment, victim: str) -> Path:
 
 
 def plans(
-    experiment: Experiment, scene: World, sample: Sample | None = None,
-    objects: Sequence[VoxelGridObject] | None = None, ending: str = "",
-) -> list[SourcePlan]:  # fmt: skip
+    experiment: Experiment,
+    scene: World,
+    sample: Sample | None = None,
+    objects: Sequence[VoxelGridObject] | None = None,
+    ending: str = "",
+) -> list[SourcePlan]:
     """For each drive its frames from the deployment scene and from the surrogate, with its goal and its teacher.
 
     Args:
@@ -113,15 +130,20 @@ def plans(
     found = []
     for name in experiment.config.scenarios:
         common: dict[str, Any] = {
-            "drive_steps": config.drive_steps, "goal": experiment.goal(name), "expert": experiment.expert(name),
-            "driven_m": config.driven_m, "drives_from_m": config.drives_from_m,
-        }  # fmt: skip
+            "drive_steps": config.drive_steps,
+            "goal": experiment.goal(name),
+            "expert": experiment.expert(name),
+            "driven_m": config.driven_m,
+            "drives_from_m": config.drives_from_m,
+        }
         domains = (
             ("deployed", seen_in_scene, config.deployed_stills, config.deployed_drives),
             ("surrogate", seen_in_surrogate, config.surrogate_stills, config.surrogate_drives),
         )
         for domain, prepare, stills, drives in domains:
-            source = RenderedSource(f"{domain}-{name}{ending}", prepare, experiment.dynamics, sample or any_colours)
+            source = RenderedSource(
+                f"{domain}-{name}{ending}", prepare, experiment.dynamics, sample or any_colours
+            )
             found.append(SourcePlan(source, stills, drives, **common))
     return found
 
@@ -137,7 +159,9 @@ def agreement(experiment: Experiment) -> list[dict[str, float]]:
         real = experiment.view.image(load_image(frame)[0])
         with torch.no_grad():
             on_real = float(policy(images_to_tensor(real), goal)[0])
-            on_surrogate = float(policy(surrogate.render(frame.T_world_from_camera[None], None).images, goal)[0])
+            on_surrogate = float(
+                policy(surrogate.render(frame.T_world_from_camera[None], None).images, goal)[0]
+            )
         rows.append({"real": on_real, "surrogate": on_surrogate})
     return rows
 

@@ -33,7 +33,13 @@ class PoseMapSettings:
 
     points: tuple[int, int] = (9, 9)
     sideways_m: tuple[float, ...] = (-0.6, -0.3, 0.0, 0.3, 0.6)
-    object_moves_m: tuple[tuple[float, float], ...] = ((0.0, 0.0), (-1.0, 0.0), (1.0, 0.0), (0.0, -1.0), (0.0, 1.0))
+    object_moves_m: tuple[tuple[float, float], ...] = (
+        (0.0, 0.0),
+        (-1.0, 0.0),
+        (1.0, 0.0),
+        (0.0, -1.0),
+        (0.0, 1.0),
+    )
 
 
 def draw_maps(

@@ -81,12 +81,16 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
 def print_summary(experiment: Experiment, console: Console) -> None:
     """The transfer table, and where the page is."""
     console.print(transfer_table(rows_of(experiment)).rich())
-    console.print(f"report: {experiment.stage_folder('report') / 'report.html'}", highlight=False, soft_wrap=True)
+    console.print(
+        f"report: {experiment.stage_folder('report') / 'report.html'}", highlight=False, soft_wrap=True
+    )
 
 
 def read_cell(experiment: Experiment, cell: Cell) -> dict[str, Any]:
     """A finished cell."""
-    found: dict[str, Any] = json.loads((experiment.stage_folder("deploy") / f"{cell.name}.cell.json").read_text())
+    found: dict[str, Any] = json.loads(
+        (experiment.stage_folder("deploy") / f"{cell.name}.cell.json").read_text()
+    )
     return found
 
 
@@ -125,28 +129,52 @@ def transfer_table(rows: Sequence[Row]) -> Table:
         first = tuple(now if here != before else "" for now in here)
         std = float(np.std(row.total_cte_m, ddof=1)) if len(row.total_cte_m) > 1 else None
         ratio_std = float(np.std(row.ratios, ddof=1)) if len(row.ratios) > 1 else None
-        texts.append((
-            *first, style_of(row.method).title, str(len(row.total_cte_m)), spread(float(np.mean(row.total_cte_m)), std),
-            "" if row.method == NONE else spread(row.ratio, ratio_std), f"{row.off_track} of {len(row.total_cte_m)}",
-        ))  # fmt: skip
+        texts.append(
+            (
+                *first,
+                style_of(row.method).title,
+                str(len(row.total_cte_m)),
+                spread(float(np.mean(row.total_cte_m)), std),
+                "" if row.method == NONE else spread(row.ratio, ratio_std),
+                f"{row.off_track} of {len(row.total_cte_m)}",
+            )
+        )
         before = here
-    columns = ("victim", "drive", "domain", "objects show", "runs", "total CTE [m]", "over no attack", "off-track")
-    return Table("Total CTE: surrogate and deployed", columns, tuple(texts), (False,) * 4 + (True,) * 4, tuple(groups))
+    columns = (
+        "victim",
+        "drive",
+        "domain",
+        "objects show",
+        "runs",
+        "total CTE [m]",
+        "over no attack",
+        "off-track",
+    )
+    return Table(
+        "Total CTE: surrogate and deployed", columns, tuple(texts), (False,) * 4 + (True,) * 4, tuple(groups)
+    )
 
 
 def write_results(experiment: Experiment, rows: Sequence[Row], folder: Path) -> None:
     """All cells as JSON, and the table as CSV."""
-    kept = {"setting": experiment.setting, "cells": [read_cell(experiment, cell) for cell in cells(experiment)]}
+    kept = {
+        "setting": experiment.setting,
+        "cells": [read_cell(experiment, cell) for cell in cells(experiment)],
+    }
     write_atomically(folder / "results.json", json.dumps(kept, indent=1) + "\n")
     lines = ["victim,scenario,domain,method,runs,total_cte_mean_m,total_cte_std_m,ratio,off_track"]
     for row in rows:
         std = np.std(row.total_cte_m, ddof=1) if len(row.total_cte_m) > 1 else float("nan")
-        numbers = f"{len(row.total_cte_m)},{np.mean(row.total_cte_m):.4f},{std:.4f},{row.ratio:.4f},{row.off_track}"
+        numbers = (
+            f"{len(row.total_cte_m)},{np.mean(row.total_cte_m):.4f},{std:.4f},{row.ratio:.4f},{row.off_track}"
+        )
         lines.append(f"{row.victim},{row.scenario},{row.domain},{row.method},{numbers}")
     write_atomically(folder / "results.csv", "\n".join(lines) + "\n")
 
 
-def textures_seen(experiment: Experiment, scene: World, space: Space, scenario: str) -> dict[str, NDArray[np.uint8]]:
+def textures_seen(
+    experiment: Experiment, scene: World, space: Space, scenario: str
+) -> dict[str, NDArray[np.uint8]]:
     """The same views of the driving camera past the plain, random and attacked objects of the first seed, one row each."""
     searched, seed = experiment.stage_folder("attack"), experiment.config.attack.seeds[0]
     reference = experiment.references[scenario]
@@ -155,5 +183,7 @@ def textures_seen(experiment: Experiment, scene: World, space: Space, scenario: 
     for method in (NONE, *experiment.config.attack.method_names):
         shown = load_shown(space, searched, Cell(scenario, HARDENED, method, seed))
         dressed = DressedScene(scene, experiment.view, shown.objects)
-        seen[method] = np.concatenate([dressed.camera_image(state, shown.colours) for state in states], axis=1)
+        seen[method] = np.concatenate(
+            [dressed.camera_image(state, shown.colours) for state in states], axis=1
+        )
     return seen

@@ -77,10 +77,12 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
             if number == 1:
                 old_attacks = _under_old_attacks(experiment, dressed, folder / "round0", first)
             summary = {
-                "rounds": rounds, "old_attacks": old_attacks, "pays_ratio": wanted.pays_ratio,
+                "rounds": rounds,
+                "old_attacks": old_attacks,
+                "pays_ratio": wanted.pays_ratio,
                 "final_policy": os.path.relpath(file, experiment.folder),
                 "settings_hash": hash_of(wanted.model_dump(mode="json")),
-            }  # fmt: skip
+            }
             # After every round: a loop takes hours, and may be stopped.
             write_atomically(folder / "retrain.json", json.dumps(summary, indent=1) + "\n")
             retrain_plot.draw(folder / "curve.png", rounds, wanted.pays_ratio)
@@ -88,7 +90,9 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
                 break
             thetas += list(found.thetas.values())
             new = _collect(experiment, scene, victim, thetas, here, told)
-            settings = RetrainConfig(steps=wanted.steps, new_share=wanted.new_share, seed=wanted.seed + number)
+            settings = RetrainConfig(
+                steps=wanted.steps, new_share=wanted.new_share, seed=wanted.seed + number
+            )
             file = here / "policy.safetensors"
             if not file.exists():
                 fine_tune(victim, kept, new, settings, file, _stepping(told, wanted.steps))
@@ -139,9 +143,13 @@ def _first_attacks(
 
 
 def _attack_again(
-    experiment: Experiment, space: ColourSpace, dressed: DressedScene, victim: LoadedPolicy, folder: Path,
+    experiment: Experiment,
+    space: ColourSpace,
+    dressed: DressedScene,
+    victim: LoadedPolicy,
+    folder: Path,
     report: Callable[[float, str], None],
-) -> Found:  # fmt: skip
+) -> Found:
     """The gradient attack of the first seed on a retrained victim, as long as the attack on the first one."""
     attack = experiment.config.attack
     thetas: dict[str, torch.Tensor] = {}
@@ -149,22 +157,34 @@ def _attack_again(
         problem = attack_problem(experiment, space, victim, scenario, attack.seeds[0])
 
         def told(evaluation: Any, index: int = index, scenario: str = scenario) -> None:
-            done = (index + (evaluation.iteration + 1) / attack.evaluations) / len(experiment.config.scenarios)
-            report(0.4 * done, f"attacking again, {scenario}: total CTE {evaluation.predicted_total_cte_m:.1f} m")
+            done = (index + (evaluation.iteration + 1) / attack.evaluations) / len(
+                experiment.config.scenarios
+            )
+            report(
+                0.4 * done, f"attacking again, {scenario}: total CTE {evaluation.predicted_total_cte_m:.1f} m"
+            )
 
         result = gradient_attack(
-            problem, attack.evaluations, attack.learning_rate, seed=attack.seeds[0],
-            state_path=folder / f"{scenario}.state.safetensors", on_evaluation=told,
+            problem,
+            attack.evaluations,
+            attack.learning_rate,
+            seed=attack.seeds[0],
+            state_path=folder / f"{scenario}.state.safetensors",
+            on_evaluation=told,
             settings_hash=hash_of({"victim": victim.sha256, "scenario": scenario}),
-        )  # fmt: skip
+        )
         thetas[scenario] = result.theta
     return _judged(experiment, space, dressed, victim, thetas, folder)
 
 
 def _judged(
-    experiment: Experiment, space: ColourSpace, dressed: DressedScene, policy: LoadedPolicy,
-    thetas: dict[str, torch.Tensor], folder: Path,
-) -> Found:  # fmt: skip
+    experiment: Experiment,
+    space: ColourSpace,
+    dressed: DressedScene,
+    policy: LoadedPolicy,
+    thetas: dict[str, torch.Tensor],
+    folder: Path,
+) -> Found:
     """Ratios to no attack of the same victim in both domains, from the attack's starts; kept in the folder of the round."""
     seed, kept = experiment.config.attack.seeds[0], folder / "ratios.json"
     key = [policy.sha256, *(hashlib.sha256(theta.numpy().tobytes()).hexdigest() for theta in thetas.values())]
@@ -173,18 +193,27 @@ def _judged(
     ratios: dict[str, dict[str, float]] = {"surrogate": {}, "deployed": {}}
     for scenario, theta in thetas.items():
         problem = attack_problem(experiment, space, policy, scenario, seed)
-        learned = [float(evaluate(problem, each)[1].protocol_cte_m.mean()) for each in (theta, space.plain.colours)]
+        learned = [
+            float(evaluate(problem, each)[1].protocol_cte_m.mean()) for each in (theta, space.plain.colours)
+        ]
         starts = experiment.start_states(scenario, seed)
         driven = [_total_cte_m(experiment, dressed, policy, scenario, starts, each) for each in (theta, None)]
-        ratios["surrogate"][scenario], ratios["deployed"][scenario] = learned[0] / learned[1], driven[0] / driven[1]
+        ratios["surrogate"][scenario], ratios["deployed"][scenario] = (
+            learned[0] / learned[1],
+            driven[0] / driven[1],
+        )
     write_atomically(kept, json.dumps({"of": key, "ratios": ratios}, indent=1) + "\n")
     return Found(thetas, ratios)
 
 
 def _total_cte_m(
-    experiment: Experiment, dressed: DressedScene, policy: LoadedPolicy, scenario: str, starts: torch.Tensor,
+    experiment: Experiment,
+    dressed: DressedScene,
+    policy: LoadedPolicy,
+    scenario: str,
+    starts: torch.Tensor,
     theta: torch.Tensor | None,
-) -> float:  # fmt: skip
+) -> float:
     """Total CTE [m] of deployed drives, the mean over starts ``[B, 3]``; plain objects for None."""
     shown = dressed.plain_theta() if theta is None else theta
     drives = deployed_drives(experiment, dressed, policy.policy, scenario, starts, shown)
@@ -192,9 +221,13 @@ def _total_cte_m(
 
 
 def _collect(
-    experiment: Experiment, scene: World, victim: LoadedPolicy, thetas: Sequence[torch.Tensor], folder: Path,
+    experiment: Experiment,
+    scene: World,
+    victim: LoadedPolicy,
+    thetas: Sequence[torch.Tensor],
+    folder: Path,
     report: Callable[[float, str], None],
-) -> list[Frames]:  # fmt: skip
+) -> list[Frames]:
     """Frames of both domains with the found objects: stills about the paths, and drives of the victim, labelled by the teacher.
 
     Where it is asked for also stills with all objects in random colours at random places.
@@ -249,7 +282,9 @@ def _frames(
     return Frames(seen.images, seen.states, labels, goals, seen.textured)
 
 
-def _under_old_attacks(experiment: Experiment, dressed: DressedScene, folder: Path, first: Found) -> dict[str, Any]:
+def _under_old_attacks(
+    experiment: Experiment, dressed: DressedScene, folder: Path, first: Found
+) -> dict[str, Any]:
     """The retrained policy past the attacks that it was trained on, from a start that nothing has seen, beside the original undisturbed."""
     original, file = load_policy(victim_file(experiment, HARDENED)), folder / "policy.safetensors"
     retrained, rows = load_policy(file), {}

@@ -37,7 +37,9 @@ def curve(rounds: Sequence[dict[str, Any]], pays_ratio: float) -> Figure:
         for domain, style in (("surrogate", "--"), ("deployed", "-")):
             values = [each[domain][scenario] for each in rounds]
             label = f"{scenario}, {domain}"
-            axes.plot(range(len(values)), values, style, marker="o", ms=4, color=_COLOURS.get(scenario), label=label)
+            axes.plot(
+                range(len(values)), values, style, marker="o", ms=4, color=_COLOURS.get(scenario), label=label
+            )
     axes.axhline(pays_ratio, color="0.4", lw=0.8, ls=":", label=f"pays from {pays_ratio:g}")
     axes.axhline(1.0, color="0.8", lw=0.8)
     axes.set_xticks(range(len(rounds)), ["original", *map(str, range(1, len(rounds)))])

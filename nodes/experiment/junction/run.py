@@ -122,7 +122,11 @@ def stages_of(experiment: Experiment) -> list[Stage]:
     placed = [thing.model_dump(mode="json") for thing in config.objects]
 
     def stage(
-        name: str, module: Any, settings: dict[str, Any], after: Sequence[str], parts: Sequence[dict[str, Any]] = ()
+        name: str,
+        module: Any,
+        settings: dict[str, Any],
+        after: Sequence[str],
+        parts: Sequence[dict[str, Any]] = (),
     ) -> Stage:
         def work(folder: Path, told: Report) -> None:
             module.run(experiment, folder, told)
@@ -140,14 +144,31 @@ def stages_of(experiment: Experiment) -> list[Stage]:
     view, space = part("view"), part("space")
     driven = {"world": world, "objects": placed, "view": view, **measured}
     stages = [
-        stage("capture", capture, {"world": experiment.seen_settings, "capture": part("capture"), **measured}, ()),
+        stage(
+            "capture",
+            capture,
+            {"world": experiment.seen_settings, "capture": part("capture"), **measured},
+            (),
+        ),
         stage("scene", scene, {"scene": part("scene"), "view": view}, ("capture",)),
         stage("object", objects, {"object": part("object"), "kinds": kinds}, ()),
-        stage("policy", policy, {**driven, "policy": part("policy"), "sigma": config.attack.random_sigma}, ("capture", "scene", "object")),
-        stage("attack", attack, {**driven, "attack": searched, "space": space}, ("scene", "object", "policy")),
+        stage(
+            "policy",
+            policy,
+            {**driven, "policy": part("policy"), "sigma": config.attack.random_sigma},
+            ("capture", "scene", "object"),
+        ),
+        stage(
+            "attack", attack, {**driven, "attack": searched, "space": space}, ("scene", "object", "policy")
+        ),
         stage("deploy", deploy, {**driven, "space": space}, ("object", "policy", "attack")),
-        stage("report", report, {"attack": searched, **measured}, ("capture", "scene", "policy", "attack", "deploy")),
-    ]  # fmt: skip
+        stage(
+            "report",
+            report,
+            {"attack": searched, **measured},
+            ("capture", "scene", "policy", "attack", "deploy"),
+        ),
+    ]
     if config.retrain is not None:
         settings = {**driven, "retrain": part("retrain"), "attack": searched}
         fewer = [

@@ -28,11 +28,14 @@ class PlacesConfig(_Section):
     kind: Literal["places"] = "places"
     move_m: NotNegative = Field(default=1.5, description="An object's x and y may change by this [m].")
     turn_rad: NotNegative = Field(
-        default=0.6, description="A car's heading may change by this [rad]; a hydrant may turn all the way round."
+        default=0.6,
+        description="A car's heading may change by this [rad]; a hydrant may turn all the way round.",
     )
     samples: Positive = Field(default=5, description="Placements that are drawn.")
     steps: Positive = Field(default=10, description="Evaluations of each placement.")
-    colour_rate: PositiveNumber = Field(default=0.5, description="Adam's step of the colours before squashing.")
+    colour_rate: PositiveNumber = Field(
+        default=0.5, description="Adam's step of the colours before squashing."
+    )
     colours: bool = Field(default=True, description="Search the colours too; false keeps the plain ones.")
 
 
@@ -59,9 +62,13 @@ class MeshShapeConfig(_MeshConfig):
 
     kind: Literal["mesh_shape"] = "mesh_shape"
     bound_m: PositiveNumber = Field(default=0.4, description="No vertex moves farther [m].")
-    smoothness: NotNegative = Field(default=19.0, description="Lambda of the large-steps preconditioner; 0: none.")
+    smoothness: NotNegative = Field(
+        default=19.0, description="Lambda of the large-steps preconditioner; 0: none."
+    )
     samples: Positive = Field(default=4, description="Rays a pixel for the gradient inside the silhouettes.")
     boundary_samples: Positive = Field(default=1, description="Points a pixel for that of the silhouettes.")
 
 
-SpaceConfig = Annotated[ColoursConfig | PlacesConfig | MeshTextureConfig | MeshShapeConfig, Field(discriminator="kind")]
+SpaceConfig = Annotated[
+    ColoursConfig | PlacesConfig | MeshTextureConfig | MeshShapeConfig, Field(discriminator="kind")
+]

@@ -37,7 +37,9 @@ from nodes.lab.worlds.expert_drive import as_path
 
 def colour_space(experiment: Experiment, surrogate: Surrogate | None = None) -> ColourSpace:
     """The colours of the voxel objects, in the learned scene; ``surrogate`` if it is made already."""
-    return ColourSpace(surrogate or surrogate_of(experiment, placed_objects(experiment)), _named_voxels(experiment))
+    return ColourSpace(
+        surrogate or surrogate_of(experiment, placed_objects(experiment)), _named_voxels(experiment)
+    )
 
 
 def make_space(experiment: Experiment, scene: World | None) -> Space:
@@ -56,7 +58,9 @@ def make_space(experiment: Experiment, scene: World | None) -> Space:
     fields = mesh_objects(experiment, wanted)
     frames = DeployedFrames(scene, experiment.view)
     surrogate = Surrogate(frames, experiment.view.pinhole, experiment.mount, fields, depth_tolerance_m=0.0)
-    named = [NamedObject(thing.name, field.sha256) for thing, field in zip(experiment.objects, fields, strict=True)]
+    named = [
+        NamedObject(thing.name, field.sha256) for thing, field in zip(experiment.objects, fields, strict=True)
+    ]
     if isinstance(wanted, MeshTextureConfig):
         return ColourSpace(surrogate, named)
     limits = ShapeLimits(wanted.bound_m, wanted.smoothness, wanted.samples, wanted.boundary_samples)
@@ -92,7 +96,11 @@ def bounds_of(things: Sequence[PlacedObject], wanted: PlacesConfig) -> list[Pose
         turn_rad = np.pi if thing.kind == "hydrant" else wanted.turn_rad
         x, y, yaw = (
             (at - reach, at + reach)
-            for at, reach in ((thing.x_m, wanted.move_m), (thing.y_m, wanted.move_m), (thing.yaw_rad, turn_rad))
+            for at, reach in (
+                (thing.x_m, wanted.move_m),
+                (thing.y_m, wanted.move_m),
+                (thing.yaw_rad, turn_rad),
+            )
         )
         found.append(PoseBounds(x_m=x, y_m=y, yaw_rad=yaw))
     return found

@@ -109,15 +109,26 @@ def check(request: AttackRequest, directions: int, memory: bool, report: Report)
     along = random_directions(theta.double(), directions, prepared.seed)
     reference, frozen = _frozen_slopes(exact, theta.double(), along)
     closed = closed_loop_cosine(
-        partial(closed_loss, exact), theta.double(), reference.gradient, min(directions, _CLOSED_DIRECTIONS), seed=prepared.seed,
+        partial(closed_loss, exact),
+        theta.double(),
+        reference.gradient,
+        min(directions, _CLOSED_DIRECTIONS),
+        seed=prepared.seed,
         told=lambda done: report(0.3 + 0.4 * done, "finite differences of the closed loop"),
-    )  # fmt: skip
+    )
     adjoint = slopes_of(reference.gradient, along)
     return Check(
-        relative_error(adjoint, frozen), _difference(result.gradient.double(), reference.gradient),
-        float(reference.gradient.norm()), tuple(adjoint), tuple(frozen), prepared.clean_drive, closed,
-        ticks, split, _memory(request, report) if memory else {},
-    )  # fmt: skip
+        relative_error(adjoint, frozen),
+        _difference(result.gradient.double(), reference.gradient),
+        float(reference.gradient.norm()),
+        tuple(adjoint),
+        tuple(frozen),
+        prepared.clean_drive,
+        closed,
+        ticks,
+        split,
+        _memory(request, report) if memory else {},
+    )
 
 
 def in_double(prepared: Prepared) -> AttackProblem:
@@ -159,9 +170,13 @@ def _on_the_gradient(found: Check) -> list[str]:
         f"(expected <= {EXACT:.0e})"
     ]
     if not right:
-        lines.append("  is the policy smooth, in eval mode, and free of randomness? is its declared stateless true?")
+        lines.append(
+            "  is the policy smooth, in eval mode, and free of randomness? is its declared stateless true?"
+        )
     if found.float32_error > FLOAT32_EXACT:
-        lines.append(f"float32 NOT ENOUGH: {found.float32_error:.1e} from float64 (expected <= {FLOAT32_EXACT:.0e})")
+        lines.append(
+            f"float32 NOT ENOUGH: {found.float32_error:.1e} from float64 (expected <= {FLOAT32_EXACT:.0e})"
+        )
     lines.append(f"{found.closed.in_words} (information; the method does not claim it)")
     return lines
 
@@ -169,14 +184,18 @@ def _on_the_gradient(found: Check) -> list[str]:
 def _on_the_drive(found: Check) -> list[str]:
     ticks, lines = found.ticks, found.clean.lines
     saturated = sum(ticks.saturated) / len(ticks.saturated)
-    lines.append(f"steering saturated in {saturated:.0%} of the frames" + _because(
-        saturated > MUCH, "they give no gradient: is the policy too sharp, or the start too far off?"
-    ))  # fmt: skip
+    lines.append(
+        f"steering saturated in {saturated:.0%} of the frames"
+        + _because(
+            saturated > MUCH, "they give no gradient: is the policy too sharp, or the start too far off?"
+        )
+    )
     if ticks.visible:
         seen = sum(ticks.visible) / len(ticks.visible)
-        lines.append(f"an object is seen in {seen:.0%} of the frames" + _because(
-            seen < 0.1, "the attack has little to work with: move the objects toward the path"
-        ))  # fmt: skip
+        lines.append(
+            f"an object is seen in {seen:.0%} of the frames"
+            + _because(seen < 0.1, "the attack has little to work with: move the objects toward the path")
+        )
     largest = max(ticks.lambda_yaw_m)
     lines.append(f"adjoint of the yaw: {ticks.lambda_yaw_m[0]:.3g} m/rad at the start, at most {largest:.3g}")
     return lines
@@ -185,8 +204,11 @@ def _on_the_drive(found: Check) -> list[str]:
 def _on_the_cost(found: Check) -> list[str]:
     split, lines = found.split, []
     each = {
-        "render": split.render_s, "policy in the drive": split.drive_s, "policy backward": split.backward_s, "vjp": split.vjp_s,
-    }  # fmt: skip
+        "render": split.render_s,
+        "policy in the drive": split.drive_s,
+        "policy backward": split.backward_s,
+        "vjp": split.vjp_s,
+    }
     times = ", ".join(f"{name} {1e3 * seconds / split.frames:.1f}" for name, seconds in each.items())
     lines.append(f"time a frame [ms]: {times}")
     if found.memory_mib:

@@ -22,7 +22,9 @@ ENDED = ("done", "failed", "cancelled", "refused")
 
 def new_request_id(name: str) -> str:
     """A name for a request that is not taken: its own, shortened, and the time."""
-    safe = "".join(letter if (letter.isalnum() and letter.isascii()) or letter in "-_" else "-" for letter in name)
+    safe = "".join(
+        letter if (letter.isalnum() and letter.isascii()) or letter in "-_" else "-" for letter in name
+    )
     return f"{safe.strip('-_')[:24] or 'attack'}-{time.strftime('%Y%m%d-%H%M%S')}"
 
 
@@ -47,7 +49,11 @@ def ask_for_attack(
 
     def make(asked: Asked, now: Now) -> Any:
         return types.AttackRequest(
-            header=header(asked.real_ns), request_id=request_id, request=text, source="operator", ask_id=asked.ask_id
+            header=header(asked.real_ns),
+            request_id=request_id,
+            request=text,
+            source="operator",
+            ask_id=asked.ask_id,
         )
 
     text = request_text(request)
@@ -99,4 +105,6 @@ def _progress(bus: Bus, request_id: str) -> Iterator[Any]:
             message = received.message()
             if message.request_id == request_id:
                 yield message
-    raise LaunchError(f"the attack node has said nothing of this request for {_SILENCE_S:g} s; look into its log")
+    raise LaunchError(
+        f"the attack node has said nothing of this request for {_SILENCE_S:g} s; look into its log"
+    )

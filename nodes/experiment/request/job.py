@@ -67,9 +67,13 @@ class Job:
         ]
         with open(self.log, "ab") as log:
             self._process = subprocess.Popen(
-                [*command, str(folder)], stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=log, env=environment,
+                [*command, str(folder)],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=log,
+                env=environment,
                 start_new_session=True,
-            )  # fmt: skip
+            )
         assert self._process.stdout is not None
         self._pipe = self._process.stdout.fileno()
         self._buffer = bytearray()

@@ -23,10 +23,12 @@ def peak_above_idle_mib(request: AttackRequest, ticks: int, cache_mib: float) ->
     """Measure in this process, which must be fresh; idle is after one tick, as libraries and compiled kernels are idle memory."""
     prepared = prepare(request)
     problem = replace(
-        prepared.problem, start_states=prepared.problem.start_states[:1], steps=ticks,
+        prepared.problem,
+        start_states=prepared.problem.start_states[:1],
+        steps=ticks,
         goals=None if prepared.problem.goals is None else prepared.problem.goals[:1],
         cache_bytes=int(cache_mib * 2**20),
-    )  # fmt: skip
+    )
     theta = prepared.surrogate.initial_theta(torch.Generator().manual_seed(0))
     evaluate(replace(problem, steps=1), theta)
     idle_mib = restart_peak()
@@ -39,7 +41,14 @@ def measured_mib(request: AttackRequest, ticks: int, cache_mib: float = 0.0) -> 
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "request.attack.yaml"
         file.write_text(request_text(request))
-        command = [sys.executable, "-m", "nodes.experiment.request.memory", str(file), str(ticks), str(cache_mib)]
+        command = [
+            sys.executable,
+            "-m",
+            "nodes.experiment.request.memory",
+            str(file),
+            str(ticks),
+            str(cache_mib),
+        ]
         done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
     return float(done.stdout.split()[-1])
 

@@ -23,8 +23,12 @@ class MeshRequest(_Section):
     file: Path | None = Field(default=None, description="GLB, OBJ, PLY, STL.")
     generate: Literal["hydrant", "car", "ball"] | None = Field(default=None, description="Instead of a file.")
     up: Literal["z", "y"] = Field(default="z", description="Which axis of the file points up.")
-    height_m: AboveZero | None = Field(default=None, description="Scale to this height [m]; a ball's diameter.")
-    texels: Annotated[int, Field(ge=2, le=512)] = Field(default=32, description="Texels along its longest side.")
+    height_m: AboveZero | None = Field(
+        default=None, description="Scale to this height [m]; a ball's diameter."
+    )
+    texels: Annotated[int, Field(ge=2, le=512)] = Field(
+        default=32, description="Texels along its longest side."
+    )
     rgb: tuple[Unit, Unit, Unit] = Field(default=(0.75, 0.1, 0.08), description="Colour of a ball.")
 
     @model_validator(mode="after")
@@ -38,6 +42,8 @@ class ShapeRequest(_Section):
     """Shapes are attacked instead of colours, of all objects, which must be meshes."""
 
     bound_m: AboveZero = Field(default=0.2, description="No vertex moves farther [m].")
-    smoothness: NotNegative = Field(default=19.0, description="Lambda of the large-steps preconditioner; 0: none.")
+    smoothness: NotNegative = Field(
+        default=19.0, description="Lambda of the large-steps preconditioner; 0: none."
+    )
     samples: Samples = Field(default=4, description="Rays a pixel for the gradient inside the silhouettes.")
     boundary_samples: Samples = Field(default=1, description="Points a pixel for that of the silhouettes.")

@@ -44,7 +44,9 @@ def shape_sensor(surrogate: Surrogate, wanted: ShapeRequest) -> ShapeSensor:
     return ShapeSensor(surrogate, limits)
 
 
-def found_meshes(sensor: Sensor, objects: Sequence[ColouredObject], theta: Tensor) -> list[TexturedMesh | None]:
+def found_meshes(
+    sensor: Sensor, objects: Sequence[ColouredObject], theta: Tensor
+) -> list[TexturedMesh | None]:
     """The meshes that ``theta`` means, each in its own frame; None for an object that is none."""
     if isinstance(sensor, ShapeSensor):
         parts = split_theta(sensor.meshes, sensor.colours)

@@ -65,9 +65,13 @@ def place(wanted: ObjectRequest) -> PlacedObject:
         mesh = mesh_field(wanted.mesh, wanted.pose, wanted.scale)
         return PlacedObject(mesh_name(wanted.mesh), mesh, None, mesh.sha256)
     field = cube_face_object(
-        wanted.size_m, wanted.resolution, wanted.plain_rgb, wanted.pose, one_sided=wanted.kind == "face",
+        wanted.size_m,
+        wanted.resolution,
+        wanted.plain_rgb,
+        wanted.pose,
+        one_sided=wanted.kind == "face",
         depth_m=wanted.size_m if wanted.kind == "cube" else 0.01,
-    )  # fmt: skip
+    )
     field = _scaled(field, wanted.scale)
     return PlacedObject(wanted.kind, field, _face(wanted), object_sha256(field))
 
@@ -100,8 +104,17 @@ def _face(wanted: ObjectRequest) -> Face:
 
 def object_sha256(field: VoxelGridObject) -> str:
     """Hash of everything about an object except the colours that are searched for."""
-    digest = hashlib.sha256(repr((field.theta_shape, field.scale, field.one_sided, field.step_units)).encode())
-    parts = [field.slots, field.fixed_colours, field.box_min, field.box_max, field.T_world_from_object, field.density]
+    digest = hashlib.sha256(
+        repr((field.theta_shape, field.scale, field.one_sided, field.step_units)).encode()
+    )
+    parts = [
+        field.slots,
+        field.fixed_colours,
+        field.box_min,
+        field.box_max,
+        field.T_world_from_object,
+        field.density,
+    ]
     if field.mixing is not None:
         parts += [field.mixing.data, field.mixing.indices, field.mixing.indptr]
     for part in parts:

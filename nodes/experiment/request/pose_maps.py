@@ -23,19 +23,28 @@ from nodes.experiment.request.request import AttackRequest
 from nodes.runtime.errors import ConfigError
 
 
-def make_landscape(request: AttackRequest, folder: Path, attack: Path | None, report: Report) -> tuple[Landscape, Path]:
+def make_landscape(
+    request: AttackRequest, folder: Path, attack: Path | None, report: Report
+) -> tuple[Landscape, Path]:
     """The landscape that the request asks for, and its picture; ``attack`` gives the colours and the other objects' places."""
     ready = prepare_poses(request)
     theta = _theta(ready, attack)
     asked = ready.asked.landscape
     if asked.object >= len(ready.asked.bounds):
-        raise ConfigError(f"poses.landscape.object: expected 0..{len(ready.asked.bounds) - 1}, got {asked.object}")
+        raise ConfigError(
+            f"poses.landscape.object: expected 0..{len(ready.asked.bounds) - 1}, got {asked.object}"
+        )
     place = ready.sensor.placements(theta)[asked.object]
     x_m, y_m = places_over(ready.sensor.space, asked.object, asked.points)
     found = landscape(
-        ready.problem, theta, (x_m, y_m, asked.yaws_rad or (float(place[2]),)), asked.object,
-        folder / "landscape.json", _telling(report), ready.settings_hash,
-    )  # fmt: skip
+        ready.problem,
+        theta,
+        (x_m, y_m, asked.yaws_rad or (float(place[2]),)),
+        asked.object,
+        folder / "landscape.json",
+        _telling(report),
+        ready.settings_hash,
+    )
     marked = {"here": (float(place[0]), float(place[1]))} if attack is not None else None
     picture = folder / "landscape.png"
     write_atomically(picture, draw_landscape(found, [ready.problem.path], marked))
@@ -49,13 +58,21 @@ def make_robustness(
     ready = prepare_poses(request)
     asked = ready.asked.robustness
     if asked.object >= len(ready.asked.bounds):
-        raise ConfigError(f"poses.robustness.object: expected 0..{len(ready.asked.bounds) - 1}, got {asked.object}")
+        raise ConfigError(
+            f"poses.robustness.object: expected 0..{len(ready.asked.bounds) - 1}, got {asked.object}"
+        )
     starts = starts_beside(ready.problem.start_states[0, :3].tolist(), asked.sideways_m, asked.turn_rad)
     moves = [(dx, dy, turn) for turn in asked.object_turns_rad for dx, dy in asked.object_moves_m]
     found = robustness_map(
-        ready.problem, _theta(ready, attack), starts, moves, asked.object, folder / "robustness.json", _telling(report),
+        ready.problem,
+        _theta(ready, attack),
+        starts,
+        moves,
+        asked.object,
+        folder / "robustness.json",
+        _telling(report),
         ready.settings_hash,
-    )  # fmt: skip
+    )
     picture = folder / "robustness.png"
     write_atomically(picture, draw_robustness(found))
     return found, picture

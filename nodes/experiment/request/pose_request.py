@@ -23,7 +23,9 @@ class PoseBoundsRequest(_Section):
     x_m: Interval | None = Field(default=None, description="Lowest and highest x of the object's origin [m].")
     y_m: Interval | None = Field(default=None, description="The same of y [m].")
     yaw_rad: Interval | None = Field(default=None, description="Of its heading [rad].")
-    scale: Interval | None = Field(default=None, description="Of the world metres per object unit; not of a face.")
+    scale: Interval | None = Field(
+        default=None, description="Of the world metres per object unit; not of a face."
+    )
 
     @field_validator("x_m", "y_m", "yaw_rad", "scale")
     @classmethod
@@ -38,7 +40,9 @@ class LandscapeRequest(_Section):
 
     object: Annotated[int, Field(ge=0)] = Field(default=0, description="Number of the object.")
     points: tuple[Count, Count] = Field(default=(11, 11), description="Points along x and y.")
-    yaws_rad: tuple[float, ...] = Field(default=(), description="Headings [rad]; the found one if none is given.")
+    yaws_rad: tuple[float, ...] = Field(
+        default=(), description="Headings [rad]; the found one if none is given."
+    )
 
 
 class RobustnessMapRequest(_Section):
@@ -48,25 +52,34 @@ class RobustnessMapRequest(_Section):
     sideways_m: Numbers = Field(
         default=(-0.2, -0.1, 0.0, 0.1, 0.2), description="Starts: to the left of the nominal one [m]."
     )
-    turn_rad: Numbers = Field(default=(0.0,), description="Starts: turned to the left [rad]; each with each sideways.")
+    turn_rad: Numbers = Field(
+        default=(0.0,), description="Starts: turned to the left [rad]; each with each sideways."
+    )
     object_moves_m: tuple[tuple[float, float], ...] = Field(
-        default=((0.0, 0.0), (-0.2, 0.0), (0.2, 0.0), (0.0, -0.2), (0.0, 0.2)), min_length=1,
+        default=((0.0, 0.0), (-0.2, 0.0), (0.2, 0.0), (0.0, -0.2), (0.0, 0.2)),
+        min_length=1,
         description="Moves of the object along x and y [m].",
-    )  # fmt: skip
-    object_turns_rad: Numbers = Field(default=(0.0,), description="Turns of the object [rad]; each with each move.")
+    )
+    object_turns_rad: Numbers = Field(
+        default=(0.0,), description="Turns of the object [rad]; each with each move."
+    )
 
 
 class PosesRequest(_Section):
     """Where objects may stand, and the budget: ``samples * steps`` evaluations, for random poses as well."""
 
-    bounds: tuple[PoseBoundsRequest, ...] = Field(min_length=1, description="One for each object, in their order.")
+    bounds: tuple[PoseBoundsRequest, ...] = Field(
+        min_length=1, description="One for each object, in their order."
+    )
     keep_out_m: Annotated[float, Field(ge=0)] = Field(
         default=0.4, description="Least distance of every footprint from the reference path [m]."
     )
     colours: bool = Field(default=True, description="Whether the colours are searched for too.")
     samples: Count = Field(default=5, description="Poses that are drawn.")
     steps: Count = Field(default=10, description="Evaluations of each.")
-    pose_rate: AboveZero = Field(default=0.1, description="Adam's step of a pose; 2 is the whole width of the bounds.")
+    pose_rate: AboveZero = Field(
+        default=0.1, description="Adam's step of a pose; 2 is the whole width of the bounds."
+    )
     colour_rate: AboveZero = Field(default=0.1, description="Adam's step of the colours before squashing.")
     edge_width: AboveZero | None = Field(
         default=None, description="Width of the soft edges [object units]; two voxels if not given."

@@ -65,7 +65,9 @@ class PreparedPoses:
     @property
     def settings_hash(self) -> str:
         """Names everything that must not change between a search and its resumption, or a map and its file."""
-        return hash_of([self.prepared.hashes, self.asked.model_dump(mode="json", include={"colours", "edge_width"})])
+        return hash_of(
+            [self.prepared.hashes, self.asked.model_dump(mode="json", include={"colours", "edge_width"})]
+        )
 
     def with_seed(self, seed: int) -> PreparedPoses:
         """The same with another seed."""
@@ -86,7 +88,9 @@ class PreparedPoses:
                 f"{file}: expected objects that stand within the bounds of the request, got {placements.tolist()}"
             )
         if not self.asked.colours and not torch.allclose(colours, self.sensor.fixed_colours):
-            raise ConfigError(f"{file}: expected the colours of the request (poses.attack, or plain ones), got others")
+            raise ConfigError(
+                f"{file}: expected the colours of the request (poses.attack, or plain ones), got others"
+            )
         return self.sensor.join(unit, colours)
 
 
@@ -116,13 +120,19 @@ def prepare_poses(request: AttackRequest, seed: int | None = None) -> PreparedPo
 def _checked(request: AttackRequest) -> PosesRequest:
     asked = request.poses
     if asked is None:
-        raise ConfigError("expected the key poses in the request, with bounds of each object; see docs/poses.md")
+        raise ConfigError(
+            "expected the key poses in the request, with bounds of each object; see docs/poses.md"
+        )
     if request.search.method not in ("gradient", "random"):
-        raise ConfigError(f"search.method: expected gradient or random for poses, got {request.search.method_name}")
+        raise ConfigError(
+            f"search.method: expected gradient or random for poses, got {request.search.method_name}"
+        )
     if request.search.together or request.robustness.smoothness or any(o.display for o in request.objects):
         raise ConfigError("poses: expected no search.together, robustness.smoothness or display with them")
     if asked.colours and asked.attack is not None:
-        raise ConfigError("poses.attack: expected colours: false with it; it gives colours that are not searched for")
+        raise ConfigError(
+            "poses.attack: expected colours: false with it; it gives colours that are not searched for"
+        )
     for bound, each in zip(asked.bounds, request.objects, strict=True):
         if bound.scale is not None and each.kind != "file":
             raise ConfigError(
@@ -142,8 +152,12 @@ def placements_and_colours(file: Path, sensor: PlacedSensor) -> tuple[Tensor, Te
     parts = [each.theta for each in attack.objects]
     shapes, expected = [part.shape for part in parts], [tuple(field.theta_shape) for field in fields]
     if shapes != expected:
-        raise ConfigError(f"{file}: expected colours of shapes {expected} for the objects of the request, got {shapes}")
-    moved = [f.moved(each.T_world_from_object, each.scale) for f, each in zip(fields, attack.objects, strict=True)]
+        raise ConfigError(
+            f"{file}: expected colours of shapes {expected} for the objects of the request, got {shapes}"
+        )
+    moved = [
+        f.moved(each.T_world_from_object, each.scale) for f, each in zip(fields, attack.objects, strict=True)
+    ]
     colours = torch.cat([torch.from_numpy(part).double().reshape(-1, 3) for part in parts])
     return torch.stack([placement_of(each) for each in moved]), colours.reshape(sensor.surrogate.theta_shape)
 
@@ -176,9 +190,11 @@ def pose_attack_file(ready: PreparedPoses, result: SearchResult) -> AttackFile:
     # Without an attack the objects stand where the request has them, in their plain colours.
     file = prepared.make_attack_file(replace(result, theta=colours), predicted_m, ready.prepared.clean_drive)
     extra = {
-        **file.extra, "colours_free": ready.asked.colours,
-        "keep_out_m": ready.asked.keep_out_m, "searched_total_cte_m": result.best.predicted_total_cte_m,
-    }  # fmt: skip
+        **file.extra,
+        "colours_free": ready.asked.colours,
+        "keep_out_m": ready.asked.keep_out_m,
+        "searched_total_cte_m": result.best.predicted_total_cte_m,
+    }
     return replace(file, space=PLACES, extra=extra)
 
 
@@ -208,16 +224,26 @@ def _keep(ready: PreparedPoses, result: SearchResult, file: Path) -> None:
     sharp, colours = placed_problem(ready.problem.undisturbed(), result.theta)
     before = replace(sharp, sensor=ready.sensor.surrogate)
     plain = ready.sensor.surrogate.plain_theta()
-    drives = {ready.prepared.request.search.method: evaluate(sharp, colours)[0], "none": evaluate(before, plain)[0]}
+    drives = {
+        ready.prepared.request.search.method: evaluate(sharp, colours)[0],
+        "none": evaluate(before, plain)[0],
+    }
     tracks = {name: rollout.states[:, 0, :2].numpy() for name, rollout in drives.items()}
-    picture = draw_placements(ready.sensor.space, ready.sensor.placements(result.theta), [ready.problem.path], tracks)
+    picture = draw_placements(
+        ready.sensor.space, ready.sensor.placements(result.theta), [ready.problem.path], tracks
+    )
     write_atomically(file.with_name(f"seed_{ready.prepared.seed}.poses.png"), picture)
     attack = pose_attack_file(ready, result)
     curve = {
-        "attack_id": attack.attack_id, "method": attack.method, "seed": attack.seed, "best_evaluation": result.best.iteration,
-        "predicted_total_cte_m": attack.predicted_total_cte_m, "clean_drive": ready.prepared.clean_drive.to_dict(),
-        "placements": [each.placement for each in attack.objects], "searched_total_cte_m": [e.predicted_total_cte_m for e in result.history],
+        "attack_id": attack.attack_id,
+        "method": attack.method,
+        "seed": attack.seed,
+        "best_evaluation": result.best.iteration,
+        "predicted_total_cte_m": attack.predicted_total_cte_m,
+        "clean_drive": ready.prepared.clean_drive.to_dict(),
+        "placements": [each.placement for each in attack.objects],
+        "searched_total_cte_m": [e.predicted_total_cte_m for e in result.history],
         "seconds": [e.seconds for e in result.history],
-    }  # fmt: skip
+    }
     write_atomically(file.with_name(f"seed_{ready.prepared.seed}.json"), json.dumps(curve, indent=1) + "\n")
     save_attack(file, attack)  # last: a file that is there is a finished seed

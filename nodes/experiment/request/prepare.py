@@ -95,23 +95,40 @@ class Prepared:
         return clean_drive(self.problem, self.plain_theta)
 
     def make_attack_file(
-        self, result: SearchResult, predicted_total_cte_m: float | None = None, clean: CleanDrive | None = None
+        self,
+        result: SearchResult,
+        predicted_total_cte_m: float | None = None,
+        clean: CleanDrive | None = None,
     ) -> AttackFile:
         """The attack file of a search's result; the prediction is the best evaluation's own unless another is given."""
-        predicted = result.best.predicted_total_cte_m if predicted_total_cte_m is None else predicted_total_cte_m
+        predicted = (
+            result.best.predicted_total_cte_m if predicted_total_cte_m is None else predicted_total_cte_m
+        )
         objects = self.attacked_objects(result.theta)
         extra = {
-            "name": self.request.name, "horizon": self.problem.steps, "evaluations": len(result.history),
-            "start_states": self.problem.start_states[:, :3].tolist(), "objects_sha256": self.hashes["objects"],
-        }  # fmt: skip
+            "name": self.request.name,
+            "horizon": self.problem.steps,
+            "evaluations": len(result.history),
+            "start_states": self.problem.start_states[:, :3].tolist(),
+            "objects_sha256": self.hashes["objects"],
+        }
         if self.request.shape is not None:
             extra["shape"] = self.request.shape.model_dump(mode="json")
         return AttackFile(
-            method=self.request.search.method_name, space=self._space, objects=objects, face=self._face(objects), camera=self.surrogate.camera,
-            scene_sha256=self.hashes["scene"], policy_sha256=self.hashes["policy"], config_sha256=self.hashes["config"],
-            seed=self.seed, predicted_total_cte_m=predicted, software_version=version("advnerf"), extra=extra,
+            method=self.request.search.method_name,
+            space=self._space,
+            objects=objects,
+            face=self._face(objects),
+            camera=self.surrogate.camera,
+            scene_sha256=self.hashes["scene"],
+            policy_sha256=self.hashes["policy"],
+            config_sha256=self.hashes["config"],
+            seed=self.seed,
+            predicted_total_cte_m=predicted,
+            software_version=version("advnerf"),
+            extra=extra,
             clean_drive=clean or self.clean_drive,
-        )  # fmt: skip
+        )
 
     def attacked_objects(self, theta: Tensor) -> tuple[AttackedObject, ...]:
         """All objects with their colours, or what their shapes were made of, as an attack file keeps them."""
@@ -165,9 +182,12 @@ def prepare(request: AttackRequest, seed: int | None = None) -> Prepared:
     require_camera(loaded.view, camera, str(request.policy), request.calibration_file("camera"))
     objects = tuple(place(wanted) for wanted in request.objects)
     surrogate = Surrogate(
-        FieldRenderer.from_file(request.scene), loaded.view.pinhole, camera.mount,
-        [each.field for each in objects], depth_tolerance_m=request.depth_tolerance_m,
-    )  # fmt: skip
+        FieldRenderer.from_file(request.scene),
+        loaded.view.pinhole,
+        camera.mount,
+        [each.field for each in objects],
+        depth_tolerance_m=request.depth_tolerance_m,
+    )
     dynamics = make_dynamics(request)
     hashes = {
         "scene": str(load_scene(request.scene)[2]["scene_hash"]),
@@ -227,7 +247,13 @@ def make_dynamics(request: AttackRequest) -> Dynamics:
     if wanted.delay_s == wanted.lag_s == 0.0 and wanted.slew_radps is None:
         return Ackermann(vehicle.wheelbase_m, wanted.speed_mps, wanted.dt_s, limits)
     return ActuatedAckermann(
-        vehicle.wheelbase_m, wanted.speed_mps, wanted.dt_s, wanted.delay_s, wanted.lag_s, wanted.slew_radps, limits
+        vehicle.wheelbase_m,
+        wanted.speed_mps,
+        wanted.dt_s,
+        wanted.delay_s,
+        wanted.lag_s,
+        wanted.slew_radps,
+        limits,
     )
 
 
@@ -254,13 +280,20 @@ def _problem(
     starts, search = start_states(request, room, dynamics, seed), request.search
     smoothness = request.robustness.smoothness
     return AttackProblem(
-        loaded.policy, sensor_of(request, surrogate), dynamics, room.reference_path, starts, request.horizon,
-        goals=_goals(request, loaded, len(starts)), time_batch=search.time_batch,
-        cache_bytes=int(search.cache_mib * 2**20), fence_m=float(np.abs(np.array(room.fence_m)).min()),
+        loaded.policy,
+        sensor_of(request, surrogate),
+        dynamics,
+        room.reference_path,
+        starts,
+        request.horizon,
+        goals=_goals(request, loaded, len(starts)),
+        time_batch=search.time_batch,
+        cache_bytes=int(search.cache_mib * 2**20),
+        fence_m=float(np.abs(np.array(room.fence_m)).min()),
         off_track_m=room.off_track_m,
         disturbances=disturbances(request, seed),
         regulariser=Smoothness(surrogate.objects, smoothness) if smoothness else None,
-    )  # fmt: skip
+    )
 
 
 def sensor_of(request: AttackRequest, surrogate: Surrogate) -> Surrogate | DisplayedSensor | ShapeSensor:
@@ -270,7 +303,9 @@ def sensor_of(request: AttackRequest, surrogate: Surrogate) -> Surrogate | Displ
     wanted = request.objects[0]
     if wanted.display is None:
         return surrogate
-    return DisplayedSensor(surrogate, load_calibration(DisplayCalibration, wanted.display).display, wanted.display_cos)
+    return DisplayedSensor(
+        surrogate, load_calibration(DisplayCalibration, wanted.display).display, wanted.display_cos
+    )
 
 
 def disturbances(request: AttackRequest, seed: int) -> Disturbances | None:
@@ -278,7 +313,9 @@ def disturbances(request: AttackRequest, seed: int) -> Disturbances | None:
     wanted = request.robustness
     if not wanted.disturbed:
         return None
-    return Disturbances(wanted.noise, wanted.gain, wanted.brightness, wanted.jitter_m, wanted.jitter_rad, seed)
+    return Disturbances(
+        wanted.noise, wanted.gain, wanted.brightness, wanted.jitter_m, wanted.jitter_rad, seed
+    )
 
 
 def _goals(request: AttackRequest, loaded: LoadedPolicy, starts: int) -> Tensor | None:

@@ -45,33 +45,44 @@ class ObjectRequest(_Section):
     kind: Literal["face", "cube", "file", "mesh"] = "face"
     file: Path | None = Field(default=None, description="Object file; with kind 'file' only.")
     mesh: MeshRequest | None = Field(default=None, description="The mesh; with kind 'mesh' only.")
-    T_world_from_object: tuple[Row, Row, Row, Row] | None = Field(default=None, description="Rigid pose, four rows.")
+    T_world_from_object: tuple[Row, Row, Row, Row] | None = Field(
+        default=None, description="Rigid pose, four rows."
+    )
     x_m: float | None = Field(default=None, description="Position, instead of T_world_from_object [m].")
     y_m: float | None = None
     z_m: float | None = None
     yaw_rad: float | None = Field(default=None, description="Heading of the object's x axis [rad].")
     scale: AboveZero = Field(default=1.0, description="World metres per object unit.")
     size_m: AboveZero = Field(default=0.8, description="Edge of a face or cube, before scaling [m].")
-    resolution: Annotated[int, Field(ge=2, le=128)] = Field(default=64, description="Cells along an edge of the face.")
-    plain_rgb: tuple[Unit, Unit, Unit] = Field(default=(0.2, 0.62, 0.28), description="Colour of what is not attacked.")
+    resolution: Annotated[int, Field(ge=2, le=128)] = Field(
+        default=64, description="Cells along an edge of the face."
+    )
+    plain_rgb: tuple[Unit, Unit, Unit] = Field(
+        default=(0.2, 0.62, 0.28), description="Colour of what is not attacked."
+    )
     free: Literal["all", "face"] = Field(
-        default="all", description="Which colours of an object file may change: all, or those on its deployed face."
+        default="all",
+        description="Which colours of an object file may change: all, or those on its deployed face.",
     )
     levels: Annotated[int, Field(ge=0, le=32)] = Field(
         default=0,
         description="Summed grids, coarse to fine, that give an object file's colours; 0: one value per voxel.",
     )
     target: Path | None = Field(
-        default=None, description="Calibration file of the face that shows the attack: its subject and its corners."
+        default=None,
+        description="Calibration file of the face that shows the attack: its subject and its corners.",
     )
     display: Path | None = Field(
         default=None,
         description="What 'advnerf calibrate display' wrote, where a monitor shows the face: its colours are in the loop.",
     )
     display_cos: Annotated[float, Field(gt=0, le=1)] = Field(
-        default=1.0, description="Cosine of the angle at which the camera looks at the monitor, in the mean of a drive."
+        default=1.0,
+        description="Cosine of the angle at which the camera looks at the monitor, in the mean of a drive.",
     )
-    subject: str = Field(default="board", min_length=1, description="Motion-capture subject, where no target is given.")
+    subject: str = Field(
+        default="board", min_length=1, description="Motion-capture subject, where no target is given."
+    )
 
     @model_validator(mode="after")
     def _consistent(self) -> ObjectRequest:
@@ -99,7 +110,9 @@ class ObjectRequest(_Section):
             T = np.array(rows)
             error = max(np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max(), np.abs(T[3] - [0, 0, 0, 1]).max())
             if error > _RIGID_TOLERANCE or np.linalg.det(T[:3, :3]) < 0:
-                raise ValueError(f"expected a rotation and a translation with last row 0 0 0 1, is off by {error:.1e}")
+                raise ValueError(
+                    f"expected a rotation and a translation with last row 0 0 0 1, is off by {error:.1e}"
+                )
         return rows
 
     @property
@@ -107,7 +120,9 @@ class ObjectRequest(_Section):
         """``T_world_from_object`` ``[4, 4]``."""
         if self.T_world_from_object is not None:
             return np.array(self.T_world_from_object)
-        return make_transform(rotation_z(self.yaw_rad or 0.0), [self.x_m or 0.0, self.y_m or 0.0, self.z_m or 0.0])
+        return make_transform(
+            rotation_z(self.yaw_rad or 0.0), [self.x_m or 0.0, self.y_m or 0.0, self.z_m or 0.0]
+        )
 
 
 class StartsRequest(_Section):
@@ -128,7 +143,9 @@ class DynamicsRequest(_Section):
 
     speed_mps: AboveZero = Field(default=0.8, description="Driving speed [m/s].")
     dt_s: AboveZero = Field(default=0.1, description="Control period [s].")
-    delay_s: NotNegative = Field(default=0.0, description="From image to wheels, fractions of a period allowed [s].")
+    delay_s: NotNegative = Field(
+        default=0.0, description="From image to wheels, fractions of a period allowed [s]."
+    )
     lag_s: NotNegative = Field(default=0.0, description="Time constant of the steering [s].")
     slew_radps: AboveZero | None = Field(default=None, description="Limit of the wheels' rate [rad/s].")
 
@@ -138,10 +155,18 @@ class RobustnessRequest(_Section):
 
     noise: NotNegative = Field(default=0.0, description="Pixel noise, standard deviation in 0..1.")
     gain: NotNegative = Field(default=0.0, description="Spread of the logarithm of the exposure of a drive.")
-    brightness: NotNegative = Field(default=0.0, description="Spread of a drive's additive brightness, in 0..1.")
-    jitter_m: NotNegative = Field(default=0.0, description="Spread of the camera's position in each frame [m].")
-    jitter_rad: NotNegative = Field(default=0.0, description="Spread of the camera's rotation in each frame [rad].")
-    draws: Count = Field(default=1, description="Drives of each start pose per evaluation, each drawn by itself.")
+    brightness: NotNegative = Field(
+        default=0.0, description="Spread of a drive's additive brightness, in 0..1."
+    )
+    jitter_m: NotNegative = Field(
+        default=0.0, description="Spread of the camera's position in each frame [m]."
+    )
+    jitter_rad: NotNegative = Field(
+        default=0.0, description="Spread of the camera's rotation in each frame [rad]."
+    )
+    draws: Count = Field(
+        default=1, description="Drives of each start pose per evaluation, each drawn by itself."
+    )
     smoothness: NotNegative = Field(
         default=0.0, description="Weight of the texture's total variation in the loss [m per unit of colour]."
     )
@@ -160,7 +185,9 @@ class SearchRequest(_Section):
         description="A method of attack: built in, of an installed package, or file.py:Name, relative to this file.",
     )
     options: dict[str, Any] = Field(default_factory=dict, description="What the method alone knows.")
-    evaluations: Count = Field(default=50, description="Closed-loop evaluations; an iteration of the gradient is one.")
+    evaluations: Count = Field(
+        default=50, description="Closed-loop evaluations; an iteration of the gradient is one."
+    )
     learning_rate: AboveZero | None = Field(
         default=None,
         description="Of Adam: 0.1 for gradient and distilled, 0.3 for guided, 0.5 for evolution, if not given.",
@@ -171,10 +198,12 @@ class SearchRequest(_Section):
     )
     population: Annotated[int, Field(ge=4)] = Field(default=10, description="Candidates of a generation.")
     cells: Annotated[int, Field(ge=0)] = Field(
-        default=8, description="Cells along an edge that cem, evolution and guided search over; 0 for the face's own."
+        default=8,
+        description="Cells along an edge that cem, evolution and guided search over; 0 for the face's own.",
     )
     probes: Count | None = Field(
-        default=None, description="Pairs of textures asked about after each drive: 3 for guided, 1 for distilled."
+        default=None,
+        description="Pairs of textures asked about after each drive: 3 for guided, 1 for distilled.",
     )
     warm_pairs: Count | None = Field(
         default=None, description="Pairs of the first lesson of distilled and guided; 300 if not given."
@@ -183,7 +212,9 @@ class SearchRequest(_Section):
     together: bool = Field(
         default=False, description="Gradient: search all seeds in one batch, not one after the other."
     )
-    cache_mib: NotNegative = Field(default=512.0, description="Budget of the frames kept for the gradient [MiB].")
+    cache_mib: NotNegative = Field(
+        default=512.0, description="Budget of the frames kept for the gradient [MiB]."
+    )
     time_batch: Count = Field(default=16, description="Frames per gradient batch.")
 
     @property
@@ -198,39 +229,57 @@ class AttackRequest(_Section):
     name: str = Field(default="attack", min_length=1)
     scene: Path = Field(description="Checkpoint of a trained scene.")
     policy: Path = Field(description="Policy file, or package.module:factory.")
-    calibration: Path | None = Field(default=None, description="Folder with camera.yaml, vehicle.yaml and room.yaml.")
+    calibration: Path | None = Field(
+        default=None, description="Folder with camera.yaml, vehicle.yaml and room.yaml."
+    )
     camera: Path | None = Field(default=None, description="Camera calibration, instead of the folder's.")
     vehicle: Path | None = Field(default=None, description="Vehicle calibration, instead of the folder's.")
     room: Path | None = Field(default=None, description="Room calibration, instead of the folder's.")
     objects: tuple[ObjectRequest, ...] = Field(min_length=1, description="What carries the attack.")
     starts: StartsRequest = StartsRequest()
     goals: tuple[tuple[float, ...], ...] = Field(
-        default=(), description="Goal vectors: one for all starts, or one for each listed start; none without goals."
+        default=(),
+        description="Goal vectors: one for all starts, or one for each listed start; none without goals.",
     )
     horizon: Count = Field(default=60, description="Control ticks that are optimised (T).")
     depth_tolerance_m: NotNegative = Field(
-        default=0.15, description="An object is hidden only by a surface nearer than this much in front of it [m]."
+        default=0.15,
+        description="An object is hidden only by a surface nearer than this much in front of it [m].",
     )
     dynamics: DynamicsRequest = DynamicsRequest()
     search: SearchRequest = SearchRequest()
     robustness: RobustnessRequest = RobustnessRequest()
-    poses: PosesRequest | None = Field(default=None, description="Where objects may stand; 'advnerf attack poses'.")
-    shape: ShapeRequest | None = Field(default=None, description="Attack the shapes of meshes, not their colours.")
+    poses: PosesRequest | None = Field(
+        default=None, description="Where objects may stand; 'advnerf attack poses'."
+    )
+    shape: ShapeRequest | None = Field(
+        default=None, description="Attack the shapes of meshes, not their colours."
+    )
 
     @model_validator(mode="after")
     def _complete(self) -> AttackRequest:
         missing = [name for name in ("camera", "vehicle", "room") if getattr(self, name) is None]
-        if (built_in := METHODS.get(self.search.method)) is not None:  # others are looked at when they are loaded
+        if (
+            built_in := METHODS.get(self.search.method)
+        ) is not None:  # others are looked at when they are loaded
             built_in.options(self.search.options, "search.options")
         if self.search.together and self.search.method != "gradient":
-            raise ValueError(f"search.together is for the gradient method only, got method {self.search.method}")
+            raise ValueError(
+                f"search.together is for the gradient method only, got method {self.search.method}"
+            )
         one_face = len(self.objects) == 1 and self.objects[0].kind in ("face", "cube")
-        if any(wanted.display is not None for wanted in self.objects) and (not one_face or self.search.together):
-            raise ValueError("display: expected one object, a face or cube, and seeds searched one after the other")
+        if any(wanted.display is not None for wanted in self.objects) and (
+            not one_face or self.search.together
+        ):
+            raise ValueError(
+                "display: expected one object, a face or cube, and seeds searched one after the other"
+            )
         if self.calibration is None and missing:
             raise ValueError(f"expected a calibration folder, or files for {', '.join(missing)}")
         if self.poses is not None and len(self.poses.bounds) != len(self.objects):
-            raise ValueError(f"poses: expected bounds of {len(self.objects)} object(s), got {len(self.poses.bounds)}")
+            raise ValueError(
+                f"poses: expected bounds of {len(self.objects)} object(s), got {len(self.poses.bounds)}"
+            )
         meshes = [wanted.kind == "mesh" for wanted in self.objects]
         if self.poses is not None and any(meshes):
             raise ValueError(
@@ -274,7 +323,9 @@ def request_text(request: AttackRequest) -> str:
     """YAML text from which `parse_request` makes the same request on the same machine."""
     import yaml
 
-    return yaml.safe_dump(request.model_dump(mode="json"), sort_keys=False, default_flow_style=None, width=120)
+    return yaml.safe_dump(
+        request.model_dump(mode="json"), sort_keys=False, default_flow_style=None, width=120
+    )
 
 
 def _resolve(document: Document, folder: Path, overrides: Sequence[str]) -> AttackRequest:

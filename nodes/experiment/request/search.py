@@ -136,13 +136,17 @@ def keep_request(request: AttackRequest, folder: Path) -> None:
     if not kept.exists():
         write_atomically(kept, request_text(request))
     elif load_request(kept) != request:
-        raise ConfigError(f"{kept}: this folder belongs to another attack; resume it, or choose another folder")
+        raise ConfigError(
+            f"{kept}: this folder belongs to another attack; resume it, or choose another folder"
+        )
 
 
 def kept_request(folder: Path) -> AttackRequest:
     """The request of a folder."""
     if not (folder / REQUEST).exists():
-        raise ConfigError(f"expected a folder of 'advnerf attack run' with a {REQUEST}, found none in {folder}")
+        raise ConfigError(
+            f"expected a folder of 'advnerf attack run' with a {REQUEST}, found none in {folder}"
+        )
     return load_request(folder / REQUEST)
 
 
@@ -158,9 +162,12 @@ def _run_seed(prepared: Prepared, folder: Path, display: Display, on_evaluation:
 
 
 def _run_together(
-    request: AttackRequest, folder: Path, display: Display, on_evaluation: OnEvaluation | None,
+    request: AttackRequest,
+    folder: Path,
+    display: Display,
+    on_evaluation: OnEvaluation | None,
     on_prepared: Callable[[Prepared], None] | None,
-) -> list[Path]:  # fmt: skip
+) -> list[Path]:
     """All seeds of a gradient attack in one batch; their files are written when all are done."""
     seeds, state_path = request.search.seeds, folder / TOGETHER_STATE
     files = [attack_file(folder, seed) for seed in seeds]
@@ -174,14 +181,20 @@ def _run_together(
         on_prepared(prepared)
     told = [
         _both(
-            telling(request.search.evaluations, display.start(f"seed_{one.seed}"), clean=one.clean_drive), on_evaluation
+            telling(request.search.evaluations, display.start(f"seed_{one.seed}"), clean=one.clean_drive),
+            on_evaluation,
         )
         for one in each
     ]
     results = gradient_attacks(
-        [one.problem for one in each], seeds, request.search.evaluations, request.search.learning_rate or 0.1,
-        state_path, lambda k, evaluation: told[k](evaluation), prepared.settings_hash,
-    )  # fmt: skip
+        [one.problem for one in each],
+        seeds,
+        request.search.evaluations,
+        request.search.learning_rate or 0.1,
+        state_path,
+        lambda k, evaluation: told[k](evaluation),
+        prepared.settings_hash,
+    )
     for one, result in zip(each, results, strict=True):
         _keep(one, result, folder)
         display.finish(f"seed_{one.seed}", sum(e.seconds for e in result.history), cached=False)
@@ -193,11 +206,15 @@ def _keep(prepared: Prepared, result: SearchResult, folder: Path) -> None:
     """Write the attack file of a finished search, and its curve beside it."""
     attack_id = save_attack(attack_file(folder, prepared.seed), finish(prepared, result))
     curve = {
-        "attack_id": attack_id, "method": prepared.request.search.method_name, "seed": prepared.seed,
-        "best_evaluation": result.best.iteration, "loss_m": [e.loss_m for e in result.history],
+        "attack_id": attack_id,
+        "method": prepared.request.search.method_name,
+        "seed": prepared.seed,
+        "best_evaluation": result.best.iteration,
+        "loss_m": [e.loss_m for e in result.history],
         "predicted_total_cte_m": [e.predicted_total_cte_m for e in result.history],
-        "seconds": [e.seconds for e in result.history], "clean_drive": prepared.clean_drive.to_dict(),
-    }  # fmt: skip
+        "seconds": [e.seconds for e in result.history],
+        "clean_drive": prepared.clean_drive.to_dict(),
+    }
     write_atomically(folder / f"seed_{prepared.seed}.json", json.dumps(curve, indent=1) + "\n")
 
 

@@ -18,6 +18,9 @@ def telling(
         nonlocal best_m
         total_m, done = evaluation.predicted_total_cte_m, evaluation.iteration + 1
         best_m = max(best_m, total_m)
-        report(done / evaluations, f"{of}{done}/{evaluations}, total CTE {total_m:.1f} m, best {best_m:.1f} m{beside}")
+        report(
+            done / evaluations,
+            f"{of}{done}/{evaluations}, total CTE {total_m:.1f} m, best {best_m:.1f} m{beside}",
+        )
 
     return told

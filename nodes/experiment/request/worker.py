@@ -55,10 +55,16 @@ class Speaker:
         done, self._best_m = _so_far(self._state(prepared))
         self._prepared, self._evaluations = prepared, planned_evaluations(prepared)
         self.say(
-            "progress", state="searching", seed=prepared.seed, evaluation=done, evaluations=self._evaluations, text="",
-            total_cte_m=self._best_m or 0.0, clean_total_cte_m=prepared.clean_drive.mean_total_cte_m,
+            "progress",
+            state="searching",
+            seed=prepared.seed,
+            evaluation=done,
+            evaluations=self._evaluations,
+            text="",
+            total_cte_m=self._best_m or 0.0,
+            clean_total_cte_m=prepared.clean_drive.mean_total_cte_m,
             clean_drives=prepared.clean_drive.drives,
-        )  # fmt: skip
+        )
 
     def told(self, evaluation: Evaluation) -> None:
         """An evaluation is done and its state is on disk."""
@@ -67,9 +73,16 @@ class Speaker:
         better = self._best_m is None or total_m > self._best_m
         self._best_m = total_m if better else self._best_m
         self.say(
-            "progress", state="searching", seed=self._prepared.seed, evaluation=evaluation.iteration + 1, text="",
-            evaluations=self._evaluations, loss_m=evaluation.loss_m, total_cte_m=total_m, seconds=evaluation.seconds,
-        )  # fmt: skip
+            "progress",
+            state="searching",
+            seed=self._prepared.seed,
+            evaluation=evaluation.iteration + 1,
+            text="",
+            evaluations=self._evaluations,
+            loss_m=evaluation.loss_m,
+            total_cte_m=total_m,
+            seconds=evaluation.seconds,
+        )
         if better:
             self._show(self._prepared)
 
@@ -134,7 +147,10 @@ def work(folder: Path, stream: BinaryIO) -> None:
     best = max(range(len(files)), key=lambda k: attacks[k].predicted_total_cte_m or 0.0)
     found = attacks[best]
     speaker.say(
-        "done", file=str(files[best]), attack_id=found.attack_id, total_cte_m=found.predicted_total_cte_m or 0.0
+        "done",
+        file=str(files[best]),
+        attack_id=found.attack_id,
+        total_cte_m=found.predicted_total_cte_m or 0.0,
     )
 
 

@@ -68,12 +68,23 @@ def capture(
         total = len(poses) + len(states)
 
         taken = write_posed_images(
-            folder / PHOTOS, poses, scene.photo_pinhole, lambda i: scene.photograph(poses[i]), "jpg", keep=True, told=counted(report, PHOTOS, len(poses), 0, total)
-        )  # fmt: skip
+            folder / PHOTOS,
+            poses,
+            scene.photo_pinhole,
+            lambda i: scene.photograph(poses[i]),
+            "jpg",
+            keep=True,
+            told=counted(report, PHOTOS, len(poses), 0, total),
+        )
         taken += write_posed_images(
-            folder / HELD_OUT, [planar_pose(*s) @ scene.T_car_from_camera for s in states], scene.camera_pinhole,
-            lambda i: scene.observe_at(*states[i], depth=False)[0], "png", keep=True, told=counted(report, HELD_OUT, len(states), len(poses), total),
-        )  # fmt: skip
+            folder / HELD_OUT,
+            [planar_pose(*s) @ scene.T_car_from_camera for s in states],
+            scene.camera_pinhole,
+            lambda i: scene.observe_at(*states[i], depth=False)[0],
+            "png",
+            keep=True,
+            told=counted(report, HELD_OUT, len(states), len(poses), total),
+        )
     return taken, total - taken
 
 
@@ -84,7 +95,9 @@ def _claim(folder: Path, config: CarlaConfig, request: CaptureRequest, drives: d
     digest, file = hashlib.sha256(text.encode()).hexdigest(), folder / REQUEST
     if file.exists():
         if json.loads(file.read_text(encoding="utf-8")).get("sha256") != digest:
-            raise ConfigError(f"{folder} holds a capture with other settings: name another folder, or remove it")
+            raise ConfigError(
+                f"{folder} holds a capture with other settings: name another folder, or remove it"
+            )
         return
     if folder.exists() and any(folder.iterdir()):
         raise ConfigError(f"{folder} is not empty and holds no capture: name another folder")

@@ -100,7 +100,9 @@ def _look_at_map(config: CarlaConfig, client: Any, world: Any, checks: list[Chec
         text = f"{loaded}; an experiment would load {wanted}. To look at that: ask with --set server.town={loaded}, or load it first"
         checks.append(Check("map", "warning", text))
     else:
-        checks.append(Check("map", "failure", f"expected {wanted}, got {loaded}, and server.load_town is off"))
+        checks.append(
+            Check("map", "failure", f"expected {wanted}, got {loaded}, and server.load_town is off")
+        )
     return False
 
 
@@ -131,7 +133,9 @@ def _look_at_blueprints(config: CarlaConfig, world: Any, checks: list[Check]) ->
             world.get_blueprint_library().find(vehicle)
         except IndexError as error:
             raise CarlaMapError(f"expected the vehicle {vehicle} (body.blueprint), got: {error}") from error
-    checks.append(Check("blueprints", "ok", f"{RGB}, {DEPTH}, {vehicle or 'no vehicle'}, with all attributes"))
+    checks.append(
+        Check("blueprints", "ok", f"{RGB}, {DEPTH}, {vehicle or 'no vehicle'}, with all attributes")
+    )
     return True
 
 
@@ -146,9 +150,7 @@ def _look_at_pictures(config: CarlaConfig, library: Any, folder: Path | None, ch
         seconds, repeated = (time.monotonic() - began) / _STEPS, scene.repeated_frames
         text = f"frame numbers and poses as asked, {1e3 * seconds:.0f} ms for a step and its picture"
         if repeated:
-            text += (
-                f"; {repeated} of {_STEPS + 1} pictures had to be asked for again, which costs time and nothing else"
-            )
+            text += f"; {repeated} of {_STEPS + 1} pictures had to be asked for again, which costs time and nothing else"
         checks.append(Check("pictures", "warning" if repeated else "ok", text))
         if folder is not None:
             _write(folder, rgb, depth)
@@ -156,7 +158,9 @@ def _look_at_pictures(config: CarlaConfig, library: Any, folder: Path | None, ch
     return True
 
 
-def _ground(pinhole: Pinhole, T_car_from_camera: Any, rgb: NDArray[np.uint8], depth: NDArray[np.float32]) -> Check:
+def _ground(
+    pinhole: Pinhole, T_car_from_camera: Any, rgb: NDArray[np.uint8], depth: NDArray[np.float32]
+) -> Check:
     """Is the road where depth says, for a camera mounted as ours is? Wrong units, a wrong angle or a bonnet in view show here."""
     rows, columns = slice(int(0.75 * pinhole.height), None), slice(pinhole.width // 3, 2 * pinhole.width // 3)
     down = -(pinhole.directions()[rows, columns] @ T_car_from_camera[:3, :3].T)[..., 2]
@@ -182,12 +186,17 @@ def _ground(pinhole: Pinhole, T_car_from_camera: Any, rgb: NDArray[np.uint8], de
 def _look_at_settings(world: Any, checks: list[Check]) -> bool:
     settings = world.get_settings()
     if settings.synchronous_mode:
-        raise CarlaFrameError("expected the world to tick by itself again, it does not: `advnerf carla release`")
+        raise CarlaFrameError(
+            "expected the world to tick by itself again, it does not: `advnerf carla release`"
+        )
     checks.append(Check("put back", "ok", "the world ticks by itself again"))
     return True
 
 
 def _write(folder: Path, rgb: NDArray[np.uint8], depth: NDArray[np.float32]) -> None:
     near = 255.0 * np.clip(2.0 / np.maximum(depth, 2.0), 0.0, 1.0)
-    for name, image in (("colour.png", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)), ("depth.png", near.astype(np.uint8))):
+    for name, image in (
+        ("colour.png", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)),
+        ("depth.png", near.astype(np.uint8)),
+    ):
         write_atomically(folder / name, cv2.imencode(".png", image)[1].tobytes())

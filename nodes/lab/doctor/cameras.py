@@ -27,7 +27,9 @@ def video_devices(port: VideoPort | None = None) -> list[Finding]:
     """List every video device of Linux with its formats."""
     port = port or KernelPort()
     rows = [row for name in port.names() if (row := _device(port, Path(name))) is not None]
-    return rows or [Finding(_NAME, ABSENT, "no video device", "check its USB cable, then run advnerf camera list")]
+    return rows or [
+        Finding(_NAME, ABSENT, "no video device", "check its USB cable, then run advnerf camera list")
+    ]
 
 
 def _device(port: VideoPort, path: Path) -> Finding | None:
@@ -40,7 +42,9 @@ def _device(port: VideoPort, path: Path) -> Finding | None:
         return Finding(_NAME, WARNING, str(error), permission_cure("video") if denied else "")
     try:
         identity = identify(port, fd, path)
-        return Finding(_NAME, OK, f"{path}: {identity.card} ({identity.driver}), {'; '.join(modes(port, fd))}")
+        return Finding(
+            _NAME, OK, f"{path}: {identity.card} ({identity.driver}), {'; '.join(modes(port, fd))}"
+        )
     except ProtocolError:
         return None  # not a camera: the second device of a webcam, or a decoder
     except HardwareError as error:
@@ -55,7 +59,11 @@ def oaks(required: bool = False, timeout_s: float = _OAK_S) -> list[Finding]:
     bad = FAILURE if required else WARNING
     if answer.data is None:
         if "ModuleNotFoundError" in answer.trouble:
-            return [Finding("OAK", FAILURE if required else ABSENT, "depthai is missing", "pip install 'advnerf[oak]'")]
+            return [
+                Finding(
+                    "OAK", FAILURE if required else ABSENT, "depthai is missing", "pip install 'advnerf[oak]'"
+                )
+            ]
         return [
             Finding(
                 "OAK",
@@ -70,7 +78,9 @@ def oaks(required: bool = False, timeout_s: float = _OAK_S) -> list[Finding]:
     return [Finding("OAK", OK, str(line)) for line in answer.data]
 
 
-def source(config: Any, calibration: CameraCalibration | None = None, timeout_s: float = _TRY_S) -> list[Finding]:
+def source(
+    config: Any, calibration: CameraCalibration | None = None, timeout_s: float = _TRY_S
+) -> list[Finding]:
     """Take a few frames of a launch file's source, as the camera node does, and compare them with the configuration.
 
     Args:
@@ -104,7 +114,9 @@ def _measured(config: Any, trial: Trial, calibration: CameraCalibration | None) 
         do = "reduce size or rate, or close other programs; the camera node drops such frames"
         rows.append(Finding(_NAME, FAILURE, f"frames are {trial.age_ms[0]:.0f} ms old", do))
     if not _DARK < trial.brightness < _BRIGHT:
-        rows.append(Finding(_NAME, WARNING, "the image is black or white", "check lens cap, light and exposure"))
+        rows.append(
+            Finding(_NAME, WARNING, "the image is black or white", "check lens cap, light and exposure")
+        )
     return [Finding(_NAME, OK, text), *rows]
 
 

@@ -56,7 +56,9 @@ class Check:
     name: str
     run: Callable[[], Sequence[Finding]]
     deadline_s: float = 10.0
-    cure: str = "look for a process in state D (ps aux), unplug the device it waits for, or restart the computer"
+    cure: str = (
+        "look for a process in state D (ps aux), unplug the device it waits for, or restart the computer"
+    )
 
 
 @dataclass(frozen=True)
@@ -113,10 +115,16 @@ def in_child(probe: str, *arguments: Any, timeout_s: float = CHILD_S) -> Answer:
 def _within_deadline(check: Check) -> Sequence[Finding]:
     """Run a check in a daemon thread and return its findings, or a failure after the deadline."""
     found: list[Sequence[Finding]] = []
-    thread = threading.Thread(target=lambda: found.append(_run(check)), name=f"doctor {check.name}", daemon=True)
+    thread = threading.Thread(
+        target=lambda: found.append(_run(check)), name=f"doctor {check.name}", daemon=True
+    )
     thread.start()
     thread.join(check.deadline_s)
-    return found[0] if found else [Finding(check.name, FAILURE, f"no answer within {check.deadline_s:g} s", check.cure)]
+    return (
+        found[0]
+        if found
+        else [Finding(check.name, FAILURE, f"no answer within {check.deadline_s:g} s", check.cure)]
+    )
 
 
 def _run(check: Check) -> Sequence[Finding]:
@@ -125,4 +133,8 @@ def _run(check: Check) -> Sequence[Finding]:
     except (AdvnerfError, OSError, ValueError) as error:
         return [Finding(check.name, FAILURE, str(error) or type(error).__name__)]
     except Exception as error:  # a bug in one check must not prevent the others
-        return [Finding(check.name, WARNING, f"the check itself failed: {type(error).__name__}: {error}", "report it")]
+        return [
+            Finding(
+                check.name, WARNING, f"the check itself failed: {type(error).__name__}: {error}", "report it"
+            )
+        ]

@@ -26,13 +26,21 @@ def checks(folder: Path, vicon_port: int, vesc_port: str | None = None) -> list[
     vesc = partial(motor.vesc, vesc_port, required=vesc_port is not None)
     recorded = bytes_per_s(Pictures(), publishers=_ROLES)
     return [
-        Check("versions", machine.versions), Check("machine", machine.machine),
-        Check("torch", graphics.torch, _CHILD_DEADLINE_S), Check("EGL", graphics.egl, _CHILD_DEADLINE_S),
-        Check("LLVM", graphics.llvm, _CHILD_DEADLINE_S), Check("disk", partial(machine.disk, folder, recorded)),
-        Check("sockets", machine.sockets), Check("keys", machine.keys), Check("clock", machine.clock),
-        Check("serial", motor.serial_ports), Check("VESC", vesc),
+        Check("versions", machine.versions),
+        Check("machine", machine.machine),
+        Check("torch", graphics.torch, _CHILD_DEADLINE_S),
+        Check("EGL", graphics.egl, _CHILD_DEADLINE_S),
+        Check("LLVM", graphics.llvm, _CHILD_DEADLINE_S),
+        Check("disk", partial(machine.disk, folder, recorded)),
+        Check("sockets", machine.sockets),
+        Check("keys", machine.keys),
+        Check("clock", machine.clock),
+        Check("serial", motor.serial_ports),
+        Check("VESC", vesc),
         Check("VICON", partial(mocap.listen, ViconConfig((), "", vicon_port))),
-        Check("camera", cameras.video_devices), Check("OAK", cameras.oaks, 30.0),
-        Check("screens", graphics.screens, _CHILD_DEADLINE_S), Check("gamepad", partial(motor.gamepads, False)),
+        Check("camera", cameras.video_devices),
+        Check("OAK", cameras.oaks, 30.0),
+        Check("screens", graphics.screens, _CHILD_DEADLINE_S),
+        Check("gamepad", partial(motor.gamepads, False)),
         Check("launches", machine.launches),
-    ]  # fmt: skip
+    ]

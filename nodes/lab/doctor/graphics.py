@@ -10,7 +10,9 @@ from hardware.screen.edid import connected_displays
 from nodes.lab.doctor.check import ABSENT, FAILURE, OK, WARNING, Answer, Finding, in_child
 
 _EGL_CURE = "apt-get install libegl1 libgl1-mesa-dri libegl-mesa0 libopengl0 (Debian, Ubuntu)"
-_SCREEN_CURE = "run it in the desktop session of the computer with the screen, where DISPLAY or WAYLAND_DISPLAY is set"
+_SCREEN_CURE = (
+    "run it in the desktop session of the computer with the screen, where DISPLAY or WAYLAND_DISPLAY is set"
+)
 
 
 # Drivers that SDL uses without a window system. They show no image.
@@ -37,7 +39,9 @@ def torch(required: bool = False) -> list[Finding]:
     """Check the version of torch and its devices."""
     answer = in_child("torch")
     if answer.data is None:
-        text = "is missing: no training, no attack, only ONNX policies" if _missing(answer) else answer.trouble
+        text = (
+            "is missing: no training, no attack, only ONNX policies" if _missing(answer) else answer.trouble
+        )
         state = FAILURE if required else ABSENT if _missing(answer) else WARNING
         return [Finding("torch", state, text, "pip install 'advnerf[core]'")]
     version, gpus, built_for = (answer.data[key] for key in ("version", "gpus", "built_for"))
@@ -55,7 +59,9 @@ def llvm() -> list[Finding]:
     if answer.data is not None:
         return [Finding("LLVM", OK, f"{answer.data['llvm']} compiles for Mitsuba {answer.data['version']}")]
     if "cannot be imported" in answer.trouble or _missing(answer):
-        return [Finding("LLVM", ABSENT, "Mitsuba is missing: no attacks on meshes", "pip install 'advnerf[mesh]'")]
+        return [
+            Finding("LLVM", ABSENT, "Mitsuba is missing: no attacks on meshes", "pip install 'advnerf[mesh]'")
+        ]
     return [Finding("LLVM", WARNING, answer.trouble, "apt-get install libllvm19 (Debian, Ubuntu)")]
 
 
@@ -67,7 +73,8 @@ def screens(display: Any | None = None) -> list[Finding]:
     """
     answer, plugged = in_child("screens"), connected_displays()
     named = ", ".join(
-        f"{name} {edid.name or edid.maker} {edid.size_px[0]} x {edid.size_px[1]}" for name, edid in plugged.items()
+        f"{name} {edid.name or edid.maker} {edid.size_px[0]} x {edid.size_px[1]}"
+        for name, edid in plugged.items()
     )
     state = ABSENT if display is None else FAILURE
     if answer.data is None:
@@ -113,5 +120,7 @@ def _fits(display: Any, sizes: Sequence[tuple[int, ...]], plugged: dict[str, Any
     native = plugged[display.connector].size_px
     if tuple(native) != tuple(sizes[display.index]):
         text = f"screen {display.index} is {sizes[display.index][0]} x {sizes[display.index][1]}, the panel {native[0]} x {native[1]}"
-        return [Finding("screens", FAILURE, text, "use the native resolution and 100 % scaling, or another index")]
+        return [
+            Finding("screens", FAILURE, text, "use the native resolution and 100 % scaling, or another index")
+        ]
     return []

@@ -65,10 +65,14 @@ def checks_of(plan: Plan, folder: Path) -> list[Check]:
         folder: Folder for its runs.
     """
     checks = [
-        Check("versions", machine.versions), Check("machine", machine.machine), Check("sockets", machine.sockets),
-        Check("launches", machine.launches), Check("nodes", partial(_nodes, plan), _NODES_S),
-        Check("calibration", partial(files.calibrations, plan)), Check("files", partial(files.named, plan)),
-    ]  # fmt: skip
+        Check("versions", machine.versions),
+        Check("machine", machine.machine),
+        Check("sockets", machine.sockets),
+        Check("launches", machine.launches),
+        Check("nodes", partial(_nodes, plan), _NODES_S),
+        Check("calibration", partial(files.calibrations, plan)),
+        Check("files", partial(files.named, plan)),
+    ]
     for name, entry in plan.nodes.items():
         asked = _Asked(plan, name)
         if (make := _BY_MODULE.get(entry.module)) is not None:
@@ -110,7 +114,8 @@ def _nodes(plan: Plan) -> list[Finding]:
     problems = check_nodes(plan)
     if problems:
         return [
-            Finding("nodes", FAILURE, " ".join(text.split()), "correct the launch file") for text in problems.values()
+            Finding("nodes", FAILURE, " ".join(text.split()), "correct the launch file")
+            for text in problems.values()
         ]
     return [Finding("nodes", OK, f"{', '.join(plan.nodes)} accept their configuration")]
 
@@ -170,7 +175,11 @@ def _motor(asked: _Asked) -> list[Check]:
 
 
 def _safety(asked: _Asked) -> list[Check]:
-    return [Check("gamepad", partial(motor.gamepads, True))] if asked.config(SafetyConfig).teleop == "hold" else []
+    return (
+        [Check("gamepad", partial(motor.gamepads, True))]
+        if asked.config(SafetyConfig).teleop == "hold"
+        else []
+    )
 
 
 def _policy(asked: _Asked) -> list[Check]:
@@ -199,12 +208,22 @@ def _policy_findings(config: PolicyConfig, size: tuple[int, int] | None) -> list
         return rows
     if data["ms"] > _POLICY_SLOW_MS:
         rows.append(
-            Finding("policy", FAILURE, f"{data['ms']:.0f} ms for one image", "use a faster computer, or an ONNX policy")
+            Finding(
+                "policy",
+                FAILURE,
+                f"{data['ms']:.0f} ms for one image",
+                "use a faster computer, or an ONNX policy",
+            )
         )
-    return [Finding("policy", OK, f"{config.policy}, {data['sha256'][:12]}, {data['ms']:.1f} ms for one image"), *rows]
+    return [
+        Finding("policy", OK, f"{config.policy}, {data['sha256'][:12]}, {data['ms']:.1f} ms for one image"),
+        *rows,
+    ]
 
 
-def _try_policy(config: PolicyConfig, size: tuple[int, int] | None) -> tuple[dict[str, Any] | None, list[Finding]]:
+def _try_policy(
+    config: PolicyConfig, size: tuple[int, int] | None
+) -> tuple[dict[str, Any] | None, list[Finding]]:
     """Load a policy in a separate process.
 
     Args:
@@ -239,7 +258,9 @@ def _attack(asked: _Asked) -> list[Check]:
 def _monitor(asked: _Asked) -> list[Check]:
     config = asked.config(MonitorConfig)
     if not isinstance(config.display, ScreenConfig):
-        return [] if asked.on_twin else [Check("screens", partial(_nobody, "screens", str(config.display.path)))]
+        return (
+            [] if asked.on_twin else [Check("screens", partial(_nobody, "screens", str(config.display.path)))]
+        )
     return [Check("screens", partial(graphics.screens, config.display), _CHILD_DEADLINE_S)]
 
 
@@ -258,7 +279,9 @@ def _disk(plan: Plan, folder: Path) -> Sequence[Finding]:
     # With two hosts, all recorded topics are sent to this host.
     roles = None
     if GATEWAY not in plan.nodes:
-        roles = {role for name, entry in plan.nodes.items() for role in (name, entry.module.rsplit(".", 1)[-1])}
+        roles = {
+            role for name, entry in plan.nodes.items() for role in (name, entry.module.rsplit(".", 1)[-1])
+        }
     return machine.disk(folder, bytes_per_s(pictures_of(plan), config.topics, roles, len(config.statuses_of)))
 
 

@@ -30,7 +30,9 @@ CLOCK_ERROR_S = 0.005
 _UNSYNCHRONISED = 0x0040
 _CHRONYC_S = 2.0
 _OFFSET_WAIT_S = 0.8
-_REQUIREMENT = re.compile(r"^([A-Za-z0-9._-]+)\s*(?:\[[^\]]*\])?\s*([^;]*)(?:;.*extra == ['\"]([a-z]+)['\"])?")
+_REQUIREMENT = re.compile(
+    r"^([A-Za-z0-9._-]+)\s*(?:\[[^\]]*\])?\s*([^;]*)(?:;.*extra == ['\"]([a-z]+)['\"])?"
+)
 _NOT_OURS = ("all", "dev")
 
 
@@ -57,7 +59,9 @@ def packages(requirements: Iterable[str]) -> list[Finding]:
     extras = [name for name in wrong if name and not wrong[name]]
     rows = [Finding("extras", OK, f"complete: {', '.join(extras) or 'none'}")]
     if base := wrong.get("", []):
-        rows.insert(0, Finding("packages", FAILURE, "; ".join(base), "pip install -c constraints.txt advnerf"))
+        rows.insert(
+            0, Finding("packages", FAILURE, "; ".join(base), "pip install -c constraints.txt advnerf")
+        )
     for name in (name for name in wrong if name and wrong[name]):
         stale = [trouble for trouble in wrong[name] if not trouble.endswith("missing")]
         if stale:
@@ -113,7 +117,10 @@ def disk(folder: Path, bytes_per_s: float, minutes: float = 30.0) -> list[Findin
     if not os.access(existing, os.W_OK):
         return [
             Finding(
-                "disk", FAILURE, f"{existing} cannot be written to", "choose another folder, or change its permissions"
+                "disk",
+                FAILURE,
+                f"{existing} cannot be written to",
+                "choose another folder, or change its permissions",
             )
         ]
     free = shutil.disk_usage(existing).free
@@ -134,7 +141,10 @@ def sockets() -> list[Finding]:
     except (BusError, OSError) as error:
         return [
             Finding(
-                "sockets", FAILURE, str(error), "change the owner of that folder to your user, or set XDG_RUNTIME_DIR"
+                "sockets",
+                FAILURE,
+                str(error),
+                "change the owner of that folder to your user, or set XDG_RUNTIME_DIR",
             )
         ]
 
@@ -164,7 +174,10 @@ def clock() -> list[Finding]:
         do = "for two hosts, install chrony on both: sudo apt-get install chrony"
         return [
             Finding(
-                "clock", WARNING, f"not synchronised according to the kernel; {keeper or 'no time service found'}", do
+                "clock",
+                WARNING,
+                f"not synchronised according to the kernel; {keeper or 'no time service found'}",
+                do,
             )
         ]
     text = f"off by at most {seconds * 1e3:.1f} ms{', ' + keeper if keeper else ''}"
@@ -187,7 +200,11 @@ def _keeper() -> str:
     if shutil.which("chronyc"):
         try:
             told = subprocess.run(
-                ["chronyc", "-n", "-c", "tracking"], capture_output=True, text=True, timeout=_CHRONYC_S, check=False
+                ["chronyc", "-n", "-c", "tracking"],
+                capture_output=True,
+                text=True,
+                timeout=_CHRONYC_S,
+                check=False,
             )
         except (subprocess.TimeoutExpired, OSError):
             return "no answer from chronyc"
@@ -203,7 +220,9 @@ def launches() -> list[Finding]:
     rows = []
     for launch in active_launches():
         text = f"running: {launch['name']} in {launch['run_dir']} (process {launch['pid']})"
-        rows.append(Finding("launches", WARNING, text, "its devices are in use; stop it with Ctrl-C in its terminal"))
+        rows.append(
+            Finding("launches", WARNING, text, "its devices are in use; stop it with Ctrl-C in its terminal")
+        )
         rows += _offset(Path(launch["run_dir"]))
     return rows or [Finding("launches", OK, "none running")]
 
@@ -229,4 +248,6 @@ def offset_finding(peer: str, offset_s: float, error_s: float) -> Finding:
         do = "install chrony on both hosts, then run chronyc makestep; until then the car cannot be armed"
         return Finding("clock offset", FAILURE, text, do)
     near = abs(offset_s) <= CLOCK_ERROR_S
-    return Finding("clock offset", OK if near else WARNING, text, "" if near else "install chrony on both hosts")
+    return Finding(
+        "clock offset", OK if near else WARNING, text, "" if near else "install chrony on both hosts"
+    )

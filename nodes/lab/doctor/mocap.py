@@ -31,7 +31,10 @@ def free_port(port: int = DEFAULT_PORT, host: str = "") -> list[Finding]:
 
 
 def listen(
-    config: ViconConfig, required: bool = False, listen_s: float = LISTEN_S, needed: Sequence[str] | None = None
+    config: ViconConfig,
+    required: bool = False,
+    listen_s: float = LISTEN_S,
+    needed: Sequence[str] | None = None,
 ) -> list[Finding]:
     """Listen to the stream for a moment, and check datagrams, senders, subjects and rates.
 
@@ -61,7 +64,9 @@ def listen(
     rows = [Finding(_NAME, OK, f"{rate_hz:.0f} datagrams a second on {where}")]
     if counts.refused:
         do = "find the other sender, or set vicon.source to Tracker's address"
-        rows = [Finding(_NAME, WARNING, f"{counts.refused} of {counts.datagrams} datagrams are not Tracker's", do)]
+        rows = [
+            Finding(_NAME, WARNING, f"{counts.refused} of {counts.datagrams} datagrams are not Tracker's", do)
+        ]
     return rows + [
         _subject(name, number / listen_s, required and name in (needed or config.subjects))
         for name, number in seen.items()

@@ -39,14 +39,22 @@ def serial_ports() -> list[Finding]:
     if not found:
         return [
             Finding(
-                "serial", ABSENT, "no USB serial device", "check the USB cable of the VESC; the twin does not need one"
+                "serial",
+                ABSENT,
+                "no USB serial device",
+                "check the USB cable of the VESC; the twin does not need one",
             )
         ]
     rows = [_port(port) for port in found]
     if manager := _running("ModemManager"):
         do = 'ENV{ID_MM_DEVICE_IGNORE}="1" in the udev rule (docs/wiring.md), or: sudo apt-get purge modemmanager'
         rows.append(
-            Finding("serial", WARNING, f"ModemManager is running (process {manager}) and writes to serial devices", do)
+            Finding(
+                "serial",
+                WARNING,
+                f"ModemManager is running (process {manager}) and writes to serial devices",
+                do,
+            )
         )
     return rows
 
@@ -64,7 +72,10 @@ def _port(port: Any) -> Finding:
 
 def stable_names(device: Path, folders: Iterable[Path] = (BY_ID,), fixed: Path = FIXED_NAME) -> list[Path]:
     """Names of a device that stay the same when it is plugged in again."""
-    candidates = [fixed, *(link for folder in folders if folder.is_dir() for link in sorted(folder.iterdir()))]
+    candidates = [
+        fixed,
+        *(link for folder in folders if folder.is_dir() for link in sorted(folder.iterdir())),
+    ]
     return [link for link in candidates if link.is_symlink() and link.resolve() == device.resolve()]
 
 
@@ -90,7 +101,10 @@ def find_vesc() -> str | None:
 
 
 def vesc(
-    port: str | None, wanted: TimeoutSettings = WANTED, battery_v: float = BATTERY_WARNING_V, required: bool = False
+    port: str | None,
+    wanted: TimeoutSettings = WANTED,
+    battery_v: float = BATTERY_WARNING_V,
+    required: bool = False,
 ) -> list[Finding]:
     """Check a motor controller: firmware, telemetry, faults, battery and its own time-out. No motor command is sent.
 
@@ -103,7 +117,12 @@ def vesc(
     port = port or find_vesc()
     if port is None:
         return [
-            Finding("VESC", FAILURE if required else ABSENT, "none found", "check its USB cable; see docs/wiring.md")
+            Finding(
+                "VESC",
+                FAILURE if required else ABSENT,
+                "none found",
+                "check its USB cable; see docs/wiring.md",
+            )
         ]
     device = Vesc(port, VehicleGains(), DriveLimits())
     try:
@@ -112,13 +131,20 @@ def vesc(
         return [Finding("VESC", WARNING, str(error), "stop the launch, or close VESC Tool")]
     except DeviceNotFound as error:
         denied = os.path.exists(port) and not os.access(port, os.R_OK | os.W_OK)
-        do = permission_cure(_SERIAL_GROUP) if denied else "check its USB cable and udev rule (docs/wiring.md)"
+        do = (
+            permission_cure(_SERIAL_GROUP) if denied else "check its USB cable and udev rule (docs/wiring.md)"
+        )
         return [Finding("VESC", FAILURE, str(error), do)]
     try:
         return _ask(device, wanted, battery_v)
     except LinkTimeout as error:
         return [
-            Finding("VESC", FAILURE, str(error), "connect the motor battery, check the port, and disconnect VESC Tool")
+            Finding(
+                "VESC",
+                FAILURE,
+                str(error),
+                "connect the motor battery, check the port, and disconnect VESC Tool",
+            )
         ]
     except HardwareError as error:
         return [Finding("VESC", FAILURE, str(error), "run advnerf motor info, then check cable and firmware")]
@@ -150,7 +176,10 @@ def _time_out(device: Vesc, wanted: TimeoutSettings) -> Finding:
         f"--brake-current {wanted.brake_current_a:g}"
     )
     return Finding(
-        name, FAILURE, f"{found}; required is at most {wanted}: the car would keep rolling if its computer failed", do
+        name,
+        FAILURE,
+        f"{found}; required is at most {wanted}: the car would keep rolling if its computer failed",
+        do,
     )
 
 
@@ -168,11 +197,15 @@ def _running(name: str) -> int | None:
 
 def gamepads(required: bool) -> Sequence[Finding]:
     """Check which gamepads the teleop node can read."""
-    found = sorted(Path("/dev/input/by-id").glob("*-event-joystick")) or sorted(Path("/dev/input").glob("js*"))
+    found = sorted(Path("/dev/input/by-id").glob("*-event-joystick")) or sorted(
+        Path("/dev/input").glob("js*")
+    )
     if not found:
         do = "use advnerf teleop with the keyboard, or plug in a gamepad (docs/driving.md)"
         return [Finding("gamepad", WARNING if required else ABSENT, "none", do)]
     denied = [str(path) for path in found if not os.access(path, os.R_OK)]
     if denied:
-        return [Finding("gamepad", WARNING, f"no permission for {', '.join(denied)}", permission_cure("input"))]
+        return [
+            Finding("gamepad", WARNING, f"no permission for {', '.join(denied)}", permission_cure("input"))
+        ]
     return [Finding("gamepad", OK, ", ".join(map(str, found)))]

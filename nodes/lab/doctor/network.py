@@ -47,7 +47,12 @@ def _keys(config: GatewayConfig, address: str) -> list[Finding]:
         ]
     if not drivers:
         return [
-            Finding("keys", FAILURE, "no key may drive over the network", "advnerf keys allow workstation --to drive")
+            Finding(
+                "keys",
+                FAILURE,
+                "no key may drive over the network",
+                "advnerf keys allow workstation --to drive",
+            )
         ]
     return [Finding("keys", OK, f"ours is {config.key}; {drivers} may drive")]
 
@@ -90,7 +95,10 @@ def mocap_library(system: str, hostname: str) -> list[Finding]:
     if importlib.util.find_spec("motioncapture") is None:
         return [
             Finding(
-                "VICON", FAILURE, "the library motioncapture is missing", "pip install 'advnerf[mocap]' (Linux on x86)"
+                "VICON",
+                FAILURE,
+                "the library motioncapture is missing",
+                "pip install 'advnerf[mocap]' (Linux on x86)",
             )
         ]
     if system not in SYSTEMS:
@@ -99,6 +107,11 @@ def mocap_library(system: str, hostname: str) -> list[Finding]:
         socket.getaddrinfo(hostname, None)
     except OSError as error:
         return [
-            Finding("VICON", FAILURE, f"{hostname}: {error.strerror or error}", "set vicon.hostname to its IP address")
+            Finding(
+                "VICON",
+                FAILURE,
+                f"{hostname}: {error.strerror or error}",
+                "set vicon.hostname to its IP address",
+            )
         ]
     return [Finding("VICON", OK, f"{system} at {hostname}; the node reports the subjects")]

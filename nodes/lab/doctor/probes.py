@@ -18,7 +18,9 @@ def torch() -> dict[str, Any]:
     import torch
 
     gpus = (
-        [torch.cuda.get_device_name(k) for k in range(torch.cuda.device_count())] if torch.cuda.is_available() else []
+        [torch.cuda.get_device_name(k) for k in range(torch.cuda.device_count())]
+        if torch.cuda.is_available()
+        else []
     )
     return {"version": str(torch.__version__), "gpus": gpus, "built_for": torch.version.cuda}
 
@@ -46,7 +48,8 @@ def oaks() -> list[str]:
     import depthai
 
     return [
-        f"{info.getDeviceId()} at {info.name} ({info.state.name})" for info in depthai.Device.getAllAvailableDevices()
+        f"{info.getDeviceId()} at {info.name} ({info.state.name})"
+        for info in depthai.Device.getAllAvailableDevices()
     ]
 
 
@@ -56,7 +59,10 @@ def screens() -> dict[str, Any]:
     import pygame
 
     pygame.display.init()
-    return {"sizes": [list(size) for size in pygame.display.get_desktop_sizes()], "driver": pygame.display.get_driver()}
+    return {
+        "sizes": [list(size) for size in pygame.display.get_desktop_sizes()],
+        "driver": pygame.display.get_driver(),
+    }
 
 
 def policy(spec: str, sha256: str) -> dict[str, Any]:
@@ -77,11 +83,16 @@ def policy(spec: str, sha256: str) -> dict[str, Any]:
         driver.steer(image, goal)
         times.append(1e3 * (time.perf_counter() - began))
     return {
-        "sha256": driver.sha256, "size": [camera.width, camera.height], "goal_size": driver.goal_size, "ms": float(np.median(times[3:])),
-    }  # fmt: skip
+        "sha256": driver.sha256,
+        "size": [camera.width, camera.height],
+        "goal_size": driver.goal_size,
+        "ms": float(np.median(times[3:])),
+    }
 
 
-PROBES: dict[str, Callable[..., Any]] = {probe.__name__: probe for probe in (torch, egl, llvm, oaks, screens, policy)}
+PROBES: dict[str, Callable[..., Any]] = {
+    probe.__name__: probe for probe in (torch, egl, llvm, oaks, screens, policy)
+}
 
 
 def main(arguments: list[str]) -> int:

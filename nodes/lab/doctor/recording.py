@@ -33,7 +33,10 @@ class Pictures:
 
 
 def bytes_per_s(
-    pictures: Pictures, topics: Iterable[str] | None = None, publishers: Iterable[str] | None = None, statuses: int = 8
+    pictures: Pictures,
+    topics: Iterable[str] | None = None,
+    publishers: Iterable[str] | None = None,
+    statuses: int = 8,
 ) -> float:
     """Data rate of a bag [bytes/s].
 

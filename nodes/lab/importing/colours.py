@@ -50,7 +50,9 @@ def match_colours(scene: Path, images: Path, output: Path, most: int) -> ColourM
         ImportRecordingError: The frames do not show the scene.
     """
     listed = load_transforms(images)
-    chosen = np.unique(np.linspace(0, len(listed.frames) - 1, min(most, len(listed.frames))).round().astype(int))
+    chosen = np.unique(
+        np.linspace(0, len(listed.frames) - 1, min(most, len(listed.frames))).round().astype(int)
+    )
     frames = listed.with_frames([listed.frames[i] for i in chosen]).load()
     field, occupied, metadata = load_scene(scene)
     # Do not apply the map of an earlier fit.
@@ -63,7 +65,9 @@ def match_colours(scene: Path, images: Path, output: Path, most: int) -> ColourM
         )
     found = fit_colour_map(learned[inside], frames.rgb[inside])
     real = frames.rgb[inside] / np.float32(255.0)
-    match = ColourMatch(found, len(frames.rgb), psnr(learned[inside], real), psnr(found.apply(learned[inside]), real))
+    match = ColourMatch(
+        found, len(frames.rgb), psnr(learned[inside], real), psnr(found.apply(learned[inside]), real)
+    )
     kept = {key: value for key, value in metadata.items() if key != "scene_hash"}
     save_scene(output, field, occupied, {**kept, "colour_map": found.to_dict()})
     return match

@@ -54,7 +54,12 @@ class Imported:
 
 
 def from_media(
-    media: Sequence[Path], output: Path, media_config: MediaConfig, sfm: SfmConfig, extent_m: float, report: Report
+    media: Sequence[Path],
+    output: Path,
+    media_config: MediaConfig,
+    sfm: SfmConfig,
+    extent_m: float,
+    report: Report,
 ) -> Imported:
     """Make an upright, centred data set from videos and photographs. Its scale is only as accurate as ``extent_m``.
 
@@ -73,7 +78,12 @@ def from_media(
 
 
 def _from_media(
-    media: Sequence[Path], output: Path, media_config: MediaConfig, sfm: SfmConfig, extent_m: float, report: Report
+    media: Sequence[Path],
+    output: Path,
+    media_config: MediaConfig,
+    sfm: SfmConfig,
+    extent_m: float,
+    report: Report,
 ) -> Imported:
     sources = gather(media, output, media_config, lambda share, text="": report(_MEDIA_SHARE * share, text))
     model = _reconstruct(output, sources, sfm, report)
@@ -88,7 +98,12 @@ def _from_media(
 
 
 def from_bag(
-    bag: Path, output: Path, config: BagConfig, margin_m: float, report: Report, calibration: Path | None = None
+    bag: Path,
+    output: Path,
+    config: BagConfig,
+    margin_m: float,
+    report: Report,
+    calibration: Path | None = None,
 ) -> Imported:
     """Make a data set from recorded frames with motion-capture poses. No pose is estimated.
 
@@ -101,7 +116,10 @@ def from_bag(
         calibration: Camera calibration file; None uses the one in the bag.
     """
     imported = build_beside(
-        output, (), lambda folder: _from_bag(bag, folder, config, margin_m, report, calibration), resumes=False
+        output,
+        (),
+        lambda folder: _from_bag(bag, folder, config, margin_m, report, calibration),
+        resumes=False,
     )
     return imported.moved_to(output)
 
@@ -119,27 +137,48 @@ def _from_bag(
 
 
 def from_phone_and_car(
-    media: Sequence[Path], bag: Path, output: Path, media_config: MediaConfig, bag_config: BagConfig, sfm: SfmConfig,
-    placing: PlacingConfig, report: Report, calibration: Path | None = None,
-) -> Imported:  # fmt: skip
+    media: Sequence[Path],
+    bag: Path,
+    output: Path,
+    media_config: MediaConfig,
+    bag_config: BagConfig,
+    sfm: SfmConfig,
+    placing: PlacingConfig,
+    report: Report,
+    calibration: Path | None = None,
+) -> Imported:
     """Combine phone media and frames of a bag in one model, metric and in the motion-capture world.
 
     ``transforms.json`` has all registered images with the model's poses, ``transforms_phone.json`` only those of the phone (for
     training), ``transforms_car.json`` all frames of the car with their motion-capture poses (to fit colours and to compare).
     """
     imported = build_beside(
-        output, media,
-        lambda folder: _from_phone_and_car(media, bag, folder, media_config, bag_config, sfm, placing, report, calibration),
-    )  # fmt: skip
+        output,
+        media,
+        lambda folder: _from_phone_and_car(
+            media, bag, folder, media_config, bag_config, sfm, placing, report, calibration
+        ),
+    )
     return imported.moved_to(output)
 
 
 def _from_phone_and_car(
-    media: Sequence[Path], bag: Path, output: Path, media_config: MediaConfig, bag_config: BagConfig, sfm: SfmConfig,
-    placing: PlacingConfig, report: Report, calibration: Path | None,
-) -> Imported:  # fmt: skip
+    media: Sequence[Path],
+    bag: Path,
+    output: Path,
+    media_config: MediaConfig,
+    bag_config: BagConfig,
+    sfm: SfmConfig,
+    placing: PlacingConfig,
+    report: Report,
+    calibration: Path | None,
+) -> Imported:
     frames = take_frames(
-        bag, output / IMAGES / CAR_CAMERA, bag_config, lambda share, text="": report(0.1 * share, text), calibration
+        bag,
+        output / IMAGES / CAR_CAMERA,
+        bag_config,
+        lambda share, text="": report(0.1 * share, text),
+        calibration,
     )
     sources = gather(
         media, output, media_config, lambda share, text="": report(0.1 + (_MEDIA_SHARE - 0.1) * share, text)
@@ -154,9 +193,12 @@ def _from_phone_and_car(
     model = _reconstruct(output, [*sources, car], sfm, report)
     placed = place_in_mocap(model, dict(zip(names, frames.T_world_from_camera, strict=True)), placing)
     facts = {
-        "bag": str(bag), **_bag_facts(frames), "structure_from_motion": model.summary(), "placing": placed.summary(),
+        "bag": str(bag),
+        **_bag_facts(frames),
+        "structure_from_motion": model.summary(),
+        "placing": placed.summary(),
         "scale": "metric: motion capture",
-    }  # fmt: skip
+    }
     return _write_joint(output, model, placed, frames, facts)
 
 
@@ -185,8 +227,12 @@ def upright(model: Model, extent_m: float) -> Similarity:
 
 def _reconstruct(output: Path, sources: Sequence[Source], sfm: SfmConfig, report: Report) -> Model:
     return reconstruct(
-        output, sources, output / COLMAP, sfm, lambda share, text: report(_MEDIA_SHARE + (1.0 - _MEDIA_SHARE) * share, text)
-    )  # fmt: skip
+        output,
+        sources,
+        output / COLMAP,
+        sfm,
+        lambda share, text: report(_MEDIA_SHARE + (1.0 - _MEDIA_SHARE) * share, text),
+    )
 
 
 def _write(output: Path, model: Model, poses: Array, points: Array, facts: dict[str, Any]) -> Imported:
@@ -195,7 +241,9 @@ def _write(output: Path, model: Model, poses: Array, points: Array, facts: dict[
     return _finish(output, (path,), facts)
 
 
-def _write_joint(output: Path, model: Model, placed: Placed, frames: DrivenFrames, facts: dict[str, Any]) -> Imported:
+def _write_joint(
+    output: Path, model: Model, placed: Placed, frames: DrivenFrames, facts: dict[str, Any]
+) -> Imported:
     poses, everything = placed.T_world_from_camera, range(len(model.images))
     extra = {**_box_of(placed.points, poses), "world": "mocap"}
     phone = [index for index in everything if model.images[index].camera_id != CAR_CAMERA]
@@ -215,31 +263,46 @@ def _write_model(
 ) -> None:
     images = [model.images[index] for index in chosen]
     write_transforms(
-        path, [output.absolute() / image.name for image in images], poses[list(chosen)],
-        [image.pinhole for image in images], lens=[image.lens for image in images],
-        camera_ids=[image.camera_id for image in images], extra=extra,
-    )  # fmt: skip
+        path,
+        [output.absolute() / image.name for image in images],
+        poses[list(chosen)],
+        [image.pinhole for image in images],
+        lens=[image.lens for image in images],
+        camera_ids=[image.camera_id for image in images],
+        extra=extra,
+    )
 
 
 def _write_car(path: Path, frames: DrivenFrames, extra: dict[str, Any]) -> None:
     camera, count = frames.calibration, len(frames.files)
     pinhole: Pinhole = camera.pinhole
     write_transforms(
-        path, [file.absolute() for file in frames.files], frames.T_world_from_camera, pinhole,
-        lens=Lens(camera.distortion), camera_ids=[CAR_CAMERA] * count, extra=extra,
-    )  # fmt: skip
+        path,
+        [file.absolute() for file in frames.files],
+        frames.T_world_from_camera,
+        pinhole,
+        lens=Lens(camera.distortion),
+        camera_ids=[CAR_CAMERA] * count,
+        extra=extra,
+    )
 
 
 def _bag_facts(frames: DrivenFrames) -> dict[str, Any]:
     return {
-        "recorded_frames": frames.recorded, "without_pose": frames.without_pose, "taken_frames": len(frames.files),
+        "recorded_frames": frames.recorded,
+        "without_pose": frames.without_pose,
+        "taken_frames": len(frames.files),
         "unchecked": frames.unchecked,
-    }  # fmt: skip
+    }
 
 
 def _box_of(points: Array, poses: Array) -> dict[str, Any]:
     """Box around nearly all points and all cameras. A few points of every model lie far outside."""
-    ends = np.percentile(points, [_BOX_PERCENT, 100.0 - _BOX_PERCENT], axis=0) if len(points) else np.zeros((0, 3))
+    ends = (
+        np.percentile(points, [_BOX_PERCENT, 100.0 - _BOX_PERCENT], axis=0)
+        if len(points)
+        else np.zeros((0, 3))
+    )
     return _box(np.concatenate([ends, poses[:, :3, 3]]), _BOX_MARGIN)
 
 

@@ -92,7 +92,11 @@ def take_frames(
     poses = _car_poses(bag, config)
     topic = image_topic(bag)
     stamps = [stamp_ns(message) for message in image_messages(bag, topic)]
-    placed = [(index, stamp, pose.T @ camera.mount) for index, stamp in enumerate(stamps) if (pose := poses.at(stamp))]
+    placed = [
+        (index, stamp, pose.T @ camera.mount)
+        for index, stamp in enumerate(stamps)
+        if (pose := poses.at(stamp))
+    ]
     if not placed:
         raise ImportRecordingError(
             f"expected frames of {bag} with poses of {CAR_TOPIC} at their stamps, got {len(stamps)} frames without any pose; "
@@ -103,9 +107,14 @@ def take_frames(
     files = _write_frames(bag, topic, folder, wanted, camera, report)
     rows = [wanted[index] for index in sorted(wanted)]
     return DrivenFrames(
-        tuple(files), tuple(stamp for _, stamp, _ in rows), np.stack([T for _, _, T in rows]), camera, len(stamps),
-        len(stamps) - len(placed), read_info(bag).unchecked,
-    )  # fmt: skip
+        tuple(files),
+        tuple(stamp for _, stamp, _ in rows),
+        np.stack([T for _, _, T in rows]),
+        camera,
+        len(stamps),
+        len(stamps) - len(placed),
+        read_info(bag).unchecked,
+    )
 
 
 def choose_by_motion(T_world_from_camera: Array, config: BagConfig) -> list[int]:

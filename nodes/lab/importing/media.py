@@ -85,13 +85,16 @@ def _part_of(report: Report, index: int, parts: int) -> Report:
 
 def photographs_in(folder: Path) -> list[Path]:
     """Image files of a folder, sorted by name. Numbers in names are sorted by value."""
-    files = [path for path in folder.iterdir() if path.suffix.lower() in image_files.SUFFIXES and path.is_file()]
+    files = [
+        path for path in folder.iterdir() if path.suffix.lower() in image_files.SUFFIXES and path.is_file()
+    ]
     if not files:
         raise ImportRecordingError(
             f"expected photographs ({', '.join(image_files.SUFFIXES)}) in {folder}, got none; give the folder that holds them"
         )
     return sorted(
-        files, key=lambda path: [(int(p), "") if p.isdigit() else (-1, p) for p in re.split(r"(\d+)", path.name)]
+        files,
+        key=lambda path: [(int(p), "") if p.isdigit() else (-1, p) for p in re.split(r"(\d+)", path.name)],
     )
 
 
@@ -135,7 +138,9 @@ def _copy(file: Path, copy: Path) -> None:
         as_stored = cv2.imdecode(raw, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
         upright = cv2.imdecode(raw, cv2.IMREAD_COLOR)
         if as_stored is not None and upright is not None and not np.array_equal(as_stored, upright):
-            turned = cv2.imencode(".jpg", upright, [cv2.IMWRITE_JPEG_QUALITY, video.JPEG_QUALITY])[1].tobytes()
+            turned = cv2.imencode(".jpg", upright, [cv2.IMWRITE_JPEG_QUALITY, video.JPEG_QUALITY])[
+                1
+            ].tobytes()
             # Keep the camera and focal length in the EXIF data for structure from motion.
             data = turned[:2] + image_files.upright_exif(data) + turned[2:]
     write_atomically(copy, data)

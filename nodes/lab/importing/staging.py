@@ -29,7 +29,9 @@ def work_folder(output: Path) -> Path:
     return output.with_name(f"{output.name}.part")
 
 
-def build_beside(output: Path, media: Sequence[Path], build: Callable[[Path], Built], resumes: bool = True) -> Built:
+def build_beside(
+    output: Path, media: Sequence[Path], build: Callable[[Path], Built], resumes: bool = True
+) -> Built:
     """Build a data set in the work folder and move it to its destination.
 
     A stopped import keeps its work folder if structure from motion or the selection of video frames had started, and the next import
@@ -62,7 +64,8 @@ def build_beside(output: Path, media: Sequence[Path], build: Callable[[Path], Bu
             if began_here and resumes:
                 _take_over(output, work)
             write_atomically(
-                work / IMAGES / _CLAIM, "Images in this folder are copies; an import replaces and removes them.\n"
+                work / IMAGES / _CLAIM,
+                "Images in this folder are copies; an import replaces and removes them.\n",
             )
             built = build(work)
         except BaseException as error:
@@ -90,7 +93,11 @@ def _require_ours(output: Path, work: Path, media: Sequence[Path]) -> None:
         raise ImportRecordingError(
             f"expected a new folder or one of an earlier import, but {images} has other files; give another --output"
         )
-    if work.exists() and any(work.iterdir()) and not ((work / IMAGES / _CLAIM).exists() or (work / _LOCK).exists()):
+    if (
+        work.exists()
+        and any(work.iterdir())
+        and not ((work / IMAGES / _CLAIM).exists() or (work / _LOCK).exists())
+    ):
         raise ImportRecordingError(
             f"expected to build the data set in {work}, but that folder has other files; rename it, or give another --output"
         )

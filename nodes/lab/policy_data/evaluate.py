@@ -54,10 +54,14 @@ def compare(predicted_rad: NDArray[np.floating[Any]], true_rad: NDArray[np.float
     error = predicted - true
     varies = predicted.std() > 0.0 and true.std() > 0.0
     return Errors(
-        len(true), float(np.abs(error).mean()), float(np.sqrt((error**2).mean())), float(np.abs(error).max()),
-        float(error.mean()), float(np.corrcoef(predicted, true)[0, 1]) if varies else float("nan"),
+        len(true),
+        float(np.abs(error).mean()),
+        float(np.sqrt((error**2).mean())),
+        float(np.abs(error).max()),
+        float(error.mean()),
+        float(np.corrcoef(predicted, true)[0, 1]) if varies else float("nan"),
         float(np.abs(true).mean()),
-    )  # fmt: skip
+    )
 
 
 def predict(policy: Any, images: NDArray[np.uint8], goal: tuple[float, ...] = ()) -> NDArray[np.float64]:
@@ -106,7 +110,9 @@ def draw(recording: Recording, predicted_rad: NDArray[np.float64], title: str, o
     axes.plot(time_s, recording.recorded_rad, color="0.6", lw=1, label="recorded")
     axes.plot(time_s, labels, color="C0", lw=1, label="label")
     axes.plot(time_s, predicted_rad, color="C3", lw=1, label="predicted")
-    axes.set(xlabel="frame" if recording.stamps_ns[0] == 0 else "time [s]", ylabel="steering, left positive [rad]")
+    axes.set(
+        xlabel="frame" if recording.stamps_ns[0] == 0 else "time [s]", ylabel="steering, left positive [rad]"
+    )
     axes.set_title(title, fontsize=9)
     axes.legend(fontsize=8)
     scatter.plot(labels, predicted_rad, ".", ms=2, color="C3")
@@ -126,7 +132,9 @@ def write_saliency(
     chosen = np.unique(np.linspace(0, len(images) - 1, min(count, len(images))).round().astype(int))
     out.mkdir(parents=True, exist_ok=True)
     files = []
-    for index, share in zip(chosen, saliency(policy, images[chosen], goal), strict=True) if len(chosen) else ():
+    for index, share in (
+        zip(chosen, saliency(policy, images[chosen], goal), strict=True) if len(chosen) else ()
+    ):
         both = np.concatenate([images[index], overlay(images[index], share)])
         files.append(out / f"saliency_{index:05d}.png")
         write_atomically(files[-1], cv2.imencode(".png", both[..., ::-1])[1].tobytes())

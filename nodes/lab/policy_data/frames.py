@@ -82,7 +82,11 @@ class _Track:
 
 
 def frames_of_bag(
-    bag: Path, view: PolicyView, expert: Expert | None, labels: Labels = "expert", images_on: str | None = None
+    bag: Path,
+    view: PolicyView,
+    expert: Expert | None,
+    labels: Labels = "expert",
+    images_on: str | None = None,
 ) -> Recording:
     """Take the frames of a bag.
 
@@ -96,7 +100,9 @@ def frames_of_bag(
     counts_of = {topic.name: topic.count for topic in read_info(bag).topics}
     topic = image_topic(bag, [images_on] if images_on else _IMAGES)
     if labels == "expert" and (expert is None or not counts_of.get(_CAR)):
-        raise BagError(f"expected poses on {_CAR} in {bag} for the expert's labels, got none; use --labels recorded")
+        raise BagError(
+            f"expected poses on {_CAR} in {bag} for the expert's labels, got none; use --labels recorded"
+        )
     track = _read_track(bag, [t for t in (_CAR, _SAFETY, _SENT, _EXPERT) if counts_of.get(t)])
     counts = dict.fromkeys(("not armed", "no pose", "no command", "disturbed", "too far from the path"), 0)
     images, states, steering, recorded, stamps = [], [], [], [], []
@@ -116,7 +122,9 @@ def frames_of_bag(
         steering.append(sent_rad if labels == "recorded" or expert is None else float(expert.steer(*state)))
     if len(images) < 4:
         why = ", ".join(f"{count} {reason}" for reason, count in counts.items() if count)
-        raise BagError(f"expected at least 4 usable frames in {bag}, got {len(images)} ({why or 'no images at all'})")
+        raise BagError(
+            f"expected at least 4 usable frames in {bag}, got {len(images)} ({why or 'no images at all'})"
+        )
     return _recording(images, states, steering, recorded, stamps, str(bag), counts)
 
 
@@ -233,9 +241,12 @@ def _recording(
 ) -> Recording:
     count = len(images)
     frames = Frames(
-        np.stack(images), np.array(states, dtype=np.float64), np.array(steering, dtype=np.float32),
-        np.zeros((count, 0), np.float32), np.zeros(count, bool),
-    )  # fmt: skip
+        np.stack(images),
+        np.array(states, dtype=np.float64),
+        np.array(steering, dtype=np.float32),
+        np.zeros((count, 0), np.float32),
+        np.zeros(count, bool),
+    )
     return Recording(frames, np.array(stamps, np.int64), np.array(recorded, np.float64), name, counts)
 
 

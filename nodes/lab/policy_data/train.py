@@ -71,19 +71,28 @@ class Training:
 
 
 def train_from_recordings(
-    parts: Sequence[Part], view: PolicyView, expert: Expert, config: ImitationConfig, out: Path,
-    surrogate: SourcePlan | None = None, progress: Progress | None = None,
-) -> Training:  # fmt: skip
+    parts: Sequence[Part],
+    view: PolicyView,
+    expert: Expert,
+    config: ImitationConfig,
+    out: Path,
+    surrogate: SourcePlan | None = None,
+    progress: Progress | None = None,
+) -> Training:
     """Train on recordings, and on the surrogate if given, and write ``policy.safetensors`` to ``out``.
 
     Frames and checkpoints are in ``out/work/<digest of all inputs>``. The same call resumes, or returns at once if finished. Other
     recordings or settings start a new training, and remove the earlier work when they are finished.
     """
     claim = {
-        "parts": {part.name: part.digest for part in parts}, "view": view.to_dict(), "expert": expert.to_dict(),
+        "parts": {part.name: part.digest for part in parts},
+        "view": view.to_dict(),
+        "expert": expert.to_dict(),
         "config": asdict(config),
-        "surrogate": None if surrogate is None else [surrogate.source.name, surrogate.stills, surrogate.drives],
-    }  # fmt: skip
+        "surrogate": None
+        if surrogate is None
+        else [surrogate.source.name, surrogate.stills, surrogate.drives],
+    }
     work = out / "work" / _digest(claim)
     report = progress or (lambda share, text: None)
     store = FrameStore(work / "frames")
@@ -119,19 +128,30 @@ def _cut(part: Part, store: FrameStore, work: Path, report: Progress) -> dict[st
 
 
 def _clone(
-    store: FrameStore, view: PolicyView, expert: Expert, config: ImitationConfig, work: Path, metadata: dict[str, Any],
+    store: FrameStore,
+    view: PolicyView,
+    expert: Expert,
+    config: ImitationConfig,
+    work: Path,
+    metadata: dict[str, Any],
     report: Progress,
-) -> tuple[str, float]:  # fmt: skip
+) -> tuple[str, float]:
     torch.manual_seed(config.seed)
     policy = PilotNet(0, config.max_steering_rad, config.hidden)
     frames = FrameSet([store.load(name) for name in store.names()], True, config.holdout_every)
     settings = FitConfig(
-        steps=config.first_steps, batch_size=config.batch_size, learning_rate=config.learning_rate, seed=config.seed,
+        steps=config.first_steps,
+        batch_size=config.batch_size,
+        learning_rate=config.learning_rate,
+        seed=config.seed,
         augment=config.augment,
-    )  # fmt: skip
+    )
 
     def tell(step: int, loss: float) -> None:
-        report(step / config.first_steps, f"training: step {step}/{config.first_steps}, error {loss**0.5:.3f} rad")
+        report(
+            step / config.first_steps,
+            f"training: step {step}/{config.first_steps}, error {loss**0.5:.3f} rad",
+        )
 
     fit(policy, frames, settings, work / "clone.checkpoint.safetensors", tell)
     mae = mean_absolute_error(policy, frames)

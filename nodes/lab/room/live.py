@@ -18,7 +18,9 @@ _LOST_S = 0.5
 _LEAST_POSES = 5
 
 
-def standing_poses(run_dir: Path, topic: str, period_s: float, window_s: float = 0.5) -> Iterator[Array | None]:
+def standing_poses(
+    run_dir: Path, topic: str, period_s: float, window_s: float = 0.5
+) -> Iterator[Array | None]:
     """Yield the mean pose ``[4, 4]`` over a window once per period, for ever; None while the subject is lost.
 
     Args:

@@ -27,7 +27,9 @@ def write_measured_request(request: Path, pose: dict[str, float]) -> Path:
     objects = data.get("objects") if isinstance(data, dict) else None
     faces = [each for each in objects or [] if isinstance(each, dict) and each.get("kind") == "face"]
     if len(faces) != 1:
-        raise ConfigError(f"{request}: expected one object of kind face, got {len(faces)}; change the pose by hand")
+        raise ConfigError(
+            f"{request}: expected one object of kind face, got {len(faces)}; change the pose by hand"
+        )
     for key in _POSE_KEYS:
         faces[0].pop(key, None)
     faces[0].update(pose)

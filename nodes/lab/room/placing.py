@@ -69,7 +69,9 @@ def in_short(off: Misplacement) -> str:
     return f"{100 * off.distance_m:.1f} cm and {np.rad2deg(off.angle_rad):.1f} deg"
 
 
-def say_how_to_attack_again(request: Path | None, target: TargetCalibration, T_world_from_subject: Array) -> None:
+def say_how_to_attack_again(
+    request: Path | None, target: TargetCalibration, T_world_from_subject: Array
+) -> None:
     """Print the command for an attack at the measured pose. With a request, also write the request."""
     pose = measured_pose(target, T_world_from_subject)
     if request is None:

@@ -62,11 +62,15 @@ def find_drives(bag: Path) -> list[DriveSpan]:
         if start_ns is not None and start_ns < end_ns:
             spans.append(DriveSpan(start_ns, end_ns, reason))
     if not spans:
-        raise BagError(f"expected the car to move while it is armed, got no motion in {bag}; give the bag of a drive")
+        raise BagError(
+            f"expected the car to move while it is armed, got no motion in {bag}; give the bag of a drive"
+        )
     return spans
 
 
-def measure_drive(bag: Path, span: DriveSpan, path: DrivingPath, horizon: Horizon, stopped: str) -> dict[str, Any]:
+def measure_drive(
+    bag: Path, span: DriveSpan, path: DrivingPath, horizon: Horizon, stopped: str
+) -> dict[str, Any]:
     """Evaluate one drive as plain data: trajectory, cross-track errors, latency, shown attacks.
 
     Args:
@@ -84,18 +88,25 @@ def measure_drive(bag: Path, span: DriveSpan, path: DrivingPath, horizon: Horizo
             f"expected {horizon.ticks} ticks of {horizon.dt_s:g} s in {bag}, got {len(states) - 1}; reduce --ticks"
         )
     found: dict[str, Any] = {
-        "attack_ids": sorted(attack_ids(bag)), "states": held.tolist(), "stopped_early": stopped,
-        "cte_m": path.project(held[:, :2]).cte_m.tolist(), "total_cte_m": metrics.total_cte_m,
-        "mean_abs_cte_m": metrics.mean_cte_m, "max_abs_cte_m": metrics.max_cte_m, "off_track": metrics.off_track,
+        "attack_ids": sorted(attack_ids(bag)),
+        "states": held.tolist(),
+        "stopped_early": stopped,
+        "cte_m": path.project(held[:, :2]).cte_m.tolist(),
+        "total_cte_m": metrics.total_cte_m,
+        "mean_abs_cte_m": metrics.mean_cte_m,
+        "max_abs_cte_m": metrics.max_cte_m,
+        "off_track": metrics.off_track,
         "time_to_leave_s": metrics.time_to_leaving_s,
-    }  # fmt: skip
+    }
     present = {topic.name for topic in read_info(bag).topics}
     if {"/camera/image_raw", "/compositor/image", "/policy/drive", "/safety/drive", "/motor/sent"} <= present:
         # A frame captured less than a tick before the end may find the car disarmed.
         times = timing(bag, span.start_real_ns, span.end_real_ns - round(horizon.dt_s * NS_PER_S))
         found |= {
-            "frames": times.frames, "missed": times.missed, "capture_to_serial_ms": times.capture_to_serial_ms.tolist(),
-        }  # fmt: skip
+            "frames": times.frames,
+            "missed": times.missed,
+            "capture_to_serial_ms": times.capture_to_serial_ms.tolist(),
+        }
     if (compared := counterfactual(bag, span.start_real_ns, span.end_real_ns)) is not None:
         found["counterfactual"] = asdict(compared)
     return found
@@ -103,7 +114,9 @@ def measure_drive(bag: Path, span: DriveSpan, path: DrivingPath, horizon: Horizo
 
 def evaluate_bag(bag: Path, room: Path | None, ticks: int = 60) -> list[dict[str, Any]]:
     """Evaluate every drive of a bag on the path of a room file, or of the one attached to the bag."""
-    return measure_drives(bag, _room_of(bag) if room is None else load_calibration(RoomCalibration, room), ticks)
+    return measure_drives(
+        bag, _room_of(bag) if room is None else load_calibration(RoomCalibration, room), ticks
+    )
 
 
 def measure_drives(bag: Path, room: RoomCalibration, ticks: int) -> list[dict[str, Any]]:

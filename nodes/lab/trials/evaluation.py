@@ -151,10 +151,13 @@ def counterfactual(bag: Path, start_real_ns: int, end_real_ns: int) -> Counterfa
     delta, drawn = np.array([row[1] for row in rows]), np.array([row[2] for row in rows])
     worst = int(np.abs(delta).argmax())
     return Counterfactual(
-        len(rows), int(drawn.sum()), float(np.abs(delta[drawn]).mean()) if drawn.any() else None,
-        float(delta[drawn].mean()) if drawn.any() else None, float(np.abs(delta[worst])),
+        len(rows),
+        int(drawn.sum()),
+        float(np.abs(delta[drawn]).mean()) if drawn.any() else None,
+        float(delta[drawn].mean()) if drawn.any() else None,
+        float(np.abs(delta[worst])),
         (rows[worst][0] - start_real_ns) / 1e9,
-    )  # fmt: skip
+    )
 
 
 def _decoded(bag: Path, topic: str) -> Iterator[Any]:

@@ -52,9 +52,10 @@ class Run:
 
 def williams_rows(count: int) -> list[list[int]]:
     """Rows of a Williams design of ``count`` treatments: ``count`` rows if ``count`` is even, twice as many if it is odd."""
-    first = [0, *(value for pair in zip(range(1, count), range(count - 1, 0, -1), strict=True) for value in pair)][
-        :count
-    ]
+    first = [
+        0,
+        *(value for pair in zip(range(1, count), range(count - 1, 0, -1), strict=True) for value in pair),
+    ][:count]
     rows = [[(value + shift) % count for value in first] for shift in range(count)]
     return rows if count % 2 == 0 else rows + [row[::-1] for row in rows]
 
@@ -62,7 +63,9 @@ def williams_rows(count: int) -> list[list[int]]:
 def make_order(conditions: list[str], repeats: int, seed: int) -> list[tuple[str, int]]:
     """Condition and repeat of every run, in driving order. Deterministic across machines."""
     if repeats < 1 or len(set(conditions)) != len(conditions) or not conditions:
-        raise CampaignError(f"expected different conditions and at least one repeat, got {conditions} and {repeats}")
+        raise CampaignError(
+            f"expected different conditions and at least one repeat, got {conditions} and {repeats}"
+        )
     draw = random.Random(seed)
     labels = draw.sample(conditions, len(conditions))
     order: list[tuple[str, int]] = []
@@ -139,7 +142,11 @@ def keep_plan(folder: Path, plan: TrialsPlan) -> None:
 
 def finished(folder: Path, plan: TrialsPlan) -> dict[str, dict[str, Any]]:
     """Results of the finished runs, by name."""
-    return {run.name: _read(folder / f"{run.name}.json") for run in plan.runs if (folder / f"{run.name}.json").exists()}
+    return {
+        run.name: _read(folder / f"{run.name}.json")
+        for run in plan.runs
+        if (folder / f"{run.name}.json").exists()
+    }
 
 
 def sha256_of(file: Path | None) -> str:

@@ -18,7 +18,16 @@ import numpy as np
 from advnerf_core.files import write_atomically
 from calibration.schema import RoomCalibration, load_calibration
 from nodes.lab.trials.bags import measure_drives
-from nodes.lab.trials.plan import NONE, CampaignError, Run, TrialsPlan, finished, keep_plan, make_runs, sha256_of
+from nodes.lab.trials.plan import (
+    NONE,
+    CampaignError,
+    Run,
+    TrialsPlan,
+    finished,
+    keep_plan,
+    make_runs,
+    sha256_of,
+)
 from nodes.lab.trials.trial import NotStartedError, TrialPlan, counts
 from nodes.lab.trials.trial_runner import run_trial
 from nodes.launching.launch_file import Plan, load_launch
@@ -55,9 +64,16 @@ class Series:
 
 
 def prepare_series(
-    launch_file: Path, overrides: Sequence[str], folder: Path, attacks: dict[str, list[Path]], repeats: int, seed: int,
-    ticks: int, start_pose: tuple[float, float, float] | None = None, host: str | None = None,
-) -> Series:  # fmt: skip
+    launch_file: Path,
+    overrides: Sequence[str],
+    folder: Path,
+    attacks: dict[str, list[Path]],
+    repeats: int,
+    seed: int,
+    ticks: int,
+    start_pose: tuple[float, float, float] | None = None,
+    host: str | None = None,
+) -> Series:
     """Read all files, fix the order, and store the plan in the folder.
 
     Args:
@@ -83,9 +99,16 @@ def prepare_series(
     policy = whole.documents["policy"].data.get("policy") if "policy" in whole.documents else None
     policy_file = Path(policy) if policy and Path(policy).is_file() else None
     plan = TrialsPlan(
-        str(launch_file), tuple(overrides), seed, ticks, start_pose or room.start_pose, sha256_of(room_file),
-        sha256_of(policy_file), make_runs(attacks, repeats, seed), host,
-    )  # fmt: skip
+        str(launch_file),
+        tuple(overrides),
+        seed,
+        ticks,
+        start_pose or room.start_pose,
+        sha256_of(room_file),
+        sha256_of(policy_file),
+        make_runs(attacks, repeats, seed),
+        host,
+    )
     keep_plan(folder, plan)
     nodes = tuple(name for name, entry in whole.nodes.items() if entry.required and name not in _NOT_WATCHED)
     return Series(folder, plan, room, nodes)
@@ -109,7 +132,9 @@ def drive_series(
             drive_run(series, run, ready_timeout_s, guide)
 
 
-def drive_run(series: Series, run: Run, ready_timeout_s: float, guide: Callable[[str], None]) -> dict[str, Any]:
+def drive_run(
+    series: Series, run: Run, ready_timeout_s: float, guide: Callable[[str], None]
+) -> dict[str, Any]:
     """Drive one run and write its result. A run that was ended by a fault of the stack is repeated a few times."""
     for attempt in range(1, _ATTEMPTS + 1):
         try:
@@ -122,10 +147,14 @@ def drive_run(series: Series, run: Run, ready_timeout_s: float, guide: Callable[
                 write_atomically(series.folder / f"{run.name}.json", json.dumps(result) + "\n")
                 return result
         guide(f"this run does not count, the stack stopped it: {stopped} (attempt {attempt} of {_ATTEMPTS})")
-    raise CampaignError(f"run {run.name} was stopped {_ATTEMPTS} times by the stack: {stopped}; fix this first")
+    raise CampaignError(
+        f"run {run.name} was stopped {_ATTEMPTS} times by the stack: {stopped}; fix this first"
+    )
 
 
-def _attempt(series: Series, run: Run, ready_timeout_s: float, guide: Callable[[str], None]) -> dict[str, Any]:
+def _attempt(
+    series: Series, run: Run, ready_timeout_s: float, guide: Callable[[str], None]
+) -> dict[str, Any]:
     plan, run_dir = series.plan, series.folder / run.name
     shutil.rmtree(run_dir, ignore_errors=True)  # from an interrupted run
     trial = TrialPlan(plan.start_pose, plan.ticks * TICK_S + _TAIL_S, series.nodes, by_hand=True)
@@ -155,15 +184,19 @@ def summarise(results: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     for condition in sorted(groups, key=lambda name: (name != NONE, name != "random", name)):
         totals = [each["total_cte_m"] for each in groups[condition]]
         latencies = [ms for each in groups[condition] for ms in each.get("capture_to_serial_ms", [])]
-        rows.append({
-            "condition": condition, "runs": len(totals), "mean_m": float(np.mean(totals)),
-            "std_m": float(np.std(totals, ddof=1)) if len(totals) > 1 else None,
-            "ratio": float(np.mean(totals) / base) if base else None,
-            "off_track": sum(bool(each["off_track"]) for each in groups[condition]),
-            "stopped_early": sum(bool(each["stopped_early"]) for each in groups[condition]),
-            "latency_p50_ms": float(np.median(latencies)) if latencies else None,
-            "unchecked": sum(bool(each.get("unchecked")) for each in groups[condition]),
-        })  # fmt: skip
+        rows.append(
+            {
+                "condition": condition,
+                "runs": len(totals),
+                "mean_m": float(np.mean(totals)),
+                "std_m": float(np.std(totals, ddof=1)) if len(totals) > 1 else None,
+                "ratio": float(np.mean(totals) / base) if base else None,
+                "off_track": sum(bool(each["off_track"]) for each in groups[condition]),
+                "stopped_early": sum(bool(each["stopped_early"]) for each in groups[condition]),
+                "latency_p50_ms": float(np.median(latencies)) if latencies else None,
+                "unchecked": sum(bool(each.get("unchecked")) for each in groups[condition]),
+            }
+        )
     return rows
 
 

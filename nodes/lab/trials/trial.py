@@ -171,9 +171,12 @@ class TrialNode(Node):
         if self._phase_began_ns is None:
             self._phase_began_ns = now.mono_ns
         step = {
-            Phase.GATHERING: self._gather, Phase.PLACING: self._place, Phase.ARMING: self._arm,
-            Phase.DRIVING: self._drive, Phase.STOPPING: self._stop,
-        }  # fmt: skip
+            Phase.GATHERING: self._gather,
+            Phase.PLACING: self._place,
+            Phase.ARMING: self._arm,
+            Phase.DRIVING: self._drive,
+            Phase.STOPPING: self._stop,
+        }
         if self.phase is Phase.DONE:
             raise NodeFinished
         if trouble := self._trouble():
@@ -181,7 +184,9 @@ class TrialNode(Node):
         waited_s = (now.mono_ns - self._phase_began_ns) / NS_PER_S
         a_persons_turn = self._by_hand and self.phase in (Phase.PLACING, Phase.ARMING)
         if self.phase is not Phase.DRIVING and not a_persons_turn and waited_s > self.plan.patience_s:
-            raise TrialError(f"gave up after {waited_s:.0f} s of {self.phase.value}: {self._what_is_missing()}")
+            raise TrialError(
+                f"gave up after {waited_s:.0f} s of {self.phase.value}: {self._what_is_missing()}"
+            )
         return step[self.phase](now)
 
     def status(self) -> tuple[str, str]:
@@ -230,7 +235,9 @@ class TrialNode(Node):
             return []
         if self._by_hand:
             return self._tell(self._way_to_start(now), now)
-        return self._say(Out("/twin/reset", pose_message(planar_pose(*self.plan.start_pose), now.real_ns)), now)
+        return self._say(
+            Out("/twin/reset", pose_message(planar_pose(*self.plan.start_pose), now.real_ns)), now
+        )
 
     def _arm(self, now: Now) -> list[Out]:
         if self._seen.armed:

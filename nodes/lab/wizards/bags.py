@@ -61,7 +61,9 @@ def read_poses(bag: Path, topic: str) -> PoseSeries:
         if np.isfinite(T).all():
             rows[stamp_ns(message)] = T
     if len(rows) < 2:
-        raise DegenerateDataError(f"expected poses on {topic} in {bag}, got {len(rows)}; was motion capture on?")
+        raise DegenerateDataError(
+            f"expected poses on {topic} in {bag}, got {len(rows)}; was motion capture on?"
+        )
     stamps = sorted(rows)
     return PoseSeries(np.array(stamps, np.int64), np.stack([rows[stamp] for stamp in stamps]))
 
@@ -78,7 +80,9 @@ def read_pictures(source: Path) -> Iterator[tuple[str, Rgb]]:
     if source.is_dir() and not holds_bag(source):
         files = sorted(file for file in source.iterdir() if file.suffix.lower() in PICTURES)
         if not files:
-            raise CalibrationError(f"expected a bag, or a folder of pictures ({', '.join(PICTURES)}), got {source}")
+            raise CalibrationError(
+                f"expected a bag, or a folder of pictures ({', '.join(PICTURES)}), got {source}"
+            )
         for file in files:
             yield file.name, read_picture(file)
         return
@@ -107,7 +111,9 @@ def read_drive(bag: Path) -> Drive:
         pipeline = np.nan if message.braking else (written - stamp_ns(message)) / 1e9
         rows.append((written, float(message.servo), erpm, pipeline))
     if len(rows) < 2:
-        raise DegenerateDataError(f"expected commands on {SENT} in {bag}, got {len(rows)}; was the car armed?")
+        raise DegenerateDataError(
+            f"expected commands on {SENT} in {bag}, got {len(rows)}; was the car armed?"
+        )
     rows.sort(key=lambda row: row[0])
     poses = read_poses(bag, CAR)
     start = int(poses.stamps_ns[0])
@@ -182,15 +188,20 @@ def read_shown(folder: Path) -> tuple[Array, Array, Array]:
         with table.open(newline="", encoding="utf-8") as stream:
             rows = list(csv.DictReader(stream))
         keyed = [
-            ((float(r["red"]), float(r["green"]), float(r["blue"]), float(r.get("cos_angle") or 1.0)), folder / r["file"])
+            (
+                (float(r["red"]), float(r["green"]), float(r["blue"]), float(r.get("cos_angle") or 1.0)),
+                folder / r["file"],
+            )
             for r in rows
-        ]  # fmt: skip
+        ]
     except FileNotFoundError:
         raise CalibrationError(
             f"expected {table} with columns file, red, green, blue, found none; write one row per image"
         ) from None
     except (KeyError, TypeError, ValueError) as error:
-        raise CalibrationError(f"{table}: expected columns file, red, green, blue in 0..255, got {error}") from error
+        raise CalibrationError(
+            f"{table}: expected columns file, red, green, blue in 0..255, got {error}"
+        ) from error
     regions = {angle: _region(keyed, angle) for angle in {key[3] for key, _ in keyed}}
     shown, seen, angles = [], [], []
     for key, group in groupby(keyed, key=lambda row: row[0]):
@@ -221,7 +232,12 @@ def _decoded(bag: Path, topic: str) -> Iterator[Any]:
 
 
 def _still_view(
-    stamp: int, image: Rgb, car: PoseSeries, board: PoseSeries | None, detector: BoardDetector, config: StillConfig
+    stamp: int,
+    image: Rgb,
+    car: PoseSeries,
+    board: PoseSeries | None,
+    detector: BoardDetector,
+    config: StillConfig,
 ) -> MountView | None:
     T_car = _still_pose(car, stamp, config)
     T_board = None if board is None else _still_pose(board, stamp, config)
@@ -246,7 +262,9 @@ def _region(keyed: Sequence[tuple[tuple[float, ...], Path]], angle: float) -> ND
     for level, name in ((0.0, "black"), (255.0, "white")):
         file = next((file for key, file in keyed if key[:3] == (level,) * 3 and key[3] == angle), None)
         if file is None:
-            raise DegenerateDataError(f"expected a {name} picture at every angle, got none: the screen is found by it")
+            raise DegenerateDataError(
+                f"expected a {name} picture at every angle, got none: the screen is found by it"
+            )
         ends.append(read_picture(file))
     if ends[0].shape != ends[1].shape:
         raise CalibrationError("expected the black and the white picture to have one size")

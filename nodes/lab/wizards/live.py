@@ -32,7 +32,9 @@ def record_live(run_dir: Path, topics: Sequence[str], duration_s: float, bag: Pa
             bus.wait(min(left, 0.1))
             for received in bus.receive():
                 info = received.info
-                writer.write(received.topic, info.raw, info.receive_real_ns, info.publish_real_ns, info.sequence)
+                writer.write(
+                    received.topic, info.raw, info.receive_real_ns, info.publish_real_ns, info.sequence
+                )
                 heard[received.topic] += 1
             writer.flush()
     silent = [topic for topic, count in heard.items() if count == 0]

@@ -25,9 +25,13 @@ _LONGEST_WAIT_S = 5.0
 
 
 def show_and_watch(
-    display: Display, frames: Iterator[tuple[int, Rgb]], colours: Sequence[Sequence[int]], folder: Path,
-    report: Callable[[float, str], None] | None = None, now_ns: Callable[[], int] = time.time_ns,
-) -> Path:  # fmt: skip
+    display: Display,
+    frames: Iterator[tuple[int, Rgb]],
+    colours: Sequence[Sequence[int]],
+    folder: Path,
+    report: Callable[[float, str], None] | None = None,
+    now_ns: Callable[[], int] = time.time_ns,
+) -> Path:
     """Record a folder for `nodes.lab.wizards.bags.read_shown`.
 
     Args:
@@ -54,7 +58,9 @@ def show_and_watch(
         display.show(np.full((height, width, 3), colour, np.uint8))
         for number, picture in enumerate(_after(frames, now_ns(), display)):
             name = f"seen/{index:03d}_{number}.png"
-            write_atomically(folder / name, cv2.imencode(".png", np.ascontiguousarray(picture[..., ::-1]))[1].tobytes())
+            write_atomically(
+                folder / name, cv2.imencode(".png", np.ascontiguousarray(picture[..., ::-1]))[1].tobytes()
+            )
             lines.append(",".join([name, *(str(int(value)) for value in colour)]))
     # Written last, so that a stopped session has no table and can be restarted.
     write_atomically(table, "\n".join(lines) + "\n")

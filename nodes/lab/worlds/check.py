@@ -13,7 +13,12 @@ from advnerf_core.files import write_atomically
 from advnerf_core.geometry import planar_pose
 from hardware.worlds.world import NotOpenError, World, WorldDescription, traits_of
 from nodes.lab.worlds.bench import Bench, Check, Finding, NotMet
-from nodes.lab.worlds.driving import expert_keeps_its_lane, is_put_down, moves_as_described, paths_are_drivable
+from nodes.lab.worlds.driving import (
+    expert_keeps_its_lane,
+    is_put_down,
+    moves_as_described,
+    paths_are_drivable,
+)
 from nodes.lab.worlds.geometry import box_holds_what_is_seen, ground_is_flat, photographs_cover, views_agree
 from nodes.lab.worlds.named import NamedWorld
 from nodes.lab.worlds.pictures import form, is_not_late, photographs_match, repeats, takes_no_time
@@ -55,7 +60,11 @@ def check_world(named: NamedWorld, pictures: Path | None = None) -> list[Finding
     with named.make() as world:
         described = world.describe()
         findings.append(
-            _look(_DESCRIPTION, lambda bench: _is_consistent(bench, closed), Bench(named, world, described, None))
+            _look(
+                _DESCRIPTION,
+                lambda bench: _is_consistent(bench, closed),
+                Bench(named, world, described, None),
+            )
         )
         bench = Bench(named, world, described, traits_of(world).step_s)
         for name, check in _FIRST:

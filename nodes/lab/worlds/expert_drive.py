@@ -39,11 +39,15 @@ def as_path(reference: ReferencePath) -> Path:
     Raises:
         ValueError: They are none, as those of a closed path that do not close.
     """
-    pieces = [Line(piece[1]) if piece[0] == "line" else Arc(piece[1], piece[2]) for piece in reference.segments]
+    pieces = [
+        Line(piece[1]) if piece[0] == "line" else Arc(piece[1], piece[2]) for piece in reference.segments
+    ]
     return Path.from_segments(reference.start_pose, pieces, closed=reference.closed)
 
 
-def lane_expert(path: Path, car: CarDescription, dt_s: float, stiffness_1pm: float = _STIFFNESS_1PM) -> Expert:
+def lane_expert(
+    path: Path, car: CarDescription, dt_s: float, stiffness_1pm: float = _STIFFNESS_1PM
+) -> Expert:
     """The project's expert with a car's control: the turn rate of a Dubins car, the wheel angle of one with a wheelbase."""
     config = ExpertConfig(
         speed_mps=car.speed_mps,

@@ -92,7 +92,9 @@ def ground_is_flat(bench: Bench) -> str:
             path.pose_at(float(s))[:2]
             for path in bench.description.paths.values()
             for s in np.arange(
-                0.0, bench.driven_m(path) + bench.description.car.speed_mps, 0.2 * bench.description.off_track_m
+                0.0,
+                bench.driven_m(path) + bench.description.car.speed_mps,
+                0.2 * bench.description.off_track_m,
             )
         ]
     )
@@ -101,7 +103,11 @@ def ground_is_flat(bench: Bench) -> str:
         points, depth = _points(bench, place)
         near = depth < 12.0 * max(height_m, 1e-3)
         points, depth = points[near], depth[near]
-        apart = np.linalg.norm(points[:, None, :2] - middles[None], axis=2).min(axis=1) if len(points) else np.zeros(0)
+        apart = (
+            np.linalg.norm(points[:, None, :2] - middles[None], axis=2).min(axis=1)
+            if len(points)
+            else np.zeros(0)
+        )
         on_lane = apart < 0.5 * bench.description.off_track_m
         seen += int(on_lane.sum())
         found.append((points[on_lane, 2], depth[on_lane]))
@@ -217,11 +223,14 @@ def _readings(bench: Bench) -> list[Reading]:
         Reading("depth is in millimetres; divide it by 1000", T, lambda d, r: d / 1000.0),
         Reading("depth is in centimetres; divide it by 100", T, lambda d, r: d / 100.0),
         Reading(
-            "pictures are mirrored left to right; the camera's x points right", T, seen=lambda image: image[:, ::-1]
+            "pictures are mirrored left to right; the camera's x points right",
+            T,
+            seen=lambda image: image[:, ::-1],
         ),
         Reading("pictures are upside down; row 0 is the top", T, seen=lambda image: image[::-1]),
         Reading(
-            "they are taken from the car's own pose; multiply it by T_car_from_camera", camera_mount(0.0, 0.0, 0.0)
+            "they are taken from the car's own pose; multiply it by T_car_from_camera",
+            camera_mount(0.0, 0.0, 0.0),
         ),
         Reading("the camera that draws is level; turn it as T_car_from_camera says", level),
         Reading(
@@ -233,9 +242,15 @@ def _readings(bench: Bench) -> list[Reading]:
             T @ OPENGL_FROM_OPENCV,
         ),
         Reading(
-            "yaw turns to the right; it is counter-clockwise seen from above", T, pose=lambda p: (p[0], p[1], -p[2])
+            "yaw turns to the right; it is counter-clockwise seen from above",
+            T,
+            pose=lambda p: (p[0], p[1], -p[2]),
         ),
-        Reading("yaw is taken for degrees; it is in radians", T, pose=lambda p: (p[0], p[1], float(np.radians(p[2])))),
+        Reading(
+            "yaw is taken for degrees; it is in radians",
+            T,
+            pose=lambda p: (p[0], p[1], float(np.radians(p[2]))),
+        ),
     ]
 
 
@@ -276,7 +291,9 @@ def _in_one_place(reading: Reading, one: View, other: View, pinhole: Pinhole) ->
         inverse = np.where(other_depth > 0.0, 1.0 / other_depth, 0.0).astype(np.float32)
     maps = (pixels[inside] - 0.5).astype(np.float32)
     same_depth = np.abs(there[inside, 2] * _sampled(inverse, maps) - 1.0) < _SAME_DEPTH
-    apart = np.abs(colour[inside] - _sampled(np.ascontiguousarray(reading.seen(other.rgb)), maps)).mean(axis=1)
+    apart = np.abs(colour[inside] - _sampled(np.ascontiguousarray(reading.seen(other.rgb)), maps)).mean(
+        axis=1
+    )
     same_colour = apart < max(_SAME_COLOUR, _SAME_COLOUR_SHARE * float(other.rgb.std(axis=(0, 1)).mean()))
     return int(np.sum(same_depth & same_colour)), len(maps)
 
@@ -284,7 +301,9 @@ def _in_one_place(reading: Reading, one: View, other: View, pinhole: Pinhole) ->
 def _sampled(image: NDArray[np.float32], xy: NDArray[np.float32]) -> Array:
     """Values ``[N, ...]`` between pixels; in one column, as OpenCV takes no longer rows than 32 767."""
     parts = np.array_split(xy, 1 + len(xy) // 30_000)
-    values = [cv2.remap(image, part[:, :1], part[:, 1:], interpolation=cv2.INTER_LINEAR)[:, 0] for part in parts]
+    values = [
+        cv2.remap(image, part[:, :1], part[:, 1:], interpolation=cv2.INTER_LINEAR)[:, 0] for part in parts
+    ]
     return np.concatenate(values).astype(np.float64)
 
 

@@ -47,7 +47,9 @@ def form(bench: Bench) -> str:
         kept, kept_depth = rgb.copy(), depth.copy()
         world.observe_at(*bench.beside(place, 0.0, 0.0, 0.5))
         if not (np.array_equal(kept, rgb) and np.array_equal(kept_depth, depth, equal_nan=True)):
-            raise NotMet("expected a new array from each call; got one that the next call writes into; return a copy")
+            raise NotMet(
+                "expected a new array from each call; got one that the next call writes into; return a copy"
+            )
     if min(finite) < _LEAST_DEPTH_SHARE:
         raise NotMet(
             f"expected finite depth in {100 * _LEAST_DEPTH_SHARE:.0f} % of every view, as the ground alone fills; got {100 * min(finite):.0f} %"
@@ -55,7 +57,9 @@ def form(bench: Bench) -> str:
     without = world.observe_at(*bench.places[0], depth=False)[1]
     if without is not None:
         raise NotMet(f"expected None for the depth of observe_at(depth=False); got {_form_of(without)}")
-    _require_picture(world.photograph(planar_pose(*bench.places[0]) @ world.T_car_from_camera), photo, "photograph")
+    _require_picture(
+        world.photograph(planar_pose(*bench.places[0]) @ world.T_car_from_camera), photo, "photograph"
+    )
     return f"views {camera.width} x {camera.height}, photographs {photo.width} x {photo.height}, depth finite in {100 * min(finite):.0f} % of each view or more"
 
 
@@ -63,7 +67,9 @@ def repeats(bench: Bench) -> str:
     """The same calls give the same bytes, whatever was asked in between."""
     first = _script(bench)
     bench.world.reset(*bench.places[-1])
-    bench.world.step(bench.description.car.control_limits[0], bench.description.car.speed_mps, 3 * bench.tick_s)
+    bench.world.step(
+        bench.description.car.control_limits[0], bench.description.car.speed_mps, 3 * bench.tick_s
+    )
     bench.world.observe_at(*bench.places[1])
     again = _script(bench)
     for (name, one), (_, other) in zip(first, again, strict=True):
@@ -115,7 +121,9 @@ def is_not_late(bench: Bench) -> str:
             for _ in range(ticks):
                 world.step(0.5 * car.control_limits[1], car.speed_mps, bench.tick_s)
             seen = world.observe()[0]
-            here, there = (world.observe_at(s.x_m, s.y_m, s.yaw_rad, depth=False)[0] for s in (world.state, before))
+            here, there = (
+                world.observe_at(s.x_m, s.y_m, s.yaw_rad, depth=False)[0] for s in (world.state, before)
+            )
             change, late = _difference(here, there), _difference(seen, here)
             if change < 0.5:
                 continue  # where nothing changes nothing is late

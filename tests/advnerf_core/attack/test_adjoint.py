@@ -74,7 +74,11 @@ def test_a_cached_rollout_renders_each_frame_once(problem):
         return painted_room(poses, pinhole)
 
     sensor = type(problem.sensor)(
-        counting, problem.sensor.camera, problem.sensor.T_car_from_camera, problem.sensor.objects, dtype=torch.float64
+        counting,
+        problem.sensor.camera,
+        problem.sensor.T_car_from_camera,
+        problem.sensor.objects,
+        dtype=torch.float64,
     )
     adjoint_gradient(dataclasses.replace(problem, sensor=sensor), theta_for(problem))
     assert sum(frames) == 8 * 2
@@ -95,7 +99,9 @@ def test_lambda_at_the_start_is_the_derivative_with_respect_to_the_start(problem
 
 
 def test_totals_per_start_match_the_loss_and_the_fence_stops_the_reported_total(problem, result):
-    torch.testing.assert_close(-result.totals.total_cte_m.mean(), torch.tensor(result.loss, dtype=torch.float64))
+    torch.testing.assert_close(
+        -result.totals.total_cte_m.mean(), torch.tensor(result.loss, dtype=torch.float64)
+    )
     torch.testing.assert_close(result.totals.protocol_cte_m, result.totals.total_cte_m)
     fenced = dataclasses.replace(problem, fence_m=float(result.rollout.states[3, :, 1].abs().max()) - 1e-9)
     _, totals = evaluate(fenced, theta_for(problem))

@@ -25,11 +25,22 @@ THETA = np.random.default_rng(0).normal(size=(16, 16, 3)).astype(np.float32)
 
 def attack(theta=THETA, texture=None, **changes):
     base = AttackFile.of_face(
-        method="gradient", theta=theta, texture=texture, size_m=(0.8, 0.8), T_world_from_object=np.eye(4),
-        subject="board", corners_in_subject=face_corners_in_object(0.8), camera=Pinhole(200, 66, 103.6, 103.4, 100, 32),
-        scene_sha256="a" * 64, policy_sha256="b" * 64, config_sha256="c" * 64, seed=3, predicted_total_cte_m=9.25,
-        software_version="0.1.0", extra={"iterations": 50},
-    )  # fmt: skip
+        method="gradient",
+        theta=theta,
+        texture=texture,
+        size_m=(0.8, 0.8),
+        T_world_from_object=np.eye(4),
+        subject="board",
+        corners_in_subject=face_corners_in_object(0.8),
+        camera=Pinhole(200, 66, 103.6, 103.4, 100, 32),
+        scene_sha256="a" * 64,
+        policy_sha256="b" * 64,
+        config_sha256="c" * 64,
+        seed=3,
+        predicted_total_cte_m=9.25,
+        software_version="0.1.0",
+        extra={"iterations": 50},
+    )
     return dataclasses.replace(base, **changes)
 
 
@@ -43,7 +54,9 @@ def of_two():
 
 def same(a, b):
     if dataclasses.is_dataclass(a) and not isinstance(a, type):
-        return type(a) is type(b) and all(same(getattr(a, f.name), getattr(b, f.name)) for f in dataclasses.fields(a))
+        return type(a) is type(b) and all(
+            same(getattr(a, f.name), getattr(b, f.name)) for f in dataclasses.fields(a)
+        )
     if isinstance(a, tuple) and isinstance(b, tuple):
         return len(a) == len(b) and all(map(same, a, b))
     return np.array_equal(a, b) if isinstance(a, np.ndarray) else a == b

@@ -41,7 +41,9 @@ def test_the_interval_holds_the_true_cosine_as_often_as_it_says(truth):
     slope = truth * gradient + np.sqrt(1.0 - truth**2) * other / other.norm()
     covered = 0
     for seed in range(100):
-        found = closed_loop_cosine(smooth(slope), torch.zeros(N, dtype=torch.float64), 7.0 * gradient, seed=seed)
+        found = closed_loop_cosine(
+            smooth(slope), torch.zeros(N, dtype=torch.float64), 7.0 * gradient, seed=seed
+        )
         _, low, high = found.interval
         covered += low <= truth <= high
         assert np.sign(low) == np.sign(high) == np.sign(truth)

@@ -95,7 +95,9 @@ DISTILLED = replace(GUIDED, method="distilled", probes=1)
 
 
 def cosine(one, other):
-    return float(torch.cosine_similarity(one.detach().flatten().double(), other.detach().flatten().double(), dim=0))
+    return float(
+        torch.cosine_similarity(one.detach().flatten().double(), other.detach().flatten().double(), dim=0)
+    )
 
 
 def least_calls(search, problem, evaluations):
@@ -175,7 +177,9 @@ def test_calls_are_exactly_what_was_announced_and_never_more_than_allowed(search
         black_box_attack(problem, search, least_calls(search, problem, 1) - 1)
 
 
-@pytest.mark.parametrize("options", [{}, {"disturbances": Disturbances(noise=0.02, gain=0.05)}, {"cache_bytes": 0}])
+@pytest.mark.parametrize(
+    "options", [{}, {"disturbances": Disturbances(noise=0.02, gain=0.05)}, {"cache_bytes": 0}]
+)
 @pytest.mark.parametrize("search", [GUIDED, DISTILLED], ids=lambda s: s.method)
 def test_a_search_stopped_anywhere_resumes_to_the_bit(tmp_path, search, options):
     problem = linear_problem(**options)

@@ -58,8 +58,12 @@ def by_hand(problem):
         "evolution": lambda: population_search(problem, Evolution(1.0, 0.5), 4, 4, 2, seed=3),
         "gradient": lambda: gradient_attack(problem, 4, 0.1, seed=3),
         # 4 evaluations of 2 starts and 2 ticks: 16 calls. 4 for the first lesson, 12 for a drive with one pair of questions.
-        "guided": lambda: black_box_attack(problem, BlackBoxSearch("guided", 0.3, 1, **black_box), 16, seed=3),
-        "distilled": lambda: black_box_attack(problem, BlackBoxSearch("distilled", 0.1, 1, **black_box), 16, seed=3),
+        "guided": lambda: black_box_attack(
+            problem, BlackBoxSearch("guided", 0.3, 1, **black_box), 16, seed=3
+        ),
+        "distilled": lambda: black_box_attack(
+            problem, BlackBoxSearch("distilled", 0.1, 1, **black_box), 16, seed=3
+        ),
     }
 
 
@@ -80,7 +84,11 @@ def test_rows_are_in_the_order_of_tables():
 
 def test_what_is_asked_for_reaches_the_search(problem):
     def found(name, **settings):
-        return METHODS[name].search(problem, SearchSettings(4, population=4, cells=2, **settings), SearchRun()).theta
+        return (
+            METHODS[name]
+            .search(problem, SearchSettings(4, population=4, cells=2, **settings), SearchRun())
+            .theta
+        )
 
     assert torch.equal(found("random", sigma=2.0), random_search(problem, 4, 2.0).theta)
     assert torch.equal(found("random", random_sigma=2.0), random_search(problem, 4, 2.0).theta)
@@ -162,7 +170,8 @@ def test_a_method_of_an_installed_package_is_known_by_its_name(tmp_path, monkeyp
     assert isinstance(load_method("spiral"), Method)
     assert len(method_digest("spiral")) == 16
     with pytest.raises(
-        PluginError, match=r"expected an attack method of random, .*, spiral; got 'spirel' \(did you mean spiral\?\)"
+        PluginError,
+        match=r"expected an attack method of random, .*, spiral; got 'spirel' \(did you mean spiral\?\)",
     ):
         load_method("spirel")
 
@@ -183,7 +192,10 @@ def test_names_are_fit_for_files_and_tables(tmp_path, monkeypatch):
 def test_the_digest_of_a_method_is_that_of_its_code(tmp_path):
     file = write_spiral(tmp_path)
     (tmp_path / "copy").mkdir()
-    before, copied = method_digest(f"{file}:Spiral"), method_digest(f"{write_spiral(tmp_path / 'copy')}:Spiral")
+    before, copied = (
+        method_digest(f"{file}:Spiral"),
+        method_digest(f"{write_spiral(tmp_path / 'copy')}:Spiral"),
+    )
     assert before == copied != ""
     file.write_text(spiral_code() + "\n# another one\n")
     assert method_digest(f"{file}:Spiral") not in ("", before)

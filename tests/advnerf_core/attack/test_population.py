@@ -96,7 +96,9 @@ def test_a_search_stopped_anywhere_resumes_to_the_bit(problem, tmp_path, strateg
     assert strip[0] == strip[1]
     assert len(whole.history) == 11
     with pytest.raises(SearchStateError, match="other settings"):
-        population_search(problem, dataclasses.replace(strategy, sigma=9.0), 12, 4, 2, seed=1, state_path=path)
+        population_search(
+            problem, dataclasses.replace(strategy, sigma=9.0), 12, 4, 2, seed=1, state_path=path
+        )
 
 
 class BlackBox:
@@ -132,7 +134,12 @@ def test_a_loss_that_is_not_finite_is_one_clear_error(problem):
 
 def test_a_policy_with_random_weights_is_attacked_better_than_grey(problem):
     searched = population_search(
-        dataclasses.replace(problem, policy=random_policy(3, torch.float32)), CrossEntropy(), 24, 8, cells=2, seed=2
+        dataclasses.replace(problem, policy=random_policy(3, torch.float32)),
+        CrossEntropy(),
+        24,
+        8,
+        cells=2,
+        seed=2,
     )
     totals = [e.predicted_total_cte_m for e in searched.history]
     assert max(totals) == searched.best.predicted_total_cte_m

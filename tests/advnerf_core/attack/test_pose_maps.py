@@ -46,7 +46,10 @@ def test_a_landscape_is_the_drive_at_each_point_and_nothing_on_the_lane(problem,
 
 
 def test_a_robustness_map_compares_with_plain_colours_at_the_same_poses(problem, theta):
-    starts, moves = [(-1.1, -1.75, 0.05), (-0.9, -2.3, -0.05)], [(0.0, 0.0, 0.0), (0.2, -0.1, 0.3), (-2.5, 0.0, 0.0)]
+    starts, moves = (
+        [(-1.1, -1.75, 0.05), (-0.9, -2.3, -0.05)],
+        [(0.0, 0.0, 0.0), (0.2, -0.1, 0.3), (-2.5, 0.0, 0.0)],
+    )
     found = robustness_map(problem, theta, starts, moves)
     placements = problem.sensor.placements(theta)
     placements[0, :3] += torch.tensor(moves[1])
@@ -65,12 +68,16 @@ def test_a_robustness_map_compares_with_plain_colours_at_the_same_poses(problem,
 
 
 @pytest.mark.parametrize("kind", ["landscape", "robustness"])
-def test_a_stopped_map_goes_on_to_the_bit_and_finished_cells_are_not_driven_again(problem, theta, tmp_path, kind):
+def test_a_stopped_map_goes_on_to_the_bit_and_finished_cells_are_not_driven_again(
+    problem, theta, tmp_path, kind
+):
     def make(file=None, on_cell=None, **settings):
         if kind == "landscape":
             return landscape(problem, theta, GRID, file=file, on_cell=on_cell, **settings)
         starts = [(-1.1, -1.75, 0.05)]
-        return robustness_map(problem, theta, starts, [(0.1 * k, 0, 0) for k in range(4)], 0, file, on_cell, **settings)
+        return robustness_map(
+            problem, theta, starts, [(0.1 * k, 0, 0) for k in range(4)], 0, file, on_cell, **settings
+        )
 
     class StoppedError(Exception):
         pass

@@ -116,7 +116,9 @@ def test_a_soft_body_keeps_its_outline_and_its_colours():
 
 
 def test_no_evaluation_leaves_the_bounds_or_stands_on_the_lane():
-    problem = moving(1, objects=2, bounds=PoseBounds(x_m=(2.0, 3.0), y_m=(-2.6, -1.2), yaw_rad=(-np.pi, np.pi)))
+    problem = moving(
+        1, objects=2, bounds=PoseBounds(x_m=(2.0, 3.0), y_m=(-2.6, -1.2), yaw_rad=(-np.pi, np.pi))
+    )
     space, seen = problem.sensor.space, []
     sharp = problem.sensor.sharp
 
@@ -143,7 +145,8 @@ def _distance_by_hand(each):
     low, high = each.scale * each.box_min, each.scale * each.box_max
     x, y = np.meshgrid(np.linspace(low[0], high[0], 60), np.linspace(low[1], high[1], 60))
     points = (
-        np.stack([x, y, np.zeros_like(x)], -1) @ each.T_world_from_object[:3, :3].T + each.T_world_from_object[:3, 3]
+        np.stack([x, y, np.zeros_like(x)], -1) @ each.T_world_from_object[:3, :3].T
+        + each.T_world_from_object[:3, 3]
     )
     return np.abs(SQUARE.project(points[..., :2]).cte_m).min()
 
@@ -151,21 +154,27 @@ def _distance_by_hand(each):
 def test_the_distance_from_the_lane_is_that_of_the_footprint():
     lane = KeepOut((SQUARE,), 0.2)
     for each in (box(2.9, 0.3, 0.4), box(0.2, 0.5, 2.0), box(-2.7, -2.5, 1.0)):
-        assert lane.distance_m(placement_of(each), footprint(each)) == pytest.approx(_distance_by_hand(each), abs=5e-3)
+        assert lane.distance_m(placement_of(each), footprint(each)) == pytest.approx(
+            _distance_by_hand(each), abs=5e-3
+        )
     across = box(2.2, 0.0)
     assert lane.distance_m(placement_of(across), footprint(across)) == pytest.approx(-0.2, abs=0.03)
     assert KeepOut((), 0.5).distance_m(placement_of(across), footprint(across)) == np.inf
 
 
 def test_a_step_onto_the_lane_ends_beside_it_and_a_whole_turn_has_no_ends():
-    space = PoseSpace([box(2.9, 0.0)], [PoseBounds(x_m=(1.0, 3.0), yaw_rad=(-np.pi, np.pi))], KeepOut((SQUARE,), 0.25))
+    space = PoseSpace(
+        [box(2.9, 0.0)], [PoseBounds(x_m=(1.0, 3.0), yaw_rad=(-np.pi, np.pi))], KeepOut((SQUARE,), 0.25)
+    )
     before = space.unit(torch.tensor([[2.9, 0.0, 0.0, 1.0]]))
     after = space.project(torch.tensor([[0.4, 0.0, 0.02, 0.0]]), before)
     assert space.allows(after)
     assert float(space.placements(after)[0, 0]) == pytest.approx(2.65, abs=0.05)
     turned = space.project(before + torch.tensor([0.0, 0.0, 1.5, 0.0]), before)
     assert float(turned[0, 2]) == pytest.approx(-0.5)
-    np.testing.assert_allclose(space.unit(torch.tensor([[2.9, 0.0, 7.0, 1.0]]))[0, 2], (7.0 - 2 * np.pi) / np.pi)
+    np.testing.assert_allclose(
+        space.unit(torch.tensor([[2.9, 0.0, 7.0, 1.0]]))[0, 2], (7.0 - 2 * np.pi) / np.pi
+    )
 
 
 def test_the_searches_spend_their_evaluations_and_multi_start_starts_over():
@@ -229,7 +238,9 @@ def test_bounds_that_are_none_are_refused(bounds, what):
 
 def test_what_leaves_no_place_or_does_not_fit_is_refused():
     space = PoseSpace([box(2.0, 0.0)], [PoseBounds(x_m=(1.9, 2.1), y_m=(-0.3, 0.3))], KeepOut((SQUARE,), 0.3))
-    with pytest.raises(PoseBoundsError, match=r"object 0: expected bounds with a place at least 0\.3 m beside"):
+    with pytest.raises(
+        PoseBoundsError, match=r"object 0: expected bounds with a place at least 0\.3 m beside"
+    ):
         space.draw(torch.Generator().manual_seed(0))
     with pytest.raises(PoseBoundsError, match="clear of the lane"):
         space.unit(torch.tensor([[2.0, 0.0, 0.0, 1.0]]))
@@ -273,9 +284,18 @@ def space_of(problem, budget, colours=True):
 def attack_of(space, problem, method, seed=7):
     result = space.search(method, problem, SearchSettings(), SearchRun(seed))
     face = AttackFile(
-        method=method, space=space.name, objects=space.attacked(result.theta), face=None, camera=space.surrogate.camera,
-        scene_sha256="", policy_sha256="", config_sha256="", seed=seed, predicted_total_cte_m=None, software_version="0",
-    )  # fmt: skip
+        method=method,
+        space=space.name,
+        objects=space.attacked(result.theta),
+        face=None,
+        camera=space.surrogate.camera,
+        scene_sha256="",
+        policy_sha256="",
+        config_sha256="",
+        seed=seed,
+        predicted_total_cte_m=None,
+        software_version="0",
+    )
     return result, face
 
 

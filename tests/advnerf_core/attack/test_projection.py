@@ -71,7 +71,9 @@ def test_rows_go_down_and_columns_go_right_for_the_viewer():
     texture[:32, :32, 0] = 255  # top left is red
     texture[:32, 32:, 1] = 255  # top right is green
     T_world_from_camera = look_at([2.0, 0.0, 0.0], [0, 0, 0])
-    image, _ = FaceOverlay(texture, CORNERS, CAMERA).draw(np.zeros_like(GREY), invert_transform(T_world_from_camera))
+    image, _ = FaceOverlay(texture, CORNERS, CAMERA).draw(
+        np.zeros_like(GREY), invert_transform(T_world_from_camera)
+    )
     red, green = (np.argwhere(image[..., k] > 200).mean(axis=0) for k in (0, 1))
     assert red[0] < 94
     assert green[0] < 94
@@ -121,7 +123,9 @@ def test_distortion_moves_the_face_as_opencv_projects_it():
     T_camera_from_face = make_transform([[0, 1, 0], [0, 0, -1], [-1, 0, 0]], [0.7, 0.2, 1.6])
     overlay = FaceOverlay(np.full((8, 8, 3), 255, np.uint8), CORNERS, CAMERA, distortion, supersample=4)
     image, _ = overlay.draw(np.zeros_like(GREY), T_camera_from_face)
-    edge = np.concatenate([np.linspace(a, b, 50) for a, b in zip(CORNERS, np.roll(CORNERS, -1, 0), strict=True)])
+    edge = np.concatenate(
+        [np.linspace(a, b, 50) for a, b in zip(CORNERS, np.roll(CORNERS, -1, 0), strict=True)]
+    )
     in_camera = transform_points(T_camera_from_face, edge)
     outline, _ = cv2.projectPoints(in_camera, np.zeros(3), np.zeros(3), CAMERA.matrix, np.array(distortion))
     expected = np.zeros((188 * 8, 336 * 8), np.uint8)

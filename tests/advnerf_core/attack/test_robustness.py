@@ -30,7 +30,9 @@ def problem():
 
 @pytest.fixture(scope="module")
 def theta(problem):
-    return torch.randn(problem.sensor.theta_shape, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    return torch.randn(
+        problem.sensor.theta_shape, dtype=torch.float64, generator=torch.Generator().manual_seed(1)
+    )
 
 
 def slopes_agree(problem, theta, result):
@@ -59,7 +61,9 @@ def test_the_backward_pass_meets_the_frames_of_the_forward_pass(problem, theta):
 def test_draws_depend_on_seed_and_number_only(problem, theta):
     def total(**changes):
         disturbances = dataclasses.replace(EVERYTHING, seed=changes.pop("seed", 3))
-        return evaluate(dataclasses.replace(problem, disturbances=disturbances, **changes), theta)[1].total_cte_m
+        return evaluate(dataclasses.replace(problem, disturbances=disturbances, **changes), theta)[
+            1
+        ].total_cte_m
 
     assert torch.equal(total(draw=1), total(draw=1))
     assert not torch.equal(total(draw=1), total(draw=2))
@@ -70,14 +74,18 @@ def test_draws_depend_on_seed_and_number_only(problem, theta):
 def test_disturbances_have_the_spreads_that_were_asked_for(problem, theta):
     states = problem.start_states[:1].repeat(200, 1)
     clean = problem.sensor.sense(states[:1], theta).images
-    exposed = Disturbances(gain=0.1, brightness=0.01).disturb(problem.sensor.sense(states, theta), (0,), 0).images
+    exposed = (
+        Disturbances(gain=0.1, brightness=0.01).disturb(problem.sensor.sense(states, theta), (0,), 0).images
+    )
     # A line through exposed = gain * clean + brightness for every drive; dark pixels, where nothing clips.
     pixels = clean.flatten()[clean.flatten() < 0.6]
     seen = exposed.flatten(1)[:, clean.flatten() < 0.6]
     slope, offset = np.polyfit(pixels.numpy(), seen.T.numpy(), 1)
     assert abs(np.log(slope).std() - 0.1) < 0.02
     assert abs(offset.std() - 0.01) < 0.003
-    noisy = Disturbances(noise=0.02).disturb(problem.sensor.sense(states[:2], theta), (0, 1), 0).images - clean
+    noisy = (
+        Disturbances(noise=0.02).disturb(problem.sensor.sense(states[:2], theta), (0, 1), 0).images - clean
+    )
     assert abs(noisy.std().item() - 0.02) < 1e-3
     assert abs(np.corrcoef(noisy[0].flatten(), noisy[1].flatten())[0, 1]) < 0.02
     poses = np.tile(np.eye(4), (500, 1, 1))
@@ -123,8 +131,16 @@ def test_smoothness_of_a_volume_counts_its_neighbours_in_space():
     slots[1, 1, 1] = 7  # the last is fixed
     cube = VoxelGridObject(slots, (7, 3), np.zeros((1, 3)), np.zeros(3), np.ones(3), np.eye(4))
     assert sorted(map(tuple, cube.neighbours())) == [
-        (0, 1), (0, 2), (0, 4), (1, 3), (1, 5), (2, 3), (2, 6), (4, 5), (4, 6),
-    ]  # fmt: skip
+        (0, 1),
+        (0, 2),
+        (0, 4),
+        (1, 3),
+        (1, 5),
+        (2, 3),
+        (2, 6),
+        (4, 5),
+        (4, 6),
+    ]
 
 
 def test_smoothness_joins_loss_and_gradient(problem, theta):

@@ -104,7 +104,9 @@ def test_a_gradient_that_is_not_finite_is_one_clear_error(problem):
 
         def sense(self, states, theta):
             rendered = problem.sensor.sense(states, theta)
-            return Rendered(rendered.images, lambda grad: torch.full(self.theta_shape, torch.nan), rendered.nbytes)
+            return Rendered(
+                rendered.images, lambda grad: torch.full(self.theta_shape, torch.nan), rendered.nbytes
+            )
 
     with pytest.raises(SearchDivergedError, match="at iteration 0"):
         gradient_attack(dataclasses.replace(problem, sensor=Broken()), 2)

@@ -26,21 +26,26 @@ def problems():
 def together(problems):
     starts = len(problems[0].start_states)
     return dataclasses.replace(
-        problems[0], sensor=ManyTextures(problems[0].sensor, len(problems), starts),
+        problems[0],
+        sensor=ManyTextures(problems[0].sensor, len(problems), starts),
         start_states=torch.cat([p.start_states for p in problems]),
-    )  # fmt: skip
+    )
 
 
 @pytest.mark.parametrize(("time_batch", "cache_bytes"), [(2, 0), (8, 2**40)])
 def test_every_texture_gets_its_own_gradient(problems, time_batch, cache_bytes):
-    theta = torch.randn(3, *problems[0].sensor.theta_shape, dtype=torch.float64, generator=torch.manual_seed(0))
+    theta = torch.randn(
+        3, *problems[0].sensor.theta_shape, dtype=torch.float64, generator=torch.manual_seed(0)
+    )
     batch = dataclasses.replace(together(problems), time_batch=time_batch, cache_bytes=cache_bytes)
     result = adjoint_gradient(batch, theta)
     for k, problem in enumerate(problems):
         alone = adjoint_gradient(problem, theta[k])
         torch.testing.assert_close(3.0 * result.gradient[k], alone.gradient, rtol=1e-9, atol=1e-12)
         rows = slice(2 * k, 2 * k + 2)
-        torch.testing.assert_close(result.totals.protocol_cte_m[rows], alone.totals.protocol_cte_m, rtol=1e-9, atol=0.0)
+        torch.testing.assert_close(
+            result.totals.protocol_cte_m[rows], alone.totals.protocol_cte_m, rtol=1e-9, atol=0.0
+        )
 
 
 @pytest.mark.slow
@@ -50,7 +55,9 @@ def test_a_search_together_ends_where_searches_alone_do(problems):
     for problem, seed, result in zip(smooth, SEEDS, results, strict=True):
         alone = gradient_attack(problem, 3, seed=seed)
         torch.testing.assert_close(result.theta, alone.theta, rtol=1e-6, atol=1e-9)
-        assert [e.loss_m for e in result.history] == pytest.approx([e.loss_m for e in alone.history], rel=1e-9)
+        assert [e.loss_m for e in result.history] == pytest.approx(
+            [e.loss_m for e in alone.history], rel=1e-9
+        )
         assert result.best.iteration == alone.best.iteration
     assert not torch.equal(results[0].theta, results[1].theta)
 

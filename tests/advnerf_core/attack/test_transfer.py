@@ -84,7 +84,10 @@ def test_draws_differ_by_what_was_measured_and_repeat_with_the_seed():
     alone = predict_transfer(problem(), images, clean, other, START, HORIZON, draws=8, seed=3)
     assert alone.none_m == first.none_m != alone.attacked_m  # the drive without attack knows nothing of it
     assert (
-        predict_transfer(problem(), images, clean, other, START, HORIZON, draws=8, seed=3, none_m=first.none_m) == alone
+        predict_transfer(
+            problem(), images, clean, other, START, HORIZON, draws=8, seed=3, none_m=first.none_m
+        )
+        == alone
     )
     with pytest.raises(ValueError, match="two draws"):
         predict_transfer(problem(), images, clean, effect, START, HORIZON, draws=1)

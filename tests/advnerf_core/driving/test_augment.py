@@ -2,7 +2,9 @@ import numpy as np
 
 from advnerf_core.learning.augment import AugmentConfig, augment
 
-OFF = AugmentConfig(brightness=0.0, contrast=0.0, gamma=0.0, colour=0.0, noise=0.0, blur_share=0.0, shift_px=0)
+OFF = AugmentConfig(
+    brightness=0.0, contrast=0.0, gamma=0.0, colour=0.0, noise=0.0, blur_share=0.0, shift_px=0
+)
 
 
 def _images() -> np.ndarray:
@@ -24,7 +26,9 @@ def test_same_generator_same_result_within_range() -> None:
 
 def test_noise_level_and_blur() -> None:
     grey = np.full((64, 66, 200, 3), 128, np.uint8)
-    noisy = augment(grey, AugmentConfig(0, 0, 0, 0, noise=0.1, blur_share=0, shift_px=0), np.random.default_rng(0))
+    noisy = augment(
+        grey, AugmentConfig(0, 0, 0, 0, noise=0.1, blur_share=0, shift_px=0), np.random.default_rng(0)
+    )
     levels = noisy.std(axis=(1, 2, 3))
     assert levels.min() < 0.03
     assert 0.08 < levels.max() < 0.11
@@ -46,6 +50,9 @@ def test_shift_moves_by_whole_pixels() -> None:
     moved = augment(_images(), AugmentConfig(0, 0, 0, 0, 0, 0, shift_px=1), np.random.default_rng(3))
     inner = (slice(2, -2), slice(2, -2))
     candidates = [np.roll(_images(), (dy, dx), (1, 2)) / 255.0 for dy in (-1, 0, 1) for dx in (-1, 0, 1)]
-    found = [[np.allclose(image[inner], c[i][inner], atol=1e-6) for c in candidates] for i, image in enumerate(moved)]
+    found = [
+        [np.allclose(image[inner], c[i][inner], atol=1e-6) for c in candidates]
+        for i, image in enumerate(moved)
+    ]
     assert all(sum(row) == 1 for row in found)
     assert len({row.index(True) for row in found}) > 3

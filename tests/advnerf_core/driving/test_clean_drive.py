@@ -38,7 +38,9 @@ def test_a_drive_is_told_in_metres_and_one_that_is_none_is_warned_about():
     assert good.warning == ""
     assert good.total_cte_m == pytest.approx((0.4, 1.0), abs=1e-6)
     assert good.mean_total_cte_m == pytest.approx(0.7)
-    assert good.lines == ["drive without attack: total CTE 0.70 m over 20 ticks, mean |CTE| 0.035 m, at most 0.05 m"]
+    assert good.lines == [
+        "drive without attack: total CTE 0.70 m over 20 ticks, mean |CTE| 0.035 m, at most 0.05 m"
+    ]
     assert good.short == "without attack 0.70 m"
     wide = drive(0.02, 0.3)
     assert not wide.drives

@@ -26,9 +26,9 @@ def test_jacobians_equal_autograd_and_finite_differences(model: Dynamics) -> Non
         auto_x, auto_u = jacobian(lambda a, c: model.step(a[None], c[None])[0], (x[b], u[b]))
         torch.testing.assert_close(df_dx[b], auto_x, rtol=1e-12, atol=1e-13)
         torch.testing.assert_close(df_du[b], auto_u, rtol=1e-11, atol=1e-13)
-        numeric_u = (model.step(x[b : b + 1], u[b : b + 1] + eps) - model.step(x[b : b + 1], u[b : b + 1] - eps)) / (
-            2 * eps
-        )
+        numeric_u = (
+            model.step(x[b : b + 1], u[b : b + 1] + eps) - model.step(x[b : b + 1], u[b : b + 1] - eps)
+        ) / (2 * eps)
         torch.testing.assert_close(df_du[b], numeric_u[0], rtol=1e-7, atol=1e-8)
         for j in range(model.state_size):
             step = eps * torch.eye(model.state_size, dtype=torch.float64)[j]

@@ -33,7 +33,9 @@ def test_shards_survive_and_are_memory_mapped(tmp_path: Path) -> None:
 
 def test_a_failed_write_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     store = FrameStore(tmp_path)
-    monkeypatch.setattr(np, "save", lambda *_, **__: (_ for _ in ()).throw(OSError("no space left on device")))
+    monkeypatch.setattr(
+        np, "save", lambda *_, **__: (_ for _ in ()).throw(OSError("no space left on device"))
+    )
     with pytest.raises(OSError, match="no space"):
         store.append("a", _frames(2))
     assert list(tmp_path.iterdir()) == []

@@ -21,15 +21,34 @@ from advnerf_core.policies.view import PolicyView
 
 VIEW = PolicyView(Pinhole(336, 188, 173.97, 173.97, 168.0, 94.0))
 TURNING = ExpertConfig(
-    speed_mps=6.0, delay_s=0.05, stiffness_1pm=0.3, smoothing_m=0.6, steering_limits_rad=(-1.2, 1.2), output="turn_rate"
+    speed_mps=6.0,
+    delay_s=0.05,
+    stiffness_1pm=0.3,
+    smoothing_m=0.6,
+    steering_limits_rad=(-1.2, 1.2),
+    output="turn_rate",
 )
-LEFT = Expert(Track.from_segments((0.0, 0.0, 0.0), [Line(4.0), Arc(10.0, 1.0), Line(10.0)], closed=False), TURNING)
-RIGHT = Expert(Track.from_segments((0.0, 0.0, 0.0), [Line(4.0), Arc(10.0, -1.0), Line(10.0)], closed=False), TURNING)
+LEFT = Expert(
+    Track.from_segments((0.0, 0.0, 0.0), [Line(4.0), Arc(10.0, 1.0), Line(10.0)], closed=False), TURNING
+)
+RIGHT = Expert(
+    Track.from_segments((0.0, 0.0, 0.0), [Line(4.0), Arc(10.0, -1.0), Line(10.0)], closed=False), TURNING
+)
 CAR = Dubins(6.0, 0.1)
 CONFIG = ImitationConfig(
-    first_steps=3, round_steps=2, dagger_rounds=1, batch_size=8, max_steering_rad=1.2, hidden=(32, 16, 8),
-    lateral_m=0.5, heading_rad=0.1, drive_lateral_m=0.3, drive_heading_rad=0.05, give_up_m=2.0, holdout_every=4,
-)  # fmt: skip
+    first_steps=3,
+    round_steps=2,
+    dagger_rounds=1,
+    batch_size=8,
+    max_steering_rad=1.2,
+    hidden=(32, 16, 8),
+    lateral_m=0.5,
+    heading_rad=0.1,
+    drive_lateral_m=0.3,
+    drive_heading_rad=0.05,
+    give_up_m=2.0,
+    holdout_every=4,
+)
 
 
 def prepare(states: np.ndarray):
@@ -46,7 +65,13 @@ def plans(stills: int = 12, drives: int = 2) -> list[SourcePlan]:
     told = (("left", (1.0, 0.0), LEFT), ("right", (0.0, 1.0), RIGHT))
     return [
         SourcePlan(
-            RenderedSource(name, prepare, CAR), stills, drives, drive_steps=4, goal=goal, expert=expert, driven_m=8.0
+            RenderedSource(name, prepare, CAR),
+            stills,
+            drives,
+            drive_steps=4,
+            goal=goal,
+            expert=expert,
+            driven_m=8.0,
         )
         for name, goal, expert in told
     ]
@@ -118,6 +143,14 @@ def test_goals_of_different_lengths_are_refused(tmp_path: Path) -> None:
     first, second = plans()
     with pytest.raises(ValueError, match="goals of one length"):
         train_policy(CONFIG, [first, replace(second, goal=(1.0,))], LEFT, VIEW, tmp_path)
-    assert second.settings().keys() == {"source", "stills", "drives", "drive_steps", "goal", "expert", "driven_m"}
+    assert second.settings().keys() == {
+        "source",
+        "stills",
+        "drives",
+        "drive_steps",
+        "goal",
+        "expert",
+        "driven_m",
+    }
     plain = replace(second, goal=(), expert=None, driven_m=None)
     assert plain.settings().keys() == {"source", "stills", "drives", "drive_steps"}

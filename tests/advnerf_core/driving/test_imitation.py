@@ -25,7 +25,9 @@ VIEW = PolicyView(Pinhole(336, 188, 173.97, 173.97, 168.0, 94.0))
 T_CAR_FROM_CAMERA = camera_mount(0.30, 0.0, 0.20, np.deg2rad(10.0))
 DYNAMICS = Ackermann(0.25, 0.8, 0.1)
 EXPERT = Expert(TRACK)
-TINY = ImitationConfig(first_steps=3, round_steps=3, naive_steps=3, batch_size=4, dagger_rounds=1, holdout_every=2)
+TINY = ImitationConfig(
+    first_steps=3, round_steps=3, naive_steps=3, batch_size=4, dagger_rounds=1, holdout_every=2
+)
 
 
 def paint_floor(states: np.ndarray, pinhole: Pinhole) -> np.ndarray:
@@ -76,7 +78,9 @@ class FloorScene:
     def observe(self, depth: Literal[False]) -> tuple[np.ndarray, None]:
         return self.observe_at(*map(float, self.state), depth=depth)
 
-    def observe_at(self, x_m: float, y_m: float, yaw_rad: float, depth: Literal[False]) -> tuple[np.ndarray, None]:
+    def observe_at(
+        self, x_m: float, y_m: float, yaw_rad: float, depth: Literal[False]
+    ) -> tuple[np.ndarray, None]:
         image = paint_floor(np.array([[x_m, y_m, yaw_rad]]), VIEW.camera)[0]
         return (image * 255).astype(np.uint8), None
 
@@ -121,7 +125,11 @@ def test_drives_follow_the_policy_and_stop_when_told() -> None:
     starts = np.array([[-1.0, -2.0, 0.0], [0.2, -2.0, 0.0]])
     for plan in _plans():
         seen = plan.source.drive(
-            lambda images: np.full(len(images), 0.1), starts, 3, lambda s: s[:, 0] < 0.3, np.random.default_rng(0)
+            lambda images: np.full(len(images), 0.1),
+            starts,
+            3,
+            lambda s: s[:, 0] < 0.3,
+            np.random.default_rng(0),
         )
         plain = seen.states[~seen.textured]
         assert len(plain) == 3 + 2  # the second drive passes x = 0.3 after two steps
@@ -132,7 +140,9 @@ def test_drives_follow_the_policy_and_stop_when_told() -> None:
 
 def test_recipe_writes_both_policies_and_repeats_itself(tmp_path: Path) -> None:
     heard: list[float] = []
-    result = train_policy(TINY, _plans(), EXPERT, VIEW, tmp_path / "a", lambda share, text: heard.append(share))
+    result = train_policy(
+        TINY, _plans(), EXPERT, VIEW, tmp_path / "a", lambda share, text: heard.append(share)
+    )
     again = train_policy(TINY, _plans(), EXPERT, VIEW, tmp_path / "b")
     assert result.sha256 == again.sha256
     assert result.naive_sha256 == again.naive_sha256 != result.sha256

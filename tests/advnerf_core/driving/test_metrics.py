@@ -18,7 +18,9 @@ def test_sum_of_magnitudes_without_the_start() -> None:
     assert result.max_cte_m == pytest.approx(0.3)
     assert (result.off_track, result.time_to_leaving_s, result.held_ticks) == (False, None, 0)
     assert result.ctes_m == pytest.approx((0.1, -0.2, 0.3))
-    assert drive_metrics(LINE, _states([9.0, 0.1, -0.2, 0.3]), Horizon(ticks=2)).total_cte_m == pytest.approx(0.3)
+    assert drive_metrics(LINE, _states([9.0, 0.1, -0.2, 0.3]), Horizon(ticks=2)).total_cte_m == pytest.approx(
+        0.3
+    )
 
 
 def test_a_stopped_car_keeps_its_last_error_up_to_the_cap() -> None:

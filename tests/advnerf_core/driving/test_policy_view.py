@@ -39,7 +39,9 @@ def test_distortion_is_removed() -> None:
     view = PolicyView(CAMERA, distortion=coefficients)
     point = np.array([[0.35, 0.12, 1.0]])
     matrix = CAMERA.matrix - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
-    distorted = cv2.projectPoints(point, np.zeros(3), np.zeros(3), matrix, np.array(coefficients))[0][0, 0] + 0.5
+    distorted = (
+        cv2.projectPoints(point, np.zeros(3), np.zeros(3), matrix, np.array(coefficients))[0][0, 0] + 0.5
+    )
     yy, xx = np.mgrid[:188, :336] + 0.5
     blob = np.exp(-((xx - distorted[0]) ** 2 + (yy - distorted[1]) ** 2) / 18.0)
     seen = view.image(np.repeat((255 * blob)[..., None], 3, 2).astype(np.uint8))[..., 0].astype(float)

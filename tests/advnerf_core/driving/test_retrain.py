@@ -23,9 +23,12 @@ def frames(count, red, steering_rad, goals=0, seed=0):
     if red:
         images[:, 20:40, 80:120] = [250, 10, 10]
     return Frames(
-        images, np.zeros((count, 3)), np.full(count, steering_rad, np.float32), np.zeros((count, goals), np.float32),
+        images,
+        np.zeros((count, 3)),
+        np.full(count, steering_rad, np.float32),
+        np.zeros((count, goals), np.float32),
         np.full(count, red),
-    )  # fmt: skip
+    )
 
 
 @pytest.fixture

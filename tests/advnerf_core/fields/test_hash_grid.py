@@ -28,13 +28,17 @@ def test_a_dense_level_interpolates_a_linear_function_exactly() -> None:
     with torch.no_grad():  # x is fastest in the table
         grid.table[:, 0] = (nodes @ torch.tensor([1.0, -2.0, 0.5])).permute(2, 1, 0).reshape(-1)
     points = torch.rand(200, 3, generator=torch.Generator().manual_seed(2))
-    np.testing.assert_allclose(grid(points)[:, 0].detach(), points @ torch.tensor([1.0, -2.0, 0.5]), atol=1e-6)
+    np.testing.assert_allclose(
+        grid(points)[:, 0].detach(), points @ torch.tensor([1.0, -2.0, 0.5]), atol=1e-6
+    )
 
 
 @pytest.mark.parametrize("features", [2, 4])
 def test_kernels_agree_with_plain_torch(features: int) -> None:
     grid = random_grid(HashGridConfig(levels=6, features=features, log2_entries=10, coarsest=4, finest=300))
-    points = torch.rand(3001, 3, generator=torch.Generator().manual_seed(3)) * 1.2 - 0.1  # some outside: clamped
+    points = (
+        torch.rand(3001, 3, generator=torch.Generator().manual_seed(3)) * 1.2 - 0.1
+    )  # some outside: clamped
     expected = encode_reference(points, grid.table, grid.levels)
     np.testing.assert_allclose(grid(points).detach(), expected.detach(), atol=1e-6)
     weights = torch.randn(expected.shape, generator=torch.Generator().manual_seed(4))
@@ -45,7 +49,9 @@ def test_kernels_agree_with_plain_torch(features: int) -> None:
 
 def test_the_plain_path_passes_gradcheck_in_double_precision() -> None:
     grid = random_grid(HashGridConfig(levels=2, features=2, log2_entries=5, coarsest=2, finest=7)).double()
-    points = torch.rand(5, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(5), requires_grad=True)
+    points = torch.rand(
+        5, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(5), requires_grad=True
+    )
 
     def encode(x: torch.Tensor, table: torch.Tensor) -> torch.Tensor:
         return encode_reference(x, table, grid.levels)

@@ -23,7 +23,9 @@ def test_functions_are_orthonormal_on_the_sphere() -> None:
 
 @pytest.mark.parametrize("bands", [1, 2, 3, 4])
 def test_kernel_agrees_with_torch(bands: int) -> None:
-    directions = torch.nn.functional.normalize(torch.randn(20, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
+    directions = torch.nn.functional.normalize(
+        torch.randn(20, 3, generator=torch.Generator().manual_seed(0)), dim=-1
+    )
     out = np.zeros((2 + bands**2, 20), np.float32)
     for n, (x, y, z) in enumerate(directions.numpy()):
         write_spherical_harmonics(x, y, z, bands, out, 2, n)

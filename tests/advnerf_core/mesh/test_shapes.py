@@ -45,7 +45,11 @@ def sensor_of(mesh, near_m=5.0, supersample=2, **limits):
 
 @pytest.mark.parametrize(
     ("coloured", "near_m"),
-    [(False, 1.2), pytest.param(False, 5.0, marks=pytest.mark.slow), pytest.param(True, 5.0, marks=pytest.mark.slow)],
+    [
+        (False, 1.2),
+        pytest.param(False, 5.0, marks=pytest.mark.slow),
+        pytest.param(True, 5.0, marks=pytest.mark.slow),
+    ],
 )
 def test_the_vertex_gradient_is_that_of_finite_differences(coloured, near_m):
     # What is nearer than the ball hides half of it; colours are fine enough to be continuous where charts meet.
@@ -95,7 +99,11 @@ def test_several_meshes_have_each_its_own_gradient():
     limits = ShapeLimits(samples=16, boundary_samples=16)
     both = ShapeSensor(scene, limits).render(BATCH, torch.zeros(42 * 2, 3)).vjp(smooth_seed())
     for k, field in enumerate(scene.objects):
-        alone = ShapeSensor(scene.with_objects([field]), limits).render(BATCH, torch.zeros(42, 3)).vjp(smooth_seed())
+        alone = (
+            ShapeSensor(scene.with_objects([field]), limits)
+            .render(BATCH, torch.zeros(42, 3))
+            .vjp(smooth_seed())
+        )
         part = both[42 * k : 42 * (k + 1)]
         assert torch.norm(part - alone) < 0.15 * torch.norm(alone)
 
@@ -121,7 +129,9 @@ def test_the_preconditioner_is_that_of_large_steps():
 
 def test_no_vertex_leaves_its_bound_or_the_ground():
     sensor = sensor_of(unwrapped(sphere(0.4, (0, 0, 0), 2)), bound_m=0.1)
-    (moved,) = sensor.vertices(100.0 * torch.randn(sensor.theta_shape, generator=torch.Generator().manual_seed(0)))
+    (moved,) = sensor.vertices(
+        100.0 * torch.randn(sensor.theta_shape, generator=torch.Generator().manual_seed(0))
+    )
     distance = (moved - torch.tensor(sensor.meshes[0].mesh.vertices)).norm(dim=1)
     assert 0.08 < float(distance.max()) <= 0.1 + 1e-12
     assert float(moved[:, 2].min()) >= 0.0
@@ -130,7 +140,9 @@ def test_no_vertex_leaves_its_bound_or_the_ground():
 def test_the_pull_back_is_the_derivative_of_the_vertices():
     sensor = sensor_of(unwrapped(sphere(0.4, (0, 0, 0), 1)), bound_m=0.05)
     generator = torch.Generator().manual_seed(0)
-    theta, along = (torch.randn(sensor.theta_shape, generator=generator, dtype=torch.float64) for _ in range(2))
+    theta, along = (
+        torch.randn(sensor.theta_shape, generator=generator, dtype=torch.float64) for _ in range(2)
+    )
     slopes = torch.randn(sensor.theta_shape, generator=generator, dtype=torch.float64)
     up, down = (sensor.vertices(theta + s * 1e-6 * along)[0] for s in (1, -1))
     expected = float(((up - down) * slopes).sum() / 2e-6)
@@ -152,9 +164,13 @@ class _Wheel(torch.nn.Module):
 def problem():
     lens = Pinhole(50, 16, 26.0, 26.0, 25.0, 7.0)
     grey = torch.full((1, 16, 50, 3), 0.3), torch.full((1, 16, 50), 6.0)
-    field = MeshField(unwrapped(sphere(0.3, (0.9, 0.9, 0.9), 2), 8), make_transform(np.eye(3), [2.0, 0.25, 0.0]))
+    field = MeshField(
+        unwrapped(sphere(0.3, (0.9, 0.9, 0.9), 2), 8), make_transform(np.eye(3), [2.0, 0.25, 0.0])
+    )
     mount = camera_mount(0.1, 0.0, 0.25)
-    scene = Surrogate(lambda p, c: tuple(part.expand(len(p), *part.shape[1:]) for part in grey), lens, mount, field)
+    scene = Surrogate(
+        lambda p, c: tuple(part.expand(len(p), *part.shape[1:]) for part in grey), lens, mount, field
+    )
     path = Path.from_segments((0.0, 0.0, 0.0), [Line(6.0)], closed=False)
     starts = torch.tensor([[0.0, 0.02, 0.0]], dtype=torch.float64)
     sensor = ShapeSensor(scene, ShapeLimits(bound_m=0.15, smoothness=4.0))

@@ -45,11 +45,15 @@ def test_coverage_is_that_of_the_rasteriser_and_colours_come_near():
 
 
 def test_a_plain_sphere_has_its_colour_and_its_planar_depth():
-    field = MeshField(unwrapped(sphere(0.4, (0.2, 0.3, 0.9), 4), 32), make_transform(np.eye(3), [0.0, 0.0, 2.0]), 0.5)
+    field = MeshField(
+        unwrapped(sphere(0.4, (0.2, 0.3, 0.9), 4), 32), make_transform(np.eye(3), [0.0, 0.0, 2.0]), 0.5
+    )
     pinhole = PINHOLE
     picture, cast = drawn(field, np.eye(4)[None], pinhole, 1)
     inside = picture[0, ..., 3] == 1.0
-    np.testing.assert_allclose(picture[0][inside][:, :3], np.tile([0.2, 0.3, 0.9], (inside.sum(), 1)), atol=1e-6)
+    np.testing.assert_allclose(
+        picture[0][inside][:, :3], np.tile([0.2, 0.3, 0.9], (inside.sum(), 1)), atol=1e-6
+    )
     # The centre of the ball is at z = 2 + 0.5 * 0.4, its radius 0.2.
     d = pinhole.directions().reshape(-1, 3)[cast.pixels]
     middle = np.array([0.0, 0.0, 2.2])
@@ -124,7 +128,9 @@ def test_a_glb_is_read_again_and_looks_the_same(ball, tmp_path):
     assert np.abs(here - there).max() < 0.6 / 255
     # Any other reader of meshes sees it too: upright, as large, of the same colours.
     strangers = load_mesh(file, up="y")
-    np.testing.assert_allclose(strangers.size_m, ball.mesh.vertices.max(0) - ball.mesh.vertices.min(0), atol=1e-5)
+    np.testing.assert_allclose(
+        strangers.size_m, ball.mesh.vertices.max(0) - ball.mesh.vertices.min(0), atol=1e-5
+    )
 
 
 @pytest.mark.parametrize("content", [b"", b"not a glb at all", b"glTF\x02\x00\x00\x00"])

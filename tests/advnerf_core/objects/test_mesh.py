@@ -12,7 +12,14 @@ from PIL import Image
 
 from advnerf_core.geometry import Pinhole
 from advnerf_core.objects.voxel.generators import GENERATORS, hydrant, small_car
-from advnerf_core.objects.voxel.mesh import MeshError, SurfaceMesh, load_mesh, part_from_colours, stand, texture_colours
+from advnerf_core.objects.voxel.mesh import (
+    MeshError,
+    SurfaceMesh,
+    load_mesh,
+    part_from_colours,
+    stand,
+    texture_colours,
+)
 from advnerf_core.objects.voxel.rasterise import draw_mesh
 from advnerf_core.objects.voxel.views import dome, look_at, ring, viewing_lens
 
@@ -115,7 +122,9 @@ def test_drawing_leaves_the_threads_of_others_alone():
         "draw_mesh(hydrant(), pose, Pinhole(40, 30, 40.0, 40.0, 20.0, 15.0))\nprint(torch.get_num_threads())"
     )
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    told = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, env=environment, check=True)
+    told = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, env=environment, check=True
+    )
     assert told.stdout.split() == ["1"]
 
 

@@ -104,7 +104,9 @@ def test_pictures_in_bytes_give_the_same_hull_and_the_same_rays():
     np.testing.assert_allclose(real.colours, rounded.colours, atol=2 / 255)
     box = real.box_min, real.box_max
     for ours, theirs in zip(
-        RayBatches(views, *box, seed=3).draw(500), RayBatches(as_bytes(views), *box, seed=3).draw(500), strict=True
+        RayBatches(views, *box, seed=3).draw(500),
+        RayBatches(as_bytes(views), *box, seed=3).draw(500),
+        strict=True,
     ):
         np.testing.assert_allclose(ours, theirs, atol=0.51 / 255)
 
@@ -156,7 +158,9 @@ def test_a_hundred_large_pictures_fit_into_memory(tmp_path):
     for k, (image, pose) in enumerate(zip(views.images, views.T_object_from_camera, strict=True)):
         large = cv2.resize(np.rint(255 * image).astype(np.uint8), (side, side))
         cv2.imwrite(str(tmp_path / f"{k:03d}.png"), large, [cv2.IMWRITE_PNG_COMPRESSION, 1])
-        frames.append({"file_path": f"{k:03d}.png", "transform_matrix": (pose @ np.diag([1, -1, -1, 1.0])).tolist()})
+        frames.append(
+            {"file_path": f"{k:03d}.png", "transform_matrix": (pose @ np.diag([1, -1, -1, 1.0])).tolist()}
+        )
     content = {"fl_x": views.pinholes[0].fx * side / 64, "frames": frames}
     (tmp_path / "transforms.json").write_text(json.dumps(content))
     done = subprocess.run(
@@ -179,7 +183,13 @@ def test_a_hundred_large_pictures_fit_into_memory(tmp_path):
     ],
 )
 def test_advice_names_what_is_wrong(changes, words):
-    about = {"train_object_psnr_db": 26.0, "held_out_object_psnr_db": 24.0, "gain_db": 0.1, "steps": 600, **changes}
+    about = {
+        "train_object_psnr_db": 26.0,
+        "held_out_object_psnr_db": 24.0,
+        "gain_db": 0.1,
+        "steps": 600,
+        **changes,
+    }
     text = "; ".join(advice(about))
     assert bool(text) == bool(words)
     for word in words:
@@ -273,7 +283,9 @@ def test_pictures_that_no_object_fits(tmp_path):
     with pytest.raises(FitError, match="finite"):
         PosedRgba(views.images * np.nan, views.T_object_from_camera, views.pinholes)
     with pytest.raises(FitError, match="same way"):
-        visual_hull(PosedRgba(views.images, np.repeat(views.T_object_from_camera[:1], 6, axis=0), views.pinholes))
+        visual_hull(
+            PosedRgba(views.images, np.repeat(views.T_object_from_camera[:1], 6, axis=0), views.pinholes)
+        )
     away = np.asarray(views.T_object_from_camera).copy()
     away[:, :3, 2] *= -1.0
     away[:, :3, 0] *= -1.0

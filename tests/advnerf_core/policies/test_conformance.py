@@ -75,15 +75,40 @@ def swapped(x):
     ("before", "after", "advice", "contract"),
     [
         (swapped, lambda y: y, "takes BGR for RGB: set colour_space = 'BGR'", {}),
-        (lambda x: x / 255, lambda y: y, "expects values of 0..255, but is given 0..1: set value_max = 255", {}),
-        (lambda x: x, lambda y: y, "expects values of 0..1, but is given 0..255: set value_max = 1", {"value_max": 255.0}),
-        (lambda x: x, lambda y: y * 180 / np.pi, "steers in degrees for radians: set output_unit = 'deg'", {}),
-        (lambda x: x, lambda y: y, "steers in radians for degrees: set output_unit = 'rad'", {"output_unit": "deg"}),
-        (lambda x: x, lambda y: -y, "steers positive to the right, not to the left: set positive = 'right'", {}),
+        (
+            lambda x: x / 255,
+            lambda y: y,
+            "expects values of 0..255, but is given 0..1: set value_max = 255",
+            {},
+        ),
+        (
+            lambda x: x,
+            lambda y: y,
+            "expects values of 0..1, but is given 0..255: set value_max = 1",
+            {"value_max": 255.0},
+        ),
+        (
+            lambda x: x,
+            lambda y: y * 180 / np.pi,
+            "steers in degrees for radians: set output_unit = 'deg'",
+            {},
+        ),
+        (
+            lambda x: x,
+            lambda y: y,
+            "steers in radians for degrees: set output_unit = 'rad'",
+            {"output_unit": "deg"},
+        ),
+        (
+            lambda x: x,
+            lambda y: -y,
+            "steers positive to the right, not to the left: set positive = 'right'",
+            {},
+        ),
         (lambda x: swapped(x) / 255, lambda y: y, "0..255, but is given 0..1 and takes BGR for RGB", {}),
         (swapped, lambda y: -y, "takes BGR for RGB and steers positive to the right", {}),
     ],
-)  # fmt: skip
+)
 def test_a_lie_is_recognised_and_named(before, after, advice, contract):
     found = findings(around(before, after), replace(DECLARED, **contract))
     assert found["expert"].verdict == FAILURE, found
@@ -212,7 +237,11 @@ def test_a_black_box_is_told_every_method_that_can_attack_it():
 
 def test_a_network_of_yuv_that_is_declared_rgb_is_recognised():
     back = torch.tensor(
-        [[1.0, 0.0, 1.0 / 0.877], [1.0, -0.114 / 0.587 / 0.492, -0.299 / 0.587 / 0.877], [1.0, 1.0 / 0.492, 0.0]]
+        [
+            [1.0, 0.0, 1.0 / 0.877],
+            [1.0, -0.114 / 0.587 / 0.492, -0.299 / 0.587 / 0.877],
+            [1.0, 1.0 / 0.492, 0.0],
+        ]
     )
 
     def from_yuv(x):

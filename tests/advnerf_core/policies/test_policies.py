@@ -110,7 +110,11 @@ def test_onnx_steers_as_torch_does(tmp_path, goals):
     file = tmp_path / "policy.onnx"
     export_onnx(policy.network, policy.contract, file)
     loaded = load_any_policy(file)
-    assert (loaded.policy.differentiable, loaded.policy.stateless, loaded.policy.goal_size) == (False, True, goals)
+    assert (loaded.policy.differentiable, loaded.policy.stateless, loaded.policy.goal_size) == (
+        False,
+        True,
+        goals,
+    )
     assert loaded.view == VIEW
     goal = torch.rand(5, goals) if goals else None
     torch.testing.assert_close(loaded.policy(images(5), goal), policy(images(5), goal), atol=1e-5, rtol=1e-3)
@@ -134,7 +138,9 @@ def test_a_foreign_onnx_file_is_declared_beside_it(tmp_path):
     for value in (model.graph.input[0], model.graph.output[0]):
         value.type.tensor_type.shape.dim[0].dim_value = 1  # a fixed batch, as many exporters leave it
     onnx.save(model, file)
-    with pytest.raises(PolicyContractError, match=r"says nothing about its colours.*policy\.onnx\.policy\.yaml"):
+    with pytest.raises(
+        PolicyContractError, match=r"says nothing about its colours.*policy\.onnx\.policy\.yaml"
+    ):
         OnnxNetwork(file)
     beside = tmp_path / "policy.onnx.policy.yaml"
     beside.write_text(yaml.safe_dump({"view": VIEW.to_dict(), "positive": "right"}))
@@ -298,9 +304,22 @@ def test_the_attack_knows_a_black_box(tmp_path):
 def udacity(**changes):
     """The public behavioural-cloning PilotNet: cropped, YUV in -1..1, a share of 25 degrees, positive to the right."""
     view = replace(VIEW, crop_top_px=60, crop_height_px=103, crop_left_px=16, crop_width_px=300)
-    declared = {"colour_space": "YUV", "value_max": 255.0, "mean": (127.5,), "std": (127.5,), "layout": "NHWC"}
+    declared = {
+        "colour_space": "YUV",
+        "value_max": 255.0,
+        "mean": (127.5,),
+        "std": (127.5,),
+        "layout": "NHWC",
+    }
     return PolicyContract(
-        view, **{**declared, "output_unit": "normalised", "full_steering_rad": 0.436, "positive": "right", **changes}
+        view,
+        **{
+            **declared,
+            "output_unit": "normalised",
+            "full_steering_rad": 0.436,
+            "positive": "right",
+            **changes,
+        },
     )
 
 
@@ -335,7 +354,9 @@ def test_yuv_and_grey_are_what_opencv_makes_of_an_8_bit_picture():
 @pytest.mark.parametrize("space", ["YUV", "GRAY", "BGR"])
 def test_the_gradient_through_a_colour_space_agrees_with_finite_differences(space):
     contract = PolicyContract(SMALL, space, 255.0, (127.5,), (127.5,))
-    weights = torch.randn(contract.channels, *contract.size, generator=torch.Generator().manual_seed(2)).double()
+    weights = torch.randn(
+        contract.channels, *contract.size, generator=torch.Generator().manual_seed(2)
+    ).double()
     policy = adapt(lambda given: 0.1 * torch.tanh(1e-2 * (weights * given.sin()).sum((1, 2, 3))), contract)
     # Away from full saturation, where V is clipped.
     x = (0.2 + 0.6 * images(1, contract).double()).requires_grad_()
@@ -375,7 +396,10 @@ def test_a_public_pilotnet_steers_alike_live_in_onnx_and_in_an_attack(tmp_path, 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"full_steering_rad": None}, "full_steering_rad: expected a number > 0 with output_unit = 'normalised'"),
+        (
+            {"full_steering_rad": None},
+            "full_steering_rad: expected a number > 0 with output_unit = 'normalised'",
+        ),
         ({"output_unit": "1/m", "full_steering_rad": None}, "wheelbase_m: expected a number > 0"),
         ({"output_unit": "rad"}, "full_steering_rad: expected it with output_unit = 'normalised' only"),
         ({"steering_ratio": 15.0}, "steering_ratio: expected it with output_unit = 'rad' or 'deg' only"),

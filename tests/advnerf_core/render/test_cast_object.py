@@ -88,8 +88,17 @@ def test_a_dense_medium_converges_to_the_opaque_solid_and_a_thin_one_obeys_beer_
     colours = face.colours(torch.randn(6, 6, 3, dtype=torch.float64)).numpy()
     np.testing.assert_allclose(dense(thick, colours), dense(solid, colours), atol=2e-3)
     # A cube of constant extinction 2 per unit at scale 0.5, looked at along its axis: alpha = 1 - exp(-2 * 1).
-    cube = VoxelGridObject(np.zeros((4, 4, 4), np.int32), (1, 3), np.zeros((0, 3)), -0.5 * np.ones(3), 0.5 * np.ones(3),
-                           np.eye(4), scale=0.5, density=np.full((4, 4, 4), 2.0), step_units=0.001)  # fmt: skip
+    cube = VoxelGridObject(
+        np.zeros((4, 4, 4), np.int32),
+        (1, 3),
+        np.zeros((0, 3)),
+        -0.5 * np.ones(3),
+        0.5 * np.ones(3),
+        np.eye(4),
+        scale=0.5,
+        density=np.full((4, 4, 4), 2.0),
+        step_units=0.001,
+    )
     narrow = Pinhole(1, 1, 1e6, 1e6, 0.5, 0.5)
     cast = cast_object(cube, look_at([3.0, 0, 1e-6], [0, 0, 0])[None], narrow, 1, np.float64)
     np.testing.assert_allclose(cast.alpha, [1 - np.exp(-2.0)], rtol=1e-6)
@@ -145,9 +154,16 @@ def test_a_thin_cloud_equals_a_ray_march_written_out():
     shape, step = (5, 6, 7), 0.01
     density = generator.uniform(0.0, 3.0, shape)
     cloud = VoxelGridObject(
-        np.arange(210, dtype=np.int32).reshape(shape), (210, 3), np.zeros((0, 3)), -0.5 * np.ones(3), 0.5 * np.ones(3),
-        make_transform(rotation_z(0.3), [0.1, 0, 0]), scale=0.8, density=density, step_units=step,
-    )  # fmt: skip
+        np.arange(210, dtype=np.int32).reshape(shape),
+        (210, 3),
+        np.zeros((0, 3)),
+        -0.5 * np.ones(3),
+        0.5 * np.ones(3),
+        make_transform(rotation_z(0.3), [0.1, 0, 0]),
+        scale=0.8,
+        density=density,
+        step_units=step,
+    )
     pinhole, T = Pinhole(3, 2, 8.0, 8.0, 1.5, 1.0), look_at([2.0, 0.2, 0.3], [0, 0, 0])
     colours = generator.uniform(size=(210, 3))
     cast = cast_object(cloud, T[None], pinhole, 1, np.float64)
@@ -186,14 +202,27 @@ def sparse_blob(T_world_from_object=None, scale=1.0):
     generator = np.random.default_rng(5)
     shape = (24, 20, 16)
     i, j, k = np.indices(shape)
-    density = np.where((i - 6) ** 2 + (j - 6) ** 2 + (k - 8) ** 2 < 9, 4.0, 0.0) * generator.uniform(0.5, 1.0, shape)
+    density = np.where((i - 6) ** 2 + (j - 6) ** 2 + (k - 8) ** 2 < 9, 4.0, 0.0) * generator.uniform(
+        0.5, 1.0, shape
+    )
     density[18:20, 3:17, 2:14] = 60.0
     density[12, 18, 12] = 9.0
-    pose = make_transform(rotation_z(0.4), [0.2, -0.1, 0.3]) if T_world_from_object is None else T_world_from_object
+    pose = (
+        make_transform(rotation_z(0.4), [0.2, -0.1, 0.3])
+        if T_world_from_object is None
+        else T_world_from_object
+    )
     return VoxelGridObject(
-        np.arange(density.size, dtype=np.int32).reshape(shape), (density.size, 3), np.zeros((0, 3)),
-        np.array([-0.6, -0.5, -0.4]), np.array([0.6, 0.5, 0.4]), pose, scale=scale, density=density, step_units=0.02,
-    )  # fmt: skip
+        np.arange(density.size, dtype=np.int32).reshape(shape),
+        (density.size, 3),
+        np.zeros((0, 3)),
+        np.array([-0.6, -0.5, -0.4]),
+        np.array([0.6, 0.5, 0.4]),
+        pose,
+        scale=scale,
+        density=density,
+        step_units=0.02,
+    )
 
 
 def test_leaping_over_empty_space_changes_nothing():
@@ -202,7 +231,9 @@ def test_leaping_over_empty_space_changes_nothing():
     plodding = dataclasses.replace(field, density=field.density + 1e-300)  # no cell is empty
     everywhere = cast_object(plodding, poses, PINHOLE, 2, np.float64)
     colours = np.random.default_rng(0).uniform(size=(field.slot_count, 3))
-    np.testing.assert_allclose(dense(leaping, colours, batch=4), dense(everywhere, colours, batch=4), atol=1e-10)
+    np.testing.assert_allclose(
+        dense(leaping, colours, batch=4), dense(everywhere, colours, batch=4), atol=1e-10
+    )
     assert len(leaping.pixels) > 1000
 
 
@@ -215,9 +246,12 @@ def test_a_turned_object_looks_like_a_turned_camera():
     field, T = sparse_blob(), camera_toward(0.4)
     colours = np.random.default_rng(0).uniform(size=(field.slot_count, 3))
     moved = dense(
-        cast_object(field.moved(turn @ field.T_world_from_object), (turn @ T)[None], PINHOLE, 2, np.float64), colours
+        cast_object(field.moved(turn @ field.T_world_from_object), (turn @ T)[None], PINHOLE, 2, np.float64),
+        colours,
     )
-    np.testing.assert_allclose(moved, dense(cast_object(field, T[None], PINHOLE, 2, np.float64), colours), atol=1e-9)
+    np.testing.assert_allclose(
+        moved, dense(cast_object(field, T[None], PINHOLE, 2, np.float64), colours), atol=1e-9
+    )
     # Twice as large and twice as far is the same picture.
     large = make_transform(rotation_z(0.4), 2 * field.T_world_from_object[:3, 3])
     far = T.copy()
@@ -232,8 +266,16 @@ def test_a_ball_of_fog_has_the_transmittance_and_depth_of_its_chords():
     away = np.sqrt(axis[:, None, None] ** 2 + axis[None, :, None] ** 2 + axis[None, None, :] ** 2)
     # The share of a voxel inside the ball, nearly: a ramp of one voxel across the surface.
     density = sigma * np.clip((radius_m - away) * count + 0.5, 0.0, 1.0)
-    ball = VoxelGridObject(np.zeros((count,) * 3, np.int32), (1, 3), np.zeros((0, 3)), -0.5 * np.ones(3), 0.5 * np.ones(3),
-                           np.eye(4), density=density, step_units=0.004)  # fmt: skip
+    ball = VoxelGridObject(
+        np.zeros((count,) * 3, np.int32),
+        (1, 3),
+        np.zeros((0, 3)),
+        -0.5 * np.ones(3),
+        0.5 * np.ones(3),
+        np.eye(4),
+        density=density,
+        step_units=0.004,
+    )
     T = look_at([2.0, 0.0, 0.001], [0, 0, 0])
     cast = cast_object(ball, T[None], PINHOLE, 1, np.float64)
     rays = PINHOLE.directions().reshape(-1, 3)[cast.pixels]
@@ -250,7 +292,11 @@ def test_a_ball_of_fog_has_the_transmittance_and_depth_of_its_chords():
 
 
 def test_several_objects_and_threads_give_what_each_gives_alone():
-    fields = [sparse_blob(), face_toward_camera(), sparse_blob(make_transform(rotation_z(2.0), [-0.4, 0.5, 0.1]), 0.5)]
+    fields = [
+        sparse_blob(),
+        face_toward_camera(),
+        sparse_blob(make_transform(rotation_z(2.0), [-0.4, 0.5, 0.1]), 0.5),
+    ]
     poses = np.stack([camera_toward(azimuth) for azimuth in (0.3, 1.7)])
     for dtype in (np.float32, np.float64):
         together = cast_objects(fields, poses, PINHOLE, 2, dtype)

@@ -66,7 +66,9 @@ def test_sparse_layers_follow_the_dense_formula_in_any_order():
     dense_alpha[-1], dense_depth[-1] = 1.0, torch.from_numpy(np.nan_to_num(behind, nan=np.inf))
     expected = visible_shares(dense_alpha, dense_depth).numpy()
     for order in (range(layers), [3, 0, 4, 1, 2]):
-        background, shares = sparse_shares(*([part[k] for k in order] for part in (pixels, alphas, depths)), behind)
+        background, shares = sparse_shares(
+            *([part[k] for k in order] for part in (pixels, alphas, depths)), behind
+        )
         np.testing.assert_allclose(background, expected[-1], atol=1e-12)
         for k, share in zip(order, shares, strict=True):
             np.testing.assert_allclose(share, expected[k, pixels[k]], atol=1e-12)

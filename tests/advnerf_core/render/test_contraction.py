@@ -26,7 +26,9 @@ def random_rays(count: int, seed: int, reach: float = 0.5) -> NDArray[np.float32
     rng = np.random.default_rng(seed)
     directions = rng.normal(size=(count, 3))
     directions /= SIDE_M * np.linalg.norm(directions, axis=1, keepdims=True)
-    return np.concatenate([0.5 + rng.uniform(-reach, reach, (count, 3)), directions], axis=1).astype(np.float32)
+    return np.concatenate([0.5 + rng.uniform(-reach, reach, (count, 3)), directions], axis=1).astype(
+        np.float32
+    )
 
 
 def cell_of(points: NDArray[np.floating], cells: int) -> tuple[NDArray[np.int64], ...]:
@@ -85,7 +87,9 @@ def test_it_is_continuous_at_the_inner_region_and_leaves_the_corners_empty() -> 
     lengths = np.linalg.norm(uncontract(centres + step) - uncontract(centres - step), axis=1) / (2 * 2e-6)
     outside = reached & (np.abs(centres - 0.5).max(axis=1) > 0.25)
     # Along the axis only: the other coordinates, too, move outwards by their share.
-    along = np.abs(uncontract(centres + step) - uncontract(centres - step))[np.arange(len(axis)), axis] / (2 * 2e-6)
+    along = np.abs(uncontract(centres + step) - uncontract(centres - step))[np.arange(len(axis)), axis] / (
+        2 * 2e-6
+    )
     np.testing.assert_allclose(along[outside], stretch.reshape(-1)[outside], rtol=1e-4)
     np.testing.assert_allclose(lengths[reached & ~outside], 1.0, rtol=1e-6)
 
@@ -93,7 +97,9 @@ def test_it_is_continuous_at_the_inner_region_and_leaves_the_corners_empty() -> 
 def test_leaps_leave_out_exactly_what_is_empty() -> None:
     rng = np.random.default_rng(2)
     occupied, rays, step_m, until_m = rng.random((CELLS,) * 3) > 0.7, random_rays(25, 3, 2.0), 0.05, 60.0
-    march = MarchConfig(near_m=0.1, smallest_step_m=step_m, largest_step_m=step_m, step_growth=0.0, max_samples=9000)
+    march = MarchConfig(
+        near_m=0.1, smallest_step_m=step_m, largest_step_m=step_m, step_growth=0.0, max_samples=9000
+    )
     samples = walk(rays, occupied, march)
     fine_m = 0.0025
     t = np.arange(0.1, until_m, fine_m) + 0.5 * fine_m
@@ -103,7 +109,8 @@ def test_leaps_leave_out_exactly_what_is_empty() -> None:
         mine = mine[mine < until_m - step_m]
         # Everything occupied lies in some interval, but for the slack that keeps rays from being trapped on faces.
         nearest = np.abs(
-            t[truth & (t < until_m - 2 * step_m), None] - _nearest(mine, t[truth & (t < until_m - 2 * step_m)])[:, None]
+            t[truth & (t < until_m - 2 * step_m), None]
+            - _nearest(mine, t[truth & (t < until_m - 2 * step_m)])[:, None]
         )
         assert nearest.size == 0 or nearest.max() < 0.5 * step_m + 0.01
         visits = 1 + int((np.diff(mine) > 1.5 * step_m).sum())
@@ -141,7 +148,9 @@ def test_a_thin_shell_far_outside_is_found_where_its_closed_form_says() -> None:
 
 def test_intervals_grow_outside_and_rays_end() -> None:
     rays = random_rays(50, 5)
-    march = MarchConfig(near_m=0.1, smallest_step_m=0.004, largest_step_m=0.05, step_growth=0.016, max_samples=1024)
+    march = MarchConfig(
+        near_m=0.1, smallest_step_m=0.004, largest_step_m=0.05, step_growth=0.016, max_samples=1024
+    )
     samples = walk(rays, np.ones((CELLS,) * 3, np.bool_), march)
     for r, ray in enumerate(rays):
         part = slice(samples.begins[r], samples.begins[r + 1])

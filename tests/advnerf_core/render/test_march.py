@@ -14,18 +14,37 @@ CELLS = (np.array(SHAPE) / HIGH).astype(np.float32)
 def random_rays(count: int) -> NDArray[np.float32]:
     origins = RNG.uniform(-0.3, 1.3, (count, 3))
     directions = RNG.normal(size=(count, 3))
-    directions *= 0.125 / np.linalg.norm(directions, axis=1, keepdims=True)  # a box with a longest side of 8 m
+    directions *= 0.125 / np.linalg.norm(
+        directions, axis=1, keepdims=True
+    )  # a box with a longest side of 8 m
     return np.concatenate([origins, directions], axis=1).astype(np.float32)
 
 
 def walk(rays: NDArray[np.float32], occupied: NDArray[np.bool_], step_m: float):  # type: ignore[no-untyped-def]
     leaps = leap_distances(occupied, CELLS)
     room, count = 200_000, len(rays)
-    points, t, widths = np.empty((room, 3), np.float32), np.empty(room, np.float32), np.empty(room, np.float32)
+    points, t, widths = (
+        np.empty((room, 3), np.float32),
+        np.empty(room, np.float32),
+        np.empty(room, np.float32),
+    )
     begins, steps = np.zeros(count + 1, np.int64), np.array([step_m, step_m, 0.0], np.float32)
     half = np.full(count, 0.5, np.float32)
     fitted = march(
-        rays, half, 0, count, HIGH, np.float32(0.1), steps, leaps.distance, leaps.cells, points, t, widths, begins, 1000
+        rays,
+        half,
+        0,
+        count,
+        HIGH,
+        np.float32(0.1),
+        steps,
+        leaps.distance,
+        leaps.cells,
+        points,
+        t,
+        widths,
+        begins,
+        1000,
     )
     assert fitted == count
     return points, t, widths, begins

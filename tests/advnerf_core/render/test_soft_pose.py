@@ -19,9 +19,16 @@ def cloud(position_m=(0.1, 0.0, 0.2), thickness=8.0):
     i, j, k = (index / (count - 1) - 0.5 for index in np.indices((count,) * 3))
     density = thickness * np.clip(3.0 * (0.3 - np.sqrt(i**2 + 2 * j**2 + 1.5 * k**2)), 0.0, 1.0)
     return VoxelGridObject(
-        np.arange(count**3, dtype=np.int32).reshape((count,) * 3), (count**3, 3), np.zeros((0, 3)), -0.5 * np.ones(3),
-        0.5 * np.ones(3), make_transform(rotation_z(0.3), position_m), scale=0.9, density=density, step_units=0.02,
-    )  # fmt: skip
+        np.arange(count**3, dtype=np.int32).reshape((count,) * 3),
+        (count**3, 3),
+        np.zeros((0, 3)),
+        -0.5 * np.ones(3),
+        0.5 * np.ones(3),
+        make_transform(rotation_z(0.3), position_m),
+        scale=0.9,
+        density=density,
+        step_units=0.02,
+    )
 
 
 def colours_of(field, seed=0):

@@ -5,7 +5,12 @@ import torch
 from numpy.typing import NDArray
 
 from advnerf_core.fields.mlp_kernels import TILE
-from advnerf_core.render.volume_kernels import accumulate, accumulate_backward, add_distortion_gradient, mark_visible
+from advnerf_core.render.volume_kernels import (
+    accumulate,
+    accumulate_backward,
+    add_distortion_gradient,
+    mark_visible,
+)
 
 RNG = np.random.default_rng(0)
 CHANNELS = 3
@@ -64,12 +69,21 @@ def test_forward_and_backward_agree_with_automatic_differentiation() -> None:
 
     grad_features, grad_alpha = RNG.normal(size=(R, CHANNELS)), RNG.normal(size=R)
     direct = RNG.normal(size=N)
-    loss = (true_features * torch.from_numpy(grad_features)).sum() + (true_alpha * torch.from_numpy(grad_alpha)).sum()
+    loss = (true_features * torch.from_numpy(grad_features)).sum() + (
+        true_alpha * torch.from_numpy(grad_alpha)
+    ).sum()
     (loss + (true_weights * torch.from_numpy(direct)).sum()).backward()
     accumulate_backward(
-        field, widths, BEGINS, 0, R, weights, tiled(grad_features), grad_alpha.astype(np.float32),
+        field,
+        widths,
+        BEGINS,
+        0,
+        R,
+        weights,
+        tiled(grad_features),
+        grad_alpha.astype(np.float32),
         direct.astype(np.float32),
-    )  # fmt: skip
+    )
     assert leaf.grad is not None
     np.testing.assert_allclose(untiled(field, N), leaf.grad, atol=2e-5)
 

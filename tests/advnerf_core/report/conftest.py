@@ -49,11 +49,21 @@ def drive(domain, condition, amplitude, seed=0, start=0, steps=60, victim="harde
     states = offset_states(-0.2 + 0.05 * start + SPEED * t, cte)
     over = np.flatnonzero(np.abs(cte) > OFF_TRACK)
     return rd.Run(
-        domain=domain, condition=condition, victim=victim, seed=seed, start=start, states=states, cte_m=cte,
-        total_cte_m=np.abs(cte).sum(), mean_abs_cte_m=np.abs(cte).mean(), off_track=bool(len(over)),
+        domain=domain,
+        condition=condition,
+        victim=victim,
+        seed=seed,
+        start=start,
+        states=states,
+        cte_m=cte,
+        total_cte_m=np.abs(cte).sum(),
+        mean_abs_cte_m=np.abs(cte).mean(),
+        off_track=bool(len(over)),
         time_to_leave_s=over[0] * PERIOD if len(over) else None,
-        attack_id={"gradient": f"9f3a{seed}c", "random": "41b07e"}.get(condition, ""), note=note, clip=clip,
-    )  # fmt: skip
+        attack_id={"gradient": f"9f3a{seed}c", "random": "41b07e"}.get(condition, ""),
+        note=note,
+        clip=clip,
+    )
 
 
 def ray_cast(state, texture=None, camera=CAMERA):
@@ -63,14 +73,18 @@ def ray_cast(state, texture=None, camera=CAMERA):
     o = T[:3, 3]
     with np.errstate(divide="ignore"):
         floor = np.where(d[..., 2] < -1e-6, -o[2] / d[..., 2], np.inf)
-        walls = np.minimum(*(np.where(d[..., i] > 0, (4 - o[i]) / d[..., i], (-4 - o[i]) / d[..., i]) for i in (0, 1)))
+        walls = np.minimum(
+            *(np.where(d[..., i] > 0, (4 - o[i]) / d[..., i], (-4 - o[i]) / d[..., i]) for i in (0, 1))
+        )
     depth = np.minimum(floor, walls)
     p = o + depth[..., None] * d
     outside = np.maximum(np.abs(p[..., :2]) - (SIDE / 2 - RADIUS), 0.0)
     to_path = np.abs(np.hypot(outside[..., 0], outside[..., 1]) - RADIUS)
     shade = 0.5 + 0.06 * np.sin(3 * p[..., 0]) * np.sin(2.3 * p[..., 1]) + 0.05 * np.sin(5 * p[..., 2])
     rgb = np.where(
-        (floor < walls)[..., None], shade[..., None] * [0.95, 0.9, 0.8], (shade + 0.2)[..., None] * [0.8, 0.9, 1.0]
+        (floor < walls)[..., None],
+        shade[..., None] * [0.95, 0.9, 0.8],
+        (shade + 0.2)[..., None] * [0.8, 0.9, 1.0],
     )
     rgb = np.where(((floor < walls) & (to_path < 0.025))[..., None], [0.12, 0.55, 0.25], rgb)
     normal, left = BOARD[:3, 0], BOARD[:3, 1]
@@ -81,7 +95,9 @@ def ray_cast(state, texture=None, camera=CAMERA):
     on = (hit > 0) & (hit < depth) & (np.abs(u - 0.5) < 0.5) & (np.abs(v - 0.5) < 0.5)
     face = np.full((8, 8, 3), [0.2, 0.6, 0.3]) if texture is None else texture / 255.0
     n = len(face)
-    index = (np.clip(v * n, 0, n - 1).astype(int), np.clip(u * n, 0, n - 1).astype(int)) if on.any() else (0, 0)
+    index = (
+        (np.clip(v * n, 0, n - 1).astype(int), np.clip(u * n, 0, n - 1).astype(int)) if on.any() else (0, 0)
+    )
     rgb = np.where(on[..., None], face[index], rgb)
     return (np.clip(rgb, 0, 1) * 255).astype(np.uint8)
 
@@ -100,7 +116,9 @@ def psnr(a, b):
 def colour_grid(seed, scale):
     rng = np.random.default_rng(seed)
     coarse = 1 / (1 + np.exp(-scale * rng.standard_normal((8, 8, 3))))
-    return np.clip(cv2.resize(coarse, (64, 64), interpolation=cv2.INTER_LINEAR) * 255, 0, 255).astype(np.uint8)
+    return np.clip(cv2.resize(coarse, (64, 64), interpolation=cv2.INTER_LINEAR) * 255, 0, 255).astype(
+        np.uint8
+    )
 
 
 def settings(name="full", starts=2, seeds=(0, 1, 2)):
@@ -114,9 +132,13 @@ def scene():
     path = np.stack([pose_at(s)[:2] for s in np.linspace(0, LENGTH, 240, endpoint=False)])
     monitor = make_transform(rotation_z(-2.4), np.array([3.0, 3.0, 0.5]))
     return rd.Scene(
-        path, OFF_TRACK, (-4, -4, 4, 4), np.array([[-3.5, -3.5], [3.5, -3.5], [3.5, 3.5], [-3.5, 3.5]]),
-        rd.face_segment(BOARD, 0.8), rd.face_segment(monitor, 0.5977),
-    )  # fmt: skip
+        path,
+        OFF_TRACK,
+        (-4, -4, 4, 4),
+        np.array([[-3.5, -3.5], [3.5, -3.5], [3.5, 3.5], [-3.5, 3.5]]),
+        rd.face_segment(BOARD, 0.8),
+        rd.face_segment(monitor, 0.5977),
+    )
 
 
 def fidelity(count=24, shown=3):
@@ -128,10 +150,17 @@ def fidelity(count=24, shown=3):
         steering = 0.22 * (s % (LENGTH / 4) > STRAIGHT) - 0.02 * np.sin(i)
         views.append(
             rd.FidelityView(
-                f"view {i:03d}", psnr(real, fake), psnr(*small), 0.93, 0.97, steering, steering + 0.012 * np.cos(3 * i),
-                real if i % (count // shown) == 4 else None, fake if i % (count // shown) == 4 else None,
+                f"view {i:03d}",
+                psnr(real, fake),
+                psnr(*small),
+                0.93,
+                0.97,
+                steering,
+                steering + 0.012 * np.cos(3 * i),
+                real if i % (count // shown) == 4 else None,
+                fake if i % (count // shown) == 4 else None,
             )
-        )  # fmt: skip
+        )
     return rd.Fidelity(tuple(views))
 
 
@@ -148,7 +177,9 @@ def latency():
         "policy": rng.gamma(30, 0.4, 900),
         "motor": rng.gamma(4, 0.4, 900),
     }
-    return rd.Latency(sum(hops.values()) + 2, 100.0, 0, tuple(rd.Hop.from_samples(k, v) for k, v in hops.items()))
+    return rd.Latency(
+        sum(hops.values()) + 2, 100.0, 0, tuple(rd.Hop.from_samples(k, v) for k, v in hops.items())
+    )
 
 
 def all_runs(starts=2, seeds=(0, 1, 2), victims=("hardened", "naive")):
@@ -174,10 +205,13 @@ def all_runs(starts=2, seeds=(0, 1, 2), victims=("hardened", "naive")):
 
 def manifest():
     return rd.Manifest(
-        "advnerf experiment launch/room.experiment.yaml --setting full", "2025-03-02T10:11:12+00:00",
+        "advnerf experiment launch/room.experiment.yaml --setting full",
+        "2025-03-02T10:11:12+00:00",
         {"scene": "b1946ac92492d2347c6235b4d2611184", "policy": "591785b794601e212b260e25925636fd"},
-        {"advnerf": "0.1.0", "numpy": np.__version__}, {"processor": "x86_64, 2 cores", "memory": "8 GiB"}, 5400.0,
-    )  # fmt: skip
+        {"advnerf": "0.1.0", "numpy": np.__version__},
+        {"processor": "x86_64, 2 cores", "memory": "8 GiB"},
+        5400.0,
+    )
 
 
 def make_clip(folder: Path, steps=60):
@@ -203,15 +237,28 @@ def full_report(folder: Path, steps=60):
         for s in (0, 1, 2)
     ]
     curves.append(rd.LossCurve("random", 0, 4 + rng.gamma(2, 0.5, 50)))
-    textures = [rd.Texture(f"gradient, seed {s}", "gradient", colour_grid(s, 3.0), f"9f3a{s}c", s) for s in (0, 1, 2)]
+    textures = [
+        rd.Texture(f"gradient, seed {s}", "gradient", colour_grid(s, 3.0), f"9f3a{s}c", s) for s in (0, 1, 2)
+    ]
     textures.append(rd.Texture("best random", "random", colour_grid(9, 5.0), "41b07e"))
     return rd.ReportData(
-        settings(), scene(), all_runs(), manifest(), tuple(curves), tuple(textures),
-        (rd.Clip("Surrogate and live drive", make_clip(folder, steps), "Start 1, seed 0."),), fidelity(), latency(),
+        settings(),
+        scene(),
+        all_runs(),
+        manifest(),
+        tuple(curves),
+        tuple(textures),
+        (rd.Clip("Surrogate and live drive", make_clip(folder, steps), "Start 1, seed 0."),),
+        fidelity(),
+        latency(),
         tuple(rd.MemoryRow(t, 180 + 0.01 * t, 60 + 9.0 * t) for t in (50, 100, 200, 400)),
-        tuple(rd.StageTiming(n, w, False) for n, w in (("capture", 41.0), ("scene", 610.0), ("policy", 700.2), ("attack", 3200.0))),
-        laps(), (rd.Check("adjoint against back-propagation, float64", "relative error ≤ 1e-8", "3.1e-12", True),),
-    )  # fmt: skip
+        tuple(
+            rd.StageTiming(n, w, False)
+            for n, w in (("capture", 41.0), ("scene", 610.0), ("policy", 700.2), ("attack", 3200.0))
+        ),
+        laps(),
+        (rd.Check("adjoint against back-propagation, float64", "relative error ≤ 1e-8", "3.1e-12", True),),
+    )
 
 
 @pytest.fixture(scope="session")

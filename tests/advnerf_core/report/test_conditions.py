@@ -52,7 +52,11 @@ def test_a_stranger_appears_in_the_report(make):
     legend = [text.get_text() for text in plots.cte_over_time(data, "surrogate").legends[0].get_texts()]
     assert legend == [f"{name}, surrogate" for name in shown]
     legend = [text.get_text() for text in plots.loss_curves(data).legends[0].get_texts()]
-    assert legend == ["gradient, one line per seed", "Spiral: each texture, best so far", "no attack, surrogate"]
+    assert legend == [
+        "gradient, one line per seed",
+        "Spiral: each texture, best so far",
+        "no attack, surrogate",
+    ]
     page = render_page(data)
     assert f"var(--{style_of('Spiral').key})" in page
     assert "Spiral" in page

@@ -13,8 +13,16 @@ from advnerf_core.report.palette import DARK, LIGHT
 
 # Machado, Oliveira and Fernandes 2009: dichromacy (severity 1) on linear RGB.
 DICHROMATS = {
-    "protanopia": [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]],
-    "deuteranopia": [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]],
+    "protanopia": [
+        [0.152286, 1.052583, -0.204868],
+        [0.114503, 0.786281, 0.099216],
+        [-0.003882, -0.048116, 1.051998],
+    ],
+    "deuteranopia": [
+        [0.367322, 0.860646, -0.227968],
+        [0.280085, 0.672501, 0.047413],
+        [-0.011820, 0.042940, 0.968881],
+    ],
     "none": np.eye(3),
 }
 
@@ -58,7 +66,9 @@ def test_face_segment_ends_and_front():
 def test_band_contains_exactly_the_points_near_the_path(make):
     scene = make.scene()
     band = maps.band_outline(scene)
-    points = np.array([[0.0, -2.0], [0.0, -2.39], [0.0, -1.61], [0.0, -2.42], [0.0, -1.58], [0.0, 0.0], [2.0, 0.0]])
+    points = np.array(
+        [[0.0, -2.0], [0.0, -2.39], [0.0, -1.61], [0.0, -2.42], [0.0, -1.58], [0.0, 0.0], [2.0, 0.0]]
+    )
     # Even-odd by hand: inside the outer ring and not inside the inner one.
     rings = [r for r in band.to_polygons(closed_only=True)]
     inside = sum(cv2_inside(r, points) for r in rings) % 2 == 1
@@ -67,7 +77,9 @@ def test_band_contains_exactly_the_points_near_the_path(make):
 
 def cv2_inside(ring, points):
     contour = ring.astype(np.float32)
-    return np.array([cv2.pointPolygonTest(contour, (float(x), float(y)), False) >= 0 for x, y in points]).astype(int)
+    return np.array(
+        [cv2.pointPolygonTest(contour, (float(x), float(y)), False) >= 0 for x, y in points]
+    ).astype(int)
 
 
 def test_svg_follows_the_theme_and_loads_nothing(report):

@@ -23,17 +23,23 @@ def test_nothing_measured_is_neither_met_nor_missed(bare_report):
 def test_surrogate_ratio(bare_report, make, ratio, met):
     clean = replace(make.drive("surrogate", "none", 0.0), total_cte_m=1.0)
     attacked = replace(make.drive("surrogate", "gradient", 0.0), total_cte_m=ratio)
-    assert verdicts(replace(bare_report, runs=(clean, attacked)))["gradient attack, surrogate: total CTE"] is met
+    assert (
+        verdicts(replace(bare_report, runs=(clean, attacked)))["gradient attack, surrogate: total CTE"] is met
+    )
 
 
 @pytest.mark.parametrize(("off_track", "met"), [((True, True, False), True), ((True, False, False), False)])
 def test_leaving_the_track_in_two_of_three(bare_report, make, off_track, met):
-    runs = tuple(replace(make.drive("deployed", "gradient", 0.0, s), off_track=o) for s, o in enumerate(off_track))
+    runs = tuple(
+        replace(make.drive("deployed", "gradient", 0.0, s), off_track=o) for s, o in enumerate(off_track)
+    )
     name = "gradient attack, live: left the track (|CTE| > 0.4 m)"
     assert verdicts(replace(bare_report, runs=runs))[name] is met
 
 
-@pytest.mark.parametrize(("ratio", "left", "met"), [(1.4, False, True), (1.6, False, False), (1.4, True, False)])
+@pytest.mark.parametrize(
+    ("ratio", "left", "met"), [(1.4, False, True), (1.6, False, False), (1.4, True, False)]
+)
 def test_random_may_neither_be_strong_nor_leave(bare_report, make, ratio, left, met):
     clean = replace(make.drive("deployed", "none", 0.0), total_cte_m=1.0)
     random = replace(make.drive("deployed", "random", 0.0), total_cte_m=ratio, off_track=left)
@@ -42,8 +48,9 @@ def test_random_may_neither_be_strong_nor_leave(bare_report, make, ratio, left, 
 
 
 @pytest.mark.parametrize(
-    ("samples", "missed", "met"), [((20.0, 30.0), 0, True), ((20.0, 130.0), 0, False), ((20.0,), 1, False), ((20.0,), None, None)]
-)  # fmt: skip
+    ("samples", "missed", "met"),
+    [((20.0, 30.0), 0, True), ((20.0, 130.0), 0, False), ((20.0,), 1, False), ((20.0,), None, None)],
+)
 def test_latency(bare_report, samples, missed, met):
     latency = Latency(np.array(samples), 100.0, missed)
     assert verdicts(replace(bare_report, latency=latency))["capture to serial write, live"] is met

@@ -30,9 +30,17 @@ def wanted_of(cells):
 def cell(scenario, method, seed, surrogate, deployed, clip=None, victim="hardened"):
     """Totals ``(attacked, none, off-track)`` of each domain, lists of one entry per start."""
     data = {
-        "scenario": scenario, "victim": victim, "method": method, "seed": seed, "attack_id": None, "settings_hash": "h",
-        "seconds": 1.0, "machine": "m", "date": "2026-11-21", "extra": {"clip": clip},
-    }  # fmt: skip
+        "scenario": scenario,
+        "victim": victim,
+        "method": method,
+        "seed": seed,
+        "attack_id": None,
+        "settings_hash": "h",
+        "seconds": 1.0,
+        "machine": "m",
+        "date": "2026-11-21",
+        "extra": {"clip": clip},
+    }
     for name, drives in (("surrogate", surrogate), ("deployed", deployed)):
         if drives is not None:
             data[name] = dict(zip(("total_cte_m", "none_total_cte_m", "off_track"), drives, strict=True))
@@ -65,7 +73,9 @@ def test_the_lines_by_hand(table):
     # Deployed from the first start only, so from that one in the surrogate: 16 over 4, and 21 over 6.
     assert deployed.transfer == pytest.approx(4.0 / 3.5)
     # Seed 0 alone: 3 over 4.5; seed 1 alone: 5 over 3.
-    assert (deployed.transfer_interval.low, deployed.transfer_interval.high) == pytest.approx((3.0 / 4.5, 5.0 / 3.0))
+    assert (deployed.transfer_interval.low, deployed.transfer_interval.high) == pytest.approx(
+        (3.0 / 4.5, 5.0 / 3.0)
+    )
     assert (deployed.paper_m, deployed.paper_std_m) == (1702, 160)
     assert deployed.paper_ratio == pytest.approx(1702 / 1166)
     assert "elsewhere" not in {row.scenario for row in table.rows}
@@ -73,7 +83,13 @@ def test_the_lines_by_hand(table):
 
 def test_what_was_not_run_is_missing_and_never_a_number(table):
     row = table.find("straight", "hardened", "none", "deployed")
-    assert (row.mean_m, row.ratio, row.std_m, row.transfer, row.missing) == (None, None, None, None, (0, 1, 2))
+    assert (row.mean_m, row.ratio, row.std_m, row.transfer, row.missing) == (
+        None,
+        None,
+        None,
+        None,
+        (0, 1, 2),
+    )
     assert "missing" in as_markdown(table)
     assert "from the same starts" in as_markdown(table)
     line = next(r for r in csv.DictReader(io.StringIO(as_csv(table))) if r["method"] == "none")
@@ -108,7 +124,8 @@ def test_targets_are_met_missed_or_not_measured(table):
 
 def test_the_live_scenarios_have_targets_of_their_own():
     cells = [
-        cell("monitor", "gradient", seed, ([9.0], [2.0], [True]), ([8.0], [2.0], [seed < 4])) for seed in range(5)
+        cell("monitor", "gradient", seed, ([9.0], [2.0], [True]), ([8.0], [2.0], [seed < 4]))
+        for seed in range(5)
     ] + [
         cell("green_screen", "gradient", seed, ([9.0], [2.0], [True]), ([5.0 + 10 * seed], [1.0], [True]))
         for seed in (0, 1)
@@ -139,8 +156,11 @@ def test_clips_are_grouped_by_outcome(tmp_path):
     gone = cell("right", "gradient", 0, ([3.0], [1.0], [False]), None, "c/clip.mp4")
     held = cell("right", "random", 0, ([1.1], [1.0], [False]), None)
     assert [outcome_of(each) for each in (strayed, left, gone, held)] == [
-        "strayed", "left the track", "strayed", "held its course",
-    ]  # fmt: skip
+        "strayed",
+        "left the track",
+        "strayed",
+        "held its course",
+    ]
     crashed = strayed.model_copy(update={"extra": {"blocked_tick": [None, 42]}})
     assert outcome_of(crashed) == "ran into something"
     assert outcome_of(left.model_copy(update={"extra": crashed.extra})) == "left the track"
@@ -151,8 +171,9 @@ def test_clips_are_grouped_by_outcome(tmp_path):
     cells = [strayed, left, gone, held]
     shown = gather_clips(make_table(wanted_of(cells), cells), tmp_path / "cells", tmp_path / "page")
     assert {clip.file for clip in shown} == {
-        "videos/strayed/straight_hardened_gradient_0.mp4", "videos/left_the_track/left_hardened_gradient_0.mp4",
-    }  # fmt: skip
+        "videos/strayed/straight_hardened_gradient_0.mp4",
+        "videos/left_the_track/left_hardened_gradient_0.mp4",
+    }
     assert all((tmp_path / "page" / clip.file).is_file() for clip in shown)
 
 

@@ -19,13 +19,22 @@ from advnerf_core.scene.train import TrainConfig, TrainedScene, Trainer, train_s
 from advnerf_core.scene.train_step import CpuStep, Matte
 
 GRID = HashGridConfig(levels=6, features=4, log2_entries=12, coarsest=8, finest=64)
-FIELD = SceneFieldConfig((-0.8, -0.8, -0.8), (0.8, 0.8, 0.8), GRID, hidden=16, features=7, learned_background=False)
+FIELD = SceneFieldConfig(
+    (-0.8, -0.8, -0.8), (0.8, 0.8, 0.8), GRID, hidden=16, features=7, learned_background=False
+)
 CAMERA = Pinhole(32, 32, 40.0, 40.0, 16.0, 16.0)
 RADIUS_M, DENSITY_PER_M = 0.5, 3.0
 TRAIN = TrainConfig(
-    steps=250, samples_per_step=1 << 13, max_rays=1024, occupancy_resolution=32, warmup_steps=40, distortion=0.0,
-    march=MarchConfig(near_m=0.5, smallest_step_m=0.02, largest_step_m=0.04, step_growth=0.01, max_samples=128),
-)  # fmt: skip
+    steps=250,
+    samples_per_step=1 << 13,
+    max_rays=1024,
+    occupancy_resolution=32,
+    warmup_steps=40,
+    distortion=0.0,
+    march=MarchConfig(
+        near_m=0.5, smallest_step_m=0.02, largest_step_m=0.04, step_growth=0.01, max_samples=128
+    ),
+)
 
 
 def some_batch(rays: int, seed: int) -> tuple[NDArray[np.float32], NDArray[np.uint8], Samples, Matte]:
@@ -91,7 +100,9 @@ def test_the_loss_vanishes_only_at_the_true_opacity() -> None:
         colours, _, alpha = render_rays(scene, torch.from_numpy(rays), samples)
     exact = np.rint(255 * colours.numpy()).astype(np.uint8)
     right = Matte(np.rint(255 * alpha.numpy()).astype(np.uint8), matte.behind)
-    wrong = dataclasses.replace(right, opacities=np.minimum(right.opacities.astype(int) + 40, 255).astype(np.uint8))
+    wrong = dataclasses.replace(
+        right, opacities=np.minimum(right.opacities.astype(int) + 40, 255).astype(np.uint8)
+    )
     step = CpuStep(scene, huber=10.0)
     losses = []
     for opacities in (right, wrong):

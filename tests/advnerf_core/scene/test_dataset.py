@@ -35,7 +35,9 @@ def test_written_sets_read_back(tmp_path: Path) -> None:
     assert loaded.rgb.shape == (3, 48, 64, 3)
     assert loaded.rgb[0, 10, 5].tolist() == [230, 20, 10], "channels are red, green, blue"
     assert loaded.pinholes[0] == PINHOLE
-    np.testing.assert_allclose(loaded.T_world_from_camera[1], look_at([3.0, 1.0, 1.0], [0.0, 0.0, 0.5]), atol=1e-9)
+    np.testing.assert_allclose(
+        loaded.T_world_from_camera[1], look_at([3.0, 1.0, 1.0], [0.0, 0.0, 0.5]), atol=1e-9
+    )
     assert listed.aabb_scale == 4
     np.testing.assert_allclose(listed.box()[1], 2.0 / 0.33)
 
@@ -43,7 +45,9 @@ def test_written_sets_read_back(tmp_path: Path) -> None:
 def test_files_hold_opengl_axes(tmp_path: Path) -> None:
     content = json.loads(write_set(tmp_path).read_text())
     matrix = np.array(content["frames"][0]["transform_matrix"])
-    np.testing.assert_allclose(matrix @ OPENGL_FROM_OPENCV, look_at([3.0, 0.0, 1.0], [0.0, 0.0, 0.5]), atol=1e-9)
+    np.testing.assert_allclose(
+        matrix @ OPENGL_FROM_OPENCV, look_at([3.0, 0.0, 1.0], [0.0, 0.0, 0.5]), atol=1e-9
+    )
     assert matrix[2, 1] > 0.5, "the file's y axis points up"
 
 

@@ -23,16 +23,20 @@ def test_each_limit_alone_refuses_and_says_why():
     good = agreement(list(REAL), list(REAL + 5), STEERING, STEERING + 0.02)
     assert judge(good, GateLimits()).passed
     for limits, why in (
-        ({"psnr_db": 40.0}, "PSNR 34.15 dB, at least 40"), ({"steering": 0.01}, "steering difference 0.0200, at most 0.01"),
-        ({"views": 13}, "12 pictures, at least 13"), ({"ssim": 1.0}, "SSIM"),
-    ):  # fmt: skip
+        ({"psnr_db": 40.0}, "PSNR 34.15 dB, at least 40"),
+        ({"steering": 0.01}, "steering difference 0.0200, at most 0.01"),
+        ({"views": 13}, "12 pictures, at least 13"),
+        ({"ssim": 1.0}, "SSIM"),
+    ):
         verdict = judge(good, GateLimits(**limits), "views of mine")
         assert not verdict.passed
         assert len(verdict.reasons) == 1
         assert verdict.reasons[0].startswith("views of mine: ")
         assert why in verdict.reasons[0]
     turned = agreement(list(REAL), list(REAL), STEERING, -STEERING)
-    assert any("correlation of the steering -1.000" in reason for reason in judge(turned, GateLimits()).reasons)
+    assert any(
+        "correlation of the steering -1.000" in reason for reason in judge(turned, GateLimits()).reasons
+    )
 
 
 def test_constant_steering_correlates_only_with_itself():

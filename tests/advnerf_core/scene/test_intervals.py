@@ -20,12 +20,21 @@ RADIUS_M, DISTANCE_M, SIDE_PX = 0.5, 6.0, 48
 FOCAL_PX = SIDE_PX / 1.2 * DISTANCE_M
 LENS = Pinhole(SIDE_PX, SIDE_PX, FOCAL_PX, FOCAL_PX, SIDE_PX / 2, SIDE_PX / 2)
 FIELD = SceneFieldConfig(
-    (-0.6,) * 3, (0.6,) * 3, HashGridConfig(levels=8, features=4, log2_entries=14, finest=256), learned_background=False
+    (-0.6,) * 3,
+    (0.6,) * 3,
+    HashGridConfig(levels=8, features=4, log2_entries=14, finest=256),
+    learned_background=False,
 )
 TRAIN = TrainConfig(
-    steps=350, samples_per_step=1 << 14, max_rays=1 << 12, occupancy_resolution=64, warmup_steps=64, distortion=2e-3,
-    near_m=0.05, backend="numba",
-)  # fmt: skip
+    steps=350,
+    samples_per_step=1 << 14,
+    max_rays=1 << 12,
+    occupancy_resolution=64,
+    warmup_steps=64,
+    distortion=2e-3,
+    near_m=0.05,
+    backend="numba",
+)
 
 INSIDE, OUTSIDE = np.eye(4)[None], look_at([DISTANCE_M, 0.0, 0.0], [0.0, 0.0, 0.0])[None]
 
@@ -67,7 +76,9 @@ def test_an_interval_is_a_few_pixels_at_any_distance():
         pixel_m = distance_m / focal_px
         assert step_size(np.float32(distance_m), steps) == pytest.approx(INTERVAL_PX * pixel_m, rel=1e-5)
     finer = pixel_intervals([LENS], INSIDE, field, interval_px=1.0)
-    assert finer.step_growth == pytest.approx(pixel_intervals([LENS], INSIDE, field).step_growth / INTERVAL_PX)
+    assert finer.step_growth == pytest.approx(
+        pixel_intervals([LENS], INSIDE, field).step_growth / INTERVAL_PX
+    )
 
 
 def test_content_is_sampled_finely_whatever_the_pictures():
@@ -80,7 +91,8 @@ def test_content_is_sampled_finely_whatever_the_pictures():
 
 def test_cameras_around_an_object_get_finer_intervals_than_cameras_in_a_room():
     growth = [
-        pixel_intervals([LENS], np.concatenate(poses), FIELD).step_growth for poses in ([OUTSIDE], [OUTSIDE, INSIDE])
+        pixel_intervals([LENS], np.concatenate(poses), FIELD).step_growth
+        for poses in ([OUTSIDE], [OUTSIDE, INSIDE])
     ]
     assert growth == [INTERVAL_PX_FROM_OUTSIDE / FOCAL_PX, INTERVAL_PX / FOCAL_PX]
 
@@ -141,7 +153,9 @@ def test_a_camera_that_stands_back_is_learned_from(standing_back):
     renderer = FieldRenderer(trained.scene, trained.occupied, trained.march)
     scores = [
         psnr(renderer.render(pose[None], LENS)[0][0].numpy(), real / 255.0)
-        for pose, real in zip(held_out.T_world_from_camera, held_out.on_background((1.0, 1.0, 1.0)), strict=True)
+        for pose, real in zip(
+            held_out.T_world_from_camera, held_out.on_background((1.0, 1.0, 1.0)), strict=True
+        )
     ]
     print(f"{np.mean(scores):.2f} dB")
     assert np.mean(scores) > 21.5

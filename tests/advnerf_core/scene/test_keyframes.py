@@ -105,7 +105,8 @@ def test_a_video_becomes_files_and_a_second_run_uses_them_again(tmp_path):
     assert reports[-1] > 0.9
     stamps = [file.stat().st_mtime_ns for file in files]
     assert (
-        keep_keyframes(video, tmp_path / "kept", config, 100, lambda share, text: pytest.fail("worked again")) == files
+        keep_keyframes(video, tmp_path / "kept", config, 100, lambda share, text: pytest.fail("worked again"))
+        == files
     )
     assert [file.stat().st_mtime_ns for file in files] == stamps
     few = keep_keyframes(video, tmp_path / "kept", config, 5, lambda share, text: None)
@@ -118,7 +119,9 @@ def test_what_is_no_video_is_one_error(tmp_path):
     with pytest.raises(DatasetError, match=r"video that can be decoded, got .*a\.mp4"):
         list(read_video(tmp_path / "a.mp4"))
     with pytest.raises(DatasetError, match=r"nowhere\.mp4"):
-        keep_keyframes(tmp_path / "nowhere.mp4", tmp_path / "k", KeyframeConfig(), 5, lambda share, text: None)
+        keep_keyframes(
+            tmp_path / "nowhere.mp4", tmp_path / "k", KeyframeConfig(), 5, lambda share, text: None
+        )
 
 
 def test_a_video_that_was_cut_off_gives_what_it_has(tmp_path):

@@ -35,7 +35,12 @@ def test_a_capture_that_was_stopped_takes_only_what_is_missing(tmp_path):
         write_posed_images(tmp_path, POSES, PINHOLE, stopped, "png", keep=True)
     assert not (tmp_path / "transforms.json").exists()
     asked = []
-    assert write_posed_images(tmp_path, POSES, PINHOLE, lambda i: asked.append(i) or picture(i), "png", keep=True) == 1
+    assert (
+        write_posed_images(
+            tmp_path, POSES, PINHOLE, lambda i: asked.append(i) or picture(i), "png", keep=True
+        )
+        == 1
+    )
     assert asked == [2]
     assert len(load_transforms(tmp_path, require_all=True).frames) == 3
 

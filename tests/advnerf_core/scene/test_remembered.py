@@ -22,7 +22,11 @@ class Scene:
     def __call__(self, poses, pinhole):
         self.asked += poses[:, 0, 3].tolist()
         values = torch.tensor(poses[:, 0, 3] * pinhole.fx, dtype=torch.float32)
-        return values[:, None, None, None].expand(-1, 3, 4, 3), values[:, None, None].expand(-1, 3, 4), "opacity"
+        return (
+            values[:, None, None, None].expand(-1, 3, 4, 3),
+            values[:, None, None].expand(-1, 3, 4),
+            "opacity",
+        )
 
 
 def poses(*x_m):

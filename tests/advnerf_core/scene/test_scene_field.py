@@ -40,14 +40,18 @@ def room_view(T: Array) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
     with np.errstate(divide="ignore"):
         t = ((np.sign(directions) * HALF - T[:3, 3]) / directions).min(-1)
     hit = T[:3, 3] + t[..., None] * directions
-    rgb = 0.5 + 0.4 * np.sin(7.0 * hit[..., [0, 1, 2]] + 5.0 * hit[..., [1, 2, 0]] + np.array([0.0, 1.0, 2.0]))
+    rgb = 0.5 + 0.4 * np.sin(
+        7.0 * hit[..., [0, 1, 2]] + 5.0 * hit[..., [1, 2, 0]] + np.array([0.0, 1.0, 2.0])
+    )
     return np.round(255 * rgb).astype(np.uint8), t
 
 
 def room_poses(count: int, seed: int) -> Array:
     rng = np.random.default_rng(seed)
     eyes = rng.uniform(-0.6, 0.6, (count, 3)) * HALF
-    return np.stack([look_at(eye, eye + np.append(rng.normal(size=2), rng.uniform(-0.5, 0.5))) for eye in eyes])
+    return np.stack(
+        [look_at(eye, eye + np.append(rng.normal(size=2), rng.uniform(-0.5, 0.5))) for eye in eyes]
+    )
 
 
 def room_images(count: int = 90, seed: int = 0) -> ImageSet:
@@ -85,7 +89,9 @@ def test_rendering_agrees_with_plain_torch_and_is_the_same_each_time(trained: Tr
         rays[part, :3] = (T[:3, 3] - np.array(BOX[0])) / FIELD.extent_m
         rays[part, 3:] = (directions @ T[:3, :3].T).reshape(-1, 3) / FIELD.extent_m
     leaps = leap_distances(trained.occupied, np.array(trained.occupied.shape) / FIELD.box_high)
-    samples, kept = Marcher(1 << 20, trained.march, FIELD.box_high)(rays, np.full(len(rays), 0.5, np.float32), leaps)
+    samples, kept = Marcher(1 << 20, trained.march, FIELD.box_high)(
+        rays, np.full(len(rays), 0.5, np.float32), leaps
+    )
     assert len(kept) == len(rays)
     with torch.no_grad():
         plain = render_rays(trained.scene, torch.from_numpy(rays), samples)[0]
@@ -161,7 +167,9 @@ def test_scene_files_survive_and_damage_is_reported(tmp_path: Path, trained: Tra
     np.testing.assert_array_equal(occupied, trained.occupied)
     pose = room_poses(1, seed=5)
     loaded = FieldRenderer.from_file(path).render(pose, CAMERA)[0]
-    assert torch.equal(loaded, FieldRenderer(trained.scene, trained.occupied, trained.march).render(pose, CAMERA)[0])
+    assert torch.equal(
+        loaded, FieldRenderer(trained.scene, trained.occupied, trained.march).render(pose, CAMERA)[0]
+    )
     with torch.no_grad():
         scene.background += 1.0
     assert save_scene(tmp_path / "other.safetensors", scene, occupied) != content

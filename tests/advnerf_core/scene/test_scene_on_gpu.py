@@ -81,7 +81,13 @@ def test_a_training_runs_there_and_its_scene_renders_here(field: SceneFieldConfi
     rgb = rng.integers(0, 256, (6, 18, 24, 3)).astype(np.uint8)
     alpha = None if field.learned_background else rng.integers(0, 256, (6, 18, 24)).astype(np.uint8)
     config = TrainConfig(
-        steps=40, samples_per_step=4096, max_rays=512, occupancy_resolution=16, warmup_steps=8, march=MARCH, opacity=0.0
+        steps=40,
+        samples_per_step=4096,
+        max_rays=512,
+        occupancy_resolution=16,
+        warmup_steps=8,
+        march=MARCH,
+        opacity=0.0,
     )
     trainer = Trainer(ImageSet(rgb, (CAMERA,) * 6, poses, alpha), field, config)
     assert isinstance(trainer.stepper, TorchStep)

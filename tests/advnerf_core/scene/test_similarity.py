@@ -19,7 +19,9 @@ def disturbed(poses, position_m, angle_rad, seed=1):
     rng = np.random.default_rng(seed)
     noisy = poses.copy()
     noisy[:, :3, 3] += rng.normal(0.0, position_m, (len(poses), 3))
-    noisy[:, :3, :3] = Rotation.from_rotvec(rng.normal(0.0, angle_rad, (len(poses), 3))).as_matrix() @ poses[:, :3, :3]
+    noisy[:, :3, :3] = (
+        Rotation.from_rotvec(rng.normal(0.0, angle_rad, (len(poses), 3))).as_matrix() @ poses[:, :3, :3]
+    )
     return noisy
 
 
@@ -49,7 +51,9 @@ def test_a_third_of_wrong_poses_is_thrown_out():
     target = disturbed(TRUE.poses(source), 0.005, 0.003)
     rng = np.random.default_rng(5)
     target[:6, :3, 3] += rng.normal(0.0, 2.0, (6, 3))
-    target[6:10, :3, :3] = Rotation.random(4, random_state=6).as_matrix()  # in the right place, looking elsewhere
+    target[6:10, :3, :3] = Rotation.random(
+        4, random_state=6
+    ).as_matrix()  # in the right place, looking elsewhere
     found = align_poses(source, target, *TOLERANCES)
     assert found.inliers.tolist() == [False] * 10 + [True] * 20
     assert found.similarity.scale == pytest.approx(TRUE.scale, rel=5e-3)

@@ -19,7 +19,9 @@ def wall(poses, pinhole, depth_m=5.0):
 
 
 def face(x_m, resolution=4, y_m=0.0):
-    return cube_face_object(0.8, resolution, (0.2, 0.5, 0.3), make_transform(rotation_z(np.pi), [x_m, y_m, 0.4]))
+    return cube_face_object(
+        0.8, resolution, (0.2, 0.5, 0.3), make_transform(rotation_z(np.pi), [x_m, y_m, 0.4])
+    )
 
 
 def surrogate(objects, background=wall, **options):
@@ -88,7 +90,8 @@ def test_two_objects_keep_their_order_and_their_gradients_apart():
     alphas = []
     for o, n in ((far, 2), (near, 3)):
         white, black = (
-            surrogate(o).render(poses, torch.full((n, n, 3), v, dtype=torch.float64)).images for v in (60, -60)
+            surrogate(o).render(poses, torch.full((n, n, 3), v, dtype=torch.float64)).images
+            for v in (60, -60)
         )
         alphas.append((white - black)[:, 0])
     alpha = torch.stack([*alphas, torch.ones_like(alphas[0])])
@@ -101,7 +104,9 @@ def test_two_objects_keep_their_order_and_their_gradients_apart():
     torch.testing.assert_close(rendered.images.permute(0, 2, 3, 1), expected, atol=1e-12, rtol=0)
     gradient = rendered.vjp(torch.ones_like(rendered.images))
     torch.testing.assert_close(gradient[4:], single[1].vjp(torch.ones_like(rendered.images)).reshape(9, 3))
-    assert (gradient[:4].abs() <= single[0].vjp(torch.ones_like(rendered.images)).reshape(4, 3).abs() + 1e-12).all()
+    assert (
+        gradient[:4].abs() <= single[0].vjp(torch.ones_like(rendered.images)).reshape(4, 3).abs() + 1e-12
+    ).all()
 
 
 def test_frames_can_be_rendered_again_without_the_scene():
@@ -141,7 +146,9 @@ def test_float32_agrees_with_float64():
 
 def test_initial_theta_is_plain_with_little_noise_that_differs_by_seed():
     scene = surrogate(face(2.0))
-    torch.testing.assert_close(squash(scene.plain_theta()), torch.tensor([0.2, 0.5, 0.3]).double().expand(4, 4, 3))
+    torch.testing.assert_close(
+        squash(scene.plain_theta()), torch.tensor([0.2, 0.5, 0.3]).double().expand(4, 4, 3)
+    )
     a, b, again = (scene.initial_theta(torch.Generator().manual_seed(s)) for s in (0, 1, 0))
     assert torch.equal(a, again)
     assert not torch.equal(a, b)

@@ -28,9 +28,15 @@ def cloud(x_m, y_m, density=6.0, count=8):
     i, j, k = np.indices(shape)
     inside = (i - 3.5) ** 2 + (j - 3.5) ** 2 + (k - 3.5) ** 2 < 10
     return VoxelGridObject(
-        slots, (count**3 - 20, 3), np.array([[0.1, 0.2, 0.3]]), -0.3 * np.ones(3), 0.3 * np.ones(3),
-        make_transform(rotation_z(x_m), [x_m, y_m, 0.2]), density=np.where(inside, density, 0.0), step_units=0.02,
-    )  # fmt: skip
+        slots,
+        (count**3 - 20, 3),
+        np.array([[0.1, 0.2, 0.3]]),
+        -0.3 * np.ones(3),
+        0.3 * np.ones(3),
+        make_transform(rotation_z(x_m), [x_m, y_m, 0.2]),
+        density=np.where(inside, density, 0.0),
+        step_units=0.02,
+    )
 
 
 def surrogate(objects, **options):
@@ -39,7 +45,9 @@ def surrogate(objects, **options):
 
 def assert_vjp_is_the_derivative(scene, seed=0):
     generator = torch.Generator().manual_seed(seed)
-    theta, direction = (torch.randn(scene.theta_shape, dtype=torch.float64, generator=generator) for _ in range(2))
+    theta, direction = (
+        torch.randn(scene.theta_shape, dtype=torch.float64, generator=generator) for _ in range(2)
+    )
     poses, h = scene.camera_poses(STATES), 1e-5
     probe = torch.randn(2, 3, 26, 40, dtype=torch.float64, generator=generator)
     gradient = scene.render(poses, theta).vjp(probe)
@@ -57,7 +65,10 @@ def test_the_order_in_which_objects_are_named_does_not_matter():
     poses = scene.camera_poses(STATES)
     a, b = scene.render(poses, theta), shuffled.render(poses, torch.cat([parts[2], parts[0], parts[1]]))
     torch.testing.assert_close(a.images, b.images, atol=1e-12, rtol=0)
-    ga, gb = (rendered.vjp(torch.ones_like(rendered.images)).split([near.parameter_count] * 3) for rendered in (a, b))
+    ga, gb = (
+        rendered.vjp(torch.ones_like(rendered.images)).split([near.parameter_count] * 3)
+        for rendered in (a, b)
+    )
     for mine, other in zip(ga, (gb[1], gb[2], gb[0]), strict=True):
         torch.testing.assert_close(mine, other, atol=1e-12, rtol=0)
     assert_vjp_is_the_derivative(scene)
@@ -79,7 +90,9 @@ def test_opaque_composition_shows_object_or_scene_whichever_is_nearer():
     torch.testing.assert_close(alone.render(poses, theta[: visible.parameter_count]).images, images)
     rgb, depth_m = wall(poses, PINHOLE)
     torch.testing.assert_close(scene.overlay(rgb, depth_m, poses, theta), images)
-    assert torch.equal(scene.overlay(rgb, torch.full_like(depth_m, 0.1), poses, theta), rgb.permute(0, 3, 1, 2))
+    assert torch.equal(
+        scene.overlay(rgb, torch.full_like(depth_m, 0.1), poses, theta), rgb.permute(0, 3, 1, 2)
+    )
     with pytest.raises(ValueError, match="expected a background of shapes"):
         scene.overlay(rgb[:1], depth_m, poses, theta)
 
@@ -92,7 +105,10 @@ def test_summed_levels_are_trilinear_grids_added_before_the_squash():
     total, first = 0.0, 0
     for n in sizes:
         grid = theta[first : first + n**3].reshape(n, n, n, 3).permute(3, 0, 1, 2)[None]
-        total = total + torch.nn.functional.interpolate(grid, size=(8, 8, 8), mode="trilinear", align_corners=False)[0]
+        total = (
+            total
+            + torch.nn.functional.interpolate(grid, size=(8, 8, 8), mode="trilinear", align_corners=False)[0]
+        )
         first += n**3
     values = total.permute(1, 2, 3, 0).reshape(-1, 3)
     colours = field.colours(theta)[:-1]

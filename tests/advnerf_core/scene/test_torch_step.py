@@ -72,7 +72,9 @@ def test_loss_gradients_and_updates_agree_with_the_kernels() -> None:
 def test_densities_agree_with_the_kernels() -> None:
     points = np.random.default_rng(2).random((1000, 3), dtype=np.float32)
     scene = some_scene(3)
-    np.testing.assert_allclose(TorchStep(scene).log_density(points), CpuStep(scene).log_density(points), atol=1e-5)
+    np.testing.assert_allclose(
+        TorchStep(scene).log_density(points), CpuStep(scene).log_density(points), atol=1e-5
+    )
 
 
 def constant_scene(log_density: float) -> SceneField:
@@ -97,7 +99,9 @@ def test_a_slab_has_the_transmittance_of_its_closed_form(opaque_first: bool) -> 
         points, t, begins = np.tile(points, (2, 1)), np.tile(t, 2), np.array([0, count, 2 * count])
     rays = torch.ones(len(begins) - 1, 6)
     with torch.no_grad():
-        _, weights, alpha = render_rays(constant_scene(float(np.log(sigma))), rays, Samples(points, t, widths, begins))
+        _, weights, alpha = render_rays(
+            constant_scene(float(np.log(sigma))), rays, Samples(points, t, widths, begins)
+        )
     assert alpha[-1].item() == pytest.approx(1.0 - np.exp(-sigma * length), rel=1e-5)
     expected = np.exp(-sigma * length * np.arange(count) / count) * (1.0 - np.exp(-sigma * length / count))
     np.testing.assert_allclose(weights[-count:], expected, rtol=1e-5)
@@ -145,9 +149,16 @@ def striped_room(count: int) -> ImageSet:
 
 
 TRAIN = TrainConfig(
-    steps=12, samples_per_step=2048, max_rays=256, occupancy_resolution=16, warmup_steps=4, backend="torch",
-    march=MarchConfig(near_m=0.05, smallest_step_m=0.05, largest_step_m=0.1, step_growth=0.02, max_samples=64),
-)  # fmt: skip
+    steps=12,
+    samples_per_step=2048,
+    max_rays=256,
+    occupancy_resolution=16,
+    warmup_steps=4,
+    backend="torch",
+    march=MarchConfig(
+        near_m=0.05, smallest_step_m=0.05, largest_step_m=0.1, step_growth=0.02, max_samples=64
+    ),
+)
 
 
 def test_a_training_in_torch_learns_as_the_kernels_do_and_resumes_in_them(tmp_path: Path) -> None:

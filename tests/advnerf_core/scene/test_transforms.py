@@ -37,7 +37,9 @@ def test_blender_folder_with_its_splits(tmp_path):
         frames = [{"file_path": f"./{split}/r_{k}", "transform_matrix": pose(k)} for k in range(count)]
         for k in range(count):
             paint(tmp_path / split / f"r_{k}.png", channels=4)
-        (tmp_path / f"transforms_{split}.json").write_text(json.dumps({"camera_angle_x": 0.69, "frames": frames}))
+        (tmp_path / f"transforms_{split}.json").write_text(
+            json.dumps({"camera_angle_x": 0.69, "frames": frames})
+        )
     listed = load_transforms(tmp_path)
     assert listed.splits == ("train", "val", "test")
     training, held_out = listed.training_and_held_out()
@@ -49,7 +51,9 @@ def test_blender_folder_with_its_splits(tmp_path):
 
 def test_nerfstudio_lists_of_splits(tmp_path):
     frames = [{"file_path": f"{k}.png", "transform_matrix": pose(k)} for k in range(4)]
-    listed = load_transforms(write(tmp_path, frames, train_filenames=["0.png", "./2.png"], test_filenames=["3.png"]))
+    listed = load_transforms(
+        write(tmp_path, frames, train_filenames=["0.png", "./2.png"], test_filenames=["3.png"])
+    )
     assert [f.split for f in listed.frames] == ["train", None, "train", "test"]
     training, held_out = listed.training_and_held_out()
     assert [f.path.name for f in (*training.frames, *held_out.frames)] == ["0.png", "2.png", "3.png"]
@@ -90,7 +94,10 @@ def test_fields_of_view_in_degrees_and_of_both_axes(tmp_path):
 def test_cameras_of_one_set_keep_their_own_intrinsics_and_names(tmp_path):
     for name in ("phone.png", "car.png"):
         paint(tmp_path / name)
-    pinholes = [Pinhole(WIDTH, HEIGHT, 30.0, 31.0, 16.0, 12.0), Pinhole(WIDTH, HEIGHT, 20.0, 20.0, 15.0, 11.0)]
+    pinholes = [
+        Pinhole(WIDTH, HEIGHT, 30.0, 31.0, 16.0, 12.0),
+        Pinhole(WIDTH, HEIGHT, 20.0, 20.0, 15.0, 11.0),
+    ]
     lenses = [Lens((0.1, -0.05, 0.001, 0.0, 0.0)), Lens((0.01, 0.0, 0.0, 0.0), fisheye=True)]
     poses = np.stack([look_at([3.0, k, 1.0], [0.0, 0.0, 0.5]) for k in range(2)])
     path = tmp_path / "transforms.json"
@@ -140,7 +147,10 @@ FRAME = r"transforms\.json: frame 1 \(1\.png\): "
         ({"transform_matrix": moved(float("nan"))}, FRAME + "transform_matrix: expected finite numbers"),
         ({"transform_matrix": scaled(1.7)}, FRAME + r"transform_matrix: .*a stretch by 1\.7, 1\.7, 1\.7"),
         ({"transform_matrix": scaled([1.0, 1.0, -1.0])}, FRAME + "transform_matrix: .*a mirror image"),
-        ({"transform_matrix": np.array(moved(2.0)).T.tolist()}, FRAME + "transform_matrix: .*is it transposed"),
+        (
+            {"transform_matrix": np.array(moved(2.0)).T.tolist()},
+            FRAME + "transform_matrix: .*is it transposed",
+        ),
         (
             {"transform_matrix": [[1, 2], [3, 4]]},
             FRAME + r"transform_matrix: expected 4 x 4 numbers, got shape \[2, 2\]",
@@ -152,7 +162,10 @@ FRAME = r"transforms\.json: frame 1 \(1\.png\): "
         ),
         ({"fl_x": -3}, FRAME + "fl_x: expected a positive number, got -3"),
         ({"fl_x": None}, FRAME + "fl_x: expected fl_x, camera_angle_x or x_fov"),
-        ({"fl_x": None, "camera_angle_x": 4.0}, FRAME + "camera_angle_x: expected a field of view below a half turn"),
+        (
+            {"fl_x": None, "camera_angle_x": 4.0},
+            FRAME + "camera_angle_x: expected a field of view below a half turn",
+        ),
         ({"cx": "middle"}, FRAME + "cx: expected a number, got 'middle'"),
         ({"mask_path": "no.png"}, FRAME + r"mask_path: expected a mask at .*no\.png"),
         ({"file_path": 7}, r"transforms\.json: frame 1 \(7\): file_path: expected the name"),

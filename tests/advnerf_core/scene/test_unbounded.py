@@ -49,7 +49,9 @@ def some_rays(count: int, seed: int) -> tuple[NDArray[np.float32], Samples]:
     directions /= FIELD.extent_m * np.linalg.norm(directions, axis=1, keepdims=True)
     rays = np.concatenate([rng.uniform(0.2, 0.8, (count, 3)), directions], axis=1).astype(np.float32)
     leaps = leap_distances(rng.random((32, 32, 32)) > 0.5, np.full(3, 32.0))
-    samples, kept = Marcher(1 << 18, MARCH, FIELD.box_high, True)(rays, rng.random(count, dtype=np.float32), leaps)
+    samples, kept = Marcher(1 << 18, MARCH, FIELD.box_high, True)(
+        rays, rng.random(count, dtype=np.float32), leaps
+    )
     assert len(kept) == count
     return rays, samples
 
@@ -58,7 +60,9 @@ def test_world_points_go_to_the_cube() -> None:
     scene = SceneField(FIELD)
     # The cube around the flat box is the inner region: z from -1 to 1.
     points = torch.tensor([[0.0, 0.0, 0.0], [1.0, -1.0, 1.0], [4.0, 1.0, -2.0]])
-    expected = torch.tensor([[0.5, 0.5, 0.5], [0.75, 0.25, 0.75], [(1.75 + 2) / 4, (0.25 + 2) / 4, (-0.5 + 2) / 4]])
+    expected = torch.tensor(
+        [[0.5, 0.5, 0.5], [0.75, 0.25, 0.75], [(1.75 + 2) / 4, (0.25 + 2) / 4, (-0.5 + 2) / 4]]
+    )
     torch.testing.assert_close(scene.to_box(points), expected)
     np.testing.assert_allclose(poses_in_box(np.eye(4)[None], FIELD.origin_m, FIELD.extent_m)[0, :, 3], 0.5)
 
@@ -66,7 +70,9 @@ def test_world_points_go_to_the_cube() -> None:
 def test_hand_written_gradients_agree_with_automatic_differentiation() -> None:
     rays, samples = some_rays(200, seed=1)
     assert contract(rays[:, :3]).min() >= 0.25
-    assert (np.abs(samples.points - 0.5).max(axis=1) > 0.25).mean() > 0.3, "many samples lie outside the inner region"
+    assert (np.abs(samples.points - 0.5).max(axis=1) > 0.25).mean() > 0.3, (
+        "many samples lie outside the inner region"
+    )
     targets = np.random.default_rng(2).integers(0, 256, (200, 3)).astype(np.uint8)
     kernels = CpuStep(some_scene(3), 0.1, distortion=0.3, opacity=0.02)
     plain = TorchStep(some_scene(3), 0.1, distortion=0.3, opacity=0.02)
@@ -85,14 +91,18 @@ def test_the_renderer_agrees_with_plain_torch_in_colour_and_planar_depth() -> No
     scene, rng = some_scene(4), np.random.default_rng(5)
     occupied = rng.random((32, 32, 32)) > 0.6
     T = look_at([0.3, -0.2, 0.1], [2.0, 1.0, 0.4])
-    rgb, depth_m, alpha = FieldRenderer(scene, occupied, MARCH, least_transmittance=1e-4).render(T[None], CAMERA)
+    rgb, depth_m, alpha = FieldRenderer(scene, occupied, MARCH, least_transmittance=1e-4).render(
+        T[None], CAMERA
+    )
     directions = CAMERA.directions()
     cosine = 1.0 / np.linalg.norm(directions, axis=-1)
     pose = poses_in_box(T[None], FIELD.origin_m, FIELD.extent_m)[0]
     rays = np.empty((30 * 40, 6), np.float32)
     rays[:, :3], rays[:, 3:] = pose[:, 3], ((directions * cosine[..., None]) @ pose[:, :3].T).reshape(-1, 3)
     leaps = leap_distances(occupied, np.full(3, 32.0))
-    samples, kept = Marcher(1 << 20, MARCH, FIELD.box_high, True)(rays, np.full(len(rays), 0.5, np.float32), leaps)
+    samples, kept = Marcher(1 << 20, MARCH, FIELD.box_high, True)(
+        rays, np.full(len(rays), 0.5, np.float32), leaps
+    )
     assert len(kept) == len(rays)
     with torch.no_grad():
         colours, weights, opacity = render_rays(scene, torch.from_numpy(rays), samples)
@@ -135,25 +145,42 @@ def test_a_far_environment_is_learned_only_with_the_contraction(backend: str) ->
     images = ImageSet(np.stack([environment(T) for T in poses]), (CAMERA,) * 150, poses)
     real = np.stack([environment(T) for T in held_out]) / 255.0
     config = TrainConfig(
-        steps=600, samples_per_step=1 << 14, max_rays=1024, occupancy_resolution=32, warmup_steps=40, march=WIDE,
-        opacity=0.0, distortion=2e-3, backend=backend,
-    )  # fmt: skip
+        steps=600,
+        samples_per_step=1 << 14,
+        max_rays=1024,
+        occupancy_resolution=32,
+        warmup_steps=40,
+        march=WIDE,
+        opacity=0.0,
+        distortion=2e-3,
+        backend=backend,
+    )
     field = dataclasses.replace(FIELD, box_low_m=(-1.0, -1.0, -1.0), box_high_m=(1.0, 1.0, 1.0))
     reached = {}
     for contraction in (False, True):
         trained = train_scene(images, dataclasses.replace(field, contraction=contraction), config)
-        rendered, depth_m, _ = FieldRenderer(trained.scene, trained.occupied, trained.march).render(held_out, CAMERA)
+        rendered, depth_m, _ = FieldRenderer(trained.scene, trained.occupied, trained.march).render(
+            held_out, CAMERA
+        )
         reached[contraction] = psnr(rendered.numpy(), real)
     assert reached[True] > 23.0
     assert reached[True] > reached[False] + 8.0
-    assert depth_m[torch.isfinite(depth_m)].median() > 4.0, "the environment is seen far outside the inner region"
+    assert depth_m[torch.isfinite(depth_m)].median() > 4.0, (
+        "the environment is seen far outside the inner region"
+    )
 
 
 def test_a_contracted_scene_survives_its_file_and_an_interruption(tmp_path: Path) -> None:
     poses = environment_poses(4, 2)
     images = ImageSet(np.stack([environment(T) for T in poses]), (CAMERA,) * 4, poses)
     config = TrainConfig(
-        steps=20, samples_per_step=2048, max_rays=256, occupancy_resolution=16, warmup_steps=4, march=MARCH, opacity=0.0
+        steps=20,
+        samples_per_step=2048,
+        max_rays=256,
+        occupancy_resolution=16,
+        warmup_steps=4,
+        march=MARCH,
+        opacity=0.0,
     )
     whole = train_scene(images, FIELD, config)
     half = Trainer(images, FIELD, config)
@@ -175,7 +202,9 @@ def test_a_contracted_scene_survives_its_file_and_an_interruption(tmp_path: Path
 def test_bounded_configurations_are_written_as_ever() -> None:
     bounded = dataclasses.replace(FIELD, contraction=False).to_dict()
     assert sorted(bounded) == ["box_high_m", "box_low_m", "direction_bands", "features", "grid", "hidden"]
-    assert SceneFieldConfig.from_dict(json.loads(json.dumps(bounded))) == dataclasses.replace(FIELD, contraction=False)
+    assert SceneFieldConfig.from_dict(json.loads(json.dumps(bounded))) == dataclasses.replace(
+        FIELD, contraction=False
+    )
 
 
 @pytest.mark.skipif(not list(RUNS.glob("**/scene*.safetensors")), reason="needs a scene of an earlier run")

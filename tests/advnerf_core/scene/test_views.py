@@ -22,7 +22,12 @@ def save(path, pixels):
 
 def test_transparency_is_kept_and_averaged_by_opacity(tmp_path):
     rgba = np.zeros((4, 4, 4), np.uint8)
-    rgba[:, ::2] = (0, 0, 200, 255)  # opaque red columns between transparent green ones (file order blue, green, red)
+    rgba[:, ::2] = (
+        0,
+        0,
+        200,
+        255,
+    )  # opaque red columns between transparent green ones (file order blue, green, red)
     rgba[:, 1::2] = (0, 250, 0, 0)
     save(tmp_path / "0.png", rgba)
     loaded = load_transforms(write(tmp_path)).load(size=(2, 4))
@@ -74,7 +79,9 @@ def test_undistorted_views_say_which_pixels_the_lens_saw(tmp_path):
 
 def test_an_image_of_another_shape_than_listed_is_refused_but_a_smaller_copy_is_not(tmp_path):
     save(tmp_path / "0.png", np.zeros((30, 40, 3), np.uint8))
-    assert load_transforms(write(tmp_path, w=80, h=60, fl_x=70.0)).load().pinholes[0].fx == pytest.approx(35.0)
+    assert load_transforms(write(tmp_path, w=80, h=60, fl_x=70.0)).load().pinholes[0].fx == pytest.approx(
+        35.0
+    )
     with pytest.raises(DatasetError, match=r"shape 60 x 80 .*0\.png of 40 x 30; it was turned"):
         load_transforms(write(tmp_path, w=60, h=80)).load()
 

@@ -73,7 +73,9 @@ def test_stamp_is_depthais_own_and_not_that_of_receipt(clip):
 def test_pictures_of_another_size_are_refused(clip):
     camera = OakCamera(OakSettings(width=640, height=400), replay(clip))
     camera.open()
-    with pytest.raises(ProtocolError, match=r"expected pictures \[400, 640, 3\] from the OAK, got \[188, 336, 3\]"):
+    with pytest.raises(
+        ProtocolError, match=r"expected pictures \[400, 640, 3\] from the OAK, got \[188, 336, 3\]"
+    ):
         camera.read(1.0)
     camera.close()
 
@@ -123,7 +125,8 @@ def test_controls_reach_depthais_own_structure():
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"fps": 0.0}, {"iso": 200}, {"exposure_us": 8000, "iso": 20}, {"white_balance_k": 100}, {"width": 0}]
+    "wrong",
+    [{"fps": 0.0}, {"iso": 200}, {"exposure_us": 8000, "iso": 20}, {"white_balance_k": 100}, {"width": 0}],
 )
 def test_impossible_settings(wrong):
     with pytest.raises(ValueError, match="expected"):

@@ -25,7 +25,10 @@ def test_monotonic_stamp_keeps_its_instant_on_both_clocks():
 
 
 def test_stamp_of_the_real_time_clock_is_recognised():
-    assert Clocks().at(0.1, 1_700_000_000 * S + 70_000_000) == (1_700_000_000 * S + 70_000_000, 500 * S + 70_000_000)
+    assert Clocks().at(0.1, 1_700_000_000 * S + 70_000_000) == (
+        1_700_000_000 * S + 70_000_000,
+        500 * S + 70_000_000,
+    )
 
 
 @pytest.mark.parametrize("stamp_ns", [None, 3 * S, 900 * S])

@@ -345,7 +345,12 @@ def test_kernel_port_on_what_is_no_camera(tmp_path):
 
 
 class WindowSize(ctypes.Structure):
-    _fields_ = (("rows", ctypes.c_uint16), ("columns", ctypes.c_uint16), ("x", ctypes.c_uint16), ("y", ctypes.c_uint16))
+    _fields_ = (
+        ("rows", ctypes.c_uint16),
+        ("columns", ctypes.c_uint16),
+        ("x", ctypes.c_uint16),
+        ("y", ctypes.c_uint16),
+    )
 
 
 def test_kernel_port_makes_real_system_calls(tmp_path):
@@ -386,7 +391,9 @@ def test_first_real_device_delivers_frames():
     port.ioctl(fd, abi.G_PARM, parameters)
     port.close(fd)
     pix, interval = answer.fmt.pix, parameters.parm.capture.timeperframe
-    mode = Mode(pix.width, pix.height, interval.denominator / interval.numerator, abi.fourcc_name(pix.pixelformat))
+    mode = Mode(
+        pix.width, pix.height, interval.denominator / interval.numerator, abi.fourcc_name(pix.pixelformat)
+    )
     cam = V4l2Camera(path, mode)
     cam.open()
     frames = [frame for _ in range(10) if (frame := cam.read(2.0)) is not None]

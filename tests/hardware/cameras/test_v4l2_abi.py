@@ -21,7 +21,15 @@ OFFSETS = {
     "FormatDescription": {"description": 12, "pixelformat": 44},
     "Format": {"fmt": 8},
     "PixelFormat": {"pixelformat": 8, "bytesperline": 16, "sizeimage": 20, "quantization": 40},
-    "Buffer": {"bytesused": 8, "flags": 12, "timestamp": 24, "sequence": 56, "memory": 60, "m": 64, "length": 72},
+    "Buffer": {
+        "bytesused": 8,
+        "flags": 12,
+        "timestamp": 24,
+        "sequence": 56,
+        "memory": 60,
+        "m": 64,
+        "length": 72,
+    },
     "StreamParameters": {"parm": 4},
     "QueryControl": {"minimum": 40, "flags": 56},
     "FrameSize": {"width": 12},
@@ -57,16 +65,39 @@ def test_pixel_format_letters():
     assert abi.fourcc_name(abi.fourcc("Y16")) == "Y16"
 
 
-@pytest.mark.skipif(not (HEADERS.exists() and shutil.which("cc")), reason="needs a C compiler and the kernel's headers")
+@pytest.mark.skipif(
+    not (HEADERS.exists() and shutil.which("cc")), reason="needs a C compiler and the kernel's headers"
+)
 def test_constants_against_the_compiler(tmp_path):
     names = [f"V4L2_CID_{C_CONTROLS[name]}" for name in abi.CONTROL_IDS]
-    names += ["V4L2_CAP_VIDEO_CAPTURE", "V4L2_CAP_VIDEO_CAPTURE_MPLANE", "V4L2_CAP_META_CAPTURE", "V4L2_CAP_STREAMING"]
-    names += ["V4L2_CAP_DEVICE_CAPS", "V4L2_BUF_FLAG_ERROR", "V4L2_CTRL_FLAG_DISABLED", "V4L2_EXPOSURE_MANUAL"]
+    names += [
+        "V4L2_CAP_VIDEO_CAPTURE",
+        "V4L2_CAP_VIDEO_CAPTURE_MPLANE",
+        "V4L2_CAP_META_CAPTURE",
+        "V4L2_CAP_STREAMING",
+    ]
+    names += [
+        "V4L2_CAP_DEVICE_CAPS",
+        "V4L2_BUF_FLAG_ERROR",
+        "V4L2_CTRL_FLAG_DISABLED",
+        "V4L2_EXPOSURE_MANUAL",
+    ]
     lines = "".join(f'printf("%lu\\n", (unsigned long)({name}));' for name in names)
     source = f"#include <stdio.h>\n#include <linux/videodev2.h>\nint main(void) {{ {lines} return 0; }}"
     (tmp_path / "c.c").write_text(source)
     subprocess.run(["cc", "-o", tmp_path / "c", tmp_path / "c.c"], check=True)
     printed = subprocess.run([tmp_path / "c"], check=True, capture_output=True, text=True).stdout.split()
-    ours = [*abi.CONTROL_IDS.values(), abi.CAP_VIDEO_CAPTURE, abi.CAP_VIDEO_CAPTURE_MPLANE, abi.CAP_META_CAPTURE]
-    ours += [abi.CAP_STREAMING, abi.CAP_DEVICE_CAPS, abi.BUF_FLAG_ERROR, abi.CTRL_FLAG_DISABLED, abi.EXPOSURE_MANUAL]
+    ours = [
+        *abi.CONTROL_IDS.values(),
+        abi.CAP_VIDEO_CAPTURE,
+        abi.CAP_VIDEO_CAPTURE_MPLANE,
+        abi.CAP_META_CAPTURE,
+    ]
+    ours += [
+        abi.CAP_STREAMING,
+        abi.CAP_DEVICE_CAPS,
+        abi.BUF_FLAG_ERROR,
+        abi.CTRL_FLAG_DISABLED,
+        abi.EXPOSURE_MANUAL,
+    ]
     assert [int(value) for value in printed] == ours

@@ -8,7 +8,12 @@ import pytest
 
 from advnerf_core.geometry import Pinhole
 from hardware.cameras.v4l2.controls import Controls
-from hardware.cameras.zed.calibration import EyeCalibration, Rectifier, ZedCalibrationError, load_factory_calibration
+from hardware.cameras.zed.calibration import (
+    EyeCalibration,
+    Rectifier,
+    ZedCalibrationError,
+    load_factory_calibration,
+)
 from hardware.cameras.zed.driver import ZedCamera
 from hardware.cameras.zed.exposure import (
     ExtensionUnit,
@@ -84,7 +89,9 @@ def test_camera_without_distortion_is_only_scaled():
     """Focal length halves and the principal point follows cx' = (cx + 0.5) / 2 - 0.5 of OpenCV's convention."""
     source = Pinhole(672, 376, 350.0, 350.0, 336.0, 188.0)
     rectifier = Rectifier(EyeCalibration(source, (0.0,) * 5), (336, 188))
-    assert rectifier.pinhole.fx == pytest.approx(175.0, rel=4e-3)  # OpenCV fits it to the grid of pixel centres
+    assert rectifier.pinhole.fx == pytest.approx(
+        175.0, rel=4e-3
+    )  # OpenCV fits it to the grid of pixel centres
     assert rectifier.pinhole.cx == pytest.approx(168.0, abs=0.5)
     flat = np.full((376, 672, 3), (10, 120, 250), np.uint8)
     assert (rectifier(flat) == flat[:188, :336]).all()
@@ -177,7 +184,9 @@ def test_other_cameras_are_told_apart():
         ExtensionUnit(port, port.open(PATH), PATH)
 
 
-@pytest.mark.parametrize(("percent", "fps", "lines"), [(100, 15, 1550), (50, 30, 550), (100, 100, 720), (0.01, 60, 2)])
+@pytest.mark.parametrize(
+    ("percent", "fps", "lines"), [(100, 15, 1550), (50, 30, 550), (100, 100, 720), (0.01, 60, 2)]
+)
 def test_exposure_in_lines(percent, fps, lines):
     assert exposure_lines(percent, fps) == lines
 

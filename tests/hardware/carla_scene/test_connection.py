@@ -76,7 +76,9 @@ def test_another_version_answers_the_real_client(carla):
     ours = carla.Client("127.0.0.1", 1).get_client_version()
     with (
         listening(says_version("0.9.13")) as port,
-        pytest.raises(CarlaVersionMismatch, match=rf"expected CARLA {ours} at .*got 0.9.13.*pip install carla==0.9.13"),
+        pytest.raises(
+            CarlaVersionMismatch, match=rf"expected CARLA {ours} at .*got 0.9.13.*pip install carla==0.9.13"
+        ),
     ):
         connect(ServerConfig(port=port, timeout_s=5.0), carla)
 
@@ -94,7 +96,9 @@ def test_what_a_build_adds_to_a_version_does_not_count():
 
 
 def test_map_names():
-    assert map_name("/Game/Carla/Maps/Town02") == map_name("Carla/Maps/Town02") == map_name("Town02") == "Town02"
+    assert (
+        map_name("/Game/Carla/Maps/Town02") == map_name("Carla/Maps/Town02") == map_name("Town02") == "Town02"
+    )
 
 
 def test_the_wanted_map_is_loaded_with_patience(library):

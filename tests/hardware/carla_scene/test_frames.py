@@ -34,7 +34,9 @@ def test_points_go_where_the_library_sends_them(carla):
 
 def test_pose_comes_back_from_its_matrix():
     for pose in POSES:
-        np.testing.assert_allclose(CarlaPose.from_matrix(pose.matrix).matrix, pose.matrix, atol=1e-9, err_msg=str(pose))
+        np.testing.assert_allclose(
+            CarlaPose.from_matrix(pose.matrix).matrix, pose.matrix, atol=1e-9, err_msg=str(pose)
+        )
 
 
 def test_reads_a_transform_of_the_library(carla):
@@ -49,8 +51,10 @@ def test_a_camera_axis_by_axis(carla):
     transform = frame.camera_pose(T).to_transform(carla)
     R = (frame.T_mirrored_from_world @ T)[:3, :3]
     for vector, ours in (
-        (transform.get_forward_vector(), R[:, 2]), (transform.get_right_vector(), R[:, 0]), (transform.get_up_vector(), -R[:, 1]),
-    ):  # fmt: skip
+        (transform.get_forward_vector(), R[:, 2]),
+        (transform.get_right_vector(), R[:, 0]),
+        (transform.get_up_vector(), -R[:, 1]),
+    ):
         np.testing.assert_allclose([vector.x, -vector.y, vector.z], ours, atol=1e-6)
 
 

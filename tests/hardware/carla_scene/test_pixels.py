@@ -10,7 +10,9 @@ from hardware.worlds.carla.pixels import depth_of, rgb_of
 
 
 def image(bgra):
-    return SimpleNamespace(width=bgra.shape[1], height=bgra.shape[0], raw_data=bgra.astype(np.uint8).tobytes())
+    return SimpleNamespace(
+        width=bgra.shape[1], height=bgra.shape[0], raw_data=bgra.astype(np.uint8).tobytes()
+    )
 
 
 def test_colours_lose_alpha_and_are_turned_round():
@@ -34,5 +36,7 @@ def test_depth_comes_back_to_a_tenth_of_a_millimetre():
 
 
 def test_wrong_size_is_said():
-    with pytest.raises(CarlaFrameError, match="expected an image of 4 x 3 pixels in BGRA, got 3 x 4 in 48 bytes"):
+    with pytest.raises(
+        CarlaFrameError, match="expected an image of 4 x 3 pixels in BGRA, got 3 x 4 in 48 bytes"
+    ):
         rgb_of(image(np.zeros((4, 3, 4))), 4, 3)

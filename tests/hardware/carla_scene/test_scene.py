@@ -52,7 +52,9 @@ def test_colours_depth_and_pose_belong_together(library, settings, where):
         assert seen.mean() > 0.4
         assert np.isinf(depth[:5]).any()  # the sky
         T = planar_pose(*where) @ scene.T_car_from_camera
-        points = transform_points(T, scene.camera_pinhole.directions() * np.where(seen, depth, 0.0)[..., None])
+        points = transform_points(
+            T, scene.camera_pinhole.directions() * np.where(seen, depth, 0.0)[..., None]
+        )
         expected = world.colour(carla_points(scene, points))
         assert np.abs(expected - rgb.astype(float))[seen].max() <= 1.0
         ground = seen & (np.abs(points[..., 2]) < 0.01)
@@ -87,7 +89,9 @@ def test_car_drives_as_the_dubins_car_it_is(library, settings):
         )
         assert state.yaw_rad == pytest.approx(0.5)
         (body,) = world.actors.filter("vehicle.*")
-        x, y, z = carla_points(scene, np.array([state.x_m + 1.4 * math.cos(0.5), state.y_m + 1.4 * math.sin(0.5), 0.0]))
+        x, y, z = carla_points(
+            scene, np.array([state.x_m + 1.4 * math.cos(0.5), state.y_m + 1.4 * math.sin(0.5), 0.0])
+        )
         at = body.transform.location
         assert (at.x, at.y, at.z) == pytest.approx((x, y, z), abs=1e-4)
         assert body.transform.rotation.yaw == pytest.approx(-math.degrees(0.5 + 0.6), abs=1e-3)

@@ -7,7 +7,13 @@ import numpy as np
 import pytest
 
 from advnerf_core.geometry import camera_mount, planar_pose, transform_points
-from hardware.worlds.carla.errors import CarlaBusy, CarlaError, CarlaFrameError, CarlaMapError, CarlaUnreachable
+from hardware.worlds.carla.errors import (
+    CarlaBusy,
+    CarlaError,
+    CarlaFrameError,
+    CarlaMapError,
+    CarlaUnreachable,
+)
 from tests.support.carla.scenes import carla_points, drive, is_put_back, scene_of
 
 
@@ -54,7 +60,9 @@ def test_a_picture_from_elsewhere_is_not_taken(library, settings):
             rgb, depth = scene.observe()
             T = state.T_world_from_car @ scene.T_car_from_camera
             seen = depth < 50.0
-            points = transform_points(T, scene.camera_pinhole.directions() * np.where(seen, depth, 0.0)[..., None])
+            points = transform_points(
+                T, scene.camera_pinhole.directions() * np.where(seen, depth, 0.0)[..., None]
+            )
             assert np.abs(world.colour(carla_points(scene, points)) - rgb.astype(float))[seen].max() <= 1.0
         assert scene.repeated_frames == 3
 
@@ -135,7 +143,9 @@ def test_blueprints_that_the_server_lacks(library, settings):
         scene.observe()
     with (
         scene_of(library, settings, body={"blueprint": "vehicle.cart"}) as scene,
-        pytest.raises(CarlaError, match=r"vehicle vehicle.cart into CARLA's world, got: blueprint 'vehicle.cart' not"),
+        pytest.raises(
+            CarlaError, match=r"vehicle vehicle.cart into CARLA's world, got: blueprint 'vehicle.cart' not"
+        ),
     ):
         scene.reset(0.0, 0.0, 0.0)
     assert is_put_back(library.world)
@@ -146,7 +156,10 @@ def test_cameras_without_a_body(library, settings):
         scene.reset(-20.0, -1.75, 0.0)
         scene.step(0.0, 6.0, 0.1)
         scene.observe()
-        assert {actor.type_id for actor in library.world.actors} == {"sensor.camera.rgb", "sensor.camera.depth"}
+        assert {actor.type_id for actor in library.world.actors} == {
+            "sensor.camera.rgb",
+            "sensor.camera.depth",
+        }
         assert "cast_ray" not in library.world.calls
 
 
@@ -166,9 +179,12 @@ def test_a_closed_scene_touches_nothing(library, settings):
     calls = list(library.world.calls)
     T = planar_pose(-10.0, 0.0, 0.0) @ camera_mount(0.0, 0.0, 2.0)
     uses = (
-        lambda: scene.reset(0.0, 0.0, 0.0), lambda: scene.step(0.0, 6.0, 0.1), scene.observe,
-        lambda: scene.observe_at(0.0, 0.0, 0.0), lambda: scene.photograph(T),
-    )  # fmt: skip
+        lambda: scene.reset(0.0, 0.0, 0.0),
+        lambda: scene.step(0.0, 6.0, 0.1),
+        scene.observe,
+        lambda: scene.observe_at(0.0, 0.0, 0.0),
+        lambda: scene.photograph(T),
+    )
     for use in uses:
         with pytest.raises(CarlaError, match="this one is closed"):
             use()
@@ -194,7 +210,9 @@ def test_a_world_in_other_hands(library, settings):
 
 def test_traffic_would_be_in_the_pictures(library, settings, scripted, carla):
     world = library.world
-    world.actors.append(scripted.Actor(world, scripted.Blueprint("vehicle.lincoln.mkz_2020"), carla.Transform()))
+    world.actors.append(
+        scripted.Actor(world, scripted.Blueprint("vehicle.lincoln.mkz_2020"), carla.Transform())
+    )
     with pytest.raises(CarlaBusy, match=r"1 vehicles or walkers \(vehicle.lincoln.mkz_2020\)"):
         scene_of(library, settings).__enter__()
     with scene_of(library, settings, server={**settings["server"], "allow_traffic": True}):
@@ -203,7 +221,9 @@ def test_traffic_would_be_in_the_pictures(library, settings, scripted, carla):
 
 
 def test_a_hill_is_refused(carla, scripted, settings, TJunction):
-    library = scripted.Library(carla, scripted.World(carla, carla.Map("written", TJunction(slope=0.05).text())))
+    library = scripted.Library(
+        carla, scripted.World(carla, carla.Map("written", TJunction(slope=0.05).text()))
+    )
     with pytest.raises(
         CarlaMapError, match=r"expected a flat junction, heights within 0.15 m, got 2.00 m at junction 100"
     ):

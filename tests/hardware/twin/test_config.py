@@ -24,7 +24,9 @@ def test_wider_image_keeps_the_field_of_view():
 def test_camera_looks_forward_and_down():
     T = LabConfig().camera.T_car_from_camera
     np.testing.assert_allclose(T[:3, 3], [0.30, 0.0, 0.20])
-    np.testing.assert_allclose(T[:3, 2], [math.cos(math.radians(10)), 0.0, -math.sin(math.radians(10))], atol=1e-12)
+    np.testing.assert_allclose(
+        T[:3, 2], [math.cos(math.radians(10)), 0.0, -math.sin(math.radians(10))], atol=1e-12
+    )
     np.testing.assert_allclose(T[:3, 0], [0.0, -1.0, 0.0], atol=1e-12)
 
 

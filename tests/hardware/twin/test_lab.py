@@ -71,7 +71,9 @@ def test_commands_go_through_nominal_gains_and_servo_limits(lab):
     car = lab.config.car
     lab.reset(-1.1, -2.0, 0.0)
     state = lab.step(0.2, 0.8, 0.9)
-    expected = ((car.nominal_servo_gain * 0.2 + car.nominal_servo_offset) - car.true_servo_offset) / car.true_servo_gain
+    expected = (
+        (car.nominal_servo_gain * 0.2 + car.nominal_servo_offset) - car.true_servo_offset
+    ) / car.true_servo_gain
     assert state.steering_rad == pytest.approx(expected, abs=1e-5)
     assert state.speed_mps == pytest.approx(0.8 / 1.02, rel=0.01)
     lab.reset(-1.1, -2.0, 0.0)

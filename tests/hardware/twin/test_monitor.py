@@ -66,4 +66,6 @@ def test_the_cameras_see_it_and_the_default_lab_does_not_change():
                 tilted = look_at((at @ T)[:3, 3] + [0.1, 0.0, 0.3], PANEL.T_world_from_face[:3, 3])
                 assert lab.photograph(tilted).shape[2] == 3
     np.testing.assert_allclose(rgb["ideal"], np.array([180, 120, 60]) / 255.0, atol=0.006)
-    np.testing.assert_allclose(rgb["office"], closed_form(np.array([180, 120, 60]) / 255.0, cosine), atol=0.012)
+    np.testing.assert_allclose(
+        rgb["office"], closed_form(np.array([180, 120, 60]) / 255.0, cosine), atol=0.012
+    )

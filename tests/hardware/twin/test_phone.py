@@ -8,7 +8,13 @@ import pytest
 from advnerf_core.geometry import yaw_of
 from hardware.worlds.lab.config import LabConfig, PhoneConfig
 from hardware.worlds.lab.furniture import furnish
-from hardware.worlds.lab.phone import apply_colours, car_mounted_poses, track_length, track_pose, walk_around_poses
+from hardware.worlds.lab.phone import (
+    apply_colours,
+    car_mounted_poses,
+    track_length,
+    track_pose,
+    walk_around_poses,
+)
 
 CONFIG = LabConfig()
 

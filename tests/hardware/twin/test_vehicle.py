@@ -51,10 +51,14 @@ def test_steering_is_slew_limited_then_lags():
     rest = vehicle.state.steering_rad
     vehicle.command(servo=0.15)
     target = (0.15 - CAR.true_servo_offset) / CAR.true_servo_gain
-    assert vehicle.advance(0.02).steering_rad - rest == pytest.approx(CAR.steering_slew_radps * 0.02, rel=1e-6)
+    assert vehicle.advance(0.02).steering_rad - rest == pytest.approx(
+        CAR.steering_slew_radps * 0.02, rel=1e-6
+    )
     vehicle.advance(0.2)
     remaining = target - vehicle.state.steering_rad
-    assert target - vehicle.advance(CAR.steering_lag_s).steering_rad == pytest.approx(remaining / math.e, rel=1e-6)
+    assert target - vehicle.advance(CAR.steering_lag_s).steering_rad == pytest.approx(
+        remaining / math.e, rel=1e-6
+    )
 
 
 def test_left_is_a_smaller_servo_position():

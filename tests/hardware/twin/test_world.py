@@ -101,7 +101,8 @@ def test_depth_of_the_board_is_that_of_its_face(lab):
     pose = POSES[0]
     _, depth = lab.observe_at(*pose)
     T_camera_from_face = (
-        invert_transform(planar_pose(*pose) @ CONFIG.camera.T_car_from_camera) @ CONFIG.board.T_world_from_face
+        invert_transform(planar_pose(*pose) @ CONFIG.camera.T_car_from_camera)
+        @ CONFIG.board.T_world_from_face
     )
     grid = np.linspace(-0.3, 0.3, 7)
     points = transform_points(T_camera_from_face, [[0.0, y, z] for y in grid for z in grid])
@@ -181,7 +182,9 @@ def test_nothing_stands_in_the_lane():
                 max(abs(c * dx + n * dy) - obstacle.half_length_m, 0.0),
                 max(abs(c * dy - n * dx) - obstacle.half_width_m, 0.0),
             )
-            assert math.hypot(*outside) >= clear - 0.15, f"obstacle at ({obstacle.x_m:.2f}, {obstacle.y_m:.2f})"
+            assert math.hypot(*outside) >= clear - 0.15, (
+                f"obstacle at ({obstacle.x_m:.2f}, {obstacle.y_m:.2f})"
+            )
 
 
 def test_furniture_stays_in_the_room():
@@ -216,7 +219,9 @@ def test_missing_egl_names_the_packages(monkeypatch):
             raise AttributeError("'NoneType' object has no attribute 'eglQueryString'")
 
     monkeypatch.setattr(gl.importlib, "import_module", lambda name: Broken)
-    with pytest.raises(gl.TwinUnavailable, match=r"libegl1 libgl1-mesa-dri libegl-mesa0 libopengl0.*MUJOCO_GL=egl"):
+    with pytest.raises(
+        gl.TwinUnavailable, match=r"libegl1 libgl1-mesa-dri libegl-mesa0 libopengl0.*MUJOCO_GL=egl"
+    ):
         gl.create_context(8, 8)
 
 

@@ -18,7 +18,9 @@ SQUARE = ReferencePath(
 
 
 def driven(reference: ReferencePath) -> Path:
-    pieces = [Line(piece[1]) if piece[0] == "line" else Arc(piece[1], piece[2]) for piece in reference.segments]
+    pieces = [
+        Line(piece[1]) if piece[0] == "line" else Arc(piece[1], piece[2]) for piece in reference.segments
+    ]
     return Path.from_segments(reference.start_pose, pieces, closed=reference.closed)
 
 
@@ -47,7 +49,9 @@ def test_plain_data_brings_the_same_path_back() -> None:
         ((0.0, 0.0), (("line", 1.0),)),
     ],
 )
-def test_what_is_no_path_is_refused(start: tuple[float, ...], segments: tuple[tuple[object, ...], ...]) -> None:
+def test_what_is_no_path_is_refused(
+    start: tuple[float, ...], segments: tuple[tuple[object, ...], ...]
+) -> None:
     with pytest.raises(ValueError, match="expected a finite start pose"):
         ReferencePath(start, segments)  # type: ignore[arg-type]
 

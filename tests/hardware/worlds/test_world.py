@@ -9,7 +9,14 @@ import pytest
 
 from advnerf_core.geometry import Pinhole, camera_mount
 from hardware.worlds.paths import ReferencePath
-from hardware.worlds.world import Box, CarDescription, Traits, WorldDescription, WorldError, members_of_a_world
+from hardware.worlds.world import (
+    Box,
+    CarDescription,
+    Traits,
+    WorldDescription,
+    WorldError,
+    members_of_a_world,
+)
 
 PATH = ReferencePath((0.0, 0.0, 0.0), (("line", 10.0),), (1.0, 0.0))
 CAR = CarDescription("ackermann", 1.2, (-0.4, 0.5), 0.5)
@@ -89,7 +96,13 @@ def test_cars_and_boxes_that_cannot_be_are_refused(make: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    "data", [{}, [], {**description().to_dict(), "box": None}, {**description().to_dict(), "car": {"kind": "dubins"}}]
+    "data",
+    [
+        {},
+        [],
+        {**description().to_dict(), "box": None},
+        {**description().to_dict(), "car": {"kind": "dubins"}},
+    ],
 )
 def test_other_data_is_no_description(data: Any) -> None:
     with pytest.raises(WorldError, match="expected a world as written"):

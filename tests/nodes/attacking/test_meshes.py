@@ -77,7 +77,9 @@ def test_shapes_are_searched_only_by_methods_that_read_their_scale(tmp_path):
     with pytest.raises(
         ConfigError, match="expected a method that searches shapes, such as random or gradient, got Spiral"
     ):
-        run_attack(load_request(file, ["search.method=spiral.py:Spiral"]), tmp_path / "out", ProgressDisplay())
+        run_attack(
+            load_request(file, ["search.method=spiral.py:Spiral"]), tmp_path / "out", ProgressDisplay()
+        )
     assert not (tmp_path / "out").exists()
 
 

@@ -104,7 +104,9 @@ def test_poses_alone_keep_the_colours_they_are_given_and_random_ones_spend_as_mu
     np.testing.assert_array_equal(attack.face_object.theta, load_attack(coloured).face_object.theta)
     assert attack.extra["evaluations"] == 4
     assert attack.config_sha256 != load_attack(coloured).config_sha256
-    np.testing.assert_allclose(ready.sensor.placements(ready.theta_of(found)), [attack.objects[0].placement], atol=1e-9)
+    np.testing.assert_allclose(
+        ready.sensor.placements(ready.theta_of(found)), [attack.objects[0].placement], atol=1e-9
+    )
     with pytest.raises(ConfigError, match="expected the colours of the request"):
         prepare_poses(load_request(file, ["horizon=1", "poses.colours=false"])).theta_of(coloured)
 
@@ -138,7 +140,9 @@ def test_a_request_that_cannot_be_is_refused(tmp_path, changes, what):
 
     if what is None:
         with pytest.raises(ConfigError, match=r"poses.landscape.object: expected 0..0, got 3"):
-            make_landscape(load_request(request_file(tmp_path), changes), tmp_path, None, lambda fraction, text: None)
+            make_landscape(
+                load_request(request_file(tmp_path), changes), tmp_path, None, lambda fraction, text: None
+            )
         return
     with pytest.raises(ConfigError, match=what):
         prepare_poses(load_request(request_file(tmp_path), changes))

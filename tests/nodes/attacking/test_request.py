@@ -43,8 +43,14 @@ def test_a_pose_from_position_and_heading_looks_where_it_says():
         (["objects=[]"], "objects: .* at least 1 item"),
         (["objects=[{kind: face}]"], r"objects.0: expected either T_world_from_object or x_m, y_m and z_m"),
         (["objects=[{kind: file, x_m: 0, y_m: 0, z_m: 0}]"], "expected a file exactly with kind 'file'"),
-        (["objects=[{T_world_from_object: [[2,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}]"], "expected a rotation"),
-        (["starts.count=3", "goals=[[1, 0], [0, 1]]"], r"expected no goal, one, or 3 \(one per start\), got 2"),
+        (
+            ["objects=[{T_world_from_object: [[2,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}]"],
+            "expected a rotation",
+        ),
+        (
+            ["starts.count=3", "goals=[[1, 0], [0, 1]]"],
+            r"expected no goal, one, or 3 \(one per start\), got 2",
+        ),
         (["dynamics.delay_s=.nan"], "dynamics.delay_s"),
     ],
 )

@@ -50,7 +50,12 @@ _SLOW = pytest.mark.slow  # the same loop with another search inside; tests of t
 )
 def test_a_stopped_run_goes_on_to_the_same_bytes(tmp_path, method):
     file = tiny_request(tmp_path)
-    changes = [f"search.method={method}", "search.population=4", "robustness.noise=0.01", "dynamics.delay_s=0.05"]
+    changes = [
+        f"search.method={method}",
+        "search.population=4",
+        "robustness.noise=0.01",
+        "dynamics.delay_s=0.05",
+    ]
     request = load_request(file, changes)
     (whole,) = run_attack(request, tmp_path / "whole", ProgressDisplay())
     with pytest.raises(StoppedError):
@@ -66,8 +71,12 @@ def test_a_stopped_run_goes_on_to_the_same_bytes(tmp_path, method):
         run_attack(load_request(file), tmp_path / "whole", ProgressDisplay())
 
 
-@pytest.mark.parametrize("method", [pytest.param("distilled", marks=_SLOW), pytest.param("guided", marks=_SLOW)])
-def test_an_onnx_policy_is_attacked_by_questions_within_the_budget_and_resumes_to_the_same_bytes(tmp_path, method):
+@pytest.mark.parametrize(
+    "method", [pytest.param("distilled", marks=_SLOW), pytest.param("guided", marks=_SLOW)]
+)
+def test_an_onnx_policy_is_attacked_by_questions_within_the_budget_and_resumes_to_the_same_bytes(
+    tmp_path, method
+):
     file = tiny_request(tmp_path)
     loaded = load_policy(tmp_path / "policy.safetensors")
     export_onnx(loaded.policy, PolicyContract(loaded.view), tmp_path / "policy.onnx")
@@ -88,9 +97,13 @@ def test_an_onnx_policy_is_attacked_by_questions_within_the_budget_and_resumes_t
     assert load_attack(whole).method == method
     assert len(json.loads((tmp_path / "whole" / "seed_0.json").read_text())["loss_m"]) == 3
     with pytest.raises(BudgetError, match="allow more evaluations"):
-        run_attack(load_request(file, [*changes, "search.evaluations=4"]), tmp_path / "poor", ProgressDisplay())
+        run_attack(
+            load_request(file, [*changes, "search.evaluations=4"]), tmp_path / "poor", ProgressDisplay()
+        )
     with pytest.raises(BlackBoxError, match="guided"):
-        run_attack(load_request(file, [*changes, "search.method=gradient"]), tmp_path / "blind", ProgressDisplay())
+        run_attack(
+            load_request(file, [*changes, "search.method=gradient"]), tmp_path / "blind", ProgressDisplay()
+        )
 
 
 @pytest.mark.slow  # tests/advnerf_core/attack/test_together.py has the search itself
@@ -107,19 +120,25 @@ def test_seeds_searched_together_resume_to_the_same_bytes_and_end_as_they_do_alo
         assert load_attack(one).predicted_total_cte_m == pytest.approx(
             load_attack(other).predicted_total_cte_m, rel=1e-4
         )
-        np.testing.assert_allclose(load_attack(one).face_object.theta, load_attack(other).face_object.theta, atol=1e-3)
+        np.testing.assert_allclose(
+            load_attack(one).face_object.theta, load_attack(other).face_object.theta, atol=1e-3
+        )
     with pytest.raises(ConfigError, match="gradient method only"):
         load_request(file, ["search.method=random", "search.together=true"])
 
 
 def test_a_monitor_in_the_loop_is_searched_through_its_colours_and_the_gradient_is_sound(tmp_path):
-    dim = DisplayModel(np.tile(np.linspace(0.0, 1.0, 9) ** 2.2, (3, 1)), 0.8 * np.eye(3) + 0.03, np.full(3, 0.05), 2.2)
+    dim = DisplayModel(
+        np.tile(np.linspace(0.0, 1.0, 9) ** 2.2, (3, 1)), 0.8 * np.eye(3) + 0.03, np.full(3, 0.05), 2.2
+    )
     calibration = DisplayCalibration(date=datetime.date(2026, 1, 1), method="computed", model=dim.to_dict())
     save_calibration(calibration, tmp_path / "display.yaml")
     file = tiny_request(tmp_path)
     changes = ["search.evaluations=2", "robustness.jitter_m=0.001"]
     shown = load_request(file, changes)
-    text = file.read_text().replace("resolution: 8,", "resolution: 8, display: display.yaml, display_cos: 0.9,")
+    text = file.read_text().replace(
+        "resolution: 8,", "resolution: 8, display: display.yaml, display_cos: 0.9,"
+    )
     file.write_text(text)
     request = load_request(file, changes)
     prepared = prepare(request)
@@ -137,8 +156,11 @@ def test_a_monitor_in_the_loop_is_searched_through_its_colours_and_the_gradient_
 
 def test_show_writes_the_texture_and_resume_needs_a_folder_of_a_run(tmp_path, monkeypatch, capsys):
     file = tiny_request(tmp_path)
-    for command in (["run", str(file), "-o", str(tmp_path / "out")], ["resume", str(tmp_path / "out")],
-                    ["show", str(tmp_path / "out" / "seed_0.attack.safetensors")]):  # fmt: skip
+    for command in (
+        ["run", str(file), "-o", str(tmp_path / "out")],
+        ["resume", str(tmp_path / "out")],
+        ["show", str(tmp_path / "out" / "seed_0.attack.safetensors")],
+    ):
         monkeypatch.setattr(sys, "argv", ["advnerf", "attack", *command])
         with pytest.raises(SystemExit) as ended:
             cli.main()
@@ -197,10 +219,9 @@ def test_every_result_stands_beside_the_drive_without_attack(tmp_path, monkeypat
     shown = capsys.readouterr().out
     assert "drive without attack" in shown
     assert "NO DRIVE" in shown
-    assert command(monkeypatch, "check", file, "-o", tmp_path / "out", "--directions", 2, "--no-memory", *changes) in (
-        0,
-        1,
-    )
+    assert command(
+        monkeypatch, "check", file, "-o", tmp_path / "out", "--directions", 2, "--no-memory", *changes
+    ) in (0, 1)
     checked = capsys.readouterr().out
     assert f"drive without attack: total CTE {clean.mean_total_cte_m:.2f} m over 3 ticks" in checked
     assert "NO DRIVE" in checked

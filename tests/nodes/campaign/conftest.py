@@ -160,10 +160,10 @@ class Bench:
         self.write("seeds: [0, 1]\nmethods: [gradient, none]\nvictims: [hardened]\n")
 
     def write(self, head, scenarios=""):
-        scenario = (
-            f"{{kind: {self.kind}, experiment: toy.experiment.yaml, setting: full, run_folder: {self.folder / 'run'}}}"
+        scenario = f"{{kind: {self.kind}, experiment: toy.experiment.yaml, setting: full, run_folder: {self.folder / 'run'}}}"
+        self.file.write_text(
+            f"name: toy\nfolder: {self.folder}\n{head}scenarios:\n  straight: {scenario}\n{scenarios}"
         )
-        self.file.write_text(f"name: toy\nfolder: {self.folder}\n{head}scenarios:\n  straight: {scenario}\n{scenarios}")
 
     @property
     def environment(self):

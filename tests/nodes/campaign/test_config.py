@@ -37,7 +37,11 @@ def test_a_campaign_is_the_product_of_what_it_lists(file):
     campaign = load_campaign(file)
     names = [cell.name for cell in campaign.cells]
     assert len(names) == len(set(names)) == 2 * 2 * 2 + 1 * 2 * 4
-    assert names[:3] == ["straight_hardened_none_0", "straight_hardened_gradient_0", "straight_hardened_none_1"]
+    assert names[:3] == [
+        "straight_hardened_none_0",
+        "straight_hardened_gradient_0",
+        "straight_hardened_none_1",
+    ]
     assert "straight.near_hardened_gradient_1" in names
     near = next(cell for cell in campaign.cells if cell.placement)
     assert campaign.overrides(near) == ["lab.board.x_m=1.9"]
@@ -64,9 +68,17 @@ def test_cells_are_selected_by_what_they_are(file):
 @pytest.mark.parametrize(
     ("old", "new", "says"),
     [
-        ("seeds: [0, 1]", "seed: [0, 1]", r"mine.campaign.yaml:2: unknown key seed; valid keys here: .*seeds"),
+        (
+            "seeds: [0, 1]",
+            "seed: [0, 1]",
+            r"mine.campaign.yaml:2: unknown key seed; valid keys here: .*seeds",
+        ),
         ("    run_folder: runs/one\n", "", r":4: scenarios.straight.run_folder is missing"),
-        ("placements:\n      near: {run", "placements:\n      near: {rum", r":10: unknown key .*near.rum_folder"),
+        (
+            "placements:\n      near: {run",
+            "placements:\n      near: {rum",
+            r":10: unknown key .*near.rum_folder",
+        ),
         (
             "[none, gradient]",
             "[none, gradiant]",
@@ -75,7 +87,11 @@ def test_cells_are_selected_by_what_they_are(file):
         ("seeds: [0, 1]", "seeds: [0, 0]", "every one of seeds once"),
         ("seeds: [7]", "seeds: [7, 7]", "every one of seeds once"),
         ("methods: [none, gradient]", "methods: []", r":7: scenarios.straight.methods: .*at least 1 item"),
-        ("one.experiment", "two.experiment", "expected the experiment file of scenario straight at .*two.experiment"),
+        (
+            "one.experiment",
+            "two.experiment",
+            "expected the experiment file of scenario straight at .*two.experiment",
+        ),
         ("  left:", "  Left!:", "Left!"),
     ],
 )
@@ -86,10 +102,7 @@ def test_a_bad_file_is_told_with_its_line(file, old, new, says):
 
 
 def test_an_unknown_kind_is_told_with_what_there_is():
-    with pytest.raises(
-        ConfigError,
-        match=r"\(room, room_search, world\).*got 'moon'",
-    ):
+    with pytest.raises(ConfigError, match=r"\(room, room_search, world\).*got 'moon'"):
         load_kind("moon")
     with pytest.raises(ConfigError, match="function run_cell in json"):
         load_kind("json")
@@ -137,4 +150,6 @@ def test_a_page_of_some_cells_does_not_take_the_place_of_the_page_of_all(bench, 
     assert "0 of 2 cells; -o FOLDER writes a page of them" in said
     assert (bench.cells.parent / "table" / "table.json").read_text() == whole
     table("--only", "method=gradient", "-o", str(tmp_path / "some"))
-    assert {row["method"] for row in json.loads((tmp_path / "some" / "table.json").read_text())["rows"]} == {"gradient"}
+    assert {row["method"] for row in json.loads((tmp_path / "some" / "table.json").read_text())["rows"]} == {
+        "gradient"
+    }

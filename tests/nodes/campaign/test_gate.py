@@ -69,7 +69,10 @@ def test_a_drive_without_attack_is_judged_too_as_soon_as_there_is_one(gated):
     (gated.folder / "toy.experiment.yaml").write_text("base: 2.0\nlate: 1.0\nwrong_drive: 0.2\n")
     ended, said = run(gated)
     assert {end.how for end in ended} == {"done"}
-    assert any("only held-out views are judged" in line and "expected a live drive, got none" in line for line in said)
+    assert any(
+        "only held-out views are judged" in line and "expected a live drive, got none" in line
+        for line in said
+    )
     verdict = gated.folder / "gate" / "straight_hardened.drive.json"
     assert not verdict.exists()
     gated.write(HEAD.replace("[0]", "[0, 1]"))
@@ -136,7 +139,9 @@ def driven(turn_radps):
     def images(states):
         return (-0.5 * states[:, 1] - states[:, 2] + turn_radps)[:, None, None, None]
 
-    rollout = drive(Reads(), images, Dubins(1.0, 0.1), torch.tensor([[0.0, 0.3, 0.0]], dtype=torch.float64), 20)
+    rollout = drive(
+        Reads(), images, Dubins(1.0, 0.1), torch.tensor([[0.0, 0.3, 0.0]], dtype=torch.float64), 20
+    )
     path = Path.from_segments((0.0, 0.0, 0.0), [Line(50.0)], closed=False)
     return drive_metrics(path, rollout.states[:, 0].numpy(), Horizon(20, 0.1, 0.4)).total_cte_m
 

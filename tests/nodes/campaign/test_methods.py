@@ -54,7 +54,9 @@ def states(bench):
     return {each.cell.name: each.state for each in statuses(campaign, campaign.cells)}
 
 
-def test_a_method_of_a_file_runs_in_worker_processes_and_appears_in_the_table(searching, monkeypatch, tmp_path):
+def test_a_method_of_a_file_runs_in_worker_processes_and_appears_in_the_table(
+    searching, monkeypatch, tmp_path
+):
     campaign = load_campaign(searching.file)
     names = [f"straight_hardened_{method}_1" for method in ("none", "gradient", "Spiral")]
     assert [cell.name for cell in campaign.cells] == names
@@ -78,8 +80,12 @@ def test_a_method_of_a_file_runs_in_worker_processes_and_appears_in_the_table(se
 def test_its_cells_run_again_when_its_code_changes_and_no_others(searching):
     searching.write("seeds: [1]\nmethods: [spiral.py:Spiral, none]\nvictims: [hardened]\n")
     run(searching)
-    (searching.folder / "spiral.py").write_text(spiral_code().replace("growth: float = 0.2", "growth: float = 0.4"))
-    assert [name for name, state in states(searching).items() if state != "done"] == ["straight_hardened_Spiral_1"]
+    (searching.folder / "spiral.py").write_text(
+        spiral_code().replace("growth: float = 0.2", "growth: float = 0.4")
+    )
+    assert [name for name, state in states(searching).items() if state != "done"] == [
+        "straight_hardened_Spiral_1"
+    ]
     ended, _ = run(searching)
     assert [(end.name, end.how) for end in ended] == [("straight_hardened_Spiral_1", "done")]
 

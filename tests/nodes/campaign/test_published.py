@@ -21,10 +21,18 @@ def put(plan, folder, settings_hash=None):
     drives = {"total_cte_m": [6.0], "off_track": [True], "none_total_cte_m": [2.0]}
     cell = plan.cell
     data = {
-        "scenario": cell.scenario, "victim": cell.victim, "method": cell.method, "seed": cell.seed, "attack_id": None,
-        "settings_hash": settings_hash or plan.job.settings_hash, "seconds": 1.0, "machine": "m", "date": "d",
-        "surrogate": drives, "deployed": drives,
-    }  # fmt: skip
+        "scenario": cell.scenario,
+        "victim": cell.victim,
+        "method": cell.method,
+        "seed": cell.seed,
+        "attack_id": None,
+        "settings_hash": settings_hash or plan.job.settings_hash,
+        "seconds": 1.0,
+        "machine": "m",
+        "date": "d",
+        "surrogate": drives,
+        "deployed": drives,
+    }
     folder.mkdir(parents=True, exist_ok=True)
     (folder / f"{cell.name}.json").write_text(json.dumps(data))
 
@@ -49,7 +57,12 @@ def test_a_table_and_published_cells_from_finished_cells(here, tmp_path):
     table = campaign_table(campaign, found)
     assert list(table.cells) == [plan[0].cell.name]
     page = write_table(table, bench.cells, tmp_path / "page")
-    assert {path.name for path in page.parent.iterdir()} == {"index.html", "table.csv", "table.json", "table.md"}
+    assert {path.name for path in page.parent.iterdir()} == {
+        "index.html",
+        "table.csv",
+        "table.json",
+        "table.md",
+    }
     assert publish(campaign, found, tmp_path / "kept") == Published((plan[0].cell.name,), (), ())
     assert publish(campaign, found, tmp_path / "kept") == Published((), (plan[0].cell.name,), ())
     kept = tmp_path / "kept" / "toy" / f"{plan[0].cell.name}.json"
@@ -60,7 +73,9 @@ def test_a_table_and_published_cells_from_finished_cells(here, tmp_path):
     assert publish(campaign, found, tmp_path / "kept") == Published((plan[0].cell.name,), (), ())
     assert json.loads(kept.read_text())["extra"] == {"changed": 1}
     assert publish(campaign, found, tmp_path / "kept") == Published((), (plan[0].cell.name,), ())
-    row = published_table(tmp_path / "kept" / "toy", campaign).find("straight", "hardened", "none", "deployed")
+    row = published_table(tmp_path / "kept" / "toy", campaign).find(
+        "straight", "hardened", "none", "deployed"
+    )
     assert row.ratio == 3.0
     assert set(row.seeds) | set(row.missing) == set(campaign.config.seeds)
     with pytest.raises(ConfigError, match="advnerf campaign publish"):
@@ -96,7 +111,10 @@ def test_a_lost_folder_comes_back_from_what_was_published(here, tmp_path):
         (folder / "stage.json").write_text(json.dumps({"key": "k", "digest": digest, "seconds": 1.0}))
     campaign = load_campaign(here.file)
     cells = select(campaign.cells, "seed=0")
-    assert [end.how for end in run_campaign(campaign, cells, Options(jobs=2), lambda text: None)] == ["done", "done"]
+    assert [end.how for end in run_campaign(campaign, cells, Options(jobs=2), lambda text: None)] == [
+        "done",
+        "done",
+    ]
     first, second = (here.cells / f"{cell.name}.json" for cell in cells)
     before = first.read_bytes()
     assert json.loads(before)["stages"] == {"capture": "c1", "policy": "p1"}

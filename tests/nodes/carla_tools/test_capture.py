@@ -20,7 +20,11 @@ REQUEST = CaptureRequest(photos=12, held_out=3, seed=4)
 
 def run(library, settings, folder, request=REQUEST, **changes):
     return capture(
-        CarlaConfig.model_validate({**settings, **changes}), request, folder, lambda share, text="": None, library
+        CarlaConfig.model_validate({**settings, **changes}),
+        request,
+        folder,
+        lambda share, text="": None,
+        library,
     )
 
 
@@ -48,11 +52,15 @@ def test_photographs_are_along_the_lanes_and_above(carla, TJunction):
     T = np.array(photo_poses(drives, CarlaConfig(), 300, np.random.default_rng(1)))
     raised = T[:, 2, 3] > 2.5
     assert raised.sum() == 60
-    assert 0.0 < np.median(np.degrees(np.arcsin(-T[~raised, 2, 2]))) < 16.0  # about the driving camera's 8 degrees
+    assert (
+        0.0 < np.median(np.degrees(np.arcsin(-T[~raised, 2, 2]))) < 16.0
+    )  # about the driving camera's 8 degrees
     # Every camera is over the asphalt, or as far beside it as it is ahead of a car that has turned in its lane.
     x, y = T[:, 0, 3], T[:, 1, 3]
     assert (
-        (np.abs(y) < 3.5 + 3.2) | ((y < 0.0) & (np.abs(x) < 3.5 + 3.2)) | ((np.hypot(x, y) < 15.0) & (y < 0.0))
+        (np.abs(y) < 3.5 + 3.2)
+        | ((y < 0.0) & (np.abs(x) < 3.5 + 3.2))
+        | ((np.hypot(x, y) < 15.0) & (y < 0.0))
     ).all()
     for path in drives.paths.values():
         start = np.hypot(x - path.start_pose[0], y - path.start_pose[1])
@@ -70,7 +78,9 @@ def test_a_stopped_capture_goes_on_to_the_same_result(library, settings, tmp_pat
     taken, there = run(library, settings, tmp_path / "set")
     assert there > 0
     assert taken + there == 15
-    files = sorted(path.relative_to(tmp_path / "whole") for path in (tmp_path / "whole").rglob("*.*") if path.is_file())
+    files = sorted(
+        path.relative_to(tmp_path / "whole") for path in (tmp_path / "whole").rglob("*.*") if path.is_file()
+    )
     for file in files:
         assert (tmp_path / "set" / file).read_bytes() == (tmp_path / "whole" / file).read_bytes(), file
 

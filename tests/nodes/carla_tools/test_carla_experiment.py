@@ -52,7 +52,9 @@ def test_every_stage_runs_against_a_server_and_leaves_it_as_it_was(as_carla, fil
     assert kept["facts"]["junction_id"] == 100
     assert len(load_transforms(run / "capture" / "photos", require_all=True).frames) == 6
     cell = json.loads((run / "deploy" / "right_hardened_gradient_0.cell.json").read_text())
-    driven = np.array(json.loads((run / "deploy" / "right_hardened_gradient_0.drives.json").read_text())["states"][0])
+    driven = np.array(
+        json.loads((run / "deploy" / "right_hardened_gradient_0.drives.json").read_text())["states"][0]
+    )
     cte_m = experiment.paths["right"].project(driven[1:, :2]).cte_m
     assert cell["deployed"]["total_cte_m"] == pytest.approx([np.abs(cte_m).sum()])
     assert len(read_clip(run / "report" / "right.mp4")) == 4  # three ticks and the start
@@ -86,7 +88,9 @@ def test_objects_are_held_against_the_lanes_once_these_are_known(as_carla, file,
     with pytest.raises(ConfigError, match=r"--set objects=.*bump reaches into a lane"):
         load_experiment(file, "tiny", changes, tmp_path / "run")
     # What was captured with other settings says nothing about these.
-    assert not load_experiment(file, "tiny", [*changes, "world.junction.beyond_m=31"], tmp_path / "run").is_described
+    assert not load_experiment(
+        file, "tiny", [*changes, "world.junction.beyond_m=31"], tmp_path / "run"
+    ).is_described
 
 
 def test_the_servers_address_changes_no_cell_and_its_junction_does(as_carla, file, tmp_path):

@@ -9,7 +9,10 @@ from nodes.lab.carla.check import check_server
 
 
 def checks_of(library, settings, pictures=None, **changes):
-    return {c.name: c for c in check_server(CarlaConfig.model_validate({**settings, **changes}), library, pictures)}
+    return {
+        c.name: c
+        for c in check_server(CarlaConfig.model_validate({**settings, **changes}), library, pictures)
+    }
 
 
 def test_a_good_server(library, settings, tmp_path):

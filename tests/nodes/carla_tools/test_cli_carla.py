@@ -88,7 +88,17 @@ def test_junctions_of_a_server(as_carla, port):
 
 
 def test_drive_and_its_record(as_carla, file, tmp_path):
-    arguments = ["drive", "--config", str(file), "--path", "left", "--seconds", "3", "-o", str(tmp_path / "drive.json")]
+    arguments = [
+        "drive",
+        "--config",
+        str(file),
+        "--path",
+        "left",
+        "--seconds",
+        "3",
+        "-o",
+        str(tmp_path / "drive.json"),
+    ]
     done = CliRunner().invoke(app, arguments)
     assert done.exit_code == 0, done.output
     assert "over 30 ticks of 0.1 s" in done.output
@@ -114,7 +124,17 @@ def test_a_command_that_is_ended_puts_the_world_back(as_carla, file):
 
 
 def test_capture_twice(as_carla, file, tmp_path):
-    arguments = ["capture", "--config", str(file), "-o", str(tmp_path / "set"), "--photos", "4", "--held-out", "2"]
+    arguments = [
+        "capture",
+        "--config",
+        str(file),
+        "-o",
+        str(tmp_path / "set"),
+        "--photos",
+        "4",
+        "--held-out",
+        "2",
+    ]
     assert "6 pictures taken, 0 were there" in CliRunner().invoke(app, arguments).output
     assert "0 pictures taken, 6 were there" in CliRunner().invoke(app, arguments).output
 

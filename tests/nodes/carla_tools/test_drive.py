@@ -61,7 +61,9 @@ def hit_m(box, T_world_from_camera, pinhole):
 
 def test_objects_are_composed_by_carlas_depth(library, settings, carla):
     """One cube before a wall of CARLA's, one behind it: the first is seen whole, of the second only what no wall hides."""
-    config = CarlaConfig.model_validate({**settings, "camera": {**settings["camera"], "width": 168, "height": 94}})
+    config = CarlaConfig.model_validate(
+        {**settings, "camera": {**settings["camera"], "width": 168, "height": 94}}
+    )
     with CarlaScene(config, library) as scene:
         ends = [scene.drives.frame.carla_point([-6.0, y, 0.0])[:2] for y in (-10.0, 0.0)]
         library.world.walls = [(*ends, carla.CityObjectLabel.Walls)]
@@ -69,10 +71,14 @@ def test_objects_are_composed_by_carlas_depth(library, settings, carla):
         rgb, depth = scene.observe()
         T = scene.state.T_world_from_car @ scene.T_car_from_camera
         cubes = [box(-9.0, -3.0), box(-3.0, 0.3)]
-        surrogate = Surrogate(None, scene.camera_pinhole, scene.T_car_from_camera, cubes, supersample=1, opaque=True)
+        surrogate = Surrogate(
+            None, scene.camera_pinhole, scene.T_car_from_camera, cubes, supersample=1, opaque=True
+        )
         theta = torch.full((2, 3), 9.0)  # white; nothing that the server paints is so blue
         image = (
-            surrogate.overlay(rgb[None] / np.float32(255.0), depth[None], T[None], theta)[0].permute(1, 2, 0).numpy()
+            surrogate.overlay(rgb[None] / np.float32(255.0), depth[None], T[None], theta)[0]
+            .permute(1, 2, 0)
+            .numpy()
         )
     white = (image > 0.99).all(-1)
     front, back = (hit_m(cube, T, scene.camera_pinhole) for cube in cubes)
@@ -86,7 +92,9 @@ def test_objects_are_composed_by_carlas_depth(library, settings, carla):
 
 def test_the_intersections_own_loop_drives_in_carla(library, settings):
     """Observe, put the object in by depth, crop for the policy, command: the loop of the experiment, unchanged."""
-    config = CarlaConfig.model_validate({**settings, "camera": {**settings["camera"], "width": 336, "height": 188}})
+    config = CarlaConfig.model_validate(
+        {**settings, "camera": {**settings["camera"], "width": 336, "height": 188}}
+    )
     seen = []
 
     def policy(images, goals):
@@ -99,7 +107,15 @@ def test_the_intersections_own_loop_drives_in_carla(library, settings):
         cube = box(x + 14.0 * np.cos(yaw), y + 14.0 * np.sin(yaw))
         dressed = DressedScene(scene, PolicyView(scene.camera_pinhole), [cube])
         limits = Horizon(4, 0.1, scene.off_track_m, 6.0)
-        arguments = (dressed, policy, reference.goal, np.array(reference.start_pose), as_path(reference), limits, 6.0)
+        arguments = (
+            dressed,
+            policy,
+            reference.goal,
+            np.array(reference.start_pose),
+            as_path(reference),
+            limits,
+            6.0,
+        )
         drive = drive_deployed(*arguments, torch.full(dressed.theta_shape, 9.0))
     assert drive.states.shape == (5, 3)
     assert np.hypot(*np.diff(drive.states[:, :2], axis=0).T) == pytest.approx(0.6, abs=0.01)

@@ -25,7 +25,10 @@ def test_video_devices_with_their_formats_and_without_metadata():
     webcam = VideoDevice(formats={"YUYV": [(640, 480)], "MJPG": [(1280, 720)]})
     port = VideoPortEmulator({"/dev/a": webcam, "/dev/b": VideoDevice(metadata_only=True)})
     (row,) = cameras.video_devices(port)
-    assert (row.state, row.found) == (OK, "/dev/a: Emulated Camera (uvcvideo), YUYV 640x480@30/15; MJPG 1280x720@30/15")
+    assert (row.state, row.found) == (
+        OK,
+        "/dev/a: Emulated Camera (uvcvideo), YUYV 640x480@30/15; MJPG 1280x720@30/15",
+    )
     assert port.open_files == 0
     assert cameras.video_devices(VideoPortEmulator({}))[0].state == ABSENT
 
@@ -50,7 +53,9 @@ class Emulated(V4l2Source):
 
     def camera(self):
         mode = Mode(self.width, self.height, self.fps, self.pixel_format)
-        return V4l2Camera(self.device, mode, rate_hz=self.rate_hz, size=self.size, port=PORTS.get(str(self.device)))
+        return V4l2Camera(
+            self.device, mode, rate_hz=self.rate_hz, size=self.size, port=PORTS.get(str(self.device))
+        )
 
 
 PORTS = {}

@@ -26,16 +26,25 @@ def test_a_hung_check_costs_its_deadline_and_the_others_are_told_in_order():
 
     began = time.monotonic()
     found = list(
-        examine([
-            Check("a", fine("a")), Check("b", never.wait, 0.2, "unplug it"), Check("c", lost), Check("d", defect),
-            Check("e", fine("e")),
-        ])
-    )  # fmt: skip
+        examine(
+            [
+                Check("a", fine("a")),
+                Check("b", never.wait, 0.2, "unplug it"),
+                Check("c", lost),
+                Check("d", defect),
+                Check("e", fine("e")),
+            ]
+        )
+    )
     never.set()
     assert time.monotonic() - began < 2.0
     assert [(row.check, row.state) for row in found] == [
-        ("a", OK), ("b", FAILURE), ("c", FAILURE), ("d", WARNING), ("e", OK),
-    ]  # fmt: skip
+        ("a", OK),
+        ("b", FAILURE),
+        ("c", FAILURE),
+        ("d", WARNING),
+        ("e", OK),
+    ]
     assert (found[1].found, found[1].do) == ("no answer within 0.2 s", "unplug it")
     assert found[2].found == "lost the camera"
     assert "IndexError" in found[3].found
@@ -100,6 +109,9 @@ def test_gpus_are_named_and_a_build_that_sees_none_is_a_warning(library):
 
 
 def test_output_of_a_library_does_not_disturb_the_answer(library):
-    library("depthai", "print('[info] hello')\nclass Device:\n    getAllAvailableDevices = staticmethod(lambda: [])\n")
+    library(
+        "depthai",
+        "print('[info] hello')\nclass Device:\n    getAllAvailableDevices = staticmethod(lambda: [])\n",
+    )
     assert in_child("oaks").data == []
     assert cameras.oaks()[0].state == ABSENT

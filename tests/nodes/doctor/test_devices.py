@@ -101,7 +101,12 @@ def test_a_terminal_that_takes_no_bytes_does_not_hang_the_doctor():
 
 class Port:
     def __init__(self, device, vid=0x0483, pid=0x5740):
-        self.device, self.vid, self.pid, self.description = str(device), vid, pid, "ChibiOS/RT Virtual COM Port"
+        self.device, self.vid, self.pid, self.description = (
+            str(device),
+            vid,
+            pid,
+            "ChibiOS/RT Virtual COM Port",
+        )
 
 
 def test_a_serial_device_is_told_with_what_it_lacks(tmp_path, monkeypatch):

@@ -30,7 +30,9 @@ SLOW = ("nodes", "policy", "EGL")
 
 
 def plan_of(name, *overrides, host=None):
-    return load_launch(ROOT / "launch" / f"{name}.launch.yaml", [f"params.calibration={TWIN}", *overrides], host=host)
+    return load_launch(
+        ROOT / "launch" / f"{name}.launch.yaml", [f"params.calibration={TWIN}", *overrides], host=host
+    )
 
 
 def findings(plan, folder, leave_out=SLOW):
@@ -53,8 +55,18 @@ def test_the_twin_needs_its_files_a_port_and_a_disk(tmp_path):
     policy.touch()
     plan = plan_of("green_screen", f"params.policy={policy}", f"params.vicon_port={free_port()}")
     assert [check.name for check in checks_of(plan, tmp_path)] == [
-        "versions", "machine", "sockets", "launches", "nodes", "calibration", "files", "EGL", "VICON", "policy", "disk",
-    ]  # fmt: skip
+        "versions",
+        "machine",
+        "sockets",
+        "launches",
+        "nodes",
+        "calibration",
+        "files",
+        "EGL",
+        "VICON",
+        "policy",
+        "disk",
+    ]
     rows = findings(plan, tmp_path)
     assert states(rows, "calibration") == [OK]
     assert states(rows, "files") == [OK]
@@ -74,7 +86,9 @@ def test_files_that_are_missing_or_damaged_are_named(tmp_path):
     assert "policy: no file policy.safetensors" in found
     assert any(str(broken) in text for text in found)
     assert states(rows, "attack") == [FAILURE]
-    assert "policy" not in {check.name for check in checks_of(plan_of("green_screen"), tmp_path)}  # said under files
+    assert "policy" not in {
+        check.name for check in checks_of(plan_of("green_screen"), tmp_path)
+    }  # said under files
 
 
 @pytest.fixture
@@ -92,12 +106,17 @@ def test_the_car_is_asked_for_what_its_launch_file_wants(car, tmp_path, monkeypa
     monkeypatch.setattr(launch.mocap, "LISTEN_S", 0.3)
     vesc, vicon_port = car
     overrides = [
-        f"params.vesc={vesc.port}", f"params.vicon_port={vicon_port}", "params.camera={kind: v4l2, device: /dev/video99, width: 640, height: 480}",
-    ]  # fmt: skip
+        f"params.vesc={vesc.port}",
+        f"params.vicon_port={vicon_port}",
+        "params.camera={kind: v4l2, device: /dev/video99, width: 640, height: 480}",
+    ]
     rows = findings(plan_of("robot", *overrides), tmp_path)
     assert states(rows, "VESC") == [OK]
     (timeout,) = [row for row in rows if row.check == "VESC time-out"]
-    assert (timeout.state, "1000 ms with 0 A, at most 250 ms with 20 A wanted" in timeout.found) == (FAILURE, True)
+    assert (timeout.state, "1000 ms with 0 A, at most 250 ms with 20 A wanted" in timeout.found) == (
+        FAILURE,
+        True,
+    )
     assert states(rows, "battery") == [OK]
     seen = {row.found.split(":")[0]: row.state for row in rows if row.check == "VICON"}
     assert (seen["car"], seen["board"], seen["wand is not seen"]) == (OK, OK, WARNING)
@@ -171,7 +190,9 @@ def test_the_command_prints_one_line_per_finding_and_tells_by_its_exit_code(tmp_
     code, output, _ = run(monkeypatch, capsys, file)
     lines = output.splitlines()
     assert code == 0
-    assert any(line.startswith("ok       calibration") and str(tmp_path / "room.yaml") in line for line in lines)
+    assert any(
+        line.startswith("ok       calibration") and str(tmp_path / "room.yaml") in line for line in lines
+    )
     assert any("safety accept their configuration" in line for line in lines)
     assert lines[-1].startswith("0 failures")
     (tmp_path / "room.yaml").unlink()
@@ -199,9 +220,18 @@ def test_a_computer_without_a_launch_file_in_mind(tmp_path, monkeypatch, capsys)
     code, output, _ = run(monkeypatch, capsys, "--folder", tmp_path, "--vicon-port", free_port(), "--json")
     told = json.loads(output)["findings"]
     assert code == 0
-    assert {"python", "extras", "machine", "disk", "sockets", "keys", "VICON", "camera", "gamepad", "launches"} <= {
-        row["check"] for row in told
-    }
+    assert {
+        "python",
+        "extras",
+        "machine",
+        "disk",
+        "sockets",
+        "keys",
+        "VICON",
+        "camera",
+        "gamepad",
+        "launches",
+    } <= {row["check"] for row in told}
     assert ABSENT in {row["state"] for row in told if row["check"] == "VICON"}
     with VescEmulator(VescEmulatorConfig(), TwinVehicle(CarConfig())) as vesc:
         code, output, _ = run(
@@ -234,7 +264,9 @@ def test_launch_check_says_which_policy_does_not_fit_the_camera(tmp_path, monkey
     ]
     saved_policy(file, 400, 224)
     (problem,) = launch.policy_problems(plan_of("green_screen", f"params.policy={file}"))
-    assert problem.startswith("policy: trained for 400 x 224, the camera is calibrated for 336 x 188; train for this")
+    assert problem.startswith(
+        "policy: trained for 400 x 224, the camera is calibrated for 336 x 188; train for this"
+    )
     monkeypatch.setattr("nodes.launching.launch_check.check_nodes", lambda plan: {})
     with pytest.raises(typer.Exit):
         cli._say_problems(missing)

@@ -56,7 +56,8 @@ def test_chrony_says_whom_it_follows_and_one_that_hangs_costs_its_deadline_only(
 
 
 @pytest.mark.parametrize(
-    ("offset_s", "state", "cure"), [(0.001, OK, ""), (-0.012, WARNING, "chrony"), (0.05, FAILURE, "cannot be armed")]
+    ("offset_s", "state", "cure"),
+    [(0.001, OK, ""), (-0.012, WARNING, "chrony"), (0.05, FAILURE, "cannot be armed")],
 )
 def test_offset_of_the_other_host_is_heard_from_a_running_launch(tmp_path, offset_s, state, cure):
     with Bus(tmp_path) as gateway:
@@ -103,7 +104,9 @@ def test_requirements_are_compared_with_what_is_installed():
     assert machine.packages(["numpy>=1.26,<3", 'nobody-has-this>=1; extra == "gadget"']) == [
         Finding("extras", OK, "complete: none")
     ]
-    rows = machine.packages(["numpy>=99", "nobody-has-this", 'numpy<1; extra == "old"', 'pydantic>=2; extra == "good"'])
+    rows = machine.packages(
+        ["numpy>=99", "nobody-has-this", 'numpy<1; extra == "old"', 'pydantic>=2; extra == "good"']
+    )
     assert [row.state for row in rows] == [FAILURE, OK, WARNING]
     assert "is not >=99; nobody-has-this is missing" in rows[0].found
     assert rows[1].found == "complete: good"
@@ -113,9 +116,16 @@ def test_requirements_are_compared_with_what_is_installed():
 
 @pytest.mark.parametrize(
     ("version", "specifier", "fits"),
-    [("2.13.0+cpu", ">=2.4", True), ("0.12.1", "<0.12,>=0.11", False), ("5", "<5,>=4.10", False), ("4.10.0.84", "<5,>=4.10", True),
-     ("0.9.16", "==0.9.16", True), ("3.1", "==3.1.0", True), ("1.0", "", True)],
-)  # fmt: skip
+    [
+        ("2.13.0+cpu", ">=2.4", True),
+        ("0.12.1", "<0.12,>=0.11", False),
+        ("5", "<5,>=4.10", False),
+        ("4.10.0.84", "<5,>=4.10", True),
+        ("0.9.16", "==0.9.16", True),
+        ("3.1", "==3.1.0", True),
+        ("1.0", "", True),
+    ],
+)
 def test_specifiers(version, specifier, fits):
     assert machine.satisfies(version, specifier) is fits
 

@@ -37,7 +37,9 @@ def test_memory_for_the_cache_is_no_part_of_what_a_cell_depends_on(tmp_path):
 
 def test_a_car_that_runs_into_something_stands_from_then_on():
     free = [[0.08 * tick, 0.0, 0.0] for tick in range(20)]
-    against_it = free + [[1.52 + 0.001 * (tick % 2), 0.0, 0.0] for tick in range(10)]  # motion capture's noise
+    against_it = free + [
+        [1.52 + 0.001 * (tick % 2), 0.0, 0.0] for tick in range(10)
+    ]  # motion capture's noise
     assert blocked_tick(driven(free)) is None
     assert blocked_tick(driven(against_it)) == 19
     assert blocked_tick(driven(against_it, "outside of the fence")) is None
@@ -54,7 +56,9 @@ def test_a_method_gets_its_own_part_of_the_budget(tmp_path):
     ]
     experiment = load_experiment(LAUNCH / "room.experiment.yaml", "full", changes, tmp_path)
     settings = {name: search_settings(experiment, METHODS[name]) for name in METHODS}
-    assert {name: each.evaluations for name, each in settings.items() if each.evaluations != 5} == {"gradient": 7}
+    assert {name: each.evaluations for name, each in settings.items() if each.evaluations != 5} == {
+        "gradient": 7
+    }
     assert {(each.gradient_rate, each.random_sigma) for each in settings.values()} == {(0.3, 2.0)}
     assert {(each.learning_rate, each.sigma, each.population, each.cells) for each in settings.values()} == {
         (None, None, 10, 8)

@@ -42,7 +42,9 @@ def made(experiment, until=None):
 
 @pytest.fixture(autouse=True)
 def frozen(monkeypatch):
-    monkeypatch.setattr(attack, "frozen_hashes", lambda experiment: {"scene": "same", "victim": "same", "config": "?"})
+    monkeypatch.setattr(
+        attack, "frozen_hashes", lambda experiment: {"scene": "same", "victim": "same", "config": "?"}
+    )
 
 
 def test_a_folder_is_what_its_stages_were_made_with_whatever_was_asked_for_last(tmp_path):
@@ -94,7 +96,9 @@ def test_folders_from_before_settings_were_kept_are_known_by_their_key(tmp_path)
 
 
 def driven(attack_ids, stopped_early="", off_track=False):
-    return json.dumps({"attack_ids": attack_ids, "outcome": {"stopped_early": stopped_early}, "off_track": off_track})
+    return json.dumps(
+        {"attack_ids": attack_ids, "outcome": {"stopped_early": stopped_early}, "off_track": off_track}
+    )
 
 
 def test_a_live_drive_is_taken_of_the_same_graph_the_same_attack_and_no_fault(tmp_path, monkeypatch):
@@ -102,7 +106,9 @@ def test_a_live_drive_is_taken_of_the_same_graph_the_same_attack_and_no_fault(tm
     other = room(tmp_path / "run", "deploy.nodes=[twin, camera, vicon, policy, safety, motor, recorder]")
     assert has_same_graph(experiment)
     assert not has_same_graph(other)
-    monkeypatch.setattr("nodes.experiment.cells.load_attack", lambda path: type("Attack", (), {"attack_id": "abc"}))
+    monkeypatch.setattr(
+        "nodes.experiment.cells.load_attack", lambda path: type("Attack", (), {"attack_id": "abc"})
+    )
     folder = tmp_path / "run" / "deploy"
     (tmp_path / "run" / "attack" / "hardened_gradient_0.json").touch()
     (tmp_path / "run" / "attack" / "hardened_none_0.json").touch()
@@ -110,10 +116,14 @@ def test_a_live_drive_is_taken_of_the_same_graph_the_same_attack_and_no_fault(tm
     live = folder / "hardened_gradient_0.json"
     assert cell.driven_in("gradient") == tmp_path / "cell" / "live"
     for text, taken in (
-        (driven(["abc"]), True), (driven(["old"]), False), (driven([]), False),
-        (driven(["abc"], "outside of the fence"), True), (driven(["abc"], "no fresh pose"), False),
-        (driven(["abc"], "stalled: ...", off_track=True), True), (driven(["abc"], "stalled: ..."), False),
-    ):  # fmt: skip
+        (driven(["abc"]), True),
+        (driven(["old"]), False),
+        (driven([]), False),
+        (driven(["abc"], "outside of the fence"), True),
+        (driven(["abc"], "no fresh pose"), False),
+        (driven(["abc"], "stalled: ...", off_track=True), True),
+        (driven(["abc"], "stalled: ..."), False),
+    ):
         live.write_text(text)
         assert (cell.driven_in("gradient") == folder) is taken, text
     live.write_text(driven(["abc"]))

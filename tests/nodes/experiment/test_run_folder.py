@@ -12,7 +12,9 @@ from nodes.runtime.errors import ConfigError
 
 def run(folder, name, value=1):
     config = SimpleNamespace(name=name, model_dump=lambda mode: {"value": value})
-    stage = Stage("capture", lambda here, told: (here / "photo").write_text(f"{name} {value}"), {"value": value})
+    stage = Stage(
+        "capture", lambda here, told: (here / "photo").write_text(f"{name} {value}"), {"value": value}
+    )
     experiment = RunFolder(config, folder / f"{name}.experiment.yaml", folder, "demo")
     return run_to_end(experiment, [stage], ["numpy"], lambda console: None, None, Console(file=io.StringIO()))
 

@@ -101,7 +101,8 @@ def test_an_attack_looks_through_the_display_model_where_a_monitor_shows_it_and_
     write_twin_calibrations(asked.lab_config, tmp_path / "capture" / CALIBRATION)
     surrogate = surrogate_of(asked, [attacked_object(asked)], grey_room)
     save_calibration(
-        DisplayCalibration(date=LAB_DATE, method=METHOD, model=SEEN_AS.to_dict()), asked.calibration_file("display")
+        DisplayCalibration(date=LAB_DATE, method=METHOD, model=SEEN_AS.to_dict()),
+        asked.calibration_file("display"),
     )
     sensor = sensor_of(asked, surrogate)
     colour = seen_on_the_face(sensor, asked)

@@ -33,7 +33,9 @@ def test_from_photographs_to_report_and_nothing_twice(tmp_path, file):
     assert "<html" in page
     data = read_results(tmp_path / "report" / "results.json")
     assert {(run.domain, run.condition) for run in data.runs} == {
-        (domain, condition) for domain in ("surrogate", "deployed") for condition in ("none", "random", "gradient")
+        (domain, condition)
+        for domain in ("surrogate", "deployed")
+        for condition in ("none", "random", "gradient")
     }
     assert data.latency is not None
     drawn = json.loads((tmp_path / "deploy" / "hardened_gradient_0.json").read_text())["attack_ids"]

@@ -51,7 +51,11 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Experiment:
     folder = tmp_path_factory.mktemp("intersection")
     experiment = load_experiment(write_file(folder), "tiny", [], folder / "run")
     torch.manual_seed(0)
-    field = SceneField(SceneFieldConfig((-60.0, -60.0, -1.0), (60.0, 60.0, 36.0), HashGridConfig(levels=8, features=4, log2_entries=8)))  # fmt: skip
+    field = SceneField(
+        SceneFieldConfig(
+            (-60.0, -60.0, -1.0), (60.0, 60.0, 36.0), HashGridConfig(levels=8, features=4, log2_entries=8)
+        )
+    )
     for stage in ("scene", "object", "policy", "attack", "deploy"):
         experiment.stage_folder(stage).mkdir(parents=True)
     save_scene(scene_file(experiment), field, np.zeros((16, 16, 5), dtype=bool))

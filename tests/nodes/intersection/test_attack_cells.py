@@ -44,7 +44,12 @@ def test_cells_are_all_methods_of_all_drives(trained: Experiment) -> None:
     names = [cell.name for cell in cells(trained)]
     assert len(set(names)) == len(names) == 2 * 3 * 4  # victims, drives, none and three methods
     assert names[:3] == ["straight_hardened_none_0", "right_hardened_none_0", "left_hardened_none_0"]
-    more = replace(trained, config=trained.config.model_copy(update={"attack": trained.config.attack.model_copy(update={"seeds": (0, 1, 2)})}))  # fmt: skip
+    more = replace(
+        trained,
+        config=trained.config.model_copy(
+            update={"attack": trained.config.attack.model_copy(update={"seeds": (0, 1, 2)})}
+        ),
+    )
     assert sum(cell.victim == NAIVE for cell in cells(more)) == 3 * 4
     assert len(cells(more)) == (3 + 1) * 3 * 4
 
@@ -72,7 +77,9 @@ def test_search_is_kept_and_its_file_brings_the_colours_back(fresh: Experiment, 
     assert surrogate_part(fresh, space, cell, folder, silent) == marked
 
 
-def test_a_method_of_a_file_runs_a_cell_and_appears_in_the_tables(fresh: Experiment, wall: Any, tmp_path: Path) -> None:
+def test_a_method_of_a_file_runs_a_cell_and_appears_in_the_tables(
+    fresh: Experiment, wall: Any, tmp_path: Path
+) -> None:
     spiral_file, file = write_spiral(tmp_path), Path(shutil.copy(fresh.file, tmp_path))
     changes = ["attack.methods=[spiral.py:Spiral, gradient]", "scenarios=[right]", "policy.naive_steps=0"]
     experiment = run.load_experiment(file, "tiny", changes, fresh.folder)
@@ -125,7 +132,9 @@ def test_a_stopped_search_goes_on_and_refuses_another_victim(fresh: Experiment) 
 
 def test_cell_has_both_domains_over_their_own_clean_drive(fresh: Experiment, wall: Any) -> None:
     folder, space = fresh.stage_folder("attack"), colour_space(fresh)
-    learned = {cell: surrogate_part(fresh, space, cell, folder, silent) for cell in (GRADIENT.clean, GRADIENT)}
+    learned = {
+        cell: surrogate_part(fresh, space, cell, folder, silent) for cell in (GRADIENT.clean, GRADIENT)
+    }
     out = fresh.stage_folder("deploy")
     cell = deployed_part(fresh, space, wall, GRADIENT, folder, out)
     assert cell["surrogate"]["total_cte_m"] == learned[GRADIENT]["total_cte_m"]
@@ -176,13 +185,19 @@ def test_table_divides_by_the_clean_drive_of_the_same_domain(fresh: Experiment) 
     for cell in cells(fresh):
         factor = {"none": 1.0, "random": 1.1, "cem": 1.5, "gradient": 3.0}[cell.method]
         parts = {
-            domain: {"total_cte_m": [factor * clean], "off_track": [factor > 2.0], "none_total_cte_m": [clean]}
+            domain: {
+                "total_cte_m": [factor * clean],
+                "off_track": [factor > 2.0],
+                "none_total_cte_m": [clean],
+            }
             for domain, clean in (("surrogate", 4.0), ("deployed", 6.0))
         }
         (out / f"{cell.name}.cell.json").write_text(json.dumps({"attack_id": None, **parts}))
     rows = report.rows_of(fresh)
     assert len(rows) == 2 * 3 * 2 * 4
-    first = [row for row in rows if (row.victim, row.scenario, row.domain) == ("hardened", "straight", "deployed")]
+    first = [
+        row for row in rows if (row.victim, row.scenario, row.domain) == ("hardened", "straight", "deployed")
+    ]
     assert [row.method for row in first] == ["none", "random", "cem", "gradient"]
     assert [row.ratio for row in first] == pytest.approx([1.0, 1.1, 1.5, 3.0])
     assert [row.off_track for row in first] == [0, 0, 0, 1]

@@ -91,7 +91,17 @@ def test_meshes_are_searched_over_the_pictures_of_the_world(
         assert (moved < 1e-6) == (space.kind == "mesh_texture")
     # What the file holds is what was driven past.
     restored = make_space(experiment, wall).restored(file)
-    there = attack.past(attack.attack_problem(experiment, make_space(experiment, wall), attack._victim(victim_file(experiment, "hardened")), "straight", 0), make_space(experiment, wall), restored)  # fmt: skip
+    there = attack.past(
+        attack.attack_problem(
+            experiment,
+            make_space(experiment, wall),
+            attack._victim(victim_file(experiment, "hardened")),
+            "straight",
+            0,
+        ),
+        make_space(experiment, wall),
+        restored,
+    )
     _, scores = attack.learned_drives(experiment, there, restored.colours)
     assert [score.total_cte_m for score in scores] == list(result.surrogate.total_cte_m)
     assert not list(tmp_path.glob("*.state.safetensors"))
@@ -153,13 +163,17 @@ def test_places_alone_keep_the_plain_colours_and_are_filmed(
     moved, plain_drive, again = shown
     np.testing.assert_array_equal(moved.frames, again.frames)  # the same drive
     assert not np.array_equal(moved.frames, plain_drive.frames)
-    own, file = (load_attack(tmp_path / "moved" / "right_hardened_random_0.attack.safetensors") for _ in range(2))
+    own, file = (
+        load_attack(tmp_path / "moved" / "right_hardened_random_0.attack.safetensors") for _ in range(2)
+    )
     voxels = make_space(experiment, None)
     assert torch.equal(voxels.restored(own).colours, voxels.plain.colours)
     coloured = searching(experiment, ONE)
     run_cell(coloured, *PLACES, tmp_path / "other", silent)
     other = load_attack(tmp_path / "other" / "right_hardened_random_0.attack.safetensors")
-    assert [each.placement for each in other.objects] == [each.placement for each in file.objects]  # the same draws
+    assert [each.placement for each in other.objects] == [
+        each.placement for each in file.objects
+    ]  # the same draws
     assert not np.array_equal(other.objects[0].theta, own.objects[0].theta)
 
 
@@ -193,7 +207,13 @@ def test_a_cell_of_colours_depends_on_the_world_and_not_on_what_else_is_searched
         return settings_hash(kind, experiment, "right", victim, "random", 0)
 
     same = digest()
-    for free in ("name=mine", "attack.methods=[random]", "attack.seeds=[0,1,2]", "attack.cache_mib=64", "retrain={}"):
+    for free in (
+        "name=mine",
+        "attack.methods=[random]",
+        "attack.seeds=[0,1,2]",
+        "attack.cache_mib=64",
+        "retrain={}",
+    ):
         assert digest(free) == same
     needed = ("world.car.turn_rate_lag_s=0.2", "attack.evaluations=9", "held_cap_m=5", "policy.seed=1")
     assert len({same, digest(victim="naive"), *(digest(change) for change in needed)}) == 6
@@ -207,14 +227,20 @@ def test_the_gate_judges_learned_scenes_and_predictions_need_objects_where_they_
     kind = load_kind("world")
     judged = {space.kind: kind.judges(searching(trained, space)) for space in (ColoursConfig(), ONE, *MESHES)}
     assert judged == {"colours": True, "places": True, "mesh_texture": False, "mesh_shape": False}
-    predicted = {space.kind: kind.predicts(searching(trained, space)) for space in (ColoursConfig(), ONE, *MESHES)}
+    predicted = {
+        space.kind: kind.predicts(searching(trained, space)) for space in (ColoursConfig(), ONE, *MESHES)
+    }
     assert predicted == {"colours": True, "places": False, "mesh_texture": False, "mesh_shape": False}
 
 
-def test_a_defence_that_nothing_asks_for_is_told(trained: Experiment, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_defence_that_nothing_asks_for_is_told(
+    trained: Experiment, monkeypatch: pytest.MonkeyPatch
+) -> None:
     config = trained.config.model_copy(update={"retrain": RetrainConfig(pays_ratio=9.0)})
     monkeypatch.setattr(run, "run_experiment", lambda *arguments, **options: {})  # ends as no attack pays
-    with pytest.raises(ConfigError, match=r"no attack reaches retrain.pays_ratio = 9 .*nothing was retrained"):
+    with pytest.raises(
+        ConfigError, match=r"no attack reaches retrain.pays_ratio = 9 .*nothing was retrained"
+    ):
         run.prepare_victims(replace(trained, config=config), silent)
 
 
@@ -253,7 +279,9 @@ def test_the_retrained_victim_is_that_of_the_first_round(trained: Experiment, tm
     assert json.dumps(naive["deployed"]) == json.dumps(cell["deployed"])  # the very same weights
 
 
-def test_maps_are_of_what_the_cell_found(trained: Experiment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_maps_are_of_what_the_cell_found(
+    trained: Experiment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     experiment = searching(trained, ONE)
     found = run_cell(experiment, *PLACES, tmp_path, silent)
     small = PoseMapSettings(points=(2, 2), sideways_m=(0.0, 0.3), object_moves_m=((0.0, 0.0), (0.0, 0.2)))

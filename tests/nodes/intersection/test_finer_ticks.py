@@ -71,7 +71,9 @@ def driven(experiment: Experiment, car: Dubins | SelfDriving, turn_rate_radps: f
     return states[:, 0].numpy()
 
 
-def where(start: Array, turn_rate_radps: float, lag_s: float, gain: float, after_s: float) -> tuple[float, float]:
+def where(
+    start: Array, turn_rate_radps: float, lag_s: float, gain: float, after_s: float
+) -> tuple[float, float]:
     """Speed times time along the heading: the turn rate's lag in closed form, the way by quadrature."""
 
     def heading_rad(t_s: float) -> float:
@@ -84,14 +86,17 @@ def where(start: Array, turn_rate_radps: float, lag_s: float, gain: float, after
 
 
 @pytest.mark.parametrize("turn_rate_radps", [0.0, 0.15])
-def test_both_cars_are_where_speed_and_time_say(junction: World, tmp_path: Path, turn_rate_radps: float) -> None:
+def test_both_cars_are_where_speed_and_time_say(
+    junction: World, tmp_path: Path, turn_rate_radps: float
+) -> None:
     for dt_s in TICKS_S:
         experiment = in_ticks_of(dt_s, tmp_path)
         start, flaws = np.array(experiment.references["straight"].start_pose), DubinsConfig()
         deployed = SelfDriving(junction, flaws.speed_mps, experiment.limits.dt_s)
         cars: list[tuple[Dubins | SelfDriving, float, float]] = [
-            (experiment.dynamics, 0.0, 1.0), (deployed, flaws.turn_rate_lag_s, flaws.turn_rate_gain)
-        ]  # fmt: skip
+            (experiment.dynamics, 0.0, 1.0),
+            (deployed, flaws.turn_rate_lag_s, flaws.turn_rate_gain),
+        ]
         for car, lag_s, gain in cars:
             states = driven(experiment, car, turn_rate_radps, start)
             assert len(states) == round(SECONDS / dt_s) + 1
@@ -112,7 +117,9 @@ def test_total_cte_is_the_sum_over_the_ticks_that_there_are(junction: World, tmp
         found[dt_s] = drive_metrics(experiment.paths["straight"], states, experiment.limits, car.blocked_tick)
         # A straight line away from a straight line: |CTE| = v t sin(angle) at t = dt, 2 dt, ..., T dt.
         ticks = round(SECONDS / dt_s)
-        assert found[dt_s].total_cte_m == pytest.approx(6.0 * np.sin(ASKEW_RAD) * dt_s * ticks * (ticks + 1) / 2)
+        assert found[dt_s].total_cte_m == pytest.approx(
+            6.0 * np.sin(ASKEW_RAD) * dt_s * ticks * (ticks + 1) / 2
+        )
         assert found[dt_s].mean_cte_m == pytest.approx(found[dt_s].total_cte_m / ticks)
         assert found[dt_s].max_cte_m == pytest.approx(6.0 * SECONDS * np.sin(ASKEW_RAD))
     coarse, fine = (found[dt_s] for dt_s in TICKS_S)
@@ -127,9 +134,13 @@ def finer(trained: Experiment, horizon: int, folder: Path) -> Experiment:
     return replace(trained, config=config, folder=folder)
 
 
-def test_the_gradient_is_what_a_turn_of_a_hundredth_of_a_second_is_worth(trained: Experiment, tmp_path: Path) -> None:
+def test_the_gradient_is_what_a_turn_of_a_hundredth_of_a_second_is_worth(
+    trained: Experiment, tmp_path: Path
+) -> None:
     experiment = finer(trained, 8, tmp_path / "run")
-    space = colour_space(experiment, surrogate_of(experiment, placed_objects(experiment)).in_type(torch.float64))
+    space = colour_space(
+        experiment, surrogate_of(experiment, placed_objects(experiment)).in_type(torch.float64)
+    )
     surrogate = space.surrogate
     loaded = load_policy(victim_file(experiment, HARDENED))
     loaded.policy.double()
@@ -152,7 +163,10 @@ def test_the_gradient_is_what_a_turn_of_a_hundredth_of_a_second_is_worth(trained
         turned.append(float((more - less)[0]) / (2.0 * step))
     # Turning at a rate u for one tick turns what is driven afterwards by u dt: v dt of way per tick, half of it in the tick itself.
     ticks, dt_s = len(turned), 0.01
-    worth = [sum(6.0 * dt_s * dt_s * (after - tick - 0.5) for after in range(tick + 1, ticks + 1)) for tick in range(ticks)]  # fmt: skip
+    worth = [
+        sum(6.0 * dt_s * dt_s * (after - tick - 0.5) for after in range(tick + 1, ticks + 1))
+        for tick in range(ticks)
+    ]
     heading = float(torch.cos(states[:, 0, 2]).mean())
     assert states[-1, 0, 1] > y_m  # on the left throughout, so that what turns left adds to |CTE|
     expected = -heading * float(np.dot(turned, worth))
@@ -177,6 +191,8 @@ def test_search_drive_and_film_in_finer_ticks(trained: Experiment, wall: Any, tm
     assert len(read_clip(film_cell(experiment, wall, load_shown(space, folder, cell), cell, folder))) == 2
 
 
-@pytest.mark.parametrize(("dt_s", "every", "rate_hz"), [(0.1, 1, 10.0), (0.01, 10, 10.0), (0.05, 2, 10.0), (0.2, 1, 5.0)])  # fmt: skip
+@pytest.mark.parametrize(
+    ("dt_s", "every", "rate_hz"), [(0.1, 1, 10.0), (0.01, 10, 10.0), (0.05, 2, 10.0), (0.2, 1, 5.0)]
+)
 def test_films_run_in_real_time(dt_s: float, every: int, rate_hz: float) -> None:
     assert filmed(dt_s) == (every, pytest.approx(rate_hz))

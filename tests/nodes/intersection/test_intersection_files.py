@@ -77,14 +77,23 @@ def test_a_world_chooses_the_experiment(tmp_path: Path) -> None:
     [
         ({"world": {"kind": "moon"}}, "expected a world of lab, junction, carla; got 'moon'"),
         ({"world": {"road": {}}}, "expected kind: NAME"),
-        ({"scenarios": ["backwards"]}, "scenarios: expected a scenario of straight, right, left; got 'backwards'"),
+        (
+            {"scenarios": ["backwards"]},
+            "scenarios: expected a scenario of straight, right, left; got 'backwards'",
+        ),
         ({"scenarios": ["left", "left"]}, "expected different scenarios, got left, left"),
-        ({"world": {"kind": "junction", "road": {"lane_width_m": 9.0}}}, "road.lane_width_m: input should be less"),
+        (
+            {"world": {"kind": "junction", "road": {"lane_width_m": 9.0}}},
+            "road.lane_width_m: input should be less",
+        ),
         (
             {"world": {"kind": "junction", "roads": {}}},
             "unknown key roads; valid keys here: approach_m, beyond_m, camera",
         ),
-        ({"objects": [{"name": "one", "kind": "hydrant", "x_m": 0.0, "y_m": -3.6}]}, "one reaches into a lane at (0."),
+        (
+            {"objects": [{"name": "one", "kind": "hydrant", "x_m": 0.0, "y_m": -3.6}]},
+            "one reaches into a lane at (0.",
+        ),
         ({"view": {"crop_top_px": 100}}, "view: expected a crop inside 336 x 188"),
         ({"polcy": {}}, "polcy"),
     ],
@@ -128,7 +137,9 @@ def test_training_drives_that_end_before_the_junction_are_refused(tmp_path: Path
     assert load(tmp_path, *fine, "policy.dagger_rounds=0").limits.dt_s == 0.01  # it drives in no training
     with pytest.raises(ConfigError, match=r"retrain\.drive_steps.* got 60 ticks"):
         load(tmp_path, *fine, "policy.drive_steps=600", "retrain.rounds=1")
-    assert load(tmp_path, *fine, "policy.drive_steps=600", "retrain.drive_steps=600").config.retrain is not None
+    assert (
+        load(tmp_path, *fine, "policy.drive_steps=600", "retrain.drive_steps=600").config.retrain is not None
+    )
 
 
 class Quiet:
@@ -141,7 +152,9 @@ class Quiet:
         pass
 
 
-def test_cells_of_the_retrained_victim_wait_for_one_round_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cells_of_the_retrained_victim_wait_for_one_round_only(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The stages write next to nothing here: what is asked for is decided by their records."""
     experiment = load(tmp_path, "retrain.rounds=6")
     asked: list[tuple[int, str]] = []
@@ -165,7 +178,9 @@ def test_cells_of_the_retrained_victim_wait_for_one_round_only(tmp_path: Path, m
     shutil.rmtree(experiment.folder / "retrain")
     run.prepare_victims(load(tmp_path, "retrain.rounds=4"), lambda fraction, text="": None)
     assert asked[1:] == [(1, "retrain")]
-    run.prepare_victims(load(tmp_path, "retrain.rounds=6", "retrain.stills=7"), lambda fraction, text="": None)
+    run.prepare_victims(
+        load(tmp_path, "retrain.rounds=6", "retrain.stills=7"), lambda fraction, text="": None
+    )
     assert asked[2:] == [(1, "retrain")]
     longer = load(tmp_path / "longer", "retrain.rounds=6")
 

@@ -65,7 +65,9 @@ def test_five_objects_stand_clear_of_every_lane(experiment: Experiment) -> None:
         (hydrant_at(-10.0, -3.8, 2.0), "reaches into a lane"),
     ],
 )
-def test_what_stands_in_a_lane_is_found(experiment: Experiment, thing: PlacedObject, told: str | None) -> None:
+def test_what_stands_in_a_lane_is_found(
+    experiment: Experiment, thing: PlacedObject, told: str | None
+) -> None:
     first = hydrant_at(9.0, 5.0)
     found = in_a_lane([first, thing], experiment.world)
     assert (found is None) == (told is None)
@@ -86,7 +88,9 @@ def test_an_object_in_a_lane_is_told_with_its_line(tmp_path: Path) -> None:
     file = tmp_path / "moved.experiment.yaml"
     file.write_text(text)
     line = 1 + next(number for number, each in enumerate(text.splitlines()) if "hydrant_south" in each)
-    with pytest.raises(ValueError, match=rf"moved\.experiment\.yaml:{line}: .*hydrant_south reaches into a lane"):
+    with pytest.raises(
+        ValueError, match=rf"moved\.experiment\.yaml:{line}: .*hydrant_south reaches into a lane"
+    ):
         load_experiment(file, "full", [], tmp_path / "run")
 
 
@@ -127,7 +131,9 @@ def test_the_picture_from_above_shows_paths_and_objects(experiment: Experiment) 
     assert not np.array_equal(picture, bare)
 
 
-def test_a_world_without_a_view_from_above_is_drawn_as_a_plan(experiment: Experiment, wall: Intersection) -> None:
+def test_a_world_without_a_view_from_above_is_drawn_as_a_plan(
+    experiment: Experiment, wall: Intersection
+) -> None:
     picture = from_above(experiment, wall)
     assert picture.shape == (720, 960, 3)
     for rgb in ((40, 110, 230), (235, 140, 20), (200, 40, 170), (240, 30, 30), (150, 150, 150)):

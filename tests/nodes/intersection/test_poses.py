@@ -38,5 +38,7 @@ def test_cars_turn_a_little_and_hydrants_all_the_way(trained: Experiment) -> Non
     for thing, bound in zip(trained.objects, bounds_of(trained.objects, PlacesConfig()), strict=True):
         assert bound.yaw_rad is not None
         width_rad = bound.yaw_rad[1] - bound.yaw_rad[0]
-        assert width_rad == pytest.approx(2 * np.pi if thing.kind == "hydrant" else 2 * PlacesConfig().turn_rad)
+        assert width_rad == pytest.approx(
+            2 * np.pi if thing.kind == "hydrant" else 2 * PlacesConfig().turn_rad
+        )
         assert bound.scale is None

@@ -73,7 +73,9 @@ def test_errors_against_numpy():
 def test_saliency_is_where_the_gradient_is():
     weight = torch.zeros(3, 66, 200)
     weight[:, 20, 150] = 1.0
-    maps = saliency(lambda images, goals: (images * weight).sum((1, 2, 3)), np.zeros((3, 66, 200, 3), np.uint8))
+    maps = saliency(
+        lambda images, goals: (images * weight).sum((1, 2, 3)), np.zeros((3, 66, 200, 3), np.uint8)
+    )
     assert maps.shape == (3, 66, 200)
     assert np.unravel_index(maps[1].argmax(), (66, 200)) == (20, 150)
     assert maps.max() == pytest.approx(1.0)

@@ -10,25 +10,12 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
 from nodes.bags import part as bag_part
-from nodes.bags.reader import (
-    extract_attachments,
-    read_attachment,
-    read_info,
-    read_messages,
-    require_readable,
-)
+from nodes.bags.reader import extract_attachments, read_attachment, read_info, read_messages, require_readable
 from nodes.bags.stamps import read_delays
 from nodes.bags.writer import BagWriter
 from nodes.cli import main as cli
 from nodes.runtime.errors import BagError
-from nodes.runtime.messages import (
-    encode,
-    header,
-    pose_message,
-    type_definition,
-    type_hash,
-    types,
-)
+from nodes.runtime.messages import encode, header, pose_message, type_definition, type_hash, types
 from nodes.runtime.topics import TOPICS
 from tests.support.bag_samples import START_NS, write_all_topics
 
@@ -47,7 +34,9 @@ def test_three_readers_agree_and_decode_every_topic(tmp_path):
     path = tmp_path / "bag" / "bag.mcap"
     names = {*TOPICS, "/status/x"}
     with open(path, "rb") as file:
-        mcap_messages = [(c.topic, m.data) for _, c, m in make_reader(file, validate_crcs=True).iter_messages()]
+        mcap_messages = [
+            (c.topic, m.data) for _, c, m in make_reader(file, validate_crcs=True).iter_messages()
+        ]
     with open(path, "rb") as file:
         decoded = list(make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages())
     assert {channel.topic for _, channel, _, _ in decoded} == names
@@ -89,7 +78,9 @@ def test_file_is_a_rosbag2_bag(tmp_path):
 
 
 def test_info_attachments_and_selection(tmp_path):
-    write_all_topics(tmp_path / "bag", attachments={"a.yaml": b"1"}, metadata={"git": "abc"}).close({"lost /arm": "3"})
+    write_all_topics(tmp_path / "bag", attachments={"a.yaml": b"1"}, metadata={"git": "abc"}).close(
+        {"lost /arm": "3"}
+    )
     info = read_info(tmp_path / "bag")
     assert info.messages == 5 * (len(TOPICS) + 1)
     assert info.duration_s == pytest.approx(0.45)
@@ -107,29 +98,49 @@ def test_info_attachments_and_selection(tmp_path):
     require_readable(tmp_path / "bag", {name: row.type for name, row in TOPICS.items()})
 
 
-@pytest.mark.parametrize("compression", [CompressionType.NONE, CompressionType.ZSTD, CompressionType.LZ4, None])
+@pytest.mark.parametrize(
+    "compression", [CompressionType.NONE, CompressionType.ZSTD, CompressionType.LZ4, None]
+)
 def test_messages_come_in_the_order_of_the_general_reader(tmp_path, compression):
     """Late messages, equal log times, small chunks that overlap, all compressions, and a file without chunks."""
     rng = np.random.default_rng(1)
     path = tmp_path / "x.mcap"
     writer = Writer(
-        str(path), chunk_size=300, compression=compression or CompressionType.NONE, use_chunking=compression is not None
+        str(path),
+        chunk_size=300,
+        compression=compression or CompressionType.NONE,
+        use_chunking=compression is not None,
     )
     writer.start()
     schema = writer.register_schema("geometry_msgs/msg/PoseStamped", "ros2msg", b"")
-    ids = [writer.register_channel(topic, "cdr", schema) for topic in ("/vicon/car", "/vicon/board", "/vicon/monitor")]
+    ids = [
+        writer.register_channel(topic, "cdr", schema)
+        for topic in ("/vicon/car", "/vicon/board", "/vicon/monitor")
+    ]
     for i in range(500):
         time_ns = START_NS + i * 10 + int(rng.integers(-8, 9)) * 40
-        writer.add_message(ids[int(rng.integers(3))], time_ns, bytes(rng.integers(0, 255, 20, np.uint8)), i, i)
+        writer.add_message(
+            ids[int(rng.integers(3))], time_ns, bytes(rng.integers(0, 255, 20, np.uint8)), i, i
+        )
     writer.finish()
-    for topics, offset_s in [(None, 0.0), (["/vicon/car"], 0.0), (None, 2e-6), (["/vicon/board", "/vicon/car"], 1e-6)]:
+    for topics, offset_s in [
+        (None, 0.0),
+        (["/vicon/car"], 0.0),
+        (None, 2e-6),
+        (["/vicon/board", "/vicon/car"], 1e-6),
+    ]:
         start_ns = read_info(path).start_ns + round(offset_s * 1e9)
         with open(path, "rb") as file:
             expected = [
                 (c.topic, bytes(m.data), m.log_time, m.publish_time, m.sequence)
-                for _, c, m in make_reader(file).iter_messages(topics, starting_at=start_ns, log_time_order=True)
+                for _, c, m in make_reader(file).iter_messages(
+                    topics, starting_at=start_ns, log_time_order=True
+                )
             ]
-        got = [(m.topic, m.cdr, m.log_ns, m.publish_ns, m.sequence) for m in read_messages(path, topics, offset_s)]
+        got = [
+            (m.topic, m.cdr, m.log_ns, m.publish_ns, m.sequence)
+            for m in read_messages(path, topics, offset_s)
+        ]
         assert got == expected
         assert len(got) > 100
 
@@ -156,9 +167,13 @@ def test_a_strangers_bag_does_not_write_where_it_likes(tmp_path, name):
 
 def test_delays_are_those_that_were_written(tmp_path):
     with BagWriter(tmp_path / "bag") as writer:
-        for i, (stamp_ms, publish_ms, log_ms) in enumerate([(0, 4, 5), (20, 22, 27), (10, 13, 28), (99, 31, 32)]):
+        for i, (stamp_ms, publish_ms, log_ms) in enumerate(
+            [(0, 4, 5), (20, 22, 27), (10, 13, 28), (99, 31, 32)]
+        ):
             pose = encode(pose_message(np.eye(4), START_NS + stamp_ms * 1_000_000))
-            writer.write("/vicon/car", pose, START_NS + log_ms * 1_000_000, START_NS + publish_ms * 1_000_000, i)
+            writer.write(
+                "/vicon/car", pose, START_NS + log_ms * 1_000_000, START_NS + publish_ms * 1_000_000, i
+            )
         clock = encode(types.Clock(clock=header(START_NS).stamp))
         writer.write("/clock", clock, START_NS + 3_000_000, START_NS, 0)
     delays = read_delays(tmp_path / "bag")

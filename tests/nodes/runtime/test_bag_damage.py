@@ -129,7 +129,9 @@ def test_a_bad_chunk_is_named_and_what_follows_is_kept_only_when_asked_for(bags,
     # A topic that has no message in the damaged chunk, and a time after it, are read.
     after = next(read_messages(path, start_offset_s=1.0))
     assert after.log_ns >= START_NS + 1_000_000_000
-    with pytest.raises(BagError, match="messages would be lost that are not at the end of an unfinished recording"):
+    with pytest.raises(
+        BagError, match="messages would be lost that are not at the end of an unfinished recording"
+    ):
         repair(path)
     assert path.read_bytes() == damaged
     assert sorted(file.name for file in path.parent.iterdir()) == ["bag.mcap"]

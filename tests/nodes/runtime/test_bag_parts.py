@@ -40,7 +40,9 @@ def test_metadata_gives_the_order_and_old_versions_wrote_the_folder_before_the_n
 
 
 def test_parts_that_a_killed_recorder_did_not_list_follow(tmp_path):
-    bag = folder_with(tmp_path, *(part_name("drive", n) for n in range(3)), "stranger.mcap", listed=["drive_0.mcap"])
+    bag = folder_with(
+        tmp_path, *(part_name("drive", n) for n in range(3)), "stranger.mcap", listed=["drive_0.mcap"]
+    )
     assert names(bag) == ["drive_0.mcap", "drive_1.mcap", "drive_2.mcap"]
     assert names(bag / "drive_2.mcap") == names(bag)
     assert names(bag / "stranger.mcap") == ["stranger.mcap"]
@@ -49,11 +51,27 @@ def test_parts_that_a_killed_recorder_did_not_list_follow(tmp_path):
 @pytest.mark.parametrize(
     ("files", "listed", "missing"),
     [
-        (["drive_0.mcap", "drive_2.mcap"], None, "drive_1.mcap of the bag is missing, but a later one exists"),
-        (["drive_1.mcap", "drive_2.mcap"], None, "drive_0.mcap of the bag is missing, but a later one exists"),
+        (
+            ["drive_0.mcap", "drive_2.mcap"],
+            None,
+            "drive_1.mcap of the bag is missing, but a later one exists",
+        ),
+        (
+            ["drive_1.mcap", "drive_2.mcap"],
+            None,
+            "drive_0.mcap of the bag is missing, but a later one exists",
+        ),
         (["drive_1.mcap"], None, "drive_0.mcap of the bag is missing, but a later one exists"),
-        (["drive_0.mcap"], ["drive_0.mcap", "drive_1.mcap"], r"drive_1.mcap of the bag is missing, but metadata.yaml"),
-        (["drive_0.mcap", "drive_2.mcap"], ["drive_0.mcap"], "drive_1.mcap of the bag is missing, but a later one"),
+        (
+            ["drive_0.mcap"],
+            ["drive_0.mcap", "drive_1.mcap"],
+            r"drive_1.mcap of the bag is missing, but metadata.yaml",
+        ),
+        (
+            ["drive_0.mcap", "drive_2.mcap"],
+            ["drive_0.mcap"],
+            "drive_1.mcap of the bag is missing, but a later one",
+        ),
     ],
 )
 def test_a_missing_part_is_named_in_one_line(tmp_path, files, listed, missing):
@@ -65,7 +83,9 @@ def test_a_missing_part_is_named_in_one_line(tmp_path, files, listed, missing):
 
 
 def test_numbered_files_of_a_folder_with_another_name_are_bags_by_themselves(tmp_path):
-    bag = folder_with(tmp_path, "take_1.mcap", "take_2.mcap", "corner.mcap", "corner.golden.mcap", folder="clips")
+    bag = folder_with(
+        tmp_path, "take_1.mcap", "take_2.mcap", "corner.mcap", "corner.golden.mcap", folder="clips"
+    )
     for name in ("take_1.mcap", "take_2.mcap", "corner.mcap", "corner.golden.mcap"):
         assert names(bag / name) == [name]
     with pytest.raises(
@@ -91,12 +111,21 @@ def test_hidden_files_and_single_files_without_a_number(tmp_path):
 
 @pytest.mark.parametrize(
     "content",
-    [b"", b"a: [", b"\xff\xfe\x00", b"[" * 5000, b"rosbag2_bagfile_information: 3",
-     b"rosbag2_bagfile_information: {relative_file_paths: ['']}", b"rosbag2_bagfile_information: {relative_file_paths: [3]}"],
-)  # fmt: skip
+    [
+        b"",
+        b"a: [",
+        b"\xff\xfe\x00",
+        b"[" * 5000,
+        b"rosbag2_bagfile_information: 3",
+        b"rosbag2_bagfile_information: {relative_file_paths: ['']}",
+        b"rosbag2_bagfile_information: {relative_file_paths: [3]}",
+    ],
+)
 def test_metadata_that_makes_no_sense_is_one_line(tmp_path, content):
     bag = folder_with(tmp_path, "drive_0.mcap")
     (bag / "metadata.yaml").write_bytes(content)
-    with pytest.raises(BagError, match=r"metadata\.yaml: expected .*; remove it to read the parts by their") as raised:
+    with pytest.raises(
+        BagError, match=r"metadata\.yaml: expected .*; remove it to read the parts by their"
+    ) as raised:
         bag_parts(bag)
     assert "\n" not in str(raised.value)

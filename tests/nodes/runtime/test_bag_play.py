@@ -116,7 +116,9 @@ def test_a_window_and_another_name(bag):
     assert bench.node.publications == ("/vicon/board", "/player/state")
     outs = bench.run(5.0)
     assert bench.done
-    stamps = [ns_from_stamp(decode("geometry_msgs/msg/PoseStamped", out.message).header.stamp) for out in outs]
+    stamps = [
+        ns_from_stamp(decode("geometry_msgs/msg/PoseStamped", out.message).header.stamp) for out in outs
+    ]
     assert {out.topic for out in outs} == {"/vicon/board"}
     assert (min(stamps) - START_NS, max(stamps) - START_NS) == (S // 2, 8 * S // 10)
 
@@ -170,7 +172,10 @@ def test_texts_that_mean_nothing_change_nothing(bag, text):
 def test_names_that_cannot_be_are_refused(bag):
     for remap, words in [
         ({"/arm": "/vicon/car"}, "/arm is not played; played are /vicon/car"),
-        ({"/vicon/car": "/policy/drive"}, "/vicon/car is geometry_msgs/msg/PoseStamped, expected ackermann_msgs"),
+        (
+            {"/vicon/car": "/policy/drive"},
+            "/vicon/car is geometry_msgs/msg/PoseStamped, expected ackermann_msgs",
+        ),
     ]:
         with pytest.raises(BagError, match=words):
             Bench(bag, remap=remap)
@@ -233,7 +238,9 @@ def test_command_plays_under_a_terminal_and_obeys_keys_and_bus(bag, tmp_path):
 
     with Bus(tmp_path) as bus:
         bus.subscribe("/vicon/car", queue=500)
-        process = subprocess.Popen([*command, "--topics", "/vicon/car"], stdin=slave, stdout=subprocess.PIPE, text=True)
+        process = subprocess.Popen(
+            [*command, "--topics", "/vicon/car"], stdin=slave, stdout=subprocess.PIPE, text=True
+        )
 
         def hear(wanted, limit_s=20.0):
             got, deadline = [], time.monotonic() + limit_s

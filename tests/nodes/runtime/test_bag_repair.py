@@ -17,11 +17,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from nodes.bags import writer as bag_module
 from nodes.bags.journal import journal_of
-from nodes.bags.reader import (
-    read_attachments,
-    read_info,
-    read_messages,
-)
+from nodes.bags.reader import read_attachments, read_info, read_messages
 from nodes.bags.repair import repair
 from nodes.bags.stamps import read_delays
 from nodes.bags.writer import BagWriter
@@ -36,7 +32,9 @@ def test_a_summary_that_lies_is_an_error_and_takes_no_memory(tmp_path):
     content = bytearray(path.read_bytes())
     with open(path, "rb") as file:
         chunk = make_reader(file).get_summary().chunk_indexes[0]
-    index = content.rindex(chunk.chunk_start_offset.to_bytes(8, "little") + chunk.chunk_length.to_bytes(8, "little"))
+    index = content.rindex(
+        chunk.chunk_start_offset.to_bytes(8, "little") + chunk.chunk_length.to_bytes(8, "little")
+    )
     start = int.from_bytes(content[-28:-20], "little")
     for wrong in (1 << 60, chunk.chunk_length + 10**9, 5):
         content[index + 8 : index + 16] = wrong.to_bytes(8, "little")
@@ -56,7 +54,14 @@ def test_no_damage_makes_a_reader_do_anything_but_say_so(tmp_path):
     path = tmp_path / "x.mcap"
 
     def read_everything():
-        for read in (read_info, read_attachments, read_delays, lambda bag: list(read_messages(bag)), repair, read_info):
+        for read in (
+            read_info,
+            read_attachments,
+            read_delays,
+            lambda bag: list(read_messages(bag)),
+            repair,
+            read_info,
+        ):
             with contextlib.suppress(BagError):
                 read(path)
 
@@ -241,7 +246,9 @@ def test_full_disk_is_one_clear_error_and_the_part_before_is_readable(tmp_path, 
         for i in range(10_000):
             writer.write("/vicon/car", pose, START_NS + i, START_NS + i, i)
 
-    with pytest.raises(BagError, match=r"No space left on device; \d+ messages up to that point are readable"):
+    with pytest.raises(
+        BagError, match=r"No space left on device; \d+ messages up to that point are readable"
+    ):
         fill()
     writer.close()
     kept = [m.sequence for m in read_messages(tmp_path / "bag")]

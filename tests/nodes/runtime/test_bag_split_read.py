@@ -21,9 +21,13 @@ def split_bag(tmp_path, parts=4, each=60, chunked=True):
     for number in range(parts):
         topics = TOPICS[1:] if number == 0 else TOPICS
         rows = [
-            (topics[int(rng.integers(len(topics)))], START_NS + (number * each + i) * 1000 + int(rng.integers(-5000, 5000)), i)
+            (
+                topics[int(rng.integers(len(topics)))],
+                START_NS + (number * each + i) * 1000 + int(rng.integers(-5000, 5000)),
+                i,
+            )
             for i in range(each)
-        ]  # fmt: skip
+        ]
         # rosbags reads no file without chunks whose messages are out of order.
         rows = rows if chunked else sorted(rows, key=lambda row: row[1])
         everything += rows
@@ -82,7 +86,9 @@ def test_files_are_opened_only_when_their_time_has_come():
 
         return Source(start, read)
 
-    merged = merge_by_time([source(0, [0, 1, 2, 5]), source(3, [3, 4]), source(100, [100])], lambda time: time)
+    merged = merge_by_time(
+        [source(0, [0, 1, 2, 5]), source(3, [3, 4]), source(100, [100])], lambda time: time
+    )
     assert [next(merged) for _ in range(3)] == [0, 1, 2]
     assert opened == [0]
     assert list(merged) == [3, 4, 5, 100]

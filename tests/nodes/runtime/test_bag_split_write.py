@@ -33,7 +33,9 @@ def fill(writer, count=400, first=0):
     pose, image = sample(POSE, START_NS), sample(IMAGE, START_NS)
     for i in range(first, first + count):
         topic, cdr = ("/camera/image_raw", image) if i % 4 == 0 else ("/vicon/car", pose)
-        writer.write(topic, cdr, START_NS + i * 10_000_000, START_NS + i * 10_000_000 - 1000, i, lost=int(i == 7))
+        writer.write(
+            topic, cdr, START_NS + i * 10_000_000, START_NS + i * 10_000_000 - 1000, i, lost=int(i == 7)
+        )
 
 
 @pytest.mark.parametrize("limits", [SplitLimits(duration_s=0.5), SplitLimits(size_mib=0.03)])
@@ -56,22 +58,34 @@ def test_every_part_opens_alone_and_independent_readers_find_every_message_once(
             assert {m.name: m.metadata for m in reader.iter_metadata()}["advnerf"] == {"git": "abc"}
             numbers = [message.sequence for _, _, message in reader.iter_messages()]
         with AnyReader([tmp_path / "drive" / name], default_typestore=store) as alone:
-            assert len([alone.deserialize(data, c.msgtype) for c, _, data in alone.messages()]) == len(numbers)
+            assert len([alone.deserialize(data, c.msgtype) for c, _, data in alone.messages()]) == len(
+                numbers
+            )
         counts.append(len(numbers))
         seen += numbers
     assert seen == list(range(400))
-    with AnyReader([tmp_path / "drive"], default_typestore=store) as reader, Reader(tmp_path / "drive") as direct:
+    with (
+        AnyReader([tmp_path / "drive"], default_typestore=store) as reader,
+        Reader(tmp_path / "drive") as direct,
+    ):
         assert len(list(reader.messages())) == reader.message_count == direct.message_count == 400
         assert (direct.start_time, direct.end_time) == (START_NS, START_NS + 399 * 10_000_000 + 1)
-    information = yaml.safe_load((tmp_path / "drive" / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
-    assert information["relative_file_paths"] == [entry["path"] for entry in information["files"]] == names[:-1]
+    information = yaml.safe_load((tmp_path / "drive" / "metadata.yaml").read_text())[
+        "rosbag2_bagfile_information"
+    ]
+    assert (
+        information["relative_file_paths"] == [entry["path"] for entry in information["files"]] == names[:-1]
+    )
     assert [entry["message_count"] for entry in information["files"]] == counts
     starts = np.cumsum([0, *counts[:-1]])
     for entry, first, count in zip(information["files"], starts, counts, strict=True):
         assert entry["starting_time"]["nanoseconds_since_epoch"] == START_NS + int(first) * 10_000_000
         assert entry["duration"]["nanoseconds"] == (count - 1) * 10_000_000
     info = read_info(tmp_path / "drive")
-    assert {t.name: (t.count, t.lost) for t in info.topics} == {"/camera/image_raw": (100, 0), "/vicon/car": (300, 1)}
+    assert {t.name: (t.count, t.lost) for t in info.topics} == {
+        "/camera/image_raw": (100, 0),
+        "/vicon/car": (300, 1),
+    }
     assert (info.attachments, info.metadata) == (("launch.yaml",), {"git": "abc"})
 
 
@@ -87,7 +101,9 @@ def test_a_clock_that_is_set_back_begins_a_part_and_does_not_end_the_limit(tmp_p
 
 
 def test_the_split_bag_is_replayed_and_compared_like_the_whole_one(tmp_path):
-    with BagWriter(tmp_path / "split", read_attachments(CORNER), limits=SplitLimits(duration_s=0.2)) as writer:
+    with BagWriter(
+        tmp_path / "split", read_attachments(CORNER), limits=SplitLimits(duration_s=0.2)
+    ) as writer:
         for m in read_messages(CORNER):
             writer.write(m.topic, m.cdr, m.log_ns, m.publish_ns, m.sequence)
             while writer._finishing:
@@ -120,7 +136,9 @@ def test_a_slow_disk_at_the_split_does_not_hold_up_the_recorder(tmp_path, monkey
     assert [m.sequence for m in read_messages(tmp_path / "drive")] == list(range(400))
 
 
-def test_a_part_that_cannot_be_finished_is_one_clear_error_and_everything_before_is_readable(tmp_path, monkeypatch):
+def test_a_part_that_cannot_be_finished_is_one_clear_error_and_everything_before_is_readable(
+    tmp_path, monkeypatch
+):
     def no_space(descriptor):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
@@ -134,7 +152,9 @@ def test_a_part_that_cannot_be_finished_is_one_clear_error_and_everything_before
         fill(writer, 10, 51)
     writer.close()
     assert [m.sequence for m in read_messages(tmp_path / "drive")] == list(range(51))
-    assert {"drive_0.mcap", "drive_1.mcap", "metadata.yaml"} <= {path.name for path in (tmp_path / "drive").iterdir()}
+    assert {"drive_0.mcap", "drive_1.mcap", "metadata.yaml"} <= {
+        path.name for path in (tmp_path / "drive").iterdir()
+    }
 
 
 # Writes a bag again and again, each time in a process that is killed in front of its n-th change to the disk.

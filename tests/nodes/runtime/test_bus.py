@@ -110,7 +110,9 @@ def test_subscribers_are_counted_up_and_down(tmp_path):
 def test_second_publisher_is_one_clear_error_and_the_endpoint_is_free_afterwards(tmp_path):
     with Bus(tmp_path) as first, Bus(tmp_path) as second:
         first.publisher("/twin/reset")
-        with pytest.raises(BusError, match=r"/twin/reset is already published in .* by process \d+.*--run-dir"):
+        with pytest.raises(
+            BusError, match=r"/twin/reset is already published in .* by process \d+.*--run-dir"
+        ):
             second.publisher("/twin/reset")
     with Bus(tmp_path) as third:
         third.publisher("/twin/reset")
@@ -127,7 +129,8 @@ def test_several_may_ask_for_a_stop_at_the_same_time(tmp_path):
             while bus.subscribers("/arm") == 0:
                 receiver.wait(0.01)
             bus.publish(
-                "/arm", types.Arm(header=header(1), arm=False, source=f"{number}", reason="", ask_id="a", age_ns=0)
+                "/arm",
+                types.Arm(header=header(1), arm=False, source=f"{number}", reason="", ask_id="a", age_ns=0),
             )
         got = receive_for(receiver, 0.2)
         assert [received.message().source for received in got] == [f"{number}" for number in range(senders)]
@@ -145,7 +148,8 @@ def test_restarted_publisher_has_a_new_instance_and_is_found_again(tmp_path):
                 while sender.subscribers("/arm") == 0:
                     receiver.wait(0.01)
                 sender.publish(
-                    "/arm", types.Arm(header=header(1), arm=True, source="test", reason="", ask_id="a", age_ns=0)
+                    "/arm",
+                    types.Arm(header=header(1), arm=True, source="test", reason="", ask_id="a", age_ns=0),
                 )
                 (got,) = receive_for(receiver, 0.1)
                 instances.append(got.info.instance_id)

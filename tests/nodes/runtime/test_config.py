@@ -6,13 +6,7 @@ import pytest
 import yaml
 from pydantic import BaseModel, ConfigDict, Field
 
-from nodes.runtime.config import (
-    apply_overrides,
-    load_config,
-    load_node_config,
-    node_document,
-    parse_yaml,
-)
+from nodes.runtime.config import apply_overrides, load_config, load_node_config, node_document, parse_yaml
 from nodes.runtime.errors import BusError, ConfigError
 from nodes.runtime.paths import bus_folder, private_folder, user_folder
 
@@ -43,7 +37,12 @@ def write(tmp_path, text):
 def test_values_and_overrides(tmp_path):
     path = write(tmp_path, "name: front\nlens:\n  fov_deg: 80\n")
     camera = load_config(Camera, path, ["rate_hz=5", "lens.fov_deg=70", "by_name.wide.fov_deg=120"])
-    assert (camera.name, camera.rate_hz, camera.lens.fov_deg, camera.by_name["wide"].fov_deg) == ("front", 5, 70, 120)
+    assert (camera.name, camera.rate_hz, camera.lens.fov_deg, camera.by_name["wide"].fov_deg) == (
+        "front",
+        5,
+        70,
+        120,
+    )
 
 
 @pytest.mark.parametrize(
@@ -54,8 +53,14 @@ def test_values_and_overrides(tmp_path):
             r":2: unknown key rat_hz; valid keys here: by_name, lens, maybe, name, rate_hz, spares",
         ),
         ("name: a\nlens:\n  fov: 3\n", r":3: unknown key lens\.fov; valid keys here: fov_deg"),
-        ("name: a\nspares:\n- fov_deg: 3\n- fov: 3\n", r":4: unknown key spares\.1\.fov; valid keys here: fov_deg"),
-        ("name: a\nby_name:\n  wide:\n    fov: 3\n", r":4: unknown key by_name\.wide\.fov; valid keys here: fov_deg"),
+        (
+            "name: a\nspares:\n- fov_deg: 3\n- fov: 3\n",
+            r":4: unknown key spares\.1\.fov; valid keys here: fov_deg",
+        ),
+        (
+            "name: a\nby_name:\n  wide:\n    fov: 3\n",
+            r":4: unknown key by_name\.wide\.fov; valid keys here: fov_deg",
+        ),
         ("name: a\nmaybe:\n  fov: 3\n", r":3: unknown key maybe\.fov; valid keys here: fov_deg"),
         ("name: a\nlens: {fov_deg: 200}\n", r":2: lens\.fov_deg: input should be less than 180, got 200"),
         ("rate_hz: 3\n", r":1: name is missing"),

@@ -56,7 +56,9 @@ from tests.support.foreign_samples import (
 pytestmark = pytest.mark.live
 
 LOGS = Path("/work/shared/data/logs/rosbag2")
-POSES = [f"geometry_msgs/msg/{name}" for name in ("PoseStamped", "TransformStamped", "PoseWithCovarianceStamped")]
+POSES = [
+    f"geometry_msgs/msg/{name}" for name in ("PoseStamped", "TransformStamped", "PoseWithCovarianceStamped")
+]
 EVERY_WRITER = pytest.mark.parametrize("writer", WRITERS)
 
 
@@ -93,7 +95,10 @@ def test_every_type_with_a_pose_is_a_pose(tmp_path, writer, pose_type):
         np.testing.assert_allclose(
             pose_matrix(message), make_transform(rotation_from_quaternion(q), position), atol=1e-12
         )
-        assert (stamp_ns(message), message.header.frame_id) == (START_NS + index * STEP_NS - 5_000_000, "world")
+        assert (stamp_ns(message), message.header.frame_id) == (
+            START_NS + index * STEP_NS - 5_000_000,
+            "world",
+        )
 
 
 @EVERY_WRITER
@@ -148,12 +153,16 @@ def test_a_type_that_cannot_stand_for_ours_is_named_with_what_can(tmp_path, writ
 
 def test_a_topic_can_be_read_as_another_type_than_the_table_says(tmp_path):
     bag = write_mcap(tmp_path / "drive")
-    with pytest.raises(BagError, match=r"/chatter is std_msgs/msg/String, expected sensor_msgs/msg/Image \(or "):
+    with pytest.raises(
+        BagError, match=r"/chatter is std_msgs/msg/String, expected sensor_msgs/msg/Image \(or "
+    ):
         list(image_messages(bag, "/chatter"))
     assert decode("std_msgs/msg/String", next(read_messages(bag, ["/chatter"])).cdr).data == "word 0"
 
 
-def add_topic(path, topic, typename, definition, language, cdr, encoding="cdr", log_times=(START_NS,), **options):
+def add_topic(
+    path, topic, typename, definition, language, cdr, encoding="cdr", log_times=(START_NS,), **options
+):
     writer = McapWriter(str(path), **options)
     writer.start()
     schema = writer.register_schema(typename, language, definition)
@@ -192,12 +201,24 @@ string frame_id
     time = store.types["builtin_interfaces/msg/Time"](5, 7)
     window = store.types["sensor_msgs/msg/RegionOfInterest"](1, 2, 3, 4, True)
     message = store.types[name](
-        header=store.types["std_msgs/msg/Header"](3, time, "cam"), K=np.arange(9.0), width=30, height=20, distortion_model="plumb_bob",
-        D=np.arange(5.0), R=np.eye(3).reshape(-1), P=np.arange(12.0), binning_y=6, binning_x=8, roi=window, vendor="x",
-    )  # fmt: skip
+        header=store.types["std_msgs/msg/Header"](3, time, "cam"),
+        K=np.arange(9.0),
+        width=30,
+        height=20,
+        distortion_model="plumb_bob",
+        D=np.arange(5.0),
+        R=np.eye(3).reshape(-1),
+        P=np.arange(12.0),
+        binning_y=6,
+        binning_x=8,
+        roi=window,
+        vendor="x",
+    )
     for endian in (True, False):
         cdr = bytes(store.serialize_cdr(message, name, little_endian=endian))
-        path = add_topic(tmp_path / f"{endian}.mcap", "/camera/camera_info", name, text.encode(), "ros2msg", cdr)
+        path = add_topic(
+            tmp_path / f"{endian}.mcap", "/camera/camera_info", name, text.encode(), "ros2msg", cdr
+        )
         (got,) = (decode(name, m.cdr) for m in read_messages(path, ["/camera/camera_info"]))
         assert (got.width, got.height, got.binning_x, got.binning_y) == (30, 20, 8, 6)
         assert (got.header.stamp.nanosec, got.header.frame_id, got.roi.do_rectify) == (7, "cam", True)
@@ -260,24 +281,48 @@ module geometry_msgs { module msg { struct PoseStamped {
     # The pose comes first here: seven numbers, then the header.
     numbers = struct.pack("<7d", 1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0)
     head = struct.pack("<iII6s", 0, 8, 6, b"world\0")
-    path = add_topic(tmp_path / "a.mcap", "/vicon/car", name, text.encode(), "ros2idl", b"\0\1\0\0" + numbers + head)
+    path = add_topic(
+        tmp_path / "a.mcap", "/vicon/car", name, text.encode(), "ros2idl", b"\0\1\0\0" + numbers + head
+    )
     assert [m.cdr for m in read_messages(path, ["/vicon/car"])] == [encode(ours)]
 
 
 @pytest.mark.parametrize(
     ("definition", "language", "encoding", "message"),
     [
-        (b"this is; no definition", "ros2msg", "cdr", "/vicon/car: cannot read the definition of geometry_msgs/msg/PoseStamped"),
+        (
+            b"this is; no definition",
+            "ros2msg",
+            "cdr",
+            "/vicon/car: cannot read the definition of geometry_msgs/msg/PoseStamped",
+        ),
         (b"{}", "jsonschema", "cdr", "its language is 'jsonschema'; ros2msg and ros2idl are read"),
         (b"{}", "jsonschema", "json", "/vicon/car is stored as 'json', expected cdr or ros1"),
-        (b"std_msgs/Header header\n", "ros2msg", "cdr", "expected the fields pose, which its geometry_msgs/msg/PoseStamped lacks"),
-        (b"std_msgs/Header header\nnowhere_msgs/Pose pose\n", "ros2msg", "cdr", "needs nowhere_msgs/msg/Pose, which the bag does not define"),
-        (b"std_msgs/Header header\nstring pose\n", "ros2msg", "cdr", "expected the fields pose, which its geometry_msgs/msg/PoseStamped lacks"),
+        (
+            b"std_msgs/Header header\n",
+            "ros2msg",
+            "cdr",
+            "expected the fields pose, which its geometry_msgs/msg/PoseStamped lacks",
+        ),
+        (
+            b"std_msgs/Header header\nnowhere_msgs/Pose pose\n",
+            "ros2msg",
+            "cdr",
+            "needs nowhere_msgs/msg/Pose, which the bag does not define",
+        ),
+        (
+            b"std_msgs/Header header\nstring pose\n",
+            "ros2msg",
+            "cdr",
+            "expected the fields pose, which its geometry_msgs/msg/PoseStamped lacks",
+        ),
     ],
-)  # fmt: skip
+)
 def test_a_definition_that_cannot_be_used_is_one_line(tmp_path, definition, language, encoding, message):
     path = tmp_path / "a.mcap"
-    add_topic(path, "/vicon/car", POSES[0], definition, language, encode(pose_message(np.eye(4), 5)), encoding)
+    add_topic(
+        path, "/vicon/car", POSES[0], definition, language, encode(pose_message(np.eye(4), 5)), encoding
+    )
     with pytest.raises((BagError, MessageError)) as caught:
         list(read_messages(path, ["/vicon/car"]))
     assert message in str(caught.value)
@@ -285,11 +330,19 @@ def test_a_definition_that_cannot_be_used_is_one_line(tmp_path, definition, lang
 
 
 def test_bytes_that_do_not_fit_their_definition_are_one_line_that_names_the_topic(tmp_path):
-    definition = type_definition(POSES[0]).replace("std_msgs/Header header", "std_msgs/Header header\nuint8[] more", 1)
+    definition = type_definition(POSES[0]).replace(
+        "std_msgs/Header header", "std_msgs/Header header\nuint8[] more", 1
+    )
     good = encode(pose_message(np.eye(4), 5))
-    for number, bad in enumerate((b"", good[:20], b"\1\2" + good[2:], good[:24] + b"\xff" * 60, good + bytes(90))):
-        path = add_topic(tmp_path / f"{number}.mcap", "/vicon/car", POSES[0], definition.encode(), "ros2msg", bad)
-        with pytest.raises(MessageError, match=rf"{number}\.mcap: /vicon/car: expected {POSES[0]} in {len(bad)} bytes"):
+    for number, bad in enumerate(
+        (b"", good[:20], b"\1\2" + good[2:], good[:24] + b"\xff" * 60, good + bytes(90))
+    ):
+        path = add_topic(
+            tmp_path / f"{number}.mcap", "/vicon/car", POSES[0], definition.encode(), "ros2msg", bad
+        )
+        with pytest.raises(
+            MessageError, match=rf"{number}\.mcap: /vicon/car: expected {POSES[0]} in {len(bad)} bytes"
+        ):
             list(read_messages(path, ["/vicon/car"]))
 
 
@@ -297,7 +350,9 @@ def test_a_definition_that_contains_itself_is_one_line(tmp_path):
     text = type_definition(POSES[0]).replace(
         "geometry_msgs/Point position", "geometry_msgs/Point position\ngeometry_msgs/Pose again"
     )
-    path = add_topic(tmp_path / "a.mcap", "/vicon/car", POSES[0], text.encode(), "ros2msg", b"\0\1\0\0" + bytes(400))
+    path = add_topic(
+        tmp_path / "a.mcap", "/vicon/car", POSES[0], text.encode(), "ros2msg", b"\0\1\0\0" + bytes(400)
+    )
     with pytest.raises((BagError, MessageError), match="/vicon/car"):
         list(read_messages(path, ["/vicon/car"]))
 
@@ -353,7 +408,9 @@ def test_two_publishers_of_one_topic_are_one_topic(tmp_path):
             connection = writer.add_connection("/vicon/car", POSES[0], typestore=store, callerid=caller)
             for _index, (_, typename, message, log_ns) in enumerate(drive(Make(store))):
                 if typename == POSES[0]:
-                    writer.write(connection, log_ns + (caller == "/two"), store.serialize_ros1(message, typename))
+                    writer.write(
+                        connection, log_ns + (caller == "/two"), store.serialize_ros1(message, typename)
+                    )
     (topic,) = read_info(path).topics
     assert (topic.name, topic.count) == ("/vicon/car", 2 * COUNT)
     assert len(list(read_messages(path, ["/vicon/car"]))) == 2 * COUNT
@@ -376,7 +433,7 @@ TAIL = "expected a bag: MCAP (.mcap), rosbag2 in SQLite (.db3), or ROS 1 (.bag)"
         (bytes(5000), "is full of zeros: its disk was full or lost power"),
         (bytes(range(255, 0, -1)), "is a file of unknown format (it begins with ff fe fd fc"),
     ],
-)  # fmt: skip
+)
 @pytest.mark.parametrize("name", ["bag.mcap", "bag.db3"])
 def test_a_file_that_is_no_bag_is_named_for_what_it_is(tmp_path, content, said, name):
     path = tmp_path / name
@@ -401,16 +458,21 @@ def test_a_zip_archive_and_a_folder_without_a_bag_are_named(tmp_path):
     folder = tmp_path / "folder"
     (folder / "images").mkdir(parents=True)
     (folder / "notes.txt").write_text("x")
-    with pytest.raises(BagError, match=r"folder is a folder without a bag: it has images/, notes\.txt; expected"):
+    with pytest.raises(
+        BagError, match=r"folder is a folder without a bag: it has images/, notes\.txt; expected"
+    ):
         read_info(folder)
 
 
-@pytest.mark.parametrize(("writer", "said"), [("rosbags-sqlite3", "rosbag2 in SQLite"), ("ros1", "ROS 1 bag")])
+@pytest.mark.parametrize(
+    ("writer", "said"), [("rosbags-sqlite3", "rosbag2 in SQLite"), ("ros1", "ROS 1 bag")]
+)
 def test_what_needs_an_mcap_says_how_to_get_one_and_changes_nothing(tmp_path, writer, said):
     bag = WRITERS[writer](tmp_path / "drive")
     before = {file: file.read_bytes() for file in (tmp_path / "drive").iterdir()}
     with pytest.raises(
-        BagError, match=rf"is {said}; only MCAP bags can be repaired\. Convert it first: rosbags-convert --src "
+        BagError,
+        match=rf"is {said}; only MCAP bags can be repaired\. Convert it first: rosbags-convert --src ",
     ):
         repair(bag)
     assert {file: file.read_bytes() for file in (tmp_path / "drive").iterdir()} == before
@@ -462,7 +524,9 @@ def test_the_samples_of_rosbag2_are_read_whole():
 def test_our_own_bytes_are_not_touched(tmp_path):
     """A definition that is ours, in whatever words, costs nothing and changes nothing."""
     cdr = encode(image_message(rgb_at(0), 5, "camera", "rgb8"))
-    path = add_topic(tmp_path / "a.mcap", "/camera/image_raw", IMAGE, type_definition(IMAGE).encode(), "ros2msg", cdr)
+    path = add_topic(
+        tmp_path / "a.mcap", "/camera/image_raw", IMAGE, type_definition(IMAGE).encode(), "ros2msg", cdr
+    )
     assert [m.cdr for m in read_messages(path)] == [cdr]
     assert types.Image is type(decode(IMAGE, cdr))
 

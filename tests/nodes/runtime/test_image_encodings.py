@@ -18,9 +18,14 @@ COLOUR = (200, 90, 30)
 def message(encoding, data, height, width, step=None, big=0):
     data = np.frombuffer(np.ascontiguousarray(data).tobytes(), np.uint8)
     image = types.Image(
-        header=header(5, "cam"), height=height, width=width, encoding=encoding, is_bigendian=big,
-        step=step or len(data) // height, data=data,
-    )  # fmt: skip
+        header=header(5, "cam"),
+        height=height,
+        width=width,
+        encoding=encoding,
+        is_bigendian=big,
+        step=step or len(data) // height,
+        data=data,
+    )
     return decode("sensor_msgs/msg/Image", encode(image))
 
 
@@ -62,7 +67,9 @@ def test_sixteen_bit_colours(name, padding, big):
 @pytest.mark.parametrize("name", ["mono8", "8UC1"])
 def test_grey(name):
     grey = RNG.integers(0, 256, (3, 5), np.uint8)
-    np.testing.assert_array_equal(rgb_image(message(name, pad(grey, 2), 3, 5), "/c"), np.stack([grey] * 3, axis=2))
+    np.testing.assert_array_equal(
+        rgb_image(message(name, pad(grey, 2), 3, 5), "/c"), np.stack([grey] * 3, axis=2)
+    )
 
 
 @pytest.mark.parametrize("big", [0, 1])
@@ -137,7 +144,13 @@ def test_what_is_not_supported_is_named_with_what_is(encoding):
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
 def test_data_that_do_not_fit_the_encoding_are_one_error(encoding):
-    for height, width, step, size in [(4, 6, 60, 100), (4, 6, 1, 4), (0, 0, 0, 0), (5, 7, 80, 400), (1, 1, 8, 8)]:
+    for height, width, step, size in [
+        (4, 6, 60, 100),
+        (4, 6, 1, 4),
+        (0, 0, 0, 0),
+        (5, 7, 80, 400),
+        (1, 1, 8, 8),
+    ]:
         try:
             got = rgb_image(message(encoding, np.zeros(size, np.uint8), max(height, 1), width, step), "/c")
             assert got.shape == (max(height, 1), width, 3)
@@ -151,7 +164,9 @@ def test_a_picture_becomes_rgb8_with_its_own_stamp():
     assert (got.encoding, got.header.frame_id, got.header.stamp.nanosec) == ("rgb8", "cam", 5)
     np.testing.assert_array_equal(rgb_image(got, "/c"), rgb)
     assert rgb8_message(got, "/c") is got
-    with pytest.raises(MessageError, match=r"/c: expected sensor_msgs/msg/Image or .*, got std_msgs/msg/Header"):
+    with pytest.raises(
+        MessageError, match=r"/c: expected sensor_msgs/msg/Image or .*, got std_msgs/msg/Header"
+    ):
         rgb_image(got.header, "/c")
 
 
@@ -163,10 +178,17 @@ def compressed(form, pixels, kind=".png"):
 @pytest.mark.parametrize(
     ("form", "order"),
     [
-        ("png", 1), ("jpeg", 1), ("rgb8; png compressed bgr8", 1), ("bgr8; png compressed bgr8", 1), ("bgr8;png compressed bgr8", 1),
-        ("bgr8; jpeg compressed bgr8", 1), ("rgb8; png compressed rgb8", -1), ("rgb8; png compressed ", -1), ("", 1),
+        ("png", 1),
+        ("jpeg", 1),
+        ("rgb8; png compressed bgr8", 1),
+        ("bgr8; png compressed bgr8", 1),
+        ("bgr8;png compressed bgr8", 1),
+        ("bgr8; jpeg compressed bgr8", 1),
+        ("rgb8; png compressed rgb8", -1),
+        ("rgb8; png compressed ", -1),
+        ("", 1),
     ],
-)  # fmt: skip
+)
 def test_compressed_colours_by_what_image_transport_means(form, order):
     rgb = RNG.integers(0, 256, (8, 10, 3), np.uint8)
     got = rgb_image(compressed(form, np.ascontiguousarray(rgb[..., ::-1])), "/c")
@@ -176,7 +198,9 @@ def test_compressed_colours_by_what_image_transport_means(form, order):
 def test_compressed_grey_alpha_sixteen_bits_and_mosaics():
     rgba = RNG.integers(0, 256, (8, 10, 4), np.uint8)
     grey = np.ascontiguousarray(rgba[..., 0])
-    np.testing.assert_array_equal(rgb_image(compressed("mono8; png compressed ", grey), "/c"), np.stack([grey] * 3, 2))
+    np.testing.assert_array_equal(
+        rgb_image(compressed("mono8; png compressed ", grey), "/c"), np.stack([grey] * 3, 2)
+    )
     np.testing.assert_array_equal(
         rgb_image(compressed("png", np.ascontiguousarray(rgba[..., (2, 1, 0, 3)])), "/c"), rgba[..., :3]
     )
@@ -194,12 +218,16 @@ def test_the_orientation_of_the_file_is_not_applied():
     exif = b"Exif\0\0II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0\x06\0\0\0\0\0\0\0"
     turned = data[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + data[2:]
     assert cv2.imdecode(np.frombuffer(turned, np.uint8), cv2.IMREAD_COLOR).shape == (16, 8, 3)
-    message = types.CompressedImage(header=header(5, "cam"), format="jpeg", data=np.frombuffer(turned, np.uint8))
+    message = types.CompressedImage(
+        header=header(5, "cam"), format="jpeg", data=np.frombuffer(turned, np.uint8)
+    )
     assert rgb_image(message, "/c").shape == (8, 16, 3)
 
 
 @pytest.mark.parametrize("form", ["16UC1; compressedDepth png", "tiff", "h264"])
 def test_compressed_data_of_another_kind_are_named(form):
     message = types.CompressedImage(header=header(5, "cam"), format=form, data=np.arange(99, dtype=np.uint8))
-    with pytest.raises(MessageError, match=rf"/c: expected JPEG or PNG data, got the format '{form}' \(99 bytes\)"):
+    with pytest.raises(
+        MessageError, match=rf"/c: expected JPEG or PNG data, got the format '{form}' \(99 bytes\)"
+    ):
         rgb_image(message, "/c")

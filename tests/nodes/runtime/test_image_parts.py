@@ -36,7 +36,12 @@ def test_small_and_strided_images_stay_in_one_piece():
 
 def test_parts_that_do_not_belong_together_are_refused():
     prefix, pixels = split_image(image_message(PIXELS, 0, "c"))
-    for parts in ((prefix, bytes(pixels)[:-1]), (prefix[:8], bytes(pixels)), (b"", b""), (prefix[4:], bytes(pixels))):
+    for parts in (
+        (prefix, bytes(pixels)[:-1]),
+        (prefix[:8], bytes(pixels)),
+        (b"", b""),
+        (prefix[4:], bytes(pixels)),
+    ):
         with pytest.raises(MessageError):
             join_image(*parts)
 

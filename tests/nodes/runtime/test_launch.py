@@ -79,7 +79,9 @@ def write(path, **nodes):
 def assert_gone(pids):
     # A zombie of ours is gone for all that matters; psutil would still list it.
     deadline = time.monotonic() + 3
-    while alive := [p for p in pids if psutil.pid_exists(p) and psutil.Process(p).status() != psutil.STATUS_ZOMBIE]:
+    while alive := [
+        p for p in pids if psutil.pid_exists(p) and psutil.Process(p).status() != psutil.STATUS_ZOMBIE
+    ]:
         assert time.monotonic() < deadline, f"still running: {alive}"
         time.sleep(0.02)
 
@@ -131,7 +133,9 @@ def test_kill_of_a_required_node_is_named_with_its_signal(probe, tmp_path):
 
 def test_hung_node_is_found_and_killed(probe, tmp_path):
     file = write(
-        tmp_path / "a.launch.yaml", good={}, sleepy={"hang_timeout_s": 0.6, "config": {"then": "hang", "after_s": 0.6}}
+        tmp_path / "a.launch.yaml",
+        good={},
+        sleepy={"hang_timeout_s": 0.6, "config": {"then": "hang", "after_s": 0.6}},
     )
     with Launch(file, run_dir=tmp_path / "run") as launch:
         pids = launch.pids
@@ -157,7 +161,9 @@ def test_node_that_is_not_required_comes_back_and_stays_down_after_too_many_time
 
 
 def test_regular_end_of_a_node_can_end_the_launch(probe, tmp_path):
-    file = write(tmp_path / "a.launch.yaml", good={}, player={"ends_launch": True, "config": {"then": "finish"}})
+    file = write(
+        tmp_path / "a.launch.yaml", good={}, player={"ends_launch": True, "config": {"then": "finish"}}
+    )
     with Launch(file, run_dir=tmp_path / "run") as launch:
         assert launch.wait(20) == 0
 
@@ -198,7 +204,9 @@ def test_wrong_key_in_a_node_names_the_launch_file_and_line(probe, tmp_path):
     line = file.read_text().splitlines().index("      rate: 3") + 1
     with Launch(file, run_dir=tmp_path / "run") as launch:
         assert launch.wait(20) == 1
-    assert f"a.launch.yaml:{line}: unknown key rate; valid keys here: after_s, hears, rate_hz" in launch.failure
+    assert (
+        f"a.launch.yaml:{line}: unknown key rate; valid keys here: after_s, hears, rate_hz" in launch.failure
+    )
 
 
 LAUNCH_TEXT = """\
@@ -229,7 +237,9 @@ def test_parameters_conditions_and_overrides(probe, tmp_path):
 def test_parameters_may_name_folders_of_the_run_and_other_parameters(probe, tmp_path):
     file = tmp_path / "p.launch.yaml"
     text = LAUNCH_TEXT.replace("in ${run_dir}", "${port}")
-    file.write_text(text.replace("  with_b: false", "  with_b: false\n  port: ${dev}/vesc\n  dev: ${run_dir}/dev"))
+    file.write_text(
+        text.replace("  with_b: false", "  with_b: false\n  port: ${dev}/vesc\n  dev: ${run_dir}/dev")
+    )
     assert load_launch(file, (), "/run/x").documents["a"].data["then"] == "/run/x/dev/vesc"
     set_ = load_launch(file, ["params.port=${run_dir}/other"], "/run/x")
     assert set_.documents["a"].data["then"] == "/run/x/other"
@@ -243,7 +253,9 @@ def test_parameters_may_name_folders_of_the_run_and_other_parameters(probe, tmp_
 def test_include_is_a_base_that_can_be_changed(probe, tmp_path):
     (tmp_path / "p.launch.yaml").write_text(LAUNCH_TEXT)
     file = tmp_path / "q.launch.yaml"
-    file.write_text("name: more\ninclude: [p.launch.yaml]\nnodes:\n  a: {config: {after_s: 9}}\n  b: {if: true}\n")
+    file.write_text(
+        "name: more\ninclude: [p.launch.yaml]\nnodes:\n  a: {config: {after_s: 9}}\n  b: {if: true}\n"
+    )
     plan = load_launch(file)
     assert plan.launch.name == "more"
     assert plan.documents["a"].data["after_s"] == 9
@@ -256,7 +268,11 @@ def test_record_adds_a_recorder_that_stops_last(probe, tmp_path):
     file.write_text(LAUNCH_TEXT + "record: {output: my_bag, max_bag_size_mb: 64}\n")
     plan = load_launch(file)
     recorder = RecorderConfig(**plan.documents["recorder"].data)
-    assert (str(recorder.output), recorder.max_bag_size_mb, recorder.max_bag_duration_s) == ("my_bag", 64.0, 600.0)
+    assert (str(recorder.output), recorder.max_bag_size_mb, recorder.max_bag_duration_s) == (
+        "my_bag",
+        64.0,
+        600.0,
+    )
     assert plan.nodes["recorder"].stop_last
     assert plan.documents["recorder"].data["statuses_of"] == ["a"]
 
@@ -277,7 +293,10 @@ def test_record_adds_a_recorder_that_stops_last(probe, tmp_path):
         (LAUNCH_TEXT.replace("  a:", "  A-b:"), r":6: expected a node name"),
         (LAUNCH_TEXT.replace("nodes:", "nodes: ["), r":\d+: expected valid YAML"),
         ("just text", r":1: expected a launch file"),
-        (LAUNCH_TEXT.replace("    config:", "    respawn: {}\n    config:"), "must also have required: false"),
+        (
+            LAUNCH_TEXT.replace("    config:", "    respawn: {}\n    config:"),
+            "must also have required: false",
+        ),
     ],
 )
 def test_wrong_launch_file_is_one_error_with_file_and_line(probe, tmp_path, text, message):
@@ -302,7 +321,9 @@ def test_a_module_in_the_working_folder_is_found_whatever_started_the_command(tm
     )
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])}
     command = [sys.executable, script]
-    done = subprocess.run(command, cwd=tmp_path / "mine", env=environment, capture_output=True, text=True, timeout=60)
+    done = subprocess.run(
+        command, cwd=tmp_path / "mine", env=environment, capture_output=True, text=True, timeout=60
+    )
     assert (done.stdout, done.stderr) == ("['a']\n", "")
 
 

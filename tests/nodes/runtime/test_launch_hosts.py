@@ -53,8 +53,14 @@ def test_each_host_runs_its_nodes_and_a_gateway_whose_lists_mirror_the_other(lau
 
 def test_all_runs_everything_here_without_a_gateway(launch_file):
     assert set(load_launch(launch_file(), host="all").nodes) == {
-        "camera", "vicon", "safety", "motor", "compositor", "policy", "recorder",
-    }  # fmt: skip
+        "camera",
+        "vicon",
+        "safety",
+        "motor",
+        "compositor",
+        "policy",
+        "recorder",
+    }
 
 
 @pytest.mark.parametrize(
@@ -87,11 +93,19 @@ def test_people_may_be_at_the_car(launch_file):
         (("", ""), None, "expected --host with one of robot, workstation, or all; got None"),
         (("", ""), "laptop", "with one of robot, workstation, or all; got laptop"),
         (("workstation: {}", "workstation: {address: 10.0.0.3}"), "robot", "one of them with an address"),
-        (("{module: nodes.policy, host: workstation}", "{module: nodes.policy}"), "robot", "node policy needs a host"),
-        (("{module: nodes.motor, host: robot}", "{module: nodes.motor, host: workstation}"), "robot", "no network lies between"),
+        (
+            ("{module: nodes.policy, host: workstation}", "{module: nodes.policy}"),
+            "robot",
+            "node policy needs a host",
+        ),
+        (
+            ("{module: nodes.motor, host: robot}", "{module: nodes.motor, host: workstation}"),
+            "robot",
+            "no network lies between",
+        ),
         (("workstation: {}", "workstation: {port: 1}"), "robot", "unknown key hosts.workstation.port"),
     ],
-)  # fmt: skip
+)
 def test_wrong_hosts_are_one_error(launch_file, change, host, words):
     with pytest.raises(ConfigError, match=words):
         load_launch(launch_file(FILE.replace(*change)), host=host)

@@ -40,7 +40,11 @@ def test_cdr_bytes_of_a_drive_command_written_by_hand():
     expected += struct.pack("<5f", 0.25, 0, 0.8, 0, 0)
     assert encode(drive_message(0.8, 0.25, 12_000_000_345)) == expected
     message = decode(DRIVE, expected)
-    assert (message.drive.steering_angle, message.header.frame_id, stamp_ns(message)) == (0.25, "car", 12_000_000_345)
+    assert (message.drive.steering_angle, message.header.frame_id, stamp_ns(message)) == (
+        0.25,
+        "car",
+        12_000_000_345,
+    )
 
 
 def test_type_hash_is_that_of_ros():
@@ -52,11 +56,17 @@ def test_type_hash_is_that_of_ros():
 
 def test_definition_contains_everything_below():
     text = type_definition(DRIVE)
-    for part in ("MSG: ackermann_msgs/AckermannDrive", "MSG: std_msgs/Header", "MSG: builtin_interfaces/Time"):
+    for part in (
+        "MSG: ackermann_msgs/AckermannDrive",
+        "MSG: std_msgs/Header",
+        "MSG: builtin_interfaces/Time",
+    ):
         assert part in text
 
 
-@pytest.mark.parametrize("pixels", [np.zeros((2, 3)), np.zeros((2, 3), np.uint8), np.zeros((2, 3, 4), np.uint8)])
+@pytest.mark.parametrize(
+    "pixels", [np.zeros((2, 3)), np.zeros((2, 3), np.uint8), np.zeros((2, 3, 4), np.uint8)]
+)
 def test_what_is_no_image_is_refused(pixels):
     with pytest.raises(MessageError, match="expected a uint8 image for rgb8"):
         image_message(pixels, 0, "camera")
@@ -77,7 +87,9 @@ def test_pose_without_orientation_is_refused():
 
 def test_camera_info_has_the_principal_point_of_ros_and_comes_back_as_ours():
     pinhole = Pinhole(336, 188, 173.97, 173.97, 168.0, 94.0)
-    message = decode("sensor_msgs/msg/CameraInfo", encode(camera_info_message(pinhole, 5, "camera", [0.1, 0, 0, 0, 0])))
+    message = decode(
+        "sensor_msgs/msg/CameraInfo", encode(camera_info_message(pinhole, 5, "camera", [0.1, 0, 0, 0, 0]))
+    )
     # ROS counts pixel centres from 0, so the centre of 336 columns is 167.5.
     assert (message.k[2], message.k[5], message.d[0]) == (167.5, 93.5, 0.1)
     assert pinhole_from_camera_info(message) == pinhole
@@ -103,7 +115,8 @@ def test_truncated_bytes_are_refused():
 
 @settings(max_examples=300, deadline=None)
 @given(
-    st.sampled_from(sorted({row.type for row in TOPICS.values()} | {topic("/status/x").type})), st.binary(max_size=200)
+    st.sampled_from(sorted({row.type for row in TOPICS.values()} | {topic("/status/x").type})),
+    st.binary(max_size=200),
 )
 def test_arbitrary_bytes_are_decoded_or_refused_and_nothing_else(typename, noise):
     with contextlib.suppress(MessageError):

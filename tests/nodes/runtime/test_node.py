@@ -136,7 +136,9 @@ def test_node_answers_messages_ticks_and_tells_its_status(tmp_path):
         bus.wait_for_subscribers(["/camera/image_raw"], 3)
         bus.publish("/camera/image_raw", image_message(np.zeros((2, 3, 3), np.uint8), 42, "cam"))
         assert stamp_of(wait_for(bus, "/policy/drive").message()) == 42
-        status = wait_for(bus, "/status/echo", accept=lambda m: m.state == "active" and m.subscribers[0] == 1).message()
+        status = wait_for(
+            bus, "/status/echo", accept=lambda m: m.state == "active" and m.subscribers[0] == 1
+        ).message()
         assert status.pid == os.getpid()
         assert list(status.publications) == ["/policy/drive"]
         counters = dict(zip(status.counter_names, status.counter_values, strict=True))
@@ -166,7 +168,9 @@ def test_a_change_of_state_is_told_at_once(tmp_path):
         before = wait_for(bus, "/status/echo", 10)
         node.broken = True
         told = wait_for(bus, "/status/echo", accept=lambda m: m.state == "fault")
-    assert told.info.publish_mono_ns - before.info.publish_mono_ns < 190_000_000  # 200 ms would have been its turn
+    assert (
+        told.info.publish_mono_ns - before.info.publish_mono_ns < 190_000_000
+    )  # 200 ms would have been its turn
 
 
 class FromThread(Node):
@@ -287,7 +291,9 @@ def script(tmp_path):
 def test_signal_ends_a_process_cleanly_and_at_once(script, tmp_path, number):
     with Bus(tmp_path) as bus:
         bus.subscribe("/status/counter")
-        process = subprocess.Popen([sys.executable, script, "--run-dir", tmp_path], stdout=subprocess.PIPE, text=True)
+        process = subprocess.Popen(
+            [sys.executable, script, "--run-dir", tmp_path], stdout=subprocess.PIPE, text=True
+        )
         wait_for(bus, "/status/counter", 10, accept=lambda m: m.state == "active")
         start = time.monotonic()
         process.send_signal(number)

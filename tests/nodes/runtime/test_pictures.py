@@ -32,7 +32,11 @@ def test_picture_keeps_its_stamp_and_its_colours():
     assert got.format == "rgb8; jpeg compressed bgr8"
     assert len(got.data) < rgb.size / 8
     image = rgb8_message(got, "/c")
-    assert (ns_from_stamp(image.header.stamp), image.header.frame_id, image.encoding) == (STAMP, "camera", "rgb8")
+    assert (ns_from_stamp(image.header.stamp), image.header.frame_id, image.encoding) == (
+        STAMP,
+        "camera",
+        "rgb8",
+    )
     assert np.abs(rgb_image(got, "/c").astype(int) - rgb).mean() < 3.0
     # Anybody's JPEG decoder gives BGR of the same picture.
     assert np.abs(cv2.imdecode(got.data, cv2.IMREAD_COLOR)[:, :, ::-1].astype(int) - rgb).mean() < 3.0

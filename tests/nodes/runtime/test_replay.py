@@ -75,9 +75,12 @@ def test_an_output_reaches_the_next_node_at_the_same_time_and_keeps_the_order():
     run = lockstep(listener=Listener(), echo=Echo())
     made = run.feed(pose(7, x=0.25))
     assert [(m.topic, m.log_ns) for m in made] == [
-        ("/policy/drive", START_NS + 7 * MS), ("/safety/drive", START_NS + 7 * MS)
-    ]  # fmt: skip
-    assert decode("ackermann_msgs/msg/AckermannDriveStamped", made[1].cdr).drive.steering_angle == np.float32(0.25)
+        ("/policy/drive", START_NS + 7 * MS),
+        ("/safety/drive", START_NS + 7 * MS),
+    ]
+    assert decode("ackermann_msgs/msg/AckermannDriveStamped", made[1].cdr).drive.steering_angle == np.float32(
+        0.25
+    )
     # The digest is that of topic, time, length and bytes, computed here by hand.
     expected = hashlib.sha256()
     for m in made:
@@ -92,8 +95,13 @@ def test_ticks_come_on_the_grid_of_recorded_time_between_the_messages():
         run.advance_to(START_NS + ms * MS)
         run.feed(pose(ms))
     assert [(name, (ns - START_NS) // MS) for name, ns in echo.calls] == [
-        ("tick", 0), ("tick", 10), ("/vicon/car", 15), ("tick", 20), ("tick", 30), ("/vicon/car", 30)
-    ]  # fmt: skip
+        ("tick", 0),
+        ("tick", 10),
+        ("/vicon/car", 15),
+        ("tick", 20),
+        ("tick", 30),
+        ("/vicon/car", 30),
+    ]
 
 
 def test_gaps_and_restarts_of_a_publisher_are_told_as_the_bus_tells_them():
@@ -135,7 +143,9 @@ def test_a_node_that_fails_finishes_or_breaks_its_word_is_told():
         def handle(self, topic, message, info, now):
             raise NodeFinished
 
-    with pytest.raises(BagError, match="bad failed at 1800000000001000000 ns on /vicon/car: ZeroDivisionError: why"):
+    with pytest.raises(
+        BagError, match="bad failed at 1800000000001000000 ns on /vicon/car: ZeroDivisionError: why"
+    ):
         lockstep(bad=Bad()).feed(pose(1))
     with pytest.raises(MessageError, match="wrong sends /safety/drive, but declares only /policy/drive"):
         lockstep(wrong=Wrong()).feed(pose(1))
@@ -150,7 +160,9 @@ def test_nodes_that_answer_each_other_for_ever_are_stopped():
         def handle(self, topic, message, info, now):
             return [Out("/arm", info.raw)]
 
-    arm = types.Arm(header=pose_message(np.eye(4), 0).header, arm=False, source="", reason="", ask_id="a", age_ns=0)
+    arm = types.Arm(
+        header=pose_message(np.eye(4), 0).header, arm=False, source="", reason="", ask_id="a", age_ns=0
+    )
     with pytest.raises(BagError, match="answer each other endlessly on /arm"):
         lockstep(loop=Loop()).feed(BagMessage("/arm", encode(arm), START_NS, START_NS, 0))
 
@@ -178,13 +190,17 @@ def test_outputs_equal_those_of_nodes_driven_by_hand(tmp_path):
     for name, content in read_attachments(CORNER).items():
         (tmp_path / name).write_bytes(content)
     config = CompositorConfig(
-        attack=tmp_path / "corner.attack.safetensors", camera=tmp_path / "camera.yaml", target=tmp_path / "board.yaml"
+        attack=tmp_path / "corner.attack.safetensors",
+        camera=tmp_path / "camera.yaml",
+        target=tmp_path / "board.yaml",
     )
     node = CompositorNode.build(config, NodeContext("compositor", tmp_path, ManualClock()))
     images = []
     for m in read_messages(CORNER):
         info = MessageInfo(m.publish_ns, m.log_ns, m.sequence, m.cdr)
-        for out in node.handle(m.topic, decode(topic_row(m.topic).type, m.cdr), info, Now(m.log_ns, m.log_ns)):
+        for out in node.handle(
+            m.topic, decode(topic_row(m.topic).type, m.cdr), info, Now(m.log_ns, m.log_ns)
+        ):
             if out.topic == "/compositor/image":
                 images.append(out.message if isinstance(out.message, bytes) else encode(out.message))
     made, _ = run()
@@ -232,7 +248,10 @@ def test_wrong_choices_are_one_clear_error(tmp_path):
         (Choice(("policy",), {"policy": "json"}), "expected json to have one node class"),
         (Choice(("policy",)), r"policy cannot be built for replay: .*--set policy.KEY=VALUE"),
         (Choice(("recorder",)), "recorder cannot be replayed: it publishes nothing"),
-        (Choice(("policy",), {"policy": "green_policy"}), "has nothing for policy: they listen to /compositor/image"),
+        (
+            Choice(("policy",), {"policy": "green_policy"}),
+            "has nothing for policy: they listen to /compositor/image",
+        ),
         (Choice(GREEN.nodes, GREEN.replacements, None, ("policy.gain=1",)), "gain"),
     ]:
         with pytest.raises(Exception, match=words) as caught:

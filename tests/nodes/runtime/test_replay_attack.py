@@ -66,7 +66,9 @@ def test_retro_attack_is_the_difference_of_two_drives(clean_drive, tmp_path):
     # Truth: the policy by hand on the images that were recorded and those with the face, made above in another way.
     green = {}
     for name, choice in (("attacked", GREEN), ("clean", clean())):
-        images = [decode("sensor_msgs/msg/Image", m.cdr) for m in run(choice)[0] if m.topic == "/compositor/image"]
+        images = [
+            decode("sensor_msgs/msg/Image", m.cdr) for m in run(choice)[0] if m.topic == "/compositor/image"
+        ]
         pixels = np.array([np.asarray(image.data).reshape(27, 48, 3)[..., 1] for image in images], float)
         green[name] = 0.01 * (pixels[:, :, 24:].sum((1, 2)) - pixels[:, :, :24].sum((1, 2))) / pixels[0].size
     np.testing.assert_allclose(result.clean_rad, green["clean"], atol=1e-7)
@@ -74,7 +76,11 @@ def test_retro_attack_is_the_difference_of_two_drives(clean_drive, tmp_path):
     np.testing.assert_array_equal(result.recorded_rad, result.clean_rad)
     delta = green["attacked"] - green["clean"]
     numbers = result.numbers()
-    assert (numbers["frames"], numbers["frames_drawn"], numbers["clean_against_recorded_rad"]) == (12, 12, 0.0)
+    assert (numbers["frames"], numbers["frames_drawn"], numbers["clean_against_recorded_rad"]) == (
+        12,
+        12,
+        0.0,
+    )
     assert numbers["mean_abs_delta_rad"] == pytest.approx(np.abs(delta).mean(), abs=1e-7)
     assert numbers["largest_delta_rad"] == pytest.approx(delta[np.abs(delta).argmax()], abs=1e-7)
     side = "left" if delta.mean() > 0 else "right"
@@ -103,7 +109,10 @@ def test_retro_attack_on_the_command_line(clean_drive, tmp_path, capsys):
     [
         (["--nodes", "policy", "--json", "x.json"], "expected --json and --plot only with --attack"),
         (["--nodes", "policy", "--update-golden"], "expected --golden FILE.mcap with --update-golden"),
-        (["--nodes", "policy", "--golden", "x.mcap", "-o", "out"], "expected one of --golden, --output and --attack"),
+        (
+            ["--nodes", "policy", "--golden", "x.mcap", "-o", "out"],
+            "expected one of --golden, --output and --attack",
+        ),
         (["--nodes", "policy", "--tolerance", "1"], "expected --topics and --tolerance only with --golden"),
         (["--nodes", "policy", "--replace", "policy"], "expected NODE=MODULE or NODE=MODULE:CLASS"),
         (["--nodes", "compositor", "--policy", "x.onnx"], "expected the node policy among --nodes"),
@@ -125,14 +134,19 @@ def test_options_that_do_not_go_together_are_one_clear_error(arguments, words):
         (drive_message(1, 0.25, 5), drive_message(1, 0.25, 5), [], None, None),
         (drive_message(1, 0.25, 5), drive_message(1, 0.5, 5), [], "drive.steering_angle", 0.25),
         (drive_message(1, 0.25, 5), drive_message(1, 0.5, 5), ["0.3"], None, None),
-        (drive_message(1, 0.25, 5), drive_message(1, 0.5, 5), ["0.3", "/policy/drive:drive.steering_angle=0.2"],
-         "drive.steering_angle", 0.25),
+        (
+            drive_message(1, 0.25, 5),
+            drive_message(1, 0.5, 5),
+            ["0.3", "/policy/drive:drive.steering_angle=0.2"],
+            "drive.steering_angle",
+            0.25,
+        ),
         (drive_message(1, 0.25, 5), drive_message(1, 0.25, 9), [], "header.stamp.nanosec", 4),
         (drive_message(1, 0.25, 5, "a"), drive_message(1, 0.25, 5, "b"), ["9"], "header.frame_id", None),
         (drive_message(1, np.nan, 5), drive_message(1, np.nan, 5), [], None, None),
         (drive_message(1, 0.0, 5), drive_message(1, np.nan, 5), ["9"], "drive.steering_angle", np.inf),
     ],
-)  # fmt: skip
+)
 def test_fields_are_compared_one_by_one(old, new, tolerances, name, by):
     pair = [BagMessage("/policy/drive", encode(message), 1, 1, 0) for message in (old, new)]
     found = compare(*pair, 3, Tolerances.parse(tolerances))
@@ -160,7 +174,9 @@ def test_another_time_another_count_and_another_topic_are_differences(tmp_path):
     assert "2.0" in extra.text(START_NS)
 
 
-@pytest.mark.parametrize("text", ["x", "-1", "nan", "/policy/drive=1", "policy:drive=1", "/policy/drive:=1", "inf"])
+@pytest.mark.parametrize(
+    "text", ["x", "-1", "nan", "/policy/drive=1", "policy:drive=1", "/policy/drive:=1", "inf"]
+)
 def test_a_tolerance_that_is_none_is_refused(text):
     with pytest.raises(BagError, match="expected VALUE or TOPIC:FIELD=VALUE"):
         Tolerances.parse([text])

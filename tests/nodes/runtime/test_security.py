@@ -80,7 +80,9 @@ def lab(tmp_path):
     class Lab:
         def host(self, name, **options):
             config = GatewayConfig(
-                watch_port=watch_port, drive_port=drive_port, **{"keys": keys[name].path, "key": name, **options}
+                watch_port=watch_port,
+                drive_port=drive_port,
+                **{"keys": keys[name].path, "key": name, **options},
             )
             run_dir = tmp_path / f"run_{name}_{len(hosts)}"
             run_dir.mkdir()
@@ -88,13 +90,20 @@ def lab(tmp_path):
             return hosts[-1]
 
         def robot(self):
-            host = self.host("robot", listen="127.0.0.1", exports=("/vicon/car",), imports=("/policy/drive", "/arm"))
+            host = self.host(
+                "robot", listen="127.0.0.1", exports=("/vicon/car",), imports=("/policy/drive", "/arm")
+            )
             for topic in ("/policy/drive", "/arm", "/clock/offset"):
                 host.eyes.subscribe(topic)
             return host
 
         def workstation(self, name="workstation", **options):
-            options = {"connect": "127.0.0.1", "exports": ("/policy/drive",), "imports": ("/vicon/car",), **options}
+            options = {
+                "connect": "127.0.0.1",
+                "exports": ("/policy/drive",),
+                "imports": ("/vicon/car",),
+                **options,
+            }
             host = self.host(name, **options)
             host.eyes.subscribe("/vicon/car")
             return host
@@ -286,7 +295,9 @@ def test_malformed_and_oversized_messages_of_an_allowed_key_are_refused(lab, cap
         got = lab.run(3.0, lambda got: robot.node.counters()["refused"] >= before + len(bad))
         assert robot.node.counters()["refused"] == before + len(bad)
         assert not [r for r in drives(got) if r.info.receive_mono_ns > 0 and len(r.info.raw) != len(good[2])]
-        friend.say(b"/policy/drive", good[1], bytes(20 << 20))  # beyond the socket's own limit: ends the connection
+        friend.say(
+            b"/policy/drive", good[1], bytes(20 << 20)
+        )  # beyond the socket's own limit: ends the connection
         assert drives(lab.run(8.0, drives, lambda: friend.say(*good_frames())))  # and the honest go on
     finally:
         friend.close()
@@ -313,7 +324,9 @@ def test_something_follows_every_message_soon_so_that_tcp_notices_a_loss(listens
         other.connect(f"tcp://127.0.0.1:{watch_port}")
     else:
         other.bind(f"tcp://127.0.0.1:{drive_port}")
-    config = LinkConfig("127.0.0.1", listens, watch_port, drive_port, keys, "robot", "robot", (), ("/policy/drive",))
+    config = LinkConfig(
+        "127.0.0.1", listens, watch_port, drive_port, keys, "robot", "robot", (), ("/policy/drive",)
+    )
     inbox = Inbox(10)
     link = Link(config, inbox)
     try:
@@ -339,7 +352,8 @@ def test_without_keys_a_link_carries_nothing_towards_the_end_that_listens():
         GatewayConfig(connect="127.0.0.1", exports=("/arm",), **ports),
     ):
         with pytest.raises(
-            SecurityError, match=r"without keys a link can only be used to watch, .*/arm.* could drive the car"
+            SecurityError,
+            match=r"without keys a link can only be used to watch, .*/arm.* could drive the car",
         ):
             GatewayNode(config, lambda topic: 1)
 
@@ -350,7 +364,9 @@ def test_without_keys_others_watch_and_no_door_leads_in(lab, capfd):
     robot.eyes.publisher("/vicon/car")
     pose = encode(types.PoseStamped(header=header(0), pose=IDENTITY))
     got = lab.run(
-        5.0, lambda got: any(r.topic == "/vicon/car" for _, r in got), lambda: robot.eyes.publish("/vicon/car", pose)
+        5.0,
+        lambda got: any(r.topic == "/vicon/car" for _, r in got),
+        lambda: robot.eyes.publish("/vicon/car", pose),
     )
     assert any(host is watcher and r.topic == "/vicon/car" for host, r in got)
     with socket.socket() as stranger:
@@ -386,9 +402,10 @@ def test_a_topic_that_nobody_reads_does_not_travel(lab):
     workstation = lab.workstation(imports=("/camera/image_raw", "/vicon/car"))
     robot.eyes.publisher("/vicon/car")
     got = lab.run(
-        5.0, lambda got: any(r.topic == "/vicon/car" for _, r in got),
+        5.0,
+        lambda got: any(r.topic == "/vicon/car" for _, r in got),
         lambda: robot.eyes.publish("/vicon/car", encode(types.PoseStamped(header=header(0), pose=IDENTITY))),
-    )  # fmt: skip
+    )
     assert any(r.topic == "/vicon/car" for _, r in got)
     assert workstation.node._link._doors._subscribed == {"/vicon/car"}
 

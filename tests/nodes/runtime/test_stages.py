@@ -53,7 +53,10 @@ def test_a_changed_setting_runs_what_depends_on_it_and_no_more(tmp_path):
     assert run_and_note(tmp_path, job(second_setting=2)) == ["second"]
     # The first stage runs again but writes the same bytes, so what follows still fits.
     assert run_and_note(tmp_path, job(first_setting=2, second_setting=2)) == ["first"]
-    assert run_and_note(tmp_path, job(first_setting=3, second_setting=2, first_text="new")) == ["first", "second"]
+    assert run_and_note(tmp_path, job(first_setting=3, second_setting=2, first_text="new")) == [
+        "first",
+        "second",
+    ]
 
 
 def test_an_interrupted_stage_finds_its_own_partial_work(tmp_path):
@@ -143,7 +146,9 @@ def test_two_processes_do_not_make_one_stage(tmp_path):
     lock = hold(tmp_path / ".second.lock")
     with (
         lock,
-        pytest.raises(StageError, match=rf"second for this process alone, but process {os.getpid()} is at work there"),
+        pytest.raises(
+            StageError, match=rf"second for this process alone, but process {os.getpid()} is at work there"
+        ),
     ):
         run_and_note(tmp_path, job())
     assert not (tmp_path / "second").exists()

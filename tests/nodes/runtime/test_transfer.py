@@ -33,7 +33,12 @@ def test_a_file_arrives_as_it_was(size):
     assert len(chunks) == -(-size // CHUNK_BYTES)
     assembler = Assembler()
     (file,), troubles = put(assembler, chunks)
-    assert (file.content, file.name, file.sha256, troubles) == (data, "a", hashlib.sha256(data).hexdigest(), [])
+    assert (file.content, file.name, file.sha256, troubles) == (
+        data,
+        "a",
+        hashlib.sha256(data).hexdigest(),
+        [],
+    )
     assert not assembler.receiving
     assert len(put(assembler, chunks)[0]) == 1
 

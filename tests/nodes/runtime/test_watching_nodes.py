@@ -49,7 +49,9 @@ def test_top_shows_process_memory_rate_and_restarts(tmp_path):
     try:
         with NodeWatch(tmp_path) as watch:
             deadline = time.monotonic() + 15.0
-            while not ((rows := watch.rows(0.5)) and rows[0].state == "ready") and time.monotonic() < deadline:
+            while (
+                not ((rows := watch.rows(0.5)) and rows[0].state == "ready") and time.monotonic() < deadline
+            ):
                 pass
             (row,) = watch.rows(1.0)
             assert (row.name, row.pid, row.restarts) == ("safety", process.pid, 0)

@@ -40,7 +40,11 @@ def write_bag(tmp_path):
                 if not any(low <= time_s <= high for low, high in gap):
                     stamp = START_NS + round(1e9 * time_s)
                     bag.write(
-                        "/vicon/car", encode(pose_message(planar_pose(*state(time_s)), stamp)), stamp, stamp, k + 5
+                        "/vicon/car",
+                        encode(pose_message(planar_pose(*state(time_s)), stamp)),
+                        stamp,
+                        stamp,
+                        k + 5,
                     )
             for k in range(round(seconds * 10)):
                 stamp = START_NS + k * PERIOD_NS

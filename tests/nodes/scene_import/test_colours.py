@@ -39,7 +39,9 @@ def frames_of(scene, folder, poses, colours=TRUE):
         rgb = colours.apply(renderer.render(pose[None], CAMERA)[0][0].numpy())
         names.append(f"{index}.png")
         cv2.imwrite(str(folder / names[-1]), np.rint(255 * rgb[..., ::-1]).astype(np.uint8))
-    write_transforms(folder / "transforms_car.json", names, np.stack(poses), CAMERA, camera_ids=["car"] * len(names))
+    write_transforms(
+        folder / "transforms_car.json", names, np.stack(poses), CAMERA, camera_ids=["car"] * len(names)
+    )
     return folder / "transforms_car.json"
 
 

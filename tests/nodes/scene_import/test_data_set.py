@@ -25,7 +25,8 @@ def walk(count=40):
 
 def model_of(poses):
     images = [
-        Registered(f"{k}", "phone", pose, Pinhole(4, 3, 3.0, 3.0, 2.0, 1.5), Lens(), 9) for k, pose in enumerate(poses)
+        Registered(f"{k}", "phone", pose, Pinhole(4, 3, 3.0, 3.0, 2.0, 1.5), Lens(), 9)
+        for k, pose in enumerate(poses)
     ]
     return Model(tuple(images), (), np.array([[1.0, 2.0, 3.0], [2.0, 2.0, 3.0], [9.0, 2.0, 3.0]]), 0.5, 1)
 
@@ -61,7 +62,9 @@ def test_pictures_of_a_person_are_never_touched(tmp_path):
     for media, message in ((mine.parent, "outside"), (tmp_path / "other", "has other files")):
         media.mkdir(exist_ok=True)
         with pytest.raises(ImportRecordingError, match=message):
-            from_media([media], tmp_path / "holiday", MediaConfig(), SfmConfig(), 4.0, lambda share, text="": None)
+            from_media(
+                [media], tmp_path / "holiday", MediaConfig(), SfmConfig(), 4.0, lambda share, text="": None
+            )
     assert mine.read_bytes() == b"precious"
 
 
@@ -103,7 +106,9 @@ def test_phone_and_car_come_out_metric_in_the_motion_capture_world(tmp_path):
     with Lab(config) as lab:
         files = photograph(lab, poses, tmp_path / "phone")
         record_drive(lab, tmp_path / "drive", laps=0.3)
-    result = run("from-phone-and-car", tmp_path / "phone", "--bag", tmp_path / "drive", "-o", tmp_path / "set")
+    result = run(
+        "from-phone-and-car", tmp_path / "phone", "--bag", tmp_path / "drive", "-o", tmp_path / "set"
+    )
     assert (result.returncode, result.stderr) == (0, "")
     truth = {file.name: pose for file, pose in zip(files, poses, strict=True)}
     phone = load_transforms(tmp_path / "set" / "transforms_phone.json", require_all=True)

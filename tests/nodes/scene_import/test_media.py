@@ -37,8 +37,12 @@ def test_each_folder_is_a_camera_and_names_sort_as_people_count(tmp_path):
     sources = gather([tmp_path / "my phone", tmp_path / "other"], tmp_path / "out", MediaConfig(), quiet)
     assert [source.camera_id for source in sources] == ["my_phone", "other"]
     assert sources[0].images == tuple(f"images/my_phone/IMG_{n}.jpg" for n in (9, 10, 100))
-    assert (tmp_path / "out" / sources[1].images[0]).read_bytes() == (tmp_path / "other" / "a.png").read_bytes()
-    one = gather([tmp_path / "my phone", tmp_path / "other"], tmp_path / "out", MediaConfig(one_camera=True), quiet)
+    assert (tmp_path / "out" / sources[1].images[0]).read_bytes() == (
+        tmp_path / "other" / "a.png"
+    ).read_bytes()
+    one = gather(
+        [tmp_path / "my phone", tmp_path / "other"], tmp_path / "out", MediaConfig(one_camera=True), quiet
+    )
     assert {source.camera_id for source in one} == {"camera"}
 
 
@@ -48,7 +52,9 @@ def test_photographs_are_turned_upright_for_readers_without_exif(tmp_path, orien
     before = read_image(file)[0]
     turned(file, orientation)
     gather([tmp_path / "phone"], tmp_path / "out", MediaConfig(), quiet)
-    raw = cv2.imread(str(tmp_path / "out/images/phone/a.jpg"), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    raw = cv2.imread(
+        str(tmp_path / "out/images/phone/a.jpg"), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+    )
     expected = np.rot90(before, turns)
     assert raw.shape == expected.shape
     assert np.abs(raw[..., ::-1].astype(int) - expected).mean() < 6.0

@@ -160,7 +160,9 @@ def test_a_stopped_import_ends_in_one_line_and_goes_on(tmp_path, number, code):
     assert "6 of 6 images placed" in result.stdout
     assert not (tmp_path / "scene.part").exists()
     assert len(load_transforms(tmp_path / "scene", require_all=True).frames) == len(truth)
-    camera = json.loads((tmp_path / "scene" / "import.json").read_text())["structure_from_motion"]["cameras"]["photos"]
+    camera = json.loads((tmp_path / "scene" / "import.json").read_text())["structure_from_motion"]["cameras"][
+        "photos"
+    ]
     assert camera["registered"] == 6
     assert camera["why"] in result.stdout
 

@@ -7,7 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from advnerf_core.geometry import OPENGL_FROM_OPENCV, VehicleState, camera_mount, invert_transform, planar_pose
+from advnerf_core.geometry import (
+    OPENGL_FROM_OPENCV,
+    VehicleState,
+    camera_mount,
+    invert_transform,
+    planar_pose,
+)
 from hardware.worlds.paths import ReferencePath
 from hardware.worlds.world import Box, CarDescription, NotOpenError
 from nodes.lab.worlds.check import check_world
@@ -48,7 +54,9 @@ class Small(Warehouse):  # type: ignore[misc]
 
 
 def test_the_small_warehouse_passes() -> None:
-    assert [f"{finding.name}: {finding.text}" for finding in check_world(small(Small)) if not finding.met] == []
+    assert [
+        f"{finding.name}: {finding.text}" for finding in check_world(small(Small)) if not finding.met
+    ] == []
 
 
 class Mirrored(Small):

@@ -89,7 +89,10 @@ def test_a_file_is_named_relative_to_the_experiment(
     moved = yard / "moved"
     moved.mkdir()
     (moved / "yard.py").write_text(BODY)
-    assert read(moved, "{kind: 'yard.py:Yard', seed: 5, host: there, lens: {width: 32}}").settings == found.settings
+    assert (
+        read(moved, "{kind: 'yard.py:Yard', seed: 5, host: there, lens: {width: 32}}").settings
+        == found.settings
+    )
     assert read(yard, "{kind: 'yard.py:Yard'}").settings != found.settings
     (moved / "yard.py").write_text(BODY + "\n# another floor\n")
     assert read(moved, "{kind: 'yard.py:Yard', seed: 5, lens: {width: 32}}").settings != found.settings
@@ -103,7 +106,11 @@ def test_a_package_brings_a_world(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     (info / "entry_points.txt").write_text("[advnerf.worlds]\nyard = stranger_yard:Yard\n")
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.delitem(sys.modules, "stranger_yard", raising=False)
-    assert read(tmp_path, "{kind: yard, seed: 4}").settings == {"kind": "yard", "seed": 4, "lens": {"width": 64}}
+    assert read(tmp_path, "{kind: yard, seed: 4}").settings == {
+        "kind": "yard",
+        "seed": 4,
+        "lens": {"width": 64},
+    }
     listed = CliRunner().invoke(app, ["world", "list"])
     assert listed.output.split() == ["lab", "junction", "carla", "yard"]
 
@@ -115,16 +122,25 @@ def test_a_package_brings_a_world(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         ("kind: junctoin", r"did you mean junction\?"),
         ("{}", r"expected kind: NAME"),
         ("{kind: [1]}", r"expected kind: NAME"),
-        ("kind: yard.py:Garden", r":1: world yard\.py:Garden: expected a name in yard\.py of .*; got 'Garden'"),
+        (
+            "kind: yard.py:Garden",
+            r":1: world yard\.py:Garden: expected a name in yard\.py of .*; got 'Garden'",
+        ),
         ("kind: garden.py:Yard", r"expected a Python file at .*garden\.py, found none"),
         ("kind: yard.py:NoConfig", r"expected a class with an attribute Config"),
         ("kind: yard.py:a_function", r"expected a class with an attribute Config"),
         ("kind: yard.py:Yard\nsede: 4", r":2: unknown key sede; valid keys here: host, lens, seed"),
         ("kind: yard.py:Yard\nlens:\n  heigth: 4", r":3: unknown key lens\.heigth; valid keys here: width"),
         ("kind: yard.py:Yard\nseed: many", r":2: seed: input should be a valid integer.*got 'many'"),
-        ("kind: yard.py:Yard\nlens: 3", r":2: lens: input should be a dictionary or an instance of Lens, got 3"),
+        (
+            "kind: yard.py:Yard\nlens: 3",
+            r":2: lens: input should be a dictionary or an instance of Lens, got 3",
+        ),
         ("kind: yard.py:Modelled\nsede: 4", r":2: unknown key sede; valid keys here: lens, seed"),
-        ("kind: yard.py:Modelled\nlens: {heigth: 4}", r":2: unknown key lens\.heigth; valid keys here: width"),
+        (
+            "kind: yard.py:Modelled\nlens: {heigth: 4}",
+            r":2: unknown key lens\.heigth; valid keys here: width",
+        ),
         ("kind: junction\nroad:\n  lane: 3", r":3: unknown key road\.lane; valid keys here: corner_radius_m"),
     ],
 )
@@ -136,7 +152,8 @@ def test_a_mistake_is_one_line_with_file_and_line(yard: Path, text: str, told: s
 
 def test_a_world_that_lacks_something_is_told_what(yard: Path) -> None:
     with pytest.raises(
-        ConfigError, match=r"world yard\.py:Lacking: expected T_car_from_camera, __enter__.*photograph.* which it lacks"
+        ConfigError,
+        match=r"world yard\.py:Lacking: expected T_car_from_camera, __enter__.*photograph.* which it lacks",
     ):
         read(yard, "kind: yard.py:Lacking").make()
 

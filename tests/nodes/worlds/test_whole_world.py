@@ -29,7 +29,9 @@ def test_every_stage_runs_in_a_strangers_world(
     asked = ("experiment", file, "--setting", "tiny", "--run-folder", str(run))
     monkeypatch.chdir(tmp_path)  # the world is found beside its experiment, wherever one is
     advnerf(monkeypatch, *asked)
-    world = WorldDescription.from_dict(json.loads((run / "capture" / "world.json").read_text())["description"])
+    world = WorldDescription.from_dict(
+        json.loads((run / "capture" / "world.json").read_text())["description"]
+    )
     assert (world.car.kind, world.car.wheelbase_m) == ("ackermann", 0.5)
     found = json.loads((run / "report" / "results.json").read_text())["cells"]
     assert {(cell["scenario"], cell["method"]) for cell in found} == {
@@ -41,7 +43,9 @@ def test_every_stage_runs_in_a_strangers_world(
         )
         states, controls = np.array(drives["states"][0]), np.array(drives["controls"][0])
         path: DrivingPath = as_path(world.paths[cell["scenario"]])
-        assert cell["deployed"]["total_cte_m"] == pytest.approx([np.abs(path.project(states[1:, :2]).cte_m).sum()])
+        assert cell["deployed"]["total_cte_m"] == pytest.approx(
+            [np.abs(path.project(states[1:, :2]).cte_m).sum()]
+        )
         # A wheel angle, held by a car with a wheelbase whose wheels lag: it turns by less than one without lag would.
         assert np.abs(controls).max() <= world.car.largest_control
         way_m = np.linalg.norm(np.diff(states[:, :2], axis=0), axis=1)
@@ -70,15 +74,35 @@ def test_a_mistake_in_the_file_is_one_line(
     (tmp_path / "world_warehouse.py").write_text((EXAMPLES / "world_warehouse.py").read_text())
     file = tmp_path / "mine.experiment.yaml"
     for wrong, told in (
-        (text.replace("scenarios: [loop, dock]", "scenarios: [lopo]"), "mine.experiment.yaml:6: scenarios: expected a scenario of loop, dock; got 'lopo' (did you mean loop?)"),
-        (text.replace("x_m: 1.5, y_m: -1.95", "x_m: 1.5, y_m: -2.5"), "mine.experiment.yaml:11: expected objects beside the lanes, at least 0.6 m from their middles, but hydrant_left"),
-        (text.replace(":Warehouse\"}", ":Warehouse\", speed: 2}"), "mine.experiment.yaml:5: unknown key speed; valid keys here: height, seed, speed_mps"),
-        (text.replace("horizon: 50", "view: {crop_height_px: 300}\nhorizon: 50"), "view: expected a crop inside 336 x 188"),
-    ):  # fmt: skip
+        (
+            text.replace("scenarios: [loop, dock]", "scenarios: [lopo]"),
+            "mine.experiment.yaml:6: scenarios: expected a scenario of loop, dock; got 'lopo' (did you mean loop?)",
+        ),
+        (
+            text.replace("x_m: 1.5, y_m: -1.95", "x_m: 1.5, y_m: -2.5"),
+            "mine.experiment.yaml:11: expected objects beside the lanes, at least 0.6 m from their middles, but hydrant_left",
+        ),
+        (
+            text.replace(':Warehouse"}', ':Warehouse", speed: 2}'),
+            "mine.experiment.yaml:5: unknown key speed; valid keys here: height, seed, speed_mps",
+        ),
+        (
+            text.replace("horizon: 50", "view: {crop_height_px: 300}\nhorizon: 50"),
+            "view: expected a crop inside 336 x 188",
+        ),
+    ):
         assert wrong != text
         file.write_text(wrong)
         with pytest.raises(SystemExit) as ended:
-            advnerf(monkeypatch, "experiment", str(file), "--setting", "tiny", "--run-folder", str(tmp_path / "run"))
+            advnerf(
+                monkeypatch,
+                "experiment",
+                str(file),
+                "--setting",
+                "tiny",
+                "--run-folder",
+                str(tmp_path / "run"),
+            )
         assert ended.value.code == 2
         said = capsys.readouterr().err
         assert told in said

@@ -84,11 +84,24 @@ class TJunction:
         return (-self.half_m - radius * math.sin(turn), radius * (1.0 - math.cos(turn)), -turn)
 
     def _road(
-        self, number: int, junction: int, start: tuple[float, float, float], length: float, curvature: float,
-        both: bool = False, predecessor: bool = False, successor: bool = False, slope: float = 0.0, link=None,
-    ) -> str:  # fmt: skip
+        self,
+        number: int,
+        junction: int,
+        start: tuple[float, float, float],
+        length: float,
+        curvature: float,
+        both: bool = False,
+        predecessor: bool = False,
+        successor: bool = False,
+        slope: float = 0.0,
+        link=None,
+    ) -> str:
         c, s = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
-        x, y, heading = self.x_m + c * start[0] - s * start[1], self.y_m + s * start[0] + c * start[1], start[2]
+        x, y, heading = (
+            self.x_m + c * start[0] - s * start[1],
+            self.y_m + s * start[0] + c * start[1],
+            start[2],
+        )
         shape = "<line/>" if curvature == 0.0 else f'<arc curvature="{curvature:.12g}"/>'
         links = ""
         if predecessor:

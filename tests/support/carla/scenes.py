@@ -24,7 +24,9 @@ def drive(library, settings, steps, error=None):
 
 def is_put_back(world):
     s = world.settings
-    same = not s.synchronous_mode and not s.fixed_delta_seconds and not world.lights_frozen and not world.actors
+    same = (
+        not s.synchronous_mode and not s.fixed_delta_seconds and not world.lights_frozen and not world.actors
+    )
     return same and world.weather == world.library.WeatherParameters()
 
 

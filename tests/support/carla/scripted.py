@@ -44,7 +44,13 @@ class Blueprint:
 class Actor:
     def __init__(self, world, blueprint, transform):
         self.world, self.type_id, self.values = world, blueprint.id, dict(blueprint.values)
-        self.transform, self.wanted, self.callback, self.physics, self.alive = transform, None, None, True, True
+        self.transform, self.wanted, self.callback, self.physics, self.alive = (
+            transform,
+            None,
+            None,
+            True,
+            True,
+        )
 
     def set_transform(self, transform):
         self.world.answer("set_transform")
@@ -80,7 +86,11 @@ class World:
 
     def __init__(self, library, carla_map, ground_m=0.0):
         self.library, self.map, self.ground_m = library, carla_map, ground_m
-        self.settings, self.weather, self.lights_frozen = library.WorldSettings(), library.WeatherParameters(), False
+        self.settings, self.weather, self.lights_frozen = (
+            library.WorldSettings(),
+            library.WeatherParameters(),
+            False,
+        )
         self.actors, self.walls, self.calls, self.script = Actors(), [], [], {}
         self.frame, self.ticks, self.late_poses, self.dead, self.threads = 4000, 0, False, False, []
 
@@ -102,7 +112,13 @@ class World:
         return self.frame
 
     def _copy(self, settings):
-        names = ("synchronous_mode", "no_rendering_mode", "substepping", "max_substep_delta_time", "max_substeps")
+        names = (
+            "synchronous_mode",
+            "no_rendering_mode",
+            "substepping",
+            "max_substep_delta_time",
+            "max_substeps",
+        )
         copy = self.library.WorldSettings(**{name: getattr(settings, name) for name in names})
         copy.fixed_delta_seconds = settings.fixed_delta_seconds
         return copy
@@ -170,7 +186,9 @@ class World:
             if self.late_poses and actor.wanted is not None:
                 actor.transform, actor.wanted = actor.wanted, None
         if what == "late":
-            self.threads.append(threading.Timer(0.05, lambda: [callback(picture) for callback, picture in pictures]))
+            self.threads.append(
+                threading.Timer(0.05, lambda: [callback(picture) for callback, picture in pictures])
+            )
             self.threads[-1].start()
         else:
             for callback, picture in pictures:
@@ -187,9 +205,13 @@ class World:
             bgr = self.colour(points)[..., ::-1]
         bgra = np.concatenate([bgr, np.full((height, width, 1), 255)], -1).astype(np.uint8)
         return SimpleNamespace(
-            frame=self.frame, transform=actor.transform, width=width, height=height, fov=float(actor.values["fov"]),
+            frame=self.frame,
+            transform=actor.transform,
+            width=width,
+            height=height,
+            fov=float(actor.values["fov"]),
             raw_data=bgra.tobytes(),
-        )  # fmt: skip
+        )
 
     def colour(self, points):
         """Where a point is, as a colour: two counts of red and green per metre from the map's origin, 50 of blue upwards."""

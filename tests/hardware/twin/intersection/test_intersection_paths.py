@@ -54,7 +54,9 @@ def test_a_mirrored_drive_is_the_drive_in_the_mirror():
         ("left", (1.75, -24.0, 0.5 * math.pi), (-7.0, -7.0), 8.75, 1.0, math.pi, 1, 1.75),
     ],
 )
-def test_turns_are_quarter_circles_from_lane_to_lane(name, start, centre, radius, turn, end_yaw, end_axis, end_at):
+def test_turns_are_quarter_circles_from_lane_to_lane(
+    name, start, centre, radius, turn, end_yaw, end_axis, end_at
+):
     path = PATHS[name]
     assert path.start_pose == pytest.approx(start)
     first = path.segments[0][1]

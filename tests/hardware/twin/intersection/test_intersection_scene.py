@@ -52,7 +52,12 @@ def test_depth_of_the_road_is_that_of_its_plane(intersection):
     expected = eye[2] / np.maximum(-rays[..., 2], 1e-9)
     hit = eye + expected[..., None] * rays
     # Bare lane: left of the right-hand kerb, right of the centre line, before the zebra, beside the arrow.
-    bare = (hit[..., 1] > -3.3) & (hit[..., 1] < -0.3) & (hit[..., 0] < -13.5) & (np.abs(hit[..., 1] + 1.75) > 0.6)
+    bare = (
+        (hit[..., 1] > -3.3)
+        & (hit[..., 1] < -0.3)
+        & (hit[..., 0] < -13.5)
+        & (np.abs(hit[..., 1] + 1.75) > 0.6)
+    )
     assert bare.sum() > 4000
     np.testing.assert_allclose(depth[bare], expected[bare], rtol=2e-4)
 
@@ -65,7 +70,10 @@ def test_depth_of_a_facade_is_that_of_its_plane(intersection):
     expected = (house.y[0] - eye[1]) / np.maximum(rays[..., 1], 1e-9)
     hit = eye + expected[..., None] * rays
     on_it = (
-        (hit[..., 0] > house.x[0] + 0.3) & (hit[..., 0] < house.x[0] + 6.0) & (hit[..., 2] > 1.6) & (hit[..., 2] < 8.0)
+        (hit[..., 0] > house.x[0] + 0.3)
+        & (hit[..., 0] < house.x[0] + 6.0)
+        & (hit[..., 2] > 1.6)
+        & (hit[..., 2] < 8.0)
     )
     assert on_it.sum() > 4000
     np.testing.assert_allclose(depth[on_it], expected[on_it], rtol=2e-4)
@@ -83,7 +91,9 @@ def test_depth_of_the_pavement_is_a_kerb_nearer(intersection):
 
 def test_the_world_encloses_every_view(intersection):
     rng = np.random.default_rng(0)
-    for x, y, _ in [path.pose_at(float(s)) for path in intersection.config.paths().values() for s in (0, 20, 50)]:
+    for x, y, _ in [
+        path.pose_at(float(s)) for path in intersection.config.paths().values() for s in (0, 20, 50)
+    ]:
         depth = intersection.observe_at(x, y, float(rng.uniform(-math.pi, math.pi)))[1]
         assert np.isfinite(depth).all()
         assert depth.min() > 1.0
@@ -128,7 +138,9 @@ def test_two_scenes_of_one_configuration_agree_to_the_byte(intersection):
 
 
 def test_the_seed_decides_what_is_painted():
-    painted = [pictures.asphalt(RoadConfig(), np.random.default_rng(seed), pixels_per_m=2.0) for seed in (1, 1, 2)]
+    painted = [
+        pictures.asphalt(RoadConfig(), np.random.default_rng(seed), pixels_per_m=2.0) for seed in (1, 1, 2)
+    ]
     np.testing.assert_array_equal(painted[0], painted[1])
     assert np.abs(painted[0] - painted[2]).max() > 0.05
 
@@ -207,7 +219,10 @@ def test_it_is_described_without_being_opened_and_drawn_only_open():
     description = closed.describe()
     assert list(description.paths) == ["straight", "right", "left"]
     assert (description.car.kind, description.car.control_limits) == ("dubins", (-1.2, 1.2))
-    assert WorldDescription.from_dict(json.loads(json.dumps(description.to_dict()))).to_dict() == description.to_dict()
+    assert (
+        WorldDescription.from_dict(json.loads(json.dumps(description.to_dict()))).to_dict()
+        == description.to_dict()
+    )
     for line in description.road_edge:
         middle = 0.5 * (line[:-1] + line[1:])
         along = line[1:] - line[:-1]
