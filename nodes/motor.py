@@ -19,7 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from calibration.schema import VehicleCalibration, load_calibration
 from hardware.errors import HardwareError, ProtocolError
-from hardware.motor.limits import Sent
+from hardware.motor.limits import DriveLimits, Sent
 from hardware.motor.vesc import Vesc
 from hardware.motor.vesc_replies import Values
 from hardware.motor.vesc_settings import TimeoutSettings
@@ -48,7 +48,7 @@ class MotorConfig(BaseModel):
         brake_current_a: Brake current of a stop [A].
         brake_ramp_s: Time over which the brake current rises from a third to its full value [s].
         brake_hold_s: Duration of braking, after which the motor is released [s].
-        current_max_a: Largest commanded current [A].
+        current_max_a: Largest commanded current [A]; None for that of the calibration. It can only lower the calibration's.
         link_timeout_s: Time without an answer of the controller after which the link is faulty [s].
         controller_timeout_ms: Longest accepted command time-out of the controller [ms].
         controller_brake_current_a: Smallest accepted brake current of the controller after its time-out [A].
@@ -66,7 +66,7 @@ class MotorConfig(BaseModel):
     brake_current_a: float = Field(default=20.0, gt=0.0, le=60.0)
     brake_ramp_s: float = Field(default=0.1, ge=0.0, le=0.5)
     brake_hold_s: float = Field(default=1.0, gt=0.0)
-    current_max_a: float = Field(default=60.0, gt=0.0)
+    current_max_a: float | None = Field(default=None, gt=0.0)
     link_timeout_s: float = Field(default=0.2, gt=0.0)
     controller_timeout_ms: int = Field(default=1000, gt=0)
     controller_brake_current_a: float = Field(default=0.0, ge=0.0)
@@ -114,7 +114,7 @@ class MotorNode(Node):
         """Build the node. The first tick opens the port, and later ticks reopen it after a disconnection."""
         car = load_calibration(VehicleCalibration, config.calibration)
 
-        limits = replace(car.drive_limits, current_max_a=config.current_max_a)
+        limits = drive_limits(car, config.current_max_a)
 
         def make() -> Vesc:
             return Vesc(config.port, car.vehicle_gains, limits, config.brake_current_a)
@@ -296,6 +296,14 @@ class MotorNode(Node):
             fault=values.fault,
             fault_text=values.fault_name if values.fault else "",
         )
+
+
+def drive_limits(car: VehicleCalibration, current_max_a: float | None) -> DriveLimits:
+    """Limits of the driver: those of the calibration, with a lower current if the node's configuration asks for one [A]."""
+    limits = car.drive_limits
+    if current_max_a is None:
+        return limits
+    return replace(limits, current_max_a=min(limits.current_max_a, current_max_a))
 
 
 def main() -> int:

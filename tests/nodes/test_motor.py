@@ -14,7 +14,7 @@ from hardware.emulators.vesc_firmware import VescEmulatorConfig
 from hardware.motor.vesc import Vesc
 from hardware.worlds.lab.config import CarConfig
 from hardware.worlds.lab.vehicle import TwinVehicle
-from nodes.motor import MotorConfig, MotorNode
+from nodes.motor import MotorConfig, MotorNode, drive_limits
 from nodes.runtime.clock import SystemClock
 from nodes.runtime.messages import drive_message, ns_from_stamp
 from nodes.runtime.node import MessageInfo
@@ -167,3 +167,12 @@ def test_vehicle_file_reaches_the_driver():
     car = load_calibration(VehicleCalibration, TWIN / "vehicle.yaml")
     vesc = Vesc("/dev/null", car.vehicle_gains, car.drive_limits)
     assert vesc.gains.erpm(0.8) == pytest.approx(3691.2)
+
+
+@pytest.mark.parametrize(
+    ("calibrated_a", "asked_a", "limit_a"), [(30.0, None, 30.0), (30.0, 60.0, 30.0), (60.0, 25.0, 25.0)]
+)
+def test_the_current_of_the_calibration_can_only_be_lowered(calibrated_a, asked_a, limit_a):
+    car = load_calibration(VehicleCalibration, TWIN / "vehicle.yaml")
+    limits = car.limits.model_copy(update={"current_max_a": calibrated_a})
+    assert drive_limits(car.model_copy(update={"limits": limits}), asked_a).current_max_a == limit_a
