@@ -16,7 +16,7 @@ import numpy as np
 
 from advnerf_core.geometry import Array, Pinhole, VehicleState, camera_mount, look_at, planar_pose
 from hardware.worlds.fitting import path_through
-from hardware.worlds.paths import ReferencePath
+from hardware.worlds.paths import ReferencePath, Segment
 from hardware.worlds.world import Box, CarDescription, Depth, Rgb, Traits, WorldDescription
 
 HALL_M = (8.0, 5.0, 4.0)  # half of its length, half of its width, its height
@@ -80,7 +80,9 @@ class Warehouse:
         x = np.linspace(-4.0, 6.5, 43)
         bend = np.clip((x - 1.0) / 4.0, 0.0, 1.0)
         dock = np.column_stack([x, -3.0 - 0.6 * bend**2 * (3.0 - 2.0 * bend)])
-        side, front, corner = ("line", 8.0), ("line", 3.0), ("arc", 1.5, 0.5 * math.pi)
+        side: Segment = ("line", 8.0)
+        front: Segment = ("line", 3.0)
+        corner: Segment = ("arc", 1.5, 0.5 * math.pi)
         half_x, half_y = HALL_M[:2]
         return WorldDescription(
             paths={

@@ -19,7 +19,7 @@ from advnerf_core.report.measurements import Fidelity, FidelityView, Hop, Latenc
 from advnerf_core.report.record import Floats, Image, Record
 
 Domain = Literal["surrogate", "deployed"]
-Victim = Literal["hardened", "naive"]
+Victim = str
 
 __all__ = [
     "DOMAINS",

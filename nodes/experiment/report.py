@@ -142,7 +142,7 @@ def _surrogate_runs(experiment: Experiment) -> Iterator[rd.Run]:
                 seed,
                 start,
                 held,
-                path.project(held[:, :2]).cte_m,  # type: ignore[arg-type]
+                path.project(held[:, :2]).cte_m,
                 metrics.total_cte_m,
                 metrics.mean_cte_m,
                 metrics.off_track,
@@ -185,7 +185,7 @@ def _deployed_runs(experiment: Experiment, live: dict[str, dict[str, Any]]) -> I
 def _curves(experiment: Experiment) -> Iterator[rd.LossCurve]:
     for search in searches(experiment):
         result = json.loads((experiment.stage_folder("attack") / f"{search.name}.json").read_text())
-        yield rd.LossCurve(search.method, search.seed, np.array(result["curve_total_cte_m"]), search.victim)  # type: ignore[arg-type]
+        yield rd.LossCurve(search.method, search.seed, np.array(result["curve_total_cte_m"]), search.victim)
 
 
 def _textures(experiment: Experiment) -> Iterator[rd.Texture]:
@@ -195,7 +195,7 @@ def _textures(experiment: Experiment) -> Iterator[rd.Texture]:
             "" if search.victim == HARDENED else f", {search.victim} victim"
         )
         texture = attack.required_face().texture
-        yield rd.Texture(label, search.method, texture, attack.attack_id, search.seed, search.victim)  # type: ignore[arg-type]
+        yield rd.Texture(label, search.method, texture, attack.attack_id, search.seed, search.victim)
 
 
 def _fidelity(experiment: Experiment) -> rd.Fidelity:
