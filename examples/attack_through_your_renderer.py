@@ -39,10 +39,8 @@ class RugRenderer:
         theta = theta.detach().requires_grad_()
         with torch.enable_grad():
             rug = torch.sigmoid(theta).permute(2, 0, 1).expand(len(states), -1, -1, -1)
-            images = grid_sample(rug, spots, align_corners=False) * (down > 0.0)
-        return adv.Rendered(
-            images.detach(), lambda slope: grad(images, theta, slope, retain_graph=True)[0], images.nbytes
-        )
+            seen = grid_sample(rug, spots, align_corners=False) * (down > 0.0)
+        return adv.Rendered(seen.detach(), lambda slope: grad(seen, theta, slope)[0], seen.nbytes)
 
 
 class SteersToTheLight:
@@ -70,14 +68,12 @@ if __name__ == "__main__":
     car = adv.Ackermann(wheelbase_m=0.25, speed_mps=0.8, dt_s=0.1)
     start = torch.tensor([[0.0, 0.1, 0.02]], dtype=torch.float64)
     problem = adv.AttackProblem(SteersToTheLight(), RugRenderer(), car, road, start, steps=30)
-    theta, direction = torch.randn(
-        2, 6, 6, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64
-    )
+    seeded = torch.Generator().manual_seed(0)
+    theta, direction = torch.randn(2, 6, 6, 3, generator=seeded, dtype=torch.float64)
     result = adv.adjoint_gradient(problem, theta)
     ahead, behind = (held_loss(problem, theta + h * direction, result.rollout.states) for h in (1e-5, -1e-5))
-    print(
-        f"slope: adjoint {(result.gradient * direction).sum():.8f}, finite differences {(ahead - behind) / 2e-5:.8f}"
-    )
+    adjoint, differences = (result.gradient * direction).sum(), (ahead - behind) / 2e-5
+    print(f"slope: adjoint {adjoint:.8f}, finite differences {differences:.8f}")
     attack = adv.gradient_attack(problem, iterations=15, learning_rate=0.5)
     totals_m = [each.predicted_total_cte_m for each in (attack.history[0], attack.best)]
     print("total cross-track error: grey rug {:.2f} m, attacked rug {:.2f} m".format(*totals_m))

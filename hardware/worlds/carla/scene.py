@@ -143,11 +143,11 @@ class CarlaScene:
         )
 
     def photo_poses(self, count: int, rng: np.random.Generator) -> list[Array]:
-        """Along, beside and above the drives, no farther from them than a lane; see `hardware.worlds.carla.photos`."""
+        """Poses ``T_world_from_camera [4, 4]`` along, beside and above the drives, within a lane of them; see `hardware.worlds.carla.photos`."""
         return photo_poses(self.drives, self.config, count, rng)
 
     def overview(self) -> tuple[Rgb, Pinhole, Array]:
-        """A photograph from above the straight drive, and the camera that took it."""
+        """A photograph ``[H, W, 3]`` from above the straight drive, its lens, and ``T_world_from_camera [4, 4]``."""
         T = look_at(_FROM_ABOVE_M, np.zeros(3))
         return self.photograph(T), self.photo_pinhole, T
 

@@ -61,7 +61,7 @@ class Intersection:
         )
 
     def photo_poses(self, count: int, rng: np.random.Generator) -> list[Array]:
-        """Along, beside and above the drives; see `hardware.worlds.junction.photos`."""
+        """Poses ``T_world_from_camera [4, 4]`` along, beside and above the drives; see `hardware.worlds.junction.photos`."""
         return photo_poses(self.config, count, rng)
 
     def reset(self, x_m: float, y_m: float, yaw_rad: float) -> VehicleState:

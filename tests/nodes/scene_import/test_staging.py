@@ -110,7 +110,7 @@ def test_folders_of_others_are_refused(tmp_path):
         build_beside(tmp_path / "scene", (), whole)
 
     def inside(folder):
-        with pytest.raises(ImportRecordingError, match=r"no other import into .*process \d+ is at work"):
+        with pytest.raises(ImportRecordingError, match=r"no other import into .*process \d+ is using"):
             build_beside(tmp_path / "other", (), whole)
         return whole(folder)
 
