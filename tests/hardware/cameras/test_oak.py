@@ -74,7 +74,7 @@ def test_pictures_of_another_size_are_refused(clip):
     camera = OakCamera(OakSettings(width=640, height=400), replay(clip))
     camera.open()
     with pytest.raises(
-        ProtocolError, match=r"expected pictures \[400, 640, 3\] from the OAK, got \[188, 336, 3\]"
+        ProtocolError, match=r"expected images \[400, 640, 3\] from the OAK, got \[188, 336, 3\]"
     ):
         camera.read(1.0)
     camera.close()

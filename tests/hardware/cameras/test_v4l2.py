@@ -191,10 +191,10 @@ def test_first_frames_are_skipped_after_every_start(video):
     [
         (
             Mode(64, 48, 30.0),
-            r"expected 64 x 48 YUYV .*chose 32 x 16 YUYV; it offers YUYV 32x16@30/15 640x480@30/15; MJPG",
+            r"expected 64 x 48 YUYV .*got 32 x 16 YUYV; it offers YUYV 32x16@30/15 640x480@30/15; MJPG",
         ),
-        (Mode(32, 16, 30.0, "UYVY"), "expected 32 x 16 UYVY .*chose 32 x 16 YUYV"),
-        (Mode(32, 16, 60.0), "expected 60 Hz .*chose 30 Hz"),
+        (Mode(32, 16, 30.0, "UYVY"), "expected 32 x 16 UYVY .*got 32 x 16 YUYV"),
+        (Mode(32, 16, 60.0), "expected 60 Hz .*got 30 Hz"),
     ],
 )
 def test_mode_that_the_device_replaces_is_refused(video, mode, message):

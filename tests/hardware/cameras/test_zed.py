@@ -247,5 +247,5 @@ def test_left_eye_rectified_at_ten_hertz_with_exposure_fixed(zed_conf):
 def test_device_that_falls_back_to_another_mode_is_refused(zed_conf):
     video = VideoDevice(formats={"YUYV": [(2560, 720)]}, rates=(30.0,), extension=ZedRegisters())
     camera = ZedCamera(PATH, zed_conf, port=VideoPortEmulator({PATH: video}))
-    with pytest.raises(ProtocolError, match=r"expected 1344 x 376 YUYV .*chose 2560 x 720"):
+    with pytest.raises(ProtocolError, match=r"expected 1344 x 376 YUYV .*got 2560 x 720"):
         camera.open()
