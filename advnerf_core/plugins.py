@@ -120,11 +120,11 @@ def load_from_file(reference: str, what: str, folder: Path | None = None) -> Any
     if module is None:
         spec = importlib.util.spec_from_file_location(name, file)
         assert spec is not None, "a file with the ending .py has a loader"
-        assert spec.loader is not None, "a file with the ending .py has a loader"
         module = importlib.util.module_from_spec(spec)
         sys.modules[name] = module  # dataclasses look their module up while it is being loaded
         try:
-            spec.loader.exec_module(module)
+            # Not by the loader: its byte code is as old as the file to the second, and a file may be saved twice in one.
+            exec(compile(file.read_bytes(), file, "exec"), module.__dict__)
         except Exception as error:
             del sys.modules[name]
             raise PluginError(

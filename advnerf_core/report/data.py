@@ -19,7 +19,7 @@ from advnerf_core.report.measurements import Fidelity, FidelityView, Hop, Latenc
 from advnerf_core.report.record import Floats, Image, Record
 
 Domain = Literal["surrogate", "deployed"]
-Victim = str
+Victim = Literal["hardened", "naive"]
 
 __all__ = [
     "DOMAINS",

@@ -138,7 +138,7 @@ def _surrogate_runs(experiment: Experiment) -> Iterator[rd.Run]:
             yield rd.Run(
                 "surrogate",
                 condition,
-                victim,
+                victim,  # type: ignore[arg-type]
                 seed,
                 start,
                 held,
@@ -185,7 +185,7 @@ def _deployed_runs(experiment: Experiment, live: dict[str, dict[str, Any]]) -> I
 def _curves(experiment: Experiment) -> Iterator[rd.LossCurve]:
     for search in searches(experiment):
         result = json.loads((experiment.stage_folder("attack") / f"{search.name}.json").read_text())
-        yield rd.LossCurve(search.method, search.seed, np.array(result["curve_total_cte_m"]), search.victim)
+        yield rd.LossCurve(search.method, search.seed, np.array(result["curve_total_cte_m"]), search.victim)  # type: ignore[arg-type]
 
 
 def _textures(experiment: Experiment) -> Iterator[rd.Texture]:
@@ -195,7 +195,7 @@ def _textures(experiment: Experiment) -> Iterator[rd.Texture]:
             "" if search.victim == HARDENED else f", {search.victim} victim"
         )
         texture = attack.required_face().texture
-        yield rd.Texture(label, search.method, texture, attack.attack_id, search.seed, search.victim)
+        yield rd.Texture(label, search.method, texture, attack.attack_id, search.seed, search.victim)  # type: ignore[arg-type]
 
 
 def _fidelity(experiment: Experiment) -> rd.Fidelity:

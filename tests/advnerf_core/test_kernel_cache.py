@@ -21,6 +21,7 @@ def ask(folder: Path, value: int, before: str) -> int:
     """What a fresh process computes when the called kernel returns a value."""
     (folder / "pack" / "called.py").write_text(CALLED.format(value=value))
     environment = {key: text for key, text in os.environ.items() if key != "NUMBA_CACHE_DIR"}
+    environment["PYTHONDONTWRITEBYTECODE"] = "1"  # byte code is as old as its source to the second
     environment["PYTHONPATH"] = os.pathsep.join([str(folder), str(Path(__file__).parents[2])])
     done = subprocess.run(
         [sys.executable, "-c", ASK.format(before=before)],
