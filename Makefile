@@ -7,7 +7,7 @@ export MUJOCO_GL ?= egl
 export PYTHONDONTWRITEBYTECODE :=
 DEFAULT_TESTS := not slow and not gpu and not hardware and not data
 
-.PHONY: help setup demo experiment test test-slow test-gpu test-hardware check bench campaign rooms api fmt clean
+.PHONY: help setup demo experiment test test-slow test-gpu test-hardware check bench campaign rooms api docs fmt clean
 
 help:  ## Show this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
@@ -61,6 +61,10 @@ rooms: setup  ## Draw the rooms of the code into docs/architecture.md
 
 api: setup  ## Write docs/api.md from the docstrings of the public names
 	@$(BIN)/python docs/write_api.py
+
+docs: setup  ## Build the documentation into site/ (no network; search needs `python -m http.server -d site`)
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build -q
+	@echo "open site/index.html"
 
 fmt: setup  ## Format and fix what can be fixed
 	@$(BIN)/ruff check --fix .

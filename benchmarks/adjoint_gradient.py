@@ -103,7 +103,7 @@ def main() -> None:
         f"against back-propagation: {back:.2e} (target 1e-8)\nagainst finite differences: {worst:.2e} (target 1e-5)"
     )
     record_row(
-        "#2 adjoint gradient against back-propagation",
+        "adjoint gradient against back-propagation",
         back,
         "relative",
         "<= 1e-8",
@@ -112,7 +112,7 @@ def main() -> None:
         note,
     )
     record_row(
-        "#2 adjoint gradient against finite differences",
+        "adjoint gradient against finite differences",
         worst,
         "relative",
         "<= 1e-5",

@@ -209,7 +209,7 @@ def compare(repeats: int, trial: bool, horizons: tuple[int, int, int] = (60, 200
     for line, value, unit, target, met, note in rows:
         print(f"{line}: {value:.3f} {unit} (target {target})")
         if not trial:
-            record_row(f"#3 adjoint {line}", value, unit, target, met, f"{COMMAND} --compare", note)
+            record_row(f"adjoint {line}", value, unit, target, met, f"{COMMAND} --compare", note)
 
 
 def main() -> None:
@@ -253,7 +253,7 @@ def main() -> None:
         note = f"{short['adjoint_mib']:.1f} MiB at T = 50, {long['adjoint_mib']:.1f} MiB at T = 400"
         note += f"; plain back-propagation {short['backprop_mib']:.0f} and {long['backprop_mib']:.0f} MiB; one start, time batch 8"
         record_row(
-            "#2 adjoint memory, T = 400 against T = 50", ratio, "x", "<= 1.1 x", ratio <= 1.1, COMMAND, note
+            "adjoint memory, T = 400 against T = 50", ratio, "x", "<= 1.1 x", ratio <= 1.1, COMMAND, note
         )
 
 

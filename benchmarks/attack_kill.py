@@ -80,7 +80,7 @@ def main() -> None:
     if not arguments.trial:
         note = f"{', '.join(arguments.methods)} in turns, SIGKILL at random moments of {arguments.evaluations} evaluations"
         record_row(
-            "#3 kill -9 at a random moment: attack",
+            "kill -9 at a random moment: attack",
             f"{same}/{struck}",
             "same bytes",
             "20/20",

@@ -351,7 +351,7 @@ def main() -> None:
         print(f"{options.count} {what}: 0 {value}; {note}", flush=True)
         if options.count == COUNT:
             record_row(
-                f"#15 {COUNT:,} {what}",
+                f"{COUNT:,} {what}",
                 0,
                 value,
                 "0; the damaged file is kept as it was",

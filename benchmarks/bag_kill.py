@@ -239,7 +239,7 @@ def measure(kills: int, folder: Path, splits: bool, save: bool) -> None:
     target = f"<= {MOST_LOST} each; all repaired files open in mcap+mcap-ros2-support, rosbags, Foxglove's npm decoder"
     if splits:
         record_row(
-            f"#15 kill -9 of a recorder that begins a new file every 0.25 s, {kills} times at 30 Hz images + 50 Hz poses",
+            f"kill -9 of a recorder that begins a new file every 0.25 s, {kills} times at 30 Hz images + 50 Hz poses",
             worst,
             "messages lost at most",
             target,
@@ -249,7 +249,7 @@ def measure(kills: int, folder: Path, splits: bool, save: bool) -> None:
         )
     else:
         record_row(
-            f"#4 kill -9 of the recorder, {kills} times at 30 Hz images + 50 Hz poses",
+            f"kill -9 of the recorder, {kills} times at 30 Hz images + 50 Hz poses",
             worst,
             "messages lost at most",
             target,

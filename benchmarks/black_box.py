@@ -46,7 +46,7 @@ from benchmarks.attack_lab import lab_problem
 from benchmarks.results import record_row
 from calibration.schema import RoomCalibration, load_calibration
 
-LINE = "#5 black box"
+LINE = "black box"
 METHODS = ("distilled", "guided", "evolution", "cem", "random")
 MARKS = (1, 2, 5, 10, 20, 50)
 TARGET_SHARE, TARGET_MULTIPLE = 0.6, 50

@@ -202,7 +202,7 @@ def measure_display(lab: Lab, seed: int) -> tuple[float, float]:
 
 
 def record(name: str, value: float, unit: str, target: str, met: bool, note: str) -> None:
-    record_row(f"#4 calibration on the twin: {name}", round(value, 4), unit, target, met, COMMAND, note)
+    record_row(f"calibration on the twin: {name}", round(value, 4), unit, target, met, COMMAND, note)
 
 
 def main() -> None:

@@ -97,7 +97,7 @@ def main() -> None:
     )
     print(f"gain {gain:.2f}; {note}")
     if not arguments.dry:
-        record_row("#5 campaign, 2 workers against 1", gain, "x", ">= 1.7 x", gain >= 1.7, COMMAND, note)
+        record_row("campaign, 2 workers against 1", gain, "x", ">= 1.7 x", gain >= 1.7, COMMAND, note)
 
 
 if __name__ == "__main__":

@@ -62,7 +62,7 @@ def main() -> None:
         return
     heaviest = max(sizes, key=lambda name: sizes[name] / LIMITS_MB[name])
     record_row(
-        "#4 car nodes: resident memory, none with torch",
+        "car nodes: resident memory, none with torch",
         round(sizes[heaviest], 1),
         "MB",
         "<= 80 MB each, compositor 100",

@@ -81,7 +81,7 @@ def record(ticks: int, prepared: Prepared, directions: int, found: dict[str, Any
         value, low, high = found["interval"]
         agreeing = f"{found['plateau'][0]:g} to {found['plateau'][-1]:g}"
         note += f". 95 % interval {low:+.3f} to {high:+.3f}; the finite differences agree at steps {agreeing}"
-    record_row(f"#15 cosine to the true closed loop, T = {ticks}", value, "cosine", "", None, COMMAND, note)
+    record_row(f"cosine to the true closed loop, T = {ticks}", value, "cosine", "", None, COMMAND, note)
 
 
 def main() -> None:

@@ -54,14 +54,14 @@ def main() -> None:
     p99, p99_alone = (float(np.percentile(each["capture_to_serial_ms"], 99)) for each in (compared, alone))
     rows = [
         (
-            "#5 counterfactual steering live: what the attack adds",
+            "counterfactual steering live: what the attack adds",
             found["mean_abs_delta_rad"],
             "rad mean abs",
             f"{found['frames_drawn']} frames with the attack, {found['frames']} compared of {compared['frames']} frames of the drive; to one "
             f"side {found['mean_delta_rad']:+.3f} rad, at most {found['max_abs_delta_rad']:.3f} rad after {found['max_at_s']:.1f} s",
         ),
         (
-            "#5 counterfactual steering live: capture to serial write",
+            "counterfactual steering live: capture to serial write",
             p99,
             "ms p99",
             f"{p99_alone:.1f} ms on the same drive without the comparison; frames missed {compared['missed']} and {alone['missed']}",

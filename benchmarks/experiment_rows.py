@@ -29,13 +29,11 @@ def record_fidelity(data: ReportData, record: Record) -> None:
     for name, key in (("336x188", "psnr_full_db"), ("200x66", "psnr_policy_db")):
         value = data.fidelity.mean(key)
         assert value is not None
-        record(
-            f"#2 surrogate on held-out lab views, {name}", value, "dB PSNR", ">= 27 dB", value >= 27.0, views
-        )
+        record(f"surrogate on held-out lab views, {name}", value, "dB PSNR", ">= 27 dB", value >= 27.0, views)
     difference = data.fidelity.steering_difference_rad
     assert difference is not None
     record(
-        "#2 surrogate on held-out lab views, steering",
+        "surrogate on held-out lab views, steering",
         difference,
         "rad mean abs",
         "<= 0.03 rad",
@@ -51,7 +49,7 @@ def record_transfer(data: ReportData, record: Record) -> None:
     mean_abs = float(np.mean([run.mean_abs_cte_m for run in live]))
     gradient = _row(rows, "surrogate", "gradient")
     record(
-        "#2 total CTE, gradient, surrogate",
+        "total CTE, gradient, surrogate",
         gradient.ratio or 0.0,
         "x no attack",
         ">= 3.3 x",
@@ -61,7 +59,7 @@ def record_transfer(data: ReportData, record: Record) -> None:
     gradient = _row(rows, "deployed", "gradient")
     met = (gradient.ratio or 0.0) >= 3.0 and mean_abs >= 0.25 and off >= 2
     record(
-        "#2 total CTE, gradient, live green screen",
+        "total CTE, gradient, live green screen",
         gradient.ratio or 0.0,
         "x no attack",
         ">= 3.0 x, mean |CTE| >= 0.25 m, off-track in >= 2 of 3",
@@ -79,14 +77,14 @@ def record_transfer(data: ReportData, record: Record) -> None:
             ticks = data.settings.horizon_steps
             more_mm = 1e3 * (random.total_cte_mean_m - plain.total_cte_mean_m) / ticks
             note += f": over {ticks} ticks the difference is {more_mm:.0f} mm a tick of a drive that is exact to {1e3 * plain.total_cte_mean_m / ticks:.0f} mm"
-        record(f"#2 total CTE, best random, {domain}", random.ratio or 0.0, "x no attack", target, met, note)
+        record(f"total CTE, best random, {domain}", random.ratio or 0.0, "x no attack", target, met, note)
 
 
 def record_live(data: ReportData, record: Record) -> None:
     if data.laps is not None:
         met = drives(data.laps.mean_abs_cte_m, data.laps.off_track, data.settings.off_track_m)
         record(
-            "#2 policy, no attack, laps live",
+            "policy, no attack, laps live",
             data.laps.mean_abs_cte_m,
             "m mean |CTE|",
             "<= 0.08 m, never off-track",
@@ -97,7 +95,7 @@ def record_live(data: ReportData, record: Record) -> None:
     overall = data.latency.overall
     met = overall.p99_ms <= data.latency.camera_period_ms and data.latency.missed_ticks == 0
     record(
-        "#2 capture to serial write, live",
+        "capture to serial write, live",
         overall.p99_ms,
         "ms p99",
         "<= 100 ms, no tick missed",
@@ -125,7 +123,7 @@ def record_bags(folder: Path, record: Record) -> None:
             ]
         if len(counted) != len(decoded_again):
             record(
-                "#2 the bag",
+                "the bag",
                 len(counted),
                 "messages",
                 "every topic decodes in both",
@@ -136,7 +134,7 @@ def record_bags(folder: Path, record: Record) -> None:
         topics |= set(counted)
         messages += len(counted)
     note = f"{len(bags)} bags, {len(topics)} topics; mcap with mcap-ros2-support and rosbags decode the same messages"
-    record("#2 the bag", messages, "messages", "every topic decodes in both", bool(bags), note)
+    record("the bag", messages, "messages", "every topic decodes in both", bool(bags), note)
 
 
 def _row(rows: tuple[TransferRow, ...], domain: str, condition: str) -> TransferRow:
@@ -190,7 +188,7 @@ def record_time(folder: Path, record: Record) -> None:
     total_min = sum(seconds.values()) / 60
     longest = max(seconds, key=lambda name: seconds[name])
     note = f"{len(stages)} stages, the longest is {longest} with {seconds[longest] / 60:.0f} min"
-    record("#2 make experiment, all stages", total_min, "min", "<= 120 min", total_min <= 120, note)
+    record("make experiment, all stages", total_min, "min", "<= 120 min", total_min <= 120, note)
 
 
 if __name__ == "__main__":

@@ -249,7 +249,7 @@ def report(results: list[dict[str, Any]], record: bool) -> None:
     if not record:
         return
     record_row(
-        f"#4 fault campaign: stopped and stayed stopped, of {len(results)} random faults",
+        f"fault campaign: stopped and stayed stopped, of {len(results)} random faults",
         len(good),
         f"of {len(results)}",
         f"{len(results)}",
@@ -258,7 +258,7 @@ def report(results: list[dict[str, Any]], record: bool) -> None:
         "; ".join(r["broken"] for r in broken)[:300] or f"{len(FAULTS)} kinds of fault",
     )
     record_row(
-        "#4 fault campaign: worst time from fault to brake at the controller",
+        "fault campaign: worst time from fault to brake at the controller",
         round(slowest["stop_ms"]),
         "ms",
         f"<= {LIMIT_MS:g} ms",
@@ -269,7 +269,7 @@ def report(results: list[dict[str, Any]], record: bool) -> None:
     for fault, limit_ms in SLOW_LIMITS_MS.items():
         if times := [r["stop_ms"] for r in good if r["fault"] == fault]:
             record_row(
-                f"#4 fault campaign: worst time from '{fault}' to brake at the controller",
+                f"fault campaign: worst time from '{fault}' to brake at the controller",
                 round(max(times)),
                 "ms",
                 f"<= {limit_ms:g} ms",
@@ -278,7 +278,7 @@ def report(results: list[dict[str, Any]], record: bool) -> None:
                 f"of {len(times)}; a stall is a second without motion",
             )
     record_row(
-        "#4 fault campaign: worst stopping distance at 0.8 m/s",
+        "fault campaign: worst stopping distance at 0.8 m/s",
         round(longest["distance_m"], 2),
         "m",
         "-",

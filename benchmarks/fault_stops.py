@@ -155,7 +155,7 @@ def measure_software_stops() -> None:
             )
     slowest = max(worst, key=lambda key: worst[key])
     record_row(
-        "#2 brake at the controller after kill -9 or SIGSTOP of camera, vicon, compositor, policy, safety",
+        "brake at the controller after kill -9 or SIGSTOP of camera, vicon, compositor, policy, safety",
         round(worst[slowest]),
         "ms",
         f"<= {BRAKE_LIMIT_MS:g} ms, then zero, no motion until armed again",
@@ -177,7 +177,7 @@ def measure_last_line() -> None:
                 f"{victim:10s} SIGKILL, controller {name}: {stop.brake_ms:.0f} ms, {stop.distance_m:.2f} m to standstill"
             )
             record_row(
-                f"#2 stopping distance after kill -9 of {victim}, controller {name}",
+                f"stopping distance after kill -9 of {victim}, controller {name}",
                 round(stop.distance_m, 2),
                 "m",
                 "the controller's time-out stops the car, no process left",

@@ -155,13 +155,13 @@ def main() -> None:
     if "ten" in options.only:
         sets = [generated(options.folder / f"ten_{seed}", seed, cameras=10) for seed in range(options.count)]
         target = "<= 5 %, or left out by name; >= 8 of 10 placed"
-        record("#15 lenses of ten photographs by ten cameras", target, TEN_PERCENT, 8, sets, trial)
+        record("lenses of ten photographs by ten cameras", target, TEN_PERCENT, 8, sets, trial)
     if "eleven" in options.only:
         sets = [
             generated(options.folder / f"eleven_{seed}", seed, cameras=1) for seed in range(options.count)
         ]
         record(
-            "#15 lens of eleven photographs by one camera",
+            "lens of eleven photographs by one camera",
             "all placed, <= 1 %",
             ELEVEN_PERCENT,
             11,
@@ -171,12 +171,10 @@ def main() -> None:
     if "fox" in options.only and (options.data / "transforms.json").exists():
         sets = [fox(options.folder / "fox_ten", options.data, 2, ten_cameras=True)]
         target = "<= 5 %, or left out by name; >= 8 of 10 placed"
-        record(
-            "#15 lenses of ten fox photographs, each cropped and scaled", target, TEN_PERCENT, 8, sets, trial
-        )
+        record("lenses of ten fox photographs, each cropped and scaled", target, TEN_PERCENT, 8, sets, trial)
         for step, words in ((4, "all round the fox"), (1, "neighbours")):
             sets = [fox(options.folder / f"fox_eleven_{step}", options.data, step, ten_cameras=False)]
-            line = f"#15 lens of eleven fox photographs, {words}"
+            line = f"lens of eleven fox photographs, {words}"
             miss = (
                 "on a short arc an error of the focal length is made up for by the distances"
                 if step == 1

@@ -83,7 +83,7 @@ def main() -> None:
     print(f"p99 {p99:.1f} ms ({note})")
     if not options.trial:
         record_row(
-            "#4 frame age at a consumer of 50 ms per frame, 60 Hz source, p99",
+            "frame age at a consumer of 50 ms per frame, 60 Hz source, p99",
             float(p99),
             "ms",
             f"<= {LIMIT_MS:.1f} ms (one period + 5 ms)",

@@ -276,7 +276,7 @@ def main() -> None:
     print(f"{total} inputs: no crash, no hang ({note})")
     if not (options.trial or options.only):
         record_row(
-            "#4 fuzz: VESC, VICON, bus, config, attack file, bag",
+            "fuzz: VESC, VICON, bus, config, attack file, bag",
             total,
             "inputs",
             "10^6: no crash, hang or memory growth",

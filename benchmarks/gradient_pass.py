@@ -28,7 +28,7 @@ from benchmarks.attack_lab import lab_problem
 from benchmarks.results import record_row
 
 WAYS = ("batched", "stepwise", "rendering")
-LINE = "#3 gradient pass"
+LINE = "gradient pass"
 _SIZE_M = 1.0
 
 

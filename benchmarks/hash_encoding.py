@@ -47,7 +47,7 @@ def main() -> None:
     print(f"{ratio:.1f} x: {note}")
     if not arguments.dry_run:
         record_row(
-            "#2 hash encoding forward + backward against plain torch indexing",
+            "hash encoding forward + backward against plain torch indexing",
             ratio,
             "x",
             ">= 20 x",

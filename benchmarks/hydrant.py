@@ -39,7 +39,7 @@ def main() -> None:
         argument = "" if options.mesh is None else f" {options.mesh}"
         command = f"python -m benchmarks.hydrant{argument}"
         record_row(
-            f"#3 {name} from its mesh, held-out views",
+            f"{name} from its mesh, held-out views",
             psnr_db,
             "dB",
             ">= 30 dB",

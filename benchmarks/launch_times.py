@@ -95,7 +95,7 @@ def main() -> None:
     if options.trial:
         return
     record_row(
-        "#4 launch to driving",
+        "launch to driving",
         round(max(starts), 2),
         "s",
         f"<= {START_LIMIT_S:g} s",
@@ -104,7 +104,7 @@ def main() -> None:
         f"slowest of {len(starts)}; the car stands ready, a policy without torch, a recorder",
     )
     record_row(
-        "#4 Ctrl-C to all stopped",
+        "Ctrl-C to all stopped",
         round(max(stops), 2),
         "s",
         f"<= {STOP_LIMIT_S:g} s, no orphan",

@@ -141,7 +141,7 @@ def measure(bag: Path, replays: int, record: bool) -> None:
         print(f"{len(digests)} digest(s), median {speed:.1f} x real time (not recorded)")
         return
     record_row(
-        "#4 lockstep replay of one bag, 10 times",
+        "lockstep replay of one bag, 10 times",
         len(digests),
         "digest(s)",
         "one digest",
@@ -150,7 +150,7 @@ def measure(bag: Path, replays: int, record: bool) -> None:
         what,
     )
     record_row(
-        "#4 lockstep replay, speed without torch nodes",
+        "lockstep replay, speed without torch nodes",
         round(speed, 1),
         "x real time",
         f">= {SPEED_TARGET:g}",

@@ -37,7 +37,7 @@ from advnerf_core.scene.surrogate import Surrogate
 from benchmarks.attack_lab import lab_problem
 from benchmarks.results import record_row
 
-LINE, COMMAND = "#5 mesh render", "python -m benchmarks.mesh_render"
+LINE, COMMAND = "mesh render", "python -m benchmarks.mesh_render"
 PINHOLE = Pinhole(200, 66, 103.6, 103.4, 100.0, 41.6)
 MOUNT = camera_mount(0.2, 0.0, 0.25, 0.17)
 STEP_M = 4e-3

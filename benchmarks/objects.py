@@ -42,7 +42,7 @@ from benchmarks.attack_lab import lab_problem
 from benchmarks.results import record_row
 from benchmarks.timing import seconds_in_turns
 
-LINE = "#3 objects"
+LINE = "objects"
 COUNTS = (1, 5, 20)
 _HEIGHT_M = 0.7
 

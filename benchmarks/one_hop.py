@@ -156,7 +156,7 @@ def main() -> None:
         if not options.trial:
             size = f" {WIDTH}x{HEIGHT}" if kind == IMAGE else ""
             record_row(
-                f"#4 one hop, {kind}{size}, publish to decoded, round trip against raw pyzmq",
+                f"one hop, {kind}{size}, publish to decoded, round trip against raw pyzmq",
                 ratio,
                 "x",
                 f"<= {target:g} x",

@@ -69,7 +69,7 @@ def main() -> None:
     print(f"{with_map['steering_rad']:.4f} rad: {note}")
     if not arguments.trial and arguments.scene is None:
         record_row(
-            "#3 surrogate from the phone camera, seen by the car's camera, steering",
+            "surrogate from the phone camera, seen by the car's camera, steering",
             with_map["steering_rad"],
             "rad mean abs",
             "<= 0.04 rad",

@@ -123,7 +123,7 @@ def main() -> None:
     )
     if not trial:
         record_row(
-            "#4 policy trained only from bags of the expert driving the twin, 3 laps live, mean |CTE|",
+            "policy trained only from bags of the expert driving the twin, 3 laps live, mean |CTE|",
             round(mean_m, 3),
             "m",
             f"<= {_TARGET_M} m, 3 laps",

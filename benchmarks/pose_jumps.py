@@ -301,7 +301,7 @@ def main() -> None:
         return
     note = f"0.05 to 2.4 m in random directions, at 0.2 to 1.0 m/s, with noise, loss and delays; missed: {sizes or 'none'}"
     record_row(
-        f"#15 jumps of the car's pose that disarm, of {len(jumps)} planted in simulated drives",
+        f"jumps of the car's pose that disarm, of {len(jumps)} planted in simulated drives",
         caught,
         f"of {len(jumps)}",
         f"{len(jumps)}",
@@ -311,7 +311,7 @@ def main() -> None:
     )
     note = f"{len(stops) / options.hours:.2f} in an hour; noise 0.5 mm and 1 mrad, loss, late and repeated datagrams, occlusions"
     record_row(
-        f"#15 false stops by pose and stall checks in {options.hours:g} h of simulated driving",
+        f"false stops by pose and stall checks in {options.hours:g} h of simulated driving",
         len(stops),
         "stops",
         "0",

@@ -159,7 +159,7 @@ def report(tally: Tally) -> None:
     back_ms = max(tally.return_ms)
     answered = 2 * tally.pairs + len(tally.refused)
     record_row(
-        f"#15 requests lost, of {tally.pairs} to arm and {tally.pairs} to disarm",
+        f"requests lost, of {tally.pairs} to arm and {tally.pairs} to disarm",
         len(tally.lost),
         "requests",
         "0",
@@ -170,7 +170,7 @@ def report(tally: Tally) -> None:
         f" {len(tally.stopped)} drives stopped by the safety node first",
     )
     record_row(
-        "#15 disarm to brake at the controller, p99",
+        "disarm to brake at the controller, p99",
         round(p99_ms),
         "ms",
         f"<= {BRAKE_LIMIT_MS:g} ms",
@@ -180,7 +180,7 @@ def report(tally: Tally) -> None:
         " with a bus opened for it, to the first brake command; the start of the command's process is not in it",
     )
     record_row(
-        "#15 brake at the controller to the return of the disarm, worst",
+        "brake at the controller to the return of the disarm, worst",
         round(back_ms),
         "ms",
         f"<= {RETURN_LIMIT_MS:g} ms",

@@ -1,7 +1,7 @@
-"""The ledger of measured claims: ``docs/results.json``, and ``docs/results.md`` made from it.
+"""The ledger of measured claims: ``docs/results.json``, and the pages made from it, one for each question.
 
 A row is written by the command that measured it (`record_row`), replaces the older row of the same line, and stays in when it
-misses its target, with the reason. ``python -m benchmarks.results`` renders the page.
+misses its target, with the reason. ``python -m benchmarks.results`` renders the pages.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from advnerf_core.files import write_atomically
+from benchmarks.questions import OTHER, QUESTIONS, Question, question_of
 from nodes.runtime.machine import memory_gib, processor_name
 
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -48,10 +49,10 @@ def record_row(
     ledger: Path = LEDGER,
     page: Path = PAGE,
 ) -> None:
-    """Write one measured claim into the ledger and render the page.
+    """Write one measured claim into the ledger and render the pages.
 
     Args:
-        line: The line of the issue that asks for it, e.g. ``"#2 adjoint gradient against back-propagation"``; the row's key.
+        line: What was measured, e.g. ``"adjoint gradient against back-propagation"``; the row's key.
         value: What was measured.
         unit: Unit of ``value``.
         target: The target in words, e.g. ``">= 26 dB"``.
@@ -61,7 +62,7 @@ def record_row(
         machine: Where it was measured; this machine if it is not said.
         date: When, ISO; today if it is not said.
         ledger: Where the ledger is kept.
-        page: Where the page is written.
+        page: Where the index of the pages is written; the questions lie beside it in ``results/``.
     """
     if found := MACHINE_PATH.search(f"{line} {value} {target} {command} {note}"):
         raise ValueError(
@@ -84,7 +85,7 @@ def record_row(
         write_atomically(
             ledger, json.dumps(sorted(rows, key=lambda r: r["line"]), indent=1, ensure_ascii=False) + "\n"
         )
-        write_atomically(page, render_page(read_rows(ledger)))
+        write_pages(read_rows(ledger), page)
 
 
 def read_rows(ledger: Path = LEDGER) -> list[dict[str, Any]]:
@@ -95,28 +96,56 @@ def read_rows(ledger: Path = LEDGER) -> list[dict[str, Any]]:
     return rows
 
 
-def render_page(rows: list[dict[str, Any]]) -> str:
-    """The ledger as a Markdown page."""
+def write_pages(rows: list[dict[str, Any]], page: Path) -> None:
+    """Write the index ``page``, and beside it ``results/<question>.md`` for each question that has rows."""
+    asked: dict[Question, list[dict[str, Any]]] = {question: [] for question in (*QUESTIONS, OTHER)}
+    for row in rows:
+        asked[question_of(row["command"])].append(row)
+    answered = {question: found for question, found in asked.items() if found}
+    folder = page.parent / "results"
+    folder.mkdir(parents=True, exist_ok=True)
+    for question, found in answered.items():
+        write_atomically(folder / f"{question.slug}.md", _question_page(question, found))
+    write_atomically(page, _index_page(answered))
+
+
+def _index_page(answered: dict[Question, list[dict[str, Any]]]) -> str:
     head = (
-        "# Measured results\n\nMade from `docs/results.json` by `python -m benchmarks.results`; every row was measured by the "
-        "command beside it, on that machine and day; rows of campaigns are gathered from its cells by `python -m benchmarks.transfer_table`, those of "
-        "retraining by `python -m benchmarks.retraining`.\n\n| line | value | target | met | command | machine, date | note |\n|---|---|---|---|---|---|---|\n"
+        "# Measured results\n\nEvery figure was written by the command beside it, on the machine and day that its row names. A row that "
+        "misses its target stays, with the reason. The rows are in `results.json`; `python -m benchmarks.results` makes these pages.\n\n"
+        "| question | rows | with a target | missed |\n|---|---|---|---|\n"
     )
-    return head + "".join(_render_row(row) for row in rows)
+    lines = [
+        f"| [{question.title}](results/{question.slug}.md) {question.answers} | {len(found)} "
+        f"| {sum(row['met'] is not None for row in found)} | {sum(row['met'] is False for row in found)} |\n"
+        for question, found in answered.items()
+    ]
+    missed = [
+        f"- {row['line']}: {_value(row)}, target {row['target']} ([{question.slug.replace('_', ' ')}](results/{question.slug}.md))\n"
+        for question, found in answered.items()
+        for row in found
+        if row["met"] is False
+    ]
+    return head + "".join(lines) + "\n## Missed targets\n\n" + ("".join(missed) or "None.\n")
+
+
+def _question_page(question: Question, rows: list[dict[str, Any]]) -> str:
+    """A page with one table for each command, in the order of the rows."""
+    text = f"# {question.title}\n\n{question.answers} [All questions](../results.md).\n"
+    for command in dict.fromkeys(row["command"] for row in rows):
+        text += f"\n## `{command}`\n\n| measured | value | target | met | note | machine, date |\n|---|---|---|---|---|---|\n"
+        text += "".join(_render_row(row) for row in rows if row["command"] == command)
+    return text
+
+
+def _value(row: dict[str, Any]) -> str:
+    value = f"{row['value']:.4g}" if isinstance(row["value"], float) else str(row["value"])
+    return f"{value} {row['unit']}".strip()
 
 
 def _render_row(row: dict[str, Any]) -> str:
-    value = f"{row['value']:.4g}" if isinstance(row["value"], float) else str(row["value"])
     met = {True: "yes", False: "**no**", None: "-"}[row["met"]]
-    cells = [
-        row["line"],
-        f"{value} {row['unit']}".strip(),
-        row["target"],
-        met,
-        f"`{row['command']}`",
-        f"{row['machine']}, {row['date']}",
-        row["note"],
-    ]
+    cells = [row["line"], _value(row), row["target"], met, row["note"], f"{row['machine']}, {row['date']}"]
     return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |\n"
 
 
@@ -135,8 +164,8 @@ def _locked(ledger: Path) -> Iterator[None]:
 def main() -> None:
     """Render the page from the ledger."""
     argparse.ArgumentParser(description=main.__doc__).parse_args()
-    write_atomically(PAGE, render_page(read_rows()))
-    print(f"wrote {PAGE} ({len(read_rows())} rows)")
+    write_pages(read_rows(), PAGE)
+    print(f"wrote {PAGE} and its questions ({len(read_rows())} rows)")
 
 
 if __name__ == "__main__":

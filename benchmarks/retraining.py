@@ -28,11 +28,11 @@ def rows_of(summary: dict[str, Any], allowed: int) -> list[tuple[str, float, str
             f"one seed, one start that nothing has seen, deployed: original undisturbed {drive['original_undisturbed_m']:.2f} m, attacked "
             f"{drive['original_attacked_m']:.2f} m; retrained undisturbed {drive['retrained_undisturbed_m']:.2f} m, attacked {drive['retrained_attacked_m']:.2f} m"
         )
-        line = f"#5 retrained under the old attack, {name}, over the original undisturbed"
+        line = f"retrained under the old attack, {name}, over the original undisturbed"
         rows.append((line, drive["ratio"], "x", f"<= {_TARGET} x", drive["ratio"] <= _TARGET, note))
     for number, each in enumerate(summary["rounds"]):
         for name in each["surrogate"]:
-            line = f"#5 attack -> retrain -> attack, round {number}, {name}, deployed"
+            line = f"attack -> retrain -> attack, round {number}, {name}, deployed"
             note = f"in the learned scene {each['surrogate'][name]:.2f} x; victim {each['victim'][:12]}, gradient, one seed"
             if (
                 number == len(summary["rounds"]) - 1

@@ -134,7 +134,7 @@ def main() -> None:
         )
         print(f"{name}: {gain_db:+.2f} dB; {note}", flush=True)
         if arguments.count == parser.get_default("count"):
-            line, command = f"#15 sample intervals, {name.replace('_', ' ')}", f"{COMMAND} --cases {name}"
+            line, command = f"sample intervals, {name.replace('_', ' ')}", f"{COMMAND} --cases {name}"
             record_row(f"{line}: PSNR gained", gain_db, "dB", ">= 0 dB", gain_db >= 0.0, command, note)
             target = slower <= 1.0 if name == "room" else None
             record_row(

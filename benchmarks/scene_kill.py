@@ -142,7 +142,7 @@ def main() -> None:
             f"moments of {arguments.steps} steps, a checkpoint every 0.2 s"
         )
         record_row(
-            "#3 kill -9 at a random moment: scene training",
+            "kill -9 at a random moment: scene training",
             f"{good}/{struck}",
             "within 0.1 dB",
             "20/20",

@@ -70,7 +70,7 @@ def main() -> None:
     print(f"median {statistics.median(times):.2f} s; {note}")
     if not options.trial:
         record_row(
-            "#15 time from a car that is held to the brake at the controller, median",
+            "time from a car that is held to the brake at the controller, median",
             round(statistics.median(times), 2),
             "s",
             f"worst <= {LIMIT_S:g} s",

@@ -182,7 +182,7 @@ def main() -> None:
         print(log)
     if not options.trial:
         record_row(
-            "#4 strangers: no key, wrong key, watch-only key driving, oversized, malformed",
+            "strangers: no key, wrong key, watch-only key driving, oversized, malformed",
             sum(reached.values()),
             "messages let in",
             "0: all refused and logged",

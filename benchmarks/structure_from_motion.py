@@ -75,7 +75,7 @@ def main() -> None:
     print(f"{percent:.3f} % of the extent: {note}")
     if not arguments.trial:
         record_row(
-            "#3 structure from motion on rendered lab images",
+            "structure from motion on rendered lab images",
             percent,
             "% of the extent, rms",
             "all placed, <= 0.3 %, <= 0.3 degrees",

@@ -219,7 +219,7 @@ def record(samples: list[dict[str, Any]], stops: Stops, note: str) -> None:
     )
     unexplained = len(stops.found) - stops.by_host
     record_row(
-        "#15 half an hour live with the trained policy: unexplained stops",
+        "half an hour live with the trained policy: unexplained stops",
         unexplained,
         "stops",
         "0",
@@ -229,7 +229,7 @@ def record(samples: list[dict[str, Any]], stops: Stops, note: str) -> None:
     )
     said = ", ".join(f"{name} {count}" for name, count in late.items() if count) or "no node missed any"
     record_row(
-        "#15 half an hour live with the trained policy: missed ticks",
+        "half an hour live with the trained policy: missed ticks",
         sum(late.values()),
         "ticks",
         "0",
@@ -239,7 +239,7 @@ def record(samples: list[dict[str, Any]], stops: Stops, note: str) -> None:
     )
     worst = max(trend, key=lambda name: trend[name])
     record_row(
-        "#4 half an hour live: missed ticks, last third less first",
+        "half an hour live: missed ticks, last third less first",
         round(trend[worst], 3),
         "per 100 ticks",
         f"no trend (<= {TREND_LIMIT:g})",
@@ -250,7 +250,7 @@ def record(samples: list[dict[str, Any]], stops: Stops, note: str) -> None:
     fattest = max(grown, key=lambda name: grown[name])
     every = ", ".join(f"{name} {100 * share:+.2f} %" for name, share in grown.items())
     record_row(
-        "#4 half an hour live: growth of memory after warm-up",
+        "half an hour live: growth of memory after warm-up",
         round(100.0 * grown[fattest], 2),
         "%",
         "<= 2 %",
@@ -259,7 +259,7 @@ def record(samples: list[dict[str, Any]], stops: Stops, note: str) -> None:
         f"{every}; {note}",
     )
     record_row(
-        "#4 half an hour live: messages numbered and not counted",
+        "half an hour live: messages numbered and not counted",
         round(sum(missing.values())),
         "messages",
         "0",

@@ -122,7 +122,7 @@ def main() -> None:
     )
     print(f"{ratio:.1f} x: {note}")
     if not arguments.trial:
-        line = "#3 training step, 1024 rays, lab, against plain torch without occupancy grid"
+        line = "training step, 1024 rays, lab, against plain torch without occupancy grid"
         record_row(line, ratio, "x", ">= 10 x", ratio >= TARGET, COMMAND, note)
 
 

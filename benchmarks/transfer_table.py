@@ -49,11 +49,11 @@ MISSED: dict[tuple[str, str], str] = {
 
 
 def line_of(row: TableRow, cells: Sequence[CellResult] = ()) -> str:
-    """What a row of the ledger is called, e.g. ``#5 straight, gradient, surrogate``."""
+    """What a row of the ledger is called, e.g. ``straight, gradient, surrogate``."""
     own_frames = row.domain == "surrogate" and any(cell.extra.get("frames") == "deployment" for cell in cells)
     where = "ideal car over the same frames" if own_frames else row.domain
     parts = [row.scenario, row.placement, style_of(row.method).title, where]
-    return "#5 " + ", ".join(filter(None, [*parts, "" if row.victim == VICTIM else f"{row.victim} victim"]))
+    return "" + ", ".join(filter(None, [*parts, "" if row.victim == VICTIM else f"{row.victim} victim"]))
 
 
 def note_of(row: TableRow, cells: Sequence[CellResult] = ()) -> str:
@@ -188,7 +188,7 @@ def gate_rows(
                 f"(rad, or rad/s at the junction), correlation {n['correlation']:.4f}"
                 + "".join(f"; {reason}" for reason in verdict["reasons"])
             )
-            line = f"#5 fidelity gate, {key}, {of}"
+            line = f"fidelity gate, {key}, {of}"
             rows.append((key, (line, n["psnr_db"], "dB PSNR", "passes the gate", verdict["passed"], note)))
     return rows
 
@@ -207,7 +207,7 @@ def skill_rows(
     )
     return [
         (
-            "#5 predicted against deployed ratio, median factor",
+            "predicted against deployed ratio, median factor",
             skill.factor or 0.0,
             "x",
             "",
@@ -260,7 +260,7 @@ def main() -> None:
         )
     for target in table_targets(table):
         if target.what != "ratio to no attack" and target.value is not None:
-            line = f"#5 {target.scenario}, {style_of(target.method).title}, {target.domain}: {target.what}"
+            line = f"{target.scenario}, {style_of(target.method).title}, {target.domain}: {target.what}"
             row_of_target = table.find(target.scenario, target.victim, target.method, target.domain)
             cells = table.cells_of(row_of_target) if row_of_target else []
             note = f"{target.seeds} seeds" + (how_far(cells) if "off the track" in target.what else "")

@@ -226,7 +226,7 @@ def record(found: dict[str, Result]) -> None:
         value = result.get(key)
         notes = [note, result.get("broken", ""), _words(result)]
         record_row(
-            f"#4 two hosts: {line}",
+            f"two hosts: {line}",
             "-" if value is None else round(value, 2 if unit == "m" else 0),
             unit,
             target,

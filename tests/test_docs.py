@@ -108,8 +108,8 @@ def test_paths_of_a_machine_are_noticed_anywhere_in_a_row(tmp_path, text, path):
     assert (found and found[0]) == path
     ledger = {"ledger": tmp_path / "r.json", "page": tmp_path / "r.md"}
     if path is None:
-        record_row("#0 a", 1, "m", "", None, text, **ledger)
+        record_row("a", 1, "m", "", None, text, **ledger)
         return
     with pytest.raises(ValueError, match="without paths of this machine"):
-        record_row("#0 a", 1, "m", "", None, "command", text, **ledger)
+        record_row("a", 1, "m", "", None, "command", text, **ledger)
     assert not ledger["ledger"].exists()

@@ -39,9 +39,9 @@ def test_a_retrained_policy_is_held_against_the_original_undisturbed():
     old = {"right": {**drive, "ratio": 1.1}, "left": {**drive, "ratio": 1.11}}
     summary = {"old_attacks": old, "rounds": rounds, "pays_ratio": 1.5}
     rows = {line: (value, met) for line, value, _, _, met, _ in retraining.rows_of(summary, 0)}
-    assert rows["#5 retrained under the old attack, right, over the original undisturbed"] == (1.1, True)
-    assert rows["#5 retrained under the old attack, left, over the original undisturbed"] == (1.11, False)
-    assert rows["#5 attack -> retrain -> attack, round 0, right, deployed"] == (4.0, None)
+    assert rows["retrained under the old attack, right, over the original undisturbed"] == (1.1, True)
+    assert rows["retrained under the old attack, left, over the original undisturbed"] == (1.11, False)
+    assert rows["attack -> retrain -> attack, round 0, right, deployed"] == (4.0, None)
     assert "the number of rounds ended the loop" in retraining.rows_of(summary, 0)[-1][-1]
     assert "stopped before its 6 rounds were over" in retraining.rows_of(summary, 6)[-1][-1]
     cured = retraining.rows_of({**summary, "pays_ratio": 5.1}, 6)[-1][-1]
@@ -158,11 +158,11 @@ def test_rows_of_gate_and_predictions_come_from_what_was_published(tmp_path):
     assert transfer_table.gate_rows(tmp_path, ["left_hardened"]) == []
     assert (key, drive[0], drive[4]) == (
         "right_hardened",
-        "#5 fidelity gate, right_hardened, drive without attack",
+        "fidelity gate, right_hardened, drive without attack",
         True,
     )
     assert (line, value, unit, met) == (
-        "#5 fidelity gate, right_hardened, held-out views",
+        "fidelity gate, right_hardened, held-out views",
         27.5,
         "dB PSNR",
         False,

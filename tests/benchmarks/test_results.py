@@ -1,24 +1,43 @@
 import json
 
-from benchmarks.results import read_rows, record_row
+from benchmarks.questions import OTHER, QUESTIONS, question_of
+from benchmarks.results import PAGE, read_rows, record_row, write_pages
 
 
 def test_a_row_replaces_its_older_self_and_a_miss_stays_with_its_reason(tmp_path):
     where = {"ledger": tmp_path / "results.json", "page": tmp_path / "results.md"}
-    record_row("#2 a", 25.0, "dB", ">= 26 dB", False, "make bench", "too few photos", **where)
-    record_row("#2 b", 3, "x", ">= 2", True, "make bench", machine="another", date="2026-01-02", **where)
-    record_row("#2 a", 25.5, "dB", ">= 26 dB", False, "make bench", "0.5 dB short | dark images", **where)
+    record_row("a", 25.0, "dB", ">= 26 dB", False, "make bench", "too few photos", **where)
+    record_row("b", 3, "x", ">= 2", True, "make bench", machine="another", date="2026-01-02", **where)
+    record_row("a", 25.5, "dB", ">= 26 dB", False, "make bench", "0.5 dB short | dark images", **where)
 
     rows = read_rows(where["ledger"])
-    assert [(r["line"], r["value"], r["met"]) for r in rows] == [("#2 a", 25.5, False), ("#2 b", 3, True)]
+    assert [(r["line"], r["value"], r["met"]) for r in rows] == [("a", 25.5, False), ("b", 3, True)]
     assert json.loads(where["ledger"].read_text()) == rows
     assert (rows[1]["machine"], rows[1]["date"]) == ("another", "2026-01-02")
     assert "cores" in rows[0]["machine"]
-    page = where["page"].read_text()
+    page = (tmp_path / "results" / "other.md").read_text()
+    assert "## `make bench`" in page
     assert "25.5 dB" in page
     assert "**no**" in page
     assert "0.5 dB short \\| dark images" in page
+    index = where["page"].read_text()
+    assert "| 2 | 2 | 1 |" in index
+    assert "- a: 25.5 dB, target >= 26 dB ([other](results/other.md))" in index
 
 
 def test_an_absent_ledger_has_no_rows(tmp_path):
     assert read_rows(tmp_path / "none.json") == []
+
+
+def test_every_row_answers_a_question_and_every_benchmark_belongs_to_one():
+    rows = read_rows()
+    assert len(rows) > 200
+    assert [row["line"] for row in rows if question_of(row["command"]) is OTHER] == []
+    named = [name for question in QUESTIONS for name in question.commands]
+    assert len(named) == len(set(named))
+
+
+def test_the_pages_are_those_of_the_ledger(tmp_path):
+    write_pages(read_rows(), tmp_path / "results.md")
+    for made in [tmp_path / "results.md", *(tmp_path / "results").iterdir()]:
+        assert made.read_text() == (PAGE.parent / made.relative_to(tmp_path)).read_text()

@@ -1,0 +1,118 @@
+"""The questions that the measured rows answer: one page each, by the command that measured the row."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Question:
+    """One page of results.
+
+    Attributes:
+        slug: Name of the page, ``docs/results/<slug>.md``.
+        title: The question.
+        answers: What it is about, in a sentence.
+        commands: Benchmarks (``python -m benchmarks.NAME``) and other commands, by their beginning, that measure its rows.
+    """
+
+    slug: str
+    title: str
+    answers: str
+    commands: tuple[str, ...]
+
+
+QUESTIONS = (
+    Question(
+        "gradients",
+        "Are the gradients right, and what do they cost?",
+        "The adjoint against back-propagation and finite differences, its memory and time, and the search without gradients.",
+        (
+            "adjoint_gradient",
+            "adjoint_memory",
+            "gradient_pass",
+            "closed_loop_cosine",
+            "mesh_render",
+            "black_box",
+        ),
+    ),
+    Question(
+        "learned_places",
+        "How good are learned places and objects?",
+        "Held-out photographs, poses found from them, objects learned from meshes, and the speed of training.",
+        (
+            "fox",
+            "hydrant",
+            "objects",
+            "phone_to_car",
+            "structure_from_motion",
+            "few_photographs",
+            "sample_intervals",
+            "training_step",
+            "hash_encoding",
+        ),
+    ),
+    Question(
+        "room",
+        "Does an attack found in the learned room work live?",
+        "The room with green screen and monitor, driven live on the simulated lab.",
+        ("make experiment", "newcomer", "counterfactual_live"),
+    ),
+    Question(
+        "junction",
+        "Does an attack found in the learned junction work there?",
+        "The paper's transfer experiment: objects beside three paths, searched in the learned scene, driven in the world itself.",
+        ("advnerf campaign run launch/paper", "advnerf campaign predict launch/paper", "campaign_scaling"),
+    ),
+    Question(
+        "places_and_meshes",
+        "Do places, mesh textures and mesh shapes work as attacks?",
+        "The same transfer experiment over other spaces of search.",
+        ("advnerf campaign run launch/poses", "advnerf campaign run launch/meshes"),
+    ),
+    Question(
+        "retraining",
+        "Does retraining on attacks help?",
+        "Policies trained again on the attacks that were found against them.",
+        ("advnerf experiment launch/",),
+    ),
+    Question(
+        "stopping",
+        "Does the car stop when it must?",
+        "Time and distance to the brake after faults, false stops, strangers, and half an hour of driving.",
+        ("fault_stops", "fault_campaign", "stalls", "pose_jumps", "requests", "strangers", "thirty_minutes"),
+    ),
+    Question(
+        "live_stack",
+        "Is the live stack fast and accurate?",
+        "Latency, launch, memory, two computers, calibration, and a policy learned from recordings.",
+        (
+            "one_hop",
+            "frame_age",
+            "launch_times",
+            "car_nodes",
+            "two_hosts",
+            "lockstep_replay",
+            "calibrations",
+            "policy_from_bags",
+        ),
+    ),
+    Question(
+        "nothing_is_lost",
+        "Is anything lost when something breaks?",
+        "Damaged and cut files, killed processes, and hostile input.",
+        ("bag_damage", "bag_kill", "attack_kill", "scene_kill", "fuzz"),
+    ),
+)
+
+OTHER = Question("other", "Other measurements", "Rows of commands that no question names.", ())
+
+
+def question_of(command: str) -> Question:
+    """The question that a row measured by ``command`` answers; `OTHER` if none names it."""
+    benchmark = re.search(r"\bbenchmarks\.(\w+)", command)
+    for question in QUESTIONS:
+        if any(benchmark[1] == name if benchmark else command.startswith(name) for name in question.commands):
+            return question
+    return OTHER
