@@ -44,10 +44,11 @@ test-gpu: setup  ## The tests that need a CUDA device
 test-hardware: setup  ## The tests that need a real device; each says which, and skips without it
 	@$(BIN)/pytest -q -m 'hardware' --timeout 1200
 
-check: setup  ## Lint, types, import contracts
+check: setup  ## Lint, types (also of the Python in the pages), import contracts
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check .
 	@$(BIN)/mypy
+	@$(BIN)/python docs/check_code.py
 	@$(BIN)/lint-imports
 
 bench: setup  ## The benchmarks (about an hour); each writes its rows to docs/results.json

@@ -182,7 +182,7 @@ def scene_hash(scene: SceneField, occupancy: NDArray[np.bool_]) -> str:
 
 
 def save_scene(
-    path: Path, scene: SceneField, occupancy: NDArray[np.bool_], metadata: dict[str, Any] | None = None
+    path: str | Path, scene: SceneField, occupancy: NDArray[np.bool_], metadata: dict[str, Any] | None = None
 ) -> str:
     """Write a trained scene to one ``.safetensors`` file, atomically.
 
@@ -209,7 +209,7 @@ def save_scene(
     return content
 
 
-def load_scene(path: Path) -> tuple[SceneField, NDArray[np.bool_], dict[str, Any]]:
+def load_scene(path: str | Path) -> tuple[SceneField, NDArray[np.bool_], dict[str, Any]]:
     """Read a scene file: field, occupancy ``[X, Y, Z]``, metadata (with ``scene_hash``).
 
     Raises:

@@ -1,0 +1,75 @@
+"""Holds the Python of the pages against the types of the code: ``python docs/check_code.py``, part of ``make check``.
+
+A block goes through mypy as it stands. Names that an earlier paragraph explains may be undefined, and ``...`` may stand for what
+the reader has; a module, attribute or argument that does not exist is an error, named by page and line.
+"""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+_BLOCK = re.compile(r"^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+_ALLOWED = ("name-defined", "arg-type", "list-item", "import-untyped")
+
+
+def blocks(text: str) -> dict[int, str]:
+    """The Python blocks of a page by the number of their first line."""
+    return {text[: found.start()].count("\n") + 2: found[1] for found in _BLOCK.finditer(text)}
+
+
+def faults(pages: dict[str, str]) -> list[str]:
+    """What mypy says of the blocks of some pages (name and text), as ``page:line: error``."""
+    with tempfile.TemporaryDirectory(prefix="advnerf-pages-") as folder:
+        names = {}
+        for number, (page, text) in enumerate(pages.items()):
+            for line, code in blocks(text).items():
+                file = Path(folder) / f"page{number}_line{line}.py"
+                file.write_text(
+                    "\n" * (line - 1) + code, encoding="utf-8"
+                )  # so that mypy counts lines as the page does
+                names[str(file)] = page
+        if not names:
+            return []
+        options = [f"--disable-error-code={code}" for code in _ALLOWED]
+        command = [
+            sys.executable,
+            "-m",
+            "mypy",
+            "--allow-untyped-defs",
+            "--no-error-summary",
+            *options,
+            *names,
+        ]
+        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    if done.stderr:
+        return [done.stderr.strip()]
+    found = [line for line in done.stdout.splitlines() if ": error: " in line]
+    return [
+        names[file] + rest for file, rest in (re.match(r"(.*?\.py)(:.*)", line).groups() for line in found)
+    ]
+
+
+def main() -> None:
+    """Check every page except the generated one; exit 1 if a block is wrong."""
+    files = [ROOT / "README.md", ROOT / "examples" / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+    pages = {
+        str(file.relative_to(ROOT)): file.read_text(encoding="utf-8")
+        for file in files
+        if file.name != "api.md"
+    }
+    found = faults(pages)
+    print(
+        "\n".join(found)
+        if found
+        else f"{sum(len(blocks(text)) for text in pages.values())} Python blocks fit the code"
+    )
+    sys.exit(bool(found))
+
+
+if __name__ == "__main__":
+    main()
