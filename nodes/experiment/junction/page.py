@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
@@ -80,10 +81,11 @@ def opening(experiment: Experiment) -> str:
     """What was done, in one paragraph."""
     attack, things = experiment.config.attack, experiment.objects
     methods = ", ".join(style_of(name).title for name in attack.method_names)
-    kinds = {kind: sum(thing.kind == kind for thing in things) for kind in ("small_car", "hydrant")}
+    counts = Counter(thing.kind.replace("_", " ") for thing in things)
+    named = " and ".join(f"{count} {kind}{'s' if count > 1 else ''}" for kind, count in counts.items())
     return (
-        f"One goal-conditioned policy drives {', '.join(experiment.config.scenarios)}. The colours of {kinds['small_car']} cars and "
-        f"{kinds['hydrant']} hydrants are searched together in the learned scene ({methods}; {attack.evaluations} evaluations each, "
+        f"One goal-conditioned policy drives {', '.join(experiment.config.scenarios)}. "
+        f"{experiment.config.space.searched.format(named)} ({methods}; {attack.evaluations} evaluations each, "
         f"{len(attack.seeds)} seed(s), {attack.starts} start(s), T = {experiment.config.horizon} ticks of {experiment.config.dt_s:g} s), then the opaque objects are put into the "
         f"world {experiment.named_world.kind} by depth. Total CTE is the sum of |CTE| over the drive's ticks; ratios are to the same start past the plain "
         "objects in the same domain."

@@ -1,8 +1,8 @@
-"""The section ``space`` of an experiment: what its attacks may change."""
+"""The section ``space`` of an experiment: what its attacks may change, and the words of the report for it (``searched``)."""
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -20,12 +20,14 @@ class ColoursConfig(_Section):
     """The colours of the objects."""
 
     kind: Literal["colours"] = "colours"
+    searched: ClassVar[str] = "The colours of {} are searched together in the learned scene"
 
 
 class PlacesConfig(_Section):
     """Where the objects stand, and their colours unless these are kept."""
 
     kind: Literal["places"] = "places"
+    searched: ClassVar[str] = "The places of {} are searched together in the learned scene"
     move_m: NotNegative = Field(default=1.5, description="An object's x and y may change by this [m].")
     turn_rad: NotNegative = Field(
         default=0.6,
@@ -55,12 +57,14 @@ class MeshTextureConfig(_MeshConfig):
     """The textures of the objects as meshes, searched over the world's own pictures."""
 
     kind: Literal["mesh_texture"] = "mesh_texture"
+    searched: ClassVar[str] = "The textures of {} as meshes are searched over the world's own pictures"
 
 
 class MeshShapeConfig(_MeshConfig):
     """The shapes of the objects as meshes, searched over the world's own pictures."""
 
     kind: Literal["mesh_shape"] = "mesh_shape"
+    searched: ClassVar[str] = "The shapes of {} as meshes are searched over the world's own pictures"
     bound_m: PositiveNumber = Field(default=0.4, description="No vertex moves farther [m].")
     smoothness: NotNegative = Field(
         default=19.0, description="Lambda of the large-steps preconditioner; 0: none."

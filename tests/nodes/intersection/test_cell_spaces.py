@@ -24,6 +24,7 @@ from nodes.experiment.junction.cells import CellError, run_cell
 from nodes.experiment.junction.config import RetrainConfig
 from nodes.experiment.junction.context import Experiment
 from nodes.experiment.junction.deploy import deployed_part
+from nodes.experiment.junction.page import opening
 from nodes.experiment.junction.policy import victim_file
 from nodes.experiment.junction.pose_maps import PoseMapSettings
 from nodes.experiment.junction.run import load_experiment
@@ -299,3 +300,21 @@ def test_maps_are_of_what_the_cell_found(
     with pytest.raises(CellError, match="expected an object of 0 to 4, got 5"):
         cells.draw_maps(*asked, 5, tmp_path, silent)
     assert cells.draw_maps(experiment, "right", "hardened", 0, "none", 1, tmp_path, silent) == []
+
+
+@pytest.mark.parametrize(
+    ("space", "searched"),
+    [
+        (ColoursConfig(), "The colours of "),
+        (ONE, "The places of "),
+        (MESHES[0], "The textures of "),
+        (MESHES[1], "The shapes of "),
+    ],
+)
+def test_the_page_says_what_was_searched(trained: Experiment, space: Any, searched: str) -> None:
+    experiment = searching(trained, space)
+    text = opening(experiment)
+    assert searched in text
+    kinds = {thing.kind for thing in experiment.objects}
+    assert kinds
+    assert all(kind.replace("_", " ") in text for kind in kinds)
