@@ -18,7 +18,7 @@ from nodes.experiment.stages import run_stages
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import Report
 
-LAUNCH = Path(__file__).parents[3] / "launch" / "junction.experiment.yaml"
+LAUNCH = Path(__file__).parents[4] / "launch" / "junction.experiment.yaml"
 
 
 def load(folder: Path, *overrides: str) -> Experiment:

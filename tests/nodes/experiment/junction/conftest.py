@@ -23,7 +23,7 @@ from nodes.experiment.junction.policy import HARDENED, NAIVE, victim_file
 from nodes.experiment.junction.run import load_experiment
 from nodes.experiment.learned_scene import scene_file
 
-LAUNCH = Path(__file__).parents[3] / "launch" / "junction.experiment.yaml"
+LAUNCH = Path(__file__).parents[4] / "launch" / "junction.experiment.yaml"
 TINY: dict[str, Any] = {
     "capture": {"photos": 9, "held_out": 3},
     "scene": {"steps": 20, "log2_entries": 10, "finest": 32},

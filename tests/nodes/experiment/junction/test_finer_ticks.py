@@ -31,7 +31,7 @@ from nodes.experiment.junction.policy import HARDENED, victim_file
 from nodes.experiment.junction.run import load_experiment
 from nodes.experiment.junction.spaces import colour_space
 
-LAUNCH = Path(__file__).parents[3] / "launch" / "junction.experiment.yaml"
+LAUNCH = Path(__file__).parents[4] / "launch" / "junction.experiment.yaml"
 SECONDS, TICKS_S = 2.0, (0.1, 0.01)
 ASKEW_RAD = 0.05
 

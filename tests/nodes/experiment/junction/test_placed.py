@@ -17,7 +17,7 @@ from nodes.experiment.junction.overview import from_above
 from nodes.experiment.junction.run import load_experiment
 from nodes.experiment.placed import OBJECT_SIZES_M, PlacedObject, in_a_lane
 
-LAUNCH = Path(__file__).parents[3] / "launch" / "junction.experiment.yaml"
+LAUNCH = Path(__file__).parents[4] / "launch" / "junction.experiment.yaml"
 CONFIG = IntersectionConfig()
 
 
