@@ -145,7 +145,7 @@ def _in_fresh_process(method: str, steps: int, *options: str) -> dict[str, float
 
 
 def compare(repeats: int, trial: bool, horizons: tuple[int, int, int] = (60, 200, 600)) -> None:
-    """The lines of issue 3: memory and time at T = 200 against other ways, memory at T = 600 against T = 60."""
+    """Memory and time at T = 200 against other ways, memory at T = 600 against T = 60."""
     short, middle, long = horizons
     wanted = [("adjoint", short), ("adjoint", long), ("cached", short), ("cached", long)]
     wanted += [(way, middle) for way in WAYS]

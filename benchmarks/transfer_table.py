@@ -1,4 +1,4 @@
-"""Question: what does a campaign's table show, and is it what issue 5 asks for? ``python -m benchmarks.transfer_table [CAMPAIGN_FILE]``.
+"""Question: what does a campaign's table show, and does it meet the targets? ``python -m benchmarks.transfer_table [CAMPAIGN_FILE]``.
 
 It computes nothing anew: the cells in ``docs/results/<campaign>`` are what ``advnerf campaign run`` finished and ``advnerf campaign publish`` copied,
 with the verdicts of the fidelity gate and the predictions of transfer.

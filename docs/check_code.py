@@ -48,10 +48,9 @@ def faults(pages: dict[str, str]) -> list[str]:
         done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     if done.stderr:
         return [done.stderr.strip()]
-    found = [line for line in done.stdout.splitlines() if ": error: " in line]
-    return [
-        names[file] + rest for file, rest in (re.match(r"(.*?\.py)(:.*)", line).groups() for line in found)
-    ]
+    found = (re.match(r"(.*?\.py)(:\d+: error: .*)", line) for line in done.stdout.splitlines())
+    # Faults of the code itself are the concern of mypy's own run, which has other options.
+    return [names[each[1]] + each[2] for each in found if each and each[1] in names]
 
 
 def main() -> None:
