@@ -27,6 +27,7 @@ from calibration.vehicle import Drive, fit_gains
 from calibration.vehicle_response import fit_response
 from hardware.worlds.lab.config import CarConfig, LabConfig, MonitorOpticsConfig
 from hardware.worlds.lab.lab import Lab
+from hardware.worlds.lab.lab_world import LabWorld
 from hardware.worlds.lab.vehicle import TwinVehicle
 from nodes.experiment import screen
 
@@ -188,14 +189,17 @@ def measure_time_offset(lab: Lab, seed: int) -> float:
     return error
 
 
-def measure_display(lab: Lab, seed: int) -> tuple[float, float]:
+def measure_display(world: LabWorld, seed: int) -> tuple[float, float]:
     """RMSE on held-out colours, of the model and of a monitor taken for ideal, over three places of the car."""
     rng = np.random.default_rng(seed)
-    fit = screen.measure_display(lab, seed, lambda clean: [noisy_image(clean, rng) for _ in range(8)])
+    panel = world.describe().panels["monitor"]
+    fit = screen.measure_display(
+        world, "monitor", panel, seed, lambda clean: [noisy_image(clean, rng) for _ in range(8)]
+    )
     ideal = float(np.sqrt(np.mean((fit.shown[fit.held_out] - fit.seen[fit.held_out]) ** 2)))
     print(
         f"display: held out {100 * fit.rmse(True):.2f} %, taken for ideal {100 * ideal:.1f} %; falloff {fit.model.falloff:.2f} "
-        f"(true {lab.config.monitor_optics.falloff}), {len(fit.shown)} colours",
+        f"(true {world.config.monitor_optics.falloff}), {len(fit.shown)} colours",
         flush=True,
     )
     return fit.rmse(True), ideal
@@ -213,12 +217,13 @@ def main() -> None:
     seeds = range(1 if trial else REPETITIONS)
     drives = np.array([measure_vehicle(seed) for seed in seeds])
     config = LabConfig(monitor_optics=MonitorOpticsConfig.office())
-    with Lab(config) as lab:
+    with LabWorld(config) as world:
+        lab = world.lab
         lab.set_board_image(board_texture())
         mounts = np.array([measure_camera_to_car(lab, seed)[:2] for seed in seeds])
         lab.set_board_image(None)
         offsets = [measure_time_offset(lab, seed) for seed in seeds]
-        displays = np.array([measure_display(lab, seed) for seed in seeds])
+        displays = np.array([measure_display(world, seed) for seed in seeds])
     if trial:
         return
     noise = (

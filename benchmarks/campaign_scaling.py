@@ -25,11 +25,11 @@ methods: [gradient]
 victims: [hardened]
 scenarios:
   green_screen:
-    kind: room_search
+    as_scenario: track
     experiment: {experiment}
     setting: full
     run_folder: {folder}
-    set: [attack.starts=1, attack.iterations={iterations}]
+    set: [deploy.through=nothing, attack.starts=1, attack.evaluations={iterations}]
 """
 
 

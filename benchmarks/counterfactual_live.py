@@ -16,22 +16,24 @@ from typing import Any
 import numpy as np
 
 from benchmarks.results import record_row
-from nodes.experiment.attack import Search, attack_path
+from nodes.experiment.attack import Cell, attack_path
 from nodes.experiment.context import Experiment
-from nodes.experiment.deploy import LiveRun, drive_live
+from nodes.experiment.live import LiveRun, drive_live
 from nodes.experiment.run import load_experiment
 from nodes.lab.trials.series import COUNTED_STOPS
 
-LIVE = LiveRun("hardened", "gradient", 0)
+CELL = Cell("track", "hardened", "gradient", 0)
 
 
 def drive(experiment: Experiment, folder: Path, compare: bool) -> dict[str, Any]:
     """One live drive past the attack; what was measured in its bag."""
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-    attack = attack_path(experiment.stage_folder("attack"), Search(LIVE.victim, "gradient", LIVE.seed))
-    drive_live(experiment, LIVE, folder, attack, compare)
-    measured: dict[str, Any] = json.loads((folder / f"{LIVE.name}.json").read_text(encoding="utf-8"))
+    attack = attack_path(experiment.stage_folder("attack"), CELL).resolve()
+    start = experiment.references[CELL.scenario].drive_start
+    live = LiveRun(CELL.name, CELL.victim, CELL.scenario, start, attack, compare=compare)
+    drive_live(experiment, live, folder)
+    measured: dict[str, Any] = json.loads((folder / f"{live.name}.json").read_text(encoding="utf-8"))
     stopped = measured["outcome"]["stopped_early"]
     if stopped and not any(word in stopped for word in COUNTED_STOPS):
         raise SystemExit(f"the stack stopped the drive: {stopped}; run it again on idle cores")

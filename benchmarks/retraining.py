@@ -13,9 +13,9 @@ from typing import Any
 
 from advnerf_core.files import write_atomically
 from benchmarks.results import REPOSITORY, record_row
-from nodes.experiment.junction import retrain_plot
-from nodes.experiment.junction.context import Experiment
-from nodes.experiment.junction.run import load_experiment
+from nodes.experiment import retrain_plot
+from nodes.experiment.context import Experiment
+from nodes.experiment.run import load_experiment
 
 _TARGET = 1.1
 

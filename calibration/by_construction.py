@@ -7,7 +7,6 @@
 from __future__ import annotations
 
 import datetime
-import math
 import sys
 from pathlib import Path
 
@@ -24,14 +23,11 @@ from calibration.schema import (
 )
 from hardware.motor.limits import DriveLimits, VehicleGains
 from hardware.worlds.lab.config import CarConfig, LabConfig, PanelConfig
+from hardware.worlds.lab.lab_world import FENCE_MARGIN_M, HALF_LANE_M
 
 METHOD = "by construction"
 # The day the default lab got its numbers; the files do not change when they are written again.
 LAB_DATE = datetime.date(2026, 11, 21)
-FENCE_MARGIN_M = 0.5
-OFF_TRACK_M = 0.4
-# Two metres of path before the corner at which the board stands, for the default track.
-START_BEFORE_CORNER_M = 2.0
 
 
 def twin_calibrations(lab: LabConfig) -> dict[str, Calibration]:
@@ -101,17 +97,13 @@ def _target(subject: str, panel: PanelConfig) -> TargetCalibration:
 def _room(lab: LabConfig) -> RoomCalibration:
     track = lab.track
     path = DrivingPath.rounded_square(track.side_m, track.corner_radius_m)
-    corner_s_m = track.side_m - 2.0 * track.corner_radius_m
-    x, y, yaw = (float(v) for v in path.pose_at(corner_s_m))
-    # Straight back from the corner: with a long lead the start lies on the extension of the straight, not on the arc before it.
-    start = (x - START_BEFORE_CORNER_M * math.cos(yaw), y - START_BEFORE_CORNER_M * math.sin(yaw), yaw)
     reach = 0.5 * lab.room.side_m - FENCE_MARGIN_M
     return RoomCalibration(
         date=LAB_DATE,
         method=METHOD,
         path=path.to_dict(),
-        off_track_m=OFF_TRACK_M,
-        start_pose=start,
+        off_track_m=HALF_LANE_M,
+        start_pose=lab.start_pose,
         fence_m=((-reach, -reach), (reach, -reach), (reach, reach), (-reach, reach)),
     )
 

@@ -27,11 +27,8 @@ Steer = Callable[[Image], Array]
 KeepDriving = Callable[[Array], NDArray[np.bool_]]
 """Which of the states ``[B, 3]`` are still worth driving on from, ``[B]``."""
 
-Texture = NDArray[np.float32]
-"""Colours ``[n, n, 3]`` in 0..1 of the object's face, row 0 on top, column 0 left for a viewer who faces it."""
-
-Overlay = Callable[[Image, Array, Texture], Image]
-"""``(rgb [H, W, 3], state [3], texture) -> rgb`` with the texture on the object's face; the same image if out of view."""
+Overlay = Callable[[Image, Array, Any], Image]
+"""``(rgb [H, W, 3], state [3], texture) -> rgb`` with the object showing a texture parameter; the same image if it is out of view."""
 
 
 @dataclass(frozen=True)
@@ -73,11 +70,6 @@ class FrameSource(Protocol):
         """Closed-loop drives of up to ``steps`` ticks from ``starts [B, 3]``: everything seen on the way."""
 
 
-def random_texture(rng: np.random.Generator, cells: int, sigma: float = 5.0) -> Texture:
-    """Random colours as the random attack draws them: squashed normal grid values, method section 2."""
-    return (1.0 / (1.0 + np.exp(-sigma * rng.standard_normal((cells, cells, 3))))).astype(np.float32)
-
-
 class SteppedScene(Protocol):
     """A deployment scene that moves its own car, such as the synchronous lab."""
 
@@ -103,8 +95,8 @@ class SceneSource:
         view: How camera images become policy images.
         speed_mps: Commanded speed [m/s].
         dt_s: Control tick [s].
-        overlay: Paints a texture on the object's face; None for scenes without a changing object.
-        texture_cells: The random textures have so many cells per side.
+        overlay: Shows the object with a texture parameter; None for scenes without a changing object.
+        sample_texture: Draws a texture parameter for ``overlay``; needed with it.
         variants: Textured images per state in which the object is in view.
     """
 
@@ -118,13 +110,15 @@ class SceneSource:
         speed_mps: float,
         dt_s: float,
         overlay: Overlay | None = None,
-        texture_cells: int = 16,
+        sample_texture: Callable[[np.random.Generator], Any] | None = None,
         variants: int = 1,
     ) -> None:
+        if (overlay is None) != (sample_texture is None):
+            raise ValueError("expected overlay and sample_texture together, got one of them")
         self.name = name
         self._scene, self._view, self._overlay = scene, view, overlay
         self._speed_mps, self._dt_s = speed_mps, dt_s
-        self._cells, self._variants = texture_cells, variants
+        self._sample, self._variants = sample_texture, variants
 
     def look(self, states: Array, rng: np.random.Generator) -> Seen:
         """What is seen from the states ``[B, 3]``."""
@@ -140,7 +134,7 @@ class SceneSource:
         """Drives, one after another; in every second one the policy sees one random texture throughout."""
         parts = []
         for number, start in enumerate(starts):
-            held = random_texture(rng, self._cells) if self._overlay is not None and number % 2 else None
+            held = self._sample(rng) if self._sample is not None and number % 2 else None
             self._scene.reset(*map(float, start))
             state = np.asarray(start, dtype=np.float64)
             for _ in range(steps):
@@ -154,11 +148,11 @@ class SceneSource:
                     break
         return Seen.join(parts)
 
-    def _seen(self, rgb: Image, state: Array, rng: np.random.Generator, held: Texture | None = None) -> Seen:
+    def _seen(self, rgb: Image, state: Array, rng: np.random.Generator, held: Any = None) -> Seen:
         """The plain view first, the textured ones after it, a held texture last."""
         images = [self._view.image(rgb)]
-        if self._overlay is not None:
-            textures = [random_texture(rng, self._cells) for _ in range(self._variants)]
+        if self._overlay is not None and self._sample is not None:
+            textures = [self._sample(rng) for _ in range(self._variants)]
             for texture in textures if held is None else [*textures[:-1], held]:
                 painted = self._overlay(rgb, state, texture)
                 if np.array_equal(painted, rgb):  # the object is out of view

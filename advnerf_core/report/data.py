@@ -43,10 +43,23 @@ __all__ = [
     "Texture",
     "Victim",
     "face_segment",
+    "victim_named",
 ]
 
 DOMAINS: tuple[Domain, ...] = get_args(Domain)
 VICTIMS: tuple[Victim, ...] = get_args(Victim)
+
+
+def victim_named(name: str) -> Victim:
+    """A victim's name as it is typed here.
+
+    Raises:
+        ValueError: There is no such victim.
+    """
+    found = next((victim for victim in VICTIMS if victim == name), None)
+    if found is None:
+        raise ValueError(f"expected one of the victims {', '.join(VICTIMS)}, got {name!r}")
+    return found
 
 
 @dataclass(frozen=True, eq=False)

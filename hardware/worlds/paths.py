@@ -18,23 +18,29 @@ class ReferencePath:
     `hardware.worlds.fitting.path_through` makes one from points.
 
     Attributes:
-        start_pose: x [m], y [m], yaw [rad] where the drive starts.
+        start_pose: x [m], y [m], yaw [rad] where the path begins.
         segments: In driving order, ``("line", length_m)`` or ``("arc", radius_m, angle_rad)``, left positive.
         goal: What a goal-conditioned policy is told on this drive, such as a one-hot exit; empty where it is told nothing.
         closed: Whether the end of the path is its start.
+        drive_from: Where drives start, if that is not where the path begins, as on a closed path; x [m], y [m], yaw [rad].
     """
 
     start_pose: Pose
     segments: tuple[Segment, ...]
     goal: tuple[float, ...] = ()
     closed: bool = False
+    drive_from: Pose | None = None
 
     def __post_init__(self) -> None:
         """Refuse what is no path."""
-        numbers = [*self.start_pose, *(value for segment in self.segments for value in segment[1:])]
+        numbers = [
+            *self.start_pose,
+            *self.drive_start,
+            *(value for segment in self.segments for value in segment[1:]),
+        ]
         positive = [segment[1] for segment in self.segments]
         if (
-            len(self.start_pose) != 3
+            not len(self.start_pose) == len(self.drive_start) == 3
             or not self.segments
             or not all(map(math.isfinite, numbers))
             or min(positive) <= 0
@@ -43,6 +49,11 @@ class ReferencePath:
                 "expected a finite start pose (x, y, yaw) and at least one line or arc of positive length or radius, got "
                 f"{self.start_pose} and {self.segments}"
             )
+
+    @property
+    def drive_start(self) -> Pose:
+        """x [m], y [m], yaw [rad] where drives start."""
+        return self.start_pose if self.drive_from is None else self.drive_from
 
     @property
     def length_m(self) -> float:
@@ -73,12 +84,16 @@ class ReferencePath:
 
     def mirrored(self, across: Literal["x", "y"]) -> ReferencePath:
         """The same drive seen in a mirror along the x or the y axis of the world: what was on the left of the axis is on its right."""
-        x, y, yaw = self.start_pose
-        start = (x, -y, -yaw) if across == "x" else (-x, y, math.pi - yaw)
+
+        def turned_over(pose: Pose) -> Pose:
+            x, y, yaw = pose
+            return (x, -y, -yaw) if across == "x" else (-x, y, math.pi - yaw)
+
         turned: tuple[Segment, ...] = tuple(
             piece if piece[0] == "line" else (piece[0], piece[1], -piece[2]) for piece in self.segments
         )
-        return ReferencePath(start, turned, self.goal, self.closed)
+        begin = None if self.drive_from is None else turned_over(self.drive_from)
+        return ReferencePath(turned_over(self.start_pose), turned, self.goal, self.closed, begin)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data (JSON types) from which :meth:`from_dict` makes the same path."""
@@ -87,6 +102,7 @@ class ReferencePath:
             "segments": [list(segment) for segment in self.segments],
             "goal": list(self.goal),
             "closed": self.closed,
+            "drive_from": None if self.drive_from is None else list(self.drive_from),
         }
 
     @classmethod
@@ -96,14 +112,25 @@ class ReferencePath:
         Raises:
             KeyError, TypeError, ValueError: The data is something else.
         """
-        x, y, yaw = map(float, data["start_pose"])
         segments = tuple(_segment(piece) for piece in data["segments"])
-        return cls((x, y, yaw), segments, tuple(map(float, data["goal"])), bool(data["closed"]))
+        begin = data["drive_from"]
+        return cls(
+            _pose(data["start_pose"]),
+            segments,
+            tuple(map(float, data["goal"])),
+            bool(data["closed"]),
+            None if begin is None else _pose(begin),
+        )
 
 
 def segment_length_m(segment: Segment) -> float:
     """Length of one piece of a path [m]."""
     return segment[1] if segment[0] == "line" else segment[1] * abs(segment[2])
+
+
+def _pose(data: Any) -> Pose:
+    x, y, yaw = map(float, data)
+    return x, y, yaw
 
 
 def _segment(piece: Any) -> Segment:

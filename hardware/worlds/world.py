@@ -99,6 +99,50 @@ class Box:
 
 
 @dataclass(frozen=True, eq=False)
+class Panel:
+    """A flat rectangle in the world that can carry a texture: a board, or a screen.
+
+    Attributes:
+        T_world_from_face: Frame ``[4, 4]`` at its centre: x out of it towards a viewer, z up.
+        width_m: Its width [m].
+        height_m: Its height [m].
+        screen_px: Width and height [px] of a screen, which shows pictures by itself (`Screens.show`); None for a board.
+    """
+
+    T_world_from_face: Array
+    width_m: float
+    height_m: float
+    screen_px: tuple[int, int] | None = None
+
+    @property
+    def square_m(self) -> float:
+        """Side of the largest square in its middle [m]."""
+        return min(self.width_m, self.height_m)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data (JSON types)."""
+        pixels = None if self.screen_px is None else list(self.screen_px)
+        pose = np.asarray(self.T_world_from_face, dtype=np.float64).tolist()
+        return {
+            "T_world_from_face": pose,
+            "width_m": self.width_m,
+            "height_m": self.height_m,
+            "screen_px": pixels,
+        }
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Panel:
+        """Rebuild a panel from :meth:`to_dict`."""
+        pixels = data["screen_px"]
+        return cls(
+            np.array(data["T_world_from_face"], dtype=np.float64),
+            float(data["width_m"]),
+            float(data["height_m"]),
+            None if pixels is None else (int(pixels[0]), int(pixels[1])),
+        )
+
+
+@dataclass(frozen=True, eq=False)
 class WorldDescription:
     """What an experiment must know of a world, as plain data: it is kept beside the photographs, and read where the world is not open.
 
@@ -111,6 +155,8 @@ class WorldDescription:
         box: What is learned.
         lanes: Middles of the lanes in which no object may stand: at least the paths, which stand here if nothing is given.
         road_edge: Lines ``[N, 2]`` [m] where the road ends, for drawings.
+        panels: Boards and screens that can carry a texture, by name.
+        fence_m: The car is stopped where abs(x) or abs(y) exceeds this [m]; None without a fence.
         facts: JSON data that the results depend on and that neither the configuration nor the rest of the description has, such as which
             junction a server found.
     """
@@ -123,6 +169,8 @@ class WorldDescription:
     box: Box
     lanes: tuple[ReferencePath, ...] = ()
     road_edge: tuple[Array, ...] = ()
+    panels: Mapping[str, Panel] = field(default_factory=dict)
+    fence_m: float | None = None
     facts: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -159,6 +207,8 @@ class WorldDescription:
             },
             "lanes": [lane.to_dict() for lane in self.lanes],
             "road_edge": [np.asarray(line, dtype=np.float64).tolist() for line in self.road_edge],
+            "panels": {name: panel.to_dict() for name, panel in self.panels.items()},
+            "fence_m": self.fence_m,
             "facts": dict(self.facts),
         }
 
@@ -182,6 +232,8 @@ class WorldDescription:
                 road_edge=tuple(
                     np.array(line, dtype=np.float64).reshape(-1, 2) for line in data["road_edge"]
                 ),
+                panels={str(name): Panel.from_dict(panel) for name, panel in data["panels"].items()},
+                fence_m=None if data["fence_m"] is None else float(data["fence_m"]),
                 facts=dict(data["facts"]),
             )
         except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
@@ -272,7 +324,7 @@ class World(Protocol):
         ...
 
     def photograph(self, T_world_from_camera: Array, /) -> Rgb:
-        """A photograph ``[H, W, 3]`` with ``photo_pinhole``, in the driving camera's colours, for learning the scene."""
+        """A photograph ``[H, W, 3]`` with ``photo_pinhole``, for learning the scene; in the driving camera's colours, unless its traits say otherwise."""
         ...
 
     def __enter__(self) -> World: ...
@@ -305,11 +357,13 @@ class Traits:
             description: what was captured and learned stays valid when they change.
         exclusive: Whether only one may be open at a time, as where one server steps one world.
         step_s: Every step is a whole multiple of this [s]; None for any duration.
+        own_photo_colours: Whether ``photograph`` has colours of its own, as a phone has: an experiment then fits a map to those of the driving camera.
     """
 
     unseen: tuple[str, ...] = ()
     exclusive: bool = False
     step_s: float | None = None
+    own_photo_colours: bool = False
 
 
 @runtime_checkable
@@ -340,3 +394,11 @@ def members_of_a_world() -> tuple[str, ...]:
     """Names of everything that a world must have."""
     named = [name for name in vars(World) if not name.startswith("_") or name in ("__enter__", "__exit__")]
     return tuple(sorted({*named, *World.__annotations__}))
+
+
+@runtime_checkable
+class Screens(Protocol):
+    """A world that has screens among its panels."""
+
+    def show(self, panel: str, rgb: Rgb | None, /) -> None:
+        """Show a picture ``[h, w, 3]`` (row 0 on top) on the whole of a screen; None shows what it shows when nothing is asked."""

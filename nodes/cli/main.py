@@ -215,17 +215,9 @@ def _run_experiment(
 ) -> None:
     # Rendering without a display is the only way the stages know; an import of MuJoCo decides on it.
     os.environ.setdefault("MUJOCO_GL", "egl")
-    from nodes.experiment.run import is_in_a_world
-
-    folder = folder or Path("runs") / setting
-    if is_in_a_world(file):
-        from nodes.experiment.junction import run as world_run
-
-        with ends_in_order():
-            world_run.run_experiment(world_run.load_experiment(file, setting, overrides or [], folder), until)
-        return
     from nodes.experiment.run import load_experiment, run_experiment
 
+    folder = folder or Path("runs") / setting
     with ends_in_order():
         run_experiment(load_experiment(file, setting, overrides or [], folder), until)
 

@@ -296,8 +296,7 @@ def _calibration(model: Any, given: Path | None, bags: list[Path], name: str) ->
 
 
 def _surrogate(folder: Path, file: Path, setting: str, view: PolicyView) -> SourcePlan:
-    from advnerf_core.learning.imitation import SourcePlan
-    from nodes.experiment.policy import surrogate_source
+    from nodes.experiment.policy import surrogate_plan
     from nodes.experiment.run import load_experiment
     from nodes.runtime.errors import ConfigError
 
@@ -306,7 +305,4 @@ def _surrogate(folder: Path, file: Path, setting: str, view: PolicyView) -> Sour
         raise ConfigError(
             f"expected the run in {folder} to have the camera of the recordings, got another; use bags of that run and its --camera"
         )
-    config = run.config.policy
-    return SourcePlan(
-        surrogate_source(run), config.surrogate_stills, config.surrogate_drives, config.drive_steps
-    )
+    return surrogate_plan(run)

@@ -24,11 +24,11 @@ def gate(
     setting: Annotated[str, typer.Option("--setting", help="Setting of the experiment file.")] = "full",
     run_folder: Annotated[Path | None, typer.Option("--run-folder", show_default="runs/<setting>")] = None,
     kind: Annotated[
-        str, typer.Option("--kind", help="Kind of experiment: room, intersection, or a module of cells.")
-    ] = "room",
+        str, typer.Option("--kind", help="Kind of experiment: world, or a module of cells.")
+    ] = "world",
     scenario: Annotated[
-        str, typer.Option("--scenario", help="Scenario, for experiments that have several.")
-    ] = "straight",
+        str, typer.Option("--scenario", help="Which path; the views that are compared are of all.")
+    ] = "",
     victim: Annotated[str, typer.Option("--victim", help="Victim: hardened or naive.")] = "hardened",
     bag: Annotated[
         Path | None,

@@ -1,239 +1,308 @@
-"""Stage attack: for every victim and seed the gradient attack and random search, in the learned scene only."""
+"""The part of a cell in the surrogate: the search, its attack file, and the drives past what was found."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
-import numpy as np
 import torch
 
-from advnerf_core.attack.adjoint import AttackProblem, evaluate
-from advnerf_core.attack.artifact import AttackFile, save_attack
+from advnerf_core.attack.adjoint import AttackProblem
+from advnerf_core.attack.artifact import AttackFile, load_attack, save_attack
 from advnerf_core.attack.clean import clean_drive
-from advnerf_core.attack.methods import Method, SearchRun, SearchSettings, load_method
-from advnerf_core.attack.search.search import SearchResult, draw_start_states
-from advnerf_core.attack.spaces.displayed import DisplayedSensor
-from advnerf_core.driving.clean_drive import CleanDrive
+from advnerf_core.attack.methods import Method, SearchRun, SearchSettings, load_method, method_name
+from advnerf_core.attack.search.search import SearchResult
+from advnerf_core.attack.spaces.space import Shown, Space
 from advnerf_core.files import write_atomically
 from advnerf_core.policies.pilotnet import LoadedPolicy, load_policy
-from advnerf_core.scene.surrogate import Surrogate
+from advnerf_core.report.cells import cell_name
+from advnerf_core.report.conditions import NONE
 from nodes.experiment.context import Experiment
-from nodes.experiment.learned_scene import load_background, scene_sha256
-from nodes.experiment.objects import attacked_object, surrogate_of
-from nodes.experiment.policy import HARDENED, NAIVE, victim_file
-from nodes.experiment.request.objects import object_sha256
+from nodes.experiment.drives import learned_drives, totals
+from nodes.experiment.faces import has_face, panel_of
+from nodes.experiment.learned_scene import scene_sha256
+from nodes.experiment.policy import HARDENED, victim_file, victims
 from nodes.experiment.request.telling import telling
-from nodes.experiment.screen import shown
+from nodes.experiment.space_config import FaceConfig, MeshShapeConfig, MeshTextureConfig, PlacesConfig
+from nodes.experiment.spaces import geometry_sha256, make_space, over_the_world
 from nodes.experiment.stages import hash_of
 from nodes.runtime.progress import Report
 
-METHODS = ("random", "gradient")  # of an experiment; a campaign may compare any
-
 
 @dataclass(frozen=True)
-class Search:
-    """One search.
+class Cell:
+    """One entry of the transfer table: which drive, which victim meets what, which seed.
 
     Attributes:
+        scenario: Name of the drive.
         victim: Which policy.
-        method: Name of the method.
-        seed: Of starts and search.
+        method: Name of the method that found what it meets; ``none``: the plain objects.
+        seed: Of the search and its starts.
         reference: Where the method's code is, as `load_method` takes it, if its name does not say.
     """
 
+    scenario: str
     victim: str
     method: str
     seed: int
-    reference: str = ""
+    reference: str = field(default="", compare=False)
+
+    @classmethod
+    def of(cls, scenario: str, victim: str, method: str, seed: int) -> Cell:
+        """The cell of a method as `load_method` takes it, or of ``none``."""
+        name = method_name(method)
+        return cls(scenario, victim, name, seed, "" if method == name else method)
 
     @property
     def name(self) -> str:
         """Name of its files."""
-        return f"{self.victim}_{self.method}_{self.seed}"
+        return cell_name(self.scenario, self.victim, self.method, self.seed)
+
+    @property
+    def clean(self) -> Cell:
+        """The same drive past the plain objects."""
+        return Cell(self.scenario, self.victim, NONE, self.seed)
 
 
-def victims(experiment: Experiment) -> list[str]:
-    """The policies that are attacked."""
-    return [HARDENED, NAIVE] if experiment.config.policy.naive_steps else [HARDENED]
-
-
-def searches(experiment: Experiment) -> list[Search]:
-    """All searches: every seed against the hardened victim, the first also against the naive one."""
-    seeds = experiment.config.attack.seeds
-    plan = [Search(HARDENED, method, seed) for seed in seeds for method in METHODS]
-    if NAIVE in victims(experiment):
-        plan += [Search(NAIVE, method, seeds[0]) for method in METHODS]
-    return plan
-
-
-def start_states(experiment: Experiment, seed: int) -> torch.Tensor:
-    """Start poses ``[B, 3]`` of one attack; the first is the nominal one."""
-    attack = experiment.config.attack
-    return draw_start_states(experiment.room.start_pose, attack.starts, attack.start_sigma, seed)
+def cells(experiment: Experiment) -> list[Cell]:
+    """All cells in order: every seed against the hardened victim, the first also against the naive one; quick ones first."""
+    seeds, methods = experiment.config.attack.seeds, experiment.config.attack.methods
+    rows = [
+        (victim, seed)
+        for victim in victims(experiment)
+        for seed in (seeds if victim == HARDENED else seeds[:1])
+    ]
+    return [
+        Cell.of(scenario, victim, condition, seed)
+        for victim, seed in rows
+        for condition in (NONE, *methods)
+        for scenario in experiment.config.scenarios
+    ]
 
 
 def frozen_hashes(experiment: Experiment) -> dict[str, str]:
-    """What is fixed before the first attack: scene, victims, placement, starts and seeds."""
+    """What is fixed before the first attack: scene, victims, objects and their places, starts and seeds."""
     policies = {
         f"policy_{name}": load_policy(victim_file(experiment, name)).sha256 for name in victims(experiment)
     }
-    placement = np.asarray(attacked_object(experiment).T_world_from_object).tolist()
-    starts = {str(seed): start_states(experiment, seed).tolist() for seed in experiment.config.attack.seeds}
+    starts = {
+        f"{scenario} {seed}": experiment.start_states(scenario, seed).tolist()
+        for scenario in experiment.config.scenarios
+        for seed in experiment.config.attack.seeds
+    }
+    things = experiment.objects
     return {
         "scene": scene_sha256(experiment),
         **policies,
-        "placement": hash_of(placement),
+        "objects": hash_of([geometry_sha256(experiment, thing.kind) for thing in things]),
+        "placement": hash_of(
+            [thing.model_dump(mode="json") for thing in things]
+            + ([panel_of(experiment).to_dict()] if has_face(experiment) else [])
+        ),
         "starts_and_seeds": hash_of(starts),
         "config": hash_of(experiment.config.model_dump(mode="json")),
     }
 
 
 def run(experiment: Experiment, folder: Path, report: Report) -> None:
-    """Freeze, drive without attack, search; one attack file and one JSON of surrogate drives per search."""
+    """Freeze, then search what is not searched yet; one attack file and one JSON of surrogate drives per cell."""
     write_atomically(folder / "frozen.json", json.dumps(frozen_hashes(experiment), indent=1) + "\n")
-    background = load_background(experiment)
-    bare = surrogate_of(experiment, [], background)
-    attacked = sensor_of(experiment, surrogate_of(experiment, [attacked_object(experiment)], background))
-    plan = searches(experiment)
-    for victim in victims(experiment):
-        for seed in experiment.config.attack.seeds:
-            drive_without_attack(experiment, bare, victim, seed, folder)
-    for index, search in enumerate(plan):
-        if (folder / f"{search.name}.json").exists():
-            continue
+    if over_the_world(experiment):
+        with experiment.open_world() as scene:
+            _search_all(experiment, make_space(experiment, scene), folder, report)
+    else:
+        _search_all(experiment, make_space(experiment, None), folder, report)
 
-        def progress(fraction: float, text: str = "", index: int = index, search: Search = search) -> None:
+
+def _search_all(experiment: Experiment, space: Space, folder: Path, report: Report) -> None:
+    plan = cells(experiment)
+    for index, cell in enumerate(plan):
+
+        def progress(fraction: float, text: str = "", index: int = index, cell: Cell = cell) -> None:
             report(
-                (index + fraction) / len(plan), f"{search.victim} {search.method} seed {search.seed}: {text}"
+                (index + fraction) / len(plan),
+                f"{cell.scenario} {cell.victim} {cell.method} seed {cell.seed}: {text}",
             )
 
-        run_search(experiment, attacked, search, folder, progress)
+        surrogate_part(experiment, space, cell, folder, progress)
 
 
-def sensor_of(experiment: Experiment, surrogate: Surrogate) -> Surrogate | DisplayedSensor:
-    """What the attack looks through: on a monitor, the surrogate behind what the monitor does to colours."""
-    in_loop = experiment.shown_on_monitor and experiment.config.attack.display_model
-    return shown(experiment, surrogate) if in_loop else surrogate
+def surrogate_part(
+    experiment: Experiment, space: Space, cell: Cell, folder: Path, report: Callable[..., None]
+) -> dict[str, Any]:
+    """Search if the cell has a method, drive in the surrogate, and keep both; what is there already is read.
+
+    Args:
+        experiment: The experiment.
+        space: What is searched.
+        cell: Which.
+        folder: Gets ``<cell>.attack.safetensors`` and ``<cell>.json``.
+        report: Told the finished fraction.
+
+    Returns:
+        Attack id (None without an attack), states and metrics of the drives, the curve of the search [m], and its seconds.
+    """
+    kept = folder / f"{cell.name}.json"
+    if kept.exists():
+        found: dict[str, Any] = json.loads(kept.read_text())
+        return found
+    policy = _victim(victim_file(experiment, cell.victim))
+    problem = attack_problem(experiment, space, policy, cell.scenario, cell.seed)
+    attack_id, curve, seconds = None, [], 0.0
+    if cell.method != NONE:
+        result = _search(experiment, space, problem, cell, folder, report)
+        seconds = sum(evaluation.seconds for evaluation in result.history)
+        curve = [evaluation.predicted_total_cte_m for evaluation in result.history]
+        attack = _attack_file(experiment, space, problem, policy, cell, result)
+        attack_id = save_attack(attack_path(folder, cell), attack)
+    shown = load_shown(space, folder, cell)
+    measured = replace(past(problem, space, shown), steps=experiment.config.horizon)
+    states, scores = learned_drives(experiment, measured, shown.colours)
+    data = {
+        "attack_id": attack_id,
+        "states": states.tolist(),
+        **totals(scores),
+        "mean_cte_m": [score.mean_cte_m for score in scores],
+        "time_to_leave_s": [score.time_to_leaving_s for score in scores],
+        "curve_total_cte_m": curve,
+        "seconds": seconds,
+    }
+    write_atomically(kept, json.dumps(data) + "\n")
+    _state_path(folder, cell).unlink(missing_ok=True)
+    return data
 
 
 def attack_problem(
-    experiment: Experiment, surrogate: Surrogate | DisplayedSensor, policy: LoadedPolicy, seed: int
+    experiment: Experiment, space: Space, policy: LoadedPolicy, scenario: str, seed: int
 ) -> AttackProblem:
-    """The attack on one victim with the starts of one seed."""
-    attack = experiment.config.attack
-    fence = np.abs(np.array(experiment.room.fence_m)).min()
+    """The attack on one victim on one drive, with the starts of one seed."""
+    attack, starts = experiment.config.attack, experiment.start_states(scenario, seed)
+    goals = torch.tensor([experiment.goal(scenario)], dtype=torch.float32).expand(len(starts), -1)
     return AttackProblem(
         policy.policy,
-        surrogate,
+        space.sensor,
         experiment.dynamics,
-        experiment.path,
-        start_states(experiment, seed),
-        attack.horizon,
+        experiment.paths[scenario],
+        starts,
+        experiment.searched_ticks,
+        goals,
         time_batch=attack.time_batch,
         cache_bytes=int(attack.cache_mib * 2**20),
-        fence_m=float(fence),
-        off_track_m=experiment.room.off_track_m,
+        fence_m=experiment.world.fence_m,
+        held_cap_m=experiment.config.held_cap_m,
+        off_track_m=experiment.world.off_track_m,
     )
 
 
-def measured(experiment: Experiment, problem: AttackProblem) -> AttackProblem:
-    """The same drive over the ticks that the protocol measures, whatever was optimised."""
-    return replace(problem, steps=experiment.config.horizon)
+def past(problem: AttackProblem, space: Space, shown: Shown) -> AttackProblem:
+    """The problem with the surrogate as its sensor, in which objects stand as they are shown; its theta are their colours."""
+    return replace(problem, sensor=shown.seen_by(space.surrogate))
 
 
-def drive_without_attack(
-    experiment: Experiment, bare: Surrogate, victim: str, seed: int, folder: Path
-) -> None:
-    """Drive in the learned scene without attack; leaves a JSON of the drives."""
-    policy = load_policy(victim_file(experiment, victim))
-    problem = measured(experiment, attack_problem(experiment, bare, policy, seed))
-    rollout, totals = evaluate(problem, torch.zeros(bare.theta_shape))
-    drives = {
-        "states": rollout.states.transpose(0, 1).tolist(),
-        "total_cte_m": totals.protocol_cte_m.tolist(),
-    }
-    write_atomically(folder / f"{victim}_none_{seed}.json", json.dumps(drives) + "\n")
+def attack_path(folder: Path, cell: Cell) -> Path:
+    """The attack file of a cell."""
+    return folder / f"{cell.name}.attack.safetensors"
 
 
-def run_search(
-    experiment: Experiment,
-    surrogate: Surrogate | DisplayedSensor,
-    search: Search,
-    folder: Path,
-    progress: Callable[..., None],
-) -> None:
-    """One search; leaves its attack file and a JSON of surrogate drives, and goes on from its state file if it was stopped."""
-    method = load_method(search.reference or search.method)
-    settings = search_settings(experiment, method)
-    policy = load_policy(victim_file(experiment, search.victim))
-    problem = attack_problem(experiment, surrogate, policy, search.seed)
-    state_path = folder / f"{search.name}.state.safetensors"
-    told = telling(method.evaluations(problem, settings), progress)
-    searching = SearchRun(search.seed, state_path, told, hash_of(frozen_hashes(experiment)))
-    result = method.search(problem, settings, searching)
-    clean = clean_drive(problem, plain_theta(surrogate))
-    attack_id = save_attack(
-        attack_path(folder, search), _attack_file(experiment, policy, search, result, clean)
-    )
-    rollout, totals = evaluate(measured(experiment, problem), result.theta)
-    drives = {
-        "attack_id": attack_id,
-        "clean_drive": clean.to_dict(),
-        "states": rollout.states.transpose(0, 1).tolist(),
-        "total_cte_m": totals.protocol_cte_m.tolist(),
-        "curve_total_cte_m": [evaluation.predicted_total_cte_m for evaluation in result.history],
-        "seconds": sum(evaluation.seconds for evaluation in result.history),
-    }
-    write_atomically(folder / f"{search.name}.json", json.dumps(drives) + "\n")
-    state_path.unlink(missing_ok=True)
+def load_shown(space: Space, folder: Path, cell: Cell) -> Shown:
+    """The objects as a search found them, of its attack file; as they are where the cell has no method."""
+    attack = load_found(folder, cell)
+    return space.plain if attack is None else space.restored(attack)
+
+
+def load_found(folder: Path, cell: Cell) -> AttackFile | None:
+    """The attack file of a search; None where the cell has no method."""
+    return None if cell.method == NONE else load_attack(attack_path(folder, cell))
 
 
 def search_settings(experiment: Experiment, method: Method) -> SearchSettings:
-    """What a method may spend: the budget of the gradient attack if it needs a gradient, else that of random search."""
-    attack = experiment.config.attack
+    """What a search may spend."""
+    attack, space = experiment.config.attack, experiment.config.space
+    # Objects that are no face have no coarse texture: every colour is searched.
+    cells = space.cells if isinstance(space, FaceConfig) else 0
     return SearchSettings(
-        attack.iterations if method.needs_gradient else attack.random_evaluations,
+        evaluations=planned_evaluations(experiment),
+        learning_rate=space.learning_rate
+        if isinstance(space, (MeshTextureConfig, MeshShapeConfig))
+        else None,
+        population=attack.cem_population,
+        cells=cells,
         gradient_rate=attack.learning_rate,
         random_sigma=attack.random_sigma,
         options=method.options({}),
     )
 
 
-def attack_path(folder: Path, search: Search) -> Path:
-    """The attack file of a search."""
-    return folder / f"{search.name}.attack.safetensors"
+def planned_evaluations(experiment: Experiment) -> int:
+    """Drives of each search."""
+    space = experiment.config.space
+    return (
+        space.samples * space.steps
+        if isinstance(space, PlacesConfig)
+        else experiment.config.attack.evaluations
+    )
 
 
-def plain_theta(sensor: Surrogate | DisplayedSensor) -> torch.Tensor:
-    """The object's own colours, whatever is between them and the camera."""
-    behind = sensor.sensor if isinstance(sensor, DisplayedSensor) else sensor
-    assert isinstance(behind, Surrogate)
-    return behind.plain_theta()
+def _search(
+    experiment: Experiment,
+    space: Space,
+    problem: AttackProblem,
+    cell: Cell,
+    folder: Path,
+    report: Callable[..., None],
+) -> SearchResult:
+    frozen = {
+        key: value
+        for key, value in frozen_hashes(experiment).items()
+        if key not in ("config", "starts_and_seeds")
+    }
+    wanted = experiment.config.space.model_dump(mode="json")
+    settings_hash = hash_of({**frozen, "victim": cell.victim, "scenario": cell.scenario, "space": wanted})
+    reference = cell.reference or cell.method
+    method = load_method(reference)
+    settings = search_settings(experiment, method)
+    told = telling(method.evaluations(problem, settings), report)
+    run = SearchRun(cell.seed, _state_path(folder, cell), told, settings_hash)
+    return space.search(reference, problem, settings, run)
+
+
+def _state_path(folder: Path, cell: Cell) -> Path:
+    return folder / f"{cell.name}.state.safetensors"
+
+
+@lru_cache(maxsize=4)
+def _victim(path: Path) -> LoadedPolicy:
+    return load_policy(path)
 
 
 def _attack_file(
-    experiment: Experiment, policy: LoadedPolicy, search: Search, result: SearchResult, clean: CleanDrive
+    experiment: Experiment,
+    space: Space,
+    problem: AttackProblem,
+    policy: LoadedPolicy,
+    cell: Cell,
+    result: SearchResult,
 ) -> AttackFile:
-    theta, field = result.theta.numpy().astype(np.float32), attacked_object(experiment)
-    return AttackFile.of_face(
-        method=search.method,
-        theta=theta,
-        size_m=(experiment.face_m, experiment.face_m),
-        T_world_from_object=np.asarray(field.T_world_from_object),
-        sha256=object_sha256(field),
-        subject=experiment.target.subject,
-        corners_in_subject=experiment.target.corners,
+    clean = clean_drive(past(problem, space, space.plain), space.plain.colours)
+    return AttackFile(
+        method=cell.method,
+        space=space.name,
+        objects=space.attacked(result.theta),
+        face=space.face(result.theta),
         camera=experiment.view.pinhole,
-        scene_sha256=scene_sha256(experiment),
+        scene_sha256=hash_of(experiment.world_settings)
+        if over_the_world(experiment)
+        else scene_sha256(experiment),
         policy_sha256=policy.sha256,
         config_sha256=hash_of(experiment.config.model_dump(mode="json")),
-        seed=search.seed,
+        seed=cell.seed,
         predicted_total_cte_m=result.best.predicted_total_cte_m,
         software_version=version("advnerf"),
-        extra={"victim": search.victim, "horizon": experiment.config.attack.horizon},
+        extra={"victim": cell.victim, "scenario": cell.scenario, "horizon": experiment.searched_ticks},
         clean_drive=clean,
     )

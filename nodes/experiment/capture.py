@@ -1,8 +1,7 @@
-"""Stage capture: photograph the lab with the phone, and with the driving camera for comparison."""
+"""Stage capture: photograph the world, and keep what it says about itself and views of the driving camera that nothing learns from."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -10,74 +9,98 @@ from numpy.typing import NDArray
 
 from advnerf_core.data.posed_images import write_posed_images
 from advnerf_core.geometry import Array, planar_pose
+from advnerf_core.learning.imitation import recovery_states
 from calibration.by_construction import write_twin_calibrations
 from calibration.schema import save_calibration
-from hardware.worlds.lab.lab import Lab
-from hardware.worlds.lab.phone import car_mounted_poses, walk_around_poses
-from nodes.experiment.config import CaptureConfig
-from nodes.experiment.context import CALIBRATION, DISPLAY, Experiment
+from hardware.worlds.lab.lab_world import LabWorld
+from hardware.worlds.world import World
+from nodes.experiment.context import CALIBRATION, Experiment
+from nodes.experiment.faces import DISPLAY, on_screen, panel_of, plain_screen, wanted_face
 from nodes.experiment.learned_scene import HELD_OUT
-from nodes.experiment.screen import measure_display, plain_picture
+from nodes.experiment.screen import measure_display, screens_of
 from nodes.runtime.progress import Report, counted
 
-PHONE, COLOUR_PAIRS = "phone", "colour_pairs"
+PHOTOS, COLOUR_PAIRS = "photos", "colour_pairs"
+# Held-out views lie as far from a path as a fooled car drives [m, of half a lane of 1.75 m], and as turned [rad].
+_LATERAL_M, _HEADING_RAD = 1.0, 0.2
 
 
 def run(experiment: Experiment, folder: Path, report: Report) -> None:
-    """Write three posed image sets: ``phone`` (learned from), ``colour_pairs`` and ``held_out`` (driving camera)."""
-    capture, lab_config = experiment.config.capture, experiment.lab_config
-    write_twin_calibrations(lab_config, folder / CALIBRATION)
-    rng = np.random.default_rng(capture.seed)
-    phone_poses = [
-        *walk_around_poses(lab_config, capture.walk_around, rng),
-        *car_mounted_poses(lab_config, capture.car_mounted, rng),
-    ]
-    car_states = driving_states(experiment, capture.colour_pairs + capture.held_out, rng)
-    driving_poses = [planar_pose(*state) @ experiment.camera.mount for state in car_states]
-    total = len(phone_poses) + len(driving_poses)
-    with Lab(lab_config) as lab:
-        if experiment.shown_on_monitor:
-            report(0.0, "measuring the monitor's colours")
-            fit = measure_display(lab, capture.seed)
-            save_calibration(fit.calibration(), folder / CALIBRATION / f"{DISPLAY}.yaml")
-            lab.set_monitor_image(plain_picture(experiment))
-
-        def photograph(
-            name: str, poses: list[Array], take: Callable[[int], NDArray[np.uint8]], done: int
-        ) -> None:
-            phone = name == PHONE
-            write_posed_images(
-                folder / name,
-                poses,
-                (lab_config.phone if phone else lab_config.camera).pinhole,
-                take,
-                "jpg" if phone else "png",
-                told=counted(report, name, len(poses), done, total),
-            )
-
-        photograph(PHONE, phone_poses, lambda i: lab.photograph(phone_poses[i]), 0)
-        # Interleaved, so that both sets cover the whole track.
-        held_out = _held_out_indices(capture)
-        pairs = [i for i in range(len(driving_poses)) if i not in held_out]
-        for name, chosen, done in ((COLOUR_PAIRS, pairs, 0), (HELD_OUT, sorted(held_out), len(pairs))):
-            poses = [driving_poses[i] for i in chosen]
-            states = [car_states[i] for i in chosen]
-            photograph(name, poses, lambda i, s=states: lab.observe_at(*s[i])[0], len(phone_poses) + done)  # type: ignore[misc]
+    """Write ``world.json`` and posed image sets: ``photos`` (learned from), ``held_out`` and ``colour_pairs`` (driving camera, without objects)."""
+    config = experiment.config.capture
+    rng = np.random.default_rng(config.seed)
+    with experiment.open_world() as scene:
+        experiment.keep_world(scene)
+        _calibrate(experiment, scene, folder / CALIBRATION, report)
+        poses = scene.photo_poses(config.photos, rng)
+        write_posed_images(
+            folder / PHOTOS,
+            poses,
+            scene.photo_pinhole,
+            lambda index: scene.photograph(poses[index]),
+            "jpg",
+            keep=True,
+            told=counted(
+                report, PHOTOS, len(poses), 0, config.photos + config.held_out + config.colour_pairs
+            ),
+        )
+        for name, count, done in (
+            (HELD_OUT, config.held_out, config.photos),
+            (COLOUR_PAIRS, config.colour_pairs, config.photos + config.held_out),
+        ):
+            if count:
+                _driving_views(experiment, scene, name, count, rng, done, folder, report)
 
 
-def driving_states(experiment: Experiment, count: int, rng: np.random.Generator) -> Array:
-    """Car states ``[count, 3]`` spread evenly over the path, with the offsets that driving shows."""
-    path = experiment.path
-    s_m = (np.arange(count) + rng.uniform(0.0, 1.0, count)) / count * path.length_m
-    poses = path.pose_at(s_m)
-    lateral_m = rng.uniform(-0.15, 0.15, count)
-    states = poses.copy()
-    states[:, 0] -= np.sin(poses[:, 2]) * lateral_m
-    states[:, 1] += np.cos(poses[:, 2]) * lateral_m
-    states[:, 2] += rng.uniform(-0.15, 0.15, count)
-    return states
+def _driving_views(
+    experiment: Experiment,
+    scene: World,
+    name: str,
+    count: int,
+    rng: np.random.Generator,
+    done: int,
+    folder: Path,
+    report: Report,
+) -> None:
+    """A set of views of the driving camera about the paths."""
+    config, states = experiment.config.capture, states_about(experiment, count, rng)
+
+    def observed(index: int) -> NDArray[np.uint8]:
+        x, y, yaw = map(float, states[index])
+        return scene.observe_at(x, y, yaw, depth=False)[0]
+
+    write_posed_images(
+        folder / name,
+        [planar_pose(*state) @ experiment.mount for state in states],
+        experiment.camera,
+        observed,
+        "png",
+        keep=True,
+        told=counted(report, name, count, done, config.photos + config.held_out + config.colour_pairs),
+    )
 
 
-def _held_out_indices(capture: CaptureConfig) -> set[int]:
-    total = capture.colour_pairs + capture.held_out
-    return {int(i) for i in np.linspace(0, total - 1, capture.held_out).round()}
+def _calibrate(experiment: Experiment, scene: World, folder: Path, report: Report) -> None:
+    """Files that live nodes read, and the colours of a screen that carries the attack, which then shows the plain face."""
+    if isinstance(scene, LabWorld):
+        write_twin_calibrations(scene.config, folder)
+    if on_screen(experiment):
+        report(0.0, "measuring the screen's colours")
+        name, panel = wanted_face(experiment).panel, panel_of(experiment)
+        fit = measure_display(scene, name, panel, experiment.config.capture.seed)
+        folder.mkdir(parents=True, exist_ok=True)
+        save_calibration(fit.calibration(), folder / DISPLAY)
+        screens_of(scene).show(name, plain_screen(experiment))
+
+
+def states_about(experiment: Experiment, count: int, rng: np.random.Generator) -> Array:
+    """Car states ``[count, 3]`` about the stretch of all paths that is measured."""
+    names = list(experiment.paths)
+    driven_m = experiment.config.horizon * experiment.config.dt_s * experiment.car.speed_mps
+    parts = []
+    for index, name in enumerate(names):
+        path, share = experiment.paths[name], len(range(index, count, len(names)))
+        lateral_m = experiment.across_m(_LATERAL_M)
+        reach_m = None if path.closed else driven_m
+        parts.append(recovery_states(path, share, rng, lateral_m, _HEADING_RAD, reach_m))
+    return np.concatenate(parts)

@@ -1,13 +1,20 @@
-"""The experiment file: what is captured, learned, attacked and deployed, in two settings (``demo`` and ``full``)."""
+"""The experiment file: which world, what is captured, learned, attacked and deployed, in its settings."""
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from advnerf_core.attack.methods import method_name
+from nodes.experiment.deploy_config import DeployConfig
+from nodes.experiment.method_names import MethodReference
+from nodes.experiment.placed import PlacedObject
+from nodes.experiment.space_config import ColoursConfig, FaceConfig, SpaceConfig
 
 Count = Annotated[int, Field(ge=0)]
 Positive = Annotated[int, Field(ge=1)]
+PositiveNumber = Annotated[float, Field(gt=0)]
 
 
 class _Section(BaseModel):
@@ -15,128 +22,281 @@ class _Section(BaseModel):
 
 
 class CaptureConfig(_Section):
-    """How the room is photographed, by a phone for learning and by the driving camera for comparison."""
+    """How the world is photographed."""
 
-    walk_around: Positive = Field(default=140, description="Phone photographs on a walk around the room.")
-    car_mounted: Positive = Field(default=120, description="Phone photographs with the phone on the car.")
-    colour_pairs: Positive = Field(default=12, description="Driving-camera frames that fit the colour map.")
-    held_out: Positive = Field(default=24, description="Driving-camera frames that nothing learns from.")
+    photos: Positive = Field(default=450, description="Posed photographs that the scene is learned from.")
+    held_out: Annotated[int, Field(ge=3)] = Field(
+        default=36, description="Views of the driving camera along the paths that nothing learns from."
+    )
+    colour_pairs: Count = Field(
+        default=0,
+        description="Views of the driving camera that fit a colour map, where photographs have colours of their own.",
+    )
     seed: int = 0
 
 
 class SceneConfig(_Section):
     """How the radiance field is trained; the length is in steps, so that the result does not depend on the machine."""
 
-    steps: Positive = Field(default=700, description="Training iterations.")
-    margin_m: Annotated[float, Field(ge=0)] = Field(
-        default=0.1, description="How far the field's box reaches beyond the walls [m]."
+    steps: Positive = Field(default=1500, description="Training iterations.")
+    levels: Annotated[int, Field(ge=1, le=20)] = Field(default=8, description="Levels of the hash grid.")
+    finest: Positive = Field(
+        default=2048, description="Cells of its finest level along the box's longest side."
     )
-    interval_px: Annotated[float, Field(gt=0)] | None = Field(
+    log2_entries: Annotated[int, Field(ge=10, le=24)] = Field(
+        default=18, description="Entries of a level of the hash grid, as a power of two."
+    )
+    occupancy: Positive = Field(
+        default=128, description="Cells of the occupancy grid along the box's longest side."
+    )
+    refine_depth: PositiveNumber = Field(
+        default=0.005, description="Optical depth from which rendering looks into a cell; see TrainConfig."
+    )
+    margin_m: Annotated[float, Field(ge=0)] = Field(
+        default=0.5,
+        description="The learned box reaches so far beyond the world's, if that is not contracted [m].",
+    )
+    near_m: PositiveNumber = Field(default=0.3, description="Nothing stands nearer to the cameras [m].")
+    interval_px: PositiveNumber | None = Field(
         default=None,
         description="Sample intervals in pixels of the policy's view; none: the default of pixel_intervals.",
     )
     seed: int = 0
 
 
-class PolicyConfig(_Section):
-    """How the driving policy is trained: frames per domain, rounds, optimiser steps."""
+class ViewConfig(_Section):
+    """What the policy sees of the driving camera: a window of its image, resized to 200 x 66; the default fits 336 x 188."""
 
-    stiffness_1pm: Annotated[float, Field(gt=0)] = Field(
-        default=0.75, description="How firmly the expert returns to the path [1/m]; see ExpertConfig."
+    crop_top_px: Count = Field(default=24, description="First row that is kept.")
+    crop_height_px: Positive = Field(default=111, description="Number of rows that are kept.")
+    crop_left_px: Count = Field(default=0, description="First column that is kept.")
+    crop_width_px: Positive | None = Field(
+        default=None, description="Number of columns that are kept; none: all to the right edge."
+    )
+
+
+class PolicyConfig(_Section):
+    """How the goal-conditioned policy is trained: frames per path and domain, rounds, optimiser steps."""
+
+    stiffness_1pm: PositiveNumber = Field(
+        default=0.2, description="How firmly the expert returns to the path [1/m]; see ExpertConfig."
     )
     feed_forward: Annotated[float, Field(ge=0, le=1)] = Field(
-        default=0.97,
-        description="Share of the path's curvature that the expert steers ahead; see ExpertConfig.",
+        default=1.0, description="Share of the path's curvature that the expert steers ahead."
     )
-    lab_stills: Positive = Field(
-        default=900, description="Lab poses around the path, each seen plain and with random textures."
+    delay_s: Annotated[float, Field(ge=0)] = Field(
+        default=0.1,
+        description="What the expert looks ahead by: half a tick and part of the deployed car's lag [s].",
     )
-    surrogate_stills: Positive = Field(default=600, description="The same in the surrogate.")
-    lab_drives: Positive = Field(default=6, description="Lab drives of each DAgger round.")
-    surrogate_drives: Positive = Field(default=8, description="Surrogate drives of each DAgger round.")
-    drive_steps: Positive = Field(default=40, description="Control ticks of a drive.")
-    dagger_rounds: Count = Field(default=1, description="Rounds of DAgger.")
-    first_steps: Positive = Field(default=350, description="Optimiser steps of behaviour cloning.")
-    round_steps: Positive = Field(default=150, description="Optimiser steps after each round.")
+    smoothing_m: PositiveNumber | None = Field(
+        default=None,
+        description="The expert averages the path's curvature over this [m]; none: the way of one tick.",
+    )
+    driven_m: PositiveNumber | None = Field(
+        default=44.0, description="Frames are taken so far along each path [m]; none: all along."
+    )
+    drives_from_m: PositiveNumber | None = Field(
+        default=12.0,
+        description="DAgger drives start so far along each path at most, so that they pass the junction [m]; none: anywhere.",
+    )
+    stills_heading_rad: PositiveNumber = Field(
+        default=0.3, description="Stills are turned up to this much from the path [rad]."
+    )
+    drives_heading_rad: PositiveNumber = Field(
+        default=0.12, description="DAgger drives start turned up to this much [rad]."
+    )
+    own_car: bool = Field(
+        default=False,
+        description="Drives in the deployment scene are those of its own car, with its lag, one after another; else the surrogate's.",
+    )
+    deployed_stills: Count = Field(default=320, description="Poses about each path in the deployment scene.")
+    surrogate_stills: Count = Field(default=240, description="The same in the surrogate.")
+    deployed_drives: Count = Field(
+        default=3, description="Drives on each path in the deployment scene, per DAgger round."
+    )
+    surrogate_drives: Count = Field(default=3, description="The same in the surrogate.")
+    drive_steps: Positive = Field(
+        default=60, description="Control ticks of such a drive; finer ticks need more."
+    )
+    dagger_rounds: Count = Field(default=2, description="Rounds of DAgger.")
+    first_steps: Positive = Field(default=800, description="Optimiser steps of behaviour cloning.")
+    round_steps: Positive = Field(default=300, description="Optimiser steps after each round.")
     naive_steps: Count = Field(
-        default=250, description="Optimiser steps of the victim that never sees a random texture; 0: none."
+        default=800, description="Optimiser steps of the victim that never sees a random texture; 0: none."
+    )
+    hidden: tuple[int, int, int] = Field(
+        default=(200, 100, 20), description="Widths of the policy's linear layers."
     )
     seed: int = 0
 
 
 class ObjectConfig(_Section):
-    """The attacked object: one face of a cube, projected where the green board stands or shown on the monitor."""
+    """How the objects are made; where they stand is the section objects."""
 
-    target: Literal["board", "monitor"] = Field(
-        default="board", description="What carries the face: the board, or the centre square of the monitor."
+    car_resolution: Annotated[int, Field(ge=8, le=128)] = Field(
+        default=64, description="Voxels along a car's longest side."
     )
-
-    resolution: Annotated[int, Field(ge=2, le=128)] = Field(
-        default=64, description="Grid cells along each side of the face."
+    hydrant_resolution: Annotated[int, Field(ge=8, le=128)] = Field(
+        default=48, description="The same of a hydrant."
     )
-    plain_rgb: tuple[float, float, float] = Field(
-        default=(0.25, 0.62, 0.3), description="Colour of the plain object, 0..1."
-    )
+    fit_steps: Count = Field(default=300, description="Steps that refine the voxels on pictures of the mesh.")
 
 
 class AttackConfig(_Section):
-    """The adversary, and what it may spend."""
+    """The adversary, and what it may spend: all methods evaluate equally often."""
 
+    methods: tuple[MethodReference, ...] = Field(
+        default=("random", "cem", "gradient"),
+        min_length=1,
+        description="Methods of attack; also file.py:Name, relative to the experiment file.",
+    )
     starts: Positive = Field(
-        default=1, description="Start poses optimised together; the first is the nominal one."
+        default=1, description="Start poses optimised together; the first of seed 0 is the nominal one."
+    )
+    nominal_start: bool = Field(
+        default=False, description="The first start of every seed is the nominal one, not of seed 0 alone."
     )
     start_sigma: Annotated[float, Field(ge=0)] = Field(
-        default=0.1, description="Spread of the other starts [m and rad]."
+        default=0.1, description="Spread of all other starts [m and rad]; headings a quarter of it."
     )
-    horizon: Positive = Field(default=40, description="Control ticks of the rollouts that are optimised (T).")
-    iterations: Positive = Field(default=30, description="Gradient iterations.")
-    random_evaluations: Positive = Field(default=10, description="Random textures tried.")
-    learning_rate: Annotated[float, Field(gt=0)] = 0.1
-    random_sigma: Annotated[float, Field(gt=0)] = Field(
-        default=5.0, description="Spread of the random textures' theta."
+    evaluations: Positive = Field(default=50, description="Closed-loop evaluations of each search.")
+    horizon: Positive | None = Field(
+        default=None,
+        description="Control ticks of the drives that are optimised; none: all that are measured.",
     )
-    seeds: tuple[int, ...] = Field(default=(0,), min_length=1, description="One attack per seed.")
+    learning_rate: PositiveNumber = 0.1
+    random_sigma: PositiveNumber = Field(default=5.0, description="Spread of the random textures' theta.")
+    cem_population: Annotated[int, Field(ge=4)] = Field(default=10, description="Candidates of a generation.")
+    seeds: tuple[int, ...] = Field(
+        default=(0,), min_length=1, description="One search of each method per seed."
+    )
     time_batch: Positive = Field(default=16, description="Frames per gradient batch.")
     cache_mib: Annotated[float, Field(ge=0)] = Field(
         default=512.0, description="Budget of the frame cache [MiB]."
     )
-    display_model: bool = Field(
-        default=True,
-        description="On a monitor: search with its measured colours in the loop; false takes it for ideal.",
-    )
+
+    @property
+    def method_names(self) -> tuple[str, ...]:
+        """What the methods are called in tables and file names."""
+        return tuple(map(method_name, self.methods))
+
+    @model_validator(mode="after")
+    def _told_apart(self) -> AttackConfig:
+        if len(set(self.method_names)) != len(self.methods):
+            raise ValueError(f"expected methods of different names, got {', '.join(self.method_names)}")
+        return self
 
 
-class DeployConfig(_Section):
-    """The live runs through the node graph."""
+class RetrainConfig(_Section):
+    """The defence: how often the victim answers the attack, and what it learns from."""
 
-    launch_file: str = Field(
-        default="green_screen.launch.yaml", description="Node graph, beside the experiment file."
+    rounds: Positive = Field(default=1, description="Rounds of attack and retraining, at most.")
+    pays_ratio: PositiveNumber = Field(
+        default=1.5,
+        description="The loop ends when no attack's total CTE in the surrogate is this many times that of none.",
     )
-    nodes: tuple[str, ...] = Field(
-        default=("twin", "camera", "vicon", "compositor", "policy", "safety", "motor", "recorder"),
-        description="Nodes that must be ready before the car moves.",
+    stills: Positive = Field(
+        default=120, description="Poses about each path, per domain, seen plain and with a found texture."
     )
-    laps: Count = Field(default=0, description="Laps driven live without attack before the runs.")
-    empty_scene: bool = Field(
-        default=False, description="Also drive with the board, or the monitor, taken away."
+    drives: Positive = Field(
+        default=2,
+        description="Pairs of the victim's drives on each path, per domain: past plain objects and past a found texture.",
     )
-    ready_timeout_s: Annotated[float, Field(gt=0)] = Field(
-        default=60.0, description="Time for the graph to become ready [s]."
+    drive_steps: Positive = Field(
+        default=60, description="Control ticks of such a drive; finer ticks need more."
     )
+    placements: Count = Field(
+        default=0,
+        description="Random places of all objects in random colours that the victim also learns from; see poses.py.",
+    )
+    steps: Positive = Field(default=500, description="Optimiser steps of the fine-tuning.")
+    new_share: Annotated[float, Field(gt=0, lt=1)] = Field(
+        default=0.4, description="Share of new frames in the training."
+    )
+    seed: int = 0
 
 
 class ExperimentConfig(_Section):
     """One experiment, resolved: the file's values, one of its settings over them, then the command line."""
 
+    @model_validator(mode="after")
+    def _different_names(self) -> ExperimentConfig:
+        for what, names in (
+            ("scenarios", self.scenarios),
+            ("names of objects", [each.name for each in self.objects]),
+        ):
+            if len(set(names)) != len(names):
+                raise ValueError(f"expected different {what}, got {', '.join(names)}")
+        return self
+
+    @model_validator(mode="after")
+    def _retraining_needs_the_gradient(self) -> ExperimentConfig:
+        if self.retrain is not None and "gradient" not in self.attack.methods:
+            raise ValueError(
+                f"expected gradient among attack.methods, as retrain learns from what it finds, got {', '.join(self.attack.methods)}"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _a_face_stands_alone(self) -> ExperimentConfig:
+        if isinstance(self.space, FaceConfig):
+            if self.objects:
+                raise ValueError(
+                    f"expected no objects where a panel carries the attack (space.kind face), got {', '.join(each.name for each in self.objects)}"
+                )
+            if self.retrain is not None:
+                raise ValueError(
+                    "expected retrain only where objects are attacked, got it with space.kind face"
+                )
+        elif self.deploy.live:
+            raise ValueError(
+                f"expected space.kind face, which the live nodes can show, with deploy.through nodes, got {self.space.kind}"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _training_drives_last(self) -> ExperimentConfig:
+        """Fine ticks with the default number of them would train on drives that end before the junction."""
+        policy, asked = self.policy, {}
+        if policy.dagger_rounds and (policy.deployed_drives or policy.surrogate_drives):
+            asked["policy.drive_steps"] = policy.drive_steps
+        if policy.driven_m is None:  # of a closed path every part is passed
+            asked = {}
+        if self.retrain is not None:
+            asked["retrain.drive_steps"] = self.retrain.drive_steps
+        for key, ticks in asked.items():
+            if 2 * ticks < self.horizon:
+                raise ValueError(
+                    f"expected {key} to be at least half of horizon = {self.horizon} ticks, so that what is learned from passes the "
+                    f"junction too, got {ticks} ticks of dt_s = {self.dt_s:g} s, {ticks * self.dt_s:g} s; set {key}={self.horizon}"
+                )
+        return self
+
     name: str = Field(min_length=1)
-    horizon: Positive = Field(
-        default=60,
-        description="Control ticks over which every drive is measured, learned or live (the protocol's 6 s).",
+    world: dict[str, Any] = Field(
+        description="kind: junction, carla, an installed package's, or file.py:Class relative to this file; and changes of that world's Config."
     )
-    lab: dict[str, Any] = Field(default_factory=dict, description="Changes to the simulated lab.")
+    scenarios: tuple[str, ...] = Field(min_length=1, description="Which of the world's paths are driven.")
+    objects: tuple[PlacedObject, ...] = Field(
+        default=(),
+        description="Where the objects of the attack stand; composed by depth, not part of the world.",
+    )
+    horizon: Positive = Field(default=60, description="Control ticks of every drive (T).")
+    dt_s: PositiveNumber = Field(
+        default=0.1,
+        description="Control tick [s]; the paper's CARLA runs have finer ones: docs/intersection_experiment.md.",
+    )
+    held_cap_m: PositiveNumber = Field(
+        default=6.0, description="Largest |CTE| that a stopped car is charged per tick [m]."
+    )
     capture: CaptureConfig = CaptureConfig()
     scene: SceneConfig = SceneConfig()
+    view: ViewConfig = ViewConfig()
     policy: PolicyConfig = PolicyConfig()
     object: ObjectConfig = ObjectConfig()
     attack: AttackConfig = AttackConfig()
+    space: SpaceConfig = Field(default=ColoursConfig(), description="What the attacks may change.")
     deploy: DeployConfig = DeployConfig()
+    retrain: RetrainConfig | None = Field(
+        default=None, description="Retrain the hardened victim on what was found; none: not."
+    )

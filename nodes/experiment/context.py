@@ -1,31 +1,39 @@
-"""What all stages of one experiment share: the resolved configuration, the lab, the calibration, the path."""
+"""What all stages of an experiment in a world share: the resolved configuration, the world, paths, camera, car, objects."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path as FilePath
+from typing import Any
 
-from advnerf_core.display import DisplayModel
-from advnerf_core.driving.dynamics import Ackermann
+import numpy as np
+import torch
+
+from advnerf_core.driving.dynamics import Ackermann, Dubins
+from advnerf_core.driving.expert import Expert, ExpertConfig
+from advnerf_core.driving.metrics import Horizon
 from advnerf_core.driving.path import Path
+from advnerf_core.files import write_atomically
+from advnerf_core.geometry import Array, Pinhole
+from advnerf_core.plugins import unknown
 from advnerf_core.policies.view import PolicyView
-from calibration.display_colour import DisplayCalibration
-from calibration.panel import centre_square
-from calibration.schema import (
-    CameraCalibration,
-    RoomCalibration,
-    TargetCalibration,
-    VehicleCalibration,
-    load_calibration,
-)
-from hardware.worlds.lab.config import LabConfig, PanelConfig
+from hardware.worlds.paths import ReferencePath
+from hardware.worlds.world import CarDescription, NotOpenError, Traits, World, WorldDescription, traits_of
 from nodes.experiment.config import ExperimentConfig
+from nodes.experiment.placed import PlacedObject, in_a_lane
 from nodes.experiment.run_folder import RunFolder
+from nodes.lab.worlds.expert_drive import as_path
+from nodes.lab.worlds.named import NamedWorld, read_world, without
+from nodes.runtime.config import Document
+from nodes.runtime.errors import ConfigError
 
-CONTROL_PERIOD_S = 0.1
-CALIBRATION = "calibration"
-DISPLAY = "display"
+WORLD, CALIBRATION = "world.json", "calibration"
+# Distances that stages use were chosen for half a lane of this width [m] and for this speed [m/s]: those of the simulated junction.
+_HALF_LANE_M, _SPEED_MPS = 1.75, 6.0
 
 
 @dataclass(frozen=True)
@@ -33,73 +41,232 @@ class Experiment(RunFolder[ExperimentConfig]):
     """One resolved experiment."""
 
     @cached_property
-    def lab_config(self) -> LabConfig:
-        """The simulated lab with the experiment's changes."""
-        return LabConfig.model_validate(self.config.lab)
+    def named_world(self) -> NamedWorld:
+        """The world as the file names it, with its changes."""
+        return read_world(Document(self.config.world, str(self.file)), self.file.parent)
 
     @property
-    def launch_file(self) -> FilePath:
-        """The node graph of the live runs."""
-        return self.file.parent / self.config.deploy.launch_file
-
-    def calibration_file(self, name: str) -> FilePath:
-        """A calibration file that the capture stage left: camera, vehicle, board, monitor or room."""
-        return self.stage_folder("capture") / CALIBRATION / f"{name}.yaml"
+    def world_settings(self) -> dict[str, Any]:
+        """What of the world's configuration the results depend on, as JSON data."""
+        return self.named_world.settings
 
     @cached_property
-    def camera(self) -> CameraCalibration:
-        """The driving camera."""
-        return load_calibration(CameraCalibration, self.calibration_file("camera"))
-
-    @cached_property
-    def room(self) -> RoomCalibration:
-        """Path, fence and start pose."""
-        return load_calibration(RoomCalibration, self.calibration_file("room"))
-
-    @cached_property
-    def target(self) -> TargetCalibration:
-        """The face on which an attack is shown: the board, or the monitor's centre square."""
-        target = load_calibration(TargetCalibration, self.calibration_file(self.config.object.target))
-        return centre_square(target) if self.shown_on_monitor else target
+    def traits(self) -> Traits:
+        """What is known of the world without opening it."""
+        return traits_of(self.named_world.make())
 
     @property
-    def shown_on_monitor(self) -> bool:
-        """Whether the face is shown on the monitor; else it is projected onto the board."""
-        return self.config.object.target == "monitor"
-
-    @property
-    def panel(self) -> PanelConfig:
-        """What carries the face in the lab."""
-        return self.lab_config.monitor if self.shown_on_monitor else self.lab_config.board
-
-    @property
-    def face_m(self) -> float:
-        """Side of the square face [m]."""
-        return min(self.panel.width_m, self.panel.height_m)
+    def seen_settings(self) -> dict[str, Any]:
+        """What of the world's configuration its pictures and its description depend on, as JSON data."""
+        return without(self.world_settings, self.traits.unseen)
 
     @cached_property
-    def display(self) -> DisplayModel:
-        """What the driving camera sees of the monitor's colours, as measured in the capture stage."""
-        return load_calibration(DisplayCalibration, self.calibration_file(DISPLAY)).display
+    def world(self) -> WorldDescription:
+        """Paths, lanes, car and camera. A world that must be asked for them was asked by the capture stage, which has kept them.
+
+        Raises:
+            ConfigError: It must be asked, and nothing is captured yet.
+        """
+        try:
+            return self.named_world.make().describe()
+        except NotOpenError:
+            kept = self._captured()
+            if kept is None or kept["settings"] != self.seen_settings:
+                raise ConfigError(
+                    f"expected {self._kept_world} of this configuration, which the capture stage writes when the world {self.named_world.kind} is "
+                    "open; run that stage first"
+                ) from None
+            return WorldDescription.from_dict(kept["description"])
+
+    @property
+    def is_described(self) -> bool:
+        """Whether the world is known: not before the capture stage if it must be asked."""
+        try:
+            _ = self.world
+        except ConfigError:
+            return False
+        return True
+
+    @contextmanager
+    def open_world(self) -> Iterator[World]:
+        """The world, open; closed at the end.
+
+        Raises:
+            ConfigError: It is not the world that was captured.
+        """
+        with self.named_world.make() as world:
+            kept, found = self._captured(), as_json(world.describe())
+            if kept is not None and kept["settings"] == self.seen_settings and kept["description"] != found:
+                differ = [name for name, value in found.items() if kept["description"].get(name) != value]
+                raise ConfigError(
+                    f"expected the world of {self._kept_world}, got one with other {', '.join(differ)}: open the world that was captured, or name "
+                    "another run folder"
+                )
+            yield world
+
+    def keep_world(self, world: World) -> None:
+        """Write what an open world says about itself into the capture stage's folder.
+
+        Raises:
+            ConfigError: It says something else than before.
+        """
+        found = as_json(world.describe())
+        text = json.dumps({"settings": self.seen_settings, "description": found}, indent=1)
+        write_atomically(self._kept_world, text + "\n")
+        if as_json(self.world) != found:
+            raise ConfigError(
+                f"expected the world {self.named_world.kind} to say the same about itself every time, got something else once it was open; a world "
+                "that must be asked raises NotOpenError before"
+            )
+
+    @property
+    def _kept_world(self) -> FilePath:
+        return self.stage_folder("capture") / WORLD
+
+    def _captured(self) -> dict[str, Any] | None:
+        if not self._kept_world.exists():
+            return None
+        kept: dict[str, Any] = json.loads(self._kept_world.read_text(encoding="utf-8"))
+        return kept
 
     @cached_property
-    def path(self) -> Path:
-        """The reference path."""
-        return self.room.reference_path
+    def references(self) -> dict[str, ReferencePath]:
+        """The paths of the experiment by scenario.
+
+        Raises:
+            ConfigError: The world has no such path.
+        """
+        known = self.world.paths
+        for name in self.config.scenarios:
+            if name not in known:
+                raise ConfigError(f"{self.file}: scenarios: {unknown(name, 'scenario', known)}")
+        return {name: known[name] for name in self.config.scenarios}
+
+    @cached_property
+    def paths(self) -> dict[str, Path]:
+        """Reference paths by scenario.
+
+        Raises:
+            ConfigError: The world's lines and arcs are no path, as one that does not close.
+        """
+        try:
+            return {name: as_path(reference) for name, reference in self.references.items()}
+        except ValueError as error:
+            raise ConfigError(f"world {self.named_world.kind}: {error}") from error
+
+    @cached_property
+    def objects(self) -> tuple[PlacedObject, ...]:
+        """The objects of the attack, beside the lanes.
+
+        Raises:
+            ConfigError: One stands in a lane.
+        """
+        if (found := in_a_lane(self.config.objects, self.world)) is not None:
+            raise ConfigError(f"{self.file}: objects.{found[0]}: {found[1]}")
+        return self.config.objects
+
+    def goal(self, scenario: str) -> tuple[float, ...]:
+        """What the policy is told on a path; empty where it is told nothing."""
+        return self.references[scenario].goal
+
+    def expert(self, scenario: str) -> Expert:
+        """The teacher on one path; its output is the car's control: turn rate [rad/s] or wheel angle [rad]."""
+        wanted, car = self.config.policy, self.car
+        config = ExpertConfig(
+            speed_mps=car.speed_mps,
+            delay_s=wanted.delay_s,
+            stiffness_1pm=wanted.stiffness_1pm,
+            feed_forward=wanted.feed_forward,
+            smoothing_m=wanted.smoothing_m or car.speed_mps * self.config.dt_s,
+            steering_limits_rad=car.control_limits,
+            output="turn_rate",
+        )
+        if car.wheelbase_m is not None:
+            config = replace(config, wheelbase_m=car.wheelbase_m, output="wheel_angle")
+        return Expert(self.paths[scenario], config)
+
+    @property
+    def car(self) -> CarDescription:
+        """The car as the surrogate believes it to be."""
+        return self.world.car
+
+    @property
+    def mount(self) -> Array:
+        """Driving camera on the car ``[4, 4]``."""
+        return self.world.T_car_from_camera
+
+    @property
+    def camera(self) -> Pinhole:
+        """Intrinsics of the driving camera."""
+        return self.world.camera
 
     @cached_property
     def view(self) -> PolicyView:
-        """What the policy sees of the driving camera."""
-        return PolicyView(self.camera.pinhole, distortion=self.camera.distortion)
+        """What the policy sees of the driving camera.
+
+        Raises:
+            ConfigError: The window leaves the camera's image.
+        """
+        try:
+            return PolicyView(self.camera, **self.config.view.model_dump())
+        except ValueError as error:
+            raise ConfigError(
+                f"{self.file}: view: {error}; give the section view the window of the camera's image that is kept"
+            ) from error
 
     @cached_property
-    def dynamics(self) -> Ackermann:
-        """The surrogate's car: as calibrated, without the lags and errors of the real one."""
-        vehicle = load_calibration(VehicleCalibration, self.calibration_file("vehicle"))
-        limits = (vehicle.limits.steering_min_rad, vehicle.limits.steering_max_rad)
-        return Ackermann(vehicle.wheelbase_m, self.speed_mps, CONTROL_PERIOD_S, limits)
+    def dynamics(self) -> Dubins | Ackermann:
+        """The surrogate's car, without the lag and the gain error of the deployed one."""
+        car, dt_s = self.car, self.config.dt_s
+        if car.wheelbase_m is None:
+            return Dubins(car.speed_mps, dt_s)
+        return Ackermann(car.wheelbase_m, car.speed_mps, dt_s, car.control_limits)
 
     @property
-    def speed_mps(self) -> float:
-        """Driving speed."""
-        return self.lab_config.car.speed_mps
+    def limits(self) -> Horizon:
+        """Over how many ticks a drive is measured, and what counts as off the track."""
+        return Horizon(self.config.horizon, self.config.dt_s, self.world.off_track_m, self.config.held_cap_m)
+
+    @property
+    def searched_ticks(self) -> int:
+        """Over how many ticks attacks are optimised."""
+        return self.config.attack.horizon or self.config.horizon
+
+    @property
+    def launch_file(self) -> FilePath:
+        """The node graph of live drives."""
+        return self.file.parent / self.config.deploy.launch_file
+
+    @property
+    def calibration_folder(self) -> FilePath:
+        """Calibration files that the capture stage left for the live nodes, and those of a screen."""
+        return self.stage_folder("capture") / CALIBRATION
+
+    def across_m(self, length_m: float) -> float:
+        """A distance sideways [m] that was chosen for half a lane of 1.75 m, in this world's lanes."""
+        return length_m * (self.world.off_track_m / _HALF_LANE_M)
+
+    def along_m(self, length_m: float) -> float:
+        """A distance along a path [m] that was chosen for 6 m/s, at this car's speed."""
+        return length_m * (self.car.speed_mps / _SPEED_MPS)
+
+    def start_states(self, scenario: str, seed: int) -> torch.Tensor:
+        """Start poses ``[B, 3]`` float64 of one attack, drawn about the nominal one; the first of seed 0 is the nominal one itself.
+
+        A seed that changed only the search's first noise would repeat one drive: gradients end in the same colours from everywhere.
+        """
+        wanted, nominal = self.config.attack, self.references[scenario].drive_start
+        noise = np.random.default_rng([seed, self.config.scenarios.index(scenario)]).standard_normal(
+            (wanted.starts, 3)
+        )
+        if seed == 0 or wanted.nominal_start:
+            noise[0] = 0.0
+        # A tenth of a radian at the start would be 2.4 m of error at the junction.
+        spread = wanted.start_sigma * np.array([1.0, 1.0, 0.25])
+        return torch.from_numpy(np.array(nominal) + spread * noise)
+
+
+def as_json(description: WorldDescription) -> dict[str, Any]:
+    """A description as it is read back from a file."""
+    data: dict[str, Any] = json.loads(json.dumps(description.to_dict()))
+    return data

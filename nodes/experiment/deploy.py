@@ -1,237 +1,257 @@
-"""Stage deploy: drive every attack live through the node graph against the simulated lab, and measure from the bag."""
+"""Stage deploy: every cell's drives past what its search found, by the world's own car or through the live nodes."""
 
 from __future__ import annotations
 
 import json
-import shutil
-import socket
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from datetime import datetime, timezone
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
-from advnerf_core.attack.artifact import load_attack
-from advnerf_core.driving.metrics import Horizon
+import torch
+
+from advnerf_core.attack.spaces.space import Space
 from advnerf_core.files import write_atomically
 from advnerf_core.policies.pilotnet import load_policy
 from advnerf_core.report.conditions import NONE
-from nodes.experiment.attack import METHODS, Search, attack_path, frozen_hashes, victims
-from nodes.experiment.context import CONTROL_PERIOD_S, Experiment
-from nodes.experiment.policy import HARDENED, NAIVE, victim_file
-from nodes.lab.trials.evaluation import attack_ids, counterfactual, score, timing, trajectory
-from nodes.lab.trials.trial import NotStartedError, TrialPlan, counts
-from nodes.lab.trials.trial_runner import run_trial
-from nodes.runtime.clock import NS_PER_S
+from hardware.worlds.world import World
+from nodes.experiment.attack import Cell, attack_path, cells, frozen_hashes, load_found, load_shown
+from nodes.experiment.context import Experiment
+from nodes.experiment.deployed import DeployedDrive
+from nodes.experiment.drives import deployed_drives, totals
+from nodes.experiment.live import LiveRun, as_drive, drive_until_it_counts, run_extras
+from nodes.experiment.policy import HARDENED, victim_file
+from nodes.experiment.spaces import dress, make_space, shown_there
+from nodes.experiment.stages import hash_of
 from nodes.runtime.errors import RuntimeFault
+from nodes.runtime.machine import machine_name
 from nodes.runtime.progress import Report
-
-# The absent board or monitor of the empty scene stands outside the room, out of every camera's sight.
-_OUT_OF_SIGHT_M = 60.0
 
 
 class FrozenChangedError(RuntimeFault):
     """Something that was fixed before the first attack is no longer what it was."""
 
 
-class DriveFault(RuntimeFault):
-    """A live drive was ended again and again by a fault of the stack, so that it measures nothing."""
-
-
-_ATTEMPTS = 3
-# What every victim meets, in this order.
-_CONDITIONS = (NONE, *METHODS)
-
-
-@dataclass(frozen=True)
-class LiveRun:
-    """One live run: which victim meets what; conditions have the names of `advnerf_core.report.conditions`."""
-
-    victim: str
-    condition: str
-    seed: int
-
-    @property
-    def name(self) -> str:
-        """Name of its folder and result."""
-        return f"{self.victim}_{self.condition}_{self.seed}"
-
-
-def live_runs(experiment: Experiment) -> list[LiveRun]:
-    """All runs of the stage, in order: laps, then for each seed none, random, gradient; the naive victim last."""
-    seeds, deploy = experiment.config.attack.seeds, experiment.config.deploy
-    plan = [LiveRun(HARDENED, "laps", seeds[0])] if deploy.laps else []
-    plan += [LiveRun(HARDENED, condition, seed) for seed in seeds for condition in _CONDITIONS]
-    if deploy.empty_scene:
-        plan.append(LiveRun(HARDENED, "empty", seeds[0]))
-    if NAIVE in victims(experiment):
-        plan += [LiveRun(NAIVE, condition, seeds[0]) for condition in _CONDITIONS]
-    return plan
-
-
 def run(experiment: Experiment, folder: Path, report: Report) -> None:
-    """Drive what is not driven yet; one folder with a bag and one JSON per run."""
-    _check_frozen(experiment)
-    plan = live_runs(experiment)
-    for index, live in enumerate(plan):
-        report(index / len(plan), f"{live.victim} {live.condition} seed {live.seed}")
-        if not (folder / f"{live.name}.json").exists():
-            attack = _attack_file(experiment, live) if live.condition in METHODS else None
-            drive_until_it_counts(experiment, live, folder, attack, partial(report, index / len(plan)))
+    """Drive what is not driven yet; one ``.cell.json`` per entry of the transfer table."""
+    check_frozen(experiment)
+    searched, plan = experiment.stage_folder("attack"), cells(experiment)
+    with ExitStack() as stack:
+        deployer = open_deployer(experiment, stack)
+        if isinstance(deployer, ThroughNodes):
+            run_extras(experiment, HARDENED, folder, report)
+        space = make_space(experiment, deployer.scene)
+        for index, cell in enumerate(plan):
+            told = partial(report, index / len(plan))
+            told(f"{cell.scenario} {cell.victim} {cell.method} seed {cell.seed}")
+            deployed_part(experiment, space, deployer, cell, searched, folder, told)
 
 
-def drive_until_it_counts(
-    experiment: Experiment, live: LiveRun, folder: Path, attack: Path | None, tell: Callable[[str], None]
-) -> None:
-    """Drive one run, again if a fault of the stack ended it or kept it from beginning: a busy machine is late now and then.
-
-    Args:
-        experiment: Of the room.
-        live: Which run.
-        folder: Where its folder and its JSON go.
-        attack: What is shown.
-        tell: Told of drives that do not count.
-
-    Raises:
-        DriveFault: None of a few attempts counts; no JSON is left.
-    """
-    for attempt in range(1, _ATTEMPTS + 1):
-        shutil.rmtree(folder / live.name, ignore_errors=True)  # of a drive that was broken off
-        if not (stopped := _fault_of(experiment, live, folder, attack)):
-            return
-        tell(
-            f"{live.name} does not count, the stack stopped it: {stopped} (attempt {attempt} of {_ATTEMPTS})"
-        )
-    raise DriveFault(
-        f"the stack stopped the live drive {live.name} {_ATTEMPTS} times, at last: {stopped}; cure that (advnerf doctor, another load on this machine), "
-        "and give the command again, which goes on here"
-    )
-
-
-def _check_frozen(experiment: Experiment) -> None:
+def check_frozen(experiment: Experiment) -> None:
+    """Refuse to drive if scene, victims, objects, places or starts are not those of the attack."""
     then = json.loads((experiment.stage_folder("attack") / "frozen.json").read_text())
-    changed = [
-        name for name, value in frozen_hashes(experiment).items() if name != "config" and then[name] != value
-    ]
+    now = frozen_hashes(experiment)
+    changed = [name for name, value in now.items() if name != "config" and then.get(name) != value]
     if changed:
         raise FrozenChangedError(
             f"expected {', '.join(changed)} as frozen before the first attack, got another; run the attack stage again"
         )
 
 
-def drive_live(
-    experiment: Experiment, live: LiveRun, folder: Path, attack: Path | None, compare: bool = False
-) -> None:
-    """Drive one run through the node graph, with an attack file or none; leaves its bag and a JSON of what was measured in it.
+class Deployer(Protocol):
+    """Drives past what a search found."""
+
+    @property
+    def scene(self) -> World | None:
+        """The world, if it is open."""
+
+    def drive(
+        self, space: Space, cell: Cell, searched: Path, folder: Path, tell: Callable[[str], None], /
+    ) -> Deployed:
+        """Drive a cell from the starts that are deployed; its attack file is in ``searched``, and what is kept goes to ``folder``."""
+
+
+@dataclass(frozen=True, eq=False)
+class Deployed:
+    """Deployed drives of one cell.
+
+    Attributes:
+        drives: One per start.
+        live: Of live drives what was measured in each bag, and in which folder it is.
+    """
+
+    drives: list[DeployedDrive]
+    live: list[dict[str, Any]] = field(default_factory=list)
+
+
+@dataclass(frozen=True, eq=False)
+class ThroughWorld:
+    """The open world's own car, tick by tick."""
+
+    experiment: Experiment
+    scene: World
+
+    def drive(
+        self, space: Space, cell: Cell, searched: Path, folder: Path, tell: Callable[[str], None]
+    ) -> Deployed:
+        """Drive in this process; see `Deployer.drive`."""
+        del folder, tell
+        experiment = self.experiment
+        policy = load_policy(victim_file(experiment, cell.victim)).policy
+        shown = load_shown(space, searched, cell)
+        there = dress(experiment, self.scene, shown)
+        starts, colours = deployed_starts(experiment, cell), shown_there(shown, load_found(searched, cell))
+        return Deployed(deployed_drives(experiment, there, policy, cell.scenario, starts, colours))
+
+
+@dataclass(frozen=True, eq=False)
+class ThroughNodes:
+    """The live node graph; every drive leaves a bag."""
+
+    experiment: Experiment
+    scene: None = None
+
+    def drive(
+        self, space: Space, cell: Cell, searched: Path, folder: Path, tell: Callable[[str], None]
+    ) -> Deployed:
+        """Launch the nodes once per start; see `Deployer.drive`."""
+        del space
+        attack = None if cell.method == NONE else attack_path(searched, cell).resolve()
+        found = []
+        for number, start in enumerate(deployed_starts(self.experiment, cell).tolist()):
+            name = live_name(cell, number)
+            live = LiveRun(name, cell.victim, cell.scenario, (start[0], start[1], start[2]), attack)
+            found.append({"run": name, **drive_until_it_counts(self.experiment, live, folder, tell)})
+        return Deployed([as_drive(each) for each in found], found)
+
+
+def live_name(cell: Cell, start: int) -> str:
+    """Name of the live run of a cell from one of its starts."""
+    return f"{cell.name}.live{start}"
+
+
+def open_deployer(experiment: Experiment, stack: ExitStack, scene: World | None = None) -> Deployer:
+    """What the section ``deploy`` asks for.
 
     Args:
-        experiment: Of the room.
-        live: Which run.
-        folder: Where its folder and its JSON go.
-        attack: What the compositor or the monitor shows.
-        compare: Let the counterfactual node steer by the clean frames too, and measure what the attack added.
+        experiment: The experiment.
+        stack: Closes the world again.
+        scene: The world, if it is open already.
     """
-    deploy = experiment.config.deploy
-    horizon = live_horizon(experiment, live)
-    nodes, overrides = tuple(deploy.nodes), live_overrides(experiment, live, attack)
-    if compare:
-        nodes, overrides = (*nodes, "counterfactual"), [*overrides, "params.counterfactual=true"]
-    plan = TrialPlan(experiment.room.start_pose, horizon.ticks * horizon.dt_s + 0.2, nodes)
-    run_dir = folder / live.name
-    outcome = run_trial(experiment.launch_file, overrides, run_dir, plan, deploy.ready_timeout_s)
-    bag = run_dir / "bag"
-    states = trajectory(bag, outcome.start_real_ns, horizon)
-    stopped_s = (outcome.end_real_ns - outcome.start_real_ns) / NS_PER_S if outcome.stopped_early else None
-    metrics, held = score(states, experiment.path, horizon, stopped_s)
-    # A frame that was captured less than a tick before the end may rightly find the car disarmed.
-    last_frame_ns = outcome.end_real_ns - round(CONTROL_PERIOD_S * NS_PER_S)
-    times = timing(bag, outcome.start_real_ns, last_frame_ns)
-    drawn = sorted(attack_ids(bag))
-    _check_drawn(live, drawn, attack)
-    result: dict[str, Any] = {
-        "victim": live.victim,
-        "condition": live.condition,
-        "seed": live.seed,
-        "attack_ids": drawn,
-        "outcome": outcome.to_dict(),
-        "states": held.tolist(),
-        "cte_m": experiment.path.project(held[:, :2]).cte_m.tolist(),
-        "total_cte_m": metrics.total_cte_m,
-        "mean_abs_cte_m": metrics.mean_cte_m,
-        "max_abs_cte_m": metrics.max_cte_m,
-        "off_track": metrics.off_track,
-        "time_to_leave_s": metrics.time_to_leaving_s,
-        "frames": times.frames,
-        "missed": times.missed,
-        "capture_to_serial_ms": times.capture_to_serial_ms.tolist(),
-        "hops_ms": {name: values.tolist() for name, values in times.hops_ms.items()},
+    if experiment.config.deploy.live:
+        return ThroughNodes(experiment)
+    return ThroughWorld(experiment, scene or stack.enter_context(experiment.open_world()))
+
+
+def deployed_starts(experiment: Experiment, cell: Cell) -> torch.Tensor:
+    """The starts ``[B, 3]`` of a cell that are deployed."""
+    return experiment.start_states(cell.scenario, cell.seed)[: experiment.config.deploy.starts]
+
+
+def deployed_part(
+    experiment: Experiment,
+    space: Space,
+    deployer: Deployer | None,
+    cell: Cell,
+    searched: Path,
+    folder: Path,
+    tell: Callable[[str], None],
+    clean_folder: Path | None = None,
+) -> dict[str, Any]:
+    """Drive a searched cell and its clean drive where they are deployed; writes ``<cell>.cell.json`` and ``<cell>.drives.json``.
+
+    Args:
+        experiment: The experiment.
+        space: What was searched.
+        deployer: What drives; None deploys nothing.
+        cell: Which.
+        searched: Where the surrogate's part is.
+        folder: Where the result goes.
+        tell: Told of drives that do not count.
+        clean_folder: Where the clean drives go, which several cells share; None: where the result goes.
+
+    Returns:
+        Scenario, victim, method, seed, attack id, hash of all settings, seconds, machine, date; for ``surrogate`` and ``deployed``
+        the total CTE [m] and whether the car left the track, per start, and the total CTE past the plain objects.
+    """
+    result = folder / f"{cell.name}.cell.json"
+    if result.exists():
+        found: dict[str, Any] = json.loads(result.read_text())
+        return found
+    learned, clean = (json.loads((searched / f"{each.name}.json").read_text()) for each in (cell, cell.clean))
+    data = {
+        "scenario": cell.scenario,
+        "victim": cell.victim,
+        "method": cell.method,
+        "seed": cell.seed,
+        "attack_id": learned["attack_id"],
+        "settings_hash": hash_of(frozen_hashes(experiment)),
+        "seconds": round(learned["seconds"], 1),
+        "machine": machine_name(),
+        "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        "surrogate": _drives_of(learned, clean),
+        "extra": {
+            "evaluations": len(learned["curve_total_cte_m"]),
+            "horizon": experiment.config.horizon,
+            "space": experiment.config.space.model_dump(mode="json"),
+            "deployed_through": experiment.config.deploy.through,
+        },
     }
-    if compare and (found := counterfactual(bag, outcome.start_real_ns, last_frame_ns)) is not None:
-        result["counterfactual"] = asdict(found)
-    write_atomically(folder / f"{live.name}.json", json.dumps(result) + "\n")
-
-
-def _fault_of(experiment: Experiment, live: LiveRun, folder: Path, attack: Path | None) -> str:
-    """Drive once; empty, or the fault of the stack for which the drive does not count."""
-    file = folder / f"{live.name}.json"
-    try:
-        drive_live(experiment, live, folder, attack)
-    except NotStartedError as error:
-        return str(error)
-    driven = json.loads(file.read_text())
-    stopped: str = driven["outcome"]["stopped_early"]
-    if counts(stopped, driven["off_track"]):
-        return ""
-    file.unlink()
-    return stopped
-
-
-def live_horizon(experiment: Experiment, live: LiveRun) -> Horizon:
-    """Control ticks over which a run is measured."""
-    ticks = experiment.config.horizon
-    if live.condition == "laps":
-        ticks = round(
-            experiment.config.deploy.laps * experiment.path.length_m / experiment.speed_mps / CONTROL_PERIOD_S
+    if deployer is not None:
+        undisturbed = _drives(space, deployer, cell.clean, searched, clean_folder or folder, tell)
+        driven = (
+            undisturbed if cell.method == NONE else _drives(space, deployer, cell, searched, folder, tell)
         )
-    return Horizon(ticks, CONTROL_PERIOD_S, experiment.room.off_track_m)
+        data["deployed"] = _drives_of(driven, undisturbed)
+        data["extra"] |= {"blocked_tick": driven["blocked_tick"], **_live_extra(driven["live"])}
+    write_atomically(result, json.dumps(data, indent=1) + "\n")
+    return data
 
 
-def live_overrides(experiment: Experiment, live: LiveRun, attack: Path | None) -> list[str]:
-    """What the launch file is told for a run: its calibration and room, its victim, its attack."""
-    policy = victim_file(experiment, live.victim)
-    calibration = experiment.calibration_file("camera").parent
-    overrides = [
-        f"params.calibration={calibration}",
-        f"params.policy={policy}",
-        f"params.vicon_port={_free_udp_port()}",
-        f"policy.sha256={load_policy(policy).sha256}",
-        f"twin.lab={json.dumps(experiment.lab_config.model_dump(mode='json'))}",
-    ]
-    if experiment.shown_on_monitor:
-        overrides += [
-            f"monitor.plain_rgb={json.dumps(experiment.config.object.plain_rgb)}",
-            f"monitor.face_m={experiment.face_m}",
-        ]
-    if attack is not None:
-        overrides.append(f"params.attack={attack}")
-    if live.condition == "empty":
-        overrides.append(f"twin.lab.{experiment.config.object.target}.x_m={_OUT_OF_SIGHT_M}")
-    return overrides
+def _drives_of(found: Mapping[str, Any], clean: Mapping[str, Any]) -> dict[str, Any]:
+    return {
+        "total_cte_m": found["total_cte_m"],
+        "off_track": found["off_track"],
+        "none_total_cte_m": clean["total_cte_m"],
+    }
 
 
-def _free_udp_port() -> int:
-    """A port for this run's motion capture, so that a lab or another run on this host does not answer."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
+def _live_extra(live: list[dict[str, Any]]) -> dict[str, Any]:
+    """What only live drives can tell, per start."""
+    if not live:
+        return {}
+    return {
+        "stopped_early": [each["outcome"]["stopped_early"] for each in live],
+        "missed_frames": [each["missed"] for each in live],
+        "time_to_leave_s": [each["metrics"]["time_to_leaving_s"] for each in live],
+    }
 
 
-def _attack_file(experiment: Experiment, live: LiveRun) -> Path:
-    assert live.condition in METHODS
-    return attack_path(experiment.stage_folder("attack"), Search(live.victim, live.condition, live.seed))
+def _drives(
+    space: Space, deployer: Deployer, cell: Cell, searched: Path, folder: Path, tell: Callable[[str], None]
+) -> dict[str, Any]:
+    """Deployed drives of a cell from its starts; kept, as the clean ones are asked for again and again."""
+    kept = drives_file(folder, cell)
+    if kept.exists():
+        found: dict[str, Any] = json.loads(kept.read_text())
+        return found
+    folder.mkdir(parents=True, exist_ok=True)
+    deployed = deployer.drive(space, cell, searched, folder, tell)
+    data = {
+        "states": [drive.states.tolist() for drive in deployed.drives],
+        "controls": [drive.controls.tolist() for drive in deployed.drives],
+        **totals([drive.metrics for drive in deployed.drives]),
+        "mean_cte_m": [drive.metrics.mean_cte_m for drive in deployed.drives],
+        "blocked_tick": [drive.blocked_tick for drive in deployed.drives],
+        "live": deployed.live,
+    }
+    write_atomically(kept, json.dumps(data) + "\n")
+    return data
 
 
-def _check_drawn(live: LiveRun, drawn: list[str], attack: Path | None) -> None:
-    expected = [load_attack(attack).attack_id] if attack is not None else []
-    if drawn != expected:
-        raise RuntimeFault(f"expected the attacks {expected} in the frames of run {live.name}, got {drawn}")
+def drives_file(folder: Path, cell: Cell) -> Path:
+    """Where the deployed drives of a cell are kept."""
+    return folder / f"{cell.name}.drives.json"

@@ -1,12 +1,14 @@
-"""Real and learned pictures of the simulated lab, without and with an attack: what the fidelity gate and the prediction of transfer look at.
+"""Real and learned pictures, without and with an attack: what the fidelity gate and the prediction of transfer look at.
 
-Real pictures with an attack are made from real pictures without: from a driven bag without attack, into which the face is drawn by the
-code that draws it live. On the monitor the face is drawn in the colours that its calibration says the camera sees.
+Real pictures are the deployment scene's, with the opaque objects composed by depth, from where the car was on its drive past the plain
+objects; of a live drive those in its bag, into which a face is drawn by the code that draws it live, on a screen in the colours that its
+calibration says the camera sees. No drive with the attack is looked at.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,22 +19,31 @@ from numpy.typing import NDArray
 from advnerf_core.attack.adjoint import AttackProblem
 from advnerf_core.attack.artifact import AttackFile, face_texture
 from advnerf_core.attack.projection import FaceOverlay
+from advnerf_core.attack.spaces.displayed import DisplayedSensor
+from advnerf_core.attack.spaces.space import Shown, Space
 from advnerf_core.data.dataset import load_transforms
 from advnerf_core.driving.metrics import Horizon
 from advnerf_core.geometry import Array, invert_transform, planar_poses, yaw_of
 from advnerf_core.policies.pilotnet import load_policy
+from advnerf_core.report.conditions import NONE
 from advnerf_core.scene.fidelity import Pictures
+from advnerf_core.scene.surrogate import Surrogate
 from nodes.bags.reader import read_messages
 from nodes.control.pose_buffer import PoseBuffer
-from nodes.experiment import attack, capture
-from nodes.experiment.cells import CellFault, attack_file, drive_without_attack_of, is_searched
-from nodes.experiment.context import CONTROL_PERIOD_S, Experiment
+from nodes.experiment import capture
+from nodes.experiment.attack import Cell, attack_path, attack_problem, load_found
+from nodes.experiment.cells import clean_folder
+from nodes.experiment.context import Experiment
+from nodes.experiment.deploy import live_name
+from nodes.experiment.drives import deployed_drives
+from nodes.experiment.faces import face_space, has_face, on_screen, panel_of
 from nodes.experiment.images import as_uint8
-from nodes.experiment.learned_scene import load_background
-from nodes.experiment.objects import attacked_object, surrogate_of
+from nodes.experiment.objects import surrogate_of
 from nodes.experiment.policy import victim_file
-from nodes.experiment.screen import shown
-from nodes.runtime.errors import BagError
+from nodes.experiment.run import stages_of
+from nodes.experiment.spaces import dress, make_space, shown_there
+from nodes.experiment.stages import is_current
+from nodes.runtime.errors import BagError, RuntimeFault
 from nodes.runtime.messages import decode, ns_from_stamp, pose_matrix
 from nodes.runtime.pictures import rgb_image
 from nodes.runtime.topics import topic as topic_row
@@ -43,115 +54,178 @@ _CAR, _IMAGE, _SAFETY = "/vicon/car", "/compositor/image", "/safety/state"
 
 
 def policy_of(experiment: Experiment, victim: str, scenario: str) -> tuple[Any, tuple[float, ...]]:
-    """The victim and what it is told; in the room nothing."""
-    del scenario
-    return load_policy(victim_file(experiment, victim)).policy, ()
+    """The victim and what it is told on a path, of the first where none is named."""
+    goal = experiment.goal(scenario or experiment.config.scenarios[0])
+    return load_policy(victim_file(experiment, victim)).policy, goal
 
 
 def held_out(experiment: Experiment, scenario: str) -> Pictures:
-    """The driving camera's views that nothing was learned from."""
+    """The driving camera's views that nothing was learned from, about all drives, without objects."""
     del scenario
     views = load_transforms(experiment.stage_folder("capture") / capture.HELD_OUT, require_all=True).load()
-    real = np.stack([experiment.view.image(rgb) for rgb in views.rgb])
+    surrogate = surrogate_of(experiment, [])
+    learned = [as_uint8(surrogate.render(pose[None], None).images[0]) for pose in views.T_world_from_camera]
     return Pictures(
-        "held-out views",
-        real,
-        _learned(surrogate_of(experiment, []), np.stack(list(views.T_world_from_camera)), None),
+        "held-out views", np.stack([experiment.view.image(rgb) for rgb in views.rgb]), np.stack(learned)
     )
 
 
 def driven(
     experiment: Experiment, scenario: str, victim: str, seed: int, folder: Path, bag: Path | None = None
 ) -> Pictures:
-    """What the camera saw on a live drive without attack.
+    """What the camera sees on the deployed drive without an attack.
 
     Args:
         experiment: The experiment.
-        scenario: Not used; there is one drive.
-        victim: Whose drive without attack.
+        scenario: Which drive.
+        victim: Whose drive.
         seed: Which of its drives.
-        folder: A cell's folder, beside which drives without attack are kept.
-        bag: Instead, a bag of any drive without attack.
+        folder: A cell's folder, beside which live drives without attack are kept.
+        bag: Instead, a bag of any live drive without attack.
+
+    Raises:
+        RuntimeFault: A bag is given where drives are asked of the scene, or there is no live drive yet.
     """
-    del scenario
-    frames, states = _posed_frames(bag or drive_without_attack_of(experiment, victim, seed, folder))
-    learned = _learned(surrogate_of(experiment, []), planar_poses(states) @ experiment.camera.mount, None)
+    if bag is None and not experiment.config.deploy.live:
+        return _along_the_drive(experiment, scenario, victim, seed, None, "drive without attack")
+    if bag is not None and not has_face(experiment):
+        raise RuntimeFault(
+            "expected no bag for drives that are asked of the scene (deploy.through world); leave --bag out"
+        )
+    frames, states = posed_frames(bag or clean_bag(experiment, scenario, victim, seed, folder))
+    surrogate = surrogate_of(experiment, [])
+    learned = _learned(surrogate, planar_poses(states) @ experiment.mount, None)
     return Pictures("driven bag", np.stack([experiment.view.image(rgb) for rgb in frames]), learned)
 
 
 def lacks(experiment: Experiment, scenario: str, victim: str, method: str, seed: int, folder: Path) -> str:
     """What a prediction still needs, in words; empty if all is there."""
-    del scenario
-    if not is_searched(experiment, victim, method, seed, folder):
+    if _searched_in(experiment, Cell.of(scenario, victim, method, seed), folder) is None:
         return "its search"
-    try:
-        drive_without_attack_of(experiment, victim, seed, folder)
-    except CellFault:
-        return "the live drive without attack: run the cell of method none first"
+    if experiment.config.deploy.live:
+        try:
+            clean_bag(experiment, scenario, victim, seed, folder)
+        except RuntimeFault:
+            return "the live drive without attack: run the cell of method none first"
     return ""
 
 
 def attacked(
     experiment: Experiment, scenario: str, victim: str, method: str, seed: int, folder: Path
 ) -> Pictures:
-    """The same drive, frame by frame, with the face of a finished search drawn in; nothing here was deployed with it."""
-    del scenario
-    found = attack_file(experiment, victim, method, seed, folder)
-    frames, states = _posed_frames(drive_without_attack_of(experiment, victim, seed, folder))
-    cars = planar_poses(states)
-    overlay = _overlay(experiment, found)
-    T_world_from_subject = experiment.panel.T_world_from_face
+    """The same places with the colours of a finished search."""
+    space, attack = _found(experiment, scenario, victim, method, seed, folder)
+    shown = space.restored(attack)
+    if not experiment.config.deploy.live:
+        there = shown_there(shown, attack)
+        return _along_the_drive(
+            experiment, scenario, victim, seed, (shown, there), "the same drive, attacked"
+        )
+    frames, states = posed_frames(clean_bag(experiment, scenario, victim, seed, folder))
+    cars, overlay, panel = planar_poses(states), _overlay(experiment, attack), panel_of(experiment)
     real = []
     for rgb, car in zip(frames, cars, strict=True):
-        drawn, _ = overlay.draw(rgb, invert_transform(car @ experiment.camera.mount) @ T_world_from_subject)
+        drawn, _ = overlay.draw(rgb, invert_transform(car @ experiment.mount) @ panel.T_world_from_face)
         real.append(experiment.view.image(drawn))
-    sensor = attack.sensor_of(experiment, surrogate_of(experiment, [attacked_object(experiment)]))
-    theta = torch.from_numpy(np.array(found.face_object.theta))
-    return Pictures(
-        "driven bag, attacked", np.stack(real), _learned(sensor, cars @ experiment.camera.mount, theta)
-    )
+    surrogate = shown.seen_by(space.surrogate)
+    learned = _learned(surrogate, cars @ experiment.mount, shown.colours)
+    return Pictures("driven bag, attacked", np.stack(real), learned)
 
 
 def loop(
     experiment: Experiment, scenario: str, victim: str, method: str, seed: int, folder: Path
 ) -> tuple[AttackProblem, Callable[[torch.Tensor, bool], torch.Tensor], torch.Tensor, Horizon]:
     """What a prediction drives: the problem, pictures with or without the attack, the deployed starts ``[S, n]`` and the horizon."""
-    del scenario
-    theta = torch.from_numpy(
-        np.array(attack_file(experiment, victim, method, seed, folder).face_object.theta)
-    )
-    background = load_background(experiment)
-    bare = surrogate_of(experiment, [], background)
-    sensor = attack.sensor_of(experiment, surrogate_of(experiment, [attacked_object(experiment)], background))
-    problem = attack.attack_problem(experiment, sensor, load_policy(victim_file(experiment, victim)), seed)
+    space, attack = _found(experiment, scenario, victim, method, seed, folder)
+    found, plain = space.restored(attack), space.plain
+    with_it, without = (each.seen_by(space.surrogate) for each in (found, plain))
+    problem = attack_problem(experiment, space, load_policy(victim_file(experiment, victim)), scenario, seed)
+    problem = replace(problem, steps=experiment.config.horizon)
 
     def images(states: torch.Tensor, with_attack: bool) -> torch.Tensor:
-        return sensor.sense(states, theta).images if with_attack else bare.sense(states, None).images
+        sensor, colours = (with_it, found.colours) if with_attack else (without, plain.colours)
+        return sensor.sense(states, colours).images
 
-    starts = torch.tensor([experiment.room.start_pose], dtype=problem.start_states.dtype)
-    return (
-        problem,
-        images,
-        starts,
-        Horizon(experiment.config.horizon, CONTROL_PERIOD_S, experiment.room.off_track_m),
-    )
+    starts = problem.start_states[: experiment.config.deploy.starts]
+    return problem, images, starts, experiment.limits
 
 
-def _overlay(experiment: Experiment, found: AttackFile) -> FaceOverlay:
-    texture = found.required_face().texture
-    if experiment.shown_on_monitor:
-        sensor = shown(experiment, surrogate_of(experiment, [attacked_object(experiment)]))
-        texture = face_texture(sensor.seen_theta(torch.from_numpy(np.array(found.face_object.theta))).numpy())
-    return FaceOverlay(
-        texture, experiment.target.corners, experiment.camera.pinhole, experiment.camera.distortion
-    )
+def _searched_in(experiment: Experiment, cell: Cell, folder: Path) -> Path | None:
+    """Where the attack file of a finished search is: the cell's own folder, or the experiment's where the cell was taken from there."""
+    places = [folder]
+    if is_current(stages_of(experiment), experiment.folder, "attack"):
+        places.append(experiment.stage_folder("attack"))
+    return next((at for at in places if attack_path(at, cell).exists()), None)
 
 
-def _learned(sensor: Any, poses: Array, theta: torch.Tensor | None) -> Rgb:
+def _found(
+    experiment: Experiment, scenario: str, victim: str, method: str, seed: int, folder: Path
+) -> tuple[Space, AttackFile]:
+    """The space, in the learned scene, and the attack file of a finished search."""
+    cell = Cell.of(scenario, victim, method, seed)
+    attack = load_found(_searched_in(experiment, cell, folder) or folder, cell)
+    assert attack is not None, "a prediction is of a method"
+    return make_space(experiment, None), attack
+
+
+def clean_bag(experiment: Experiment, scenario: str, victim: str, seed: int, folder: Path) -> Path:
+    """The bag of the live drive that cells of this victim and seed are compared with.
+
+    Raises:
+        RuntimeFault: It is not driven yet, or its bag is gone.
+    """
+    cell = Cell(scenario, victim, NONE, seed)
+    places = [clean_folder(experiment, cell, folder), experiment.stage_folder("deploy")]
+    bags = [at / live_name(cell, 0) / "bag" for at in places]
+    found = next((bag for bag in bags if bag.exists()), None)
+    if found is None:
+        raise RuntimeFault(
+            f"expected the live drive without attack of the {victim} victim, seed {seed}, at {bags[0]}, got none; run that cell first"
+        )
+    return found
+
+
+def _overlay(experiment: Experiment, attack: AttackFile) -> FaceOverlay:
+    """Draws the face into pictures of the driving camera, in the colours that the camera sees."""
+    face, texture = attack.required_face(), attack.required_face().texture
+    if on_screen(experiment):
+        sensor = face_space(experiment, ideal=False).sensor
+        assert isinstance(sensor, DisplayedSensor), "a screen is not taken for ideal here"
+        texture = face_texture(
+            sensor.seen_theta(torch.from_numpy(np.array(attack.face_object.theta))).numpy()
+        )
+    return FaceOverlay(texture, face.corners_in_subject, experiment.camera)
+
+
+def _learned(sensor: Surrogate, poses: Array, theta: torch.Tensor | None) -> Rgb:
     return np.stack([as_uint8(sensor.render(pose[None], theta).images[0]) for pose in poses])
 
 
-def _posed_frames(bag: Path) -> tuple[list[Rgb], Array]:
+def _along_the_drive(
+    experiment: Experiment,
+    scenario: str,
+    victim: str,
+    seed: int,
+    attack: tuple[Shown, torch.Tensor | None] | None,
+    of: str,
+) -> Pictures:
+    """Pictures of the deployed drive without attack, again with an attack if one is given: as it is seen in the surrogate, and as it is shown."""
+    space = make_space(experiment, None)
+    policy, _ = policy_of(experiment, victim, scenario)
+    shown, there = attack or (space.plain, shown_there(space.plain, None))
+    with experiment.open_world() as scene:
+        dressed = dress(experiment, scene, space.plain)
+        start = experiment.start_states(scenario, seed)[:1]
+        plain = shown_there(space.plain, None)
+        (drive,) = deployed_drives(experiment, dressed, policy, scenario, start, plain)
+        states = drive.states[:-1]
+        real = dressed.policy_images(dressed.prepare(states), there)
+    surrogate = shown.seen_by(space.surrogate)
+    poses = planar_poses(states) @ experiment.mount
+    return Pictures(of, real, _learned(surrogate, poses, shown.colours))
+
+
+def posed_frames(bag: Path) -> tuple[list[Rgb], Array]:
     """Frames that were captured while the car was armed, of a long drive an even choice, and the car's states ``[N, 3]`` at their stamps."""
     poses, armed = PoseBuffer(keep_s=1e6), []
     for message in read_messages(bag, [_CAR, _SAFETY]):

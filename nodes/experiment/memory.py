@@ -22,7 +22,7 @@ from advnerf_core.report.data import MemoryRow
 from nodes.experiment.attack import attack_problem
 from nodes.experiment.config import ExperimentConfig
 from nodes.experiment.context import Experiment
-from nodes.experiment.objects import attacked_object, surrogate_of
+from nodes.experiment.faces import face_space
 from nodes.experiment.policy import HARDENED, victim_file
 from nodes.runtime.progress import Report
 
@@ -46,11 +46,11 @@ def measure(experiment: Experiment, folder: Path, report: Report) -> tuple[Memor
 
 def peak_above_idle_mib(experiment: Experiment, ticks: int) -> float:
     """Peak above idle of one gradient over so many ticks [MiB]; the process must be fresh."""
-    surrogate = surrogate_of(experiment, [attacked_object(experiment)])
-    policy = load_policy(victim_file(experiment, HARDENED))
-    problem = attack_problem(experiment, surrogate, policy, experiment.config.attack.seeds[0])
+    space = face_space(experiment, ideal=True)
+    policy, scenario = load_policy(victim_file(experiment, HARDENED)), experiment.config.scenarios[0]
+    problem = attack_problem(experiment, space, policy, scenario, experiment.config.attack.seeds[0])
     problem = dataclasses.replace(problem, start_states=problem.start_states[:1], steps=ticks, cache_bytes=0)
-    theta = surrogate.initial_theta(torch.Generator().manual_seed(0))
+    theta = space.surrogate.initial_theta(torch.Generator().manual_seed(0))
     # Libraries, compiled kernels and thread pools are idle memory.
     evaluate(dataclasses.replace(problem, steps=1), theta)
     idle_mib = restart_peak()

@@ -1,8 +1,7 @@
-"""Stage object: the attacked face as a voxel-grid object in the learned scene, and what it looks like plain."""
+"""Stage object: cars and hydrants as voxels; and all objects as they stand in the world."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -10,35 +9,64 @@ from typing import Any
 import numpy as np
 import torch
 
-from advnerf_core.data.image_files import write_image
-from advnerf_core.fields.voxel_grid import VoxelGridObject, cube_face_object
-from advnerf_core.files import write_atomically
-from advnerf_core.geometry import Array, Pinhole, make_transform, planar_pose
+from advnerf_core.fields.voxel_grid import VoxelGridObject
+from advnerf_core.geometry import Array, Pinhole
+from advnerf_core.objects.voxel.build import build_from_mesh
+from advnerf_core.objects.voxel.generators import GENERATORS
+from advnerf_core.objects.voxel.mesh import stand
+from advnerf_core.objects.voxel.model import ObjectModel, load_object, save_object
 from advnerf_core.scene.surrogate import BackgroundRenderer, Surrogate
 from nodes.experiment.context import Experiment
-from nodes.experiment.images import as_uint8
 from nodes.experiment.learned_scene import load_background
+from nodes.experiment.placed import ObjectKind
 from nodes.runtime.progress import Report
 
-# The deployed face lies this far in front of the board or monitor that carries it, so that it is never inside it.
-FACE_OFFSET_M = 0.01
+GENERATOR_OF: dict[ObjectKind, str] = {"small_car": "car", "hydrant": "hydrant"}
 
 
-def attacked_object(experiment: Experiment) -> VoxelGridObject:
-    """The cube's deployed face on the lab's board or monitor, plain."""
-    wanted = experiment.config.object
-    T_world_from_object = experiment.panel.T_world_from_face @ make_transform(
-        np.eye(3), [FACE_OFFSET_M, 0.0, 0.0]
-    )
-    return cube_face_object(experiment.face_m, wanted.resolution, wanted.plain_rgb, T_world_from_object)
+def run(experiment: Experiment, folder: Path, report: Report) -> None:
+    """Write one object file for each kind; where they stand is not part of it."""
+    kinds = sorted({thing.kind for thing in experiment.config.objects})
+    for index, kind in enumerate(kinds):
+
+        def progress(fraction: float, text: str, index: int = index, kind: str = kind) -> None:
+            report((index + fraction) / len(kinds), f"{kind}: {text}")
+
+        if not object_file(experiment, kind).exists():
+            save_object(object_file(experiment, kind), build(experiment, kind, progress))
+
+
+def build(experiment: Experiment, kind: ObjectKind, progress: Any = None) -> ObjectModel:
+    """One kind of object from its generator."""
+    wanted, generator = experiment.config.object, GENERATOR_OF[kind]
+    resolution = wanted.car_resolution if kind == "small_car" else wanted.hydrant_resolution
+    mesh = stand(GENERATORS[generator]())
+    return build_from_mesh(mesh, kind, resolution, wanted.fit_steps, {"generator": generator}, progress)
+
+
+def object_file(experiment: Experiment, kind: str) -> Path:
+    """Where a kind of object is."""
+    return experiment.stage_folder("object") / f"{kind}.object.safetensors"
+
+
+def placed_objects(experiment: Experiment) -> list[VoxelGridObject]:
+    """The objects in the order of the experiment file, in their plain colours."""
+    models = {thing.kind: load_object(object_file(experiment, thing.kind)) for thing in experiment.objects}
+    return [models[thing.kind].placed(thing.T_world_from_object, thing.scale) for thing in experiment.objects]
+
+
+def describe(experiment: Experiment) -> list[dict[str, Any]]:
+    """Names, places and free colours of the objects, as plain data."""
+    things = zip(experiment.objects, placed_objects(experiment), strict=True)
+    return [{**thing.model_dump(), "free_colours": field.free_count} for thing, field in things]
 
 
 def surrogate_of(
     experiment: Experiment, objects: Sequence[VoxelGridObject], background: BackgroundRenderer | None = None
 ) -> Surrogate:
-    """The learned scene as the policy's camera sees it, with objects; ``background`` if it is loaded already."""
+    """The learned junction as the policy's camera sees it; ``background`` if it is loaded already."""
     render = background or load_background(experiment)
-    return Surrogate(render, experiment.view.pinhole, experiment.camera.mount, objects)
+    return Surrogate(render, experiment.view.pinhole, experiment.mount, objects)
 
 
 def last_result_kept(render: BackgroundRenderer) -> BackgroundRenderer:
@@ -53,28 +81,6 @@ def last_result_kept(render: BackgroundRenderer) -> BackgroundRenderer:
     return remembered
 
 
-def run(experiment: Experiment, folder: Path, report: Report) -> None:
-    """Write the object's geometry, and a preview of the start view without and with its plain face."""
-    report(0.0, "placing the object")
-    field = attacked_object(experiment)
-    description = {
-        "resolution": experiment.config.object.resolution,
-        "plain_rgb": list(experiment.config.object.plain_rgb),
-        "size_m": experiment.face_m,
-        "T_world_from_object": np.asarray(field.T_world_from_object).tolist(),
-        "subject": experiment.target.subject,
-        "corners_in_subject_m": [list(corner) for corner in experiment.target.corners_in_subject_m],
-        "free_parameters": 3 * field.free_count,
-    }
-    write_atomically(folder / "object.json", json.dumps(description, indent=1) + "\n")
-    for name, image in _previews(experiment, field).items():
-        write_image(folder / f"{name}.png", image)
-
-
-def _previews(experiment: Experiment, field: VoxelGridObject) -> dict[str, Any]:
-    pose = planar_pose(*experiment.room.start_pose) @ experiment.camera.mount
-    surrogate = surrogate_of(experiment, [field])
-    theta = surrogate.initial_theta(torch.Generator().manual_seed(0))
-    plain = surrogate.render(pose[None], theta).images[0]
-    bare = surrogate_of(experiment, []).render(pose[None], None).images[0]
-    return {"start_view": as_uint8(bare), "start_view_with_plain_face": as_uint8(plain)}
+def random_theta(shape: tuple[int, ...], sigma: float, rng: np.random.Generator) -> torch.Tensor:
+    """Grid values as the random attack draws them."""
+    return torch.from_numpy(sigma * rng.standard_normal(shape, dtype=np.float32))

@@ -1,40 +1,51 @@
-"""Stage policy: learn to drive from lab and surrogate frames, with the object plain and with random textures."""
+"""Stage policy: one goal-conditioned network learns all drives, from the deployment scene and the surrogate, by DAgger."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
-from advnerf_core.attack.artifact import face_texture
-from advnerf_core.attack.projection import FaceOverlay
+from advnerf_core.attack.spaces.displayed import DisplayedSensor
+from advnerf_core.attack.spaces.face import FaceSpace
 from advnerf_core.data.dataset import load_image, load_transforms
-from advnerf_core.driving.expert import Expert, ExpertConfig
+from advnerf_core.data.image_files import write_image
 from advnerf_core.driving.path import Array
-from advnerf_core.fields.voxel_grid import inverse_squash
+from advnerf_core.fields.voxel_grid import VoxelGridObject
 from advnerf_core.files import write_atomically
-from advnerf_core.geometry import invert_transform, planar_pose
+from advnerf_core.geometry import planar_pose
 from advnerf_core.learning.imitation import ImitationConfig, SourcePlan, train_policy
-from advnerf_core.learning.sources import Overlay, RenderedSource, SceneSource, Show, Texture
+from advnerf_core.learning.sources import FrameSource, RenderedSource, SceneSource, Show
 from advnerf_core.policies.pilotnet import images_to_tensor, load_policy
-from hardware.worlds.lab.lab import Lab
+from hardware.worlds.world import World
 from nodes.experiment import capture
-from nodes.experiment.context import CONTROL_PERIOD_S, Experiment
+from nodes.experiment.context import Experiment
+from nodes.experiment.deployed import Dressed, DressedScene
+from nodes.experiment.faces import PaintedScene, face_object, face_space, has_face
+from nodes.experiment.images import as_uint8
 from nodes.experiment.learned_scene import load_background
-from nodes.experiment.objects import attacked_object, last_result_kept, surrogate_of
-from nodes.experiment.screen import face_picture, plain_picture, shown
+from nodes.experiment.objects import describe, last_result_kept, placed_objects, random_theta, surrogate_of
+from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import Report
 
-HARDENED, NAIVE = "hardened", "naive"
+HARDENED, NAIVE, RETRAINED = "hardened", "naive", "retrained"
+VICTIMS = (HARDENED, NAIVE)
 FILES = {HARDENED: "policy.safetensors", NAIVE: "naive.safetensors"}
+# Poses that the policy learns from: as far from the path [m, of half a lane of 1.75 m] as a recovery may have to begin.
+_STILLS_M, _DRIVES_M, _GIVE_UP_M = 1.6, 0.8, 3.0
+# Of a face in training: as many pixels as its nearest view has.
 _TRAINING_TEXTURE_PX = 128
+
+Sample = Callable[[np.random.Generator], torch.Tensor]
 
 
 def run(experiment: Experiment, folder: Path, report: Report) -> None:
-    """Train the victims, then compare their steering on held-out lab views and the surrogate's image of them."""
+    """Train the victims, then compare their controls on held-out views and on the surrogate's image of them."""
     config = experiment.config.policy
     settings = ImitationConfig(
         seed=config.seed,
@@ -42,130 +53,208 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
         first_steps=config.first_steps,
         round_steps=config.round_steps,
         naive_steps=config.naive_steps,
+        hidden=config.hidden,
+        lateral_m=experiment.across_m(_STILLS_M),
+        heading_rad=config.stills_heading_rad,
+        drive_lateral_m=experiment.across_m(_DRIVES_M),
+        drive_heading_rad=config.drives_heading_rad,
+        give_up_m=experiment.across_m(_GIVE_UP_M),
+        max_steering_rad=experiment.car.largest_control,
     )
-    expert = Expert(
-        experiment.path,
-        ExpertConfig(
-            speed_mps=experiment.speed_mps,
-            stiffness_1pm=config.stiffness_1pm,
-            feed_forward=config.feed_forward,
-        ),
-    )
-    with Lab(experiment.lab_config) as lab:
-        if experiment.shown_on_monitor:
-            lab.set_monitor_image(plain_picture(experiment))
-        plans = [
-            SourcePlan(
-                _lab_source(experiment, lab), config.lab_stills, config.lab_drives, config.drive_steps
-            ),
-            SourcePlan(
-                surrogate_source(experiment),
-                config.surrogate_stills,
-                config.surrogate_drives,
-                config.drive_steps,
-            ),
-        ]
+    write_placement(experiment, folder)
+    with experiment.open_world() as scene:
         trained = train_policy(
-            settings, plans, expert, experiment.view, folder, lambda part, text: report(0.98 * part, text)
+            settings,
+            plans(experiment, scene),
+            experiment.expert(experiment.config.scenarios[0]),
+            experiment.view,
+            folder,
+            lambda part, text: report(0.98 * part, text),
         )
-    report(0.98, "comparing steering on real and learned views")
+    report(0.98, "comparing controls on true and learned views")
     summary = {
         "sha256": trained.sha256,
         "naive_sha256": trained.naive_sha256,
         "frames": trained.frames,
-        "validation_mae_rad": trained.validation_mae_rad,
-        "naive_validation_mae_rad": trained.naive_validation_mae_rad,
-        "steering_on_held_out_views": steering_on_held_out_views(experiment),
+        "validation_mae": trained.validation_mae_rad,
+        "naive_validation_mae": trained.naive_validation_mae_rad,
+        "control_unit": experiment.car.control_unit,
+        "on_held_out_views": agreement(experiment),
     }
     write_atomically(folder / "policy.json", json.dumps(summary, indent=1) + "\n")
 
 
+def victims(experiment: Experiment) -> tuple[str, ...]:
+    """The policies that are attacked."""
+    return VICTIMS if experiment.config.policy.naive_steps else (HARDENED,)
+
+
+def attackable(experiment: Experiment) -> tuple[str, ...]:
+    """The policies that there are to attack: also the retrained one, where the experiment retrains."""
+    return (*victims(experiment), *([] if experiment.config.retrain is None else [RETRAINED]))
+
+
 def victim_file(experiment: Experiment, victim: str) -> Path:
-    """Policy file of a victim."""
+    """Policy file of a victim; the retrained one is that of the first round, as in the paper."""
+    if victim == RETRAINED:
+        return experiment.stage_folder("retrain") / "round0" / "policy.safetensors"
     return experiment.stage_folder("policy") / FILES[victim]
 
 
-def steering_on_held_out_views(experiment: Experiment) -> list[dict[str, float]]:
-    """Steering [rad] of the hardened victim on each held-out view of the driving camera and on the surrogate's image of it."""
-    views = load_transforms(experiment.stage_folder("capture") / capture.HELD_OUT / "transforms.json")
-    policy = load_policy(victim_file(experiment, HARDENED)).policy
-    surrogate = surrogate_of(experiment, [])
-    rows = []
-    for frame in views.frames:
-        real = experiment.view.image(load_image(frame)[0])
-        with torch.no_grad():
-            on_real = float(policy(images_to_tensor(real))[0])
-            on_surrogate = float(policy(surrogate.render(frame.T_world_from_camera[None], None).images)[0])
-        rows.append({"real_rad": on_real, "surrogate_rad": on_surrogate})
-    return rows
+def plans(
+    experiment: Experiment,
+    scene: World,
+    sample: Sample | None = None,
+    objects: Sequence[VoxelGridObject] | None = None,
+    ending: str = "",
+) -> list[SourcePlan]:
+    """For each drive its frames from the deployment scene and from the surrogate, with its goal and its teacher.
 
-
-def _lab_source(experiment: Experiment, lab: Lab) -> SceneSource:
-    overlay = _monitor_overlay(experiment, lab) if experiment.shown_on_monitor else _board_overlay(experiment)
-    return SceneSource(
-        "lab",
-        lab,
-        experiment.view,
-        experiment.speed_mps,
-        CONTROL_PERIOD_S,
-        overlay,
-        experiment.config.object.resolution,
+    Args:
+        experiment: The experiment.
+        scene: The deployment scene.
+        sample: Draws the colours of all objects ``[K, 3]``; None draws random ones.
+        objects: The objects where they are to stand; None has them where the world does.
+        ending: Of the sources' names, which tell their frames apart.
+    """
+    config = experiment.config.policy
+    domains = (
+        _face_domains(experiment, scene)
+        if has_face(experiment)
+        else _object_domains(experiment, scene, objects)
     )
+    sigma, shape, dressed = experiment.config.attack.random_sigma, domains.theta_shape, domains.dressed
 
+    def any_colours(rng: np.random.Generator) -> torch.Tensor:
+        return random_theta(shape, sigma, rng)
 
-def _monitor_overlay(experiment: Experiment, lab: Lab) -> Overlay:
-    """Shows textures on the lab's own monitor and looks again: its optics are not known to any projection."""
-    plain = plain_picture(experiment)
+    def seen_in_scene(states: Array) -> Show:
+        frames = dressed.prepare(states)
+        return lambda theta: images_to_tensor(dressed.policy_images(frames, theta))
 
-    def overlay(rgb: NDArray[np.uint8], state: Array, texture: Texture) -> NDArray[np.uint8]:
-        del rgb  # the screen is seen again, not drawn over
-        lab.set_monitor_image(
-            face_picture(experiment, face_texture(inverse_squash(texture), _TRAINING_TEXTURE_PX))
+    def source(domain: str, name: str) -> FrameSource:
+        called, drawn = f"{domain}-{name}{ending}", sample or any_colours
+        if domain == "surrogate":
+            return RenderedSource(called, domains.seen_in_surrogate, experiment.dynamics, drawn)
+        if config.own_car:
+            speed_mps, dt_s = experiment.car.speed_mps, experiment.config.dt_s
+            return SceneSource(called, scene, experiment.view, speed_mps, dt_s, dressed.paint, drawn)
+        return RenderedSource(called, seen_in_scene, experiment.dynamics, drawn)
+
+    found = []
+    for name in experiment.config.scenarios:
+        common: dict[str, Any] = {
+            "drive_steps": config.drive_steps,
+            "goal": experiment.goal(name),
+            "expert": experiment.expert(name),
+            "driven_m": config.driven_m,
+            "drives_from_m": config.drives_from_m,
+        }
+        amounts = (
+            ("deployed", config.deployed_stills, config.deployed_drives),
+            ("surrogate", config.surrogate_stills, config.surrogate_drives),
         )
-        x, y, yaw = map(float, state[:3])
-        painted, _ = lab.observe_at(x, y, yaw, depth=False)
-        lab.set_monitor_image(plain)
-        return painted
-
-    return overlay
+        for domain, stills, drives in amounts:
+            found.append(SourcePlan(source(domain, name), stills, drives, **common))
+    return found
 
 
-def _board_overlay(experiment: Experiment) -> Overlay:
-    """Paints textures on the board's face with the compositor's own projection."""
-    T_camera_from_car = invert_transform(experiment.camera.mount)
-    T_world_from_face = experiment.panel.T_world_from_face
+@dataclass(frozen=True, eq=False)
+class _Domains:
+    """Where frames come from: the dressed deployment scene, and the surrogate with the objects plain (None) or in any colours."""
 
-    def overlay(rgb: NDArray[np.uint8], state: Array, texture: Texture) -> NDArray[np.uint8]:
-        displayed = face_texture(inverse_squash(texture), _TRAINING_TEXTURE_PX)
-        face = FaceOverlay(
-            displayed, experiment.target.corners, experiment.camera.pinhole, experiment.camera.distortion
+    dressed: Dressed
+    seen_in_surrogate: Callable[[Array], Show]
+    theta_shape: tuple[int, ...]
+
+
+def _object_domains(
+    experiment: Experiment, scene: World, objects: Sequence[VoxelGridObject] | None
+) -> _Domains:
+    """Objects stand in both scenes, plain or coloured."""
+    objects = placed_objects(experiment) if objects is None else objects
+    surrogate = surrogate_of(experiment, objects, load_background(experiment))
+
+    def seen(states: Array) -> Show:
+        frames = surrogate.prepare(surrogate.camera_poses(torch.from_numpy(np.asarray(states))))
+        return lambda theta: frames.render(surrogate.plain_theta() if theta is None else theta).images
+
+    return _Domains(DressedScene(scene, experiment.view, objects), seen, surrogate.theta_shape)
+
+
+def surrogate_plan(experiment: Experiment) -> SourcePlan:
+    """Frames of the learned scene alone, along the first path: beside recordings of the real one.
+
+    Raises:
+        ConfigError: The experiment attacks no face.
+    """
+    if not has_face(experiment):
+        raise ConfigError(
+            f"expected an experiment whose attack is a face (space.kind face), got {experiment.config.space.kind}"
         )
-        T_camera_from_world = T_camera_from_car @ invert_transform(planar_pose(*state[:3]))
-        return face.draw(rgb, T_camera_from_world @ T_world_from_face)[0]
+    space, seen = _seen_face(experiment)
+    shape, sigma = space.surrogate.theta_shape, experiment.config.attack.random_sigma
+    source = RenderedSource(
+        "surrogate", seen, experiment.dynamics, lambda rng: random_theta(shape, sigma, rng)
+    )
+    wanted = experiment.config.policy
+    return SourcePlan(source, wanted.surrogate_stills, wanted.surrogate_drives, wanted.drive_steps)
 
-    return overlay
+
+def _face_domains(experiment: Experiment, scene: World) -> _Domains:
+    """The panel is seen as it was learned, or carries a face."""
+    space, seen = _seen_face(experiment)
+    dressed = PaintedScene(experiment, scene, _TRAINING_TEXTURE_PX)
+    return _Domains(dressed, seen, space.surrogate.theta_shape)
 
 
-def surrogate_source(experiment: Experiment) -> RenderedSource:
-    """Frames of the learned room, with the object plain and with random textures."""
-    background = last_result_kept(load_background(experiment))
-    bare = surrogate_of(experiment, [], background)
-    with_object = surrogate_of(experiment, [attacked_object(experiment)], background)
-    sigma = experiment.config.attack.random_sigma
-    seen = shown(experiment, with_object).seen_theta if experiment.shown_on_monitor else None
+def _seen_face(experiment: Experiment) -> tuple[FaceSpace, Callable[[Array], Show]]:
+    """The face in the learned scene, behind the display if a screen shows it, and what is seen of it."""
+    space = face_space(experiment, last_result_kept(load_background(experiment)), ideal=False)
+    surrogate, bare, sensor = space.surrogate, space.plain.seen_by(space.surrogate), space.sensor
 
-    def prepare(states: Array) -> Show:
-        poses = with_object.camera_poses(torch.from_numpy(np.asarray(states)))
-        plain, attacked = bare.prepare(poses), with_object.prepare(poses)
+    def seen(states: Array) -> Show:
+        poses = surrogate.camera_poses(torch.from_numpy(np.asarray(states)))
+        plain, attacked = bare.prepare(poses), surrogate.prepare(poses)
 
         def show(theta: torch.Tensor | None) -> torch.Tensor:
             if theta is None:
                 return plain.render(None).images
-            return attacked.render(theta if seen is None else seen(theta)).images
+            behind = sensor.seen_theta(theta) if isinstance(sensor, DisplayedSensor) else theta
+            return attacked.render(behind).images
 
         return show
 
-    def sample(rng: np.random.Generator) -> torch.Tensor:
-        return torch.from_numpy(sigma * rng.standard_normal(with_object.theta_shape)).float()
+    return space, seen
 
-    return RenderedSource("surrogate", prepare, experiment.dynamics, sample)
+
+def agreement(experiment: Experiment) -> list[dict[str, float]]:
+    """Control of the hardened victim on each held-out view and on the surrogate's image of it, told to follow the first path."""
+    views = load_transforms(experiment.stage_folder("capture") / capture.HELD_OUT / "transforms.json")
+    policy = load_policy(victim_file(experiment, HARDENED)).policy
+    surrogate = surrogate_of(experiment, [])
+    goal = torch.tensor([experiment.goal(experiment.config.scenarios[0])], dtype=torch.float32)
+    rows = []
+    for frame in views.frames:
+        real = experiment.view.image(load_image(frame)[0])
+        with torch.no_grad():
+            on_real = float(policy(images_to_tensor(real), goal)[0])
+            on_surrogate = float(
+                policy(surrogate.render(frame.T_world_from_camera[None], None).images, goal)[0]
+            )
+        rows.append({"real": on_real, "surrogate": on_surrogate})
+    return rows
+
+
+def write_placement(experiment: Experiment, folder: Path) -> None:
+    """The objects' places, and each drive's first view without and with them, plain."""
+    write_atomically(folder / "objects.json", json.dumps(describe(experiment), indent=1) + "\n")
+    background = load_background(experiment)
+    bare = surrogate_of(experiment, [], background)
+    attacked = [face_object(experiment)] if has_face(experiment) else placed_objects(experiment)
+    dressed = surrogate_of(experiment, attacked, background)
+    for name, reference in experiment.references.items():
+        pose = (planar_pose(*reference.drive_start) @ experiment.mount)[None]
+        with_objects = dressed.render(pose, dressed.plain_theta()).images[0]
+        write_image(folder / f"{name}_start_view.png", as_uint8(bare.render(pose, None).images[0]))
+        write_image(folder / f"{name}_start_view_with_objects.png", as_uint8(with_objects))

@@ -1,21 +1,27 @@
-"""Runs an experiment file: resolves it, runs its stages, prints the table. Called by ``advnerf experiment``."""
+"""Runs an experiment: resolves its file, runs its stages, prints the table. Called by ``advnerf experiment``."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel
 from rich.console import Console
 
-from hardware.worlds.lab.config import LabConfig
-from nodes.experiment import attack, capture, deploy, objects, policy, report, scene
+from advnerf_core.attack.methods import method_digest, method_name
+from advnerf_core.plugins import unknown
+from nodes.experiment import attack, capture, deploy, objects, policy, report, retrain, scene
 from nodes.experiment.config import ExperimentConfig
 from nodes.experiment.context import Experiment
+from nodes.experiment.live import lab_of
+from nodes.experiment.placed import in_a_lane
 from nodes.experiment.run_folder import run_to_end
-from nodes.experiment.stages import Stage, StageRecord
+from nodes.experiment.space_config import FaceConfig
+from nodes.experiment.stages import Stage, StageRecord, begun_with
+from nodes.lab.worlds.named import read_world
 from nodes.launching.launch_file import load_launch
 from nodes.runtime.config import Document, apply_overrides, read_yaml, validate
 from nodes.runtime.errors import ConfigError
@@ -31,7 +37,7 @@ _LIBRARIES = (
     "rosbags",
     "mcap",
 )
-STAGES = ("capture", "scene", "policy", "object", "attack", "deploy", "report")
+_WHOLE_STEP_S = 1e-6
 
 
 def load_experiment(file: Path, setting: str, overrides: Sequence[str], folder: Path) -> Experiment:
@@ -47,15 +53,15 @@ def load_experiment(file: Path, setting: str, overrides: Sequence[str], folder: 
         ConfigError: With file, line and the valid keys.
     """
     document = read_setting(file, setting, overrides)
-    config = validate(ExperimentConfig, document)
-    validate(LabConfig, document.part(("lab",)))
-    return Experiment(config, file.resolve(), folder.resolve(), setting)
-
-
-def is_in_a_world(file: Path) -> bool:
-    """Whether an experiment file names a world; one that does not is the room's."""
-    data = read_yaml(file).data
-    return isinstance(data, dict) and "world" in data
+    config = validate(ExperimentConfig, document, file.parent)
+    read_world(document.part(("world",)), file.resolve().parent)
+    experiment = Experiment(config, file.resolve(), folder.resolve(), setting)
+    _check_ticks(experiment, document)
+    if config.deploy.live:
+        lab_of(experiment)
+    if experiment.is_described:
+        _check_places(experiment, document)
+    return experiment
 
 
 def read_setting(file: Path, setting: str, overrides: Sequence[str]) -> Document:
@@ -71,6 +77,38 @@ def read_setting(file: Path, setting: str, overrides: Sequence[str]) -> Document
     return document
 
 
+def _check_ticks(experiment: Experiment, document: Document) -> None:
+    """A control tick must be whole steps of the world."""
+    step_s, dt_s = experiment.traits.step_s, experiment.config.dt_s
+    if step_s is not None and abs(round(dt_s / step_s) * step_s - dt_s) > _WHOLE_STEP_S:
+        raise ConfigError(
+            f"{document.place(('dt_s',))}: expected dt_s to be whole steps of the world {experiment.named_world.kind}, {step_s:g} s each, "
+            f"got {dt_s:g} s"
+        )
+
+
+def _check_places(experiment: Experiment, document: Document) -> None:
+    """Scenarios must be the world's, and objects must stand beside its lanes; said with the line of the file."""
+    for index, name in enumerate(experiment.config.scenarios):
+        if name not in experiment.world.paths:
+            message = unknown(name, "scenario", experiment.world.paths)
+            raise ConfigError(f"{document.place(('scenarios', index))}: scenarios: {message}")
+    if (found := in_a_lane(experiment.config.objects, experiment.world)) is not None:
+        raise ConfigError(f"{document.place(('objects', found[0]))}: {found[1]}")
+    if (
+        isinstance(space := experiment.config.space, FaceConfig)
+        and space.panel not in experiment.world.panels
+    ):
+        message = unknown(space.panel, "panel", experiment.world.panels)
+        raise ConfigError(f"{document.place(('space', 'panel'))}: space.panel: {message}")
+    if experiment.traits.own_photo_colours and not experiment.config.capture.colour_pairs:
+        raise ConfigError(
+            f"{document.place(('capture',))}: expected capture.colour_pairs of at least 1, as the photographs of the world "
+            f"{experiment.named_world.kind} have colours of their own, got 0; 12 will do"
+        )
+    _ = experiment.view
+
+
 def run_experiment(
     experiment: Experiment, until: str | None = None, console: Console | None = None
 ) -> dict[str, StageRecord]:
@@ -79,41 +117,117 @@ def run_experiment(
     return run_to_end(experiment, stages_of(experiment), _LIBRARIES, summarise, until, console)
 
 
+def prepare_victims(experiment: Experiment, report: Report) -> None:
+    """Make scene, objects and policies, also the retrained one where the experiment retrains.
+
+    One round of it, if none is begun; rounds that were begun are gone on with, as many as were asked for then.
+    """
+    del report  # the stages show their own progress
+    wanted = experiment.config.retrain
+    if wanted is None:
+        run_experiment(experiment, until="policy")
+        return
+    begun = begun_with(stages_of(experiment), experiment.folder, "retrain")
+    if begun is not None and policy.victim_file(experiment, policy.RETRAINED).exists():
+        return
+    # Its victim is that of the first round: the others are left to the experiment itself, which goes on from here.
+    rounds = 1 if begun is None else begun["retrain"]["rounds"]
+    config = experiment.config.model_copy(update={"retrain": wanted.model_copy(update={"rounds": rounds})})
+    run_experiment(replace(experiment, config=config), until="retrain")
+    if not policy.victim_file(experiment, policy.RETRAINED).exists():
+        raise ConfigError(
+            f"expected a retrained policy in {experiment.stage_folder('retrain')}, got none: no attack reaches retrain.pays_ratio = "
+            f"{wanted.pays_ratio:g} (see retrain.json there), so nothing was retrained; lower it, or leave the victim retrained out of the campaign"
+        )
+
+
 def stages_of(experiment: Experiment) -> list[Stage]:
-    """The stages with the part of the configuration that each depends on."""
-    config = experiment.config
-    lab = experiment.lab_config.model_dump(mode="json")
+    """The stages with the part of the configuration that each depends on; moving an object keeps capture, scene and object files.
 
-    def stage(name: str, module: Any, sections: Sequence[BaseModel], after: Sequence[str]) -> Stage:
-        settings = {
-            "lab": lab,
-            "horizon": config.horizon if name in ("attack", "deploy", "report") else None,
-            **{type(s).__name__: s.model_dump(mode="json") for s in sections},
-        }
-        if name == "deploy":
-            settings["graph"] = load_launch(experiment.launch_file).resolved
+    The world must not have been opened for them.
 
+    More rounds of retraining go on from those that are there.
+    """
+    config, world = experiment.config, experiment.world_settings
+    measured = {
+        "horizon": config.horizon,
+        "dt_s": config.dt_s,
+        "held_cap_m": config.held_cap_m,
+        "scenarios": config.scenarios,
+    }
+    kinds = sorted({thing.kind for thing in config.objects})
+    placed = [thing.model_dump(mode="json") for thing in config.objects]
+
+    def stage(
+        name: str,
+        module: Any,
+        settings: dict[str, Any],
+        after: Sequence[str],
+        parts: Sequence[dict[str, Any]] = (),
+    ) -> Stage:
         def work(folder: Path, told: Report) -> None:
             module.run(experiment, folder, told)
 
-        return Stage(name, work, settings, after)
+        settings, *smaller = json.loads(json.dumps([settings, *parts]))
+        return Stage(name, work, settings, after, goes_on_from=smaller)
 
-    return [
-        stage("capture", capture, [config.capture], ()),
-        stage("scene", scene, [config.scene], ("capture",)),
-        stage("policy", policy, [config.policy, config.object], ("capture", "scene")),
-        stage("object", objects, [config.object], ("capture", "scene")),
+    def part(name: str) -> Any:
+        return getattr(config, name).model_dump(mode="json")
+
+    # Of users' methods the code counts, not where it is.
+    searched = {**part("attack"), "methods": config.attack.method_names}
+    if codes := {method_name(each): code for each in config.attack.methods if (code := method_digest(each))}:
+        searched["code"] = codes
+    view, space = part("view"), part("space")
+    # What a screen shows while a scene is photographed, and what policies meet, is part of what is learned.
+    shown = ("panel", "resolution", "plain_rgb")
+    face = {"face": {name: space[name] for name in shown}} if isinstance(config.space, FaceConfig) else {}
+    deployed: dict[str, Any] = {"deploy": part("deploy")}
+    if config.deploy.live:
+        deployed["graph"] = load_launch(experiment.launch_file).resolved
+    driven = {"world": world, "objects": placed, "view": view, **measured}
+    stages = [
         stage(
-            "attack",
-            attack,
-            [config.policy, config.object, config.attack],
-            ("capture", "scene", "policy", "object"),
+            "capture",
+            capture,
+            {"world": experiment.seen_settings, "capture": part("capture"), **face, **measured},
+            (),
         ),
         stage(
-            "deploy", deploy, [config.policy, config.deploy, config.attack], ("capture", "policy", "attack")
+            "scene",
+            scene,
+            {"scene": part("scene"), "view": view, "colour_pairs": config.capture.colour_pairs},
+            ("capture",),
         ),
-        stage("report", report, [config], ("capture", "scene", "policy", "object", "attack", "deploy")),
+        stage("object", objects, {"object": part("object"), "kinds": kinds}, ()),
+        stage(
+            "policy",
+            policy,
+            {**driven, **face, "policy": part("policy"), "sigma": config.attack.random_sigma},
+            ("capture", "scene", "object"),
+        ),
+        stage(
+            "attack", attack, {**driven, "attack": searched, "space": space}, ("scene", "object", "policy")
+        ),
     ]
+    if config.deploy.through != "nothing":
+        stages += [
+            stage("deploy", deploy, {**driven, "space": space, **deployed}, ("object", "policy", "attack")),
+            stage(
+                "report",
+                report,
+                {"attack": searched, **measured},
+                ("capture", "scene", "policy", "attack", "deploy"),
+            ),
+        ]
+    if config.retrain is not None:
+        settings = {**driven, "retrain": part("retrain"), "attack": searched}
+        fewer = [
+            {**settings, "retrain": {**settings["retrain"], "rounds": rounds}}
+            for rounds in range(1, config.retrain.rounds)
+        ]
+        stages.append(stage("retrain", retrain, settings, ("scene", "object", "policy", "attack"), fewer))
+    return stages
 
 
 def _lay_over(

@@ -1,4 +1,4 @@
-"""The lab's monitor as an experiment uses it: pictures of the face, and the monitor's colours measured by the driving camera."""
+"""A screen among the panels of a world: pictures of the face on it, and its colours as the driving camera sees them, measured."""
 
 from __future__ import annotations
 
@@ -8,87 +8,94 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from advnerf_core.attack.spaces.displayed import DisplayedSensor
-from advnerf_core.geometry import Array, invert_transform, planar_pose, planar_poses, transform_points
-from advnerf_core.scene.surrogate import Surrogate
+from advnerf_core.geometry import Array, invert_transform, transform_points
 from calibration.display_colour import DisplayFit, colours_to_show, fit_display, mean_colour, screen_region
-from calibration.panel import Panel
-from hardware.worlds.lab.lab import Lab
-from hardware.worlds.lab.monitor import ScreenOptics
-from hardware.worlds.lab.world import MONITOR_PIXELS
-from nodes.experiment.context import Experiment
+from calibration.panel import Panel as Pixels
+from hardware.worlds.world import Panel, Screens, World
+from nodes.runtime.errors import ConfigError
 
 Rgb = NDArray[np.uint8]
 # Where the car stands while the colours are shown: distance [m], and angles to the panel's normal [rad] for the falloff.
 _DISTANCE_M, _ANGLES_RAD = 1.1, (0.0, 0.5, -0.85)
 
 
-def face_picture(experiment: Experiment, texture: Rgb) -> Rgb:
-    """A face ``[n, n, 3]`` in true size in the middle of a black screen, as the monitor node shows it."""
-    panel = Panel(MONITOR_PIXELS, (experiment.panel.width_m, experiment.panel.height_m))
-    return panel.picture(texture, (experiment.face_m, experiment.face_m))
+def face_picture(panel: Panel, texture: Rgb) -> Rgb:
+    """A square face ``[n, n, 3]`` in true size in the middle of a black screen, as the monitor node shows it."""
+    assert panel.screen_px is not None, "a board shows no pictures"
+    pixels = Pixels(panel.screen_px, (panel.width_m, panel.height_m))
+    return pixels.picture(texture, (panel.square_m, panel.square_m))
 
 
-def plain_picture(experiment: Experiment) -> Rgb:
-    """The screen without an attack: the face in its plain colour."""
-    plain = np.round(255.0 * np.array(experiment.config.object.plain_rgb))
-    return face_picture(experiment, np.full((8, 8, 3), plain, np.uint8))
+def plain_picture(panel: Panel, rgb: Sequence[float]) -> Rgb:
+    """The screen without an attack: the face in one colour (0..1)."""
+    return face_picture(panel, np.full((8, 8, 3), np.round(255.0 * np.asarray(rgb)), np.uint8))
+
+
+def screens_of(world: World) -> Screens:
+    """The world as one that has screens.
+
+    Raises:
+        ConfigError: It has no way to show a picture.
+    """
+    if not isinstance(world, Screens):
+        raise ConfigError(
+            f"expected a world with a method show(panel, rgb), as one of its panels is a screen, got {type(world).__name__} without"
+        )
+    return world
+
+
+def cos_angle(panel: Panel, points: Array) -> Array:
+    """Cosine ``[...]`` of the angle between a panel's normal and the way to points ``[..., 3]``."""
+    seen = transform_points(invert_transform(panel.T_world_from_face), points)
+    return np.asarray(seen[..., 0] / np.linalg.norm(seen, axis=-1), dtype=np.float64)
 
 
 def measure_display(
-    lab: Lab, seed: int = 0, frames_of: Callable[[Rgb], Sequence[Rgb]] | None = None
+    world: World,
+    name: str,
+    panel: Panel,
+    seed: int = 0,
+    frames_of: Callable[[Rgb], Sequence[Rgb]] | None = None,
 ) -> DisplayFit:
-    """Show the calibration's colours on the lab's monitor, look at them from three places, fit the display model.
+    """Show the calibration's colours on a screen, look at them from three places, fit the display model.
 
     Args:
-        lab: The lab; its monitor shows the last colour afterwards.
+        world: Open; its screen shows the last colour afterwards.
+        name: Of the screen.
+        panel: The screen.
         seed: Of the mixed colours.
         frames_of: What a camera makes of a rendered picture, such as several noisy frames; None takes the picture as it is.
     """
-    colours = colours_to_show(seed=seed)
-    optics = ScreenOptics(lab.config.monitor_optics, lab.config.monitor, MONITOR_PIXELS)
+    colours, screens = colours_to_show(seed=seed), screens_of(world)
     shown, seen, cosines = [], [], []
     for angle in _ANGLES_RAD:
-        car = _car_before_screen(lab, angle)
-        cosine = optics.cos_angle((car @ lab.config.camera.T_car_from_camera)[:3, 3])
+        car = _car_before(panel, world.T_car_from_camera, angle)
+        camera = np.array([*car[:2], 0.0]) + _turned(world.T_car_from_camera[:3, 3], car[2])
         pictures = []
         for colour in colours:
-            lab.set_monitor_image(np.full((2, 2, 3), colour, np.uint8))
-            picture = lab.observe_held(car)
+            screens.show(name, np.full((2, 2, 3), colour, np.uint8))
+            picture = world.observe_at(*car, depth=False)[0]
             pictures.append([picture] if frames_of is None else frames_of(picture))
         region = screen_region(pictures[0][0], pictures[1][0])
         seen += [mean_colour(frames, region) for frames in pictures]
         shown += list(colours / 255.0)
-        cosines += [cosine] * len(colours)
+        cosines += [float(cos_angle(panel, camera))] * len(colours)
     return fit_display(np.array(shown), np.array(seen), np.array(cosines))
 
 
-def _car_before_screen(lab: Lab, angle_rad: float) -> Array:
-    """Pose ``[4, 4]`` of a car on the floor whose camera looks at the screen from an angle to its normal."""
-    face, camera = lab.config.monitor.T_world_from_face, lab.config.camera
+def _car_before(panel: Panel, T_car_from_camera: Array, angle_rad: float) -> tuple[float, float, float]:
+    """Pose of a car on the floor whose camera looks at a panel from an angle to its normal: x [m], y [m], yaw [rad]."""
+    face, ahead_m = panel.T_world_from_face, float(T_car_from_camera[0, 3])
     place = face @ np.array([_DISTANCE_M * math.cos(angle_rad), _DISTANCE_M * math.sin(angle_rad), 0.0, 1.0])
     towards = face[:3, 3] - place[:3]
     heading = math.atan2(towards[1], towards[0])
-    x_m, y_m = (
-        float(place[i] - camera.x_m * side) for i, side in enumerate((math.cos(heading), math.sin(heading)))
+    return (
+        float(place[0] - ahead_m * math.cos(heading)),
+        float(place[1] - ahead_m * math.sin(heading)),
+        heading,
     )
-    return planar_pose(x_m, y_m, heading)
 
 
-def mean_cos_angle(experiment: Experiment) -> float:
-    """Cosine of the angle at which the camera looks at the panel, in the mean of the measured stretch of the path, while it sees it."""
-    ticks = np.arange(experiment.config.horizon + 1)
-    start_s_m = float(experiment.path.project(np.array(experiment.room.start_pose[:2])).s_m)
-    along = experiment.path.pose_at(start_s_m + ticks * experiment.speed_mps * experiment.dynamics.dt_s)
-    cameras = planar_poses(along) @ experiment.camera.mount
-    middle = experiment.panel.T_world_from_face[:3, 3]
-    from_face = transform_points(invert_transform(experiment.panel.T_world_from_face), cameras[:, :3, 3])
-    ahead = np.einsum("ni,ni->n", middle - cameras[:, :3, 3], cameras[:, :3, 2]) > 0.0
-    cosines = from_face[:, 0] / np.linalg.norm(from_face, axis=1)
-    seen = cosines[ahead & (cosines > 0.0)]
-    return float(seen.mean()) if seen.size else 1.0
-
-
-def shown(experiment: Experiment, surrogate: Surrogate) -> DisplayedSensor:
-    """The surrogate behind the measured monitor: its ``theta`` is what is shown."""
-    return DisplayedSensor(surrogate, experiment.display, mean_cos_angle(experiment))
+def _turned(offset: Array, yaw_rad: float) -> Array:
+    c, s = math.cos(yaw_rad), math.sin(yaw_rad)
+    return np.array([c * offset[0] - s * offset[1], s * offset[0] + c * offset[1], offset[2]])

@@ -100,6 +100,9 @@ class PlaceSpace:
             for named, field, part in rows
         )
 
+    def face(self, theta: Tensor) -> None:
+        """None: a solid object is no face."""
+
     def restored(self, attack: AttackFile) -> Shown:
         """The objects at the places of the file; see `Space.restored`."""
         require_same(attack, self._named)

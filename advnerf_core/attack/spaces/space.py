@@ -21,6 +21,7 @@ from advnerf_core.attack.artifact import (
     AttackedObject,
     AttackFile,
     AttackFileError,
+    Face,
 )
 from advnerf_core.attack.methods import SearchRun, SearchSettings, load_method
 from advnerf_core.attack.problem import AttackProblem, Sensor
@@ -98,6 +99,9 @@ class Space(Protocol):
     def attacked(self, theta: Tensor) -> tuple[AttackedObject, ...]:
         """What an attack file keeps of ``theta``."""
 
+    def face(self, theta: Tensor) -> Face | None:
+        """The face that a projection or a display can show; None where the objects are none."""
+
     def restored(self, attack: AttackFile) -> Shown:
         """The objects of an attack file, as a deployment shows them.
 
@@ -163,6 +167,9 @@ class ColourSpace:
         )
         return tuple(_attacked(named, field, part, _textured_glb(field, part)) for named, field, part in rows)
 
+    def face(self, theta: Tensor) -> None:
+        """None: a solid object is no face."""
+
     def restored(self, attack: AttackFile) -> Shown:
         """The objects where they are, in the colours of the file; see `Space.restored`."""
         require_same(attack, self._named)
@@ -208,6 +215,9 @@ class ShapeSpace:
         return tuple(
             _attacked(named, field, part, _textured_glb(field, colour)) for named, field, part, colour in rows
         )
+
+    def face(self, theta: Tensor) -> None:
+        """None: a mesh is no face."""
 
     def restored(self, attack: AttackFile) -> Shown:
         """The meshes in the shapes of the file; see `Space.restored`."""

@@ -153,14 +153,17 @@ class Lab:
 
     def overview(self, width: int = 960, height: int = 720) -> Rgb:
         """Picture ``[height, width, 3]`` of the whole room and the car from above the south wall, without the ceiling, for reports."""
+        return self.seen_from_above(width, height)[0]
+
+    def seen_from_above(self, width: int = 960, height: int = 720) -> tuple[Rgb, Pinhole, Array]:
+        """The picture of :meth:`overview`, and the camera that took it: intrinsics and ``T_world_from_camera`` ``[4, 4]``."""
         focal = 1.04 * width
         pinhole = Pinhole(width, height, focal, focal, 0.5 * width, 0.5 * height)
         side = self.config.room.side_m
+        T = look_at([0.0, -1.12 * side, 1.12 * side], [0.0, -0.3, 0.0])
         self._renderer.place("car", planar_pose(*self._pose()), hidden_groups=(CEILING_GROUP,))
         try:
-            return self._renderer.render_rgb(
-                look_at([0.0, -1.12 * side, 1.12 * side], [0.0, -0.3, 0.0]), pinhole
-            )
+            return self._renderer.render_rgb(T, pinhole), pinhole, T
         finally:
             self._renderer.place("car", np.eye(4), hidden_groups=(CAR_GROUP,))
 

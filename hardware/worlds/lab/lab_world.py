@@ -1,4 +1,4 @@
-"""The simulated lab as a world: the car drives along the tape, and photographs have the driving camera's colours."""
+"""The simulated lab as a world: the car drives along the tape, past a board and a monitor."""
 
 from __future__ import annotations
 
@@ -12,41 +12,51 @@ from advnerf_core.geometry import Array, Pinhole, VehicleState
 from hardware.worlds.lab.config import LabConfig
 from hardware.worlds.lab.lab import Lab
 from hardware.worlds.lab.phone import car_mounted_poses, track_pose, walk_around_poses
+from hardware.worlds.lab.world import MONITOR_PIXELS
 from hardware.worlds.paths import ReferencePath, Segment
-from hardware.worlds.world import Box, CarDescription, Depth, NotOpenError, Rgb, Traits, WorldDescription
+from hardware.worlds.world import (
+    Box,
+    CarDescription,
+    Depth,
+    NotOpenError,
+    Panel,
+    Rgb,
+    Traits,
+    WorldDescription,
+    WorldError,
+)
 
 HALF_LANE_M = 0.4
+FENCE_MARGIN_M = 0.5
 # The true car behind the nominal one: how it answers, not what it is asked.
 _UNSEEN = (
     "car.true_servo_gain", "car.true_servo_offset", "car.true_erpm_gain", "car.steering_lag_s", "car.steering_slew_radps", "car.motor_lag_s",
     "car.drag_stop_lag_s", "car.friction_mps2", "car.acceleration_per_amp_mps2", "car.grip_mps2", "car.command_delay_s",
 )  # fmt: skip
-_SAME_COLOURS = {"colour_matrix": ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), "gamma": 1.0}
 
 
 class LabWorld:
     """`hardware.worlds.lab.lab.Lab` behind the contract `hardware.worlds.world.World`.
 
     Args:
-        config: All numbers of the lab; the phone's colours do not count.
+        config: All numbers of the lab.
 
     Raises:
         TwinUnavailable: When it is opened, MuJoCo or EGL is missing; the message names the packages.
     """
 
     Config: ClassVar[type[LabConfig]] = LabConfig
-    traits: ClassVar[Traits] = Traits(unseen=_UNSEEN)
+    traits: ClassVar[Traits] = Traits(unseen=_UNSEEN, own_photo_colours=True)
 
     def __init__(self, config: LabConfig | None = None) -> None:
-        given = LabConfig() if config is None else config
-        self.config = given.model_copy(update={"phone": given.phone.model_copy(update=_SAME_COLOURS)})
+        self.config = given = LabConfig() if config is None else config
         self.camera_pinhole: Pinhole = given.camera.pinhole
         self.photo_pinhole: Pinhole = given.phone.pinhole
         self.T_car_from_camera: Array = given.camera.T_car_from_camera
         self._lab: Lab | None = None
 
     def describe(self) -> WorldDescription:
-        """One closed path: the tape. The box is the room."""
+        """One closed path: the tape. The box is the room; its panels are the board and the monitor."""
         track, room, car = self.config.track, self.config.room, self.config.car
         straight: Segment = ("line", track.side_m - 2.0 * track.corner_radius_m)
         corner: Segment = ("arc", track.corner_radius_m, 0.5 * math.pi)
@@ -55,8 +65,19 @@ class LabWorld:
             for servo in (car.servo_min, car.servo_max)
         ]
         half = 0.5 * room.side_m
+        board, monitor = (
+            Panel(each.T_world_from_face, each.width_m, each.height_m, pixels)
+            for each, pixels in ((self.config.board, None), (self.config.monitor, MONITOR_PIXELS))
+        )
         return WorldDescription(
-            paths={"track": ReferencePath(track_pose(track, 0.0), (straight, corner) * 4, closed=True)},
+            paths={
+                "track": ReferencePath(
+                    track_pose(track, 0.0),
+                    (straight, corner) * 4,
+                    closed=True,
+                    drive_from=self.config.start_pose,
+                )
+            },
             off_track_m=HALF_LANE_M,
             car=CarDescription("ackermann", car.speed_mps, (min(ends), max(ends)), car.wheelbase_m),
             camera=self.camera_pinhole,
@@ -65,6 +86,8 @@ class LabWorld:
             road_edge=(
                 np.array([(-half, -half), (half, -half), (half, half), (-half, half), (-half, -half)]),
             ),
+            panels={"board": board, "monitor": monitor},
+            fence_m=half - FENCE_MARGIN_M,
         )
 
     def photo_poses(self, count: int, rng: np.random.Generator) -> list[Array]:
@@ -118,6 +141,25 @@ class LabWorld:
     def photograph(self, T_world_from_camera: Array) -> Rgb:
         """A photograph ``[H, W, 3]`` with the phone's lens."""
         return self._open().photograph(T_world_from_camera)
+
+    def show(self, panel: str, rgb: Rgb | None) -> None:
+        """Show a picture on the monitor.
+
+        Raises:
+            WorldError: The panel is no screen.
+        """
+        if panel != "monitor":
+            raise WorldError(f"expected a screen of the lab: monitor; got {panel!r}")
+        self._open().set_monitor_image(rgb)
+
+    @property
+    def lab(self) -> Lab:
+        """The open lab behind this contract, for what only a lab has: a car that is held, tilted too."""
+        return self._open()
+
+    def overview(self) -> tuple[Rgb, Pinhole, Array]:
+        """The room from above the south wall, without the ceiling."""
+        return self._open().seen_from_above()
 
     def __enter__(self) -> LabWorld:
         if self._lab is None:

@@ -55,9 +55,9 @@ class ScenarioConfig(_NothingTwice):
     """One scenario: an experiment, and how it is read."""
 
     kind: str = Field(
-        default="room",
+        default="world",
         min_length=1,
-        description="room, room_search, world, or a Python module that runs cells (see nodes/experiment/campaign/kinds.py).",
+        description="world, or a Python module that runs cells (see nodes/experiment/campaign/kinds.py).",
     )
     experiment: Path = Field(description="Experiment file; relative to the campaign file.")
     setting: str = Field(default="full", description="Which of its settings.")

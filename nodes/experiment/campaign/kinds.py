@@ -32,11 +32,7 @@ from nodes.experiment.stages import hash_of, is_current, read_record
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import Report
 
-KINDS = {
-    "room": "nodes.experiment.cells",
-    "room_search": "nodes.experiment.search_cells",
-    "world": "nodes.experiment.junction.cells",
-}
+KINDS = {"world": "nodes.experiment.cells"}
 RunCell = Callable[[Any, str, str, str, int, Path, Report], dict[str, Any]]
 # The stages that a cell needs of its experiment; what comes after is the cell itself.
 _NEEDED = ("capture", "scene", "policy", "object", "objects")

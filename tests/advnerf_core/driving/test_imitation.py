@@ -16,7 +16,7 @@ from advnerf_core.learning import imitation
 from advnerf_core.learning.fit import FitConfig, fit, mean_absolute_error
 from advnerf_core.learning.frames import Frames, FrameSet, FrameStore, FrameStoreError
 from advnerf_core.learning.imitation import ImitationConfig, SourcePlan, recovery_states, train_policy
-from advnerf_core.learning.sources import RenderedSource, SceneSource, random_texture, steer_with
+from advnerf_core.learning.sources import RenderedSource, SceneSource, steer_with
 from advnerf_core.policies.pilotnet import PilotNet, load_policy
 from advnerf_core.policies.view import PolicyView
 
@@ -92,9 +92,13 @@ def overlay(rgb: np.ndarray, state: np.ndarray, texture: np.ndarray) -> np.ndarr
     return painted
 
 
+def random_texture(rng: np.random.Generator) -> np.ndarray:
+    return (1.0 / (1.0 + np.exp(-5.0 * rng.standard_normal((4, 4, 3))))).astype(np.float32)
+
+
 def _plans() -> list[SourcePlan]:
-    rendered = RenderedSource("rendered", prepare, DYNAMICS, lambda rng: random_texture(rng, 4), batch_size=4)
-    scene = SceneSource("scene", FloorScene(), VIEW, 0.8, 0.1, overlay, texture_cells=4, variants=2)
+    rendered = RenderedSource("rendered", prepare, DYNAMICS, random_texture, batch_size=4)
+    scene = SceneSource("scene", FloorScene(), VIEW, 0.8, 0.1, overlay, random_texture, variants=2)
     return [SourcePlan(rendered, 20, drives=2, drive_steps=3), SourcePlan(scene, 4, drives=2, drive_steps=2)]
 
 

@@ -20,7 +20,7 @@ scenarios:
     methods: [none, gradient]
     victims: [hardened]
     placements:
-      near: {run_folder: runs/near, set: [lab.board.x_m=1.9]}
+      near: {run_folder: runs/near, set: [world.board.x_m=1.9]}
   left: {experiment: one.experiment.yaml, run_folder: runs/one, seeds: [7], set: [horizon=40]}
 """
 
@@ -44,7 +44,7 @@ def test_a_campaign_is_the_product_of_what_it_lists(file):
     ]
     assert "straight.near_hardened_gradient_1" in names
     near = next(cell for cell in campaign.cells if cell.placement)
-    assert campaign.overrides(near) == ["lab.board.x_m=1.9"]
+    assert campaign.overrides(near) == ["world.board.x_m=1.9"]
     assert campaign.run_folder(near).name == "near"
     assert campaign.folder.parts[-3:] == ("runs", "campaigns", "mine")
     left = [cell for cell in campaign.cells if cell.scenario == "left"]
@@ -102,7 +102,7 @@ def test_a_bad_file_is_told_with_its_line(file, old, new, says):
 
 
 def test_an_unknown_kind_is_told_with_what_there_is():
-    with pytest.raises(ConfigError, match=r"\(room, room_search, world\).*got 'moon'"):
+    with pytest.raises(ConfigError, match=r"\(world\).*got 'moon'"):
         load_kind("moon")
     with pytest.raises(ConfigError, match="function run_cell in json"):
         load_kind("json")

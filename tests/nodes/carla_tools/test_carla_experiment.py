@@ -9,7 +9,7 @@ import yaml
 from advnerf_core.data.dataset import load_transforms
 from advnerf_core.report.clips import read_clip
 from nodes.experiment.campaign.kinds import load_kind, settings_hash
-from nodes.experiment.junction.run import load_experiment, run_experiment
+from nodes.experiment.run import load_experiment, run_experiment
 from nodes.runtime.errors import ConfigError
 
 TINY = {

@@ -1,81 +1,63 @@
-"""Cells of the room in a campaign: where their parts lie, and what a live drive says of its end."""
+"""Cells of live experiments: what they depend on, what they may spend, and where their drives lie."""
 
 from pathlib import Path
 
-import pytest
-
 from advnerf_core.attack.methods import METHODS, load_method, method_name
-from nodes.experiment.attack import search_settings
-from nodes.experiment.cells import _cell, blocked_tick, cell_inputs
+from nodes.experiment.attack import Cell, search_settings
+from nodes.experiment.cells import cell_inputs, clean_folder, runs_alone
+from nodes.experiment.deploy import live_name
 from nodes.experiment.run import load_experiment
 from tests.support.strangers import write_spiral
 
 LAUNCH = Path(__file__).parents[3] / "launch"
 
 
-def driven(states, stopped_early=""):
-    return {"outcome": {"stopped_early": stopped_early}, "states": states}
+def room(folder, *overrides, file="room"):
+    return load_experiment(LAUNCH / f"{file}.experiment.yaml", "full", overrides, folder)
 
 
-@pytest.mark.parametrize("method", ["none", "random", "gradient"])
-def test_search_and_live_drive_of_a_cell_leave_different_files(tmp_path, method):
-    experiment = load_experiment(LAUNCH / "monitor.experiment.yaml", "full", [], tmp_path / "run")
-    cell = _cell(experiment, "monitor", "hardened", method, 1, tmp_path / "cell")
-    name = f"hardened_{method}_1.json"
-    assert cell.live(method).name + ".json" == name
-    assert cell.searched_in(method) / name != cell.driven_in(method) / name
+def test_methods_of_one_victim_and_seed_share_the_live_drive_without_attack(tmp_path):
+    experiment = room(tmp_path / "run", file="monitor")
+    gradient, none, other = (
+        Cell("track", "hardened", method, seed)
+        for method, seed in (("gradient", 1), ("none", 1), ("none", 2))
+    )
+    folders = [clean_folder(experiment, cell, tmp_path / cell.name) for cell in (gradient, none, other)]
+    assert folders[0] == folders[1] != folders[2]
+    assert live_name(gradient, 0) != live_name(none, 0)
+    driven_here = room(tmp_path / "run", "deploy.through=world", file="monitor")
+    assert clean_folder(driven_here, gradient, tmp_path / "cell") == tmp_path / "cell"
 
 
-def test_memory_for_the_cache_is_no_part_of_what_a_cell_depends_on(tmp_path):
+def test_live_nodes_have_the_machine_for_themselves(tmp_path):
+    assert runs_alone(room(tmp_path))
+    assert not runs_alone(room(tmp_path, "deploy.through=world"))
+
+
+def test_what_changes_no_result_is_no_part_of_what_a_cell_depends_on(tmp_path):
     def inputs(*overrides):
-        experiment = load_experiment(LAUNCH / "room.experiment.yaml", "full", overrides, tmp_path)
-        return cell_inputs(experiment, "", "hardened", "gradient", 0)
+        return cell_inputs(room(tmp_path, *overrides), "track", "hardened", "gradient", 0)
 
-    assert inputs("attack.cache_mib=64") == inputs()
-    assert inputs("attack.starts=2") != inputs()
-
-
-def test_a_car_that_runs_into_something_stands_from_then_on():
-    free = [[0.08 * tick, 0.0, 0.0] for tick in range(20)]
-    against_it = free + [
-        [1.52 + 0.001 * (tick % 2), 0.0, 0.0] for tick in range(10)
-    ]  # motion capture's noise
-    assert blocked_tick(driven(free)) is None
-    assert blocked_tick(driven(against_it)) == 19
-    assert blocked_tick(driven(against_it, "outside of the fence")) is None
-    assert blocked_tick(driven(against_it, "stalled: the car does not move")) == 19
+    for free in ("attack.cache_mib=64", "attack.seeds=[4]", "deploy.laps=0", "deploy.ready_timeout_s=90"):
+        assert inputs(free) == inputs(), free
+    for counts in ("attack.starts=2", "deploy.through=world", "world.car.speed_mps=0.6"):
+        assert inputs(counts) != inputs(), counts
 
 
-def test_a_method_gets_its_own_part_of_the_budget(tmp_path):
-    """The gradient's iterations and rate are not those of methods without a gradient, nor the spread of random textures theirs."""
-    changes = [
-        "attack.iterations=7",
-        "attack.random_evaluations=5",
-        "attack.learning_rate=0.3",
-        "attack.random_sigma=2",
-    ]
-    experiment = load_experiment(LAUNCH / "room.experiment.yaml", "full", changes, tmp_path)
+def test_all_methods_may_evaluate_equally_often_and_those_without_a_gradient_search_a_coarse_face(tmp_path):
+    changes = ["attack.evaluations=7", "attack.learning_rate=0.3", "attack.random_sigma=2", "space.cells=4"]
+    experiment = room(tmp_path, *changes)
     settings = {name: search_settings(experiment, METHODS[name]) for name in METHODS}
-    assert {name: each.evaluations for name, each in settings.items() if each.evaluations != 5} == {
-        "gradient": 7
-    }
+    assert {each.evaluations for each in settings.values()} == {7}
     assert {(each.gradient_rate, each.random_sigma) for each in settings.values()} == {(0.3, 2.0)}
     assert {(each.learning_rate, each.sigma, each.population, each.cells) for each in settings.values()} == {
-        (None, None, 10, 8)
+        (None, None, 10, 4)
     }
 
 
-def test_a_method_that_a_user_brings_depends_on_all_that_it_may_spend(tmp_path):
+def test_a_method_that_a_user_brings_names_its_cells(tmp_path):
     write_spiral(tmp_path)
-
-    def inputs(method, *overrides):
-        experiment = load_experiment(LAUNCH / "room.experiment.yaml", "full", overrides, tmp_path / "run")
-        return cell_inputs(experiment, "", "hardened", method, 0)
-
-    for method, spent in ((f"{tmp_path / 'spiral.py'}:Spiral", True), ("evolution", True), ("cem", False)):
-        assert (inputs(method, "attack.random_sigma=2") != inputs(method)) == spent
-        experiment = load_experiment(LAUNCH / "room.experiment.yaml", "full", [], tmp_path / "run")
-        cell = _cell(experiment, "", "hardened", method, 1, tmp_path)
-        assert cell.search.name == f"hardened_{method_name(method)}_1"
-        assert cell.live(cell.method).name == cell.search.name
-        assert load_method(cell.search.reference) is load_method(method)
+    reference = f"{tmp_path / 'spiral.py'}:Spiral"
+    cell = Cell.of("track", "hardened", reference, 1)
+    assert cell.name == f"track_hardened_{method_name(reference)}_1"
+    assert load_method(cell.reference) is load_method(reference)

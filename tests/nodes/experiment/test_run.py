@@ -3,9 +3,8 @@ from pathlib import Path
 
 import pytest
 
-from nodes.experiment.attack import Search, searches
-from nodes.experiment.deploy import live_runs
-from nodes.experiment.run import STAGES, load_experiment, run_experiment, stages_of
+from nodes.experiment.attack import Cell, cells
+from nodes.experiment.run import load_experiment, run_experiment, stages_of
 from nodes.experiment.stages import StageError
 from nodes.runtime.errors import ConfigError
 
@@ -19,18 +18,22 @@ def room(tmp_path, setting="demo", *overrides):
 def test_settings_lie_over_the_file_and_the_command_line_over_both(tmp_path):
     assert room(tmp_path).config.attack.horizon == 40
     assert room(tmp_path, "full").config.attack.seeds == (0, 1, 2)
-    changed = room(tmp_path, "full", "attack.horizon=30", "lab.car.speed_mps=0.6")
-    assert (changed.config.attack.horizon, changed.speed_mps) == (30, 0.6)
-    assert changed.config.object.resolution == 64
+    changed = room(tmp_path, "full", "attack.horizon=30", "world.car.speed_mps=0.6")
+    assert (changed.searched_ticks, changed.car.speed_mps) == (30, 0.6)
+    assert room(tmp_path, "full").searched_ticks == room(tmp_path, "full").config.horizon
+    assert changed.config.space.resolution == 64
 
 
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (["attack.iteration=3"], r"unknown key attack\.iteration; valid keys here: .*iterations"),
+        (["attack.evaluation=3"], r"unknown key attack\.evaluation; valid keys here: .*evaluations"),
         (["attack.horizon=0"], r"attack\.horizon.*greater than or equal to 1"),
-        (["attack.display_model=sometimes"], r"attack\.display_model.*valid boolean"),
-        (["lab.camera.widht=3"], r"unknown key camera\.widht"),
+        (["space.display_model=sometimes"], r"display_model.*valid boolean"),
+        (["space.panel=door"], r"space\.panel: .*board, monitor.*door"),
+        (["world.camera.widht=3"], r"unknown key camera\.widht"),
+        (["capture.colour_pairs=0"], r"colour_pairs of at least 1.*world lab have colours of their own"),
+        (["deploy.through=air"], r"deploy\.through"),
         (["attack"], "expected KEY=VALUE"),
     ],
 )
@@ -46,28 +49,46 @@ def test_an_unknown_setting_names_those_there_are(tmp_path):
 
 def test_an_error_names_the_line_of_the_file(tmp_path):
     file = tmp_path / "bad.experiment.yaml"
-    file.write_text("name: room\nsettings:\n  demo:\n    attack:\n      horizen: 3\n")
-    with pytest.raises(ConfigError, match=r"bad\.experiment\.yaml:5: unknown key attack\.horizen"):
+    file.write_text(
+        "name: room\nworld: {kind: lab}\nscenarios: [track]\nsettings:\n  demo:\n    attack:\n      horizen: 3\n"
+    )
+    with pytest.raises(ConfigError, match=r"bad\.experiment\.yaml:7: unknown key attack\.horizen"):
         load_experiment(file, "demo", [], tmp_path)
 
 
 def test_a_stage_depends_on_its_own_settings_and_on_no_others(tmp_path):
-    before = {stage.name: stage.settings for stage in stages_of(room(tmp_path))}
-    after = {stage.name: stage.settings for stage in stages_of(room(tmp_path, "demo", "attack.iterations=7"))}
-    assert tuple(before) == STAGES
-    assert {name for name in before if before[name] != after[name]} == {"attack", "deploy", "report"}
+    def changed(override):
+        before = {stage.name: stage.settings for stage in stages_of(room(tmp_path))}
+        after = {stage.name: stage.settings for stage in stages_of(room(tmp_path, "demo", override))}
+        assert list(before) == ["capture", "scene", "object", "policy", "attack", "deploy", "report"]
+        return {name for name in before if before[name] != after[name]}
+
+    assert changed("attack.evaluations=7") == {"attack", "report"}
+    assert changed("space.cells=4") == {"attack", "deploy"}
+    assert changed("deploy.starts=2") == {"deploy"}
+    # What the panel shows without an attack is photographed and learned from.
+    assert changed("space.plain_rgb=[0.5, 0.5, 0.5]") == {"capture", "policy", "attack", "deploy"}
+
+
+def test_an_experiment_that_deploys_nothing_ends_with_its_searches(tmp_path):
+    stages = [stage.name for stage in stages_of(room(tmp_path, "demo", "deploy.through=nothing"))]
+    assert stages == ["capture", "scene", "object", "policy", "attack"]
 
 
 def test_every_seed_meets_every_condition_and_the_naive_victim_the_first(tmp_path):
-    full = room(tmp_path, "full")
-    assert Search("hardened", "gradient", 2) in searches(full)
-    assert [s.seed for s in searches(full) if s.victim == "naive"] == [0, 0]
-    runs = [run.name for run in live_runs(full)]
-    assert runs[0] == "hardened_laps_0"
-    assert {f"hardened_{c}_{s}" for c in ("none", "random", "gradient") for s in (0, 1, 2)} < set(runs)
-    assert "hardened_empty_0" in runs
-    assert len(runs) == len(set(runs))
-    assert not any("laps" in run.name or "empty" in run.name for run in live_runs(room(tmp_path)))
+    full = cells(room(tmp_path, "full"))
+    assert Cell("track", "hardened", "gradient", 2) in full
+    assert {cell.seed for cell in full if cell.victim == "naive"} == {0}
+    assert len(full) == len({cell.name for cell in full}) == 3 * 3 + 3
+
+
+def test_the_first_start_of_every_seed_is_the_nominal_one_where_a_file_says_so(tmp_path):
+    def first(seed, *overrides):
+        return room(tmp_path, "full", *overrides).start_states("track", seed)[0].tolist()
+
+    nominal = [-1.1, -2.0, 0.0]
+    assert first(0) == first(2) == first(0, "attack.nominal_start=false") == nominal
+    assert first(2, "attack.nominal_start=false") != nominal
 
 
 def test_a_changed_node_graph_is_driven_again(tmp_path):

@@ -9,16 +9,13 @@ import torch
 from advnerf_core.attack.spaces.displayed import DisplayedSensor
 from advnerf_core.display import DisplayModel
 from advnerf_core.geometry import invert_transform, planar_pose, transform_points
-from calibration.by_construction import LAB_DATE, METHOD, write_twin_calibrations
+from calibration.by_construction import LAB_DATE, METHOD, twin_calibrations
 from calibration.display_colour import DisplayCalibration
+from calibration.panel import centre_square
 from calibration.schema import CalibrationError, save_calibration
 from hardware.worlds.lab.config import MonitorOpticsConfig
-from hardware.worlds.lab.lab import Lab
 from hardware.worlds.lab.world import MONITOR_PIXELS
-from nodes.experiment import screen
-from nodes.experiment.attack import sensor_of
-from nodes.experiment.context import CALIBRATION
-from nodes.experiment.objects import attacked_object, surrogate_of
+from nodes.experiment import faces, screen
 from nodes.experiment.run import load_experiment
 
 LAUNCH = Path(__file__).parents[3] / "launch"
@@ -35,14 +32,12 @@ SHOWN = np.array([0.8, 0.3, 0.6])
 
 @pytest.fixture
 def experiment(tmp_path):
-    loaded = load_experiment(LAUNCH / "monitor.experiment.yaml", "demo", [], tmp_path)
-    write_twin_calibrations(loaded.lab_config, tmp_path / "capture" / CALIBRATION)
-    return loaded
+    return load_experiment(LAUNCH / "monitor.experiment.yaml", "demo", [], tmp_path)
 
 
 def test_the_face_is_the_centre_square_and_the_rest_is_black(experiment):
     width, height = MONITOR_PIXELS
-    picture = screen.plain_picture(experiment)
+    picture = faces.plain_screen(experiment)
     assert picture.shape == (height, width, 3)
     lit = picture.any(axis=2)
     columns = np.flatnonzero(lit.any(axis=0))
@@ -53,21 +48,21 @@ def test_the_face_is_the_centre_square_and_the_rest_is_black(experiment):
     assert (picture[lit] == np.round(255 * np.array([0.20, 0.62, 0.28]))).all()
 
 
-def test_the_face_of_an_attack_is_where_the_monitor_will_show_it(experiment):
-    corners = experiment.target.corners
-    assert experiment.target.subject == "monitor"
-    assert np.ptp(corners[:, 1]) == pytest.approx(experiment.face_m, abs=1e-5)
-    assert np.abs(corners.mean(axis=0)).max() < 1e-5
+def test_the_face_of_an_attack_is_where_the_calibrated_monitor_will_show_it(experiment):
+    corners = faces.corners_on(faces.panel_of(experiment))
+    target = centre_square(twin_calibrations(experiment.named_world.config)["monitor"])
+    assert target.subject == faces.wanted_face(experiment).panel == "monitor"
+    assert np.abs(corners - target.corners).max() < 1e-6
 
 
 def test_the_mean_viewing_angle_is_that_of_the_drive(experiment):
     # Straight stretch before the corner, by plane geometry: the camera 0.3 m before the axle, at 0.2 m, the screen's middle at 0.28 m.
-    monitor = experiment.lab_config.monitor
+    monitor = experiment.named_world.config.monitor
     cosines = []
     for x_m in -1.1 + 0.08 * np.arange(26):
         away = np.array([x_m + 0.3 - monitor.x_m, -2.0 - monitor.y_m, 0.2 - monitor.z_m])
         cosines.append(away @ [np.cos(monitor.yaw_rad), np.sin(monitor.yaw_rad), 0.0] / np.linalg.norm(away))
-    cosine = screen.mean_cos_angle(experiment)
+    cosine = faces.mean_cos_angle(experiment)
     assert min(cosines) - 0.05 < cosine < max(cosines)
 
 
@@ -79,7 +74,7 @@ def grey_room(poses, pinhole):
 
 def seen_on_the_face(sensor, experiment):
     """Colour ``[3]`` of the face's middle from a car 1.1 m before it, when all of it shows one colour."""
-    face, mount = experiment.panel.T_world_from_face, experiment.camera.mount
+    face, mount = faces.panel_of(experiment).T_world_from_face, experiment.mount
     x_m, y_m, _ = (face @ [1.1, 0.0, 0.0, 1.0])[:3]
     heading_rad = np.arctan2(*(face[:2, 3] - [x_m, y_m])[::-1])
     state = torch.tensor([[x_m, y_m, heading_rad]], dtype=torch.float64)
@@ -96,39 +91,37 @@ def seen_on_the_face(sensor, experiment):
 def test_an_attack_looks_through_the_display_model_where_a_monitor_shows_it_and_it_is_on(
     tmp_path, file, display_model, seen
 ):
-    override = f"attack.display_model={str(display_model).lower()}"
+    override = f"space.display_model={str(display_model).lower()}"
     asked = load_experiment(LAUNCH / f"{file}.experiment.yaml", "demo", [override], tmp_path)
-    write_twin_calibrations(asked.lab_config, tmp_path / "capture" / CALIBRATION)
-    surrogate = surrogate_of(asked, [attacked_object(asked)], grey_room)
+    asked.calibration_folder.mkdir(parents=True)
     save_calibration(
         DisplayCalibration(date=LAB_DATE, method=METHOD, model=SEEN_AS.to_dict()),
-        asked.calibration_file("display"),
+        asked.calibration_folder / faces.DISPLAY,
     )
-    sensor = sensor_of(asked, surrogate)
+    space = faces.face_space(asked, grey_room)
+    sensor = space.sensor
     colour = seen_on_the_face(sensor, asked)
     # The law in numpy, which the sensor's torch knows nothing of.
-    displayed = SEEN_AS.forward(SHOWN, screen.mean_cos_angle(asked))
+    displayed = SEEN_AS.forward(SHOWN, faces.mean_cos_angle(asked))
     assert np.abs(displayed - SHOWN).max() > 0.2
     assert colour == pytest.approx(displayed if seen == "the display" else SHOWN, abs=1e-4)
     assert isinstance(sensor, DisplayedSensor) is (seen == "the display")
-    assert (sensor is surrogate) is (seen == "as shown")
+    assert (sensor is space.surrogate) is (seen == "as shown")
 
 
 def test_a_display_model_that_was_never_measured_is_one_clear_error(experiment):
-    surrogate = surrogate_of(experiment, [attacked_object(experiment)], grey_room)
     with pytest.raises(CalibrationError, match=r"display\.yaml"):
-        sensor_of(experiment, surrogate)
+        faces.face_space(experiment, grey_room)
 
 
 @pytest.mark.slow
 def test_the_measured_colours_are_those_of_the_optics(experiment):
-    optics = experiment.lab_config.monitor_optics
+    optics = experiment.named_world.config.monitor_optics
     assert optics == MonitorOpticsConfig.office()
-    with Lab(experiment.lab_config) as lab:
-        fit = screen.measure_display(lab)
-    save_calibration(fit.calibration(), experiment.calibration_file("display"))
+    with experiment.open_world() as world:
+        fit = screen.measure_display(world, "monitor", faces.panel_of(experiment))
     assert fit.rmse(True) < 0.02
     assert fit.model.falloff == pytest.approx(optics.falloff, abs=0.3)
     shown = np.random.default_rng(0).random((50, 3))
     light = np.array(optics.glare) + shown ** np.array(optics.gamma) @ np.array(optics.mixing).T
-    assert np.abs(experiment.display.forward(shown) - light ** (1 / optics.response)).max() < 0.03
+    assert np.abs(fit.model.forward(shown) - light ** (1 / optics.response)).max() < 0.03

@@ -4,6 +4,7 @@ import json
 import os
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from advnerf_core.report.results import read_results
@@ -15,10 +16,10 @@ from nodes.experiment.run import load_experiment, run_experiment
 
 LAUNCH = Path(__file__).parents[3] / "launch"
 SMALL = [
-    "capture.walk_around=12", "capture.car_mounted=12", "capture.colour_pairs=2", "capture.held_out=2", "scene.steps=60",
-    "policy.lab_stills=12", "policy.surrogate_stills=8", "policy.lab_drives=2", "policy.surrogate_drives=2",
+    "capture.photos=24", "capture.colour_pairs=2", "capture.held_out=3", "scene.steps=60",
+    "policy.deployed_stills=12", "policy.surrogate_stills=8", "policy.deployed_drives=2", "policy.surrogate_drives=2",
     "policy.drive_steps=4", "policy.first_steps=8", "policy.round_steps=4", "policy.naive_steps=0",
-    "attack.horizon=8", "attack.iterations=2", "attack.random_evaluations=2", "object.resolution=8",
+    "attack.horizon=8", "attack.evaluations=2", "space.resolution=8",
 ]  # fmt: skip
 
 
@@ -38,12 +39,31 @@ def test_from_photographs_to_report_and_nothing_twice(tmp_path, file):
         for condition in ("none", "random", "gradient")
     }
     assert data.latency is not None
-    drawn = json.loads((tmp_path / "deploy" / "hardened_gradient_0.json").read_text())["attack_ids"]
-    assert len(drawn) == 1
+    cell = json.loads((tmp_path / "deploy" / "track_hardened_gradient_0.cell.json").read_text())
+    (live,) = json.loads((tmp_path / "deploy" / "track_hardened_gradient_0.drives.json").read_text())["live"]
+    assert live["attack_ids"] == [cell["attack_id"]]
     kept = (tmp_path / "report" / "report.html").stat().st_mtime_ns
     again = run_experiment(load_experiment(experiment, "demo", SMALL, tmp_path))
     assert {name: record.digest for name, record in again.items()} == {n: r.digest for n, r in first.items()}
     assert (tmp_path / "report" / "report.html").stat().st_mtime_ns == kept
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize("file", ["room", "monitor"])
+def test_a_face_is_also_deployed_without_nodes_and_meets_the_same_searches(tmp_path, file):
+    """The second deployer: the lab's own car in this process, past the face that is drawn, or shown on the screen."""
+    os.environ.setdefault("MUJOCO_GL", "egl")
+    asked = [*SMALL, "deploy.through=world", "deploy.starts=null"]
+    experiment = load_experiment(LAUNCH / f"{file}.experiment.yaml", "demo", asked, tmp_path)
+    run_experiment(experiment)
+    drives = json.loads((tmp_path / "deploy" / "track_hardened_random_0.drives.json").read_text())
+    clean = json.loads((tmp_path / "deploy" / "track_hardened_none_0.drives.json").read_text())
+    assert drives["live"] == []
+    assert np.shape(drives["states"]) == (1, 61, 3)
+    # The face is seen: it steers otherwise than what is there without it.
+    assert drives["controls"] != clean["controls"]
+    assert "<html" in (tmp_path / "report" / "report.html").read_text()
 
 
 @pytest.mark.slow
@@ -54,7 +74,7 @@ def test_a_cell_of_another_seed_is_searched_and_driven_live_once(tmp_path):
     run_experiment(experiment, until="object")
     asked = (
         experiment,
-        "monitor",
+        "track",
         "hardened",
         "gradient",
         1,
@@ -63,13 +83,14 @@ def test_a_cell_of_another_seed_is_searched_and_driven_live_once(tmp_path):
     )
     cell = run_cell(*asked)
     assert len(cell["deployed"]["total_cte_m"]) == len(cell["deployed"]["none_total_cte_m"]) == 1
-    live = json.loads((tmp_path / "cells" / "one" / "live" / "hardened_gradient_1.json").read_text())
+    live = json.loads((tmp_path / "cells" / "one" / "track_hardened_gradient_1.live0.json").read_text())
     assert live["attack_ids"] == [cell["attack_id"]]
+    assert (tmp_path / "cells" / cell["extra"]["clip"]).stat().st_size > 1000
     assert run_cell(*asked)["deployed"] == cell["deployed"]
     # What a prediction needs is there: the search, and the bag of the drive without attack.
-    which = (experiment, "monitor", "hardened", "gradient")
+    which = (experiment, "track", "hardened", "gradient")
     assert fidelity.lacks(*which, 2, tmp_path / "cells" / "one") == "its search"
     assert fidelity.lacks(*which, 1, tmp_path / "cells" / "one") == ""
-    found, clean = predict_cell(load_kind("room"), *which, 1, tmp_path / "cells" / "one", draws=2)
+    found, clean = predict_cell(load_kind("world"), *which, 1, tmp_path / "cells" / "one", draws=2)
     assert found.ratio > 0.0
     assert clean.agreement.summary()["views"] >= 10

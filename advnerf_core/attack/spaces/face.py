@@ -1,0 +1,96 @@
+"""The space of a face: one flat texture that a board or a screen carries, alone or behind a measured display."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from advnerf_core.attack.artifact import COLOURS, AttackedObject, AttackFile, Face, face_texture
+from advnerf_core.attack.methods import SearchRun, SearchSettings, load_method
+from advnerf_core.attack.problem import AttackProblem
+from advnerf_core.attack.search.search import SearchResult
+from advnerf_core.attack.spaces.displayed import DisplayedSensor
+from advnerf_core.attack.spaces.space import NamedObject, Shown, require_same
+from advnerf_core.display import DisplayModel
+from advnerf_core.geometry import Array
+from advnerf_core.scene.surrogate import Surrogate
+
+
+@dataclass(frozen=True, eq=False)
+class FaceMount:
+    """Where a face is.
+
+    Attributes:
+        subject: What carries it: the panel's name, which is also that of the motion-capture subject.
+        size_m: Width and height [m].
+        corners_in_subject: As of `advnerf_core.attack.artifact.Face`, ``[4, 3]`` [m].
+    """
+
+    subject: str
+    size_m: tuple[float, float]
+    corners_in_subject: Array
+
+
+class FaceSpace:
+    """Colours of a face, which hides what carries it; without an attack what carries it is seen, as it was learned.
+
+    Args:
+        surrogate: The scene with the face as its only object.
+        named: What attack files say of the face.
+        mount: Where it is.
+        display: What a screen and the room do to its colours; None for a board, or for a screen that is taken for ideal.
+        cos_angle: Cosine of the angle at which the camera looks at a screen; see `DisplayedSensor`.
+    """
+
+    name = COLOURS
+
+    def __init__(
+        self,
+        surrogate: Surrogate,
+        named: NamedObject,
+        mount: FaceMount,
+        display: DisplayModel | None = None,
+        cos_angle: float = 1.0,
+    ) -> None:
+        if len(surrogate.objects) != 1:
+            raise ValueError(f"expected a surrogate with one face, got {len(surrogate.objects)} objects")
+        self.surrogate, self.mount, self._named = surrogate, mount, named
+        self.sensor: Surrogate | DisplayedSensor = surrogate
+        if display is not None:
+            self.sensor = DisplayedSensor(surrogate, display, cos_angle)
+
+    @property
+    def plain(self) -> Shown:
+        """The scene as it was learned, with no face in it."""
+        return Shown((), torch.zeros(0, 3, dtype=self.surrogate.dtype))
+
+    def search(
+        self, method: str, problem: AttackProblem, settings: SearchSettings, run: SearchRun
+    ) -> SearchResult:
+        """Search with any method; see `Space.search`."""
+        return load_method(method).search(problem, settings, run)
+
+    def attacked(self, theta: Tensor) -> tuple[AttackedObject, ...]:
+        """The colours that are shown."""
+        (field,) = self.surrogate.objects
+        colours = theta.detach().numpy().astype(np.float32)
+        return (
+            AttackedObject(
+                self._named.name, colours, field.T_world_from_object, field.scale, self._named.sha256
+            ),
+        )
+
+    def face(self, theta: Tensor) -> Face:
+        """The face as it is displayed."""
+        texture = face_texture(theta.detach().numpy().astype(np.float32))
+        return Face(texture, self.mount.size_m, self.mount.subject, self.mount.corners_in_subject)
+
+    def restored(self, attack: AttackFile) -> Shown:
+        """The face in the colours that are seen, behind the display if there is one; see `Space.restored`."""
+        require_same(attack, [self._named])
+        shown = torch.from_numpy(np.array(attack.face_object.theta)).to(self.surrogate.dtype)
+        seen = self.sensor.seen_theta(shown) if isinstance(self.sensor, DisplayedSensor) else shown
+        return Shown(self.surrogate.objects, seen.detach())

@@ -1,0 +1,42 @@
+"""The section ``deploy`` of an experiment: what drives past a found attack."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Count = Annotated[int, Field(ge=0)]
+Positive = Annotated[int, Field(ge=1)]
+
+
+class DeployConfig(BaseModel):
+    """What drives past a found attack, and how often. All but ``through`` and ``starts`` concerns live nodes only."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    through: Literal["world", "nodes", "nothing"] = Field(
+        default="world",
+        description="world: the world's own car, in this process; nodes: the live nodes and the simulated lab; nothing: search only.",
+    )
+    starts: Positive | None = Field(
+        default=None,
+        description="So many of the starts are driven; none: all. A live drive takes half a minute.",
+    )
+    launch_file: str = Field(
+        default="green_screen.launch.yaml", description="Node graph, beside the experiment file."
+    )
+    nodes: tuple[str, ...] = Field(
+        default=("twin", "camera", "vicon", "compositor", "policy", "safety", "motor", "recorder"),
+        description="Nodes that must be ready before the car moves.",
+    )
+    laps: Count = Field(default=0, description="Laps driven live without attack before the cells.")
+    empty_scene: bool = Field(default=False, description="Also drive with the panel taken away.")
+    ready_timeout_s: Annotated[float, Field(gt=0)] = Field(
+        default=60.0, description="Time for the graph to become ready [s]."
+    )
+
+    @property
+    def live(self) -> bool:
+        """Whether live nodes drive."""
+        return self.through == "nodes"

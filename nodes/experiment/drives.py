@@ -1,0 +1,68 @@
+"""Drives past objects, in the learned scene and where they are deployed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+from advnerf_core.attack.adjoint import AttackProblem, evaluate
+from advnerf_core.driving.metrics import DriveMetrics, drive_metrics
+from advnerf_core.geometry import Array
+from advnerf_core.policies.pilotnet import Policy
+from nodes.experiment.context import Experiment
+from nodes.experiment.deployed import DeployedDrive, Dressed, drive_deployed
+
+
+def learned_drives(
+    experiment: Experiment, problem: AttackProblem, theta: Tensor
+) -> tuple[Array, list[DriveMetrics]]:
+    """States ``[B, T + 1, n]`` of the drives from all starts of a problem in its own scene, and their metrics."""
+    rollout, _ = evaluate(problem, theta)
+    states = rollout.states.transpose(0, 1).numpy()
+    return states, [
+        drive_metrics(problem.path, each, experiment.limits, _fenced_tick(experiment, each))
+        for each in states
+    ]
+
+
+def _fenced_tick(experiment: Experiment, states: Array) -> int | None:
+    """The tick at which the car is outside of the world's fence, where it is stopped; None if it never is."""
+    if experiment.world.fence_m is None:
+        return None
+    outside = np.flatnonzero((np.abs(states[:, :2]) > experiment.world.fence_m).any(axis=1))
+    return int(outside[0]) if outside.size else None
+
+
+def deployed_drives(
+    experiment: Experiment,
+    dressed: Dressed,
+    policy: Policy,
+    scenario: str,
+    starts: Tensor,
+    theta: Tensor | None,
+) -> list[DeployedDrive]:
+    """Drives of the deployment scene's own car from starts ``[B, 3]``."""
+    return [
+        drive_deployed(
+            dressed,
+            policy,
+            experiment.goal(scenario),
+            np.asarray(start),
+            experiment.paths[scenario],
+            experiment.limits,
+            experiment.car.speed_mps,
+            theta,
+        )
+        for start in starts.numpy()
+    ]
+
+
+def totals(scores: Sequence[DriveMetrics]) -> dict[str, Any]:
+    """Total CTE [m] and whether the track was left, drive by drive, as cells have them."""
+    return {
+        "total_cte_m": [score.total_cte_m for score in scores],
+        "off_track": [score.off_track for score in scores],
+    }

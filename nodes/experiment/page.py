@@ -1,0 +1,198 @@
+"""The report page of an experiment in a world: one self-contained HTML file that loads nothing."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from markupsafe import Markup
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from advnerf_core.files import write_atomically
+from advnerf_core.report.clips import data_uri, image_uri
+from advnerf_core.report.conditions import style_of
+from advnerf_core.report.palette import DARK, LIGHT, LINE_STYLES, css_variables
+from advnerf_core.report.plots import new_axes, svg
+from advnerf_core.report.tables import Table
+from nodes.experiment import films
+from nodes.experiment.attack import Cell, cells
+from nodes.experiment.context import Experiment
+from nodes.experiment.policy import HARDENED
+from nodes.experiment.stages import read_record
+
+_MARGIN_M, _SHOWN_VIEWS = 3.0, 3
+_HEAD = """<!doctype html>
+<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{title}</title><style>:root {{ {light} }} @media (prefers-color-scheme: dark) {{ :root {{ {dark} }} }} {style}
+img, video {{ max-width: 100%; height: auto; }}</style></head><body><main>
+"""
+
+
+def write(
+    experiment: Experiment,
+    folder: Path,
+    table: Table,
+    overview: NDArray[np.uint8],
+    clips: Sequence[Path],
+    seen: Mapping[str, Mapping[str, NDArray[np.uint8]]],
+) -> Path:
+    """Write ``report.html``.
+
+    Args:
+        experiment: With all stages before finished.
+        folder: Where to.
+        table: The transfer table.
+        overview: The world from above.
+        clips: One film per drive.
+        seen: Per drive and method, what the camera saw of the objects.
+    """
+    title = f"{experiment.config.name} ({experiment.setting})"
+    style = files("advnerf_core.report").joinpath("page.css").read_text(encoding="utf-8")
+    parts = [
+        Markup(_HEAD).format(
+            title=title,
+            light=Markup(css_variables(LIGHT)),
+            dark=Markup(css_variables(DARK)),
+            style=Markup(style),
+        ),
+        Markup("<h1>{}</h1><p>{}</p>").format(title, opening(experiment)),
+        Markup("<h2>Total cross-track error</h2>{}").format(table.html()),
+        Markup("<h2>The world</h2>"),
+        _picture(overview, "Paths of the drives, and the places of the objects"),
+    ]
+    for name, clip in zip(experiment.config.scenarios, clips, strict=True):
+        parts += [
+            Markup("<h2>{}</h2>").format(name.capitalize()),
+            *_drive(experiment, name, clip, seen[name]),
+        ]
+    parts += [*_fidelity(experiment), *_how(experiment), Markup("</main></body></html>\n")]
+    path = folder / "report.html"
+    write_atomically(path, str(Markup("\n").join(parts)))
+    return path
+
+
+def opening(experiment: Experiment) -> str:
+    """What was done, in one paragraph."""
+    attack, things = experiment.config.attack, experiment.objects
+    methods = ", ".join(style_of(name).title for name in attack.method_names)
+    counts = Counter(thing.kind.replace("_", " ") for thing in things)
+    named = " and ".join(f"{count} {kind}{'s' if count > 1 else ''}" for kind, count in counts.items())
+    return (
+        f"One goal-conditioned policy drives {', '.join(experiment.config.scenarios)}. "
+        f"{experiment.config.space.searched.format(named)} ({methods}; {attack.evaluations} evaluations each, "
+        f"{len(attack.seeds)} seed(s), {attack.starts} start(s), T = {experiment.config.horizon} ticks of {experiment.config.dt_s:g} s), then the opaque objects are put into the "
+        f"world {experiment.named_world.kind} by depth. Total CTE is the sum of |CTE| over the drive's ticks; ratios are to the same start past the plain "
+        "objects in the same domain."
+    )
+
+
+def _picture(image: NDArray[np.uint8], caption: str) -> Markup:
+    return Markup('<figure><img src="{}" alt="{}"><figcaption>{}</figcaption></figure>').format(
+        image_uri(image, 88), caption, caption
+    )
+
+
+def _drive(
+    experiment: Experiment, name: str, clip: Path, seen: Mapping[str, NDArray[np.uint8]]
+) -> list[Markup]:
+    text = f"Drives ({name}) from above: dashed in the learned scene, solid deployed"
+    parts = [
+        Markup("<figure>{}<figcaption>{}</figcaption></figure>").format(
+            Markup(svg(trajectories(experiment, name), text)), text
+        ),
+        Markup('<video controls loop muted src="{}"></video>').format(data_uri(clip)),
+    ]
+    return [*parts, *(_picture(image, f"Objects seen: {style_of(key).title}") for key, image in seen.items())]
+
+
+def trajectories(experiment: Experiment, name: str) -> Figure:
+    """All drives of the hardened victim on one path, from above."""
+    path = experiment.paths[name]
+    line = path.pose_at(np.linspace(0.0, path.length_m, 300))[:, :2]
+    found = [cell for cell in cells(experiment) if cell.scenario == name and cell.victim == HARDENED]
+    drives = [
+        (cell, domain, states)
+        for cell in found
+        for domain in films.DOMAINS
+        for states in films.drives_of(experiment, domain, cell)
+    ]
+    every = np.concatenate([states[:, :2] for _, _, states in drives])
+    low, high = every.min(axis=0) - _MARGIN_M, every.max(axis=0) + _MARGIN_M
+    with new_axes(6.4, float(np.clip(5.6 * (high - low)[1] / (high - low)[0], 2.2, 6.0)) + 0.9) as ax:
+        _ground(ax, experiment)
+        ax.plot(*line.T, color=LIGHT["tape"], lw=7.0, alpha=0.25, zorder=1)
+        for cell, domain, states in drives:
+            drawn = {"color": style_of(cell.method).light, "ls": LINE_STYLES[domain], "lw": 1.2, "zorder": 2}
+            ax.plot(*states[:, :2].T, label=_label(cell, domain), **drawn)
+        entries = dict(zip(*reversed(ax.get_legend_handles_labels()), strict=True))
+        ax.figure.legend(
+            entries.values(), entries.keys(), loc="outside upper left", ncols=3, columnspacing=1.4
+        )
+        ax.set(xlabel="x [m]", ylabel="y [m]", xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+        ax.set_aspect("equal")
+    return ax.figure
+
+
+def _label(cell: Cell, domain: str) -> str:
+    return f"{style_of(cell.method).title}, {domain}"
+
+
+def _ground(ax: Any, experiment: Experiment) -> None:
+    """The roads' edges, and the objects."""
+    from matplotlib.patches import Polygon
+
+    ax.grid(False)
+    for edge in experiment.world.road_edge:
+        ax.plot(*edge.T, color=LIGHT["muted"], lw=1.0, zorder=0.5)
+    for thing in experiment.objects:
+        ax.add_patch(
+            Polygon(thing.corners_m(), closed=True, fc=LIGHT["grid"], ec=LIGHT["ink"], lw=1.0, zorder=1.5)
+        )
+
+
+def _fidelity(experiment: Experiment) -> list[Markup]:
+    scene = json.loads((experiment.stage_folder("scene") / "fidelity.json").read_text())
+    controls = json.loads((experiment.stage_folder("policy") / "policy.json").read_text())[
+        "on_held_out_views"
+    ]
+    difference = float(np.mean([abs(row["real"] - row["surrogate"]) for row in controls]))
+    mean, views = scene["mean"], scene["views"]
+    text = (
+        f"Held-out views of the driving camera: {mean['psnr_full_db']:.1f} dB at full size, {mean['psnr_policy_db']:.1f} dB at 200x66; "
+        f"the policy's control on true and learned views differs by {difference:.3f} {experiment.car.control_unit} on average."
+    )
+    parts = [Markup("<h2>The learned scene</h2><p>{}</p>").format(text)]
+    for index in np.linspace(0, len(views) - 1, min(_SHOWN_VIEWS, len(views))).round().astype(int):
+        pair = [_read(experiment.folder / views[index][f"{name}_image"]) for name in ("real", "surrogate")]
+        parts.append(_picture(np.concatenate(pair, axis=1), "True and learned"))
+    return parts
+
+
+def _how(experiment: Experiment) -> list[Markup]:
+    manifest = json.loads((experiment.folder / "manifest.json").read_text())
+    frozen = json.loads((experiment.stage_folder("attack") / "frozen.json").read_text())
+    records = {
+        name: read_record(experiment.stage_folder(name))
+        for name in ("capture", "scene", "object", "policy", "attack", "deploy")
+    }
+    times = ", ".join(
+        f"{name} {record.seconds:.0f} s" for name, record in records.items() if record is not None
+    )
+    hashes = ", ".join(f"{name} {value[:12]}" for name, value in frozen.items())
+    return [
+        Markup(
+            "<h2>How it was made</h2><p><code>{}</code></p><p>Stages: {}.</p><p>Fixed before the first attack: {}.</p>"
+        ).format(manifest["command"], times, hashes)
+    ]
+
+
+def _read(path: Path) -> NDArray[np.uint8]:
+    import cv2
+
+    return np.ascontiguousarray(cv2.cvtColor(np.asarray(cv2.imread(str(path))), cv2.COLOR_BGR2RGB))

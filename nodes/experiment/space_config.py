@@ -1,0 +1,103 @@
+"""The section ``space`` of an experiment: what its attacks may change, and the words of the report for it (``searched``)."""
+
+from __future__ import annotations
+
+from typing import Annotated, ClassVar, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Positive = Annotated[int, Field(ge=1)]
+PositiveNumber = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Unit = Annotated[float, Field(ge=0, le=1)]
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class ColoursConfig(_Section):
+    """The colours of the objects."""
+
+    kind: Literal["colours"] = "colours"
+    searched: ClassVar[str] = "The colours of {} are searched together in the learned scene"
+
+
+class PlacesConfig(_Section):
+    """Where the objects stand, and their colours unless these are kept."""
+
+    kind: Literal["places"] = "places"
+    searched: ClassVar[str] = "The places of {} are searched together in the learned scene"
+    move_m: NotNegative = Field(default=1.5, description="An object's x and y may change by this [m].")
+    turn_rad: NotNegative = Field(
+        default=0.6,
+        description="A car's heading may change by this [rad]; a hydrant may turn all the way round.",
+    )
+    samples: Positive = Field(default=5, description="Placements that are drawn.")
+    steps: Positive = Field(default=10, description="Evaluations of each placement.")
+    colour_rate: PositiveNumber = Field(
+        default=0.5, description="Adam's step of the colours before squashing."
+    )
+    colours: bool = Field(default=True, description="Search the colours too; false keeps the plain ones.")
+
+
+class _MeshConfig(_Section):
+    texels: Positive = Field(default=32, description="Texels along the longest side of an object.")
+    ball_m: PositiveNumber | None = Field(
+        default=None,
+        description="The objects are balls of this radius, before their own scale [m]; none: their meshes.",
+    )
+    ball_rgb: tuple[Unit, Unit, Unit] = Field(default=(0.75, 0.1, 0.08), description="Colour of the balls.")
+    learning_rate: PositiveNumber | None = Field(
+        default=None, description="Of Adam; none: 0.1 for textures, a twentieth of the bound for shapes."
+    )
+
+
+class MeshTextureConfig(_MeshConfig):
+    """The textures of the objects as meshes, searched over the world's own pictures."""
+
+    kind: Literal["mesh_texture"] = "mesh_texture"
+    searched: ClassVar[str] = "The textures of {} as meshes are searched over the world's own pictures"
+
+
+class MeshShapeConfig(_MeshConfig):
+    """The shapes of the objects as meshes, searched over the world's own pictures."""
+
+    kind: Literal["mesh_shape"] = "mesh_shape"
+    searched: ClassVar[str] = "The shapes of {} as meshes are searched over the world's own pictures"
+    bound_m: PositiveNumber = Field(default=0.4, description="No vertex moves farther [m].")
+    smoothness: NotNegative = Field(
+        default=19.0, description="Lambda of the large-steps preconditioner; 0: none."
+    )
+    samples: Positive = Field(default=4, description="Rays a pixel for the gradient inside the silhouettes.")
+    boundary_samples: Positive = Field(default=1, description="Points a pixel for that of the silhouettes.")
+
+
+class FaceConfig(_Section):
+    """One flat texture that a panel of the world carries: projected onto a board, or shown on a screen."""
+
+    kind: Literal["face"] = "face"
+    searched: ClassVar[str] = "The texture of one face is searched in the learned scene"
+    panel: str = Field(
+        default="board", min_length=1, description="Which of the world's panels carries the face."
+    )
+    resolution: Annotated[int, Field(ge=2, le=128)] = Field(
+        default=64, description="Grid cells along each side of the face."
+    )
+    cells: Annotated[int, Field(ge=0, le=128)] = Field(
+        default=8,
+        description="Cells a side of the coarse texture that methods without a gradient search; 0: every cell.",
+    )
+    plain_rgb: tuple[Unit, Unit, Unit] = Field(
+        default=(0.20, 0.62, 0.28), description="What a screen shows without an attack."
+    )
+    display_model: bool = Field(
+        default=True,
+        description="On a screen: search with its measured colours in the loop; false takes it for ideal.",
+    )
+
+
+SpaceConfig = Annotated[
+    ColoursConfig | PlacesConfig | MeshTextureConfig | MeshShapeConfig | FaceConfig,
+    Field(discriminator="kind"),
+]

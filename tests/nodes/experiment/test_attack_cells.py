@@ -1,0 +1,217 @@
+"""Searches on five objects at once, their files, the cells of the transfer table and its figures."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import pytest
+import torch
+
+from advnerf_core.attack.artifact import load_attack
+from advnerf_core.attack.search.search import SearchStateError
+from nodes.experiment import attack, page, report, run
+from nodes.experiment.attack import Cell, cells, load_shown, surrogate_part
+from nodes.experiment.campaign.kinds import load_kind, settings_hash
+from nodes.experiment.cells import CellError, run_cell
+from nodes.experiment.context import Experiment
+from nodes.experiment.deploy import FrozenChangedError, ThroughWorld, check_frozen, deployed_part
+from nodes.experiment.films import film_cell
+from nodes.experiment.policy import NAIVE, victim_file
+from nodes.experiment.spaces import colour_space
+from tests.support.strangers import spiral_code, spiral_theta, write_spiral
+
+PLACE = ("right", "hardened")
+GRADIENT = Cell("right", "hardened", "gradient", 0)
+
+
+def silent(fraction: float, text: str = "") -> None:
+    """Takes progress."""
+
+
+@pytest.fixture
+def fresh(trained: Experiment, tmp_path: Path) -> Experiment:
+    """The same experiment, its own attack and deploy folders."""
+    folder = tmp_path / "run"
+    shutil.copytree(trained.folder, folder)
+    return replace(trained, folder=folder)
+
+
+def test_cells_are_all_methods_of_all_drives(trained: Experiment) -> None:
+    names = [cell.name for cell in cells(trained)]
+    assert len(set(names)) == len(names) == 2 * 3 * 4  # victims, drives, none and three methods
+    assert names[:3] == ["straight_hardened_none_0", "right_hardened_none_0", "left_hardened_none_0"]
+    more = replace(
+        trained,
+        config=trained.config.model_copy(
+            update={"attack": trained.config.attack.model_copy(update={"seeds": (0, 1, 2)})}
+        ),
+    )
+    assert sum(cell.victim == NAIVE for cell in cells(more)) == 3 * 4
+    assert len(cells(more)) == (3 + 1) * 3 * 4
+
+
+@pytest.mark.parametrize("method", ["gradient", "random", "cem"])
+def test_search_is_kept_and_its_file_brings_the_colours_back(fresh: Experiment, method: str) -> None:
+    folder, cell = fresh.stage_folder("attack"), replace(GRADIENT, method=method)
+    space = colour_space(fresh)
+    found = surrogate_part(fresh, space, cell, folder, silent)
+    assert len(found["curve_total_cte_m"]) == 2
+    assert found["total_cte_m"][0] == pytest.approx(
+        max(found["curve_total_cte_m"])
+    )  # the best evaluation, driven again
+    file = load_attack(attack.attack_path(folder, cell))
+    theta = space.restored(file).colours
+    assert theta.shape == space.sensor.theta_shape
+    assert [thing.name for thing in file.objects] == [thing.name for thing in fresh.objects]
+    assert file.attack_id == found["attack_id"]
+    moved = (theta - space.plain.colours).abs().max()
+    assert moved > (1e-5 if method == "gradient" else 1.0)
+    assert not list(folder.glob("*.state.*"))
+    # What is there is not searched again.
+    marked = {**found, "seconds": -1.0}
+    (folder / f"{cell.name}.json").write_text(json.dumps(marked))
+    assert surrogate_part(fresh, space, cell, folder, silent) == marked
+
+
+def test_a_method_of_a_file_runs_a_cell_and_appears_in_the_tables(
+    fresh: Experiment, wall: Any, tmp_path: Path
+) -> None:
+    spiral_file, file = write_spiral(tmp_path), Path(shutil.copy(fresh.file, tmp_path))
+    changes = ["attack.methods=[spiral.py:Spiral, gradient]", "scenarios=[right]", "policy.naive_steps=0"]
+    experiment = run.load_experiment(file, "tiny", changes, fresh.folder)
+    names = [f"right_hardened_{method}_0" for method in ("none", "Spiral", "gradient")]
+    assert [cell.name for cell in cells(experiment)] == names
+    space, out = colour_space(experiment), experiment.stage_folder("deploy")
+    for cell in cells(experiment):
+        surrogate_part(experiment, space, cell, out, silent)
+        deployed_part(experiment, space, ThroughWorld(experiment, wall), cell, out, out, print)
+    spiral = cells(experiment)[1]
+    shown = load_shown(space, out, spiral)
+    found = shown.colours
+    thetas = [spiral_theta(tuple(space.sensor.theta_shape), number) for number in range(2)]
+    assert min(float((found - theta).abs().max()) for theta in thetas) < 1e-5
+    assert load_attack(attack.attack_path(out, spiral)).method == "Spiral"
+    assert film_cell(experiment, wall, space, spiral, out, out).exists()
+    table = report.transfer_table(report.rows_of(experiment))
+    assert [row[3] for row in table.rows] == 2 * ["no attack", "gradient", "Spiral"]
+    assert "Spiral" in page.opening(experiment)
+
+    # What its code is decides, not where it lies.
+    def digests() -> tuple[str, Any]:
+        reference = f"{spiral_file}:Spiral"
+        (stage,) = (each for each in run.stages_of(experiment) if each.name == "attack")
+        assert stage.settings["attack"]["methods"] == ["Spiral", "gradient"]
+        return settings_hash(load_kind("world"), experiment, *PLACE, reference, 0), stage.settings
+
+    before = digests()
+    spiral_file.write_text(spiral_code() + "# changed\n")
+    assert all(now != then for now, then in zip(digests(), before, strict=True))
+
+
+def test_a_stopped_search_goes_on_and_refuses_another_victim(fresh: Experiment) -> None:
+    folder, space = fresh.stage_folder("attack"), colour_space(fresh)
+    whole = surrogate_part(fresh, space, GRADIENT, folder, silent)
+
+    def stop(fraction: float, text: str = "") -> None:
+        raise KeyboardInterrupt
+
+    other = fresh.folder / "again"
+    with pytest.raises(KeyboardInterrupt):
+        surrogate_part(fresh, space, GRADIENT, other, stop)
+    stopped = (other / f"{GRADIENT.name}.state.safetensors").read_bytes()
+    assert surrogate_part(fresh, space, GRADIENT, other, silent)["states"] == whole["states"]
+    naive = replace(GRADIENT, victim=NAIVE)
+    (other / f"{naive.name}.state.safetensors").write_bytes(stopped)
+    with pytest.raises(SearchStateError, match="other settings"):
+        surrogate_part(fresh, space, naive, other, silent)
+
+
+def test_cell_has_both_domains_over_their_own_clean_drive(fresh: Experiment, wall: Any) -> None:
+    folder, space = fresh.stage_folder("attack"), colour_space(fresh)
+    learned = {
+        cell: surrogate_part(fresh, space, cell, folder, silent) for cell in (GRADIENT.clean, GRADIENT)
+    }
+    out = fresh.stage_folder("deploy")
+    cell = deployed_part(fresh, space, ThroughWorld(fresh, wall), GRADIENT, folder, out, print)
+    assert cell["surrogate"]["total_cte_m"] == learned[GRADIENT]["total_cte_m"]
+    assert cell["surrogate"]["none_total_cte_m"] == learned[GRADIENT.clean]["total_cte_m"]
+    driven = np.array(json.loads((out / f"{GRADIENT.name}.drives.json").read_text())["states"][0])
+    cte_m = fresh.paths["right"].project(driven[1:, :2]).cte_m
+    assert cell["deployed"]["total_cte_m"] == pytest.approx([np.abs(cte_m).sum()])
+    assert (out / f"{GRADIENT.clean.name}.drives.json").exists()
+    assert cell["extra"]["blocked_tick"] == [None]
+    # Once there, it is not driven again: here it would end where it starts.
+    blocking = replace(wall, blocked_beyond_m=-1e3)
+    assert deployed_part(fresh, space, ThroughWorld(fresh, blocking), GRADIENT, folder, out, print) == cell
+    (out / f"{GRADIENT.name}.cell.json").unlink()
+    (out / f"{GRADIENT.name}.drives.json").unlink()
+    held = deployed_part(fresh, space, ThroughWorld(fresh, blocking), GRADIENT, folder, out, print)
+    assert held["extra"]["blocked_tick"] == [1]
+
+
+def test_a_cell_is_filmed_frame_by_frame(fresh: Experiment, wall: Any) -> None:
+    folder, space = fresh.stage_folder("attack"), colour_space(fresh)
+    for cell in (GRADIENT.clean, GRADIENT):
+        surrogate_part(fresh, space, cell, folder, silent)
+    deployed_part(fresh, space, ThroughWorld(fresh, wall), GRADIENT, folder, folder, print)
+    with av.open(str(film_cell(fresh, wall, space, GRADIENT, folder, folder))) as film:
+        frames = [frame.to_ndarray(format="rgb24") for frame in film.decode(video=0)]
+    assert len(frames) >= fresh.config.horizon
+    assert frames[0].std() > 5  # something is to be seen
+
+
+def test_unknown_cells_are_refused(trained: Experiment, tmp_path: Path) -> None:
+    for wrong in (("back", "hardened", "none"), ("left", "nobody", "none"), ("left", "hardened", "luck")):
+        with pytest.raises(CellError, match=r"expected an? (scenario|victim|attack method) of"):
+            run_cell(trained, *wrong, 0, tmp_path, silent)  # type: ignore[arg-type]
+    assert not list(tmp_path.iterdir())
+
+
+def test_another_policy_after_the_attack_is_refused(fresh: Experiment) -> None:
+    frozen = attack.frozen_hashes(fresh)
+    (fresh.stage_folder("attack") / "frozen.json").write_text(json.dumps(frozen))
+    check_frozen(fresh)
+    shutil.copy(victim_file(fresh, NAIVE), victim_file(fresh, "hardened"))
+    with pytest.raises(FrozenChangedError, match="policy_hardened"):
+        check_frozen(fresh)
+
+
+def test_table_divides_by_the_clean_drive_of_the_same_domain(fresh: Experiment) -> None:
+    out = fresh.stage_folder("deploy")
+    for cell in cells(fresh):
+        factor = {"none": 1.0, "random": 1.1, "cem": 1.5, "gradient": 3.0}[cell.method]
+        parts = {
+            domain: {
+                "total_cte_m": [factor * clean],
+                "off_track": [factor > 2.0],
+                "none_total_cte_m": [clean],
+            }
+            for domain, clean in (("surrogate", 4.0), ("deployed", 6.0))
+        }
+        (out / f"{cell.name}.cell.json").write_text(json.dumps({"attack_id": None, **parts}))
+    rows = report.rows_of(fresh)
+    assert len(rows) == 2 * 3 * 2 * 4
+    first = [
+        row for row in rows if (row.victim, row.scenario, row.domain) == ("hardened", "straight", "deployed")
+    ]
+    assert [row.method for row in first] == ["none", "random", "cem", "gradient"]
+    assert [row.ratio for row in first] == pytest.approx([1.0, 1.1, 1.5, 3.0])
+    assert [row.off_track for row in first] == [0, 0, 0, 1]
+    report.write_results(fresh, rows, fresh.folder)
+    lines = (fresh.folder / "results.csv").read_text().splitlines()
+    assert lines[1].startswith("hardened,straight,surrogate,none,1,4.0000,nan,1.0000,0")
+    assert len(lines) == 1 + len(rows)
+    table = report.transfer_table(rows)
+    assert table.rows[3][:4] == ("", "", "", "gradient")
+    assert table.rows[3][6] == "3.00"
+
+
+def test_attack_differs_between_seeds_and_repeats_itself(trained: Experiment) -> None:
+    surrogate = colour_space(trained).surrogate
+    first, again, other = (surrogate.initial_theta(torch.Generator().manual_seed(seed)) for seed in (0, 0, 1))
+    assert torch.equal(first, again)
+    assert not torch.equal(first, other)

@@ -1,0 +1,328 @@
+"""Cells of every space: searched, driven in both domains, kept with their attack file, and not done again."""
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from advnerf_core.attack.artifact import load_attack
+from advnerf_core.objects.mesh.engine import MeshEngineError, engine
+from advnerf_core.objects.mesh.glb import mesh_from_glb
+from advnerf_core.report.cells import cell_from
+from advnerf_core.report.clips import ClipTrack, read_clip
+from nodes.experiment import attack, cells, films, pose_maps, run
+from nodes.experiment.attack import Cell, attack_path, surrogate_part
+from nodes.experiment.campaign.kinds import load_kind, settings_hash
+from nodes.experiment.cells import CellError, run_cell
+from nodes.experiment.config import RetrainConfig
+from nodes.experiment.context import Experiment
+from nodes.experiment.deploy import ThroughWorld, deployed_part
+from nodes.experiment.page import opening
+from nodes.experiment.policy import victim_file
+from nodes.experiment.pose_maps import PoseMapSettings
+from nodes.experiment.run import load_experiment
+from nodes.experiment.space_config import (
+    ColoursConfig,
+    MeshShapeConfig,
+    MeshTextureConfig,
+    PlacesConfig,
+)
+from nodes.experiment.spaces import make_space, mesh_objects
+from nodes.runtime.errors import ConfigError
+
+PLACES = ("right", "hardened", "random", 0)
+ONE = PlacesConfig(samples=1, steps=1)
+MESHES = [
+    MeshTextureConfig(texels=8, ball_m=0.5),
+    MeshShapeConfig(texels=8, ball_m=0.5, bound_m=0.3, samples=1),
+]
+
+
+def silent(fraction: float, text: str = "") -> None:
+    """Takes progress."""
+
+
+def searching(trained: Experiment, space: Any, **changes: Any) -> Experiment:
+    """The experiment with a space, and drives short enough for a test."""
+    config = trained.config.model_copy(update={"horizon": 2, "space": space, **changes})
+    return replace(trained, config=config)
+
+
+@pytest.fixture
+def mitsuba() -> None:
+    """Skips where shapes cannot be rendered."""
+    try:
+        engine()
+    except MeshEngineError as error:
+        pytest.skip(str(error))
+
+
+def whole(experiment: Experiment, scene: Any, cell: Cell, folder: Path) -> dict[str, Any]:
+    """A cell but for its film, in a scene of the test's."""
+    space = make_space(experiment, scene)
+    for each in (cell.clean, cell):
+        surrogate_part(experiment, space, each, folder, silent)
+    return deployed_part(experiment, space, ThroughWorld(experiment, scene), cell, folder, folder, print)
+
+
+@pytest.mark.usefixtures("mitsuba")
+@pytest.mark.parametrize("space", MESHES, ids=lambda space: space.kind)
+def test_meshes_are_searched_over_the_pictures_of_the_world(
+    space: Any, trained: Experiment, wall: Any, tmp_path: Path
+) -> None:
+    experiment, cell = searching(trained, space), Cell("straight", "hardened", "gradient", 0)
+    data = whole(experiment, wall, cell, tmp_path)
+    result = cell_from(data, "the cell")
+    assert data["extra"]["evaluations"] == experiment.config.attack.evaluations
+    assert result.deployed is not None
+    assert all(np.isfinite(drives.total_cte_m).all() for drives in (result.surrogate, result.deployed))
+    file = load_attack(attack_path(tmp_path, cell))
+    assert (file.space, file.attack_id) == (space.kind, data["attack_id"])
+    plain = mesh_objects(experiment, space)
+    for found, before in zip(file.objects, plain, strict=True):
+        again = mesh_from_glb(found.glb, found.name)
+        moved = np.abs(np.sort(again.vertices, axis=0) - np.sort(before.mesh.vertices, axis=0)).max()
+        assert (moved < 1e-6) == (space.kind == "mesh_texture")
+    # What the file holds is what was driven past.
+    restored = make_space(experiment, wall).restored(file)
+    there = attack.past(
+        attack.attack_problem(
+            experiment,
+            make_space(experiment, wall),
+            attack._victim(victim_file(experiment, "hardened")),
+            "straight",
+            0,
+        ),
+        make_space(experiment, wall),
+        restored,
+    )
+    _, scores = attack.learned_drives(experiment, there, restored.colours)
+    assert [score.total_cte_m for score in scores] == list(result.surrogate.total_cte_m)
+    assert not list(tmp_path.glob("*.state.safetensors"))
+
+
+@pytest.mark.usefixtures("mitsuba")
+def test_without_an_attack_meshes_are_their_own_base(trained: Experiment, wall: Any, tmp_path: Path) -> None:
+    experiment = searching(trained, MeshTextureConfig(texels=8))
+    data = whole(experiment, wall, Cell("right", "naive", "none", 0), tmp_path)
+    assert data["attack_id"] is None
+    for domain in ("surrogate", "deployed"):
+        assert data[domain]["total_cte_m"] == data[domain]["none_total_cte_m"]
+
+
+@pytest.mark.parametrize("method", ["random", "gradient"])
+def test_places_are_searched_and_the_file_says_where_things_stand(
+    trained: Experiment, wall: Any, tmp_path: Path, method: str
+) -> None:
+    experiment, cell = searching(trained, ONE, horizon=4), Cell("right", "hardened", method, 0)
+    data = whole(experiment, wall, cell, tmp_path)
+    assert data["extra"]["evaluations"] == 1
+    file = load_attack(attack_path(tmp_path, cell))
+    assert file.space == "places"
+    hand = np.array([[thing.x_m, thing.y_m] for thing in experiment.objects])
+    there = np.array([each.placement[:2] for each in file.objects])
+    assert 0.0 < np.abs(there - hand).max() <= ONE.move_m + 1e-9
+    # The surrogate's own prediction is what is driven again.
+    assert file.predicted_total_cte_m is not None
+    assert np.mean(data["surrogate"]["total_cte_m"]) == pytest.approx(file.predicted_total_cte_m, rel=1e-6)
+    plain = deployed_part(
+        experiment,
+        make_space(experiment, None),
+        ThroughWorld(experiment, wall),
+        cell.clean,
+        tmp_path,
+        tmp_path,
+        print,
+    )
+    assert plain["deployed"]["total_cte_m"] == data["deployed"]["none_total_cte_m"]
+
+
+def test_places_alone_keep_the_plain_colours_and_are_filmed(
+    trained: Experiment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The simulated junction itself; the colour cell of the same name in the run folder is not taken for it."""
+    shown = []  # what is filmed, before the codec: x264 gives the same pictures other bytes in one run of ten
+
+    def write_clip(file: Path, tracks: list[ClipTrack], *rest: Any) -> Path:
+        shown.extend(tracks)
+        return films_write_clip(file, tracks, *rest)
+
+    films_write_clip = films.write_clip
+    monkeypatch.setattr(films, "write_clip", write_clip)
+    folder = shutil.copytree(trained.folder, tmp_path / "run")
+    alone = PlacesConfig(samples=1, steps=1, colours=False)
+    experiment = replace(searching(trained, alone), folder=folder)
+    (folder / "deploy" / "right_hardened_random_0.cell.json").write_text("{}")
+    assert load_kind("world").finished(experiment, *PLACES) is None
+    cell = run_cell(experiment, *PLACES, tmp_path / "moved", silent)
+    plain = run_cell(experiment, "right", "hardened", "none", 0, tmp_path / "plain", silent)
+    assert plain["deployed"]["total_cte_m"] == cell["deployed"]["none_total_cte_m"]
+    plain_film, film = (read_clip(tmp_path / each["extra"]["clip"]) for each in (plain, cell))
+    assert len(plain_film) == len(film) == experiment.config.horizon + 1
+    # A cell that was finished without a film is filmed when it is asked for again, and not searched.
+    (tmp_path / "moved" / "clip.mp4").unlink()
+    assert run_cell(experiment, *PLACES, tmp_path / "moved", silent) == cell
+    moved, plain_drive, again = shown
+    np.testing.assert_array_equal(moved.frames, again.frames)  # the same drive
+    assert not np.array_equal(moved.frames, plain_drive.frames)
+    own, file = (
+        load_attack(tmp_path / "moved" / "right_hardened_random_0.attack.safetensors") for _ in range(2)
+    )
+    voxels = make_space(experiment, None)
+    assert torch.equal(voxels.restored(own).colours, voxels.plain.colours)
+    coloured = searching(experiment, ONE)
+    run_cell(coloured, *PLACES, tmp_path / "other", silent)
+    other = load_attack(tmp_path / "other" / "right_hardened_random_0.attack.safetensors")
+    assert [each.placement for each in other.objects] == [
+        each.placement for each in file.objects
+    ]  # the same draws
+    assert not np.array_equal(other.objects[0].theta, own.objects[0].theta)
+
+
+def test_a_cell_depends_on_its_space_and_on_its_victim(trained: Experiment) -> None:
+    kind, experiment = load_kind("world"), searching(trained, ONE)
+    same = settings_hash(kind, experiment, *PLACES)
+    assert settings_hash(kind, searching(trained, ONE), *PLACES) == same
+    others = [
+        settings_hash(kind, searching(trained, ONE.model_copy(update={"move_m": 0.2})), *PLACES),
+        settings_hash(kind, searching(trained, ONE.model_copy(update={"colours": False})), *PLACES),
+        settings_hash(kind, experiment, "right", "naive", "random", 0),
+        settings_hash(kind, experiment, "right", "hardened", "random", 1),
+        settings_hash(kind, searching(trained, MESHES[0]), *PLACES),
+        settings_hash(kind, searching(trained, ColoursConfig()), *PLACES),
+    ]
+    assert len({same, *others}) == 7
+    for wrong in (
+        ("up", "hardened", "random", 0),
+        ("right", "retrained", "random", 0),
+        ("right", "hardened", "luck", 0),
+    ):
+        with pytest.raises(CellError, match="expected a"):
+            settings_hash(kind, experiment, *wrong)
+
+
+def test_a_cell_of_colours_depends_on_the_world_and_not_on_what_else_is_searched(trained: Experiment) -> None:
+    kind = load_kind("world")
+
+    def digest(*changes: str, victim: str = "hardened") -> str:
+        experiment = kind.load(trained.file, "tiny", list(changes), trained.folder)
+        return settings_hash(kind, experiment, "right", victim, "random", 0)
+
+    same = digest()
+    for free in (
+        "name=mine",
+        "attack.methods=[random]",
+        "attack.seeds=[0,1,2]",
+        "attack.cache_mib=64",
+        "retrain={}",
+    ):
+        assert digest(free) == same
+    needed = ("world.car.turn_rate_lag_s=0.2", "attack.evaluations=9", "held_cap_m=5", "policy.seed=1")
+    assert len({same, digest(victim="naive"), *(digest(change) for change in needed)}) == 6
+    with pytest.raises(CellError, match="expected a victim of hardened, got 'naive'"):
+        digest("policy.naive_steps=0", victim="naive")
+
+
+def test_the_gate_judges_learned_scenes_and_predictions_need_objects_where_they_were_placed(
+    trained: Experiment,
+) -> None:
+    kind = load_kind("world")
+    judged = {space.kind: kind.judges(searching(trained, space)) for space in (ColoursConfig(), ONE, *MESHES)}
+    assert judged == {"colours": True, "places": True, "mesh_texture": False, "mesh_shape": False}
+    predicted = {
+        space.kind: kind.predicts(searching(trained, space)) for space in (ColoursConfig(), ONE, *MESHES)
+    }
+    assert predicted == {"colours": True, "places": False, "mesh_texture": False, "mesh_shape": False}
+
+
+def test_a_defence_that_nothing_asks_for_is_told(
+    trained: Experiment, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = trained.config.model_copy(update={"retrain": RetrainConfig(pays_ratio=9.0)})
+    monkeypatch.setattr(run, "run_experiment", lambda *arguments, **options: {})  # ends as no attack pays
+    with pytest.raises(
+        ConfigError, match=r"no attack reaches retrain.pays_ratio = 9 .*nothing was retrained"
+    ):
+        run.prepare_victims(replace(trained, config=config), silent)
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        (["space.kind=places", "space.moves_m=1"], "unknown key"),
+        (["space.kind=places", "space.samples=many"], "input should be a valid integer"),
+        (["space.kind=colour"], "'colours', 'places', 'mesh_texture', 'mesh_shape'"),
+        (["space.kind=mesh_shape", "space.bound_m=0"], "greater than 0"),
+        (["space.kind=places", "space.samples=0"], "greater than or equal to 1"),
+        (["space.kind=places", "space.move_m=.nan"], "finite number"),
+        (["space=0"], "space"),
+        (["space.move_m=1"], "move_m"),
+    ],
+)
+def test_a_wrong_space_is_one_clear_error(
+    tiny_file: Callable[..., Path], tmp_path: Path, changes: list[str], says: str
+) -> None:
+    with pytest.raises(ConfigError) as error:
+        load_experiment(tiny_file(), "tiny", changes, tmp_path)
+    assert says in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_the_retrained_victim_is_that_of_the_first_round(trained: Experiment, tmp_path: Path) -> None:
+    folder = shutil.copytree(trained.folder, tmp_path / "run")
+    experiment = replace(searching(trained, ONE, retrain=RetrainConfig()), folder=folder)
+    kind, asked = load_kind("world"), ("left", "retrained", "none", 0)
+    unknown = settings_hash(kind, experiment, *asked)  # it is not trained yet
+    (folder / "retrain" / "round0").mkdir(parents=True)
+    shutil.copy(folder / "policy" / "naive.safetensors", folder / "retrain" / "round0" / "policy.safetensors")
+    assert settings_hash(kind, experiment, *asked) != unknown
+    cell = run_cell(experiment, *asked, tmp_path / "retrained", silent)
+    naive = run_cell(experiment, "left", "naive", "none", 0, tmp_path / "naive", silent)
+    assert json.dumps(naive["deployed"]) == json.dumps(cell["deployed"])  # the very same weights
+
+
+def test_maps_are_of_what_the_cell_found(
+    trained: Experiment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    experiment = searching(trained, ONE)
+    found = run_cell(experiment, *PLACES, tmp_path, silent)
+    small = PoseMapSettings(points=(2, 2), sideways_m=(0.0, 0.3), object_moves_m=((0.0, 0.0), (0.0, 0.2)))
+    monkeypatch.setattr(pose_maps, "PoseMapSettings", lambda: small)
+    asked = (experiment, "right", "hardened", 0, "random")
+    pictures = cells.draw_maps(*asked, 1, tmp_path, silent)
+    assert [cv2.imread(str(picture)) is not None for picture in pictures] == [True, True]
+    rows = json.loads((tmp_path / f"robustness_{trained.objects[1].name}.json").read_text())["cells"]
+    # The first start past objects that nobody has moved is the cell's own drive.
+    assert rows["0"][0][0] == pytest.approx(np.mean(found["surrogate"]["total_cte_m"]), rel=1e-6)
+    assert len(rows) == 2
+    kept = pictures[0].with_suffix(".json").stat().st_mtime_ns
+    cells.draw_maps(*asked, 1, tmp_path, silent)
+    assert pictures[0].with_suffix(".json").stat().st_mtime_ns == kept
+    with pytest.raises(CellError, match="expected an object of 0 to 4, got 5"):
+        cells.draw_maps(*asked, 5, tmp_path, silent)
+    assert cells.draw_maps(experiment, "right", "hardened", 0, "none", 1, tmp_path, silent) == []
+
+
+@pytest.mark.parametrize(
+    ("space", "searched"),
+    [
+        (ColoursConfig(), "The colours of "),
+        (ONE, "The places of "),
+        (MESHES[0], "The textures of "),
+        (MESHES[1], "The shapes of "),
+    ],
+)
+def test_the_page_says_what_was_searched(trained: Experiment, space: Any, searched: str) -> None:
+    experiment = searching(trained, space)
+    text = opening(experiment)
+    assert searched in text
+    kinds = {thing.kind for thing in experiment.objects}
+    assert kinds
+    assert all(kind.replace("_", " ") in text for kind in kinds)

@@ -1,0 +1,70 @@
+"""Pictures that a prediction looks at, from the simulated junction itself, untrained scene and policy."""
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from nodes.experiment import fidelity
+from nodes.experiment.campaign.gate import predict_cell
+from nodes.experiment.campaign.kinds import load_kind
+from nodes.experiment.cells import search_cell
+from nodes.experiment.context import Experiment
+from nodes.experiment.deployed import DressedScene
+from nodes.experiment.drives import deployed_drives
+from nodes.experiment.objects import placed_objects
+
+WHICH = ("right", "hardened", "random", 0)
+
+
+@pytest.fixture(scope="module")
+def searched(trained: Experiment, tmp_path_factory: pytest.TempPathFactory) -> tuple[Experiment, Path]:
+    """A cell's folder with a finished search, nothing deployed; its own copy of the experiment."""
+    folder = tmp_path_factory.mktemp("fidelity")
+    experiment = replace(trained, folder=shutil.copytree(trained.folder, folder / "run"))
+    cell = folder / "cell"
+    cell.mkdir()
+    assert fidelity.lacks(experiment, *WHICH, cell) == "its search"
+    search_cell(experiment, "right", "hardened", "random", 0, cell, lambda fraction, text="": None)
+    assert fidelity.lacks(experiment, *WHICH, cell) == ""
+    return experiment, cell
+
+
+def test_real_pictures_are_what_the_policy_saw_on_the_clean_drive(searched: tuple[Experiment, Path]) -> None:
+    experiment, cell = searched
+    clean = fidelity.driven(experiment, "right", "hardened", 0, cell)
+    policy, goal = fidelity.policy_of(experiment, "hardened", "right")
+    assert goal == experiment.goal("right")
+    with experiment.open_world() as scene:
+        dressed = DressedScene(scene, experiment.view, placed_objects(experiment))
+        start = experiment.start_states("right", 0)[:1]
+        (drive,) = deployed_drives(experiment, dressed, policy, "right", start, dressed.plain_theta())
+        scene.reset(*drive.states[1])
+        rgb, _ = scene.observe(depth=False)
+    assert clean.real.shape == clean.learned.shape == (experiment.config.horizon, 66, 200, 3)
+    # Where no object is, a picture is the bare scene's: at least its upper rows, which are sky and houses.
+    assert np.array_equal(clean.real[1][:8], experiment.view.image(rgb)[:8])
+
+
+def test_an_attack_changes_only_where_objects_are(searched: tuple[Experiment, Path]) -> None:
+    experiment, cell = searched
+    clean = fidelity.driven(experiment, "right", "hardened", 0, cell)
+    attacked = fidelity.attacked(experiment, *WHICH, cell)
+    changed = [(a != b).any(-1) for a, b in ((clean.real, attacked.real), (clean.learned, attacked.learned))]
+    for each in changed:
+        assert 0.0 < each.mean() < 0.3
+    both = changed[0] & changed[1]
+    assert both.sum() > 0.3 * changed[0].sum()  # rough untrained objects, yet in the same places
+
+
+def test_a_prediction_needs_no_drive_with_the_attack(searched: tuple[Experiment, Path]) -> None:
+    experiment, cell = searched
+    before = {path.name for path in cell.iterdir()}
+    found, clean = predict_cell(load_kind("world"), experiment, *WHICH, cell, draws=2)
+    assert found.ratio > 0.0
+    assert len(clean.agreement.real) == experiment.config.horizon
+    assert predict_cell(load_kind("world"), experiment, *WHICH, cell, 2, clean)[0] == found
+    assert {path.name for path in cell.iterdir()} == before
+    assert not any(experiment.stage_folder("deploy").iterdir())

@@ -1,0 +1,120 @@
+"""Live drives of an experiment: which there are, which count, and what a bag says of their end."""
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from advnerf_core.driving.metrics import Horizon, drive_metrics
+from advnerf_core.driving.path import Path as DrivingPath
+from nodes.experiment import live
+from nodes.experiment.run import load_experiment
+from nodes.lab.trials.trial import NotStartedError
+from nodes.runtime.errors import ConfigError
+
+LAUNCH = Path(__file__).parents[3] / "launch"
+
+
+def room(folder, *overrides, setting="demo"):
+    return load_experiment(LAUNCH / "room.experiment.yaml", setting, overrides, folder)
+
+
+def driven(states=(), stopped_early="", off_track=False):
+    return {
+        "outcome": {"stopped_early": stopped_early},
+        "states": list(states),
+        "metrics": {"off_track": off_track},
+    }
+
+
+def test_a_car_that_runs_into_something_stands_from_then_on():
+    free = [[0.08 * tick, 0.0, 0.0] for tick in range(20)]
+    # With the noise of motion capture.
+    against_it = free + [[1.52 + 0.001 * (tick % 2), 0.0, 0.0] for tick in range(10)]
+    assert live.blocked_tick(driven(free)) is None
+    assert live.blocked_tick(driven(against_it)) == 19
+    assert live.blocked_tick(driven(against_it, "outside of the fence")) is None
+    assert live.blocked_tick(driven(against_it, "stalled: the car does not move")) == 19
+
+
+def test_a_drive_that_the_stack_stopped_is_driven_again_and_never_kept(tmp_path, monkeypatch):
+    experiment = room(tmp_path)
+    run = live.LiveRun("track_hardened_gradient_0.live0", "hardened", "track", (0.0, 0.0, 0.0))
+    stops, told = ["no fresh pose", "never began", ""], []
+
+    def drive(experiment, run, folder):
+        if stops[0] == "never began":
+            raise NotStartedError(stops.pop(0))
+        (folder / run.name).mkdir()  # which must be gone before it is driven again
+        (folder / f"{run.name}.json").write_text(json.dumps(driven(stopped_early=stops.pop(0))))
+
+    monkeypatch.setattr(live, "drive_live", drive)
+    found = live.drive_until_it_counts(experiment, run, tmp_path, told.append)
+    assert found["outcome"]["stopped_early"] == ""
+    assert [text.partition("stopped it: ")[2] for text in told] == [
+        "no fresh pose (attempt 1 of 3)",
+        "never began (attempt 2 of 3)",
+    ]
+    # It is there: nothing is driven, and nothing could be.
+    assert live.drive_until_it_counts(experiment, run, tmp_path, told.append) == found
+    (tmp_path / f"{run.name}.json").unlink()
+    stops[:] = ["no fresh pose"] * 3
+    with pytest.raises(live.DriveFault, match=r"stopped the live drive .*live0 3 times, at last: no fresh"):
+        live.drive_until_it_counts(experiment, run, tmp_path, told.append)
+    assert not (tmp_path / f"{run.name}.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("stopped_early", "off_track", "taken"),
+    [
+        ("outside of the fence", False, True),
+        ("no fresh pose", False, False),
+        ("stalled: ...", True, True),
+        ("stalled: ...", False, False),
+    ],
+)
+def test_a_stop_counts_where_the_policy_led_the_car_astray(
+    tmp_path, monkeypatch, stopped_early, off_track, taken
+):
+    run = live.LiveRun("one", "hardened", "track", (0.0, 0.0, 0.0))
+
+    def drive(experiment, run, folder):
+        (folder / "one.json").write_text(json.dumps(driven([], stopped_early, off_track)))
+
+    monkeypatch.setattr(live, "drive_live", drive)
+    if taken:
+        live.drive_until_it_counts(room(tmp_path), run, tmp_path, print)
+    else:
+        with pytest.raises(live.DriveFault):
+            live.drive_until_it_counts(room(tmp_path), run, tmp_path, print)
+
+
+def test_a_live_run_reads_as_any_deployed_drive():
+    path = DrivingPath.rounded_square(4.0, 1.1)
+    states = np.array([[-0.9 + 0.08 * tick, -2.0 + 0.01 * tick, 0.0] for tick in range(21)])
+    metrics = drive_metrics(path, states, Horizon(20))
+    kept = json.loads(json.dumps({**driven(states.tolist()), "metrics": asdict(metrics)}))
+    drive = live.as_drive(kept)
+    assert drive.metrics == metrics
+    assert np.array_equal(drive.states, states)
+    assert drive.blocked_tick is None
+
+
+def test_laps_and_the_empty_scene_are_driven_where_they_are_asked_for(tmp_path):
+    assert live.extra_runs(room(tmp_path), "hardened") == {}
+    full = live.extra_runs(room(tmp_path, setting="full"), "hardened")
+    assert set(full) == {"laps", "empty"}
+    # Three laps of a square of 4 m with corners of 1.1 m, at 0.8 m/s and 10 Hz.
+    length_m = 4 * 1.8 + 2 * np.pi * 1.1
+    assert full["laps"].ticks == round(3 * length_m / 0.08)
+    assert full["empty"].start == (-1.1, -2.0, 0.0)
+
+
+def test_live_nodes_simulate_the_lab_alone(tmp_path):
+    junction = LAUNCH / "junction.experiment.yaml"
+    with pytest.raises(ConfigError, match=r"expected space\.kind face.*with deploy\.through nodes"):
+        load_experiment(junction, "demo", ["deploy.through=nodes"], tmp_path)
+    with pytest.raises(ConfigError, match=r"expected world\.kind lab with deploy\.through nodes"):
+        load_experiment(junction, "demo", ["deploy.through=nodes", "space.kind=face", "objects=[]"], tmp_path)

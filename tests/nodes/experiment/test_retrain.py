@@ -1,0 +1,112 @@
+"""Attack, retraining and attack again, on the simulated junction itself, in its smallest size."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from advnerf_core.attack.artifact import load_attack
+from advnerf_core.learning.frames import Frames, FrameStore
+from advnerf_core.policies.pilotnet import load_policy
+from nodes.experiment import attack, retrain
+from nodes.experiment.attack import Cell
+from nodes.experiment.config import RetrainConfig
+from nodes.experiment.context import Experiment
+from nodes.experiment.policy import HARDENED, RETRAINED, victim_file
+
+SMALL = RetrainConfig(rounds=1, pays_ratio=1e-6, stills=2, drives=1, drive_steps=2, placements=1, steps=2)
+
+
+def silent(fraction: float, text: str = "") -> None:
+    """Takes progress."""
+
+
+def old_frames(experiment: Experiment, count: int = 24) -> Frames:
+    images = np.random.default_rng(0).integers(0, 255, (count, 66, 200, 3)).astype(np.uint8)
+    goals = np.tile(np.eye(3, dtype=np.float32)[0], (count, 1))
+    return Frames(images, np.zeros((count, 3)), np.zeros(count, np.float32), goals, np.zeros(count, bool))
+
+
+@pytest.fixture
+def attacked(trained: Experiment, tmp_path: Path) -> Experiment:
+    """A run folder with searches of one seed and a little of what the victim was trained on."""
+    folder = tmp_path / "run"
+    shutil.copytree(trained.folder, folder)
+    config = trained.config.model_copy(update={"retrain": SMALL})
+    experiment = replace(trained, folder=folder, config=config)
+    attack.run(experiment, folder / "attack", silent)
+    FrameStore(folder / "policy" / "frames").append("stills", old_frames(experiment))
+    return experiment
+
+
+def test_the_unseen_start_is_a_metre_back_and_to_the_left(trained: Experiment) -> None:
+    for scenario, reference in trained.references.items():
+        start = retrain.unseen_start(trained, scenario)[0].numpy()
+        ahead = np.array([np.cos(start[2]), np.sin(start[2])])
+        assert trained.paths[scenario].project(start[:2] + ahead).cte_m == pytest.approx(0.35, abs=1e-9)
+        assert start[2] == reference.start_pose[2]
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_a_round_of_retraining_and_the_attack_on_it(attacked: Experiment) -> None:
+    folder = attacked.stage_folder("retrain")
+    retrain.run(attacked, folder, silent)
+    found = json.loads((folder / "retrain.json").read_text())
+    assert len(found["rounds"]) == 2  # the original, and the one that was retrained
+    assert found["rounds"][0]["victim"] == load_policy(victim_file(attacked, HARDENED)).sha256
+    retrained = load_policy(victim_file(attacked, RETRAINED))
+    assert found["rounds"][1]["victim"] == retrained.sha256
+    assert found["final_policy"] == "retrain/round0/policy.safetensors"  # in the run folder, wherever that is
+    assert retrained.metadata["fine_tuned_from"] == found["rounds"][0]["victim"]
+    for name in attacked.config.scenarios:
+        row = found["old_attacks"][name]
+        assert row["ratio"] == pytest.approx(row["retrained_attacked_m"] / row["original_undisturbed_m"])
+        assert found["rounds"][0]["surrogate"][name] > 0.0
+    # what it learned from: both domains, all drives, the colours that were found, and random ones where the objects were moved
+    store = FrameStore(folder / "round0" / "frames")
+    assert sorted(store.names()) == sorted(
+        f"{domain}-{name}{moved}"
+        for domain in ("deployed", "surrogate")
+        for name in attacked.config.scenarios
+        for moved in ("", "-moved0")
+    )
+    picture = cv2.imread(str(folder / "curve.png"))
+    assert picture is not None
+    assert picture.std() > 10.0
+    assert sorted(file.parent.name for file in folder.glob("*/ratios.json")) == ["round0", "round1"]
+    # once more: everything is there, nothing is collected, trained or searched again
+    times = {file: file.stat().st_mtime_ns for file in folder.rglob("*.npy")}
+    before = load_policy(victim_file(attacked, RETRAINED)).sha256
+    retrain.run(attacked, folder, silent)
+    assert {file: file.stat().st_mtime_ns for file in folder.rglob("*.npy")} == times
+    assert load_policy(victim_file(attacked, RETRAINED)).sha256 == before
+    # one more round goes on from the one that is there
+    twice = SMALL.model_copy(update={"rounds": SMALL.rounds + 1, "pays_ratio": 1e-6})
+    more = replace(attacked, config=attacked.config.model_copy(update={"retrain": twice}))
+    retrain.run(more, folder, silent)
+    grown = json.loads((folder / "retrain.json").read_text())
+    assert grown["rounds"][:2] == found["rounds"]
+    assert len(grown["rounds"]) == 3
+    assert grown["old_attacks"] == found["old_attacks"]
+    assert times.items() <= {file: file.stat().st_mtime_ns for file in folder.rglob("*.npy")}.items()
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_an_attack_that_does_not_pay_ends_it(attacked: Experiment) -> None:
+    config = attacked.config.model_copy(update={"retrain": SMALL.model_copy(update={"pays_ratio": 1e6})})
+    experiment = replace(attacked, config=config)
+    folder = attacked.stage_folder("retrain")
+    retrain.run(experiment, folder, silent)
+    found = json.loads((folder / "retrain.json").read_text())
+    assert len(found["rounds"]) == 1
+    assert found["old_attacks"] == {}
+    assert not victim_file(attacked, RETRAINED).exists()
+    seed = attacked.config.attack.seeds[0]
+    file = attack.attack_path(attacked.stage_folder("attack"), Cell("left", HARDENED, "gradient", seed))
+    assert load_attack(file).objects

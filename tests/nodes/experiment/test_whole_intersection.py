@@ -1,0 +1,58 @@
+"""The stages after training, in order, on the simulated junction itself."""
+
+import csv
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from advnerf_core.report.clips import read_clip
+from nodes.experiment import attack, deploy, report
+from nodes.experiment.attack import cells
+from nodes.experiment.context import Experiment
+
+
+def silent(fraction: float, text: str = "") -> None:
+    """Takes progress."""
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_attack_deploy_and_report(trained: Experiment, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    shutil.copytree(trained.folder, folder)
+    experiment = replace(trained, folder=folder)
+    (folder / "report").mkdir()
+    picture = np.full((188, 336, 3), 90, np.uint8)
+    for name in ("real", "surrogate"):
+        cv2.imwrite(str(folder / f"{name}.png"), picture)
+    view = {"real_image": "real.png", "surrogate_image": "surrogate.png"}
+    means = {"psnr_full_db": 28.0, "psnr_policy_db": 27.5}
+    (folder / "scene" / "fidelity.json").write_text(json.dumps({"mean": means, "views": [view]}))
+    rates = [{"real": 0.1, "surrogate": 0.12}]
+    (folder / "policy" / "policy.json").write_text(json.dumps({"on_held_out_views": rates}))
+    (folder / "manifest.json").write_text(json.dumps({"command": "advnerf experiment <it>"}))
+
+    attack.run(experiment, folder / "attack", silent)
+    deploy.run(experiment, folder / "deploy", silent)
+    report.run(experiment, folder / "report", silent)
+
+    found = json.loads((folder / "report" / "results.json").read_text())["cells"]
+    assert len(found) == len(cells(experiment)) == 24
+    for cell in found:
+        assert len(cell["deployed"]["total_cte_m"]) == 1
+        if cell["method"] == "none":
+            assert cell["deployed"]["total_cte_m"] == cell["deployed"]["none_total_cte_m"]
+    rows = list(csv.DictReader((folder / "report" / "results.csv").open()))
+    assert len(rows) == 48
+    assert all(float(row["ratio"]) > 0.0 for row in rows)
+    for name in experiment.config.scenarios:
+        assert len(read_clip(folder / "report" / f"{name}.mp4")) == 4  # three ticks and the start
+    page = (folder / "report" / "report.html").read_text()
+    assert "&lt;it&gt;" in page  # what it quotes is escaped
+    assert page.count("<video") == page.count("<svg") == 3
+    assert "http" not in page.replace("http://www.w3.org", "")
