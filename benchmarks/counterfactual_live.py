@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks.results import record_row
-from nodes.experiment.attack import Cell, attack_path
+from nodes.experiment.attack import attack_path
+from nodes.experiment.cell import Cell
 from nodes.experiment.context import Experiment
 from nodes.experiment.live import LiveRun, drive_live
 from nodes.experiment.run import load_experiment

@@ -16,7 +16,8 @@ from nodes.runtime.termination import ends_in_order
 
 if TYPE_CHECKING:
     from advnerf_core.report.transfer import TransferTable
-    from nodes.experiment.campaign.config import Campaign, Cell
+    from nodes.experiment.campaign.config import Campaign
+from nodes.experiment.cell import Cell
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -52,7 +53,8 @@ _FAILURE_EXIT = 1
 def _load(
     file: Path, folder: Path | None, overrides: list[str] | None, only: str
 ) -> tuple[Campaign, list[Cell]]:
-    from nodes.experiment.campaign.config import load_campaign, select
+    from nodes.experiment.campaign.config import load_campaign
+    from nodes.experiment.cell import select
 
     campaign = load_campaign(file, folder, tuple(overrides or ()))
     return campaign, select(campaign.cells, only)

@@ -24,8 +24,8 @@ def gate(
     setting: Annotated[str, typer.Option("--setting", help="Setting of the experiment file.")] = "full",
     run_folder: Annotated[Path | None, typer.Option("--run-folder", show_default="runs/<setting>")] = None,
     kind: Annotated[
-        str, typer.Option("--kind", help="Kind of experiment: world, or a module of cells.")
-    ] = "world",
+        str, typer.Option("--kind", help="Kind of cells: experiment, or file.py:Class of your own.")
+    ] = "experiment",
     scenario: Annotated[
         str, typer.Option("--scenario", help="Which path; the views that are compared are of all.")
     ] = "",
@@ -50,15 +50,17 @@ def gate(
 ) -> None:
     """Compare learned with real views by image quality and by the policy's steering. Exit code 1 if the surrogate fails."""
     os.environ.setdefault("MUJOCO_GL", "egl")
+    from advnerf_core.report.conditions import NONE
     from advnerf_core.scene.gate_limits import GateLimits
     from nodes.experiment.campaign.gate import judge_scene
-    from nodes.experiment.campaign.kinds import load_kind
+    from nodes.experiment.cell import Cell
+    from nodes.experiment.cell_kind import load_kind
 
     found = load_kind(kind)
     experiment = found.load(file, setting, overrides or [], run_folder or Path("runs") / setting)
     wanted = {"psnr_db": psnr_db, "ssim": ssim, "steering": steering}
     limits = GateLimits.model_validate({name: value for name, value in wanted.items() if value is not None})
-    verdicts = judge_scene(found, experiment, scenario, victim, limits, bag)
+    verdicts = judge_scene(found, experiment, Cell(scenario, victim, NONE, 0), limits, bag)
     if as_json:
         print(json.dumps({of: verdict.record() for of, verdict in verdicts}))
     else:

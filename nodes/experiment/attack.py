@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
@@ -15,13 +15,13 @@ import torch
 from advnerf_core.attack.adjoint import AttackProblem
 from advnerf_core.attack.artifact import AttackFile, load_attack, save_attack
 from advnerf_core.attack.clean import clean_drive
-from advnerf_core.attack.methods import Method, SearchRun, SearchSettings, load_method, method_name
+from advnerf_core.attack.methods import Method, SearchRun, SearchSettings, load_method
 from advnerf_core.attack.search.search import SearchResult
 from advnerf_core.attack.spaces.space import Shown, Space
 from advnerf_core.files import write_atomically
 from advnerf_core.policies.pilotnet import LoadedPolicy, load_policy
-from advnerf_core.report.cells import cell_name
 from advnerf_core.report.conditions import NONE
+from nodes.experiment.cell import Cell
 from nodes.experiment.context import Experiment
 from nodes.experiment.drives import learned_drives, totals
 from nodes.experiment.faces import has_face, panel_of
@@ -32,41 +32,6 @@ from nodes.experiment.space_config import FaceConfig, MeshShapeConfig, MeshTextu
 from nodes.experiment.spaces import geometry_sha256, make_space, over_the_world
 from nodes.experiment.stages import hash_of
 from nodes.runtime.progress import Report
-
-
-@dataclass(frozen=True)
-class Cell:
-    """One entry of the transfer table: which drive, which victim meets what, which seed.
-
-    Attributes:
-        scenario: Name of the drive.
-        victim: Which policy.
-        method: Name of the method that found what it meets; ``none``: the plain objects.
-        seed: Of the search and its starts.
-        reference: Where the method's code is, as `load_method` takes it, if its name does not say.
-    """
-
-    scenario: str
-    victim: str
-    method: str
-    seed: int
-    reference: str = field(default="", compare=False)
-
-    @classmethod
-    def of(cls, scenario: str, victim: str, method: str, seed: int) -> Cell:
-        """The cell of a method as `load_method` takes it, or of ``none``."""
-        name = method_name(method)
-        return cls(scenario, victim, name, seed, "" if method == name else method)
-
-    @property
-    def name(self) -> str:
-        """Name of its files."""
-        return cell_name(self.scenario, self.victim, self.method, self.seed)
-
-    @property
-    def clean(self) -> Cell:
-        """The same drive past the plain objects."""
-        return Cell(self.scenario, self.victim, NONE, self.seed)
 
 
 def cells(experiment: Experiment) -> list[Cell]:
@@ -263,12 +228,11 @@ def _search(
     }
     wanted = experiment.config.space.model_dump(mode="json")
     settings_hash = hash_of({**frozen, "victim": cell.victim, "scenario": cell.scenario, "space": wanted})
-    reference = cell.reference or cell.method
-    method = load_method(reference)
+    method = load_method(cell.code)
     settings = search_settings(experiment, method)
     told = telling(method.evaluations(problem, settings), report)
     run = SearchRun(cell.seed, _state_path(folder, cell), told, settings_hash)
-    return space.search(reference, problem, settings, run)
+    return space.search(cell.code, problem, settings, run)
 
 
 def _state_path(folder: Path, cell: Cell) -> Path:

@@ -18,7 +18,8 @@ from advnerf_core.files import write_atomically
 from advnerf_core.policies.pilotnet import load_policy
 from advnerf_core.report.conditions import NONE
 from hardware.worlds.world import World
-from nodes.experiment.attack import Cell, attack_path, cells, frozen_hashes, load_found, load_shown
+from nodes.experiment.attack import attack_path, cells, frozen_hashes, load_found, load_shown
+from nodes.experiment.cell import Cell
 from nodes.experiment.context import Experiment
 from nodes.experiment.deployed import DeployedDrive
 from nodes.experiment.drives import deployed_drives, totals

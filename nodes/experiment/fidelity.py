@@ -7,7 +7,6 @@ calibration says the camera sees. No drive with the attack is looked at.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,18 +20,18 @@ from advnerf_core.attack.artifact import AttackFile, face_texture
 from advnerf_core.attack.projection import FaceOverlay
 from advnerf_core.attack.spaces.displayed import DisplayedSensor
 from advnerf_core.attack.spaces.space import Shown, Space
+from advnerf_core.attack.transfer import Scene
 from advnerf_core.data.dataset import load_transforms
 from advnerf_core.driving.metrics import Horizon
 from advnerf_core.geometry import Array, invert_transform, planar_poses, yaw_of
 from advnerf_core.policies.pilotnet import load_policy
-from advnerf_core.report.conditions import NONE
 from advnerf_core.scene.fidelity import Pictures
 from advnerf_core.scene.surrogate import Surrogate
 from nodes.bags.reader import read_messages
 from nodes.control.pose_buffer import PoseBuffer
 from nodes.experiment import capture
-from nodes.experiment.attack import Cell, attack_path, attack_problem, load_found
-from nodes.experiment.cells import clean_folder
+from nodes.experiment.attack import attack_path, attack_problem, load_found
+from nodes.experiment.cell import Cell
 from nodes.experiment.context import Experiment
 from nodes.experiment.deploy import live_name
 from nodes.experiment.drives import deployed_drives
@@ -53,15 +52,14 @@ _MOST_FRAMES = 120
 _CAR, _IMAGE, _SAFETY = "/vicon/car", "/compositor/image", "/safety/state"
 
 
-def policy_of(experiment: Experiment, victim: str, scenario: str) -> tuple[Any, tuple[float, ...]]:
-    """The victim and what it is told on a path, of the first where none is named."""
-    goal = experiment.goal(scenario or experiment.config.scenarios[0])
-    return load_policy(victim_file(experiment, victim)).policy, goal
+def policy_of(experiment: Experiment, cell: Cell) -> tuple[Any, tuple[float, ...]]:
+    """The victim and what it is told on its path, of the first where none is named."""
+    goal = experiment.goal(cell.scenario or experiment.config.scenarios[0])
+    return load_policy(victim_file(experiment, cell.victim)).policy, goal
 
 
-def held_out(experiment: Experiment, scenario: str) -> Pictures:
+def held_out(experiment: Experiment) -> Pictures:
     """The driving camera's views that nothing was learned from, about all drives, without objects."""
-    del scenario
     views = load_transforms(experiment.stage_folder("capture") / capture.HELD_OUT, require_all=True).load()
     surrogate = surrogate_of(experiment, [])
     learned = [as_uint8(surrogate.render(pose[None], None).images[0]) for pose in views.T_world_from_camera]
@@ -70,58 +68,50 @@ def held_out(experiment: Experiment, scenario: str) -> Pictures:
     )
 
 
-def driven(
-    experiment: Experiment, scenario: str, victim: str, seed: int, folder: Path, bag: Path | None = None
-) -> Pictures:
+def driven(experiment: Experiment, cell: Cell, clean: Path, bag: Path | None = None) -> Pictures:
     """What the camera sees on the deployed drive without an attack.
 
     Args:
         experiment: The experiment.
-        scenario: Which drive.
-        victim: Whose drive.
-        seed: Which of its drives.
-        folder: A cell's folder, beside which live drives without attack are kept.
+        cell: Which drive.
+        clean: Where its live drives without attack are kept.
         bag: Instead, a bag of any live drive without attack.
 
     Raises:
         RuntimeFault: A bag is given where drives are asked of the scene, or there is no live drive yet.
     """
     if bag is None and not experiment.config.deploy.live:
-        return _along_the_drive(experiment, scenario, victim, seed, None, "drive without attack")
+        return _along_the_drive(experiment, cell, None, "drive without attack")
     if bag is not None and not has_face(experiment):
         raise RuntimeFault(
             "expected no bag for drives that are asked of the scene (deploy.through world); leave --bag out"
         )
-    frames, states = posed_frames(bag or clean_bag(experiment, scenario, victim, seed, folder))
+    frames, states = posed_frames(bag or clean_bag(experiment, cell, clean))
     surrogate = surrogate_of(experiment, [])
     learned = _learned(surrogate, planar_poses(states) @ experiment.mount, None)
     return Pictures("driven bag", np.stack([experiment.view.image(rgb) for rgb in frames]), learned)
 
 
-def lacks(experiment: Experiment, scenario: str, victim: str, method: str, seed: int, folder: Path) -> str:
+def lacks(experiment: Experiment, cell: Cell, folder: Path, clean: Path) -> str:
     """What a prediction still needs, in words; empty if all is there."""
-    if _searched_in(experiment, Cell.of(scenario, victim, method, seed), folder) is None:
+    if _searched_in(experiment, cell, folder) is None:
         return "its search"
     if experiment.config.deploy.live:
         try:
-            clean_bag(experiment, scenario, victim, seed, folder)
+            clean_bag(experiment, cell, clean)
         except RuntimeFault:
             return "the live drive without attack: run the cell of method none first"
     return ""
 
 
-def attacked(
-    experiment: Experiment, scenario: str, victim: str, method: str, seed: int, folder: Path
-) -> Pictures:
+def attacked(experiment: Experiment, cell: Cell, folder: Path, clean: Path) -> Pictures:
     """The same places with the colours of a finished search."""
-    space, attack = _found(experiment, scenario, victim, method, seed, folder)
+    space, attack = _found(experiment, cell, folder)
     shown = space.restored(attack)
     if not experiment.config.deploy.live:
         there = shown_there(shown, attack)
-        return _along_the_drive(
-            experiment, scenario, victim, seed, (shown, there), "the same drive, attacked"
-        )
-    frames, states = posed_frames(clean_bag(experiment, scenario, victim, seed, folder))
+        return _along_the_drive(experiment, cell, (shown, there), "the same drive, attacked")
+    frames, states = posed_frames(clean_bag(experiment, cell, clean))
     cars, overlay, panel = planar_poses(states), _overlay(experiment, attack), panel_of(experiment)
     real = []
     for rgb, car in zip(frames, cars, strict=True):
@@ -133,17 +123,19 @@ def attacked(
 
 
 def loop(
-    experiment: Experiment, scenario: str, victim: str, method: str, seed: int, folder: Path
-) -> tuple[AttackProblem, Callable[[torch.Tensor, bool], torch.Tensor], torch.Tensor, Horizon]:
+    experiment: Experiment, cell: Cell, folder: Path
+) -> tuple[AttackProblem, Scene, torch.Tensor, Horizon]:
     """What a prediction drives: the problem, pictures with or without the attack, the deployed starts ``[S, n]`` and the horizon."""
-    space, attack = _found(experiment, scenario, victim, method, seed, folder)
+    space, attack = _found(experiment, cell, folder)
     found, plain = space.restored(attack), space.plain
     with_it, without = (each.seen_by(space.surrogate) for each in (found, plain))
-    problem = attack_problem(experiment, space, load_policy(victim_file(experiment, victim)), scenario, seed)
+    problem = attack_problem(
+        experiment, space, load_policy(victim_file(experiment, cell.victim)), cell.scenario, cell.seed
+    )
     problem = replace(problem, steps=experiment.config.horizon)
 
-    def images(states: torch.Tensor, with_attack: bool) -> torch.Tensor:
-        sensor, colours = (with_it, found.colours) if with_attack else (without, plain.colours)
+    def images(states: torch.Tensor, attacked: bool) -> torch.Tensor:
+        sensor, colours = (with_it, found.colours) if attacked else (without, plain.colours)
         return sensor.sense(states, colours).images
 
     starts = problem.start_states[: experiment.config.deploy.starts]
@@ -158,29 +150,24 @@ def _searched_in(experiment: Experiment, cell: Cell, folder: Path) -> Path | Non
     return next((at for at in places if attack_path(at, cell).exists()), None)
 
 
-def _found(
-    experiment: Experiment, scenario: str, victim: str, method: str, seed: int, folder: Path
-) -> tuple[Space, AttackFile]:
+def _found(experiment: Experiment, cell: Cell, folder: Path) -> tuple[Space, AttackFile]:
     """The space, in the learned scene, and the attack file of a finished search."""
-    cell = Cell.of(scenario, victim, method, seed)
     attack = load_found(_searched_in(experiment, cell, folder) or folder, cell)
     assert attack is not None, "a prediction is of a method"
     return make_space(experiment, None), attack
 
 
-def clean_bag(experiment: Experiment, scenario: str, victim: str, seed: int, folder: Path) -> Path:
-    """The bag of the live drive that cells of this victim and seed are compared with.
+def clean_bag(experiment: Experiment, cell: Cell, clean: Path) -> Path:
+    """The bag of the live drive that cells of this victim and seed are compared with, in a folder or in that of the stage deploy.
 
     Raises:
         RuntimeFault: It is not driven yet, or its bag is gone.
     """
-    cell = Cell(scenario, victim, NONE, seed)
-    places = [clean_folder(experiment, cell, folder), experiment.stage_folder("deploy")]
-    bags = [at / live_name(cell, 0) / "bag" for at in places]
+    bags = [at / live_name(cell.clean, 0) / "bag" for at in (clean, experiment.stage_folder("deploy"))]
     found = next((bag for bag in bags if bag.exists()), None)
     if found is None:
         raise RuntimeFault(
-            f"expected the live drive without attack of the {victim} victim, seed {seed}, at {bags[0]}, got none; run that cell first"
+            f"expected the live drive without attack of the {cell.victim} victim, seed {cell.seed}, at {bags[0]}, got none; run that cell first"
         )
     return found
 
@@ -203,21 +190,19 @@ def _learned(sensor: Surrogate, poses: Array, theta: torch.Tensor | None) -> Rgb
 
 def _along_the_drive(
     experiment: Experiment,
-    scenario: str,
-    victim: str,
-    seed: int,
+    cell: Cell,
     attack: tuple[Shown, torch.Tensor | None] | None,
     of: str,
 ) -> Pictures:
     """Pictures of the deployed drive without attack, again with an attack if one is given: as it is seen in the surrogate, and as it is shown."""
     space = make_space(experiment, None)
-    policy, _ = policy_of(experiment, victim, scenario)
+    policy, _ = policy_of(experiment, cell)
     shown, there = attack or (space.plain, shown_there(space.plain, None))
     with experiment.open_world() as scene:
         dressed = dress(experiment, scene, space.plain)
-        start = experiment.start_states(scenario, seed)[:1]
+        start = experiment.start_states(cell.scenario, cell.seed)[:1]
         plain = shown_there(space.plain, None)
-        (drive,) = deployed_drives(experiment, dressed, policy, scenario, start, plain)
+        (drive,) = deployed_drives(experiment, dressed, policy, cell.scenario, start, plain)
         states = drive.states[:-1]
         real = dressed.policy_images(dressed.prepare(states), there)
     surrogate = shown.seen_by(space.surrogate)

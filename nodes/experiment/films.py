@@ -15,7 +15,8 @@ from advnerf_core.report.clips import ClipTrack, write_clip
 from advnerf_core.report.conditions import NONE, style_of
 from advnerf_core.scene.surrogate import Surrogate
 from hardware.worlds.world import World
-from nodes.experiment.attack import Cell, load_found, load_shown
+from nodes.experiment.attack import load_found, load_shown
+from nodes.experiment.cell import Cell
 from nodes.experiment.context import Experiment
 from nodes.experiment.deploy import drives_file
 from nodes.experiment.images import as_uint8

@@ -21,7 +21,8 @@ from advnerf_core.report.conditions import NONE
 from advnerf_core.report.page import write_report
 from advnerf_core.report.results import read_results
 from nodes.experiment import films, memory
-from nodes.experiment.attack import Cell, attack_path, cells
+from nodes.experiment.attack import attack_path, cells
+from nodes.experiment.cell import Cell
 from nodes.experiment.context import Experiment
 from nodes.experiment.deploy import drives_file
 from nodes.experiment.live import extra_runs, lab_of

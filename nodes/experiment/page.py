@@ -21,7 +21,8 @@ from advnerf_core.report.palette import DARK, LIGHT, LINE_STYLES, css_variables
 from advnerf_core.report.plots import new_axes, svg
 from advnerf_core.report.tables import Table
 from nodes.experiment import films
-from nodes.experiment.attack import Cell, cells
+from nodes.experiment.attack import cells
+from nodes.experiment.cell import Cell
 from nodes.experiment.context import Experiment
 from nodes.experiment.policy import HARDENED
 from nodes.experiment.stages import read_record

@@ -14,7 +14,8 @@ from advnerf_core.attack.pose_plots import draw_landscape, draw_robustness
 from advnerf_core.attack.spaces.placed_sensor import PlacedSensor
 from advnerf_core.files import write_atomically
 from advnerf_core.policies.pilotnet import load_policy
-from nodes.experiment.attack import Cell, attack_problem
+from nodes.experiment.attack import attack_problem
+from nodes.experiment.cell import Cell
 from nodes.experiment.context import Experiment
 from nodes.experiment.policy import victim_file
 from nodes.experiment.spaces import make_space

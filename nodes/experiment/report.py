@@ -18,7 +18,8 @@ from advnerf_core.report.conditions import NONE, order_of, style_of
 from advnerf_core.report.tables import Table, spread
 from hardware.worlds.world import World
 from nodes.experiment import films, live_report, page
-from nodes.experiment.attack import Cell, cells, load_shown
+from nodes.experiment.attack import cells, load_shown
+from nodes.experiment.cell import Cell
 from nodes.experiment.context import Experiment
 from nodes.experiment.deployed import DressedScene
 from nodes.experiment.overview import from_above

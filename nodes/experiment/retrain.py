@@ -31,7 +31,8 @@ from advnerf_core.learning.sources import Seen, steer_with
 from advnerf_core.policies.pilotnet import LoadedPolicy, load_policy
 from hardware.worlds.world import World
 from nodes.experiment import retrain_plot
-from nodes.experiment.attack import Cell, attack_problem, load_shown
+from nodes.experiment.attack import attack_problem, load_shown
+from nodes.experiment.cell import Cell
 from nodes.experiment.context import Experiment
 from nodes.experiment.deployed import DressedScene
 from nodes.experiment.drives import deployed_drives

@@ -117,12 +117,11 @@ def run_experiment(
     return run_to_end(experiment, stages_of(experiment), _LIBRARIES, summarise, until, console)
 
 
-def prepare_victims(experiment: Experiment, report: Report) -> None:
+def prepare_victims(experiment: Experiment) -> None:
     """Make scene, objects and policies, also the retrained one where the experiment retrains.
 
     One round of it, if none is begun; rounds that were begun are gone on with, as many as were asked for then.
     """
-    del report  # the stages show their own progress
     wanted = experiment.config.retrain
     if wanted is None:
         run_experiment(experiment, until="policy")

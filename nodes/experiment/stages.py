@@ -147,6 +147,12 @@ def begun_with(stages: Sequence[Stage], folder: Path, name: str) -> Mapping[str,
     )
 
 
+def stage_digests(folder: Path, names: Sequence[str]) -> dict[str, str]:
+    """Digests of what finished stages of a run folder wrote, of those of some names that there are."""
+    records = {name: read_record(folder / name) for name in names}
+    return {name: record.digest for name, record in records.items() if record is not None and record.digest}
+
+
 def hash_of(value: Any) -> str:
     """SHA-256 of a JSON value, independent of the order of keys."""
     return hashlib.sha256(json.dumps(value, sort_keys=True, separators=(",", ":")).encode()).hexdigest()

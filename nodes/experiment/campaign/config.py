@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, model_validator
 
 from advnerf_core.attack.methods import method_name
-from advnerf_core.report.cells import cell_name
 from advnerf_core.report.conditions import NONE, order_of
 from advnerf_core.scene.gate_limits import GateLimits
+from nodes.experiment.cell import Cell
+from nodes.experiment.cell_kind import absolute_kind
 from nodes.experiment.method_names import ConditionReference
 from nodes.runtime.config import load_config
 from nodes.runtime.errors import ConfigError
@@ -55,9 +56,9 @@ class ScenarioConfig(_NothingTwice):
     """One scenario: an experiment, and how it is read."""
 
     kind: str = Field(
-        default="world",
+        default="experiment",
         min_length=1,
-        description="world, or a Python module that runs cells (see nodes/experiment/campaign/kinds.py).",
+        description="experiment, or file.py:Class of your own that runs cells; see nodes/experiment/cell_kind.py.",
     )
     experiment: Path = Field(description="Experiment file; relative to the campaign file.")
     setting: str = Field(default="full", description="Which of its settings.")
@@ -98,30 +99,6 @@ class CampaignConfig(_NothingTwice):
 
 
 @dataclass(frozen=True)
-class Cell:
-    """One cell that a campaign asks for.
-
-    Attributes:
-        scenario: Its name in the campaign file.
-        placement: Name of the placement; empty for the scenario's own.
-        victim: Which policy.
-        method: Name of the search, or ``none``.
-        seed: Of starts and search.
-    """
-
-    scenario: str
-    placement: str
-    victim: str
-    method: str
-    seed: int
-
-    @property
-    def name(self) -> str:
-        """Name of its file and folder."""
-        return cell_name(self.scenario, self.victim, self.method, self.seed, self.placement)
-
-
-@dataclass(frozen=True)
 class Campaign:
     """A campaign file that was read.
 
@@ -139,22 +116,25 @@ class Campaign:
     def cells(self) -> list[Cell]:
         """All cells, in the order in which they are run: per scenario and seed, none first, as others are compared with it."""
         return [
-            Cell(name, placement, victim, method, seed)
+            Cell.of(name, victim, method, seed, placement)
             for name, scenario in self.config.scenarios.items()
             for placement in ("", *scenario.placements)
             for seed in scenario.seeds or self.config.seeds
             for victim in scenario.victims or self.config.victims
-            for method in sorted(map(method_name, scenario.methods or self.config.methods), key=order_of)
+            for method in sorted(scenario.methods or self.config.methods, key=_order)
         ]
 
     def scenario(self, cell: Cell) -> ScenarioConfig:
         """The scenario of a cell."""
         return self.config.scenarios[cell.scenario]
 
-    def method(self, cell: Cell) -> str:
-        """The method of a cell as `advnerf_core.attack.methods.load_method` takes it, or ``none``."""
-        references = self.scenario(cell).methods or self.config.methods
-        return next((each for each in references if method_name(each) == cell.method), cell.method)
+    def inside(self, cell: Cell) -> Cell:
+        """The cell as its experiment names it."""
+        return replace(cell, scenario=self.scenario(cell).as_scenario or cell.scenario, placement="")
+
+    def kind(self, cell: Cell) -> str:
+        """The kind of a cell as another process understands it."""
+        return absolute_kind(self.scenario(cell).kind, self.file.parent)
 
     def experiment_file(self, cell: Cell) -> Path:
         """The experiment file of a cell."""
@@ -196,21 +176,5 @@ def load_campaign(file: Path, folder: Path | None = None, overrides: tuple[str, 
     return campaign
 
 
-def select(cells: list[Cell], only: str) -> list[Cell]:
-    """The cells that fit a text such as ``scenario=straight,method=gradient+none,seed=0``; an empty text takes all."""
-    wanted: dict[str, set[str]] = {}
-    for part in filter(None, only.split(",")):
-        key, separator, value = part.partition("=")
-        if not separator or key.strip() not in Cell.__dataclass_fields__:
-            raise ConfigError(
-                f"--only {only}: expected KEY=VALUE with KEY one of {', '.join(Cell.__dataclass_fields__)}, got {part!r}"
-            )
-        wanted[key.strip()] = {each.strip() for each in value.split("+")}
-    chosen = [
-        cell for cell in cells if all(str(getattr(cell, key)) in values for key, values in wanted.items())
-    ]
-    if not chosen:
-        raise ConfigError(
-            f"--only {only}: expected some cells of the campaign, got none; see advnerf campaign status"
-        )
-    return chosen
+def _order(method: str) -> tuple[int, str]:
+    return order_of(method_name(method))

@@ -1,8 +1,4 @@
-"""The fidelity gate of an experiment, and predictions of how its attacks transfer, for any kind of scenario.
-
-The package of a kind has a module ``fidelity`` with ``policy_of``, ``held_out``, ``driven``, ``lacks``, ``attacked`` and ``loop``; a kind without
-one has no gate. See `nodes/experiment/fidelity.py`.
-"""
+"""The fidelity gate of an experiment, and predictions of how its attacks transfer, for any kind of cells that has pictures."""
 
 from __future__ import annotations
 
@@ -16,10 +12,10 @@ from advnerf_core.attack.transfer import TransferPrediction, predict_transfer
 from advnerf_core.files import write_atomically
 from advnerf_core.scene.fidelity import Agreement, Effect, Pictures, Verdict, agreement, judge
 from advnerf_core.scene.gate_limits import GateLimits
-from nodes.experiment.campaign.kinds import Kind, stage_digests
-from nodes.experiment.stages import hash_of
+from nodes.experiment.cell import Cell
+from nodes.experiment.cell_kind import CellKind
+from nodes.experiment.stages import hash_of, stage_digests
 from nodes.lab.policy_data.evaluate import predict
-from nodes.runtime.errors import RuntimeFault
 
 
 @dataclass(frozen=True)
@@ -35,10 +31,6 @@ class CleanDrive:
     none_m: tuple[float, ...]
 
 
-class GateError(RuntimeFault):
-    """A surrogate is not good enough for attacks found in it to mean anything."""
-
-
 def agreement_on(policy: Any, goal: tuple[float, ...], pictures: Pictures) -> Agreement:
     """How alike pictures look, and how alike the policy steers on them."""
     steering = [predict(policy, images, goal) for images in (pictures.real, pictures.learned)]
@@ -46,67 +38,47 @@ def agreement_on(policy: Any, goal: tuple[float, ...], pictures: Pictures) -> Ag
 
 
 def judge_scene(
-    kind: Kind, experiment: Any, scenario: str, victim: str, limits: GateLimits, bag: Path | None = None
+    kind: CellKind, experiment: Any, cell: Cell, limits: GateLimits, bag: Path | None = None
 ) -> list[tuple[str, Verdict]]:
     """The gate's verdicts: on held-out views, and on a driven bag if one is given.
 
     Raises:
-        GateError: The kind has no pictures to judge by.
+        NoPicturesError: The kind has no pictures to judge by.
     """
-    module = kind.fidelity
-    if module is None:
-        raise GateError(
-            f"expected a module fidelity beside the cells of kind {kind.name}, got none; it has no gate"
-        )
-    policy, goal = module.policy_of(experiment, victim, scenario)
-    sets = [module.held_out(experiment, scenario)]
+    policy, goal = kind.policy_of(experiment, cell)
+    sets = [kind.held_out(experiment, cell)]
     if bag is not None:
-        sets.append(module.driven(experiment, scenario, victim, 0, Path(), bag))
+        sets.append(kind.driven(experiment, cell, Path(), bag))
     return [(each.of, judge(agreement_on(policy, goal, each), limits, each.of)) for each in sets]
 
 
 def cached_verdict(
-    kind: Kind,
-    experiment: Any,
-    scenario: str,
-    victim: str,
-    limits: GateLimits,
-    file: Path,
-    drive: tuple[int, Path] | None = None,
-) -> Verdict | None:
-    """The verdict on held-out views, or on a drive; judged again only if scene, policy or limits changed; None where the kind has no gate.
+    kind: CellKind, experiment: Any, cell: Cell, limits: GateLimits, file: Path, drive: Path | None = None
+) -> Verdict:
+    """The verdict on held-out views, or on a drive; judged again only if scene, policy or limits changed.
 
     Args:
-        kind: Kind of the scenario.
+        kind: Kind of the cell.
         experiment: Its experiment.
-        scenario: What the experiment calls it.
-        victim: Which policy.
+        cell: The cell without attack whose drive is looked at, as the experiment names it.
         limits: What must be reached.
         file: Where the verdict is kept.
-        drive: Of a deployed drive without attack its seed and the folder of its cell.
+        drive: Folder of the cell, if its drive is to be judged.
 
     Raises:
         RuntimeFault: There is no such drive yet.
     """
-    module = kind.fidelity
-    if module is None:
-        return None
-    policy, goal = module.policy_of(experiment, victim, scenario)
-    which = [scenario, victim, *(["drive", drive[0]] if drive else [])]
-    key = hash_of(
-        [stage_digests(experiment.folder), _weights_sha256(policy), limits.model_dump(mode="json"), *which]
-    )
+    policy, goal = kind.policy_of(experiment, cell)
+    which = [cell.scenario, cell.victim, *(["drive", cell.seed] if drive else [])]
+    stages = stage_digests(experiment.folder, list(kind.needed_settings(experiment)))
+    key = hash_of([stages, _weights_sha256(policy), limits.model_dump(mode="json"), *which])
     try:
         kept = json.loads(file.read_text(encoding="utf-8"))
         if kept["key"] == key:
             return Verdict(kept["passed"], tuple(kept["reasons"]), kept["numbers"])
     except (OSError, ValueError, KeyError, TypeError):
         pass  # an unreadable verdict is judged again
-    pictures = (
-        module.driven(experiment, scenario, victim, *drive)
-        if drive
-        else module.held_out(experiment, scenario)
-    )
+    pictures = kind.driven(experiment, cell, drive) if drive else kind.held_out(experiment, cell)
     verdict = judge(agreement_on(policy, goal, pictures), limits, pictures.of)
     write_atomically(file, json.dumps({"key": key, **verdict.record()}, indent=1) + "\n")
     return verdict
@@ -121,12 +93,9 @@ def _weights_sha256(policy: Any) -> str:
 
 
 def predict_cell(
-    kind: Kind,
+    kind: CellKind,
     experiment: Any,
-    scenario: str,
-    victim: str,
-    method: str,
-    seed: int,
+    cell: Cell,
     folder: Path,
     draws: int = 6,
     clean: CleanDrive | None = None,
@@ -134,12 +103,9 @@ def predict_cell(
     """Predict the deployed drives of a cell whose search is finished, from pictures and the surrogate alone.
 
     Args:
-        kind: Kind of the scenario.
+        kind: Kind of the cell.
         experiment: Its experiment.
-        scenario: What the experiment calls it.
-        victim: Which policy.
-        method: Which search.
-        seed: Of the search.
+        cell: Which, as the experiment names it.
         folder: The cell's folder.
         draws: Drives per prediction.
         clean: What an earlier prediction of the same scenario, victim, seed and draws returned of the drive without attack.
@@ -147,22 +113,11 @@ def predict_cell(
     Returns:
         The prediction, and what it says of the drive without attack.
     """
-    module = kind.fidelity
-    if module is None:
-        raise GateError(
-            f"expected a module fidelity beside the cells of kind {kind.name}, got none; it has no predictions"
-        )
-    policy, goal = module.policy_of(experiment, victim, scenario)
-    without = (
-        clean.agreement
-        if clean
-        else agreement_on(policy, goal, module.driven(experiment, scenario, victim, seed, folder))
-    )
-    with_attack = agreement_on(
-        policy, goal, module.attacked(experiment, scenario, victim, method, seed, folder)
-    )
+    policy, goal = kind.policy_of(experiment, cell)
+    without = clean.agreement if clean else agreement_on(policy, goal, kind.driven(experiment, cell, folder))
+    with_attack = agreement_on(policy, goal, kind.attacked(experiment, cell, folder))
     effect = Effect(with_attack.learned - without.learned, with_attack.real - without.real)
-    problem, images, starts, horizon = module.loop(experiment, scenario, victim, method, seed, folder)
+    problem, images, starts, horizon = kind.loop(experiment, cell, folder)
     none_m = clean.none_m if clean else None
-    found = predict_transfer(problem, images, without, effect, starts, horizon, draws, seed, none_m)
+    found = predict_transfer(problem, images, without, effect, starts, horizon, draws, cell.seed, none_m)
     return found, CleanDrive(without, found.none_m)

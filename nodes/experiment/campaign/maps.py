@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from advnerf_core.report.conditions import NONE
-from nodes.experiment.campaign.config import Campaign, Cell
-from nodes.experiment.campaign.kinds import load_kind
+from nodes.experiment.campaign.config import Campaign
 from nodes.experiment.campaign.run import plan_cells
 from nodes.experiment.campaign.store import store_of
+from nodes.experiment.cell import Cell
+from nodes.experiment.cell_kind import load_kind
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import ProgressDisplay
 
@@ -30,21 +30,14 @@ def map_cells(campaign: Campaign, cells: Sequence[Cell], number: int) -> list[Pa
     experiments: dict[tuple[str, str], Any] = {}
     for cell in cells:
         (planned,) = plan_cells(campaign, [cell], experiments)
-        draw = getattr(load_kind(planned.job.kind).module, "draw_maps", None)
         status = store.status(cell, planned.job.settings_hash)
-        if draw is None or cell.method == NONE or status.state != "done" or status.result is None:
+        if status.state != "done" or status.result is None:
             continue
-        experiment = experiments[cell.scenario, cell.placement]
+        kind, experiment = load_kind(planned.job.kind), experiments[cell.scenario, cell.placement]
         with ProgressDisplay() as display:
-            pictures += draw(
-                experiment,
-                planned.job.scenario,
-                cell.victim,
-                cell.seed,
-                cell.method,
-                number,
-                store.work(cell.name),
-                display.start(cell.name),
+            report = display.start(cell.name)
+            pictures += kind.draw_maps(
+                experiment, campaign.inside(cell), number, store.work(cell.name), report
             )
     if not pictures:
         raise ConfigError(

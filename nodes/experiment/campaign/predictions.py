@@ -14,11 +14,12 @@ from advnerf_core.files import write_atomically
 from advnerf_core.report.cells import CellResult
 from advnerf_core.report.conditions import NONE
 from advnerf_core.report.transfer_prediction import Predicted
-from nodes.experiment.campaign.config import Campaign, Cell
+from nodes.experiment.campaign.config import Campaign
 from nodes.experiment.campaign.gate import CleanDrive, predict_cell
-from nodes.experiment.campaign.kinds import load_kind
 from nodes.experiment.campaign.run import plan_cells
 from nodes.experiment.campaign.store import store_of
+from nodes.experiment.cell import Cell
+from nodes.experiment.cell_kind import load_kind
 
 _KEYS = {"ratio", "ratio_low", "ratio_high", "retained", "total_cte_m", "clean_drive"}
 
@@ -51,8 +52,8 @@ def predict_campaign(
                 say(f"{cell.name}: not predicted, as its search is not in {store.work(cell.name)}")
             continue
         experiment = experiments[cell.scenario, cell.placement]
-        which = (experiment, planned.job.scenario, cell.victim, cell.method, cell.seed, store.work(cell.name))
-        if lacking := kind.fidelity.lacks(*which):
+        which = (experiment, campaign.inside(cell), store.work(cell.name))
+        if lacking := kind.lacks(*which):
             say(f"{cell.name}: not predicted, as it lacks {lacking}")
             continue
         drive = (cell.scenario, cell.placement, cell.victim, cell.seed)

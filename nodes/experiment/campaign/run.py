@@ -11,11 +11,11 @@ from typing import Any, Literal
 import joblib
 
 from advnerf_core.report.cells import CellResult
-from advnerf_core.report.conditions import NONE
-from nodes.experiment.campaign.config import Campaign, Cell, ScenarioConfig
-from nodes.experiment.campaign.kinds import load_kind, settings_hash
+from nodes.experiment.campaign.config import Campaign
 from nodes.experiment.campaign.store import CellStatus, Store, store_of
 from nodes.experiment.campaign.worker import Ended, Job, run_in_process
+from nodes.experiment.cell import Cell
+from nodes.experiment.cell_kind import load_kind, settings_hash
 from nodes.runtime.errors import ConfigError, RuntimeFault
 from nodes.runtime.progress import Report
 
@@ -78,31 +78,30 @@ def plan_cells(
     experiments = {} if experiments is None else experiments
     planned = []
     for cell in cells:
-        scenario = campaign.scenario(cell)
-        kind = load_kind(scenario.kind)
+        kind = load_kind(campaign.kind(cell))
         key = (cell.scenario, cell.placement)
         if key not in experiments:
             experiments[key] = _experiment(campaign, cell)
-        inside, method = _inside(scenario, cell), campaign.method(cell)
-        digest = settings_hash(kind, experiments[key], inside, cell.victim, method, cell.seed)
+        inside = campaign.inside(cell)
+        digest = settings_hash(kind, experiments[key], inside)
         job = Job(
             str(campaign.folder),
             cell.name,
-            scenario.kind,
+            campaign.kind(cell),
             str(campaign.experiment_file(cell)),
-            scenario.setting,
+            campaign.scenario(cell).setting,
             tuple(campaign.overrides(cell)),
             str(campaign.run_folder(cell)),
-            inside,
+            inside.scenario,
             cell.scenario,
             cell.placement,
             cell.victim,
-            method,
+            cell.code,
             cell.seed,
             digest,
             threads=1,
         )
-        planned.append(Planned(cell, job, kind.runs_alone(experiments[key]), kind.search_cell is not None))
+        planned.append(Planned(cell, job, kind.runs_alone(experiments[key]), kind.searches_apart))
     return planned
 
 
@@ -199,15 +198,12 @@ def _at_a_time(jobs: int, threads: int) -> str:
     return f"{jobs or 'all the cluster has cores for'} at a time, {threads} threads each"
 
 
-def _inside(scenario: ScenarioConfig, cell: Cell) -> str:
-    return scenario.as_scenario or cell.scenario
-
-
 def _experiment(campaign: Campaign, cell: Cell) -> Any:
-    scenario = campaign.scenario(cell)
-    kind = load_kind(scenario.kind)
-    return kind.load(
-        campaign.experiment_file(cell), scenario.setting, campaign.overrides(cell), campaign.run_folder(cell)
+    return load_kind(campaign.kind(cell)).load(
+        campaign.experiment_file(cell),
+        campaign.scenario(cell).setting,
+        campaign.overrides(cell),
+        campaign.run_folder(cell),
     )
 
 
@@ -218,7 +214,7 @@ def _prepare(campaign: Campaign, cells: Sequence[Cell], say: Say) -> None:
     _refuse_two_in_one_folder(campaign, cells)
     for cell, experiment in experiments.values():
         folder = campaign.run_folder(cell)
-        kind = campaign.scenario(cell).kind  # kinds need different stages of one experiment
+        kind = campaign.kind(cell)  # kinds need different stages of one experiment
         if (folder, kind) in done:
             continue
         done.add((folder, kind))
@@ -233,7 +229,7 @@ def _refuse_two_in_one_folder(campaign: Campaign, cells: Sequence[Cell]) -> None
     for cell in {(each.scenario, each.placement): each for each in campaign.cells}.values():
         if (folder := campaign.run_folder(cell)) not in folders:
             continue
-        needed = load_kind(campaign.scenario(cell).kind).needed_settings(_experiment(campaign, cell))
+        needed = load_kind(campaign.kind(cell)).needed_settings(_experiment(campaign, cell))
         name, others = first.setdefault(folder, (cell.scenario, needed))
         if wrong := [stage for stage in needed.keys() & others.keys() if needed[stage] != others[stage]]:
             raise ConfigError(
@@ -254,19 +250,19 @@ def _past_the_gate(campaign: Campaign, cells: Sequence[Cell], options: Options, 
 def _judge(campaign: Campaign, cell: Cell, options: Options, say: Say) -> bool:
     """Whether the cells of this one's scenario and victim may be run: by held-out views, and by a drive without attack where there is one."""
     scenario = campaign.scenario(cell)
-    kind, key = load_kind(scenario.kind), gate_key(cell)
+    kind, key = load_kind(campaign.kind(cell)), gate_key(cell)
     if not kind.judges(_experiment(campaign, cell)):
         return True
     from nodes.experiment.campaign.gate import cached_verdict  # loads torch
 
     limits = scenario.gate or campaign.config.gate
-    which = (kind, _experiment(campaign, cell), _inside(scenario, cell), cell.victim)
-    found = [cached_verdict(*which, limits, gate_file(campaign.folder, key))]
     first = min(each.seed for each in campaign.cells if gate_key(each) == key)
-    without = replace(cell, method=NONE, seed=first)
+    without = replace(cell.clean, seed=first)
+    which = (kind, _experiment(campaign, cell), campaign.inside(without), limits)
+    found = [cached_verdict(*which, gate_file(campaign.folder, key))]
     try:
-        drive = first, store_of(campaign).work(without.name)
-        found.append(cached_verdict(*which, limits, gate_file(campaign.folder, key, drive=True), drive))
+        drive = store_of(campaign).work(without.name)
+        found.append(cached_verdict(*which, gate_file(campaign.folder, key, drive=True), drive))
     except RuntimeFault as fault:
         say(
             f"fidelity gate, {key}: only held-out views are judged, as there is no drive without attack yet: {fault}"

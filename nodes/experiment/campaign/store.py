@@ -11,7 +11,8 @@ from typing import Any, Literal
 
 from advnerf_core.files import write_atomically
 from advnerf_core.report.cells import CellError, CellResult, cell_from, read_cell
-from nodes.experiment.campaign.config import Campaign, Cell
+from nodes.experiment.campaign.config import Campaign
+from nodes.experiment.cell import Cell
 from nodes.runtime.locks import HeldError, hold
 
 State = Literal["done", "failed", "changed", "running", "begun", "missing", "unreadable"]

@@ -11,8 +11,9 @@ from markupsafe import Markup
 from advnerf_core.files import write_atomically
 from advnerf_core.report.transfer import TransferTable, Wanted, make_table
 from advnerf_core.report.transfer_page import as_csv, as_json, as_markdown, gather_clips, render_transfer_page
-from nodes.experiment.campaign.config import Campaign, Cell
+from nodes.experiment.campaign.config import Campaign
 from nodes.experiment.campaign.store import CellStatus
+from nodes.experiment.cell import Cell
 
 
 def wanted_rows(campaign: Campaign, cells: Sequence[Cell]) -> list[Wanted]:

@@ -21,10 +21,11 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any, Literal, TextIO
 
-from advnerf_core.attack.methods import method_name
 from advnerf_core.files import write_atomically
-from nodes.experiment.campaign.kinds import Kind, load_kind, settings_hash, stage_digests
 from nodes.experiment.campaign.store import LOG, Store
+from nodes.experiment.cell import Cell
+from nodes.experiment.cell_kind import CellKind, load_kind, settings_hash
+from nodes.experiment.stages import stage_digests
 from nodes.runtime.errors import RuntimeFault
 from nodes.runtime.locks import HeldError, hold
 from nodes.runtime.machine import machine_name
@@ -83,6 +84,11 @@ class Job:
     settings_hash: str
     threads: int
     phase: Phase = "whole"
+
+    @property
+    def cell(self) -> Cell:
+        """The cell as its experiment names it."""
+        return Cell.of(self.scenario, self.victim, self.method, self.seed)
 
 
 @dataclass(frozen=True)
@@ -189,16 +195,13 @@ def take_cell(store: Store, name: str) -> TextIO:
             time.sleep(0.05)
 
 
-def _checked(job: Job, store: Store) -> tuple[Kind, Any]:
+def _checked(job: Job, store: Store) -> tuple[CellKind, Any]:
     """The kind and the experiment as they are now, before anything of the cell is touched."""
     try:
         kind = load_kind(job.kind)
         _use_threads(job.threads)
         experiment = kind.load(Path(job.experiment), job.setting, job.overrides, Path(job.run_folder))
-        if (
-            settings_hash(kind, experiment, job.scenario, job.victim, job.method, job.seed)
-            != job.settings_hash
-        ):
+        if settings_hash(kind, experiment, job.cell) != job.settings_hash:
             raise ChangedError(
                 f"{job.name}: its settings or inputs changed after the campaign was started; run the campaign again"
             )
@@ -210,28 +213,26 @@ def _checked(job: Job, store: Store) -> tuple[Kind, Any]:
     return kind, experiment
 
 
-def _run(job: Job, store: Store, work: Path, kind: Kind, experiment: Any) -> None:
+def _run(job: Job, store: Store, work: Path, kind: CellKind, experiment: Any) -> None:
     began = time.monotonic()
-    arguments = (experiment, job.scenario, job.victim, job.method, job.seed)
     report = _log_progress()
     if job.phase == "search":
-        if kind.search_cell is not None and kind.finished(*arguments) is None:
-            kind.search_cell(*arguments, work, report)
+        if kind.finished(experiment, job.cell) is None:
+            kind.search(experiment, job.cell, work, report)
         _add_seconds(work, time.monotonic() - began)
         return
-    taken = kind.finished(*arguments)
-    if taken is None:
+    found = kind.finished(experiment, job.cell)
+    if found is None:
         with _alone(kind, experiment):
-            taken = kind.run_cell(*arguments, work, report)
-    found = taken
+            found = kind.run(experiment, job.cell, work, report)
     ours = {
         "scenario": job.shown_scenario,
         "placement": job.placement,
         "victim": job.victim,
-        "method": method_name(job.method),
+        "method": job.cell.method,
         "seed": job.seed,
         "settings_hash": job.settings_hash,
-        "stages": stage_digests(Path(job.run_folder)),
+        "stages": stage_digests(Path(job.run_folder), list(kind.needed_settings(experiment))),
         "machine": found.get("machine") or machine_name(),
         "date": found.get("date") or datetime.now(timezone.utc).isoformat(timespec="seconds"),
     }
@@ -241,7 +242,7 @@ def _run(job: Job, store: Store, work: Path, kind: Kind, experiment: Any) -> Non
 
 
 @contextmanager
-def _alone(kind: Kind, experiment: Any) -> Iterator[None]:
+def _alone(kind: CellKind, experiment: Any) -> Iterator[None]:
     """A live graph measures time: of all campaigns on this machine only one cell at a time drives one."""
     with _wait_for_live() if kind.runs_alone(experiment) else nullcontext():
         yield

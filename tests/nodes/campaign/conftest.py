@@ -3,63 +3,67 @@
 import os
 import subprocess
 import sys
-import textwrap
 from pathlib import Path
 
 import pytest
 
 CELLS = """
-import json, os, time
+import os, time
 from pathlib import Path
 from types import SimpleNamespace
+from nodes.experiment.cell_kind import CellKind
 from nodes.runtime.config import read_yaml
-
-def load_experiment(file, setting, overrides, folder):
-    data = read_yaml(file).data
-    for text in overrides:
-        key, value = text.split("=")
-        data[key] = float(value)
-    return SimpleNamespace(folder=Path(folder), data=data)
-
-def prepare(experiment, report):
-    experiment.folder.mkdir(parents=True, exist_ok=True)
-
-def cell_inputs(experiment, scenario, victim, method, seed):
-    return dict(experiment.data)
 
 def _note(folder, text):
     with open(folder.parent.parent / "calls.txt", "a") as file:
         file.write(text + "\\n")
 
-def run_cell(experiment, scenario, victim, method, seed, folder, report):
-    name = f"{scenario}_{victim}_{method}_{seed}"
-    _note(folder, f"begin {name} {os.environ['OMP_NUM_THREADS']}")
-    if (folder.parent.parent / "fail").exists() and method == "cem":
-        raise RuntimeError("the search came to nothing")
-    done = folder / "half"
-    try:
-        while (folder.parent.parent / "hang").exists() and method == "gradient" and not done.exists():
-            (folder / "pid").write_text(str(os.getpid()))
-            time.sleep(0.02)
-    except BaseException:
-        _note(folder, f"closed {name}")
-        raise
-    _note(folder, f"end {name}")
-    factor = {"none": 1.0, "random": 1.1, "cem": 2.0, "gradient": 3.0}[method]
-    none = experiment.data["base"] + seed
-    drives = {"total_cte_m": [factor * none], "off_track": [method == "gradient"], "none_total_cte_m": [none]}
-    return {"attack_id": None, "surrogate": drives, "deployed": drives, "extra": {}}
+class Toy(CellKind):
+    def load(self, file, setting, overrides, folder):
+        data = read_yaml(file).data
+        for text in overrides:
+            key, value = text.split("=")
+            data[key] = float(value)
+        return SimpleNamespace(folder=Path(folder), data=data)
+
+    def prepare(self, experiment, report):
+        experiment.folder.mkdir(parents=True, exist_ok=True)
+
+    def inputs(self, experiment, cell):
+        return dict(experiment.data)
+
+    def needed_settings(self, experiment):
+        return {"capture": {}, "policy": {}}
+
+    def run(self, experiment, cell, folder, report):
+        _note(folder, f"begin {cell.name} {os.environ['OMP_NUM_THREADS']}")
+        if (folder.parent.parent / "fail").exists() and cell.method == "cem":
+            raise RuntimeError("the search came to nothing")
+        done = folder / "half"
+        try:
+            while (folder.parent.parent / "hang").exists() and cell.method == "gradient" and not done.exists():
+                (folder / "pid").write_text(str(os.getpid()))
+                time.sleep(0.02)
+        except BaseException:
+            _note(folder, f"closed {cell.name}")
+            raise
+        _note(folder, f"end {cell.name}")
+        factor = {"none": 1.0, "random": 1.1, "cem": 2.0, "gradient": 3.0}[cell.method]
+        none = experiment.data["base"] + cell.seed
+        drives = {"total_cte_m": [factor * none], "off_track": [cell.method == "gradient"], "none_total_cte_m": [none]}
+        return {"attack_id": None, "surrogate": drives, "deployed": drives, "extra": {}}
 """
 
 
-FIDELITY = """
+PICTURES = """
 import numpy as np
 import torch
 
 from advnerf_core.attack.problem import AttackProblem
 from advnerf_core.driving.dynamics import Dubins
 from advnerf_core.driving.metrics import Horizon
-from advnerf_core.driving.path import Line, Path
+from advnerf_core.driving.path import Line
+from advnerf_core.driving.path import Path as DrivingPath
 from advnerf_core.scene.fidelity import Pictures
 from nodes.runtime.errors import RuntimeFault
 
@@ -82,85 +86,80 @@ def _pictures(of, real, learned):
     show = lambda values: np.round(255 * (grain + np.asarray(values)[:, None, None, None])).astype(np.uint8)
     return Pictures(of, show(real), show(learned))
 
-def policy_of(experiment, victim, scenario):
-    return Reads(), ()
+class Gated(Toy):
+    searches_apart = True
 
-def held_out(experiment, scenario):
-    with open(experiment.folder / "looked.txt", "a") as file:
-        file.write(scenario + "\\n")
-    real = np.linspace(0.3, 0.6, 16)
-    return _pictures("held-out views", real, real + experiment.data.get("wrong", 0.0))
+    def judges(self, experiment):
+        return True
 
-def driven(experiment, scenario, victim, seed, folder, bag=None):
-    if experiment.data.get("late") and not folder.with_suffix(".json").exists():
-        raise RuntimeFault("expected a live drive, got none")
-    real = np.full(16, 0.5)
-    return _pictures("driven bag", real, real + experiment.data.get("wrong_drive", 0.0))
+    def search(self, experiment, cell, folder, report):
+        _note(folder, f"search {cell.name}")
+        (folder / "searched").touch()
 
-def lacks(experiment, scenario, victim, method, seed, folder):
-    return "" if (folder / "searched").exists() else "its search"
+    def policy_of(self, experiment, cell):
+        return Reads(), ()
 
-def attacked(experiment, scenario, victim, method, seed, folder):
-    return _pictures("attacked", np.full(16, 0.5 + KEPT * TURN), np.full(16, 0.5 + TURN))
+    def held_out(self, experiment, cell):
+        with open(experiment.folder / "looked.txt", "a") as file:
+            file.write(cell.scenario + "\\n")
+        real = np.linspace(0.3, 0.6, 16)
+        return _pictures("held-out views", real, real + experiment.data.get("wrong", 0.0))
 
-def loop(experiment, scenario, victim, method, seed, folder):
-    path = Path.from_segments((0.0, 0.0, 0.0), [Line(50.0)], closed=False)
+    def driven(self, experiment, cell, folder, bag=None):
+        if experiment.data.get("late") and not folder.with_suffix(".json").exists():
+            raise RuntimeFault("expected a live drive, got none")
+        real = np.full(16, 0.5)
+        return _pictures("driven bag", real, real + experiment.data.get("wrong_drive", 0.0))
 
-    def images(states, with_attack):
-        return (0.5 - 0.5 * states[:, 1] - states[:, 2] + TURN * with_attack)[:, None, None, None]
+    def lacks(self, experiment, cell, folder):
+        return "" if (folder / "searched").exists() else "its search"
 
-    return AttackProblem(Reads(), Nothing(), Dubins(1.0, 0.1), path, START, 20), images, START, Horizon(20, 0.1, 0.4)
-"""
-SEARCH = """
-def search_cell(experiment, scenario, victim, method, seed, folder, report):
-    _note(folder, f"search {scenario}_{victim}_{method}_{seed}")
-    (folder / "searched").touch()
+    def attacked(self, experiment, cell, folder):
+        return _pictures("attacked", np.full(16, 0.5 + KEPT * TURN), np.full(16, 0.5 + TURN))
+
+    def loop(self, experiment, cell, folder):
+        path = DrivingPath.from_segments((0.0, 0.0, 0.0), [Line(50.0)], closed=False)
+
+        def images(states, attacked):
+            return (0.5 - 0.5 * states[:, 1] - states[:, 2] + TURN * attacked)[:, None, None, None]
+
+        return AttackProblem(Reads(), Nothing(), Dubins(1.0, 0.1), path, START, 20), images, START, Horizon(20, 0.1, 0.4)
 """
 
 
 @pytest.fixture
-def gated(bench, monkeypatch):
-    """The bench with cells in a package that also has searches and a module of fidelity, importable here as on the command line."""
-    package = bench.folder / "toyland"
-    package.mkdir()
-    (package / "__init__.py").touch()
-    (package / "cells.py").write_text(CELLS + SEARCH)
-    (package / "fidelity.py").write_text(FIDELITY)
-    bench.kind = "toyland.cells"
-    bench.write("seeds: [0, 1]\nmethods: [gradient, none]\nvictims: [hardened]\n")
-    monkeypatch.syspath_prepend(str(bench.folder))
-    monkeypatch.setenv("PYTHONPATH", bench.environment["PYTHONPATH"])
-    yield bench
-    for name in [name for name in sys.modules if name.partition(".")[0] == "toyland"]:
-        del sys.modules[name]
+def gated(here):
+    """The bench with cells that also have searches apart, and real and learned pictures."""
+    here.code.write_text(CELLS + PICTURES)
+    here.kind = "toy_cells.py:Gated"
+    here.write("seeds: [0, 1]\nmethods: [gradient, none]\nvictims: [hardened]\n")
+    return here
 
 
 @pytest.fixture
 def bench(tmp_path):
-    """A folder with a module of toy cells, an experiment and a campaign of one scenario, two seeds, three methods."""
+    """A folder with a kind of toy cells, an experiment and a campaign of one scenario, two seeds, three methods."""
     return Bench(tmp_path)
 
 
 @pytest.fixture
 def here(bench, monkeypatch):
-    """The bench, with its module of cells importable in this process too, as the command line has it."""
-    monkeypatch.syspath_prepend(str(bench.folder))
+    """The bench, whose workers find the benchmarks too."""
     monkeypatch.setenv("PYTHONPATH", bench.environment["PYTHONPATH"])
-    yield bench
-    sys.modules.pop("toy_cells", None)
+    return bench
 
 
 class Bench:
     def __init__(self, folder):
         self.folder = folder
-        self.cells, self.kind = folder / "cells", "toy_cells"
-        (folder / "toy_cells.py").write_text(textwrap.dedent(CELLS))
+        self.cells, self.kind, self.code = folder / "cells", "toy_cells.py:Toy", folder / "toy_cells.py"
+        self.code.write_text(CELLS)
         (folder / "toy.experiment.yaml").write_text("base: 2.0\n")
         self.file = folder / "toy.campaign.yaml"
         self.write("seeds: [0, 1]\nmethods: [gradient, none]\nvictims: [hardened]\n")
 
     def write(self, head, scenarios=""):
-        scenario = f"{{kind: {self.kind}, experiment: toy.experiment.yaml, setting: full, run_folder: {self.folder / 'run'}}}"
+        scenario = f"{{kind: '{self.kind}', experiment: toy.experiment.yaml, setting: full, run_folder: {self.folder / 'run'}}}"
         self.file.write_text(
             f"name: toy\nfolder: {self.folder}\n{head}scenarios:\n  straight: {scenario}\n{scenarios}"
         )

@@ -5,9 +5,10 @@ import pytest
 from typer.testing import CliRunner
 
 from nodes.cli.main import app
-from nodes.experiment.campaign.config import load_campaign, select
-from nodes.experiment.campaign.kinds import load_kind
+from nodes.experiment.campaign.config import load_campaign
 from nodes.experiment.campaign.run import _refuse_two_in_one_folder
+from nodes.experiment.cell import select
+from nodes.experiment.cell_kind import load_kind
 from nodes.runtime.errors import ConfigError
 
 ROOT = Path(__file__).parents[3]
@@ -101,18 +102,19 @@ def test_a_bad_file_is_told_with_its_line(file, old, new, says):
         load_campaign(file)
 
 
-def test_an_unknown_kind_is_told_with_what_there_is():
-    with pytest.raises(ConfigError, match=r"\(world\).*got 'moon'"):
+def test_an_unknown_kind_is_told_with_what_there_is(tmp_path):
+    with pytest.raises(ConfigError, match=r"kind of cells of experiment; got 'moon'; .*file\.py:Name"):
         load_kind("moon")
-    with pytest.raises(ConfigError, match="function run_cell in json"):
-        load_kind("json")
+    (tmp_path / "no.py").write_text("class Cells:\n    pass\n")
+    with pytest.raises(ConfigError, match=r"a subclass of nodes\.experiment\.cell_kind\.CellKind"):
+        load_kind("no.py:Cells", tmp_path)
 
 
 TWICE = """name: twice
 seeds: [0]
 scenarios:
-  straight: {{kind: world, experiment: {file}, run_folder: {folder}}}
-  other: {{kind: world, as_scenario: straight, experiment: {file}, run_folder: {folder}, set: [{change}]}}
+  straight: {{experiment: {file}, run_folder: {folder}}}
+  other: {{as_scenario: straight, experiment: {file}, run_folder: {folder}, set: [{change}]}}
 """
 
 

@@ -13,10 +13,11 @@ from advnerf_core.driving.rollout import drive
 from advnerf_core.scene.gate_limits import GateLimits
 from nodes.cli.main import app
 from nodes.experiment.campaign.config import load_campaign
-from nodes.experiment.campaign.gate import GateError, judge_scene
-from nodes.experiment.campaign.kinds import load_kind
+from nodes.experiment.campaign.gate import judge_scene
 from nodes.experiment.campaign.predictions import predict_campaign, predicted
 from nodes.experiment.campaign.run import Options, run_campaign, statuses
+from nodes.experiment.cell import Cell
+from nodes.experiment.cell_kind import NoPicturesError, load_kind
 from nodes.runtime.errors import ConfigError
 
 HEAD = "seeds: [0]\nmethods: [gradient, none]\nvictims: [hardened]\n"
@@ -110,9 +111,8 @@ def test_transfer_is_predicted_from_the_search_before_any_drive(gated):
     assert pair.ratio == pytest.approx(kept["ratio"])
 
 
-def test_searches_are_not_run_alone_where_there_are_none_apart(bench, monkeypatch):
-    monkeypatch.syspath_prepend(str(bench.folder))
-    with pytest.raises(ConfigError, match="got kinds toy_cells; run them without --search-only"):
+def test_searches_are_not_run_alone_where_there_are_none_apart(bench):
+    with pytest.raises(ConfigError, match=r"toy_cells\.py:Toy; run them without --search-only"):
         run(bench, search_only=True)
 
 
@@ -153,7 +153,7 @@ def test_the_gate_is_a_command_of_its_own_with_an_exit_code(gated, wrong, code):
     arguments = (
         str(gated.folder / "toy.experiment.yaml"),
         "--kind",
-        "toyland.cells",
+        f"{gated.code}:Gated",
         "--run-folder",
         str(gated.folder / "run"),
     )
@@ -164,7 +164,8 @@ def test_the_gate_is_a_command_of_its_own_with_an_exit_code(gated, wrong, code):
     assert verdicts["held-out views"]["numbers"]["steering"] == pytest.approx(wrong, abs=0.002)
 
 
-def test_a_kind_without_pictures_has_no_gate(bench, monkeypatch):
-    monkeypatch.syspath_prepend(str(bench.folder))
-    with pytest.raises(GateError, match="expected a module fidelity beside the cells of kind toy_cells"):
-        judge_scene(load_kind("toy_cells"), None, "straight", "hardened", GateLimits())
+def test_a_kind_without_pictures_has_no_gate(bench):
+    with pytest.raises(NoPicturesError, match="expected cells with real and learned pictures, got Toy"):
+        judge_scene(
+            load_kind(bench.kind, bench.folder), None, Cell("straight", "hardened", "none", 0), GateLimits()
+        )

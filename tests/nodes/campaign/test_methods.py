@@ -7,9 +7,10 @@ import torch
 
 from advnerf_core.report.transfer_page import text_table
 from benchmarks.attack_toy import toy_problem
-from nodes.experiment.campaign.config import load_campaign, select
+from nodes.experiment.campaign.config import load_campaign
 from nodes.experiment.campaign.run import Options, run_campaign, statuses
 from nodes.experiment.campaign.table import campaign_table
+from nodes.experiment.cell import select
 from nodes.runtime.errors import ConfigError
 from tests.support.strangers import install_method, spiral_code, spiral_theta, write_spiral
 
@@ -20,25 +21,26 @@ from advnerf_core.attack.adjoint import evaluate
 from advnerf_core.attack.methods import SearchRun, SearchSettings, load_method
 from benchmarks.attack_toy import toy_problem
 
-def run_cell(experiment, scenario, victim, method, seed, folder, report):
-    _note(folder, f"begin {scenario}_{victim}_{method}_{seed}")
-    problem = toy_problem(2, dtype=torch.float32)
-    plain = evaluate(problem, problem.sensor.plain_theta())[1].protocol_cte_m.tolist()
-    found, theta = plain, None
-    if method != "none":
-        chosen = load_method(method)
-        settings = SearchSettings(3, population=4, options=chosen.options({}))
-        result = chosen.search(problem, settings, SearchRun(seed))
-        found, theta = list(result.best.protocol_cte_m), result.theta.flatten().tolist()
-    drives = {"total_cte_m": found, "off_track": [False] * len(found), "none_total_cte_m": plain}
-    return {"attack_id": None, "surrogate": drives, "extra": {"theta": theta}}
+class Searching(Toy):
+    def run(self, experiment, cell, folder, report):
+        _note(folder, f"begin {cell.scenario}_{cell.victim}_{cell.code}_{cell.seed}")
+        problem = toy_problem(2, dtype=torch.float32)
+        plain = evaluate(problem, problem.sensor.plain_theta())[1].protocol_cte_m.tolist()
+        found, theta = plain, None
+        if cell.method != "none":
+            chosen = load_method(cell.code)
+            settings = SearchSettings(3, population=4, options=chosen.options({}))
+            result = chosen.search(problem, settings, SearchRun(cell.seed))
+            found, theta = list(result.best.protocol_cte_m), result.theta.flatten().tolist()
+        drives = {"total_cte_m": found, "off_track": [False] * len(found), "none_total_cte_m": plain}
+        return {"attack_id": None, "surrogate": drives, "extra": {"theta": theta}}
 """
 
 
 @pytest.fixture
 def searching(here):
-    module = here.folder / "toy_cells.py"
-    module.write_text(module.read_text() + SEARCHES)
+    here.code.write_text(here.code.read_text() + SEARCHES)
+    here.kind = "toy_cells.py:Searching"
     write_spiral(here.folder)
     here.write("seeds: [1]\nmethods: [spiral.py:Spiral, gradient, none]\nvictims: [hardened]\n")
     return here
@@ -103,8 +105,8 @@ def test_a_broken_method_fails_alone_and_in_one_line(searching):
 
 
 def test_a_method_of_an_installed_package_runs_in_worker_processes(here, monkeypatch):
-    module = here.folder / "toy_cells.py"
-    module.write_text(module.read_text() + SEARCHES)
+    here.code.write_text(here.code.read_text() + SEARCHES)
+    here.kind = "toy_cells.py:Searching"
     install_method(here.folder, monkeypatch, spiral_code())
     here.write("seeds: [0]\nmethods: [spiral]\nvictims: [hardened]\n")
     ended, _ = run(here)

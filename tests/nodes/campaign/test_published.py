@@ -8,11 +8,12 @@ import pytest
 from typer.testing import CliRunner
 
 from nodes.cli.main import app
-from nodes.experiment.campaign.config import load_campaign, select
+from nodes.experiment.campaign.config import load_campaign
 from nodes.experiment.campaign.predictions import prediction_file
 from nodes.experiment.campaign.published import Published, publish, published_table, restore
 from nodes.experiment.campaign.run import Options, plan_cells, run_campaign, statuses
 from nodes.experiment.campaign.table import campaign_table, write_table
+from nodes.experiment.cell import select
 from nodes.runtime.errors import ConfigError
 
 

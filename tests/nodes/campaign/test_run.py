@@ -110,13 +110,11 @@ def test_failed_cells_say_why_and_are_retried_when_asked(here):
 
 @pytest.mark.slow
 def test_live_cells_run_alone_after_all_others(here):
-    module = here.folder / "toy_cells.py"
-    (here.folder / "toy_live.py").write_text(
-        module.read_text() + "\nruns_alone = lambda experiment: True\nsearch_cell = lambda *a: None\n"
-    )
+    alone = "class Live(Toy):\n    searches_apart = True\n    runs_alone = lambda self, experiment: True\n"
+    (here.folder / "toy_live.py").write_text(here.code.read_text() + alone)
     here.write(
         "seeds: [0, 1]\nmethods: [none, cem]\nvictims: [hardened]\n",
-        f"  live: {{kind: toy_live, experiment: toy.experiment.yaml, run_folder: {here.folder / 'run'}}}\n",
+        f"  live: {{kind: 'toy_live.py:Live', experiment: toy.experiment.yaml, run_folder: {here.folder / 'run'}}}\n",
     )
     ended, _ = run(here)
     assert {end.how for end in ended} == {"done"}

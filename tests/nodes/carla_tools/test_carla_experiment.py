@@ -8,7 +8,8 @@ import yaml
 
 from advnerf_core.data.dataset import load_transforms
 from advnerf_core.report.clips import read_clip
-from nodes.experiment.campaign.kinds import load_kind, settings_hash
+from nodes.experiment.cell import Cell
+from nodes.experiment.cell_kind import load_kind, settings_hash
 from nodes.experiment.run import load_experiment, run_experiment
 from nodes.runtime.errors import ConfigError
 
@@ -94,13 +95,13 @@ def test_objects_are_held_against_the_lanes_once_these_are_known(as_carla, file,
 
 
 def test_the_servers_address_changes_no_cell_and_its_junction_does(as_carla, file, tmp_path):
-    kind = load_kind("world")
+    kind = load_kind("experiment")
     assert kind.runs_alone(kind.load(file, "tiny", [], tmp_path / "run"))
-    assert kind.search_cell is not None
+    assert kind.searches_apart
 
     def of(*changes):
         experiment = kind.load(file, "tiny", list(changes), tmp_path / "run")
-        return settings_hash(kind, experiment, "right", "hardened", "gradient", 0)
+        return settings_hash(kind, experiment, Cell("right", "hardened", "gradient", 0))
 
     assert of() == of("world.server.port=3000") == of("attack.seeds=[0,7]")
     assert of() != of("world.junction.beyond_m=31")

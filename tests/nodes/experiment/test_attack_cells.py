@@ -14,8 +14,9 @@ import torch
 from advnerf_core.attack.artifact import load_attack
 from advnerf_core.attack.search.search import SearchStateError
 from nodes.experiment import attack, page, report, run
-from nodes.experiment.attack import Cell, cells, load_shown, surrogate_part
-from nodes.experiment.campaign.kinds import load_kind, settings_hash
+from nodes.experiment.attack import cells, load_shown, surrogate_part
+from nodes.experiment.cell import Cell
+from nodes.experiment.cell_kind import load_kind, settings_hash
 from nodes.experiment.cells import CellError, run_cell
 from nodes.experiment.context import Experiment
 from nodes.experiment.deploy import FrozenChangedError, ThroughWorld, check_frozen, deployed_part
@@ -105,7 +106,9 @@ def test_a_method_of_a_file_runs_a_cell_and_appears_in_the_tables(
         reference = f"{spiral_file}:Spiral"
         (stage,) = (each for each in run.stages_of(experiment) if each.name == "attack")
         assert stage.settings["attack"]["methods"] == ["Spiral", "gradient"]
-        return settings_hash(load_kind("world"), experiment, *PLACE, reference, 0), stage.settings
+        return settings_hash(
+            load_kind("experiment"), experiment, Cell.of(*PLACE, reference, 0)
+        ), stage.settings
 
     before = digests()
     spiral_file.write_text(spiral_code() + "# changed\n")
@@ -167,7 +170,7 @@ def test_a_cell_is_filmed_frame_by_frame(fresh: Experiment, wall: Any) -> None:
 def test_unknown_cells_are_refused(trained: Experiment, tmp_path: Path) -> None:
     for wrong in (("back", "hardened", "none"), ("left", "nobody", "none"), ("left", "hardened", "luck")):
         with pytest.raises(CellError, match=r"expected an? (scenario|victim|attack method) of"):
-            run_cell(trained, *wrong, 0, tmp_path, silent)  # type: ignore[arg-type]
+            run_cell(trained, Cell(*wrong, 0), tmp_path, silent)
     assert not list(tmp_path.iterdir())
 
 

@@ -18,8 +18,9 @@ from advnerf_core.objects.mesh.glb import mesh_from_glb
 from advnerf_core.report.cells import cell_from
 from advnerf_core.report.clips import ClipTrack, read_clip
 from nodes.experiment import attack, cells, films, pose_maps, run
-from nodes.experiment.attack import Cell, attack_path, surrogate_part
-from nodes.experiment.campaign.kinds import load_kind, settings_hash
+from nodes.experiment.attack import attack_path, surrogate_part
+from nodes.experiment.cell import Cell
+from nodes.experiment.cell_kind import load_kind, settings_hash
 from nodes.experiment.cells import CellError, run_cell
 from nodes.experiment.config import RetrainConfig
 from nodes.experiment.context import Experiment
@@ -37,7 +38,7 @@ from nodes.experiment.space_config import (
 from nodes.experiment.spaces import make_space, mesh_objects
 from nodes.runtime.errors import ConfigError
 
-PLACES = ("right", "hardened", "random", 0)
+PLACES = Cell("right", "hardened", "random", 0)
 ONE = PlacesConfig(samples=1, steps=1)
 MESHES = [
     MeshTextureConfig(texels=8, ball_m=0.5),
@@ -160,15 +161,15 @@ def test_places_alone_keep_the_plain_colours_and_are_filmed(
     alone = PlacesConfig(samples=1, steps=1, colours=False)
     experiment = replace(searching(trained, alone), folder=folder)
     (folder / "deploy" / "right_hardened_random_0.cell.json").write_text("{}")
-    assert load_kind("world").finished(experiment, *PLACES) is None
-    cell = run_cell(experiment, *PLACES, tmp_path / "moved", silent)
-    plain = run_cell(experiment, "right", "hardened", "none", 0, tmp_path / "plain", silent)
+    assert load_kind("experiment").finished(experiment, PLACES) is None
+    cell = run_cell(experiment, PLACES, tmp_path / "moved", silent)
+    plain = run_cell(experiment, Cell("right", "hardened", "none", 0), tmp_path / "plain", silent)
     assert plain["deployed"]["total_cte_m"] == cell["deployed"]["none_total_cte_m"]
     plain_film, film = (read_clip(tmp_path / each["extra"]["clip"]) for each in (plain, cell))
     assert len(plain_film) == len(film) == experiment.config.horizon + 1
     # A cell that was finished without a film is filmed when it is asked for again, and not searched.
     (tmp_path / "moved" / "clip.mp4").unlink()
-    assert run_cell(experiment, *PLACES, tmp_path / "moved", silent) == cell
+    assert run_cell(experiment, PLACES, tmp_path / "moved", silent) == cell
     moved, plain_drive, again = shown
     np.testing.assert_array_equal(moved.frames, again.frames)  # the same drive
     assert not np.array_equal(moved.frames, plain_drive.frames)
@@ -178,7 +179,7 @@ def test_places_alone_keep_the_plain_colours_and_are_filmed(
     voxels = make_space(experiment, None)
     assert torch.equal(voxels.restored(own).colours, voxels.plain.colours)
     coloured = searching(experiment, ONE)
-    run_cell(coloured, *PLACES, tmp_path / "other", silent)
+    run_cell(coloured, PLACES, tmp_path / "other", silent)
     other = load_attack(tmp_path / "other" / "right_hardened_random_0.attack.safetensors")
     assert [each.placement for each in other.objects] == [
         each.placement for each in file.objects
@@ -187,16 +188,16 @@ def test_places_alone_keep_the_plain_colours_and_are_filmed(
 
 
 def test_a_cell_depends_on_its_space_and_on_its_victim(trained: Experiment) -> None:
-    kind, experiment = load_kind("world"), searching(trained, ONE)
-    same = settings_hash(kind, experiment, *PLACES)
-    assert settings_hash(kind, searching(trained, ONE), *PLACES) == same
+    kind, experiment = load_kind("experiment"), searching(trained, ONE)
+    same = settings_hash(kind, experiment, PLACES)
+    assert settings_hash(kind, searching(trained, ONE), PLACES) == same
     others = [
-        settings_hash(kind, searching(trained, ONE.model_copy(update={"move_m": 0.2})), *PLACES),
-        settings_hash(kind, searching(trained, ONE.model_copy(update={"colours": False})), *PLACES),
-        settings_hash(kind, experiment, "right", "naive", "random", 0),
-        settings_hash(kind, experiment, "right", "hardened", "random", 1),
-        settings_hash(kind, searching(trained, MESHES[0]), *PLACES),
-        settings_hash(kind, searching(trained, ColoursConfig()), *PLACES),
+        settings_hash(kind, searching(trained, ONE.model_copy(update={"move_m": 0.2})), PLACES),
+        settings_hash(kind, searching(trained, ONE.model_copy(update={"colours": False})), PLACES),
+        settings_hash(kind, experiment, Cell("right", "naive", "random", 0)),
+        settings_hash(kind, experiment, Cell("right", "hardened", "random", 1)),
+        settings_hash(kind, searching(trained, MESHES[0]), PLACES),
+        settings_hash(kind, searching(trained, ColoursConfig()), PLACES),
     ]
     assert len({same, *others}) == 7
     for wrong in (
@@ -205,15 +206,15 @@ def test_a_cell_depends_on_its_space_and_on_its_victim(trained: Experiment) -> N
         ("right", "hardened", "luck", 0),
     ):
         with pytest.raises(CellError, match="expected a"):
-            settings_hash(kind, experiment, *wrong)
+            settings_hash(kind, experiment, Cell(*wrong))
 
 
 def test_a_cell_of_colours_depends_on_the_world_and_not_on_what_else_is_searched(trained: Experiment) -> None:
-    kind = load_kind("world")
+    kind = load_kind("experiment")
 
     def digest(*changes: str, victim: str = "hardened") -> str:
         experiment = kind.load(trained.file, "tiny", list(changes), trained.folder)
-        return settings_hash(kind, experiment, "right", victim, "random", 0)
+        return settings_hash(kind, experiment, Cell("right", victim, "random", 0))
 
     same = digest()
     for free in (
@@ -233,7 +234,7 @@ def test_a_cell_of_colours_depends_on_the_world_and_not_on_what_else_is_searched
 def test_the_gate_judges_learned_scenes_and_predictions_need_objects_where_they_were_placed(
     trained: Experiment,
 ) -> None:
-    kind = load_kind("world")
+    kind = load_kind("experiment")
     judged = {space.kind: kind.judges(searching(trained, space)) for space in (ColoursConfig(), ONE, *MESHES)}
     assert judged == {"colours": True, "places": True, "mesh_texture": False, "mesh_shape": False}
     predicted = {
@@ -250,7 +251,7 @@ def test_a_defence_that_nothing_asks_for_is_told(
     with pytest.raises(
         ConfigError, match=r"no attack reaches retrain.pays_ratio = 9 .*nothing was retrained"
     ):
-        run.prepare_victims(replace(trained, config=config), silent)
+        run.prepare_victims(replace(trained, config=config))
 
 
 @pytest.mark.parametrize(
@@ -278,13 +279,13 @@ def test_a_wrong_space_is_one_clear_error(
 def test_the_retrained_victim_is_that_of_the_first_round(trained: Experiment, tmp_path: Path) -> None:
     folder = shutil.copytree(trained.folder, tmp_path / "run")
     experiment = replace(searching(trained, ONE, retrain=RetrainConfig()), folder=folder)
-    kind, asked = load_kind("world"), ("left", "retrained", "none", 0)
-    unknown = settings_hash(kind, experiment, *asked)  # it is not trained yet
+    kind, asked = load_kind("experiment"), Cell("left", "retrained", "none", 0)
+    unknown = settings_hash(kind, experiment, asked)  # it is not trained yet
     (folder / "retrain" / "round0").mkdir(parents=True)
     shutil.copy(folder / "policy" / "naive.safetensors", folder / "retrain" / "round0" / "policy.safetensors")
-    assert settings_hash(kind, experiment, *asked) != unknown
-    cell = run_cell(experiment, *asked, tmp_path / "retrained", silent)
-    naive = run_cell(experiment, "left", "naive", "none", 0, tmp_path / "naive", silent)
+    assert settings_hash(kind, experiment, asked) != unknown
+    cell = run_cell(experiment, asked, tmp_path / "retrained", silent)
+    naive = run_cell(experiment, Cell("left", "naive", "none", 0), tmp_path / "naive", silent)
     assert json.dumps(naive["deployed"]) == json.dumps(cell["deployed"])  # the very same weights
 
 
@@ -292,10 +293,10 @@ def test_maps_are_of_what_the_cell_found(
     trained: Experiment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     experiment = searching(trained, ONE)
-    found = run_cell(experiment, *PLACES, tmp_path, silent)
+    found = run_cell(experiment, PLACES, tmp_path, silent)
     small = PoseMapSettings(points=(2, 2), sideways_m=(0.0, 0.3), object_moves_m=((0.0, 0.0), (0.0, 0.2)))
     monkeypatch.setattr(pose_maps, "PoseMapSettings", lambda: small)
-    asked = (experiment, "right", "hardened", 0, "random")
+    asked = (experiment, PLACES)
     pictures = cells.draw_maps(*asked, 1, tmp_path, silent)
     assert [cv2.imread(str(picture)) is not None for picture in pictures] == [True, True]
     rows = json.loads((tmp_path / f"robustness_{trained.objects[1].name}.json").read_text())["cells"]
@@ -307,7 +308,7 @@ def test_maps_are_of_what_the_cell_found(
     assert pictures[0].with_suffix(".json").stat().st_mtime_ns == kept
     with pytest.raises(CellError, match="expected an object of 0 to 4, got 5"):
         cells.draw_maps(*asked, 5, tmp_path, silent)
-    assert cells.draw_maps(experiment, "right", "hardened", 0, "none", 1, tmp_path, silent) == []
+    assert cells.draw_maps(experiment, PLACES.clean, 1, tmp_path, silent) == []
 
 
 @pytest.mark.parametrize(

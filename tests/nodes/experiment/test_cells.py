@@ -3,8 +3,9 @@
 from pathlib import Path
 
 from advnerf_core.attack.methods import METHODS, load_method, method_name
-from nodes.experiment.attack import Cell, search_settings
-from nodes.experiment.cells import cell_inputs, clean_folder, runs_alone
+from nodes.experiment.attack import search_settings
+from nodes.experiment.cell import Cell
+from nodes.experiment.cells import ExperimentCells, cell_inputs, clean_folder
 from nodes.experiment.deploy import live_name
 from nodes.experiment.run import load_experiment
 from tests.support.strangers import write_spiral
@@ -30,13 +31,14 @@ def test_methods_of_one_victim_and_seed_share_the_live_drive_without_attack(tmp_
 
 
 def test_live_nodes_have_the_machine_for_themselves(tmp_path):
-    assert runs_alone(room(tmp_path))
-    assert not runs_alone(room(tmp_path, "deploy.through=world"))
+    kind = ExperimentCells()
+    assert kind.runs_alone(room(tmp_path))
+    assert not kind.runs_alone(room(tmp_path, "deploy.through=world"))
 
 
 def test_what_changes_no_result_is_no_part_of_what_a_cell_depends_on(tmp_path):
     def inputs(*overrides):
-        return cell_inputs(room(tmp_path, *overrides), "track", "hardened", "gradient", 0)
+        return cell_inputs(room(tmp_path, *overrides), Cell("track", "hardened", "gradient", 0))
 
     for free in ("attack.cache_mib=64", "attack.seeds=[4]", "deploy.laps=0", "deploy.ready_timeout_s=90"):
         assert inputs(free) == inputs(), free

@@ -7,16 +7,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nodes.experiment import fidelity
 from nodes.experiment.campaign.gate import predict_cell
-from nodes.experiment.campaign.kinds import load_kind
+from nodes.experiment.cell import Cell
+from nodes.experiment.cell_kind import load_kind
 from nodes.experiment.cells import search_cell
 from nodes.experiment.context import Experiment
 from nodes.experiment.deployed import DressedScene
 from nodes.experiment.drives import deployed_drives
 from nodes.experiment.objects import placed_objects
 
-WHICH = ("right", "hardened", "random", 0)
+WHICH = Cell("right", "hardened", "random", 0)
+KIND = load_kind("experiment")
 
 
 @pytest.fixture(scope="module")
@@ -26,16 +27,16 @@ def searched(trained: Experiment, tmp_path_factory: pytest.TempPathFactory) -> t
     experiment = replace(trained, folder=shutil.copytree(trained.folder, folder / "run"))
     cell = folder / "cell"
     cell.mkdir()
-    assert fidelity.lacks(experiment, *WHICH, cell) == "its search"
-    search_cell(experiment, "right", "hardened", "random", 0, cell, lambda fraction, text="": None)
-    assert fidelity.lacks(experiment, *WHICH, cell) == ""
+    assert KIND.lacks(experiment, WHICH, cell) == "its search"
+    search_cell(experiment, WHICH, cell, lambda fraction, text="": None)
+    assert KIND.lacks(experiment, WHICH, cell) == ""
     return experiment, cell
 
 
 def test_real_pictures_are_what_the_policy_saw_on_the_clean_drive(searched: tuple[Experiment, Path]) -> None:
     experiment, cell = searched
-    clean = fidelity.driven(experiment, "right", "hardened", 0, cell)
-    policy, goal = fidelity.policy_of(experiment, "hardened", "right")
+    clean = KIND.driven(experiment, WHICH, cell)
+    policy, goal = KIND.policy_of(experiment, WHICH)
     assert goal == experiment.goal("right")
     with experiment.open_world() as scene:
         dressed = DressedScene(scene, experiment.view, placed_objects(experiment))
@@ -50,8 +51,8 @@ def test_real_pictures_are_what_the_policy_saw_on_the_clean_drive(searched: tupl
 
 def test_an_attack_changes_only_where_objects_are(searched: tuple[Experiment, Path]) -> None:
     experiment, cell = searched
-    clean = fidelity.driven(experiment, "right", "hardened", 0, cell)
-    attacked = fidelity.attacked(experiment, *WHICH, cell)
+    clean = KIND.driven(experiment, WHICH, cell)
+    attacked = KIND.attacked(experiment, WHICH, cell)
     changed = [(a != b).any(-1) for a, b in ((clean.real, attacked.real), (clean.learned, attacked.learned))]
     for each in changed:
         assert 0.0 < each.mean() < 0.3
@@ -62,9 +63,9 @@ def test_an_attack_changes_only_where_objects_are(searched: tuple[Experiment, Pa
 def test_a_prediction_needs_no_drive_with_the_attack(searched: tuple[Experiment, Path]) -> None:
     experiment, cell = searched
     before = {path.name for path in cell.iterdir()}
-    found, clean = predict_cell(load_kind("world"), experiment, *WHICH, cell, draws=2)
+    found, clean = predict_cell(KIND, experiment, WHICH, cell, draws=2)
     assert found.ratio > 0.0
     assert len(clean.agreement.real) == experiment.config.horizon
-    assert predict_cell(load_kind("world"), experiment, *WHICH, cell, 2, clean)[0] == found
+    assert predict_cell(KIND, experiment, WHICH, cell, 2, clean)[0] == found
     assert {path.name for path in cell.iterdir()} == before
     assert not any(experiment.stage_folder("deploy").iterdir())

@@ -21,7 +21,8 @@ from advnerf_core.policies.pilotnet import load_policy
 from advnerf_core.report.clips import read_clip
 from hardware.worlds.junction.config import DubinsConfig
 from hardware.worlds.world import World
-from nodes.experiment.attack import Cell, attack_problem, surrogate_part
+from nodes.experiment.attack import attack_problem, surrogate_part
+from nodes.experiment.cell import Cell
 from nodes.experiment.context import Experiment
 from nodes.experiment.deploy import ThroughWorld, deployed_part
 from nodes.experiment.deployed import SelfDriving

@@ -171,18 +171,14 @@ def test_cells_of_the_retrained_victim_wait_for_one_round_only(
         run_stages([replace(stage, run=work) for stage in stages_of(wanted)], wanted.folder, Quiet())
 
     monkeypatch.setattr(run, "run_experiment", run_experiment)
-    run.prepare_victims(experiment, lambda fraction, text="": None)
+    run.prepare_victims(experiment)
     assert asked == [(1, "retrain")]
-    run.prepare_victims(
-        experiment, lambda fraction, text="": None
-    )  # also of a longer loop it is the first round's victim
+    run.prepare_victims(experiment)  # also of a longer loop it is the first round's victim
     assert asked == [(1, "retrain")]
     shutil.rmtree(experiment.folder / "retrain")
-    run.prepare_victims(load(tmp_path, "retrain.rounds=4"), lambda fraction, text="": None)
+    run.prepare_victims(load(tmp_path, "retrain.rounds=4"))
     assert asked[1:] == [(1, "retrain")]
-    run.prepare_victims(
-        load(tmp_path, "retrain.rounds=6", "retrain.stills=7"), lambda fraction, text="": None
-    )
+    run.prepare_victims(load(tmp_path, "retrain.rounds=6", "retrain.stills=7"))
     assert asked[2:] == [(1, "retrain")]
     longer = load(tmp_path / "longer", "retrain.rounds=6")
 
@@ -192,5 +188,5 @@ def test_cells_of_the_retrained_victim_wait_for_one_round_only(
 
     with pytest.raises(InterruptedError):
         run_stages([replace(stage, run=stopped) for stage in stages_of(longer)], longer.folder, Quiet())
-    run.prepare_victims(longer, lambda fraction, text="": None)
+    run.prepare_victims(longer)
     assert asked[3:] == [(6, "retrain")]  # begun, but no victim yet: nothing of it is thrown away

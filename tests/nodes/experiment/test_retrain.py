@@ -13,7 +13,7 @@ from advnerf_core.attack.artifact import load_attack
 from advnerf_core.learning.frames import Frames, FrameStore
 from advnerf_core.policies.pilotnet import load_policy
 from nodes.experiment import attack, retrain
-from nodes.experiment.attack import Cell
+from nodes.experiment.cell import Cell
 from nodes.experiment.config import RetrainConfig
 from nodes.experiment.context import Experiment
 from nodes.experiment.policy import HARDENED, RETRAINED, victim_file

@@ -3,7 +3,8 @@ from pathlib import Path
 
 import pytest
 
-from nodes.experiment.attack import Cell, cells
+from nodes.experiment.attack import cells
+from nodes.experiment.cell import Cell
 from nodes.experiment.run import load_experiment, run_experiment, stages_of
 from nodes.experiment.stages import StageError
 from nodes.runtime.errors import ConfigError

@@ -2,15 +2,16 @@
 
 import json
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from advnerf_core.report.results import read_results
-from nodes.experiment import fidelity
 from nodes.experiment.campaign.gate import predict_cell
-from nodes.experiment.campaign.kinds import load_kind
+from nodes.experiment.cell import Cell
+from nodes.experiment.cell_kind import load_kind
 from nodes.experiment.cells import run_cell
 from nodes.experiment.run import load_experiment, run_experiment
 
@@ -71,13 +72,10 @@ def test_a_face_is_also_deployed_without_nodes_and_meets_the_same_searches(tmp_p
 def test_a_cell_of_another_seed_is_searched_and_driven_live_once(tmp_path):
     os.environ.setdefault("MUJOCO_GL", "egl")
     experiment = load_experiment(LAUNCH / "monitor.experiment.yaml", "demo", SMALL, tmp_path / "run")
-    run_experiment(experiment, until="object")
+    run_experiment(experiment, until="policy")
     asked = (
         experiment,
-        "track",
-        "hardened",
-        "gradient",
-        1,
+        Cell("track", "hardened", "gradient", 1),
         tmp_path / "cells" / "one",
         lambda fraction, text="": None,
     )
@@ -88,9 +86,9 @@ def test_a_cell_of_another_seed_is_searched_and_driven_live_once(tmp_path):
     assert (tmp_path / "cells" / cell["extra"]["clip"]).stat().st_size > 1000
     assert run_cell(*asked)["deployed"] == cell["deployed"]
     # What a prediction needs is there: the search, and the bag of the drive without attack.
-    which = (experiment, "track", "hardened", "gradient")
-    assert fidelity.lacks(*which, 2, tmp_path / "cells" / "one") == "its search"
-    assert fidelity.lacks(*which, 1, tmp_path / "cells" / "one") == ""
-    found, clean = predict_cell(load_kind("world"), *which, 1, tmp_path / "cells" / "one", draws=2)
+    kind, folder = load_kind("experiment"), tmp_path / "cells" / "one"
+    assert kind.lacks(experiment, replace(asked[1], seed=2), folder) == "its search"
+    assert kind.lacks(experiment, asked[1], folder) == ""
+    found, clean = predict_cell(kind, experiment, asked[1], folder, draws=2)
     assert found.ratio > 0.0
     assert clean.agreement.summary()["views"] >= 10

@@ -1,0 +1,164 @@
+"""How cells are run: the contract of a kind of cells, and the kinds by name."""
+
+from __future__ import annotations
+
+import json
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from advnerf_core.attack.methods import method_digest
+from advnerf_core.plugins import PluginError, absolute_reference, resolve
+from nodes.experiment.cell import Cell
+from nodes.experiment.stages import hash_of
+from nodes.runtime.errors import ConfigError, RuntimeFault
+from nodes.runtime.progress import Report
+
+if TYPE_CHECKING:
+    import torch
+
+    from advnerf_core.attack.adjoint import AttackProblem
+    from advnerf_core.attack.transfer import Scene
+    from advnerf_core.driving.metrics import Horizon
+    from advnerf_core.scene.fidelity import Pictures
+
+    Loop = tuple[AttackProblem, Scene, torch.Tensor, Horizon]
+
+ENTRY_POINTS = "advnerf.cells"
+
+
+class NoPicturesError(RuntimeFault):
+    """Real and learned pictures were asked of a kind of cells that has none."""
+
+
+class CellKind(ABC):
+    """Runs cells of one kind. `nodes.experiment.cells.ExperimentCells` runs those of experiment files.
+
+    ``experiment`` is whatever `load` returns; it has an attribute ``folder``, its run folder.
+
+    Attributes:
+        searches_apart: Whether `search` does a part of a cell that may run beside others.
+    """
+
+    searches_apart: ClassVar[bool] = False
+
+    @abstractmethod
+    def load(self, file: Path, setting: str, overrides: Sequence[str], folder: Path) -> Any:
+        """Read an experiment."""
+
+    @abstractmethod
+    def inputs(self, experiment: Any, cell: Cell) -> dict[str, Any]:
+        """What the result of a cell depends on, as JSON data."""
+
+    @abstractmethod
+    def run(self, experiment: Any, cell: Cell, folder: Path, report: Report) -> dict[str, Any]:
+        """Run a cell to its end, or on from where an earlier run of it was stopped; see `advnerf_core.report.cells`."""
+
+    def prepare(self, experiment: Any, report: Report) -> None:
+        """Make what all cells of the experiment need and is not there yet."""
+        return
+
+    def search(self, experiment: Any, cell: Cell, folder: Path, report: Report) -> None:
+        """The part of `run` that may run beside others."""
+        return
+
+    def finished(self, experiment: Any, cell: Cell) -> dict[str, Any] | None:
+        """The cell as the experiment itself has run it, with these settings; None where it has not."""
+        return None
+
+    def runs_alone(self, experiment: Any) -> bool:
+        """Whether `run` needs the machine, or the one server, for itself: such cells run after all others."""
+        return False
+
+    def needed_settings(self, experiment: Any) -> dict[str, Any]:
+        """Settings of the stages that cells need, by name: two experiments in one run folder must agree on them."""
+        return {}
+
+    def draw_maps(self, experiment: Any, cell: Cell, number: int, folder: Path, report: Report) -> list[Path]:
+        """Pictures about what a finished cell found; none where there is nothing to draw."""
+        return []
+
+    def judges(self, experiment: Any) -> bool:
+        """Whether there is a learned scene that the fidelity gate judges; the methods below are called only then."""
+        return False
+
+    def predicts(self, experiment: Any) -> bool:
+        """Whether transfer can be predicted from pictures."""
+        return self.judges(experiment)
+
+    def policy_of(self, experiment: Any, cell: Cell) -> tuple[Any, tuple[float, ...]]:
+        """The victim of a cell and what it is told."""
+        raise self._no_pictures()
+
+    def held_out(self, experiment: Any, cell: Cell) -> Pictures:
+        """Views that nothing was learned from, without an attack."""
+        raise self._no_pictures()
+
+    def driven(self, experiment: Any, cell: Cell, folder: Path, bag: Path | None = None) -> Pictures:
+        """Views of the deployed drive without attack of a cell, or of a bag of one."""
+        raise self._no_pictures()
+
+    def lacks(self, experiment: Any, cell: Cell, folder: Path) -> str:
+        """What a prediction still needs, in words; empty if all is there."""
+        raise self._no_pictures()
+
+    def attacked(self, experiment: Any, cell: Cell, folder: Path) -> Pictures:
+        """The views of `driven` with what the finished search found."""
+        raise self._no_pictures()
+
+    def loop(self, experiment: Any, cell: Cell, folder: Path) -> Loop:
+        """What a prediction drives: the problem, pictures with or without the attack, the deployed starts ``[S, n]`` and the horizon."""
+        raise self._no_pictures()
+
+    def _no_pictures(self) -> NoPicturesError:
+        return NoPicturesError(
+            f"expected cells with real and learned pictures, got {type(self).__name__}, which has none: no gate and no prediction"
+        )
+
+
+def _experiment() -> CellKind:
+    from nodes.experiment.cells import ExperimentCells
+
+    return ExperimentCells()
+
+
+KINDS: Mapping[str, Callable[[], CellKind]] = {"experiment": _experiment}
+
+
+def load_kind(name: str, folder: Path | None = None) -> CellKind:
+    """The kind that a name stands for: ``experiment``, an entry point of ``advnerf.cells``, or ``file.py:Class``.
+
+    Raises:
+        ConfigError: There is none, or it is no `CellKind`.
+    """
+    try:
+        found: Any = resolve(name, "kind of cells", KINDS, ENTRY_POINTS, folder)
+    except PluginError as error:
+        raise ConfigError(str(error)) from None
+    made = found() if isinstance(found, type) else found
+    if not isinstance(made, CellKind):
+        raise ConfigError(
+            f"expected a subclass of nodes.experiment.cell_kind.CellKind, got {name} = {found!r:.80}"
+        )
+    return made
+
+
+def absolute_kind(name: str, folder: Path) -> str:
+    """The name as another process understands it."""
+    return absolute_reference(name, folder)
+
+
+def settings_hash(kind: CellKind, experiment: Any, cell: Cell) -> str:
+    """The key of a cell: a hash of everything that its result depends on; a change of it makes the cell run again."""
+    named = {
+        "scenario": cell.scenario,
+        "victim": cell.victim,
+        "method": cell.method,
+        "seed": cell.seed,
+        "inputs": kind.inputs(experiment, cell),
+    }
+    if code := method_digest(cell.code):
+        named["code"] = code
+    # Through JSON, so that tuples and lists, or paths that were not turned into text, cannot change the hash between processes.
+    return hash_of(json.loads(json.dumps(named, default=str)))
