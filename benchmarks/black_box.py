@@ -59,7 +59,7 @@ class OutOfTimeError(Exception):
 
 def make_problem(folder: Path, steps: int) -> AttackProblem:
     """The experiment's own attack: its face where its attack files have it, its starts of seed 0, over fewer ticks."""
-    attack = load_attack(folder / "attack" / "track_hardened_gradient_0.attack.safetensors")
+    attack = load_attack(folder / "cells" / "track_hardened_gradient_0" / "attack.safetensors")
     plain = json.loads((folder / "manifest.json").read_text())["config"]["object"]["plain_rgb"]
     shown, carrier = attack.required_face(), attack.face_object
     face = cube_face_object(
@@ -151,7 +151,7 @@ def victim_of(folder: Path, out: Path) -> Any:
 
 def about(folder: Path, steps: int) -> str:
     """Short hash of the victim, the scene, the attacked face and the ticks: another one has a folder of its own."""
-    attack = load_attack(folder / "attack" / "track_hardened_gradient_0.attack.safetensors")
+    attack = load_attack(folder / "cells" / "track_hardened_gradient_0" / "attack.safetensors")
     policy = load_policy(folder / "policy" / "policy.safetensors")
     pose, size_m = attack.face_object.T_world_from_object, attack.required_face().size_m
     told = [policy.sha256, attack.scene_sha256, pose.tolist(), list(size_m), steps]

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.results import record_row
-from nodes.experiment.attack import attack_path
+from nodes.experiment.attack import ATTACK
 from nodes.experiment.cell import Cell
 from nodes.experiment.context import Experiment
 from nodes.experiment.live import LiveRun, drive_live
@@ -30,7 +30,7 @@ def drive(experiment: Experiment, folder: Path, compare: bool) -> dict[str, Any]
     """One live drive past the attack; what was measured in its bag."""
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-    attack = attack_path(experiment.stage_folder("attack"), CELL).resolve()
+    attack = (experiment.cell_folder(CELL) / ATTACK).resolve()
     start = experiment.references[CELL.scenario].drive_start
     live = LiveRun(CELL.name, CELL.victim, CELL.scenario, start, attack, compare=compare)
     drive_live(experiment, live, folder)

@@ -106,7 +106,7 @@ def record_live(data: ReportData, record: Record) -> None:
 
 def record_bags(folder: Path, record: Record) -> None:
     """Open every bag of the run with two independent readers and decode every message."""
-    bags = sorted((folder / "deploy").glob("*/bag"))
+    bags = sorted(path for part in ("cells", "live") for path in (folder / part).glob("**/bag"))
     topics: set[str] = set()
     messages = 0
     for bag in bags:

@@ -30,7 +30,7 @@ def main() -> None:
     parser.add_argument("run_folder", type=Path)
     parser.add_argument("picture", type=Path)
     arguments = parser.parse_args()
-    frames, shown_ms = frames_of(arguments.run_folder / "report" / "attack.mp4", WIDTH_PX)
+    frames, shown_ms = frames_of(next((arguments.run_folder / "report").glob("*.mp4")), WIDTH_PX)
     buffer = io.BytesIO()
     frames[0].save(
         buffer,

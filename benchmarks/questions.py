@@ -63,13 +63,13 @@ QUESTIONS = (
         "junction",
         "Does an attack found in the learned junction work there?",
         "The paper's transfer experiment: objects beside three paths, searched in the learned scene, driven in the world itself.",
-        ("advnerf campaign run launch/paper", "advnerf campaign predict launch/paper", "campaign_scaling"),
+        ("advnerf experiment launch/paper", "advnerf predict launch/paper", "campaign_scaling"),
     ),
     Question(
         "places_and_meshes",
         "Do places, mesh textures and mesh shapes work as attacks?",
         "The same transfer experiment over other spaces of search.",
-        ("advnerf campaign run launch/poses", "advnerf campaign run launch/meshes"),
+        ("advnerf experiment launch/poses", "advnerf experiment launch/meshes"),
     ),
     Question(
         "retraining",

@@ -1,6 +1,6 @@
 """Question: what does a campaign's table show, and does it meet the targets? ``python -m benchmarks.transfer_table [CAMPAIGN_FILE]``.
 
-It computes nothing anew: the cells in ``docs/results/<campaign>`` are what ``advnerf campaign run`` finished and ``advnerf campaign publish`` copied,
+It computes nothing anew: the cells in ``docs/results/<campaign>`` are what ``advnerf experiment`` finished and ``advnerf publish`` copied,
 with the verdicts of the fidelity gate and the predictions of transfer.
 """
 
@@ -22,8 +22,8 @@ from advnerf_core.report.transfer_targets import VICTIM, TableTarget, table_targ
 from benchmarks.results import record_row
 from nodes.experiment.campaign.config import load_campaign
 from nodes.experiment.campaign.predictions import predicted, prediction_file
-from nodes.experiment.campaign.published import PUBLISHED, published_table
-from nodes.experiment.campaign.run import gate_file, gate_key
+from nodes.experiment.campaign.published import published_table
+from nodes.experiment.campaign.run import PUBLISHED, gate_file, gate_key
 
 CAMPAIGN = Path("launch/paper.campaign.yaml")
 # Of targets that are missed: what was tried, and what it points to.
@@ -199,7 +199,7 @@ def skill_rows(
     """How good the predictions of transfer were, and how alike pictures are along the deployed drives without attack."""
     if not (pairs := predicted(folder, cells)):
         return []
-    skill, command = skill_of(pairs), f"advnerf campaign predict {campaign}"
+    skill, command = skill_of(pairs), f"advnerf predict {campaign}"
     clean = [json.loads(prediction_file(folder, pair.name).read_text())["clean_drive"] for pair in pairs]
     views = (
         f"along the drives without attack PSNR {min(c['psnr_db'] for c in clean):.1f} to {max(c['psnr_db'] for c in clean):.1f} dB, "
@@ -228,9 +228,9 @@ def main() -> None:
     parser.add_argument("--dry", action="store_true", help="print only")
     arguments = parser.parse_args()
     campaign = load_campaign(arguments.campaign)
-    folder = arguments.folder or PUBLISHED / campaign.config.name
+    folder = arguments.folder or PUBLISHED / campaign.name
     table = published_table(folder, campaign)
-    run = f"advnerf campaign run {arguments.campaign}"
+    run = f"advnerf experiment {arguments.campaign}"
 
     def record(
         line: str,

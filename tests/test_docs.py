@@ -79,9 +79,9 @@ def is_a_command(command, line):
 
 
 def test_what_is_no_command_is_noticed(command):
-    assert is_a_command(command, "advnerf campaign run FILE --jobs 2")
-    assert not is_a_command(command, "advnerf campaign ran FILE")
-    assert not is_a_command(command, "advnerf campaign run FILE --jobbs 2")
+    assert is_a_command(command, "advnerf experiment FILE --jobs 2")
+    assert not is_a_command(command, "advnerf keys ran FILE")
+    assert not is_a_command(command, "advnerf experiment FILE --jobbs 2")
     assert commands_of("text\n\n    advnerf arm   # drives\n") == ["advnerf arm"]
 
 

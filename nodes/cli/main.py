@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import os
 import signal
 import time
 from pathlib import Path
@@ -19,9 +18,9 @@ from nodes.cli import attack_poses as cli_attack_poses
 from nodes.cli import bag as cli_bag
 from nodes.cli import calibrate as cli_calibrate
 from nodes.cli import camera as cli_camera
-from nodes.cli import campaign as cli_campaign
 from nodes.cli import carla as cli_carla
 from nodes.cli import doctor as cli_doctor
+from nodes.cli import experiment as cli_experiment
 from nodes.cli import keys as cli_keys
 from nodes.cli import motor as cli_motor
 from nodes.cli import node as cli_node
@@ -35,7 +34,6 @@ from nodes.cli import topic as cli_topic
 from nodes.cli import trial as cli_trial
 from nodes.cli import world as cli_world
 from nodes.runtime.terminal import Overrides, RunDir, print_table, say_error, table
-from nodes.runtime.termination import ends_in_order
 
 if TYPE_CHECKING:
     from nodes.launching.launch import Launch
@@ -72,7 +70,6 @@ cli_node.add_to(app)
 app.add_typer(cli_motor.app, name="motor")
 app.add_typer(cli_calibrate.app, name="calibrate")
 app.add_typer(cli_camera.app, name="camera")
-app.add_typer(cli_campaign.app, name="campaign")
 cli_attack_node.add_to(cli_attack.app)
 cli_attack_poses.add_to(cli_attack.app)
 app.add_typer(cli_attack.app, name="attack")
@@ -83,15 +80,10 @@ app.add_typer(cli_room.app, name="room")
 app.add_typer(cli_carla.app, name="carla")
 app.add_typer(cli_world.app, name="world")
 cli_doctor.add_to(app)
+cli_experiment.add_to(app)
 cli_replay.add_to(app)
 cli_teleop.add_to(app)
 cli_trial.add_to(app)
-stage_app = typer.Typer(
-    no_args_is_help=True,
-    help="One stage of an experiment, and what it needs first: capture, scene, policy, object, attack, deploy, report.",
-)
-app.add_typer(stage_app, name="stage")
-
 _debug = False
 
 
@@ -191,61 +183,6 @@ def _say_problems(plan: Any) -> None:
         say_error(problem)
     if problems:
         raise typer.Exit(ERROR_EXIT)
-
-
-@app.command()
-def experiment(
-    file: Annotated[Path, typer.Argument(help="A *.experiment.yaml file.", exists=True, dir_okay=False)],
-    setting: Annotated[str, typer.Option("--setting", help="Which of the file's settings.")] = "demo",
-    run_folder: Annotated[
-        Path | None,
-        typer.Option("--run-folder", help="Folder of all results.", show_default="runs/<setting>"),
-    ] = None,
-    until: Annotated[
-        str | None, typer.Option("--until", metavar="STAGE", help="Stop after this stage.")
-    ] = None,
-    overrides: Overrides = None,
-) -> None:
-    """Run an experiment: every stage that is not there yet, from the photographs to the report."""
-    _run_experiment(file, setting, run_folder, until, overrides)
-
-
-def _run_experiment(
-    file: Path, setting: str, folder: Path | None, until: str | None, overrides: list[str] | None
-) -> None:
-    # Rendering without a display is the only way the stages know; an import of MuJoCo decides on it.
-    os.environ.setdefault("MUJOCO_GL", "egl")
-    from nodes.experiment.run import load_experiment, run_experiment
-
-    folder = folder or Path("runs") / setting
-    with ends_in_order():
-        run_experiment(load_experiment(file, setting, overrides or [], folder), until)
-
-
-def _add_stage(name: str, what: str) -> None:
-    def command(
-        file: Annotated[Path, typer.Argument(help="A *.experiment.yaml file.", exists=True, dir_okay=False)],
-        setting: Annotated[str, typer.Option("--setting", help="Which of the file's settings.")] = "demo",
-        run_folder: Annotated[
-            Path | None, typer.Option("--run-folder", show_default="runs/<setting>")
-        ] = None,
-        overrides: Overrides = None,
-    ) -> None:
-        _run_experiment(file, setting, run_folder, name, overrides)
-
-    stage_app.command(name, help=f"{what[0].upper()}{what[1:]} (and what it needs first).")(command)
-
-
-for _name, _what in {
-    "capture": "photograph the room",
-    "scene": "learn the room from its photographs",
-    "policy": "train the policy that will be attacked",
-    "object": "make the object that carries the attack",
-    "attack": "search for the texture",
-    "deploy": "drive through the real nodes, with and without the attack",
-    "report": "put everything on one page",
-}.items():
-    _add_stage(_name, _what)
 
 
 @app.command()

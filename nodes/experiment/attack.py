@@ -29,9 +29,16 @@ from nodes.experiment.learned_scene import scene_sha256
 from nodes.experiment.policy import HARDENED, victim_file, victims
 from nodes.experiment.request.telling import telling
 from nodes.experiment.space_config import FaceConfig, MeshShapeConfig, MeshTextureConfig, PlacesConfig
-from nodes.experiment.spaces import geometry_sha256, make_space, over_the_world
+from nodes.experiment.spaces import geometry_sha256, over_the_world
 from nodes.experiment.stages import hash_of
-from nodes.runtime.progress import Report
+from nodes.runtime.errors import RuntimeFault
+
+FROZEN, SEARCHED, ATTACK = "frozen.json", "surrogate.json", "attack.safetensors"
+_STATE = "state.safetensors"
+
+
+class FrozenChangedError(RuntimeFault):
+    """Something that was fixed before the first attack is no longer what it was."""
 
 
 def cells(experiment: Experiment) -> list[Cell]:
@@ -74,27 +81,24 @@ def frozen_hashes(experiment: Experiment) -> dict[str, str]:
     }
 
 
-def run(experiment: Experiment, folder: Path, report: Report) -> None:
-    """Freeze, then search what is not searched yet; one attack file and one JSON of surrogate drives per cell."""
-    write_atomically(folder / "frozen.json", json.dumps(frozen_hashes(experiment), indent=1) + "\n")
-    if over_the_world(experiment):
-        with experiment.open_world() as scene:
-            _search_all(experiment, make_space(experiment, scene), folder, report)
-    else:
-        _search_all(experiment, make_space(experiment, None), folder, report)
+def freeze(experiment: Experiment, folder: Path) -> None:
+    """Write what is fixed before the search of a cell, once."""
+    if not (folder / FROZEN).exists():
+        write_atomically(folder / FROZEN, json.dumps(frozen_hashes(experiment), indent=1) + "\n")
 
 
-def _search_all(experiment: Experiment, space: Space, folder: Path, report: Report) -> None:
-    plan = cells(experiment)
-    for index, cell in enumerate(plan):
+def check_frozen(experiment: Experiment, folder: Path) -> None:
+    """Refuse to drive if scene, victims, objects, places or starts are not those of the search.
 
-        def progress(fraction: float, text: str = "", index: int = index, cell: Cell = cell) -> None:
-            report(
-                (index + fraction) / len(plan),
-                f"{cell.scenario} {cell.victim} {cell.method} seed {cell.seed}: {text}",
-            )
-
-        surrogate_part(experiment, space, cell, folder, progress)
+    Raises:
+        FrozenChangedError: Something of it changed.
+    """
+    then, now = json.loads((folder / FROZEN).read_text()), frozen_hashes(experiment)
+    changed = [name for name, value in now.items() if name != "config" and then.get(name) != value]
+    if changed:
+        raise FrozenChangedError(
+            f"expected {', '.join(changed)} as frozen before the search in {folder}, got another; remove that folder to search again"
+        )
 
 
 def surrogate_part(
@@ -106,13 +110,13 @@ def surrogate_part(
         experiment: The experiment.
         space: What is searched.
         cell: Which.
-        folder: Gets ``<cell>.attack.safetensors`` and ``<cell>.json``.
+        folder: The cell's; gets ``attack.safetensors`` and ``surrogate.json``.
         report: Told the finished fraction.
 
     Returns:
         Attack id (None without an attack), states and metrics of the drives, the curve of the search [m], and its seconds.
     """
-    kept = folder / f"{cell.name}.json"
+    kept = folder / SEARCHED
     if kept.exists():
         found: dict[str, Any] = json.loads(kept.read_text())
         return found
@@ -124,7 +128,7 @@ def surrogate_part(
         seconds = sum(evaluation.seconds for evaluation in result.history)
         curve = [evaluation.predicted_total_cte_m for evaluation in result.history]
         attack = _attack_file(experiment, space, problem, policy, cell, result)
-        attack_id = save_attack(attack_path(folder, cell), attack)
+        attack_id = save_attack(folder / ATTACK, attack)
     shown = load_shown(space, folder, cell)
     measured = replace(past(problem, space, shown), steps=experiment.config.horizon)
     states, scores = learned_drives(experiment, measured, shown.colours)
@@ -138,7 +142,7 @@ def surrogate_part(
         "seconds": seconds,
     }
     write_atomically(kept, json.dumps(data) + "\n")
-    _state_path(folder, cell).unlink(missing_ok=True)
+    (folder / _STATE).unlink(missing_ok=True)
     return data
 
 
@@ -169,11 +173,6 @@ def past(problem: AttackProblem, space: Space, shown: Shown) -> AttackProblem:
     return replace(problem, sensor=shown.seen_by(space.surrogate))
 
 
-def attack_path(folder: Path, cell: Cell) -> Path:
-    """The attack file of a cell."""
-    return folder / f"{cell.name}.attack.safetensors"
-
-
 def load_shown(space: Space, folder: Path, cell: Cell) -> Shown:
     """The objects as a search found them, of its attack file; as they are where the cell has no method."""
     attack = load_found(folder, cell)
@@ -182,7 +181,7 @@ def load_shown(space: Space, folder: Path, cell: Cell) -> Shown:
 
 def load_found(folder: Path, cell: Cell) -> AttackFile | None:
     """The attack file of a search; None where the cell has no method."""
-    return None if cell.method == NONE else load_attack(attack_path(folder, cell))
+    return None if cell.method == NONE else load_attack(folder / ATTACK)
 
 
 def search_settings(experiment: Experiment, method: Method) -> SearchSettings:
@@ -231,12 +230,8 @@ def _search(
     method = load_method(cell.code)
     settings = search_settings(experiment, method)
     told = telling(method.evaluations(problem, settings), report)
-    run = SearchRun(cell.seed, _state_path(folder, cell), told, settings_hash)
+    run = SearchRun(cell.seed, folder / _STATE, told, settings_hash)
     return space.search(cell.code, problem, settings, run)
-
-
-def _state_path(folder: Path, cell: Cell) -> Path:
-    return folder / f"{cell.name}.state.safetensors"
 
 
 @lru_cache(maxsize=4)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -63,9 +64,9 @@ class CellKind(ABC):
         """The part of `run` that may run beside others."""
         return
 
-    def finished(self, experiment: Any, cell: Cell) -> dict[str, Any] | None:
-        """The cell as the experiment itself has run it, with these settings; None where it has not."""
-        return None
+    def hold(self, experiment: Any) -> AbstractContextManager[None]:
+        """Keep open what cells of one experiment share, while several are run one after the other in this process."""
+        return nullcontext()
 
     def runs_alone(self, experiment: Any) -> bool:
         """Whether `run` needs the machine, or the one server, for itself: such cells run after all others."""

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from advnerf_core.attack.methods import method_name
+from advnerf_core.scene.gate_limits import GateLimits
 from nodes.experiment.deploy_config import DeployConfig
 from nodes.experiment.method_names import MethodReference
 from nodes.experiment.placed import PlacedObject
@@ -297,6 +298,10 @@ class ExperimentConfig(_Section):
     attack: AttackConfig = AttackConfig()
     space: SpaceConfig = Field(default=ColoursConfig(), description="What the attacks may change.")
     deploy: DeployConfig = DeployConfig()
+    gate: GateLimits | None = Field(
+        default=None,
+        description="What the learned scene must reach before it is attacked; none: it is not judged.",
+    )
     retrain: RetrainConfig | None = Field(
         default=None, description="Retrain the hardened victim on what was found; none: not."
     )

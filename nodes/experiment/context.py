@@ -23,6 +23,7 @@ from advnerf_core.plugins import unknown
 from advnerf_core.policies.view import PolicyView
 from hardware.worlds.paths import ReferencePath
 from hardware.worlds.world import CarDescription, NotOpenError, Traits, World, WorldDescription, traits_of
+from nodes.experiment.cell import Cell
 from nodes.experiment.config import ExperimentConfig
 from nodes.experiment.placed import PlacedObject, in_a_lane
 from nodes.experiment.run_folder import RunFolder
@@ -31,7 +32,7 @@ from nodes.lab.worlds.named import NamedWorld, read_world, without
 from nodes.runtime.config import Document
 from nodes.runtime.errors import ConfigError
 
-WORLD, CALIBRATION = "world.json", "calibration"
+WORLD, CALIBRATION, CELLS = "world.json", "calibration", "cells"
 # Distances that stages use were chosen for half a lane of this width [m] and for this speed [m/s]: those of the simulated junction.
 _HALF_LANE_M, _SPEED_MPS = 1.75, 6.0
 
@@ -236,6 +237,14 @@ class Experiment(RunFolder[ExperimentConfig]):
     def launch_file(self) -> FilePath:
         """The node graph of live drives."""
         return self.file.parent / self.config.deploy.launch_file
+
+    def cell_folder(self, cell: Cell) -> FilePath:
+        """Where this experiment itself runs a cell."""
+        return self.folder / CELLS / cell.name
+
+    def cell_result(self, cell: Cell) -> FilePath:
+        """Where the result of a cell is that this experiment itself has run."""
+        return self.folder / CELLS / f"{cell.name}.json"
 
     @property
     def calibration_folder(self) -> FilePath:

@@ -1,13 +1,10 @@
-"""Stage deploy: every cell's drives past what its search found, by the world's own car or through the live nodes."""
+"""The part of a cell where it is deployed: drives past what its search found, by the world's own car or through the live nodes."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
-from contextlib import ExitStack
 from dataclasses import dataclass, field
-from datetime import datetime, timezone
-from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -18,48 +15,16 @@ from advnerf_core.files import write_atomically
 from advnerf_core.policies.pilotnet import load_policy
 from advnerf_core.report.conditions import NONE
 from hardware.worlds.world import World
-from nodes.experiment.attack import attack_path, cells, frozen_hashes, load_found, load_shown
+from nodes.experiment.attack import ATTACK, SEARCHED, load_found, load_shown
 from nodes.experiment.cell import Cell
 from nodes.experiment.context import Experiment
 from nodes.experiment.deployed import DeployedDrive
 from nodes.experiment.drives import deployed_drives, totals
-from nodes.experiment.live import LiveRun, as_drive, drive_until_it_counts, run_extras
-from nodes.experiment.policy import HARDENED, victim_file
-from nodes.experiment.spaces import dress, make_space, shown_there
-from nodes.experiment.stages import hash_of
-from nodes.runtime.errors import RuntimeFault
-from nodes.runtime.machine import machine_name
-from nodes.runtime.progress import Report
+from nodes.experiment.live import LiveRun, as_drive, drive_until_it_counts
+from nodes.experiment.policy import victim_file
+from nodes.experiment.spaces import dress, shown_there
 
-
-class FrozenChangedError(RuntimeFault):
-    """Something that was fixed before the first attack is no longer what it was."""
-
-
-def run(experiment: Experiment, folder: Path, report: Report) -> None:
-    """Drive what is not driven yet; one ``.cell.json`` per entry of the transfer table."""
-    check_frozen(experiment)
-    searched, plan = experiment.stage_folder("attack"), cells(experiment)
-    with ExitStack() as stack:
-        deployer = open_deployer(experiment, stack)
-        if isinstance(deployer, ThroughNodes):
-            run_extras(experiment, HARDENED, folder, report)
-        space = make_space(experiment, deployer.scene)
-        for index, cell in enumerate(plan):
-            told = partial(report, index / len(plan))
-            told(f"{cell.scenario} {cell.victim} {cell.method} seed {cell.seed}")
-            deployed_part(experiment, space, deployer, cell, searched, folder, told)
-
-
-def check_frozen(experiment: Experiment) -> None:
-    """Refuse to drive if scene, victims, objects, places or starts are not those of the attack."""
-    then = json.loads((experiment.stage_folder("attack") / "frozen.json").read_text())
-    now = frozen_hashes(experiment)
-    changed = [name for name, value in now.items() if name != "config" and then.get(name) != value]
-    if changed:
-        raise FrozenChangedError(
-            f"expected {', '.join(changed)} as frozen before the first attack, got another; run the attack stage again"
-        )
+DRIVES = "drives.json"
 
 
 class Deployer(Protocol):
@@ -69,10 +34,8 @@ class Deployer(Protocol):
     def scene(self) -> World | None:
         """The world, if it is open."""
 
-    def drive(
-        self, space: Space, cell: Cell, searched: Path, folder: Path, tell: Callable[[str], None], /
-    ) -> Deployed:
-        """Drive a cell from the starts that are deployed; its attack file is in ``searched``, and what is kept goes to ``folder``."""
+    def drive(self, space: Space, cell: Cell, folder: Path, tell: Callable[[str], None], /) -> Deployed:
+        """Drive a searched cell from the starts that are deployed; its attack file is in ``folder``, where bags go too."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,16 +58,14 @@ class ThroughWorld:
     experiment: Experiment
     scene: World
 
-    def drive(
-        self, space: Space, cell: Cell, searched: Path, folder: Path, tell: Callable[[str], None]
-    ) -> Deployed:
+    def drive(self, space: Space, cell: Cell, folder: Path, tell: Callable[[str], None]) -> Deployed:
         """Drive in this process; see `Deployer.drive`."""
-        del folder, tell
+        del tell
         experiment = self.experiment
         policy = load_policy(victim_file(experiment, cell.victim)).policy
-        shown = load_shown(space, searched, cell)
+        shown = load_shown(space, folder, cell)
         there = dress(experiment, self.scene, shown)
-        starts, colours = deployed_starts(experiment, cell), shown_there(shown, load_found(searched, cell))
+        starts, colours = deployed_starts(experiment, cell), shown_there(shown, load_found(folder, cell))
         return Deployed(deployed_drives(experiment, there, policy, cell.scenario, starts, colours))
 
 
@@ -115,36 +76,21 @@ class ThroughNodes:
     experiment: Experiment
     scene: None = None
 
-    def drive(
-        self, space: Space, cell: Cell, searched: Path, folder: Path, tell: Callable[[str], None]
-    ) -> Deployed:
+    def drive(self, space: Space, cell: Cell, folder: Path, tell: Callable[[str], None]) -> Deployed:
         """Launch the nodes once per start; see `Deployer.drive`."""
         del space
-        attack = None if cell.method == NONE else attack_path(searched, cell).resolve()
+        attack = None if cell.method == NONE else (folder / ATTACK).resolve()
         found = []
         for number, start in enumerate(deployed_starts(self.experiment, cell).tolist()):
-            name = live_name(cell, number)
+            name = live_name(number)
             live = LiveRun(name, cell.victim, cell.scenario, (start[0], start[1], start[2]), attack)
             found.append({"run": name, **drive_until_it_counts(self.experiment, live, folder, tell)})
         return Deployed([as_drive(each) for each in found], found)
 
 
-def live_name(cell: Cell, start: int) -> str:
-    """Name of the live run of a cell from one of its starts."""
-    return f"{cell.name}.live{start}"
-
-
-def open_deployer(experiment: Experiment, stack: ExitStack, scene: World | None = None) -> Deployer:
-    """What the section ``deploy`` asks for.
-
-    Args:
-        experiment: The experiment.
-        stack: Closes the world again.
-        scene: The world, if it is open already.
-    """
-    if experiment.config.deploy.live:
-        return ThroughNodes(experiment)
-    return ThroughWorld(experiment, scene or stack.enter_context(experiment.open_world()))
+def live_name(start: int) -> str:
+    """Name of the live run of a cell from one of its starts, in the cell's folder."""
+    return f"live{start}"
 
 
 def deployed_starts(experiment: Experiment, cell: Cell) -> torch.Tensor:
@@ -152,48 +98,39 @@ def deployed_starts(experiment: Experiment, cell: Cell) -> torch.Tensor:
     return experiment.start_states(cell.scenario, cell.seed)[: experiment.config.deploy.starts]
 
 
-def deployed_part(
+def cell_data(
     experiment: Experiment,
     space: Space,
     deployer: Deployer | None,
     cell: Cell,
-    searched: Path,
     folder: Path,
+    clean: Path,
     tell: Callable[[str], None],
-    clean_folder: Path | None = None,
 ) -> dict[str, Any]:
-    """Drive a searched cell and its clean drive where they are deployed; writes ``<cell>.cell.json`` and ``<cell>.drives.json``.
+    """Drive a searched cell, and without attack, where they are deployed, and put together what was found.
 
     Args:
         experiment: The experiment.
         space: What was searched.
         deployer: What drives; None deploys nothing.
         cell: Which.
-        searched: Where the surrogate's part is.
-        folder: Where the result goes.
+        folder: The cell's folder, with the surrogate's part.
+        clean: The folder of the same drive without attack, with the surrogate's part.
         tell: Told of drives that do not count.
-        clean_folder: Where the clean drives go, which several cells share; None: where the result goes.
 
     Returns:
-        Scenario, victim, method, seed, attack id, hash of all settings, seconds, machine, date; for ``surrogate`` and ``deployed``
-        the total CTE [m] and whether the car left the track, per start, and the total CTE past the plain objects.
+        Attack id, seconds; for ``surrogate`` and ``deployed`` the total CTE [m] and whether the car left the track, per start, and the total
+        CTE without attack; see `advnerf_core.report.cells`.
     """
-    result = folder / f"{cell.name}.cell.json"
-    if result.exists():
-        found: dict[str, Any] = json.loads(result.read_text())
-        return found
-    learned, clean = (json.loads((searched / f"{each.name}.json").read_text()) for each in (cell, cell.clean))
+    learned, undisturbed = (json.loads((at / SEARCHED).read_text()) for at in (folder, clean))
     data = {
         "scenario": cell.scenario,
         "victim": cell.victim,
         "method": cell.method,
         "seed": cell.seed,
         "attack_id": learned["attack_id"],
-        "settings_hash": hash_of(frozen_hashes(experiment)),
         "seconds": round(learned["seconds"], 1),
-        "machine": machine_name(),
-        "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
-        "surrogate": _drives_of(learned, clean),
+        "surrogate": _drives_of(learned, undisturbed),
         "extra": {
             "evaluations": len(learned["curve_total_cte_m"]),
             "horizon": experiment.config.horizon,
@@ -202,13 +139,10 @@ def deployed_part(
         },
     }
     if deployer is not None:
-        undisturbed = _drives(space, deployer, cell.clean, searched, clean_folder or folder, tell)
-        driven = (
-            undisturbed if cell.method == NONE else _drives(space, deployer, cell, searched, folder, tell)
-        )
-        data["deployed"] = _drives_of(driven, undisturbed)
+        without = deployed_part(space, deployer, cell.clean, clean, tell)
+        driven = without if folder == clean else deployed_part(space, deployer, cell, folder, tell)
+        data["deployed"] = _drives_of(driven, without)
         data["extra"] |= {"blocked_tick": driven["blocked_tick"], **_live_extra(driven["live"])}
-    write_atomically(result, json.dumps(data, indent=1) + "\n")
     return data
 
 
@@ -231,16 +165,15 @@ def _live_extra(live: list[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def _drives(
-    space: Space, deployer: Deployer, cell: Cell, searched: Path, folder: Path, tell: Callable[[str], None]
+def deployed_part(
+    space: Space, deployer: Deployer, cell: Cell, folder: Path, tell: Callable[[str], None]
 ) -> dict[str, Any]:
-    """Deployed drives of a cell from its starts; kept, as the clean ones are asked for again and again."""
-    kept = drives_file(folder, cell)
+    """Deployed drives of a searched cell from its starts, kept in ``drives.json``; what is there already is read."""
+    kept = folder / DRIVES
     if kept.exists():
         found: dict[str, Any] = json.loads(kept.read_text())
         return found
-    folder.mkdir(parents=True, exist_ok=True)
-    deployed = deployer.drive(space, cell, searched, folder, tell)
+    deployed = deployer.drive(space, cell, folder, tell)
     data = {
         "states": [drive.states.tolist() for drive in deployed.drives],
         "controls": [drive.controls.tolist() for drive in deployed.drives],
@@ -251,8 +184,3 @@ def _drives(
     }
     write_atomically(kept, json.dumps(data) + "\n")
     return data
-
-
-def drives_file(folder: Path, cell: Cell) -> Path:
-    """Where the deployed drives of a cell are kept."""
-    return folder / f"{cell.name}.drives.json"

@@ -30,7 +30,7 @@ from advnerf_core.scene.surrogate import Surrogate
 from nodes.bags.reader import read_messages
 from nodes.control.pose_buffer import PoseBuffer
 from nodes.experiment import capture
-from nodes.experiment.attack import attack_path, attack_problem, load_found
+from nodes.experiment.attack import ATTACK, attack_problem, load_found
 from nodes.experiment.cell import Cell
 from nodes.experiment.context import Experiment
 from nodes.experiment.deploy import live_name
@@ -39,9 +39,7 @@ from nodes.experiment.faces import face_space, has_face, on_screen, panel_of
 from nodes.experiment.images import as_uint8
 from nodes.experiment.objects import surrogate_of
 from nodes.experiment.policy import victim_file
-from nodes.experiment.run import stages_of
 from nodes.experiment.spaces import dress, make_space, shown_there
-from nodes.experiment.stages import is_current
 from nodes.runtime.errors import BagError, RuntimeFault
 from nodes.runtime.messages import decode, ns_from_stamp, pose_matrix
 from nodes.runtime.pictures import rgb_image
@@ -86,7 +84,7 @@ def driven(experiment: Experiment, cell: Cell, clean: Path, bag: Path | None = N
         raise RuntimeFault(
             "expected no bag for drives that are asked of the scene (deploy.through world); leave --bag out"
         )
-    frames, states = posed_frames(bag or clean_bag(experiment, cell, clean))
+    frames, states = posed_frames(bag or clean_bag(cell, clean))
     surrogate = surrogate_of(experiment, [])
     learned = _learned(surrogate, planar_poses(states) @ experiment.mount, None)
     return Pictures("driven bag", np.stack([experiment.view.image(rgb) for rgb in frames]), learned)
@@ -94,11 +92,11 @@ def driven(experiment: Experiment, cell: Cell, clean: Path, bag: Path | None = N
 
 def lacks(experiment: Experiment, cell: Cell, folder: Path, clean: Path) -> str:
     """What a prediction still needs, in words; empty if all is there."""
-    if _searched_in(experiment, cell, folder) is None:
+    if not (folder / ATTACK).exists():
         return "its search"
     if experiment.config.deploy.live:
         try:
-            clean_bag(experiment, cell, clean)
+            clean_bag(cell, clean)
         except RuntimeFault:
             return "the live drive without attack: run the cell of method none first"
     return ""
@@ -111,7 +109,7 @@ def attacked(experiment: Experiment, cell: Cell, folder: Path, clean: Path) -> P
     if not experiment.config.deploy.live:
         there = shown_there(shown, attack)
         return _along_the_drive(experiment, cell, (shown, there), "the same drive, attacked")
-    frames, states = posed_frames(clean_bag(experiment, cell, clean))
+    frames, states = posed_frames(clean_bag(cell, clean))
     cars, overlay, panel = planar_poses(states), _overlay(experiment, attack), panel_of(experiment)
     real = []
     for rgb, car in zip(frames, cars, strict=True):
@@ -142,34 +140,25 @@ def loop(
     return problem, images, starts, experiment.limits
 
 
-def _searched_in(experiment: Experiment, cell: Cell, folder: Path) -> Path | None:
-    """Where the attack file of a finished search is: the cell's own folder, or the experiment's where the cell was taken from there."""
-    places = [folder]
-    if is_current(stages_of(experiment), experiment.folder, "attack"):
-        places.append(experiment.stage_folder("attack"))
-    return next((at for at in places if attack_path(at, cell).exists()), None)
-
-
 def _found(experiment: Experiment, cell: Cell, folder: Path) -> tuple[Space, AttackFile]:
     """The space, in the learned scene, and the attack file of a finished search."""
-    attack = load_found(_searched_in(experiment, cell, folder) or folder, cell)
+    attack = load_found(folder, cell)
     assert attack is not None, "a prediction is of a method"
     return make_space(experiment, None), attack
 
 
-def clean_bag(experiment: Experiment, cell: Cell, clean: Path) -> Path:
-    """The bag of the live drive that cells of this victim and seed are compared with, in a folder or in that of the stage deploy.
+def clean_bag(cell: Cell, clean: Path) -> Path:
+    """The bag of the live drive that cells of this victim and seed are compared with.
 
     Raises:
         RuntimeFault: It is not driven yet, or its bag is gone.
     """
-    bags = [at / live_name(cell.clean, 0) / "bag" for at in (clean, experiment.stage_folder("deploy"))]
-    found = next((bag for bag in bags if bag.exists()), None)
-    if found is None:
+    bag = clean / live_name(0) / "bag"
+    if not bag.exists():
         raise RuntimeFault(
-            f"expected the live drive without attack of the {cell.victim} victim, seed {cell.seed}, at {bags[0]}, got none; run that cell first"
+            f"expected the live drive without attack of the {cell.victim} victim, seed {cell.seed}, at {bag}, got none; run that cell first"
         )
-    return found
+    return bag
 
 
 def _overlay(experiment: Experiment, attack: AttackFile) -> FaceOverlay:

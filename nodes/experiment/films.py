@@ -15,11 +15,12 @@ from advnerf_core.report.clips import ClipTrack, write_clip
 from advnerf_core.report.conditions import NONE, style_of
 from advnerf_core.scene.surrogate import Surrogate
 from hardware.worlds.world import World
-from nodes.experiment.attack import load_found, load_shown
+from nodes.experiment.attack import SEARCHED, load_found, load_shown
 from nodes.experiment.cell import Cell
 from nodes.experiment.context import Experiment
-from nodes.experiment.deploy import drives_file
+from nodes.experiment.deploy import DRIVES
 from nodes.experiment.images import as_uint8
+from nodes.experiment.keys import driven_folder
 from nodes.experiment.learned_scene import load_background
 from nodes.experiment.policy import HARDENED
 from nodes.experiment.spaces import dress, shown_there
@@ -47,9 +48,8 @@ def film_scenario(
         scenario: Which drive.
         folder: Gets the film.
     """
-    searched, deployed = experiment.stage_folder("attack"), experiment.stage_folder("deploy")
     attacked = Cell(scenario, HARDENED, strongest(experiment), experiment.config.attack.seeds[0])
-    shown = load_shown(space, searched, attacked)
+    shown = load_shown(space, driven_folder(experiment, attacked), attacked)
     whole = Surrogate(load_background(experiment), experiment.camera, experiment.mount, shown.objects)
     every, rate_hz = filmed(experiment.config.dt_s)
     learned = drives_of(experiment, "surrogate", attacked)[0][::every]
@@ -58,17 +58,16 @@ def film_scenario(
     tracks = [_track(experiment, attacked, "learned scene, attacked", frames, learned)]
     for cell in (attacked.clean, attacked):
         title = "deployed, no attack" if cell.method == NONE else "deployed, attacked"
-        tracks.append(_deployed_track(experiment, scene, space, cell, title, searched, deployed))
+        tracks.append(_deployed_track(experiment, scene, space, cell, title, driven_folder(experiment, cell)))
     return write_clip(folder / f"{scenario}.mp4", tracks, rate_hz, experiment.world.off_track_m)
 
 
 def film_cell(
-    experiment: Experiment, scene: World | None, space: Space, cell: Cell, folder: Path, clean_folder: Path
+    experiment: Experiment, scene: World | None, space: Space, cell: Cell, folder: Path, driven: Path
 ) -> Path:
-    """The deployed drive of one cell, from its first start; its files are in ``folder``, and ``clip.mp4`` will be."""
+    """The deployed drive of one cell, from its first start, as ``clip.mp4`` in ``folder``; its files are in the folder ``driven``."""
     title = f"{style_of(cell.method).title}, {cell.victim}, seed {cell.seed}"
-    deployed = clean_folder if cell.method == NONE else folder
-    track = _deployed_track(experiment, scene, space, cell, title, folder, deployed)
+    track = _deployed_track(experiment, scene, space, cell, title, driven)
     _, rate_hz = filmed(experiment.config.dt_s)
     return write_clip(folder / "clip.mp4", [track], rate_hz, experiment.world.off_track_m)
 
@@ -79,21 +78,20 @@ def _deployed_track(
     space: Space,
     cell: Cell,
     title: str,
-    searched: Path,
-    deployed: Path,
+    folder: Path,
 ) -> ClipTrack:
     """What the camera saw on the first deployed drive of a cell: asked of the open scene again, or from the bag of a live drive."""
     every, _ = filmed(experiment.config.dt_s)
-    file = drives_file(deployed, cell)
+    file = folder / DRIVES
     states = _states(file)[0][::every]
     if scene is None:
         live = json.loads(file.read_text())["live"][0]
         began_ns, period_s = live["outcome"]["start_real_ns"], every * experiment.config.dt_s
-        views = list(evaluation.frames(deployed / live["run"] / "bag", began_ns, len(states), period_s))
+        views = list(evaluation.frames(folder / live["run"] / "bag", began_ns, len(states), period_s))
         note = live["outcome"]["stopped_early"] or "ended"
         return _track(experiment, cell, title, views, states, "".join(live["attack_ids"]), note)
-    shown = load_shown(space, searched, cell)
-    dressed, colours = dress(experiment, scene, shown), shown_there(shown, load_found(searched, cell))
+    shown = load_shown(space, folder, cell)
+    dressed, colours = dress(experiment, scene, shown), shown_there(shown, load_found(folder, cell))
     return _track(experiment, cell, title, [dressed.camera_image(state, colours) for state in states], states)
 
 
@@ -130,8 +128,7 @@ def _track(
 
 def drives_of(experiment: Experiment, domain: str, cell: Cell) -> list[Array]:
     """States ``[T + 1, 3]`` of a cell's drives in one domain."""
-    stage, suffix = ("attack", "json") if domain == "surrogate" else ("deploy", "drives.json")
-    return _states(experiment.stage_folder(stage) / f"{cell.name}.{suffix}")
+    return _states(driven_folder(experiment, cell) / (SEARCHED if domain == "surrogate" else DRIVES))
 
 
 def _states(file: Path) -> list[Array]:

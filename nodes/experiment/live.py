@@ -21,12 +21,13 @@ from hardware.worlds.lab.config import LabConfig
 from nodes.experiment.context import Experiment
 from nodes.experiment.deployed import DeployedDrive
 from nodes.experiment.faces import on_screen, panel_of, wanted_face
-from nodes.experiment.policy import victim_file
+from nodes.experiment.policy import HARDENED, victim_file
 from nodes.lab.trials.evaluation import attack_ids, counterfactual, score, timing, trajectory
 from nodes.lab.trials.trial import STALLED, NotStartedError, TrialPlan, counts
 from nodes.lab.trials.trial_runner import run_trial
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import ConfigError, RuntimeFault
+from nodes.runtime.progress import Report
 
 Pose = tuple[float, float, float]
 # The absent panel of the empty scene stands outside the room, out of every camera's sight.
@@ -160,25 +161,26 @@ def blocked_tick(driven: dict[str, Any]) -> int | None:
     return first_still_tick(driven["states"]) if not stopped or STALLED in stopped else None
 
 
-def extra_runs(experiment: Experiment, victim: str) -> dict[str, LiveRun]:
-    """Runs beside the cells that the experiment asks for: laps without attack, and a drive with the panel taken away."""
+def extra_runs(experiment: Experiment) -> dict[str, LiveRun]:
+    """Runs of the hardened victim beside the cells: laps without attack, and a drive with the panel taken away, where they are asked for."""
     wanted, scenario = experiment.config.deploy, experiment.config.scenarios[0]
     start = experiment.references[scenario].drive_start
     runs = {}
     if wanted.laps:
         way_m = wanted.laps * experiment.paths[scenario].length_m
         ticks = round(way_m / experiment.car.speed_mps / experiment.config.dt_s)
-        runs["laps"] = LiveRun(f"{victim}_laps", victim, scenario, start, ticks=ticks)
+        runs["laps"] = LiveRun("laps", HARDENED, scenario, start, ticks=ticks)
     if wanted.empty_scene:
-        runs["empty"] = LiveRun(f"{victim}_empty", victim, scenario, start, empty=True)
+        runs["empty"] = LiveRun("empty", HARDENED, scenario, start, empty=True)
     return runs
 
 
-def run_extras(experiment: Experiment, victim: str, folder: Path, tell: Callable[..., None]) -> None:
-    """Drive the runs of `extra_runs` that are not driven yet."""
-    for live in extra_runs(experiment, victim).values():
-        tell(0.0, live.name)
-        drive_until_it_counts(experiment, live, folder, partial(tell, 0.0))
+def run(experiment: Experiment, folder: Path, report: Report) -> None:
+    """Stage live: drive the runs of `extra_runs` that are not driven yet."""
+    runs = extra_runs(experiment)
+    for index, live in enumerate(runs.values()):
+        report(index / len(runs), live.name)
+        drive_until_it_counts(experiment, live, folder, partial(report, index / len(runs)))
 
 
 def live_overrides(experiment: Experiment, live: LiveRun) -> list[str]:

@@ -21,10 +21,11 @@ from advnerf_core.report.conditions import NONE
 from advnerf_core.report.page import write_report
 from advnerf_core.report.results import read_results
 from nodes.experiment import films, memory
-from nodes.experiment.attack import attack_path, cells
+from nodes.experiment.attack import ATTACK, SEARCHED, cells, frozen_hashes
 from nodes.experiment.cell import Cell
 from nodes.experiment.context import Experiment
-from nodes.experiment.deploy import drives_file
+from nodes.experiment.deploy import DRIVES
+from nodes.experiment.keys import driven_folder
 from nodes.experiment.live import extra_runs, lab_of
 from nodes.experiment.policy import HARDENED
 from nodes.experiment.spaces import make_space
@@ -58,8 +59,11 @@ def print_summary(experiment: Experiment, console: Console) -> None:
 def _report_data(
     experiment: Experiment, clips: tuple[rd.Clip, ...], memory_rows: tuple[rd.MemoryRow, ...]
 ) -> rd.ReportData:
-    deployed, extras = experiment.stage_folder("deploy"), extra_runs(experiment, HARDENED)
-    driven = {name: json.loads((deployed / f"{run.name}.json").read_text()) for name, run in extras.items()}
+    extras = experiment.stage_folder("live")
+    driven = {
+        name: json.loads((extras / f"{run.name}.json").read_text())
+        for name, run in extra_runs(experiment).items()
+    }
     live = {cell: _live_results(experiment, cell) for cell in cells(experiment)}
     measured = [*driven.values(), *(each for found in live.values() for each in found)]
     laps = driven.get("laps")
@@ -147,14 +151,12 @@ def _surrogate_runs(experiment: Experiment) -> Iterator[rd.Run]:
 
 
 def _searched(experiment: Experiment, cell: Cell) -> dict[str, Any]:
-    found: dict[str, Any] = json.loads((experiment.stage_folder("attack") / f"{cell.name}.json").read_text())
+    found: dict[str, Any] = json.loads((driven_folder(experiment, cell) / SEARCHED).read_text())
     return found
 
 
 def _live_results(experiment: Experiment, cell: Cell) -> list[dict[str, Any]]:
-    found: list[dict[str, Any]] = json.loads(
-        drives_file(experiment.stage_folder("deploy"), cell).read_text()
-    )["live"]
+    found: list[dict[str, Any]] = json.loads((driven_folder(experiment, cell) / DRIVES).read_text())["live"]
     return found
 
 
@@ -201,7 +203,7 @@ def _curves(experiment: Experiment) -> Iterator[rd.LossCurve]:
 
 def _textures(experiment: Experiment) -> Iterator[rd.Texture]:
     for cell in _attacked(experiment):
-        attack = load_attack(attack_path(experiment.stage_folder("attack"), cell))
+        attack = load_attack(experiment.cell_folder(cell) / ATTACK)
         naive = "" if cell.victim == HARDENED else f", {cell.victim} victim"
         yield rd.Texture(
             f"{cell.method}, seed {cell.seed}{naive}",
@@ -255,15 +257,16 @@ def _latency(experiment: Experiment, results: list[dict[str, Any]]) -> rd.Latenc
 
 
 def _timings(experiment: Experiment) -> Iterator[rd.StageTiming]:
-    for name in ("capture", "scene", "policy", "object", "attack", "deploy"):
+    for name in ("capture", "scene", "policy", "object", "live"):
         record = read_record(experiment.stage_folder(name))
         if record is not None:
             yield rd.StageTiming(name, record.seconds)
+    results = [experiment.cell_result(cell) for cell in cells(experiment)]
+    yield rd.StageTiming("cells", sum(json.loads(file.read_text())["seconds"] for file in results))
 
 
 def _manifest(experiment: Experiment) -> rd.Manifest:
     manifest = json.loads((experiment.folder / "manifest.json").read_text())
-    frozen = json.loads((experiment.stage_folder("attack") / "frozen.json").read_text())
     machine = {
         "processor": processor_name(),
         "cores": str(len(os.sched_getaffinity(0))),
@@ -274,7 +277,7 @@ def _manifest(experiment: Experiment) -> rd.Manifest:
     return rd.Manifest(
         manifest["command"],
         datetime.now(timezone.utc).isoformat(timespec="seconds"),
-        frozen,
+        frozen_hashes(experiment),
         manifest["versions"],
         machine,
     )

@@ -21,7 +21,7 @@ from advnerf_core.report.palette import DARK, LIGHT, LINE_STYLES, css_variables
 from advnerf_core.report.plots import new_axes, svg
 from advnerf_core.report.tables import Table
 from nodes.experiment import films
-from nodes.experiment.attack import cells
+from nodes.experiment.attack import cells, frozen_hashes
 from nodes.experiment.cell import Cell
 from nodes.experiment.context import Experiment
 from nodes.experiment.policy import HARDENED
@@ -177,10 +177,9 @@ def _fidelity(experiment: Experiment) -> list[Markup]:
 
 def _how(experiment: Experiment) -> list[Markup]:
     manifest = json.loads((experiment.folder / "manifest.json").read_text())
-    frozen = json.loads((experiment.stage_folder("attack") / "frozen.json").read_text())
+    frozen = frozen_hashes(experiment)
     records = {
-        name: read_record(experiment.stage_folder(name))
-        for name in ("capture", "scene", "object", "policy", "attack", "deploy")
+        name: read_record(experiment.stage_folder(name)) for name in ("capture", "scene", "object", "policy")
     }
     times = ", ".join(
         f"{name} {record.seconds:.0f} s" for name, record in records.items() if record is not None

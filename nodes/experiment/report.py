@@ -18,13 +18,13 @@ from advnerf_core.report.conditions import NONE, order_of, style_of
 from advnerf_core.report.tables import Table, spread
 from hardware.worlds.world import World
 from nodes.experiment import films, live_report, page
-from nodes.experiment.attack import cells, load_shown
+from nodes.experiment.attack import cells, load_found, load_shown
 from nodes.experiment.cell import Cell
 from nodes.experiment.context import Experiment
-from nodes.experiment.deployed import DressedScene
+from nodes.experiment.keys import driven_folder
 from nodes.experiment.overview import from_above
 from nodes.experiment.policy import HARDENED
-from nodes.experiment.spaces import make_space
+from nodes.experiment.spaces import dress, make_space, shown_there
 from nodes.runtime.progress import Report
 
 # Where along a drive its objects are shown [m, at 6 m/s]: most of them are in view, some close.
@@ -95,9 +95,7 @@ def print_summary(experiment: Experiment, console: Console) -> None:
 
 def read_cell(experiment: Experiment, cell: Cell) -> dict[str, Any]:
     """A finished cell."""
-    found: dict[str, Any] = json.loads(
-        (experiment.stage_folder("deploy") / f"{cell.name}.cell.json").read_text()
-    )
+    found: dict[str, Any] = json.loads(experiment.cell_result(cell).read_text())
     return found
 
 
@@ -183,14 +181,14 @@ def textures_seen(
     experiment: Experiment, scene: World, space: Space, scenario: str
 ) -> dict[str, NDArray[np.uint8]]:
     """The same views of the driving camera past the plain, random and attacked objects of the first seed, one row each."""
-    searched, seed = experiment.stage_folder("attack"), experiment.config.attack.seeds[0]
+    seed = experiment.config.attack.seeds[0]
     reference = experiment.references[scenario]
     states = [np.array(reference.pose_at(experiment.along_m(at))) for at in _SEEN_AT_M]
     seen = {}
     for method in (NONE, *experiment.config.attack.method_names):
-        shown = load_shown(space, searched, Cell(scenario, HARDENED, method, seed))
-        dressed = DressedScene(scene, experiment.view, shown.objects)
-        seen[method] = np.concatenate(
-            [dressed.camera_image(state, shown.colours) for state in states], axis=1
-        )
+        cell = Cell(scenario, HARDENED, method, seed)
+        folder = driven_folder(experiment, cell)
+        shown = load_shown(space, folder, cell)
+        dressed, colours = dress(experiment, scene, shown), shown_there(shown, load_found(folder, cell))
+        seen[method] = np.concatenate([dressed.camera_image(state, colours) for state in states], axis=1)
     return seen

@@ -31,7 +31,7 @@ from advnerf_core.learning.sources import Seen, steer_with
 from advnerf_core.policies.pilotnet import LoadedPolicy, load_policy
 from hardware.worlds.world import World
 from nodes.experiment import retrain_plot
-from nodes.experiment.attack import attack_problem, load_shown
+from nodes.experiment.attack import attack_problem, freeze, load_shown, surrogate_part
 from nodes.experiment.cell import Cell
 from nodes.experiment.context import Experiment
 from nodes.experiment.deployed import DressedScene
@@ -69,7 +69,9 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
     thetas: list[torch.Tensor] = []
     with experiment.open_world() as scene:
         dressed = DressedScene(scene, experiment.view, placed_objects(experiment))
-        first, old_attacks = _first_attacks(experiment, space, dressed, victim, folder / "round0"), {}
+        told = _part(report, 0.0, 1.0 / (wanted.rounds + 1), "round 0")
+        first = _first_attacks(experiment, space, dressed, victim, folder / "round0", told)
+        old_attacks: dict[str, Any] = {}
         for number in range(wanted.rounds + 1):
             here = folder / f"round{number}"
             told = _part(report, number / (wanted.rounds + 1), 1.0 / (wanted.rounds + 1), f"round {number}")
@@ -132,14 +134,26 @@ def _old_frames(experiment: Experiment) -> list[Frames]:
 
 
 def _first_attacks(
-    experiment: Experiment, space: ColourSpace, dressed: DressedScene, victim: LoadedPolicy, folder: Path
+    experiment: Experiment,
+    space: ColourSpace,
+    dressed: DressedScene,
+    victim: LoadedPolicy,
+    folder: Path,
+    report: Callable[[float, str], None],
 ) -> Found:
-    """What the attack stage found for its first seed."""
-    searched, seed = experiment.stage_folder("attack"), experiment.config.attack.seeds[0]
-    thetas: dict[str, torch.Tensor] = {
-        name: load_shown(space, searched, Cell(name, HARDENED, "gradient", seed)).colours
-        for name in experiment.config.scenarios
-    }
+    """What the gradient's cells of the first seed find; they are searched here if they are not yet."""
+    thetas: dict[str, torch.Tensor] = {}
+    for index, name in enumerate(experiment.config.scenarios):
+        cell = Cell(name, HARDENED, "gradient", experiment.config.attack.seeds[0])
+        at = experiment.cell_folder(cell)
+        freeze(experiment, at)
+
+        def told(part: float, text: str = "", index: int = index, name: str = name) -> None:
+            done = (index + part) / len(experiment.config.scenarios)
+            report(0.4 * done, f"attacking, {name}: {text}")
+
+        surrogate_part(experiment, space, cell, at, told)
+        thetas[name] = load_shown(space, at, cell).colours
     return _judged(experiment, space, dressed, victim, thetas, folder)
 
 

@@ -1,11 +1,10 @@
-"""Runs an experiment: resolves its file, runs its stages, prints the table. Called by ``advnerf experiment``."""
+"""Resolves experiment files, and runs the stages that cells need."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ from rich.console import Console
 
 from advnerf_core.attack.methods import method_digest, method_name
 from advnerf_core.plugins import unknown
-from nodes.experiment import attack, capture, deploy, objects, policy, report, retrain, scene
+from nodes.experiment import capture, live, objects, policy, retrain, scene
 from nodes.experiment.config import ExperimentConfig
 from nodes.experiment.context import Experiment
 from nodes.experiment.live import lab_of
@@ -109,12 +108,11 @@ def _check_places(experiment: Experiment, document: Document) -> None:
     _ = experiment.view
 
 
-def run_experiment(
+def make_ready(
     experiment: Experiment, until: str | None = None, console: Console | None = None
 ) -> dict[str, StageRecord]:
-    """Run the stages that are not there yet, and print the result of a finished experiment."""
-    summarise = partial(report.print_summary, experiment)
-    return run_to_end(experiment, stages_of(experiment), _LIBRARIES, summarise, until, console)
+    """Run the stages that are not there yet: what cells need."""
+    return run_to_end(experiment, stages_of(experiment), _LIBRARIES, until, console)
 
 
 def prepare_victims(experiment: Experiment) -> None:
@@ -124,7 +122,7 @@ def prepare_victims(experiment: Experiment) -> None:
     """
     wanted = experiment.config.retrain
     if wanted is None:
-        run_experiment(experiment, until="policy")
+        make_ready(experiment, until="policy")
         return
     begun = begun_with(stages_of(experiment), experiment.folder, "retrain")
     if begun is not None and policy.victim_file(experiment, policy.RETRAINED).exists():
@@ -132,7 +130,7 @@ def prepare_victims(experiment: Experiment) -> None:
     # Its victim is that of the first round: the others are left to the experiment itself, which goes on from here.
     rounds = 1 if begun is None else begun["retrain"]["rounds"]
     config = experiment.config.model_copy(update={"retrain": wanted.model_copy(update={"rounds": rounds})})
-    run_experiment(replace(experiment, config=config), until="retrain")
+    make_ready(replace(experiment, config=config), until="retrain")
     if not policy.victim_file(experiment, policy.RETRAINED).exists():
         raise ConfigError(
             f"expected a retrained policy in {experiment.stage_folder('retrain')}, got none: no attack reaches retrain.pays_ratio = "
@@ -141,7 +139,7 @@ def prepare_victims(experiment: Experiment) -> None:
 
 
 def stages_of(experiment: Experiment) -> list[Stage]:
-    """The stages with the part of the configuration that each depends on; moving an object keeps capture, scene and object files.
+    """The stages that cells need, with the part of the configuration that each depends on; moving an object keeps capture, scene and object files.
 
     The world must not have been opened for them.
 
@@ -181,9 +179,6 @@ def stages_of(experiment: Experiment) -> list[Stage]:
     # What a screen shows while a scene is photographed, and what policies meet, is part of what is learned.
     shown = ("panel", "resolution", "plain_rgb")
     face = {"face": {name: space[name] for name in shown}} if isinstance(config.space, FaceConfig) else {}
-    deployed: dict[str, Any] = {"deploy": part("deploy")}
-    if config.deploy.live:
-        deployed["graph"] = load_launch(experiment.launch_file).resolved
     driven = {"world": world, "objects": placed, "view": view, **measured}
     stages = [
         stage(
@@ -205,27 +200,24 @@ def stages_of(experiment: Experiment) -> list[Stage]:
             {**driven, **face, "policy": part("policy"), "sigma": config.attack.random_sigma},
             ("capture", "scene", "object"),
         ),
-        stage(
-            "attack", attack, {**driven, "attack": searched, "space": space}, ("scene", "object", "policy")
-        ),
     ]
-    if config.deploy.through != "nothing":
-        stages += [
-            stage("deploy", deploy, {**driven, "space": space, **deployed}, ("object", "policy", "attack")),
-            stage(
-                "report",
-                report,
-                {"attack": searched, **measured},
-                ("capture", "scene", "policy", "attack", "deploy"),
-            ),
-        ]
     if config.retrain is not None:
-        settings = {**driven, "retrain": part("retrain"), "attack": searched}
+        settings = {**driven, "retrain": part("retrain"), "attack": searched, "space": space}
         fewer = [
             {**settings, "retrain": {**settings["retrain"], "rounds": rounds}}
             for rounds in range(1, config.retrain.rounds)
         ]
-        stages.append(stage("retrain", retrain, settings, ("scene", "object", "policy", "attack"), fewer))
+        stages.append(stage("retrain", retrain, settings, ("scene", "object", "policy"), fewer))
+    if config.deploy.live and (config.deploy.laps or config.deploy.empty_scene):
+        graph = load_launch(experiment.launch_file).resolved
+        stages.append(
+            stage(
+                "live",
+                live,
+                {**driven, **face, "deploy": part("deploy"), "graph": graph},
+                ("capture", "policy"),
+            )
+        )
     return stages
 
 

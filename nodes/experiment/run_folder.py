@@ -5,8 +5,7 @@ from __future__ import annotations
 import json
 import platform
 import sys
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -48,17 +47,15 @@ def run_to_end(
     experiment: RunFolder[Any],
     stages: Sequence[Stage],
     libraries: Sequence[str],
-    summarise: Callable[[Console], None],
     until: str | None = None,
     console: Console | None = None,
 ) -> dict[str, StageRecord]:
-    """Run the stages that are not there yet, and say what a finished experiment found.
+    """Run the stages that are not there yet.
 
     Args:
         experiment: The experiment.
         stages: Its stages in order.
         libraries: Whose versions the manifest names, of those that are installed.
-        summarise: Prints the result; called if the stage ``report`` was reached.
         until: Last stage to run; None for all.
         console: Where to print.
 
@@ -66,19 +63,12 @@ def run_to_end(
         ConfigError: The folder has the stages of another experiment, which would be replaced.
     """
     console = console or Console()
-    began = time.monotonic()
     check_until(stages, until)
     _refuse_the_folder_of_another(experiment)
     experiment.folder.mkdir(parents=True, exist_ok=True)
     _write_manifest(experiment, libraries)
     with ProgressDisplay(console) as display:
-        records = run_stages(stages, experiment.folder, display, until)
-    if "report" in records:
-        summarise(console)
-    console.print(
-        f"{experiment.config.name} ({experiment.setting}): {time.monotonic() - began:.0f} s", highlight=False
-    )
-    return records
+        return run_stages(stages, experiment.folder, display, until)
 
 
 def _refuse_the_folder_of_another(experiment: RunFolder[Any]) -> None:

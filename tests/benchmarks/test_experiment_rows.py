@@ -184,4 +184,4 @@ def test_rows_of_gate_and_predictions_come_from_what_was_published(tmp_path):
     ((_, factor, _, _, _, note, command),) = transfer_table.skill_rows(tmp_path, [deployed], "file")
     assert factor == pytest.approx(2.0)  # 1.5 expected, 3 measured
     assert "1 of 1 rightly said to work" in note
-    assert command == "advnerf campaign predict file"
+    assert command == "advnerf predict file"

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, model_validator
 
@@ -14,8 +15,11 @@ from advnerf_core.scene.gate_limits import GateLimits
 from nodes.experiment.cell import Cell
 from nodes.experiment.cell_kind import absolute_kind
 from nodes.experiment.method_names import ConditionReference
-from nodes.runtime.config import load_config
+from nodes.runtime.config import load_config, read_yaml
 from nodes.runtime.errors import ConfigError
+
+if TYPE_CHECKING:
+    from nodes.experiment.context import Experiment
 
 Victim = Literal["hardened", "naive", "retrained"]
 # Names become file names, whose parts are separated by "_" and "."; a scenario may hold "_" as its victim is one of three words.
@@ -100,33 +104,27 @@ class CampaignConfig(_NothingTwice):
 
 @dataclass(frozen=True)
 class Campaign:
-    """A campaign file that was read.
+    """Cells that make one table: those of a campaign file, or of one experiment.
 
     Attributes:
-        config: Its content.
-        file: Where it is.
+        name: Of the campaign or the experiment.
+        file: Where it was read.
         folder: Where its cells go.
+        scenarios: Where each scenario's experiment is, by name.
+        cells: All cells, in the order in which they are run.
+        gate: What a learned scene must reach; None judges none.
     """
 
-    config: CampaignConfig
+    name: str
     file: Path
     folder: Path
-
-    @property
-    def cells(self) -> list[Cell]:
-        """All cells, in the order in which they are run: per scenario and seed, none first, as others are compared with it."""
-        return [
-            Cell.of(name, victim, method, seed, placement)
-            for name, scenario in self.config.scenarios.items()
-            for placement in ("", *scenario.placements)
-            for seed in scenario.seeds or self.config.seeds
-            for victim in scenario.victims or self.config.victims
-            for method in sorted(scenario.methods or self.config.methods, key=_order)
-        ]
+    scenarios: Mapping[str, ScenarioConfig]
+    cells: tuple[Cell, ...]
+    gate: GateLimits | None = None
 
     def scenario(self, cell: Cell) -> ScenarioConfig:
         """The scenario of a cell."""
-        return self.config.scenarios[cell.scenario]
+        return self.scenarios[cell.scenario]
 
     def inside(self, cell: Cell) -> Cell:
         """The cell as its experiment names it."""
@@ -164,8 +162,9 @@ def load_campaign(file: Path, folder: Path | None = None, overrides: tuple[str, 
         ConfigError: With file, line and the valid keys.
     """
     config = load_config(CampaignConfig, file, overrides)
+    where = (folder or config.folder or Path("runs/campaigns") / config.name).resolve()
     campaign = Campaign(
-        config, file.resolve(), (folder or config.folder or Path("runs/campaigns") / config.name).resolve()
+        config.name, file.resolve(), where, config.scenarios, tuple(_cells(config)), config.gate
     )
     for cell in campaign.cells:
         if not campaign.experiment_file(cell).is_file():
@@ -174,6 +173,47 @@ def load_campaign(file: Path, folder: Path | None = None, overrides: tuple[str, 
                 "not there; the path is relative to the campaign file"
             )
     return campaign
+
+
+def is_campaign(file: Path) -> bool:
+    """Whether a file lists several experiments; else it is one."""
+    data = read_yaml(file).data
+    return isinstance(data, dict) and isinstance(data.get("scenarios"), dict)
+
+
+def campaign_of(experiment: Experiment, overrides: Sequence[str], cells: Sequence[Cell]) -> Campaign:
+    """The cells of one experiment, in its own run folder.
+
+    Args:
+        experiment: The experiment.
+        overrides: ``key=value`` texts with which it was read.
+        cells: Its cells.
+    """
+    scenario = ScenarioConfig(
+        experiment=experiment.file,
+        setting=experiment.setting,
+        run_folder=experiment.folder,
+        set=tuple(overrides),
+    )
+    scenarios = dict.fromkeys(experiment.config.scenarios, scenario)
+    return Campaign(
+        experiment.config.name,
+        experiment.file,
+        experiment.folder,
+        scenarios,
+        tuple(cells),
+        experiment.config.gate,
+    )
+
+
+def _cells(config: CampaignConfig) -> Iterator[Cell]:
+    """Per scenario and seed, none first, as others are compared with it."""
+    for name, scenario in config.scenarios.items():
+        for placement in ("", *scenario.placements):
+            for seed in scenario.seeds or config.seeds:
+                for victim in scenario.victims or config.victims:
+                    for method in sorted(scenario.methods or config.methods, key=_order):
+                        yield Cell.of(name, victim, method, seed, placement)
 
 
 def _order(method: str) -> tuple[int, str]:

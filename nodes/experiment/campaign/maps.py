@@ -42,6 +42,6 @@ def map_cells(campaign: Campaign, cells: Sequence[Cell], number: int) -> list[Pa
     if not pictures:
         raise ConfigError(
             f"expected finished cells that have placed objects (space.kind=places), got none of {len(cells)}; run them first, "
-            "see advnerf campaign status"
+            "see advnerf status"
         )
     return pictures

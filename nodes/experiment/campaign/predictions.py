@@ -29,7 +29,7 @@ def predict_campaign(
 ) -> int:
     """Predict every attacked cell that has been searched and is not predicted yet; returns how many were.
 
-    A prediction needs the finished search (``campaign run --search-only`` makes no more than that) and the drive without attack. It reads
+    A prediction needs the finished search (``advnerf experiment --search-only`` makes no more than that) and the drive without attack. It reads
     no drive with the attack, so it is the same before and after that drive.
     """
     store, made = store_of(campaign), 0

@@ -3,24 +3,28 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import groupby
 from pathlib import Path
 from typing import Any, Literal
 
 import joblib
+from rich.console import Console
 
 from advnerf_core.report.cells import CellResult
 from nodes.experiment.campaign.config import Campaign
 from nodes.experiment.campaign.store import CellStatus, Store, store_of
-from nodes.experiment.campaign.worker import Ended, Job, run_in_process
+from nodes.experiment.campaign.worker import Ended, Job, run_here, run_in_process
 from nodes.experiment.cell import Cell
 from nodes.experiment.cell_kind import load_kind, settings_hash
 from nodes.runtime.errors import ConfigError, RuntimeFault
-from nodes.runtime.progress import Report
+from nodes.runtime.progress import ProgressDisplay, Report
 
 Backend = Literal["local", "ray"]
 Say = Callable[[str], None]
+# Where cells are kept with the code.
+PUBLISHED = Path("docs/results")
 # How often cells are handed out again after a whole machine of a cluster was lost.
 _ROUNDS = 3
 
@@ -37,6 +41,8 @@ class Options:
         retry: Also run cells that failed before.
         gate: Whether scenarios whose surrogate the fidelity gate refuses are left out; else it is only told.
         search_only: Search, and deploy nothing: for predictions before the drives, or to choose what is worth one.
+        here: One cell after another in this process, which starts none and shares what cells of one experiment have in common.
+        ready: What cells need is there already.
     """
 
     jobs: int = 0
@@ -46,6 +52,8 @@ class Options:
     retry: bool = False
     gate: bool = True
     search_only: bool = False
+    here: bool = False
+    ready: bool = False
 
 
 @dataclass(frozen=True)
@@ -109,7 +117,19 @@ def statuses(campaign: Campaign, cells: Sequence[Cell]) -> list[CellStatus]:
     """Where every cell is; one whose experiment cannot be read, as it is not made yet, is missing."""
     store = store_of(campaign)
     experiments: dict[tuple[str, str], Any] = {}
-    return [store.status(cell, hash_as_it_is(campaign, cell, experiments)) for cell in cells]
+    return [
+        store.status(cell, hash_as_it_is(campaign, cell, experiments), elsewhere(campaign, cell))
+        for cell in cells
+    ]
+
+
+def elsewhere(campaign: Campaign, cell: Cell) -> list[Path]:
+    """Files where a cell may be besides the campaign's own folder: in the run folder of its experiment, and where cells are kept with the code."""
+    run = campaign.run_folder(cell)
+    return [
+        *([run / "cells" / f"{campaign.inside(cell).name}.json"] if run != campaign.folder else []),
+        PUBLISHED / campaign.name / f"{cell.name}.json",
+    ]
 
 
 def hash_as_it_is(campaign: Campaign, cell: Cell, experiments: dict[tuple[str, str], Any]) -> str | None:
@@ -131,7 +151,14 @@ def hash_as_it_is(campaign: Campaign, cell: Cell, experiments: dict[tuple[str, s
         return None
 
 
-def run_campaign(campaign: Campaign, cells: Sequence[Cell], options: Options, say: Say) -> list[Ended]:
+def run_campaign(
+    campaign: Campaign,
+    cells: Sequence[Cell],
+    options: Options,
+    say: Say,
+    experiments: dict[tuple[str, str], Any] | None = None,
+    console: Console | None = None,
+) -> list[Ended]:
     """Run the cells that are not there yet.
 
     Args:
@@ -139,6 +166,8 @@ def run_campaign(campaign: Campaign, cells: Sequence[Cell], options: Options, sa
         cells: Those of its cells that are wanted.
         options: Over what, and how many at a time.
         say: Told of every start and end.
+        experiments: As of `plan_cells`.
+        console: Where the progress of cells in this process is shown.
 
     Returns:
         How every cell that was run ended, in the order of their ends.
@@ -146,19 +175,29 @@ def run_campaign(campaign: Campaign, cells: Sequence[Cell], options: Options, sa
     Raises:
         ConfigError: An experiment or a kind of scenario is wrong; nothing was run.
     """
-    store = store_of(campaign)
-    _prepare(campaign, cells, say)
+    store, experiments = store_of(campaign), {} if experiments is None else experiments
+    if not options.ready:
+        _prepare(campaign, cells, say)
     # Before the gate, so that a cell that there cannot be is told first.
-    plan = plan_cells(campaign, cells)
+    plan = plan_cells(campaign, cells, experiments)
     judged = _past_the_gate(campaign, cells, options, say)
-    wanted = [each for each in plan if each.cell in judged and _is_wanted(store, each, options, say)]
+    wanted = [
+        each
+        for each in plan
+        if each.cell in judged and _is_wanted(store, each, elsewhere(campaign, each.cell), options, say)
+    ]
     if not wanted:
-        there = sum(store.status(each.cell, each.job.settings_hash).state == "done" for each in plan)
+        there = sum(
+            store.status(each.cell, each.job.settings_hash, elsewhere(campaign, each.cell)).state == "done"
+            for each in plan
+        )
         say(
             f"nothing to do: {'every cell is' if there == len(plan) else f'{there} of {len(plan)} cells are'} there"
         )
         return []
     _require_positive(options)
+    if options.here:
+        return _run_here(store, wanted, experiments, options, say, console)
     jobs, threads = _shares(options)
     if options.search_only:
         return _search(wanted, jobs, threads, options, say)
@@ -177,6 +216,31 @@ def run_campaign(campaign: Campaign, cells: Sequence[Cell], options: Options, sa
             ended.append(_tell(run_in_process(replace(each.job, threads=_cores())), say))
     # Their drives without attack are there now.
     _past_the_gate(campaign, [each.cell for each in wanted if each.live], options, say)
+    return ended
+
+
+def _run_here(
+    store: Store,
+    wanted: Sequence[Planned],
+    experiments: Mapping[tuple[str, str], Any],
+    options: Options,
+    say: Say,
+    console: Console | None,
+) -> list[Ended]:
+    """One cell after another in this process; those of one experiment share what it opens."""
+    ended, display = [], ProgressDisplay(console)
+    kinds = {each.job.kind: load_kind(each.job.kind) for each in wanted}
+    for (kind_name, key), group in groupby(
+        wanted, lambda each: (each.job.kind, (each.cell.scenario, each.cell.placement))
+    ):
+        kind, experiment = kinds[kind_name], experiments[key]
+        with display, kind.hold(experiment):
+            for each in group:
+                job = replace(each.job, threads=_cores(), phase="search" if options.search_only else "whole")
+                ended.append(run_here(job, store, kind, experiment, display))
+    for end in ended:
+        if end.how != "done":
+            say(f"{end.name}: {end.how}: {end.text}")
     return ended
 
 
@@ -251,11 +315,11 @@ def _judge(campaign: Campaign, cell: Cell, options: Options, say: Say) -> bool:
     """Whether the cells of this one's scenario and victim may be run: by held-out views, and by a drive without attack where there is one."""
     scenario = campaign.scenario(cell)
     kind, key = load_kind(campaign.kind(cell)), gate_key(cell)
-    if not kind.judges(_experiment(campaign, cell)):
+    limits = scenario.gate or campaign.gate
+    if limits is None or not kind.judges(_experiment(campaign, cell)):
         return True
     from nodes.experiment.campaign.gate import cached_verdict  # loads torch
 
-    limits = scenario.gate or campaign.config.gate
     first = min(each.seed for each in campaign.cells if gate_key(each) == key)
     without = replace(cell.clean, seed=first)
     which = (kind, _experiment(campaign, cell), campaign.inside(without), limits)
@@ -295,8 +359,8 @@ class _PrintedReport(Report):
             self._say(f"  {100 * fraction:.0f} % {text}")
 
 
-def _is_wanted(store: Store, each: Planned, options: Options, say: Say) -> bool:
-    status = store.status(each.cell, each.job.settings_hash)
+def _is_wanted(store: Store, each: Planned, elsewhere: Sequence[Path], options: Options, say: Say) -> bool:
+    status = store.status(each.cell, each.job.settings_hash, elsewhere)
     if status.state == "failed" and not options.retry:
         say(f"{each.cell.name}: failed before, not run again without --retry: {status.text}")
         return False
@@ -325,7 +389,7 @@ def _run_on_ray(jobs: list[Job], at_a_time: int, options: Options, say: Say) -> 
     from nodes.experiment.campaign.cluster import collect_on_ray, ray_session
 
     with ray_session(options.address, at_a_time or _cores()) as cores:
-        say(f"Ray cluster with {cores} cores; advnerf campaign status tells how far it is")
+        say(f"Ray cluster with {cores} cores; advnerf status tells how far it is")
         at_a_time = at_a_time or max(1, cores // (options.threads or 1))
         ended: list[Ended] = []
         left = jobs

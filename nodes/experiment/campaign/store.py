@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
@@ -94,12 +95,13 @@ class Store:
         """Whether what is in the cell's folder is of these settings."""
         return self._begun_with(name) == settings_hash
 
-    def status(self, cell: Cell, settings_hash: str | None) -> CellStatus:
+    def status(self, cell: Cell, settings_hash: str | None, elsewhere: Sequence[Path] = ()) -> CellStatus:
         """Where a cell is.
 
         Args:
             cell: Which.
             settings_hash: Of the settings as they are; None if they cannot be known yet, as what the cell needs is not made.
+            elsewhere: Files where this cell may be too: one whose key matches is done, wherever it was run.
         """
         name = cell.name
         if self._is_held(name):
@@ -110,6 +112,9 @@ class Store:
             return CellStatus(cell, "unreadable", str(broken))
         if result is not None and settings_hash is not None and result.settings_hash == settings_hash:
             return CellStatus(cell, "done", "", result)
+        if settings_hash is not None and (found := _first_of(elsewhere, settings_hash)) is not None:
+            file, other = found
+            return CellStatus(cell, "done", f"from {file}", _named(other, cell))
         if settings_hash is not None and (error := self.error(name, settings_hash)):
             return CellStatus(cell, "failed", error, result)
         if result is not None:
@@ -140,6 +145,23 @@ class Store:
         except OSError:
             return ""
         return lines[-1][:200] if lines else ""
+
+
+def _first_of(files: Sequence[Path], settings_hash: str) -> tuple[Path, CellResult] | None:
+    """The first readable result of these settings."""
+    for file in files:
+        try:
+            result = read_cell(file)
+        except CellError:
+            continue
+        if result.settings_hash == settings_hash:
+            return file, result
+    return None
+
+
+def _named(result: CellResult, cell: Cell) -> CellResult:
+    """A result under the name that it has here: a campaign may call a path otherwise than its experiment."""
+    return result.model_copy(update={"scenario": cell.scenario, "placement": cell.placement})
 
 
 def store_of(campaign: Campaign) -> Store:

@@ -22,7 +22,7 @@ def wanted_rows(campaign: Campaign, cells: Sequence[Cell]) -> list[Wanted]:
     for cell in cells:
         seeds.setdefault((cell.scenario, cell.placement, cell.victim, cell.method), []).append(cell.seed)
     # By victim before method: the reader compares the methods on one victim.
-    order = sorted(seeds, key=lambda key: (list(campaign.config.scenarios).index(key[0]), key[1]))
+    order = sorted(seeds, key=lambda key: (list(campaign.scenarios).index(key[0]), key[1]))
     return [Wanted(*key, tuple(seeds[key])) for key in order]
 
 
@@ -34,7 +34,7 @@ def campaign_table(campaign: Campaign, found: Sequence[CellStatus]) -> TransferT
         found: Where the cells are that the table is of; only results of the settings as they are now are taken.
     """
     cells = [each.result for each in found if each.result is not None and each.state == "done"]
-    return make_table(wanted_rows(campaign, [each.cell for each in found]), cells, campaign.config.name)
+    return make_table(wanted_rows(campaign, [each.cell for each in found]), cells, campaign.name)
 
 
 def write_table(

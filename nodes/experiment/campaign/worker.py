@@ -29,6 +29,7 @@ from nodes.experiment.stages import stage_digests
 from nodes.runtime.errors import RuntimeFault
 from nodes.runtime.locks import HeldError, hold
 from nodes.runtime.machine import machine_name
+from nodes.runtime.progress import Display, Report
 from nodes.runtime.termination import ends_in_order
 
 Phase = Literal["search", "whole"]
@@ -156,6 +157,28 @@ def run_in_process(job: Job) -> Ended:
     return Ended(job.name, "failed", said, seconds)
 
 
+def run_here(job: Job, store: Store, kind: CellKind, experiment: Any, display: Display) -> Ended:
+    """Run a cell in this process; what ends it by an error is kept, and other cells go on."""
+    began = time.monotonic()
+    store.lock_file(job.name).parent.mkdir(parents=True, exist_ok=True)
+    try:
+        lock = hold(store.lock_file(job.name))
+    except HeldError as held:
+        return Ended(job.name, "elsewhere", f"{job.name} is being run by process {held.owner}", 0.0)
+    with lock:
+        work, report = store.begin(job.name, job.settings_hash), display.start(job.name)
+        try:
+            _run(job, store, work, kind, experiment, report)
+        except Exception as error:
+            text = f"{type(error).__name__}: {' '.join(str(error).split())}"
+            store.keep_error(job.name, job.settings_hash, text)
+            (work / LOG).write_text(traceback.format_exc(), encoding="utf-8")
+            return Ended(job.name, "failed", text, time.monotonic() - began)
+    seconds = time.monotonic() - began
+    display.finish(job.name, seconds, cached=False)
+    return Ended(job.name, "done", "", seconds)
+
+
 def main() -> None:
     """Run the job on stdin."""
     with ends_in_order():
@@ -173,7 +196,7 @@ def _run_job() -> None:
         with open(work / LOG, "a", encoding="utf-8", buffering=1) as log:
             os.dup2(log.fileno(), 1)
             try:
-                _run(job, store, work, kind, experiment)
+                _run(job, store, work, kind, experiment, _log_progress())
             except Exception as error:
                 traceback.print_exc(file=log)
                 store.keep_error(
@@ -213,18 +236,14 @@ def _checked(job: Job, store: Store) -> tuple[CellKind, Any]:
     return kind, experiment
 
 
-def _run(job: Job, store: Store, work: Path, kind: CellKind, experiment: Any) -> None:
+def _run(job: Job, store: Store, work: Path, kind: CellKind, experiment: Any, report: Report) -> None:
     began = time.monotonic()
-    report = _log_progress()
     if job.phase == "search":
-        if kind.finished(experiment, job.cell) is None:
-            kind.search(experiment, job.cell, work, report)
+        kind.search(experiment, job.cell, work, report)
         _add_seconds(work, time.monotonic() - began)
         return
-    found = kind.finished(experiment, job.cell)
-    if found is None:
-        with _alone(kind, experiment):
-            found = kind.run(experiment, job.cell, work, report)
+    with _alone(kind, experiment):
+        found = kind.run(experiment, job.cell, work, report)
     ours = {
         "scenario": job.shown_scenario,
         "placement": job.placement,

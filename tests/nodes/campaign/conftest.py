@@ -171,7 +171,7 @@ class Bench:
         return {**os.environ, "PYTHONPATH": path}
 
     def start(self, *arguments):
-        command = [sys.executable, "-m", "nodes.cli", "campaign", *arguments]
+        command = [sys.executable, "-m", "nodes.cli", *arguments]
         return subprocess.Popen(
             command, env=self.environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
         )

@@ -9,8 +9,7 @@ from typer.testing import CliRunner
 
 from nodes.cli.main import app
 from nodes.experiment.campaign.config import load_campaign
-from nodes.experiment.campaign.predictions import prediction_file
-from nodes.experiment.campaign.published import Published, publish, published_table, restore
+from nodes.experiment.campaign.published import Published, publish, published_table
 from nodes.experiment.campaign.run import Options, plan_cells, run_campaign, statuses
 from nodes.experiment.campaign.table import campaign_table, write_table
 from nodes.experiment.cell import select
@@ -38,8 +37,8 @@ def put(plan, folder, settings_hash=None):
     (folder / f"{cell.name}.json").write_text(json.dumps(data))
 
 
-def campaign_command(*arguments):
-    done = CliRunner().invoke(app, ["campaign", *map(str, arguments)])
+def command(*arguments):
+    done = CliRunner().invoke(app, [*map(str, arguments)])
     assert done.exit_code == 0, done.output
     return done.output
 
@@ -78,8 +77,8 @@ def test_a_table_and_published_cells_from_finished_cells(here, tmp_path):
         "straight", "hardened", "none", "deployed"
     )
     assert row.ratio == 3.0
-    assert set(row.seeds) | set(row.missing) == set(campaign.config.seeds)
-    with pytest.raises(ConfigError, match="advnerf campaign publish"):
+    assert set(row.seeds) | set(row.missing) == {0, 1}
+    with pytest.raises(ConfigError, match="advnerf publish"):
         published_table(tmp_path / "nowhere", campaign)
     # A cell that other settings have made goes when it is asked for, unless it is not the one that is here; one that was never begun here stays.
     changed, missing = next(each for each in found if each.state == "changed").cell.name, found[-1].cell.name
@@ -103,9 +102,10 @@ def test_a_table_and_published_cells_from_finished_cells(here, tmp_path):
     ]
 
 
-def test_a_lost_folder_comes_back_from_what_was_published(here, tmp_path):
-    """In real processes: a cell says of which scene and policy it is, and what was taken back is not run again."""
-    kept, only = tmp_path / "kept", ("--only", "seed=0")
+def test_a_published_cell_whose_key_matches_is_done_on_any_machine(here, tmp_path, monkeypatch):
+    """In real processes: nothing is restored; a machine that has only the repository goes on where another stopped."""
+    monkeypatch.chdir(tmp_path)
+    kept, only = tmp_path / "docs" / "results", ("--only", "seed=0")
     for stage, digest in (("capture", "c1"), ("policy", "p1"), ("report", "r1")):
         folder = here.folder / "run" / stage
         folder.mkdir(parents=True)
@@ -117,45 +117,39 @@ def test_a_lost_folder_comes_back_from_what_was_published(here, tmp_path):
         "done",
     ]
     first, second = (here.cells / f"{cell.name}.json" for cell in cells)
-    before = first.read_bytes()
-    assert json.loads(before)["stages"] == {"capture": "c1", "policy": "p1"}
-    assert "2 cells written" in campaign_command("publish", here.file, "--to", kept, *only)
+    assert json.loads(first.read_bytes())["stages"] == {"capture": "c1", "policy": "p1"}
+    assert "2 cells written" in command("publish", here.file, *only)
     shutil.rmtree(here.cells)
-    said = campaign_command("table", here.file, "--from", kept, *only)
-    assert "2 of 2 cells; -o FOLDER writes a page of them" in said
-    said = campaign_command("table", here.file, "--from", kept, "-o", tmp_path / "page")
+    assert "2 of 2 cells" in command("table", here.file, *only)
+    assert "2 of 2 cells" in command("table", here.file, "--from", kept, *only)
+    said = command("page", here.file, "-o", tmp_path / "page")
     assert f"2 of 4 cells; page: {tmp_path / 'page' / 'index.html'}" in said.replace("\n", "")
     rows = list(csv.DictReader((tmp_path / "page" / "table.csv").open()))
     (attacked,) = [row for row in rows if (row["method"], row["domain"]) == ("gradient", "deployed")]
     assert float(attacked["ratio"]) == 3.0
-    assert not (here.folder / "table").exists()  # that of the campaign's own cells
-    (kept / "toy" / second.name).unlink()
-
-    said = campaign_command("restore", here.file, "--from", kept, *only)
-    assert "1 cells taken back, 0 were there, 0 were made with other settings" in said
-    assert "1 are not published" in said
-    assert first.read_bytes() == before
+    assert not (here.folder / "table").exists()  # the page of all cells of this file
+    assert run_campaign(campaign, cells, Options(jobs=2), lambda text: None) == []
+    assert {each.text for each in statuses(campaign, cells)} == {
+        f"from {file.relative_to(tmp_path)}"
+        for file in (kept / "toy" / first.name, kept / "toy" / second.name)
+    }
+    # Nor is one of other settings taken, or one that cannot be read.
+    (kept / "toy" / second.name).write_text("{")
+    (here.folder / "toy.experiment.yaml").write_text("base: 2.0\nother: 1\n")
+    assert [each.state for each in statuses(campaign, cells)] == ["missing", "missing"]
+    (here.folder / "toy.experiment.yaml").write_text("base: 2.0\n")
     ended = run_campaign(campaign, cells, Options(jobs=2), lambda text: None)
     assert [end.name for end in ended] == [second.stem]
-    assert "0 cells taken back, 2 were there" in campaign_command("restore", here.file, "--from", kept, *only)
 
 
-def test_predictions_come_back_and_what_other_settings_made_does_not(here, tmp_path):
-    kept, campaign = tmp_path / "kept", load_campaign(here.file)
+def test_a_cell_that_its_experiment_has_run_is_done_for_a_campaign_too(here):
+    campaign = load_campaign(here.file)
     plan = plan_cells(campaign, campaign.cells)
-    for each in plan[:2]:
-        put(each, kept / "toy")
-    keys = ("ratio", "ratio_low", "ratio_high", "retained", "total_cte_m")
-    prediction = {"settings_hash": plan[0].job.settings_hash, **dict.fromkeys(keys, 1.5), "clean_drive": {}}
-    for each in plan[:2]:  # that of the second cell is of other settings than the cell
-        prediction_file(kept / "toy", each.cell.name).parent.mkdir(exist_ok=True)
-        prediction_file(kept / "toy", each.cell.name).write_text(json.dumps(prediction))
-    settings = (here.folder / "toy.experiment.yaml").read_text()
-    (here.folder / "toy.experiment.yaml").write_text("base: 5.0\n")
-    found = restore(campaign, campaign.cells, kept)
-    assert (len(found.other), len(found.missing), len(found.taken)) == (2, 2, 0)
-    assert {each.state for each in statuses(campaign, campaign.cells)} == {"missing"}
-    (here.folder / "toy.experiment.yaml").write_text(settings)
-    assert restore(campaign, campaign.cells, kept).taken == (plan[0].cell.name, plan[1].cell.name)
-    assert json.loads(prediction_file(here.folder, plan[0].cell.name).read_text()) == prediction
-    assert not prediction_file(here.folder, plan[1].cell.name).exists()
+    put(plan[0], here.folder / "run" / "cells")
+    put(plan[1], here.folder / "run" / "cells", "of before")
+    assert [each.state for each in statuses(campaign, campaign.cells)] == [
+        "done",
+        "missing",
+        "missing",
+        "missing",
+    ]

@@ -92,7 +92,7 @@ def test_a_killed_campaign_takes_its_workers_along_and_goes_on(here):
 def test_failed_cells_say_why_and_are_retried_when_asked(here):
     here.write("seeds: [0, 1]\nmethods: [none, cem]\nvictims: [hardened]\n")
     (here.folder / "fail").touch()
-    code, out, err = here.call("run", str(here.file), "--jobs", "2")
+    code, out, err = here.call("experiment", str(here.file), "--jobs", "2")
     assert code == 1
     assert "straight_hardened_cem_0: RuntimeError: the search came to nothing" in err
     code, out, _ = here.call("status", str(here.file))
@@ -136,12 +136,12 @@ def test_a_ray_cluster_of_several_workers_runs_the_cells(here):
         for _ in range(2):
             cluster.add_node(num_cpus=1)
         cluster.wait_for_nodes()
-        code, out, err = here.call("run", str(here.file), "--backend", "ray", "--address", cluster.address)
+        code, out, err = here.call("experiment", str(here.file), "--cluster", cluster.address)
         assert code == 0, err
         assert "Ray cluster with 2 cores" in out
         assert set(states(here).values()) == {"done"}
         assert len(here.begun()) == 4
-        code, out, _ = here.call("run", str(here.file), "--backend", "ray", "--address", cluster.address)
+        code, out, _ = here.call("experiment", str(here.file), "--cluster", cluster.address)
         assert "nothing to do" in out
     finally:
         cluster.shutdown()
@@ -149,7 +149,7 @@ def test_a_ray_cluster_of_several_workers_runs_the_cells(here):
 
 @pytest.mark.slow
 def test_no_cluster_is_one_clear_error(here):
-    code, _, err = here.call("run", str(here.file), "--backend", "ray", "--address", "127.0.0.1:1")
+    code, _, err = here.call("experiment", str(here.file), "--cluster", "127.0.0.1:1")
     assert code == 2
     assert "expected a Ray cluster at 127.0.0.1:1" in err
     assert "ray start --head" in err
@@ -159,7 +159,7 @@ def test_no_cluster_is_one_clear_error(here):
 def start_hanging(bench, jobs=1):
     """The campaign's process, and the pid of the worker that hangs in the gradient cell of seed 0."""
     (bench.folder / "hang").touch()
-    process = bench.start("run", str(bench.file), "--jobs", str(jobs))
+    process = bench.start("experiment", str(bench.file), "--jobs", str(jobs))
     return process, pid_of(bench, "straight_hardened_gradient_0")
 
 

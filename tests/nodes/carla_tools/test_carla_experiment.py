@@ -10,7 +10,8 @@ from advnerf_core.data.dataset import load_transforms
 from advnerf_core.report.clips import read_clip
 from nodes.experiment.cell import Cell
 from nodes.experiment.cell_kind import load_kind, settings_hash
-from nodes.experiment.run import load_experiment, run_experiment
+from nodes.experiment.run import load_experiment
+from nodes.experiment.whole import run_experiment
 from nodes.runtime.errors import ConfigError
 
 TINY = {
@@ -52,9 +53,9 @@ def test_every_stage_runs_against_a_server_and_leaves_it_as_it_was(as_carla, fil
     assert kept["off_track_m"] == experiment.world.off_track_m == pytest.approx(1.75)
     assert kept["facts"]["junction_id"] == 100
     assert len(load_transforms(run / "capture" / "photos", require_all=True).frames) == 6
-    cell = json.loads((run / "deploy" / "right_hardened_gradient_0.cell.json").read_text())
+    cell = json.loads((run / "cells" / "right_hardened_gradient_0.json").read_text())
     driven = np.array(
-        json.loads((run / "deploy" / "right_hardened_gradient_0.drives.json").read_text())["states"][0]
+        json.loads((run / "cells" / "right_hardened_gradient_0" / "drives.json").read_text())["states"][0]
     )
     cte_m = experiment.paths["right"].project(driven[1:, :2]).cte_m
     assert cell["deployed"]["total_cte_m"] == pytest.approx([np.abs(cte_m).sum()])

@@ -56,7 +56,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Experiment:
             (-60.0, -60.0, -1.0), (60.0, 60.0, 36.0), HashGridConfig(levels=8, features=4, log2_entries=8)
         )
     )
-    for stage in ("scene", "object", "policy", "attack", "deploy"):
+    for stage in ("scene", "object", "policy", "cells"):
         experiment.stage_folder(stage).mkdir(parents=True)
     save_scene(scene_file(experiment), field, np.zeros((16, 16, 5), dtype=bool))
     for kind in ("small_car", "hydrant"):

@@ -17,10 +17,11 @@ from nodes.experiment import attack, page, report, run
 from nodes.experiment.attack import cells, load_shown, surrogate_part
 from nodes.experiment.cell import Cell
 from nodes.experiment.cell_kind import load_kind, settings_hash
-from nodes.experiment.cells import CellError, run_cell
+from nodes.experiment.cells import run_cell
 from nodes.experiment.context import Experiment
-from nodes.experiment.deploy import FrozenChangedError, ThroughWorld, check_frozen, deployed_part
+from nodes.experiment.deploy import DRIVES, ThroughWorld, cell_data
 from nodes.experiment.films import film_cell
+from nodes.experiment.keys import CellError, clean_folder
 from nodes.experiment.policy import NAIVE, victim_file
 from nodes.experiment.spaces import colour_space
 from tests.support.strangers import spiral_code, spiral_theta, write_spiral
@@ -41,6 +42,18 @@ def fresh(trained: Experiment, tmp_path: Path) -> Experiment:
     return replace(trained, folder=folder)
 
 
+def finished(experiment: Experiment, scene: Any, cell: Cell) -> dict[str, Any]:
+    """A cell in the experiment's own folder, but for its film, in a scene of the test's."""
+    folder, space = experiment.cell_folder(cell), colour_space(experiment)
+    clean = clean_folder(experiment, cell, folder)
+    surrogate_part(experiment, space, cell.clean, clean, silent)
+    at = clean if cell.method == "none" else folder
+    surrogate_part(experiment, space, cell, at, silent)
+    data = cell_data(experiment, space, ThroughWorld(experiment, scene), cell, at, clean, print)
+    experiment.cell_result(cell).write_text(json.dumps(data))
+    return data
+
+
 def test_cells_are_all_methods_of_all_drives(trained: Experiment) -> None:
     names = [cell.name for cell in cells(trained)]
     assert len(set(names)) == len(names) == 2 * 3 * 4  # victims, drives, none and three methods
@@ -57,24 +70,25 @@ def test_cells_are_all_methods_of_all_drives(trained: Experiment) -> None:
 
 @pytest.mark.parametrize("method", ["gradient", "random", "cem"])
 def test_search_is_kept_and_its_file_brings_the_colours_back(fresh: Experiment, method: str) -> None:
-    folder, cell = fresh.stage_folder("attack"), replace(GRADIENT, method=method)
+    cell = replace(GRADIENT, method=method)
+    folder = fresh.cell_folder(cell)
     space = colour_space(fresh)
     found = surrogate_part(fresh, space, cell, folder, silent)
     assert len(found["curve_total_cte_m"]) == 2
     assert found["total_cte_m"][0] == pytest.approx(
         max(found["curve_total_cte_m"])
     )  # the best evaluation, driven again
-    file = load_attack(attack.attack_path(folder, cell))
+    file = load_attack(folder / attack.ATTACK)
     theta = space.restored(file).colours
     assert theta.shape == space.sensor.theta_shape
     assert [thing.name for thing in file.objects] == [thing.name for thing in fresh.objects]
     assert file.attack_id == found["attack_id"]
     moved = (theta - space.plain.colours).abs().max()
     assert moved > (1e-5 if method == "gradient" else 1.0)
-    assert not list(folder.glob("*.state.*"))
+    assert not (folder / "state.safetensors").exists()
     # What is there is not searched again.
     marked = {**found, "seconds": -1.0}
-    (folder / f"{cell.name}.json").write_text(json.dumps(marked))
+    (folder / attack.SEARCHED).write_text(json.dumps(marked))
     assert surrogate_part(fresh, space, cell, folder, silent) == marked
 
 
@@ -86,37 +100,32 @@ def test_a_method_of_a_file_runs_a_cell_and_appears_in_the_tables(
     experiment = run.load_experiment(file, "tiny", changes, fresh.folder)
     names = [f"right_hardened_{method}_0" for method in ("none", "Spiral", "gradient")]
     assert [cell.name for cell in cells(experiment)] == names
-    space, out = colour_space(experiment), experiment.stage_folder("deploy")
+    space = colour_space(experiment)
     for cell in cells(experiment):
-        surrogate_part(experiment, space, cell, out, silent)
-        deployed_part(experiment, space, ThroughWorld(experiment, wall), cell, out, out, print)
+        finished(experiment, wall, cell)
     spiral = cells(experiment)[1]
+    out = experiment.cell_folder(spiral)
     shown = load_shown(space, out, spiral)
     found = shown.colours
     thetas = [spiral_theta(tuple(space.sensor.theta_shape), number) for number in range(2)]
     assert min(float((found - theta).abs().max()) for theta in thetas) < 1e-5
-    assert load_attack(attack.attack_path(out, spiral)).method == "Spiral"
+    assert load_attack(out / attack.ATTACK).method == "Spiral"
     assert film_cell(experiment, wall, space, spiral, out, out).exists()
     table = report.transfer_table(report.rows_of(experiment))
     assert [row[3] for row in table.rows] == 2 * ["no attack", "gradient", "Spiral"]
     assert "Spiral" in page.opening(experiment)
 
     # What its code is decides, not where it lies.
-    def digests() -> tuple[str, Any]:
-        reference = f"{spiral_file}:Spiral"
-        (stage,) = (each for each in run.stages_of(experiment) if each.name == "attack")
-        assert stage.settings["attack"]["methods"] == ["Spiral", "gradient"]
-        return settings_hash(
-            load_kind("experiment"), experiment, Cell.of(*PLACE, reference, 0)
-        ), stage.settings
+    def digest() -> str:
+        return settings_hash(load_kind("experiment"), experiment, Cell.of(*PLACE, f"{spiral_file}:Spiral", 0))
 
-    before = digests()
+    before = digest()
     spiral_file.write_text(spiral_code() + "# changed\n")
-    assert all(now != then for now, then in zip(digests(), before, strict=True))
+    assert digest() != before
 
 
 def test_a_stopped_search_goes_on_and_refuses_another_victim(fresh: Experiment) -> None:
-    folder, space = fresh.stage_folder("attack"), colour_space(fresh)
+    folder, space = fresh.folder / "whole", colour_space(fresh)
     whole = surrogate_part(fresh, space, GRADIENT, folder, silent)
 
     def stop(fraction: float, text: str = "") -> None:
@@ -125,43 +134,38 @@ def test_a_stopped_search_goes_on_and_refuses_another_victim(fresh: Experiment) 
     other = fresh.folder / "again"
     with pytest.raises(KeyboardInterrupt):
         surrogate_part(fresh, space, GRADIENT, other, stop)
-    stopped = (other / f"{GRADIENT.name}.state.safetensors").read_bytes()
+    stopped = (other / "state.safetensors").read_bytes()
     assert surrogate_part(fresh, space, GRADIENT, other, silent)["states"] == whole["states"]
-    naive = replace(GRADIENT, victim=NAIVE)
-    (other / f"{naive.name}.state.safetensors").write_bytes(stopped)
+    naive = fresh.folder / "naive"
+    naive.mkdir()
+    (naive / "state.safetensors").write_bytes(stopped)
     with pytest.raises(SearchStateError, match="other settings"):
-        surrogate_part(fresh, space, naive, other, silent)
+        surrogate_part(fresh, space, replace(GRADIENT, victim=NAIVE), naive, silent)
 
 
 def test_cell_has_both_domains_over_their_own_clean_drive(fresh: Experiment, wall: Any) -> None:
-    folder, space = fresh.stage_folder("attack"), colour_space(fresh)
-    learned = {
-        cell: surrogate_part(fresh, space, cell, folder, silent) for cell in (GRADIENT.clean, GRADIENT)
-    }
-    out = fresh.stage_folder("deploy")
-    cell = deployed_part(fresh, space, ThroughWorld(fresh, wall), GRADIENT, folder, out, print)
-    assert cell["surrogate"]["total_cte_m"] == learned[GRADIENT]["total_cte_m"]
-    assert cell["surrogate"]["none_total_cte_m"] == learned[GRADIENT.clean]["total_cte_m"]
-    driven = np.array(json.loads((out / f"{GRADIENT.name}.drives.json").read_text())["states"][0])
+    cell, folder = finished(fresh, wall, GRADIENT), fresh.cell_folder(GRADIENT)
+    clean = clean_folder(fresh, GRADIENT, folder)
+    learned = {at: json.loads((at / attack.SEARCHED).read_text()) for at in (folder, clean)}
+    assert cell["surrogate"]["total_cte_m"] == learned[folder]["total_cte_m"]
+    assert cell["surrogate"]["none_total_cte_m"] == learned[clean]["total_cte_m"]
+    driven = np.array(json.loads((folder / DRIVES).read_text())["states"][0])
     cte_m = fresh.paths["right"].project(driven[1:, :2]).cte_m
     assert cell["deployed"]["total_cte_m"] == pytest.approx([np.abs(cte_m).sum()])
-    assert (out / f"{GRADIENT.clean.name}.drives.json").exists()
+    assert (clean / DRIVES).exists()
     assert cell["extra"]["blocked_tick"] == [None]
     # Once there, it is not driven again: here it would end where it starts.
     blocking = replace(wall, blocked_beyond_m=-1e3)
-    assert deployed_part(fresh, space, ThroughWorld(fresh, blocking), GRADIENT, folder, out, print) == cell
-    (out / f"{GRADIENT.name}.cell.json").unlink()
-    (out / f"{GRADIENT.name}.drives.json").unlink()
-    held = deployed_part(fresh, space, ThroughWorld(fresh, blocking), GRADIENT, folder, out, print)
+    assert finished(fresh, blocking, GRADIENT) == cell
+    (folder / DRIVES).unlink()
+    held = finished(fresh, blocking, GRADIENT)
     assert held["extra"]["blocked_tick"] == [1]
 
 
 def test_a_cell_is_filmed_frame_by_frame(fresh: Experiment, wall: Any) -> None:
-    folder, space = fresh.stage_folder("attack"), colour_space(fresh)
-    for cell in (GRADIENT.clean, GRADIENT):
-        surrogate_part(fresh, space, cell, folder, silent)
-    deployed_part(fresh, space, ThroughWorld(fresh, wall), GRADIENT, folder, folder, print)
-    with av.open(str(film_cell(fresh, wall, space, GRADIENT, folder, folder))) as film:
+    finished(fresh, wall, GRADIENT)
+    folder = fresh.cell_folder(GRADIENT)
+    with av.open(str(film_cell(fresh, wall, colour_space(fresh), GRADIENT, folder, folder))) as film:
         frames = [frame.to_ndarray(format="rgb24") for frame in film.decode(video=0)]
     assert len(frames) >= fresh.config.horizon
     assert frames[0].std() > 5  # something is to be seen
@@ -175,16 +179,15 @@ def test_unknown_cells_are_refused(trained: Experiment, tmp_path: Path) -> None:
 
 
 def test_another_policy_after_the_attack_is_refused(fresh: Experiment) -> None:
-    frozen = attack.frozen_hashes(fresh)
-    (fresh.stage_folder("attack") / "frozen.json").write_text(json.dumps(frozen))
-    check_frozen(fresh)
+    folder = fresh.cell_folder(GRADIENT)
+    attack.freeze(fresh, folder)
+    attack.check_frozen(fresh, folder)
     shutil.copy(victim_file(fresh, NAIVE), victim_file(fresh, "hardened"))
-    with pytest.raises(FrozenChangedError, match="policy_hardened"):
-        check_frozen(fresh)
+    with pytest.raises(attack.FrozenChangedError, match="policy_hardened"):
+        attack.check_frozen(fresh, folder)
 
 
 def test_table_divides_by_the_clean_drive_of_the_same_domain(fresh: Experiment) -> None:
-    out = fresh.stage_folder("deploy")
     for cell in cells(fresh):
         factor = {"none": 1.0, "random": 1.1, "cem": 1.5, "gradient": 3.0}[cell.method]
         parts = {
@@ -195,7 +198,7 @@ def test_table_divides_by_the_clean_drive_of_the_same_domain(fresh: Experiment) 
             }
             for domain, clean in (("surrogate", 4.0), ("deployed", 6.0))
         }
-        (out / f"{cell.name}.cell.json").write_text(json.dumps({"attack_id": None, **parts}))
+        fresh.cell_result(cell).write_text(json.dumps({"attack_id": None, **parts}))
     rows = report.rows_of(fresh)
     assert len(rows) == 2 * 3 * 2 * 4
     first = [

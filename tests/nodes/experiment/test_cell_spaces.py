@@ -18,13 +18,14 @@ from advnerf_core.objects.mesh.glb import mesh_from_glb
 from advnerf_core.report.cells import cell_from
 from advnerf_core.report.clips import ClipTrack, read_clip
 from nodes.experiment import attack, cells, films, pose_maps, run
-from nodes.experiment.attack import attack_path, surrogate_part
+from nodes.experiment.attack import surrogate_part
 from nodes.experiment.cell import Cell
 from nodes.experiment.cell_kind import load_kind, settings_hash
-from nodes.experiment.cells import CellError, run_cell
+from nodes.experiment.cells import run_cell
 from nodes.experiment.config import RetrainConfig
 from nodes.experiment.context import Experiment
-from nodes.experiment.deploy import ThroughWorld, deployed_part
+from nodes.experiment.deploy import DRIVES, ThroughWorld, cell_data
+from nodes.experiment.keys import CellError
 from nodes.experiment.page import opening
 from nodes.experiment.policy import victim_file
 from nodes.experiment.pose_maps import PoseMapSettings
@@ -66,11 +67,12 @@ def mitsuba() -> None:
 
 
 def whole(experiment: Experiment, scene: Any, cell: Cell, folder: Path) -> dict[str, Any]:
-    """A cell but for its film, in a scene of the test's."""
-    space = make_space(experiment, scene)
-    for each in (cell.clean, cell):
-        surrogate_part(experiment, space, each, folder, silent)
-    return deployed_part(experiment, space, ThroughWorld(experiment, scene), cell, folder, folder, print)
+    """A cell but for its film, in a scene of the test's; its drives without attack are in ``folder / "clean"``."""
+    space, clean = make_space(experiment, scene), folder / "clean"
+    surrogate_part(experiment, space, cell.clean, clean, silent)
+    at = clean if cell.method == "none" else folder
+    surrogate_part(experiment, space, cell, at, silent)
+    return cell_data(experiment, space, ThroughWorld(experiment, scene), cell, at, clean, print)
 
 
 @pytest.mark.usefixtures("mitsuba")
@@ -80,11 +82,11 @@ def test_meshes_are_searched_over_the_pictures_of_the_world(
 ) -> None:
     experiment, cell = searching(trained, space), Cell("straight", "hardened", "gradient", 0)
     data = whole(experiment, wall, cell, tmp_path)
-    result = cell_from(data, "the cell")
+    result = cell_from({**data, "settings_hash": "h", "machine": "m", "date": "d"}, "the cell")
     assert data["extra"]["evaluations"] == experiment.config.attack.evaluations
     assert result.deployed is not None
     assert all(np.isfinite(drives.total_cte_m).all() for drives in (result.surrogate, result.deployed))
-    file = load_attack(attack_path(tmp_path, cell))
+    file = load_attack(tmp_path / attack.ATTACK)
     assert (file.space, file.attack_id) == (space.kind, data["attack_id"])
     plain = mesh_objects(experiment, space)
     for found, before in zip(file.objects, plain, strict=True):
@@ -106,7 +108,7 @@ def test_meshes_are_searched_over_the_pictures_of_the_world(
     )
     _, scores = attack.learned_drives(experiment, there, restored.colours)
     assert [score.total_cte_m for score in scores] == list(result.surrogate.total_cte_m)
-    assert not list(tmp_path.glob("*.state.safetensors"))
+    assert not (tmp_path / "state.safetensors").exists()
 
 
 @pytest.mark.usefixtures("mitsuba")
@@ -125,7 +127,7 @@ def test_places_are_searched_and_the_file_says_where_things_stand(
     experiment, cell = searching(trained, ONE, horizon=4), Cell("right", "hardened", method, 0)
     data = whole(experiment, wall, cell, tmp_path)
     assert data["extra"]["evaluations"] == 1
-    file = load_attack(attack_path(tmp_path, cell))
+    file = load_attack(tmp_path / attack.ATTACK)
     assert file.space == "places"
     hand = np.array([[thing.x_m, thing.y_m] for thing in experiment.objects])
     there = np.array([each.placement[:2] for each in file.objects])
@@ -133,22 +135,14 @@ def test_places_are_searched_and_the_file_says_where_things_stand(
     # The surrogate's own prediction is what is driven again.
     assert file.predicted_total_cte_m is not None
     assert np.mean(data["surrogate"]["total_cte_m"]) == pytest.approx(file.predicted_total_cte_m, rel=1e-6)
-    plain = deployed_part(
-        experiment,
-        make_space(experiment, None),
-        ThroughWorld(experiment, wall),
-        cell.clean,
-        tmp_path,
-        tmp_path,
-        print,
-    )
-    assert plain["deployed"]["total_cte_m"] == data["deployed"]["none_total_cte_m"]
+    plain = json.loads((tmp_path / "clean" / DRIVES).read_text())
+    assert plain["total_cte_m"] == data["deployed"]["none_total_cte_m"]
 
 
 def test_places_alone_keep_the_plain_colours_and_are_filmed(
     trained: Experiment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The simulated junction itself; the colour cell of the same name in the run folder is not taken for it."""
+    """The simulated junction itself."""
     shown = []  # what is filmed, before the codec: x264 gives the same pictures other bytes in one run of ten
 
     def write_clip(file: Path, tracks: list[ClipTrack], *rest: Any) -> Path:
@@ -160,8 +154,6 @@ def test_places_alone_keep_the_plain_colours_and_are_filmed(
     folder = shutil.copytree(trained.folder, tmp_path / "run")
     alone = PlacesConfig(samples=1, steps=1, colours=False)
     experiment = replace(searching(trained, alone), folder=folder)
-    (folder / "deploy" / "right_hardened_random_0.cell.json").write_text("{}")
-    assert load_kind("experiment").finished(experiment, PLACES) is None
     cell = run_cell(experiment, PLACES, tmp_path / "moved", silent)
     plain = run_cell(experiment, Cell("right", "hardened", "none", 0), tmp_path / "plain", silent)
     assert plain["deployed"]["total_cte_m"] == cell["deployed"]["none_total_cte_m"]
@@ -173,14 +165,12 @@ def test_places_alone_keep_the_plain_colours_and_are_filmed(
     moved, plain_drive, again = shown
     np.testing.assert_array_equal(moved.frames, again.frames)  # the same drive
     assert not np.array_equal(moved.frames, plain_drive.frames)
-    own, file = (
-        load_attack(tmp_path / "moved" / "right_hardened_random_0.attack.safetensors") for _ in range(2)
-    )
+    own, file = (load_attack(tmp_path / "moved" / attack.ATTACK) for _ in range(2))
     voxels = make_space(experiment, None)
     assert torch.equal(voxels.restored(own).colours, voxels.plain.colours)
     coloured = searching(experiment, ONE)
     run_cell(coloured, PLACES, tmp_path / "other", silent)
-    other = load_attack(tmp_path / "other" / "right_hardened_random_0.attack.safetensors")
+    other = load_attack(tmp_path / "other" / attack.ATTACK)
     assert [each.placement for each in other.objects] == [
         each.placement for each in file.objects
     ]  # the same draws
@@ -247,7 +237,7 @@ def test_a_defence_that_nothing_asks_for_is_told(
     trained: Experiment, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config = trained.config.model_copy(update={"retrain": RetrainConfig(pays_ratio=9.0)})
-    monkeypatch.setattr(run, "run_experiment", lambda *arguments, **options: {})  # ends as no attack pays
+    monkeypatch.setattr(run, "make_ready", lambda *arguments, **options: {})  # ends as no attack pays
     with pytest.raises(
         ConfigError, match=r"no attack reaches retrain.pays_ratio = 9 .*nothing was retrained"
     ):

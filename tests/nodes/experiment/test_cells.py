@@ -5,8 +5,8 @@ from pathlib import Path
 from advnerf_core.attack.methods import METHODS, load_method, method_name
 from nodes.experiment.attack import search_settings
 from nodes.experiment.cell import Cell
-from nodes.experiment.cells import ExperimentCells, cell_inputs, clean_folder
-from nodes.experiment.deploy import live_name
+from nodes.experiment.cells import ExperimentCells
+from nodes.experiment.keys import cell_inputs, clean_folder
 from nodes.experiment.run import load_experiment
 from tests.support.strangers import write_spiral
 
@@ -25,9 +25,9 @@ def test_methods_of_one_victim_and_seed_share_the_live_drive_without_attack(tmp_
     )
     folders = [clean_folder(experiment, cell, tmp_path / cell.name) for cell in (gradient, none, other)]
     assert folders[0] == folders[1] != folders[2]
-    assert live_name(gradient, 0) != live_name(none, 0)
-    driven_here = room(tmp_path / "run", "deploy.through=world", file="monitor")
-    assert clean_folder(driven_here, gradient, tmp_path / "cell") == tmp_path / "cell"
+    # Of other settings it is another drive.
+    slower = room(tmp_path / "run", "world.car.speed_mps=0.6", file="monitor")
+    assert clean_folder(slower, none, tmp_path / none.name) != folders[0]
 
 
 def test_live_nodes_have_the_machine_for_themselves(tmp_path):

@@ -68,4 +68,3 @@ def test_a_prediction_needs_no_drive_with_the_attack(searched: tuple[Experiment,
     assert len(clean.agreement.real) == experiment.config.horizon
     assert predict_cell(KIND, experiment, WHICH, cell, 2, clean)[0] == found
     assert {path.name for path in cell.iterdir()} == before
-    assert not any(experiment.stage_folder("deploy").iterdir())

@@ -21,10 +21,10 @@ from advnerf_core.policies.pilotnet import load_policy
 from advnerf_core.report.clips import read_clip
 from hardware.worlds.junction.config import DubinsConfig
 from hardware.worlds.world import World
-from nodes.experiment.attack import attack_problem, surrogate_part
+from nodes.experiment.attack import SEARCHED, attack_problem, surrogate_part
 from nodes.experiment.cell import Cell
 from nodes.experiment.context import Experiment
-from nodes.experiment.deploy import ThroughWorld, deployed_part
+from nodes.experiment.deploy import DRIVES, ThroughWorld, cell_data
 from nodes.experiment.deployed import SelfDriving
 from nodes.experiment.films import film_cell, filmed
 from nodes.experiment.objects import placed_objects, surrogate_of
@@ -178,13 +178,13 @@ def test_the_gradient_is_what_a_turn_of_a_hundredth_of_a_second_is_worth(
 @pytest.mark.slow
 def test_search_drive_and_film_in_finer_ticks(trained: Experiment, wall: Any, tmp_path: Path) -> None:
     experiment, cell = finer(trained, 10, tmp_path / "run"), Cell("straight", HARDENED, "gradient", 0)
-    space, folder = colour_space(experiment), experiment.stage_folder("deploy")
-    for each in (cell.clean, cell):
-        found = surrogate_part(experiment, space, each, folder, lambda fraction, text="": None)
+    space, folder, clean = colour_space(experiment), tmp_path / "cell", tmp_path / "clean"
+    for each, at in ((cell.clean, clean), (cell, folder)):
+        found = surrogate_part(experiment, space, each, at, lambda fraction, text="": None)
     assert len(found["curve_total_cte_m"]) == experiment.config.attack.evaluations
-    result = deployed_part(experiment, space, ThroughWorld(experiment, wall), cell, folder, folder, print)
+    result = cell_data(experiment, space, ThroughWorld(experiment, wall), cell, folder, clean, print)
     assert result["extra"]["horizon"] == 10
-    for name in (f"{cell.name}.json", f"{cell.name}.drives.json"):
+    for name in (SEARCHED, DRIVES):
         (states,) = np.array(json.loads((folder / name).read_text())["states"])
         way_m = np.linalg.norm(np.diff(states[:, :2], axis=0), axis=1).sum()
         assert way_m == pytest.approx(6.0 * 10 * 0.01, rel=1e-3)

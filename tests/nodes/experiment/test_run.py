@@ -5,8 +5,9 @@ import pytest
 
 from nodes.experiment.attack import cells
 from nodes.experiment.cell import Cell
-from nodes.experiment.run import load_experiment, run_experiment, stages_of
+from nodes.experiment.run import load_experiment, stages_of
 from nodes.experiment.stages import StageError
+from nodes.experiment.whole import run_experiment
 from nodes.runtime.errors import ConfigError
 
 ROOM = Path(__file__).parents[3] / "launch" / "room.experiment.yaml"
@@ -61,19 +62,19 @@ def test_a_stage_depends_on_its_own_settings_and_on_no_others(tmp_path):
     def changed(override):
         before = {stage.name: stage.settings for stage in stages_of(room(tmp_path))}
         after = {stage.name: stage.settings for stage in stages_of(room(tmp_path, "demo", override))}
-        assert list(before) == ["capture", "scene", "object", "policy", "attack", "deploy", "report"]
+        assert list(before) == ["capture", "scene", "object", "policy"]
         return {name for name in before if before[name] != after[name]}
 
-    assert changed("attack.evaluations=7") == {"attack", "report"}
-    assert changed("space.cells=4") == {"attack", "deploy"}
-    assert changed("deploy.starts=2") == {"deploy"}
+    assert changed("attack.evaluations=7") == changed("space.cells=4") == changed("deploy.starts=2") == set()
+    assert changed("attack.random_sigma=4") == {"policy"}
     # What the panel shows without an attack is photographed and learned from.
-    assert changed("space.plain_rgb=[0.5, 0.5, 0.5]") == {"capture", "policy", "attack", "deploy"}
+    assert changed("space.plain_rgb=[0.5, 0.5, 0.5]") == {"capture", "policy"}
 
 
-def test_an_experiment_that_deploys_nothing_ends_with_its_searches(tmp_path):
-    stages = [stage.name for stage in stages_of(room(tmp_path, "demo", "deploy.through=nothing"))]
-    assert stages == ["capture", "scene", "object", "policy", "attack"]
+def test_laps_are_a_stage_where_they_are_asked_for(tmp_path):
+    assert [stage.name for stage in stages_of(room(tmp_path, "full"))][-1] == "live"
+    for nothing in ("deploy.through=world", "deploy={through: nodes, laps: 0}"):
+        assert "live" not in [stage.name for stage in stages_of(room(tmp_path, "full", nothing))]
 
 
 def test_every_seed_meets_every_condition_and_the_naive_victim_the_first(tmp_path):
@@ -95,12 +96,12 @@ def test_the_first_start_of_every_seed_is_the_nominal_one_where_a_file_says_so(t
 def test_a_changed_node_graph_is_driven_again(tmp_path):
     for name in (ROOM.name, "green_screen.launch.yaml"):
         shutil.copy(ROOM.parent / name, tmp_path / name)
-    experiment = load_experiment(tmp_path / ROOM.name, "demo", [], tmp_path / "run")
+    experiment = load_experiment(tmp_path / ROOM.name, "full", [], tmp_path / "run")
     before = {stage.name: stage.settings for stage in stages_of(experiment)}
     graph = tmp_path / "green_screen.launch.yaml"
     graph.write_text(graph.read_text().replace("timeout_ms: 250", "timeout_ms: 300"))
     after = {stage.name: stage.settings for stage in stages_of(experiment)}
-    assert {name for name in before if before[name] != after[name]} == {"deploy"}
+    assert {name for name in before if before[name] != after[name]} == {"live"}
 
 
 def test_an_unknown_last_stage_leaves_nothing_behind(tmp_path):

@@ -16,7 +16,7 @@ def run(folder, name, value=1):
         "capture", lambda here, told: (here / "photo").write_text(f"{name} {value}"), {"value": value}
     )
     experiment = RunFolder(config, folder / f"{name}.experiment.yaml", folder, "demo")
-    return run_to_end(experiment, [stage], ["numpy"], lambda console: None, None, Console(file=io.StringIO()))
+    return run_to_end(experiment, [stage], ["numpy"], None, Console(file=io.StringIO()))
 
 
 def test_the_folder_of_another_experiment_is_not_emptied(tmp_path):

@@ -13,7 +13,9 @@ from nodes.experiment.campaign.gate import predict_cell
 from nodes.experiment.cell import Cell
 from nodes.experiment.cell_kind import load_kind
 from nodes.experiment.cells import run_cell
-from nodes.experiment.run import load_experiment, run_experiment
+from nodes.experiment.keys import driven_folder
+from nodes.experiment.run import load_experiment, make_ready
+from nodes.experiment.whole import run_experiment
 
 LAUNCH = Path(__file__).parents[3] / "launch"
 SMALL = [
@@ -30,7 +32,8 @@ SMALL = [
 def test_from_photographs_to_report_and_nothing_twice(tmp_path, file):
     os.environ.setdefault("MUJOCO_GL", "egl")
     experiment = LAUNCH / f"{file}.experiment.yaml"
-    first = run_experiment(load_experiment(experiment, "demo", SMALL, tmp_path))
+    first = run_experiment(load_experiment(experiment, "demo", SMALL, tmp_path), overrides=SMALL)
+    assert {end.how for end in first} == {"done"}
     page = (tmp_path / "report" / "report.html").read_text()
     assert "<html" in page
     data = read_results(tmp_path / "report" / "results.json")
@@ -40,12 +43,13 @@ def test_from_photographs_to_report_and_nothing_twice(tmp_path, file):
         for condition in ("none", "random", "gradient")
     }
     assert data.latency is not None
-    cell = json.loads((tmp_path / "deploy" / "track_hardened_gradient_0.cell.json").read_text())
-    (live,) = json.loads((tmp_path / "deploy" / "track_hardened_gradient_0.drives.json").read_text())["live"]
+    cell = json.loads((tmp_path / "cells" / "track_hardened_gradient_0.json").read_text())
+    (live,) = json.loads((tmp_path / "cells" / "track_hardened_gradient_0" / "drives.json").read_text())[
+        "live"
+    ]
     assert live["attack_ids"] == [cell["attack_id"]]
     kept = (tmp_path / "report" / "report.html").stat().st_mtime_ns
-    again = run_experiment(load_experiment(experiment, "demo", SMALL, tmp_path))
-    assert {name: record.digest for name, record in again.items()} == {n: r.digest for n, r in first.items()}
+    assert run_experiment(load_experiment(experiment, "demo", SMALL, tmp_path)) == []
     assert (tmp_path / "report" / "report.html").stat().st_mtime_ns == kept
 
 
@@ -58,8 +62,11 @@ def test_a_face_is_also_deployed_without_nodes_and_meets_the_same_searches(tmp_p
     asked = [*SMALL, "deploy.through=world", "deploy.starts=null"]
     experiment = load_experiment(LAUNCH / f"{file}.experiment.yaml", "demo", asked, tmp_path)
     run_experiment(experiment)
-    drives = json.loads((tmp_path / "deploy" / "track_hardened_random_0.drives.json").read_text())
-    clean = json.loads((tmp_path / "deploy" / "track_hardened_none_0.drives.json").read_text())
+    cell = Cell("track", "hardened", "random", 0)
+    drives, clean = (
+        json.loads((driven_folder(experiment, each) / "drives.json").read_text())
+        for each in (cell, cell.clean)
+    )
     assert drives["live"] == []
     assert np.shape(drives["states"]) == (1, 61, 3)
     # The face is seen: it steers otherwise than what is there without it.
@@ -72,7 +79,7 @@ def test_a_face_is_also_deployed_without_nodes_and_meets_the_same_searches(tmp_p
 def test_a_cell_of_another_seed_is_searched_and_driven_live_once(tmp_path):
     os.environ.setdefault("MUJOCO_GL", "egl")
     experiment = load_experiment(LAUNCH / "monitor.experiment.yaml", "demo", SMALL, tmp_path / "run")
-    run_experiment(experiment, until="policy")
+    make_ready(experiment, until="policy")
     asked = (
         experiment,
         Cell("track", "hardened", "gradient", 1),
@@ -81,7 +88,7 @@ def test_a_cell_of_another_seed_is_searched_and_driven_live_once(tmp_path):
     )
     cell = run_cell(*asked)
     assert len(cell["deployed"]["total_cte_m"]) == len(cell["deployed"]["none_total_cte_m"]) == 1
-    live = json.loads((tmp_path / "cells" / "one" / "track_hardened_gradient_1.live0.json").read_text())
+    live = json.loads((tmp_path / "cells" / "one" / "live0.json").read_text())
     assert live["attack_ids"] == [cell["attack_id"]]
     assert (tmp_path / "cells" / cell["extra"]["clip"]).stat().st_size > 1000
     assert run_cell(*asked)["deployed"] == cell["deployed"]

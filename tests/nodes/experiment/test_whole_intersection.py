@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from advnerf_core.report.clips import read_clip
-from nodes.experiment import attack, deploy, report
+from nodes.experiment import report
 from nodes.experiment.attack import cells
+from nodes.experiment.cells import ExperimentCells
 from nodes.experiment.context import Experiment
 
 
@@ -22,7 +23,7 @@ def silent(fraction: float, text: str = "") -> None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-def test_attack_deploy_and_report(trained: Experiment, tmp_path: Path) -> None:
+def test_all_cells_and_the_report(trained: Experiment, tmp_path: Path) -> None:
     folder = tmp_path / "run"
     shutil.copytree(trained.folder, folder)
     experiment = replace(trained, folder=folder)
@@ -37,8 +38,11 @@ def test_attack_deploy_and_report(trained: Experiment, tmp_path: Path) -> None:
     (folder / "policy" / "policy.json").write_text(json.dumps({"on_held_out_views": rates}))
     (folder / "manifest.json").write_text(json.dumps({"command": "advnerf experiment <it>"}))
 
-    attack.run(experiment, folder / "attack", silent)
-    deploy.run(experiment, folder / "deploy", silent)
+    kind = ExperimentCells()
+    with kind.hold(experiment):
+        for cell in cells(experiment):
+            data = kind.run(experiment, cell, experiment.cell_folder(cell), silent)
+            experiment.cell_result(cell).write_text(json.dumps(data))
     report.run(experiment, folder / "report", silent)
 
     found = json.loads((folder / "report" / "results.json").read_text())["cells"]

@@ -1,4 +1,4 @@
-"""The commands ``advnerf campaign ...``: many attacks over cores or machines, and the table they make."""
+"""The commands of experiments: run one, or many in one table; say how far they are; print the table; write the page."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ import json
 import os
 import sys
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -17,18 +18,26 @@ from nodes.runtime.termination import ends_in_order
 if TYPE_CHECKING:
     from advnerf_core.report.transfer import TransferTable
     from nodes.experiment.campaign.config import Campaign
-from nodes.experiment.cell import Cell
+    from nodes.experiment.campaign.run import Options
+    from nodes.experiment.cell import Cell
 
-app = typer.Typer(
-    no_args_is_help=True,
-    help="Many attacks over cores and machines, resumed where they were left, and the table they make.",
-)
-
-File = Annotated[Path, typer.Argument(help="A *.campaign.yaml file.", exists=True, dir_okay=False)]
+File = Annotated[
+    Path,
+    typer.Argument(
+        help="A *.experiment.yaml file, or a *.campaign.yaml file that lists several.",
+        exists=True,
+        dir_okay=False,
+    ),
+]
+Setting = Annotated[
+    str, typer.Option("--setting", help="Which of the experiment file's settings; a campaign names them.")
+]
 Folder = Annotated[
     Path | None,
     typer.Option(
-        "--folder", help="Folder of the cells.", show_default="the file's, or runs/campaigns/<name>"
+        "--run-folder",
+        help="Folder of all results.",
+        show_default="runs/<setting>; of a campaign the file's, or runs/campaigns/<name>",
     ),
 ]
 Only = Annotated[
@@ -51,22 +60,45 @@ _FAILURE_EXIT = 1
 
 
 def _load(
-    file: Path, folder: Path | None, overrides: list[str] | None, only: str
+    file: Path, setting: str, folder: Path | None, overrides: list[str] | None, only: str
 ) -> tuple[Campaign, list[Cell]]:
-    from nodes.experiment.campaign.config import load_campaign
+    """The cells of a file, all and those that are wanted."""
+    os.environ.setdefault("MUJOCO_GL", "egl")
+    from nodes.experiment.campaign.config import campaign_of, is_campaign, load_campaign
     from nodes.experiment.cell import select
 
-    campaign = load_campaign(file, folder, tuple(overrides or ()))
+    if is_campaign(file):
+        campaign = load_campaign(file, folder, tuple(overrides or ()))
+    else:
+        from nodes.experiment.attack import cells
+        from nodes.experiment.run import load_experiment
+
+        experiment = load_experiment(file, setting, overrides or [], folder or Path("runs") / setting)
+        campaign = campaign_of(experiment, overrides or [], cells(experiment))
     return campaign, select(campaign.cells, only)
 
 
-@app.command()
-def run(
+def experiment(
     file: File,
+    setting: Setting = "demo",
     folder: Folder = None,
+    until: Annotated[
+        str | None,
+        typer.Option(
+            "--until",
+            metavar="STAGE",
+            help="Stop after this stage: capture, scene, object, policy, retrain or live.",
+        ),
+    ] = None,
     only: Only = "",
     jobs: Annotated[
-        int | None, typer.Option("--jobs", min=1, help="Cells at a time.", show_default="one per core")
+        int | None,
+        typer.Option(
+            "--jobs",
+            min=1,
+            help="Cells at a time, each in a process of its own.",
+            show_default="one after another in this process; of a campaign one per core",
+        ),
     ] = None,
     threads: Annotated[
         int | None,
@@ -74,20 +106,19 @@ def run(
             "--threads", min=1, help="Threads per cell.", show_default="cores shared among the jobs"
         ),
     ] = None,
-    backend: Annotated[
-        str, typer.Option("--backend", help="local: the cores of this machine; ray: a cluster.")
-    ] = "local",
-    address: Annotated[
-        str,
+    cluster: Annotated[
+        str | None,
         typer.Option(
-            "--address", help="Of a running Ray cluster.", show_default="RAY_ADDRESS, or one started here"
+            "--cluster",
+            metavar="ADDRESS",
+            help="Run cells on the Ray cluster at host:port; auto: the one in RAY_ADDRESS, or one started here.",
         ),
-    ] = "",
+    ] = None,
     retry: Annotated[bool, typer.Option("--retry", help="Also run cells that failed before.")] = False,
     gate: Annotated[
         bool,
         typer.Option(
-            "--gate/--no-gate", help="Leave out scenarios whose surrogate the fidelity gate refuses."
+            "--gate/--no-gate", help="Leave out cells whose learned scene the fidelity gate refuses."
         ),
     ] = True,
     search_only: Annotated[
@@ -98,32 +129,77 @@ def run(
     ] = False,
     overrides: Overrides = None,
 ) -> None:
-    """Run the cells that are not there yet, and print the table; each is kept when it is finished, so that a run may be stopped at any time."""
+    """Run an experiment, from the photographs to the report: every stage and every cell that is not there yet. It may be stopped at any time."""
     os.environ.setdefault("MUJOCO_GL", "egl")
-    from nodes.experiment.campaign.run import Options, run_campaign
+    from nodes.experiment.campaign.config import is_campaign
+    from nodes.experiment.campaign.run import Options
     from nodes.runtime.errors import ConfigError
 
-    if backend not in ("local", "ray"):
-        raise ConfigError(f"expected --backend local or ray, got {backend!r}")
-    campaign, cells = _load(file, folder, overrides, only)
-    options = Options(jobs or 0, threads or 0, backend, address, retry, gate, search_only)  # type: ignore[arg-type]
+    many = is_campaign(file)
+    address = "" if cluster in (None, "auto") else str(cluster)
+    backend: Literal["local", "ray"] = "local" if cluster is None else "ray"
+    here = not many and jobs is None and cluster is None
+    options = Options(
+        jobs or 0, threads or 0, backend, address, retry, gate, search_only, here, ready=not many
+    )
+    if not many:
+        _run_one(file, setting, folder or Path("runs") / setting, until, only, options, overrides or [])
+        return
+    if until is not None:
+        raise ConfigError(f"expected --until with an experiment file, got it with the campaign {file}")
+    _run_many(file, folder, only, options, overrides)
+
+
+def _run_one(
+    file: Path,
+    setting: str,
+    folder: Path,
+    until: str | None,
+    only: str,
+    options: Options,
+    overrides: Sequence[str],
+) -> None:
+    from nodes.experiment.run import load_experiment
+    from nodes.experiment.whole import run_experiment
+
+    with ends_in_order():
+        loaded = load_experiment(file, setting, overrides, folder)
+        ended = run_experiment(loaded, until, options, only, overrides)
+    _say_wrong(ended)
+
+
+def _run_many(
+    file: Path, folder: Path | None, only: str, options: Options, overrides: list[str] | None
+) -> None:
+    from nodes.experiment.campaign.run import run_campaign
+
+    campaign, cells = _load(file, "", folder, overrides, only)
     with ends_in_order():
         ended = run_campaign(campaign, cells, options, lambda text: print(text, flush=True))
-    wrong = [end for end in ended if end.how != "done"]
-    if not search_only:
+    if not options.search_only:
         _show_table(campaign, campaign.cells, _page_folder(campaign))
+    _say_wrong(ended)
+
+
+def _say_wrong(ended: Sequence[Any]) -> None:
+    wrong = [end for end in ended if end.how != "done"]
     for end in wrong:
         say_error(f"{end.name}: {end.text}")
     if wrong:
         raise typer.Exit(_FAILURE_EXIT)
 
 
-@app.command()
-def status(file: File, folder: Folder = None, only: Only = "", overrides: Overrides = None) -> None:
+def status(
+    file: File,
+    setting: Setting = "demo",
+    folder: Folder = None,
+    only: Only = "",
+    overrides: Overrides = None,
+) -> None:
     """Say which cells are done, running, failed (and why), made with other settings, or missing."""
     from nodes.experiment.campaign.run import statuses
 
-    campaign, cells = _load(file, folder, overrides, only)
+    campaign, cells = _load(file, setting, folder, overrides, only)
     found = statuses(campaign, cells)
     rows = table("cell", "state", "")
     for each in found:
@@ -137,44 +213,66 @@ def status(file: File, folder: Folder = None, only: Only = "", overrides: Overri
     )
 
 
-@app.command(name="table")
 def table_command(
     file: File,
+    setting: Setting = "demo",
+    folder: Folder = None,
+    only: Only = "",
+    source: Annotated[
+        Path | None,
+        typer.Option(
+            "--from",
+            help="Show the cells that were published there, e.g. in docs/results, of whatever settings.",
+            show_default="those of these settings",
+        ),
+    ] = None,
+    overrides: Overrides = None,
+) -> None:
+    """Print the table of all cells, and the targets."""
+    campaign, cells = _load(file, setting, folder, overrides, only)
+    _show(campaign, cells, None, source)
+
+
+def page(
+    file: File,
+    setting: Setting = "demo",
     folder: Folder = None,
     only: Only = "",
     output: Annotated[
         Path | None,
         typer.Option(
-            "--output",
-            "-o",
-            help="Folder of the page.",
-            show_default="table in the campaign's folder; with --only or --from, no page is written",
+            "--output", "-o", help="Folder of the page.", show_default="table in the folder of the cells"
         ),
     ] = None,
     source: Annotated[
         Path | None,
-        typer.Option(
-            "--from",
-            help="Show the cells that were published there, e.g. in docs/results, wherever they were run.",
-            show_default="the campaign's own cells",
-        ),
+        typer.Option("--from", help="Of the cells that were published there.", show_default="the own cells"),
     ] = None,
     overrides: Overrides = None,
 ) -> None:
-    """Print the transfer table and the targets, and write them as JSON, CSV, Markdown and a page with the clips by outcome."""
-    campaign, cells = _load(file, folder, overrides, only)
-    if source is not None:
-        _show_published(campaign, cells, output, source / campaign.config.name)
-        return
-    # A page of some cells never takes the place of the page of all.
-    _show_table(campaign, cells, output or (None if only else _page_folder(campaign)))
+    """Write the table as JSON, CSV, Markdown and a page with the films by outcome, and print it."""
+    from nodes.runtime.errors import ConfigError
+
+    if only and output is None:
+        raise ConfigError(
+            "expected --output with --only, as the page of some cells would replace that of all"
+        )
+    campaign, cells = _load(file, setting, folder, overrides, only)
+    _show(campaign, cells, output or _page_folder(campaign), source)
+
+
+def _show(campaign: Campaign, cells: Sequence[Cell], output: Path | None, source: Path | None) -> None:
+    if source is None:
+        _show_table(campaign, cells, output)
+    else:
+        _show_published(campaign, cells, output, source / campaign.name)
 
 
 def _page_folder(campaign: Campaign) -> Path:
     return campaign.folder / "table"
 
 
-def _show_table(campaign: Campaign, cells: list[Cell], output: Path | None) -> None:
+def _show_table(campaign: Campaign, cells: Sequence[Cell], output: Path | None) -> None:
     from nodes.experiment.campaign.run import statuses
     from nodes.experiment.campaign.table import campaign_table
 
@@ -187,10 +285,10 @@ def _show_table(campaign: Campaign, cells: list[Cell], output: Path | None) -> N
     _say_where(full, cells, page)
 
 
-def _show_published(campaign: Campaign, cells: list[Cell], output: Path | None, folder: Path) -> None:
+def _show_published(campaign: Campaign, cells: Sequence[Cell], output: Path | None, folder: Path) -> None:
     from nodes.experiment.campaign.published import published_table
 
-    full = published_table(folder, campaign, cells)
+    full = published_table(folder, campaign, list(cells))
     # Films are not published; those of the campaign's own cells may be of other drives.
     _say_where(full, cells, _write_and_print(full, folder, folder, output))
 
@@ -226,16 +324,16 @@ def _write_and_print(
     return page
 
 
-def _say_where(full: TransferTable, cells: list[Cell], page: Path | None) -> None:
+def _say_where(full: TransferTable, cells: Sequence[Cell], page: Path | None) -> None:
     print(
         f"{len(full.cells)} of {len(cells)} cells; "
-        + (f"page: {page}" if page else "-o FOLDER writes a page of them")
+        + (f"page: {page}" if page else "advnerf page writes a page of them")
     )
 
 
-@app.command()
 def predict(
     file: File,
+    setting: Setting = "demo",
     folder: Folder = None,
     only: Only = "",
     draws: Annotated[int, typer.Option("--draws", min=2, help="Drives per prediction.")] = 6,
@@ -245,15 +343,15 @@ def predict(
     os.environ.setdefault("MUJOCO_GL", "egl")
     from nodes.experiment.campaign.predictions import predict_campaign
 
-    campaign, cells = _load(file, folder, overrides, only)
+    campaign, cells = _load(file, setting, folder, overrides, only)
     with ends_in_order():
         made = predict_campaign(campaign, cells, lambda text: print(text, flush=True), draws)
     print(f"{made} predictions made")
 
 
-@app.command()
 def maps(
     file: File,
+    setting: Setting = "demo",
     folder: Folder = None,
     only: Only = "",
     number: Annotated[int, typer.Option("--object", min=0, help="Which object is moved.")] = 0,
@@ -263,14 +361,14 @@ def maps(
     os.environ.setdefault("MUJOCO_GL", "egl")
     from nodes.experiment.campaign.maps import map_cells
 
-    campaign, cells = _load(file, folder, overrides, only)
+    campaign, cells = _load(file, setting, folder, overrides, only)
     for picture in map_cells(campaign, cells, number):
         print(picture)
 
 
-@app.command()
 def publish(
     file: File,
+    setting: Setting = "demo",
     folder: Folder = None,
     only: Only = "",
     to: Annotated[Path, typer.Option("--to", help="Gets a folder with the campaign's name.")] = Path(
@@ -285,10 +383,10 @@ def publish(
     from nodes.experiment.campaign.published import publish as copy_cells
     from nodes.experiment.campaign.run import statuses
 
-    campaign, cells = _load(file, folder, overrides, only)
+    campaign, cells = _load(file, setting, folder, overrides, only)
     found = copy_cells(campaign, statuses(campaign, cells), to, prune)
     for name in found.written:
-        print(f"{to / campaign.config.name / name}.json")
+        print(f"{to / campaign.name / name}.json")
     unfinished = len(cells) - len(found.written) - len(found.same)
     print(f"{len(found.written)} cells written, {len(found.same)} were there, {unfinished} are not finished")
     if found.stale:
@@ -298,25 +396,8 @@ def publish(
         print(f"{len(found.stale)} of those there {what}: {', '.join(found.stale)}")
 
 
-@app.command()
-def restore(
-    file: File,
-    folder: Folder = None,
-    only: Only = "",
-    source: Annotated[
-        Path, typer.Option("--from", help="Has a folder with the campaign's name, as publish makes it.")
-    ] = Path("docs/results"),
-    overrides: Overrides = None,
-) -> None:
-    """Take published cells back into a campaign's folder that was lost: those of these settings, scenes and policies. Nothing is run."""
-    os.environ.setdefault("MUJOCO_GL", "egl")
-    from nodes.experiment.campaign.published import restore as take_back
-
-    campaign, cells = _load(file, folder, overrides, only)
-    found = take_back(campaign, cells, source)
-    for name in found.taken:
-        print(campaign.folder / "cells" / f"{name}.json")
-    print(
-        f"{len(found.taken)} cells taken back, {len(found.there)} were there, {len(found.other)} were made with other settings, scenes or "
-        f"policies than are there, {len(found.missing)} are not published"
-    )
+def add_to(app: typer.Typer) -> None:
+    """Add the commands."""
+    for command in (experiment, status, page, predict, maps, publish):
+        app.command()(command)
+    app.command(name="table")(table_command)

@@ -1,0 +1,85 @@
+"""What a cell depends on, by which it is known whether it is done; and where what its methods share is kept."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from advnerf_core.attack.methods import require_method
+from advnerf_core.plugins import PluginError
+from advnerf_core.policies.pilotnet import load_policy
+from advnerf_core.report.conditions import NONE
+from nodes.experiment.cell import Cell
+from nodes.experiment.context import Experiment
+from nodes.experiment.policy import RETRAINED, attackable, victim_file
+from nodes.experiment.stages import hash_of, stage_digests
+from nodes.runtime.errors import RuntimeFault
+
+# The stages that cells need of their experiment; what comes after is the cells themselves.
+NEEDED = ("capture", "scene", "policy", "object")
+# What a cell does not depend on: which others there are, how much memory may be used, and what is told of the world elsewhere.
+_FREE: Mapping[str, bool | set[str]] = {
+    "name": True,
+    "scenarios": True,
+    "retrain": True,
+    "gate": True,
+    "world": True,
+    "attack": {"seeds", "methods", "cache_mib"},
+    "deploy": {"laps", "empty_scene", "ready_timeout_s"},
+}
+
+
+class CellError(RuntimeFault):
+    """A cell was asked for that this experiment does not have."""
+
+
+def cell_inputs(experiment: Experiment, cell: Cell) -> dict[str, Any]:
+    """What a cell depends on: the resolved world (of a server, not its address), settings, and what the stages before it wrote.
+
+    Raises:
+        CellError: No such drive, victim or method.
+    """
+    require_known(experiment, cell)
+    config = experiment.config.model_dump(mode="json", exclude=_FREE)
+    inputs = {
+        "config": config,
+        "world": experiment.world_settings,
+        "stages": stage_digests(experiment.folder, NEEDED),
+    }
+    if cell.victim != RETRAINED:
+        return inputs
+    file = victim_file(experiment, cell.victim)
+    return {**inputs, "victim": load_policy(file).sha256 if file.exists() else None}
+
+
+def require_known(experiment: Experiment, cell: Cell) -> None:
+    """Refuse a cell that there cannot be.
+
+    Raises:
+        CellError: No such drive, victim or method.
+    """
+    known: tuple[tuple[str, str, Sequence[str]], ...] = (
+        ("scenario", cell.scenario, experiment.config.scenarios),
+        ("victim", cell.victim, attackable(experiment)),
+    )
+    for what, value, choices in known:
+        if value not in choices:
+            raise CellError(f"expected a {what} of {', '.join(choices)}, got {value!r}")
+    if cell.method != NONE:
+        try:
+            require_method(cell.code)
+        except PluginError as error:
+            raise CellError(str(error)) from None
+
+
+def clean_folder(experiment: Experiment, cell: Cell, folder: Path) -> Path:
+    """Where the drives without attack of a cell go, which belong to all methods: beside the cells' folders, named by what they depend on."""
+    inputs = hash_of(cell_inputs(experiment, cell.clean))
+    return folder.parent / "shared" / f"{experiment.config.name}_{cell.clean.name}_{inputs[:12]}"
+
+
+def driven_folder(experiment: Experiment, cell: Cell) -> Path:
+    """Where the experiment itself has the drives of a cell: those without attack are shared by its methods."""
+    folder = experiment.cell_folder(cell)
+    return clean_folder(experiment, cell, folder) if cell.method == NONE else folder

@@ -1,0 +1,95 @@
+"""Runs a whole experiment: its stages, its cells (here, over cores or over a cluster), its report. Called by ``advnerf experiment``."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Sequence
+
+from rich.console import Console
+
+from nodes.experiment import report
+from nodes.experiment.attack import cells
+from nodes.experiment.campaign.config import Campaign, campaign_of
+from nodes.experiment.campaign.run import Options, run_campaign
+from nodes.experiment.campaign.worker import Ended
+from nodes.experiment.cell import Cell, select
+from nodes.experiment.context import Experiment
+from nodes.experiment.run import make_ready, stages_of
+from nodes.experiment.stages import Stage, check_until, run_stages
+from nodes.runtime.progress import ProgressDisplay
+
+REPORT = "report"
+
+
+def run_experiment(
+    experiment: Experiment,
+    until: str | None = None,
+    options: Options | None = None,
+    only: str = "",
+    overrides: Sequence[str] = (),
+    console: Console | None = None,
+) -> list[Ended]:
+    """Run the stages and the cells that are not there yet; where all cells are there, also the report.
+
+    Args:
+        experiment: The experiment.
+        until: Last stage to run; None for all, and the cells.
+        options: How cells are run; None runs one after another in this process.
+        only: Which cells; see `select`.
+        overrides: ``key=value`` texts with which the experiment was read, for other processes.
+        console: Where to print.
+
+    Returns:
+        How every cell that was run ended.
+
+    Raises:
+        StageError: ``until`` names no stage.
+        ConfigError: The folder has the stages of another experiment, or ``only`` fits no cell.
+    """
+    console, began = console or Console(), time.monotonic()
+    stages = [*stages_of(experiment), _report_stage(experiment, {})]
+    check_until(stages, until)
+    plan = cells(experiment)
+    chosen = select(plan, only)
+    make_ready(experiment, None if until == REPORT else until, console)
+    ended: list[Ended] = []
+    if until in (None, REPORT):
+        ended = _run_cells(experiment, campaign_of(experiment, overrides, plan), chosen, options, console)
+        _write_report(experiment, plan, console)
+    console.print(
+        f"{experiment.config.name} ({experiment.setting}): {time.monotonic() - began:.0f} s", highlight=False
+    )
+    return ended
+
+
+def _run_cells(
+    experiment: Experiment,
+    campaign: Campaign,
+    chosen: Sequence[Cell],
+    options: Options | None,
+    console: Console,
+) -> list[Ended]:
+    known = {(name, ""): experiment for name in campaign.scenarios}
+
+    def say(text: str) -> None:
+        console.print(text, highlight=False, soft_wrap=True)
+
+    return run_campaign(campaign, chosen, options or Options(here=True, ready=True), say, known, console)
+
+
+def _write_report(experiment: Experiment, plan: Sequence[Cell], console: Console) -> None:
+    """The report, once every cell is here and deployed; what it was made of is part of its key."""
+    files = {cell.name: experiment.cell_result(cell) for cell in plan}
+    missing = [name for name, file in files.items() if not file.exists()]
+    if missing or experiment.config.deploy.through == "nothing":
+        return
+    digests = {name: hashlib.sha256(file.read_bytes()).hexdigest() for name, file in files.items()}
+    with ProgressDisplay(console) as display:
+        run_stages([_report_stage(experiment, digests)], experiment.folder, display)
+    report.print_summary(experiment, console)
+
+
+def _report_stage(experiment: Experiment, digests: dict[str, str]) -> Stage:
+    settings = {"cells": digests, "setting": experiment.setting}
+    return Stage(REPORT, lambda folder, told: report.run(experiment, folder, told), settings)
