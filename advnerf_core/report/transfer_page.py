@@ -27,6 +27,7 @@ from advnerf_core.report.transfer_targets import TableTarget, table_targets
 
 SCHEMA = "advnerf-transfer/1"
 STRAYED_FROM = 1.5
+_LEAD = "Total cross-track error of every scenario, victim and method, in the learned scene and where it is deployed."
 OUTCOMES = (LEFT, RAN_INTO, STRAYED, HELD) = (
     "left the track",
     "ran into something",
@@ -257,7 +258,10 @@ def gather_clips(table: TransferTable, cells_folder: Path, page_folder: Path) ->
 
 
 def render_transfer_page(
-    table: TransferTable, clips: Sequence[ShownClip] = (), sections: Sequence[tuple[str, Markup]] = ()
+    table: TransferTable,
+    clips: Sequence[ShownClip] = (),
+    sections: Sequence[tuple[str, Markup]] = (),
+    lead: Sequence[str] = (),
 ) -> str:
     """The page as HTML text; it loads nothing but the clips beside it.
 
@@ -265,6 +269,7 @@ def render_transfer_page(
         table: The table.
         clips: Clips beside the page.
         sections: Further parts: heading and HTML.
+        lead: Paragraphs before the table; none: what such a table is.
     """
     environment = jinja2.Environment(
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
@@ -279,7 +284,8 @@ def render_transfer_page(
         light=Markup(css_variables(LIGHT)),
         dark=Markup(css_variables(DARK)),
         table=text_table(table).html(),
-        targets=target_table(table_targets(table)).html(),
+        targets=target_table(targets).html() if (targets := table_targets(table)) else "",
+        lead=lead or (_LEAD,),
         missing=sum(len(row.missing) for row in table.rows if row.domain == "surrogate"),
         cells=len(table.cells),
         machines=sorted({cell.machine for cell in table.cells.values()}),

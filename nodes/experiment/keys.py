@@ -18,6 +18,8 @@ from nodes.runtime.errors import RuntimeFault
 
 # The stages that cells need of their experiment; what comes after is the cells themselves.
 NEEDED = ("capture", "scene", "policy", "object")
+# As of a stage (`run.VERSIONS`): raised when what a cell finds changes with the same settings.
+VERSION = 1
 # What a cell does not depend on: which others there are, how much memory may be used, and what is told of the world elsewhere.
 _FREE: Mapping[str, bool | set[str]] = {
     "name": True,
@@ -43,6 +45,7 @@ def cell_inputs(experiment: Experiment, cell: Cell) -> dict[str, Any]:
     require_known(experiment, cell)
     config = experiment.config.model_dump(mode="json", exclude=_FREE)
     inputs = {
+        "version": VERSION,
         "config": config,
         "world": experiment.world_settings,
         "stages": stage_digests(experiment.folder, NEEDED),

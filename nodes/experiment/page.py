@@ -1,11 +1,10 @@
-"""The report page of an experiment in a world: one self-contained HTML file that loads nothing."""
+"""Parts of the report page about one experiment: the world, the drives, the learned scene, how it was made."""
 
 from __future__ import annotations
 
 import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +13,10 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from advnerf_core.files import write_atomically
 from advnerf_core.report.clips import data_uri, image_uri
 from advnerf_core.report.conditions import style_of
-from advnerf_core.report.palette import DARK, LIGHT, LINE_STYLES, css_variables
+from advnerf_core.report.palette import LIGHT, LINE_STYLES
 from advnerf_core.report.plots import new_axes, svg
-from advnerf_core.report.tables import Table
 from nodes.experiment import films
 from nodes.experiment.attack import cells, frozen_hashes
 from nodes.experiment.cell import Cell
@@ -28,54 +25,31 @@ from nodes.experiment.policy import HARDENED
 from nodes.experiment.stages import read_record
 
 _MARGIN_M, _SHOWN_VIEWS = 3.0, 3
-_HEAD = """<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{title}</title><style>:root {{ {light} }} @media (prefers-color-scheme: dark) {{ :root {{ {dark} }} }} {style}
-img, video {{ max-width: 100%; height: auto; }}</style></head><body><main>
-"""
 
 
-def write(
+def sections(
     experiment: Experiment,
-    folder: Path,
-    table: Table,
     overview: NDArray[np.uint8],
     clips: Sequence[Path],
     seen: Mapping[str, Mapping[str, NDArray[np.uint8]]],
-) -> Path:
-    """Write ``report.html``.
+) -> list[tuple[str, Markup]]:
+    """Parts of the page about one experiment: headings and HTML.
 
     Args:
-        experiment: With all stages before finished.
-        folder: Where to.
-        table: The transfer table.
+        experiment: With all stages and cells before finished.
         overview: The world from above.
         clips: One film per drive.
         seen: Per drive and method, what the camera saw of the objects.
     """
-    title = f"{experiment.config.name} ({experiment.setting})"
-    style = files("advnerf_core.report").joinpath("page.css").read_text(encoding="utf-8")
-    parts = [
-        Markup(_HEAD).format(
-            title=title,
-            light=Markup(css_variables(LIGHT)),
-            dark=Markup(css_variables(DARK)),
-            style=Markup(style),
-        ),
-        Markup("<h1>{}</h1><p>{}</p>").format(title, opening(experiment)),
-        Markup("<h2>Total cross-track error</h2>{}").format(table.html()),
-        Markup("<h2>The world</h2>"),
-        _picture(overview, "Paths of the drives, and the places of the objects"),
-    ]
+    caption = "Paths of the drives, and the places of the objects"
+    found = [("The world", _picture(overview, caption))]
     for name, clip in zip(experiment.config.scenarios, clips, strict=True):
-        parts += [
-            Markup("<h2>{}</h2>").format(name.capitalize()),
-            *_drive(experiment, name, clip, seen[name]),
-        ]
-    parts += [*_fidelity(experiment), *_how(experiment), Markup("</main></body></html>\n")]
-    path = folder / "report.html"
-    write_atomically(path, str(Markup("\n").join(parts)))
-    return path
+        found.append((name.capitalize(), Markup("\n").join(_drive(experiment, name, clip, seen[name]))))
+    return [
+        *found,
+        ("The learned scene", Markup("\n").join(_fidelity(experiment))),
+        ("How it was made", _how(experiment)),
+    ]
 
 
 def opening(experiment: Experiment) -> str:
@@ -168,14 +142,14 @@ def _fidelity(experiment: Experiment) -> list[Markup]:
         f"Held-out views of the driving camera: {mean['psnr_full_db']:.1f} dB at full size, {mean['psnr_policy_db']:.1f} dB at 200x66; "
         f"the policy's control on true and learned views differs by {difference:.3f} {experiment.car.control_unit} on average."
     )
-    parts = [Markup("<h2>The learned scene</h2><p>{}</p>").format(text)]
+    parts = [Markup("<p>{}</p>").format(text)]
     for index in np.linspace(0, len(views) - 1, min(_SHOWN_VIEWS, len(views))).round().astype(int):
         pair = [_read(experiment.folder / views[index][f"{name}_image"]) for name in ("real", "surrogate")]
         parts.append(_picture(np.concatenate(pair, axis=1), "True and learned"))
     return parts
 
 
-def _how(experiment: Experiment) -> list[Markup]:
+def _how(experiment: Experiment) -> Markup:
     manifest = json.loads((experiment.folder / "manifest.json").read_text())
     frozen = frozen_hashes(experiment)
     records = {
@@ -185,11 +159,9 @@ def _how(experiment: Experiment) -> list[Markup]:
         f"{name} {record.seconds:.0f} s" for name, record in records.items() if record is not None
     )
     hashes = ", ".join(f"{name} {value[:12]}" for name, value in frozen.items())
-    return [
-        Markup(
-            "<h2>How it was made</h2><p><code>{}</code></p><p>Stages: {}.</p><p>Fixed before the first attack: {}.</p>"
-        ).format(manifest["command"], times, hashes)
-    ]
+    return Markup("<p><code>{}</code></p><p>Stages: {}.</p><p>Fixed before the first attack: {}.</p>").format(
+        manifest["command"], times, hashes
+    )
 
 
 def _read(path: Path) -> NDArray[np.uint8]:

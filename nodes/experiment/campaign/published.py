@@ -104,4 +104,8 @@ def published_table(folder: Path, campaign: Campaign, cells: Sequence[Cell] | No
     found = read_cells(folder)
     if not found:
         raise ConfigError(f"expected published cells in {folder}, got none; run advnerf publish")
-    return make_table(wanted_rows(campaign, campaign.cells if cells is None else cells), found, campaign.name)
+    return make_table(
+        wanted_rows(campaign.cells if cells is None else cells, list(campaign.scenarios)),
+        found,
+        campaign.name,
+    )

@@ -9,6 +9,7 @@ from pathlib import Path
 from markupsafe import Markup
 
 from advnerf_core.files import write_atomically
+from advnerf_core.report.conditions import order_of
 from advnerf_core.report.transfer import TransferTable, Wanted, make_table
 from advnerf_core.report.transfer_page import as_csv, as_json, as_markdown, gather_clips, render_transfer_page
 from nodes.experiment.campaign.config import Campaign
@@ -16,13 +17,17 @@ from nodes.experiment.campaign.store import CellStatus
 from nodes.experiment.cell import Cell
 
 
-def wanted_rows(campaign: Campaign, cells: Sequence[Cell]) -> list[Wanted]:
-    """The lines that some cells of a campaign fill."""
+def wanted_rows(cells: Sequence[Cell], scenarios: Sequence[str]) -> list[Wanted]:
+    """The lines that cells fill, in the order of their scenarios."""
     seeds: dict[tuple[str, str, str, str], list[int]] = {}
     for cell in cells:
         seeds.setdefault((cell.scenario, cell.placement, cell.victim, cell.method), []).append(cell.seed)
     # By victim before method: the reader compares the methods on one victim.
-    order = sorted(seeds, key=lambda key: (list(campaign.scenarios).index(key[0]), key[1]))
+    victims = list(dict.fromkeys(victim for _, _, victim, _ in seeds))
+    order = sorted(
+        seeds,
+        key=lambda key: (scenarios.index(key[0]), key[1], victims.index(key[2]), order_of(key[3])),
+    )
     return [Wanted(*key, tuple(seeds[key])) for key in order]
 
 
@@ -34,11 +39,18 @@ def campaign_table(campaign: Campaign, found: Sequence[CellStatus]) -> TransferT
         found: Where the cells are that the table is of; only results of the settings as they are now are taken.
     """
     cells = [each.result for each in found if each.result is not None and each.state == "done"]
-    return make_table(wanted_rows(campaign, [each.cell for each in found]), cells, campaign.name)
+    return make_table(
+        wanted_rows([each.cell for each in found], list(campaign.scenarios)), cells, campaign.name
+    )
 
 
 def write_table(
-    table: TransferTable, cells_folder: Path, folder: Path, sections: Sequence[tuple[str, Markup]] = ()
+    table: TransferTable,
+    cells_folder: Path,
+    folder: Path,
+    sections: Sequence[tuple[str, Markup]] = (),
+    lead: Sequence[str] = (),
+    page: str = "index.html",
 ) -> Path:
     """Write JSON, CSV, Markdown and the page with the clips beside it.
 
@@ -47,6 +59,8 @@ def write_table(
         cells_folder: Where the cells' clips are.
         folder: Where to write.
         sections: Further parts of the page.
+        lead: Paragraphs before the table.
+        page: Name of the page.
 
     Returns:
         The page.
@@ -56,5 +70,5 @@ def write_table(
     write_atomically(folder / "table.json", json.dumps(as_json(table), indent=1, allow_nan=False) + "\n")
     write_atomically(folder / "table.csv", as_csv(table))
     write_atomically(folder / "table.md", as_markdown(table))
-    write_atomically(folder / "index.html", render_transfer_page(table, clips, sections))
-    return folder / "index.html"
+    write_atomically(folder / page, render_transfer_page(table, clips, sections, lead))
+    return folder / page

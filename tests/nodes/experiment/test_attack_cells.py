@@ -13,6 +13,7 @@ import torch
 
 from advnerf_core.attack.artifact import load_attack
 from advnerf_core.attack.search.search import SearchStateError
+from advnerf_core.report.transfer_page import text_table
 from nodes.experiment import attack, page, report, run
 from nodes.experiment.attack import cells, load_shown, surrogate_part
 from nodes.experiment.cell import Cell
@@ -50,7 +51,8 @@ def finished(experiment: Experiment, scene: Any, cell: Cell) -> dict[str, Any]:
     at = clean if cell.method == "none" else folder
     surrogate_part(experiment, space, cell, at, silent)
     data = cell_data(experiment, space, ThroughWorld(experiment, scene), cell, at, clean, print)
-    experiment.cell_result(cell).write_text(json.dumps(data))
+    kept = {**data, "settings_hash": "h", "machine": "m", "date": "d"}
+    experiment.cell_result(cell).write_text(json.dumps(kept))
     return data
 
 
@@ -111,8 +113,8 @@ def test_a_method_of_a_file_runs_a_cell_and_appears_in_the_tables(
     assert min(float((found - theta).abs().max()) for theta in thetas) < 1e-5
     assert load_attack(out / attack.ATTACK).method == "Spiral"
     assert film_cell(experiment, wall, space, spiral, out, out).exists()
-    table = report.transfer_table(report.rows_of(experiment))
-    assert [row[3] for row in table.rows] == 2 * ["no attack", "gradient", "Spiral"]
+    table = text_table(report.table_of(experiment))
+    assert [row[2] for row in table.rows if row[2]] == ["no attack", "gradient", "Spiral"]
     assert "Spiral" in page.opening(experiment)
 
     # What its code is decides, not where it lies.
@@ -198,22 +200,24 @@ def test_table_divides_by_the_clean_drive_of_the_same_domain(fresh: Experiment) 
             }
             for domain, clean in (("surrogate", 4.0), ("deployed", 6.0))
         }
-        fresh.cell_result(cell).write_text(json.dumps({"attack_id": None, **parts}))
-    rows = report.rows_of(fresh)
-    assert len(rows) == 2 * 3 * 2 * 4
+        known = {"victim": cell.victim, "scenario": cell.scenario, "method": cell.method, "seed": cell.seed}
+        made = {"settings_hash": "h", "machine": "m", "date": "d", "seconds": 1.0}
+        fresh.cell_result(cell).write_text(json.dumps({**known, **made, **parts}))
+    table = report.table_of(fresh)
+    assert len(table.rows) == 2 * 3 * 2 * 4
     first = [
-        row for row in rows if (row.victim, row.scenario, row.domain) == ("hardened", "straight", "deployed")
+        row
+        for row in table.rows
+        if (row.victim, row.scenario, row.domain) == ("hardened", "straight", "deployed")
     ]
     assert [row.method for row in first] == ["none", "random", "cem", "gradient"]
     assert [row.ratio for row in first] == pytest.approx([1.0, 1.1, 1.5, 3.0])
     assert [row.off_track for row in first] == [0, 0, 0, 1]
-    report.write_results(fresh, rows, fresh.folder)
-    lines = (fresh.folder / "results.csv").read_text().splitlines()
-    assert lines[1].startswith("hardened,straight,surrogate,none,1,4.0000,nan,1.0000,0")
-    assert len(lines) == 1 + len(rows)
-    table = report.transfer_table(rows)
-    assert table.rows[3][:4] == ("", "", "", "gradient")
-    assert table.rows[3][6] == "3.00"
+    lost = fresh.cell_result(Cell("left", "naive", "cem", 0))
+    lost.unlink()
+    row = report.table_of(fresh).find("left", "naive", "cem", "deployed")
+    assert row is not None
+    assert row.missing == (0,)
 
 
 def test_attack_differs_between_seeds_and_repeats_itself(trained: Experiment) -> None:

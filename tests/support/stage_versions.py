@@ -1,0 +1,80 @@
+"""Numbers that say whether stages and cells still make what they made: ``python -m tests.support.stage_versions`` records them.
+
+A tiny experiment in the lab, of which every part is summed up in a few numbers. They are the same from run to run, and nearly the same
+from machine to machine.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+ROOT = Path(__file__).parents[2]
+RECORDED = ROOT / "tests" / "nodes" / "experiment" / "versions.json"
+_TINY = (
+    "capture.photos=12", "capture.colour_pairs=2", "capture.held_out=3", "scene.steps=12", "scene.log2_entries=12",
+    "policy.deployed_stills=12", "policy.surrogate_stills=8", "policy.deployed_drives=1", "policy.surrogate_drives=2",
+    "policy.drive_steps=3", "policy.first_steps=6", "policy.round_steps=3", "policy.naive_steps=0",
+    "attack.horizon=6", "attack.evaluations=2", "space.resolution=8", "horizon=8", "deploy.through=world",
+)  # fmt: skip
+
+
+def measured(folder: Path) -> dict[str, dict[str, Any]]:
+    """Version and numbers of every stage and of cells.
+
+    Args:
+        folder: Gets the run folder.
+    """
+    os.environ.setdefault("MUJOCO_GL", "egl")
+    from advnerf_core.data.dataset import load_transforms
+    from advnerf_core.objects.voxel.build import build_from_mesh
+    from advnerf_core.objects.voxel.generators import GENERATORS
+    from advnerf_core.objects.voxel.mesh import stand
+    from nodes.experiment import keys
+    from nodes.experiment.cell import Cell
+    from nodes.experiment.cells import ExperimentCells
+    from nodes.experiment.run import VERSIONS, load_experiment, make_ready
+
+    experiment = load_experiment(ROOT / "launch" / "room.experiment.yaml", "demo", _TINY, folder)
+    make_ready(experiment)
+    views = load_transforms(experiment.stage_folder("capture") / "held_out", require_all=True).load()
+    fidelity = json.loads((experiment.stage_folder("scene") / "fidelity.json").read_text())["mean"]
+    policy = json.loads((experiment.stage_folder("policy") / "policy.json").read_text())
+    hydrant = build_from_mesh(stand(GENERATORS["hydrant"]()), "hydrant", 12, 0, {}).placed(np.eye(4), 1.0)
+    kind, totals = ExperimentCells(), {}
+    with kind.hold(experiment):
+        for method in ("none", "random", "gradient"):
+            cell = Cell("track", "hardened", method, 0)
+            found = kind.run(experiment, cell, experiment.cell_folder(cell), lambda part, text="": None)
+            totals[f"{method}_surrogate_m"] = found["surrogate"]["total_cte_m"][0]
+            totals[f"{method}_deployed_m"] = found["deployed"]["total_cte_m"][0]
+    numbers: dict[str, dict[str, float]] = {
+        "capture": {"mean_grey_levels": float(np.mean([rgb.mean() for rgb in views.rgb]))},
+        "scene": {name: float(value) for name, value in fidelity.items()},
+        "object": {"free_colours": float(hydrant.free_count)},
+        "policy": {
+            "frames": float(policy["frames"]),
+            "mean_control": float(np.mean([abs(row["real"]) for row in policy["on_held_out_views"]])),
+        },
+        "cells": totals,
+    }
+    versions = {**VERSIONS, "cells": keys.VERSION}
+    return {name: {"version": versions[name], "numbers": each} for name, each in numbers.items()}
+
+
+def main() -> None:
+    """Write what is made now."""
+    with tempfile.TemporaryDirectory() as folder:
+        found = measured(Path(folder) / "run")
+    RECORDED.write_text(json.dumps(found, indent=1) + "\n")
+    print(f"wrote {RECORDED.relative_to(ROOT)}: {sys.version.split()[0]}")
+
+
+if __name__ == "__main__":
+    main()
