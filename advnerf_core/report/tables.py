@@ -14,7 +14,7 @@ import rich.table
 from markupsafe import Markup
 from rich.text import Text
 
-from advnerf_core.report.conditions import NONE, order_of, style_of
+from advnerf_core.report.conditions import NONE, order_of
 from advnerf_core.report.data import DOMAINS, VICTIMS, Domain, ReportData, Run, Victim
 
 # The paper's car, green screen (its section 4): all divided by the one deployed drive without attack, 48.
@@ -186,50 +186,6 @@ class Table:
                 table.add_section()
             table.add_row(*(Text(cell) for cell in row))
         return table
-
-
-def transfer_table(rows: Sequence[TransferRow]) -> Table:
-    """The transfer table as text."""
-    several = len({r.victim for r in rows}) > 1
-    columns: tuple[str, ...] = (
-        "domain",
-        "object shows",
-        "runs",
-        "total CTE [m]",
-        "× no attack",
-        "mean |CTE| [m]",
-        "off-track",
-        "left after [s]",
-        "paper ×",
-    )
-    cells, groups = [], []
-    for i, r in enumerate(rows):
-        first = i == 0 or (r.victim, r.domain) != (rows[i - 1].victim, rows[i - 1].domain)
-        groups += [i] if first else []
-        cells.append(
-            (
-                *((r.victim if first else "",) if several else ()),
-                r.domain if first else "",
-                style_of(r.condition).title,
-                str(r.runs),
-                spread(r.total_cte_mean_m, r.total_cte_std_m),
-                spread(r.ratio, r.ratio_std),
-                number(r.mean_abs_cte_m, 3),
-                f"{r.off_track} of {r.runs}",
-                number(r.time_to_leave_s, 1),
-                number(r.paper_ratio, 1),
-            )
-        )
-    columns = ("victim", *columns) if several else columns
-    right = (*[False] * (3 if several else 2), *[True] * 7)
-    return Table(
-        "Total CTE: surrogate and deployed",
-        columns,
-        tuple(cells),
-        right,
-        tuple(groups),
-        tuple(r.condition for r in rows),
-    )
 
 
 def hop_table(data: ReportData) -> Table:

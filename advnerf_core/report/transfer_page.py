@@ -257,11 +257,23 @@ def gather_clips(table: TransferTable, cells_folder: Path, page_folder: Path) ->
     return shown
 
 
+def _targets_html(table: TransferTable) -> Markup:
+    """The targets of a table with their caption; empty where it has none."""
+    found = table_targets(table)
+    if not found:
+        return Markup("")
+    caption = "Held against the hardened victim, for whom random textures are a fair baseline; places against the retrained one."
+    return Markup('<p class="caption">{}</p><div class="verdicts">{}</div>').format(
+        caption, target_table(found).html()
+    )
+
+
 def render_transfer_page(
     table: TransferTable,
     clips: Sequence[ShownClip] = (),
     sections: Sequence[tuple[str, Markup]] = (),
-    lead: Sequence[str] = (),
+    lead: Sequence[str | Markup] = (),
+    targets: Markup | None = None,
 ) -> str:
     """The page as HTML text; it loads nothing but the clips beside it.
 
@@ -269,13 +281,14 @@ def render_transfer_page(
         table: The table.
         clips: Clips beside the page.
         sections: Further parts: heading and HTML.
-        lead: Paragraphs before the table; none: what such a table is.
+        lead: Paragraphs, or HTML, before the table; none: what such a table is.
+        targets: Instead of those of the table.
     """
     environment = jinja2.Environment(
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     resources = files("advnerf_core.report")
-    template = environment.from_string(resources.joinpath("transfer.html").read_text(encoding="utf-8"))
+    template = environment.from_string(resources.joinpath("page.html").read_text(encoding="utf-8"))
     groups = [(name, _EXPLAINED[name], [clip for clip in clips if clip.outcome == name]) for name in OUTCOMES]
     return template.render(
         name=table.name or "Transfer table",
@@ -284,11 +297,12 @@ def render_transfer_page(
         light=Markup(css_variables(LIGHT)),
         dark=Markup(css_variables(DARK)),
         table=text_table(table).html(),
-        targets=target_table(targets).html() if (targets := table_targets(table)) else "",
+        targets=targets or _targets_html(table),
         lead=lead or (_LEAD,),
         missing=sum(len(row.missing) for row in table.rows if row.domain == "surrogate"),
         cells=len(table.cells),
         machines=sorted({cell.machine for cell in table.cells.values()}),
+        clips=clips,
         groups=groups,
         sections=sections,
         style_of=style_of,

@@ -1,4 +1,4 @@
-"""The report of live drives: one page, one JSON and one table about everything that the stages before left."""
+"""What live drives add to the report: maps, films, textures, timing, memory, and `results.json` with all of it."""
 
 from __future__ import annotations
 
@@ -6,20 +6,21 @@ import json
 import os
 import platform
 from collections.abc import Iterator
+from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
-from rich.console import Console
+from markupsafe import Markup
 
 from advnerf_core.attack.artifact import load_attack
 from advnerf_core.report import data as rd
 from advnerf_core.report import tables, targets
 from advnerf_core.report.conditions import NONE
-from advnerf_core.report.page import write_report
-from advnerf_core.report.results import read_results
+from advnerf_core.report.live_parts import live_lead, live_sections, live_targets
+from advnerf_core.report.results import read_results, write_results
 from nodes.experiment import films, memory
 from nodes.experiment.attack import ATTACK, SEARCHED, cells, frozen_hashes
 from nodes.experiment.cell import Cell
@@ -38,22 +39,36 @@ SHOWN_VIEWS = 6
 _PATH_POINTS = 400
 
 
-def run(experiment: Experiment, folder: Path, report: Report) -> None:
-    """Write ``report.html`` and ``results.json``."""
+@dataclass(frozen=True)
+class Parts:
+    """What an experiment whose drives were live adds to its page.
+
+    Attributes:
+        sections: Headings and HTML.
+        lead: What the page opens with.
+        targets: The targets, and whether they were met.
+    """
+
+    sections: list[tuple[str, Markup]]
+    lead: tuple[str | Markup, ...]
+    targets: Markup
+
+
+def make_parts(experiment: Experiment, folder: Path, report: Report) -> Parts:
+    """Measure memory, cut films, and keep everything in ``results.json``."""
     rows = memory.measure(experiment, folder, lambda part, text="": report(0.6 * part, text))
     report(0.6, "cutting clips")
     clips = _clips(experiment, folder)
     report(0.9, "writing the page")
-    write_report(_report_data(experiment, clips, rows), folder)
+    data = _report_data(experiment, clips, rows)
+    write_results(data, folder / "results.json")
+    return Parts(live_sections(data), live_lead(data), live_targets(data))
 
 
-def print_summary(experiment: Experiment, console: Console) -> None:
-    """The transfer table and the targets, and where the page is."""
-    folder = experiment.stage_folder("report")
-    data = read_results(folder / "results.json")
-    console.print(tables.transfer_table(tables.transfer_rows(data)).rich())
-    console.print(targets.targets_table(targets.evaluate_targets(data)).rich())
-    console.print(f"report: {folder / 'report.html'}", highlight=False, soft_wrap=True)
+def target_rows(experiment: Experiment) -> tables.Table:
+    """The targets of the finished report."""
+    data = read_results(experiment.stage_folder("report") / "results.json")
+    return targets.targets_table(targets.evaluate_targets(data))
 
 
 def _report_data(

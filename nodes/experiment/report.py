@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from markupsafe import Markup
 from numpy.typing import NDArray
 from rich.console import Console
 
@@ -34,7 +36,8 @@ _SEEN_AT_M = (9.0, 14.0)
 def run(experiment: Experiment, folder: Path, report: Report) -> None:
     """Write ``report.html``, ``table.json``, ``table.csv``, ``table.md`` and a film of each drive; of live drives also what their bags tell."""
     if experiment.config.deploy.live:
-        live_report.run(experiment, folder, report)
+        parts = live_report.make_parts(experiment, folder, report)
+        _write(experiment, folder, parts.sections, parts.lead, parts.targets)
         return
     films_of: list[Path] = []
     with experiment.open_world() as scene:
@@ -48,19 +51,27 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
         }
     report(0.95, "writing the page")
     sections = page.sections(experiment, overview, films_of, seen)
-    lead = (page.opening(experiment),)
-    write_table(table_of(experiment), experiment.folder / CELLS, folder, sections, lead, PAGE)
+    _write(experiment, folder, sections, (page.opening(experiment),))
+
+
+def _write(
+    experiment: Experiment,
+    folder: Path,
+    sections: Sequence[tuple[str, Markup]],
+    lead: Sequence[str | Markup],
+    targets: Markup | None = None,
+) -> None:
+    write_table(table_of(experiment), experiment.folder / CELLS, folder, sections, lead, PAGE, targets)
 
 
 def print_summary(experiment: Experiment, console: Console) -> None:
     """The transfer table, and where the page is."""
-    if experiment.config.deploy.live:
-        live_report.print_summary(experiment, console)
-        return
     wide = Console(
         file=console.file, width=max(console.width, _TABLE_WIDTH), force_terminal=console.is_terminal
     )
     wide.print(text_table(table_of(experiment)).rich())
+    if experiment.config.deploy.live:
+        wide.print(live_report.target_rows(experiment).rich())
     console.print(f"report: {experiment.stage_folder('report') / PAGE}", highlight=False, soft_wrap=True)
 
 

@@ -49,8 +49,9 @@ def write_table(
     cells_folder: Path,
     folder: Path,
     sections: Sequence[tuple[str, Markup]] = (),
-    lead: Sequence[str] = (),
+    lead: Sequence[str | Markup] = (),
     page: str = "index.html",
+    targets: Markup | None = None,
 ) -> Path:
     """Write JSON, CSV, Markdown and the page with the clips beside it.
 
@@ -61,6 +62,7 @@ def write_table(
         sections: Further parts of the page.
         lead: Paragraphs before the table.
         page: Name of the page.
+        targets: Instead of those of the table.
 
     Returns:
         The page.
@@ -70,5 +72,5 @@ def write_table(
     write_atomically(folder / "table.json", json.dumps(as_json(table), indent=1, allow_nan=False) + "\n")
     write_atomically(folder / "table.csv", as_csv(table))
     write_atomically(folder / "table.md", as_markdown(table))
-    write_atomically(folder / page, render_transfer_page(table, clips, sections, lead))
+    write_atomically(folder / page, render_transfer_page(table, clips, sections, lead, targets))
     return folder / page

@@ -1,4 +1,4 @@
-"""The report page: one self-contained HTML file that loads nothing, and `results.json` beside it."""
+"""Parts of the page about an experiment whose drives were live: maps, films, textures, timing, memory."""
 
 from __future__ import annotations
 
@@ -15,8 +15,6 @@ from advnerf_core.report import maps, plots, tables
 from advnerf_core.report.clips import Frames, data_uri, film_strip, image_uri
 from advnerf_core.report.conditions import style_of
 from advnerf_core.report.data import ReportData, Victim
-from advnerf_core.report.palette import DARK, LIGHT, css_variables
-from advnerf_core.report.results import write_results, write_text_atomic
 from advnerf_core.report.summary import key_figures, opening
 from advnerf_core.report.targets import evaluate_targets, targets_table
 
@@ -26,56 +24,60 @@ _SHOWN_VIEWS = 6
 _DIFFERENCE_GAIN = 4
 
 
-def write_report(data: ReportData, out_dir: Path) -> Path:
-    """Write ``report.html`` and ``results.json``, each atomically.
-
-    Args:
-        data: What was measured; missing parts are named as such on the page.
-        out_dir: Folder of the report; made if it does not exist.
-
-    Returns:
-        The page.
-    """
-    page = render_page(data)
-    write_results(data, out_dir / "results.json")
-    write_text_atomic(out_dir / "report.html", page)
-    return out_dir / "report.html"
+_PARTS = (
+    ("trajectories", "Where the car went"),
+    ("clips", "What the camera saw"),
+    ("texture", "What the panel showed"),
+    ("fidelity", "How true the surrogate is"),
+    ("search", "The search"),
+    ("timing", "Live timing"),
+    ("memory", "Memory against the horizon"),
+    ("manifest", "How to make this page again"),
+)
 
 
-def render_page(data: ReportData) -> str:
-    """The page as HTML text."""
+def live_sections(data: ReportData) -> list[tuple[str, Markup]]:
+    """Parts of the page about one experiment whose drives were live: headings and HTML; missing parts are named as such."""
+    module = _fragments(data)
+    return [(heading, Markup(getattr(module, name)())) for name, heading in _PARTS]
+
+
+def live_lead(data: ReportData) -> tuple[str | Markup, ...]:
+    """What the page opens with: what happened in words, and the key figures."""
+    return (*opening(data), Markup(_fragments(data).key_figures_part()))
+
+
+def live_targets(data: ReportData) -> Markup:
+    """The targets of the experiment, and whether they were met."""
+    return Markup(_fragments(data).targets_part())
+
+
+def _fragments(data: ReportData) -> Any:
     environment = jinja2.Environment(
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
-        keep_trailing_newline=True,
     )
-    resources = files("advnerf_core.report")
-    template = environment.from_string(resources.joinpath("page.html").read_text(encoding="utf-8"))
-    style = resources.joinpath("page.css").read_text(encoding="utf-8")
-    targets = evaluate_targets(data)
-    return template.render(
-        data=data,
-        style=Markup(style),
-        light=Markup(css_variables(LIGHT)),
-        dark=Markup(css_variables(DARK)),
-        style_of=style_of,
-        paragraphs=opening(data),
-        key_figures=key_figures(data),
-        targets=targets_table(targets).html(),
-        transfer=tables.transfer_table(tables.transfer_rows(data)).html(),
-        hops=tables.hop_table(data).html(),
-        memory=tables.memory_table(data).html(),
-        timings=tables.timing_table(data).html(),
-        settings=_settings(data),
-        figures=_figures(data),
-        videos=_videos(data),
-        textures=[(t, image_uri(t.image)) for t in data.textures if t.image is not None],
-        views=_views(data),
-        fidelity=_fidelity_numbers(data),
-        notes=[r for r in data.runs if r.note],
-        missing=lambda part: data.not_measured.get(part, ""),
+    text = files("advnerf_core.report").joinpath("live.html").read_text(encoding="utf-8")
+    return environment.from_string(text).make_module(
+        {
+            "data": data,
+            "style_of": style_of,
+            "key_figures": key_figures(data),
+            "targets": targets_table(evaluate_targets(data)).html(),
+            "hops": tables.hop_table(data).html(),
+            "memory_rows": tables.memory_table(data).html(),
+            "timings": tables.timing_table(data).html(),
+            "settings": _settings(data),
+            "figures": _figures(data),
+            "videos": _videos(data),
+            "textures": [(t, image_uri(t.image)) for t in data.textures if t.image is not None],
+            "views": _views(data),
+            "fidelity_rows": _fidelity_numbers(data),
+            "notes": [r for r in data.runs if r.note],
+            "missing": lambda part: data.not_measured.get(part, ""),
+        }
     )
 
 
