@@ -28,7 +28,8 @@ def faults(pages: dict[str, str]) -> list[str]:
         names = {}
         for number, (page, text) in enumerate(pages.items()):
             for line, code in blocks(text).items():
-                file = Path(folder) / f"page{number}_line{line}.py"
+                # A name of this run: of a module that mypy has in its cache it would say nothing again.
+                file = Path(folder) / f"page{number}_line{line}_{Path(folder).name[-8:]}.py"
                 file.write_text(
                     "\n" * (line - 1) + code, encoding="utf-8"
                 )  # so that mypy counts lines as the page does

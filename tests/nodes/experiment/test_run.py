@@ -58,6 +58,37 @@ def test_an_error_names_the_line_of_the_file(tmp_path):
         load_experiment(file, "demo", [], tmp_path)
 
 
+def test_a_file_says_only_what_is_other_than_its_base(tmp_path):
+    (tmp_path / "base.experiment.yaml").write_text(ROOM.read_text())
+    file = tmp_path / "mine.experiment.yaml"
+    file.write_text(
+        "base: base.experiment.yaml\nname: mine\nspace: {panel: monitor}\nattack: {seeds: [4, 5]}\n"
+        "settings:\n  demo: {attack: {evaluations: 3}}\n  quick: {scene: {steps: 5}}\n"
+    )
+    mine, base = load_experiment(file, "demo", [], tmp_path), room(tmp_path)
+    assert (mine.config.name, mine.config.space.panel, mine.config.attack.evaluations) == (
+        "mine",
+        "monitor",
+        3,
+    )
+    assert mine.config.attack.seeds == (0,)  # the setting's of the base, which lies over the values of both
+    assert (mine.config.space.resolution, mine.config.policy) == (64, base.config.policy)
+    assert load_experiment(file, "quick", [], tmp_path).config.attack.seeds == (4, 5)
+    file.write_text(file.read_text() + "view:\n  crop_topp: 3\n")
+    with pytest.raises(ConfigError, match=r"mine\.experiment\.yaml:9: unknown key view\.crop_topp"):
+        load_experiment(file, "demo", [], tmp_path)
+    # A section of another kind has other keys.
+    file.write_text("base: base.experiment.yaml\nspace: {kind: colours}\ndeploy: {through: world}\n")
+    assert load_experiment(file, "demo", [], tmp_path).config.space.kind == "colours"
+    for wrong, says in (
+        ("mine.experiment.yaml", "a base other than the file itself"),
+        ("no.yaml", "expected a file"),
+    ):
+        file.write_text(f"base: {wrong}\n")
+        with pytest.raises(ConfigError, match=says):
+            load_experiment(file, "demo", [], tmp_path)
+
+
 def test_a_stage_depends_on_its_own_settings_and_on_no_others(tmp_path):
     def changed(override):
         before = {stage.name: stage.settings for stage in stages_of(room(tmp_path))}
