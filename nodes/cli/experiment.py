@@ -317,7 +317,8 @@ def _write_and_print(
             )
     console = Console(width=None if sys.stdout.isatty() else 200)
     console.print(text_table(full).rich())
-    console.print(target_table(table_targets(full)).rich())
+    if targets := table_targets(full):
+        console.print(target_table(targets).rich())
     if pairs:
         console.print(prediction_table(pairs).rich())
         print(skill_text(pairs))

@@ -32,6 +32,10 @@ _FREE: Mapping[str, bool | set[str]] = {
 }
 
 
+# What a drive without attack does not depend on besides.
+_SEARCHED_WITH = ("evaluations", "horizon", "learning_rate", "cem_population", "time_batch")
+
+
 class CellError(RuntimeFault):
     """A cell was asked for that this experiment does not have."""
 
@@ -44,6 +48,10 @@ def cell_inputs(experiment: Experiment, cell: Cell) -> dict[str, Any]:
     """
     require_known(experiment, cell)
     config = experiment.config.model_dump(mode="json", exclude=_FREE)
+    if cell.method == NONE:
+        config["attack"] = {
+            key: value for key, value in config["attack"].items() if key not in _SEARCHED_WITH
+        }
     inputs = {
         "version": VERSION,
         "config": config,

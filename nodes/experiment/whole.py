@@ -11,7 +11,7 @@ from rich.console import Console
 from nodes.experiment import report
 from nodes.experiment.attack import cells
 from nodes.experiment.campaign.config import Campaign, campaign_of
-from nodes.experiment.campaign.run import Options, run_campaign
+from nodes.experiment.campaign.run import Options, run_campaign, statuses
 from nodes.experiment.campaign.worker import Ended
 from nodes.experiment.cell import Cell, select
 from nodes.experiment.context import Experiment
@@ -55,8 +55,9 @@ def run_experiment(
     make_ready(experiment, None if until == REPORT else until, console)
     ended: list[Ended] = []
     if until in (None, REPORT):
-        ended = _run_cells(experiment, campaign_of(experiment, overrides, plan), chosen, options, console)
-        _write_report(experiment, plan, console)
+        campaign = campaign_of(experiment, overrides, plan)
+        ended = _run_cells(experiment, campaign, chosen, options, console)
+        _write_report(experiment, campaign, console)
     console.print(
         f"{experiment.config.name} ({experiment.setting}): {time.monotonic() - began:.0f} s", highlight=False
     )
@@ -78,11 +79,15 @@ def _run_cells(
     return run_campaign(campaign, chosen, options or Options(here=True, ready=True), say, known, console)
 
 
-def _write_report(experiment: Experiment, plan: Sequence[Cell], console: Console) -> None:
-    """The report, once every cell is here and deployed; what it was made of is part of its key."""
-    files = {cell.name: experiment.cell_result(cell) for cell in plan}
-    missing = [name for name, file in files.items() if not file.exists()]
-    if missing or experiment.config.deploy.through == "nothing":
+def _write_report(experiment: Experiment, campaign: Campaign, console: Console) -> None:
+    """The report, once every cell of these settings is here and deployed; what it was made of is part of its key."""
+    files = {cell.name: experiment.cell_result(cell) for cell in campaign.cells}
+    found = statuses(campaign, campaign.cells)
+    missing = [each.cell.name for each in found if each.state != "done" or not files[each.cell.name].exists()]
+    if experiment.config.deploy.through == "nothing":
+        return
+    if missing:
+        console.print(f"no report yet: {len(missing)} of {len(found)} cells are missing", highlight=False)
         return
     digests = {name: hashlib.sha256(file.read_bytes()).hexdigest() for name, file in files.items()}
     with ProgressDisplay(console) as display:

@@ -42,6 +42,9 @@ def test_what_changes_no_result_is_no_part_of_what_a_cell_depends_on(tmp_path):
 
     for free in ("attack.cache_mib=64", "attack.seeds=[4]", "deploy.laps=0", "deploy.ready_timeout_s=90"):
         assert inputs(free) == inputs(), free
+    none = Cell("track", "hardened", "none", 0)
+    assert cell_inputs(room(tmp_path, "attack.evaluations=7"), none) == cell_inputs(room(tmp_path), none)
+    assert inputs("attack.evaluations=7") != inputs()
     for counts in ("attack.starts=2", "deploy.through=world", "world.car.speed_mps=0.6"):
         assert inputs(counts) != inputs(), counts
 

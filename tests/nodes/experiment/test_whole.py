@@ -94,7 +94,7 @@ def test_a_cell_of_another_seed_is_searched_and_driven_live_once(tmp_path):
     assert run_cell(*asked)["deployed"] == cell["deployed"]
     # What a prediction needs is there: the search, and the bag of the drive without attack.
     kind, folder = load_kind("experiment"), tmp_path / "cells" / "one"
-    assert kind.lacks(experiment, replace(asked[1], seed=2), folder) == "its search"
+    assert kind.lacks(experiment, replace(asked[1], seed=2), tmp_path / "cells" / "two") == "its search"
     assert kind.lacks(experiment, asked[1], folder) == ""
     found, clean = predict_cell(kind, experiment, asked[1], folder, draws=2)
     assert found.ratio > 0.0
