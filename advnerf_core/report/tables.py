@@ -17,14 +17,6 @@ from rich.text import Text
 from advnerf_core.report.conditions import NONE, order_of
 from advnerf_core.report.data import DOMAINS, VICTIMS, Domain, ReportData, Run, Victim
 
-# The paper's car, green screen (its section 4): all divided by the one deployed drive without attack, 48.
-PAPER_RATIOS: dict[tuple[str, str], float] = {
-    ("surrogate", "random"): 34 / 48,
-    ("surrogate", "gradient"): 157 / 48,
-    ("deployed", "random"): 46 / 48,
-    ("deployed", "gradient"): 248 / 48,
-}
-
 
 @dataclass(frozen=True)
 class TransferRow:
@@ -42,7 +34,6 @@ class TransferRow:
         mean_abs_cte_m: Mean ``|CTE|`` over ticks and drives [m].
         off_track: Number of drives that left the track.
         time_to_leave_s: Mean time to leaving, of those that left [s].
-        paper_ratio: What the paper reports for its car.
     """
 
     victim: Victim
@@ -56,7 +47,6 @@ class TransferRow:
     mean_abs_cte_m: float
     off_track: int
     time_to_leave_s: float | None
-    paper_ratio: float | None
 
     def record(self) -> dict[str, Any]:
         """The row as JSON-ready values."""
@@ -103,7 +93,6 @@ def _transfer_row(runs: Sequence[Run], clean: Sequence[Run]) -> TransferRow:
         off_track=sum(r.off_track for r in runs),
         time_to_leave_s=statistics.fmean(left) if left else None,
         # The paper's victim had never seen the object with other textures, but it is the one that both are compared with.
-        paper_ratio=PAPER_RATIOS.get((first.domain, first.condition)),
     )
 
 

@@ -9,10 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field
-from typing import Any, Literal
+from typing import Any
 
 from advnerf_core.report.cells import CellResult, Drives
 from advnerf_core.report.conditions import NONE
+from advnerf_core.report.reference import Domain, Reference
 from advnerf_core.report.statistics import (
     Interval,
     mean_and_std,
@@ -21,24 +22,7 @@ from advnerf_core.report.statistics import (
     transfer_interval,
 )
 
-Domain = Literal["surrogate", "deployed"]
 DOMAINS: tuple[Domain, ...] = ("surrogate", "deployed")
-
-# Total CTE of the paper, mean and standard deviation of 5 seeds: its tables of the intersection and of the car. Units differ between scenarios.
-PAPER: dict[tuple[str, str, str], tuple[float, float | None]] = {
-    ("straight", "deployed", "none"): (1166, None), ("right", "deployed", "none"): (1315, None),
-    ("left", "deployed", "none"): (1448, None), ("green_screen", "deployed", "none"): (48, None), ("monitor", "deployed", "none"): (48, None),
-    ("straight", "surrogate", "random"): (1132, 7), ("straight", "surrogate", "gradient"): (2347, 49),
-    ("straight", "deployed", "random"): (1193, 19), ("straight", "deployed", "gradient"): (1702, 160),
-    ("right", "surrogate", "random"): (2084, 10), ("right", "surrogate", "gradient"): (4105, 847),
-    ("right", "deployed", "random"): (1476, 12), ("right", "deployed", "gradient"): (2101, 75),
-    ("left", "surrogate", "random"): (1460, 8), ("left", "surrogate", "gradient"): (4125, 124),
-    ("left", "deployed", "random"): (1158, 163), ("left", "deployed", "gradient"): (2240, 574),
-    ("green_screen", "surrogate", "random"): (34, 4), ("green_screen", "surrogate", "gradient"): (157, 1),
-    ("green_screen", "deployed", "random"): (46, 3), ("green_screen", "deployed", "gradient"): (248, 72),
-    ("monitor", "surrogate", "random"): (34, 4), ("monitor", "surrogate", "gradient"): (157, 1),
-    ("monitor", "deployed", "random"): (47, 3), ("monitor", "deployed", "gradient"): (76, 48),
-}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -117,11 +101,13 @@ class TransferTable:
         rows: The lines, in the order asked for.
         cells: The cells, by name.
         name: Name of the campaign.
+        reference: What it is held against.
     """
 
     rows: tuple[TableRow, ...]
     cells: dict[str, CellResult] = field(default_factory=dict)
     name: str = ""
+    reference: Reference = field(default_factory=Reference)
 
     def find(
         self, scenario: str, victim: str, method: str, domain: Domain, placement: str = ""
@@ -138,14 +124,21 @@ class TransferTable:
         return [cell for cell in self.cells.values() if _key(cell) == key]
 
 
-def make_table(wanted: Sequence[Wanted], cells: Iterable[CellResult], name: str = "") -> TransferTable:
+def make_table(
+    wanted: Sequence[Wanted],
+    cells: Iterable[CellResult],
+    name: str = "",
+    reference: Reference | None = None,
+) -> TransferTable:
     """Sum the cells up.
 
     Args:
         wanted: What the table should have; it says what is missing.
         cells: What is there; cells that were not asked for are left out.
         name: Name of the campaign.
+        reference: What it is held against; None for nothing.
     """
+    against = reference or Reference()
     by_name = {cell.name: cell for cell in cells}
     of_row = {_key(cell): [c for c in by_name.values() if _key(c) == _key(cell)] for cell in by_name.values()}
     rows: list[TableRow] = []
@@ -154,17 +147,17 @@ def make_table(wanted: Sequence[Wanted], cells: Iterable[CellResult], name: str 
         found = sorted(of_row.get(_key(want), []), key=lambda cell: cell.seed)
         found = [cell for cell in found if cell.seed in want.seeds]
         used |= {cell.name: cell for cell in found}
-        rows += [_row(want, found, domain) for domain in DOMAINS]
-    return TransferTable(tuple(rows), used, name)
+        rows += [_row(want, found, domain, against) for domain in DOMAINS]
+    return TransferTable(tuple(rows), used, name, against)
 
 
 def _key(cell: CellResult | Wanted) -> tuple[str, str, str, str]:
     return cell.scenario, cell.placement, cell.victim, cell.method
 
 
-def _row(want: Wanted, cells: Sequence[CellResult], domain: Domain) -> TableRow:
-    paper_m, paper_std_m = PAPER.get((want.scenario, domain, want.method), (None, None))
-    paper_none_m, _ = PAPER.get((want.scenario, "deployed", NONE), (None, None))
+def _row(want: Wanted, cells: Sequence[CellResult], domain: Domain, reference: Reference) -> TableRow:
+    paper_m, paper_std_m = reference.total(want.scenario, domain, want.method)
+    paper_none_m, _ = reference.total(want.scenario, "deployed", NONE)
     have = [(cell, drives) for cell in cells if (drives := drives_in(cell, domain)) is not None]
     seeds = tuple(cell.seed for cell, _ in have)
     empty = TableRow(

@@ -142,7 +142,12 @@ def cell_data(
         without = deployed_part(space, deployer, cell.clean, clean, tell)
         driven = without if folder == clean else deployed_part(space, deployer, cell, folder, tell)
         data["deployed"] = _drives_of(driven, without)
-        data["extra"] |= {"blocked_tick": driven["blocked_tick"], **_live_extra(driven["live"])}
+        data["extra"] |= {
+            "blocked_tick": driven["blocked_tick"],
+            "max_abs_cte_m": max(driven["max_cte_m"]),
+            "off_track_m": experiment.limits.off_track_m,
+            **_live_extra(driven["live"]),
+        }
     return data
 
 
@@ -179,6 +184,7 @@ def deployed_part(
         "controls": [drive.controls.tolist() for drive in deployed.drives],
         **totals([drive.metrics for drive in deployed.drives]),
         "mean_cte_m": [drive.metrics.mean_cte_m for drive in deployed.drives],
+        "max_cte_m": [drive.metrics.max_cte_m for drive in deployed.drives],
         "blocked_tick": [drive.blocked_tick for drive in deployed.drives],
         "live": deployed.live,
     }

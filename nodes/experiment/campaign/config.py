@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, StringConstraints, model_vali
 
 from advnerf_core.attack.methods import method_name
 from advnerf_core.report.conditions import NONE, order_of
+from advnerf_core.report.reference import Reference
 from advnerf_core.scene.gate_limits import GateLimits
 from nodes.experiment.cell import Cell
 from nodes.experiment.cell_kind import absolute_kind
@@ -100,6 +101,10 @@ class CampaignConfig(_NothingTwice):
     )
     scenarios: dict[Name, ScenarioConfig] = Field(min_length=1)
     gate: GateLimits = GateLimits()
+    reference: Path | None = Field(
+        default=None,
+        description="File of totals and limits that the table is held against; relative to the campaign file.",
+    )
 
 
 @dataclass(frozen=True)
@@ -113,6 +118,7 @@ class Campaign:
         scenarios: Where each scenario's experiment is, by name.
         cells: All cells, in the order in which they are run.
         gate: What a learned scene must reach; None judges none.
+        reference: What the table is held against.
     """
 
     name: str
@@ -121,6 +127,7 @@ class Campaign:
     scenarios: Mapping[str, ScenarioConfig]
     cells: tuple[Cell, ...]
     gate: GateLimits | None = None
+    reference: Reference = field(default_factory=Reference)
 
     def scenario(self, cell: Cell) -> ScenarioConfig:
         """The scenario of a cell."""
@@ -163,8 +170,9 @@ def load_campaign(file: Path, folder: Path | None = None, overrides: tuple[str, 
     """
     config = load_config(CampaignConfig, file, overrides)
     where = (folder or config.folder or Path("runs/campaigns") / config.name).resolve()
+    against = load_config(Reference, file.parent / config.reference) if config.reference else Reference()
     campaign = Campaign(
-        config.name, file.resolve(), where, config.scenarios, tuple(_cells(config)), config.gate
+        config.name, file.resolve(), where, config.scenarios, tuple(_cells(config)), config.gate, against
     )
     for cell in campaign.cells:
         if not campaign.experiment_file(cell).is_file():

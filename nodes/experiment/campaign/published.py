@@ -108,4 +108,5 @@ def published_table(folder: Path, campaign: Campaign, cells: Sequence[Cell] | No
         wanted_rows(campaign.cells if cells is None else cells, list(campaign.scenarios)),
         found,
         campaign.name,
+        campaign.reference,
     )

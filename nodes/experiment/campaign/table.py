@@ -40,7 +40,10 @@ def campaign_table(campaign: Campaign, found: Sequence[CellStatus]) -> TransferT
     """
     cells = [each.result for each in found if each.result is not None and each.state == "done"]
     return make_table(
-        wanted_rows([each.cell for each in found], list(campaign.scenarios)), cells, campaign.name
+        wanted_rows([each.cell for each in found], list(campaign.scenarios)),
+        cells,
+        campaign.name,
+        campaign.reference,
     )
 
 

@@ -1,11 +1,15 @@
 import csv
 import io
 import json
+from pathlib import Path
 
 import pytest
+import yaml
 
 from advnerf_core.report.cells import CellError, CellResult, read_cell
-from advnerf_core.report.transfer import Wanted, make_table
+from advnerf_core.report.reference import Reference
+from advnerf_core.report.transfer import Wanted
+from advnerf_core.report.transfer import make_table as table_of
 from advnerf_core.report.transfer_page import (
     as_csv,
     as_json,
@@ -17,6 +21,14 @@ from advnerf_core.report.transfer_page import (
 )
 from advnerf_core.report.transfer_prediction import Predicted, prediction_section, skill_of
 from advnerf_core.report.transfer_targets import table_targets
+
+ROOT = Path(__file__).parents[3]
+PAPER = Reference.model_validate(yaml.safe_load((ROOT / "launch" / "paper.reference.yaml").read_text()))
+
+
+def make_table(wanted, cells, name=""):
+    """Held against what the shipped campaigns are held against."""
+    return table_of(wanted, cells, name, PAPER)
 
 
 def wanted_of(cells):
@@ -218,3 +230,23 @@ def test_the_skill_of_predictions_by_hand():
     assert "2 of 3 rightly said" in prediction_section(pairs)
     assert "would be off by 1.60 and 1.00, rank correlation 0.50, 2 of 3 right" in prediction_section(pairs)
     assert "No attack was both" in prediction_section([])
+
+
+@pytest.mark.parametrize(
+    ("limit", "says"),
+    [
+        ({"method": "gradient"}, "one of at_least, at_most and above, got 0"),
+        ({"method": "gradient", "at_least": 1, "above": "random"}, "got 2"),
+        ({"method": "gradient", "at_least": 1, "of": "luck"}, "of"),
+    ],
+)
+def test_a_limit_that_says_nothing_or_two_things_is_refused(limit, says):
+    with pytest.raises(ValueError, match=says):
+        Reference.model_validate({"targets": {"straight": [limit]}})
+
+
+def test_without_a_reference_there_is_neither_paper_nor_target(table):
+    bare = table_of(WANTED, table.cells.values())
+    assert table_targets(bare) == []
+    assert {row.paper_m for row in bare.rows} == {None}
+    assert "Targets" not in render_transfer_page(bare)

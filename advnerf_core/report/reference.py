@@ -1,0 +1,67 @@
+"""What a table is held against: totals of a publication, and limits. Both are data that a campaign file names."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+Domain = Literal["surrogate", "deployed"]
+Measure = Literal["ratio", "spread", "off_track", "off_track_share"]
+# Mean, and standard deviation where there is one.
+Total = Annotated[tuple[float, ...], Field(min_length=1, max_length=2)]
+
+
+class _Data(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Limit(_Data):
+    """What one line of a table must show.
+
+    Attributes:
+        method: Which method's line.
+        domain: Where.
+        victim: Whose line.
+        of: ``ratio`` to no attack, ``spread`` (standard deviation over mean), ``off_track`` drives, or their share.
+        at_least: Smallest value.
+        at_most: Largest value.
+        above: Another method, whose value must be exceeded.
+        said: The limit in words; empty for the plain number.
+    """
+
+    method: str = Field(min_length=1)
+    domain: Domain = "deployed"
+    victim: str = "hardened"
+    of: Measure = "ratio"
+    at_least: float | None = None
+    at_most: float | None = None
+    above: str = ""
+    said: str = ""
+
+    @model_validator(mode="after")
+    def _one_limit(self) -> Limit:
+        given = (self.at_least is not None) + (self.at_most is not None) + bool(self.above)
+        if given != 1:
+            raise ValueError(f"expected one of at_least, at_most and above, got {given}")
+        return self
+
+
+class Reference(_Data):
+    """What tables are held against.
+
+    Attributes:
+        paper: Totals of a publication by scenario, domain and method, in its own units.
+        targets: Limits by scenario.
+    """
+
+    paper: Mapping[str, Mapping[Domain, Mapping[str, Total]]] = Field(default_factory=dict)
+    targets: Mapping[str, tuple[Limit, ...]] = Field(default_factory=dict)
+
+    def total(self, scenario: str, domain: Domain, method: str) -> tuple[float | None, float | None]:
+        """Mean and standard deviation of the publication; None where it has none."""
+        found = self.paper.get(scenario, {}).get(domain, {}).get(method)
+        if found is None:
+            return None, None
+        return found[0], found[1] if len(found) > 1 else None
