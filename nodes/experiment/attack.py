@@ -59,42 +59,60 @@ def cells(experiment: Experiment) -> list[Cell]:
 
 def frozen_hashes(experiment: Experiment) -> dict[str, str]:
     """What is fixed before the first attack: scene, victims, objects and their places, starts and seeds."""
-    policies = {
-        f"policy_{name}": load_policy(victim_file(experiment, name)).sha256 for name in victims(experiment)
-    }
+    policies = {f"policy_{name}": _policy_sha256(experiment, name) for name in victims(experiment)}
     starts = {
         f"{scenario} {seed}": experiment.start_states(scenario, seed).tolist()
         for scenario in experiment.config.scenarios
         for seed in experiment.config.attack.seeds
     }
-    things = experiment.objects
     return {
-        "scene": scene_sha256(experiment),
+        **_frozen_place(experiment),
         **policies,
-        "objects": hash_of([geometry_sha256(experiment, thing.kind) for thing in things]),
-        "placement": hash_of(
-            [thing.model_dump(mode="json") for thing in things]
-            + ([panel_of(experiment).to_dict()] if has_face(experiment) else [])
-        ),
         "starts_and_seeds": hash_of(starts),
         "config": hash_of(experiment.config.model_dump(mode="json")),
     }
 
 
-def freeze(experiment: Experiment, folder: Path) -> None:
+def _frozen_for(experiment: Experiment, cell: Cell) -> dict[str, str]:
+    """What is fixed before the search of a cell; other seeds and victims do not matter to it."""
+    return {
+        **_frozen_place(experiment),
+        "policy": _policy_sha256(experiment, cell.victim),
+        "starts": hash_of(experiment.start_states(cell.scenario, cell.seed).tolist()),
+    }
+
+
+def _policy_sha256(experiment: Experiment, victim: str) -> str:
+    return load_policy(victim_file(experiment, victim)).sha256
+
+
+def _frozen_place(experiment: Experiment) -> dict[str, str]:
+    """Scene, objects, and where they stand."""
+    things = experiment.objects
+    return {
+        "scene": scene_sha256(experiment),
+        "objects": hash_of([geometry_sha256(experiment, thing.kind) for thing in things]),
+        "placement": hash_of(
+            [thing.model_dump(mode="json") for thing in things]
+            + ([panel_of(experiment).to_dict()] if has_face(experiment) else [])
+        ),
+    }
+
+
+def freeze(experiment: Experiment, cell: Cell, folder: Path) -> None:
     """Write what is fixed before the search of a cell, once."""
     if not (folder / FROZEN).exists():
-        write_atomically(folder / FROZEN, json.dumps(frozen_hashes(experiment), indent=1) + "\n")
+        write_atomically(folder / FROZEN, json.dumps(_frozen_for(experiment, cell), indent=1) + "\n")
 
 
-def check_frozen(experiment: Experiment, folder: Path) -> None:
+def check_frozen(experiment: Experiment, cell: Cell, folder: Path) -> None:
     """Refuse to drive if scene, victims, objects, places or starts are not those of the search.
 
     Raises:
         FrozenChangedError: Something of it changed.
     """
-    then, now = json.loads((folder / FROZEN).read_text()), frozen_hashes(experiment)
-    changed = [name for name, value in now.items() if name != "config" and then.get(name) != value]
+    then, now = json.loads((folder / FROZEN).read_text()), _frozen_for(experiment, cell)
+    changed = [name for name, value in now.items() if then.get(name) != value]
     if changed:
         raise FrozenChangedError(
             f"expected {', '.join(changed)} as frozen before the search in {folder}, got another; remove that folder to search again"
@@ -220,13 +238,8 @@ def _search(
     folder: Path,
     report: Callable[..., None],
 ) -> SearchResult:
-    frozen = {
-        key: value
-        for key, value in frozen_hashes(experiment).items()
-        if key not in ("config", "starts_and_seeds")
-    }
     wanted = experiment.config.space.model_dump(mode="json")
-    settings_hash = hash_of({**frozen, "victim": cell.victim, "scenario": cell.scenario, "space": wanted})
+    settings_hash = hash_of({**_frozen_for(experiment, cell), "scenario": cell.scenario, "space": wanted})
     method = load_method(cell.code)
     settings = search_settings(experiment, method)
     told = telling(method.evaluations(problem, settings), report)

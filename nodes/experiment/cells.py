@@ -96,7 +96,7 @@ def run_cell(
     require_known(experiment, cell)
     with Bench(experiment) if bench is None else nullcontext(bench) as shared:
         clean = search_cell(experiment, cell, folder, report, shared)
-        check_frozen(experiment, folder)
+        check_frozen(experiment, cell, folder)
         tell = partial(report, _SEARCHED)
         tell("driving")
         driven = clean if cell.method == NONE else folder
@@ -122,7 +122,7 @@ def search_cell(
     """
     require_known(experiment, cell)
     clean = clean_folder(experiment, cell, folder)
-    freeze(experiment, folder)
+    freeze(experiment, cell, folder)
     with Bench(experiment) if bench is None else nullcontext(bench) as shared:
         surrogate_part(experiment, shared.space, cell.clean, clean, report)
         if cell.method == NONE:
@@ -182,9 +182,12 @@ class ExperimentCells(CellKind):
     @contextmanager
     def hold(self, experiment: Experiment) -> Iterator[None]:
         """Keep world and space open."""
-        with Bench(experiment) as self._bench:
-            yield
-        self._bench = None
+        with Bench(experiment) as bench:
+            self._bench = bench
+            try:
+                yield
+            finally:
+                self._bench = None
 
     def runs_alone(self, experiment: Experiment) -> bool:
         """Where a server steps one world at a time, or live nodes measure time."""

@@ -146,7 +146,7 @@ def _first_attacks(
     for index, name in enumerate(experiment.config.scenarios):
         cell = Cell(name, HARDENED, "gradient", experiment.config.attack.seeds[0])
         at = experiment.cell_folder(cell)
-        freeze(experiment, at)
+        freeze(experiment, cell, at)
 
         def told(part: float, text: str = "", index: int = index, name: str = name) -> None:
             done = (index + part) / len(experiment.config.scenarios)

@@ -182,11 +182,11 @@ def test_unknown_cells_are_refused(trained: Experiment, tmp_path: Path) -> None:
 
 def test_another_policy_after_the_attack_is_refused(fresh: Experiment) -> None:
     folder = fresh.cell_folder(GRADIENT)
-    attack.freeze(fresh, folder)
-    attack.check_frozen(fresh, folder)
+    attack.freeze(fresh, GRADIENT, folder)
+    attack.check_frozen(fresh, GRADIENT, folder)
     shutil.copy(victim_file(fresh, NAIVE), victim_file(fresh, "hardened"))
-    with pytest.raises(attack.FrozenChangedError, match="policy_hardened"):
-        attack.check_frozen(fresh, folder)
+    with pytest.raises(attack.FrozenChangedError, match="expected policy as frozen"):
+        attack.check_frozen(fresh, GRADIENT, folder)
 
 
 def test_table_divides_by_the_clean_drive_of_the_same_domain(fresh: Experiment) -> None:
