@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from nodes.experiment.cell_kind import Loop
 
 _SEARCHED = 0.9  # share of a cell's work
-_SEARCHED = 0.9  # share of a cell's work
 
 
 class Bench:
