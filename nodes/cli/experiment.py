@@ -197,7 +197,7 @@ def status(
     overrides: Overrides = None,
 ) -> None:
     """Say which cells are done, running, failed (and why), made with other settings, or missing."""
-    from nodes.experiment.campaign.run import statuses
+    from nodes.experiment.campaign.plan import statuses
 
     campaign, cells = _load(file, setting, folder, overrides, only)
     found = statuses(campaign, cells)
@@ -273,7 +273,7 @@ def _page_folder(campaign: Campaign) -> Path:
 
 
 def _show_table(campaign: Campaign, cells: Sequence[Cell], output: Path | None) -> None:
-    from nodes.experiment.campaign.run import statuses
+    from nodes.experiment.campaign.plan import statuses
     from nodes.experiment.campaign.table import campaign_table
 
     found = statuses(campaign, cells)
@@ -381,8 +381,8 @@ def publish(
     overrides: Overrides = None,
 ) -> None:
     """Copy the finished cells to where they are kept with the code."""
+    from nodes.experiment.campaign.plan import statuses
     from nodes.experiment.campaign.published import publish as copy_cells
-    from nodes.experiment.campaign.run import statuses
 
     campaign, cells = _load(file, setting, folder, overrides, only)
     found = copy_cells(campaign, statuses(campaign, cells), to, prune)

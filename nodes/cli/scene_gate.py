@@ -54,7 +54,7 @@ def gate(
     from advnerf_core.scene.gate_limits import GateLimits
     from nodes.experiment.campaign.gate import judge_scene
     from nodes.experiment.cell import Cell
-    from nodes.experiment.cell_kind import load_kind
+    from nodes.experiment.kinds import load_kind
 
     found = load_kind(kind)
     experiment = found.load(file, setting, overrides or [], run_folder or Path("runs") / setting)

@@ -1,19 +1,18 @@
-"""How cells are run: the contract of a kind of cells, and the kinds by name."""
+"""How cells are run: the contract of a kind of cells; `nodes.experiment.kinds` finds one by name."""
 
 from __future__ import annotations
 
 import json
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from advnerf_core.attack.methods import method_digest
-from advnerf_core.plugins import PluginError, absolute_reference, resolve
 from nodes.experiment.cell import Cell
 from nodes.experiment.stages import hash_of
-from nodes.runtime.errors import ConfigError, RuntimeFault
+from nodes.runtime.errors import RuntimeFault
 from nodes.runtime.progress import Report
 
 if TYPE_CHECKING:
@@ -25,8 +24,6 @@ if TYPE_CHECKING:
     from advnerf_core.scene.fidelity import Pictures
 
     Loop = tuple[AttackProblem, Scene, torch.Tensor, Horizon]
-
-ENTRY_POINTS = "advnerf.cells"
 
 
 class NoPicturesError(RuntimeFault):
@@ -116,38 +113,6 @@ class CellKind(ABC):
         return NoPicturesError(
             f"expected cells with real and learned pictures, got {type(self).__name__}, which has none: no gate and no prediction"
         )
-
-
-def _experiment() -> CellKind:
-    from nodes.experiment.cells import ExperimentCells
-
-    return ExperimentCells()
-
-
-KINDS: Mapping[str, Callable[[], CellKind]] = {"experiment": _experiment}
-
-
-def load_kind(name: str, folder: Path | None = None) -> CellKind:
-    """The kind that a name stands for: ``experiment``, an entry point of ``advnerf.cells``, or ``file.py:Class``.
-
-    Raises:
-        ConfigError: There is none, or it is no `CellKind`.
-    """
-    try:
-        found: Any = resolve(name, "kind of cells", KINDS, ENTRY_POINTS, folder)
-    except PluginError as error:
-        raise ConfigError(str(error)) from None
-    made = found() if isinstance(found, type) else found
-    if not isinstance(made, CellKind):
-        raise ConfigError(
-            f"expected a subclass of nodes.experiment.cell_kind.CellKind, got {name} = {found!r:.80}"
-        )
-    return made
-
-
-def absolute_kind(name: str, folder: Path) -> str:
-    """The name as another process understands it."""
-    return absolute_reference(name, folder)
 
 
 def settings_hash(kind: CellKind, experiment: Any, cell: Cell) -> str:

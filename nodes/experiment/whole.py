@@ -11,7 +11,8 @@ from rich.console import Console
 from nodes.experiment import report
 from nodes.experiment.attack import cells
 from nodes.experiment.campaign.config import Campaign, campaign_of
-from nodes.experiment.campaign.run import Options, run_campaign, statuses
+from nodes.experiment.campaign.plan import statuses
+from nodes.experiment.campaign.run import Options, run_campaign
 from nodes.experiment.campaign.worker import Ended
 from nodes.experiment.cell import Cell, select
 from nodes.experiment.context import Experiment

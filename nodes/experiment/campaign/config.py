@@ -14,7 +14,7 @@ from advnerf_core.report.conditions import NONE, order_of
 from advnerf_core.report.reference import Reference
 from advnerf_core.scene.gate_limits import GateLimits
 from nodes.experiment.cell import Cell
-from nodes.experiment.cell_kind import absolute_kind
+from nodes.experiment.kinds import absolute_kind
 from nodes.experiment.method_names import ConditionReference
 from nodes.runtime.config import load_config, read_yaml
 from nodes.runtime.errors import ConfigError

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from nodes.experiment.campaign.config import Campaign
-from nodes.experiment.campaign.run import plan_cells
+from nodes.experiment.campaign.plan import plan_cells
 from nodes.experiment.campaign.store import store_of
 from nodes.experiment.cell import Cell
-from nodes.experiment.cell_kind import load_kind
+from nodes.experiment.kinds import load_kind
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import ProgressDisplay
 

@@ -16,10 +16,10 @@ from advnerf_core.report.conditions import NONE
 from advnerf_core.report.transfer_prediction import Predicted
 from nodes.experiment.campaign.config import Campaign
 from nodes.experiment.campaign.gate import CleanDrive, predict_cell
-from nodes.experiment.campaign.run import plan_cells
+from nodes.experiment.campaign.plan import plan_cells
 from nodes.experiment.campaign.store import store_of
 from nodes.experiment.cell import Cell
-from nodes.experiment.cell_kind import load_kind
+from nodes.experiment.kinds import load_kind
 
 _KEYS = {"ratio", "ratio_low", "ratio_high", "retained", "total_cte_m", "clean_drive"}
 

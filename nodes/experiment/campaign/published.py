@@ -10,9 +10,9 @@ from pathlib import Path
 from advnerf_core.files import write_atomically
 from advnerf_core.report.cells import CellResult, read_cell, read_cells
 from advnerf_core.report.transfer import TransferTable, make_table
+from nodes.experiment.campaign.admission import gate_file, gate_key
 from nodes.experiment.campaign.config import Campaign
 from nodes.experiment.campaign.predictions import kept_prediction, prediction_file
-from nodes.experiment.campaign.run import gate_file, gate_key
 from nodes.experiment.campaign.store import CellStatus, store_of
 from nodes.experiment.campaign.table import wanted_rows
 from nodes.experiment.cell import Cell

@@ -12,19 +12,18 @@ from typing import Any, Literal
 import joblib
 from rich.console import Console
 
-from advnerf_core.report.cells import CellResult
+from nodes.experiment.campaign.admission import past_the_gate
 from nodes.experiment.campaign.config import Campaign
-from nodes.experiment.campaign.store import CellStatus, Store, store_of
+from nodes.experiment.campaign.plan import Planned, elsewhere, plan_cells, read_experiment
+from nodes.experiment.campaign.store import Store, store_of
 from nodes.experiment.campaign.worker import Ended, Job, run_here, run_in_process
 from nodes.experiment.cell import Cell
-from nodes.experiment.cell_kind import load_kind, settings_hash
-from nodes.runtime.errors import ConfigError, RuntimeFault
+from nodes.experiment.kinds import load_kind
+from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import ProgressDisplay, Report
 
 Backend = Literal["local", "ray"]
 Say = Callable[[str], None]
-# Where cells are kept with the code.
-PUBLISHED = Path("docs/results")
 # How often cells are handed out again after a whole machine of a cluster was lost.
 _ROUNDS = 3
 
@@ -56,101 +55,6 @@ class Options:
     ready: bool = False
 
 
-@dataclass(frozen=True)
-class Planned:
-    """A cell with its settings, as they are now.
-
-    Attributes:
-        cell: Which.
-        job: How it is run; without threads and phase.
-        live: Whether it drives a live graph.
-        searches: Whether it has a part that may run beside others.
-    """
-
-    cell: Cell
-    job: Job
-    live: bool
-    searches: bool
-
-
-def plan_cells(
-    campaign: Campaign, cells: Sequence[Cell], experiments: dict[tuple[str, str], Any] | None = None
-) -> list[Planned]:
-    """Settings of every cell as they are; reads experiments and digests of their stages, prepares nothing.
-
-    Args:
-        campaign: The campaign.
-        cells: Which of its cells.
-        experiments: Those that were read already, by scenario and placement; it gets what is read.
-    """
-    experiments = {} if experiments is None else experiments
-    planned = []
-    for cell in cells:
-        kind = load_kind(campaign.kind(cell))
-        key = (cell.scenario, cell.placement)
-        if key not in experiments:
-            experiments[key] = _experiment(campaign, cell)
-        inside = campaign.inside(cell)
-        digest = settings_hash(kind, experiments[key], inside)
-        job = Job(
-            str(campaign.folder),
-            cell.name,
-            campaign.kind(cell),
-            str(campaign.experiment_file(cell)),
-            campaign.scenario(cell).setting,
-            tuple(campaign.overrides(cell)),
-            str(campaign.run_folder(cell)),
-            inside.scenario,
-            cell.scenario,
-            cell.placement,
-            cell.victim,
-            cell.code,
-            cell.seed,
-            digest,
-            threads=1,
-        )
-        planned.append(Planned(cell, job, kind.runs_alone(experiments[key]), kind.searches_apart))
-    return planned
-
-
-def statuses(campaign: Campaign, cells: Sequence[Cell]) -> list[CellStatus]:
-    """Where every cell is; one whose experiment cannot be read, as it is not made yet, is missing."""
-    store = store_of(campaign)
-    experiments: dict[tuple[str, str], Any] = {}
-    return [
-        store.status(cell, hash_as_it_is(campaign, cell, experiments), elsewhere(campaign, cell))
-        for cell in cells
-    ]
-
-
-def elsewhere(campaign: Campaign, cell: Cell) -> list[Path]:
-    """Files where a cell may be besides the campaign's own folder: in the run folder of its experiment, and where cells are kept with the code."""
-    run = campaign.run_folder(cell)
-    return [
-        *([run / "cells" / f"{campaign.inside(cell).name}.json"] if run != campaign.folder else []),
-        PUBLISHED / campaign.name / f"{cell.name}.json",
-    ]
-
-
-def hash_as_it_is(campaign: Campaign, cell: Cell, experiments: dict[tuple[str, str], Any]) -> str | None:
-    """Hash of everything that a cell depends on; None if it cannot be known yet, as what the cell needs is not made.
-
-    Args:
-        campaign: The campaign.
-        cell: Which of its cells.
-        experiments: As of `plan_cells`.
-
-    Raises:
-        ConfigError: Its experiment or its kind is wrong.
-    """
-    try:
-        return plan_cells(campaign, [cell], experiments)[0].job.settings_hash
-    except ConfigError:
-        raise
-    except (RuntimeFault, OSError):
-        return None
-
-
 def run_campaign(
     campaign: Campaign,
     cells: Sequence[Cell],
@@ -180,7 +84,7 @@ def run_campaign(
         _prepare(campaign, cells, say)
     # Before the gate, so that a cell that there cannot be is told first.
     plan = plan_cells(campaign, cells, experiments)
-    judged = _past_the_gate(campaign, cells, options, say)
+    judged = past_the_gate(campaign, cells, options.gate, say)
     wanted = [
         each
         for each in plan
@@ -215,7 +119,7 @@ def run_campaign(
         if each.live and each.cell.name not in lost:
             ended.append(_tell(run_in_process(replace(each.job, threads=_cores())), say))
     # Their drives without attack are there now.
-    _past_the_gate(campaign, [each.cell for each in wanted if each.live], options, say)
+    past_the_gate(campaign, [each.cell for each in wanted if each.live], options.gate, say)
     return ended
 
 
@@ -262,19 +166,10 @@ def _at_a_time(jobs: int, threads: int) -> str:
     return f"{jobs or 'all the cluster has cores for'} at a time, {threads} threads each"
 
 
-def _experiment(campaign: Campaign, cell: Cell) -> Any:
-    return load_kind(campaign.kind(cell)).load(
-        campaign.experiment_file(cell),
-        campaign.scenario(cell).setting,
-        campaign.overrides(cell),
-        campaign.run_folder(cell),
-    )
-
-
 def _prepare(campaign: Campaign, cells: Sequence[Cell], say: Say) -> None:
     done: set[tuple[Path, str]] = set()
     # All files are read before anything is made, so that a mistake in the last does not cost the hours of the first.
-    experiments = {(cell.scenario, cell.placement): (cell, _experiment(campaign, cell)) for cell in cells}
+    experiments = {(cell.scenario, cell.placement): (cell, read_experiment(campaign, cell)) for cell in cells}
     _refuse_two_in_one_folder(campaign, cells)
     for cell, experiment in experiments.values():
         folder = campaign.run_folder(cell)
@@ -293,59 +188,13 @@ def _refuse_two_in_one_folder(campaign: Campaign, cells: Sequence[Cell]) -> None
     for cell in {(each.scenario, each.placement): each for each in campaign.cells}.values():
         if (folder := campaign.run_folder(cell)) not in folders:
             continue
-        needed = load_kind(campaign.kind(cell)).needed_settings(_experiment(campaign, cell))
+        needed = load_kind(campaign.kind(cell)).needed_settings(read_experiment(campaign, cell))
         name, others = first.setdefault(folder, (cell.scenario, needed))
         if wrong := [stage for stage in needed.keys() & others.keys() if needed[stage] != others[stage]]:
             raise ConfigError(
                 f"{campaign.file}: expected scenarios {name} and {cell.scenario} to have the same settings of stage {', '.join(sorted(wrong))}, as "
                 f"both are in {folder}, got different ones; give one of them a run_folder of its own"
             )
-
-
-def _past_the_gate(campaign: Campaign, cells: Sequence[Cell], options: Options, say: Say) -> list[Cell]:
-    """The cells whose surrogate is good enough; judged once per scenario and victim, and kept."""
-    passed: dict[str, bool] = {}
-    for cell in cells:
-        if (key := gate_key(cell)) not in passed:
-            passed[key] = _judge(campaign, cell, options, say)
-    return [cell for cell in cells if passed[gate_key(cell)]]
-
-
-def _judge(campaign: Campaign, cell: Cell, options: Options, say: Say) -> bool:
-    """Whether the cells of this one's scenario and victim may be run: by held-out views, and by a drive without attack where there is one."""
-    scenario = campaign.scenario(cell)
-    kind, key = load_kind(campaign.kind(cell)), gate_key(cell)
-    limits = scenario.gate or campaign.gate
-    if limits is None or not kind.judges(_experiment(campaign, cell)):
-        return True
-    from nodes.experiment.campaign.gate import cached_verdict  # loads torch
-
-    first = min(each.seed for each in campaign.cells if gate_key(each) == key)
-    without = replace(cell.clean, seed=first)
-    which = (kind, _experiment(campaign, cell), campaign.inside(without), limits)
-    found = [cached_verdict(*which, gate_file(campaign.folder, key))]
-    try:
-        drive = store_of(campaign).work(without.name)
-        found.append(cached_verdict(*which, gate_file(campaign.folder, key, drive=True), drive))
-    except RuntimeFault as fault:
-        say(
-            f"fidelity gate, {key}: only held-out views are judged, as there is no drive without attack yet: {fault}"
-        )
-    may = not options.gate or all(verdict is None or verdict.passed for verdict in found)
-    for reason in [reason for verdict in found if verdict is not None for reason in verdict.reasons]:
-        left_out = "" if may else "; its cells are left out (--no-gate runs them all the same)"
-        say(f"fidelity gate, {key}: {reason}{left_out}")
-    return may
-
-
-def gate_file(folder: Path, key: str, drive: bool = False) -> Path:
-    """Where a campaign, or what is published of it, keeps the verdict on held-out views, or on a drive without attack."""
-    return folder / "gate" / f"{key}{'.drive' * drive}.json"
-
-
-def gate_key(cell: Cell | CellResult) -> str:
-    """Name of what the fidelity gate judges for a cell."""
-    return f"{cell.scenario}{'.' * bool(cell.placement)}{cell.placement}_{cell.victim}"
 
 
 class _PrintedReport(Report):

@@ -24,7 +24,8 @@ from typing import Any, Literal, TextIO
 from advnerf_core.files import write_atomically
 from nodes.experiment.campaign.store import LOG, Store
 from nodes.experiment.cell import Cell
-from nodes.experiment.cell_kind import CellKind, load_kind, settings_hash
+from nodes.experiment.cell_kind import CellKind, settings_hash
+from nodes.experiment.kinds import load_kind
 from nodes.experiment.stages import stage_digests
 from nodes.runtime.errors import RuntimeFault
 from nodes.runtime.locks import HeldError, hold

@@ -8,7 +8,7 @@ from nodes.cli.main import app
 from nodes.experiment.campaign.config import load_campaign
 from nodes.experiment.campaign.run import _refuse_two_in_one_folder
 from nodes.experiment.cell import select
-from nodes.experiment.cell_kind import load_kind
+from nodes.experiment.kinds import load_kind
 from nodes.runtime.errors import ConfigError
 
 ROOT = Path(__file__).parents[3]

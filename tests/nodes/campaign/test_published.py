@@ -9,8 +9,9 @@ from typer.testing import CliRunner
 
 from nodes.cli.main import app
 from nodes.experiment.campaign.config import load_campaign
+from nodes.experiment.campaign.plan import plan_cells, statuses
 from nodes.experiment.campaign.published import Published, publish, published_table
-from nodes.experiment.campaign.run import Options, plan_cells, run_campaign, statuses
+from nodes.experiment.campaign.run import Options, run_campaign
 from nodes.experiment.campaign.table import campaign_table, write_table
 from nodes.experiment.cell import select
 from nodes.runtime.errors import ConfigError

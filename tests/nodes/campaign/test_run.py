@@ -10,7 +10,8 @@ import time
 import pytest
 
 from nodes.experiment.campaign.config import load_campaign
-from nodes.experiment.campaign.run import Options, _shares, run_campaign, statuses
+from nodes.experiment.campaign.plan import statuses
+from nodes.experiment.campaign.run import Options, _shares, run_campaign
 from nodes.experiment.campaign.store import Store
 from nodes.experiment.campaign.worker import take_cell
 from nodes.runtime.locks import hold

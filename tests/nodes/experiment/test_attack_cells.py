@@ -17,12 +17,13 @@ from advnerf_core.report.transfer_page import text_table
 from nodes.experiment import attack, page, report, run
 from nodes.experiment.attack import cells, load_shown, surrogate_part
 from nodes.experiment.cell import Cell
-from nodes.experiment.cell_kind import load_kind, settings_hash
+from nodes.experiment.cell_kind import settings_hash
 from nodes.experiment.cells import run_cell
 from nodes.experiment.context import Experiment
 from nodes.experiment.deploy import DRIVES, ThroughWorld, cell_data
 from nodes.experiment.films import film_cell
 from nodes.experiment.keys import CellError, clean_folder
+from nodes.experiment.kinds import load_kind
 from nodes.experiment.policy import NAIVE, victim_file
 from nodes.experiment.spaces import colour_space
 from tests.support.strangers import spiral_code, spiral_theta, write_spiral

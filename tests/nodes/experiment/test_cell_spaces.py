@@ -20,12 +20,13 @@ from advnerf_core.report.clips import ClipTrack, read_clip
 from nodes.experiment import attack, cells, films, pose_maps, run
 from nodes.experiment.attack import surrogate_part
 from nodes.experiment.cell import Cell
-from nodes.experiment.cell_kind import load_kind, settings_hash
+from nodes.experiment.cell_kind import settings_hash
 from nodes.experiment.cells import run_cell
 from nodes.experiment.config import RetrainConfig
 from nodes.experiment.context import Experiment
 from nodes.experiment.deploy import DRIVES, ThroughWorld, cell_data
 from nodes.experiment.keys import CellError
+from nodes.experiment.kinds import load_kind
 from nodes.experiment.page import opening
 from nodes.experiment.policy import victim_file
 from nodes.experiment.pose_maps import PoseMapSettings

@@ -9,11 +9,11 @@ import pytest
 
 from nodes.experiment.campaign.gate import predict_cell
 from nodes.experiment.cell import Cell
-from nodes.experiment.cell_kind import load_kind
 from nodes.experiment.cells import search_cell
 from nodes.experiment.context import Experiment
 from nodes.experiment.deployed import DressedScene
 from nodes.experiment.drives import deployed_drives
+from nodes.experiment.kinds import load_kind
 from nodes.experiment.objects import placed_objects
 
 WHICH = Cell("right", "hardened", "random", 0)

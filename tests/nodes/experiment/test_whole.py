@@ -11,9 +11,9 @@ import pytest
 from advnerf_core.report.results import read_results
 from nodes.experiment.campaign.gate import predict_cell
 from nodes.experiment.cell import Cell
-from nodes.experiment.cell_kind import load_kind
 from nodes.experiment.cells import run_cell
 from nodes.experiment.keys import driven_folder
+from nodes.experiment.kinds import load_kind
 from nodes.experiment.run import load_experiment, make_ready
 from nodes.experiment.whole import run_experiment
 
