@@ -24,7 +24,7 @@ $(VENV)/.installed: pyproject.toml constraints.txt docker/system-packages.sh
 	@touch $@
 
 demo: setup  ## The whole experiment, small setting, on the simulated lab (up to 20 minutes on 2 cores)
-	@$(BIN)/advnerf experiment launch/room.experiment.yaml --setting demo --run-folder runs/demo
+	@$(BIN)/advnerf experiment launch/room.experiment.yaml --setting demo --run-folder runs/demo --anew
 
 experiment: setup  ## The full experiment, 3 seeds (up to 2 hours on 2 cores); writes its rows to docs/results.json
 	@$(BIN)/advnerf experiment launch/room.experiment.yaml --setting full --run-folder runs/full

@@ -127,6 +127,10 @@ def experiment(
             "--search-only", help="Search and deploy nothing yet, so that transfer can be predicted first."
         ),
     ] = False,
+    anew: Annotated[
+        bool,
+        typer.Option("--anew", help="Make every stage here, also those that are kept in docs/results/build."),
+    ] = False,
     overrides: Overrides = None,
 ) -> None:
     """Run an experiment, from the photographs to the report: every stage and every cell that is not there yet. It may be stopped at any time."""
@@ -143,10 +147,11 @@ def experiment(
         jobs or 0, threads or 0, backend, address, retry, gate, search_only, here, ready=not many
     )
     if not many:
-        _run_one(file, setting, folder or Path("runs") / setting, until, only, options, overrides or [])
+        _run_one(file, setting, folder or Path("runs") / setting, until, only, options, overrides or [], anew)
         return
-    if until is not None:
-        raise ConfigError(f"expected --until with an experiment file, got it with the campaign {file}")
+    if until is not None or anew:
+        what = "--until" if until is not None else "--anew"
+        raise ConfigError(f"expected {what} with an experiment file, got it with the campaign {file}")
     _run_many(file, folder, only, options, overrides)
 
 
@@ -158,13 +163,14 @@ def _run_one(
     only: str,
     options: Options,
     overrides: Sequence[str],
+    anew: bool,
 ) -> None:
     from nodes.experiment.run import load_experiment
     from nodes.experiment.whole import run_experiment
 
     with ends_in_order():
         loaded = load_experiment(file, setting, overrides, folder)
-        ended = run_experiment(loaded, until, options, only, overrides)
+        ended = run_experiment(loaded, until, options, only, overrides, anew=anew)
     _say_wrong(ended)
 
 
@@ -380,14 +386,21 @@ def publish(
     ] = False,
     overrides: Overrides = None,
 ) -> None:
-    """Copy the finished cells to where they are kept with the code."""
+    """Copy the finished cells, and the scenes, victims and objects that they were run with, to where they are kept with the code."""
     from nodes.experiment.campaign.plan import statuses
     from nodes.experiment.campaign.published import publish as copy_cells
+    from nodes.experiment.campaign.published import publish_build
 
     campaign, cells = _load(file, setting, folder, overrides, only)
     found = copy_cells(campaign, statuses(campaign, cells), to, prune)
     for name in found.written:
         print(f"{to / campaign.name / name}.json")
+    build = publish_build(campaign, cells, to, prune)
+    for each in build.written:
+        print(each)
+    for each in build.removed:
+        print(f"{each}: removed, as no published cell was run with it")
+    print(f"{build.folder}: {build.size_bytes / 1e6:.1f} MB")
     unfinished = len(cells) - len(found.written) - len(found.same)
     print(f"{len(found.written)} cells written, {len(found.same)} were there, {unfinished} are not finished")
     if found.stale:

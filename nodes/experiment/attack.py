@@ -30,7 +30,7 @@ from nodes.experiment.policy import HARDENED, victim_file, victims
 from nodes.experiment.request.telling import telling
 from nodes.experiment.space_config import FaceConfig, MeshShapeConfig, MeshTextureConfig, PlacesConfig
 from nodes.experiment.spaces import geometry_sha256, over_the_world
-from nodes.experiment.stages import hash_of
+from nodes.experiment.stage_record import hash_of
 from nodes.runtime.errors import RuntimeFault
 
 FROZEN, SEARCHED, ATTACK = "frozen.json", "surrogate.json", "attack.safetensors"

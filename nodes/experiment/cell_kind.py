@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from advnerf_core.attack.methods import method_digest
 from nodes.experiment.cell import Cell
-from nodes.experiment.stages import hash_of
+from nodes.experiment.stage_record import hash_of
 from nodes.runtime.errors import RuntimeFault
 from nodes.runtime.progress import Report
 
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from advnerf_core.attack.transfer import Scene
     from advnerf_core.driving.metrics import Horizon
     from advnerf_core.scene.fidelity import Pictures
+    from nodes.experiment.reference import Reference
 
     Loop = tuple[AttackProblem, Scene, torch.Tensor, Horizon]
 
@@ -56,6 +57,10 @@ class CellKind(ABC):
     def prepare(self, experiment: Any, report: Report) -> None:
         """Make what all cells of the experiment need and is not there yet."""
         return
+
+    def keep(self, experiment: Any, reference: Reference) -> list[Path]:
+        """Copy what cells of the experiment are run with into a reference build; returns the folders that are new there."""
+        return []
 
     def search(self, experiment: Any, cell: Cell, folder: Path, report: Report) -> None:
         """The part of `run` that may run beside others."""

@@ -20,9 +20,11 @@ from nodes.experiment.context import Experiment
 from nodes.experiment.deploy import Deployer, ThroughNodes, ThroughWorld, cell_data
 from nodes.experiment.films import film_cell, kept_film, with_film
 from nodes.experiment.keys import NEEDED, CellError, cell_inputs, clean_folder, require_known
+from nodes.experiment.reference import Reference
 from nodes.experiment.run import load_experiment, prepare_victims, stages_of
 from nodes.experiment.space_config import PlacesConfig
 from nodes.experiment.spaces import make_space, over_the_world
+from nodes.experiment.stages import keep_stages
 from nodes.runtime.progress import Report
 
 if TYPE_CHECKING:
@@ -165,6 +167,11 @@ class ExperimentCells(CellKind):
         """Make scene, objects and policies."""
         del report  # the stages show their own progress
         prepare_victims(experiment)
+
+    def keep(self, experiment: Experiment, reference: Reference) -> list[Path]:
+        """Scene, objects and policies, without what only their training read."""
+        needed = [stage for stage in stages_of(experiment) if stage.name in NEEDED]
+        return keep_stages(needed, experiment.folder, reference)
 
     def inputs(self, experiment: Experiment, cell: Cell) -> dict[str, Any]:
         """See `cell_inputs`."""

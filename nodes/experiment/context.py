@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path as FilePath
 from typing import Any
@@ -39,7 +39,13 @@ _HALF_LANE_M, _SPEED_MPS = 1.75, 6.0
 
 @dataclass(frozen=True)
 class Experiment(RunFolder[ExperimentConfig]):
-    """One resolved experiment."""
+    """One resolved experiment.
+
+    Attributes:
+        kept: Digests of what its stages wrote that are kept with the code, and those of the run folder before them, when it was read.
+    """
+
+    kept: Mapping[str, str] = field(default_factory=dict)
 
     @cached_property
     def named_world(self) -> NamedWorld:

@@ -13,7 +13,7 @@ from advnerf_core.report.conditions import NONE
 from nodes.experiment.cell import Cell
 from nodes.experiment.context import Experiment
 from nodes.experiment.policy import RETRAINED, attackable, victim_file
-from nodes.experiment.stages import hash_of, stage_digests
+from nodes.experiment.stage_record import hash_of, stage_digests
 from nodes.runtime.errors import RuntimeFault
 
 # The stages that cells need of their experiment; what comes after is the cells themselves.
@@ -52,11 +52,12 @@ def cell_inputs(experiment: Experiment, cell: Cell) -> dict[str, Any]:
         config["attack"] = {
             key: value for key, value in config["attack"].items() if key not in _SEARCHED_WITH
         }
+    kept = {name: digest for name, digest in experiment.kept.items() if name in NEEDED}
     inputs = {
         "version": VERSION,
         "config": config,
         "world": experiment.world_settings,
-        "stages": stage_digests(experiment.folder, NEEDED),
+        "stages": {**kept, **stage_digests(experiment.folder, NEEDED)},
     }
     if cell.victim != RETRAINED:
         return inputs

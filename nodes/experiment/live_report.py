@@ -30,7 +30,7 @@ from nodes.experiment.keys import driven_folder
 from nodes.experiment.live import extra_runs, lab_of
 from nodes.experiment.policy import HARDENED
 from nodes.experiment.spaces import make_space
-from nodes.experiment.stages import read_record
+from nodes.experiment.stage_record import read_record
 from nodes.lab.trials import evaluation
 from nodes.runtime.machine import memory_gib, processor_name
 from nodes.runtime.progress import Report

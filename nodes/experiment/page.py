@@ -22,7 +22,7 @@ from nodes.experiment.attack import cells, frozen_hashes
 from nodes.experiment.cell import Cell
 from nodes.experiment.context import Experiment
 from nodes.experiment.policy import HARDENED
-from nodes.experiment.stages import read_record
+from nodes.experiment.stage_record import read_record
 
 _MARGIN_M, _SHOWN_VIEWS = 3.0, 3
 

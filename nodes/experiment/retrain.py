@@ -39,7 +39,7 @@ from nodes.experiment.drives import deployed_drives
 from nodes.experiment.objects import placed_objects
 from nodes.experiment.policy import HARDENED, plans, victim_file
 from nodes.experiment.spaces import colour_space, random_placements
-from nodes.experiment.stages import hash_of
+from nodes.experiment.stage_record import hash_of
 from nodes.runtime.progress import Report
 
 _NEAR_M, _TURNED_RAD, _GIVE_UP_M = 1.0, 0.15, 3.0  # metres of half a lane of 1.75 m

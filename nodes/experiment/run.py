@@ -17,9 +17,11 @@ from nodes.experiment.config import ExperimentConfig
 from nodes.experiment.context import Experiment
 from nodes.experiment.live import lab_of
 from nodes.experiment.placed import in_a_lane
+from nodes.experiment.reference import REFERENCE
 from nodes.experiment.run_folder import run_to_end
 from nodes.experiment.space_config import FaceConfig
-from nodes.experiment.stages import Stage, StageRecord, begun_with
+from nodes.experiment.stage_record import Stage, StageRecord
+from nodes.experiment.stages import begun_with
 from nodes.lab.worlds.named import read_world
 from nodes.launching.launch_file import load_launch
 from nodes.runtime.config import Document, Key, apply_overrides, read_yaml, validate
@@ -38,8 +40,10 @@ _LIBRARIES = (
 )
 # Raised when what a stage makes changes with the same settings: then its old results, and all that build on them, are made again.
 # tests/nodes/experiment/test_versions.py fails where a result changed and its version did not.
-VERSIONS = {"capture": 1, "scene": 1, "object": 1, "policy": 1, "retrain": 1, "live": 1}
+VERSIONS = {"capture": 1, "scene": 2, "object": 1, "policy": 1, "retrain": 1, "live": 1}
 _WHOLE_STEP_S = 1e-6
+# What policies are trained with, beside what comes of it.
+_TRAINING_FILES = ("frames", "*.checkpoint.safetensors", "*.shards.json", "settings.json")
 
 
 def load_experiment(file: Path, setting: str, overrides: Sequence[str], folder: Path) -> Experiment:
@@ -63,7 +67,7 @@ def load_experiment(file: Path, setting: str, overrides: Sequence[str], folder: 
         lab_of(experiment)
     if experiment.is_described:
         _check_places(experiment, document)
-    return experiment
+    return replace(experiment, kept=REFERENCE.digests(stages_of(experiment), experiment.folder))
 
 
 def read_setting(file: Path, setting: str, overrides: Sequence[str]) -> Document:
@@ -128,10 +132,11 @@ def _check_places(experiment: Experiment, document: Document) -> None:
 
 
 def make_ready(
-    experiment: Experiment, until: str | None = None, console: Console | None = None
+    experiment: Experiment, until: str | None = None, console: Console | None = None, anew: bool = False
 ) -> dict[str, StageRecord]:
-    """Run the stages that are not there yet: what cells need."""
-    return run_to_end(experiment, stages_of(experiment), _LIBRARIES, until, console)
+    """Run the stages that are not there yet: what cells need. Those that are kept with the code are there, unless all is to be made ``anew``."""
+    reference = None if anew else REFERENCE
+    return run_to_end(experiment, stages_of(experiment), _LIBRARIES, until, console, reference)
 
 
 def prepare_victims(experiment: Experiment) -> None:
@@ -180,12 +185,14 @@ def stages_of(experiment: Experiment) -> list[Stage]:
         settings: dict[str, Any],
         after: Sequence[str],
         parts: Sequence[dict[str, Any]] = (),
+        bulk: Sequence[str] = (),
+        reads_bulk_of: Sequence[str] = (),
     ) -> Stage:
         def work(folder: Path, told: Report) -> None:
             module.run(experiment, folder, told)
 
         settings, *smaller = json.loads(json.dumps([settings, *parts]))
-        return Stage(name, work, settings, after, VERSIONS[name], smaller)
+        return Stage(name, work, settings, after, VERSIONS[name], smaller, bulk, reads_bulk_of)
 
     def part(name: str) -> Any:
         return getattr(config, name).model_dump(mode="json")
@@ -205,12 +212,14 @@ def stages_of(experiment: Experiment) -> list[Stage]:
             capture,
             {"world": experiment.seen_settings, "capture": part("capture"), **face, **measured},
             (),
+            bulk=(capture.PHOTOS, capture.COLOUR_PAIRS),
         ),
         stage(
             "scene",
             scene,
             {"scene": part("scene"), "view": view, "colour_pairs": config.capture.colour_pairs},
             ("capture",),
+            reads_bulk_of=("capture",),
         ),
         stage("object", objects, {"object": part("object"), "kinds": kinds}, ()),
         stage(
@@ -218,6 +227,7 @@ def stages_of(experiment: Experiment) -> list[Stage]:
             policy,
             {**driven, **face, "policy": part("policy"), "sigma": config.attack.random_sigma},
             ("capture", "scene", "object"),
+            bulk=_TRAINING_FILES,
         ),
     ]
     if config.retrain is not None:
@@ -226,7 +236,8 @@ def stages_of(experiment: Experiment) -> list[Stage]:
             {**settings, "retrain": {**settings["retrain"], "rounds": rounds}}
             for rounds in range(1, config.retrain.rounds)
         ]
-        stages.append(stage("retrain", retrain, settings, ("scene", "object", "policy"), fewer))
+        after = ("scene", "object", "policy")
+        stages.append(stage("retrain", retrain, settings, after, fewer, reads_bulk_of=("policy",)))
     if config.deploy.live and (config.deploy.laps or config.deploy.empty_scene):
         graph = load_launch(experiment.launch_file).resolved
         stages.append(

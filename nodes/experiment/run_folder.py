@@ -14,7 +14,9 @@ from typing import Any, Generic, TypeVar
 from rich.console import Console
 
 from advnerf_core.files import write_atomically
-from nodes.experiment.stages import Stage, StageRecord, check_until, run_stages
+from nodes.experiment.reference import Reference
+from nodes.experiment.stage_record import Stage, StageRecord
+from nodes.experiment.stages import check_until, run_stages
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import ProgressDisplay
 
@@ -49,6 +51,7 @@ def run_to_end(
     libraries: Sequence[str],
     until: str | None = None,
     console: Console | None = None,
+    reference: Reference | None = None,
 ) -> dict[str, StageRecord]:
     """Run the stages that are not there yet.
 
@@ -58,6 +61,7 @@ def run_to_end(
         libraries: Whose versions the manifest names, of those that are installed.
         until: Last stage to run; None for all.
         console: Where to print.
+        reference: Where results of stages may be besides.
 
     Raises:
         ConfigError: The folder has the stages of another experiment, which would be replaced.
@@ -68,7 +72,7 @@ def run_to_end(
     experiment.folder.mkdir(parents=True, exist_ok=True)
     _write_manifest(experiment, libraries)
     with ProgressDisplay(console) as display:
-        return run_stages(stages, experiment.folder, display, until)
+        return run_stages(stages, experiment.folder, display, until, reference)
 
 
 def _refuse_the_folder_of_another(experiment: RunFolder[Any]) -> None:

@@ -17,7 +17,8 @@ from nodes.experiment.campaign.worker import Ended
 from nodes.experiment.cell import Cell, select
 from nodes.experiment.context import Experiment
 from nodes.experiment.run import make_ready, stages_of
-from nodes.experiment.stages import Stage, check_until, run_stages
+from nodes.experiment.stage_record import Stage
+from nodes.experiment.stages import check_until, run_stages
 from nodes.runtime.progress import ProgressDisplay
 
 REPORT = "report"
@@ -30,6 +31,7 @@ def run_experiment(
     only: str = "",
     overrides: Sequence[str] = (),
     console: Console | None = None,
+    anew: bool = False,
 ) -> list[Ended]:
     """Run the stages and the cells that are not there yet; where all cells are there, also the report.
 
@@ -40,6 +42,7 @@ def run_experiment(
         only: Which cells; see `select`.
         overrides: ``key=value`` texts with which the experiment was read, for other processes.
         console: Where to print.
+        anew: Whether stages are made here that are kept with the code.
 
     Returns:
         How every cell that was run ended.
@@ -53,7 +56,7 @@ def run_experiment(
     check_until(stages, until)
     plan = cells(experiment)
     chosen = select(plan, only)
-    make_ready(experiment, None if until == REPORT else until, console)
+    make_ready(experiment, None if until == REPORT else until, console, anew)
     ended: list[Ended] = []
     if until in (None, REPORT):
         campaign = campaign_of(experiment, overrides, plan)

@@ -11,9 +11,12 @@ import os
 import sys
 import tempfile
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from nodes.experiment.context import Experiment
 
 ROOT = Path(__file__).parents[2]
 RECORDED = ROOT / "tests" / "nodes" / "experiment" / "versions.json"
@@ -39,9 +42,9 @@ def measured(folder: Path) -> dict[str, dict[str, Any]]:
     from nodes.experiment import keys
     from nodes.experiment.cell import Cell
     from nodes.experiment.cells import ExperimentCells
-    from nodes.experiment.run import VERSIONS, load_experiment, make_ready
+    from nodes.experiment.run import VERSIONS, make_ready
 
-    experiment = load_experiment(ROOT / "launch" / "room.experiment.yaml", "demo", _TINY, folder)
+    experiment = tiny_experiment(folder)
     make_ready(experiment)
     views = load_transforms(experiment.stage_folder("capture") / "held_out", require_all=True).load()
     fidelity = json.loads((experiment.stage_folder("scene") / "fidelity.json").read_text())["mean"]
@@ -66,6 +69,17 @@ def measured(folder: Path) -> dict[str, dict[str, Any]]:
     }
     versions = {**VERSIONS, "cells": keys.VERSION}
     return {name: {"version": versions[name], "numbers": each} for name, each in numbers.items()}
+
+
+def tiny_experiment(folder: Path) -> Experiment:
+    """The experiment that is summed up.
+
+    Args:
+        folder: The run folder.
+    """
+    from nodes.experiment.run import load_experiment
+
+    return load_experiment(ROOT / "launch" / "room.experiment.yaml", "demo", _TINY, folder)
 
 
 def main() -> None:

@@ -14,7 +14,7 @@ from advnerf_core.scene.fidelity import Agreement, Effect, Pictures, Verdict, ag
 from advnerf_core.scene.gate_limits import GateLimits
 from nodes.experiment.cell import Cell
 from nodes.experiment.cell_kind import CellKind
-from nodes.experiment.stages import hash_of, stage_digests
+from nodes.experiment.stage_record import hash_of, stage_digests
 from nodes.lab.policy_data.evaluate import predict
 
 

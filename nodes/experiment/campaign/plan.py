@@ -13,10 +13,8 @@ from nodes.experiment.campaign.worker import Job
 from nodes.experiment.cell import Cell
 from nodes.experiment.cell_kind import settings_hash
 from nodes.experiment.kinds import load_kind
+from nodes.experiment.reference import PUBLISHED
 from nodes.runtime.errors import ConfigError, RuntimeFault
-
-# Where cells are kept with the code.
-PUBLISHED = Path("docs/results")
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,10 +13,14 @@ from advnerf_core.report.cells import CellResult, read_cell, read_cells
 from advnerf_core.report.transfer import TransferTable, make_table
 from nodes.experiment.campaign.admission import gate_file, gate_key
 from nodes.experiment.campaign.config import Campaign
+from nodes.experiment.campaign.plan import read_experiment
 from nodes.experiment.campaign.predictions import kept_prediction, prediction_file
 from nodes.experiment.campaign.store import CellStatus, store_of
 from nodes.experiment.campaign.table import wanted_rows
 from nodes.experiment.cell import Cell
+from nodes.experiment.kinds import load_kind
+from nodes.experiment.reference import BUILD, Reference
+from nodes.experiment.stage_record import RECORD, read_record
 from nodes.runtime.errors import ConfigError
 
 
@@ -67,6 +72,58 @@ def publish(campaign: Campaign, found: Sequence[CellStatus], folder: Path, prune
         written.append(each.cell.name)
     _publish_beside(campaign, [each for each in found if each.state == "done"], folder / campaign.name)
     return Published(tuple(written), tuple(same), tuple(stale))
+
+
+@dataclass(frozen=True)
+class PublishedBuild:
+    """The reference build after its publication.
+
+    Attributes:
+        folder: Where it is.
+        written: Folders of stages that are new there.
+        removed: Folders of stages that no published cell was run with.
+        size_bytes: Of all its files.
+    """
+
+    folder: Path
+    written: tuple[Path, ...]
+    removed: tuple[Path, ...]
+    size_bytes: int
+
+
+def publish_build(
+    campaign: Campaign, cells: Sequence[Cell], folder: Path, prune: bool = False
+) -> PublishedBuild:
+    """Copy the scenes, victims and objects of a campaign into the reference build.
+
+    Args:
+        campaign: The campaign.
+        cells: Whose.
+        folder: Of what is published.
+        prune: Remove stages there that no cell published in ``folder`` was run with.
+    """
+    reference = Reference(folder / BUILD)
+    experiments = {(each.scenario, each.placement): each for each in cells}
+    written = [
+        path
+        for cell in experiments.values()
+        for path in load_kind(campaign.kind(cell)).keep(read_experiment(campaign, cell), reference)
+    ]
+    removed = _prune_build(reference, folder) if prune else []
+    size = sum(path.stat().st_size for path in reference.folder.rglob("*") if path.is_file())
+    return PublishedBuild(reference.folder, tuple(written), tuple(removed), size)
+
+
+def _prune_build(reference: Reference, published: Path) -> list[Path]:
+    found = [json.loads(file.read_text(encoding="utf-8")) for file in published.glob("*/*.json")]
+    used = {digest for each in found if "stages" in each for digest in each["stages"].values()}
+    removed = []
+    for stage in sorted(each.parent for each in reference.folder.glob(f"*/{RECORD}")):
+        record = read_record(stage)
+        if record is None or record.digest not in used:
+            shutil.rmtree(stage)
+            removed.append(stage)
+    return removed
 
 
 def _is_of(published: Path, result: CellResult | None) -> bool:

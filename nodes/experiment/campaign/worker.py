@@ -26,7 +26,7 @@ from nodes.experiment.campaign.store import LOG, Store
 from nodes.experiment.cell import Cell
 from nodes.experiment.cell_kind import CellKind, settings_hash
 from nodes.experiment.kinds import load_kind
-from nodes.experiment.stages import stage_digests
+from nodes.experiment.stage_record import stage_digests
 from nodes.runtime.errors import RuntimeFault
 from nodes.runtime.locks import HeldError, hold
 from nodes.runtime.machine import machine_name

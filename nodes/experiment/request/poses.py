@@ -35,7 +35,7 @@ from nodes.experiment.request.prepare import Prepared, prepare
 from nodes.experiment.request.request import AttackRequest
 from nodes.experiment.request.search import attack_file, keep_request
 from nodes.experiment.request.telling import telling
-from nodes.experiment.stages import hash_of
+from nodes.experiment.stage_record import hash_of
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import Display
 

@@ -43,7 +43,7 @@ from calibration.schema import CameraCalibration, RoomCalibration, VehicleCalibr
 from nodes.experiment.request.meshes import found_meshes, shape_sensor
 from nodes.experiment.request.objects import PlacedObject, place
 from nodes.experiment.request.request import AttackRequest
-from nodes.experiment.stages import hash_of
+from nodes.experiment.stage_record import hash_of
 from nodes.lab.policy_camera import require_camera
 from nodes.runtime.errors import ConfigError
 

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 from nodes.cli.main import app
 from nodes.experiment.campaign.config import load_campaign
 from nodes.experiment.campaign.plan import plan_cells, statuses
-from nodes.experiment.campaign.published import Published, publish, published_table
+from nodes.experiment.campaign.published import Published, publish, publish_build, published_table
 from nodes.experiment.campaign.run import Options, run_campaign
 from nodes.experiment.campaign.table import campaign_table, write_table
 from nodes.experiment.cell import select
@@ -110,7 +110,8 @@ def test_a_published_cell_whose_key_matches_is_done_on_any_machine(here, tmp_pat
     for stage, digest in (("capture", "c1"), ("policy", "p1"), ("report", "r1")):
         folder = here.folder / "run" / stage
         folder.mkdir(parents=True)
-        (folder / "stage.json").write_text(json.dumps({"key": "k", "digest": digest, "seconds": 1.0}))
+        record = {"key": "k", "digest": digest, "seconds": 1.0, "settings": {}}
+        (folder / "stage.json").write_text(json.dumps(record))
     campaign = load_campaign(here.file)
     cells = select(campaign.cells, "seed=0")
     assert [end.how for end in run_campaign(campaign, cells, Options(jobs=2), lambda text: None)] == [
@@ -154,3 +155,20 @@ def test_a_cell_that_its_experiment_has_run_is_done_for_a_campaign_too(here):
         "missing",
         "missing",
     ]
+
+
+def test_a_published_build_stays_as_long_as_a_published_cell_was_run_with_it(here, tmp_path):
+    build, campaign = tmp_path / "build", load_campaign(here.file)
+    for name, digest in (("scene_of_a_cell", "s1"), ("scene_of_none", "s2")):
+        (build / name).mkdir(parents=True)
+        record = {"key": "k", "digest": digest, "seconds": 1.0, "settings": {}, "kept": "d"}
+        (build / name / "stage.json").write_text(json.dumps(record))
+    (tmp_path / "paper").mkdir()
+    (tmp_path / "paper" / "cell.json").write_text(json.dumps({"stages": {"scene": "s1"}}))
+    (tmp_path / "paper" / "gate.json").write_text(json.dumps({"passed": True}))
+    found = publish_build(campaign, campaign.cells, tmp_path)
+    assert (found.written, found.removed) == ((), ())
+    found = publish_build(campaign, campaign.cells, tmp_path, prune=True)
+    assert [each.name for each in found.removed] == ["scene_of_none"]
+    assert [each.name for each in build.iterdir()] == ["scene_of_a_cell"]
+    assert found.size_bytes == (build / "scene_of_a_cell" / "stage.json").stat().st_size

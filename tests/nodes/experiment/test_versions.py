@@ -4,14 +4,25 @@ import json
 
 import pytest
 
-from tests.support.stage_versions import RECORDED, measured
+from nodes.experiment import run
+from nodes.experiment.cell import Cell
+from nodes.experiment.cell_kind import settings_hash
+from nodes.experiment.cells import ExperimentCells
+from nodes.experiment.reference import Reference
+from tests.support.stage_versions import RECORDED, measured, tiny_experiment
 
 # Between processors sums are taken in another order; a change of what is computed is larger.
 _RELATIVE = 0.01
 
 
-def test_what_stages_and_cells_make_is_of_their_versions(tmp_path):
-    recorded, found = json.loads(RECORDED.read_text()), measured(tmp_path / "run")
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("versions") / "run"
+    return folder, measured(folder)
+
+
+def test_what_stages_and_cells_make_is_of_their_versions(made):
+    recorded, found = json.loads(RECORDED.read_text()), made[1]
     assert set(found) == set(recorded)
     for name, each in found.items():
         how = (
@@ -20,3 +31,20 @@ def test_what_stages_and_cells_make_is_of_their_versions(tmp_path):
         )
         assert each["version"] == recorded[name]["version"], how
         assert each["numbers"] == pytest.approx(recorded[name]["numbers"], rel=_RELATIVE), how
+
+
+def test_a_machine_that_has_only_the_reference_build_runs_the_same_cells(made, tmp_path, monkeypatch):
+    ours, kind = tiny_experiment(made[0]), ExperimentCells()
+    reference = Reference(tmp_path / "build")
+    assert len(kind.keep(ours, reference)) == 4
+    monkeypatch.setattr(run, "REFERENCE", reference)
+    theirs = tiny_experiment(tmp_path / "theirs")
+    cell = Cell("track", "hardened", "random", 0)
+    # Known before anything is copied, and the same afterwards.
+    assert settings_hash(kind, theirs, cell) == settings_hash(kind, ours, cell)
+    run.make_ready(theirs, until="policy")
+    assert settings_hash(kind, theirs, cell) == settings_hash(kind, ours, cell)
+    assert not (theirs.stage_folder("policy") / "frames").exists()
+    with kind.hold(theirs):
+        found = kind.run(theirs, cell, theirs.cell_folder(cell), lambda part, text="": None)
+    assert found["surrogate"]["total_cte_m"][0] == made[1]["cells"]["numbers"]["random_surrogate_m"]

@@ -3,7 +3,9 @@ import os
 import pytest
 
 from advnerf_core.files import write_atomically
-from nodes.experiment.stages import Stage, StageError, begun_with, digest_of, read_record, run_stages
+from nodes.experiment.reference import Reference, ReferenceBuildError
+from nodes.experiment.stage_record import Stage, digest_of, read_record
+from nodes.experiment.stages import StageError, begun_with, keep_stages, run_stages
 from nodes.runtime.locks import hold
 
 pytestmark = pytest.mark.live
@@ -162,3 +164,72 @@ def test_files_that_no_stage_wrote_are_not_wiped(tmp_path):
     with pytest.raises(StageError, match="no stage wrote"):
         run_and_note(tmp_path, job())
     assert mine.read_bytes() == b"an hour's work"
+
+
+def photographed(second_setting=1, third_setting=1):
+    """Three stages, of which the second reads what the first leaves out of a reference build, and the third does not."""
+
+    def photograph(folder, report):
+        write_atomically(folder / "photos" / "0.jpg", "large")
+        write_atomically(folder / "world.json", "{}")
+
+    def learn(folder, report):
+        assert (folder.parent / "first" / "photos" / "0.jpg").read_text() == "large"
+        write_atomically(folder / "scene", f"learned {second_setting}")
+
+    return [
+        Stage("first", photograph, {}, bulk=("photos",)),
+        Stage("second", learn, {"y": second_setting}, after=("first",), reads_bulk_of=("first",)),
+        Stage("third", writing("c"), {"z": third_setting}, after=("first", "second")),
+    ]
+
+
+def run_with(reference, folder, stages):
+    notes = Notes()
+    records = run_stages(stages, folder, notes, reference=reference)
+    return notes.ran, records
+
+
+def test_a_machine_with_a_reference_build_goes_on_from_it(tmp_path):
+    reference, ours, theirs = Reference(tmp_path / "build"), tmp_path / "ours", tmp_path / "theirs"
+    ran, records = run_with(reference, ours, photographed())
+    assert ran == ["first", "second", "third"]
+    assert [each.name.split("_")[0] for each in keep_stages(photographed(), ours, reference)] == ran
+    assert keep_stages(photographed(), ours, reference) == []
+    assert reference.digests(photographed(), theirs) == {name: each.digest for name, each in records.items()}
+    ran, again = run_with(reference, theirs, photographed())
+    assert ran == []
+    assert [each.digest for each in again.values()] == [each.digest for each in records.values()]
+    assert (theirs / "first" / "world.json").exists()
+    assert not (theirs / "first" / "photos").exists()
+    # What reads nothing that was left out goes on from there; what does has it made again.
+    assert run_with(reference, theirs, photographed(third_setting=2))[0] == ["third"]
+    assert run_with(reference, theirs, photographed(second_setting=2))[0] == ["first", "second", "third"]
+    assert (theirs / "first" / "photos" / "0.jpg").exists()
+
+
+def test_without_the_reference_build_all_is_made(tmp_path):
+    reference = Reference(tmp_path / "build")
+    run_with(reference, tmp_path / "ours", photographed())
+    keep_stages(photographed(), tmp_path / "ours", reference)
+    assert run_with(None, tmp_path / "theirs", photographed())[0] == ["first", "second", "third"]
+
+
+def test_a_damaged_reference_build_is_refused(tmp_path):
+    reference, ours = Reference(tmp_path / "build"), tmp_path / "ours"
+    run_with(reference, ours, photographed())
+    scene = next(each for each in keep_stages(photographed(), ours, reference) if "second" in each.name)
+    (scene / "scene").write_text("version https://git-lfs.github.com/spec/v1")
+    with pytest.raises(ReferenceBuildError, match=r"second_\w+ as they were kept, got others"):
+        run_with(reference, tmp_path / "theirs", photographed())
+
+
+def test_files_of_a_user_are_not_replaced_by_a_reference_build(tmp_path):
+    reference, ours = Reference(tmp_path / "build"), tmp_path / "ours"
+    run_with(reference, ours, photographed())
+    keep_stages(photographed(), ours, reference)
+    mine = tmp_path / "theirs" / "first" / "photograph.jpg"
+    write_atomically(mine, "an hour's work")
+    with pytest.raises(StageError, match="no stage wrote"):
+        run_with(reference, tmp_path / "theirs", photographed())
+    assert mine.read_text() == "an hour's work"
