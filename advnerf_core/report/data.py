@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from advnerf_core.geometry import transform_points
 from advnerf_core.report.measurements import Fidelity, FidelityView, Hop, Latency, MemoryRow
 from advnerf_core.report.record import Floats, Image, Record
+from advnerf_core.report.reference import LiveLimit
 
 Domain = Literal["surrogate", "deployed"]
 Victim = Literal["hardened", "naive"]
@@ -24,7 +25,6 @@ Victim = Literal["hardened", "naive"]
 __all__ = [
     "DOMAINS",
     "VICTIMS",
-    "Check",
     "Clip",
     "Domain",
     "Fidelity",
@@ -255,17 +255,6 @@ class Laps(Record):
 
 
 @dataclass(frozen=True, eq=False)
-class Check(Record):
-    """A target that was measured elsewhere (a benchmark, a test); `met` is None if it was not measured."""
-
-    what: str
-    target: str
-    measured: str
-    met: bool | None
-    paper: str = ""
-
-
-@dataclass(frozen=True, eq=False)
 class Manifest(Record):
     """How to make this report again.
 
@@ -291,7 +280,7 @@ class ReportData(Record):
     """Everything the report needs.
 
     `not_measured` gives the reason why a part is missing; its keys are the field names of the parts
-    ("fidelity", "latency", "memory", "laps", "clips", ...).
+    ("fidelity", "latency", "memory", "laps", "clips", ...). `limits` are what the report is held to.
     """
 
     settings: Settings
@@ -306,7 +295,7 @@ class ReportData(Record):
     memory: tuple[MemoryRow, ...] = ()
     timings: tuple[StageTiming, ...] = ()
     laps: Laps | None = None
-    checks: tuple[Check, ...] = ()
+    limits: tuple[LiveLimit, ...] = ()
     not_measured: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

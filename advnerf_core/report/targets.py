@@ -1,18 +1,19 @@
-"""The experiment's targets: what was promised, what was measured, and whether it was met. Nothing is rounded in our favour."""
+"""The targets of a live experiment: what was promised, what was measured, and whether it was met. Nothing is rounded in our favour."""
 
 # ruff: noqa: RUF001 (typography for readers: multiplication signs and dashes)
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from advnerf_core.driving.metrics import drives, mean_cte_limit_m
-from advnerf_core.report.data import Domain, ReportData
+from advnerf_core.report.data import ReportData
+from advnerf_core.report.reference import LiveLimit, LiveMeasure
 from advnerf_core.report.tables import Table, TransferRow, find_row, number, transfer_rows
 
 _NOT_MEASURED = "not measured in this run"
+_SHORT_TICKS, _LONG_TICKS = 50, 400  # horizons whose memory is compared
 
 
 @dataclass(frozen=True)
@@ -24,6 +25,8 @@ class Target:
     measured: str
     met: bool | None
     paper: str = ""
+    headline: str = ""
+    condition: str = ""
 
     @property
     def verdict(self) -> str:
@@ -35,20 +38,21 @@ class Target:
         return asdict(self)
 
 
+@dataclass(frozen=True)
+class _Measure:
+    """How a measure is read off a report, and how its values are printed."""
+
+    read: Callable[[ReportData, LiveLimit], float | None]
+    digits: int
+    unit: str = ""
+
+    def text(self, value: float) -> str:
+        return number(value, self.digits, self.unit)
+
+
 def evaluate_targets(data: ReportData) -> tuple[Target, ...]:
-    """All targets in the reader's order; those of `ReportData.checks` come last."""
-    rows = transfer_rows(data)
-    return (
-        *_attack_targets(data, rows),
-        *_drive_targets(data),
-        *_fidelity_targets(data),
-        _memory_target(data),
-        _wall_time_target(data),
-        *(
-            Target(c.what, c.target, c.measured if c.met is not None else _NOT_MEASURED, c.met, c.paper)
-            for c in data.checks
-        ),
-    )
+    """All targets of the report's limits, in their order."""
+    return tuple(_target(data, limit) for limit in data.limits if limit.setting in ("", data.settings.name))
 
 
 def targets_table(targets: Sequence[Target]) -> Table:
@@ -60,159 +64,70 @@ def targets_table(targets: Sequence[Target]) -> Table:
     )
 
 
-def _bound(
-    what: str,
-    target: str,
-    value: float | None,
-    holds: Callable[[float], bool],
-    text: Callable[[float], str],
-    paper: str = "",
-) -> Target:
-    if value is None:
-        return Target(what, target, _NOT_MEASURED, None, paper)
-    return Target(what, target, text(value), holds(value), paper)
+def _target(data: ReportData, limit: LiveLimit) -> Target:
+    measure = _MEASURES[limit.of]
+    value = measure.read(data, limit)
+    sign, bound = ("≥", limit.at_least) if limit.at_least is not None else ("≤", limit.at_most)
+    assert bound is not None, "a limit has one bound"
+    met = None if value is None else value >= bound if sign == "≥" else value <= bound
+    measured = _NOT_MEASURED if value is None else measure.text(value)
+    said = f"{sign} {bound:g}{measure.unit}"
+    return Target(limit.what, said, measured, met, limit.paper, limit.headline, limit.method)
 
 
-def _attack_targets(data: ReportData, rows: Sequence[TransferRow]) -> tuple[Target, ...]:
-    surrogate = find_row(rows, "surrogate", "gradient")
-    return (
-        _bound(
-            "gradient attack, surrogate: total CTE",
-            "≥ 3.3 × no attack",
-            surrogate.ratio if surrogate else None,
-            lambda v: v >= 3.3,
-            lambda v: f"{v:.2f} ×",
-            "3.3 ×",
-        ),
-        *_deployed_targets(data, find_row(rows, "deployed", "gradient")),
-        _random_target(rows, "surrogate", "0.7 ×"),
-        _random_target(rows, "deployed", "1.0 ×, 0 of 5"),
-    )
+def _of_row(read: Callable[[TransferRow], float | None]) -> Callable[[ReportData, LiveLimit], float | None]:
+    def found(data: ReportData, limit: LiveLimit) -> float | None:
+        row = find_row(transfer_rows(data), limit.domain, limit.method)
+        return None if row is None else read(row)
+
+    return found
 
 
-def _deployed_targets(data: ReportData, row: TransferRow | None) -> tuple[Target, ...]:
-    what = "gradient attack, live: "
-    return (
-        _bound(
-            what + "total CTE",
-            "≥ 3.0 × no attack",
-            row.ratio if row else None,
-            lambda v: v >= 3.0,
-            lambda v: f"{v:.2f} ×",
-            "5.2 ×",
-        ),
-        _bound(
-            what + "mean |CTE|",
-            "≥ 0.25 m",
-            row.mean_abs_cte_m if row else None,
-            lambda v: v >= 0.25,
-            lambda v: f"{v:.3f} m",
-        ),
-        _bound(
-            what + f"left the track (|CTE| > {data.settings.off_track_m:g} m)",
-            "in ≥ 2 of 3 drives",
-            row.off_track / row.runs if row else None,
-            lambda v: v >= 2 / 3,
-            lambda _: f"{row.off_track} of {row.runs}" if row else "",
-            "on occasion",
-        ),
-    )
+def _of_fidelity(name: str) -> Callable[[ReportData, LiveLimit], float | None]:
+    return lambda data, limit: data.fidelity.mean(name) if data.fidelity else None
 
 
-def _random_target(rows: Sequence[TransferRow], domain: Domain, paper: str) -> Target:
-    row = find_row(rows, domain, "random")
-    place = "live" if domain == "deployed" else domain
-    what = f"best random texture, {place}: total CTE" + (
-        " and drives that left" if domain == "deployed" else ""
-    )
-    target = "≤ 1.5 × no attack" + (", never off-track" if domain == "deployed" else "")
-    if row is None or row.ratio is None:
-        return Target(what, target, _NOT_MEASURED, None, paper)
-    met = row.ratio <= 1.5 and (domain == "surrogate" or row.off_track == 0)
-    measured = f"{row.ratio:.2f} ×" + (f", {row.off_track} of {row.runs}" if domain == "deployed" else "")
-    return Target(what, target, measured, met, paper)
+def _steering(data: ReportData, limit: LiveLimit) -> float | None:
+    return data.fidelity.steering_difference_rad if data.fidelity else None
 
 
-def _drive_targets(data: ReportData) -> tuple[Target, ...]:
-    laps, latency = data.laps, data.latency
-    off_track_m = data.settings.off_track_m
-    what = "policy without attack, 3 laps live"
-    target = f"mean |CTE| ≤ {mean_cte_limit_m(off_track_m):g} m, never off-track"
-    if laps is None:
-        drive = Target(what, target, _NOT_MEASURED, None)
-    else:
-        left = "left the track" if laps.off_track else "never off-track"
-        met = laps.laps >= 3 and drives(laps.mean_abs_cte_m, laps.off_track, off_track_m)
-        drive = Target(what, target, f"{laps.mean_abs_cte_m:.3f} m, {left}, {laps.laps} laps", met)
-    what, target = "capture to serial write, live", "p99 ≤ one camera period, no tick missed"
-    if latency is None:
-        return drive, Target(what, target, _NOT_MEASURED, None, "10 Hz")
-    p99 = latency.overall.p99_ms
-    missed = (
-        "missed ticks not counted" if latency.missed_ticks is None else f"{latency.missed_ticks} ticks missed"
-    )
-    # Not counting missed ticks can disprove the target, never prove it.
-    met_or_unknown = (
-        False
-        if p99 > latency.camera_period_ms or latency.missed_ticks
-        else (latency.missed_ticks is not None or None)
-    )
-    measured = f"p99 {p99:.1f} ms of {latency.camera_period_ms:g} ms, {missed}"
-    return drive, Target(what, target, measured, met_or_unknown, "10 Hz")
+def _laps(read: Callable[[Any], float]) -> Callable[[ReportData, LiveLimit], float | None]:
+    return lambda data, limit: read(data.laps) if data.laps else None
 
 
-def _fidelity_targets(data: ReportData) -> tuple[Target, ...]:
-    f = data.fidelity
-    minor = "“minor perceptual gap”"
-
-    def decibel(v: float) -> str:
-        return f"{v:.1f} dB"
-
-    return (
-        _bound(
-            "surrogate on held-out views, full size",
-            "PSNR ≥ 27 dB",
-            f.mean("psnr_full_db") if f else None,
-            lambda v: v >= 27,
-            decibel,
-            minor,
-        ),
-        _bound(
-            "surrogate on held-out views, 200x66",
-            "PSNR ≥ 27 dB",
-            f.mean("psnr_policy_db") if f else None,
-            lambda v: v >= 27,
-            decibel,
-            minor,
-        ),
-        _bound(
-            "steering on surrogate against real views",
-            "mean difference ≤ 0.03 rad",
-            f.steering_difference_rad if f else None,
-            lambda v: v <= 0.03,
-            lambda v: f"{v:.4f} rad",
-        ),
-    )
+def _latency(data: ReportData, limit: LiveLimit) -> float | None:
+    return data.latency.overall.p99_ms if data.latency else None
 
 
-def _memory_target(data: ReportData) -> Target:
-    what, target = "adjoint, peak memory above idle", "T = 400 ≤ 1.1 × T = 50"
+def _missed_ticks(data: ReportData, limit: LiveLimit) -> float | None:
+    return data.latency.missed_ticks if data.latency else None
+
+
+def _memory(data: ReportData, limit: LiveLimit) -> float | None:
     rows = {m.horizon_steps: m.adjoint_mib for m in data.memory}
-    if 50 not in rows or 400 not in rows or rows[50] <= 0:
-        return Target(what, target, _NOT_MEASURED, None, "“constant”")
-    ratio = rows[400] / rows[50]
-    return Target(
-        what,
-        target,
-        f"{ratio:.2f} × ({number(rows[50], 0)} and {number(rows[400], 0)} MiB)",
-        ratio <= 1.1,
-        "“constant”",
-    )
+    short, long = rows.get(_SHORT_TICKS), rows.get(_LONG_TICKS)
+    return None if short is None or long is None or short <= 0 else long / short
 
 
-def _wall_time_target(data: ReportData) -> Target:
-    limit_s, target = (1200.0, "≤ 20 min") if data.settings.name == "small" else (7200.0, "≤ 2 h")
-    what = "clean clone to report, 2 cores" if data.settings.name == "small" else "full setting, 2 cores"
-    cached = [t.name for t in data.timings if t.cached]
-    wall_s = None if cached else data.manifest.wall_s
-    return _bound(what, target, wall_s, lambda v: v <= limit_s, lambda v: f"{v / 60:.1f} min")
+def _wall_min(data: ReportData, limit: LiveLimit) -> float | None:
+    """Only of a run that made everything."""
+    cached = any(timing.cached for timing in data.timings)
+    return None if cached or data.manifest.wall_s is None else data.manifest.wall_s / 60
+
+
+_MEASURES: Mapping[LiveMeasure, _Measure] = {
+    "ratio": _Measure(_of_row(lambda row: row.ratio), 2, " × no attack"),
+    "mean_abs_cte_m": _Measure(_of_row(lambda row: row.mean_abs_cte_m), 3, " m"),
+    "off_track": _Measure(_of_row(lambda row: float(row.off_track)), 0, " drives"),
+    "off_track_share": _Measure(_of_row(lambda row: row.off_track / row.runs), 2, " of the drives"),
+    "laps": _Measure(_laps(lambda laps: laps.laps), 0, " laps"),
+    "laps_mean_abs_cte_m": _Measure(_laps(lambda laps: laps.mean_abs_cte_m), 3, " m"),
+    "laps_off_track": _Measure(_laps(lambda laps: float(laps.off_track)), 0, " drives"),
+    "latency_p99_ms": _Measure(_latency, 1, " ms"),
+    "missed_ticks": _Measure(_missed_ticks, 0, " ticks"),
+    "psnr_full_db": _Measure(_of_fidelity("psnr_full_db"), 1, " dB"),
+    "psnr_policy_db": _Measure(_of_fidelity("psnr_policy_db"), 1, " dB"),
+    "steering_difference_rad": _Measure(_steering, 4, " rad"),
+    "memory_ratio": _Measure(_memory, 2, " ×"),
+    "wall_min": _Measure(_wall_min, 1, " min"),
+}

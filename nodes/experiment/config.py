@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
@@ -301,6 +302,9 @@ class ExperimentConfig(_Section):
     gate: GateLimits | None = Field(
         default=None,
         description="What the learned scene must reach before it is attacked; none: it is not judged.",
+    )
+    reference: Path | None = Field(
+        default=None, description="File of what the report is held to, relative to this file; none: nothing."
     )
     retrain: RetrainConfig | None = Field(
         default=None, description="Retrain the hardened victim on what was found; none: not."

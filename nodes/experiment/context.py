@@ -21,6 +21,7 @@ from advnerf_core.files import write_atomically
 from advnerf_core.geometry import Array, Pinhole
 from advnerf_core.plugins import unknown
 from advnerf_core.policies.view import PolicyView
+from advnerf_core.report.reference import Reference
 from hardware.worlds.paths import ReferencePath
 from hardware.worlds.world import CarDescription, NotOpenError, Traits, World, WorldDescription, traits_of
 from nodes.experiment.cell import Cell
@@ -29,7 +30,7 @@ from nodes.experiment.placed import PlacedObject, in_a_lane
 from nodes.experiment.run_folder import RunFolder
 from nodes.lab.worlds.expert_drive import as_path
 from nodes.lab.worlds.named import NamedWorld, read_world, without
-from nodes.runtime.config import Document
+from nodes.runtime.config import Document, load_config
 from nodes.runtime.errors import ConfigError
 
 WORLD, CALIBRATION, CELLS = "world.json", "calibration", "cells"
@@ -238,6 +239,16 @@ class Experiment(RunFolder[ExperimentConfig]):
     def searched_ticks(self) -> int:
         """Over how many ticks attacks are optimised."""
         return self.config.attack.horizon or self.config.horizon
+
+    @cached_property
+    def held_to(self) -> Reference:
+        """What the report is held to.
+
+        Raises:
+            ConfigError: The file is not there, or is none of limits.
+        """
+        file = self.config.reference
+        return Reference() if file is None else load_config(Reference, self.file.parent / file)
 
     @property
     def launch_file(self) -> FilePath:

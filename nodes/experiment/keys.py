@@ -26,6 +26,7 @@ _FREE: Mapping[str, bool | set[str]] = {
     "scenarios": True,
     "retrain": True,
     "gate": True,
+    "reference": True,
     "world": True,
     "attack": {"seeds", "methods", "cache_mib"},
     "deploy": {"laps", "empty_scene", "ready_timeout_s"},

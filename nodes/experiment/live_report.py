@@ -103,6 +103,7 @@ def _report_data(
             laps["metrics"]["mean_cte_m"],
             laps["metrics"]["off_track"],
         ),
+        limits=experiment.held_to.live,
         not_measured={} if laps else {"laps": "this setting drives no laps; make experiment does"},
     )
 

@@ -100,5 +100,6 @@ def _write_report(experiment: Experiment, campaign: Campaign, console: Console) 
 
 
 def _report_stage(experiment: Experiment, digests: dict[str, str]) -> Stage:
-    settings = {"cells": digests, "setting": experiment.setting}
+    held_to = experiment.held_to.model_dump(mode="json")
+    settings = {"cells": digests, "setting": experiment.setting, "held_to": held_to}
     return Stage(REPORT, lambda folder, told: report.run(experiment, folder, told), settings)

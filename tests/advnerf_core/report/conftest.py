@@ -7,11 +7,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import yaml
 
 from advnerf_core.geometry import Pinhole, camera_mount, make_transform, planar_pose, rotation_z
 from advnerf_core.report import clips
 from advnerf_core.report import data as rd
+from advnerf_core.report.reference import Reference
 
+FILE = Path(__file__).parents[3] / "launch" / "room.reference.yaml"
+LIMITS = Reference.model_validate(yaml.safe_load(FILE.read_text())).live
 SIDE, RADIUS, SPEED, PERIOD, OFF_TRACK = 4.0, 1.1, 0.8, 0.1, 0.4
 STRAIGHT = SIDE - 2 * RADIUS
 LENGTH = 4 * (STRAIGHT + RADIUS * np.pi / 2)
@@ -257,7 +261,7 @@ def full_report(folder: Path, steps=60):
             for n, w in (("capture", 41.0), ("scene", 610.0), ("policy", 700.2), ("attack", 3200.0))
         ),
         laps(),
-        (rd.Check("adjoint against back-propagation, float64", "relative error ≤ 1e-8", "3.1e-12", True),),
+        limits=LIMITS,
     )
 
 
@@ -270,7 +274,12 @@ def report(tmp_path_factory):
 def bare_report():
     """Only what a report cannot do without."""
     return rd.ReportData(
-        settings("small", 1, (0,)), scene(), (), manifest(), not_measured={"latency": "No <live> drive."}
+        settings("small", 1, (0,)),
+        scene(),
+        (),
+        manifest(),
+        not_measured={"latency": "No <live> drive."},
+        limits=LIMITS,
     )
 
 
