@@ -128,6 +128,7 @@ class AttackFile:
         software_version: Version of advnerf that wrote the file.
         clean_drive: The victim's drive without an attack, from the same starts in the same scene; None if it was not driven.
         extra: Anything else worth keeping, as plain data.
+        field_total_cte_m: The predicted total CTE of the same drives through the learned field itself, where the search saw a baked one [m].
     """
 
     method: str
@@ -143,6 +144,7 @@ class AttackFile:
     software_version: str
     clean_drive: CleanDrive | None = None
     extra: dict[str, Any] = field(default_factory=dict)
+    field_total_cte_m: float | None = None
 
     def __post_init__(self) -> None:
         for name in ("method", "space"):
@@ -254,6 +256,7 @@ class AttackFile:
             "software_version": self.software_version,
             "clean_drive": None if self.clean_drive is None else self.clean_drive.to_dict(),
             "extra": self.extra,
+            **({} if self.field_total_cte_m is None else {"field_total_cte_m": self.field_total_cte_m}),
         }
 
 

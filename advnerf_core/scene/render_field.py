@@ -45,12 +45,10 @@ class FieldRenderer:
         self.config, self.march, self.colour_map = scene.config, march or MarchConfig(), colour_map
         self.least_transmittance, self.behind = least_transmittance, behind
         self.samples = 0  # evaluated by the last call, for benchmarks
-        self._weights = {
-            name: value.detach().cpu().numpy().copy() for name, value in scene.named_parameters()
-        }
-        self._levels = scene.grid.levels
+        self.weights = {name: value.detach().cpu().numpy().copy() for name, value in scene.named_parameters()}
+        self.levels = scene.grid.levels
         cells = (np.array(occupied.shape) / self.config.box_high).astype(np.float32)
-        self._leaps = leap_distances(occupied, cells)
+        self.leaps = leap_distances(occupied, cells)
 
     @classmethod
     def from_file(
@@ -127,7 +125,7 @@ class FieldRenderer:
         depth_m: NDArray[np.float32],
         alpha: NDArray[np.float32],
     ) -> int:
-        w = self._weights
+        w = self.weights
         return int(
             render_tiles(
                 poses,
@@ -136,10 +134,10 @@ class FieldRenderer:
                 self.config.box_high,
                 np.float32(self.march.near_m),
                 self.march.steps(),
-                self._leaps.distance,
-                self._leaps.cells,
+                self.leaps.distance,
+                self.leaps.cells,
                 w["grid.table"],
-                self._levels,
+                self.levels,
                 w["density_1.weight"],
                 w["density_1.bias"],
                 w["density_2.weight"],

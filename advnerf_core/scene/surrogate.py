@@ -142,6 +142,12 @@ class Surrogate:
         other.dtype = dtype
         return other
 
+    def with_background(self, background: BackgroundRenderer) -> Surrogate:
+        """The same surrogate before another renderer of the scene."""
+        other = copy.copy(self)
+        other._background = background
+        return other
+
     def with_objects(self, objects: Sequence[ColouredObject], opaque: bool | None = None) -> Surrogate:
         """The same surrogate with other objects, for example the same ones elsewhere; composed as before unless ``opaque`` says."""
         other = copy.copy(self)

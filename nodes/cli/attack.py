@@ -82,6 +82,11 @@ def attack_show(
         "searched": attack.space.replace("_", " "),
         "seed": attack.seed,
         "predicted total CTE": "unknown" if total is None else f"{total:.2f} m",
+        **(
+            {}
+            if attack.field_total_cte_m is None
+            else {"through the field": f"{attack.field_total_cte_m:.2f} m"}
+        ),
         "drive without attack": "not driven"
         if clean is None
         else clean.in_words.removeprefix("drive without attack: "),

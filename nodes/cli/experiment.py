@@ -87,7 +87,7 @@ def experiment(
         typer.Option(
             "--until",
             metavar="STAGE",
-            help="Stop after this stage: capture, scene, object, policy, retrain or live.",
+            help="Stop after this stage: capture, scene, bake, object, policy, retrain or live.",
         ),
     ] = None,
     only: Only = "",

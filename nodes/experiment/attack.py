@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 
-from advnerf_core.attack.adjoint import AttackProblem
+from advnerf_core.attack.adjoint import AttackProblem, evaluate
 from advnerf_core.attack.artifact import AttackFile, load_attack, save_attack
 from advnerf_core.attack.clean import clean_drive
 from advnerf_core.attack.methods import Method, SearchRun, SearchSettings, load_method
@@ -25,7 +25,7 @@ from nodes.experiment.cell import Cell
 from nodes.experiment.context import Experiment
 from nodes.experiment.drives import learned_drives, totals
 from nodes.experiment.faces import has_face, panel_of
-from nodes.experiment.learned_scene import scene_sha256
+from nodes.experiment.learned_scene import baked_file, load_field, scene_sha256
 from nodes.experiment.policy import HARDENED, victim_file, victims
 from nodes.experiment.request.telling import telling
 from nodes.experiment.space_config import FaceConfig, MeshShapeConfig, MeshTextureConfig, PlacesConfig
@@ -148,7 +148,7 @@ def surrogate_part(
         attack = _attack_file(experiment, space, problem, policy, cell, result)
         attack_id = save_attack(folder / ATTACK, attack)
     shown = load_shown(space, folder, cell)
-    measured = replace(past(problem, space, shown), steps=experiment.config.horizon)
+    measured = replace(past_field(experiment, problem, space, shown), steps=experiment.config.horizon)
     states, scores = learned_drives(experiment, measured, shown.colours)
     data = {
         "attack_id": attack_id,
@@ -189,6 +189,14 @@ def attack_problem(
 def past(problem: AttackProblem, space: Space, shown: Shown) -> AttackProblem:
     """The problem with the surrogate as its sensor, in which objects stand as they are shown; its theta are their colours."""
     return replace(problem, sensor=shown.seen_by(space.surrogate))
+
+
+def past_field(experiment: Experiment, problem: AttackProblem, space: Space, shown: Shown) -> AttackProblem:
+    """`past` in the learned scene itself, where searches look at it baked: it is what a finished attack is judged by."""
+    seen = shown.seen_by(space.surrogate)
+    if not over_the_world(experiment):
+        seen = seen.with_background(load_field(experiment))
+    return replace(problem, sensor=seen)
 
 
 def load_shown(space: Space, folder: Path, cell: Cell) -> Shown:
@@ -261,7 +269,7 @@ def _attack_file(
     result: SearchResult,
 ) -> AttackFile:
     clean = clean_drive(past(problem, space, space.plain), space.plain.colours)
-    return AttackFile(
+    attack = AttackFile(
         method=cell.method,
         space=space.name,
         objects=space.attacked(result.theta),
@@ -278,3 +286,8 @@ def _attack_file(
         extra={"victim": cell.victim, "scenario": cell.scenario, "horizon": experiment.searched_ticks},
         clean_drive=clean,
     )
+    if not baked_file(experiment).exists() or over_the_world(experiment):
+        return attack
+    shown = space.restored(attack)
+    _, totals_m = evaluate(past_field(experiment, problem, space, shown), shown.colours)
+    return replace(attack, field_total_cte_m=float(totals_m.protocol_cte_m.mean()))

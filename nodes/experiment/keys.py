@@ -10,6 +10,7 @@ from advnerf_core.attack.methods import require_method
 from advnerf_core.plugins import PluginError
 from advnerf_core.policies.pilotnet import load_policy
 from advnerf_core.report.conditions import NONE
+from nodes.experiment import bake
 from nodes.experiment.cell import Cell
 from nodes.experiment.context import Experiment
 from nodes.experiment.policy import RETRAINED, attackable, victim_file
@@ -19,7 +20,7 @@ from nodes.runtime.errors import RuntimeFault
 # The stages that cells need of their experiment; what comes after is the cells themselves.
 NEEDED = ("capture", "scene", "policy", "object")
 # As of a stage (`run.VERSIONS`): raised when what a cell finds changes with the same settings.
-VERSION = 1
+VERSION = 2
 # What a cell does not depend on: which others there are, how much memory may be used, and what is told of the world elsewhere.
 _FREE: Mapping[str, bool | set[str]] = {
     "name": True,
@@ -56,6 +57,7 @@ def cell_inputs(experiment: Experiment, cell: Cell) -> dict[str, Any]:
     kept = {name: digest for name, digest in experiment.kept.items() if name in NEEDED}
     inputs = {
         "version": VERSION,
+        "bake": bake.VERSION,
         "config": config,
         "world": experiment.world_settings,
         "stages": {**kept, **stage_digests(experiment.folder, NEEDED)},

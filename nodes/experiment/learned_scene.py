@@ -12,6 +12,7 @@ from advnerf_core.data.dataset import load_transforms
 from advnerf_core.data.image_files import write_image
 from advnerf_core.files import write_atomically
 from advnerf_core.policies.view import PolicyView
+from advnerf_core.scene.baked import BakedScene
 from advnerf_core.scene.field import load_scene
 from advnerf_core.scene.metrics import psnr, ssim
 from advnerf_core.scene.render_field import FieldRenderer
@@ -26,9 +27,20 @@ def scene_file(experiment: RunFolder[Any]) -> Path:
     return experiment.stage_folder("scene") / "scene.safetensors"
 
 
-def load_background(experiment: RunFolder[Any]) -> FieldRenderer:
-    """The trained scene in the colours of the driving camera."""
+def baked_file(experiment: RunFolder[Any]) -> Path:
+    """Where the scene is as voxels, if it was baked."""
+    return experiment.stage_folder("bake") / "baked.safetensors"
+
+
+def load_field(experiment: RunFolder[Any]) -> FieldRenderer:
+    """The trained scene itself in the colours of the driving camera."""
     return FieldRenderer.from_file(scene_file(experiment))
+
+
+def load_background(experiment: RunFolder[Any]) -> FieldRenderer | BakedScene:
+    """The trained scene in the colours of the driving camera, quick where it was baked."""
+    file = baked_file(experiment)
+    return BakedScene.load(file) if file.exists() else load_field(experiment)
 
 
 def scene_sha256(experiment: RunFolder[Any]) -> str:
@@ -47,7 +59,7 @@ def compare_views(experiment: RunFolder[Any], view: PolicyView, begin: float, re
         begin: Share of the stage that is done already.
         report: Told the progress.
     """
-    folder, renderer = experiment.stage_folder("scene"), load_background(experiment)
+    folder, renderer = experiment.stage_folder("scene"), load_field(experiment)
     listed = load_transforms(experiment.stage_folder("capture") / HELD_OUT, require_all=True)
     views, rows = listed.load(), []
     for index, (real, pose) in enumerate(zip(views.rgb, views.T_world_from_camera, strict=True)):

@@ -273,7 +273,7 @@ def _latency(experiment: Experiment, results: list[dict[str, Any]]) -> rd.Latenc
 
 
 def _timings(experiment: Experiment) -> Iterator[rd.StageTiming]:
-    for name in ("capture", "scene", "policy", "object", "live"):
+    for name in ("capture", "scene", "bake", "policy", "object", "live"):
         record = read_record(experiment.stage_folder(name))
         if record is not None:
             yield rd.StageTiming(name, record.seconds)

@@ -153,7 +153,8 @@ def _how(experiment: Experiment) -> Markup:
     manifest = json.loads((experiment.folder / "manifest.json").read_text())
     frozen = frozen_hashes(experiment)
     records = {
-        name: read_record(experiment.stage_folder(name)) for name in ("capture", "scene", "object", "policy")
+        name: read_record(experiment.stage_folder(name))
+        for name in ("capture", "scene", "bake", "object", "policy")
     }
     times = ", ".join(
         f"{name} {record.seconds:.0f} s" for name, record in records.items() if record is not None

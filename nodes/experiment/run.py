@@ -12,7 +12,7 @@ from rich.console import Console
 
 from advnerf_core.attack.methods import method_digest, method_name
 from advnerf_core.plugins import unknown
-from nodes.experiment import capture, live, objects, policy, retrain, scene
+from nodes.experiment import bake, capture, live, objects, policy, retrain, scene
 from nodes.experiment.config import ExperimentConfig
 from nodes.experiment.context import Experiment
 from nodes.experiment.live import lab_of
@@ -40,7 +40,7 @@ _LIBRARIES = (
 )
 # Raised when what a stage makes changes with the same settings: then its old results, and all that build on them, are made again.
 # tests/nodes/experiment/test_versions.py fails where a result changed and its version did not.
-VERSIONS = {"capture": 1, "scene": 2, "object": 1, "policy": 1, "retrain": 1, "live": 1}
+VERSIONS = {"capture": 1, "scene": 2, "bake": bake.VERSION, "object": 1, "policy": 2, "retrain": 1, "live": 1}
 _WHOLE_STEP_S = 1e-6
 # What policies are trained with, beside what comes of it.
 _TRAINING_FILES = ("frames", "*.checkpoint.safetensors", "*.shards.json", "settings.json")
@@ -221,17 +221,35 @@ def stages_of(experiment: Experiment) -> list[Stage]:
             ("capture",),
             reads_bulk_of=("capture",),
         ),
+        stage(
+            "bake",
+            bake,
+            {"view": view, "driven": {**measured, "world": world}},
+            ("capture", "scene"),
+        ),
         stage("object", objects, {"object": part("object"), "kinds": kinds}, ()),
         stage(
             "policy",
             policy,
-            {**driven, **face, "policy": part("policy"), "sigma": config.attack.random_sigma},
+            {
+                **driven,
+                **face,
+                "policy": part("policy"),
+                "sigma": config.attack.random_sigma,
+                "bake": bake.VERSION,
+            },
             ("capture", "scene", "object"),
             bulk=_TRAINING_FILES,
         ),
     ]
     if config.retrain is not None:
-        settings = {**driven, "retrain": part("retrain"), "attack": searched, "space": space}
+        settings = {
+            **driven,
+            "bake": bake.VERSION,
+            "retrain": part("retrain"),
+            "attack": searched,
+            "space": space,
+        }
         fewer = [
             {**settings, "retrain": {**settings["retrain"], "rounds": rounds}}
             for rounds in range(1, config.retrain.rounds)

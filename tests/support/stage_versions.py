@@ -48,6 +48,7 @@ def measured(folder: Path) -> dict[str, dict[str, Any]]:
     make_ready(experiment)
     views = load_transforms(experiment.stage_folder("capture") / "held_out", require_all=True).load()
     fidelity = json.loads((experiment.stage_folder("scene") / "fidelity.json").read_text())["mean"]
+    baked = json.loads((experiment.stage_folder("bake") / "baked.json").read_text())
     policy = json.loads((experiment.stage_folder("policy") / "policy.json").read_text())
     hydrant = build_from_mesh(stand(GENERATORS["hydrant"]()), "hydrant", 12, 0, {}).placed(np.eye(4), 1.0)
     kind, totals = ExperimentCells(), {}
@@ -60,6 +61,7 @@ def measured(folder: Path) -> dict[str, dict[str, Any]]:
     numbers: dict[str, dict[str, float]] = {
         "capture": {"mean_grey_levels": float(np.mean([rgb.mean() for rgb in views.rgb]))},
         "scene": {name: float(value) for name, value in fidelity.items()},
+        "bake": {"psnr_db": float(baked["psnr_baked_db"]), "used": float(baked["used"])},
         "object": {"free_colours": float(hydrant.free_count)},
         "policy": {
             "frames": float(policy["frames"]),

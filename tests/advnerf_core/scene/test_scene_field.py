@@ -12,9 +12,15 @@ from numpy.typing import NDArray
 from advnerf_core.data.dataset import ImageSet
 from advnerf_core.fields.hash_grid import HashGridConfig
 from advnerf_core.geometry import Array, Pinhole, look_at
+from advnerf_core.parallel import set_thread_count
 from advnerf_core.render.march import MarchConfig, Marcher
 from advnerf_core.render.march_kernels import span_in_box
 from advnerf_core.render.occupancy import leap_distances
+from advnerf_core.render.volume_kernels import MAX_LOG_DENSITY
+from advnerf_core.scene.bake import NotBakedError, bake
+from advnerf_core.scene.baked import BakedScene
+from advnerf_core.scene.baked_kernels import LOG_STEP, LOWEST_LOG
+from advnerf_core.scene.colour import ColourMap
 from advnerf_core.scene.field import SceneField, SceneFieldConfig, SceneFileError, load_scene, save_scene
 from advnerf_core.scene.metrics import psnr
 from advnerf_core.scene.render_field import FieldRenderer
@@ -191,3 +197,72 @@ def test_rays_outside_the_box_see_nothing(trained: TrainedScene) -> None:
     assert not alpha.any()
     start, end = span_in_box(np.array([2, 2, 2, 1, 0, 0], np.float32), FIELD.box_high, np.float32(0.0))
     assert start > end
+
+
+def test_a_baked_scene_looks_like_its_field(tmp_path: Path, trained: TrainedScene) -> None:
+    field = FieldRenderer(trained.scene, trained.occupied, trained.march)
+    poses = room_poses(12, seed=5)
+    baked, rough = (bake(field, room_poses(60, seed=8), CAMERA, part_px) for part_px in (0.7, 1e3))
+    (fine_db, depth_m), (rough_db, _) = (compared(each, field, poses) for each in (baked, rough))
+    assert fine_db > 30.0
+    assert fine_db > rough_db  # with bricks it is finer
+    assert depth_m < 0.01
+    file = tmp_path / "baked.safetensors"
+    baked.save(file)
+    again = BakedScene.load(file)
+    for ours, theirs in zip(baked.render(poses, CAMERA), again.render(poses, CAMERA), strict=True):
+        assert torch.equal(ours, theirs)
+    file.write_bytes(file.read_bytes()[:500])
+    with pytest.raises(SceneFileError, match="bake the scene again"):
+        BakedScene.load(file)
+
+
+def compared(baked: BakedScene, field: FieldRenderer, poses: Array) -> tuple[float, float]:
+    """PSNR against the field's pictures, and the median difference of depth [m]."""
+    (rgb, depth_m, _), (field_rgb, field_depth_m, _) = (each.render(poses, CAMERA) for each in (baked, field))
+    return psnr(rgb.numpy(), field_rgb.numpy()), float((depth_m - field_depth_m).abs().nanmedian())
+
+
+def test_baked_pictures_depend_neither_on_threads_nor_on_their_batch(trained: TrainedScene) -> None:
+    field = FieldRenderer(trained.scene, trained.occupied, trained.march)
+    poses = room_poses(3, seed=5)
+    baked = bake(field, poses, CAMERA)
+    together = baked.render(poses, CAMERA)[0]
+    set_thread_count(1)
+    try:
+        again = bake(field, poses, CAMERA)
+        alone = torch.cat([again.render(pose[None], CAMERA)[0] for pose in poses])
+    finally:
+        set_thread_count(0)
+    assert torch.equal(together, alone)
+
+
+def test_baked_values_are_those_of_the_field_at_the_corners(trained: TrainedScene) -> None:
+    """Against the field's own arithmetic in torch; a byte is a step of 0.07 in the logarithm of density."""
+    colours = ColourMap(((0.8, 0.1, 0.0), (0.0, 0.9, 0.05), (0.1, 0.0, 0.7)), (0.02, 0.0, 0.01), 1.3)
+    field = FieldRenderer(trained.scene, trained.occupied, trained.march, colours)
+    baked = bake(field, np.zeros((0, 4, 4)), CAMERA)
+    shape = np.array(baked.leaps.distance.shape)
+    cells = np.argwhere(baked.leaps.distance == 0)[::7]
+    rows = np.ravel_multi_index(tuple(cells.T), tuple(shape + 1))
+    points = torch.from_numpy((cells / baked.leaps.cells).astype(np.float32))
+    with torch.no_grad():
+        density, rgb = trained.scene.density_and_colour(
+            points, torch.tensor([[0.0, 0.0, 1.0]]).expand(len(points), 3)
+        )
+    logs = LOWEST_LOG + LOG_STEP * baked.voxels.values[rows, 0].astype(float)
+    wanted = np.log(density.numpy()).clip(LOWEST_LOG, MAX_LOG_DENSITY)
+    np.testing.assert_allclose(logs, wanted, atol=0.51 * LOG_STEP)
+    np.testing.assert_allclose(
+        baked.voxels.values[rows, 1:] / 255.0, colours.apply(rgb.numpy()), atol=0.51 / 255
+    )
+
+
+@pytest.mark.parametrize(
+    "change", [{"contraction": True}, {"direction_bands": 2}, {"learned_background": False}]
+)
+def test_what_cannot_be_baked_is_refused(change: dict[str, bool]) -> None:
+    scene = SceneField(dataclasses.replace(FIELD, **change))
+    field = FieldRenderer(scene, np.ones((8, 8, 4), np.bool_))
+    with pytest.raises(NotBakedError, match=f"{next(iter(change))} = {next(iter(change.values()))}"):
+        bake(field, room_poses(1, seed=0), CAMERA)

@@ -52,9 +52,9 @@ def test_starts_are_drawn_about_the_nominal_one(tmp_path: Path) -> None:
         ("scene.steps=3", {"scene"}),
         ("object.fit_steps=3", {"object"}),
         ("objects=[]", {"object", "policy"}),
-        ("world.car.turn_rate_lag_s=0.2", {"policy"}),
-        ("world.car.speed_mps=5", {"capture", "policy"}),
-        ("world.road.lane_width_m=3.4", {"capture", "policy"}),
+        ("world.car.turn_rate_lag_s=0.2", {"bake", "policy"}),
+        ("world.car.speed_mps=5", {"capture", "bake", "policy"}),
+        ("world.road.lane_width_m=3.4", {"capture", "bake", "policy"}),
         ("attack.evaluations=3", set()),
     ],
 )

@@ -93,7 +93,7 @@ def test_a_stage_depends_on_its_own_settings_and_on_no_others(tmp_path):
     def changed(override):
         before = {stage.name: stage.settings for stage in stages_of(room(tmp_path))}
         after = {stage.name: stage.settings for stage in stages_of(room(tmp_path, "demo", override))}
-        assert list(before) == ["capture", "scene", "object", "policy"]
+        assert list(before) == ["capture", "scene", "bake", "object", "policy"]
         return {name for name in before if before[name] != after[name]}
 
     assert changed("attack.evaluations=7") == changed("space.cells=4") == changed("deploy.starts=2") == set()

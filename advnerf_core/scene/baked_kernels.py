@@ -1,0 +1,306 @@
+"""The CPU kernels of a baked scene: values of the field at voxel corners, and rays that look them up between corners.
+
+A value is four bytes: the logarithm of density, and the colour. Space is a grid of cells; every cell has its eight corners in one coarse
+grid, and cells that are seen from near by have a brick of more corners instead.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from advnerf_core.fields.hash_grid_kernels import encode_level
+from advnerf_core.fields.mlp_kernels import TILE, dense
+from advnerf_core.parallel import KERNEL_OPTIONS
+from advnerf_core.render.march_kernels import span_in_box, step_size
+from advnerf_core.render.rays import write_ray
+from advnerf_core.render.volume_kernels import MAX_LOG_DENSITY, squash_features
+
+Array32 = NDArray[np.float32]
+Array8 = NDArray[np.uint8]
+Array64i = NDArray[np.int64]
+
+# Logarithms of density per box side that a byte tells apart; what is thinner is not seen.
+LOWEST_LOG = -4.0
+LOG_STEP = (MAX_LOG_DENSITY - LOWEST_LOG) / 255.0
+# Pixels of a tile, samples that are taken together, and those of one ray among them.
+WIDE, HIGH, WAVE, AHEAD = 16, 16, 512, 2
+_INTO_CELL = np.float32(1e-4)  # m beyond an edge, so that rounding cannot trap a ray on it
+_TINY = np.float32(1e-9)  # cells a metre, of a ray along the other axes
+_SEEN = np.float32(0.2)  # of a pixel's light, for a cell to count as seen
+_f = np.float32
+_ONE = np.float32(1.0)
+_ZERO = np.float32(0.0)
+_BYTE = np.float32(1.0 / 255.0)
+_LOWEST, _STEP = np.float32(LOWEST_LOG), np.float32(LOG_STEP)
+
+
+@njit(**KERNEL_OPTIONS)
+def bake_points(
+    points: Array32, first: int, stop: int, table: Array32, levels: Array64i, w1: Array32, b1: Array32, w2: Array32, b2: Array32,
+    c1: Array32, d1: Array32, c2: Array32, d2: Array32, matrix: Array32, offset: Array32, power: np.float32, values: Array8,
+) -> None:  # fmt: skip
+    """Values of the field at points ``first..stop``.
+
+    Args:
+        points: ``[N, 3]`` where the field is asked.
+        first: First point.
+        stop: One past the last point.
+        table: As of ``render_tiles``, like the following.
+        levels: ``[L, 4]``.
+        w1: ``[H, L * F]``.
+        b1: ``[H]``.
+        w2: ``[1 + C, H]``.
+        b2: ``[1 + C]``.
+        c1: ``[H, K]``; inputs beyond the features are those of a field whose colours do not depend on the direction.
+        d1: ``[H]``.
+        c2: ``[4, H]``.
+        d2: ``[4]``.
+        matrix: Of the colour map ``[3, 3]``.
+        offset: Of the colour map ``[3]``.
+        power: Of the colour map.
+        values: ``[N, 4]``, written.
+    """
+    channels = w2.shape[0] - 1
+    encoded = np.zeros((1, w1.shape[1], TILE), np.float32)
+    hidden, field = np.empty((w1.shape[0], TILE), np.float32), np.empty((w2.shape[0], TILE), np.float32)
+    inputs = np.zeros((c1.shape[1], TILE), np.float32)
+    decoded, colours = np.empty((c1.shape[0], TILE), np.float32), np.empty((4, TILE), np.float32)
+    straight = np.empty(3, np.float32)
+    for begin in range(first, stop, TILE):
+        count = min(TILE, stop - begin)
+        for level in range(levels.shape[0]):
+            encode_level(points[begin:stop], count, table, level, levels, encoded)
+        dense(w1, b1, encoded[0], hidden, True)
+        dense(w2, b2, hidden, field, False)
+        squash_features(field)
+        for n in range(count):
+            for c in range(channels):
+                inputs[c, n] = field[1 + c, n]
+            inputs[channels, n] = _f(0.28209479177387814)  # the constant spherical harmonic
+        dense(c1, d1, inputs, decoded, True)
+        dense(c2, d2, decoded, colours, False)
+        for n in range(count):
+            level_of = (field[0, n] - _LOWEST) / _STEP
+            values[begin + n, 0] = np.uint8(min(max(level_of, _ZERO), _f(255.0)) + _f(0.5))
+            for c in range(3):
+                straight[c] = (_ONE / (_ONE + np.exp(-colours[c, n]))) ** power
+            for c in range(3):
+                mapped = offset[c]
+                for k in range(3):
+                    mapped += matrix[c, k] * straight[k]
+                values[begin + n, 1 + c] = np.uint8(min(max(mapped, _ZERO), _ONE) * _f(255.0) + _f(0.5))
+
+
+@njit(**KERNEL_OPTIONS)
+def _between(values, base, across, along, fx, fy, fz):  # type: ignore[no-untyped-def]
+    """The value between the corners ``base`` and the next along x (``across`` rows on), y (``along`` rows on) and z."""
+    gx, gy, gz = _ONE - fx, _ONE - fy, _ONE - fz
+    a, b, c, d = gx * gy * gz, gx * gy * fz, gx * fy * gz, gx * fy * fz
+    e, f, g, h = fx * gy * gz, fx * gy * fz, fx * fy * gz, fx * fy * fz
+    i, j, k = base + along, base + across, base + across + along
+    v0 = (_f(values[base, 0]) * a + _f(values[base + 1, 0]) * b + _f(values[i, 0]) * c + _f(values[i + 1, 0]) * d
+          + _f(values[j, 0]) * e + _f(values[j + 1, 0]) * f + _f(values[k, 0]) * g + _f(values[k + 1, 0]) * h)  # fmt: skip
+    v1 = (_f(values[base, 1]) * a + _f(values[base + 1, 1]) * b + _f(values[i, 1]) * c + _f(values[i + 1, 1]) * d
+          + _f(values[j, 1]) * e + _f(values[j + 1, 1]) * f + _f(values[k, 1]) * g + _f(values[k + 1, 1]) * h)  # fmt: skip
+    v2 = (_f(values[base, 2]) * a + _f(values[base + 1, 2]) * b + _f(values[i, 2]) * c + _f(values[i + 1, 2]) * d
+          + _f(values[j, 2]) * e + _f(values[j + 1, 2]) * f + _f(values[k, 2]) * g + _f(values[k + 1, 2]) * h)  # fmt: skip
+    v3 = (_f(values[base, 3]) * a + _f(values[base + 1, 3]) * b + _f(values[i, 3]) * c + _f(values[i + 1, 3]) * d
+          + _f(values[j, 3]) * e + _f(values[j + 1, 3]) * f + _f(values[k, 3]) * g + _f(values[k + 1, 3]) * h)  # fmt: skip
+    return v0, v1, v2, v3
+
+
+@njit(**KERNEL_OPTIONS)
+def _leap_all(grids, t, end, distance, rays, count):  # type: ignore[no-untyped-def]
+    """Take the rays ``rays[:count]``, in cells ``grids [N, 9]``, to the first occupied place at or after ``t``, or to their end.
+
+    One leap of every ray after the other: a leap waits for the one before, but not for those of other rays. ``rays`` is used up.
+    """
+    nx, ny, nz = distance.shape
+    while count > 0:
+        going = 0
+        for a in range(count):
+            n = rays[a]
+            grid, s = grids[n], t[n]
+            x, y, z = grid[0] + s * grid[3], grid[1] + s * grid[4], grid[2] + s * grid[5]
+            i = min(max(np.int64(x), 0), nx - 1)
+            j = min(max(np.int64(y), 0), ny - 1)
+            k = min(max(np.int64(z), 0), nz - 1)
+            reach = np.int64(distance[i, j, k])
+            u = (_f(i + reach if grid[3] > _ZERO else i - reach + 1) - x) * grid[6]
+            v = (_f(j + reach if grid[4] > _ZERO else j - reach + 1) - y) * grid[7]
+            w = (_f(k + reach if grid[5] > _ZERO else k - reach + 1) - z) * grid[8]
+            further = s + max(min(min(u, v), w), _ZERO) + _INTO_CELL
+            goes = reach > 0 and s < end[n]
+            t[n] = further if goes else s
+            rays[going] = n
+            going += 1 if goes else 0
+        count = going
+
+
+@njit(**KERNEL_OPTIONS)
+def render_baked(
+    poses: Array32, intrinsics: Array32, first: int, stop: int, high: Array32, near: np.float32, steps: Array32, distance: Array8,
+    cells: Array32, brick_of: NDArray[np.int32], log_sides: Array8, values: Array8, behind: Array32, least_through: np.float32,
+    max_samples: int, rgb: Array32, depth_m: Array32, alpha: Array32, nearest_m: Array32,
+) -> None:  # fmt: skip
+    """Render pixel tiles ``first..stop`` of a batch of images.
+
+    Rays of a tile advance together, and what a wave will read is touched before: a sample waits for memory, not for arithmetic, and many
+    can wait at once.
+
+    Args:
+        poses: ``[B, 3, 4]`` from ``poses_in_box``.
+        intrinsics: ``fx, fy, cx, cy`` ``[4]``.
+        first: First tile; tiles count row by row through each image, then through the batch.
+        stop: One past the last tile.
+        high: High corner of the box ``[3]``.
+        near: Nearest ray parameter [m].
+        steps: Smallest and largest interval [m] and growth per metre ``[3]``.
+        distance: Leap distances ``[X, Y, Z]``.
+        cells: Cells per unit ``[3]``.
+        brick_of: First value of the brick of each cell ``[X, Y, Z]``; negative where it has none, and the corners of cells serve,
+            which come first among the values.
+        log_sides: Logarithm to base 2 of the parts along each side of the bricks ``[X, Y, Z]``.
+        values: ``[V, 4]``.
+        behind: Colour ``[3]`` behind everything.
+        least_through: Transmittance at which a ray stops.
+        max_samples: Most samples on one ray.
+        rgb: ``[B, H, W, 3]``, written.
+        depth_m: Planar depth ``[B, H, W]`` [m], written; infinite where nothing is.
+        alpha: ``[B, H, W]``, written.
+        nearest_m: Per cell ``[X, Y, Z]``, the nearest distance from which it was seen, kept up; empty if nobody asks.
+    """
+    nx, ny, nz = brick_of.shape
+    height, width = alpha.shape[1], alpha.shape[2]
+    across_image, down = (width + WIDE - 1) // WIDE, (height + HIGH - 1) // HIGH
+    row_stride, plane_stride = nz + 1, (ny + 1) * (nz + 1)
+    marked = nearest_m.shape[0] > 0
+    ray, grids, units = (
+        np.empty(6, np.float32),
+        np.empty((WIDE * HIGH, 9), np.float32),
+        np.empty(WIDE * HIGH, np.float32),
+    )
+    active, going = np.empty(WIDE * HIGH, np.int64), np.empty(WIDE * HIGH, np.int64)
+    t, end, scale = (
+        np.empty(WIDE * HIGH, np.float32),
+        np.empty(WIDE * HIGH, np.float32),
+        np.empty(WIDE * HIGH, np.float32),
+    )
+    through, taken = np.empty(WIDE * HIGH, np.float32), np.empty(WIDE * HIGH, np.int64)
+    found = np.empty((WIDE * HIGH, 4), np.float32)  # reach and colour
+    owner, cell = np.empty(WAVE, np.int64), np.empty(WAVE, np.int64)
+    base, strides, places = (
+        np.empty(WAVE, np.int64),
+        np.empty((WAVE, 2), np.int64),
+        np.empty((WAVE, 5), np.float32),
+    )
+    for tile in range(first, stop):
+        image, rest = tile // (across_image * down), tile % (across_image * down)
+        top, left = HIGH * (rest // across_image), WIDE * (rest % across_image)
+        count = 0
+        for n in range(WIDE * HIGH):
+            row, column = top + n // WIDE, left + n % WIDE
+            if row >= height or column >= width:
+                continue
+            scale[n] = write_ray(poses[image], intrinsics, _f(column) + _f(0.5), _f(row) + _f(0.5), ray)
+            t[n], end[n] = span_in_box(ray, high, near)
+            units[n] = np.sqrt(ray[3] * ray[3] + ray[4] * ray[4] + ray[5] * ray[5])
+            for axis in range(3):
+                grids[n, axis], step = ray[axis] * cells[axis], ray[3 + axis] * cells[axis]
+                step = step if abs(step) > _TINY else _TINY
+                grids[n, 3 + axis], grids[n, 6 + axis] = step, _ONE / step
+            through[n], taken[n] = _ONE, 0
+            found[n, 0], found[n, 1], found[n, 2], found[n, 3] = _ZERO, _ZERO, _ZERO, _ZERO
+            active[count] = n
+            count += 1
+        while count > 0:
+            used, left_over = 0, 0
+            for _ in range(AHEAD if count * AHEAD <= WAVE else 1):
+                for a in range(count):
+                    going[a] = active[a]
+                _leap_all(grids, t, end, distance, going, count)
+                for a in range(count):
+                    n = active[a]
+                    if t[n] >= end[n] or taken[n] >= max_samples:
+                        t[n] = end[n]
+                        continue
+                    grid = grids[n]
+                    span = step_size(t[n], steps)
+                    s = t[n] + _f(0.5) * span
+                    x = min(max(grid[0] + s * grid[3], _ZERO), _f(nx) - _f(1e-3))
+                    y = min(max(grid[1] + s * grid[4], _ZERO), _f(ny) - _f(1e-3))
+                    z = min(max(grid[2] + s * grid[5], _ZERO), _f(nz) - _f(1e-3))
+                    i, j, k = np.int64(x), np.int64(y), np.int64(z)
+                    owner[used], cell[used] = n, (i * ny + j) * nz + k
+                    places[used, 0], places[used, 1], places[used, 2] = x - _f(i), y - _f(j), z - _f(k)
+                    places[used, 3], places[used, 4] = span, s
+                    t[n] += span
+                    taken[n] += 1
+                    used += 1
+            for m in range(used):
+                at = cell[m]
+                brick = np.int64(brick_of.flat[at])
+                if brick < 0:
+                    k = at % nz
+                    j = at // nz % ny
+                    i = at // (nz * ny)
+                    base[m] = i * plane_stride + j * row_stride + k
+                    strides[m, 0], strides[m, 1] = plane_stride, row_stride
+                else:
+                    side = np.int64(1) << np.int64(log_sides.flat[at])
+                    x, y, z = places[m, 0] * _f(side), places[m, 1] * _f(side), places[m, 2] * _f(side)
+                    i, j, k = (
+                        min(np.int64(x), side - 1),
+                        min(np.int64(y), side - 1),
+                        min(np.int64(z), side - 1),
+                    )
+                    along = side + 1
+                    strides[m, 0], strides[m, 1] = along * along, along
+                    base[m] = brick + i * along * along + j * along + k
+                    places[m, 0], places[m, 1], places[m, 2] = x - _f(i), y - _f(j), z - _f(k)
+            touched = 0
+            for m in range(used):
+                at, plane, line = base[m], strides[m, 0], strides[m, 1]
+                touched += (
+                    values[at, 0]
+                    + values[at + line, 0]
+                    + values[at + plane, 0]
+                    + values[at + plane + line, 0]
+                )
+            owner[0] += touched >> 40  # never anything: keeps the reads
+            for m in range(used):
+                n = owner[m]
+                if through[n] < least_through:
+                    continue
+                log, red, green, blue = _between(
+                    values, base[m], strides[m, 0], strides[m, 1], places[m, 0], places[m, 1], places[m, 2]
+                )
+                keep = np.exp(-np.exp(log * _STEP + _LOWEST) * places[m, 3] * units[n])
+                weight = through[n] * (_ONE - keep)
+                through[n] *= keep
+                found[n, 0] += weight * places[m, 4]
+                found[n, 1] += weight * red
+                found[n, 2] += weight * green
+                found[n, 3] += weight * blue
+                if marked and weight > _SEEN:
+                    at = cell[m]
+                    nearest_m.flat[at] = min(nearest_m.flat[at], places[m, 4])
+            for a in range(count):
+                n = active[a]
+                if through[n] >= least_through and t[n] < end[n]:
+                    active[left_over] = n
+                    left_over += 1
+            count = left_over
+        for n in range(WIDE * HIGH):
+            row, column = top + n // WIDE, left + n % WIDE
+            if row >= height or column >= width:
+                continue
+            for c in range(3):
+                rgb[image, row, column, c] = found[n, 1 + c] * _BYTE + through[n] * behind[c]
+            opacity = _ONE - through[n]
+            alpha[image, row, column] = opacity
+            depth_m[image, row, column] = (
+                scale[n] * found[n, 0] / opacity if opacity > _f(1e-3) else _f(np.inf)
+            )
