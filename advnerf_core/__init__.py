@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import os
 from typing import TYPE_CHECKING
 
 from advnerf_core.lazy import lazy_names
+
+# Read when torch is loaded. Threads of torch that wait by spinning keep a core from our own for milliseconds: a tick of an attack takes 1.6 x as long.
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 __all__ = [
     "Ackermann",

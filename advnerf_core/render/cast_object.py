@@ -110,7 +110,7 @@ def cast_objects(
 def _cast_grids(
     fields: Mapping[int, VoxelGridObject], poses: Array, pinhole: Pinhole, supersample: int, dtype: Any
 ) -> dict[int, ObjectCast]:
-    bands = max(1, -(-_LEAST_PARTS // max(1, len(poses))))
+    bands = max(1, -(-_LEAST_PARTS // max(1, len(poses) * len(fields))))
     jobs = [
         (
             k,
