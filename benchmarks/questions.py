@@ -32,6 +32,7 @@ QUESTIONS = (
             "adjoint_gradient",
             "adjoint_memory",
             "gradient_pass",
+            "baked_scene",
             "closed_loop_cosine",
             "mesh_render",
             "black_box",

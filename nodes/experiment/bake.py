@@ -34,7 +34,7 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
     field = load_field(experiment)
     report(0.0, "baking")
     try:
-        baked = bake(field, _views(experiment), experiment.view.pinhole)
+        baked = bake(field, views_of(experiment), experiment.view.pinhole)
     except NotBakedError as error:
         write_atomically(folder / COMPARED, json.dumps({"used": False, "why": str(error)}, indent=1) + "\n")
         return
@@ -53,7 +53,7 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
     write_atomically(folder / COMPARED, json.dumps(found, indent=1) + "\n")
 
 
-def _views(experiment: Experiment) -> Array:
+def views_of(experiment: Experiment) -> Array:
     """Poses ``[N, 4, 4]`` of the driving camera about all paths."""
     rng, paths = np.random.default_rng(_SEED), list(experiment.paths.values())
     driven_m = experiment.config.horizon * experiment.config.dt_s * experiment.car.speed_mps

@@ -1,0 +1,268 @@
+"""What does baking the scene gain, and what does it cost? ``python -m benchmarks.baked_scene RUN_FOLDER``.
+
+In the scene and against the victims of a run folder of the room (``make demo``), on the same views and starts through the field and through
+the baked scene. ``--pairs`` searches and deploys attacks both ways. ``--speed`` compares with the code before there were baked scenes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+from contextlib import suppress
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from statistics import mean, median
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import torch
+from safetensors import safe_open
+from safetensors.torch import save_file
+
+from advnerf_core.attack.adjoint import AttackProblem, evaluate
+from advnerf_core.attack.methods import SearchRun, load_method
+from advnerf_core.attack.search.search import Evaluation
+from advnerf_core.geometry import planar_poses
+from advnerf_core.learning.imitation import recovery_states
+from advnerf_core.policies.pilotnet import load_policy
+from advnerf_core.scene.bake import bake
+from advnerf_core.scene.surrogate import BackgroundRenderer
+from benchmarks.results import REPOSITORY, record_row
+from benchmarks.ticks import run_of
+from nodes.experiment import bake as bake_stage
+from nodes.experiment.attack import attack_problem, search_settings
+from nodes.experiment.context import Experiment
+from nodes.experiment.drives import deployed_drives
+from nodes.experiment.faces import PaintedScene, face_space
+from nodes.experiment.learned_scene import load_background, load_field
+from nodes.experiment.policy import HARDENED, NAIVE, victim_file
+
+COMMAND = "python -m benchmarks.baked_scene runs/demo"
+_VIEWS, _EXCESS_M, _MOST_EVALUATIONS, _SEEDS = 200, 0.15, 60, 3
+Backgrounds = dict[str, BackgroundRenderer]
+
+
+def record(
+    line: str, value: float, unit: str, target: str, met: bool | None, note: str = "", option: str = ""
+) -> None:
+    """A row of the ledger."""
+    print(f"{line}: {value:.4g} {unit} ({target}); {note}", flush=True)
+    record_row(line, value, unit, target, met, f"{COMMAND}{option}", note)
+
+
+def fidelity(experiment: Experiment, backgrounds: Backgrounds) -> None:
+    """PSNR of the held-out views as the bake stage found it, and the victim's steering on views that bricks were not made for."""
+    found = json.loads((experiment.stage_folder("bake") / "baked.json").read_text())
+    lost_db = found["psnr_field_db"] - found["psnr_baked_db"]
+    note = f"{found['psnr_baked_db']:.2f} dB of {found['psnr_field_db']:.2f} dB through the field; {found['mib']:.0f} MiB of voxels"
+    record("baked scene: PSNR that held-out views lose", lost_db, "dB", "<= 0.3 dB", lost_db <= 0.3, note)
+    path = experiment.paths[experiment.config.scenarios[0]]
+    states = recovery_states(path, _VIEWS, np.random.default_rng(77), experiment.world.off_track_m, 0.3, None)
+    poses, policy = (
+        planar_poses(states) @ experiment.mount,
+        load_policy(victim_file(experiment, HARDENED)).policy,
+    )
+    with torch.no_grad():
+        on = {
+            name: torch.cat(
+                [policy(each(pose[None], experiment.view.pinhole)[0].permute(0, 3, 1, 2)) for pose in poses]
+            )
+            for name, each in backgrounds.items()
+        }
+    apart = (on["baked"] - on["field"]).abs()
+    record(
+        "baked scene: difference of steering", float(apart.mean()), "rad mean abs", "<= 0.002 rad", bool(apart.mean() <= 0.002),
+        f"{_VIEWS} driving views within {experiment.world.off_track_m:g} m and 0.3 rad of the path; largest {float(apart.max()):.4f} rad",
+    )  # fmt: skip
+
+
+def speed(run: Path, before: str, turns: int) -> None:
+    """Ticks and iterations of this code and of that of a commit, each in processes of its own, in turns."""
+    with TemporaryDirectory() as work:
+        old = Path(work) / "code"
+        subprocess.run(
+            ["git", "worktree", "add", "--detach", "-f", old, before],
+            cwd=REPOSITORY,
+            check=True,
+            capture_output=True,
+        )
+        try:
+            shutil.copy(REPOSITORY / "benchmarks" / "ticks.py", old / "benchmarks" / "ticks.py")
+            _copy_as_of_before(run, Path(work) / "run")
+            found: dict[str, list[dict[str, float]]] = {"before": [], "now": []}
+            for _ in range(turns):
+                found["before"].append(_ticks(old, Path(work) / "run"))
+                found["now"].append(_ticks(REPOSITORY, run.resolve()))
+        finally:
+            subprocess.run(["git", "worktree", "remove", "--force", old], cwd=REPOSITORY, check=True)
+    lines = {
+        "tick, 1": ("surrogate tick, one 64^3 object", 3.0),
+        "tick, 5": ("surrogate tick, five 64^3 objects", 3.0),
+        "iteration": ("attack iteration, room", 2.5),
+    }
+    for name, (line, least) in lines.items():
+        before_ms, now_ms = (median(each[name] for each in found[when]) for when in ("before", "now"))
+        note = f"{now_ms:.1f} ms against {before_ms:.1f} ms; medians of {turns} processes each, in turns"
+        ratio = before_ms / now_ms
+        record(
+            f"{line}, against the code before baked scenes",
+            ratio,
+            "x as fast",
+            f">= {least:g} x",
+            ratio >= least,
+            note,
+            " --speed",
+        )
+
+
+def _ticks(code: Path, run: Path) -> dict[str, float]:
+    environment = {**os.environ, "PYTHONPATH": str(code)}
+    environment.pop("OMP_WAIT_POLICY", None)  # each code as its commands would have it
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", code / "benchmarks" / "ticks.py", run],
+        cwd=code,
+        env=environment,
+        check=True,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    found: dict[str, float] = json.loads(done.stdout.splitlines()[-1])
+    return found
+
+
+def _copy_as_of_before(run: Path, target: Path) -> None:
+    """A run folder that the code before can read: the scene in single precision, with the header that it knew."""
+    for stage in ("capture", "policy", "scene"):
+        shutil.copytree(
+            run / stage,
+            target / stage,
+            ignore=shutil.ignore_patterns("photos", "frames", "*.checkpoint.*", "views"),
+        )
+    manifest = json.loads((run / "manifest.json").read_text())
+    manifest["config"].pop("reference")
+    (target / "manifest.json").write_text(json.dumps(manifest))
+    file = target / "scene" / "scene.safetensors"
+    with safe_open(file, framework="pt") as scene:
+        header = scene.metadata()
+        tensors = {name: scene.get_tensor(name) for name in scene.keys()}  # noqa: SIM118 - not a dict
+    tensors["grid.table"] = tensors["grid.table"].float()
+    config = {
+        key: value
+        for key, value in json.loads(header["config"]).items()
+        if key not in ("contraction", "learned_background")
+    }
+    save_file(tensors, file, {**header, "format": "advnerf-scene-1", "config": json.dumps(config)})
+
+
+def _problem(experiment: Experiment, background: BackgroundRenderer, victim: str, seed: int) -> AttackProblem:
+    policy = load_policy(victim_file(experiment, victim))
+    return attack_problem(
+        experiment, face_space(experiment, background), policy, experiment.config.scenarios[0], seed
+    )
+
+
+class _ReachedError(Exception):
+    """The search found what was asked for."""
+
+
+def reach(experiment: Experiment) -> None:
+    """From a trained scene to an attack: baking, and the search until it predicts enough."""
+    began = time.perf_counter()
+    baked = bake(load_field(experiment), bake_stage.views_of(experiment), experiment.view.pinhole)
+    baking_s = time.perf_counter() - began
+    problem, space = _problem(experiment, baked, HARDENED, 0), face_space(experiment, baked)
+    plain_m = float(evaluate(problem, space.surrogate.plain_theta())[1].protocol_cte_m.mean())
+    best: list[tuple[float, int]] = []
+
+    def told(evaluation: Evaluation) -> None:
+        excess_m = (evaluation.predicted_total_cte_m - plain_m) / problem.steps
+        best.append((excess_m, evaluation.iteration))
+        if excess_m >= _EXCESS_M:
+            raise _ReachedError
+
+    settings = replace(search_settings(experiment, load_method("gradient")), evaluations=_MOST_EVALUATIONS)
+    with suppress(_ReachedError):
+        space.search("gradient", problem, settings, SearchRun(0, None, told))
+    taken_s, (excess_m, iteration) = time.perf_counter() - began, max(best)
+    record(
+        "trained scene to an attack that predicts an excess of 0.15 m a tick",
+        taken_s,
+        "s",
+        "<= 60 s",
+        taken_s <= 60.0 and excess_m >= _EXCESS_M,
+        f"hardened victim, T = {problem.steps}: {excess_m:.3f} m a tick after {iteration + 1} evaluations; {baking_s:.0f} s of it baking",
+    )
+
+
+def pairs(experiment: Experiment, backgrounds: Backgrounds) -> None:
+    """Attacks found both ways, from the same starts and seeds, deployed in the world."""
+    scenario, rows = experiment.config.scenarios[0], []
+    settings = search_settings(experiment, load_method("gradient"))
+    with experiment.open_world() as scene:
+        dressed = PaintedScene(experiment, scene)
+        for victim in (HARDENED, NAIVE):
+            policy = load_policy(victim_file(experiment, victim)).policy
+            for seed in range(_SEEDS):
+                starts = experiment.start_states(scenario, seed)
+                driven = partial(deployed_drives, experiment, dressed, policy, scenario, starts)
+                plain_m = [drive.metrics.total_cte_m for drive in driven(None)]
+                found = {}
+                for name, each in backgrounds.items():
+                    problem = _problem(experiment, each, victim, seed)
+                    theta = (
+                        face_space(experiment, each)
+                        .search("gradient", problem, settings, SearchRun(seed))
+                        .theta
+                    )
+                    totals_m = [drive.metrics.total_cte_m for drive in driven(theta)]
+                    found[name] = mean(np.subtract(totals_m, plain_m)) / experiment.config.horizon
+                rows.append(found)
+                print(f"{victim}, seed {seed}: {found}", flush=True)
+    field_m, baked_m = (mean(row[name] for row in rows) for name in ("field", "baked"))
+    difference = abs(baked_m - field_m) / field_m
+    note = f"{baked_m:.4f} m a tick against {field_m:.4f} m; {len(rows)} pairs of searches, two victims, {settings.evaluations} evaluations each"
+    record(
+        "deployed excess of attacks found through a baked scene and through the field",
+        100 * difference,
+        "% apart",
+        "<= 10 %",
+        difference <= 0.1,
+        note,
+        " --pairs",
+    )
+
+
+def main() -> None:
+    """Measure, print and record."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--speed", action="store_true", help="compare with the code of a commit, instead")
+    parser.add_argument("--before", default="fad839a", help="that commit")
+    parser.add_argument("--turns", type=int, default=3)
+    parser.add_argument(
+        "--pairs", action="store_true", help="search and deploy attacks both ways, instead (minutes)"
+    )
+    options = parser.parse_args()
+    os.environ.setdefault("MUJOCO_GL", "egl")
+    experiment = run_of(options.run)
+    backgrounds: Backgrounds = {"field": load_field(experiment), "baked": load_background(experiment)}
+    if options.pairs:
+        pairs(experiment, backgrounds)
+        return
+    if options.speed:
+        speed(options.run, options.before, options.turns)
+        return
+    fidelity(experiment, backgrounds)
+    reach(experiment)
+
+
+if __name__ == "__main__":
+    main()

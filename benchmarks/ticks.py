@@ -1,0 +1,89 @@
+"""How long a tick of the surrogate and an iteration of an attack take in a run folder: printed as JSON, for `benchmarks.baked_scene`.
+
+It names nothing that the code of before baked scenes lacks, so that the same script measures both.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from statistics import median
+
+import advnerf_core as advnerf_core  # isort: skip  # before torch, as in the commands
+import numpy as np
+import torch
+
+from advnerf_core.attack.adjoint import adjoint_gradient
+from advnerf_core.fields.voxel_grid import VoxelGridObject
+from advnerf_core.geometry import make_transform, planar_poses, rotation_z
+from advnerf_core.objects.voxel.build import build_from_mesh
+from advnerf_core.objects.voxel.generators import GENERATORS
+from advnerf_core.objects.voxel.mesh import stand
+from advnerf_core.policies.pilotnet import load_policy
+from advnerf_core.scene.surrogate import Surrogate
+from nodes.experiment.attack import attack_problem
+from nodes.experiment.config import ExperimentConfig
+from nodes.experiment.context import Experiment
+from nodes.experiment.faces import face_space
+from nodes.experiment.learned_scene import load_background
+from nodes.experiment.policy import HARDENED, victim_file
+
+STEPS, OBJECTS = 40, (1, 5)
+
+
+def run_of(folder: Path) -> Experiment:
+    """The experiment of a run folder, as it was run."""
+    manifest = json.loads((folder / "manifest.json").read_text())
+    config = ExperimentConfig.model_validate(manifest["config"])
+    return Experiment(config, Path(manifest["file"]), folder.resolve(), manifest["setting"])
+
+
+def hydrants(count: int) -> list[VoxelGridObject]:
+    """Hydrants of 64^3 side by side at the corner that the car comes to."""
+    model = build_from_mesh(stand(GENERATORS["hydrant"]()), "hydrant", 64, 0, {})
+    places = [make_transform(rotation_z(0.3 * k), [2.6, -1.9 + 0.45 * k, 0.0]) for k in range(count)]
+    return [model.placed(place, 1.0) for place in places]
+
+
+def median_ms(function: Callable[[], object], repeats: int) -> float:
+    """Median of the runs after a first one [ms]."""
+    taken = []
+    for _ in range(repeats + 1):
+        began = time.perf_counter()
+        function()
+        taken.append(1e3 * (time.perf_counter() - began))
+    return median(taken[1:])
+
+
+def measured(folder: Path, repeats: int = 5) -> dict[str, float]:
+    """Milliseconds of a tick with one object and with five (scene, objects and policy, 200 x 66), and of an iteration on the face."""
+    experiment = run_of(folder)
+    scenario, background = experiment.config.scenarios[0], load_background(experiment)
+    path, loaded = experiment.paths[scenario], load_policy(victim_file(experiment, HARDENED))
+    states = np.array([path.pose_at(float(s)) for s in np.linspace(0.0, 3.0, 30)])
+    poses, found = planar_poses(states) @ experiment.mount, {}
+    for count in OBJECTS:
+        surrogate = Surrogate(background, experiment.view.pinhole, experiment.mount, hydrants(count))
+        theta = surrogate.plain_theta()
+
+        def drive(surrogate: Surrogate = surrogate, theta: torch.Tensor = theta) -> None:
+            with torch.no_grad():
+                for pose in poses:
+                    loaded.policy(surrogate.render(pose[None], theta).images)
+
+        found[f"tick, {count}"] = median_ms(drive, repeats) / len(poses)
+    space = face_space(experiment, background)
+    problem = replace(attack_problem(experiment, space, loaded, scenario, 0), steps=STEPS)
+    theta = space.surrogate.initial_theta(torch.Generator().manual_seed(0))
+    found["iteration"] = median_ms(lambda: adjoint_gradient(problem, theta), repeats)
+    return found
+
+
+if __name__ == "__main__":
+    os.environ.setdefault("MUJOCO_GL", "egl")
+    print(json.dumps(measured(Path(sys.argv[1]))))
