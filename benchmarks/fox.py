@@ -26,7 +26,11 @@ SIZE = (270, 480)
 HELD_OUT_EVERY = 8
 REFINE_DEPTH = 0.005
 NEAR = 0.3  # in the file's unit
-TARGETS_DB = {"real photos: fox, held-out PSNR": 26.0, "fox, 10 min on 2 cores, held-out PSNR": 28.0}
+# By seconds of training.
+TARGETS_DB = {
+    180.0: {"fox, 3 min on 2 cores, held-out PSNR": 28.5},
+    600.0: {"real photos: fox, held-out PSNR": 26.0, "fox, 10 min on 2 cores, held-out PSNR": 30.5},
+}
 
 
 def main() -> None:
@@ -35,7 +39,7 @@ def main() -> None:
         "--data", type=Path, default=Path("../shared/data/fox"), help="folder with transforms.json"
     )
     parser.add_argument(
-        "--seconds", type=float, default=600.0, help="training time; only 600 is written to the ledger"
+        "--seconds", type=float, default=600.0, help="training time; 180 and 600 are written to the ledger"
     )
     parser.add_argument(
         "--steps", type=int, help="train so many steps instead, to compare settings; nothing is recorded"
@@ -81,10 +85,10 @@ def main() -> None:
         TrainConfig.opacity,
         REFINE_DEPTH,
     )
-    if arguments.seconds == 600.0 and as_recorded:
-        command = "python -m benchmarks.fox --data ../shared/data/fox"
-        for line, target_db in TARGETS_DB.items():
-            record_row(line, mean_db, "dB", f">= {target_db:.0f} dB", mean_db >= target_db, command, note)
+    if as_recorded and arguments.seconds in TARGETS_DB:
+        command = f"python -m benchmarks.fox --data ../shared/data/fox --seconds {arguments.seconds:g}"
+        for line, target_db in TARGETS_DB[arguments.seconds].items():
+            record_row(line, mean_db, "dB", f">= {target_db:g} dB", mean_db >= target_db, command, note)
 
 
 def report(at: Progress) -> None:

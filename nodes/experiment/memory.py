@@ -49,7 +49,9 @@ def peak_above_idle_mib(experiment: Experiment, ticks: int) -> float:
     space = face_space(experiment, ideal=True)
     policy, scenario = load_policy(victim_file(experiment, HARDENED)), experiment.config.scenarios[0]
     problem = attack_problem(experiment, space, policy, scenario, experiment.config.attack.seeds[0])
-    problem = dataclasses.replace(problem, start_states=problem.start_states[:1], steps=ticks, cache_bytes=0)
+    goals = None if problem.goals is None else problem.goals[:1]
+    one = problem.start_states[:1]
+    problem = dataclasses.replace(problem, start_states=one, goals=goals, steps=ticks, cache_bytes=0)
     theta = space.surrogate.initial_theta(torch.Generator().manual_seed(0))
     # Libraries, compiled kernels and thread pools are idle memory.
     evaluate(dataclasses.replace(problem, steps=1), theta)

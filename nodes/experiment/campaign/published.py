@@ -15,7 +15,7 @@ from nodes.experiment.campaign.admission import gate_file, gate_key
 from nodes.experiment.campaign.config import Campaign
 from nodes.experiment.campaign.plan import read_experiment
 from nodes.experiment.campaign.predictions import kept_prediction, prediction_file
-from nodes.experiment.campaign.store import CellStatus, store_of
+from nodes.experiment.campaign.store import CellStatus
 from nodes.experiment.campaign.table import wanted_rows
 from nodes.experiment.cell import Cell
 from nodes.experiment.kinds import load_kind
@@ -60,11 +60,7 @@ def publish(campaign: Campaign, found: Sequence[CellStatus], folder: Path, prune
                 prediction_file(folder / campaign.name, each.cell.name).unlink(missing_ok=True)
         if each.state != "done":
             continue
-        own = store_of(campaign).result_file(each.cell.name)
-        if not own.exists():  # it is known from there
-            same.append(each.cell.name)
-            continue
-        text = own.read_text(encoding="utf-8")
+        text = _as_published(each)
         if target.exists() and target.read_text(encoding="utf-8") == text:
             same.append(each.cell.name)
             continue
@@ -72,6 +68,16 @@ def publish(campaign: Campaign, found: Sequence[CellStatus], folder: Path, prune
         written.append(each.cell.name)
     _publish_beside(campaign, [each for each in found if each.state == "done"], folder / campaign.name)
     return Published(tuple(written), tuple(same), tuple(stale))
+
+
+def _as_published(found: CellStatus) -> str:
+    """A done cell's file, under the cell's names in this campaign: an experiment that ran it itself may have others."""
+    assert found.file is not None, "a done cell is somewhere"
+    cell, text = found.cell, found.file.read_text(encoding="utf-8")
+    data = json.loads(text)
+    if (data["scenario"], data.get("placement", "")) == (cell.scenario, cell.placement):
+        return text
+    return json.dumps({**data, "scenario": cell.scenario, "placement": cell.placement}, indent=1) + "\n"
 
 
 @dataclass(frozen=True)

@@ -30,12 +30,14 @@ class CellStatus:
         state: ``changed``: there is a result, but of other settings; ``begun``: stopped on the way, goes on when run.
         text: Error, or the last line of its log.
         result: The result, of any settings; None where there is none.
+        file: Where the result of a done cell is.
     """
 
     cell: Cell
     state: State
     text: str = ""
     result: CellResult | None = None
+    file: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -111,10 +113,10 @@ class Store:
         except CellError as broken:
             return CellStatus(cell, "unreadable", str(broken))
         if result is not None and settings_hash is not None and result.settings_hash == settings_hash:
-            return CellStatus(cell, "done", "", result)
+            return CellStatus(cell, "done", "", result, self.result_file(name))
         if settings_hash is not None and (found := _first_of(elsewhere, settings_hash)) is not None:
             file, other = found
-            return CellStatus(cell, "done", f"from {file}", _named(other, cell))
+            return CellStatus(cell, "done", f"from {file}", _named(other, cell), file)
         if settings_hash is not None and (error := self.error(name, settings_hash)):
             return CellStatus(cell, "failed", error, result)
         if result is not None:

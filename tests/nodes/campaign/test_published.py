@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from nodes.cli.main import app
 from nodes.experiment.campaign.config import load_campaign
-from nodes.experiment.campaign.plan import plan_cells, statuses
+from nodes.experiment.campaign.plan import elsewhere, plan_cells, statuses
 from nodes.experiment.campaign.published import Published, publish, publish_build, published_table
 from nodes.experiment.campaign.run import Options, run_campaign
 from nodes.experiment.campaign.table import campaign_table, write_table
@@ -172,3 +172,17 @@ def test_a_published_build_stays_as_long_as_a_published_cell_was_run_with_it(her
     assert [each.name for each in found.removed] == ["scene_of_none"]
     assert [each.name for each in build.iterdir()] == ["scene_of_a_cell"]
     assert found.size_bytes == (build / "scene_of_a_cell" / "stage.json").stat().st_size
+
+
+def test_a_cell_that_its_experiment_ran_itself_is_published_too(here, tmp_path):
+    campaign = load_campaign(here.file)
+    plan = plan_cells(campaign, campaign.cells)[0]
+    own = elsewhere(campaign, plan.cell)[0]
+    assert own.parent != here.cells
+    put(plan, own.parent)
+    (own.parent / f"{plan.cell.name}.json").rename(own)
+    found = publish(campaign, statuses(campaign, campaign.cells), tmp_path / "kept")
+    assert found.written == (plan.cell.name,)
+    kept = json.loads((tmp_path / "kept" / campaign.name / f"{plan.cell.name}.json").read_text())
+    assert kept["settings_hash"] == plan.job.settings_hash
+    assert publish(campaign, statuses(campaign, campaign.cells), tmp_path / "kept").same == (plan.cell.name,)

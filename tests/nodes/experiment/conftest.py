@@ -22,6 +22,7 @@ from nodes.experiment.learned_scene import scene_file
 from nodes.experiment.objects import build, object_file
 from nodes.experiment.policy import HARDENED, NAIVE, victim_file
 from nodes.experiment.run import load_experiment
+from tests.support.stage_versions import measured
 
 LAUNCH = Path(__file__).parents[3] / "launch" / "junction.experiment.yaml"
 TINY: dict[str, Any] = {
@@ -65,6 +66,13 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Experiment:
         policy = PilotNet(3, 1.2, (16, 8, 4)).eval()
         save_policy(victim_file(experiment, victim), policy, experiment.view, {"victim": victim})
     return experiment
+
+
+@pytest.fixture(scope="session")
+def tiny_room(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, dict[str, Any]]]:
+    """The run folder of a tiny experiment in the lab, run whole, and the numbers that sum it up."""
+    folder = tmp_path_factory.mktemp("room") / "run"
+    return folder, measured(folder)
 
 
 @dataclass

@@ -9,20 +9,14 @@ from nodes.experiment.cell import Cell
 from nodes.experiment.cell_kind import settings_hash
 from nodes.experiment.cells import ExperimentCells
 from nodes.experiment.reference import Reference
-from tests.support.stage_versions import RECORDED, measured, tiny_experiment
+from tests.support.stage_versions import RECORDED, tiny_experiment
 
 # Between processors sums are taken in another order; a change of what is computed is larger.
 _RELATIVE = 0.01
 
 
-@pytest.fixture(scope="module")
-def made(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("versions") / "run"
-    return folder, measured(folder)
-
-
-def test_what_stages_and_cells_make_is_of_their_versions(made):
-    recorded, found = json.loads(RECORDED.read_text()), made[1]
+def test_what_stages_and_cells_make_is_of_their_versions(tiny_room):
+    recorded, found = json.loads(RECORDED.read_text()), tiny_room[1]
     assert set(found) == set(recorded)
     for name, each in found.items():
         how = (
@@ -33,8 +27,8 @@ def test_what_stages_and_cells_make_is_of_their_versions(made):
         assert each["numbers"] == pytest.approx(recorded[name]["numbers"], rel=_RELATIVE), how
 
 
-def test_a_machine_that_has_only_the_reference_build_runs_the_same_cells(made, tmp_path, monkeypatch):
-    ours, kind = tiny_experiment(made[0]), ExperimentCells()
+def test_a_machine_that_has_only_the_reference_build_runs_the_same_cells(tiny_room, tmp_path, monkeypatch):
+    ours, kind = tiny_experiment(tiny_room[0]), ExperimentCells()
     reference = Reference(tmp_path / "build")
     assert len(kind.keep(ours, reference)) == 4
     monkeypatch.setattr(run, "REFERENCE", reference)
@@ -47,4 +41,4 @@ def test_a_machine_that_has_only_the_reference_build_runs_the_same_cells(made, t
     assert not (theirs.stage_folder("policy") / "frames").exists()
     with kind.hold(theirs):
         found = kind.run(theirs, cell, theirs.cell_folder(cell), lambda part, text="": None)
-    assert found["surrogate"]["total_cte_m"][0] == made[1]["cells"]["numbers"]["random_surrogate_m"]
+    assert found["surrogate"]["total_cte_m"][0] == tiny_room[1]["cells"]["numbers"]["random_surrogate_m"]
