@@ -129,7 +129,9 @@ def experiment(
     ] = False,
     anew: Annotated[
         bool,
-        typer.Option("--anew", help="Make every stage here, also those that are kept in docs/results/build."),
+        typer.Option(
+            "--anew", help="Make every stage here, also those that are kept in docs/results/reference."
+        ),
     ] = False,
     overrides: Overrides = None,
 ) -> None:

@@ -25,7 +25,7 @@ from nodes.experiment.stage_record import (
 
 # Where cells and stages are kept with the code.
 PUBLISHED = Path("docs/results")
-BUILD = "build"
+BUILD = "reference"
 _KEY_DIGITS = 16
 
 

@@ -14,6 +14,7 @@ from nodes.experiment.campaign.published import Published, publish, publish_buil
 from nodes.experiment.campaign.run import Options, run_campaign
 from nodes.experiment.campaign.table import campaign_table, write_table
 from nodes.experiment.cell import select
+from nodes.experiment.reference import BUILD
 from nodes.runtime.errors import ConfigError
 
 
@@ -158,7 +159,7 @@ def test_a_cell_that_its_experiment_has_run_is_done_for_a_campaign_too(here):
 
 
 def test_a_published_build_stays_as_long_as_a_published_cell_was_run_with_it(here, tmp_path):
-    build, campaign = tmp_path / "build", load_campaign(here.file)
+    build, campaign = tmp_path / BUILD, load_campaign(here.file)
     for name, digest in (("scene_of_a_cell", "s1"), ("scene_of_none", "s2")):
         (build / name).mkdir(parents=True)
         record = {"key": "k", "digest": digest, "seconds": 1.0, "settings": {}, "kept": "d"}
