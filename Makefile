@@ -23,7 +23,7 @@ $(VENV)/.installed: pyproject.toml constraints.txt docker/system-packages.sh
 	@$(BIN)/pip install -q --disable-pip-version-check -c constraints.txt -e '.[all,dev]'
 	@touch $@
 
-demo: setup  ## The whole experiment, small setting, on the simulated lab (up to 20 minutes on 2 cores)
+demo: setup  ## The whole experiment, small setting, on the simulated lab (about six minutes on 2 cores)
 	@$(BIN)/advnerf experiment launch/room.experiment.yaml --setting demo --run-folder runs/demo --anew
 
 experiment: setup  ## The full experiment, 3 seeds (half an hour on 2 cores); writes its rows to docs/results.json
