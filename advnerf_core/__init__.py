@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from advnerf_core.lazy import lazy_names
 
-# Read when torch is loaded. Threads of torch that wait by spinning keep a core from our own for milliseconds: a tick of an attack takes 1.6 x as long.
+# Read when torch is loaded. Threads of torch that wait by spinning keep a core from our kernels.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 __all__ = [

@@ -9,9 +9,13 @@ from __future__ import annotations
 
 import itertools
 import os
+import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from advnerf_core.kernel_cache import use_own_folder
 
@@ -32,6 +36,7 @@ _pools: dict[
     tuple[int, int], ThreadPoolExecutor
 ] = {}  # by process and size: a forked child must not reuse its parent's
 _threads = 0
+_scratch = threading.local()
 
 
 def thread_count() -> int:
@@ -80,6 +85,15 @@ def slot_bounds(count: int, slots: int, multiple: int = 1) -> list[tuple[int, in
     edges = [min(count, (blocks * slot // slots) * multiple) for slot in range(slots + 1)]
     edges[-1] = count
     return list(itertools.pairwise(edges))
+
+
+def scratch(use: str, count: int, dtype: Any) -> NDArray[Any]:
+    """An array ``[>= count]`` of this thread for one use: zeros when it is made, then as the last call for that use left it."""
+    kept: dict[tuple[str, str], NDArray[Any]] = _scratch.__dict__.setdefault("arrays", {})
+    key = use, np.dtype(dtype).char
+    if key not in kept or len(kept[key]) < count:
+        kept[key] = np.zeros(count, dtype)
+    return kept[key]
 
 
 def _pool(size: int) -> ThreadPoolExecutor:

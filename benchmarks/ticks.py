@@ -8,11 +8,8 @@ from __future__ import annotations
 import json
 import os
 import sys
-import time
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from statistics import median
 
 import advnerf_core as advnerf_core  # isort: skip  # before torch, as in the commands
 import numpy as np
@@ -26,6 +23,7 @@ from advnerf_core.objects.voxel.generators import GENERATORS
 from advnerf_core.objects.voxel.mesh import stand
 from advnerf_core.policies.pilotnet import load_policy
 from advnerf_core.scene.surrogate import Surrogate
+from benchmarks.timing import seconds_in_turns
 from nodes.experiment.attack import attack_problem
 from nodes.experiment.config import ExperimentConfig
 from nodes.experiment.context import Experiment
@@ -50,16 +48,6 @@ def hydrants(count: int) -> list[VoxelGridObject]:
     return [model.placed(place, 1.0) for place in places]
 
 
-def median_ms(function: Callable[[], object], repeats: int) -> float:
-    """Median of the runs after a first one [ms]."""
-    taken = []
-    for _ in range(repeats + 1):
-        began = time.perf_counter()
-        function()
-        taken.append(1e3 * (time.perf_counter() - began))
-    return median(taken[1:])
-
-
 def measured(folder: Path, repeats: int = 5) -> dict[str, float]:
     """Milliseconds of a tick with one object and with five (scene, objects and policy, 200 x 66), and of an iteration on the face."""
     experiment = run_of(folder)
@@ -76,11 +64,13 @@ def measured(folder: Path, repeats: int = 5) -> dict[str, float]:
                 for pose in poses:
                     loaded.policy(surrogate.render(pose[None], theta).images)
 
-        found[f"tick, {count}"] = median_ms(drive, repeats) / len(poses)
+        found[f"tick, {count}"] = 1e3 * seconds_in_turns({"tick": drive}, repeats)["tick"] / len(poses)
     space = face_space(experiment, background)
     problem = replace(attack_problem(experiment, space, loaded, scenario, 0), steps=STEPS)
     theta = space.surrogate.initial_theta(torch.Generator().manual_seed(0))
-    found["iteration"] = median_ms(lambda: adjoint_gradient(problem, theta), repeats)
+    found["iteration"] = (
+        1e3 * seconds_in_turns({"iteration": lambda: adjoint_gradient(problem, theta)}, repeats)["iteration"]
+    )
     return found
 
 

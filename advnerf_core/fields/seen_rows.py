@@ -6,8 +6,6 @@ are taken for these only.
 
 from __future__ import annotations
 
-import threading
-
 import numpy as np
 import torch
 from numba import njit
@@ -17,9 +15,7 @@ from torch import Tensor
 
 from advnerf_core.fields.coloured import ColouredObject
 from advnerf_core.fields.voxel_grid import squash, squash_derivative
-from advnerf_core.parallel import KERNEL_OPTIONS
-
-_kept = threading.local()
+from advnerf_core.parallel import KERNEL_OPTIONS, scratch
 
 
 class SeenRows:
@@ -69,24 +65,16 @@ class SeenRows:
 def compact(weights: sparse.csr_matrix, field: ColouredObject) -> tuple[sparse.csr_matrix, SeenRows]:
     """Weights ``[P, slots]`` with only the columns that are used ``[P, V]``, and what these are."""
     indices = np.empty_like(weights.indices)
-    rows = _pack(weights.indices, _scratch(weights.shape[1]), indices)
+    rows = _pack(weights.indices, scratch("place", weights.shape[1], np.int32), indices)
     packed = sparse.csr_matrix((weights.data, indices, weights.indptr), (weights.shape[0], len(rows)))
     return packed, SeenRows(field, rows)
-
-
-def _scratch(count: int) -> NDArray[np.int32]:
-    """Zeros ``[>= count]`` of this thread; the kernel leaves them as it found them."""
-    if len(getattr(_kept, "place", ())) < count:
-        _kept.place = np.zeros(count, np.int32)
-    found: NDArray[np.int32] = _kept.place
-    return found
 
 
 @njit(**KERNEL_OPTIONS)
 def _pack(
     indices: NDArray[np.int32], place: NDArray[np.int32], packed: NDArray[np.int32]
 ) -> NDArray[np.int64]:
-    """The different ones of ``indices``, ascending; ``packed`` gets each index's number among them."""
+    """The different ones of ``indices``, ascending; ``packed`` gets each index's number among them. ``place`` is and stays zeros."""
     count = 0
     for n in range(indices.shape[0]):
         count += 1 - place[indices[n]]

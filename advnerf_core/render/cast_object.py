@@ -13,7 +13,6 @@ metres, and extinction is integrated over length in object units.
 from __future__ import annotations
 
 import itertools
-import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
@@ -25,13 +24,12 @@ from scipy import ndimage, sparse
 from advnerf_core.fields.coloured import ColouredObject
 from advnerf_core.fields.voxel_grid import VoxelGridObject
 from advnerf_core.geometry import Array, Pinhole, invert_transform, transform_points
-from advnerf_core.parallel import run_slots
+from advnerf_core.parallel import run_slots, scratch
 from advnerf_core.render.cast_kernels import FILLED, FOUND, NEAR_M, cast_window
 from advnerf_core.render.occupancy import leap_distances
 
 # Parts of the work when few images are cast: enough that two to four threads have something to do.
 _LEAST_PARTS = 4
-_scratch = threading.local()
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,7 +220,9 @@ class _Part:
         )
         room = area * 4 * self._supersample + 64
         indices, values = np.empty(room, np.int32), np.empty(room, grids.density.dtype)
-        row, touched = _scratch_rows(field.slot_count, grids.density.dtype)
+        # The kernel leaves the row as zeros.
+        row = scratch("row", field.slot_count, grids.density.dtype)
+        touched = scratch("touched", field.slot_count, np.int32)
         progress = np.zeros(3, np.int64)
         while not cast_window(
             R,
@@ -275,15 +275,6 @@ def _joined(parts: Sequence[_Part], field: VoxelGridObject, dtype: Any) -> Objec
     return ObjectCast(
         pixels, alpha, depth_m, sparse.csr_matrix((values, indices, np.concatenate(starts)), shape)
     )
-
-
-def _scratch_rows(count: int, dtype: Any) -> tuple[NDArray[Any], NDArray[np.int32]]:
-    """Zeros ``[count]`` and room for ``[count]`` indices, of this thread; the kernel leaves the zeros as it found them."""
-    kept = _scratch.__dict__.setdefault(np.dtype(dtype).char, (np.zeros(0, dtype), np.zeros(0, np.int32)))
-    if len(kept[0]) < count:
-        kept = _scratch.__dict__[np.dtype(dtype).char] = (np.zeros(count, dtype), np.empty(count, np.int32))
-    rows: tuple[NDArray[Any], NDArray[np.int32]] = kept
-    return rows
 
 
 def _bands(window: NDArray[np.int64], count: int) -> list[NDArray[np.int64]]:

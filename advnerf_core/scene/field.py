@@ -192,7 +192,7 @@ def save_scene(
     """Write a trained scene to one ``.safetensors`` file, atomically.
 
     The grid's tables, nearly all of it, are kept in half precision, as Instant-NGP trains them: what is read back differs by at most
-    one part in 2048 in each feature, which costs the demo's scene 0.0001 dB.
+    one part in 2048 in each feature.
 
     Args:
         path: The file.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -49,6 +50,13 @@ class FieldRenderer:
         self.levels = scene.grid.levels
         cells = (np.array(occupied.shape) / self.config.box_high).astype(np.float32)
         self.leaps = leap_distances(occupied, cells)
+
+    @property
+    def networks(self) -> tuple[Any, ...]:
+        """Encoding and networks in the order in which kernels take them."""
+        layers = ("density_1", "density_2", "colour_1", "colour_2")
+        parts = (self.weights[f"{layer}.{part}"] for layer in layers for part in ("weight", "bias"))
+        return self.weights["grid.table"], self.levels, *parts
 
     @classmethod
     def from_file(
@@ -125,7 +133,6 @@ class FieldRenderer:
         depth_m: NDArray[np.float32],
         alpha: NDArray[np.float32],
     ) -> int:
-        w = self.weights
         return int(
             render_tiles(
                 poses,
@@ -136,17 +143,8 @@ class FieldRenderer:
                 self.march.steps(),
                 self.leaps.distance,
                 self.leaps.cells,
-                w["grid.table"],
-                self.levels,
-                w["density_1.weight"],
-                w["density_1.bias"],
-                w["density_2.weight"],
-                w["density_2.bias"],
-                w["colour_1.weight"],
-                w["colour_1.bias"],
-                w["colour_2.weight"],
-                w["colour_2.bias"],
-                w["background"],
+                *self.networks,
+                self.weights["background"],
                 self.config.direction_bands,
                 np.float32(self.least_transmittance),
                 self.march.max_samples,

@@ -180,9 +180,7 @@ class Surrogate:
 
     def remembering(self, budget_bytes: int) -> Surrogate:
         """The same surrogate, which keeps as many of the last background frames as fit into a budget of memory."""
-        found = copy.copy(self)
-        found._background = RememberedBackground(self._background, budget_bytes)
-        return found
+        return self.with_background(RememberedBackground(self._background, budget_bytes))
 
     @torch.no_grad()
     def prepare(self, T_world_from_camera: ArrayLike) -> Frames:

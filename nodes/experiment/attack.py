@@ -10,15 +10,18 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
-from advnerf_core.attack.adjoint import AttackProblem, evaluate
+from advnerf_core.attack.adjoint import AttackProblem
 from advnerf_core.attack.artifact import AttackFile, load_attack, save_attack
 from advnerf_core.attack.clean import clean_drive
 from advnerf_core.attack.methods import Method, SearchRun, SearchSettings, load_method
+from advnerf_core.attack.problem import drive_scores
 from advnerf_core.attack.search.search import SearchResult
 from advnerf_core.attack.spaces.space import Shown, Space
 from advnerf_core.files import write_atomically
+from advnerf_core.geometry import Array
 from advnerf_core.policies.pilotnet import LoadedPolicy, load_policy
 from advnerf_core.report.conditions import NONE
 from nodes.experiment.cell import Cell
@@ -140,16 +143,17 @@ def surrogate_part(
         return found
     policy = _victim(victim_file(experiment, cell.victim))
     problem = attack_problem(experiment, space, policy, cell.scenario, cell.seed)
-    attack_id, curve, seconds = None, [], 0.0
+    attack, attack_id, curve, seconds = None, None, [], 0.0
     if cell.method != NONE:
         result = _search(experiment, space, problem, cell, folder, report)
         seconds = sum(evaluation.seconds for evaluation in result.history)
         curve = [evaluation.predicted_total_cte_m for evaluation in result.history]
         attack = _attack_file(experiment, space, problem, policy, cell, result)
-        attack_id = save_attack(folder / ATTACK, attack)
-    shown = load_shown(space, folder, cell)
+    shown = space.plain if attack is None else space.restored(attack)
     measured = replace(past_field(experiment, problem, space, shown), steps=experiment.config.horizon)
     states, scores = learned_drives(experiment, measured, shown.colours)
+    if attack is not None:
+        attack_id = save_attack(folder / ATTACK, _with_field_total(experiment, attack, problem, states))
     data = {
         "attack_id": attack_id,
         "states": states.tolist(),
@@ -269,7 +273,7 @@ def _attack_file(
     result: SearchResult,
 ) -> AttackFile:
     clean = clean_drive(past(problem, space, space.plain), space.plain.colours)
-    attack = AttackFile(
+    return AttackFile(
         method=cell.method,
         space=space.name,
         objects=space.attacked(result.theta),
@@ -286,8 +290,14 @@ def _attack_file(
         extra={"victim": cell.victim, "scenario": cell.scenario, "horizon": experiment.searched_ticks},
         clean_drive=clean,
     )
+
+
+def _with_field_total(
+    experiment: Experiment, attack: AttackFile, problem: AttackProblem, states: Array
+) -> AttackFile:
+    """The file with the total through the field, of drives ``[B, T + 1, n]`` at least as long as those of the search."""
     if not baked_file(experiment).exists() or over_the_world(experiment):
         return attack
-    shown = space.restored(attack)
-    _, totals_m = evaluate(past_field(experiment, problem, space, shown), shown.colours)
-    return replace(attack, field_total_cte_m=float(totals_m.protocol_cte_m.mean()))
+    searched = torch.from_numpy(states[:, : problem.steps + 1]).transpose(0, 1)
+    totals_m = [score.total_cte_m for score in drive_scores(problem, searched)]
+    return replace(attack, field_total_cte_m=float(np.mean(totals_m)))

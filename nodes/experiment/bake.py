@@ -10,13 +10,12 @@ import numpy as np
 from advnerf_core.data.dataset import load_transforms
 from advnerf_core.files import write_atomically
 from advnerf_core.geometry import Array, planar_poses
-from advnerf_core.learning.imitation import recovery_states
 from advnerf_core.scene.bake import NotBakedError, bake
 from advnerf_core.scene.baked import BakedScene
 from advnerf_core.scene.metrics import psnr
-from advnerf_core.scene.render_field import FieldRenderer
+from nodes.experiment.capture import states_about
 from nodes.experiment.context import Experiment
-from nodes.experiment.learned_scene import HELD_OUT, baked_file, load_field
+from nodes.experiment.learned_scene import FIDELITY, HELD_OUT, baked_file, load_field
 from nodes.runtime.progress import Report
 
 # As of a stage (`run.VERSIONS`). It is part of the keys of what is made through baked scenes; the digest of this stage is not, as what it
@@ -31,15 +30,15 @@ _VIEWS, _LATERAL_M, _HEADING_RAD, _SEED = 320, 3.0, 0.5, 0
 
 def run(experiment: Experiment, folder: Path, report: Report) -> None:
     """Write ``baked.safetensors``, unless the scene cannot be baked or loses by it, and ``baked.json``, which says which."""
-    field = load_field(experiment)
     report(0.0, "baking")
     try:
-        baked = bake(field, views_of(experiment), experiment.view.pinhole)
+        baked = bake(load_field(experiment), views_of(experiment), experiment.view.pinhole)
     except NotBakedError as error:
         write_atomically(folder / COMPARED, json.dumps({"used": False, "why": str(error)}, indent=1) + "\n")
         return
     report(0.8, "comparing")
-    before_db, after_db = (_held_out_psnr_db(experiment, each) for each in (field, baked))
+    fidelity = json.loads((experiment.stage_folder("scene") / FIDELITY).read_text())
+    before_db, after_db = fidelity["mean"]["psnr_policy_db"], _held_out_psnr_db(experiment, baked)
     used = before_db - after_db <= _MOST_LOST_DB
     if used:
         baked.save(baked_file(experiment))
@@ -54,30 +53,22 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
 
 
 def views_of(experiment: Experiment) -> Array:
-    """Poses ``[N, 4, 4]`` of the driving camera about all paths."""
-    rng, paths = np.random.default_rng(_SEED), list(experiment.paths.values())
-    driven_m = experiment.config.horizon * experiment.config.dt_s * experiment.car.speed_mps
-    states = [
-        recovery_states(
-            path,
-            _VIEWS // len(paths),
-            rng,
-            experiment.across_m(_LATERAL_M),
-            _HEADING_RAD,
-            None if path.closed else driven_m,
-        )
-        for path in paths
-    ]
-    return planar_poses(np.concatenate(states)) @ experiment.mount
+    """Poses ``[N, 4, 4]`` of the driving camera about all paths, equally many about each."""
+    count = len(experiment.paths) * (_VIEWS // len(experiment.paths))
+    states = states_about(experiment, count, np.random.default_rng(_SEED), _LATERAL_M, _HEADING_RAD)
+    return planar_poses(states) @ experiment.mount
 
 
-def _held_out_psnr_db(experiment: Experiment, renderer: FieldRenderer | BakedScene) -> float:
+def _held_out_psnr_db(experiment: Experiment, baked: BakedScene) -> float:
     """Mean over the held-out views as the policy sees them."""
     views = load_transforms(experiment.stage_folder("capture") / HELD_OUT, require_all=True).load()
     view = experiment.view
     pairs = zip(views.rgb, views.T_world_from_camera, strict=True)
-    found = [
-        psnr(renderer.render(pose[None], view.pinhole)[0][0].numpy(), view.image(rgb) / 255.0)
-        for rgb, pose in pairs
-    ]
-    return float(np.mean(found))
+    return float(
+        np.mean(
+            [
+                psnr(baked.render(pose[None], view.pinhole)[0][0].numpy(), view.image(rgb) / 255.0)
+                for rgb, pose in pairs
+            ]
+        )
+    )

@@ -93,14 +93,19 @@ def _calibrate(experiment: Experiment, scene: World, folder: Path, report: Repor
         screens_of(scene).show(name, plain_screen(experiment))
 
 
-def states_about(experiment: Experiment, count: int, rng: np.random.Generator) -> Array:
-    """Car states ``[count, 3]`` about the stretch of all paths that is measured."""
+def states_about(
+    experiment: Experiment,
+    count: int,
+    rng: np.random.Generator,
+    lateral_m: float = _LATERAL_M,
+    heading_rad: float = _HEADING_RAD,
+) -> Array:
+    """Car states ``[count, 3]`` about the stretch of all paths that is measured, so far from the path (of half a lane of 1.75 m) and so turned."""
     names = list(experiment.paths)
     driven_m = experiment.config.horizon * experiment.config.dt_s * experiment.car.speed_mps
     parts = []
     for index, name in enumerate(names):
         path, share = experiment.paths[name], len(range(index, count, len(names)))
-        lateral_m = experiment.across_m(_LATERAL_M)
         reach_m = None if path.closed else driven_m
-        parts.append(recovery_states(path, share, rng, lateral_m, _HEADING_RAD, reach_m))
+        parts.append(recovery_states(path, share, rng, experiment.across_m(lateral_m), heading_rad, reach_m))
     return np.concatenate(parts)

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from advnerf_core.attack.transfer import Scene
     from advnerf_core.driving.metrics import Horizon
     from advnerf_core.scene.fidelity import Pictures
-    from nodes.experiment.reference import Reference
+    from nodes.experiment.reference import ReferenceBuild
 
     Loop = tuple[AttackProblem, Scene, torch.Tensor, Horizon]
 
@@ -58,7 +58,7 @@ class CellKind(ABC):
         """Make what all cells of the experiment need and is not there yet."""
         return
 
-    def keep(self, experiment: Any, reference: Reference) -> list[Path]:
+    def keep(self, experiment: Any, reference: ReferenceBuild) -> list[Path]:
         """Copy what cells of the experiment are run with into a reference build; returns the folders that are new there."""
         return []
 

@@ -20,7 +20,7 @@ from nodes.experiment.context import Experiment
 from nodes.experiment.deploy import Deployer, ThroughNodes, ThroughWorld, cell_data
 from nodes.experiment.films import film_cell, kept_film, with_film
 from nodes.experiment.keys import NEEDED, CellError, cell_inputs, clean_folder, require_known
-from nodes.experiment.reference import Reference
+from nodes.experiment.reference import ReferenceBuild
 from nodes.experiment.run import load_experiment, prepare_victims, stages_of
 from nodes.experiment.space_config import PlacesConfig
 from nodes.experiment.spaces import make_space, over_the_world
@@ -168,7 +168,7 @@ class ExperimentCells(CellKind):
         del report  # the stages show their own progress
         prepare_victims(experiment)
 
-    def keep(self, experiment: Experiment, reference: Reference) -> list[Path]:
+    def keep(self, experiment: Experiment, reference: ReferenceBuild) -> list[Path]:
         """Scene, objects and policies, without what only their training read."""
         needed = [stage for stage in stages_of(experiment) if stage.name in NEEDED]
         return keep_stages(needed, experiment.folder, reference)

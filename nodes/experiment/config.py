@@ -257,6 +257,14 @@ class ExperimentConfig(_Section):
         return self
 
     @model_validator(mode="after")
+    def _searches_what_is_measured(self) -> ExperimentConfig:
+        if self.attack.horizon is not None and self.attack.horizon > self.horizon:
+            raise ValueError(
+                f"expected attack.horizon to be at most horizon = {self.horizon} ticks, which are measured, got {self.attack.horizon}"
+            )
+        return self
+
+    @model_validator(mode="after")
     def _training_drives_last(self) -> ExperimentConfig:
         """Fine ticks with the default number of them would train on drives that end before the junction."""
         policy, asked = self.policy, {}

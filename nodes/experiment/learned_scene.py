@@ -20,6 +20,7 @@ from nodes.experiment.run_folder import RunFolder
 from nodes.runtime.progress import Report
 
 HELD_OUT = "held_out"  # the captured set that nothing learns from
+FIDELITY = "fidelity.json"  # how near the learned scene comes to it
 
 
 def scene_file(experiment: RunFolder[Any]) -> Path:
@@ -80,4 +81,4 @@ def compare_views(experiment: RunFolder[Any], view: PolicyView, begin: float, re
             row[f"{name}_image"] = str(path.relative_to(experiment.folder))
         rows.append(row)
     means = {key: float(np.mean([row[key] for row in rows])) for key in ("psnr_full_db", "psnr_policy_db")}
-    write_atomically(folder / "fidelity.json", json.dumps({"mean": means, "views": rows}, indent=1) + "\n")
+    write_atomically(folder / FIDELITY, json.dumps({"mean": means, "views": rows}, indent=1) + "\n")

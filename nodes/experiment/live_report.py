@@ -27,6 +27,7 @@ from nodes.experiment.cell import Cell
 from nodes.experiment.context import Experiment
 from nodes.experiment.deploy import DRIVES
 from nodes.experiment.keys import driven_folder
+from nodes.experiment.learned_scene import FIDELITY
 from nodes.experiment.live import extra_runs, lab_of
 from nodes.experiment.policy import HARDENED
 from nodes.experiment.spaces import make_space
@@ -236,7 +237,7 @@ def _attacked(experiment: Experiment) -> list[Cell]:
 
 
 def _fidelity(experiment: Experiment) -> rd.Fidelity:
-    scene = json.loads((experiment.stage_folder("scene") / "fidelity.json").read_text())
+    scene = json.loads((experiment.stage_folder("scene") / FIDELITY).read_text())
     steering = json.loads((experiment.stage_folder("policy") / "policy.json").read_text())[
         "on_held_out_views"
     ]

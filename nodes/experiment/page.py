@@ -21,6 +21,7 @@ from nodes.experiment import films
 from nodes.experiment.attack import cells, frozen_hashes
 from nodes.experiment.cell import Cell
 from nodes.experiment.context import Experiment
+from nodes.experiment.learned_scene import FIDELITY
 from nodes.experiment.policy import HARDENED
 from nodes.experiment.stage_record import read_record
 
@@ -132,7 +133,7 @@ def _ground(ax: Any, experiment: Experiment) -> None:
 
 
 def _fidelity(experiment: Experiment) -> list[Markup]:
-    scene = json.loads((experiment.stage_folder("scene") / "fidelity.json").read_text())
+    scene = json.loads((experiment.stage_folder("scene") / FIDELITY).read_text())
     controls = json.loads((experiment.stage_folder("policy") / "policy.json").read_text())[
         "on_held_out_views"
     ]

@@ -34,7 +34,7 @@ class ReferenceBuildError(AdvnerfError):
 
 
 @dataclass(frozen=True)
-class Reference:
+class ReferenceBuild:
     """A folder of stages that are kept with the code.
 
     Attributes:
@@ -105,7 +105,7 @@ class Reference:
         return self.folder / f"{stage.name}_{key[:_KEY_DIGITS]}"
 
 
-REFERENCE = Reference(PUBLISHED / BUILD)
+REFERENCE = ReferenceBuild(PUBLISHED / BUILD)
 
 
 def _copy(source: Path, target: Path, without: Sequence[str], record: StageRecord) -> None:

@@ -14,7 +14,7 @@ from typing import Any, Generic, TypeVar
 from rich.console import Console
 
 from advnerf_core.files import write_atomically
-from nodes.experiment.reference import Reference
+from nodes.experiment.reference import ReferenceBuild
 from nodes.experiment.stage_record import Stage, StageRecord
 from nodes.experiment.stages import check_until, run_stages
 from nodes.runtime.errors import ConfigError
@@ -51,7 +51,7 @@ def run_to_end(
     libraries: Sequence[str],
     until: str | None = None,
     console: Console | None = None,
-    reference: Reference | None = None,
+    reference: ReferenceBuild | None = None,
 ) -> dict[str, StageRecord]:
     """Run the stages that are not there yet.
 

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from advnerf_core.errors import AdvnerfError
-from nodes.experiment.reference import Reference
+from nodes.experiment.reference import ReferenceBuild
 from nodes.experiment.stage_record import (
     RECORD,
     Stage,
@@ -42,7 +42,7 @@ def run_stages(
     folder: Path,
     display: Display,
     until: str | None = None,
-    reference: Reference | None = None,
+    reference: ReferenceBuild | None = None,
 ) -> dict[str, StageRecord]:
     """Run the stages in order, skipping those whose result is there and still fits.
 
@@ -69,7 +69,7 @@ def run_stages(
     return records
 
 
-def _read_whole(stages: Sequence[Stage], folder: Path, reference: Reference | None) -> set[str]:
+def _read_whole(stages: Sequence[Stage], folder: Path, reference: ReferenceBuild | None) -> set[str]:
     """Stages whose bulk will be read, as one that reads it has to be run."""
     there, whole = _current(stages, folder, reference), set()
     # From the last to the first: a stage that is run for its bulk reads that of others.
@@ -86,7 +86,7 @@ def check_until(stages: Sequence[Stage], until: str | None) -> None:
 
 
 def _current(
-    stages: Sequence[Stage], folder: Path, reference: Reference | None = None
+    stages: Sequence[Stage], folder: Path, reference: ReferenceBuild | None = None
 ) -> dict[str, StageRecord]:
     """Stages that are finished, as are all that they build on, and are what would be run now."""
     records: dict[str, StageRecord] = {}
@@ -114,7 +114,7 @@ def begun_with(stages: Sequence[Stage], folder: Path, name: str) -> Mapping[str,
     )
 
 
-def keep_stages(stages: Sequence[Stage], folder: Path, reference: Reference) -> list[Path]:
+def keep_stages(stages: Sequence[Stage], folder: Path, reference: ReferenceBuild) -> list[Path]:
     """Copy stages that are finished and current from a run folder into a reference build; returns what is new there."""
     records = _current(stages, folder)
     found = [
@@ -130,7 +130,7 @@ class _Place:
     """Where a stage writes, where its result may be besides, and whether its bulk is wanted too."""
 
     folder: Path
-    reference: Reference | None
+    reference: ReferenceBuild | None
     whole: bool
 
 

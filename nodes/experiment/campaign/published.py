@@ -19,7 +19,7 @@ from nodes.experiment.campaign.store import CellStatus
 from nodes.experiment.campaign.table import wanted_rows
 from nodes.experiment.cell import Cell
 from nodes.experiment.kinds import load_kind
-from nodes.experiment.reference import BUILD, Reference
+from nodes.experiment.reference import BUILD, ReferenceBuild
 from nodes.experiment.stage_record import RECORD, read_record
 from nodes.runtime.errors import ConfigError
 
@@ -108,7 +108,7 @@ def publish_build(
         folder: Of what is published.
         prune: Remove stages there that no cell published in ``folder`` was run with.
     """
-    reference = Reference(folder / BUILD)
+    reference = ReferenceBuild(folder / BUILD)
     experiments = {(each.scenario, each.placement): each for each in cells}
     written = [
         path
@@ -120,7 +120,7 @@ def publish_build(
     return PublishedBuild(reference.folder, tuple(written), tuple(removed), size)
 
 
-def _prune_build(reference: Reference, published: Path) -> list[Path]:
+def _prune_build(reference: ReferenceBuild, published: Path) -> list[Path]:
     found = [json.loads(file.read_text(encoding="utf-8")) for file in published.glob("*/*.json")]
     used = {digest for each in found if "stages" in each for digest in each["stages"].values()}
     removed = []

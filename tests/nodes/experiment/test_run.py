@@ -31,6 +31,10 @@ def test_settings_lie_over_the_file_and_the_command_line_over_both(tmp_path):
     [
         (["attack.evaluation=3"], r"unknown key attack\.evaluation; valid keys here: .*evaluations"),
         (["attack.horizon=0"], r"attack\.horizon.*greater than or equal to 1"),
+        (
+            ["attack.horizon=61"],
+            r"attack\.horizon to be at most horizon = 60 ticks, which are measured, got 61",
+        ),
         (["space.display_model=sometimes"], r"display_model.*valid boolean"),
         (["space.panel=door"], r"space\.panel: .*board, monitor.*door"),
         (["world.camera.widht=3"], r"unknown key camera\.widht"),

@@ -8,7 +8,7 @@ from nodes.experiment import run
 from nodes.experiment.cell import Cell
 from nodes.experiment.cell_kind import settings_hash
 from nodes.experiment.cells import ExperimentCells
-from nodes.experiment.reference import Reference
+from nodes.experiment.reference import ReferenceBuild
 from tests.support.stage_versions import RECORDED, tiny_experiment
 
 # Between processors sums are taken in another order; a change of what is computed is larger.
@@ -29,7 +29,7 @@ def test_what_stages_and_cells_make_is_of_their_versions(tiny_room):
 
 def test_a_machine_that_has_only_the_reference_build_runs_the_same_cells(tiny_room, tmp_path, monkeypatch):
     ours, kind = tiny_experiment(tiny_room[0]), ExperimentCells()
-    reference = Reference(tmp_path / "build")
+    reference = ReferenceBuild(tmp_path / "build")
     assert len(kind.keep(ours, reference)) == 4
     monkeypatch.setattr(run, "REFERENCE", reference)
     theirs = tiny_experiment(tmp_path / "theirs")

@@ -3,7 +3,7 @@ import os
 import pytest
 
 from advnerf_core.files import write_atomically
-from nodes.experiment.reference import Reference, ReferenceBuildError
+from nodes.experiment.reference import ReferenceBuild, ReferenceBuildError
 from nodes.experiment.stage_record import Stage, digest_of, read_record
 from nodes.experiment.stages import StageError, begun_with, keep_stages, run_stages
 from nodes.runtime.locks import hold
@@ -191,7 +191,7 @@ def run_with(reference, folder, stages):
 
 
 def test_a_machine_with_a_reference_build_goes_on_from_it(tmp_path):
-    reference, ours, theirs = Reference(tmp_path / "build"), tmp_path / "ours", tmp_path / "theirs"
+    reference, ours, theirs = ReferenceBuild(tmp_path / "build"), tmp_path / "ours", tmp_path / "theirs"
     ran, records = run_with(reference, ours, photographed())
     assert ran == ["first", "second", "third"]
     assert [each.name.split("_")[0] for each in keep_stages(photographed(), ours, reference)] == ran
@@ -209,14 +209,14 @@ def test_a_machine_with_a_reference_build_goes_on_from_it(tmp_path):
 
 
 def test_without_the_reference_build_all_is_made(tmp_path):
-    reference = Reference(tmp_path / "build")
+    reference = ReferenceBuild(tmp_path / "build")
     run_with(reference, tmp_path / "ours", photographed())
     keep_stages(photographed(), tmp_path / "ours", reference)
     assert run_with(None, tmp_path / "theirs", photographed())[0] == ["first", "second", "third"]
 
 
 def test_a_damaged_reference_build_is_refused(tmp_path):
-    reference, ours = Reference(tmp_path / "build"), tmp_path / "ours"
+    reference, ours = ReferenceBuild(tmp_path / "build"), tmp_path / "ours"
     run_with(reference, ours, photographed())
     scene = next(each for each in keep_stages(photographed(), ours, reference) if "second" in each.name)
     (scene / "scene").write_text("version https://git-lfs.github.com/spec/v1")
@@ -225,7 +225,7 @@ def test_a_damaged_reference_build_is_refused(tmp_path):
 
 
 def test_files_of_a_user_are_not_replaced_by_a_reference_build(tmp_path):
-    reference, ours = Reference(tmp_path / "build"), tmp_path / "ours"
+    reference, ours = ReferenceBuild(tmp_path / "build"), tmp_path / "ours"
     run_with(reference, ours, photographed())
     keep_stages(photographed(), ours, reference)
     mine = tmp_path / "theirs" / "first" / "photograph.jpg"
