@@ -14,6 +14,9 @@ from advnerf_core.policies.pilotnet import Policy
 Observe = Callable[[Tensor], Tensor]
 """Images ``[B, 3, 66, 200]`` RGB 0..1 seen from states ``[B, n]``."""
 
+# Torch's threads sleep between calls (`advnerf_core/__init__.py`). Waking them for so few images takes longer than they save.
+_FEW_IMAGES = 4
+
 
 @dataclass(frozen=True)
 class Rollout:
@@ -55,6 +58,18 @@ def drive(
     controls = start_states.new_empty(steps, len(start_states))
     states[0] = start_states
     for t in range(steps):
-        controls[t] = policy(observe(states[t]), goals)
+        controls[t] = _steer(policy, observe(states[t]), goals)
         states[t + 1] = dynamics.step(states[t], controls[t])
     return Rollout(states, controls)
+
+
+def _steer(policy: Policy, images: Tensor, goals: Tensor | None) -> Tensor:
+    """The policy's controls; of few images on one of torch's threads, with the same bits."""
+    threads = torch.get_num_threads()
+    if len(images) > _FEW_IMAGES:
+        return policy(images, goals)
+    torch.set_num_threads(1)
+    try:
+        return policy(images, goals)
+    finally:
+        torch.set_num_threads(threads)

@@ -6,6 +6,8 @@ are taken for these only.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 from numba import njit
@@ -44,7 +46,7 @@ class SeenRows:
         self.field.check_theta(theta)
         flat = theta.detach().reshape(-1, 3)
         if self._mixing is None:
-            return flat[self._free]
+            return torch.from_numpy(flat.numpy().take(self._free.numpy(), axis=0))
         return torch.from_numpy(self._mixing.astype(flat.numpy().dtype, copy=False) @ flat.numpy())
 
     def colours(self, values: Tensor) -> Tensor:
@@ -62,11 +64,14 @@ class SeenRows:
         return out
 
 
-def compact(weights: sparse.csr_matrix, field: ColouredObject) -> tuple[sparse.csr_matrix, SeenRows]:
-    """Weights ``[P, slots]`` with only the columns that are used ``[P, V]``, and what these are."""
+def compact(
+    weights: sparse.csr_matrix, share: NDArray[Any], field: ColouredObject
+) -> tuple[sparse.csr_matrix, SeenRows]:
+    """Weights ``[P, slots]`` times each row's ``share [P]``, with only the columns that are used ``[P, V]``, and what these are."""
     indices = np.empty_like(weights.indices)
     rows = _pack(weights.indices, scratch("place", weights.shape[1], np.int32), indices)
-    packed = sparse.csr_matrix((weights.data, indices, weights.indptr), (weights.shape[0], len(rows)))
+    data = weights.data * np.repeat(share.astype(weights.dtype), np.diff(weights.indptr))
+    packed = sparse.csr_matrix((data, indices, weights.indptr), (weights.shape[0], len(rows)))
     return packed, SeenRows(field, rows)
 
 

@@ -19,6 +19,7 @@ NEAR_M = 0.02  # closer than this to the camera nothing is drawn
 LEAST_TRANSMITTANCE = 1e-3
 # Progress of a cast: next pixel of the window, covered pixels, weights written.
 NEXT, FOUND, FILLED = 0, 1, 2
+_PIXEL_ROUNDING = 1e-6
 _ROUNDING = 1e-9  # samples; a leap may not end beyond an occupied cell for the last bit of a float
 
 
@@ -64,7 +65,82 @@ def share_of(position: float, first: int, count: int) -> float:
 
 
 @njit(**KERNEL_OPTIONS)
-def _march(o: Any, d: Any, edges: Any, t_in: float, t_out: float, slots: Any, density: Any, clear: Any, solid: bool,
+def box_windows(T: Any, box: Any, intrinsics: Any, width: int, height: int) -> Any:
+    """Pixels ``[B, 4]`` (first row, end row, first column, end column) that surely hold a box.
+
+    Args:
+        T: Box to camera ``[B, 4, 4]``; one that is not finite sees nothing.
+        box: Lowest and highest corner ``[2, 3]`` [m].
+        intrinsics: ``fx, fy, cx, cy`` ``[4]``.
+        width: Of the image [pixels].
+        height: Of the image [pixels].
+    """
+    out = np.zeros((len(T), 4), np.int64)
+    for b in range(len(T)):
+        low_u = low_v = np.inf
+        high_u = high_v = -np.inf
+        ahead = 0
+        for k in range(8):
+            x, y, z = box[k & 1, 0], box[k >> 1 & 1, 1], box[k >> 2, 2]
+            depth = T[b, 2, 0] * x + T[b, 2, 1] * y + T[b, 2, 2] * z + T[b, 2, 3]
+            if depth > NEAR_M:
+                ahead += 1
+                u = (T[b, 0, 0] * x + T[b, 0, 1] * y + T[b, 0, 2] * z + T[b, 0, 3]) / depth
+                v = (T[b, 1, 0] * x + T[b, 1, 1] * y + T[b, 1, 2] * z + T[b, 1, 3]) / depth
+                low_u, high_u = min(low_u, u), max(high_u, u)
+                low_v, high_v = min(low_v, v), max(high_v, v)
+        if ahead == 8:
+            first, last = low_v * intrinsics[1] + intrinsics[3], high_v * intrinsics[1] + intrinsics[3]
+            left, right = low_u * intrinsics[0] + intrinsics[2], high_u * intrinsics[0] + intrinsics[2]
+            out[b, 0] = min(max(np.floor(first) - 1.0, 0.0), height)
+            out[b, 1] = min(max(np.ceil(last) + 1.0, 0.0), height)
+            out[b, 2] = min(max(np.floor(left) - 1.0, 0.0), width)
+            out[b, 3] = min(max(np.ceil(right) + 1.0, 0.0), width)
+        elif ahead > 0:  # partly behind the camera
+            out[b, 1], out[b, 3] = height, width
+    return out
+
+
+@njit(**KERNEL_OPTIONS)
+def reach_of_bricks(
+    C: Any, o: Any, bricks: Any, window: Any, intrinsics: Any, nearest_m: Any, furthest_m: Any
+) -> None:
+    """Between which planar depths the rays of each pixel may meet something; where nearest > furthest, they meet nothing.
+
+    Args:
+        C: Voxel coordinates to the camera ``[3, 3]``, the inverse of ``R`` in `cast_window`.
+        o: Camera centre in voxel coordinates ``[3]``.
+        bricks: Boxes in voxel coordinates that hold the object ``[N, 2, 3]``.
+        window: First row, end row, first column, end column ``[4]``.
+        intrinsics: ``fx, fy, cx, cy`` ``[4]``.
+        nearest_m: ``[rows, columns]`` of the window, infinite; lowered.
+        furthest_m: ``[rows, columns]`` of the window, minus infinite; raised.
+    """
+    for n in range(len(bricks)):
+        low_u = low_v = near = np.inf
+        high_u = high_v = far = -np.inf
+        for k in range(8):
+            x, y, z = bricks[n, k & 1, 0] - o[0], bricks[n, k >> 1 & 1, 1] - o[1], bricks[n, k >> 2, 2] - o[2]
+            depth = C[2, 0] * x + C[2, 1] * y + C[2, 2] * z
+            if depth <= NEAR_M:  # the camera is next to the object, or within it
+                nearest_m[:] = 0.0
+                furthest_m[:] = np.inf
+                return
+            u = (C[0, 0] * x + C[0, 1] * y + C[0, 2] * z) / depth * intrinsics[0] + intrinsics[2]
+            v = (C[1, 0] * x + C[1, 1] * y + C[1, 2] * z) / depth * intrinsics[1] + intrinsics[3]
+            low_u, high_u, near = min(low_u, u), max(high_u, u), min(near, depth)
+            low_v, high_v, far = min(low_v, v), max(high_v, v), max(far, depth)
+        first = max(window[0], int(np.floor(low_v - _PIXEL_ROUNDING)))
+        left = max(window[2], int(np.floor(low_u - _PIXEL_ROUNDING)))
+        for row in range(first, min(window[1], int(np.floor(high_v + _PIXEL_ROUNDING)) + 1)):
+            for column in range(left, min(window[3], int(np.floor(high_u + _PIXEL_ROUNDING)) + 1)):
+                at = row - window[0], column - window[2]
+                nearest_m[at] = min(nearest_m[at], near)
+                furthest_m[at] = max(furthest_m[at], far)
+
+
+@njit(**KERNEL_OPTIONS)
+def _march(o: Any, d: Any, edges: Any, t_in: float, t_out: float, nearest: float, furthest: float, slots: Any, density: Any, clear: Any, solid: bool,
            step: float, share: float, row: Any, touched: Any, count: int) -> tuple[int, float, float]:  # fmt: skip
     """Add one ray to the scratch ``row [slots]``; returns the touched count, the ray's alpha and alpha-weighted depth."""
     nx, ny, nz = slots.shape
@@ -76,6 +152,9 @@ def _march(o: Any, d: Any, edges: Any, t_in: float, t_out: float, slots: Any, de
     gx, gy, gz = o[0] + begin * d[0], o[1] + begin * d[1], o[2] + begin * d[2]
     sx, sy, sz = dt * d[0], dt * d[1], dt * d[2]
     transmittance, alpha, alpha_depth, i = 1.0, 0.0, 0.0, 0
+    if not solid:  # with a sample to spare at both ends
+        i = max(int((nearest - begin) / dt) - 1, 0)
+        samples = min(samples, int(min((furthest - begin) / dt, 1e9)) + 2)
     while i < samples:
         x, y, z = gx + i * sx, gy + i * sy, gz + i * sz
         cx, cy, cz = cell_of(x, nx), cell_of(y, ny), cell_of(z, nz)
@@ -124,7 +203,7 @@ def _march(o: Any, d: Any, edges: Any, t_in: float, t_out: float, slots: Any, de
 
 
 @njit(**KERNEL_OPTIONS)
-def cast_window(R: Any, o: Any, edges: Any, window: Any, intrinsics: Any, width: int, supersample: int, slots: Any,
+def cast_window(R: Any, o: Any, edges: Any, window: Any, intrinsics: Any, nearest_m: Any, furthest_m: Any, width: int, supersample: int, slots: Any,
                 density: Any, clear: Any, solid: bool, one_sided: bool, step: float, row: Any, touched: Any, ray: Any,
                 progress: Any, pixels: Any, alphas: Any, depths: Any, ends: Any, indices: Any, values: Any) -> bool:  # fmt: skip
     """Cast the rays of one window, from where ``progress`` says.
@@ -135,6 +214,8 @@ def cast_window(R: Any, o: Any, edges: Any, window: Any, intrinsics: Any, width:
         edges: Object units per voxel along each axis ``[3]``.
         window: First row, end row, first column, end column ``[4]``.
         intrinsics: ``fx, fy, cx, cy`` ``[4]``.
+        nearest_m: From `reach_of_bricks`.
+        furthest_m: The same.
         width: Pixels in a row of the image.
         supersample: Rays along each side of a pixel.
         slots: ``[nx, ny, nz]`` int32.
@@ -162,6 +243,10 @@ def cast_window(R: Any, o: Any, edges: Any, window: Any, intrinsics: Any, width:
     while progress[NEXT] < (window[1] - window[0]) * across:
         v, u = window[0] + progress[NEXT] // across, window[2] + progress[NEXT] % across
         alpha, alpha_depth, count = 0.0, 0.0, 0
+        nearest, furthest = nearest_m[v - window[0], u - window[2]], furthest_m[v - window[0], u - window[2]]
+        if nearest > furthest:
+            progress[NEXT] += 1
+            continue
         for s in range(supersample * supersample):
             x = (u + (s % supersample + 0.5) / supersample - intrinsics[2]) / intrinsics[0]
             y = (v + (s // supersample + 0.5) / supersample - intrinsics[3]) / intrinsics[1]
@@ -171,7 +256,22 @@ def cast_window(R: Any, o: Any, edges: Any, window: Any, intrinsics: Any, width:
             if t_out <= t_in or (one_sided and not by_face):
                 continue
             count, a, ad = _march(
-                o, ray, edges, t_in, t_out, slots, density, clear, solid, step, share, row, touched, count
+                o,
+                ray,
+                edges,
+                t_in,
+                t_out,
+                nearest,
+                furthest,
+                slots,
+                density,
+                clear,
+                solid,
+                step,
+                share,
+                row,
+                touched,
+                count,
             )
             alpha += a
             alpha_depth += ad

@@ -25,11 +25,12 @@ from advnerf_core.fields.coloured import ColouredObject
 from advnerf_core.fields.voxel_grid import VoxelGridObject
 from advnerf_core.geometry import Array, Pinhole, invert_transform, transform_points
 from advnerf_core.parallel import run_slots, scratch
-from advnerf_core.render.cast_kernels import FILLED, FOUND, NEAR_M, cast_window
+from advnerf_core.render.cast_kernels import FILLED, FOUND, box_windows, cast_window, reach_of_bricks
 from advnerf_core.render.occupancy import leap_distances
 
 # Parts of the work when few images are cast: enough that two to four threads have something to do.
 _LEAST_PARTS = 4
+_BRICK_CELLS = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,9 +125,13 @@ def _cast_grids(
         )
         for k, field in fields.items()
         for b, T, whole in zip(range(len(poses)), poses, windows(field, poses, pinhole), strict=True)
+        if whole[0] < whole[1] and whole[2] < whole[3]
         for window in _bands(whole, bands)
     ]
-    run_slots(lambda slot: jobs[slot][1].cast(), len(jobs))
+    parts = sorted(
+        (part for _, part in jobs), key=lambda part: -part.area
+    )  # the longest first: threads end together
+    run_slots(lambda slot: parts[slot].cast(), len(parts))
     return {
         k: _joined([part for owner, part in jobs if owner == k], field, dtype) for k, field in fields.items()
     }
@@ -142,11 +147,15 @@ def made_opaque(cast: ObjectCast) -> ObjectCast:
 
 @dataclass(frozen=True, eq=False)
 class KernelGrids:
-    """An object as the kernel reads it; ``low`` and ``high`` bound what is not empty, in object units."""
+    """An object as the kernel reads it.
+
+    ``low`` and ``high`` bound what is not empty, in object units; ``bricks [N, 2, 3]`` are boxes in voxel coordinates that hold it.
+    """
 
     slots: NDArray[np.int32]
     density: NDArray[Any]
     clear: NDArray[np.uint8]
+    bricks: Array
     low: Array
     high: Array
 
@@ -159,7 +168,12 @@ def prepared(field: VoxelGridObject, dtype: Any) -> KernelGrids:
         low, high = np.asarray(field.box_min, np.float64), np.asarray(field.box_max, np.float64)
         if field.density is None:
             field.derived[key] = KernelGrids(
-                slots, np.zeros((1, 1, 1), dtype), np.zeros((1, 1, 1), np.uint8), low, high
+                slots,
+                np.zeros((1, 1, 1), dtype),
+                np.zeros((1, 1, 1), np.uint8),
+                _whole(slots.shape),
+                low,
+                high,
             )
         else:
             density = np.require(field.density, dtype, ["C", "W"])
@@ -174,7 +188,12 @@ def prepared(field: VoxelGridObject, dtype: Any) -> KernelGrids:
                     np.where(last >= np.array(slots.shape) - 1, high, low + edge * (last + 0.5)),
                 )
             field.derived[key] = KernelGrids(
-                slots, density, leap_distances(filled, np.ones(3, np.float32)).distance, low, high
+                slots,
+                density,
+                leap_distances(filled, np.ones(3, np.float32)).distance,
+                bricks_of(filled, slots.shape),
+                low,
+                high,
             )
     grids: KernelGrids = field.derived[key]
     return grids
@@ -186,6 +205,23 @@ def cells_with_density(density: NDArray[Any]) -> NDArray[np.bool_]:
         density > 0, size=[min(n, 2) for n in density.shape], origin=[-(n > 1) for n in density.shape]
     )
     return np.ascontiguousarray(near[tuple(slice(0, max(n - 1, 1)) for n in density.shape)])
+
+
+def bricks_of(filled: NDArray[np.bool_], voxels: tuple[int, ...]) -> Array:
+    """Boxes ``[N, 2, 3]`` in voxel coordinates that hold all cells that are ``filled``, a few cells along each side."""
+    corners = np.argwhere(filled)
+    brick = np.unique(corners // _BRICK_CELLS, axis=0, return_inverse=True)[1].reshape(-1)
+    count = int(brick.max()) + 1 if len(brick) else 0
+    low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
+    np.minimum.at(low, brick, corners)
+    np.maximum.at(high, brick, corners + 1)
+    # The first and the last cells reach to the border of the box.
+    last = np.array(voxels) - 1
+    return np.stack([np.where(low == 0, -0.5, low), np.where(high >= last, last + 0.5, high)], axis=1)
+
+
+def _whole(voxels: tuple[int, ...]) -> Array:
+    return np.array([[np.full(3, -0.5), np.array(voxels) - 0.5]])
 
 
 class _Part:
@@ -204,10 +240,15 @@ class _Part:
         self._grids, self._field, self._T, self._pinhole = grids, field, T_world_from_camera, pinhole
         self._supersample, self._window, self._offset = supersample, window, offset
 
+    @property
+    def area(self) -> int:
+        """Pixels of the window."""
+        return int(max(0, self._window[1] - self._window[0]) * max(0, self._window[3] - self._window[2]))
+
     def cast(self) -> None:
         """Fill ``pixels`` (of the batch), ``alpha``, ``depth_m``, ``ends``, ``indices`` and ``values``."""
         field, grids, window, lens = self._field, self._grids, self._window, self._pinhole
-        area = int(max(0, window[1] - window[0]) * max(0, window[3] - window[2]))
+        area = self.area
         edges = (np.asarray(field.box_max, np.float64) - field.box_min) / grids.slots.shape
         T = invert_transform(field.T_world_from_object) @ self._T
         R = np.ascontiguousarray(T[:3, :3] / field.scale / edges[:, None])
@@ -218,9 +259,13 @@ class _Part:
             np.empty(area),
             np.empty(area, np.int64),
         )
-        room = area * 4 * self._supersample + 64
+        room = area * 16 * self._supersample + 64  # what is not used is never touched
         indices, values = np.empty(room, np.int32), np.empty(room, grids.density.dtype)
         # The kernel leaves the row as zeros.
+        shape = max(0, window[1] - window[0]), max(0, window[3] - window[2])
+        nearest_m, furthest_m = np.full(shape, np.inf), np.full(shape, -np.inf)
+        intrinsics = np.array([lens.fx, lens.fy, lens.cx, lens.cy])
+        reach_of_bricks(np.linalg.inv(R), o, grids.bricks, window, intrinsics, nearest_m, furthest_m)
         row = scratch("row", field.slot_count, grids.density.dtype)
         touched = scratch("touched", field.slot_count, np.int32)
         progress = np.zeros(3, np.int64)
@@ -229,7 +274,9 @@ class _Part:
             o,
             edges,
             window,
-            np.array([lens.fx, lens.fy, lens.cx, lens.cy]),
+            intrinsics,
+            nearest_m,
+            furthest_m,
             lens.width,
             self._supersample,
             grids.slots,
@@ -286,18 +333,10 @@ def _bands(window: NDArray[np.int64], count: int) -> list[NDArray[np.int64]]:
 def windows(field: VoxelGridObject, poses: Array, pinhole: Pinhole) -> NDArray[np.int64]:
     """Pixel out ``[B, 4]`` (first row, end row, first column, end column) that surely hold the object."""
     grids = prepared(field, np.float32)
-    corners = transform_corners(poses, field.corners_in_world(grids.low, grids.high))
-    out = np.zeros((len(poses), 4), dtype=np.int64)
-    out[:, 1], out[:, 3] = pinhole.height, pinhole.width
-    ahead = (corners[..., 2] > NEAR_M).all(axis=1)
-    uv = pinhole.project(corners[ahead])
-    low, high = np.floor(uv.min(axis=1)).astype(np.int64) - 1, np.ceil(uv.max(axis=1)).astype(np.int64) + 1
-    out[ahead, 0] = np.clip(low[:, 1], 0, pinhole.height)
-    out[ahead, 1] = np.clip(high[:, 1], 0, pinhole.height)
-    out[ahead, 2] = np.clip(low[:, 0], 0, pinhole.width)
-    out[ahead, 3] = np.clip(high[:, 0], 0, pinhole.width)
-    out[~(corners[..., 2] > NEAR_M).any(axis=1)] = 0  # behind the camera, or not finite
-    return out
+    T_camera_from_object = np.ascontiguousarray(invert_transform(poses) @ field.T_world_from_object)
+    intrinsics = np.array([pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy])
+    box = field.scale * np.stack([grids.low, grids.high])
+    return box_windows(T_camera_from_object, box, intrinsics, pinhole.width, pinhole.height)
 
 
 def transform_corners(T_world_from_camera: Array, points_in_world: Array) -> Array:

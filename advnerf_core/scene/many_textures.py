@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from advnerf_core.geometry import Array
+from advnerf_core.render.composite import add_layer
 from advnerf_core.scene.surrogate import Frames, Rendered, Surrogate, split_theta
 
 
@@ -71,26 +72,27 @@ class ManyTextures:
         return self._shown(self._surrogate.prepare(poses), theta.detach())
 
     def _shown(self, frames: Frames, theta: Tensor) -> Rendered:
-        flat = frames.background.reshape(-1, 3).clone()
+        image = frames.background.numpy().copy()
         shares = [self._shares(pixels, frames.background.shape) for pixels in frames.pixels]
         values: list[list[Tensor]] = []
         for k in range(self.count):
             parts = split_theta([seen.field for seen in frames.seen], theta[k])
             values.append(
-                [seen.values(part.to(flat.dtype)) for seen, part in zip(frames.seen, parts, strict=True)]
+                [
+                    seen.values(part.to(frames.background.dtype))
+                    for seen, part in zip(frames.seen, parts, strict=True)
+                ]
             )
             for seen, W, share, value in zip(frames.seen, frames.weights, shares, values[k], strict=True):
-                colours = W[share[k].rows] @ seen.colours(value).numpy()
-                flat.index_add_(0, share[k].pixels, torch.from_numpy(colours))
-        images = flat.reshape(frames.background.shape).permute(0, 3, 1, 2).contiguous()
+                rows, pixels = W[share[k].rows], share[k].pixels.numpy()
+                add_layer(image.reshape(-1, 3), pixels, rows, seen.colours(value).numpy())
+        images = torch.from_numpy(np.ascontiguousarray(image.transpose(0, 3, 1, 2)))
         kept = sum(value.nbytes for each in values for value in each) + sum(
             seen.nbytes for seen in frames.seen
         )
-        rows = sum(share.rows.nbytes + share.pixels.nbytes for each in shares for share in each)
-        weights = sum(W.data.nbytes + W.indices.nbytes + W.indptr.nbytes for W in frames.weights)
-        return Rendered(
-            images, _vjp(frames, shares, values, theta), int(images.nbytes + kept + rows + weights)
-        )
+        own = sum(share.rows.nbytes + share.pixels.nbytes for each in shares for share in each)
+        nbytes = int(images.nbytes + kept + own + frames.weights_nbytes)
+        return Rendered(images, _vjp(frames, shares, values, theta), nbytes)
 
     def _shares(self, pixels: Tensor, shape: Sequence[int]) -> list[_Share]:
         """Which of an object's pixels show which texture."""

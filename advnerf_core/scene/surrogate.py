@@ -23,7 +23,7 @@ from advnerf_core.fields.seen_rows import SeenRows, compact
 from advnerf_core.fields.voxel_grid import INITIAL_NOISE, VoxelGridObject
 from advnerf_core.geometry import Array, Pinhole, planar_poses
 from advnerf_core.render.cast_object import ObjectCast, cast_objects, made_opaque
-from advnerf_core.render.composite import composite, sparse_shares
+from advnerf_core.render.composite import add_layer, composite, sparse_shares
 from advnerf_core.render.soft_pose import render_soft
 from advnerf_core.scene.remembered import RememberedBackground
 
@@ -64,16 +64,21 @@ class Frames:
 
     def render(self, theta: Tensor | None) -> Rendered:
         """Images for ``theta`` (of ``Surrogate.theta_shape``; ignored, and may be None, without objects)."""
-        flat = self.background.reshape(-1, 3).clone()
+        # NumPy: torch would wake its threads for each of these small steps.
+        image = self.background.numpy().copy()
         parts = split_theta([rows.field for rows in self.seen], theta)
-        values = [rows.values(part.to(flat.dtype)) for rows, part in zip(self.seen, parts, strict=True)]
+        values = [
+            rows.values(part.to(self.background.dtype)) for rows, part in zip(self.seen, parts, strict=True)
+        ]
         for rows, W, pixels, value in zip(self.seen, self.weights, self.pixels, values, strict=True):
-            flat.index_add_(0, pixels, torch.from_numpy(W @ rows.colours(value).numpy()))
-        images = flat.reshape(self.background.shape).permute(0, 3, 1, 2).contiguous()
+            add_layer(image.reshape(-1, 3), pixels.numpy(), W, rows.colours(value).numpy())
+        images = torch.from_numpy(np.ascontiguousarray(image.transpose(0, 3, 1, 2)))
         own = sum(rows.nbytes for rows in self.seen) + sum(value.nbytes for value in values)
-        return Rendered(images, self._vjp(theta, values), images.nbytes + self._weight_bytes() + own)
+        return Rendered(images, self._vjp(theta, values), images.nbytes + self.weights_nbytes + own)
 
-    def _weight_bytes(self) -> int:
+    @property
+    def weights_nbytes(self) -> int:
+        """Memory that weights and pixels hold [bytes]."""
         matrices = sum(W.data.nbytes + W.indices.nbytes + W.indptr.nbytes for W in self.weights)
         return int(matrices + sum(pixels.nbytes for pixels in self.pixels))
 
@@ -221,9 +226,9 @@ class Surrogate:
         seen = [
             _seen(cast, share, field) for cast, share, field in zip(casts, shares, self.objects, strict=True)
         ]
-        dimmed = rgb * torch.from_numpy(background).to(rgb.dtype).reshape(depth_m.shape)[..., None]
+        dimmed = rgb.numpy() * background.astype(rgb.numpy().dtype).reshape(depth_m.shape)[..., None]
         return Frames(
-            dimmed,
+            torch.from_numpy(dimmed),
             tuple(part[1] for part in seen),
             tuple(part[0] for part in seen),
             tuple(part[2] for part in seen),
@@ -293,10 +298,7 @@ def _seen(
     W, kept = cast.weights, share > 0.0
     if not kept.all():
         W, share = W[np.flatnonzero(kept)], share[kept]
-    data = W.data * np.repeat(share.astype(W.dtype), np.diff(W.indptr))
-    return torch.from_numpy(cast.pixels[kept]), *compact(
-        sparse.csr_matrix((data, W.indices, W.indptr), W.shape), field
-    )
+    return torch.from_numpy(cast.pixels[kept]), *compact(W, share, field)
 
 
 def split_theta(objects: Sequence[ColouredObject], theta: Tensor | None) -> list[Tensor]:

@@ -52,10 +52,7 @@ class Visited:
         """Memory that the kept part holds [bytes]."""
         if self._frames is None:
             return 0
-        weights = sum(W.data.nbytes + W.indices.nbytes + W.indptr.nbytes for W in self._frames.weights)
-        return int(
-            self._frames.background.nbytes + weights + sum(pixels.nbytes for pixels in self._frames.pixels)
-        )
+        return self._frames.background.nbytes + self._frames.weights_nbytes
 
     def render(self, theta: Tensor) -> Rendered:
         """What is seen with this theta."""
