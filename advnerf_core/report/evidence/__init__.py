@@ -1,0 +1,9 @@
+"""The statistics of published results: outcomes in metres, clustered intervals, and registered tests.
+
+Intervals describe every result. Tests are few and registered beforehand, and `holm` adjusts exactly those.
+"No effect" is claimed by `equivalence` alone.
+"""
+
+from advnerf_core.report.evidence.outcome import Outcome, drive_outcome
+
+__all__ = ["Outcome", "drive_outcome"]
