@@ -4,6 +4,19 @@ Intervals describe every result. Tests are few and registered beforehand, and `h
 "No effect" is claimed by `equivalence` alone.
 """
 
+from advnerf_core.report.evidence.intervals import (
+    ClusteredInterval,
+    Equivalence,
+    clustered_interval,
+    equivalence,
+)
 from advnerf_core.report.evidence.outcome import Outcome, drive_outcome
 
-__all__ = ["Outcome", "drive_outcome"]
+__all__ = [
+    "ClusteredInterval",
+    "Equivalence",
+    "Outcome",
+    "clustered_interval",
+    "drive_outcome",
+    "equivalence",
+]
