@@ -4,6 +4,15 @@ Intervals describe every result. Tests are few and registered beforehand, and `h
 "No effect" is claimed by `equivalence` alone.
 """
 
+from advnerf_core.report.evidence.exact import (
+    FEW_SEARCHES,
+    McNemar,
+    PermutationTest,
+    holm,
+    mcnemar_exact,
+    mcnemar_per_search,
+    permutation_test,
+)
 from advnerf_core.report.evidence.intervals import (
     ClusteredInterval,
     Equivalence,
@@ -13,10 +22,17 @@ from advnerf_core.report.evidence.intervals import (
 from advnerf_core.report.evidence.outcome import Outcome, drive_outcome
 
 __all__ = [
+    "FEW_SEARCHES",
     "ClusteredInterval",
     "Equivalence",
+    "McNemar",
     "Outcome",
+    "PermutationTest",
     "clustered_interval",
     "drive_outcome",
     "equivalence",
+    "holm",
+    "mcnemar_exact",
+    "mcnemar_per_search",
+    "permutation_test",
 ]
