@@ -75,8 +75,10 @@ def clustered_interval(
 
     With six searches and twenty shared starts, 95 % intervals cover 93 to 98 % for normal and for moderately
     skewed effects. They cover less if a few searches in the population differ strongly from the rest: six
-    searches cannot show how heavy its tail is. Values without any spread give an interval of zero width, so
-    do not use it for shares of drives. The measured coverages are the rows of ``benchmarks/coverage.py``.
+    searches cannot show how heavy its tail is. At equal normal effects, intervals of three searches cover
+    92 %, and of two 89 %. The measured coverages are the rows of ``benchmarks/coverage.py``.
+
+    Values without any spread give an interval of zero width, so do not use it for shares of drives.
 
     Args:
         values: One row for each search, one value for each start ``[searches][starts]``, e.g. excess CTE [m].

@@ -15,8 +15,9 @@ Intervals correct for skewness by the monotone cubic of Hall (1992), "On the rem
 transformation". Hall takes normal or bootstrap quantiles; here they are quantiles of t, because six searches
 leave few degrees of freedom. With skewness 0 the interval is the ordinary t interval.
 
-The method was chosen by measured coverage (``benchmarks/coverage.py``). A percentile bootstrap over searches
-and the plain t interval cover less, the first always and the second under skewed effects.
+The method was chosen by measured coverage (``benchmarks/coverage.py``). Of 95 % intervals, a percentile
+bootstrap over six searches covers 82 % at equal effects, and a percentile bootstrap over searches and starts
+(Owen and Eckles 2012) 92 %. The plain t interval covers too little under skewed effects.
 """
 
 from __future__ import annotations
