@@ -1,0 +1,148 @@
+"""Estimates of a mean, with a standard error and the skewness that its interval corrects for.
+
+The crossed design has I searches, each driven from the same J starts. Its model is
+
+    y_ij = mu + a_i + b_j + e_ij,    Var(mean) = Var(a) / I + Var(b) / J + Var(e) / (I J),
+
+with independent random effects of search (a), start (b), and of the drive itself (e). From the mean squares
+A (searches), B (starts) and E (residual), the unbiased estimate of the variance is ``(A + B - E) / (I J)``:
+the variance of the search means, plus that of the start means, minus what both count. This has the form of
+the two-way cluster estimate (Cameron, Gelbach and Miller 2011). Its degrees of freedom are those of
+Satterthwaite (1946). If A <= E, then the data show no search effect, and the start means are one sample.
+If B <= E, then the search means are one sample. If both hold, then all drives are one sample.
+
+Intervals correct for skewness by the monotone cubic of Hall (1992), "On the removal of skewness by
+transformation". Hall takes normal or bootstrap quantiles; here they are quantiles of t, because six searches
+leave few degrees of freedom. With skewness 0 the interval is the ordinary t interval.
+
+The method was chosen by measured coverage (``benchmarks/coverage.py``). Of 95 % intervals, a percentile
+bootstrap over six searches covers 82 % at equal effects, and a percentile bootstrap over searches and starts
+(Owen and Eckles 2012) 92 %. The plain t interval covers too little under skewed effects.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import stdtr, stdtrit
+
+Floats = NDArray[np.float64]
+# Beyond this the cubic would overflow; its p-value is 0 or 1 long before.
+_LARGEST_T = 1e90
+
+
+@dataclass(frozen=True)
+class MeanEstimate:
+    """Estimated means of data sets ``[...]``, usually of a single one ``[]``.
+
+    Attributes:
+        mean: Mean of each data set ``[...]``, in the unit of its values.
+        standard_error: Standard error of the mean ``[...]``, same unit.
+        degrees_of_freedom: Of the standard error ``[...]``.
+        skewness: Estimated skewness of the mean ``[...]``: its third cumulant over the cubed standard error.
+    """
+
+    mean: Floats
+    standard_error: Floats
+    degrees_of_freedom: Floats
+    skewness: Floats
+
+    def ends(self, level: float) -> tuple[Floats, Floats]:
+        """Lower and upper ends ``[...]`` of the two-sided intervals with coverage ``level``."""
+        quantile = stdtrit(self.degrees_of_freedom, 0.5 * (1.0 + level))
+        low = self.mean - self.standard_error * _untransformed(quantile, self.skewness)
+        high = self.mean - self.standard_error * _untransformed(-quantile, self.skewness)
+        return low, high
+
+    def p_above(self, bound: float) -> Floats:
+        """One-sided p-values ``[...]``: small values say that the true mean is above ``bound``."""
+        return np.asarray(stdtr(self.degrees_of_freedom, -self._statistic(bound)))
+
+    def p_below(self, bound: float) -> Floats:
+        """One-sided p-values ``[...]``: small values say that the true mean is below ``bound``."""
+        return np.asarray(stdtr(self.degrees_of_freedom, self._statistic(bound)))
+
+    def _statistic(self, bound: float) -> Floats:
+        """Transformed t statistic ``[...]`` of the hypothesis that the true mean is ``bound``."""
+        distance = np.asarray(self.mean - bound)
+        # Without spread, every other bound is infinitely far away.
+        far = np.asarray(np.sign(distance) * _LARGEST_T)
+        t = np.divide(distance, self.standard_error, out=far, where=self.standard_error > 0.0)
+        return _transformed(np.clip(t, -_LARGEST_T, _LARGEST_T), self.skewness)
+
+
+def one_sample(values: Floats) -> MeanEstimate:
+    """Estimate the mean from independent values ``[..., n]``, n >= 2."""
+    count = values.shape[-1]
+    variance = values.var(axis=-1, ddof=1) / count
+    freedom = np.full(variance.shape, count - 1.0)
+    return _estimate(values.mean(axis=-1), variance, freedom, _third_cumulant(values) / count**2)
+
+
+def crossed(values: Floats) -> MeanEstimate:
+    """Estimate the mean from drives ``[..., I, J]`` of I >= 2 searches from the same J >= 2 starts."""
+    searches, starts = values.shape[-2:]
+    count = searches * starts
+    search_means, start_means = values.mean(axis=-1), values.mean(axis=-2)
+    mean = values.mean(axis=(-2, -1))
+    residual = values - search_means[..., :, None] - start_means[..., None, :] + mean[..., None, None]
+    freedoms = searches - 1.0, starts - 1.0, (searches - 1.0) * (starts - 1.0)
+    of_searches = starts * search_means.var(axis=-1, ddof=1)
+    of_starts = searches * start_means.var(axis=-1, ddof=1)
+    of_residual = (residual**2).sum(axis=(-2, -1)) / freedoms[2]
+    skew_searches = _third_cumulant(search_means) / searches**2
+    skew_starts = _third_cumulant(start_means) / starts**2
+    flat = values.reshape(*values.shape[:-2], count)
+    # An effect that the data do not show is dropped, and what is left is one sample.
+    no_search, no_start = of_searches <= of_residual, of_starts <= of_residual
+    cases = [no_search & no_start, no_search, no_start]
+    both = of_searches + of_starts - of_residual
+    welch = _satterthwaite(both, (of_searches, of_starts, of_residual), freedoms)
+    square = np.select(cases, [flat.var(axis=-1, ddof=1), of_starts, of_searches], both)
+    freedom = np.select(cases, [np.full_like(both, count - 1.0), freedoms[1], freedoms[0]], welch)
+    skew = np.select(
+        cases, [_third_cumulant(flat) / count**2, skew_starts, skew_searches], skew_searches + skew_starts
+    )
+    return _estimate(mean, square / count, freedom, skew)
+
+
+def _estimate(mean: Floats, variance: Floats, freedom: Floats, third: Floats) -> MeanEstimate:
+    """Assemble the estimate from the mean's variance and third cumulant ``[...]``."""
+    error = np.asarray(np.sqrt(variance))
+    skewness = np.divide(third, error**3, out=np.zeros_like(error), where=error**3 > 0.0)
+    return MeanEstimate(np.asarray(mean), error, freedom, skewness)
+
+
+def _satterthwaite(total: Floats, squares: tuple[Floats, ...], freedoms: tuple[float, ...]) -> Floats:
+    """Degrees of freedom ``[...]`` of sums of mean squares: ``total^2 / sum(square^2 / freedom)``."""
+    below = sum(
+        (square**2 / freedom for square, freedom in zip(squares, freedoms, strict=True)), np.array(0.0)
+    )
+    return np.divide(total**2, below, out=np.ones_like(total), where=below > 0.0)
+
+
+def _third_cumulant(values: Floats) -> Floats:
+    """Unbiased third cumulant ``[...]`` of values ``[..., n]``; 0 where n < 3 tells nothing about it."""
+    count = values.shape[-1]
+    if count < 3:
+        return np.zeros(values.shape[:-1])
+    deviations = values - values.mean(axis=-1, keepdims=True)
+    return np.asarray(count / ((count - 1) * (count - 2)) * (deviations**3).sum(axis=-1))
+
+
+def _transformed(t: Floats, skewness: Floats) -> Floats:
+    """Hall's transformation ``t + g t^2 / 3 + g^2 t^3 / 27 + g / 6``, which increases with t."""
+    g = skewness
+    return np.asarray(t + g * t**2 / 3.0 + g**2 * t**3 / 27.0 + g / 6.0)
+
+
+def _untransformed(x: Floats, skewness: Floats) -> Floats:
+    """Inverse of `_transformed`: ``(3 / g) (cbrt(1 + g u) - 1)`` with ``u = x - g / 6``.
+
+    It is written without the division by g, so that it holds at skewness 0.
+    """
+    u = x - skewness / 6.0
+    root = np.cbrt(1.0 + skewness * u)
+    return np.asarray(3.0 * u / (root**2 + root + 1.0))
