@@ -61,6 +61,12 @@ QUESTIONS = (
         ("make experiment", "newcomer", "counterfactual_live"),
     ),
     Question(
+        "statistics",
+        "Are the intervals and tests right?",
+        "Coverage of intervals and error rates of tests on simulated drives whose true effect is known.",
+        ("coverage",),
+    ),
+    Question(
         "junction",
         "Does an attack found in the learned junction work there?",
         "The paper's transfer experiment: objects beside three paths, searched in the learned scene, driven in the world itself.",
