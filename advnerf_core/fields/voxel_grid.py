@@ -27,8 +27,6 @@ from advnerf_core.geometry import Array, transform_points
 
 # Inverse squash of exactly 0 or 1 is infinite; half an 8-bit step is as far as a display can show.
 _SATURATION = 0.5 / 255.0
-# An attack starts at the plain colours plus this much noise on theta; it is all that differs between seeds.
-INITIAL_NOISE = 1e-4
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from advnerf_core.fields.coloured import ColouredObject
 from advnerf_core.fields.seen_rows import SeenRows, compact
-from advnerf_core.fields.voxel_grid import INITIAL_NOISE, VoxelGridObject
+from advnerf_core.fields.voxel_grid import VoxelGridObject
 from advnerf_core.geometry import Array, Pinhole, planar_poses
 from advnerf_core.render.cast_object import ObjectCast, cast_objects, made_opaque
 from advnerf_core.render.composite import add_layer, composite, sparse_shares
@@ -174,10 +174,9 @@ class Surrogate:
         return torch.cat(rows).reshape(self.theta_shape).to(dtype or self.dtype)
 
     def initial_theta(self, generator: torch.Generator, dtype: torch.dtype | None = None) -> Tensor:
-        """Where an attack starts: plain colours with noise of 1e-4, which is what differs between seeds; ``theta_shape``."""
-        plain = self.plain_theta(torch.float64)
-        noise = torch.randn(plain.shape, generator=generator, dtype=torch.float64)
-        return (plain + INITIAL_NOISE * noise).to(dtype or self.dtype)
+        """Where an attack starts: white noise of N(0, 1), so that each seed is another search; ``theta_shape``."""
+        noise = torch.randn(self.theta_shape, generator=generator, dtype=torch.float64)
+        return noise.to(dtype or self.dtype)
 
     def camera_poses(self, states: Tensor) -> Array:
         """``T_world_from_camera [B, 4, 4]`` at car states ``[B, n]``, detached."""

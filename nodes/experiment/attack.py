@@ -10,18 +10,15 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
-from advnerf_core.attack.adjoint import AttackProblem
+from advnerf_core.attack.adjoint import AttackProblem, evaluate
 from advnerf_core.attack.artifact import AttackFile, load_attack, save_attack
 from advnerf_core.attack.clean import clean_drive
 from advnerf_core.attack.methods import Method, SearchRun, SearchSettings, load_method
-from advnerf_core.attack.problem import drive_scores
 from advnerf_core.attack.search.search import SearchResult
 from advnerf_core.attack.spaces.space import Shown, Space
 from advnerf_core.files import write_atomically
-from advnerf_core.geometry import Array
 from advnerf_core.policies.pilotnet import LoadedPolicy, load_policy
 from advnerf_core.report.conditions import NONE
 from nodes.experiment.cell import Cell
@@ -53,10 +50,12 @@ def cells(experiment: Experiment) -> list[Cell]:
         for seed in (seeds if victim == HARDENED else seeds[:1])
     ]
     return [
-        Cell.of(scenario, victim, condition, seed)
+        cell if condition != NONE else cell.clean
         for victim, seed in rows
         for condition in (NONE, *methods)
+        if condition != NONE or seed == seeds[0]
         for scenario in experiment.config.scenarios
+        for cell in [Cell.of(scenario, victim, condition, seed)]
     ]
 
 
@@ -68,6 +67,7 @@ def frozen_hashes(experiment: Experiment) -> dict[str, str]:
         for scenario in experiment.config.scenarios
         for seed in experiment.config.attack.seeds
     }
+    starts |= {name: experiment.measured_starts(name).tolist() for name in experiment.config.scenarios}
     return {
         **_frozen_place(experiment),
         **policies,
@@ -81,7 +81,12 @@ def _frozen_for(experiment: Experiment, cell: Cell) -> dict[str, str]:
     return {
         **_frozen_place(experiment),
         "policy": _policy_sha256(experiment, cell.victim),
-        "starts": hash_of(experiment.start_states(cell.scenario, cell.seed).tolist()),
+        "starts": hash_of(
+            [
+                experiment.start_states(cell.scenario, cell.seed).tolist(),
+                experiment.measured_starts(cell.scenario).tolist(),
+            ]
+        ),
     }
 
 
@@ -143,17 +148,16 @@ def surrogate_part(
         return found
     policy = _victim(victim_file(experiment, cell.victim))
     problem = attack_problem(experiment, space, policy, cell.scenario, cell.seed)
-    attack, attack_id, curve, seconds = None, None, [], 0.0
+    attack_id, curve, seconds = None, [], 0.0
     if cell.method != NONE:
         result = _search(experiment, space, problem, cell, folder, report)
         seconds = sum(evaluation.seconds for evaluation in result.history)
         curve = [evaluation.predicted_total_cte_m for evaluation in result.history]
         attack = _attack_file(experiment, space, problem, policy, cell, result)
-    shown = space.plain if attack is None else space.restored(attack)
-    measured = replace(past_field(experiment, problem, space, shown), steps=experiment.config.horizon)
+        attack_id = save_attack(folder / ATTACK, attack)
+    shown = load_shown(space, folder, cell)
+    measured = _measured(experiment, cell.scenario, past_field(experiment, problem, space, shown))
     states, scores = learned_drives(experiment, measured, shown.colours)
-    if attack is not None:
-        attack_id = save_attack(folder / ATTACK, _with_field_total(experiment, attack, problem, states))
     data = {
         "attack_id": attack_id,
         "states": states.tolist(),
@@ -173,7 +177,7 @@ def attack_problem(
 ) -> AttackProblem:
     """The attack on one victim on one drive, with the starts of one seed."""
     attack, starts = experiment.config.attack, experiment.start_states(scenario, seed)
-    goals = torch.tensor([experiment.goal(scenario)], dtype=torch.float32).expand(len(starts), -1)
+    goals = _goals(experiment, scenario, len(starts))
     return AttackProblem(
         policy.policy,
         space.sensor,
@@ -188,6 +192,17 @@ def attack_problem(
         held_cap_m=experiment.config.held_cap_m,
         off_track_m=experiment.world.off_track_m,
     )
+
+
+def _goals(experiment: Experiment, scenario: str, count: int) -> torch.Tensor:
+    return torch.tensor([experiment.goal(scenario)], dtype=torch.float32).expand(count, -1)
+
+
+def _measured(experiment: Experiment, scenario: str, problem: AttackProblem) -> AttackProblem:
+    """The problem from the starts, and over the horizon, that are measured."""
+    starts = experiment.measured_starts(scenario)
+    goals = _goals(experiment, scenario, len(starts))
+    return replace(problem, start_states=starts, goals=goals, steps=experiment.config.horizon)
 
 
 def past(problem: AttackProblem, space: Space, shown: Shown) -> AttackProblem:
@@ -273,7 +288,7 @@ def _attack_file(
     result: SearchResult,
 ) -> AttackFile:
     clean = clean_drive(past(problem, space, space.plain), space.plain.colours)
-    return AttackFile(
+    attack = AttackFile(
         method=cell.method,
         space=space.name,
         objects=space.attacked(result.theta),
@@ -290,14 +305,8 @@ def _attack_file(
         extra={"victim": cell.victim, "scenario": cell.scenario, "horizon": experiment.searched_ticks},
         clean_drive=clean,
     )
-
-
-def _with_field_total(
-    experiment: Experiment, attack: AttackFile, problem: AttackProblem, states: Array
-) -> AttackFile:
-    """The file with the total through the field, of drives ``[B, T + 1, n]`` at least as long as those of the search."""
     if not baked_file(experiment).exists() or over_the_world(experiment):
         return attack
-    searched = torch.from_numpy(states[:, : problem.steps + 1]).transpose(0, 1)
-    totals_m = [score.total_cte_m for score in drive_scores(problem, searched)]
-    return replace(attack, field_total_cte_m=float(np.mean(totals_m)))
+    shown = space.restored(attack)
+    _, totals_m = evaluate(past_field(experiment, problem, space, shown), shown.colours)
+    return replace(attack, field_total_cte_m=float(totals_m.protocol_cte_m.mean()))

@@ -22,7 +22,7 @@ class Cell:
         scenario: Name of the path, or in a campaign of the scenario.
         victim: Which policy.
         method: Name of the method that found what it meets; ``none``: no attack.
-        seed: Of the search and its starts.
+        seed: Of the search and its starts; 0 without attack.
         placement: Name of the placement of the objects; empty for the experiment's own.
         reference: Where the method's code is, as `advnerf_core.attack.methods.load_method` takes it, if its name does not say.
     """
@@ -47,8 +47,8 @@ class Cell:
 
     @property
     def clean(self) -> Cell:
-        """The same drive without attack."""
-        return replace(self, method=NONE, reference="")
+        """The same drives without attack: all seeds are measured from the same starts."""
+        return replace(self, method=NONE, seed=0, reference="")
 
     @property
     def code(self) -> str:

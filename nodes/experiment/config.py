@@ -144,6 +144,13 @@ class ObjectConfig(_Section):
     fit_steps: Count = Field(default=300, description="Steps that refine the voxels on pictures of the mesh.")
 
 
+class MeasureConfig(_Section):
+    """From where finished attacks are measured, in both domains: the same starts for all methods and seeds."""
+
+    starts: Positive = Field(default=5, description="Starts, none of which a search had.")
+    seed: int = Field(default=10_000, description="Of the starts.")
+
+
 class AttackConfig(_Section):
     """The adversary, and what it may spend: all methods evaluate equally often."""
 
@@ -159,7 +166,7 @@ class AttackConfig(_Section):
         default=False, description="The first start of every seed is the nominal one, not of seed 0 alone."
     )
     start_sigma: Annotated[float, Field(ge=0)] = Field(
-        default=0.1, description="Spread of all other starts [m and rad]; headings a quarter of it."
+        default=0.1, description="Spread of starts [m and rad]; headings a quarter of it."
     )
     evaluations: Positive = Field(default=50, description="Closed-loop evaluations of each search.")
     horizon: Positive | None = Field(
@@ -305,6 +312,7 @@ class ExperimentConfig(_Section):
     policy: PolicyConfig = PolicyConfig()
     object: ObjectConfig = ObjectConfig()
     attack: AttackConfig = AttackConfig()
+    measure: MeasureConfig = MeasureConfig()
     space: SpaceConfig = Field(default=ColoursConfig(), description="What the attacks may change.")
     deploy: DeployConfig = DeployConfig()
     gate: GateLimits | None = Field(

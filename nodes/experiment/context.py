@@ -279,17 +279,27 @@ class Experiment(RunFolder[ExperimentConfig]):
     def start_states(self, scenario: str, seed: int) -> torch.Tensor:
         """Start poses ``[B, 3]`` float64 of one attack, drawn about the nominal one; the first of seed 0 is the nominal one itself.
 
-        A seed that changed only the search's first noise would repeat one drive: gradients end in the same colours from everywhere.
+        Searches get others from `measured_starts`.
         """
-        wanted, nominal = self.config.attack, self.references[scenario].drive_start
-        noise = np.random.default_rng([seed, self.config.scenarios.index(scenario)]).standard_normal(
-            (wanted.starts, 3)
-        )
+        wanted = self.config.attack
+        noise = self._start_noise(scenario, seed, wanted.starts)
         if seed == 0 or wanted.nominal_start:
             noise[0] = 0.0
+        return self._starts(scenario, noise)
+
+    def measured_starts(self, scenario: str) -> torch.Tensor:
+        """Start poses ``[M, 3]`` float64 from which all methods and seeds are measured, about the nominal one; no search has them."""
+        wanted = self.config.measure
+        return self._starts(scenario, self._start_noise(scenario, wanted.seed, wanted.starts))
+
+    def _start_noise(self, scenario: str, seed: int, count: int) -> Array:
+        generator = np.random.default_rng([seed, self.config.scenarios.index(scenario)])
+        return generator.standard_normal((count, 3))
+
+    def _starts(self, scenario: str, noise: Array) -> torch.Tensor:
         # A tenth of a radian at the start would be 2.4 m of error at the junction.
-        spread = wanted.start_sigma * np.array([1.0, 1.0, 0.25])
-        return torch.from_numpy(np.array(nominal) + spread * noise)
+        spread = self.config.attack.start_sigma * np.array([1.0, 1.0, 0.25])
+        return torch.from_numpy(np.array(self.references[scenario].drive_start) + spread * noise)
 
 
 def as_json(description: WorldDescription) -> dict[str, Any]:

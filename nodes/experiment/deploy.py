@@ -95,7 +95,7 @@ def live_name(start: int) -> str:
 
 def deployed_starts(experiment: Experiment, cell: Cell) -> torch.Tensor:
     """The starts ``[B, 3]`` of a cell that are deployed."""
-    return experiment.start_states(cell.scenario, cell.seed)[: experiment.config.deploy.starts]
+    return experiment.measured_starts(cell.scenario)[: experiment.config.deploy.starts]
 
 
 def cell_data(

@@ -21,7 +21,7 @@ class DeployConfig(BaseModel):
     )
     starts: Positive | None = Field(
         default=None,
-        description="So many of the starts are driven; none: all. A live drive takes half a minute.",
+        description="So many of the measured starts are deployed; none: all. A live drive takes half a minute.",
     )
     launch_file: str = Field(
         default="green_screen.launch.yaml", description="Node graph, beside the experiment file."

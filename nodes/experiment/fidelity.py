@@ -189,7 +189,7 @@ def _along_the_drive(
     shown, there = attack or (space.plain, shown_there(space.plain, None))
     with experiment.open_world() as scene:
         dressed = dress(experiment, scene, space.plain)
-        start = experiment.start_states(cell.scenario, cell.seed)[:1]
+        start = experiment.measured_starts(cell.scenario)[:1]
         plain = shown_there(space.plain, None)
         (drive,) = deployed_drives(experiment, dressed, policy, cell.scenario, start, plain)
         states = drive.states[:-1]

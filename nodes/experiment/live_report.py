@@ -118,7 +118,7 @@ def _settings(experiment: Experiment) -> rd.Settings:
         control_period_s=experiment.config.dt_s,
         iterations=attack.evaluations,
         random_evaluations=attack.evaluations,
-        start_poses=experiment.start_states(scenario, attack.seeds[0]).numpy(),
+        start_poses=experiment.measured_starts(scenario).numpy(),
         seeds=attack.seeds,
         speed_mps=experiment.car.speed_mps,
         learning_rate=attack.learning_rate,

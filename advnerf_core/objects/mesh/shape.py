@@ -22,7 +22,6 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from advnerf_core.fields.voxel_grid import INITIAL_NOISE
 from advnerf_core.geometry import Array, invert_transform
 from advnerf_core.objects.mesh.field import MeshField
 from advnerf_core.objects.mesh.large_steps import LargeSteps
@@ -62,6 +61,10 @@ class ShapeLimits:
         return 0.05 * self.bound_m
 
 
+# Of vertices, in units of theta: noise of N(0, 1) would fold the surface.
+_INITIAL_NOISE = 1e-4
+
+
 class ShapeSensor:
     """Meshes of free shape in a scene.
 
@@ -95,7 +98,7 @@ class ShapeSensor:
 
     def initial_theta(self, generator: torch.Generator) -> Tensor:
         """The plain shapes, with a noise that tells seeds apart."""
-        return INITIAL_NOISE * torch.randn(self.theta_shape, generator=generator)
+        return _INITIAL_NOISE * torch.randn(self.theta_shape, generator=generator)
 
     @property
     def learning_rate(self) -> float:

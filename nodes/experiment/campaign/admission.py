@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 from advnerf_core.report.cells import CellResult
+from advnerf_core.report.conditions import NONE
 from nodes.experiment.campaign.config import Campaign
 from nodes.experiment.campaign.plan import read_experiment
 from nodes.experiment.campaign.store import store_of
@@ -42,8 +42,9 @@ def _judge(campaign: Campaign, cell: Cell, leave_out: bool, say: Callable[[str],
         return True
     from nodes.experiment.campaign.gate import cached_verdict  # loads torch
 
-    first = min(each.seed for each in campaign.cells if gate_key(each) == key)
-    without = replace(cell.clean, seed=first)
+    without = next(
+        each for each in (*campaign.cells, cell.clean) if each.method == NONE and gate_key(each) == key
+    )
     which = (kind, read_experiment(campaign, cell), campaign.inside(without), limits)
     found = [cached_verdict(*which, gate_file(campaign.folder, key))]
     try:

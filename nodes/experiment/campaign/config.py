@@ -218,10 +218,16 @@ def _cells(config: CampaignConfig) -> Iterator[Cell]:
     """Per scenario and seed, none first, as others are compared with it."""
     for name, scenario in config.scenarios.items():
         for placement in ("", *scenario.placements):
-            for seed in scenario.seeds or config.seeds:
+            for number, seed in enumerate(scenario.seeds or config.seeds):
                 for victim in scenario.victims or config.victims:
                     for method in sorted(scenario.methods or config.methods, key=_order):
-                        yield Cell.of(name, victim, method, seed, placement)
+                        cell = Cell.of(name, victim, method, seed, placement)
+                        # All seeds of an experiment are measured from the same starts; cells of another kind may not be.
+                        shared = method == NONE and scenario.kind == "experiment"
+                        if not shared:
+                            yield cell
+                        elif number == 0:
+                            yield cell.clean
 
 
 def _order(method: str) -> tuple[int, str]:

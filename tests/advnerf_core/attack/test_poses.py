@@ -43,6 +43,7 @@ def untimed(history):
 def test_the_gradient_of_poses_and_colours_is_that_of_finite_differences_with_frozen_camera_poses(objects):
     problem = moving(objects=objects)
     theta = problem.sensor.initial_theta(torch.Generator().manual_seed(3))
+    theta[problem.sensor.pose_count :] *= 0.1  # where the loss is nearly linear over the differences
     result = adjoint_gradient(problem, theta)
     loss = partial(frozen_loss, problem, rollout=result.rollout)
     # Poses weigh more than colours, so they get directions of their own.
@@ -309,8 +310,12 @@ def test_an_attack_file_of_places_gives_what_a_deployment_shows():
     assert attack.space == "places"
     found = space.restored(attack)
     places = space.sensor.placements(result.theta)
-    np.testing.assert_allclose(torch.stack([placement_of(each) for each in found.objects]), places)
-    np.testing.assert_allclose([each.placement for each in attack.objects], places, atol=1e-12)
+    turned = places.clone()
+    turned[:, 2] = torch.remainder(places[:, 2] + torch.pi, 2 * torch.pi) - torch.pi
+    np.testing.assert_allclose(
+        torch.stack([placement_of(each) for each in found.objects]), turned, atol=1e-12
+    )
+    np.testing.assert_allclose([each.placement for each in attack.objects], turned, atol=1e-12)
     seen = dataclasses.replace(problem, sensor=found.seen_by(surrogate))
     # The file holds float32, the toy computes in float64.
     totals = [evaluate(seen, found.colours)[1], judge(problem, expected.theta)]

@@ -34,6 +34,7 @@ TINY: dict[str, Any] = {
         "first_steps": 2, "round_steps": 2, "naive_steps": 2, "hidden": [16, 8, 4],
     },
     "attack": {"evaluations": 2, "cem_population": 4, "time_batch": 2},
+    "measure": {"starts": 1},
 }  # fmt: skip
 
 

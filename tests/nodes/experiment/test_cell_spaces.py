@@ -107,6 +107,7 @@ def test_meshes_are_searched_over_the_pictures_of_the_world(
         make_space(experiment, wall),
         restored,
     )
+    there = attack._measured(experiment, "straight", there)
     _, scores = attack.learned_drives(experiment, there, restored.colours)
     assert [score.total_cte_m for score in scores] == list(result.surrogate.total_cte_m)
     assert not (tmp_path / "state.safetensors").exists()
@@ -133,9 +134,16 @@ def test_places_are_searched_and_the_file_says_where_things_stand(
     hand = np.array([[thing.x_m, thing.y_m] for thing in experiment.objects])
     there = np.array([each.placement[:2] for each in file.objects])
     assert 0.0 < np.abs(there - hand).max() <= ONE.move_m + 1e-9
-    # The surrogate's own prediction is what is driven again.
-    assert file.predicted_total_cte_m is not None
-    assert np.mean(data["surrogate"]["total_cte_m"]) == pytest.approx(file.predicted_total_cte_m, rel=1e-6)
+    # The surrogate's own prediction is what is driven again, from where it was searched.
+    space = make_space(experiment, wall)
+    problem = attack.attack_problem(
+        experiment, space, attack._victim(victim_file(experiment, "hardened")), "right", 0
+    )
+    restored = space.restored(file)
+    _, scores = attack.learned_drives(experiment, attack.past(problem, space, restored), restored.colours)
+    assert np.mean([score.total_cte_m for score in scores]) == pytest.approx(
+        file.predicted_total_cte_m, rel=1e-6
+    )
     plain = json.loads((tmp_path / "clean" / DRIVES).read_text())
     assert plain["total_cte_m"] == data["deployed"]["none_total_cte_m"]
 
@@ -284,15 +292,17 @@ def test_maps_are_of_what_the_cell_found(
     trained: Experiment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     experiment = searching(trained, ONE)
-    found = run_cell(experiment, PLACES, tmp_path, silent)
+    run_cell(experiment, PLACES, tmp_path, silent)
     small = PoseMapSettings(points=(2, 2), sideways_m=(0.0, 0.3), object_moves_m=((0.0, 0.0), (0.0, 0.2)))
     monkeypatch.setattr(pose_maps, "PoseMapSettings", lambda: small)
     asked = (experiment, PLACES)
     pictures = cells.draw_maps(*asked, 1, tmp_path, silent)
     assert [cv2.imread(str(picture)) is not None for picture in pictures] == [True, True]
     rows = json.loads((tmp_path / f"robustness_{trained.objects[1].name}.json").read_text())["cells"]
-    # The first start past objects that nobody has moved is the cell's own drive.
-    assert rows["0"][0][0] == pytest.approx(np.mean(found["surrogate"]["total_cte_m"]), rel=1e-6)
+    # The first start past objects that nobody has moved is the drive that was searched.
+    assert rows["0"][0][0] == pytest.approx(
+        load_attack(tmp_path / attack.ATTACK).predicted_total_cte_m, rel=1e-6
+    )
     assert len(rows) == 2
     kept = pictures[0].with_suffix(".json").stat().st_mtime_ns
     cells.draw_maps(*asked, 1, tmp_path, silent)

@@ -40,7 +40,7 @@ def test_real_pictures_are_what_the_policy_saw_on_the_clean_drive(searched: tupl
     assert goal == experiment.goal("right")
     with experiment.open_world() as scene:
         dressed = DressedScene(scene, experiment.view, placed_objects(experiment))
-        start = experiment.start_states("right", 0)[:1]
+        start = experiment.measured_starts("right")[:1]
         (drive,) = deployed_drives(experiment, dressed, policy, "right", start, dressed.plain_theta())
         scene.reset(*drive.states[1])
         rgb, _ = scene.observe(depth=False)
