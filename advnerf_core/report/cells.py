@@ -9,6 +9,8 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from advnerf_core.errors import AdvnerfError
+from advnerf_core.report.evidence.kept import KeptDrive
+from advnerf_core.report.reference import Domain
 
 Metres = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 
@@ -64,6 +66,9 @@ class CellResult(BaseModel):
         date: When, ISO.
         surrogate: Drives in the learned scene; of an attack over the deployment scene's own frames (meshes) those of the ideal car there.
         deployed: Drives where it is deployed; None as long as they were not driven.
+        registration: Digest of the registration that the cell was run under; empty if there was none.
+        policy_sha256: Content hash of the victim; empty in cells from before it was kept.
+        kept: The drives of each domain, for whoever computes the numbers again; empty in cells from before they were kept.
         extra: Anything else, such as the file of a clip.
     """
 
@@ -82,6 +87,9 @@ class CellResult(BaseModel):
     date: str
     surrogate: Drives
     deployed: Drives | None = None
+    registration: str = ""
+    policy_sha256: str = ""
+    kept: dict[Domain, tuple[KeptDrive, ...]] = Field(default_factory=dict)
     extra: dict[str, Any] = Field(default_factory=dict)
 
     @property

@@ -59,7 +59,7 @@ _COLOURS = {
 _FAILURE_EXIT = 1
 
 
-def _load(
+def load_cells(
     file: Path, setting: str, folder: Path | None, overrides: list[str] | None, only: str
 ) -> tuple[Campaign, list[Cell]]:
     """The cells of a file, all and those that are wanted."""
@@ -181,7 +181,7 @@ def _run_many(
 ) -> None:
     from nodes.experiment.campaign.run import run_campaign
 
-    campaign, cells = _load(file, "", folder, overrides, only)
+    campaign, cells = load_cells(file, "", folder, overrides, only)
     with ends_in_order():
         ended = run_campaign(campaign, cells, options, lambda text: print(text, flush=True))
     if not options.search_only:
@@ -207,7 +207,7 @@ def status(
     """Say which cells are done, running, failed (and why), made with other settings, or missing."""
     from nodes.experiment.campaign.plan import statuses
 
-    campaign, cells = _load(file, setting, folder, overrides, only)
+    campaign, cells = load_cells(file, setting, folder, overrides, only)
     found = statuses(campaign, cells)
     rows = table("cell", "state", "")
     for each in found:
@@ -237,7 +237,7 @@ def table_command(
     overrides: Overrides = None,
 ) -> None:
     """Print the table of all cells, and the targets."""
-    campaign, cells = _load(file, setting, folder, overrides, only)
+    campaign, cells = load_cells(file, setting, folder, overrides, only)
     _show(campaign, cells, None, source)
 
 
@@ -265,7 +265,7 @@ def page(
         raise ConfigError(
             "expected --output with --only, as the page of some cells would replace that of all"
         )
-    campaign, cells = _load(file, setting, folder, overrides, only)
+    campaign, cells = load_cells(file, setting, folder, overrides, only)
     _show(campaign, cells, output or _page_folder(campaign), source)
 
 
@@ -352,7 +352,7 @@ def predict(
     os.environ.setdefault("MUJOCO_GL", "egl")
     from nodes.experiment.campaign.predictions import predict_campaign
 
-    campaign, cells = _load(file, setting, folder, overrides, only)
+    campaign, cells = load_cells(file, setting, folder, overrides, only)
     with ends_in_order():
         made = predict_campaign(campaign, cells, lambda text: print(text, flush=True), draws)
     print(f"{made} predictions made")
@@ -370,7 +370,7 @@ def maps(
     os.environ.setdefault("MUJOCO_GL", "egl")
     from nodes.experiment.campaign.maps import map_cells
 
-    campaign, cells = _load(file, setting, folder, overrides, only)
+    campaign, cells = load_cells(file, setting, folder, overrides, only)
     for picture in map_cells(campaign, cells, number):
         print(picture)
 
@@ -389,14 +389,18 @@ def publish(
     overrides: Overrides = None,
 ) -> None:
     """Copy the finished cells, and the scenes, victims and objects that they were run with, to where they are kept with the code."""
+    from advnerf_core.report.evidence.registration import FILE as REGISTERED
+    from advnerf_core.report.evidence.verify import write_set
     from nodes.experiment.campaign.plan import statuses
     from nodes.experiment.campaign.published import publish as copy_cells
     from nodes.experiment.campaign.published import publish_build
 
-    campaign, cells = _load(file, setting, folder, overrides, only)
+    campaign, cells = load_cells(file, setting, folder, overrides, only)
     found = copy_cells(campaign, statuses(campaign, cells), to, prune)
     for name in found.written:
         print(f"{to / campaign.name / name}.json")
+    if (to / campaign.name / REGISTERED).exists():
+        print(write_set(to / campaign.name))
     build = publish_build(campaign, cells, to, prune)
     for each in build.written:
         print(each)

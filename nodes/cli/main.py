@@ -32,6 +32,7 @@ from nodes.cli import scene as cli_scene
 from nodes.cli import teleop as cli_teleop
 from nodes.cli import topic as cli_topic
 from nodes.cli import trial as cli_trial
+from nodes.cli import verify as cli_verify
 from nodes.cli import world as cli_world
 from nodes.runtime.terminal import Overrides, RunDir, print_table, say_error, table
 
@@ -81,6 +82,7 @@ app.add_typer(cli_carla.app, name="carla")
 app.add_typer(cli_world.app, name="world")
 cli_doctor.add_to(app)
 cli_experiment.add_to(app)
+cli_verify.add_to(app)
 cli_replay.add_to(app)
 cli_teleop.add_to(app)
 cli_trial.add_to(app)

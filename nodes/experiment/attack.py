@@ -157,10 +157,12 @@ def surrogate_part(
         attack_id = save_attack(folder / ATTACK, attack)
     shown = load_shown(space, folder, cell)
     measured = _measured(experiment, cell.scenario, past_field(experiment, problem, space, shown))
-    states, scores = learned_drives(experiment, measured, shown.colours)
+    states, commands, scores = learned_drives(experiment, measured, shown.colours)
     data = {
         "attack_id": attack_id,
+        "policy_sha256": policy.sha256,
         "states": states.tolist(),
+        "commands": commands.tolist(),
         **totals(scores),
         "mean_cte_m": [score.mean_cte_m for score in scores],
         "time_to_leave_s": [score.time_to_leaving_s for score in scores],

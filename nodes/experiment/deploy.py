@@ -14,6 +14,7 @@ from advnerf_core.attack.spaces.space import Space
 from advnerf_core.files import write_atomically
 from advnerf_core.policies.pilotnet import load_policy
 from advnerf_core.report.conditions import NONE
+from advnerf_core.report.evidence.kept import kept_drives
 from hardware.worlds.world import World
 from nodes.experiment.attack import ATTACK, SEARCHED, load_found, load_shown
 from nodes.experiment.cell import Cell
@@ -130,7 +131,9 @@ def cell_data(
         "seed": cell.seed,
         "attack_id": learned["attack_id"],
         "seconds": round(learned["seconds"], 1),
+        "policy_sha256": learned["policy_sha256"],
         "surrogate": _drives_of(learned, undisturbed),
+        "kept": {"surrogate": kept_drives(learned)},
         "extra": {
             "evaluations": len(learned["curve_total_cte_m"]),
             "horizon": experiment.config.horizon,
@@ -142,6 +145,7 @@ def cell_data(
         without = deployed_part(space, deployer, cell.clean, clean, tell)
         driven = without if folder == clean else deployed_part(space, deployer, cell, folder, tell)
         data["deployed"] = _drives_of(driven, without)
+        data["kept"]["deployed"] = kept_drives(driven)
         data["extra"] |= {
             "blocked_tick": driven["blocked_tick"],
             "max_abs_cte_m": max(driven["max_cte_m"]),
@@ -181,7 +185,7 @@ def deployed_part(
     deployed = deployer.drive(space, cell, folder, tell)
     data = {
         "states": [drive.states.tolist() for drive in deployed.drives],
-        "controls": [drive.controls.tolist() for drive in deployed.drives],
+        "commands": [drive.controls.tolist() for drive in deployed.drives],
         **totals([drive.metrics for drive in deployed.drives]),
         "mean_cte_m": [drive.metrics.mean_cte_m for drive in deployed.drives],
         "max_cte_m": [drive.metrics.max_cte_m for drive in deployed.drives],

@@ -18,14 +18,18 @@ from nodes.experiment.deployed import DeployedDrive, Dressed, drive_deployed
 
 def learned_drives(
     experiment: Experiment, problem: AttackProblem, theta: Tensor
-) -> tuple[Array, list[DriveMetrics]]:
-    """States ``[B, T + 1, n]`` of the drives from all starts of a problem in its own scene, and their metrics."""
+) -> tuple[Array, Array, list[DriveMetrics]]:
+    """States ``[B, T + 1, n]`` and commands ``[B, T]`` of the drives from all starts of a problem in its own scene, and their metrics."""
     rollout, _ = evaluate(problem, theta)
-    states = rollout.states.transpose(0, 1).numpy()
-    return states, [
-        drive_metrics(problem.path, each, experiment.limits, _fenced_tick(experiment, each))
-        for each in states
-    ]
+    states, commands = (each.transpose(0, 1).numpy() for each in (rollout.states, rollout.controls))
+    return (
+        states,
+        commands,
+        [
+            drive_metrics(problem.path, each, experiment.limits, _fenced_tick(experiment, each))
+            for each in states
+        ],
+    )
 
 
 def _fenced_tick(experiment: Experiment, states: Array) -> int | None:
@@ -61,8 +65,9 @@ def deployed_drives(
 
 
 def totals(scores: Sequence[DriveMetrics]) -> dict[str, Any]:
-    """Total CTE [m] and whether the track was left, drive by drive, as cells have them."""
+    """Total CTE [m], whether the track was left, and ticks until the car stopped, drive by drive."""
     return {
         "total_cte_m": [score.total_cte_m for score in scores],
         "off_track": [score.off_track for score in scores],
+        "driven_ticks": [len(score.ctes_m) - score.held_ticks for score in scores],
     }

@@ -68,6 +68,16 @@ def cell_inputs(experiment: Experiment, cell: Cell) -> dict[str, Any]:
     return {**inputs, "victim": load_policy(file).sha256 if file.exists() else None}
 
 
+def registered_settings(experiment: Experiment) -> dict[str, Any]:
+    """Settings that all cells of an experiment depend on, known before any stage is run: what a registration fixes."""
+    return {
+        "version": VERSION,
+        "bake": bake.VERSION,
+        "config": experiment.config.model_dump(mode="json", exclude=_FREE),
+        "world": experiment.world_settings,
+    }
+
+
 def require_known(experiment: Experiment, cell: Cell) -> None:
     """Refuse a cell that there cannot be.
 

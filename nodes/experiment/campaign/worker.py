@@ -68,6 +68,7 @@ class Job:
         settings_hash: Of what the result depends on, when it was planned.
         threads: Threads that it may use.
         phase: ``search``: only what may run beside others; ``whole``: all of it.
+        registration: Digest of the registration that it is run under; empty if there is none.
     """
 
     campaign_folder: str
@@ -86,6 +87,7 @@ class Job:
     settings_hash: str
     threads: int
     phase: Phase = "whole"
+    registration: str = ""
 
     @property
     def cell(self) -> Cell:
@@ -252,6 +254,7 @@ def _run(job: Job, store: Store, work: Path, kind: CellKind, experiment: Any, re
         "method": job.cell.method,
         "seed": job.seed,
         "settings_hash": job.settings_hash,
+        "registration": job.registration,
         "stages": stage_digests(Path(job.run_folder), list(kind.needed_settings(experiment))),
         "machine": found.get("machine") or machine_name(),
         "date": found.get("date") or datetime.now(timezone.utc).isoformat(timespec="seconds"),

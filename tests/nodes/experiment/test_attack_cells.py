@@ -86,7 +86,7 @@ def test_search_is_kept_and_its_file_brings_the_colours_back(fresh: Experiment, 
         fresh, space, attack._victim(victim_file(fresh, cell.victim)), cell.scenario, cell.seed
     )
     again = attack.past(problem, space, space.restored(file))
-    _, scores = attack.learned_drives(fresh, again, theta)
+    _, _, scores = attack.learned_drives(fresh, again, theta)
     assert scores[0].total_cte_m == pytest.approx(
         max(found["curve_total_cte_m"])
     )  # the best evaluation, driven again

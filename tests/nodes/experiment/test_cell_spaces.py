@@ -108,7 +108,7 @@ def test_meshes_are_searched_over_the_pictures_of_the_world(
         restored,
     )
     there = attack._measured(experiment, "straight", there)
-    _, scores = attack.learned_drives(experiment, there, restored.colours)
+    _, _, scores = attack.learned_drives(experiment, there, restored.colours)
     assert [score.total_cte_m for score in scores] == list(result.surrogate.total_cte_m)
     assert not (tmp_path / "state.safetensors").exists()
 
@@ -140,7 +140,7 @@ def test_places_are_searched_and_the_file_says_where_things_stand(
         experiment, space, attack._victim(victim_file(experiment, "hardened")), "right", 0
     )
     restored = space.restored(file)
-    _, scores = attack.learned_drives(experiment, attack.past(problem, space, restored), restored.colours)
+    _, _, scores = attack.learned_drives(experiment, attack.past(problem, space, restored), restored.colours)
     assert np.mean([score.total_cte_m for score in scores]) == pytest.approx(
         file.predicted_total_cte_m, rel=1e-6
     )

@@ -70,7 +70,7 @@ def test_a_face_is_also_deployed_without_nodes_and_meets_the_same_searches(tmp_p
     assert drives["live"] == []
     assert np.shape(drives["states"]) == (1, 61, 3)
     # The face is seen: it steers otherwise than what is there without it.
-    assert drives["controls"] != clean["controls"]
+    assert drives["commands"] != clean["commands"]
     assert "<html" in (tmp_path / "report" / "report.html").read_text()
 
 

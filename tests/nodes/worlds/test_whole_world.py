@@ -46,7 +46,7 @@ def test_every_stage_runs_in_a_strangers_world(
                 (run / "cells").glob(f"**/*{cell['scenario']}_hardened_{cell['method']}_0*/drives.json")
             ).read_text()
         )
-        states, controls = np.array(drives["states"][0]), np.array(drives["controls"][0])
+        states, controls = np.array(drives["states"][0]), np.array(drives["commands"][0])
         path: DrivingPath = as_path(world.paths[cell["scenario"]])
         assert cell["deployed"]["total_cte_m"] == pytest.approx(
             [np.abs(path.project(states[1:, :2]).cte_m).sum()]

@@ -1,0 +1,92 @@
+"""Published drives: what is kept of each, so that every number can be computed again without driving."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+
+from advnerf_core.driving.metrics import DriveMetrics, Horizon, drive_metrics
+from advnerf_core.driving.path import Path
+
+Floats = NDArray[np.float64]
+# Metres and radians. A total over 60 ticks then differs from that of the drive itself by less than a millimetre.
+_DIGITS = 5
+
+
+def _numbers(text: str) -> str:
+    if not np.isfinite(np.array(text.split(), np.float64)).all():
+        raise ValueError(f"expected finite numbers with spaces between them, got {text[:60]!r}")
+    return text
+
+
+Series = Annotated[str, AfterValidator(_numbers)]
+
+
+class KeptDrive(BaseModel):
+    """One drive at its control ticks.
+
+    Attributes:
+        x_m: ``T + 1`` positions, from the start [m], as numbers with spaces between them.
+        y_m: The same.
+        yaw_rad: The same [rad].
+        command: What the policy commanded at ``T`` ticks [rad, or rad/s]; empty for a live drive, whose bag has it.
+        driven_ticks: Ticks until the car stopped; its last |CTE| counts for the rest.
+        collided: Whether the car ran into something.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    x_m: Series
+    y_m: Series
+    yaw_rad: Series
+    command: Series = ""
+    driven_ticks: Annotated[int, Field(ge=0)]
+    collided: bool = False
+
+    @classmethod
+    def of(
+        cls, states: ArrayLike, driven_ticks: int, command: ArrayLike = (), collided: bool = False
+    ) -> KeptDrive:
+        """Keep a drive of states ``[T + 1, >= 3]``."""
+        columns = [_text(column) for column in np.asarray(states, np.float64)[:, :3].T]
+        return cls(
+            x_m=columns[0],
+            y_m=columns[1],
+            yaw_rad=columns[2],
+            command=_text(command),
+            driven_ticks=driven_ticks,
+            collided=collided,
+        )
+
+    def poses(self) -> Floats:
+        """Poses ``[T + 1, 3]``: x [m], y [m], yaw [rad].
+
+        Raises:
+            ValueError: The columns differ in length.
+        """
+        columns = [np.array(text.split(), np.float64) for text in (self.x_m, self.y_m, self.yaw_rad)]
+        if len({len(column) for column in columns}) != 1:
+            raise ValueError(
+                f"expected x_m, y_m and yaw_rad of one length, got {[len(column) for column in columns]} numbers"
+            )
+        return np.stack(columns, axis=1)
+
+    def metrics(self, path: Path, horizon: Horizon) -> DriveMetrics:
+        """Metrics of the drive along a path."""
+        return drive_metrics(path, self.poses(), horizon, self.driven_ticks)
+
+
+def kept_drives(found: dict[str, Any]) -> list[dict[str, Any]]:
+    """Drives of one part of a cell (``states``, ``driven_ticks``, ``commands`` and ``blocked_tick``) as JSON data."""
+    count = len(found["states"])
+    blocked = found.get("blocked_tick", [None] * count)
+    rows = zip(found["states"], found["driven_ticks"], found["commands"], blocked, strict=True)
+    return [KeptDrive.of(*row[:3], collided=row[3] is not None).model_dump() for row in rows]
+
+
+def _text(values: ArrayLike) -> str:
+    rounded = np.round(np.asarray(values, np.float64), _DIGITS) + 0.0  # no -0
+    return " ".join(f"{value:g}" if value == 0 else repr(float(value)) for value in rounded)

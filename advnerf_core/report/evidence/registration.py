@@ -1,0 +1,169 @@
+"""A registration: what will be run, and which tests will be claimed, written before anything is run."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path as FilePath
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from advnerf_core.driving.metrics import Horizon
+from advnerf_core.driving.path import Path
+from advnerf_core.errors import AdvnerfError
+
+FORMAT: Literal["advnerf-registration-1"] = "advnerf-registration-1"
+FILE = "set/registration.json"  # in the folder of the published cells
+Pose = tuple[float, float, float]
+Share = Annotated[float, Field(gt=0, lt=1)]
+
+
+class RegistrationError(AdvnerfError, ValueError):
+    """A registration is not usable, or would come too late."""
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class RegisteredScenario(_Part):
+    """One scenario, or one placement of its objects.
+
+    Attributes:
+        settings_sha256: Hash of the world and of all settings that a result depends on.
+        path: The reference path, as `Path.to_dict` writes it.
+        ticks: Control ticks of a drive.
+        dt_s: Length of a tick [s].
+        off_track_m: |CTE| beyond which the car is off the track [m].
+        held_cap_m: Largest |CTE| that a stopped car is charged per tick [m].
+        starts: Start poses that are measured: x [m], y [m], yaw [rad]; no search has them.
+        deployed_starts: How many of them, the first ones, are deployed.
+        evaluations: Closed-loop drives of each search.
+        space: What a search may change.
+        victims: Recipe of the victims: teacher, data, optimiser steps, network.
+        drives_well_mean_cte_m: A victim drives well if its mean |CTE| without attack is at most this [m], and it never leaves the track.
+    """
+
+    settings_sha256: str
+    path: dict[str, Any]
+    ticks: Annotated[int, Field(ge=1)]
+    dt_s: float
+    off_track_m: float
+    held_cap_m: float
+    starts: tuple[Pose, ...] = Field(min_length=1)
+    deployed_starts: Annotated[int, Field(ge=0)]
+    evaluations: Annotated[int, Field(ge=1)]
+    space: dict[str, Any]
+    victims: dict[str, Any]
+    drives_well_mean_cte_m: float
+
+    @property
+    def horizon(self) -> Horizon:
+        """What is summed, and the limits."""
+        return Horizon(self.ticks, self.dt_s, self.off_track_m, self.held_cap_m)
+
+    def reference_path(self) -> Path:
+        """The path as an object."""
+        return Path.from_dict(self.path)
+
+
+class RegisteredCell(_Part):
+    """One cell.
+
+    Attributes:
+        scenario: Name of the scenario.
+        placement: Name of the placement; empty for the scenario's own.
+        victim: Which policy.
+        method: Which search, or ``none``.
+        seed: Of the search.
+    """
+
+    scenario: str
+    placement: str = ""
+    victim: str
+    method: str
+    seed: int
+
+
+class PrimaryTest(_Part):
+    """A test that is claimed: the method's deployed excess against that of the baseline that is strongest in the surrogate.
+
+    Attributes:
+        scenario: Name of the scenario.
+        placement: Name of the placement.
+        victim: Which policy.
+        method: Which search.
+        against: The baselines.
+    """
+
+    scenario: str
+    placement: str = ""
+    victim: str
+    method: str
+    against: tuple[str, ...] = Field(min_length=1)
+
+
+class Registration(_Part):
+    """What will be run.
+
+    Attributes:
+        format: Of the file.
+        name: Name of the set of results.
+        file: The experiment or campaign file.
+        setting: Its setting.
+        overrides: Changes of it on the command line.
+        date: When it was registered, ISO.
+        software_version: Of advnerf.
+        scenarios: By name, ``NAME`` or ``NAME.PLACEMENT``.
+        cells: All cells.
+        primary: The tests that are claimed; Holm's adjustment is over these.
+        level: Coverage of all intervals.
+        alpha: Level of the tests.
+    """
+
+    format: Literal["advnerf-registration-1"] = FORMAT
+    name: str
+    file: str
+    setting: str
+    overrides: tuple[str, ...] = ()
+    date: str
+    software_version: str
+    scenarios: dict[str, RegisteredScenario]
+    cells: tuple[RegisteredCell, ...]
+    primary: tuple[PrimaryTest, ...] = ()
+    level: Share = 0.95
+    alpha: Share = 0.05
+
+    def scenario(self, name: str, placement: str = "") -> RegisteredScenario | None:
+        """A scenario; None if it is not registered."""
+        return self.scenarios.get(scenario_key(name, placement))
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of everything in it but its date."""
+        data = self.model_dump(mode="json", exclude={"date"})
+        return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()
+
+
+def scenario_key(name: str, placement: str) -> str:
+    """How a registration names a scenario with a placement."""
+    return f"{name}.{placement}" if placement else name
+
+
+def read_registration(folder: FilePath) -> Registration | None:
+    """The registration in the folder of a set of results; None if there is none.
+
+    Raises:
+        RegistrationError: The file is not a registration's.
+    """
+    file = folder / FILE
+    if not file.exists():
+        return None
+    try:
+        return Registration.model_validate_json(file.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, ValidationError) as error:
+        text = error.errors(include_url=False)[0]["msg"] if isinstance(error, ValidationError) else str(error)
+        raise RegistrationError(
+            f"{file}: expected a registration, got: {text}; restore it from git"
+        ) from None

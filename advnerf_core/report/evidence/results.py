@@ -1,0 +1,273 @@
+"""The published numbers of a set of cells, in metres, computed from the kept drives alone."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from advnerf_core.driving.metrics import DriveMetrics
+from advnerf_core.report.cells import CellResult, cell_name
+from advnerf_core.report.conditions import NONE
+from advnerf_core.report.evidence.exact import McNemar, holm, mcnemar_per_search, permutation_test
+from advnerf_core.report.evidence.intervals import clustered_interval
+from advnerf_core.report.evidence.outcome import Outcome, drive_outcome
+from advnerf_core.report.evidence.registration import (
+    PrimaryTest,
+    RegisteredScenario,
+    Registration,
+)
+from advnerf_core.report.reference import Domain
+
+Floats = NDArray[np.float64]
+DOMAINS: tuple[Domain, ...] = ("surrogate", "deployed")
+Key = tuple[str, str, str, str]  # scenario, placement, victim, method
+
+
+@dataclass(frozen=True)
+class Row:
+    """One method against one victim in one domain, over its searches and their starts.
+
+    Attributes:
+        scenario: Name of the scenario.
+        placement: Name of the placement.
+        victim: Which policy.
+        method: Which search, or ``none``.
+        domain: surrogate or deployed.
+        searches: Number of searches.
+        drives: Number of drives.
+        excess_m: Mean excess |CTE| per tick [m]; of ``none`` its mean |CTE|.
+        low_m: Lower end of its interval [m]; None where there are too few drives.
+        high_m: Upper end [m].
+        over: What the interval is over.
+        off_track: Drives that left the track.
+        collided: Drives that ended in a collision.
+        off_lane_share: Share of all ticks off the track.
+        leaving_s: Median time to leaving the track of the drives that left it [s].
+        registered: Whether all its cells were registered; else it is exploration.
+    """
+
+    scenario: str
+    placement: str
+    victim: str
+    method: str
+    domain: Domain
+    searches: int
+    drives: int
+    excess_m: float
+    low_m: float | None
+    high_m: float | None
+    over: str
+    off_track: int
+    collided: int
+    off_lane_share: float
+    leaving_s: float | None
+    registered: bool
+
+
+@dataclass(frozen=True)
+class TestResult:
+    """A primary test.
+
+    Attributes:
+        test: Which, as it was registered.
+        baseline: The baseline that is strongest in the surrogate.
+        difference_m: Mean excess of the method minus that of the baseline, deployed [m].
+        p: Exact p of the permutation test; None where none is claimed.
+        p_holm: Adjusted for all primary tests.
+        reason: Why there is no p.
+        mcnemar: Off-track against the baseline, search by search.
+    """
+
+    test: PrimaryTest
+    baseline: str
+    difference_m: float
+    p: float | None
+    p_holm: float | None
+    reason: str
+    mcnemar: tuple[McNemar, ...] = field(default=())
+
+
+class Evidence:
+    """Outcomes of all drives of a registered set.
+
+    Args:
+        registration: What was registered.
+        cells: The cells that are there; those without kept drives, or of a scenario that was not registered, are left out.
+    """
+
+    def __init__(self, registration: Registration, cells: Sequence[CellResult]) -> None:
+        self.registration = registration
+        self.cells = {
+            cell.name: cell
+            for cell in cells
+            if cell.kept and registration.scenario(cell.scenario, cell.placement) is not None
+        }
+        self._named = {
+            cell_name(cell.scenario, cell.victim, cell.method, cell.seed, cell.placement)
+            for cell in registration.cells
+        }
+
+    def scenario_of(self, cell: CellResult) -> RegisteredScenario:
+        """The registered scenario of a cell."""
+        found = self.registration.scenario(cell.scenario, cell.placement)
+        assert found is not None, "cells of other scenarios were left out"
+        return found
+
+    def is_registered(self, cell: CellResult) -> bool:
+        """Whether a cell was registered, and run under this registration."""
+        return cell.name in self._named and cell.registration == self.registration.digest
+
+    def metrics(self, cell: CellResult, domain: Domain) -> list[DriveMetrics]:
+        """Metrics of the drives of a cell, computed from what is kept."""
+        scenario = self.scenario_of(cell)
+        path = scenario.reference_path()
+        return [drive.metrics(path, scenario.horizon) for drive in cell.kept.get(domain, ())]
+
+    def without(self, cell: CellResult) -> CellResult | None:
+        """The cell of the same drives without attack."""
+        return self.cells.get(cell_name(cell.scenario, cell.victim, NONE, 0, cell.placement))
+
+    def outcomes(self, cell: CellResult, domain: Domain) -> list[Outcome]:
+        """Outcomes of the drives of a cell, each against the drive without attack from the same start."""
+        clean, horizon = self.without(cell), self.scenario_of(cell).horizon
+        if clean is None:
+            return []
+        pairs = zip(
+            self.metrics(cell, domain),
+            self.metrics(clean, domain),
+            cell.kept.get(domain, ()),
+            strict=False,
+        )
+        return [
+            drive_outcome(attacked.ctes_m, none.ctes_m, horizon, "obstacle" if drive.collided else None)
+            for attacked, none, drive in pairs
+        ]
+
+    def searches(self, key: Key) -> list[CellResult]:
+        """The cells of one method against one victim, by seed."""
+        found = [
+            cell
+            for cell in self.cells.values()
+            if (cell.scenario, cell.placement, cell.victim, cell.method) == key
+        ]
+        return sorted(found, key=lambda cell: cell.seed)
+
+
+def rows(evidence: Evidence) -> list[Row]:
+    """All rows, in the order of the registration; what was not registered comes last."""
+    keys: dict[Key, None] = {}
+    for cell in evidence.registration.cells:
+        keys[cell.scenario, cell.placement, cell.victim, cell.method] = None
+    for found in evidence.cells.values():
+        keys[found.scenario, found.placement, found.victim, found.method] = None
+    made = [_row(evidence, key, domain) for key in keys for domain in DOMAINS]
+    return sorted((row for row in made if row is not None), key=lambda row: not row.registered)
+
+
+def primary_tests(evidence: Evidence) -> list[TestResult]:
+    """The registered tests, adjusted by Holm over these alone."""
+    found = [_test(evidence, test) for test in evidence.registration.primary]
+    claimed = [test for test in found if test is not None and test.p is not None]
+    adjusted = dict(
+        zip(map(id, claimed), holm([test.p for test in claimed if test.p is not None]), strict=True)
+    )
+    return [
+        TestResult(**{**vars(test), "p_holm": adjusted.get(id(test))}) for test in found if test is not None
+    ]
+
+
+def as_data(evidence: Evidence) -> dict[str, Any]:
+    """All published numbers as JSON data."""
+    return {
+        "rows": [vars(row) for row in rows(evidence)],
+        "primary": [
+            {
+                **vars(test),
+                "test": test.test.model_dump(mode="json"),
+                "mcnemar": [vars(each) for each in test.mcnemar],
+            }
+            for test in primary_tests(evidence)
+        ],
+    }
+
+
+def _row(evidence: Evidence, key: Key, domain: Domain) -> Row | None:
+    cells = [cell for cell in evidence.searches(key) if cell.kept.get(domain)]
+    outcomes = [evidence.outcomes(cell, domain) for cell in cells]
+    if not cells or not all(outcomes):
+        return None
+    values = [_values_m(evidence, cell, domain, found) for cell, found in zip(cells, outcomes, strict=True)]
+    interval = clustered_interval(values, evidence.registration.level, shared_starts=_equally_many(values))
+    flat = [outcome for found in outcomes for outcome in found]
+    leaving = [outcome.time_to_leaving_s for outcome in flat if outcome.time_to_leaving_s is not None]
+    return Row(
+        *key,
+        domain,
+        searches=len(cells),
+        drives=len(flat),
+        excess_m=float(np.mean([np.mean(each) for each in values])),
+        low_m=interval.low if interval else None,
+        high_m=interval.high if interval else None,
+        over=interval.over if interval else "",
+        off_track=sum(outcome.off_track for outcome in flat),
+        collided=sum(outcome.collided_with is not None for outcome in flat),
+        off_lane_share=float(np.mean([outcome.share_off_lane for outcome in flat])),
+        leaving_s=float(np.median(leaving)) if leaving else None,
+        registered=all(evidence.is_registered(cell) for cell in cells),
+    )
+
+
+def _values_m(
+    evidence: Evidence, cell: CellResult, domain: Domain, outcomes: Sequence[Outcome]
+) -> list[float]:
+    if cell.method == NONE:  # its excess over itself is zero: what it is an excess over
+        return [metrics.mean_cte_m for metrics in evidence.metrics(cell, domain)]
+    return [outcome.excess_cte_m_per_tick for outcome in outcomes]
+
+
+def _equally_many(values: Sequence[Sequence[float]]) -> bool:
+    return len({len(each) for each in values}) == 1
+
+
+def _test(evidence: Evidence, test: PrimaryTest) -> TestResult | None:
+    """A test whose cells are all there; None otherwise."""
+    by_method = {
+        method: evidence.searches((test.scenario, test.placement, test.victim, method))
+        for method in (test.method, *test.against)
+    }
+    if not all(cells and all(evidence.is_registered(cell) for cell in cells) for cells in by_method.values()):
+        return None
+    means: Mapping[tuple[str, Domain], Floats] = {
+        (method, domain): np.array([_mean_excess_m(evidence, cell, domain) for cell in cells])
+        for method, cells in by_method.items()
+        for domain in DOMAINS
+    }
+    baseline = max(test.against, key=lambda method: float(means[method, "surrogate"].mean()))
+    ours, theirs = means[test.method, "deployed"], means[baseline, "deployed"]
+    found = permutation_test(ours, theirs)
+    off = [_off_track(evidence, by_method[name]) for name in (test.method, baseline)]
+    same = len(off[0]) == len(off[1])
+    return TestResult(
+        test,
+        baseline,
+        found.difference,
+        found.p,
+        None,
+        found.reason,
+        mcnemar_per_search(off[0], off[1]) if same else (),
+    )
+
+
+def _mean_excess_m(evidence: Evidence, cell: CellResult, domain: Domain) -> float:
+    return float(np.mean([outcome.excess_cte_m_per_tick for outcome in evidence.outcomes(cell, domain)]))
+
+
+def _off_track(evidence: Evidence, cells: Sequence[CellResult]) -> list[list[bool]]:
+    return [[outcome.off_track for outcome in evidence.outcomes(cell, "deployed")] for cell in cells]
+
+
+__all__ = ["DOMAINS", "Evidence", "Row", "TestResult", "as_data", "primary_tests", "rows"]

@@ -1,0 +1,70 @@
+"""The commands ``advnerf register`` and ``advnerf verify``: what will be run, and whether what was published is what it gave."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from nodes.cli.experiment import File, Folder, Only, Setting, load_cells
+from nodes.runtime.terminal import Overrides, say_error
+
+Published = Annotated[
+    Path, typer.Option("--in", help="Folder of all published sets.", exists=True, file_okay=False)
+]
+_FAILURE_EXIT = 1
+
+
+def register(
+    file: File,
+    setting: Setting = "full",
+    folder: Folder = None,
+    only: Only = "",
+    published: Published = Path("docs/results"),
+    overrides: Overrides = None,
+) -> None:
+    """Write down what an experiment will run, and which tests will be claimed, before anything is run."""
+    from advnerf_core.report.evidence.registration import FILE
+    from nodes.experiment.campaign.config import is_campaign
+    from nodes.experiment.registration import register as write_registration
+
+    campaign, _ = load_cells(file, setting, folder, overrides, only)
+    shown = "" if is_campaign(file) else setting
+    found = write_registration(campaign, shown, overrides or [], published)
+    print(f"{published / found.name / FILE}: {found.digest[:12]}")
+    print(
+        f"{len(found.cells)} cells, {len(found.scenarios)} scenarios, {len(found.primary)} primary tests; commit it, then run the experiment"
+    )
+
+
+def verify(
+    name: Annotated[
+        str | None, typer.Argument(metavar="SET", help="Name of a set.", show_default="all sets")
+    ] = None,
+    published: Published = Path("docs/results"),
+) -> None:
+    """Compute every published number again from the kept drives, and check digests, registration and completeness."""
+    from advnerf_core.report.evidence.verify import SetError, sets_in, verify_set
+
+    known = sets_in(published)
+    if name is not None and name not in known:
+        raise SetError(
+            f"expected a set of {', '.join(known) or 'none that is registered'} in {published}, got {name!r}"
+        )
+    wrong = 0
+    for each in [name] if name is not None else known:
+        found = verify_set(published / each)
+        wrong += len(found.problems)
+        verdict = "all as published" if not found.problems else f"{len(found.problems)} problems"
+        print(f"{found.name}: {found.numbers} numbers from {found.drives} drives: {verdict}")
+        for problem in found.problems:
+            say_error(problem)
+    if wrong:
+        raise typer.Exit(_FAILURE_EXIT)
+
+
+def add_to(app: typer.Typer) -> None:
+    """Add the commands."""
+    for command in (register, verify):
+        app.command()(command)

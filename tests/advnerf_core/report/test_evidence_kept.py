@@ -1,0 +1,41 @@
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from advnerf_core.driving.metrics import Horizon, drive_metrics
+from advnerf_core.driving.path import Path
+from advnerf_core.report.evidence.kept import KeptDrive
+
+SQUARE = Path.rounded_square(4.0, 1.0)
+HORIZON = Horizon(20, 0.1, 0.4)
+
+
+def drive(ticks=20):
+    states = SQUARE.pose_at(np.linspace(0.0, 3.0, ticks + 1))
+    states[:, 1] += np.linspace(0.0, 0.7, ticks + 1)
+    return states
+
+
+@pytest.mark.parametrize("stopped", [20, 7])
+def test_numbers_computed_from_what_is_kept_are_those_of_the_drive(stopped):
+    states = drive()
+    whole = drive_metrics(SQUARE, states, HORIZON, stopped)
+    kept = KeptDrive.of(states, len(whole.ctes_m) - whole.held_ticks, np.linspace(-1, 1, 20))
+    again = KeptDrive.model_validate_json(kept.model_dump_json()).metrics(SQUARE, HORIZON)
+    assert again.total_cte_m == pytest.approx(whole.total_cte_m, abs=20 * 1e-5)
+    assert (again.off_track, again.held_ticks) == (whole.off_track, whole.held_ticks)
+    np.testing.assert_allclose(kept.poses(), states[:, :3], atol=5.1e-6)
+
+
+def test_a_drive_takes_a_few_kilobytes():
+    assert len(KeptDrive.of(drive(), 20).model_dump_json()) < 1000
+
+
+@pytest.mark.parametrize(
+    "changed", [{"x_m": "1 2 nan"}, {"x_m": "1 two"}, {"driven_ticks": -1}, {"colour": 1}]
+)
+def test_what_is_no_drive_is_refused(changed):
+    with pytest.raises(ValidationError):
+        KeptDrive.model_validate({**KeptDrive.of(drive(), 20).model_dump(), **changed})
+    with pytest.raises(ValueError, match="of one length"):
+        KeptDrive(x_m="1 2", y_m="1", yaw_rad="1 2", driven_ticks=1).poses()

@@ -1,0 +1,144 @@
+"""A published set is verified from its files alone; what was changed in it is found."""
+
+import json
+import random
+import shutil
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from scipy import stats
+from typer.testing import CliRunner
+
+from advnerf_core.report.cells import read_cells
+from advnerf_core.report.evidence.registration import FILE, RegistrationError, read_registration
+from advnerf_core.report.evidence.results import Evidence, primary_tests, rows
+from advnerf_core.report.evidence.verify import DIGESTS, SET, SetError, sets_in, verify_set, write_set
+from benchmarks.planted_changes import CHANGES, write_simulated_set
+from nodes.cli.main import app
+
+
+@pytest.fixture(scope="module")
+def original(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("published") / "simulated"
+    write_simulated_set(folder)
+    return folder
+
+
+@pytest.fixture
+def copied(original, tmp_path):
+    shutil.copytree(original, tmp_path / "simulated")
+    shutil.copy(original.parent / DIGESTS, tmp_path / DIGESTS)
+    return tmp_path / "simulated"
+
+
+def evidence_of(folder):
+    return Evidence(read_registration(folder), read_cells(folder))
+
+
+def test_a_set_as_it_was_published_has_no_problem(original):
+    found = verify_set(original)
+    assert found.problems == ()
+    assert found.drives == 13 * 2 * 5  # none and two methods of six searches, two domains, five starts
+    assert found.numbers > 50
+
+
+@pytest.mark.parametrize("kind", CHANGES)
+@pytest.mark.parametrize("seed", range(3))
+def test_every_kind_of_change_is_found(copied, kind, seed):
+    CHANGES[kind](copied, random.Random(seed))
+    assert verify_set(copied).problems
+
+
+def test_a_missing_cell_and_a_strange_file_are_named(copied):
+    (copied / "track_hardened_gradient_3.json").unlink()
+    (copied / "track_hardened_gradient_4.json").rename(copied / "track_hardened_other_4.json")
+    problems = "\n".join(verify_set(copied).problems)
+    assert "track_hardened_gradient_3: was registered, and is not there" in problems
+    assert "track_hardened_other_4.json: is not listed" in problems
+
+
+def test_rows_are_metres_per_tick_over_the_same_starts(original):
+    evidence = evidence_of(original)
+    (row,) = [each for each in rows(evidence) if (each.method, each.domain) == ("gradient", "deployed")]
+    totals = [
+        (cell.deployed.total_cte_m, cell.deployed.none_total_cte_m)
+        for cell in read_cells(original)
+        if cell.method == "gradient"
+    ]
+    expected = np.mean([np.subtract(attacked, none) / 60 for attacked, none in totals])
+    assert row.excess_m == pytest.approx(expected, abs=1e-5)
+    assert row.low_m < row.excess_m < row.high_m
+    assert row.registered
+    (none,) = [each for each in rows(evidence) if (each.method, each.domain) == ("none", "deployed")]
+    assert none.excess_m == pytest.approx(np.mean(totals[0][1]) / 60, abs=1e-5)
+
+
+def test_the_primary_test_is_that_of_scipy(original):
+    evidence = evidence_of(original)
+    (found,) = primary_tests(evidence)
+    ours, theirs = (
+        [
+            np.mean([outcome.excess_cte_m_per_tick for outcome in evidence.outcomes(cell, "deployed")])
+            for cell in evidence.searches(("track", "", "hardened", method))
+        ]
+        for method in ("gradient", "random")
+    )
+    expected = stats.permutation_test(
+        (ours, theirs), lambda a, b, axis: a.mean(axis) - b.mean(axis), alternative="greater", vectorized=True
+    )
+    assert found.p == pytest.approx(expected.pvalue)
+    assert found.p_holm == found.p == pytest.approx(1 / 924)
+    assert found.baseline == "random"
+    assert len(found.mcnemar) == 6
+
+
+def test_what_was_not_registered_is_exploration(copied):
+    extra = json.loads((copied / "track_hardened_gradient_0.json").read_text())
+    extra |= {"method": "cem", "registration": ""}
+    (copied / "track_hardened_cem_0.json").write_text(json.dumps(extra))
+    write_set(copied)
+    assert verify_set(copied).problems == ()
+    last = rows(evidence_of(copied))[-1]
+    assert (last.method, last.registered) == ("cem", False)
+
+
+def test_a_set_that_contradicts_its_registration_is_not_written(copied):
+    file = copied / "track_hardened_random_2.json"
+    data = json.loads(file.read_text())
+    data["kept"]["deployed"] = data["kept"]["deployed"][:-1]
+    file.write_text(json.dumps(data))
+    with pytest.raises(SetError, match="expected drives from 5 registered starts, got 4"):
+        write_set(copied)
+
+
+def test_a_folder_without_registration_is_no_set(tmp_path, copied):
+    with pytest.raises(SetError, match="advnerf register"):
+        write_set(tmp_path)
+    (copied / FILE).write_text("{}")
+    with pytest.raises(RegistrationError, match="restore it from git"):
+        read_registration(copied)
+    assert "restore it from git" in verify_set(copied).problems[0]
+
+
+def test_the_command_verifies_all_sets_and_fails_where_one_is_wrong(copied):
+    def call(*arguments):
+        return CliRunner().invoke(app, ["verify", "--in", str(copied.parent), *arguments])
+
+    assert sets_in(copied.parent) == ["simulated"]
+    done = call()
+    assert done.exit_code == 0
+    assert "all as published" in done.output
+    (copied / SET).write_text((copied / SET).read_text().replace("gradient", "gradients", 1))
+    assert call("simulated").exit_code == 1
+    assert "expected a set of simulated" in str(call("other").exception)
+
+
+def test_verifying_needs_no_torch(original):
+    code = (
+        "import sys; sys.modules['torch'] = None\n"
+        "from pathlib import Path; from advnerf_core.report.evidence.verify import verify_set\n"
+        f"assert verify_set(Path({str(original)!r})).problems == ()"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
