@@ -22,9 +22,9 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from advnerf_core.attack.methods import alternatives, black_box_methods
 from advnerf_core.attack.problem import (
     AttackProblem,
+    BlackBoxError,
     RecurrentPolicy,
     SearchDivergedError,
     Sensor,
@@ -33,17 +33,12 @@ from advnerf_core.attack.problem import (
 )
 from advnerf_core.driving.dynamics import Dynamics
 from advnerf_core.driving.rollout import Rollout, drive
-from advnerf_core.errors import AdvnerfError
 from advnerf_core.scene.surrogate import Rendered
 
 __all__ = [
     "AdjointResult", "AttackProblem", "BlackBoxError", "RecurrentPolicy", "RenderCache", "Sensor", "Totals", "adjoint_gradient", "adjoint_states",
     "evaluate", "gradient_pass", "roll_out",
 ]  # fmt: skip
-
-
-class BlackBoxError(AdvnerfError, TypeError):
-    """A gradient was asked for of a policy that has none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,11 +149,7 @@ def adjoint_gradient(problem: AttackProblem, theta: Tensor) -> AdjointResult:
     Raises:
         BlackBoxError: The policy says that it has no gradient.
     """
-    if not problem.differentiable:
-        raise BlackBoxError(
-            "expected a policy with a gradient, got one that declares differentiable = False; search with the methods "
-            f"{alternatives(black_box_methods())} instead"
-        )
+    problem.require_gradient()
     theta = theta.detach()
     cache = RenderCache(problem.cache_bytes)
     rollout, memories = roll_out(problem, theta, cache)

@@ -55,7 +55,7 @@ class SearchSettings:
         learning_rate: Step of the method's optimiser; None for the method's own default.
         sigma: Spread of the method's candidates; None for the method's own default.
         population: Candidates of a generation.
-        cells: Cells along an edge of the coarse textures that a face is searched over; 0 for its own grid.
+        cells: Cells along an edge of coarse textures, where a method searches or draws these; 0 for the objects' own grids.
         probes: Pairs of textures asked about after each drive; None for the method's own default.
         warm_pairs: Pairs of a student's first lesson; None for the default.
         gradient_rate: Step of Adam along a gradient, where neither ``learning_rate`` nor the sensor says another one.
@@ -180,9 +180,15 @@ def _late(module: str, function: str = "search") -> Callable[..., Any]:
 METHODS: Mapping[str, Method] = MappingProxyType(
     {
         "random": Method(_late("random_search"), reads_scale=True),
+        "random_coarse": Method(_late("random_families", "search_coarse")),
+        "random_levels": Method(_late("random_families", "search_levels")),
+        "random_pink": Method(_late("random_families", "search_pink")),
+        "random_natural": Method(_late("random_families", "search_natural")),
         "cem": Method(_late("cem")),
         "evolution": Method(_late("evolution")),
         "gradient": Method(_late("gradient"), needs_gradient=True, reads_scale=True),
+        "gradient_coarse": Method(_late("gradient_coarse"), needs_gradient=True),
+        "frame": Method(_late("frame"), needs_gradient=True, single_images=True),
         "guided": Method(_late("guided"), single_images=True, evaluations=_late("guided", "evaluations")),
         "distilled": Method(
             _late("distilled"), single_images=True, evaluations=_late("distilled", "evaluations")

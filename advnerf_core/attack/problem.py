@@ -10,12 +10,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from advnerf_core.attack.methods import alternatives, black_box_methods
 from advnerf_core.attack.robustness import Disturbances, PosedSensor
 from advnerf_core.driving.cross_track import cross_track
 from advnerf_core.driving.dynamics import Dynamics
 from advnerf_core.driving.metrics import LAB_OFF_TRACK_M, DriveMetrics, Horizon, drive_metrics
 from advnerf_core.driving.path import Path
 from advnerf_core.errors import AdvnerfError
+from advnerf_core.fields.coloured import ColouredObject
 from advnerf_core.scene.surrogate import Rendered
 
 Regulariser = Callable[[Tensor], tuple[float, Tensor]]
@@ -24,6 +26,14 @@ Regulariser = Callable[[Tensor], tuple[float, Tensor]]
 
 class SearchDivergedError(AdvnerfError, ArithmeticError):
     """A drive, loss or gradient is not finite."""
+
+
+class BlackBoxError(AdvnerfError, TypeError):
+    """A gradient was asked for of a policy that has none."""
+
+
+class NoColoursError(AdvnerfError, TypeError):
+    """A search that needs colours was given other parameters."""
 
 
 class Sensor(Protocol):
@@ -38,6 +48,18 @@ class Sensor(Protocol):
 
     def sense(self, states: Tensor, theta: Tensor) -> Rendered:
         """Images at detached states ``[B, n]`` and parameters ``theta`` (``theta_shape``), with their vjp."""
+
+
+@runtime_checkable
+class ColouringSensor(Protocol):
+    """A sensor whose theta are the colours of objects, in their order, as a ``Surrogate``'s."""
+
+    @property
+    def objects(self) -> Sequence[ColouredObject]:
+        """The objects; one, or several."""
+
+    def plain_theta(self) -> Tensor:
+        """Their colours without an attack, ``theta_shape``."""
 
 
 @runtime_checkable
@@ -127,6 +149,31 @@ class AttackProblem:
     def differentiable(self) -> bool:
         """Whether the policy has a gradient; one without declares ``differentiable = False``."""
         return bool(getattr(self.policy, "differentiable", True))
+
+    def require_gradient(self) -> None:
+        """Refuse a policy without a gradient.
+
+        Raises:
+            BlackBoxError: The policy says that it has none.
+        """
+        if not self.differentiable:
+            raise BlackBoxError(
+                "expected a policy with a gradient, got one that declares differentiable = False; search with the methods "
+                f"{alternatives(black_box_methods())} instead"
+            )
+
+    def coloured(self, method: str) -> ColouringSensor:
+        """The sensor, which must show colours for a method to search them.
+
+        Raises:
+            NoColoursError: Its theta is something else, such as shapes or places.
+        """
+        if not isinstance(self.sensor, ColouringSensor):
+            raise NoColoursError(
+                f"expected colours of objects for the method {method}, got the parameters of a {type(self.sensor).__name__}; "
+                "use the methods random or gradient"
+            )
+        return self.sensor
 
     def sense(self, ticks: Sequence[int], states: Tensor, theta: Tensor) -> Rendered:
         """What the policy sees at some ticks of a drive.

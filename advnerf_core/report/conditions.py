@@ -24,7 +24,7 @@ class Style:
         key: Name of its colour in the palettes, and of the page's CSS variable.
         light: Colour on a light page, ``#rrggbb``.
         dark: Colour on a dark page, ``#rrggbb``.
-        marker: Marker of matplotlib.
+        marker: Marker of matplotlib: a name, or corners, kind (0: polygon, 1: star) and angle [deg].
         climbs: Whether each evaluation of its search starts from the one before, so that a line joins them; else they are dots.
     """
 
@@ -32,7 +32,7 @@ class Style:
     key: str
     light: str
     dark: str
-    marker: str
+    marker: str | tuple[int, int, int]
     climbs: bool = False
 
 
@@ -44,9 +44,15 @@ def _rows(*styles: Style) -> Mapping[str, Style]:
 CONDITIONS: Mapping[str, Style] = _rows(
     Style("no attack", NONE, "#0072b2", "#4fb0f2", "o"),
     Style("best random", "random", "#dd9300", "#f7cc5a", "s"),
+    Style("random, coarse", "random_coarse", "#63470b", "#e99835", (4, 1, 0)),
+    Style("random, levels", "random_levels", "#5a5841", "#b8ad79", (4, 1, 45)),
+    Style("random, 1/f", "random_pink", "#73852d", "#acbe54", (6, 1, 0)),
+    Style("random, natural", "random_natural", "#bdcb58", "#e4eba3", (8, 1, 0)),
     Style("cross-entropy", "cem", "#7a3f98", "#a05ad2", "v"),
     Style("evolution strategy", "evolution", "#006b70", "#2fe0d2", "P"),
     Style("gradient", "gradient", "#b0123c", "#f4577a", "^", climbs=True),
+    Style("gradient, coarse", "gradient_coarse", "#671c44", "#b7625b", (3, 1, 0), climbs=True),
+    Style("frames alone", "frame", "#591600", "#de3512", (7, 0, 0), climbs=True),
     Style("guided", "guided", "#ef7fb8", "#ffc2e2", "X", climbs=True),
     Style("distilled", "distilled", "#b5895f", "#a87545", "*", climbs=True),
     Style("empty scene", "empty", "#7d848d", "#8f98a3", "D"),

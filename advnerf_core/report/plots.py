@@ -100,9 +100,10 @@ def loss_curves(data: ReportData, victim: Victim = "hardened") -> Figure:
             x, style = np.arange(1, len(curve.total_cte_m) + 1), style_of(curve.method)
             if style.climbs:
                 ax.plot(x, curve.total_cte_m, color=style.light)
-                ax.plot(x[-1], curve.total_cte_m[-1], style.marker, ms=5, color=style.light)
+                ax.plot(x[-1], curve.total_cte_m[-1], marker=style.marker, ms=5, color=style.light)
             else:
-                ax.plot(x, curve.total_cte_m, style.marker, ms=2.4, alpha=0.55, mew=0, color=style.light)
+                dots = {"marker": style.marker, "ls": "none", "ms": 2.4, "alpha": 0.55, "mew": 0}
+                ax.plot(x, curve.total_cte_m, color=style.light, **dots)
                 ax.plot(
                     x, np.maximum.accumulate(curve.total_cte_m), drawstyle="steps-post", color=style.light
                 )
@@ -112,7 +113,7 @@ def loss_curves(data: ReportData, victim: Victim = "hardened") -> Figure:
         ):
             style = style_of(method)
             text = f"{method}, one line per seed" if style.climbs else f"{method}: each texture, best so far"
-            marker = None if style.climbs else style.marker
+            marker: Any = None if style.climbs else style.marker
             handles.append(Line2D([], [], color=style.light, label=text, marker=marker, ms=2.4))
         if clean:
             handles.append(

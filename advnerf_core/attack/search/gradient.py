@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from advnerf_core.attack.adjoint import AttackProblem, adjoint_gradient
+from advnerf_core.attack.adjoint import AttackProblem, Totals, adjoint_gradient
 from advnerf_core.attack.methods import SearchRun, SearchSettings
+from advnerf_core.attack.search.population import Coarse
 from advnerf_core.attack.search.search import (
     OnEvaluation,
     SearchDivergedError,
@@ -57,33 +61,99 @@ def gradient_attack(
         on_evaluation: Called after every iteration.
         settings_hash: Hash of scene, policy and configuration; a state file of another one is refused.
     """
-    if iterations < 1:
-        raise ValueError(f"expected at least one iteration, got {iterations}")
-    shape = problem.sensor.theta_shape
+    run = SearchRun(seed, state_path, on_evaluation, settings_hash)
+    return climb(problem, adjoint_slope, iterations, learning_rate, run, method="gradient")
+
+
+@dataclass(frozen=True, eq=False)
+class Slope:
+    """One evaluation of a search along a gradient.
+
+    Attributes:
+        loss_m: Loss of the closed-loop drive [m].
+        totals: Of the same drive.
+        gradient: Against which theta moves, ``theta_shape``.
+    """
+
+    loss_m: float
+    totals: Totals
+    gradient: Tensor
+
+
+SlopeOf = Callable[[AttackProblem, Tensor], Slope]
+"""Evaluates a theta in a problem whose disturbances are drawn."""
+
+
+def adjoint_slope(problem: AttackProblem, theta: Tensor) -> Slope:
+    """The loss with its adjoint gradient."""
+    result = adjoint_gradient(problem, theta)
+    return Slope(result.loss, result.totals, result.gradient)
+
+
+def climb(
+    problem: AttackProblem,
+    slope_of: SlopeOf,
+    evaluations: int,
+    learning_rate: float,
+    run: SearchRun,
+    cells: int = 0,
+    **settings: Any,
+) -> SearchResult:
+    """Follow a gradient with Adam from the sensor's start, and keep the best theta by predicted total CTE.
+
+    Args:
+        problem: What is attacked.
+        slope_of: Gives drive and gradient.
+        evaluations: In all, those of a resumed state included.
+        learning_rate: Of Adam.
+        run: Seed of the starting noise, state file and callback.
+        cells: Of the coarse texture that is searched instead of theta, see `Coarse`; 0 searches theta.
+        settings: What else a state file must agree in, the method's name among it.
+
+    Raises:
+        SearchDivergedError: A loss or gradient is not finite.
+    """
+    if evaluations < 1:
+        raise ValueError(f"expected at least one iteration, got {evaluations}")
+    if cells:
+        settings["cells"] = cells
+    coarse = Coarse(tuple(problem.sensor.theta_shape), cells)
     fingerprint = search_fingerprint(
-        problem, shape, method="gradient", seed=seed, learning_rate=learning_rate, hash=settings_hash
+        problem,
+        coarse.theta_shape,
+        seed=run.seed,
+        learning_rate=learning_rate,
+        hash=run.settings_hash,
+        **settings,
     )
-    start = torch.Generator().manual_seed(seed)
-    state = begin(state_path, fingerprint, lambda: {"theta": problem.sensor.initial_theta(start)})
-    theta, adam = _adam(state, learning_rate)
-    while len(state.history) < iterations:
-        began = time.perf_counter()
-        result = adjoint_gradient(problem.at_draw(len(state.history)), theta)
-        if not (math.isfinite(result.loss) and bool(torch.isfinite(result.gradient).all())):
-            raise SearchDivergedError(
-                f"expected a finite loss and gradient at iteration {len(state.history)}, got loss {result.loss}; "
-                "check the policy and the scene for NaN"
-            )
-        evaluated = theta.detach().clone()
-        theta.grad = result.gradient
+    start = torch.Generator().manual_seed(run.seed)
+    state = begin(
+        run.state_path, fingerprint, lambda: {"theta": coarse.sampled(problem.sensor.initial_theta(start))}
+    )
+    searched, adam = _adam(state, learning_rate)
+    while len(state.history) < evaluations:
+        began, number = time.perf_counter(), len(state.history)
+        theta = coarse.expand(searched.detach())
+        slope = slope_of(problem.at_draw(number), theta)
+        _check_finite(slope, number)
+        evaluated = theta.clone()  # before Adam changes it in place
+        searched.grad = coarse.gathered(slope.gradient)
         adam.step()
-        evaluation = state.record(evaluated, result.loss, result.totals, time.perf_counter() - began)
-        state.tensors = _tensors(theta, adam)
-        if state_path is not None:
-            state.save(state_path, fingerprint)
-        if on_evaluation is not None:
-            on_evaluation(evaluation)
+        evaluation = state.record(evaluated, slope.loss_m, slope.totals, time.perf_counter() - began)
+        state.tensors = _tensors(searched, adam)
+        if run.state_path is not None:
+            state.save(run.state_path, fingerprint)
+        if run.on_evaluation is not None:
+            run.on_evaluation(evaluation)
     return state.result()
+
+
+def _check_finite(slope: Slope, number: int) -> None:
+    if not (math.isfinite(slope.loss_m) and bool(torch.isfinite(slope.gradient).all())):
+        raise SearchDivergedError(
+            f"expected a finite loss and gradient at iteration {number}, got loss {slope.loss_m}; "
+            "check the policy and the scene for NaN"
+        )
 
 
 def _adam(state: SearchState, learning_rate: float) -> tuple[Tensor, torch.optim.Adam]:

@@ -56,6 +56,23 @@ class Coarse:
         images = coarse.permute(2, 0, 1)[None]
         return torch.nn.functional.interpolate(images, size, mode="bilinear")[0].permute(1, 2, 0).contiguous()
 
+    def sampled(self, theta: Tensor) -> Tensor:
+        """The coarse texture with the values that theta has in the middle of its cells; what has one colour keeps it."""
+        if self.shape == self.theta_shape:
+            return theta
+        images = theta.permute(2, 0, 1)[None]
+        small = torch.nn.functional.interpolate(images, self.shape[:2], mode="nearest-exact")
+        return small[0].permute(1, 2, 0).contiguous()
+
+    def gathered(self, gradient: Tensor) -> Tensor:
+        """The gradient with respect to the coarse texture of what has this one with respect to theta."""
+        if self.shape == self.theta_shape:
+            return gradient
+        with torch.enable_grad():
+            coarse = gradient.new_zeros(self.shape).requires_grad_()
+            (gathered,) = torch.autograd.grad(self.expand(coarse), coarse, gradient)
+        return gathered
+
 
 class Strategy(Protocol):
     """How candidates are drawn, and what is learned from them; everything it knows is in tensors."""

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import torch
+from torch import Tensor
 
 from advnerf_core.attack.adjoint import AttackProblem
 from advnerf_core.attack.methods import SearchRun, SearchSettings
@@ -51,18 +54,41 @@ def random_search(
         on_evaluation: Called after every evaluation.
         settings_hash: Hash of scene, policy and configuration; a state file of another one is refused.
     """
+    run = SearchRun(seed, state_path, on_evaluation, settings_hash)
+    shape = problem.sensor.theta_shape
+
+    def draw(generator: torch.Generator) -> Tensor:
+        return sigma * torch.randn(shape, generator=generator)
+
+    return best_drawn(problem, draw, evaluations, run, method="random", sigma=sigma)
+
+
+def best_drawn(
+    problem: AttackProblem,
+    draw: Callable[[torch.Generator], Tensor],
+    evaluations: int,
+    run: SearchRun,
+    **settings: Any,
+) -> SearchResult:
+    """Evaluate thetas that are drawn one after the other, and keep the best.
+
+    Args:
+        problem: What is attacked.
+        draw: Draws one; all its randomness is the generator's.
+        evaluations: Thetas in all, those of a resumed state included.
+        run: Seed, state file and callback.
+        settings: What a state file must agree in: the method's name, and all that ``draw`` depends on.
+    """
     if evaluations < 1:
         raise ValueError(f"expected at least one evaluation, got {evaluations}")
-    shape = problem.sensor.theta_shape
     fingerprint = search_fingerprint(
-        problem, shape, method="random", seed=seed, sigma=sigma, hash=settings_hash
+        problem, problem.sensor.theta_shape, seed=run.seed, hash=run.settings_hash, **settings
     )
-    generator = torch.Generator().manual_seed(seed)
-    state = begin(state_path, fingerprint, lambda: {"generator": generator.get_state()})
+    generator = torch.Generator().manual_seed(run.seed)
+    state = begin(run.state_path, fingerprint, lambda: {"generator": generator.get_state()})
     generator.set_state(state.tensors["generator"])
-    run = SearchRun(seed, state_path, on_evaluation, settings_hash)
     while len(state.history) < evaluations:
-        theta = sigma * torch.randn(shape, generator=generator)
+        theta = draw(generator)
         state.tensors["generator"] = generator.get_state()
         evaluate_theta(problem, theta, state, run, fingerprint)
     return state.result()

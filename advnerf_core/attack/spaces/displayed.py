@@ -6,15 +6,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
 
-from advnerf_core.attack.problem import Sensor
+from advnerf_core.attack.problem import ColouringSensor, Sensor
 from advnerf_core.attack.robustness import PosedSensor
 from advnerf_core.display import DARKEST, DisplayModel
+from advnerf_core.fields.coloured import ColouredObject
 from advnerf_core.geometry import Array
 from advnerf_core.scene.surrogate import Rendered
 
@@ -56,6 +57,15 @@ class DisplayedSensor:
         """Of the sensor behind it."""
         return self.sensor.theta_shape
 
+    @property
+    def objects(self) -> Sequence[ColouredObject]:
+        """Of the sensor behind it, which must have them (`ColouringSensor`)."""
+        return self._coloured.objects
+
+    def plain_theta(self) -> Tensor:
+        """Showing the plain colours of the sensor behind it, as `initial_theta` does."""
+        return self._coloured.plain_theta()
+
     def initial_theta(self, generator: torch.Generator) -> Tensor:
         """Where an attack starts: showing what the sensor behind it starts with."""
         return self.sensor.initial_theta(generator)
@@ -75,6 +85,14 @@ class DisplayedSensor:
     def render(self, T_world_from_camera: Array, theta: Tensor) -> Rendered:
         """The same as `sense` at camera poses ``[B, 4, 4]``."""
         return self._shown(lambda seen: self._posed.render(T_world_from_camera, seen), theta)
+
+    @property
+    def _coloured(self) -> ColouringSensor:
+        if not isinstance(self.sensor, ColouringSensor):
+            raise TypeError(
+                f"expected a sensor with objects and plain_theta, got {type(self.sensor).__name__}"
+            )
+        return self.sensor
 
     @property
     def _posed(self) -> PosedSensor:

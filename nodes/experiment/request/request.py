@@ -190,16 +190,16 @@ class SearchRequest(_Section):
     )
     learning_rate: AboveZero | None = Field(
         default=None,
-        description="Of Adam: 0.1 for gradient and distilled, 0.3 for guided, 0.5 for evolution, if not given.",
+        description="Of Adam: 0.1 for gradient, gradient_coarse, frame and distilled, 0.3 for guided, 0.5 for evolution, if not given.",
     )
     sigma: AboveZero | None = Field(
         default=None,
-        description="Spread of theta: 5 for random, 3 to begin with for cem, 1 for evolution, if not given.",
+        description="Spread of theta: 5 for random and its families, 3 to begin with for cem, 1 for evolution, if not given.",
     )
     population: Annotated[int, Field(ge=4)] = Field(default=10, description="Candidates of a generation.")
     cells: Annotated[int, Field(ge=0)] = Field(
         default=8,
-        description="Cells along an edge that cem, evolution and guided search over; 0 for the face's own.",
+        description="Cells along an edge of coarse textures (cem, evolution, guided, gradient_coarse, random_coarse); 0 for the face's own.",
     )
     probes: Count | None = Field(
         default=None,

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from advnerf_core.attack.adjoint import evaluate
 from advnerf_core.attack.methods import (
     METHODS,
     Method,
@@ -23,14 +24,17 @@ from advnerf_core.attack.methods import (
     method_names,
     require_method,
 )
+from advnerf_core.attack.search import textures
 from advnerf_core.attack.search.black_box import BlackBoxSearch, BudgetError, black_box_attack
 from advnerf_core.attack.search.cem import CrossEntropy
 from advnerf_core.attack.search.distil import Distillation
 from advnerf_core.attack.search.evolution import Evolution
-from advnerf_core.attack.search.gradient import gradient_attack
+from advnerf_core.attack.search.frame import CleanFrames, better_side
+from advnerf_core.attack.search.gradient import Slope, adjoint_slope, climb, gradient_attack
 from advnerf_core.attack.search.population import population_search
-from advnerf_core.attack.search.random_search import random_search
+from advnerf_core.attack.search.random_search import best_drawn, random_search
 from advnerf_core.attack.search.search import SearchStateError, gradient_step, random_spread
+from advnerf_core.fields.colour_grid import colour_grid
 from advnerf_core.objects.mesh.field import MeshField
 from advnerf_core.objects.mesh.shape import ShapeLimits, ShapeSensor
 from advnerf_core.objects.mesh.surface import sphere, unwrapped
@@ -52,11 +56,34 @@ def problem():
 def by_hand(problem):
     """What each method is, said with its own function and defaults."""
     black_box = {"cells": 2, "distillation": LESSONS}
+    (only,) = problem.sensor.objects
+    run = SearchRun(seed=3)
+
+    def family(name, draw):
+        return best_drawn(
+            problem, lambda g: 5.0 * draw(colour_grid(only), g).reshape(4, 4, 3), 4, run, method=name
+        )
+
+    def frames():
+        looked = CleanFrames(problem, problem.sensor.plain_theta())
+        side = better_side(looked, problem.sensor.initial_theta(torch.Generator().manual_seed(3)))
+
+        def slope(drawn, theta):
+            return Slope(0.0, evaluate(drawn, theta)[1], -side * looked.deviation(theta)[1])
+
+        return climb(problem, slope, 4, 0.1, run, method="frame")
+
     return {
         "random": lambda: random_search(problem, 4, 5.0, seed=3),
+        "random_coarse": lambda: family("random_coarse", textures.coarse(2)),
+        "random_levels": lambda: family("random_levels", textures.levels),
+        "random_pink": lambda: family("random_pink", textures.pink),
+        "random_natural": lambda: family("random_natural", textures.natural),
         "cem": lambda: population_search(problem, CrossEntropy(3.0), 4, 4, 2, seed=3),
         "evolution": lambda: population_search(problem, Evolution(1.0, 0.5), 4, 4, 2, seed=3),
         "gradient": lambda: gradient_attack(problem, 4, 0.1, seed=3),
+        "gradient_coarse": lambda: climb(problem, adjoint_slope, 4, 0.1, run, 2, method="gradient_coarse"),
+        "frame": frames,
         # 4 evaluations of 2 starts and 2 ticks: 16 calls. 4 for the first lesson, 12 for a drive with one pair of questions.
         "guided": lambda: black_box_attack(
             problem, BlackBoxSearch("guided", 0.3, 1, **black_box), 16, seed=3
@@ -132,9 +159,10 @@ def test_names_and_needs_are_known_without_torch():
 
 
 def test_methods_without_a_gradient():
-    assert black_box_methods() == ("random", "cem", "evolution", "guided", "distilled")
-    assert black_box_methods(stateless=False) == ("random", "cem", "evolution")
-    assert alternatives(black_box_methods(stateless=False)) == "random, cem or evolution"
+    drawn = ("random", "random_coarse", "random_levels", "random_pink", "random_natural")
+    assert black_box_methods() == (*drawn, "cem", "evolution", "guided", "distilled")
+    assert black_box_methods(stateless=False) == (*drawn, "cem", "evolution")
+    assert alternatives(black_box_methods(stateless=False)) == f"{', '.join(drawn)}, cem or evolution"
     assert alternatives(["random"]) == "random"
 
 

@@ -1,0 +1,57 @@
+"""Random textures with a structure in space: the methods ``random_coarse``, ``random_levels``, ``random_pink`` and ``random_natural``.
+
+They are ``random`` with other pictures: as many evaluations, the same spread of theta, the best is kept. So a gradient that beats ``random`` cannot owe it
+to smoothness, to large areas of one colour, or to edges alone.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from advnerf_core.attack.methods import SearchRun, SearchSettings
+from advnerf_core.attack.problem import AttackProblem
+from advnerf_core.attack.search import textures
+from advnerf_core.attack.search.random_search import best_drawn
+from advnerf_core.attack.search.search import SearchResult, random_spread
+from advnerf_core.fields.colour_grid import colour_grid
+
+
+def search_coarse(problem: AttackProblem, settings: SearchSettings, run: SearchRun) -> SearchResult:
+    """The method ``random_coarse``, as `advnerf_core.attack.methods` has it."""
+    family = textures.coarse(settings.cells)
+    return _search("random_coarse", family, problem, settings, run, cells=settings.cells)
+
+
+def search_levels(problem: AttackProblem, settings: SearchSettings, run: SearchRun) -> SearchResult:
+    """The method ``random_levels``, as `advnerf_core.attack.methods` has it."""
+    return _search("random_levels", textures.levels, problem, settings, run)
+
+
+def search_pink(problem: AttackProblem, settings: SearchSettings, run: SearchRun) -> SearchResult:
+    """The method ``random_pink``, as `advnerf_core.attack.methods` has it."""
+    return _search("random_pink", textures.pink, problem, settings, run)
+
+
+def search_natural(problem: AttackProblem, settings: SearchSettings, run: SearchRun) -> SearchResult:
+    """The method ``random_natural``, as `advnerf_core.attack.methods` has it."""
+    return _search("random_natural", textures.natural, problem, settings, run)
+
+
+def _search(
+    method: str,
+    family: textures.Family,
+    problem: AttackProblem,
+    settings: SearchSettings,
+    run: SearchRun,
+    **own: Any,
+) -> SearchResult:
+    grids = [colour_grid(field) for field in problem.coloured(method).objects]
+    shape, sigma = problem.sensor.theta_shape, random_spread(problem, settings)
+
+    def draw(generator: torch.Generator) -> Tensor:
+        return sigma * torch.cat([family(grid, generator) for grid in grids]).reshape(shape)
+
+    return best_drawn(problem, draw, settings.evaluations, run, method=method, sigma=sigma, **own)
