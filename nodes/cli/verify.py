@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -29,9 +30,9 @@ def register(
     from nodes.experiment.campaign.config import is_campaign
     from nodes.experiment.registration import register as write_registration
 
-    campaign, _ = load_cells(file, setting, folder, overrides, only)
+    campaign, cells = load_cells(file, setting, folder, overrides, only)
     shown = "" if is_campaign(file) else setting
-    found = write_registration(campaign, shown, overrides or [], published)
+    found = write_registration(replace(campaign, cells=tuple(cells)), shown, overrides or [], published)
     print(f"{published / found.name / FILE}: {found.digest[:12]}")
     print(
         f"{len(found.cells)} cells, {len(found.scenarios)} scenarios, {len(found.primary)} primary tests; commit it, then run the experiment"
