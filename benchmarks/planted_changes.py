@@ -30,7 +30,15 @@ from advnerf_core.report.evidence.registration import (
     RegisteredScenario,
     Registration,
 )
-from advnerf_core.report.evidence.verify import DIGESTS, SET, digests_of, sha256_of, verify_set, write_set
+from advnerf_core.report.evidence.verify import (
+    DIGESTS,
+    PAGE,
+    SET,
+    digests_of,
+    sha256_of,
+    verify_set,
+    write_set,
+)
 from benchmarks.results import record_row
 
 PUBLISHED = Path("docs/results")
@@ -47,7 +55,8 @@ def main() -> None:
         original = Path(work) / "published" / (arguments.set or "simulated")
         if arguments.set:
             shutil.copytree(PUBLISHED / arguments.set, original)
-            shutil.copy(PUBLISHED / DIGESTS, original.parent / DIGESTS)
+            for beside in (DIGESTS, PAGE):
+                shutil.copy(PUBLISHED / beside, original.parent / beside)
         else:
             write_simulated_set(original)
         began = time.perf_counter()
@@ -74,7 +83,8 @@ def planted(original: Path, count: int, work: Path, seed: int = 0) -> dict[str, 
         shutil.rmtree(work, ignore_errors=True)
         folder = work / original.name
         shutil.copytree(original, folder)
-        shutil.copy(original.parent / DIGESTS, work / DIGESTS)
+        for beside in (DIGESTS, PAGE):
+            shutil.copy(original.parent / beside, work / beside)
         CHANGES[kind](folder, rng)
         if not verify_set(folder).problems:
             missed[kind] = missed.get(kind, 0) + 1

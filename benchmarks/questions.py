@@ -64,7 +64,7 @@ QUESTIONS = (
         "statistics",
         "Are the intervals and tests right?",
         "Coverage of intervals and error rates of tests on simulated drives whose true effect is known.",
-        ("coverage",),
+        ("coverage", "planted_changes"),
     ),
     Question(
         "junction",

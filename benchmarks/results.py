@@ -113,6 +113,8 @@ def _index_page(answered: dict[Question, list[dict[str, Any]]]) -> str:
     head = (
         "# Measured results\n\nEvery figure was written by the command beside it, on the machine and day that its row names. A row that "
         "misses its target stays, with the reason. The rows are in `results.json`; `python -m benchmarks.results` makes these pages.\n\n"
+        "Registered results, in metres and with intervals, are on a page of their own: [Does it transfer?](results/transfer.md). What was not run at "
+        "all is on [What was and was not run](was_not_run.md).\n\n"
         "| question | rows | with a target | missed |\n|---|---|---|---|\n"
     )
     lines = [

@@ -182,7 +182,9 @@ def primary_tests(evidence: Evidence) -> list[TestResult]:
 
 def as_data(evidence: Evidence) -> dict[str, Any]:
     """All published numbers as JSON data."""
+    through = {str(cell.extra.get("deployed_through", "simulation")) for cell in evidence.cells.values()}
     return {
+        "deployed_through": sorted(through),
         "rows": [vars(row) for row in rows(evidence)],
         "primary": [
             {

@@ -19,6 +19,7 @@ from advnerf_core.errors import AdvnerfError
 from advnerf_core.files import write_atomically
 from advnerf_core.report.cells import CellError, CellResult, cell_name, read_cell
 from advnerf_core.report.evidence.kept import KeptDrive
+from advnerf_core.report.evidence.page import picture_of, results_page
 from advnerf_core.report.evidence.registration import (
     FILE,
     RegisteredScenario,
@@ -29,7 +30,7 @@ from advnerf_core.report.evidence.registration import (
 from advnerf_core.report.evidence.results import DOMAINS, Evidence, as_data
 from advnerf_core.report.reference import Domain
 
-SET, DIGESTS, FORMAT = "set/set.json", "sets.json", "advnerf-set-1"
+SET, DIGESTS, PAGE, FORMAT = "set/set.json", "sets.json", "transfer.md", "advnerf-set-1"
 # Kept poses are rounded; a total of some hundred ticks then differs by less.
 _TOTAL_TOLERANCE_M = 2e-3
 # A surrogate drive begins at its start to the bit. Live, a car is put down so well [m, rad].
@@ -63,13 +64,14 @@ def sets_in(published: Path) -> list[str]:
 
 
 def write_set(folder: Path) -> Path:
-    """Write the manifest and the numbers of a set, and its digest beside its folder.
+    """Write the manifest, the numbers and the picture of a set; beside its folder its digest, and the page of all sets.
 
     Raises:
         SetError: Nothing was registered there, or its cells contradict the registration.
     """
     registration, cells = _read(folder)
-    problems = list(_against_registration(Evidence(registration, cells), cells))
+    evidence = Evidence(registration, cells)
+    problems = list(_against_registration(evidence, cells))
     if problems:
         raise SetError(f"{folder}: cannot be published: {problems[0]} ({len(problems)} problems in all)")
     data = {
@@ -77,12 +79,19 @@ def write_set(folder: Path) -> Path:
         "name": registration.name,
         "registration": registration.digest,
         "files": digests_of(folder),
-        **as_data(Evidence(registration, cells)),
+        **as_data(evidence),
     }
     write_atomically(folder / SET, json.dumps(data, indent=1) + "\n")
+    from advnerf_core.report.evidence.plot import (
+        excess_plot,  # they load matplotlib, which verifying does not need
+    )
+    from advnerf_core.report.plots import write_png
+
     known = _known_digests(folder.parent)
     known[folder.name] = sha256_of(folder / SET)
     write_atomically(folder.parent / DIGESTS, json.dumps(known, indent=1, sort_keys=True) + "\n")
+    write_png(excess_plot(evidence), folder.parent / picture_of(folder.name), dpi=110)
+    write_atomically(folder.parent / PAGE, _page(folder.parent))
     return folder / SET
 
 
@@ -102,8 +111,23 @@ def verify_set(folder: Path) -> Verified:
     if not problems:  # numbers of damaged drives say nothing more
         numbers, wrong = _numbers(folder, evidence)
         problems += wrong
+        page = folder.parent / PAGE
+        if not page.exists() or page.read_text(encoding="utf-8") != _page(folder.parent):
+            problems.append(f"{page}: is not the page of the published sets")
     drives = sum(len(kept) for cell in cells for kept in cell.kept.values())
     return Verified(folder.name, numbers, drives, tuple(problems))
+
+
+def _page(published: Path) -> str:
+    """The page of all sets, from their manifests and registrations."""
+    sets = {}
+    for name in sets_in(published):
+        registration = read_registration(published / name)
+        if registration is not None and (published / name / SET).exists():
+            registered = {**registration.model_dump(mode="json"), "digest": registration.digest}
+            data = json.loads((published / name / SET).read_text(encoding="utf-8"))
+            sets[name] = {**data, "registered": registered}
+    return results_page(sets)
 
 
 def _read(folder: Path) -> tuple[Registration, list[CellResult]]:
@@ -245,6 +269,10 @@ def _numbers(folder: Path, evidence: Evidence) -> tuple[int, list[str]]:
     published = json.loads((folder / SET).read_text(encoding="utf-8"))
     found = json.loads(json.dumps(as_data(evidence)))
     count, wrong = 0, []
+    if published["deployed_through"] != found["deployed_through"]:
+        wrong.append(
+            f"{SET}: expected drives deployed through {found['deployed_through']}, got {published['deployed_through']}"
+        )
     for part in ("rows", "primary"):
         if len(published[part]) != len(found[part]):
             wrong.append(f"{SET}, {part}: expected {len(found[part])}, got {len(published[part])}")

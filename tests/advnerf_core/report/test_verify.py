@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from advnerf_core.report.cells import read_cells
 from advnerf_core.report.evidence.registration import FILE, RegistrationError, read_registration
 from advnerf_core.report.evidence.results import Evidence, primary_tests, rows
-from advnerf_core.report.evidence.verify import DIGESTS, SET, SetError, sets_in, verify_set, write_set
+from advnerf_core.report.evidence.verify import DIGESTS, PAGE, SET, SetError, sets_in, verify_set, write_set
 from benchmarks.planted_changes import CHANGES, write_simulated_set
 from nodes.cli.main import app
 
@@ -29,7 +29,8 @@ def original(tmp_path_factory):
 @pytest.fixture
 def copied(original, tmp_path):
     shutil.copytree(original, tmp_path / "simulated")
-    shutil.copy(original.parent / DIGESTS, tmp_path / DIGESTS)
+    for beside in (DIGESTS, PAGE, "simulated_excess.png"):
+        shutil.copy(original.parent / beside, tmp_path / beside)
     return tmp_path / "simulated"
 
 
@@ -92,6 +93,16 @@ def test_the_primary_test_is_that_of_scipy(original):
     assert found.p_holm == found.p == pytest.approx(1 / 924)
     assert found.baseline == "random"
     assert len(found.mcnemar) == 6
+
+
+def test_the_page_says_it_in_two_sentences_and_a_changed_page_is_found(copied):
+    page = copied.parent / PAGE
+    text = page.read_text()
+    assert "of 30 drives leave the track" in text
+    assert "p = 0.0011 after Holm's adjustment" in text
+    assert (copied.parent / "simulated_excess.png").stat().st_size > 10_000
+    page.write_text(text.replace("of 30 drives", "of 29 drives"))
+    assert verify_set(copied).problems == (f"{page}: is not the page of the published sets",)
 
 
 def test_what_was_not_registered_is_exploration(copied):

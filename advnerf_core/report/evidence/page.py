@@ -1,0 +1,139 @@
+"""The page of registered results: for each set a picture, two sentences, the table in metres, and how to run it again."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from advnerf_core.report.conditions import NONE, style_of
+
+_HEAD = """# Does it transfer?
+
+Attacks are found in a learned copy of a place, then driven where they are deployed. The numbers
+are metres: excess |CTE| per tick is the mean |CTE| of a drive with the attack minus that of the
+drive without it from the same start. All of it was registered before it was run, and
+`advnerf verify` computes it again from the drives that are kept. What is registered, kept and
+tested is explained in [evidence.md](../evidence.md).
+"""
+_COLUMNS = (
+    "victim",
+    "object shows",
+    "driven in",
+    "searches x starts",
+    "excess [m per tick]",
+    "95 %",
+    "off track",
+    "collided",
+    "ticks off lane",
+    "leaves after [s]",
+)
+
+
+def results_page(sets: Mapping[str, Mapping[str, Any]]) -> str:
+    """The page in Markdown.
+
+    Args:
+        sets: By name, what is in each ``set.json``, with the registration under ``registered``.
+    """
+    return "\n".join([_HEAD, *(_section(name, data) for name, data in sorted(sets.items()))])
+
+
+def _section(name: str, data: Mapping[str, Any]) -> str:
+    registered, explored = (
+        [row for row in data["rows"] if row["registered"] is wanted] for wanted in (True, False)
+    )
+    parts = [
+        f"## {name}\n",
+        f"![Excess of every drive, by method and domain]({picture_of(name)})\n",
+        _where(data["deployed_through"]) + "\n",
+        *(_sentences(test, data["rows"]) + "\n" for test in data["primary"]),
+        _table(registered),
+    ]
+    if explored:
+        parts += ["### Exploration\n", "Run, and not registered before.\n", _table(explored)]
+    parts += ["### How to run it\n", _commands(name, data["registered"])]
+    return "\n".join(parts)
+
+
+def picture_of(name: str) -> str:
+    """File name of the picture of a set, beside the page."""
+    return f"{name}_excess.png"
+
+
+def _where(through: Sequence[str]) -> str:
+    """Where it was deployed, so that no simulation passes for a real car."""
+    known = {
+        "nodes": "the simulated lab, driven in real time by the live nodes",
+        "world": "the simulator of the place, with its own car",
+        "nothing": "nowhere",
+    }
+    return f"*Deployed* is {' and '.join(known.get(each, each) for each in through) or 'nowhere'}. No real car was driven."
+
+
+def _sentences(test: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> str:
+    which = test["test"]
+    key = {name: which[name] for name in ("scenario", "placement", "victim", "method")}
+    row = next(
+        each
+        for each in rows
+        if each["domain"] == "deployed" and all(each[name] == value for name, value in key.items())
+    )
+    place = f"{which['scenario']} {which['placement']}".strip()
+    first = (
+        f"**{place}, {which['victim']} victim.** Where it is deployed, the {style_of(which['method']).title} attack moves the car "
+        f"{row['excess_m']:.3f} m per tick further from its path{_between(row)}, and {row['off_track']} of {row['drives']} drives leave the "
+        "track."
+    )
+    baseline = f"{style_of(test['baseline']).title}, the strongest baseline in the surrogate"
+    if test["p"] is None:
+        return f"{first} The difference to {baseline}, is {test['difference_m']:.3f} m. {test['reason']}."
+    return (
+        f"{first} The difference to {baseline}, is {test['difference_m']:.3f} m per tick (exact permutation test over searches, "
+        f"p = {_p(test['p_holm'])} after Holm's adjustment)."
+    )
+
+
+def _between(row: Mapping[str, Any]) -> str:
+    return "" if row["low_m"] is None else f" (95 % interval {row['low_m']:.3f} to {row['high_m']:.3f} m)"
+
+
+def _p(value: float) -> str:
+    return f"{value:.4f}" if value >= 0.001 else f"{value:.1e}"
+
+
+def _table(rows: Sequence[Mapping[str, Any]]) -> str:
+    lines = [f"| {' | '.join(_COLUMNS)} |", "|" + "---|" * len(_COLUMNS)]
+    lines += [f"| {' | '.join(_cells(row))} |" for row in rows]
+    return "\n".join(lines) + "\n"
+
+
+def _cells(row: Mapping[str, Any]) -> list[str]:
+    excess = f"{row['excess_m']:.3f}" if row["method"] != NONE else f"(mean abs. CTE {row['excess_m']:.3f})"
+    interval = "" if row["low_m"] is None else f"{row['low_m']:.3f} to {row['high_m']:.3f}"
+    return [
+        row["victim"],
+        style_of(row["method"]).title,
+        row["domain"],
+        f"{row['searches']} x {row['drives'] // row['searches']}",
+        excess,
+        interval,
+        f"{row['off_track']} of {row['drives']}",
+        str(row["collided"]),
+        f"{100 * row['off_lane_share']:.0f} %",
+        "" if row["leaving_s"] is None else f"{row['leaving_s']:.1f}",
+    ]
+
+
+def _commands(name: str, registration: Mapping[str, Any]) -> str:
+    setting = f" --setting {registration['setting']}" if registration["setting"] else ""
+    changes = "".join(f" --set {text}" for text in registration["overrides"])
+    what = f"launch/{registration['file']}{setting}{changes}"
+    return "\n".join(
+        [
+            f"    advnerf experiment {what}",
+            f"    advnerf publish {what}",
+            f"    advnerf verify {name}\n",
+            f"Registered on {registration['date'][:10]}, digest `{registration['digest'][:12]}`: {len(registration['cells'])} cells, "
+            f"{len(registration['primary'])} primary tests.\n",
+        ]
+    )
