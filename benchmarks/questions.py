@@ -67,6 +67,12 @@ QUESTIONS = (
         ("coverage", "planted_changes"),
     ),
     Question(
+        "hardened",
+        "Is the hardened victim hard?",
+        "Drives past random textures of five families, four of which the victim was not trained on, compared with no attack.",
+        ("hardening",),
+    ),
+    Question(
         "junction",
         "Does an attack found in the learned junction work there?",
         "The paper's transfer experiment: objects beside three paths, searched in the learned scene, driven in the world itself.",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated
 
 import typer
@@ -44,6 +45,11 @@ def verify(
         str | None, typer.Argument(metavar="SET", help="Name of a set.", show_default="all sets")
     ] = None,
     published: Published = Path("docs/results"),
+    again: Annotated[
+        int,
+        typer.Option("--redrive", min=0, help="Also search and drive so many cells again, in the surrogate."),
+    ] = 0,
+    seed: Annotated[int, typer.Option("--seed", help="Which cells are drawn for that.")] = 0,
 ) -> None:
     """Compute every published number again from the kept drives, and check digests, registration and completeness."""
     from advnerf_core.report.evidence.verify import SetError, sets_in, verify_set
@@ -61,8 +67,27 @@ def verify(
         print(f"{found.name}: {found.numbers} numbers from {found.drives} drives: {verdict}")
         for problem in found.problems:
             say_error(problem)
+        if again:
+            wrong += _redrive(published / each, again, seed)
     if wrong:
         raise typer.Exit(_FAILURE_EXIT)
+
+
+def _redrive(folder: Path, count: int, seed: int) -> int:
+    """Drive some cells of a set again; how many came out otherwise."""
+    from advnerf_core.report.evidence.registration import read_registration
+    from nodes.experiment.redrive import TOLERANCE_M, redrive
+
+    registration = read_registration(folder)
+    assert registration is not None, "the set was verified"
+    file = Path("launch") / registration.file
+    with TemporaryDirectory() as run:
+        campaign, _ = load_cells(file, registration.setting, Path(run), list(registration.overrides), "")
+        ended = redrive(campaign, folder, count, seed, print)
+    for each in ended:
+        verdict = "as published" if each.same else f"otherwise: more than {TOLERANCE_M} m"
+        print(f"{each.name}: at most {each.off_m:.4f} m from the published poses, {verdict}")
+    return sum(not each.same for each in ended)
 
 
 def add_to(app: typer.Typer) -> None:

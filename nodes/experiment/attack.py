@@ -156,7 +156,7 @@ def surrogate_part(
         attack = _attack_file(experiment, space, problem, policy, cell, result)
         attack_id = save_attack(folder / ATTACK, attack)
     shown = load_shown(space, folder, cell)
-    measured = _measured(experiment, cell.scenario, past_field(experiment, problem, space, shown))
+    measured = from_measured_starts(experiment, cell.scenario, past_field(experiment, problem, space, shown))
     states, commands, scores = learned_drives(experiment, measured, shown.colours)
     data = {
         "attack_id": attack_id,
@@ -200,7 +200,7 @@ def _goals(experiment: Experiment, scenario: str, count: int) -> torch.Tensor:
     return torch.tensor([experiment.goal(scenario)], dtype=torch.float32).expand(count, -1)
 
 
-def _measured(experiment: Experiment, scenario: str, problem: AttackProblem) -> AttackProblem:
+def from_measured_starts(experiment: Experiment, scenario: str, problem: AttackProblem) -> AttackProblem:
     """The problem from the starts, and over the horizon, that are measured."""
     starts = experiment.measured_starts(scenario)
     goals = _goals(experiment, scenario, len(starts))

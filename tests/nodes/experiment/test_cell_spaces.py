@@ -107,7 +107,7 @@ def test_meshes_are_searched_over_the_pictures_of_the_world(
         make_space(experiment, wall),
         restored,
     )
-    there = attack._measured(experiment, "straight", there)
+    there = attack.from_measured_starts(experiment, "straight", there)
     _, _, scores = attack.learned_drives(experiment, there, restored.colours)
     assert [score.total_cte_m for score in scores] == list(result.surrogate.total_cte_m)
     assert not (tmp_path / "state.safetensors").exists()
