@@ -390,10 +390,11 @@ def publish(
 ) -> None:
     """Copy the finished cells, and the scenes, victims and objects that they were run with, to where they are kept with the code."""
     from advnerf_core.report.evidence.registration import FILE as REGISTERED
-    from advnerf_core.report.evidence.verify import write_set
+    from advnerf_core.report.evidence.verify import write_page, write_set
     from nodes.experiment.campaign.plan import statuses
     from nodes.experiment.campaign.published import publish as copy_cells
     from nodes.experiment.campaign.published import publish_build
+    from nodes.experiment.campaign.set_film import write_film
 
     campaign, cells = load_cells(file, setting, folder, overrides, only)
     found = copy_cells(campaign, statuses(campaign, cells), to, prune)
@@ -401,6 +402,9 @@ def publish(
         print(f"{to / campaign.name / name}.json")
     if (to / campaign.name / REGISTERED).exists():
         print(write_set(to / campaign.name))
+        if (film := write_film(campaign, to / campaign.name)) is not None:
+            print(film)
+        print(write_page(to))
     build = publish_build(campaign, cells, to, prune)
     for each in build.written:
         print(each)

@@ -33,7 +33,7 @@ def results_page(sets: Mapping[str, Mapping[str, Any]]) -> str:
     """The page in Markdown.
 
     Args:
-        sets: By name, what is in each ``set.json``, with the registration under ``registered``.
+        sets: By name, what is in each ``set.json``, with the registration under ``registered``, and under ``filmed`` whether there is a film.
     """
     return "\n".join([_HEAD, *(_section(name, data) for name, data in sorted(sets.items()))])
 
@@ -44,6 +44,10 @@ def _section(name: str, data: Mapping[str, Any]) -> str:
     )
     parts = [
         f"## {name}\n",
+        *(
+            [f"![Drives without attack, past the strongest baseline, past the attack]({film_of(name)})\n"]
+            * data["filmed"]
+        ),
         f"![Excess of every drive, by method and domain]({picture_of(name)})\n",
         _where(data["deployed_through"]) + "\n",
         *(_sentences(test, data["rows"]) + "\n" for test in data["primary"]),
@@ -58,6 +62,11 @@ def _section(name: str, data: Mapping[str, Any]) -> str:
 def picture_of(name: str) -> str:
     """File name of the picture of a set, beside the page."""
     return f"{name}_excess.png"
+
+
+def film_of(name: str) -> str:
+    """File name of the film of a set, beside the page."""
+    return f"{name}_drives.webp"
 
 
 def _where(through: Sequence[str]) -> str:

@@ -19,7 +19,7 @@ from advnerf_core.errors import AdvnerfError
 from advnerf_core.files import write_atomically
 from advnerf_core.report.cells import CellError, CellResult, cell_name, read_cell
 from advnerf_core.report.evidence.kept import KeptDrive
-from advnerf_core.report.evidence.page import picture_of, results_page
+from advnerf_core.report.evidence.page import film_of, picture_of, results_page
 from advnerf_core.report.evidence.registration import (
     FILE,
     RegisteredScenario,
@@ -91,8 +91,14 @@ def write_set(folder: Path) -> Path:
     known[folder.name] = sha256_of(folder / SET)
     write_atomically(folder.parent / DIGESTS, json.dumps(known, indent=1, sort_keys=True) + "\n")
     write_png(excess_plot(evidence), folder.parent / picture_of(folder.name), dpi=110)
-    write_atomically(folder.parent / PAGE, _page(folder.parent))
+    write_page(folder.parent)
     return folder / SET
+
+
+def write_page(published: Path) -> Path:
+    """Write the page of all sets."""
+    write_atomically(published / PAGE, _page(published))
+    return published / PAGE
 
 
 def verify_set(folder: Path) -> Verified:
@@ -126,7 +132,8 @@ def _page(published: Path) -> str:
         if registration is not None and (published / name / SET).exists():
             registered = {**registration.model_dump(mode="json"), "digest": registration.digest}
             data = json.loads((published / name / SET).read_text(encoding="utf-8"))
-            sets[name] = {**data, "registered": registered}
+            filmed = (published / film_of(name)).exists()
+            sets[name] = {**data, "registered": registered, "filmed": filmed}
     return results_page(sets)
 
 
