@@ -20,7 +20,7 @@ _FAILURE_EXIT = 1
 
 def register(
     file: File,
-    setting: Setting = "full",
+    setting: Setting = "evidence",
     folder: Folder = None,
     only: Only = "",
     published: Published = Path("docs/results"),
