@@ -105,7 +105,7 @@ def test_unbounded_needs_no_box(tmp_path: Path) -> None:
         ("instant-ngp", 1, (16, 2, 19, 16, 2048, 4)),
         ("instant-ngp", 2, (16, 2, 19, 16, 4096, 4)),
         ("minutes", 1, (8, 4, 18, 16, 2048, 3)),
-        ("best", 2, (8, 4, 19, 16, 4096, 3)),
+        ("best", 2, (8, 4, 18, 16, 4096, 3)),
     ],
 )
 def test_presets_have_their_sizes_train_and_render(

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import ndimage
 
 from advnerf_core.objects.voxel.fit import Fit, fit_grids
@@ -48,7 +49,7 @@ def resampled(grids: ObjectGrids, onto: ObjectGrids) -> ObjectGrids:
     ]
     places = np.stack(np.meshgrid(*axes, indexing="ij"))
 
-    def at_places(values: np.ndarray) -> np.ndarray:  # type: ignore[type-arg]
+    def at_places(values: NDArray[np.float32]) -> NDArray[np.float32]:
         return np.asarray(ndimage.map_coordinates(values, places, order=1, mode="nearest"), np.float32)
 
     share = at_places(grids.density * np.float32(grids.voxel / OPAQUE_PER_VOXEL))
