@@ -8,19 +8,21 @@ from __future__ import annotations
 
 import argparse
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from advnerf_core.data.dataset import ImageSet, load_transforms
-from advnerf_core.fields.hash_grid import HashGridConfig
 from advnerf_core.parallel import thread_count
 from advnerf_core.scene.field import SceneFieldConfig
 from advnerf_core.scene.metrics import psnr
+from advnerf_core.scene.presets import PHOTOGRAPH_BANDS, PRESETS, scene_preset
 from advnerf_core.scene.render_field import FieldRenderer
 from advnerf_core.scene.train import Progress, TrainConfig, TrainedScene, train_scene
 from benchmarks.results import record_row
+from benchmarks.timing import ProcessorUse
 
 SIZE = (270, 480)
 HELD_OUT_EVERY = 8
@@ -45,6 +47,11 @@ def main() -> None:
         "--steps", type=int, help="train so many steps instead, to compare settings; nothing is recorded"
     )
     parser.add_argument(
+        "--preset",
+        choices=tuple(PRESETS),
+        help="default: minutes up to 3 minutes, else best; any other is not recorded",
+    )
+    parser.add_argument(
         "--opacity", type=float, default=TrainConfig.opacity, help="other than the default: not recorded"
     )
     parser.add_argument(
@@ -53,7 +60,9 @@ def main() -> None:
     parser.add_argument("--pictures", type=Path, help="folder for rendered and real held-out images")
     arguments = parser.parse_args()
 
-    began = time.perf_counter()
+    usual = "minutes" if arguments.seconds <= 180.0 else "best"
+    preset = scene_preset(arguments.preset or usual)
+    began, use = time.perf_counter(), ProcessorUse()
     listed = load_transforms(arguments.data).sorted_by_name()
     training, held_out = listed.split(HELD_OUT_EVERY)
     print(
@@ -63,25 +72,27 @@ def main() -> None:
     box = SceneFieldConfig(
         (low[0], low[1], low[2]),
         (high[0], high[1], high[2]),
-        grid=HashGridConfig(levels=8, features=4, log2_entries=18, finest=2048),
-        direction_bands=3,
+        grid=preset.grid_for(contraction=False),
+        direction_bands=PHOTOGRAPH_BANDS,
     )
     # Loading counts: the ten minutes are what a user waits.
-    config = TrainConfig(
-        steps=arguments.steps or 1_000_000,
+    config = replace(
+        preset.training,
+        steps=arguments.steps or preset.training.steps,
         max_seconds=None if arguments.steps else arguments.seconds - (time.perf_counter() - began),
         opacity=arguments.opacity,
-        distortion=2e-3,
         refine_depth=arguments.refine_depth,
         near_m=NEAR,
     )
     trained = train_scene(training.load(SIZE), box, config, progress=report)
     mean_db = evaluate(trained, held_out.load(SIZE), arguments.pictures)
     minutes = (time.perf_counter() - began) / 60.0
-    note = f"{trained.history[-1][0]} steps on {thread_count()} threads; {minutes:.1f} min with loading and evaluation"
+    note = f"preset {arguments.preset or usual}: {trained.history[-1][0]} steps on {thread_count()} threads, {use.text()}; {minutes:.1f} min with loading and evaluation"
     print(f"{mean_db:.2f} dB: {note}")
-    as_recorded = (arguments.steps, arguments.opacity, arguments.refine_depth) == (
+    chosen = (arguments.steps, arguments.preset or usual, arguments.opacity, arguments.refine_depth)
+    as_recorded = chosen == (
         None,
+        usual,
         TrainConfig.opacity,
         REFINE_DEPTH,
     )

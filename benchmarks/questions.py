@@ -46,6 +46,7 @@ QUESTIONS = (
             "fox",
             "hydrant",
             "objects",
+            "object_pictures",
             "phone_to_car",
             "structure_from_motion",
             "few_photographs",

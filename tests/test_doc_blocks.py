@@ -21,7 +21,7 @@ ROOT = Path(__file__).parents[1]
 BLOCKS = runpy.run_path(str(ROOT / "docs" / "check_code.py"))["blocks"]
 # A reader has time; here the same code does less of the same.
 _LESS = {
-    r"steps=1000\b": "steps=8", r"steps=1_000_000, max_seconds=600": "steps=8", r"iterations=30": "iterations=2", r"evaluations=30": "evaluations=2",
+    r"steps=1000\b": "steps=8", r"preset\.train_config\(\)": "preset.train_config(steps=8)", r"iterations=30": "iterations=2", r"evaluations=30": "evaluations=2",
     r"stills=900, drives=6": "stills=8, drives=1, drive_steps=2",
     r"ImitationConfig\(\)": "ImitationConfig(dagger_rounds=1, first_steps=2, round_steps=2)",
     r"size=\(270, 480\)": "size=(96, 64)",

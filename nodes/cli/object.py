@@ -73,6 +73,13 @@ def object_build(
             show_default="as they are",
         ),
     ] = None,
+    coarse_to_fine: Annotated[
+        bool,
+        typer.Option(
+            "--coarse-to-fine",
+            help="With --images: fit grids of 32^3, 64^3, ... first. Sharper in the same time for large --resolution.",
+        ),
+    ] = False,
 ) -> None:
     """Build an object file from a mesh, a generator or images.
 
@@ -86,15 +93,17 @@ def object_build(
 
     if sum(given is not None for given in (file, generate, images)) != 1:
         raise ConfigError("expected exactly one of FILE, --generate and --images")
-    if images is None and (minutes is not None or size is not None):
-        raise ConfigError("expected --minutes and --size only with --images; add --images or remove them")
+    if images is None and (minutes is not None or size is not None or coarse_to_fine):
+        raise ConfigError(
+            "expected --minutes, --size and --coarse-to-fine only with --images; add --images or remove them"
+        )
     if minutes is not None and steps is not None:
         raise ConfigError("expected either --steps or --minutes, got both; remove one of them")
     name = generate or _name(file or images or Path())
     with ProgressDisplay() as display:
         report = display.start("object")
         if images is not None:
-            model = _from_images(images, name, resolution, steps, minutes, size, report)
+            model = _from_images(images, name, resolution, steps, minutes, size, coarse_to_fine, report)
         else:
             mesh, source = _mesh(file, generate, up, height_m)
             model = build_from_mesh(mesh, name, resolution, 400 if steps is None else steps, source, report)
@@ -177,6 +186,7 @@ def _from_images(
     steps: int | None,
     minutes: float | None,
     size: tuple[int, int] | None,
+    coarse_to_fine: bool,
     report: Report,
 ) -> ObjectModel:
     from advnerf_core.data.dataset import load_transforms
@@ -201,6 +211,7 @@ def _from_images(
         report,
         None if held_out is None else load_pictures(_spread(held_out), size),
         None if minutes is None else 60.0 * minutes,
+        coarse_to_fine,
     )
 
 

@@ -22,6 +22,8 @@ from advnerf_core.render.march import MarchConfig
 from advnerf_core.scene.field import SceneFieldConfig, save_scene
 from advnerf_core.scene.intervals import pixel_intervals
 from advnerf_core.scene.metrics import psnr, ssim
+from advnerf_core.scene.presets import PHOTOGRAPH_BANDS
+from advnerf_core.scene.presets import PRESETS as SCENE_PRESETS
 from advnerf_core.scene.render_field import FieldRenderer
 from advnerf_core.scene.train import Progress, TrainConfig, train_scene
 from nodes.runtime.errors import ConfigError
@@ -29,8 +31,8 @@ from nodes.runtime.progress import Report
 
 SCENE, CHECKPOINT, FIGURES = "scene.safetensors", "checkpoint.safetensors", "held_out.json"
 MM_PER_M = 1000.0
-_NO_TIME_LIMIT_STEPS = 1_000_000
-PRESETS = ("room", "instant-ngp")
+_DEFAULT_STEPS, _NO_TIME_LIMIT_STEPS = 1000, 1_000_000
+PRESETS = ("room", "instant-ngp", *SCENE_PRESETS)
 _WHITE = (1.0, 1.0, 1.0)
 _VIDEO_FPS = 10
 
@@ -52,7 +54,8 @@ class TrainingRequest:
         seed: Random seed.
         checkpoint_every_s: Time between checkpoints, the most training that a kill loses [s].
         unbounded: Whether the scene extends, contracted, outside the box; None: if the file's ``aabb_scale`` is more than 1.
-        preset: Sizes of the field: ``room`` or ``instant-ngp``.
+        preset: Sizes of the field: ``room``, ``instant-ngp``, ``minutes`` or ``best``. The last two also set how to train, see
+            `advnerf_core.scene.presets`.
         interval_px: Sample intervals in pixels of the training images; None uses the default rule, see `pixel_intervals`.
         interval: Shortest and longest sample interval, which override the rule, in the data set's unit.
         interval_growth: Interval per distance, which overrides the rule.
@@ -227,6 +230,9 @@ def scene_field(request: TrainingRequest, listed: PosedImages, transparent: bool
             levels=16, features=2, log2_entries=19, coarsest=16, finest=round(2048 * aabb_scale)
         )
         return SceneFieldConfig(_corner(low), _corner(high), grid, direction_bands=4, **common)
+    if request.preset in SCENE_PRESETS:
+        grid = SCENE_PRESETS[request.preset].grid_for(unbounded)
+        return SceneFieldConfig(_corner(low), _corner(high), grid, direction_bands=PHOTOGRAPH_BANDS, **common)
     # The contracted cube is twice as wide as its inner region, so twice the cells keep the detail.
     grid = HashGridConfig(levels=8, features=4, finest=4096 if unbounded else 2048)
     bands = 3 if request.open_scene or unbounded else 1
@@ -245,6 +251,14 @@ def sample_intervals(request: TrainingRequest, field: SceneFieldConfig, images: 
 
 def _train_config(request: TrainingRequest, field: SceneFieldConfig, march: MarchConfig) -> TrainConfig:
     is_open = request.open_scene or field.contraction
+    if request.preset in SCENE_PRESETS:
+        return replace(
+            SCENE_PRESETS[request.preset].train_config(request.minutes, request.steps),
+            seed=request.seed,
+            checkpoint_every_s=request.checkpoint_every_s,
+            march=march,
+            opacity=0.0 if is_open else TrainConfig.opacity,
+        )
     return TrainConfig(
         steps=request.steps or _NO_TIME_LIMIT_STEPS,
         seed=request.seed,
@@ -254,6 +268,15 @@ def _train_config(request: TrainingRequest, field: SceneFieldConfig, march: Marc
         opacity=0.0 if is_open else TrainConfig.opacity,
         distortion=2e-3 if is_open else TrainConfig.distortion,
     )
+
+
+def training_length(preset: str, steps: int | None, minutes: float | None) -> tuple[int | None, float | None]:
+    """Steps and minutes of a training: as given, else the preset's minutes, else 1000 steps."""
+    if steps is not None or minutes is not None:
+        return steps, minutes
+    if preset in SCENE_PRESETS:
+        return None, SCENE_PRESETS[preset].minutes
+    return _DEFAULT_STEPS, None
 
 
 def _described(request: TrainingRequest, field: SceneFieldConfig, march: MarchConfig) -> str:

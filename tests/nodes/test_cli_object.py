@@ -125,7 +125,11 @@ def test_sixteen_pictures_hold_out_two_and_can_be_made_smaller(command, tmp_path
         (["--generate", "tree"], "expected --generate to be one of hydrant, car; got 'tree'"),
         (["{folder}/none.glb"], "found none"),
         (["--generate", "car", "--height", "-1"], "height above zero"),
-        (["--generate", "car", "--minutes", "1"], "--minutes and --size only with --images"),
+        (
+            ["--generate", "car", "--minutes", "1"],
+            "--minutes, --size and --coarse-to-fine only with --images",
+        ),
+        (["--generate", "car", "--coarse-to-fine"], "--coarse-to-fine only with --images"),
         (["--images", "{folder}", "--minutes", "1", "--steps", "5"], "either --steps or --minutes"),
     ],
 )

@@ -16,11 +16,12 @@ from advnerf_core.geometry import Array, Pinhole, look_at
 from advnerf_core.render.march import MarchConfig
 from advnerf_core.scene.field import load_scene, save_scene
 from advnerf_core.scene.intervals import INTERVAL_PX_FROM_OUTSIDE
+from advnerf_core.scene.presets import PRESETS
 from advnerf_core.scene.render_field import FieldRenderer
 from advnerf_core.scene.train import TrainConfig, train_scene
 from nodes.cli import main as cli
 from nodes.lab import scene_training
-from nodes.lab.scene_training import TrainingRequest, sample_intervals, scene_field
+from nodes.lab.scene_training import TrainingRequest, sample_intervals, scene_field, training_length
 from nodes.runtime.errors import ConfigError
 
 TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -103,6 +104,8 @@ def test_unbounded_needs_no_box(tmp_path: Path) -> None:
         ("room", 1, (8, 4, 17, 16, 2048, 1)),
         ("instant-ngp", 1, (16, 2, 19, 16, 2048, 4)),
         ("instant-ngp", 2, (16, 2, 19, 16, 4096, 4)),
+        ("minutes", 1, (8, 4, 18, 16, 2048, 3)),
+        ("best", 2, (8, 4, 18, 16, 4096, 3)),
     ],
 )
 def test_presets_have_their_sizes_train_and_render(
@@ -129,8 +132,29 @@ def test_presets_have_their_sizes_train_and_render(
 
 
 def test_an_unknown_preset_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="room, instant-ngp, got 'huge'"):
+    with pytest.raises(ConfigError, match="room, instant-ngp, minutes, best, got 'huge'"):
         request_for(tmp_path, preset="huge")
+
+
+def test_presets_with_a_time_end_by_it_unless_the_user_says_when() -> None:
+    assert training_length("room", None, None) == (1000, None)
+    assert training_length("minutes", None, None) == (None, 3.0)
+    assert training_length("best", None, None) == (None, 10.0)
+    assert training_length("best", 50, None) == (50, None)
+    assert training_length("minutes", None, 7.0) == (None, 7.0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "opacity"),
+    [({}, TrainConfig.opacity), ({"open_scene": True}, 0.0), ({"unbounded": True}, 0.0)],
+)
+def test_a_preset_sets_how_to_train(pictures: Path, changes: dict[str, bool], opacity: float) -> None:
+    request = request_for(pictures, preset="best", steps=None, minutes=2.0, seed=3, **changes)
+    field = scene_field(request, dataclasses.replace(load_transforms(pictures), aabb_scale=1.0))
+    config = scene_training._train_config(request, field, MarchConfig())
+    expected = PRESETS["best"].training
+    assert (config.max_seconds, config.seed, config.opacity) == (120.0, 3, opacity)
+    assert (config.chunk, config.samples_per_step) == (expected.chunk, expected.samples_per_step)
 
 
 def test_alpha_that_is_opaque_everywhere_is_none(pictures: Path) -> None:

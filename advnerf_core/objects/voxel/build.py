@@ -16,6 +16,7 @@ from advnerf_core.objects.voxel.mesh import SurfaceMesh
 from advnerf_core.objects.voxel.model import ObjectModel
 from advnerf_core.objects.voxel.pictures import PosedRgba
 from advnerf_core.objects.voxel.rasterise import draw_mesh
+from advnerf_core.objects.voxel.stages import fit_in_stages
 from advnerf_core.objects.voxel.views import dome, viewing_lens
 from advnerf_core.objects.voxel.voxelise import voxelise
 from advnerf_core.render.cast_object import cast_object
@@ -79,6 +80,7 @@ def build_from_images(
     progress: Progress | None = None,
     held_out: PosedRgba | None = None,
     max_seconds: float | None = None,
+    coarse_to_fine: bool = False,
 ) -> ObjectModel:
     """Carve an object out of cut-out pictures, then fit density and colours.
 
@@ -95,10 +97,14 @@ def build_from_images(
         progress: Called with the finished fraction and what is being done.
         held_out: Pictures that nothing is learned from. The agreement is taken on at most 12 of each set.
         max_seconds: Time limit of the fit [s].
+        coarse_to_fine: Whether to fit smaller grids first, see `stages`.
     """
     told = progress or (lambda fraction, text: None)
     told(0.0, "carving")
-    fit = fit_grids(views, visual_hull(views, resolution), steps, progress=told, max_seconds=max_seconds)
+    if coarse_to_fine:
+        fit = fit_in_stages(views, resolution, steps, told, max_seconds)
+    else:
+        fit = fit_grids(views, visual_hull(views, resolution), steps, progress=told, max_seconds=max_seconds)
     model = ObjectModel(name, fit.grids)
     about: dict[str, Any] = {
         "source": source or {},
