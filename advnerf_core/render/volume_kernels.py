@@ -59,63 +59,6 @@ def mark_visible(
 
 
 @njit(**KERNEL_OPTIONS)
-def next_chunk(reached: Array64i, begins: Array64i, through: Array32, size: int) -> tuple[Array64i, Array64i]:
-    """Choose the next samples of the rays that have not stopped.
-
-    Args:
-        reached: Next sample of each ray ``[R]``; moved on.
-        begins: First sample of each ray ``[R + 1]``.
-        through: Transmittance of each ray so far ``[R]``.
-        size: Most samples of a ray.
-
-    Returns:
-        The samples ``[M]``, ray by ray, and where those of each ray begin among them ``[R + 1]``.
-    """
-    rays = reached.shape[0]
-    begins_taken = np.zeros(rays + 1, np.int64)
-    for r in range(rays):
-        count = 0 if through[r] < _STOP else min(size, begins[r + 1] - reached[r])
-        begins_taken[r + 1] = begins_taken[r] + count
-    taken = np.empty(begins_taken[rays], np.int64)
-    for r in range(rays):
-        for n in range(begins_taken[r], begins_taken[r + 1]):
-            taken[n] = reached[r]
-            reached[r] += 1
-    return taken, begins_taken
-
-
-@njit(**KERNEL_OPTIONS)
-def mark_chunk(
-    log_density: Array32, widths: Array32, taken: Array64i, begins: Array64i, first: int, stop: int, least: np.float32,
-    through: Array32, keep: NDArray[np.bool_],
-) -> None:  # fmt: skip
-    """``mark_visible`` for a chunk of samples that continues rays ``first..stop``.
-
-    Args:
-        log_density: Tiles ``[tiles, >= 1, TILE]`` of the samples in the chunk, channel 0.
-        widths: Interval of each sample of the batch in box coordinates ``[N]``.
-        taken: Samples in the chunk ``[M]``.
-        begins: Where those of each ray begin in ``taken [R + 1]``.
-        first: First ray.
-        stop: One past the last ray.
-        least: Smallest weight that counts.
-        through: Transmittance of each ray in front of the chunk ``[R]``; replaced by that behind it.
-        keep: ``[N]``, written where ``taken``.
-    """
-    for r in range(first, stop):
-        light = through[r]
-        for m in range(begins[r], begins[r + 1]):
-            n = taken[m]
-            if light < _STOP:
-                keep[n] = False
-                continue
-            held = np.exp(-np.exp(min(log_density[m // TILE, 0, m % TILE], _TOP)) * widths[n])
-            keep[n] = light * (_ONE - held) >= least
-            light *= held
-        through[r] = light
-
-
-@njit(**KERNEL_OPTIONS)
 def squash_features(field: Array32) -> None:
     """Replace channels 1 and up of one tile ``[1 + C, TILE]`` by ``x / (1 + |x|)``."""
     for c in range(1, field.shape[0]):

@@ -31,9 +31,6 @@ from advnerf_core.scene.train_step import CpuStep, Matte, StepResult
 
 Array32 = NDArray[np.float32]
 
-# Samples placed for each that is evaluated, at most: those behind surfaces are placed too.
-_CAPACITY_IN_CHUNKS = 5.0
-
 
 class CheckpointError(AdvnerfError):
     """A checkpoint cannot be resumed from; the message says why and what to do."""
@@ -80,7 +77,7 @@ class Trainer:
             self.config.near_m,
             self.config.interval_px,
         )
-        capacity = int((_CAPACITY_IN_CHUNKS if self.config.chunk else 1.25) * self.config.samples_per_step)
+        capacity = int(1.25 * self.config.samples_per_step)
         self._marcher = Marcher(capacity, self.march, field_config.box_high, field_config.contraction)
         # Pixels to learn from, where a mask or an undistortion leaves some out.
         self._usable = None if images.valid is None else np.flatnonzero(images.valid)
@@ -154,7 +151,7 @@ class Trainer:
             rays, rng.random(len(rays), dtype=np.float32), self._leaps, self._step_scale()
         )
         result = self._optimise(rays[kept], colours[kept], samples, self._matte(pixels, kept, rng))
-        per_ray = max((result.evaluated or len(samples.points)) / max(len(kept), 1), 1.0)
+        per_ray = max(len(samples.points) / max(len(kept), 1), 1.0)
         wanted = config.samples_per_step / per_ray
         # Follow slowly: the next batch may hold more samples per ray than this one.
         self.rays_per_step = int(np.clip(0.5 * self.rays_per_step + 0.5 * wanted, 256, config.max_rays))
@@ -232,7 +229,7 @@ class Trainer:
         if self.step % self.config.occupancy_every and self._leaps is not None:
             return
         if self.step > 0:
-            share = 1.0 if self.step <= self.config.warmup_steps else self.config.occupancy_share
+            share = 1.0 if self.step <= self.config.warmup_steps else 0.25
             self.occupancy.update(self.stepper.log_density, self.step, share)
         self._leaps = leap_distances(self.occupied(), self.occupancy.cells)
 
@@ -256,7 +253,7 @@ class Trainer:
 
     def _fingerprint(self) -> str:
         # The intervals as they were chosen: they also depend on the cameras and on the rule.
-        settings = [self.scene.config.to_dict(), {**_settings(self.config), "march": asdict(self.march)}]
+        settings = [self.scene.config.to_dict(), {**asdict(self.config), "march": asdict(self.march)}]
         digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode())
         digest.update(str(self.images.rgb.shape).encode() + self.images.T_world_from_camera.tobytes())
         digest.update(self.images.rgb[:, ::16, ::16].tobytes())
@@ -267,21 +264,12 @@ class Trainer:
         return digest.hexdigest()[:16]
 
 
-def _settings(config: TrainConfig) -> dict[str, Any]:
-    """Settings by name, without newer ones that have no effect: checkpoints from before them can still be resumed."""
-    settings, defaults = asdict(config), asdict(TrainConfig())
-    for name in ("chunk", "least_weight", "occupancy_share"):
-        if settings[name] == defaults[name]:
-            del settings[name]
-    return settings
-
-
 def _stepper(scene: SceneField, config: TrainConfig) -> CpuStep | TorchStep:
     device = "cuda" if torch.cuda.is_available() else "cpu"
     opacity = config.opacity if scene.config.learned_background else 0.0
     if config.backend == "torch" or (config.backend == "auto" and device != "cpu"):
         return TorchStep(scene.to(device), config.huber, opacity=opacity)
-    return CpuStep(scene, config.huber, opacity=opacity, chunk=config.chunk, least_weight=config.least_weight)
+    return CpuStep(scene, config.huber, opacity=opacity)
 
 
 def train_scene(

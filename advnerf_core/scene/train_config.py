@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from advnerf_core.render.march import MarchConfig
 from advnerf_core.scene.field import SceneField
-from advnerf_core.scene.train_step import LEAST_WEIGHT
 
 BACKENDS = ("auto", "numba", "torch")
 
@@ -39,10 +38,6 @@ class TrainConfig:
             alpha, which tell what is transparent.
         refine_depth: Optical depth of crossing a fine cell from which rendering looks into it. Surfaces of a finished room are
             dense; where they may still be haze, as in large boxes or after short trainings, 0.005 keeps them whole.
-        chunk: Samples of a ray that are evaluated before a step looks whether the ray has stopped. Samples behind surfaces then cost
-            nothing, and ``samples_per_step`` counts those that were evaluated. 0 evaluates all of them at once. CPU kernels only.
-        least_weight: Samples with smaller weights along their ray are left out of its colour and gradient. CPU kernels only.
-        occupancy_share: Share of the cells that an update of the occupancy grid probes after the warm-up.
         seed: Seed of everything random.
         checkpoint_every_s: Time between checkpoints [s].
         backend: ``numba`` (CPU kernels), ``torch`` (any device), or ``auto``: torch where it sees an accelerator, else numba.
@@ -64,9 +59,6 @@ class TrainConfig:
     interval_px: float | None = None
     opacity: float = 1.5e-3
     refine_depth: float = 0.05
-    chunk: int = 0
-    least_weight: float = LEAST_WEIGHT
-    occupancy_share: float = 0.25
     seed: int = 0
     checkpoint_every_s: float = 60.0
     backend: str = "auto"
@@ -76,10 +68,6 @@ class TrainConfig:
             raise ValueError(f"expected at least one step, sample and ray, got {self}")
         if self.max_seconds is not None and not self.max_seconds > 0.0:
             raise ValueError(f"expected max_seconds > 0 or none, got {self.max_seconds}")
-        if self.chunk < 0 or not 0.0 <= self.least_weight < 1.0 or not 0.0 < self.occupancy_share <= 1.0:
-            raise ValueError(
-                f"expected chunk >= 0, least_weight in [0, 1) and occupancy_share in (0, 1], got {self}"
-            )
         if self.backend not in BACKENDS:
             raise ValueError(f"expected a backend of {', '.join(BACKENDS)}, got {self.backend!r}")
 

@@ -5,7 +5,7 @@ The backward pass is written out by hand; tests compare it with torch's automati
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,9 +21,7 @@ from advnerf_core.render.volume_kernels import (
     accumulate_backward,
     add_distortion_gradient,
     gather_columns,
-    mark_chunk,
     mark_visible,
-    next_chunk,
 )
 from advnerf_core.scene.field import SceneField, SceneFieldConfig
 from advnerf_core.scene.field_kernels import (
@@ -39,9 +37,6 @@ from advnerf_core.scene.field_kernels import (
 
 Array32 = NDArray[np.float32]
 
-LEAST_WEIGHT = 5e-4
-_MOST_ROUNDS = 6  # after which a ray's last samples are taken together
-
 
 @dataclass(frozen=True)
 class StepResult:
@@ -52,14 +47,12 @@ class StepResult:
         mse: Mean squared error.
         rays: Rays used.
         samples: Samples used.
-        evaluated: Samples whose density was computed; 0 if the step does not count them.
     """
 
     loss: float
     mse: float
     rays: int
     samples: int
-    evaluated: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,20 +76,12 @@ class CpuStep:
         huber: Where the loss turns from square to linear.
         distortion: Weight of the distortion loss, with the distances of ``distortion_distances``.
         opacity: Weight of the mean transmittance of rays in the loss.
-        chunk: Samples of a ray that are evaluated before the step looks whether the ray has stopped; 0 evaluates all at once.
-        least_weight: Samples with smaller weights are left out of colours and gradients.
     """
 
     def __init__(
-        self,
-        scene: SceneField,
-        huber: float = 0.1,
-        distortion: float = 0.0,
-        opacity: float = 0.0,
-        chunk: int = 0,
-        least_weight: float = LEAST_WEIGHT,
+        self, scene: SceneField, huber: float = 0.1, distortion: float = 0.0, opacity: float = 0.0
     ) -> None:
-        self.scene, self.huber, self.chunk, self.least_weight = scene, np.float32(huber), chunk, least_weight
+        self.scene, self.huber = scene, np.float32(huber)
         self.distortion, self.opacity = distortion, opacity
         self.values = scene.arrays()
         self.grads = {name: np.zeros_like(value) for name, value in self.values.items()}
@@ -108,12 +93,9 @@ class CpuStep:
         self, rays: Array32, targets: NDArray[np.uint8], samples: Samples, matte: Matte | None = None
     ) -> StepResult:
         """Add the gradient of a batch, of the samples that show; arguments as in ``gradients``."""
-        if not self.chunk:
-            return self.gradients(rays, targets, *self.visible(samples, self.least_weight), matte)
-        shown, encoded, evaluated = self.visible_in_chunks(samples, self.chunk, self.least_weight)
-        return replace(self.gradients(rays, targets, shown, encoded, matte), evaluated=evaluated)
+        return self.gradients(rays, targets, *self.visible(samples), matte)
 
-    def visible(self, samples: Samples, least_weight: float = LEAST_WEIGHT) -> tuple[Samples, Array32]:
+    def visible(self, samples: Samples, least_weight: float = 5e-4) -> tuple[Samples, Array32]:
         """Samples that show in the image, and their encodings in tiles ``[tiles, K, TILE]``.
 
         Behind a surface, and in air that the occupancy grid is too coarse to leave out, weights and therefore gradients vanish;
@@ -124,85 +106,28 @@ class CpuStep:
         encoded, logs = self._buffer("encoded_all", tiles, rows), self._buffer("log_density", tiles, 2)
         _clear_tail(encoded, n)
         encode(samples.points, n, v["grid.table"], self.scene.grid.levels, encoded)
+        w2, b2 = (
+            np.ascontiguousarray(v["density_2.weight"][:2]),
+            np.ascontiguousarray(v["density_2.bias"][:2]),
+        )
         bounds, ray_bounds = slot_bounds(tiles, SLOTS), slot_bounds(samples.rays, SLOTS)
-        network = self._density_only()
-        run_slots(lambda s: two_layers(*network, encoded, logs, *bounds[s]), SLOTS)
+        w1, b1 = v["density_1.weight"], v["density_1.bias"]
+        run_slots(lambda s: two_layers(w1, b1, w2, b2, encoded, logs, *bounds[s]), SLOTS)
         keep, least = np.empty(n, np.bool_), np.float32(least_weight)
         run_slots(
             lambda s: mark_visible(logs, samples.widths, samples.begins, *ray_bounds[s], least, keep), SLOTS
         )
         kept = np.flatnonzero(keep)
-        return _chosen(samples, keep, kept), self._gathered(encoded, kept)
-
-    def visible_in_chunks(
-        self, samples: Samples, chunk: int, least_weight: float = LEAST_WEIGHT
-    ) -> tuple[Samples, Array32, int]:
-        """Do the same as ``visible``, front to back: what lies behind the surface that stops a ray is not evaluated.
-
-        Each round takes the next ``chunk`` samples of the rays that go on; the third and later rounds take twice as many as the
-        round before.
-
-        Returns:
-            What ``visible`` returns, and the number of samples that were evaluated.
-        """
-        n, rows = len(samples.points), self.scene.config.grid.width
-        encoded = self._buffer("encoded_all", -(-n // TILE) + _MOST_ROUNDS, rows)
-        keep, column = np.zeros(n, np.bool_), np.zeros(n, np.int64)
-        through, reached = np.ones(samples.rays, np.float32), samples.begins[:-1].copy()
-        first_tile, evaluated, size = 0, 0, chunk
-        for turn in range(_MOST_ROUNDS):
-            if turn == _MOST_ROUNDS - 1:
-                size = n
-            taken, begins = next_chunk(reached, samples.begins, through, size)
-            if not len(taken):
-                break
-            tiles = -(-len(taken) // TILE)
-            part = encoded[first_tile : first_tile + tiles]
-            self._weigh(samples, taken, begins, part, through, keep, np.float32(least_weight))
-            column[taken] = first_tile * TILE + np.arange(len(taken))
-            first_tile, evaluated = first_tile + tiles, evaluated + len(taken)
-            size = size if turn == 0 else 2 * size
-        kept = np.flatnonzero(keep)
-        return _chosen(samples, keep, kept), self._gathered(encoded, column[kept]), evaluated
-
-    def _weigh(
-        self,
-        samples: Samples,
-        taken: NDArray[np.int64],
-        begins: NDArray[np.int64],
-        encoded: Array32,
-        through: Array32,
-        keep: NDArray[np.bool_],
-        least: np.float32,
-    ) -> None:
-        """Encode the samples ``taken``, mark those that show in ``keep``, and advance each ray's transmittance ``through``."""
-        logs = self._buffer("log_density", len(encoded), 2)
-        points, count = samples.points[taken], len(taken)
-        _clear_tail(encoded, count)
-        encode(points, count, self.values["grid.table"], self.scene.grid.levels, encoded)
-        bounds, network = slot_bounds(len(encoded), SLOTS), self._density_only()
-        run_slots(lambda s: two_layers(*network, encoded, logs, *bounds[s]), SLOTS)
-        ray_bounds = slot_bounds(samples.rays, SLOTS)
-        run_slots(
-            lambda s: mark_chunk(logs, samples.widths, taken, begins, *ray_bounds[s], least, through, keep),
-            SLOTS,
+        compact = self._buffer("encoded", -(-len(kept) // TILE), rows)
+        columns = slot_bounds(len(kept), SLOTS, TILE)
+        run_slots(lambda s: gather_columns(encoded, kept, *columns[s], compact), SLOTS)
+        before = np.concatenate([[0], np.cumsum(keep)])
+        return (
+            Samples(
+                samples.points[kept], samples.t_mid_m[kept], samples.widths[kept], before[samples.begins]
+            ),
+            compact,
         )
-
-    def _density_only(self) -> tuple[Array32, Array32, Array32, Array32]:
-        """Weights of the density network with as few outputs as the kernels take: two, of which the first is the density."""
-        v = self.values
-        w2, b2 = (
-            np.ascontiguousarray(v["density_2.weight"][:2]),
-            np.ascontiguousarray(v["density_2.bias"][:2]),
-        )
-        return v["density_1.weight"], v["density_1.bias"], w2, b2
-
-    def _gathered(self, encoded: Array32, columns: NDArray[np.int64]) -> Array32:
-        """The columns of tiles, side by side."""
-        compact = self._buffer("encoded", -(-len(columns) // TILE), encoded.shape[1])
-        bounds = slot_bounds(len(columns), SLOTS, TILE)
-        run_slots(lambda s: gather_columns(encoded, columns, *bounds[s], compact), SLOTS)
-        return compact
 
     def gradients(
         self,
@@ -386,12 +311,6 @@ class CpuStep:
         if held is None or len(held) < tiles:
             held = self._buffers[name] = np.zeros((tiles + tiles // 8, rows, TILE), np.float32)
         return held[:tiles]
-
-
-def _chosen(samples: Samples, keep: NDArray[np.bool_], kept: NDArray[np.int64]) -> Samples:
-    """The samples at ``kept``, which are those marked in ``keep``."""
-    before = np.concatenate([[0], np.cumsum(keep)])
-    return Samples(samples.points[kept], samples.t_mid_m[kept], samples.widths[kept], before[samples.begins])
 
 
 def distortion_distances(samples: Samples, config: SceneFieldConfig) -> tuple[Array32, Array32]:

@@ -154,7 +154,7 @@ def test_a_preset_sets_how_to_train(pictures: Path, changes: dict[str, bool], op
     config = scene_training._train_config(request, field, MarchConfig())
     expected = PRESETS["best"].training
     assert (config.max_seconds, config.seed, config.opacity) == (120.0, 3, opacity)
-    assert (config.chunk, config.samples_per_step) == (expected.chunk, expected.samples_per_step)
+    assert (config.distortion, config.refine_depth) == (expected.distortion, expected.refine_depth)
 
 
 def test_alpha_that_is_opaque_everywhere_is_none(pictures: Path) -> None:

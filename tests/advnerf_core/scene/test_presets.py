@@ -11,7 +11,7 @@ from advnerf_core.geometry import Pinhole, look_at
 from advnerf_core.render.march import MarchConfig
 from advnerf_core.scene.field import SceneFieldConfig
 from advnerf_core.scene.presets import PRESETS, PresetError, scene_preset
-from advnerf_core.scene.train import TrainConfig, Trainer
+from advnerf_core.scene.train import Trainer
 
 
 def test_presets_end_by_time_unless_steps_are_given() -> None:
@@ -34,17 +34,6 @@ def test_an_unknown_preset_is_refused_with_the_names_that_exist() -> None:
         scene_preset("quick")
 
 
-def test_defaults_of_training_are_those_that_cached_stages_were_made_with() -> None:
-    config = TrainConfig()
-    assert (config.chunk, config.least_weight, config.occupancy_share) == (0, 5e-4, 0.25)
-
-
-@pytest.mark.parametrize("wrong", [{"chunk": -1}, {"least_weight": 1.0}, {"occupancy_share": 0.0}])
-def test_settings_out_of_range_are_refused(wrong: dict[str, float]) -> None:
-    with pytest.raises(ValueError, match="expected"):
-        TrainConfig(**wrong)  # type: ignore[arg-type]
-
-
 def images() -> ImageSet:
     """Two bright pictures of a box from outside."""
     lens = Pinhole(8, 8, 10.0, 10.0, 4.0, 4.0)
@@ -63,6 +52,4 @@ def test_a_preset_trains(name: str) -> None:
     )
     trainer = Trainer(images(), field, config)
     results = [trainer.train_step() for _ in range(8)]
-    chunk = PRESETS[name].training.chunk
-    assert all((each.evaluated > 0) == (chunk > 0) for each in results)
     assert results[-1].loss < results[0].loss
