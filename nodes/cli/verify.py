@@ -29,7 +29,7 @@ def register(
     """Write down what an experiment will run, and which tests will be claimed, before anything is run."""
     from advnerf_core.report.evidence.registration import FILE
     from nodes.experiment.campaign.config import is_campaign
-    from nodes.experiment.registration import register as write_registration
+    from nodes.experiment.campaign.registering import register as write_registration
 
     campaign, cells = load_cells(file, setting, folder, overrides, only)
     shown = "" if is_campaign(file) else setting
@@ -76,7 +76,7 @@ def verify(
 def _redrive(folder: Path, count: int, seed: int) -> int:
     """Drive some cells of a set again; how many came out otherwise."""
     from advnerf_core.report.evidence.registration import read_registration
-    from nodes.experiment.redrive import TOLERANCE_M, redrive
+    from nodes.experiment.campaign.redrive import TOLERANCE_M, redrive
 
     registration = read_registration(folder)
     assert registration is not None, "the set was verified"

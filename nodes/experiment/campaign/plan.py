@@ -14,7 +14,7 @@ from nodes.experiment.cell import Cell
 from nodes.experiment.cell_kind import settings_hash
 from nodes.experiment.kinds import load_kind
 from nodes.experiment.reference import PUBLISHED
-from nodes.experiment.registration import registered_under
+from nodes.experiment.registered import registered_under
 from nodes.runtime.errors import ConfigError, RuntimeFault
 
 
@@ -70,7 +70,7 @@ def plan_cells(
             cell.seed,
             digest,
             threads=1,
-            registration=registered_under(campaign, cell, experiments[key], PUBLISHED),
+            registration=registered_under(campaign.name, cell, experiments[key], PUBLISHED),
         )
         planned.append(Planned(cell, job, kind.runs_alone(experiments[key]), kind.searches_apart))
     return planned

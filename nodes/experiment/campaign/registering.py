@@ -14,7 +14,6 @@ from advnerf_core.report.conditions import NONE
 from advnerf_core.report.evidence.registration import (
     FILE,
     PrimaryTest,
-    RegisteredCell,
     RegisteredScenario,
     Registration,
     RegistrationError,
@@ -23,12 +22,14 @@ from advnerf_core.report.evidence.registration import (
 )
 from nodes.experiment.attack import planned_evaluations
 from nodes.experiment.campaign.config import Campaign
+from nodes.experiment.campaign.plan import read_experiment, statuses
 from nodes.experiment.cell import Cell
 from nodes.experiment.cell_kind import CellKind
 from nodes.experiment.context import Experiment
 from nodes.experiment.keys import registered_settings
 from nodes.experiment.kinds import load_kind
 from nodes.experiment.policy import HARDENED
+from nodes.experiment.registered import registered_cell
 from nodes.experiment.stage_record import hash_of
 
 _CLAIMED = "gradient"  # the method that primary tests are about
@@ -54,7 +55,7 @@ def register(campaign: Campaign, setting: str, overrides: Sequence[str], publish
         date=datetime.now(timezone.utc).isoformat(timespec="seconds"),
         software_version=version("advnerf"),
         scenarios=_scenarios(campaign),
-        cells=tuple(_registered(cell) for cell in campaign.cells),
+        cells=tuple(registered_cell(cell) for cell in campaign.cells),
         primary=tuple(_primary(campaign.cells)),
     )
     folder = published / campaign.name
@@ -71,20 +72,6 @@ def register(campaign: Campaign, setting: str, overrides: Sequence[str], publish
     return found
 
 
-def registered_under(campaign: Campaign, cell: Cell, experiment: object, published: Path) -> str:
-    """Digest of the registration that a cell is run under; empty if it, with the settings of now, is not registered."""
-    registration = read_registration(published / campaign.name)
-    if (
-        registration is None
-        or not isinstance(experiment, Experiment)
-        or _registered(cell) not in registration.cells
-    ):
-        return ""
-    scenario = registration.scenario(cell.scenario, cell.placement)
-    same = scenario is not None and scenario.settings_sha256 == hash_of(registered_settings(experiment))
-    return registration.digest if same else ""
-
-
 def _scenarios(campaign: Campaign) -> dict[str, RegisteredScenario]:
     found: dict[str, RegisteredScenario] = {}
     for cell in campaign.cells:
@@ -95,8 +82,6 @@ def _scenarios(campaign: Campaign) -> dict[str, RegisteredScenario]:
 
 
 def _experiment(campaign: Campaign, cell: Cell) -> Experiment:
-    from nodes.experiment.campaign.plan import read_experiment  # it reads registrations itself
-
     kind: CellKind = load_kind(campaign.kind(cell))
     experiment = read_experiment(campaign, cell)
     if not isinstance(experiment, Experiment):
@@ -126,16 +111,6 @@ def _scenario(experiment: Experiment, name: str) -> RegisteredScenario:
     )
 
 
-def _registered(cell: Cell) -> RegisteredCell:
-    return RegisteredCell(
-        scenario=cell.scenario,
-        placement=cell.placement,
-        victim=cell.victim,
-        method=cell.method,
-        seed=cell.seed,
-    )
-
-
 def _primary(cells: Sequence[Cell]) -> list[PrimaryTest]:
     """The gradient against all other methods, per scenario, on the hardened victim."""
     tests = []
@@ -156,8 +131,6 @@ def _primary(cells: Sequence[Cell]) -> list[PrimaryTest]:
 
 
 def _refuse_late(campaign: Campaign) -> None:
-    from nodes.experiment.campaign.plan import statuses
-
     done = [
         each.cell.name
         for each in statuses(campaign, campaign.cells)
