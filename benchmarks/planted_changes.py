@@ -23,6 +23,7 @@ from advnerf_core.driving.metrics import drive_metrics
 from advnerf_core.driving.path import Path as DrivingPath
 from advnerf_core.report.cells import cell_name
 from advnerf_core.report.evidence.kept import KeptDrive
+from advnerf_core.report.evidence.page import film_of
 from advnerf_core.report.evidence.registration import (
     FILE,
     PrimaryTest,
@@ -35,6 +36,7 @@ from advnerf_core.report.evidence.verify import (
     PAGE,
     SET,
     digests_of,
+    sets_in,
     sha256_of,
     verify_set,
     write_set,
@@ -54,7 +56,12 @@ def main() -> None:
     with TemporaryDirectory() as work:
         original = Path(work) / "published" / (arguments.set or "simulated")
         if arguments.set:
-            shutil.copytree(PUBLISHED / arguments.set, original)
+            # All sets, as one page is of all of them.
+            original.parent.mkdir()
+            for name in sets_in(PUBLISHED):
+                shutil.copytree(PUBLISHED / name, original.parent / name)
+                if (film := PUBLISHED / film_of(name)).exists():
+                    shutil.copy(film, original.parent / film.name)
             for beside in (DIGESTS, PAGE):
                 shutil.copy(PUBLISHED / beside, original.parent / beside)
         else:
@@ -82,9 +89,8 @@ def planted(original: Path, count: int, work: Path, seed: int = 0) -> dict[str, 
         kind = kinds[number % len(kinds)]
         shutil.rmtree(work, ignore_errors=True)
         folder = work / original.name
-        shutil.copytree(original, folder)
-        for beside in (DIGESTS, PAGE):
-            shutil.copy(original.parent / beside, work / beside)
+        shutil.copytree(original.parent, work)
+        assert number or not verify_set(folder).problems, "the copy is as it was published"
         CHANGES[kind](folder, rng)
         if not verify_set(folder).problems:
             missed[kind] = missed.get(kind, 0) + 1
