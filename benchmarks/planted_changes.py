@@ -84,7 +84,8 @@ def main() -> None:
 
 def planted(original: Path, count: int, work: Path, seed: int = 0) -> dict[str, int]:
     """Plant changes one at a time; how many of each kind were not found."""
-    rng, missed, kinds = random.Random(seed), {}, list(CHANGES)
+    rng, kinds = random.Random(seed), list(CHANGES)
+    missed: dict[str, int] = {}
     for number in range(count):
         kind = kinds[number % len(kinds)]
         shutil.rmtree(work, ignore_errors=True)
