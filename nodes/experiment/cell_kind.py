@@ -78,6 +78,10 @@ class CellKind(ABC):
         """Settings of the stages that cells need, by name: two experiments in one run folder must agree on them."""
         return {}
 
+    def registered_settings(self, experiment: Any) -> dict[str, Any] | None:
+        """What a registration fixes of an experiment, known before any stage is run, as JSON data; None where it cannot be registered."""
+        return None
+
     def draw_maps(self, experiment: Any, cell: Cell, number: int, folder: Path, report: Report) -> list[Path]:
         """Pictures about what a finished cell found; none where there is nothing to draw."""
         return []

@@ -19,7 +19,14 @@ from nodes.experiment.cell_kind import CellKind
 from nodes.experiment.context import Experiment
 from nodes.experiment.deploy import Deployer, ThroughNodes, ThroughWorld, cell_data
 from nodes.experiment.films import film_cell, kept_film, with_film
-from nodes.experiment.keys import NEEDED, CellError, cell_inputs, clean_folder, require_known
+from nodes.experiment.keys import (
+    NEEDED,
+    CellError,
+    cell_inputs,
+    clean_folder,
+    registered_settings,
+    require_known,
+)
 from nodes.experiment.reference import ReferenceBuild
 from nodes.experiment.run import load_experiment, prepare_victims, stages_of
 from nodes.experiment.space_config import PlacesConfig
@@ -202,6 +209,10 @@ class ExperimentCells(CellKind):
     def needed_settings(self, experiment: Experiment) -> dict[str, Any]:
         """Settings of capture, scene, object and policy."""
         return {stage.name: stage.settings for stage in stages_of(experiment) if stage.name in NEEDED}
+
+    def registered_settings(self, experiment: Experiment) -> dict[str, Any]:
+        """See `keys.registered_settings`."""
+        return registered_settings(experiment)
 
     def draw_maps(
         self, experiment: Experiment, cell: Cell, number: int, folder: Path, report: Report

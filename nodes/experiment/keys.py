@@ -49,19 +49,12 @@ def cell_inputs(experiment: Experiment, cell: Cell) -> dict[str, Any]:
         CellError: No such drive, victim or method.
     """
     require_known(experiment, cell)
-    config = experiment.config.model_dump(mode="json", exclude=_FREE)
+    inputs = registered_settings(experiment)
     if cell.method == NONE:
-        config["attack"] = {
-            key: value for key, value in config["attack"].items() if key not in _SEARCHED_WITH
-        }
+        for key in _SEARCHED_WITH:
+            del inputs["config"]["attack"][key]
     kept = {name: digest for name, digest in experiment.kept.items() if name in NEEDED}
-    inputs = {
-        "version": VERSION,
-        "bake": bake.VERSION,
-        "config": config,
-        "world": experiment.world_settings,
-        "stages": {**kept, **stage_digests(experiment.folder, NEEDED)},
-    }
+    inputs["stages"] = {**kept, **stage_digests(experiment.folder, NEEDED)}
     if cell.victim != RETRAINED:
         return inputs
     file = victim_file(experiment, cell.victim)

@@ -2,33 +2,25 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from typing import Any
 
-from advnerf_core.report.evidence.registration import RegisteredCell, read_registration
+from advnerf_core.report.evidence.registration import RegisteredCell, Registration
 from nodes.experiment.cell import Cell
-from nodes.experiment.context import Experiment
-from nodes.experiment.keys import registered_settings
 from nodes.experiment.stage_record import hash_of
 
 
-def registered_under(name: str, cell: Cell, experiment: object, published: Path) -> str:
-    """Digest of the registration that a cell is run under; empty if it, with the settings of now, is not registered.
+def registered_under(registration: Registration | None, cell: Cell, settings: dict[str, Any] | None) -> str:
+    """Digest of the registration that a cell is run under; empty if it, with these settings, is not registered.
 
     Args:
-        name: Of the campaign or experiment.
+        registration: Of the campaign or experiment; None if there is none.
         cell: Which, as the campaign names it.
-        experiment: What the kind of the cell has read; only experiment files can be registered.
-        published: Folder of all published sets.
+        settings: What `CellKind.registered_settings` says of its experiment.
     """
-    registration = read_registration(published / name)
-    if (
-        registration is None
-        or not isinstance(experiment, Experiment)
-        or registered_cell(cell) not in registration.cells
-    ):
+    if registration is None or settings is None or registered_cell(cell) not in registration.cells:
         return ""
     scenario = registration.scenario(cell.scenario, cell.placement)
-    same = scenario is not None and scenario.settings_sha256 == hash_of(registered_settings(experiment))
+    same = scenario is not None and scenario.settings_sha256 == hash_of(settings)
     return registration.digest if same else ""
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from advnerf_core.report.evidence.registration import read_registration
 from nodes.experiment.campaign.config import Campaign
 from nodes.experiment.campaign.store import CellStatus, store_of
 from nodes.experiment.campaign.worker import Job
@@ -46,6 +47,7 @@ def plan_cells(
         experiments: Those that were read already, by scenario and placement; it gets what is read.
     """
     experiments = {} if experiments is None else experiments
+    registration = read_registration(PUBLISHED / campaign.name)
     planned = []
     for cell in cells:
         kind = load_kind(campaign.kind(cell))
@@ -70,7 +72,7 @@ def plan_cells(
             cell.seed,
             digest,
             threads=1,
-            registration=registered_under(campaign.name, cell, experiments[key], PUBLISHED),
+            registration=registered_under(registration, cell, kind.registered_settings(experiments[key])),
         )
         planned.append(Planned(cell, job, kind.runs_alone(experiments[key]), kind.searches_apart))
     return planned

@@ -10,6 +10,7 @@ from nodes.experiment.attack import cells
 from nodes.experiment.campaign.config import campaign_of
 from nodes.experiment.campaign.plan import plan_cells
 from nodes.experiment.campaign.registering import register
+from nodes.experiment.keys import registered_settings
 from nodes.experiment.registered import registered_under
 
 GRADIENT = "right_hardened_gradient_0"
@@ -49,13 +50,17 @@ def test_a_registration_after_the_fact_is_refused(campaign, tmp_path):
 
 
 def test_cells_of_the_registered_settings_are_run_under_it_and_no_others(campaign, trained, tmp_path):
+    def under(cell, experiment):
+        registration = read_registration(tmp_path / "junction")
+        return registered_under(registration, cell, registered_settings(experiment))
+
     cell = next(each for each in campaign.cells if each.name == GRADIENT)
-    assert registered_under(campaign.name, cell, trained, tmp_path) == ""
+    assert under(cell, trained) == ""
     found = register(campaign, "tiny", [], tmp_path)
-    assert registered_under(campaign.name, cell, trained, tmp_path) == found.digest
-    assert registered_under(campaign.name, replace(cell, seed=7), trained, tmp_path) == ""
+    assert under(cell, trained) == found.digest
+    assert under(replace(cell, seed=7), trained) == ""
     config = trained.config.model_copy(update={"horizon": 2})
-    assert registered_under(campaign.name, cell, replace(trained, config=config), tmp_path) == ""
+    assert under(cell, replace(trained, config=config)) == ""
 
 
 def test_a_cell_keeps_its_drives(trained, tmp_path):
