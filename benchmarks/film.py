@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import io
 from pathlib import Path
 
 import av
 from PIL import Image
 
 from advnerf_core.files import write_atomically
+from advnerf_core.report.clips import webp
 
 WIDTH_PX, QUALITY = 780, 60
 
@@ -31,19 +31,9 @@ def main() -> None:
     parser.add_argument("picture", type=Path)
     arguments = parser.parse_args()
     frames, shown_ms = frames_of(next((arguments.run_folder / "report").glob("*.mp4")), WIDTH_PX)
-    buffer = io.BytesIO()
-    frames[0].save(
-        buffer,
-        "WEBP",
-        save_all=True,
-        append_images=frames[1:],
-        duration=round(shown_ms),
-        loop=0,
-        quality=QUALITY,
-        method=6,
-    )
-    write_atomically(arguments.picture, buffer.getvalue())
-    print(f"wrote {arguments.picture}: {len(frames)} frames, {len(buffer.getvalue()) / 1024:.0f} KiB")
+    data = webp(frames, shown_ms, QUALITY)
+    write_atomically(arguments.picture, data)
+    print(f"wrote {arguments.picture}: {len(frames)} frames, {len(data) / 1024:.0f} KiB")
 
 
 if __name__ == "__main__":

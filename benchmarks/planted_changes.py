@@ -21,6 +21,7 @@ import numpy as np
 
 from advnerf_core.driving.metrics import drive_metrics
 from advnerf_core.driving.path import Path as DrivingPath
+from advnerf_core.files import sha256_of
 from advnerf_core.report.cells import cell_name
 from advnerf_core.report.evidence.kept import KeptDrive
 from advnerf_core.report.evidence.page import film_of
@@ -37,7 +38,6 @@ from advnerf_core.report.evidence.verify import (
     SET,
     digests_of,
     sets_in,
-    sha256_of,
     verify_set,
     write_set,
 )
@@ -108,9 +108,7 @@ def rehash_a_file(folder: Path, rng: random.Random) -> None:
     """Another digit in a cell, whose digest in the manifest is renewed."""
     file = rng.choice(sorted(folder.glob("*.json")))
     file.write_text(_other_digit(file.read_text(), rng))
-    data = json.loads((folder / SET).read_text())
-    data["files"] = digests_of(folder)
-    (folder / SET).write_text(json.dumps(data, indent=1) + "\n")
+    _renew_manifest(folder)
 
 
 def drop_a_drive(folder: Path, rng: random.Random) -> None:
@@ -284,12 +282,16 @@ def _some_drive(folder: Path, rng: random.Random) -> tuple[Path, dict[str, Any],
 def _put(folder: Path, file: Path, data: dict[str, Any]) -> None:
     """Write a cell, and renew the manifest and the digest of the set."""
     file.write_text(json.dumps(data, indent=1) + "\n")
-    manifest = json.loads((folder / SET).read_text())
-    manifest["files"] = digests_of(folder)
-    (folder / SET).write_text(json.dumps(manifest, indent=1) + "\n")
+    _renew_manifest(folder)
     known = json.loads((folder.parent / DIGESTS).read_text())
     known[folder.name] = sha256_of(folder / SET)
     (folder.parent / DIGESTS).write_text(json.dumps(known, indent=1, sort_keys=True) + "\n")
+
+
+def _renew_manifest(folder: Path) -> None:
+    manifest = json.loads((folder / SET).read_text())
+    manifest["files"] = digests_of(folder)
+    (folder / SET).write_text(json.dumps(manifest, indent=1) + "\n")
 
 
 def _other_digit(text: str, rng: random.Random) -> str:

@@ -6,6 +6,7 @@ H.264 in MP4 where PyAV's FFmpeg has libx264, else VP9 in WebM: browsers play bo
 from __future__ import annotations
 
 import base64
+import io
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -118,6 +119,23 @@ def read_clip(path: Path) -> Frames:
         return np.stack(
             [np.asarray(f.to_ndarray(format="rgb24"), dtype=np.uint8) for f in container.decode(video=0)]
         )
+
+
+def webp(frames: Sequence[Image.Image], frame_ms: float, quality: int) -> bytes:
+    """An animated picture that repeats, as it stands in a README."""
+    buffer = io.BytesIO()
+    first, *others = frames
+    first.save(
+        buffer,
+        "WEBP",
+        save_all=True,
+        append_images=others,
+        duration=round(frame_ms),
+        loop=0,
+        quality=quality,
+        method=6,
+    )
+    return buffer.getvalue()
 
 
 def data_uri(path: Path) -> str:

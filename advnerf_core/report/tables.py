@@ -165,6 +165,11 @@ class Table:
     def _align(self, column: int) -> Markup:
         return Markup(' class="number"') if self.right[column] else Markup("")
 
+    def markdown(self) -> str:
+        """The table in Markdown, without its title; ends with a line break."""
+        rule = "|" + "|".join("---:" if right else "---" for right in self.right) + "|"
+        return "\n".join([_markdown_row(self.columns), rule, *map(_markdown_row, self.rows), ""])
+
     def rich(self) -> rich.table.Table:
         """The table for the terminal; `Text` keeps rich from reading units in brackets as markup."""
         table = rich.table.Table(title=self.title or None, box=rich.box.SIMPLE_HEAD, title_justify="left")
@@ -175,6 +180,10 @@ class Table:
                 table.add_section()
             table.add_row(*(Text(cell) for cell in row))
         return table
+
+
+def _markdown_row(cells: Sequence[str]) -> str:
+    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
 
 
 def hop_table(data: ReportData) -> Table:

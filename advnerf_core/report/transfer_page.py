@@ -209,26 +209,14 @@ def _field(value: Any) -> Any:
 
 def as_markdown(table: TransferTable) -> str:
     """Lines and targets as a Markdown page."""
-    parts = [
-        f"# {table.name or 'Transfer table'}",
-        "",
-        LEGEND,
-        "",
-        *_markdown_rows(text_table(table)),
-        "",
-        "## Targets",
-        "",
-    ]
-    return "\n".join([*parts, *_markdown_rows(target_table(table_targets(table))), ""])
-
-
-def _markdown_rows(table: Table) -> list[str]:
-    rule = "|" + "|".join("---:" if right else "---" for right in table.right) + "|"
-    return [_markdown_row(table.columns), rule, *(_markdown_row(row) for row in table.rows)]
-
-
-def _markdown_row(cells: Sequence[str]) -> str:
-    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+    parts = (
+        f"# {table.name or 'Transfer table'}\n",
+        f"{LEGEND}\n",
+        text_table(table).markdown(),
+        "## Targets\n",
+        target_table(table_targets(table)).markdown(),
+    )
+    return "\n".join(parts)
 
 
 def gather_clips(table: TransferTable, cells_folder: Path, page_folder: Path) -> list[ShownClip]:

@@ -67,7 +67,7 @@ def verify(
         print(f"{found.name}: {found.numbers} numbers from {found.drives} drives: {verdict}")
         for problem in found.problems:
             say_error(problem)
-        if again:
+        if again and not found.problems:
             wrong += _redrive(published / each, again, seed)
     if wrong:
         raise typer.Exit(_FAILURE_EXIT)

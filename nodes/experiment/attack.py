@@ -49,14 +49,14 @@ def cells(experiment: Experiment) -> list[Cell]:
         for victim in victims(experiment)
         for seed in (seeds if victim == HARDENED else seeds[:1])
     ]
-    return [
-        cell if condition != NONE else cell.clean
+    found = [
+        Cell.of(scenario, victim, condition, seed)
         for victim, seed in rows
         for condition in (NONE, *methods)
-        if condition != NONE or seed == seeds[0]
         for scenario in experiment.config.scenarios
-        for cell in [Cell.of(scenario, victim, condition, seed)]
     ]
+    # All seeds are measured from the same starts, so that no attack is one cell for all of them.
+    return list(dict.fromkeys(cell.clean if cell.method == NONE else cell for cell in found))
 
 
 def frozen_hashes(experiment: Experiment) -> dict[str, str]:

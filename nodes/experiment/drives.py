@@ -22,14 +22,11 @@ def learned_drives(
     """States ``[B, T + 1, n]`` and commands ``[B, T]`` of the drives from all starts of a problem in its own scene, and their metrics."""
     rollout, _ = evaluate(problem, theta)
     states, commands = (each.transpose(0, 1).numpy() for each in (rollout.states, rollout.controls))
-    return (
-        states,
-        commands,
-        [
-            drive_metrics(problem.path, each, experiment.limits, _fenced_tick(experiment, each))
-            for each in states
-        ],
-    )
+    scores = [
+        drive_metrics(problem.path, each, experiment.limits, _fenced_tick(experiment, each))
+        for each in states
+    ]
+    return states, commands, scores
 
 
 def _fenced_tick(experiment: Experiment, states: Array) -> int | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
@@ -17,6 +16,7 @@ from advnerf_core.attack.spaces.placement import KeepOut, PoseBounds
 from advnerf_core.attack.spaces.places import PlaceLimits, PlaceSpace, randomly_placed
 from advnerf_core.attack.spaces.space import ColourSpace, NamedObject, ShapeSpace, Shown, Space
 from advnerf_core.fields.voxel_grid import VoxelGridObject
+from advnerf_core.files import sha256_of
 from advnerf_core.objects.mesh.field import MeshField
 from advnerf_core.objects.mesh.shape import ShapeLimits
 from advnerf_core.objects.mesh.surface import sphere, unwrapped
@@ -163,4 +163,5 @@ def _named_voxels(experiment: Experiment) -> list[NamedObject]:
 
 @lru_cache(maxsize=8)
 def _file_sha256(path: Path, changed_ns: int) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+    del changed_ns  # a changed file is another entry of the cache
+    return sha256_of(path)

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from advnerf_core.report.conditions import NONE, style_of
+from advnerf_core.report.tables import Table
 
 _HEAD = """# Does it transfer?
 
@@ -111,9 +112,8 @@ def _p(value: float) -> str:
 
 
 def _table(rows: Sequence[Mapping[str, Any]]) -> str:
-    lines = [f"| {' | '.join(_COLUMNS)} |", "|" + "---|" * len(_COLUMNS)]
-    lines += [f"| {' | '.join(_cells(row))} |" for row in rows]
-    return "\n".join(lines) + "\n"
+    left = (False,) * len(_COLUMNS)
+    return Table("", _COLUMNS, tuple(tuple(_cells(row)) for row in rows), left).markdown()
 
 
 def _cells(row: Mapping[str, Any]) -> list[str]:

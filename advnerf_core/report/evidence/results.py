@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,7 @@ from advnerf_core.report.evidence.registration import (
     PrimaryTest,
     RegisteredScenario,
     Registration,
+    scenario_key,
 )
 from advnerf_core.report.reference import Domain
 
@@ -110,6 +111,8 @@ class Evidence:
             cell_name(cell.scenario, cell.victim, cell.method, cell.seed, cell.placement)
             for cell in registration.cells
         }
+        self._paths = {name: each.reference_path() for name, each in registration.scenarios.items()}
+        self._metrics: dict[tuple[str, Domain], list[DriveMetrics]] = {}
 
     def scenario_of(self, cell: CellResult) -> RegisteredScenario:
         """The registered scenario of a cell."""
@@ -123,9 +126,14 @@ class Evidence:
 
     def metrics(self, cell: CellResult, domain: Domain) -> list[DriveMetrics]:
         """Metrics of the drives of a cell, computed from what is kept."""
-        scenario = self.scenario_of(cell)
-        path = scenario.reference_path()
-        return [drive.metrics(path, scenario.horizon) for drive in cell.kept.get(domain, ())]
+        key = cell.name, domain
+        if key not in self._metrics:
+            path, horizon = (
+                self._paths[scenario_key(cell.scenario, cell.placement)],
+                self.scenario_of(cell).horizon,
+            )
+            self._metrics[key] = [drive.metrics(path, horizon) for drive in cell.kept.get(domain, ())]
+        return self._metrics[key]
 
     def without(self, cell: CellResult) -> CellResult | None:
         """The cell of the same drives without attack."""
@@ -170,14 +178,9 @@ def rows(evidence: Evidence) -> list[Row]:
 
 def primary_tests(evidence: Evidence) -> list[TestResult]:
     """The registered tests, adjusted by Holm over these alone."""
-    found = [_test(evidence, test) for test in evidence.registration.primary]
-    claimed = [test for test in found if test is not None and test.p is not None]
-    adjusted = dict(
-        zip(map(id, claimed), holm([test.p for test in claimed if test.p is not None]), strict=True)
-    )
-    return [
-        TestResult(**{**vars(test), "p_holm": adjusted.get(id(test))}) for test in found if test is not None
-    ]
+    found = [test for each in evidence.registration.primary if (test := _test(evidence, each)) is not None]
+    adjusted = iter(holm([test.p for test in found if test.p is not None]))
+    return [test if test.p is None else replace(test, p_holm=next(adjusted)) for test in found]
 
 
 def as_data(evidence: Evidence) -> dict[str, Any]:
@@ -243,14 +246,12 @@ def _test(evidence: Evidence, test: PrimaryTest) -> TestResult | None:
     }
     if not all(cells and all(evidence.is_registered(cell) for cell in cells) for cells in by_method.values()):
         return None
-    means: Mapping[tuple[str, Domain], Floats] = {
-        (method, domain): np.array([_mean_excess_m(evidence, cell, domain) for cell in cells])
-        for method, cells in by_method.items()
-        for domain in DOMAINS
-    }
-    baseline = max(test.against, key=lambda method: float(means[method, "surrogate"].mean()))
-    ours, theirs = means[test.method, "deployed"], means[baseline, "deployed"]
-    found = permutation_test(ours, theirs)
+
+    def means(method: str, domain: Domain) -> Floats:
+        return np.array([_mean_excess_m(evidence, cell, domain) for cell in by_method[method]])
+
+    baseline = max(test.against, key=lambda method: float(means(method, "surrogate").mean()))
+    found = permutation_test(means(test.method, "deployed"), means(baseline, "deployed"))
     off = [_off_track(evidence, by_method[name]) for name in (test.method, baseline)]
     same = len(off[0]) == len(off[1])
     return TestResult(

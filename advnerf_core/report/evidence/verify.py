@@ -6,7 +6,6 @@ the published numbers. The digests of all sets are in one file beside their fold
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -16,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from advnerf_core.errors import AdvnerfError
-from advnerf_core.files import write_atomically
+from advnerf_core.files import sha256_of, write_atomically
 from advnerf_core.report.cells import CellError, CellResult, cell_name, read_cell
 from advnerf_core.report.evidence.kept import KeptDrive
 from advnerf_core.report.evidence.page import film_of, picture_of, results_page
@@ -151,10 +150,6 @@ def _cell_files(folder: Path) -> list[Path]:
 def digests_of(folder: Path) -> dict[str, str]:
     files = (folder / FILE, *_cell_files(folder))
     return {file.relative_to(folder).as_posix(): sha256_of(file) for file in files}
-
-
-def sha256_of(file: Path) -> str:
-    return hashlib.sha256(file.read_bytes()).hexdigest()
 
 
 def _known_digests(published: Path) -> dict[str, str]:

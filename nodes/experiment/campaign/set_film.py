@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,7 +13,7 @@ from PIL import Image
 
 from advnerf_core.files import write_atomically
 from advnerf_core.report.cells import cell_name, read_cell
-from advnerf_core.report.clips import read_clip
+from advnerf_core.report.clips import read_clip, webp
 from advnerf_core.report.conditions import NONE
 from advnerf_core.report.evidence.page import film_of
 from advnerf_core.report.evidence.verify import SET
@@ -33,7 +32,7 @@ def write_film(campaign: Campaign, published: Path) -> Path | None:
         return None
     frames = _side_by_side([read_clip(clip)[::_EVERY] for clip in clips])
     for quality in _QUALITIES:
-        data = _encoded(frames, quality)
+        data = webp(frames, _FRAME_MS, quality)
         if len(data) <= MOST_BYTES:
             break
     target = published.parent / film_of(published.name)
@@ -57,18 +56,3 @@ def _side_by_side(clips: Sequence[NDArray[np.uint8]]) -> list[Image.Image]:
     rows = [np.concatenate([clip[min(at, len(clip) - 1)] for clip in clips], axis=1) for at in range(count)]
     height = round(rows[0].shape[0] * _WIDTH_PX / rows[0].shape[1])
     return [Image.fromarray(row).resize((_WIDTH_PX, height), Image.Resampling.LANCZOS) for row in rows]
-
-
-def _encoded(frames: Sequence[Image.Image], quality: int) -> bytes:
-    buffer = io.BytesIO()
-    frames[0].save(
-        buffer,
-        "WEBP",
-        save_all=True,
-        append_images=list(frames[1:]),
-        duration=_FRAME_MS,
-        loop=0,
-        quality=quality,
-        method=6,
-    )
-    return buffer.getvalue()

@@ -7,7 +7,6 @@ treatments"): after as many blocks as it has rows, every condition has been at e
 
 from __future__ import annotations
 
-import hashlib
 import json
 import random
 from dataclasses import asdict, dataclass
@@ -15,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from advnerf_core.attack.artifact import load_attack
-from advnerf_core.files import write_atomically
+from advnerf_core.files import sha256_of, write_atomically
 from nodes.runtime.errors import RuntimeFault
 
 PLAN_NAME = "plan.json"
@@ -149,9 +148,9 @@ def finished(folder: Path, plan: TrialsPlan) -> dict[str, dict[str, Any]]:
     }
 
 
-def sha256_of(file: Path | None) -> str:
+def sha256_if_any(file: Path | None) -> str:
     """Hash of a file; empty for None."""
-    return "" if file is None else hashlib.sha256(file.read_bytes()).hexdigest()
+    return "" if file is None else sha256_of(file)
 
 
 def _read(file: Path) -> dict[str, Any]:

@@ -26,7 +26,7 @@ from nodes.lab.trials.plan import (
     finished,
     keep_plan,
     make_runs,
-    sha256_of,
+    sha256_if_any,
 )
 from nodes.lab.trials.trial import NotStartedError, TrialPlan, counts
 from nodes.lab.trials.trial_runner import run_trial
@@ -104,8 +104,8 @@ def prepare_series(
         seed,
         ticks,
         start_pose or room.start_pose,
-        sha256_of(room_file),
-        sha256_of(policy_file),
+        sha256_if_any(room_file),
+        sha256_if_any(policy_file),
         make_runs(attacks, repeats, seed),
         host,
     )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import inspect
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -12,6 +11,7 @@ from typing import Any, cast
 
 from pydantic import BaseModel, TypeAdapter
 
+from advnerf_core.files import sha256_of
 from advnerf_core.plugins import PluginError, absolute_reference, is_file_reference, resolve
 from hardware.worlds import ENTRY_POINTS, WORLDS
 from hardware.worlds.world import World, WorldClass, members_of_a_world
@@ -90,7 +90,7 @@ def read_world(document: Document, folder: Path) -> NamedWorld:
         return NamedWorld(kind, world_class, config, "")
     file = Path(absolute_reference(kind, folder).rpartition(":")[0])
     name = f"{file.name}:{kind.rpartition(':')[2]}"
-    return NamedWorld(name, world_class, config, hashlib.sha256(file.read_bytes()).hexdigest())
+    return NamedWorld(name, world_class, config, sha256_of(file))
 
 
 def find_world(name: str, folder: Path) -> WorldClass:
