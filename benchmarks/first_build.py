@@ -12,7 +12,7 @@ import numpy as np
 
 from advnerf_core.files import write_atomically
 from advnerf_core.report.cells import CellResult, read_cells
-from advnerf_core.report.conditions import NONE, order_of, style_of
+from advnerf_core.report.conditions import CONTROLS, order_of, style_of
 from advnerf_core.report.evidence.registration import FILE
 from advnerf_core.report.transfer import DOMAINS, drives_in
 from benchmarks.results import REPOSITORY
@@ -48,7 +48,7 @@ def main() -> None:
 def _rows(cells: list[CellResult]) -> Iterator[str]:
     groups: dict[tuple[str, str, str, str], list[CellResult]] = {}
     for cell in cells:
-        if cell.method != NONE and cell.extra.get("horizon"):
+        if cell.method not in CONTROLS and cell.extra.get("horizon"):
             groups.setdefault((cell.scenario, cell.placement, cell.victim, cell.method), []).append(cell)
     for key in sorted(groups, key=lambda key: (key[:3], order_of(key[3]))):
         for domain in DOMAINS:

@@ -13,6 +13,9 @@ from dataclasses import dataclass
 from types import MappingProxyType
 
 NONE = "none"
+EMPTY = "empty"
+# Drives that no search belongs to: the objects in their own colours, and no objects at all.
+CONTROLS = (NONE, EMPTY)
 
 
 @dataclass(frozen=True)
@@ -55,7 +58,7 @@ CONDITIONS: Mapping[str, Style] = _rows(
     Style("frames alone", "frame", "#591600", "#de3512", (7, 0, 0), climbs=True),
     Style("guided", "guided", "#ef7fb8", "#ffc2e2", "X", climbs=True),
     Style("distilled", "distilled", "#b5895f", "#a87545", "*", climbs=True),
-    Style("empty scene", "empty", "#7d848d", "#8f98a3", "D"),
+    Style("no object", EMPTY, "#7d848d", "#8f98a3", "D"),
     Style("laps without attack", "laps", "#232c66", "#c3caff", "p"),
 )
 # Of methods that the table does not have; the titles stand for their names.
@@ -80,7 +83,7 @@ def style_of(name: str) -> Style:
 def order_of(name: str) -> tuple[int, str]:
     """Sort key of conditions: methods of the table in its order, then other methods by name, then special drives."""
     names = tuple(CONDITIONS)
-    special = names.index("empty")
+    special = names.index(EMPTY)
     if name not in CONDITIONS:
         return special, name
     place = names.index(name)

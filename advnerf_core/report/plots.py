@@ -19,7 +19,7 @@ from markupsafe import escape
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from advnerf_core.report.conditions import NONE, order_of, style_of
+from advnerf_core.report.conditions import EMPTY, NONE, order_of, style_of
 from advnerf_core.report.data import Domain, Fidelity, Laps, Latency, MemoryRow, ReportData, Run, Victim
 from advnerf_core.report.palette import LIGHT, LINE_STYLES, themed_svg
 
@@ -224,7 +224,7 @@ def run_style(run: Run) -> dict[str, Any]:
     """How a drive is drawn: colour by condition, line by domain."""
     style = style_of(run.condition)
     # Attacks in front of drives without one, and these in front of the empty scene.
-    front = {"empty": 2.0, NONE: 2.1}.get(run.condition, 2.2 + 0.01 * order_of(run.condition)[0])
+    front = {EMPTY: 2.0, NONE: 2.1}.get(run.condition, 2.2 + 0.01 * order_of(run.condition)[0])
     return {"color": style.light, "ls": LINE_STYLES[run.domain], "zorder": front, "alpha": 0.9}
 
 

@@ -20,7 +20,7 @@ from advnerf_core.attack.search.search import SearchResult
 from advnerf_core.attack.spaces.space import Shown, Space
 from advnerf_core.files import write_atomically
 from advnerf_core.policies.pilotnet import LoadedPolicy, load_policy
-from advnerf_core.report.conditions import NONE
+from advnerf_core.report.conditions import CONTROLS, EMPTY, NONE
 from nodes.experiment.cell import Cell
 from nodes.experiment.context import Experiment
 from nodes.experiment.drives import learned_drives, totals
@@ -42,21 +42,22 @@ class FrozenChangedError(RuntimeFault):
 
 
 def cells(experiment: Experiment) -> list[Cell]:
-    """All cells in order: every seed against the hardened victim, the first also against the naive one; quick ones first."""
+    """All cells in order: controls, then every seed against the hardened victim, the first also against the naive one; quick ones first."""
     seeds, methods = experiment.config.attack.seeds, experiment.config.attack.methods
     rows = [
         (victim, seed)
         for victim in victims(experiment)
         for seed in (seeds if victim == HARDENED else seeds[:1])
     ]
+    controls = CONTROLS if experiment.config.measure.no_object else (NONE,)
+    # All seeds are measured from the same starts, so that a control is one cell for all of them.
     found = [
-        Cell.of(scenario, victim, condition, seed)
+        Cell.of(scenario, victim, condition, 0 if condition in CONTROLS else seed)
         for victim, seed in rows
-        for condition in (NONE, *methods)
+        for condition in (*controls, *methods)
         for scenario in experiment.config.scenarios
     ]
-    # All seeds are measured from the same starts, so that no attack is one cell for all of them.
-    return list(dict.fromkeys(cell.clean if cell.method == NONE else cell for cell in found))
+    return list(dict.fromkeys(found))
 
 
 def frozen_hashes(experiment: Experiment) -> dict[str, str]:
@@ -149,7 +150,7 @@ def surrogate_part(
     policy = _victim(victim_file(experiment, cell.victim))
     problem = attack_problem(experiment, space, policy, cell.scenario, cell.seed)
     attack_id, curve, seconds = None, [], 0.0
-    if cell.method != NONE:
+    if cell.searched:
         result = _search(experiment, space, problem, cell, folder, report)
         seconds = sum(evaluation.seconds for evaluation in result.history)
         curve = [evaluation.predicted_total_cte_m for evaluation in result.history]
@@ -221,14 +222,16 @@ def past_field(experiment: Experiment, problem: AttackProblem, space: Space, sho
 
 
 def load_shown(space: Space, folder: Path, cell: Cell) -> Shown:
-    """The objects as a search found them, of its attack file; as they are where the cell has no method."""
+    """The objects as a search found them, of its attack file; of a control as they are, or none."""
+    if cell.method == EMPTY:
+        return Shown((), torch.zeros(0, 3))
     attack = load_found(folder, cell)
     return space.plain if attack is None else space.restored(attack)
 
 
 def load_found(folder: Path, cell: Cell) -> AttackFile | None:
-    """The attack file of a search; None where the cell has no method."""
-    return None if cell.method == NONE else load_attack(folder / ATTACK)
+    """The attack file of a search; None of a control."""
+    return load_attack(folder / ATTACK) if cell.searched else None
 
 
 def search_settings(experiment: Experiment, method: Method) -> SearchSettings:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 from advnerf_core.attack.methods import method_name
 from advnerf_core.report.cells import cell_name
-from advnerf_core.report.conditions import NONE
+from advnerf_core.report.conditions import CONTROLS, NONE
 from nodes.runtime.errors import ConfigError
 
 # What --only may name.
@@ -21,7 +21,7 @@ class Cell:
     Attributes:
         scenario: Name of the path, or in a campaign of the scenario.
         victim: Which policy.
-        method: Name of the method that found what it meets; ``none``: no attack.
+        method: Name of the method that found what it meets; ``none``: no attack, ``empty``: no object.
         seed: Of the search and its starts; 0 without attack.
         placement: Name of the placement of the objects; empty for the experiment's own.
         reference: Where the method's code is, as `advnerf_core.attack.methods.load_method` takes it, if its name does not say.
@@ -36,7 +36,7 @@ class Cell:
 
     @classmethod
     def of(cls, scenario: str, victim: str, method: str, seed: int, placement: str = "") -> Cell:
-        """The cell of a method as `load_method` takes it, or of ``none``."""
+        """The cell of a method as `load_method` takes it, or of a control."""
         name = method_name(method)
         return cls(scenario, victim, name, seed, placement, "" if method == name else method)
 
@@ -46,13 +46,18 @@ class Cell:
         return cell_name(self.scenario, self.victim, self.method, self.seed, self.placement)
 
     @property
+    def searched(self) -> bool:
+        """Whether a search finds what it meets; else it is a control."""
+        return self.method not in CONTROLS
+
+    @property
     def clean(self) -> Cell:
         """The same drives without attack: all seeds are measured from the same starts."""
         return replace(self, method=NONE, seed=0, reference="")
 
     @property
     def code(self) -> str:
-        """Its method as `load_method` takes it, or ``none``."""
+        """Its method as `load_method` takes it, or the name of a control."""
         return self.reference or self.method
 
 

@@ -145,7 +145,7 @@ def draw_maps(experiment: Experiment, cell: Cell, number: int, folder: Path, rep
     Raises:
         CellError: There is no object of this number.
     """
-    if cell.method == NONE or not isinstance(experiment.config.space, PlacesConfig):
+    if not cell.searched or not isinstance(experiment.config.space, PlacesConfig):
         return []
     count = len(experiment.objects)
     if not 0 <= number < count:

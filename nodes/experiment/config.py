@@ -149,6 +149,9 @@ class MeasureConfig(_Section):
 
     starts: Positive = Field(default=5, description="Starts, none of which a search had.")
     seed: int = Field(default=10_000, description="Of the starts.")
+    no_object: bool = Field(
+        default=False, description="A second control: the same drives with the objects taken away."
+    )
 
 
 class AttackConfig(_Section):
@@ -256,6 +259,11 @@ class ExperimentConfig(_Section):
             if self.retrain is not None:
                 raise ValueError(
                     "expected retrain only where objects are attacked, got it with space.kind face"
+                )
+            if self.measure.no_object:
+                raise ValueError(
+                    "expected measure.no_object only where objects are attacked, got it with space.kind face, whose panel was "
+                    "photographed with its scene; set deploy.empty_scene instead"
                 )
         elif self.deploy.live:
             raise ValueError(

@@ -30,6 +30,7 @@ _FREE: Mapping[str, bool | set[str]] = {
     "reference": True,
     "world": True,
     "attack": {"seeds", "methods", "cache_mib"},
+    "measure": {"no_object"},
     "deploy": {"laps", "empty_scene", "ready_timeout_s"},
 }
 
@@ -50,7 +51,7 @@ def cell_inputs(experiment: Experiment, cell: Cell) -> dict[str, Any]:
     """
     require_known(experiment, cell)
     inputs = registered_settings(experiment)
-    if cell.method == NONE:
+    if not cell.searched:
         for key in _SEARCHED_WITH:
             del inputs["config"]["attack"][key]
     kept = {name: digest for name, digest in experiment.kept.items() if name in NEEDED}
@@ -84,7 +85,7 @@ def require_known(experiment: Experiment, cell: Cell) -> None:
     for what, value, choices in known:
         if value not in choices:
             raise CellError(f"expected a {what} of {', '.join(choices)}, got {value!r}")
-    if cell.method != NONE:
+    if cell.searched:
         try:
             require_method(cell.code)
         except PluginError as error:

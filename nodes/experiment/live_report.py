@@ -18,7 +18,6 @@ from markupsafe import Markup
 from advnerf_core.attack.artifact import load_attack
 from advnerf_core.report import data as rd
 from advnerf_core.report import tables, targets
-from advnerf_core.report.conditions import NONE
 from advnerf_core.report.live_parts import live_lead, live_sections, live_targets
 from advnerf_core.report.results import read_results, write_results
 from nodes.experiment import films, memory
@@ -233,7 +232,7 @@ def _textures(experiment: Experiment) -> Iterator[rd.Texture]:
 
 
 def _attacked(experiment: Experiment) -> list[Cell]:
-    return [cell for cell in cells(experiment) if cell.method != NONE]
+    return [cell for cell in cells(experiment) if cell.searched]
 
 
 def _fidelity(experiment: Experiment) -> rd.Fidelity:

@@ -12,7 +12,7 @@ from typing import Any
 
 from advnerf_core.files import write_atomically
 from advnerf_core.report.cells import CellResult
-from advnerf_core.report.conditions import NONE
+from advnerf_core.report.conditions import CONTROLS
 from advnerf_core.report.transfer_prediction import Predicted
 from nodes.experiment.campaign.config import Campaign
 from nodes.experiment.campaign.gate import CleanDrive, predict_cell
@@ -36,7 +36,7 @@ def predict_campaign(
     experiments: dict[tuple[str, str], Any] = {}
     clean: dict[tuple[str, str, str, int], CleanDrive] = {}
     for cell in cells:
-        if cell.method == NONE:
+        if not cell.searched:
             continue
         planned = plan_cells(campaign, [cell], experiments)[0]
         kind = load_kind(planned.job.kind)
@@ -77,7 +77,7 @@ def predicted(folder: Path, results: Sequence[CellResult]) -> list[Predicted]:
     """
     pairs = []
     for cell in results:
-        if cell.deployed is None or cell.method == NONE:
+        if cell.deployed is None or cell.method in CONTROLS:
             continue
         kept = kept_prediction(prediction_file(folder, cell.name), cell.settings_hash)
         if kept is None:

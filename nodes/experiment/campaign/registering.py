@@ -10,7 +10,7 @@ from pathlib import Path
 
 from advnerf_core.driving.metrics import mean_cte_limit_m
 from advnerf_core.files import write_atomically
-from advnerf_core.report.conditions import NONE
+from advnerf_core.report.conditions import CONTROLS
 from advnerf_core.report.evidence.registration import (
     FILE,
     PrimaryTest,
@@ -120,7 +120,7 @@ def _primary(cells: Sequence[Cell]) -> list[PrimaryTest]:
             for cell in cells
             if (cell.scenario, cell.placement, cell.victim) == (scenario, placement, HARDENED)
         )
-        against = tuple(method for method in methods if method not in (NONE, _CLAIMED))
+        against = tuple(method for method in methods if method not in (*CONTROLS, _CLAIMED))
         if _CLAIMED in methods and against:
             tests.append(
                 PrimaryTest(

@@ -13,7 +13,10 @@ import torch
 
 from advnerf_core.attack.artifact import load_attack
 from advnerf_core.attack.search.search import SearchStateError
+from advnerf_core.driving.rollout import drive
+from advnerf_core.policies.pilotnet import images_to_tensor, load_policy
 from advnerf_core.report.transfer_page import text_table
+from advnerf_core.scene.surrogate import Surrogate
 from nodes.experiment import attack, page, report, run
 from nodes.experiment.attack import cells, load_shown, surrogate_part
 from nodes.experiment.cell import Cell
@@ -24,8 +27,10 @@ from nodes.experiment.deploy import DRIVES, ThroughWorld, cell_data
 from nodes.experiment.films import film_cell
 from nodes.experiment.keys import CellError, clean_folder
 from nodes.experiment.kinds import load_kind
+from nodes.experiment.learned_scene import load_field
 from nodes.experiment.policy import NAIVE, victim_file
 from nodes.experiment.spaces import colour_space
+from nodes.runtime.errors import ConfigError
 from tests.support.strangers import spiral_code, spiral_theta, write_spiral
 
 PLACE = ("right", "hardened")
@@ -173,6 +178,43 @@ def test_cell_has_both_domains_over_their_own_clean_drive(fresh: Experiment, wal
     (folder / DRIVES).unlink()
     held = finished(fresh, blocking, GRADIENT)
     assert held["extra"]["blocked_tick"] == [1]
+
+
+def test_without_objects_the_car_drives_as_in_the_bare_scene(fresh: Experiment, wall: Any) -> None:
+    control, clean = replace(GRADIENT, method="empty"), GRADIENT.clean
+    found, plain = (finished(fresh, wall, cell) for cell in (control, clean))
+    assert (found["attack_id"], found["surrogate"]["none_total_cte_m"]) == (
+        None,
+        plain["surrogate"]["total_cte_m"],
+    )
+    # The bare scene and policy, put together by hand.
+    bare = Surrogate(load_field(fresh), fresh.view.pinhole, fresh.mount)
+    policy = load_policy(victim_file(fresh, control.victim)).policy
+    starts = fresh.measured_starts(control.scenario)
+    goals = torch.tensor([fresh.goal(control.scenario)], dtype=torch.float32).expand(len(starts), -1)
+    driven = drive(policy, bare.observe(None), fresh.dynamics, starts, fresh.config.horizon, goals)
+    kept = json.loads((fresh.cell_folder(control) / attack.SEARCHED).read_text())["states"]
+    assert np.array(kept) == pytest.approx(driven.states.transpose(0, 1).numpy())
+    # Deployed, the first command is that of the world's own picture.
+    wall.reset(*map(float, starts[0]))
+    image = images_to_tensor(fresh.view.image(wall.observe()[0]))
+    first = json.loads((fresh.cell_folder(control) / DRIVES).read_text())["commands"][0][0]
+    with torch.no_grad():
+        assert first == pytest.approx(float(policy(image, goals[:1])[0]), abs=1e-6)
+    assert found["kept"]["deployed"][0] != plain["kept"]["deployed"][0]
+
+
+def test_the_control_without_objects_is_asked_for(trained: Experiment, tmp_path: Path) -> None:
+    measure = trained.config.measure.model_copy(update={"no_object": True})
+    more = replace(trained, config=trained.config.model_copy(update={"measure": measure}))
+    assert {cell.name for cell in cells(more)} - {cell.name for cell in cells(trained)} == {
+        f"{drive}_{victim}_empty_0"
+        for drive in ("straight", "right", "left")
+        for victim in ("hardened", "naive")
+    }
+    room = Path(__file__).parents[3] / "launch" / "room.experiment.yaml"
+    with pytest.raises(ConfigError, match=r"measure\.no_object only where objects are attacked.*empty_scene"):
+        run.load_experiment(room, "full", ["measure.no_object=true"], tmp_path)
 
 
 def test_a_cell_is_filmed_frame_by_frame(fresh: Experiment, wall: Any) -> None:
