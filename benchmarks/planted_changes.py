@@ -149,7 +149,9 @@ def pick_a_start(folder: Path, rng: random.Random) -> None:
     drive = KeptDrive.model_validate(data["kept"][domain][number])
     poses, turned = drive.poses(), rng.uniform(-np.pi, np.pi)
     poses[:, :2] += rng.uniform(0.1, 0.3) * np.array([np.cos(turned), np.sin(turned)])
-    moved = KeptDrive.of(poses, drive.driven_ticks, np.array(drive.command.split(), float), drive.collided)
+    moved = KeptDrive.of(
+        poses, drive.driven_ticks, np.array(drive.command.split(), float), drive.collided, drive.collided_with
+    )
     found = moved.metrics(scenario.reference_path(), scenario.horizon)
     data["kept"][domain][number] = moved.model_dump()
     data[domain]["total_cte_m"][number] = found.total_cte_m

@@ -206,24 +206,23 @@ class Warehouse:
 
     def _cast(self, T_world_from_camera: Array, pinhole: Pinhole) -> tuple[Rgb, Depth]:
         """Colours and planar depth of what each pixel's ray meets first."""
-        eye, R = T_world_from_camera[:3, 3], T_world_from_camera[:3, :3]
-        rays = (
-            pinhole.directions() @ R.T
-        )  # of unit planar depth, so that the distance along them is planar depth
+        eye, R = T_world_from_camera[:3, 3, None, None], T_world_from_camera[:3, :3]
+        # Of unit planar depth, so that the distance along them is planar depth. Axes first: numpy then reduces whole rows.
+        rays = np.ascontiguousarray(np.moveaxis(pinhole.directions() @ R.T, -1, 0))
         rays = np.where(np.abs(rays) < 1e-9, 1e-9, rays)
-        hall = np.array([[-HALL_M[0], -HALL_M[1], 0.0], HALL_M])
+        low, high = (np.array(end)[:, None, None] for end in ((-HALL_M[0], -HALL_M[1], 0.0), HALL_M))
         # Of the hall the inside is seen: the nearest of the walls ahead.
-        ends = np.maximum((hall[0] - eye) / rays, (hall[1] - eye) / rays)
-        depth, axis = ends.min(axis=-1), ends.argmin(axis=-1)
+        ends = np.maximum((low - eye) / rays, (high - eye) / rays)
+        depth, axis = ends.min(axis=0), ends.argmin(axis=0)
         index = np.full(depth.shape, len(self._low))
-        for number, (low, high) in enumerate(zip(self._low, self._high, strict=True)):
-            one, other = (low - eye) / rays, (high - eye) / rays
-            enter, leave = np.minimum(one, other), np.maximum(one, other).min(axis=-1)
-            first = enter.max(axis=-1)
+        for number, box in enumerate(np.stack([self._low, self._high], axis=1)):
+            one, other = (box[..., None, None] - eye) / rays
+            enter, leave = np.minimum(one, other), np.maximum(one, other).min(axis=0)
+            first = enter.max(axis=0)
             hit = (first < leave) & (first > 0.0) & (first < depth)
             depth, index = np.where(hit, first, depth), np.where(hit, number, index)
-            axis = np.where(hit, enter.argmax(axis=-1), axis)
-        points = eye + depth[..., None] * rays
+            axis = np.where(hit, enter.argmax(axis=0), axis)
+        points = np.moveaxis(eye + depth * rays, 0, -1)
         wave = np.einsum("hwk,hwck->hwc", points, self._waves[index]) + self._phase[index]
         light = np.array([0.75, 0.9, 1.0])[axis]  # walls along y, walls along x, floor and ceiling
         colour = self._base[index] * (0.75 + 0.25 * np.sin(2.0 * math.pi * wave)) * light[..., None]

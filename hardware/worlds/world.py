@@ -15,7 +15,7 @@ from types import TracebackType
 from typing import Any, Literal, Protocol, overload, runtime_checkable
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.geometry import Array, Pinhole, VehicleState
@@ -383,6 +383,21 @@ class Overview(Protocol):
     def overview(self) -> tuple[Rgb, Pinhole, Array]:
         """A picture ``[H, W, 3]``, and the camera that took it: its intrinsics and ``T_world_from_camera`` ``[4, 4]``."""
         ...
+
+
+@runtime_checkable
+class NamesObstacles(Protocol):
+    """A world that says what its car ran into."""
+
+    def touches(self, x_m: float, y_m: float, yaw_rad: float, /) -> str:
+        """Name of what the car stands against at a pose, such as ``wall``; empty if nothing is near."""
+        ...
+
+
+def collided_with(world: World, pose: ArrayLike) -> str:
+    """Name of what the car ran into that was stopped at a pose (x [m], y [m], yaw [rad]); ``obstacle`` where the world names nothing there."""
+    x_m, y_m, yaw_rad = map(float, np.asarray(pose)[:3])
+    return (world.touches(x_m, y_m, yaw_rad) if isinstance(world, NamesObstacles) else "") or "obstacle"
 
 
 def traits_of(world: World) -> Traits:

@@ -86,7 +86,7 @@ class ThroughNodes:
             name = live_name(number)
             live = LiveRun(name, cell.victim, cell.scenario, (start[0], start[1], start[2]), attack)
             found.append({"run": name, **drive_until_it_counts(self.experiment, live, folder, tell)})
-        return Deployed([as_drive(each) for each in found], found)
+        return Deployed([as_drive(self.experiment, each) for each in found], found)
 
 
 def live_name(start: int) -> str:
@@ -190,6 +190,7 @@ def deployed_part(
         "mean_cte_m": [drive.metrics.mean_cte_m for drive in deployed.drives],
         "max_cte_m": [drive.metrics.max_cte_m for drive in deployed.drives],
         "blocked_tick": [drive.blocked_tick for drive in deployed.drives],
+        "collided_with": [drive.collided_with for drive in deployed.drives],
         "live": deployed.live,
     }
     write_atomically(kept, json.dumps(data) + "\n")

@@ -24,7 +24,7 @@ from advnerf_core.geometry import Array, Pinhole, planar_poses
 from advnerf_core.policies.pilotnet import Policy, images_to_tensor
 from advnerf_core.policies.view import PolicyView
 from advnerf_core.scene.surrogate import Frames, Surrogate
-from hardware.worlds.world import Depth, Rgb, World
+from hardware.worlds.world import Depth, Rgb, World, collided_with
 from nodes.experiment.images import as_uint8
 
 # At a camera's own resolution one ray per pixel is what a rasteriser takes; the policy's resize averages three of them.
@@ -184,12 +184,14 @@ class DeployedDrive:
         controls: What the policy commanded ``[T]``.
         metrics: Total CTE and what belongs to it.
         blocked_tick: When the car ran into something; None if it did not.
+        collided_with: Name of what it ran into; None if it did not.
     """
 
     states: Array
     controls: Array
     metrics: DriveMetrics
     blocked_tick: int | None
+    collided_with: str | None = None
 
 
 def drive_deployed(
@@ -224,4 +226,7 @@ def drive_deployed(
     states = rollout.states[:, 0].numpy().copy()
     states[:, 2] = np.unwrap(states[:, 2])
     metrics = drive_metrics(path, states, limits, car.blocked_tick)
-    return DeployedDrive(states, rollout.controls[:, 0].double().numpy(), metrics, car.blocked_tick)
+    hit = None if car.blocked_tick is None else collided_with(dressed.scene, states[car.blocked_tick])
+    return DeployedDrive(
+        states, rollout.controls[:, 0].double().numpy(), metrics, car.blocked_tick, collided_with=hit
+    )

@@ -18,6 +18,7 @@ from advnerf_core.driving.metrics import DriveMetrics, Horizon, first_still_tick
 from advnerf_core.files import write_atomically
 from advnerf_core.policies.pilotnet import load_policy
 from hardware.worlds.lab.config import LabConfig
+from hardware.worlds.world import collided_with
 from nodes.experiment.context import Experiment
 from nodes.experiment.deployed import DeployedDrive
 from nodes.experiment.faces import on_screen, panel_of, wanted_face
@@ -147,12 +148,12 @@ def drive_live(experiment: Experiment, live: LiveRun, folder: Path) -> None:
     write_atomically(folder / f"{live.name}.json", json.dumps(result) + "\n")
 
 
-def as_drive(driven: dict[str, Any]) -> DeployedDrive:
+def as_drive(experiment: Experiment, driven: dict[str, Any]) -> DeployedDrive:
     """A live run as any deployed drive; what the policy commanded is in its bag."""
     metrics = driven["metrics"] | {"ctes_m": tuple(driven["metrics"]["ctes_m"])}
-    return DeployedDrive(
-        np.array(driven["states"]), np.zeros(0), DriveMetrics(**metrics), blocked_tick(driven)
-    )
+    states, tick = np.array(driven["states"]), blocked_tick(driven)
+    hit = None if tick is None else collided_with(experiment.named_world.make(), states[tick])
+    return DeployedDrive(states, np.zeros(0), DriveMetrics(**metrics), tick, collided_with=hit)
 
 
 def blocked_tick(driven: dict[str, Any]) -> int | None:

@@ -35,6 +35,7 @@ class KeptDrive(BaseModel):
         command: What the policy commanded at ``T`` ticks [rad, or rad/s]; empty for a live drive, whose bag has it.
         driven_ticks: Ticks until the car stopped; its last |CTE| counts for the rest.
         collided: Whether the car ran into something.
+        collided_with: Name of it; empty if the world named nothing.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -45,10 +46,16 @@ class KeptDrive(BaseModel):
     command: Series = ""
     driven_ticks: Annotated[int, Field(ge=0)]
     collided: bool = False
+    collided_with: str = ""
 
     @classmethod
     def of(
-        cls, states: ArrayLike, driven_ticks: int, command: ArrayLike = (), collided: bool = False
+        cls,
+        states: ArrayLike,
+        driven_ticks: int,
+        command: ArrayLike = (),
+        collided: bool = False,
+        collided_with: str = "",
     ) -> KeptDrive:
         """Keep a drive of states ``[T + 1, >= 3]``."""
         columns = [_text(column) for column in np.asarray(states, np.float64)[:, :3].T]
@@ -59,6 +66,7 @@ class KeptDrive(BaseModel):
             command=_text(command),
             driven_ticks=driven_ticks,
             collided=collided,
+            collided_with=collided_with,
         )
 
     def poses(self) -> Floats:
@@ -74,17 +82,25 @@ class KeptDrive(BaseModel):
             )
         return np.stack(columns, axis=1)
 
+    @property
+    def obstacle(self) -> str | None:
+        """Name of what the car ran into; None if it ran into nothing."""
+        return (self.collided_with or "obstacle") if self.collided else None
+
     def metrics(self, path: Path, horizon: Horizon) -> DriveMetrics:
         """Metrics of the drive along a path."""
         return drive_metrics(path, self.poses(), horizon, self.driven_ticks)
 
 
 def kept_drives(found: dict[str, Any]) -> list[dict[str, Any]]:
-    """Drives of one part of a cell (``states``, ``driven_ticks``, ``commands`` and ``blocked_tick``) as JSON data."""
-    count = len(found["states"])
-    blocked = found.get("blocked_tick", [None] * count)
-    rows = zip(found["states"], found["driven_ticks"], found["commands"], blocked, strict=True)
-    return [KeptDrive.of(*row[:3], collided=row[3] is not None).model_dump() for row in rows]
+    """Drives of one part of a cell (``states``, ``driven_ticks``, ``commands``, ``blocked_tick`` and ``collided_with``) as JSON data."""
+    nothing = [None] * len(found["states"])
+    driven = (found["states"], found["driven_ticks"], found["commands"])
+    hits = (found.get(key, nothing) for key in ("blocked_tick", "collided_with"))
+    return [
+        KeptDrive.of(states, ticks, commands, tick is not None, hit or "").model_dump()
+        for states, ticks, commands, tick, hit in zip(*driven, *hits, strict=True)
+    ]
 
 
 def _text(values: ArrayLike) -> str:

@@ -127,10 +127,16 @@ def _cells(row: Mapping[str, Any]) -> list[str]:
         excess,
         interval,
         f"{row['off_track']} of {row['drives']}",
-        str(row["collided"]),
+        _collisions(row["collided"]),
         f"{100 * row['off_lane_share']:.0f} %",
         "" if row["leaving_s"] is None else f"{row['leaving_s']:.1f}",
     ]
+
+
+def _collisions(counts: Mapping[str, int]) -> str:
+    """How many drives ended against something, and against what: ``3 (2 board, 1 wall)``."""
+    what = ", ".join(f"{count} {name}" for name, count in counts.items())
+    return f"{sum(counts.values())} ({what})" if counts else "0"
 
 
 def _commands(name: str, registration: Mapping[str, Any]) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -45,7 +46,7 @@ class Row:
         high_m: Upper end [m].
         over: What the interval is over.
         off_track: Drives that left the track.
-        collided: Drives that ended in a collision.
+        collided: Drives that ended in a collision, by what the car ran into.
         off_lane_share: Share of all ticks off the track.
         leaving_s: Median time to leaving the track of the drives that left it [s].
         registered: Whether all its cells were registered; else it is exploration.
@@ -63,7 +64,7 @@ class Row:
     high_m: float | None
     over: str
     off_track: int
-    collided: int
+    collided: dict[str, int]
     off_lane_share: float
     leaving_s: float | None
     registered: bool
@@ -151,7 +152,7 @@ class Evidence:
             strict=False,
         )
         return [
-            drive_outcome(attacked.ctes_m, none.ctes_m, horizon, "obstacle" if drive.collided else None)
+            drive_outcome(attacked.ctes_m, none.ctes_m, horizon, drive.obstacle)
             for attacked, none, drive in pairs
         ]
 
@@ -219,7 +220,7 @@ def _row(evidence: Evidence, key: Key, domain: Domain) -> Row | None:
         high_m=interval.high if interval else None,
         over=interval.over if interval else "",
         off_track=sum(outcome.off_track for outcome in flat),
-        collided=sum(outcome.collided_with is not None for outcome in flat),
+        collided=dict(sorted(Counter(filter(None, (outcome.collided_with for outcome in flat))).items())),
         off_lane_share=float(np.mean([outcome.share_off_lane for outcome in flat])),
         leaving_s=float(np.median(leaving)) if leaving else None,
         registered=all(evidence.is_registered(cell) for cell in cells),

@@ -15,7 +15,7 @@ from hardware.worlds.junction.photos import photo_poses
 from hardware.worlds.junction.town import obstacles
 from hardware.worlds.junction.world import build_model
 from hardware.worlds.lab.renderer import Renderer
-from hardware.worlds.lab.vehicle import Footprint
+from hardware.worlds.lab.vehicle import Footprint, touched_by
 from hardware.worlds.world import Box, Depth, NotOpenError, Rgb, Traits, WorldDescription
 
 RANGE_M = (0.1, 250.0)  # from the near plane to past the farthest corner of the sky
@@ -95,12 +95,20 @@ class Intersection:
 
     def fits(self, x_m: float, y_m: float, yaw_rad: float) -> bool:
         """Whether the car's body is clear of everything solid at a pose of its reference point."""
-        car = self.config.car
-        x, y = x_m + car.body_ahead_m * np.cos(yaw_rad), y_m + car.body_ahead_m * np.sin(yaw_rad)
-        body = Footprint(float(x), float(y), 0.5 * car.body_length_m, 0.5 * car.body_width_m, yaw_rad)
+        body = self._body(x_m, y_m, yaw_rad)
         if any(max(map(abs, corner)) > self.config.road.half_m for corner in body.corners()):
             return False
         return not any(body.overlaps(obstacle) for obstacle in self._obstacles)
+
+    def touches(self, x_m: float, y_m: float, yaw_rad: float) -> str:
+        """Name of what the car stands against at a pose; see `hardware.worlds.world.NamesObstacles`."""
+        body, half_m = self._body(x_m, y_m, yaw_rad), self.config.road.half_m
+        return touched_by(body, self._obstacles, half_m, "end of the world")
+
+    def _body(self, x_m: float, y_m: float, yaw_rad: float) -> Footprint:
+        car = self.config.car
+        x, y = x_m + car.body_ahead_m * np.cos(yaw_rad), y_m + car.body_ahead_m * np.sin(yaw_rad)
+        return Footprint(float(x), float(y), 0.5 * car.body_length_m, 0.5 * car.body_width_m, yaw_rad)
 
     @overload
     def observe(self, depth: Literal[True] = True) -> tuple[Rgb, Depth]: ...

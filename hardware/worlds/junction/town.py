@@ -117,9 +117,13 @@ def obstacles(config: IntersectionConfig) -> list[Footprint]:
     found = []
     for house in HOUSES:
         (x0, x1), (y0, y1) = house.x, house.y
-        found.append(Footprint(0.5 * (x0 + x1), 0.5 * (y0 + y1), 0.5 * (x1 - x0), 0.5 * (y1 - y0)))
-    found += [Footprint(tree.x_m, tree.y_m, 0.2, 0.2) for tree in TREES]
-    for x0, x1, y0, y1 in (*HEDGES, *(box[:4] for box in BOXES)):
-        found.append(Footprint(0.5 * (x0 + x1), 0.5 * (y0 + y1), 0.5 * (x1 - x0), 0.5 * (y1 - y0)))
-    found += [Footprint(x, y, 0.1, 0.1) for x, y in (*LAMPS, STOP_SIGN)]
-    return found
+        found.append(_upright(x0, x1, y0, y1, "house"))
+    found += [Footprint(tree.x_m, tree.y_m, 0.2, 0.2, name="tree") for tree in TREES]
+    found += [_upright(*hedge, "hedge") for hedge in HEDGES]
+    found += [_upright(*box[:4], "street furniture") for box in BOXES]
+    found += [Footprint(x, y, 0.1, 0.1, name="lamp post") for x, y in LAMPS]
+    return [*found, Footprint(*STOP_SIGN, 0.1, 0.1, name="stop sign")]
+
+
+def _upright(x0: float, x1: float, y0: float, y1: float, name: str) -> Footprint:
+    return Footprint(0.5 * (x0 + x1), 0.5 * (y0 + y1), 0.5 * (x1 - x0), 0.5 * (y1 - y0), name=name)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from hardware.worlds.lab.config import Colour, LabConfig, PanelConfig
@@ -29,6 +29,7 @@ class Solid:
         half_m: Half extents along the solid's own axes [m].
         rgb: Colour, 0..1.
         yaw_rad: Turn about the vertical axis [rad].
+        name: Of the thing that it is a part of.
     """
 
     kind: Literal["box", "cylinder", "ellipsoid"]
@@ -36,11 +37,14 @@ class Solid:
     half_m: Point
     rgb: Colour
     yaw_rad: float = 0.0
+    name: str = ""
 
     @property
     def footprint(self) -> Footprint:
         """The solid's bounding rectangle on the floor."""
-        return Footprint(self.centre_m[0], self.centre_m[1], self.half_m[0], self.half_m[1], self.yaw_rad)
+        return Footprint(
+            self.centre_m[0], self.centre_m[1], self.half_m[0], self.half_m[1], self.yaw_rad, self.name
+        )
 
 
 class _Place:
@@ -70,27 +74,28 @@ def furnish(config: LabConfig) -> list[Solid]:
     """All solids of the room: along the walls, on the middle island, and the stands of board and monitor."""
     half = 0.5 * config.room.side_m
     places = [
-        _bookshelf(-2.35, -half, math.pi),
-        _cabinet(0.05, -half, math.pi),
-        _plant(1.75, -half + 0.42, 0.34),
-        _crates(half - 0.45, -half + 0.45),
-        _sofa(half, 1.05, -0.5 * math.pi),
-        _lamp(half - 0.35, 2.75),
-        _plant(half - 0.5, half - 0.5, 0.5),
-        _desk(-1.35, half, 0.0),
-        _radiator(0.55, half, 0.0),
-        _wardrobe(-half, 1.75, 0.5 * math.pi),
-        _armchair(-half + 0.55, -0.55, 0.5 * math.pi),
-        _bin(-half + 0.4, -1.95),
-        _cartons(-half + 0.5, -half + 0.5),
-        _cartons(-half + 0.45, half - 0.5),
-        _island(),
+        ("bookshelf", _bookshelf(-2.35, -half, math.pi)),
+        ("cabinet", _cabinet(0.05, -half, math.pi)),
+        ("plant", _plant(1.75, -half + 0.42, 0.34)),
+        ("crates", _crates(half - 0.45, -half + 0.45)),
+        ("sofa", _sofa(half, 1.05, -0.5 * math.pi)),
+        ("lamp", _lamp(half - 0.35, 2.75)),
+        ("plant", _plant(half - 0.5, half - 0.5, 0.5)),
+        ("desk", _desk(-1.35, half, 0.0)),
+        ("radiator", _radiator(0.55, half, 0.0)),
+        ("wardrobe", _wardrobe(-half, 1.75, 0.5 * math.pi)),
+        ("armchair", _armchair(-half + 0.55, -0.55, 0.5 * math.pi)),
+        ("bin", _bin(-half + 0.4, -1.95)),
+        ("cartons", _cartons(-half + 0.5, -half + 0.5)),
+        ("cartons", _cartons(-half + 0.45, half - 0.5)),
+        ("island", _island()),
+        ("board", _panel(config.board, WOOD)),
+        ("monitor", _panel(config.monitor, (0.12, 0.12, 0.13))),
     ]
-    solids = [solid for place in places for solid in place.solids]
-    return solids + panel_solids(config.board, WOOD) + panel_solids(config.monitor, (0.12, 0.12, 0.13))
+    return [replace(solid, name=name) for name, place in places for solid in place.solids]
 
 
-def panel_solids(panel: PanelConfig, stand_rgb: Colour) -> list[Solid]:
+def _panel(panel: PanelConfig, stand_rgb: Colour) -> _Place:
     """The box behind a panel's face, a pole and a foot."""
     place = _Place(panel.x_m, panel.y_m, panel.yaw_rad - 0.5 * math.pi)  # local -y is behind the face
     back, half_t = -panel.thickness_m, 0.5 * panel.thickness_m
@@ -104,7 +109,7 @@ def panel_solids(panel: PanelConfig, stand_rgb: Colour) -> list[Solid]:
     top = panel.z_m
     place.box(0.0, back - 0.025, 0.0, 0.08, 0.05, top, stand_rgb)
     place.box(0.0, back - 0.04, 0.0, 0.6 * panel.width_m, 0.22, 0.025, stand_rgb)
-    return place.solids
+    return place
 
 
 def obstacles(config: LabConfig) -> list[Footprint]:

@@ -10,6 +10,7 @@ import numpy as np
 
 from advnerf_core.geometry import Array, Pinhole, VehicleState
 from hardware.worlds.lab.config import LabConfig
+from hardware.worlds.lab.furniture import vehicle_in_room
 from hardware.worlds.lab.lab import Lab
 from hardware.worlds.lab.phone import car_mounted_poses, track_pose, walk_around_poses
 from hardware.worlds.lab.world import MONITOR_PIXELS
@@ -107,6 +108,10 @@ class LabWorld:
     def blocked(self) -> bool:
         """Whether the car stands against a wall or an obstacle."""
         return self._open().blocked
+
+    def touches(self, x_m: float, y_m: float, yaw_rad: float) -> str:
+        """Name of what the car stands against at a pose; see `hardware.worlds.world.NamesObstacles`. The lab need not be open."""
+        return vehicle_in_room(self.config).touches(x_m, y_m, yaw_rad)
 
     def reset(self, x_m: float, y_m: float, yaw_rad: float) -> VehicleState:
         """Put the car down at rest."""

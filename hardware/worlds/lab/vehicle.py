@@ -7,13 +7,14 @@ and one motor mode (speed, duty, current or brake current).
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 
 from advnerf_core.geometry import VehicleState
 from hardware.worlds.lab.config import CarConfig
 
 JAMS = ("locked", "spinning")
+_REACHES_M = (0.02, 0.05, 0.1, 0.2)
 SUBSTEP_S = 0.004  # 3 mm at 0.8 m/s, and 1/15 of the fastest time constant
 
 
@@ -27,6 +28,7 @@ class Footprint:
         half_length_m: Half of the extent along its own x axis [m].
         half_width_m: Half of the extent along its own y axis [m].
         yaw_rad: Heading of its x axis [rad].
+        name: What it is, for reports.
     """
 
     x_m: float
@@ -34,6 +36,7 @@ class Footprint:
     half_length_m: float
     half_width_m: float
     yaw_rad: float = 0.0
+    name: str = ""
 
     def overlaps(self, other: Footprint) -> bool:
         """Whether two rectangles share area (separating axis theorem)."""
@@ -59,6 +62,27 @@ class Footprint:
         signs = ((1, 1), (-1, 1), (-1, -1), (1, -1))
         ends = [(a * self.half_length_m, b * self.half_width_m) for a, b in signs]
         return [(self.x_m + c * u - s * v, self.y_m + s * u + c * v) for u, v in ends]
+
+
+def touched_by(body: Footprint, obstacles: Iterable[Footprint], half_m: float, edge: str) -> str:
+    """Name of what a body stands against: the nearest thing within 0.2 m, as a car stops just before it; empty if there is none.
+
+    Args:
+        body: The car's.
+        obstacles: Named footprints.
+        half_m: The world ends at plus and minus this [m].
+        edge: Name of that end, such as wall.
+    """
+    for reach_m in _REACHES_M:
+        grown = replace(
+            body, half_length_m=body.half_length_m + reach_m, half_width_m=body.half_width_m + reach_m
+        )
+        for obstacle in obstacles:
+            if grown.overlaps(obstacle):
+                return obstacle.name
+        if any(max(abs(x), abs(y)) > half_m for x, y in grown.corners()):
+            return edge
+    return ""
 
 
 class TwinVehicle:
@@ -172,6 +196,10 @@ class TwinVehicle:
     def body(self) -> Footprint:
         """Where the body stands."""
         return self._body(self._x, self._y, self._yaw)
+
+    def touches(self, x_m: float, y_m: float, yaw_rad: float) -> str:
+        """Name of what the body stands against with the rear axle at this pose; empty if nothing is near."""
+        return touched_by(self._body(x_m, y_m, yaw_rad), self._obstacles, self._room_half_m, "wall")
 
     def fits(self, x_m: float, y_m: float, yaw_rad: float) -> bool:
         """Whether the body is clear of walls and obstacles with the rear axle at this pose."""

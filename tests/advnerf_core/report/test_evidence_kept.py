@@ -4,7 +4,7 @@ from pydantic import ValidationError
 
 from advnerf_core.driving.metrics import Horizon, drive_metrics
 from advnerf_core.driving.path import Path
-from advnerf_core.report.evidence.kept import KeptDrive
+from advnerf_core.report.evidence.kept import KeptDrive, kept_drives
 
 SQUARE = Path.rounded_square(4.0, 1.0)
 HORIZON = Horizon(20, 0.1, 0.4)
@@ -25,6 +25,14 @@ def test_numbers_computed_from_what_is_kept_are_those_of_the_drive(stopped):
     assert again.total_cte_m == pytest.approx(whole.total_cte_m, abs=20 * 1e-5)
     assert (again.off_track, again.held_ticks) == (whole.off_track, whole.held_ticks)
     np.testing.assert_allclose(kept.poses(), states[:, :3], atol=5.1e-6)
+
+
+def test_what_the_car_ran_into_is_kept():
+    found = {"states": [drive(), drive(), drive()], "driven_ticks": [20, 9, 9], "commands": [[], [], []]}
+    hits = {"blocked_tick": [None, 9, 9], "collided_with": [None, "wall", None]}
+    kept = [KeptDrive.model_validate(each) for each in kept_drives({**found, **hits})]
+    assert [each.obstacle for each in kept] == [None, "wall", "obstacle"]
+    assert [KeptDrive.model_validate(each).obstacle for each in kept_drives(found)] == [None, None, None]
 
 
 def test_a_drive_takes_a_few_kilobytes():

@@ -108,6 +108,16 @@ def test_it_stops_at_an_obstacle():
     assert vehicle.state.x_m + 0.5 * (CAR.wheelbase_m + CAR.body_length_m) == pytest.approx(1.9, abs=0.005)
 
 
+def test_it_names_what_it_stands_against():
+    shelf, crate = Footprint(2.0, 0.3, 0.1, 0.2, 0.0, "shelf"), Footprint(2.2, 0.0, 0.1, 0.1, 0.0, "crate")
+    vehicle = driven(seconds=8.0, obstacles=[crate, shelf], room_half_m=4.0)
+    state = vehicle.state
+    # The crate is also within reach, 20 cm ahead; the shelf is what stops the car.
+    assert vehicle.touches(state.x_m, state.y_m, state.yaw_rad) == "shelf"
+    assert vehicle.touches(state.x_m - 0.5, state.y_m, state.yaw_rad) == ""
+    assert vehicle.touches(3.99 - 0.5 * (CAR.wheelbase_m + CAR.body_length_m), 2.0, 0.0) == "wall"
+
+
 def test_overlap_agrees_with_dense_sampling():
     base = Footprint(0.3, -0.2, 0.5, 0.2, 0.4)
     for x, y, yaw in itertools.product((-0.5, 0.1, 0.7, 1.1), (-0.7, -0.1, 0.4), (0.0, 0.7, 2.0)):

@@ -11,6 +11,7 @@ from hardware.worlds.lab import gl, lighting
 from hardware.worlds.lab.config import LabConfig
 from hardware.worlds.lab.furniture import Solid, furnish, obstacles
 from hardware.worlds.lab.lab import Lab
+from hardware.worlds.lab.lab_world import LabWorld
 from hardware.worlds.lab.phone import track_length, track_pose
 
 CONFIG = LabConfig()
@@ -185,6 +186,17 @@ def test_nothing_stands_in_the_lane():
             assert math.hypot(*outside) >= clear - 0.15, (
                 f"obstacle at ({obstacle.x_m:.2f}, {obstacle.y_m:.2f})"
             )
+
+
+def test_a_closed_lab_names_what_the_car_stands_against():
+    board = CONFIG.board
+    lab, ahead = LabWorld(CONFIG), 0.5 * (CONFIG.car.wheelbase_m + CONFIG.car.body_length_m) + 0.01
+    # With its nose at the middle of the board's face, which looks along its yaw.
+    x = board.x_m + ahead * math.cos(board.yaw_rad)
+    y = board.y_m + ahead * math.sin(board.yaw_rad)
+    assert lab.touches(x, y, board.yaw_rad + math.pi) == "board"
+    assert lab.touches(*CONFIG.start_pose) == ""
+    assert all(obstacle.name for obstacle in obstacles(CONFIG))
 
 
 def test_furniture_stays_in_the_room():

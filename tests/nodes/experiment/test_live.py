@@ -91,15 +91,27 @@ def test_a_stop_counts_where_the_policy_led_the_car_astray(
             live.drive_until_it_counts(room(tmp_path), run, tmp_path, print)
 
 
-def test_a_live_run_reads_as_any_deployed_drive():
+def test_a_live_run_reads_as_any_deployed_drive(tmp_path):
     path = DrivingPath.rounded_square(4.0, 1.1)
     states = np.array([[-0.9 + 0.08 * tick, -2.0 + 0.01 * tick, 0.0] for tick in range(21)])
     metrics = drive_metrics(path, states, Horizon(20))
     kept = json.loads(json.dumps({**driven(states.tolist()), "metrics": asdict(metrics)}))
-    drive = live.as_drive(kept)
+    drive = live.as_drive(room(tmp_path), kept)
     assert drive.metrics == metrics
     assert np.array_equal(drive.states, states)
-    assert drive.blocked_tick is None
+    assert (drive.blocked_tick, drive.collided_with) == (None, None)
+
+
+def test_a_live_run_that_stood_still_says_against_what(tmp_path):
+    path = DrivingPath.rounded_square(4.0, 1.1)
+    # Eastwards to the bare wall at x = 4 m; the rear axle stays half a metre behind it.
+    x_m = np.minimum(2.4 + 0.08 * np.arange(21), 3.6)
+    states = np.stack([x_m, np.full(21, -1.5), np.zeros(21)], axis=1)
+    metrics = drive_metrics(path, states, Horizon(20))
+    kept = {**driven(states.tolist()), "metrics": asdict(metrics)}
+    drive = live.as_drive(room(tmp_path), kept)
+    assert drive.blocked_tick == 15
+    assert drive.collided_with == "wall"
 
 
 def test_laps_and_the_empty_scene_are_driven_where_they_are_asked_for(tmp_path):

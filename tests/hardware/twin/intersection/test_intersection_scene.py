@@ -162,10 +162,12 @@ def test_a_house_and_the_end_of_the_world_stop_the_car(intersection):
     state = intersection.step(0.0, 6.0, 5.0)
     assert intersection.blocked
     assert HOUSES[5].y[0] - 0.05 < state.y_m + reach <= HOUSES[5].y[0]
+    assert intersection.touches(state.x_m, state.y_m, state.yaw_rad) == "house"
     intersection.reset(40.0, -1.75, 0.0)
     state = intersection.step(0.0, 6.0, 10.0)
     assert intersection.blocked
     assert intersection.config.road.half_m - 0.05 < state.x_m + reach <= intersection.config.road.half_m
+    assert intersection.touches(state.x_m, state.y_m, state.yaw_rad) == "end of the world"
     assert not intersection.reset(*APPROACH).speed_mps
     assert not intersection.blocked
 
