@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from advnerf_core.files import write_atomically
+from benchmarks.answers import Answer, answers, table
 from benchmarks.questions import OTHER, QUESTIONS, Question, question_of
 from nodes.runtime.machine import memory_gib, processor_name
 
@@ -96,8 +97,14 @@ def read_rows(ledger: Path = LEDGER) -> list[dict[str, Any]]:
     return rows
 
 
-def write_pages(rows: list[dict[str, Any]], page: Path) -> None:
-    """Write the index ``page``, and beside it ``results/<question>.md`` for each question that has rows."""
+def write_pages(rows: list[dict[str, Any]], page: Path, published: Path = PAGE.parent / "results") -> None:
+    """Write the index ``page``, and beside it ``results/<question>.md`` for each question that has rows.
+
+    Args:
+        rows: Of the ledger.
+        page: The index.
+        published: Folder of the published sets, which the index sums up.
+    """
     asked: dict[Question, list[dict[str, Any]]] = {question: [] for question in (*QUESTIONS, OTHER)}
     for row in rows:
         asked[question_of(row["command"])].append(row)
@@ -106,16 +113,15 @@ def write_pages(rows: list[dict[str, Any]], page: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for question, found in answered.items():
         write_atomically(folder / f"{question.slug}.md", _question_page(question, found))
-    write_atomically(page, _index_page(answered))
+    write_atomically(page, _index_page(answered, answers(rows, published)))
 
 
-def _index_page(answered: dict[Question, list[dict[str, Any]]]) -> str:
+def _index_page(answered: dict[Question, list[dict[str, Any]]], found: list[Answer]) -> str:
     head = (
         "# Measured results\n\nEvery figure was written by the command beside it, on the machine and day that its row names. A row that "
         "misses its target stays, with the reason. The rows are in `results.json`; `python -m benchmarks.results` makes these pages.\n\n"
-        "Registered results, in metres and with intervals, are on a page of their own: [Does it transfer?](results/transfer.md). What was not run at "
-        "all is on [What was and was not run](was_not_run.md).\n\n"
-        "| question | rows | with a target | missed |\n|---|---|---|---|\n"
+        "## In short\n\n" + table(found) + "\n"
+        "## All rows\n\n| question | rows | with a target | missed |\n|---|---|---|---|\n"
     )
     lines = [
         f"| [{question.title}](results/{question.slug}.md) {question.answers} | {len(found)} "

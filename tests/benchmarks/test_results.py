@@ -1,5 +1,7 @@
 import json
+import shutil
 
+from benchmarks.answers import answers
 from benchmarks.questions import OTHER, QUESTIONS, question_of
 from benchmarks.results import PAGE, read_rows, record_row, write_pages
 
@@ -23,6 +25,26 @@ def test_a_row_replaces_its_older_self_and_a_miss_stays_with_its_reason(tmp_path
     index = where["page"].read_text()
     assert "| 2 | 2 | 1 |" in index
     assert "- a: 25.5 dB, target >= 26 dB ([other](results/other.md))" in index
+
+
+def test_the_short_answers_are_those_of_sets_and_rows(tmp_path):
+    published = PAGE.parent / "results"
+    shutil.copytree(published / "room" / "set", tmp_path / "room" / "set")
+    file = tmp_path / "room" / "set" / "set.json"
+    data = json.loads(file.read_text())
+    data["primary"][0] |= {"difference_m": 0.123, "p_holm": None}
+    file.write_text(json.dumps(data))
+    rows = [{"line": "x", "command": "python -m benchmarks.hardening runs/full", "value": -0.0234}]
+    found = {each.question: each.text for each in answers(rows, tmp_path)}
+    assert "adds 0.12 m per tick to *random, coarse* (no test is claimed)" in found["Better than what?"]
+    assert (
+        "Of 1 families of random textures none moves it by more than 0.023 m"
+        in found["Against which victims?"]
+    )
+    assert found["Does it transfer?"] == answers([], published)[0].text
+    # Nothing is claimed that was not measured.
+    assert "How fast?" not in found
+    assert answers([], tmp_path / "none") == []
 
 
 def test_an_absent_ledger_has_no_rows(tmp_path):
