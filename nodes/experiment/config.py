@@ -124,7 +124,8 @@ class PolicyConfig(_Section):
     first_steps: Positive = Field(default=800, description="Optimiser steps of behaviour cloning.")
     round_steps: Positive = Field(default=300, description="Optimiser steps after each round.")
     naive_steps: Count = Field(
-        default=800, description="Optimiser steps of the victim that never sees a random texture; 0: none."
+        default=1400,
+        description="Optimiser steps of the victim that never sees a random texture, as many as the hardened one's in all; 0: none.",
     )
     hidden: tuple[int, int, int] = Field(
         default=(200, 100, 20), description="Widths of the policy's linear layers."
