@@ -17,6 +17,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from advnerf_core.geometry import Array, VehicleState
+from hardware.cameras.effects import PRESETS, Effects, ImperfectCamera, Rgb
 from hardware.cameras.interface import Frame
 from hardware.emulators.frame_server import FrameServer
 from hardware.emulators.monitor_port import MonitorPort
@@ -45,6 +46,7 @@ class LiveLabConfig(BaseModel):
         vicon: The motion capture system.
         physics_rate_hz: Steps of the car per second.
         start_pose: Where the car stands at first: x [m], y [m], yaw [rad].
+        camera_effects: What the camera adds to an ideal picture: ``ideal``, ``webcam``, ``zed``, or the effects themselves.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -54,6 +56,7 @@ class LiveLabConfig(BaseModel):
     vicon: ViconEmulatorConfig = ViconEmulatorConfig()
     physics_rate_hz: float = Field(default=200.0, ge=100.0, le=1000.0)
     start_pose: tuple[float, float, float] = (-1.1, -2.0, 0.0)
+    camera_effects: Effects = PRESETS["ideal"]
 
 
 class PoseHistory:
@@ -242,13 +245,24 @@ class LiveLab:
         with Lab(self.config.lab) as lab:
             lab.observe(depth=False)  # the first picture pays for compiling shaders
             self._ready.set()
-            sequence = 0
+            sequence, last_ns = 0, 0
             last: Frame | None = None
+            camera = ImperfectCamera(self.config.camera_effects, lab.camera_pinhole)
+
+            def drawn(pose: Array) -> Rgb:
+                x_m, y_m, yaw_rad = map(float, pose)
+                return lab.observe_at(x_m, y_m, yaw_rad, depth=False)[0]
+
             while (tick_ns := self._camera_pacer.wait(self._stop)) is not None:
                 real_ns = tick_ns + time.time_ns() - time.monotonic_ns()
                 state = self._history.at(tick_ns, wait_s=0.02) or self.state
                 self._light_monitor(lab)
-                rgb, _ = lab.observe_at(state.x_m, state.y_m, state.yaw_rad, depth=False)
+                pose = np.array([state.x_m, state.y_m, state.yaw_rad])
+                rgb = camera.see(drawn, pose, (tick_ns - last_ns) / NS_PER_S)
+                last_ns = tick_ns
+                if rgb is None:  # lost on its way: its number is missing
+                    sequence += 1
+                    continue
                 frame = Frame(rgb, real_ns, tick_ns, sequence)
                 if self._camera_fault is None:
                     self._frames.publish(last := frame)

@@ -179,7 +179,9 @@ def attack_problem(
     experiment: Experiment, space: Space, policy: LoadedPolicy, scenario: str, seed: int
 ) -> AttackProblem:
     """The attack on one victim on one drive, with the starts of one seed."""
-    attack, starts = experiment.config.attack, experiment.start_states(scenario, seed)
+    attack, robustness = experiment.config.attack, experiment.config.attack.robustness
+    # Drives of one start differ by what is drawn in them.
+    starts = experiment.start_states(scenario, seed).repeat_interleave(robustness.repeats, dim=0)
     goals = _goals(experiment, scenario, len(starts))
     return AttackProblem(
         policy.policy,
@@ -194,6 +196,8 @@ def attack_problem(
         fence_m=experiment.world.fence_m,
         held_cap_m=experiment.config.held_cap_m,
         off_track_m=experiment.world.off_track_m,
+        disturbances=robustness.disturbances(seed),
+        regulariser=robustness.regulariser(space.surrogate.objects),
     )
 
 
@@ -202,10 +206,10 @@ def _goals(experiment: Experiment, scenario: str, count: int) -> torch.Tensor:
 
 
 def from_measured_starts(experiment: Experiment, scenario: str, problem: AttackProblem) -> AttackProblem:
-    """The problem from the starts, and over the horizon, that are measured."""
+    """The problem from the starts, and over the horizon, that are measured; nothing disturbs what is seen."""
     starts = experiment.measured_starts(scenario)
     goals = _goals(experiment, scenario, len(starts))
-    return replace(problem, start_states=starts, goals=goals, steps=experiment.config.horizon)
+    return replace(problem.undisturbed(), start_states=starts, goals=goals, steps=experiment.config.horizon)
 
 
 def past(problem: AttackProblem, space: Space, shown: Shown) -> AttackProblem:
@@ -313,5 +317,5 @@ def _attack_file(
     if not baked_file(experiment).exists() or over_the_world(experiment):
         return attack
     shown = space.restored(attack)
-    _, totals_m = evaluate(past_field(experiment, problem, space, shown), shown.colours)
+    _, totals_m = evaluate(past_field(experiment, problem.undisturbed(), space, shown), shown.colours)
     return replace(attack, field_total_cte_m=float(totals_m.protocol_cte_m.mean()))

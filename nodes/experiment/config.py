@@ -12,7 +12,14 @@ from advnerf_core.scene.gate_limits import GateLimits
 from nodes.experiment.deploy_config import DeployConfig
 from nodes.experiment.method_names import MethodReference
 from nodes.experiment.placed import PlacedObject
-from nodes.experiment.space_config import ColoursConfig, FaceConfig, SpaceConfig
+from nodes.experiment.robustness_config import RobustnessConfig
+from nodes.experiment.space_config import (
+    ColoursConfig,
+    FaceConfig,
+    MeshShapeConfig,
+    PlacesConfig,
+    SpaceConfig,
+)
 
 Count = Annotated[int, Field(ge=0)]
 Positive = Annotated[int, Field(ge=1)]
@@ -151,7 +158,9 @@ class MeasureConfig(_Section):
     starts: Positive = Field(default=5, description="Starts, none of which a search had.")
     seed: int = Field(default=10_000, description="Of the starts.")
     no_object: bool = Field(
-        default=False, description="A second control: the same drives with the objects taken away."
+        default=False,
+        exclude_if=lambda wanted: not wanted,
+        description="A second control: the same drives with the objects taken away.",
     )
 
 
@@ -182,6 +191,12 @@ class AttackConfig(_Section):
     cem_population: Annotated[int, Field(ge=4)] = Field(default=10, description="Candidates of a generation.")
     seeds: tuple[int, ...] = Field(
         default=(0,), min_length=1, description="One search of each method per seed."
+    )
+    # Left out where it changes nothing, so that results without it do not depend on it.
+    robustness: RobustnessConfig = Field(
+        default=RobustnessConfig(),
+        exclude_if=lambda wanted: wanted == RobustnessConfig(),
+        description="What the attacks shall bear, in expectation.",
     )
     time_batch: Positive = Field(default=16, description="Frames per gradient batch.")
     cache_mib: Annotated[float, Field(ge=0)] = Field(
@@ -269,6 +284,22 @@ class ExperimentConfig(_Section):
         elif self.deploy.live:
             raise ValueError(
                 f"expected space.kind face, which the live nodes can show, with deploy.through nodes, got {self.space.kind}"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _smooths_colours_only(self) -> ExperimentConfig:
+        if self.attack.robustness.smoothness and isinstance(self.space, (PlacesConfig, MeshShapeConfig)):
+            raise ValueError(
+                f"expected attack.robustness.smoothness only where colours are searched, got it with space.kind {self.space.kind}"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _measures_from_starts_of_its_own(self) -> ExperimentConfig:
+        if self.measure.seed in self.attack.seeds:
+            raise ValueError(
+                f"expected measure.seed to be none of attack.seeds, as no search may have the starts that are measured, got {self.measure.seed}"
             )
         return self
 

@@ -6,12 +6,14 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from hardware.cameras.effects import PRESETS, Effects
+
 Count = Annotated[int, Field(ge=0)]
 Positive = Annotated[int, Field(ge=1)]
 
 
 class DeployConfig(BaseModel):
-    """What drives past a found attack, and how often. All but ``through`` and ``starts`` concerns live nodes only."""
+    """What drives past a found attack, and how often. All but ``through``, ``starts`` and ``camera`` concerns live nodes only."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -22,6 +24,12 @@ class DeployConfig(BaseModel):
     starts: Positive | None = Field(
         default=None,
         description="So many of the measured starts are deployed; none: all. A live drive takes half a minute.",
+    )
+    # Left out where it changes nothing, so that results of ideal cameras do not depend on it.
+    camera: Effects = Field(
+        default=PRESETS["ideal"],
+        exclude_if=lambda effects: effects.ideal,
+        description="What the driving camera adds to an ideal picture: ideal, webcam, zed, or the effects themselves.",
     )
     launch_file: str = Field(
         default="green_screen.launch.yaml", description="Node graph, beside the experiment file."

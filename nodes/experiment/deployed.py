@@ -6,8 +6,9 @@ only then is the image cropped and resized for the policy.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Protocol
 
 import cv2
@@ -24,6 +25,7 @@ from advnerf_core.geometry import Array, Pinhole, planar_poses
 from advnerf_core.policies.pilotnet import Policy, images_to_tensor
 from advnerf_core.policies.view import PolicyView
 from advnerf_core.scene.surrogate import Frames, Surrogate
+from hardware.cameras.effects import ImperfectCamera
 from hardware.worlds.world import Depth, Rgb, World, collided_with
 from nodes.experiment.images import as_uint8
 
@@ -194,6 +196,23 @@ class DeployedDrive:
     collided_with: str | None = None
 
 
+def _through(
+    camera: ImperfectCamera, dressed: Dressed, theta: Tensor | None, dt_s: float
+) -> Callable[[], NDArray[np.uint8]]:
+    """What the policy sees through a camera, tick by tick; of a lost frame the one before."""
+    last: list[NDArray[np.uint8]] = []
+
+    def seen() -> NDArray[np.uint8]:
+        state = dressed.scene.state
+        now = np.array([state.x_m, state.y_m, state.yaw_rad])
+        picture = camera.see(lambda pose: dressed.camera_image(pose, theta), now, dt_s)
+        if picture is not None:
+            last[:] = [dressed.view.image(picture)]
+        return last[0]
+
+    return seen
+
+
 def drive_deployed(
     dressed: Dressed,
     policy: Policy,
@@ -203,6 +222,7 @@ def drive_deployed(
     limits: Horizon,
     speed_mps: float,
     theta: Tensor | None,
+    camera: ImperfectCamera | None = None,
 ) -> DeployedDrive:
     """Drive once through the dressed scene, tick by tick.
 
@@ -215,14 +235,16 @@ def drive_deployed(
         limits: Ticks and limits.
         speed_mps: Commanded speed.
         theta: The objects' colours; None for no objects.
+        camera: What takes the pictures; None for an ideal camera.
     """
     car = SelfDriving(dressed.scene, speed_mps, limits.dt_s)
     car.start(np.asarray(start))
     goals = torch.tensor([tuple(goal)], dtype=torch.float32)
     first = torch.from_numpy(np.array(start, dtype=np.float64))[None]
-    rollout = drive(
-        policy, lambda _: images_to_tensor(dressed.seen_now(theta)), car, first, limits.ticks, goals
+    seen = (
+        partial(dressed.seen_now, theta) if camera is None else _through(camera, dressed, theta, limits.dt_s)
     )
+    rollout = drive(policy, lambda _: images_to_tensor(seen()), car, first, limits.ticks, goals)
     states = rollout.states[:, 0].numpy().copy()
     states[:, 2] = np.unwrap(states[:, 2])
     metrics = drive_metrics(path, states, limits, car.blocked_tick)

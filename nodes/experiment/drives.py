@@ -12,6 +12,7 @@ from advnerf_core.attack.adjoint import AttackProblem, evaluate
 from advnerf_core.driving.metrics import DriveMetrics, drive_metrics
 from advnerf_core.geometry import Array
 from advnerf_core.policies.pilotnet import Policy
+from hardware.cameras.effects import ImperfectCamera
 from nodes.experiment.context import Experiment
 from nodes.experiment.deployed import DeployedDrive, Dressed, drive_deployed
 
@@ -46,6 +47,7 @@ def deployed_drives(
     theta: Tensor | None,
 ) -> list[DeployedDrive]:
     """Drives of the deployment scene's own car from starts ``[B, 3]``."""
+    effects = experiment.config.deploy.camera
     return [
         drive_deployed(
             dressed,
@@ -56,8 +58,9 @@ def deployed_drives(
             experiment.limits,
             experiment.car.speed_mps,
             theta,
+            None if effects.ideal else ImperfectCamera(effects, experiment.camera, number),
         )
-        for start in starts.numpy()
+        for number, start in enumerate(starts.numpy())
     ]
 
 

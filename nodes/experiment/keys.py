@@ -36,7 +36,7 @@ _FREE: Mapping[str, bool | set[str]] = {
 
 
 # What a drive without attack does not depend on besides.
-_SEARCHED_WITH = ("evaluations", "horizon", "learning_rate", "cem_population", "time_batch")
+_SEARCHED_WITH = ("evaluations", "horizon", "learning_rate", "cem_population", "time_batch", "robustness")
 
 
 class CellError(RuntimeFault):
@@ -53,7 +53,7 @@ def cell_inputs(experiment: Experiment, cell: Cell) -> dict[str, Any]:
     inputs = registered_settings(experiment)
     if not cell.searched:
         for key in _SEARCHED_WITH:
-            del inputs["config"]["attack"][key]
+            inputs["config"]["attack"].pop(key, None)
     kept = {name: digest for name, digest in experiment.kept.items() if name in NEEDED}
     inputs["stages"] = {**kept, **stage_digests(experiment.folder, NEEDED)}
     if cell.victim != RETRAINED:

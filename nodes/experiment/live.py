@@ -194,6 +194,8 @@ def live_overrides(experiment: Experiment, live: LiveRun) -> list[str]:
         f"policy.sha256={load_policy(policy).sha256}",
         f"twin.lab={json.dumps(lab_of(experiment).model_dump(mode='json'))}",
     ]
+    if not (effects := experiment.config.deploy.camera).ideal:
+        overrides.append(f"twin.camera_effects={json.dumps(effects.model_dump(mode='json'))}")
     if on_screen(experiment):
         overrides += [
             f"monitor.plain_rgb={json.dumps(wanted_face(experiment).plain_rgb)}",

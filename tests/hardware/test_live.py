@@ -160,3 +160,13 @@ def test_a_frozen_camera_gives_no_new_stamp(lab, fault):
     assert len(set(after)) >= 2
     with pytest.raises(ValueError, match=r"expected a fault of silent, repeated, got 'dusty'"):
         lab.freeze_camera("dusty")
+
+
+def test_its_camera_may_have_the_flaws_of_a_real_one(tmp_path):
+    config = LiveLabConfig(camera_effects={"read_noise": 0.02, "lost": 0.3})
+    with LiveLab(config, tmp_path) as lab, SocketCamera(lab.frames_path) as camera:
+        frames = [camera.read(2.0) for _ in range(12)]
+    # The car stands: one frame differs from the next by noise alone.
+    light = np.stack([frame.rgb for frame in frames]).astype(np.float64)
+    assert 1.0 < (light[1:] - light[:-1]).std() / np.sqrt(2.0) < 12.0
+    assert max(np.diff([frame.sequence for frame in frames])) > 1  # numbers of lost frames are missing

@@ -24,7 +24,6 @@ from advnerf_core.attack.artifact import (
 )
 from advnerf_core.attack.clean import clean_drive
 from advnerf_core.attack.methods import method_digest
-from advnerf_core.attack.robustness import Disturbances, Smoothness
 from advnerf_core.attack.search.search import SearchResult, draw_start_states
 from advnerf_core.attack.spaces.displayed import DisplayedSensor
 from advnerf_core.driving.actuated import ActuatedAckermann
@@ -79,7 +78,9 @@ class Prepared:
         """The same with another seed: other starts, other draws."""
         room = load_calibration(RoomCalibration, self.request.calibration_file("room"))
         starts = start_states(self.request, room, self.problem.dynamics, seed)
-        problem = replace(self.problem, start_states=starts, disturbances=disturbances(self.request, seed))
+        problem = replace(
+            self.problem, start_states=starts, disturbances=self.request.robustness.disturbances(seed)
+        )
         return replace(self, problem=problem, seed=seed)
 
     @property
@@ -265,7 +266,7 @@ def start_states(request: AttackRequest, room: RoomCalibration, dynamics: Dynami
     else:
         poses = draw_start_states(starts.nominal or room.start_pose, starts.count, starts.sigma, seed)
     # Drives of one start pose differ by what is drawn in them.
-    poses = poses.repeat_interleave(request.robustness.draws if request.robustness.disturbed else 1, dim=0)
+    poses = poses.repeat_interleave(request.robustness.repeats, dim=0)
     return torch.nn.functional.pad(poses, (0, dynamics.state_size - 3))
 
 
@@ -278,7 +279,6 @@ def _problem(
     seed: int,
 ) -> AttackProblem:
     starts, search = start_states(request, room, dynamics, seed), request.search
-    smoothness = request.robustness.smoothness
     return AttackProblem(
         loaded.policy,
         sensor_of(request, surrogate),
@@ -291,8 +291,8 @@ def _problem(
         cache_bytes=int(search.cache_mib * 2**20),
         fence_m=float(np.abs(np.array(room.fence_m)).min()),
         off_track_m=room.off_track_m,
-        disturbances=disturbances(request, seed),
-        regulariser=Smoothness(surrogate.objects, smoothness) if smoothness else None,
+        disturbances=request.robustness.disturbances(seed),
+        regulariser=request.robustness.regulariser(surrogate.objects),
     )
 
 
@@ -305,16 +305,6 @@ def sensor_of(request: AttackRequest, surrogate: Surrogate) -> Surrogate | Displ
         return surrogate
     return DisplayedSensor(
         surrogate, load_calibration(DisplayCalibration, wanted.display).display, wanted.display_cos
-    )
-
-
-def disturbances(request: AttackRequest, seed: int) -> Disturbances | None:
-    """What is drawn in every evaluation; None if nothing is."""
-    wanted = request.robustness
-    if not wanted.disturbed:
-        return None
-    return Disturbances(
-        wanted.noise, wanted.gain, wanted.brightness, wanted.jitter_m, wanted.jitter_rad, seed
     )
 
 

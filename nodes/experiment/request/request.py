@@ -19,6 +19,7 @@ from advnerf_core.policies.load import is_factory
 from nodes.experiment.method_names import MethodReference
 from nodes.experiment.request.mesh_request import MeshRequest, ShapeRequest
 from nodes.experiment.request.pose_request import PosesRequest
+from nodes.experiment.robustness_config import RobustnessConfig
 from nodes.runtime.config import Document, apply_overrides, parse_yaml, read_yaml, validate
 
 Count = Annotated[int, Field(ge=1)]
@@ -150,33 +151,6 @@ class DynamicsRequest(_Section):
     slew_radps: AboveZero | None = Field(default=None, description="Limit of the wheels' rate [rad/s].")
 
 
-class RobustnessRequest(_Section):
-    """What the attack shall bear: the loss is an expectation over these, drawn anew for every evaluation."""
-
-    noise: NotNegative = Field(default=0.0, description="Pixel noise, standard deviation in 0..1.")
-    gain: NotNegative = Field(default=0.0, description="Spread of the logarithm of the exposure of a drive.")
-    brightness: NotNegative = Field(
-        default=0.0, description="Spread of a drive's additive brightness, in 0..1."
-    )
-    jitter_m: NotNegative = Field(
-        default=0.0, description="Spread of the camera's position in each frame [m]."
-    )
-    jitter_rad: NotNegative = Field(
-        default=0.0, description="Spread of the camera's rotation in each frame [rad]."
-    )
-    draws: Count = Field(
-        default=1, description="Drives of each start pose per evaluation, each drawn by itself."
-    )
-    smoothness: NotNegative = Field(
-        default=0.0, description="Weight of the texture's total variation in the loss [m per unit of colour]."
-    )
-
-    @property
-    def disturbed(self) -> bool:
-        """Whether anything is drawn at all."""
-        return any((self.noise, self.gain, self.brightness, self.jitter_m, self.jitter_rad))
-
-
 class SearchRequest(_Section):
     """The adversary and its budget."""
 
@@ -248,7 +222,7 @@ class AttackRequest(_Section):
     )
     dynamics: DynamicsRequest = DynamicsRequest()
     search: SearchRequest = SearchRequest()
-    robustness: RobustnessRequest = RobustnessRequest()
+    robustness: RobustnessConfig = RobustnessConfig()
     poses: PosesRequest | None = Field(
         default=None, description="Where objects may stand; 'advnerf attack poses'."
     )

@@ -12,11 +12,14 @@ import pytest
 import torch
 
 from advnerf_core.attack.artifact import load_attack
+from advnerf_core.attack.robustness import Disturbances
+from advnerf_core.attack.search.gradient import gradient_attack
 from advnerf_core.attack.search.search import SearchStateError
 from advnerf_core.driving.rollout import drive
 from advnerf_core.policies.pilotnet import images_to_tensor, load_policy
 from advnerf_core.report.transfer_page import text_table
 from advnerf_core.scene.surrogate import Surrogate
+from hardware.cameras.effects import CameraEffects
 from nodes.experiment import attack, page, report, run
 from nodes.experiment.attack import cells, load_shown, surrogate_part
 from nodes.experiment.cell import Cell
@@ -25,10 +28,11 @@ from nodes.experiment.cells import run_cell
 from nodes.experiment.context import Experiment
 from nodes.experiment.deploy import DRIVES, ThroughWorld, cell_data
 from nodes.experiment.films import film_cell
-from nodes.experiment.keys import CellError, clean_folder
+from nodes.experiment.keys import CellError, cell_inputs, clean_folder
 from nodes.experiment.kinds import load_kind
 from nodes.experiment.learned_scene import load_field
 from nodes.experiment.policy import NAIVE, victim_file
+from nodes.experiment.robustness_config import RobustnessConfig
 from nodes.experiment.spaces import colour_space
 from nodes.runtime.errors import ConfigError
 from tests.support.strangers import spiral_code, spiral_theta, write_spiral
@@ -204,9 +208,63 @@ def test_without_objects_the_car_drives_as_in_the_bare_scene(fresh: Experiment, 
     assert found["kept"]["deployed"][0] != plain["kept"]["deployed"][0]
 
 
+def test_a_search_bears_what_it_is_asked_to_and_is_measured_undisturbed(fresh: Experiment) -> None:
+    asked = {"noise": 0.2, "gain": 0.5, "draws": 2}
+    bearing = changed(fresh, "attack", robustness=RobustnessConfig(**asked))
+    space = colour_space(bearing)
+    found = surrogate_part(bearing, space, GRADIENT, bearing.cell_folder(GRADIENT), silent)
+    victim = attack._victim(victim_file(bearing, GRADIENT.victim))
+    problem = attack.attack_problem(bearing, space, victim, "right", 0)
+    starts = bearing.start_states("right", 0)
+    assert torch.equal(problem.start_states, starts.repeat_interleave(2, dim=0))
+    # The same search by hand.
+    disturbed = replace(problem, disturbances=Disturbances(noise=0.2, gain=0.5, seed=0))
+    budget = bearing.config.attack.evaluations
+    by_hand = gradient_attack(disturbed, budget, bearing.config.attack.learning_rate, seed=0)
+    colours = space.restored(load_attack(bearing.cell_folder(GRADIENT) / attack.ATTACK)).colours
+    assert torch.equal(colours, by_hand.theta)
+    # Measured is a drive in which nothing is drawn.
+    plain = attack.attack_problem(fresh, space, victim, "right", 0)
+    shown = space.restored(load_attack(bearing.cell_folder(GRADIENT) / attack.ATTACK))
+    measured = attack.from_measured_starts(fresh, "right", attack.past_field(fresh, plain, space, shown))
+    assert np.array_equal(found["states"], attack.learned_drives(fresh, measured, shown.colours)[0])
+    # What no search belongs to does not depend on it, and a setting that changes nothing is not there.
+    assert cell_inputs(bearing, GRADIENT.clean) == cell_inputs(fresh, GRADIENT.clean)
+    assert cell_inputs(bearing, GRADIENT) != cell_inputs(fresh, GRADIENT)
+    assert "robustness" not in cell_inputs(fresh, GRADIENT)["config"]["attack"]
+    junction = Path(__file__).parents[3] / "launch" / "junction.experiment.yaml"
+    wrong = ["attack.robustness.smoothness=1", "space={kind: places}"]
+    with pytest.raises(ConfigError, match="smoothness only where colours are searched"):
+        run.load_experiment(junction, "demo", wrong, fresh.folder / "x")
+
+
+def test_the_driving_camera_may_be_a_real_one(fresh: Experiment, wall: Any) -> None:
+    def commands(**effects: Any) -> Any:
+        experiment = changed(fresh, "deploy", camera=CameraEffects(**effects))
+        for file in experiment.folder.rglob(DRIVES):
+            file.unlink()
+        finished(experiment, wall, GRADIENT)
+        return json.loads((experiment.cell_folder(GRADIENT) / DRIVES).read_text())["commands"][0]
+
+    ideal = commands()
+    # A camera that changes next to nothing takes the other way to the same pictures.
+    assert commands(gain_sigma=1e-9) == ideal
+    assert commands(gain_sigma=0.5) != ideal
+    # Of a lost frame the policy sees the one before.
+    assert len(set(commands(lost=0.999))) == 1
+    assert "camera" not in cell_inputs(fresh, GRADIENT)["config"]["deploy"]
+    noisy = changed(fresh, "deploy", camera=CameraEffects(read_noise=0.01))
+    assert cell_inputs(noisy, GRADIENT)["config"]["deploy"]["camera"]["read_noise"] == 0.01
+
+
+def changed(experiment: Experiment, section: str, **values: Any) -> Experiment:
+    """The experiment with other values in one section of its configuration."""
+    other = getattr(experiment.config, section).model_copy(update=values)
+    return replace(experiment, config=experiment.config.model_copy(update={section: other}))
+
+
 def test_the_control_without_objects_is_asked_for(trained: Experiment, tmp_path: Path) -> None:
-    measure = trained.config.measure.model_copy(update={"no_object": True})
-    more = replace(trained, config=trained.config.model_copy(update={"measure": measure}))
+    more = changed(trained, "measure", no_object=True)
     assert {cell.name for cell in cells(more)} - {cell.name for cell in cells(trained)} == {
         f"{drive}_{victim}_empty_0"
         for drive in ("straight", "right", "left")

@@ -1,0 +1,62 @@
+"""The section ``robustness`` of requests and experiments: what an attack shall bear."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Annotated
+
+from pydantic import BaseModel, ConfigDict, Field
+
+if TYPE_CHECKING:
+    from advnerf_core.attack.robustness import Disturbances, Smoothness
+    from advnerf_core.fields.coloured import ColouredObject
+
+_NotNegative = Annotated[float, Field(ge=0)]
+
+
+class RobustnessConfig(BaseModel):
+    """What the attack shall bear: the loss is an expectation over these, drawn anew for every evaluation."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    noise: _NotNegative = Field(default=0.0, description="Pixel noise, standard deviation in 0..1.")
+    gain: _NotNegative = Field(default=0.0, description="Spread of the logarithm of the exposure of a drive.")
+    brightness: _NotNegative = Field(
+        default=0.0, description="Spread of a drive's additive brightness, in 0..1."
+    )
+    jitter_m: _NotNegative = Field(
+        default=0.0, description="Spread of the camera's position in each frame [m]."
+    )
+    jitter_rad: _NotNegative = Field(
+        default=0.0, description="Spread of the camera's rotation in each frame [rad]."
+    )
+    draws: Annotated[int, Field(ge=1)] = Field(
+        default=1, description="Drives of each start pose per evaluation, each drawn by itself."
+    )
+    smoothness: _NotNegative = Field(
+        default=0.0, description="Weight of the texture's total variation in the loss [m per unit of colour]."
+    )
+
+    @property
+    def disturbed(self) -> bool:
+        """Whether anything is drawn at all."""
+        return any((self.noise, self.gain, self.brightness, self.jitter_m, self.jitter_rad))
+
+    @property
+    def repeats(self) -> int:
+        """Drives of each start pose per evaluation."""
+        return self.draws if self.disturbed else 1
+
+    def disturbances(self, seed: int) -> Disturbances | None:
+        """What is drawn in every evaluation of a search; None if nothing is."""
+        from advnerf_core.attack.robustness import Disturbances
+
+        if not self.disturbed:
+            return None
+        return Disturbances(self.noise, self.gain, self.brightness, self.jitter_m, self.jitter_rad, seed)
+
+    def regulariser(self, objects: Sequence[ColouredObject]) -> Smoothness | None:
+        """What the loss charges for rough colours of the attacked objects; None if nothing is charged."""
+        from advnerf_core.attack.robustness import Smoothness
+
+        return Smoothness(objects, self.smoothness) if self.smoothness else None
