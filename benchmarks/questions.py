@@ -95,7 +95,16 @@ QUESTIONS = (
         "stopping",
         "Does the car stop when it must?",
         "Time and distance to the brake after faults, false stops, strangers, and half an hour of driving.",
-        ("fault_stops", "fault_campaign", "stalls", "pose_jumps", "requests", "strangers", "thirty_minutes"),
+        (
+            "fault_stops",
+            "fault_campaign",
+            "stalls",
+            "pose_jumps",
+            "requests",
+            "strangers",
+            "thirty_minutes",
+            "world_faults",
+        ),
     ),
     Question(
         "live_stack",
