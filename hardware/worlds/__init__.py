@@ -67,5 +67,16 @@ def _carla() -> WorldClass:
     return CarlaScene
 
 
-WORLDS: Mapping[str, Callable[[], WorldClass]] = {"lab": _lab, "junction": _junction, "carla": _carla}
+def _metadrive() -> WorldClass:
+    from hardware.worlds.metadrive.world import MetaDrive
+
+    return MetaDrive
+
+
+WORLDS: Mapping[str, Callable[[], WorldClass]] = {
+    "lab": _lab,
+    "junction": _junction,
+    "carla": _carla,
+    "metadrive": _metadrive,
+}
 """Loaders of the worlds' classes by name; a simulator is imported when its world is opened."""

@@ -103,7 +103,8 @@ def end_with_client() -> None:
 
 
 def load(file: str) -> Any:
-    """The module in a file."""
+    """The module in a file; it finds modules beside it, after those of its environment."""
+    sys.path.append(os.path.dirname(os.path.abspath(file)))
     spec = importlib.util.spec_from_file_location("simulator", file)
     if spec is None or spec.loader is None:
         raise ValueError(f"expected a simulator in a file NAME.py, got {file}")
