@@ -73,10 +73,17 @@ def _metadrive() -> WorldClass:
     return MetaDrive
 
 
+def _duckietown() -> WorldClass:
+    from hardware.worlds.duckietown.world import Duckietown
+
+    return Duckietown
+
+
 WORLDS: Mapping[str, Callable[[], WorldClass]] = {
     "lab": _lab,
     "junction": _junction,
     "carla": _carla,
     "metadrive": _metadrive,
+    "duckietown": _duckietown,
 }
 """Loaders of the worlds' classes by name; a simulator is imported when its world is opened."""

@@ -93,7 +93,6 @@ class RemoteWorld(ABC):
         self._entered = False
         self._state: VehicleState | None = None
         self._blocked = False
-        self._panels: dict[str, tuple[Panel, Rgb]] = {}
 
     @abstractmethod
     def python(self) -> Path:
@@ -201,20 +200,6 @@ class RemoteWorld(ABC):
         T = np.asarray(T_world_from_camera, dtype=np.float64)
         return self._render("photo", self.photo_pinhole, T, False)[0]
 
-    def add_panel(self, name: str, panel: Panel, rgb: Rgb | None) -> None:
-        """Put a textured panel into the simulator's scene, or take it out; see `hardware.worlds.world.NativePanels`."""
-        if rgb is None:
-            self._panels.pop(name, None)
-            self._ask("add_panel", {"name": name, "size_m": None})
-            return
-        texture = np.ascontiguousarray(rgb)
-        if texture.ndim != 3 or texture.shape[2] != 3 or texture.dtype != np.uint8 or not texture.size:
-            raise ValueError(
-                f"expected a picture [h, w, 3] uint8 for the panel {name}; got {texture.dtype} {list(texture.shape)}"
-            )
-        self._put_panel(name, panel, texture)
-        self._panels[name] = panel, texture.copy()
-
     def __enter__(self: _World) -> _World:
         self._entered = True
         try:
@@ -232,7 +217,6 @@ class RemoteWorld(ABC):
     def close(self) -> None:
         """End the process; safe to call twice."""
         self._entered, self._state = False, None
-        self._panels.clear()
         if self.server is not None:
             self.server.close()
             self.server = None
@@ -244,7 +228,7 @@ class RemoteWorld(ABC):
             )
 
     def _open(self) -> None:
-        """Start the process, open its simulator, and put back what was in its scene."""
+        """Start the process and open its simulator."""
         self.server = RemoteServer(self._name, self.python(), self._simulator, self._server_file)
         cameras = {"driving": asdict(self.camera_pinhole), "photo": asdict(self.photo_pinhole)}
         answer = self._call(
@@ -257,8 +241,6 @@ class RemoteWorld(ABC):
                     "expected the same map as when it was opened before; got another one"
                 )
         self._description = said
-        for name, (panel, texture) in self._panels.items():
-            self._put_panel(name, panel, texture)
 
     def _described(self, answer: Answer) -> WorldDescription:
         try:
@@ -305,6 +287,38 @@ class RemoteWorld(ABC):
         with self._or_lost():
             rgb = picture_in(answer.arrays, pinhole, T)
             return rgb, depth_in(answer.arrays, pinhole, T, self._range_m, self._lowest_m) if depth else None
+
+
+class RemotePanelWorld(RemoteWorld):
+    """A remote world whose simulator takes textured panels into its own scene; a `hardware.worlds.world.NativePanels`."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self._panels: dict[str, tuple[Panel, Rgb]] = {}
+
+    def add_panel(self, name: str, panel: Panel, rgb: Rgb | None) -> None:
+        """Put a textured panel into the simulator's scene, or take it out; see `hardware.worlds.world.NativePanels`."""
+        if rgb is None:
+            self._panels.pop(name, None)
+            self._ask("add_panel", {"name": name, "size_m": None})
+            return
+        texture = np.ascontiguousarray(rgb)
+        if texture.ndim != 3 or texture.shape[2] != 3 or texture.dtype != np.uint8 or not texture.size:
+            raise ValueError(
+                f"expected a picture [h, w, 3] uint8 for the panel {name}; got {texture.dtype} {list(texture.shape)}"
+            )
+        self._put_panel(name, panel, texture)
+        self._panels[name] = panel, texture.copy()
+
+    def close(self) -> None:
+        """End the process, and forget the panels; safe to call twice."""
+        self._panels.clear()
+        super().close()
+
+    def _open(self) -> None:
+        super()._open()
+        for name, (panel, texture) in self._panels.items():
+            self._put_panel(name, panel, texture)
 
     def _put_panel(self, name: str, panel: Panel, texture: Rgb) -> None:
         self._ask(

@@ -13,7 +13,7 @@ from hardware.worlds.environments import ENVIRONMENTS
 from hardware.worlds.fitting import fit_lines_and_arcs, path_through
 from hardware.worlds.metadrive.config import MetaDriveConfig
 from hardware.worlds.paths import ReferencePath
-from hardware.worlds.remote_world import RemoteWorld
+from hardware.worlds.remote_world import RemotePanelWorld
 from hardware.worlds.road_photos import road_photo_poses
 from hardware.worlds.world import Box, CarDescription, Traits, WorldDescription, WorldError
 
@@ -25,7 +25,7 @@ _SPACING_M = 1.0  # of the route's poses
 _BESIDE_M, _HIGH_M, _LOW_M = 25.0, 12.0, -0.5
 
 
-class MetaDrive(RemoteWorld):
+class MetaDrive(RemotePanelWorld):
     """A road by block string and seed, with MetaDrive's renderer and its own car.
 
     The world's axes are those of MetaDrive's renderer: x along the first straight, z up, the middle of the road at y = 0. The body of the car is
