@@ -95,16 +95,7 @@ QUESTIONS = (
         "stopping",
         "Does the car stop when it must?",
         "Time and distance to the brake after faults, false stops, strangers, and half an hour of driving.",
-        (
-            "fault_stops",
-            "fault_campaign",
-            "stalls",
-            "pose_jumps",
-            "requests",
-            "strangers",
-            "thirty_minutes",
-            "world_faults",
-        ),
+        ("fault_stops", "fault_campaign", "stalls", "pose_jumps", "requests", "strangers", "thirty_minutes"),
     ),
     Question(
         "live_stack",
@@ -119,13 +110,14 @@ QUESTIONS = (
             "lockstep_replay",
             "calibrations",
             "policy_from_bags",
+            "foreign_worlds",
         ),
     ),
     Question(
         "nothing_is_lost",
         "Is anything lost when something breaks?",
         "Damaged and cut files, killed processes, and hostile input.",
-        ("bag_damage", "bag_kill", "attack_kill", "scene_kill", "fuzz"),
+        ("bag_damage", "bag_kill", "attack_kill", "scene_kill", "fuzz", "world_faults"),
     ),
 )
 

@@ -67,6 +67,7 @@ class MetaDriveConfig(_Frozen):
         supersampling: Every pixel is the mean of this number squared.
         sky: Whether MetaDrive's sky is drawn.
         terrain: Whether its grass is drawn.
+        anisotropic: Whether textures are filtered as MetaDrive asks for, 8 and 16 samples long; in software the frame then takes several times as long.
         server: Deadlines of its process.
     """
 
@@ -78,4 +79,5 @@ class MetaDriveConfig(_Frozen):
     supersampling: Literal[1, 3] = 3
     sky: bool = True
     terrain: bool = True
+    anisotropic: bool = False
     server: ServerDeadlines = Field(default=ServerDeadlines(), exclude=True)

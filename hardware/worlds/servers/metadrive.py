@@ -212,7 +212,7 @@ class Simulator:
         self._vehicle = self._env.vehicle
         self._vehicle.origin.hide(CamMask.RgbCam)
         self._engine.world_light.step((0.0, 0.0))
-        for texture in self._engine.render.findAllTextures():
+        for texture in [] if self._config["anisotropic"] else self._engine.render.findAllTextures():
             texture.setAnisotropicDegree(1)
 
     def _others(self) -> list[Any]:
