@@ -110,13 +110,14 @@ QUESTIONS = (
             "lockstep_replay",
             "calibrations",
             "policy_from_bags",
+            "foreign_worlds",
         ),
     ),
     Question(
         "nothing_is_lost",
         "Is anything lost when something breaks?",
         "Damaged and cut files, killed processes, and hostile input.",
-        ("bag_damage", "bag_kill", "attack_kill", "scene_kill", "fuzz"),
+        ("bag_damage", "bag_kill", "attack_kill", "scene_kill", "fuzz", "world_faults"),
     ),
 )
 

@@ -67,5 +67,23 @@ def _carla() -> WorldClass:
     return CarlaScene
 
 
-WORLDS: Mapping[str, Callable[[], WorldClass]] = {"lab": _lab, "junction": _junction, "carla": _carla}
+def _metadrive() -> WorldClass:
+    from hardware.worlds.metadrive.world import MetaDrive
+
+    return MetaDrive
+
+
+def _duckietown() -> WorldClass:
+    from hardware.worlds.duckietown.world import Duckietown
+
+    return Duckietown
+
+
+WORLDS: Mapping[str, Callable[[], WorldClass]] = {
+    "lab": _lab,
+    "junction": _junction,
+    "carla": _carla,
+    "metadrive": _metadrive,
+    "duckietown": _duckietown,
+}
 """Loaders of the worlds' classes by name; a simulator is imported when its world is opened."""

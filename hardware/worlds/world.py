@@ -417,3 +417,17 @@ class Screens(Protocol):
 
     def show(self, panel: str, rgb: Rgb | None, /) -> None:
         """Show a picture ``[h, w, 3]`` (row 0 on top) on the whole of a screen; None shows what it shows when nothing is asked."""
+
+
+@runtime_checkable
+class NativePanels(Protocol):
+    """A world that takes textured panels into its own scene: its own renderer lights, shades and occludes them."""
+
+    def add_panel(self, name: str, panel: Panel, rgb: Rgb | None, /) -> None:
+        """Put a panel into the scene, in the place of one of the same name; it stays until it is taken out, or the world is closed.
+
+        Args:
+            name: Of the panel.
+            panel: Pose and true size; its ``screen_px`` means nothing here.
+            rgb: Texture ``[h, w, 3]``, row 0 on top for a viewer; None takes the panel out.
+        """

@@ -11,7 +11,8 @@ from nodes.runtime.terminal import Overrides, print_table, table
 from nodes.runtime.termination import ends_in_order
 
 app = typer.Typer(
-    no_args_is_help=True, help="Places that are driven: which there are, and whether one keeps the contract."
+    no_args_is_help=True,
+    help="Places that are driven: which there are, installing those of other people, and whether one keeps the contract.",
 )
 Name = Annotated[
     str,
@@ -51,9 +52,50 @@ def world_check(
 
 @app.command("list")
 def world_list() -> None:
-    """Name the worlds that there are: built in, and of installed packages."""
+    """Name the worlds that there are: built in, and of installed packages; of simulators of other people, whether they are installed."""
     from advnerf_core.plugins import known_names
     from hardware.worlds import ENTRY_POINTS, WORLDS
+    from hardware.worlds.environments import ENVIRONMENTS
 
+    rows = table("", "", "")
     for name in known_names(WORLDS, ENTRY_POINTS):
-        print(name)
+        environment = ENVIRONMENTS.get(name)
+        if environment is None:
+            rows.add_row(name, "built in" if name in WORLDS else "of a package", "")
+        elif (state := environment.state) == "installed":
+            rows.add_row(name, state, str(environment.folder))
+        else:
+            rows.add_row(name, state, f"advnerf world install {name}")
+    rows.show_header = False
+    print_table(rows)
+
+
+@app.command("install")
+def world_install(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="A world of `advnerf world list`.")],
+    yes: Annotated[bool, typer.Option("--yes", help="Accept the licence without being asked.")] = False,
+    python: Annotated[
+        Path | None,
+        typer.Option(
+            "--python",
+            help="Interpreter to make it with.",
+            show_default="one of a fitting version on the path",
+        ),
+    ] = None,
+) -> None:
+    """Make the environment of a simulator of other people, apart from this one, from its lock file. Its licence is shown first."""
+    from advnerf_core.plugins import PluginError, unknown
+    from hardware.worlds.environments import ENVIRONMENTS
+    from nodes.lab.worlds.install import install
+
+    if name not in ENVIRONMENTS:
+        raise PluginError(unknown(name, "world that is installed", ENVIRONMENTS))
+    environment = ENVIRONMENTS[name]
+    if environment.state != "installed":
+        print(f"{environment.title}\n{environment.licence}")
+        if environment.system:
+            print(f"It needs these Debian packages, or what others call them: {' '.join(environment.system)}")
+        if not yes and not typer.confirm(f"Install it into {environment.folder}?"):
+            raise typer.Exit(_FAILURE_EXIT)
+    made = install(environment, lambda text: print(text, flush=True), python)
+    print(f"{'installed' if made else 'it is installed already'}: advnerf world check {name}")

@@ -11,7 +11,7 @@ import numpy as np
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.files import write_atomically
 from advnerf_core.geometry import planar_pose
-from hardware.worlds.world import NotOpenError, World, WorldDescription, traits_of
+from hardware.worlds.world import NativePanels, NotOpenError, World, WorldDescription, traits_of
 from nodes.lab.worlds.bench import Bench, Check, Finding, NotMet
 from nodes.lab.worlds.driving import (
     expert_keeps_its_lane,
@@ -21,6 +21,7 @@ from nodes.lab.worlds.driving import (
 )
 from nodes.lab.worlds.geometry import box_holds_what_is_seen, ground_is_flat, photographs_cover, views_agree
 from nodes.lab.worlds.named import NamedWorld
+from nodes.lab.worlds.panels import panels_are_native
 from nodes.lab.worlds.pictures import form, is_not_late, photographs_match, repeats, takes_no_time
 
 _DESCRIPTION = "description"
@@ -40,6 +41,8 @@ _CHECKS: tuple[tuple[str, Check], ...] = (
     ("paths", paths_are_drivable),
     ("expert", expert_keeps_its_lane),
 )
+# Of worlds that take panels into their own scene.
+_PANELS: tuple[str, Check] = ("panels", panels_are_native)
 
 
 def check_world(named: NamedWorld, pictures: Path | None = None) -> list[Finding]:
@@ -73,7 +76,8 @@ def check_world(named: NamedWorld, pictures: Path | None = None) -> list[Finding
                 return findings
         if pictures is not None:
             _write_pictures(bench, pictures)
-        findings += [_look(name, check, bench) for name, check in _CHECKS]
+        wanted = (*_CHECKS, _PANELS) if isinstance(world, NativePanels) else _CHECKS
+        findings += [_look(name, check, bench) for name, check in wanted]
     return findings
 
 

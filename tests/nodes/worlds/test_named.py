@@ -112,13 +112,17 @@ def test_a_package_brings_a_world(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         "lens": {"width": 64},
     }
     listed = CliRunner().invoke(app, ["world", "list"])
-    assert listed.output.split() == ["lab", "junction", "carla", "yard"]
+    names = [line.split()[0] for line in listed.output.splitlines()]
+    assert names == ["lab", "junction", "carla", "metadrive", "duckietown", "yard"]
 
 
 @pytest.mark.parametrize(
     ("text", "told"),
     [
-        ("kind: moon", r"yard\.experiment\.yaml:1: expected a world of lab, junction, carla; got 'moon'"),
+        (
+            "kind: moon",
+            r"yard\.experiment\.yaml:1: expected a world of lab, junction, carla, metadrive, duckietown; got 'moon'",
+        ),
         ("kind: junctoin", r"did you mean junction\?"),
         ("{}", r"expected kind: NAME"),
         ("{kind: [1]}", r"expected kind: NAME"),

@@ -1,0 +1,1 @@
+"""Duckietown as a world, in a process and an environment of its own: ``advnerf world install duckietown``."""

@@ -1,0 +1,52 @@
+"""Every number of Duckietown as a world: the map, the cameras, the robot."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from hardware.worlds.junction.config import PhotoConfig
+from hardware.worlds.lab.config import CameraConfig
+from hardware.worlds.remote_world import ServerDeadlines
+
+
+class _Frozen(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class RobotConfig(_Frozen):
+    """The differential drive: Duckietown's nominal motors, which answer 0.15 s late.
+
+    Attributes:
+        speed_mps: Speed of the experiments [m/s].
+        max_turn_rate_radps: Largest turn rate that is asked for [rad/s]; at 0.25 m/s the motors reach 4.3.
+    """
+
+    speed_mps: float = Field(default=0.25, gt=0.0, le=0.5)
+    max_turn_rate_radps: float = Field(default=3.6, gt=0.0, le=4.3)
+
+
+class DuckietownConfig(_Frozen):
+    """The whole world.
+
+    Attributes:
+        map_name: Which of Duckietown's maps; it must have a way round.
+        seed: Of what the map leaves open.
+        camera: Driving camera, mounted relative to the middle of the axle; the default is the robot's own.
+        photo: Camera of the posed images that a surrogate is learned from.
+        robot: The car.
+        supersampling: Every pixel is the mean of this number squared.
+        server: Deadlines of its process.
+    """
+
+    map_name: str = Field(default="small_loop", min_length=1, pattern=r"^[\w-]+$")
+    seed: int = Field(default=3, ge=0)
+    camera: CameraConfig = CameraConfig(
+        x_m=0.066, z_m=0.108, pitch_down_rad=math.radians(19.15), horizontal_fov_deg=107.8
+    )
+    photo: PhotoConfig = PhotoConfig(horizontal_fov_deg=110.0)
+    robot: RobotConfig = RobotConfig()
+    supersampling: Literal[1, 3] = 3
+    server: ServerDeadlines = Field(default=ServerDeadlines(), exclude=True)

@@ -1,0 +1,107 @@
+"""A map of Duckietown as a world; its simulator is ``hardware/worlds/servers/duckietown.py`` in another process."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from advnerf_core.geometry import Array
+from hardware.worlds.duckietown.config import DuckietownConfig
+from hardware.worlds.environments import ENVIRONMENTS
+from hardware.worlds.fitting import path_through
+from hardware.worlds.paths import ReferencePath
+from hardware.worlds.remote_world import RemotePanelWorld
+from hardware.worlds.road_photos import road_photo_poses
+from hardware.worlds.world import Box, CarDescription, Traits, WorldDescription, WorldError
+
+RANGE_M = (0.04, 100.0)
+# A lane's middle is at this share of a tile from the middle of the road; half a lane is as wide.
+_HALF_LANE_TILES = 0.2
+_FIT_M = 0.004  # half a lane is 0.12 m
+_LOWEST_M, _LOW_M, _HIGH_M, _BESIDE_M = -0.1, -0.05, 0.6, 0.3
+
+
+class Duckietown(RemotePanelWorld):
+    """A map of Duckietown with its own renderer and its differential drive.
+
+    Its paths are the closed ways along the lanes' middles, named by the way round: ``left`` (seen from above counter-clockwise) and ``right``. The
+    world's x is Duckietown's, its y is Duckietown's -z, and z points up. The robot is in no picture.
+
+    Args:
+        config: All numbers of the world.
+    """
+
+    Config: ClassVar[type[DuckietownConfig]] = DuckietownConfig
+    traits: ClassVar[Traits] = Traits(step_s=0.02)
+
+    def __init__(self, config: DuckietownConfig | None = None) -> None:
+        self.config = DuckietownConfig() if config is None else config
+        camera = self.config.camera
+        super().__init__(
+            "duckietown",
+            ENVIRONMENTS["duckietown"].simulator,
+            self.config.model_dump(mode="json", exclude={"camera", "photo", "robot", "server"}),
+            (camera.pinhole, self.config.photo.pinhole),
+            camera.T_car_from_camera,
+            RANGE_M,
+            _LOWEST_M,
+            self.config.server,
+        )
+
+    def python(self) -> Path:
+        """The interpreter of Duckietown's environment."""
+        return ENVIRONMENTS["duckietown"].python()
+
+    def description_of(self, facts: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> WorldDescription:
+        """The ways round the map.
+
+        Raises:
+            WorldError: It has none.
+        """
+        if not facts["ways"]:
+            raise WorldError(
+                f"expected a map of Duckietown with a way round; {self.config.map_name} has none: name another one, such as small_loop"
+            )
+        lines = np.split(np.asarray(arrays["ways"], dtype=np.float64), np.cumsum(facts["ways"])[:-1])
+        robot, (width_m, depth_m) = self.config.robot, facts["size_m"]
+        limit = robot.max_turn_rate_radps
+        return WorldDescription(
+            paths=_named(lines),
+            off_track_m=_HALF_LANE_TILES * float(facts["tile_m"]),
+            car=CarDescription("dubins", robot.speed_mps, (-limit, limit)),
+            camera=self.camera_pinhole,
+            T_car_from_camera=self.T_car_from_camera,
+            box=Box(
+                (-_BESIDE_M, -float(depth_m) - _BESIDE_M, _LOW_M),
+                (float(width_m) + _BESIDE_M, _BESIDE_M, _HIGH_M),
+                contraction=True,
+            ),
+            facts={"simulator": str(facts["simulator"])},
+        )
+
+    def photo_poses(self, count: int, rng: np.random.Generator) -> list[Array]:
+        """Along and beside the ways, and from above them; see `road_photo_poses`."""
+        description = self.describe()
+        paths, lane_m = list(description.paths.values()), 2.0 * description.off_track_m
+        return road_photo_poses(paths, lane_m, self.config.camera, count, rng)
+
+
+def _named(lines: list[Array]) -> dict[str, ReferencePath]:
+    """The ways by their names, each with a goal of its own; the longest of those that turn to one side has the side's name."""
+    areas = [
+        0.5 * float(np.sum(line[:, 0] * np.roll(line[:, 1], -1) - line[:, 1] * np.roll(line[:, 0], -1)))
+        for line in lines
+    ]
+    ranked = sorted(range(len(lines)), key=lambda index: -abs(areas[index]))
+    paths: dict[str, ReferencePath] = {}
+    for index in ranked:
+        side = "left" if areas[index] > 0.0 else "right"
+        taken = sum(name.startswith(side) for name in paths)
+        goal = tuple(float(len(paths) == other) for other in range(len(lines)))
+        paths[f"{side}{taken + 1}" if taken else side] = path_through(
+            lines[index], goal, closed=True, tolerance_m=_FIT_M
+        )
+    return paths

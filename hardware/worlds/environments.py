@@ -1,0 +1,109 @@
+"""Environments of simulators of other people: where they are, and whether one is there that fits its lock file.
+
+``advnerf world install NAME`` makes one (`nodes.lab.worlds.install`); the worlds only look for its interpreter.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+from advnerf_core.files import sha256_of
+from hardware.worlds.remote import SERVERS
+from hardware.worlds.remote_errors import WorldNotInstalled
+
+FOLDER_VARIABLE = "ADVNERF_WORLDS"
+MADE = "advnerf.json"
+
+
+@dataclass(frozen=True)
+class Environment:
+    """What a foreign world needs to run.
+
+    Attributes:
+        name: The world's kind.
+        title: What is installed.
+        licence: What whoever installs it agrees to.
+        pythons: Versions of Python that it runs on, the preferred one first.
+        size_mb: About how much is installed [MB].
+        system: Debian packages that it needs beside Python's.
+    """
+
+    name: str
+    title: str
+    licence: str
+    pythons: tuple[str, ...]
+    size_mb: int
+    system: tuple[str, ...] = ()
+
+    @property
+    def lock(self) -> Path:
+        """Its packages, each with its version."""
+        return SERVERS / f"{self.name}.lock.txt"
+
+    @property
+    def simulator(self) -> Path:
+        """Its file for ``serve.py``."""
+        return SERVERS / f"{self.name}.py"
+
+    @property
+    def folder(self) -> Path:
+        """Where it is installed: in ``$ADVNERF_WORLDS``, or among this user's data."""
+        data = (
+            Path(os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share") / "advnerf" / "worlds"
+        )
+        return Path(os.environ.get(FOLDER_VARIABLE) or data) / self.name
+
+    @property
+    def interpreter(self) -> Path:
+        """Its Python, whether it is there or not."""
+        return self.folder / "bin" / "python"
+
+    @property
+    def state(self) -> str:
+        """``installed``, ``not installed``, or ``installed from another lock file``."""
+        made = self.folder / MADE
+        if not made.exists() or not self.interpreter.exists():
+            return "not installed"
+        fits = json.loads(made.read_text(encoding="utf-8")).get("lock_sha256") == sha256_of(self.lock)
+        return "installed" if fits else "installed from another lock file"
+
+    def python(self) -> Path:
+        """Its Python.
+
+        Raises:
+            WorldNotInstalled: It is not there, or was made from another lock file.
+        """
+        if (state := self.state) != "installed":
+            raise WorldNotInstalled(
+                f"expected the environment of the world {self.name} in {self.folder}; it is {state}: run `advnerf world install {self.name}`"
+            )
+        return self.interpreter
+
+
+ENVIRONMENTS = {
+    each.name: each
+    for each in (
+        Environment(
+            "metadrive",
+            "MetaDrive 0.3.0.1, with its models and textures",
+            "MetaDrive is published under the Apache License 2.0 (https://github.com/metadriverse/metadrive). Single models and textures in it "
+            "may be under terms of their own.",
+            ("3.11", "3.10"),
+            950,
+            ("libegl1", "libgl1", "libgl1-mesa-dri"),
+        ),
+        Environment(
+            "duckietown",
+            "Duckietown's simulator (duckietown-gym-daffy 6.1.34), with its maps",
+            "Duckietown's software is licensed for research and teaching only: commercial use is not allowed without a licence of the Duckietown "
+            "Foundation. Read https://www.duckietown.org/about/sw-license before you install it.",
+            ("3.11", "3.10"),
+            870,
+            ("libegl1", "libgl1", "libgl1-mesa-dri", "libglu1-mesa"),
+        ),
+    )
+}
+"""Foreign worlds by kind."""

@@ -1,0 +1,1 @@
+"""MetaDrive as a world, in a process and an environment of its own: ``advnerf world install metadrive``."""

@@ -1,0 +1,83 @@
+"""Every number of MetaDrive as a world: the road, the cameras, the car."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from hardware.worlds.junction.config import PhotoConfig
+from hardware.worlds.lab.config import CameraConfig
+from hardware.worlds.remote_world import ServerDeadlines
+
+
+class _Frozen(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class RoadConfig(_Frozen):
+    """A road of MetaDrive's generator, and the stretch of its route that is driven.
+
+    Attributes:
+        blocks: One letter per block after the straight that every road begins with: S straight, C curve, r and R ramps, X crossing, O roundabout,
+            T junction, P parking, y and Y lanes that merge and split, and others of MetaDrive's documentation.
+        seed: Of the generator: lengths, radii, directions.
+        lanes: Lanes per direction.
+        lane_width_m: Width of a lane [m].
+        lane: Which lane is driven; 0 is the one beside the middle of the road.
+        from_m: Where on the route the driven stretch begins [m].
+        length_m: Its length [m]; a route that ends before is driven to its end.
+    """
+
+    blocks: str = Field(default="CS", min_length=1, pattern="^[A-Za-z$]+$")
+    seed: int = Field(default=5, ge=0)
+    lanes: int = Field(default=2, ge=1, le=6)
+    lane_width_m: float = Field(default=3.5, ge=2.5, le=5.0)
+    lane: int = Field(default=1, ge=0)
+    from_m: float = Field(default=30.0, ge=0.0)
+    length_m: float = Field(default=90.0, gt=10.0)
+
+
+class CarConfig(_Frozen):
+    """The car: MetaDrive's own Bullet vehicle under a speed and steering controller, or an ideal one.
+
+    Attributes:
+        own: Whether MetaDrive's vehicle drives; else a kinematic bicycle that does what it is told.
+        model: Which of MetaDrive's vehicles; it also sets the wheelbase.
+        speed_mps: Speed of the experiments [m/s].
+        max_wheel_rad: Wheel angles are clipped to plus and minus this [rad].
+    """
+
+    own: bool = True
+    model: Literal["default", "s", "m", "l", "xl"] = "default"
+    speed_mps: float = Field(default=6.0, gt=0.0, le=20.0)
+    max_wheel_rad: float = Field(default=0.4, gt=0.0, le=0.6)
+
+
+class MetaDriveConfig(_Frozen):
+    """The whole world.
+
+    Attributes:
+        road: Which road.
+        camera: Driving camera, mounted relative to the rear axle.
+        photo: Camera of the posed images that a surrogate is learned from.
+        car: The car.
+        traffic_density: Vehicles of MetaDrive's own traffic per 10 m of lane; 0 for none.
+        supersampling: Every pixel is the mean of this number squared.
+        sky: Whether MetaDrive's sky is drawn.
+        terrain: Whether its grass is drawn.
+        anisotropic: Whether textures are filtered as MetaDrive asks for, 8 and 16 samples long; in software the frame then takes several times as long.
+        server: Deadlines of its process.
+    """
+
+    road: RoadConfig = RoadConfig()
+    camera: CameraConfig = CameraConfig(x_m=1.2, z_m=1.5, pitch_down_rad=math.radians(8.0))
+    photo: PhotoConfig = PhotoConfig()
+    car: CarConfig = CarConfig()
+    traffic_density: float = Field(default=0.0, ge=0.0, le=1.0)
+    supersampling: Literal[1, 3] = 3
+    sky: bool = True
+    terrain: bool = True
+    anisotropic: bool = False
+    server: ServerDeadlines = Field(default=ServerDeadlines(), exclude=True)

@@ -1,0 +1,118 @@
+"""A road of MetaDrive as a world; its simulator is ``hardware/worlds/servers/metadrive.py`` in another process."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from advnerf_core.geometry import Array
+from hardware.worlds.environments import ENVIRONMENTS
+from hardware.worlds.fitting import fit_lines_and_arcs, path_through
+from hardware.worlds.metadrive.config import MetaDriveConfig
+from hardware.worlds.paths import ReferencePath
+from hardware.worlds.remote_world import RemotePanelWorld
+from hardware.worlds.road_photos import road_photo_poses
+from hardware.worlds.world import Box, CarDescription, Traits, WorldDescription, WorldError
+
+ROUTE = "route"
+RANGE_M = (0.2, 1000.0)
+_LOWEST_M = -0.1  # the grass lies a little under the road
+_SPACING_M = 1.0  # of the route's poses
+# The learned box reaches so far beyond the driven stretch; lanes as far away are described.
+_BESIDE_M, _HIGH_M, _LOW_M = 25.0, 12.0, -0.5
+
+
+class MetaDrive(RemotePanelWorld):
+    """A road by block string and seed, with MetaDrive's renderer and its own car.
+
+    The world's axes are those of MetaDrive's renderer: x along the first straight, z up, the middle of the road at y = 0. The body of the car is
+    in no picture.
+
+    Args:
+        config: All numbers of the world.
+    """
+
+    Config: ClassVar[type[MetaDriveConfig]] = MetaDriveConfig
+    traits: ClassVar[Traits] = Traits(unseen=("car.own",), step_s=0.02)
+
+    def __init__(self, config: MetaDriveConfig | None = None) -> None:
+        self.config = MetaDriveConfig() if config is None else config
+        camera = self.config.camera
+        super().__init__(
+            "metadrive",
+            ENVIRONMENTS["metadrive"].simulator,
+            self.config.model_dump(mode="json", exclude={"camera", "photo", "server"}),
+            (camera.pinhole, self.config.photo.pinhole),
+            camera.T_car_from_camera,
+            RANGE_M,
+            _LOWEST_M,
+            self.config.server,
+        )
+
+    def python(self) -> Path:
+        """The interpreter of MetaDrive's environment."""
+        return ENVIRONMENTS["metadrive"].python()
+
+    def description_of(self, facts: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> WorldDescription:
+        """The driven stretch of the route, the lanes near it, and the box about it.
+
+        Raises:
+            WorldError: The route is shorter than where the stretch begins.
+        """
+        road, car = self.config.road, self.config.car
+        stretch = self._stretch(arrays["route"])
+        x, y, yaw = map(float, stretch[0])
+        path = ReferencePath((x, y, yaw), fit_lines_and_arcs(stretch))
+        lanes = [path_through(line) for line in _near(arrays["middles"], facts["middles"], stretch)]
+        low, high = stretch[:, :2].min(axis=0) - _BESIDE_M, stretch[:, :2].max(axis=0) + _BESIDE_M
+        return WorldDescription(
+            paths={ROUTE: path},
+            off_track_m=0.5 * road.lane_width_m,
+            car=CarDescription(
+                "ackermann",
+                car.speed_mps,
+                (-car.max_wheel_rad, car.max_wheel_rad),
+                float(facts["wheelbase_m"]),
+            ),
+            camera=self.camera_pinhole,
+            T_car_from_camera=self.T_car_from_camera,
+            box=Box(
+                (float(low[0]), float(low[1]), _LOW_M),
+                (float(high[0]), float(high[1]), _HIGH_M),
+                contraction=True,
+            ),
+            lanes=(path, *lanes),
+            road_edge=tuple(_near(arrays["edges"], facts["edges"], stretch)),
+            facts={"simulator": str(facts["simulator"])},
+        )
+
+    def photo_poses(self, count: int, rng: np.random.Generator) -> list[Array]:
+        """Along and beside the driven stretch, and from above it; see `road_photo_poses`."""
+        description = self.describe()
+        return road_photo_poses(
+            list(description.paths.values()), 2.0 * description.off_track_m, self.config.camera, count, rng
+        )
+
+    def _stretch(self, route: Array) -> Array:
+        """Poses ``[N, 3]`` of the part of the route that is driven."""
+        road = self.config.road
+        first, last = round(road.from_m / _SPACING_M), round((road.from_m + road.length_m) / _SPACING_M)
+        if len(route) < first + 11:
+            raise WorldError(
+                f"expected a route longer than road.from_m = {road.from_m:g} m by 10 m at least; the road {road.blocks!r} of seed {road.seed} has "
+                f"{len(route)} m: add blocks, or begin earlier"
+            )
+        return np.asarray(route[first : last + 1], dtype=np.float64)
+
+
+def _near(points: Array, counts: list[int], stretch: Array) -> list[Array]:
+    """Of lines ``[N, 2]`` that follow each other those that come near the stretch."""
+    found = []
+    for line in np.split(np.asarray(points, dtype=np.float64), np.cumsum(counts)[:-1]):
+        apart = np.linalg.norm(line[:, None] - stretch[None, :, :2], axis=2)
+        if apart.min() < _BESIDE_M:
+            found.append(line)
+    return found

@@ -1,0 +1,328 @@
+"""The `World` contract on top of a simulator in another process, which is trusted with nothing.
+
+Whatever does not fit ends the process and raises a named error (`hardware.worlds.remote_errors`): the drive in which that happens has no
+result. The next `reset`, or the next picture from elsewhere, starts the process again, so that other drives go on.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Literal, TypeVar, overload
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+from advnerf_core.geometry import Array, Pinhole, VehicleState, planar_pose
+from hardware.worlds.remote import SERVERS, Answer, RemoteServer
+from hardware.worlds.remote_answers import (
+    depth_in,
+    picture_in,
+    require_driven,
+    require_ground_ahead,
+    require_put_down,
+    state_in,
+)
+from hardware.worlds.remote_errors import RemoteWorldError, ServerLost, ServerProtocolError
+from hardware.worlds.world import Depth, NotOpenError, Panel, Rgb, WorldDescription
+
+_World = TypeVar("_World", bound="RemoteWorld")
+_Arrays = Mapping[str, NDArray[Any]]
+
+
+class ServerDeadlines(BaseModel):
+    """How long the process of a world may take; nothing that results depend on.
+
+    Attributes:
+        open_s: Opening the simulator: loading its models, compiling its shaders [s].
+        call_s: Any other call [s].
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    open_s: float = Field(default=240.0, gt=0.0)
+    call_s: float = Field(default=30.0, gt=0.0)
+
+
+class RemoteWorld(ABC):
+    """A world whose simulator runs in another process; a `hardware.worlds.world.World`.
+
+    A subclass says which interpreter runs it (`python`), what its map is (`description_of`), and from where it is photographed.
+
+    Args:
+        name: What messages call it.
+        simulator: The simulator's file, for ``serve.py``.
+        settings: What the simulator is opened with, as JSON data.
+        cameras: Intrinsics of the driving camera, and of the camera of `photograph`.
+        T_car_from_camera: Where the driving camera sits on the car ``[4, 4]``.
+        range_m: Nearest and farthest depth that the cameras give [m]; what is farther is infinite.
+        lowest_m: Height of the lowest ground [m].
+        deadlines: How long calls may take.
+        server: What serves the simulator; another file than ``serve.py`` only in tests.
+
+    Attributes:
+        camera_pinhole: Intrinsics of the driving camera.
+        photo_pinhole: Intrinsics of the camera of `photograph`.
+        server: The process while it runs.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        simulator: Path,
+        settings: Mapping[str, Any],
+        cameras: tuple[Pinhole, Pinhole],
+        T_car_from_camera: Array,
+        range_m: tuple[float, float],
+        lowest_m: float = 0.0,
+        deadlines: ServerDeadlines | None = None,
+        server: Path = SERVERS / "serve.py",
+    ) -> None:
+        self.camera_pinhole, self.photo_pinhole = cameras
+        self._name, self._simulator, self._server_file = name, simulator, server
+        self._settings, self._range_m, self._lowest_m = dict(settings), range_m, lowest_m
+        self._mount: Array = np.array(T_car_from_camera, dtype=np.float64)
+        self._deadlines = ServerDeadlines() if deadlines is None else deadlines
+        self.server: RemoteServer | None = None
+        self._description: WorldDescription | None = None
+        self._entered = False
+        self._state: VehicleState | None = None
+        self._blocked = False
+
+    @abstractmethod
+    def python(self) -> Path:
+        """Interpreter of the simulator's environment.
+
+        Raises:
+            WorldNotInstalled: There is none.
+        """
+
+    @abstractmethod
+    def description_of(self, facts: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> WorldDescription:
+        """What the simulator said when it was opened, as a description."""
+
+    @abstractmethod
+    def photo_poses(self, count: int, rng: np.random.Generator, /) -> list[Array]:
+        """From where it is photographed for learning; see `World.photo_poses`."""
+
+    @property
+    def T_car_from_camera(self) -> Array:
+        """Where the driving camera sits on the car ``[4, 4]``."""
+        return self._mount.copy()
+
+    @property
+    def state(self) -> VehicleState:
+        """True state of the car.
+
+        Raises:
+            ServerLost: The process was lost since the car was put down.
+        """
+        self._require_open()
+        if self._state is None:
+            raise ServerLost(
+                f"world {self._name}: expected a car that was put down; its process was lost, or it was never reset: call reset first"
+            )
+        return self._state
+
+    @property
+    def blocked(self) -> bool:
+        """Whether the car stands against something."""
+        _ = self.state  # nothing is known of a car that was not put down
+        return self._blocked
+
+    def describe(self) -> WorldDescription:
+        """What the simulator says of its map.
+
+        Raises:
+            NotOpenError: The world was never opened.
+        """
+        if self._description is None:
+            self._require_open()
+        assert self._description is not None, "it was asked for when the world was opened"
+        return self._description
+
+    def reset(self, x_m: float, y_m: float, yaw_rad: float) -> VehicleState:
+        """Put the car down at rest; a process that was lost is started again."""
+        self._state = None
+        answer = self._ask("reset", {"x_m": x_m, "y_m": y_m, "yaw_rad": yaw_rad})
+        with self._or_lost():
+            state, self._blocked = state_in(answer.result)
+            require_put_down(state, x_m, y_m, yaw_rad)
+        self._state = state
+        return state
+
+    def step(self, control: float, speed_mps: float, duration_s: float) -> VehicleState:
+        """Send one command and let time pass; see `World.step`."""
+        before = self.state
+        answer = self._ask("step", {"control": control, "speed_mps": speed_mps, "duration_s": duration_s})
+        with self._or_lost():
+            state, self._blocked = state_in(answer.result)
+            require_driven(before, state, speed_mps, duration_s)
+        self._state = state
+        return state
+
+    @overload
+    def observe(self, depth: Literal[True] = True) -> tuple[Rgb, Depth]: ...
+    @overload
+    def observe(self, depth: Literal[False]) -> tuple[Rgb, None]: ...
+    def observe(self, depth: bool = True) -> tuple[Rgb, Depth | None]:
+        """What the driving camera sees; see `World.observe`."""
+        T = self.state.T_world_from_car @ self._mount
+        rgb, depth_m = self._render("driving", self.camera_pinhole, T, depth)
+        if depth_m is not None and not self._blocked:
+            with self._or_lost():
+                require_ground_ahead(depth_m, self.camera_pinhole, T)
+        return rgb, depth_m
+
+    @overload
+    def observe_at(
+        self, x_m: float, y_m: float, yaw_rad: float, depth: Literal[True] = True
+    ) -> tuple[Rgb, Depth]: ...
+    @overload
+    def observe_at(
+        self, x_m: float, y_m: float, yaw_rad: float, depth: Literal[False]
+    ) -> tuple[Rgb, None]: ...
+    def observe_at(
+        self, x_m: float, y_m: float, yaw_rad: float, depth: bool = True
+    ) -> tuple[Rgb, Depth | None]:
+        """What the driving camera would see from another pose of the car; see `World.observe_at`."""
+        return self._render(
+            "driving", self.camera_pinhole, planar_pose(x_m, y_m, yaw_rad) @ self._mount, depth
+        )
+
+    def photograph(self, T_world_from_camera: Array) -> Rgb:
+        """A photograph ``[H, W, 3]`` with ``photo_pinhole``."""
+        T = np.asarray(T_world_from_camera, dtype=np.float64)
+        return self._render("photo", self.photo_pinhole, T, False)[0]
+
+    def __enter__(self: _World) -> _World:
+        self._entered = True
+        try:
+            self._open()
+        except BaseException:
+            self.close()
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the process; safe to call twice."""
+        self._entered, self._state = False, None
+        if self.server is not None:
+            self.server.close()
+            self.server = None
+
+    def _require_open(self) -> None:
+        if not self._entered:
+            raise NotOpenError(
+                f"expected the world {self._name} to be open, as its simulator is asked for everything; use it as a context manager"
+            )
+
+    def _open(self) -> None:
+        """Start the process and open its simulator."""
+        self.server = RemoteServer(self._name, self.python(), self._simulator, self._server_file)
+        cameras = {"driving": asdict(self.camera_pinhole), "photo": asdict(self.photo_pinhole)}
+        answer = self._call(
+            "open", {"config": self._settings, "cameras": cameras}, {}, self._deadlines.open_s
+        )
+        with self._or_lost():
+            said = self._described(answer)
+            if self._description is not None and said.to_dict() != self._description.to_dict():
+                raise ServerProtocolError(
+                    "expected the same map as when it was opened before; got another one"
+                )
+        self._description = said
+
+    def _described(self, answer: Answer) -> WorldDescription:
+        try:
+            return self.description_of(answer.result, answer.arrays)
+        except (KeyError, TypeError, ValueError, IndexError) as error:
+            raise ServerProtocolError(
+                f"expected a map that can be driven; got {type(error).__name__}: {error}"
+            ) from error
+
+    def _ask(self, call: str, arguments: Mapping[str, Any], arrays: _Arrays | None = None) -> Answer:
+        """Call the open simulator; where it was lost it is opened again."""
+        self._require_open()
+        if self.server is None:
+            self._open()
+        return self._call(call, arguments, arrays or {}, self._deadlines.call_s)
+
+    def _call(self, call: str, arguments: Mapping[str, Any], arrays: _Arrays, limit_s: float) -> Answer:
+        assert self.server is not None, "it was started before"
+        try:
+            return self.server.call(call, arguments, arrays, limit_s)
+        except BaseException:
+            self._lose()
+            raise
+
+    @contextmanager
+    def _or_lost(self) -> Iterator[None]:
+        """An answer that is refused ends the process; the error says of which world it is."""
+        try:
+            yield
+        except RemoteWorldError as error:
+            self._lose()
+            raise type(error)(
+                f"world {self._name}: {error}; its process was ended and the drive does not count; run `advnerf world check {self._name}`"
+            ) from None
+
+    def _lose(self) -> None:
+        self._state = None
+        if self.server is not None:
+            self.server.kill()
+            self.server = None
+
+    def _render(self, camera: str, pinhole: Pinhole, T: Array, depth: bool) -> tuple[Rgb, Any]:
+        answer = self._ask("render", {"camera": camera, "depth": depth}, {"T_world_from_camera": T})
+        with self._or_lost():
+            rgb = picture_in(answer.arrays, pinhole, T)
+            return rgb, depth_in(answer.arrays, pinhole, T, self._range_m, self._lowest_m) if depth else None
+
+
+class RemotePanelWorld(RemoteWorld):
+    """A remote world whose simulator takes textured panels into its own scene; a `hardware.worlds.world.NativePanels`."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self._panels: dict[str, tuple[Panel, Rgb]] = {}
+
+    def add_panel(self, name: str, panel: Panel, rgb: Rgb | None) -> None:
+        """Put a textured panel into the simulator's scene, or take it out; see `hardware.worlds.world.NativePanels`."""
+        if rgb is None:
+            self._panels.pop(name, None)
+            self._ask("add_panel", {"name": name, "size_m": None})
+            return
+        texture = np.ascontiguousarray(rgb)
+        if texture.ndim != 3 or texture.shape[2] != 3 or texture.dtype != np.uint8 or not texture.size:
+            raise ValueError(
+                f"expected a picture [h, w, 3] uint8 for the panel {name}; got {texture.dtype} {list(texture.shape)}"
+            )
+        self._put_panel(name, panel, texture)
+        self._panels[name] = panel, texture.copy()
+
+    def close(self) -> None:
+        """End the process, and forget the panels; safe to call twice."""
+        self._panels.clear()
+        super().close()
+
+    def _open(self) -> None:
+        super()._open()
+        for name, (panel, texture) in self._panels.items():
+            self._put_panel(name, panel, texture)
+
+    def _put_panel(self, name: str, panel: Panel, texture: Rgb) -> None:
+        self._ask(
+            "add_panel",
+            {"name": name, "size_m": [panel.width_m, panel.height_m]},
+            {"T_world_from_face": np.asarray(panel.T_world_from_face, dtype=np.float64), "rgb": texture},
+        )

@@ -1,0 +1,124 @@
+"""Environments of foreign worlds: made from a lock file, refused when they do not fit it, and listed."""
+
+import json
+import subprocess
+import sys
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from advnerf_core.files import sha256_of
+from hardware.worlds import WORLDS
+from hardware.worlds.environments import ENVIRONMENTS, FOLDER_VARIABLE, MADE, Environment
+from hardware.worlds.remote_errors import WorldNotInstalled
+from nodes.cli.main import app
+from nodes.lab.worlds.install import InstallError, find_python, install
+
+HERE = f"{sys.version_info[0]}.{sys.version_info[1]}"
+
+
+@dataclass(frozen=True)
+class Small(Environment):
+    """An environment with a lock file of the test's own."""
+
+    lock_file: Path = Path()
+
+    @property
+    def lock(self) -> Path:
+        return self.lock_file
+
+
+@pytest.fixture
+def small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Small:
+    monkeypatch.setenv(FOLDER_VARIABLE, str(tmp_path / "worlds"))
+    wheel = tmp_path / "told-1.0-py3-none-any.whl"
+    _write_wheel(wheel)
+    lock = tmp_path / "small.lock.txt"
+    lock.write_text(f"# one package\ntold @ file://{wheel}\n")
+    return Small("small", "A small world", "Free.", (HERE,), 1, lock_file=lock)
+
+
+def _write_wheel(file: Path) -> None:
+    with zipfile.ZipFile(file, "w") as wheel:
+        wheel.writestr("told.py", "TEXT = 'of its own'\n")
+        wheel.writestr("told-1.0.dist-info/METADATA", "Metadata-Version: 2.1\nName: told\nVersion: 1.0\n")
+        wheel.writestr(
+            "told-1.0.dist-info/WHEEL",
+            "Wheel-Version: 1.0\nGenerator: test\nRoot-Is-Purelib: true\nTag: py3-none-any\n",
+        )
+        wheel.writestr("told-1.0.dist-info/RECORD", "told.py,,\ntold-1.0.dist-info/METADATA,,\n")
+
+
+def test_an_environment_is_made_once_and_has_what_its_lock_file_says(small: Small) -> None:
+    said: list[str] = []
+    with pytest.raises(WorldNotInstalled, match="advnerf world install small"):
+        small.python()
+    assert install(small, said.append)
+    assert "the 1 packages of small.lock.txt" in said[1]
+    assert not install(small, said.append)
+    asked = "import told, sys; print(told.TEXT, sys.prefix)"
+    told = subprocess.run([small.python(), "-I", "-c", asked], capture_output=True, text=True, check=True)
+    assert told.stdout.split() == ["of", "its", "own", str(small.folder)]
+    small.lock.write_text(small.lock.read_text() + "# changed\n")
+    with pytest.raises(WorldNotInstalled, match="installed from another lock file"):
+        small.python()
+
+
+def test_an_environment_that_was_interrupted_does_not_count(small: Small) -> None:
+    small.lock.write_text("told @ file:///nowhere/told-1.0-py3-none-any.whl\n")
+    with pytest.raises(InstallError, match="install its packages"):
+        install(small, lambda text: None)
+    assert small.interpreter.exists()
+    assert small.state == "not installed"
+
+
+def test_a_python_of_another_version_is_refused(small: Small, tmp_path: Path) -> None:
+    old = Environment("old", "Old", "Free.", ("2.7",), 1)
+    with pytest.raises(InstallError, match=r"expected Python 2\.7 .*--python"):
+        find_python(old)
+    with pytest.raises(InstallError, match=f"of version {HERE}"):
+        find_python(old, Path(sys.executable))
+    with pytest.raises(InstallError, match="of version unknown"):
+        find_python(small, tmp_path / "nowhere")
+
+
+@pytest.mark.parametrize("name", ENVIRONMENTS)
+def test_a_foreign_world_has_its_simulator_and_a_lock_of_pinned_versions(name: str) -> None:
+    environment = ENVIRONMENTS[name]
+    assert name in WORLDS
+    assert environment.simulator.is_file()
+    lines = [line for line in environment.lock.read_text().splitlines() if line and not line.startswith("#")]
+    assert all(line.count("==") == 1 for line in lines)
+    assert {"pyzmq", "numpy"} <= {line.split("==")[0].lower() for line in lines}
+
+
+def test_the_list_says_what_is_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(FOLDER_VARIABLE, str(tmp_path))
+    environment = ENVIRONMENTS["metadrive"]
+    listed = CliRunner().invoke(app, ["world", "list"]).output
+    assert "advnerf world install metadrive" in listed
+    environment.interpreter.parent.mkdir(parents=True)
+    environment.interpreter.touch()
+    (environment.folder / MADE).write_text(json.dumps({"lock_sha256": sha256_of(environment.lock)}))
+    assert "advnerf world install metadrive" not in CliRunner().invoke(app, ["world", "list"]).output
+
+
+def test_nothing_is_installed_before_its_licence_is_accepted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(FOLDER_VARIABLE, str(tmp_path))
+    refused = CliRunner().invoke(app, ["world", "install", "metadrive"], input="n\n")
+    assert refused.exit_code == 1
+    assert "Apache License" in refused.output
+    assert list(tmp_path.iterdir()) == []
+    unknown = CliRunner().invoke(app, ["world", "install", "metadrivee"])
+    assert "did you mean metadrive?" in str(unknown.exception)
+
+
+def test_a_world_that_is_not_installed_says_how(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(FOLDER_VARIABLE, str(tmp_path))
+    checked = CliRunner().invoke(app, ["world", "check", "metadrive"])
+    assert "advnerf world install metadrive" in str(checked.exception)

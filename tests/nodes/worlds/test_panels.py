@@ -1,0 +1,153 @@
+"""The check of panels in a world's own scene: a world in another process passes, and each planted fault is found and named."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from advnerf_core.geometry import make_transform, rotation_y, rotation_z
+from hardware.worlds.world import NativePanels, Panel, Rgb
+from nodes.lab.worlds.bench import Bench, NotMet
+from nodes.lab.worlds.named import NamedWorld
+from nodes.lab.worlds.panels import panels_are_native
+from tests.support.remote.flat_world import FlatConfig, FlatWorld
+from tests.support.warehouse import Warehouse
+
+pytestmark = pytest.mark.live
+
+
+class Changed(FlatWorld):
+    """Puts other panels into the scene than it was asked to."""
+
+    def add_panel(self, name: str, panel: Panel, rgb: Rgb | None) -> None:
+        if rgb is not None:
+            panel, rgb = self.changed(panel, rgb)
+        super().add_panel(name, panel, rgb)
+
+    def changed(self, panel: Panel, rgb: Rgb) -> tuple[Panel, Rgb]:
+        return panel, rgb
+
+
+def moved(panel: Panel, change: Any, width: float = 1.0, height: float = 1.0) -> Panel:
+    return Panel(panel.T_world_from_face @ change, width * panel.width_m, height * panel.height_m)
+
+
+class Mirrored(Changed):
+    def changed(self, panel: Panel, rgb: Rgb) -> tuple[Panel, Rgb]:
+        return panel, rgb[:, ::-1]
+
+
+class UpsideDown(Changed):
+    def changed(self, panel: Panel, rgb: Rgb) -> tuple[Panel, Rgb]:
+        return panel, rgb[::-1]
+
+
+class HalfATurn(Changed):
+    def changed(self, panel: Panel, rgb: Rgb) -> tuple[Panel, Rgb]:
+        return panel, rgb[::-1, ::-1]
+
+
+class BlueFirst(Changed):
+    def changed(self, panel: Panel, rgb: Rgb) -> tuple[Panel, Rgb]:
+        return panel, rgb[..., ::-1]
+
+
+class HalfSizes(Changed):
+    def changed(self, panel: Panel, rgb: Rgb) -> tuple[Panel, Rgb]:
+        return moved(panel, np.eye(4), 2.0, 2.0), rgb
+
+
+class WidthForHeight(Changed):
+    def changed(self, panel: Panel, rgb: Rgb) -> tuple[Panel, Rgb]:
+        return Panel(panel.T_world_from_face, panel.height_m, panel.width_m), rgb
+
+
+class OnItsLowerEdge(Changed):
+    def changed(self, panel: Panel, rgb: Rgb) -> tuple[Panel, Rgb]:
+        return moved(panel, make_transform(np.eye(3), [0.0, 0.0, 0.5 * panel.height_m])), rgb
+
+
+class FacesAway(Changed):
+    def changed(self, panel: Panel, rgb: Rgb) -> tuple[Panel, Rgb]:
+        return moved(panel, make_transform(rotation_z(np.pi), [0.0, 0.0, 0.0])), rgb
+
+
+class LiesDown(Changed):
+    def changed(self, panel: Panel, rgb: Rgb) -> tuple[Panel, Rgb]:
+        return moved(panel, make_transform(rotation_y(-1.2), [0.0, 0.0, 0.0])), rgb
+
+
+class OneColour(Changed):
+    def changed(self, panel: Panel, rgb: Rgb) -> tuple[Panel, Rgb]:
+        return panel, np.full_like(rgb, 200)
+
+
+class Stays(Changed):
+    def add_panel(self, name: str, panel: Panel, rgb: Rgb | None) -> None:
+        if rgb is not None:
+            super().add_panel(name, panel, rgb)
+
+
+class OverThePicture(FlatWorld):
+    """Draws the panel over what was rendered: depth does not know it, and nothing hides it."""
+
+    knows_depth = False
+    shown: tuple[Panel, Rgb] | None = None
+
+    def add_panel(self, name: str, panel: Panel, rgb: Rgb | None) -> None:
+        self.shown = None if rgb is None else (panel, rgb)
+
+    def observe_at(self, x_m: float, y_m: float, yaw_rad: float, depth: bool = True) -> Any:
+        plain, depth_m = super().observe_at(x_m, y_m, yaw_rad, depth)
+        if self.shown is None:
+            return plain, depth_m
+        super().add_panel("over", *self.shown)
+        rgb, with_it = super().observe_at(x_m, y_m, yaw_rad, depth)
+        super().add_panel("over", self.shown[0], None)
+        return rgb, with_it if self.knows_depth else depth_m
+
+
+class NothingHidesIt(OverThePicture):
+    """Knows its depth, but lifts a panel that the ground would hide onto it."""
+
+    knows_depth = True
+
+    def add_panel(self, name: str, panel: Panel, rgb: Rgb | None) -> None:
+        low_m = panel.T_world_from_face[2, 3] - 0.5 * panel.height_m
+        lifted = moved(panel, make_transform(np.eye(3), [0.0, 0.0, max(0.0, -low_m)]))
+        super().add_panel(name, lifted, rgb)
+
+
+def look(kind: type[FlatWorld]) -> str:
+    with kind(FlatConfig(width=224, height=126)) as world:
+        named = NamedWorld("flat", kind, world.config, "")
+        return panels_are_native(Bench(named, world, world.describe(), None))
+
+
+def test_a_world_that_takes_panels_says_how_well() -> None:
+    assert "the right way round" in look(FlatWorld)
+    assert issubclass(FlatWorld, NativePanels)
+    assert not issubclass(Warehouse, NativePanels)
+
+
+@pytest.mark.parametrize(
+    ("fault", "told"),
+    [
+        (Mirrored, "mirrored left to right"),
+        (UpsideDown, "upside down"),
+        (HalfATurn, "half a turn"),
+        (BlueFirst, "red and blue exchanged"),
+        (HalfSizes, "it is 1.9[0-9] times as large|it is 2.0[0-9] times as large"),
+        (WidthForHeight, "width_m and height_m"),
+        (OnItsLowerEdge, "too high"),
+        (FacesAway, "nothing in the picture changed"),
+        (LiesDown, "% of its outline is there"),
+        (OneColour, "colours of the texture's quarters"),
+        (Stays, "once a panel is taken out"),
+        (OverThePicture, "the panel's depth"),
+        (NothingHidesIt, "not over the picture"),
+    ],
+)
+def test_a_planted_fault_is_found_and_named(fault: type[FlatWorld], told: str) -> None:
+    with pytest.raises(NotMet, match=told):
+        look(fault)
