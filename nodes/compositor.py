@@ -185,9 +185,7 @@ class CompositorNode(Node):
             self._counts["dropped_bad"] += 1
             self._trouble = f"image dropped: {error}"
             return []
-        refusal = self._switch.refusal() or (
-            self._interlock.refusal(now.mono_ns) if self._interlock else ""
-        )
+        refusal = self._switch.refusal() or (self._interlock.refusal(now.mono_ns) if self._interlock else "")
         # An older image that still waits is published with the current poses, so that only one image waits.
         before = self._finish(now) if self._waiting else []
         if self._showing is None or refusal:
