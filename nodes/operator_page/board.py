@@ -30,6 +30,7 @@ LABELS = ("/compositor/attack", "/monitor/attack")
 TOPICS = (SAFETY, CAR, SENT, MOTOR, DIAGNOSTICS, COUNTERFACTUAL, DRIVE, PROGRESS, *LABELS)
 _TRAIL_POINTS, _TRAIL_STEP_M = 1500, 0.03
 _LATENCIES = 50
+_LIVE_NS = 60 * NS_PER_S
 _PATH_POINTS = 241
 _LEVELS = {0: "ok", 1: "warning", 2: "error", 3: "stale"}
 
@@ -64,8 +65,9 @@ class Board:
             self._latency_ms.append((int(message.serial_write_real_ns) - stamp_ns(message)) / 1e6)
 
     def shown(self, capture_ns: int, real_ns: int) -> None:
-        """Note that an image was sent to browsers."""
-        self._shown_ms.append((real_ns - capture_ns) / 1e6)
+        """Note that an image was sent to browsers. Images of a recording are older than any live one."""
+        if real_ns - capture_ns < _LIVE_NS:
+            self._shown_ms.append((real_ns - capture_ns) / 1e6)
 
     @property
     def armed(self) -> bool:

@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from typing import Any
 
 from nodes.linking.keys import is_loopback
@@ -22,9 +23,10 @@ from nodes.operator_page.doors import COOKIE, Doors, origin_is_ours, peer_is_sam
 from nodes.operator_page.pictures import Picture
 from nodes.operator_page.responses import Guard, code_in, web_file
 from nodes.operator_page.said import LONGEST_BYTES
-from nodes.runtime.errors import BusError
+from nodes.runtime.errors import BusError, ConfigError
 from nodes.runtime.inbox import Inbox
 
+_PACKAGES = ("starlette", "uvicorn", "websockets", "cryptography")
 _MOST_CLIENTS = 16
 _MOST_CONNECTIONS = 96
 _WRONG_CODE_S = 1.0
@@ -82,6 +84,7 @@ class PageServer:
     counts: Counts = field(default_factory=Counts)
 
     def __post_init__(self) -> None:
+        require_packages()
         self.tls: Certificate | None = None if is_loopback(self.settings.host) else certificate()
         self.doors = Doors(self.settings.code_s)
         self._door_lock = threading.Lock()
@@ -326,6 +329,12 @@ class PageServer:
         response.set_cookie(
             self._cookie, token, httponly=True, samesite="strict", secure=self.tls is not None
         )
+
+
+def require_packages() -> None:
+    """Refuse to serve without the packages of the extra ``page``."""
+    if missing := [name for name in _PACKAGES if find_spec(name) is None]:
+        raise ConfigError(f"the page needs {', '.join(missing)}, not installed: pip install 'advnerf[page]'")
 
 
 def _bound(settings: ServerSettings) -> socket.socket:

@@ -63,6 +63,7 @@ function begin(message) {
   welcome = message;
   map.set(message);
   element("policy-figure").hidden = !message.policy_view;
+  document.body.classList.toggle("watch", !message.operates);
   showAttacks(message.attacks, (id) => link.act("attack", { id }));
   link.tell({ t: "wants", c: CHANNELS.filter((channel) => channel !== 2 || message.policy_view) });
 }

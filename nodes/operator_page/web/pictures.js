@@ -2,6 +2,7 @@
 
 export const CHANNELS = [0, 1, 2];
 const HEAD_BYTES = 9;
+const LIVE_MS = 60000;
 
 export class Pictures {
   #waiting = new Map();
@@ -68,7 +69,7 @@ export class Pictures {
       if (stamp > this.#stamp) this.#stamp = stamp;
       if (this.#clockMs !== null) {
         const age = Date.now() - this.#clockMs - Number(stamp / 1000000n);
-        this.ages[channel].textContent = `${Math.max(0, Math.round(age))} ms`;
+        this.ages[channel].textContent = age < LIVE_MS ? `${Math.max(0, Math.round(age))} ms` : "recorded";
       }
       this.onDrawn(channel, String(stamp));
     }
