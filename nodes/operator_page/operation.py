@@ -87,7 +87,7 @@ class Operation:
         self._sender: Sender | None = None
         self._chosen, self._chosen_ns = "", 0
         self._rearm_ns: int | None = None
-        self._refused_press = 0
+        self._refused_press = (0, 0)
         self._why_ended = ""
         self.done = self.refused = 0
 
@@ -173,9 +173,9 @@ class Operation:
         if refusal and was_held and not desk.held:
             return self._ended(refusal, self._name(asked.client), now)
         if refusal:
-            if act.press == self._refused_press:
+            if (asked.client, act.press) == self._refused_press:
                 return []
-            self._refused_press = act.press
+            self._refused_press = (asked.client, act.press)
             return self._note(asked, "hold", "", refusal, now)
         if was_held:
             return []
@@ -283,7 +283,9 @@ class Operation:
     def _ended(self, why: str, name: str, now: Now) -> list[Out]:
         """A hold ended by itself: report it before anything else."""
         self._why_ended = why
-        self._refused_press = self._parts.desk.last_press  # its late answers are no acts of their own
+        if lease := self._parts.desk.lease:
+            # Late answers of this press are no acts of their own.
+            self._refused_press = (lease.client, self._parts.desk.last_press)
         outs = self._teleop(now)
         self._parts.diary.note(now, name, "", "let_go", why, 0, "")
         return [*outs, self._act_out(now, name, "", "let_go", why, 0, "")]

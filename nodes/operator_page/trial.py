@@ -56,7 +56,7 @@ class Trial:
         if self.phase != RUNNING:
             return False
         self.attack_id = self.attack_id or attack_id
-        tick = round((mono_ns - self._began_ns) / NS_PER_S / self._horizon.dt_s)
+        tick = (mono_ns - self._began_ns) // round(self._horizon.dt_s * NS_PER_S)
         if position_m is not None and armed:
             while len(self._states) <= min(tick, self._horizon.ticks):
                 self._states.append(position_m)
