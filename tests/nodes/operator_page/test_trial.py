@@ -16,7 +16,7 @@ def test_it_samples_the_control_ticks_from_arming_on():
     trial.start()
     assert not trial.step(False, (0.0, 0.0), "", 0)
     assert trial.phase == WAITING
-    track = [tuple(path.pose_at(0.08 * k)[:2] + [0.0, 0.01 * k]) for k in range(21)]
+    track = [tuple(np.add(path.pose_at(0.08 * k)[:2], [0.0, 0.01 * k])) for k in range(21)]
     ended = []
     for ms in range(5000, 8000, 20):
         position = track[(ms - 5000) // 100]
@@ -36,7 +36,7 @@ def test_a_car_that_stops_is_charged_for_the_rest():
     path = Path.rounded_square(4.0, 1.0)
     trial = Trial(path, 0.4, ticks=10)
     trial.start()
-    beside = tuple(path.pose_at(0.0)[:2] + [0.0, 0.3])
+    beside = tuple(np.add(path.pose_at(0.0)[:2], [0.0, 0.3]))
     for ms in range(0, 500, 20):
         assert not trial.step(True, beside, "", ms * MS)
     assert trial.step(False, beside, "", 500 * MS)
