@@ -45,6 +45,7 @@ class Asked:
         act: The act.
         frame_ns: Capture stamp of the newest picture on its screen [ns]; 0 without one.
         picture_ns: When the node received that picture, monotonic [ns]; 0 without one.
+        session: Public name of the browser's session.
     """
 
     client: int
@@ -52,6 +53,7 @@ class Asked:
     act: Act
     frame_ns: int
     picture_ns: int
+    session: str = ""
 
 
 @dataclass(frozen=True)
@@ -76,10 +78,11 @@ class Client:
         number: Number of the connection.
         address: Address of the browser.
         socket: The accepted WebSocket.
+        session: Public name of the browser's session.
     """
 
-    def __init__(self, number: int, address: str, socket: Socket) -> None:
-        self.number, self.address, self._socket = number, address, socket
+    def __init__(self, number: int, address: str, socket: Socket, session: str = "") -> None:
+        self.number, self.address, self._socket, self.session = number, address, socket, session
         self.key = secrets.token_hex(16)
         self.wants: frozenset[int] = frozenset()
         self.malformed = 0
@@ -173,7 +176,7 @@ class Client:
         if frame_ns and frame_ns not in self._sent:
             raise MessageError("expected the stamp of a picture that was sent to this page")
         self._last_n = said.n
-        return Asked(self.number, self.address, said, frame_ns, self._sent.get(frame_ns, 0))
+        return Asked(self.number, self.address, said, frame_ns, self._sent.get(frame_ns, 0), self.session)
 
     def _pay(self) -> None:
         now_s = time.monotonic()

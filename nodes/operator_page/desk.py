@@ -39,12 +39,12 @@ class Lease:
     Attributes:
         client: Number of the connection that has it.
         name: Name that the operator gave.
-        since_ns: Time at which it began [ns].
+        session: Session of the browser; another connection of the same session may take over.
     """
 
     client: int
     name: str
-    since_ns: int
+    session: str = ""
 
 
 class Desk:
@@ -91,13 +91,18 @@ class Desk:
             self._beats.popitem(last=False)
         return self._beat
 
-    def take(self, client: int, name: str, mono_ns: int) -> str:
-        """Give the desk to a client. Returns why not; empty if it has it now."""
+    def take(self, client: int, name: str, mono_ns: int, session: str = "") -> str:
+        """Give the desk to a client. Returns why not; empty if it has it now.
+
+        A browser that lost its connection may take over from itself.
+        """
         if self.lease is not None and self.lease.client != client:
-            return f"{self.lease.name} operates; one operator at a time"
+            if not session or self.lease.session != session:
+                return f"{self.lease.name} operates; one operator at a time"
+            self._end()
         if client != self._last_client:
             self._last_client, self._last_press = client, 0
-        self.lease = Lease(client, name, mono_ns)
+        self.lease = Lease(client, name, session)
         self._acted_ns = mono_ns
         return ""
 

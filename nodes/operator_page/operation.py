@@ -138,15 +138,8 @@ class Operation:
     def state(self, now: Now) -> dict[str, Any]:
         """Describe the desk and what was asked, for the page."""
         parts = self._parts
-        lease = parts.desk.lease
         return {
-            "lease": None
-            if lease is None
-            else {
-                "client": lease.client,
-                "name": lease.name,
-                "left_s": round(parts.desk.left_s(now.mono_ns)),
-            },
+            "lease": self._lease(now),
             "held": parts.desk.held,
             "press": parts.desk.press,
             "ended": self._why_ended,
@@ -161,6 +154,13 @@ class Operation:
             "recording": parts.recording.state(),
             "acts": parts.diary.last,
         }
+
+    def _lease(self, now: Now) -> dict[str, Any] | None:
+        lease = self._parts.desk.lease
+        if lease is None:
+            return None
+        left_s = round(self._parts.desk.left_s(now.mono_ns))
+        return {"client": lease.client, "session": lease.session, "name": lease.name, "left_s": left_s}
 
     def _hold(self, asked: Asked, act: Hold, now: Now) -> list[Out]:
         """Note an answered beat. The first of a press is an act; the rest only keep it alive."""
@@ -186,7 +186,7 @@ class Operation:
         """Do an act of somebody who may. Returns why not, what it was about, and messages."""
         act, parts = asked.act, self._parts
         if isinstance(act, Take):
-            return parts.desk.take(asked.client, act.name, now.mono_ns), act.name, []
+            return parts.desk.take(asked.client, act.name, now.mono_ns, asked.session), act.name, []
         if isinstance(act, Release):
             parts.desk.release(asked.client, act.press)
             return "", "", self._teleop(now)

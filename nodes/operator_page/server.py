@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import hashlib
 import socket
 import threading
 import time
@@ -189,8 +190,8 @@ class PageServer:
             ws="websockets-sansio",
             ws_max_size=LONGEST_BYTES,
             ws_per_message_deflate=False,
-            ws_ping_interval=5.0,
-            ws_ping_timeout=10.0,
+            ws_ping_interval=2.0,
+            ws_ping_timeout=4.0,
             limit_concurrency=_MOST_CONNECTIONS,
             timeout_graceful_shutdown=1,
             ssl_certfile=None if self.tls is None else str(self.tls.file),
@@ -275,9 +276,12 @@ class PageServer:
             return
         await websocket.accept()
         self._numbers += 1
-        client = Client(self._numbers, websocket.client.host, websocket)
+        session = hashlib.sha256(websocket.cookies[self._cookie].encode()).hexdigest()[:12]
+        client = Client(self._numbers, websocket.client.host, websocket, session)
         self._clients[client.number] = client
-        client.answer({"t": "welcome", "client": client.number, "key": client.key, **self.welcome()})
+        client.answer(
+            {"t": "welcome", "client": client.number, "session": session, "key": client.key, **self.welcome()}
+        )
         sending = asyncio.create_task(client.send_for_ever())
         try:
             await self._listen(websocket, client)

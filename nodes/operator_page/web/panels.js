@@ -132,13 +132,13 @@ function showActs(acts) {
   });
 }
 
-function showLease({ lease, viewers, estop }, { operates, mine }) {
+function showLease({ lease, viewers, estop }, { operates, mine, session }) {
   const others = `${viewers} ${viewers === 1 ? "page is" : "pages are"} open.`;
   if (!operates) text("lease", `This page only watches. ${others}`);
   else if (mine) text("lease", `You operate as ${lease.name}. ${others}`);
   else if (lease) text("lease", `${lease.name} operates; you watch. Free after ${lease.left_s} s without an act. ${others}`);
   else text("lease", `Nobody operates. ${others}`);
-  show("take-form", operates && !lease);
+  show("take-form", operates && (!lease || (!mine && lease.session === session)));
   show("leave", mine);
   show("reset_estop", operates && estop);
   element("estop").classList.toggle("latched", estop);

@@ -96,6 +96,18 @@ def test_one_operator_at_a_time():
     assert bench.hold(bench.beat(), client=2) == ""
 
 
+def test_a_browser_that_lost_its_connection_takes_over_from_itself():
+    bench = Bench()
+    bench.desk.leave(1)
+    assert bench.desk.take(1, "Ann", bench.ns, "session-a") == ""
+    assert bench.hold(bench.beat()) == ""
+    assert bench.desk.take(2, "Bob", bench.ns, "session-b") != ""
+    assert bench.desk.take(3, "Ann", bench.ns, "session-a") == ""
+    assert not bench.desk.held
+    assert bench.hold(bench.beat(), press=2) == "Ann operates; one operator at a time"
+    assert bench.hold(bench.beat(), client=3) == ""
+
+
 def test_a_desk_that_nobody_uses_is_free_again():
     bench = Bench()
     for _ in range(300):
