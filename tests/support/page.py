@@ -1,13 +1,11 @@
-"""Helpers of the page's tests: a run with a real page and a real safety process, and browsers that speak the page's protocol."""
+"""Helper of the page's tests: a run with a real page, a real safety process, and a car as far as both can tell."""
 
 from __future__ import annotations
 
 import contextlib
-import http.client
 import json
 import os
 import signal
-import ssl
 import subprocess
 import sys
 import threading
@@ -16,8 +14,6 @@ from pathlib import Path
 
 import numpy as np
 import yaml
-from websockets.exceptions import ConnectionClosed
-from websockets.sync.client import connect
 
 from nodes.runtime.bus import Bus
 from nodes.runtime.messages import drive_message, image_message, pose_message
@@ -165,125 +161,3 @@ class Run:
             process.wait(15.0)
         if self.car.is_alive():
             self.car.join()
-
-
-def request(port, path="/", headers=None, method="GET", body=None, tls=None, source=None):
-    """One HTTP request: status, headers, body. The certificate of a ``tls`` connection is not checked here."""
-    if tls:
-        context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
-        context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
-        connection = http.client.HTTPSConnection(
-            "127.0.0.1", port, timeout=10, context=context, source_address=source
-        )
-    else:
-        connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10, source_address=source)
-    try:
-        connection.request(method, path, body, headers or {})
-        response = connection.getresponse()
-        return response.status, response.headers, response.read()
-    finally:
-        connection.close()
-
-
-def cookie_of(port):
-    """The session that a browser of this user gets."""
-    _, headers, _ = request(port)
-    return headers["set-cookie"].partition(";")[0]
-
-
-class Browser:
-    """A browser, as far as the node can tell: answers beats while it holds, and draws every picture."""
-
-    def __init__(self, port, cookie=None, origin=None, tls=None, answers=True):
-        scheme = "https" if tls else "http"
-        context = None
-        if tls:
-            context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
-            context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
-        headers = {"Cookie": cookie_of(port) if cookie is None else cookie}
-        self._stack = contextlib.ExitStack()
-        opening = connect(
-            f"{'wss' if tls else 'ws'}://127.0.0.1:{port}/live",
-            origin=f"{scheme}://127.0.0.1:{port}" if origin is None else origin,
-            additional_headers=headers,
-            ssl=context,
-            compression=None,
-            max_size=2**22,
-        )
-        self.socket = self._stack.enter_context(opening)
-        self.welcome, self.state, self.answers, self.pictures, self.beats = None, None, [], [], []
-        self.press, self.held, self.responsive = 0, False, answers
-        self.frame, self.closed, self._n, self._lock = "0", False, 0, threading.Lock()
-        self._thread = threading.Thread(target=self._listen, daemon=True)
-        self._thread.start()
-        self.wait(lambda: self.welcome is not None and self.state is not None, "the welcome")
-        self.tell({"t": "wants", "c": [0, 1]})
-
-    def _listen(self):
-        try:
-            for data in self.socket:
-                if isinstance(data, bytes):
-                    self._draw(data)
-                else:
-                    self._hear(json.loads(data))
-        except ConnectionClosed:
-            pass
-        self.closed = True
-
-    def _draw(self, data):
-        stamp = str(int.from_bytes(data[1:9], "big"))
-        self.pictures.append((data[0], stamp, data[9:]))
-        self.frame = stamp
-        if self.responsive:
-            self.tell({"t": "seen", "c": data[0], "s": stamp})
-
-    def _hear(self, message):
-        kind = message["t"]
-        if kind == "welcome":
-            self.welcome = message
-        elif kind == "state":
-            self.state = message
-        elif kind == "beat":
-            self.beats.append(message["beat"])
-            if self.held and self.responsive:
-                self.act("hold", beat=message["beat"], press=self.press)
-        else:
-            self.answers.append(message)
-
-    def tell(self, message):
-        with contextlib.suppress(ConnectionClosed):
-            self.socket.send(json.dumps(message))
-
-    def act(self, kind, **more):
-        with self._lock:
-            self._n += 1
-            self.tell({"t": kind, "key": self.welcome["key"], "n": self._n, "frame": self.frame, **more})
-            return self._n
-
-    def do(self, kind, **more):
-        """An act and why it was refused; empty if it was done."""
-        number = self.act(kind, **more)
-        found = lambda: [a for a in self.answers if a.get("n") == number]  # noqa: E731
-        self.wait(found, f"an answer to {kind}")
-        return found()[0]["refused"]
-
-    def take(self, name="Ann"):
-        self.wait(lambda: self.frame != "0", "a picture")
-        return self.do("take", name=name)
-
-    def hold(self):
-        self.press, self.held = self.press + 1, True
-
-    def release(self):
-        self.held = False
-        return self.do("release", press=self.press)
-
-    def wait(self, condition, what, timeout_s=10.0):
-        deadline = time.monotonic() + timeout_s
-        while not condition():
-            assert time.monotonic() < deadline, f"gave up waiting for {what}; {self.answers[-3:]}"
-            time.sleep(0.005)
-
-    def close(self):
-        self._stack.close()
-        self._thread.join()

@@ -114,7 +114,8 @@ function showTrial(trial) {
   else {
     const off = trial.off_track ? ", off the track" : "";
     const shown = trial.attack_id ? `attack ${trial.attack_id}` : "no attack";
-    text("trial-text", `${begin} (${shown}): total cross-track error ${trial.total_cte_m.toFixed(2)} m, largest ${trial.max_cte_m.toFixed(2)} m${off}.`);
+    const driven = `${trial.ticks} of ${trial.of_ticks} ticks`;
+    text("trial-text", `${begin} (${shown}, ${driven}): total cross-track error ${trial.total_cte_m.toFixed(2)} m, largest ${trial.max_cte_m.toFixed(2)} m${off}.`);
   }
 }
 

@@ -10,7 +10,8 @@ pytest.importorskip("uvicorn")
 pytest.importorskip("starlette")
 pytest.importorskip("websockets")
 
-from tests.support.page import STOP_S, Browser, Run, cookie_of, request
+from benchmarks.page_client import Browser, cookie_of, request
+from tests.support.page import STOP_S, Run
 
 pytestmark = pytest.mark.live
 
