@@ -50,7 +50,7 @@ def unchecked() -> ssl.SSLContext:
 
 def cookie_of(port: int) -> str:
     """The session that a browser of this user gets."""
-    _, headers, _ = request(port)
+    _, headers, _ = request(port, "/session")
     return str(headers["set-cookie"]).partition(";")[0]
 
 

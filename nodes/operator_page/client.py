@@ -15,14 +15,15 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 from nodes.operator_page.pictures import Picture
-from nodes.operator_page.said import Act, Seen, Wants, read_said
+from nodes.operator_page.said import Act, Hold, Seen, Wants, read_said
 from nodes.runtime.errors import MessageError
 
 _CREDIT = 2
 _STAMPS_KEPT = 256
 _MALFORMED_LIMIT = 20
-# A page sends about 20 answers to beats and 30 acknowledged pictures a second.
+# A page sends about 20 answers to beats and 30 acknowledged pictures a second, and a person no ten acts.
 _RATE_HZ, _BURST = 120.0, 240.0
+_ACT_RATE_HZ, _ACT_BURST = 10.0, 40.0
 
 
 class Socket(Protocol):
@@ -71,6 +72,21 @@ class Misuse(Exception):
     """A browser sent too much, or too many messages that a page does not send. Its connection is closed."""
 
 
+class _Budget:
+    """Lets through a number of messages a second, and a burst of them."""
+
+    def __init__(self, rate_hz: float, burst: float) -> None:
+        self._rate_hz, self._burst = rate_hz, burst
+        self._left, self._paid_s = burst, time.monotonic()
+
+    def pay(self, what: str) -> None:
+        now_s = time.monotonic()
+        self._left = min(self._burst, self._left + (now_s - self._paid_s) * self._rate_hz) - 1.0
+        self._paid_s = now_s
+        if self._left < 0.0:
+            raise Misuse(f"more than {self._rate_hz:g} {what} a second")
+
+
 class Client:
     """One connected browser. Only the server's thread uses it.
 
@@ -94,7 +110,7 @@ class Client:
         self._under_way: dict[int, int] = {}
         self._sent: OrderedDict[int, int] = OrderedDict()
         self._last_n = -1
-        self._budget, self._budget_s = _BURST, time.monotonic()
+        self._messages, self._acts = _Budget(_RATE_HZ, _BURST), _Budget(_ACT_RATE_HZ, _ACT_BURST)
 
     def offer_beat(self, beat: int) -> None:
         """Send the number of a beat; one that still waits is skipped."""
@@ -149,7 +165,7 @@ class Client:
         Raises:
             Misuse: The connection must be closed.
         """
-        self._pay()
+        self._messages.pay("messages")
         try:
             return self._read(data)
         except MessageError as error:
@@ -176,11 +192,6 @@ class Client:
         if frame_ns and frame_ns not in self._sent:
             raise MessageError("expected the stamp of a picture that was sent to this page")
         self._last_n = said.n
+        if not isinstance(said, Hold):
+            self._acts.pay("acts")
         return Asked(self.number, self.address, said, frame_ns, self._sent.get(frame_ns, 0), self.session)
-
-    def _pay(self) -> None:
-        now_s = time.monotonic()
-        self._budget = min(_BURST, self._budget + (now_s - self._budget_s) * _RATE_HZ) - 1.0
-        self._budget_s = now_s
-        if self._budget < 0.0:
-            raise Misuse(f"more than {_RATE_HZ:g} messages a second")

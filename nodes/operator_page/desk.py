@@ -112,9 +112,10 @@ class Desk:
             return "nobody operates; take control first"
         return "" if self.lease.client == client else f"{self.lease.name} operates; one operator at a time"
 
-    def acted(self, mono_ns: int) -> None:
-        """Note an act of the operator, which renews the lease."""
-        self._acted_ns = mono_ns
+    def acted(self, client: int, mono_ns: int) -> None:
+        """Note an act of a client. An act of the operator renews the lease."""
+        if self.lease is not None and self.lease.client == client:
+            self._acted_ns = mono_ns
 
     def leave(self, client: int) -> bool:
         """Free the desk if the client has it. Returns whether this let go of the button."""

@@ -22,7 +22,8 @@ COOKIE = "advnerf_page"
 # 32 letters and digits without those that look alike: 8 of them are 40 bits.
 _LETTERS = "ABCDEFGHJKLMNPQRSTUVWXYZ23456789"
 _CODE_LENGTH = 8
-_TRIES = 5
+# Guessing one of 2^40 codes in so many tries succeeds once in 10^9. Fewer tries would let strangers keep the operator out.
+_TRIES = 1000
 _SESSIONS = 64
 _SESSION_S = 12 * 3600.0
 
@@ -62,7 +63,7 @@ class Doors:
     def enter(self, code: str, address: str, mono_ns: int) -> str:
         """Exchange a code for a session. Returns its token; empty if the code is wrong, used or expired.
 
-        A code is valid once. After five wrong codes it is replaced, so that it cannot be guessed.
+        A code is valid once. After a thousand wrong codes it is replaced, so that it cannot be guessed.
         """
         given = code.strip().upper().replace("-", "").replace(" ", "").encode()
         fresh = bool(self.code) and mono_ns - self._code_ns <= self.code_s * NS_PER_S

@@ -103,8 +103,7 @@ class Operation:
         elif name not in _FOR_ALL and (found := self._parts.desk.refusal(asked.client)):
             refusal = found
         else:
-            if not isinstance(act, Release):
-                self._parts.desk.acted(now.mono_ns)
+            self._parts.desk.acted(asked.client, now.mono_ns)
             refusal, detail, outs = self._do(asked, now)
         return [*outs, *self._note(asked, name, detail, refusal, now)]
 
@@ -186,7 +185,8 @@ class Operation:
         """Do an act of somebody who may. Returns why not, what it was about, and messages."""
         act, parts = asked.act, self._parts
         if isinstance(act, Take):
-            return parts.desk.take(asked.client, act.name, now.mono_ns, asked.session), act.name, []
+            refusal = parts.desk.take(asked.client, act.name, now.mono_ns, asked.session)
+            return refusal, act.name, self._teleop(now)
         if isinstance(act, Release):
             parts.desk.release(asked.client, act.press)
             return "", "", self._teleop(now)

@@ -225,15 +225,18 @@ class PageServer:
         self.counts.refused += 1
 
     async def _index(self, request: Any) -> Any:
-        response = web_file("index.html")
-        if not self._admitted(request) and self._same_user(request):
-            self._set_cookie(response, request)
-        return response
+        return web_file("index.html")
 
     async def _session(self, request: Any) -> Any:
+        """Say whether this browser may watch. One of the same user on the same computer gets its session here."""
         from starlette.responses import JSONResponse
 
-        return JSONResponse({"open": self._admitted(request), "tls": self.tls is not None})
+        admitted = self._admitted(request)
+        same_user = not admitted and self._same_user(request)
+        response = JSONResponse({"open": admitted or same_user})
+        if same_user:
+            self._set_cookie(response, request)
+        return response
 
     async def _enter(self, request: Any) -> Any:
         """Exchange the one-time code for a session."""

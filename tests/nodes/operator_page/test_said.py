@@ -122,6 +122,15 @@ def test_a_flood_is_thrown_out(client):
         flood()
 
 
+def test_a_flood_of_acts_is_thrown_out(client):
+    def flood():
+        for number in range(60):
+            client.hear(act(client, number))
+
+    with pytest.raises(Misuse, match="more than 10 acts a second"):
+        flood()
+
+
 def test_only_the_newest_picture_waits(client):
     client.hear('{"t":"wants","c":[0]}')
     rng = random.Random(0)
