@@ -5,9 +5,9 @@ BIN := $(VENV)/bin
 export MUJOCO_GL ?= egl
 # Kept byte code, whatever the shell asks for: the second run of pytest need not rewrite the assertions of 365 files again.
 export PYTHONDONTWRITEBYTECODE :=
-DEFAULT_TESTS := not slow and not gpu and not hardware and not data
+DEFAULT_TESTS := not slow and not gpu and not hardware and not data and not browser
 
-.PHONY: help setup demo experiment evidence test test-slow test-gpu test-hardware check bench bench-quick campaign rooms api docs fmt clean
+.PHONY: help setup demo experiment evidence test test-slow test-gpu test-hardware test-browser check bench bench-quick campaign rooms api docs fmt clean
 
 help:  ## Show this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
@@ -49,6 +49,9 @@ test-gpu: setup  ## The tests that need a CUDA device
 
 test-hardware: setup  ## The tests that need a real device; each says which, and skips without it
 	@$(BIN)/pytest -q -m 'hardware' --timeout 1200
+
+test-browser: setup  ## The tests that drive the operator page in Chromium (apt-get install chromium)
+	@$(BIN)/pytest -q -m 'browser' --timeout 300
 
 check: setup  ## Lint, types (also of the Python in the pages), import contracts
 	@$(BIN)/ruff check .

@@ -95,7 +95,17 @@ QUESTIONS = (
         "stopping",
         "Does the car stop when it must?",
         "Time and distance to the brake after faults, false stops, strangers, and half an hour of driving.",
-        ("fault_stops", "fault_campaign", "stalls", "pose_jumps", "requests", "strangers", "thirty_minutes"),
+        (
+            "fault_stops",
+            "fault_campaign",
+            "stalls",
+            "pose_jumps",
+            "requests",
+            "strangers",
+            "thirty_minutes",
+            "page_faults",
+            "page_strangers",
+        ),
     ),
     Question(
         "live_stack",
@@ -111,6 +121,7 @@ QUESTIONS = (
             "calibrations",
             "policy_from_bags",
             "foreign_worlds",
+            "page_latency",
         ),
     ),
     Question(

@@ -25,7 +25,7 @@ from advnerf_core.attack.projection import FaceOverlay
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.geometry import Array, invert_transform
 from calibration.schema import CameraCalibration, TargetCalibration, load_calibration
-from nodes.control.interlock import SAFETY_STATE, Interlock
+from nodes.control.interlock import ATTACK_SWITCH, SAFETY_STATE, AttackSwitch, Interlock
 from nodes.control.pose_buffer import PoseBuffer
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import ConfigError, MessageError
@@ -125,7 +125,7 @@ class CompositorNode(Node):
         image_topic: str = RAW_TOPIC,
         interlock: Interlock | None = None,
     ) -> None:
-        self._interlock = interlock
+        self._interlock, self._switch = interlock, AttackSwitch()
         self._image_topic = image_topic
         self._showing = showing
         self._prepare = prepare
@@ -136,7 +136,7 @@ class CompositorNode(Node):
         self._limit_s = extrapolation_limit_s
         self._face_topic = f"/vicon/{showing.subject if showing else subject}"
         optional = (_FILE,) * bool(prepare) + (SAFETY_STATE,) * bool(interlock)
-        self.subscriptions = (image_topic, _CAR, self._face_topic, *optional)
+        self.subscriptions = (image_topic, _CAR, self._face_topic, *optional, ATTACK_SWITCH)
         self._poses = {topic: PoseBuffer(max_gap_s=max_gap_s) for topic in (_CAR, self._face_topic)}
         self._waiting: _Waiting | None = None
         self._counts = {"images": 0, "drawn": 0, "extrapolated": 0, "dropped_no_pose": 0, "dropped_bad": 0}
@@ -164,12 +164,15 @@ class CompositorNode(Node):
         )
 
     def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
-        """Handle an image, a pose, a piece of an attack, or the state of the safety node."""
+        """Handle an image, a pose, a piece of an attack, the operator's switch, or the state of the safety node."""
         self._now_ns = now.mono_ns
         if topic == _FILE:
             return self._take_piece(message, info, now)
         if topic == SAFETY_STATE and self._interlock is not None:
             self._interlock.heard(message, info)
+            return []
+        if topic == ATTACK_SWITCH:
+            self._switch.heard(message)
             return []
         if topic != self._image_topic:
             self._poses[topic].add(stamp_ns(message), pose_matrix(message))
@@ -182,7 +185,7 @@ class CompositorNode(Node):
             self._counts["dropped_bad"] += 1
             self._trouble = f"image dropped: {error}"
             return []
-        refusal = self._interlock.refusal(now.mono_ns) if self._interlock else ""
+        refusal = self._switch.refusal() or (self._interlock.refusal(now.mono_ns) if self._interlock else "")
         # An older image that still waits is published with the current poses, so that only one image waits.
         before = self._finish(now) if self._waiting else []
         if self._showing is None or refusal:

@@ -25,6 +25,7 @@ from calibration.schema import TargetCalibration, load_calibration
 from hardware.errors import HardwareError
 from hardware.screen.display import Display, PygameDisplay, TwinDisplay
 from hardware.screen.edid import edid_of
+from nodes.control.interlock import ATTACK_SWITCH, AttackSwitch
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.messages import header, types
 from nodes.runtime.node import ACTIVE, READY, MessageInfo, Node, NodeContext, Now, Out
@@ -140,7 +141,8 @@ class MonitorNode(Node):
     ) -> None:
         self._display, self._panel, self._check = display, panel, check
         self._interlock, self._state_age_ns = interlock, round(state_age_s * NS_PER_S)
-        self.subscriptions = (_FILE, *((_SAFETY,) if interlock else ()))
+        self.subscriptions = (_FILE, ATTACK_SWITCH, *((_SAFETY,) if interlock else ()))
+        self._switch = AttackSwitch()
         self._plain = np.full((_PLAIN_PX, _PLAIN_PX, 3), np.round(255.0 * np.array(plain_rgb)), np.uint8)
         self._face_m = min(face_m or panel.square_m, panel.square_m)
         self._assembler = Assembler()
@@ -184,10 +186,12 @@ class MonitorNode(Node):
             raise
 
     def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
-        """Apply the state of the safety node at once, or handle a piece of a new attack."""
+        """Apply the state of the safety node or the operator's switch at once, or handle a piece of a new attack."""
         if topic == _SAFETY:
             self._armed, self._safety_reason = bool(message.armed), str(message.reason)
             self._state_ns = info.publish_mono_ns
+        elif topic == ATTACK_SWITCH:
+            self._switch.heard(message)
         elif self._attack is None or message.sha256 != self._attack_sha256 or self._assembler.receiving:
             received, trouble = self._assembler.add(message, info.instance_id)
             if trouble:
@@ -227,6 +231,8 @@ class MonitorNode(Node):
         """Return why the attack may not be shown now; empty if it may."""
         if self._attack is None:
             return "no attack file"
+        if refusal := self._switch.refusal():
+            return refusal
         if not self._interlock:
             return ""
         if self._state_ns < 0 or now.mono_ns - self._state_ns > self._state_age_ns:

@@ -25,6 +25,7 @@ from nodes.cli import keys as cli_keys
 from nodes.cli import motor as cli_motor
 from nodes.cli import node as cli_node
 from nodes.cli import object as cli_object
+from nodes.cli import page as cli_page
 from nodes.cli import policy as cli_policy
 from nodes.cli import replay as cli_replay
 from nodes.cli import room as cli_room
@@ -54,6 +55,9 @@ _EXTRA_OF = dict.fromkeys(("torch", "numba", "scipy", "matplotlib", "jinja2", "a
     "joblib": "cluster",
     "ray": "cluster",
     "carla": "carla",
+    "starlette": "page",
+    "uvicorn": "page",
+    "cryptography": "page",
 }
 
 app = typer.Typer(
@@ -83,6 +87,7 @@ app.add_typer(cli_world.app, name="world")
 cli_doctor.add_to(app)
 cli_experiment.add_to(app)
 cli_verify.add_to(app)
+cli_page.add_to(app)
 cli_replay.add_to(app)
 cli_teleop.add_to(app)
 cli_trial.add_to(app)

@@ -11,7 +11,7 @@ from typing import Any
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.wire import MessageInfo
 
-SAFETY_STATE = "/safety/state"
+SAFETY_STATE, ATTACK_SWITCH = "/safety/state", "/attack/switch"
 
 
 class Interlock:
@@ -39,3 +39,18 @@ class Interlock:
         if self._publish_ns is None or mono_ns - self._publish_ns > self._age_limit_ns:
             return "interlock: no message from the safety node"
         return "" if self._armed else f"interlock: not armed: {self._reason}"
+
+
+class AttackSwitch:
+    """Remembers whether the operator wants the attack to be shown. It is shown until a message says otherwise."""
+
+    def __init__(self) -> None:
+        self._off_by = ""
+
+    def heard(self, message: Any) -> None:
+        """Note an ``AttackSwitch`` message."""
+        self._off_by = "" if message.show else str(message.source) or "the operator"
+
+    def refusal(self) -> str:
+        """Return why the attack may not be shown; empty if it may."""
+        return f"switched off by {self._off_by}" if self._off_by else ""

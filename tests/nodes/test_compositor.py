@@ -222,7 +222,8 @@ def test_build_reads_the_files_and_refuses_wrong_ones(tmp_path):
     files = {"camera": CALIBRATION / "camera.yaml", "target": CALIBRATION / "board.yaml"}
     context = NodeContext("compositor", tmp_path, ManualClock())
     node = CompositorNode.build(CompositorConfig(attack=path, **files), context)
-    assert node.subscriptions == ("/camera/image_raw", "/vicon/car", "/vicon/board", "/attack/file")
+    poses = ("/vicon/car", "/vicon/board")
+    assert node.subscriptions == ("/camera/image_raw", *poses, "/attack/file", "/attack/switch")
     assert "passes through" not in node.status()[1]
     assert (
         CompositorNode.build(CompositorConfig(attack="", **files), context)

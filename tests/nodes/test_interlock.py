@@ -60,3 +60,23 @@ def test_nothing_is_drawn_unless_armed_and_fresh():
     bench.clock.advance(0.6)
     assert drawn(bench, 0.4) == (False, "interlock: no message from the safety node")
     assert len(bench.images()) == 5  # what may not be drawn on passes unchanged: the policy still sees
+
+
+def switch(bench, show_it):
+    now = bench.clock.now()
+    message = types.AttackSwitch(header=header(0), show=show_it, source="ann")
+    bench.node.handle("/attack/switch", message, MessageInfo(now.mono_ns, now.mono_ns, instance_id=1), now)
+
+
+def test_the_operator_switches_the_attack_off_and_on_but_never_past_the_interlock():
+    showing = show(bench_of.attack(), bench_of.CAMERA, bench_of.TARGET)
+    bench = bench_of.Bench(CompositorNode(showing, interlock=Interlock()))
+    say(bench, True)
+    assert drawn(bench, 0.1) == (True, "")
+    switch(bench, False)
+    assert drawn(bench, 0.2) == (False, "switched off by ann")
+    switch(bench, True)
+    assert drawn(bench, 0.3) == (True, "")
+    say(bench, False)
+    switch(bench, True)
+    assert drawn(bench, 0.4) == (False, "interlock: not armed: the car is outside the fence")

@@ -20,6 +20,24 @@ LAUNCH = Path(__file__).parents[2] / "launch"
             None,
             {"twin", "camera", "vicon", "compositor", "monitor", "policy", "safety", "motor", "recorder"},
         ),
+        (
+            "page",
+            None,
+            {
+                *(
+                    "twin",
+                    "camera",
+                    "vicon",
+                    "compositor",
+                    "counterfactual",
+                    "policy",
+                    "safety",
+                    "motor",
+                    "page",
+                ),
+                "recorder",
+            },
+        ),
         ("robot", None, {"camera", "vicon", "safety", "motor", "recorder"}),
         ("workstation", None, {"compositor", "policy", "player", "recorder"}),
         ("two_hosts", "robot", {"camera", "vicon", "safety", "motor", "gateway"}),
@@ -49,9 +67,16 @@ def test_a_real_screen_and_no_twin_are_two_options():
     }
 
 
+def test_the_page_holds_the_button_that_the_safety_node_waits_for():
+    plan = load_launch(LAUNCH / "page.launch.yaml")
+    assert plan.documents["safety"].data["teleop"] == "hold"
+    assert plan.documents["page"].data["host"] == "127.0.0.1"
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("file", "host"), [("monitor", None), ("robot", None), ("workstation", None), ("two_hosts", "all")]
+    ("file", "host"),
+    [("monitor", None), ("page", None), ("robot", None), ("workstation", None), ("two_hosts", "all")],
 )
 def test_every_node_accepts_its_configuration(file, host):
     assert check_nodes(load_launch(LAUNCH / f"{file}.launch.yaml", host=host)) == {}

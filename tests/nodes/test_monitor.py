@@ -158,6 +158,16 @@ def test_silence_of_the_safety_node_takes_the_attack_off(screen):
     assert bench.said["/monitor/attack"].reason == "no message from the safety node"
 
 
+def test_the_operator_switches_the_attack_off_and_on(screen):
+    bench = screen(attack())
+    bench.safety(True)
+    bench.hear("/attack/switch", types.AttackSwitch(header=header(0), show=False, source="ann"))
+    assert bench.said["/monitor/attack"].reason == "switched off by ann"
+    assert not bench.said["/monitor/attack"].drawn
+    bench.hear("/attack/switch", types.AttackSwitch(header=header(0), show=True, source="ann"))
+    assert bench.said["/monitor/attack"].drawn
+
+
 def test_every_pixel_of_the_texture_is_where_nearest_neighbour_puts_it():
     texture = np.random.default_rng(1).integers(0, 256, (64, 64, 3), dtype=np.uint8)
     picture = Panel((1920, 1080), (0.64, 0.36)).picture(texture, (0.18, 0.18))  # 540 px square

@@ -109,13 +109,13 @@ def test_subscribers_are_counted_up_and_down(tmp_path):
 
 def test_second_publisher_is_one_clear_error_and_the_endpoint_is_free_afterwards(tmp_path):
     with Bus(tmp_path) as first, Bus(tmp_path) as second:
-        first.publisher("/twin/reset")
+        first.publisher("/attack/request")
         with pytest.raises(
-            BusError, match=r"/twin/reset is already published in .* by process \d+.*--run-dir"
+            BusError, match=r"/attack/request is already published in .* by process \d+.*--run-dir"
         ):
-            second.publisher("/twin/reset")
+            second.publisher("/attack/request")
     with Bus(tmp_path) as third:
-        third.publisher("/twin/reset")
+        third.publisher("/attack/request")
 
 
 def test_several_may_ask_for_a_stop_at_the_same_time(tmp_path):

@@ -1,0 +1,162 @@
+"""A browser without a browser: speaks the protocol of the operator page on real sockets. For benchmarks and tests."""
+
+from __future__ import annotations
+
+import contextlib
+import http.client
+import json
+import ssl
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect
+
+
+def request(
+    port: int,
+    path: str = "/",
+    headers: dict[str, str] | None = None,
+    method: str = "GET",
+    body: str | None = None,
+    tls: bool = False,
+    source: tuple[str, int] | None = None,
+) -> tuple[int, Any, bytes]:
+    """One HTTP request: status, headers, body. The certificate of a ``tls`` connection is not checked here."""
+    connection: http.client.HTTPConnection
+    if tls:
+        context = unchecked()
+        connection = http.client.HTTPSConnection(
+            "127.0.0.1", port, timeout=10, context=context, source_address=source
+        )
+    else:
+        connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10, source_address=source)
+    try:
+        connection.request(method, path, body, headers or {})
+        response = connection.getresponse()
+        return response.status, response.headers, response.read()
+    finally:
+        connection.close()
+
+
+def unchecked() -> ssl.SSLContext:
+    """TLS to a self-signed certificate that is not checked."""
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+    return context
+
+
+def cookie_of(port: int) -> str:
+    """The session that a browser of this user gets."""
+    _, headers, _ = request(port, "/session")
+    return str(headers["set-cookie"]).partition(";")[0]
+
+
+class Browser:
+    """A browser, as far as the node can tell: answers beats while it holds, and draws every picture."""
+
+    def __init__(
+        self,
+        port: int,
+        cookie: str | None = None,
+        origin: str | None = None,
+        tls: bool = False,
+        answers: bool = True,
+    ) -> None:
+        scheme = "https" if tls else "http"
+        context = None
+        if tls:
+            context = unchecked()
+        headers = {"Cookie": cookie_of(port) if cookie is None else cookie}
+        self._stack = contextlib.ExitStack()
+        opening = connect(
+            f"{'wss' if tls else 'ws'}://127.0.0.1:{port}/live",
+            origin=f"{scheme}://127.0.0.1:{port}" if origin is None else origin,
+            additional_headers=headers,
+            ssl=context,
+            compression=None,
+            max_size=2**22,
+        )
+        self.socket = self._stack.enter_context(opening)
+        self.welcome: dict[str, Any] = {}
+        self.state: dict[str, Any] = {}
+        self.answers: list[dict[str, Any]] = []
+        self.pictures: list[tuple[int, str, bytes]] = []
+        self.beats: list[int] = []
+        self.press, self.held, self.responsive = 0, False, answers
+        self.frame, self.closed, self._n, self._lock = "0", False, 0, threading.Lock()
+        self._thread = threading.Thread(target=self._listen, daemon=True)
+        self._thread.start()
+        self.wait(lambda: self.welcome and self.state, "the welcome")
+        self.tell({"t": "wants", "c": [0, 1]})
+
+    def _listen(self) -> None:
+        try:
+            for data in self.socket:
+                if isinstance(data, bytes):
+                    self._draw(data)
+                else:
+                    self._hear(json.loads(data))
+        except ConnectionClosed:
+            pass
+        self.closed = True
+
+    def _draw(self, data: bytes) -> None:
+        stamp = str(int.from_bytes(data[1:9], "big"))
+        self.pictures.append((data[0], stamp, data[9:]))
+        self.frame = stamp
+        if self.responsive:
+            self.tell({"t": "seen", "c": data[0], "s": stamp})
+
+    def _hear(self, message: dict[str, Any]) -> None:
+        kind = message["t"]
+        if kind == "welcome":
+            self.welcome = message
+        elif kind == "state":
+            self.state = message
+        elif kind == "beat":
+            self.beats.append(message["beat"])
+            if self.held and self.responsive:
+                self.act("hold", beat=message["beat"], press=self.press)
+        else:
+            self.answers.append(message)
+
+    def tell(self, message: dict[str, Any]) -> None:
+        with contextlib.suppress(ConnectionClosed):
+            self.socket.send(json.dumps(message))
+
+    def act(self, kind: str, **more: Any) -> int:
+        with self._lock:
+            self._n += 1
+            self.tell({"t": kind, "key": self.welcome["key"], "n": self._n, "frame": self.frame, **more})
+            return self._n
+
+    def do(self, kind: str, **more: Any) -> str:
+        """An act and why it was refused; empty if it was done."""
+        number = self.act(kind, **more)
+        found = lambda: [a for a in self.answers if a.get("n") == number]  # noqa: E731
+        self.wait(found, f"an answer to {kind}")
+        return found()[0]["refused"]
+
+    def take(self, name: str = "Ann") -> str:
+        self.wait(lambda: self.frame != "0", "a picture")
+        return self.do("take", name=name)
+
+    def hold(self) -> None:
+        self.press, self.held = self.press + 1, True
+
+    def release(self) -> str:
+        self.held = False
+        return self.do("release", press=self.press)
+
+    def wait(self, condition: Callable[[], Any], what: str, timeout_s: float = 10.0) -> None:
+        deadline = time.monotonic() + timeout_s
+        while not condition():
+            assert time.monotonic() < deadline, f"gave up waiting for {what}; {self.answers[-3:]}"
+            time.sleep(0.005)
+
+    def close(self) -> None:
+        self._stack.close()
+        self._thread.join()

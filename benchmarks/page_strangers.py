@@ -1,0 +1,175 @@
+"""What can a stranger do to the operator's page? ``python -m benchmarks.page_strangers [--messages N]`` (a minute and a half).
+
+The page is served with TLS and a one-time code. One browser drives the twin. Strangers try wrong hosts and origins, wrong, used
+and expired codes, a stolen cookie, acts of another connection, and 100 000 malformed messages. What counts: acts that the node
+granted to a stranger, and whether the operator still drives and the page still answers.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import random
+import time
+from pathlib import Path
+from typing import Any
+
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import connect
+
+from benchmarks.operator import LiveOperator
+from benchmarks.page_browser import door_of, live_page
+from benchmarks.page_client import Browser, request, unchecked
+from benchmarks.results import record_row
+
+COMMAND = "python -m benchmarks.page_strangers"
+_RECORDED = 100_000
+_CODE_S = 5.0
+_WORDS = ("hold", "take", "estop", "disarm", "attack", "label", "record", "seen", "wants", "arm", "__proto__")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--messages", type=int, default=_RECORDED)
+    options = parser.parse_args()
+    with live_page("record=false", f"page.code_s={_CODE_S}", host="0.0.0.0") as operator:
+        operator.bus.subscribe("/operator/act", queue=100_000)
+        port = int(door_of(operator.run_dir)["url"].rstrip("/").rpartition(":")[2])
+        ann = Browser(port, enter(operator, port), tls=True)
+        assert ann.take() == ""
+        tried = {**refused_doors(operator, port), **refused_acts(operator, port, ann)}
+        sent = malformed(operator, port, options.messages)
+        ann.hold()
+        operator.wait_until(lambda: operator.armed, 5.0, "to arm")
+        strange = strange_acts(operator.run_dir)
+        still = ann.do("label", text="still here") == "" and request(port, tls=True)[0] == 200
+        ann.close()
+    print(
+        f"{sum(tried.values())} attempts ({tried}), {sent} malformed messages: {strange} acts of strangers; up: {still}"
+    )
+    if options.messages == _RECORDED:
+        kinds = ", ".join(f"{count} {name}" for name, count in tried.items())
+        record_row("acts that strangers got from the operator page", strange, "acts", "0, and the page stays up", strange == 0 and still, COMMAND, f"{kinds}, {sent} malformed messages; the operator drove afterwards")  # fmt: skip
+
+
+def enter(operator: LiveOperator, port: int, used: str = "") -> str:
+    """The cookie that the current code gives."""
+    code = door_of(operator.run_dir, used)["code"]
+    status, headers, _ = _enter(port, code)
+    assert status == 200, "the code opens once"
+    return str(headers["set-cookie"]).partition(";")[0]
+
+
+def _enter(port: int, code: str, origin: str = "") -> Any:
+    headers = {"Origin": origin or f"https://127.0.0.1:{port}"}
+    return request(port, "/enter", headers, "POST", json.dumps({"code": code}), tls=True)
+
+
+def refused_doors(operator: LiveOperator, port: int) -> dict[str, int]:
+    """Try to get in. Returns how many of each kind were refused, and fails if one was not."""
+    code = door_of(operator.run_dir)["code"]
+    assert _enter(port, code, "https://evil.example")[0] == 403
+    cookie = enter(operator, port)
+    wrong = ["AAAAAAAA", "", code, *("".join(random.choices("ABCDEFGH23456789", k=8)) for _ in range(6))]
+    assert [_enter(port, each)[0] for each in wrong] == [403] * len(wrong)
+    old = door_of(operator.run_dir)["code"]
+    time.sleep(_CODE_S + 1.5)
+    assert _enter(port, old)[0] == 403
+    origins = ["https://evil.example", "null", f"http://127.0.0.1:{port}", f"https://127.0.0.1:{port + 1}"]
+    for origin in origins:
+        _refused_live(port, cookie, origin)
+    for stolen in ("", cookie[:-1], "advnerf_page=x"):
+        _refused_live(port, stolen, f"https://127.0.0.1:{port}")
+    seen = request(port, "/session", {"Cookie": cookie}, tls=True, source=("127.0.0.9", 0))
+    assert json.loads(seen[2])["open"] is False
+    assert request(port, headers={"Host": "evil.example"}, tls=True)[0] == 421
+    return {
+        "wrong origins": len(origins) + 1,
+        "wrong or used codes": len(wrong),
+        "expired codes": 1,
+        "wrong or stolen cookies": 4,
+        "wrong hosts": 1,
+    }
+
+
+def _refused_live(port: int, cookie: str, origin: str) -> None:
+    try:
+        Browser(port, cookie, origin, tls=True).close()
+    except InvalidStatus:
+        return
+    raise AssertionError(f"expected origin {origin!r} with cookie {cookie!r} to be refused")
+
+
+def refused_acts(operator: LiveOperator, port: int, ann: Browser) -> dict[str, int]:
+    """Replay acts of the operator in a connection of somebody who may watch."""
+    eve = Browser(port, enter(operator, port), tls=True)
+    acts = ("hold", "disarm", "estop", "label", "record")
+    for number, act in enumerate(acts):
+        eve.tell(
+            {
+                "t": act,
+                "key": ann.welcome["key"],
+                "n": 1000 + number,
+                "frame": ann.frame,
+                "beat": 1,
+                "press": 1,
+            }
+        )
+    eve.wait(lambda: sum(answer["t"] == "refused" for answer in eve.answers) == len(acts), "refusals")
+    eve.close()
+    return {"replayed acts": len(acts)}
+
+
+def malformed(operator: LiveOperator, port: int, count: int) -> int:
+    """Send messages that no page sends, in as many connections as it takes. Returns how many were sent."""
+    rng, sent = random.Random(0), 0
+    cookie = enter(operator, port)
+    while sent < count:
+        opening = connect(
+            f"wss://127.0.0.1:{port}/live",
+            origin=f"https://127.0.0.1:{port}",
+            additional_headers={"Cookie": cookie},
+            ssl=unchecked(),
+            compression=None,
+            close_timeout=1,
+        )
+        try:
+            with opening as socket:
+                for _ in range(200):
+                    socket.send(_nonsense(rng))
+                    sent += 1
+        except ConnectionClosed:
+            continue  # thrown out, as it should be
+    return sent
+
+
+def _nonsense(rng: random.Random) -> str | bytes:
+    kind = rng.randrange(5)
+    if kind == 0:
+        return rng.randbytes(rng.randrange(1, 400))
+    if kind == 1:
+        return "".join(chr(rng.randrange(32, 0x2FFF)) for _ in range(rng.randrange(1, 200)))
+    if kind == 2:
+        return "[" * rng.randrange(1, 2000)
+    act = {
+        "t": rng.choice(_WORDS),
+        "key": "0" * 32,
+        "n": rng.randrange(-5, 10**6),
+        "frame": "0",
+        "press": 1,
+        "beat": 1,
+    }
+    if kind == 3:
+        act.pop(rng.choice(list(act)))
+        act[rng.choice(("t", "key", "n", "x"))] = rng.choice((None, [], {}, 1e308, "x" * 300))
+    return json.dumps(act)
+
+
+def strange_acts(run_dir: Path) -> int:
+    """Acts in the log that were granted to somebody else than Ann."""
+    rows = [json.loads(line) for line in (run_dir / "page" / "acts.jsonl").read_text().splitlines()]
+    return sum(row["refused"] == "" and row["operator"] != "Ann" for row in rows)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,149 @@
+"""Who may open the page: one-time codes, sessions, host names and origins. Times come as arguments.
+
+A browser on the same computer needs no code if its process belongs to the user of the node, as for the Unix sockets of the bus.
+Any other browser gives the code that is shown on the robot, once, and gets a session. A session is a cookie of 256 random bits that
+scripts cannot read. It is bound to the browser's address and ends with the node.
+"""
+
+from __future__ import annotations
+
+import hmac
+import ipaddress
+import os
+import secrets
+import socket
+from dataclasses import dataclass, field
+from pathlib import Path
+from urllib.parse import urlsplit
+
+from nodes.runtime.clock import NS_PER_S
+
+COOKIE = "advnerf_page"
+# 32 letters and digits without those that look alike: 8 of them are 40 bits.
+_LETTERS = "ABCDEFGHJKLMNPQRSTUVWXYZ23456789"
+_CODE_LENGTH = 8
+# Guessing one of 2^40 codes in so many tries succeeds once in 10^9. Fewer tries would let strangers keep the operator out.
+_TRIES = 1000
+_SESSIONS = 64
+_SESSION_S = 12 * 3600.0
+
+
+@dataclass
+class Doors:
+    """Gives out codes and sessions.
+
+    Attributes:
+        code_s: Time for which a code is valid [s].
+        code: The current code.
+        codes: Number of codes made so far.
+        refused: Number of refused codes.
+    """
+
+    code_s: float = 300.0
+    code: str = ""
+    codes: int = 0
+    refused: int = 0
+    _code_ns: int = 0
+    _tries: int = 0
+    _sessions: dict[str, tuple[str, int]] = field(default_factory=dict)
+
+    def renew(self, mono_ns: int) -> bool:
+        """Make a new code if there is none or the current one has expired. Returns whether it is new."""
+        if self.code and mono_ns - self._code_ns <= self.code_s * NS_PER_S:
+            return False
+        self.code = "".join(secrets.choice(_LETTERS) for _ in range(_CODE_LENGTH))
+        self._code_ns, self._tries = mono_ns, 0
+        self.codes += 1
+        return True
+
+    def code_left_s(self, mono_ns: int) -> float:
+        """Time for which the current code is still valid [s]."""
+        return max(0.0, self.code_s - (mono_ns - self._code_ns) / NS_PER_S)
+
+    def enter(self, code: str, address: str, mono_ns: int) -> str:
+        """Exchange a code for a session. Returns its token; empty if the code is wrong, used or expired.
+
+        A code is valid once. After a thousand wrong codes it is replaced, so that it cannot be guessed.
+        """
+        given = code.strip().upper().replace("-", "").replace(" ", "").encode()
+        fresh = bool(self.code) and mono_ns - self._code_ns <= self.code_s * NS_PER_S
+        right = hmac.compare_digest(given, self.code.encode())
+        if not (fresh and right):
+            self.refused += 1
+            self._tries += 1
+            if self._tries >= _TRIES:
+                self.code = ""
+            return ""
+        self.code = ""
+        return self.admit(address, mono_ns)
+
+    def admit(self, address: str, mono_ns: int) -> str:
+        """Make a session for an address and return its token."""
+        while len(self._sessions) >= _SESSIONS:
+            self._sessions.pop(next(iter(self._sessions)))
+        token = secrets.token_hex(32)
+        self._sessions[token] = (address, mono_ns)
+        return token
+
+    def knows(self, token: str, address: str, mono_ns: int) -> bool:
+        """Whether a token is a session of this address."""
+        found = self._sessions.get(token)
+        if found is None:
+            return False
+        known_address, since_ns = found
+        return known_address == address and mono_ns - since_ns <= _SESSION_S * NS_PER_S
+
+
+def host_is_ours(host: str, names: tuple[str, ...] = ()) -> bool:
+    """Whether a ``Host`` header names this computer: by an address, or by a name that only it has.
+
+    A page of a stranger can point a name of its own at this computer (DNS rebinding), but not an address.
+    """
+    name = _hostname(host)
+    if name is None:
+        return False
+    try:
+        ipaddress.ip_address(name)
+    except ValueError:
+        own = socket.gethostname().lower()
+        return name in ("localhost", own, f"{own}.local", *names)
+    return True
+
+
+def origin_is_ours(origin: str | None, host: str, tls: bool) -> bool:
+    """Whether a request comes from the page itself: its origin is the address that it was sent to."""
+    return origin == f"{'https' if tls else 'http'}://{host}"
+
+
+def _hostname(host: str) -> str | None:
+    try:
+        parts = urlsplit(f"//{host}")
+        _ = parts.port  # raises an error if it is not a number
+    except ValueError:
+        return None
+    return parts.hostname if parts.netloc == host and "@" not in host else None
+
+
+def peer_is_same_user(peer: tuple[str, int], ours: tuple[str, int]) -> bool:
+    """Whether the other end of a TCP connection on this computer belongs to a process of this user, or to root.
+
+    Source: proc(5), ``/proc/net/tcp``: addresses in hexadecimal, in the order of the host's bytes, and the user of each socket.
+    """
+    wanted = (_proc_address(peer), _proc_address(ours))
+    for table in ("/proc/net/tcp", "/proc/net/tcp6"):
+        try:
+            rows = Path(table).read_text(encoding="ascii").splitlines()[1:]
+        except OSError:
+            continue
+        for row in rows:
+            cells = row.split()
+            if (cells[1], cells[2]) == wanted:
+                return int(cells[7]) in (0, os.getuid())
+    return False
+
+
+def _proc_address(address: tuple[str, int]) -> str:
+    """An address and a port as ``/proc/net/tcp`` writes them."""
+    packed = ipaddress.ip_address(address[0]).packed
+    words = (int.from_bytes(packed[k : k + 4], "little") for k in range(0, len(packed), 4))
+    return "".join(f"{word:08X}" for word in words) + f":{address[1]:04X}"

@@ -1,0 +1,367 @@
+"""What the operator may do: each act of a browser is decided here, logged, and turned into messages. Times come as arguments.
+
+The desk decides who operates and whether the button counts as held. The safety node decides whether the car may move.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from advnerf_core.geometry import planar_pose
+from nodes.operator_page.board import Board
+from nodes.operator_page.catalogue import Entry, Sender
+from nodes.operator_page.client import Asked
+from nodes.operator_page.desk import Desk
+from nodes.operator_page.diary import Diary
+from nodes.operator_page.launched import Launched
+from nodes.operator_page.recording import Recording
+from nodes.operator_page.requests import ArmAsker
+from nodes.operator_page.said import ChooseAttack, Hold, Label, Release, Take
+from nodes.operator_page.trial import Trial
+from nodes.runtime.clock import NS_PER_S, Now
+from nodes.runtime.messages import header, pose_message, stamp_from_ns, types
+from nodes.runtime.node import Out
+
+TELEOP, ACT, RESET, SWITCH, FILE = (
+    "/teleop/state",
+    "/operator/act",
+    "/twin/reset",
+    "/attack/switch",
+    "/attack/file",
+)
+_TELEOP_NS = NS_PER_S // 20
+_SWITCH_NS = NS_PER_S // 2
+# The e-stop's release and the request to re-arm travel on different topics, so the request waits.
+_REARM_NS = 120_000_000
+_TAKEN_S = 8.0
+_IDLE, _AUTONOMY = "idle", "autonomy"
+_ONLY_WATCHES = "this page only watches"
+# Anyone who may see the page may stop the car.
+_FOR_ALL = ("estop", "disarm", "take")
+
+
+@dataclass
+class Parts:
+    """What an operation works with.
+
+    Attributes:
+        desk: Lease, button and e-stop.
+        board: The newest messages.
+        diary: The log.
+        trial: The trial.
+        recording: The recorder that the operator starts.
+        catalogue: Attacks by id.
+        launched: Facts of the launch.
+        start_pose: Start of a trial: x [m], y [m], yaw [rad]; None without a room.
+        operates: Whether the page may do more than show.
+    """
+
+    desk: Desk
+    board: Board
+    diary: Diary
+    trial: Trial
+    recording: Recording
+    catalogue: Mapping[str, Entry]
+    launched: Launched
+    start_pose: tuple[float, float, float] | None
+    operates: bool
+
+
+class Operation:
+    """Decides acts.
+
+    Args:
+        parts: What it works with.
+        answer: Sends the answer to an act to a browser, by the number of its connection.
+    """
+
+    def __init__(self, parts: Parts, answer: Callable[[int, dict[str, Any]], None]) -> None:
+        self._parts, self._answer = parts, answer
+        self._asker = ArmAsker()
+        self._told: tuple[str, bool] | None = None
+        self._told_ns = self._switched_ns = 0
+        self._show: bool | None = None
+        self._switched_by = ""
+        self._sender: Sender | None = None
+        self._chosen, self._chosen_ns = "", 0
+        self._rearm_ns: int | None = None
+        self._refused_press = (0, 0)
+        self._why_ended = ""
+        self.done = self.refused = 0
+
+    def obey(self, asked: Asked, now: Now) -> list[Out]:
+        """Decide an act, log it, and answer it."""
+        act = asked.act
+        if isinstance(act, Hold):
+            return self._hold(asked, act, now)
+        name, detail = act.t, ""
+        outs: list[Out] = []
+        if not self._parts.operates:
+            refusal = _ONLY_WATCHES
+        elif name not in _FOR_ALL and (found := self._parts.desk.refusal(asked.client)):
+            refusal = found
+        else:
+            self._parts.desk.acted(asked.client, now.mono_ns)
+            refusal, detail, outs = self._do(asked, now)
+        return [*outs, *self._note(asked, name, detail, refusal, now)]
+
+    def gone(self, client: int, now: Now) -> list[Out]:
+        """Note that a browser has gone. If it held the button, the car stops at once."""
+        lease = self._parts.desk.lease
+        if not self._parts.desk.leave(client) or lease is None:
+            return []
+        return self._ended("the page was closed or lost its connection", lease.name, now)
+
+    def heard_safety(self, message: Any) -> None:
+        """Note a state of the safety node."""
+        self._asker.heard(message)
+
+    def tick(self, now: Now) -> list[Out]:
+        """Check the button, and repeat what has to be repeated."""
+        if not self._parts.operates:
+            return []
+        parts, outs = self._parts, []
+        lease = parts.desk.lease
+        if ended := parts.desk.check(now.mono_ns):
+            outs += self._ended(ended, lease.name if lease else "", now)
+        if parts.trial.step(parts.board.armed, parts.board.position_m, parts.board.drawn_attack, now.mono_ns):
+            outs += self._end_trial("the trial is over", now)
+        if self._rearm_ns is not None and now.mono_ns >= self._rearm_ns:
+            self._rearm_ns = None
+            self._asker.arm(now, "e-stop reset on the page")
+        parts.recording.check()
+        return [*outs, *self._teleop(now), *self._asker.tick(now), *self._attack(now)]
+
+    def state(self, now: Now) -> dict[str, Any]:
+        """Describe the desk and what was asked, for the page."""
+        parts = self._parts
+        return {
+            "lease": self._lease(now),
+            "held": parts.desk.held,
+            "press": parts.desk.press,
+            "ended": self._why_ended,
+            "estop": parts.desk.estop,
+            "unanswered_s": round(self._asker.unanswered_s(now), 1),
+            "chosen": {
+                "id": self._chosen,
+                "show": self._show is not False,
+                "trouble": self._transfer_trouble(now),
+            },
+            "trial": parts.trial.state(),
+            "recording": parts.recording.state(),
+            "acts": parts.diary.last,
+        }
+
+    def _lease(self, now: Now) -> dict[str, Any] | None:
+        lease = self._parts.desk.lease
+        if lease is None:
+            return None
+        left_s = round(self._parts.desk.left_s(now.mono_ns))
+        return {"client": lease.client, "session": lease.session, "name": lease.name, "left_s": left_s}
+
+    def _hold(self, asked: Asked, act: Hold, now: Now) -> list[Out]:
+        """Note an answered beat. The first of a press is an act; the rest only keep it alive."""
+        desk, was_held = self._parts.desk, self._parts.desk.held
+        refusal = (
+            desk.hold(asked.client, act.beat, act.press, asked.picture_ns, now.mono_ns)
+            if self._parts.operates
+            else _ONLY_WATCHES
+        )
+        if refusal and was_held and not desk.held:
+            return self._ended(refusal, self._name(asked.client), now)
+        if refusal:
+            if (asked.client, act.press) == self._refused_press:
+                return []
+            self._refused_press = (asked.client, act.press)
+            return self._note(asked, "hold", "", refusal, now)
+        if was_held:
+            return []
+        self._why_ended = ""
+        return [*self._teleop(now), *self._note(asked, "hold", "", "", now)]
+
+    def _do(self, asked: Asked, now: Now) -> tuple[str, str, list[Out]]:
+        """Do an act of somebody who may. Returns why not, what it was about, and messages."""
+        act, parts = asked.act, self._parts
+        if isinstance(act, Take):
+            refusal = parts.desk.take(asked.client, act.name, now.mono_ns, asked.session)
+            return refusal, act.name, self._teleop(now)
+        if isinstance(act, Release):
+            parts.desk.release(asked.client, act.press)
+            return "", "", self._teleop(now)
+        if isinstance(act, ChooseAttack):
+            return self._choose(act.id, asked.client, now), act.id, []
+        if isinstance(act, Label):
+            return "", act.text, []
+        do = {
+            "leave": self._leave,
+            "estop": self._stop,
+            "reset_estop": self._reset,
+            "disarm": self._disarm,
+            "trial": self._start_trial,
+            "trial_end": self._give_up_trial,
+            "attack_off": self._attack_off,
+            "record": self._record,
+            "record_stop": self._record_stop,
+        }[act.t]
+        refusal, outs = do(asked, now)
+        return refusal, "", outs
+
+    def _leave(self, asked: Asked, now: Now) -> tuple[str, list[Out]]:
+        self._parts.desk.leave(asked.client)
+        return "", self._teleop(now)
+
+    def _stop(self, asked: Asked, now: Now) -> tuple[str, list[Out]]:
+        self._parts.desk.stop()
+        self._rearm_ns = None
+        return "", [
+            *self._teleop(now),
+            self._asker.disarm(now, f"e-stop on the page by {self._name(asked.client)}"),
+        ]
+
+    def _reset(self, asked: Asked, now: Now) -> tuple[str, list[Out]]:
+        """Release the e-stop. The safety node forgets its latch only at an explicit request of the operator.
+
+        Without a held button that request cannot arm the car. So it is only sent if the safety node requires the button.
+        """
+        refusal = self._parts.desk.reset(asked.client)
+        if not refusal and self._parts.launched.holds:
+            self._rearm_ns = now.mono_ns + _REARM_NS
+        return refusal, self._teleop(now)
+
+    def _disarm(self, asked: Asked, now: Now) -> tuple[str, list[Out]]:
+        self._parts.desk.drop()
+        return "", [self._asker.disarm(now, f"on the page by {self._name(asked.client)}"), *self._teleop(now)]
+
+    def _start_trial(self, asked: Asked, now: Now) -> tuple[str, list[Out]]:
+        """Begin a trial. The simulated car is put to the start; a real one must be carried there."""
+        parts = self._parts
+        if parts.board.armed or parts.desk.held:
+            return "the car is armed; release the button first", []
+        parts.trial.start()
+        if not (parts.launched.twin and parts.start_pose):
+            return "", []
+        return "", [Out(RESET, pose_message(planar_pose(*parts.start_pose), now.real_ns))]
+
+    def _give_up_trial(self, asked: Asked, now: Now) -> tuple[str, list[Out]]:
+        if not self._parts.trial.end():
+            return "no trial is running", []
+        return "", self._end_trial("the trial was ended", now)
+
+    def _end_trial(self, why: str, now: Now) -> list[Out]:
+        lease = self._parts.desk.lease
+        if self._parts.desk.drop():
+            return self._ended(why, lease.name if lease else "", now)
+        return []
+
+    def _choose(self, attack_id: str, client: int, now: Now) -> str:
+        entry = self._parts.catalogue.get(attack_id)
+        if entry is None:
+            return f"no attack {attack_id} among the {len(self._parts.catalogue)} of this page"
+        try:
+            self._sender = Sender(entry, now.real_ns)
+        except (OSError, ValueError) as error:
+            return f"cannot read {entry.file.name}: {error}"
+        self._chosen, self._chosen_ns = attack_id, now.mono_ns
+        self._switch(True, client)
+        return ""
+
+    def _attack_off(self, asked: Asked, now: Now) -> tuple[str, list[Out]]:
+        self._switch(False, asked.client)
+        return "", self._attack(now)
+
+    def _switch(self, show: bool, client: int) -> None:
+        self._show, self._switched_by, self._switched_ns = show, self._name(client), 0
+
+    def _record(self, asked: Asked, now: Now) -> tuple[str, list[Out]]:
+        return self._parts.recording.start(), []
+
+    def _record_stop(self, asked: Asked, now: Now) -> tuple[str, list[Out]]:
+        return self._parts.recording.stop(), []
+
+    def _ended(self, why: str, name: str, now: Now) -> list[Out]:
+        """A hold ended by itself: report it before anything else."""
+        self._why_ended = why
+        if lease := self._parts.desk.lease:
+            # Late answers of this press are no acts of their own.
+            self._refused_press = (lease.client, self._parts.desk.last_press)
+        outs = self._teleop(now)
+        self._parts.diary.note(now, name, "", "let_go", why, 0, "")
+        return [*outs, self._act_out(now, name, "", "let_go", why, 0, "")]
+
+    def _note(self, asked: Asked, act: str, detail: str, refusal: str, now: Now) -> list[Out]:
+        name = self._name(asked.client)
+        if act == "take" and refusal:
+            name = detail
+        self.done += not refusal
+        self.refused += bool(refusal)
+        self._parts.diary.note(now, name, asked.address, act, detail, asked.frame_ns, refusal)
+        self._answer(asked.client, {"t": "answer", "act": act, "n": asked.act.n, "refused": refusal})
+        if not self._parts.operates:
+            return []
+        return [self._act_out(now, name, asked.address, act, detail, asked.frame_ns, refusal)]
+
+    @staticmethod
+    def _act_out(
+        now: Now, name: str, address: str, act: str, detail: str, frame_ns: int, refusal: str
+    ) -> Out:
+        message = types.OperatorAct(
+            header=header(now.real_ns),
+            operator=name,
+            address=address,
+            act=act,
+            detail=detail,
+            seen=stamp_from_ns(frame_ns),
+            granted=not refusal,
+            answer=refusal,
+        )
+        return Out(ACT, message)
+
+    def _teleop(self, now: Now) -> list[Out]:
+        """Report the button and the e-stop at every change, and 20 times a second."""
+        desk = self._parts.desk
+        said = (_AUTONOMY if desk.held else _IDLE, desk.estop)
+        if said == self._told and now.mono_ns - self._told_ns < _TELEOP_NS:
+            return []
+        self._told, self._told_ns = said, now.mono_ns
+        message = types.Teleop(
+            header=header(now.real_ns),
+            mode=said[0],
+            estop=said[1],
+            speed_mps=0.0,
+            steering_rad=0.0,
+            device=f"page: {desk.lease.name}" if desk.lease else "page",
+        )
+        return [Out(TELEOP, message)]
+
+    def _attack(self, now: Now) -> list[Out]:
+        """Send a piece of a chosen attack, and twice a second whether it may be shown."""
+        outs = []
+        if self._show is not None and now.mono_ns - self._switched_ns >= _SWITCH_NS:
+            self._switched_ns = now.mono_ns
+            outs.append(
+                Out(
+                    SWITCH,
+                    types.AttackSwitch(header=header(now.real_ns), show=self._show, source=self._switched_by),
+                )
+            )
+        if self._sender is not None and (piece := self._sender.next(now.mono_ns)) is not None:
+            outs.append(Out(FILE, piece))
+        return outs
+
+    def _transfer_trouble(self, now: Now) -> str:
+        """Why a chosen attack has not arrived; empty if it has, or may still."""
+        label = self._parts.board.label
+        if not self._chosen or (label is not None and label.attack_id == self._chosen):
+            return ""
+        if now.mono_ns - self._chosen_ns < _TAKEN_S * NS_PER_S:
+            return "sending"
+        said = "; ".join(
+            filter(None, (self._parts.board.status_text(name) for name in ("compositor", "monitor")))
+        )
+        return f"not taken over: {said or 'no compositor or monitor node reports'}"
+
+    def _name(self, client: int) -> str:
+        lease = self._parts.desk.lease
+        return lease.name if lease is not None and lease.client == client else f"watcher {client}"

@@ -1,0 +1,88 @@
+"""A recorder that the operator starts and stops. The launch's own recorder is not affected."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import signal
+import time
+from pathlib import Path
+
+from advnerf_core.files import write_atomically
+from nodes.launching.child import Child
+from nodes.launching.launch_file import NodeEntry
+
+RECORDER = "page_recorder"
+_KILL_AFTER_S = 10.0
+
+
+class Recording:
+    """Starts and stops a recorder process.
+
+    Args:
+        run_dir: Folder of the run.
+        nodes: Nodes whose status is recorded too.
+    """
+
+    def __init__(self, run_dir: Path, nodes: tuple[str, ...]) -> None:
+        self._run_dir, self._nodes = run_dir, nodes
+        self._child: Child | None = None
+        self._folder = ""
+        self._asked_s: float | None = None
+        self._trouble = ""
+
+    def start(self) -> str:
+        """Start a recorder into a new folder. Returns why not; empty if it was started."""
+        if self._child is not None and self._child.running:
+            return f"already recording to {self._folder}"
+        self._folder = f"bags/{time.strftime('%Y%m%d-%H%M%S')}"
+        if (self._run_dir / self._folder).exists():
+            return f"{self._folder} exists; try again in a second"
+        config = {"output": self._folder, "statuses_of": list(self._nodes)}
+        child = Child(RECORDER, NodeEntry(module="nodes.recorder"), self._run_dir)
+        write_atomically(child.config, json.dumps(config))
+        child.start()
+        self._child, self._asked_s, self._trouble = child, None, ""
+        return ""
+
+    def stop(self) -> str:
+        """Ask the recorder to finish its bag. Returns why not; empty if it was asked."""
+        if self._child is None or not self._child.running:
+            return "not recording"
+        self._child.signal(signal.SIGINT)
+        self._asked_s = time.monotonic()
+        return ""
+
+    def check(self) -> None:
+        """Notice a recorder that has ended, and kill one that does not end."""
+        child = self._child
+        if child is None:
+            return
+        if child.running:
+            if self._asked_s is not None and time.monotonic() - self._asked_s > _KILL_AFTER_S:
+                child.signal(signal.SIGKILL)
+            return
+        if self._asked_s is None or child.exit_code:
+            self._trouble = f"the recorder {child.how_it_ended()}"
+        self._child = None
+
+    def state(self) -> dict[str, object]:
+        """Describe the recording and the space left on its disk, for the page."""
+        return {
+            "on": self._child is not None,
+            "stopping": self._child is not None and self._asked_s is not None,
+            "folder": self._folder,
+            "trouble": self._trouble,
+            "disk_left_gb": round(shutil.disk_usage(self._run_dir).free / 1e9, 1),
+        }
+
+    def close(self) -> None:
+        """Finish the bag, and wait for it."""
+        if self._child is None or not self._child.running:
+            return
+        if self._asked_s is None:
+            self.stop()
+        deadline = time.monotonic() + _KILL_AFTER_S
+        while self._child.running and time.monotonic() < deadline:
+            time.sleep(0.05)
+        self._child.signal(signal.SIGKILL)

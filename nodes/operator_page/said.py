@@ -1,0 +1,113 @@
+"""Messages from the page to the node, checked before anything acts on them."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints, TypeAdapter, ValidationError
+
+from nodes.runtime.errors import MessageError
+
+LONGEST_BYTES = 2048
+_Name = Annotated[
+    str, StringConstraints(strip_whitespace=True, min_length=1, max_length=40, pattern=r"^[^\x00-\x1f\x7f]+$")
+]
+_Text = Annotated[
+    str,
+    StringConstraints(strip_whitespace=True, min_length=1, max_length=200, pattern=r"^[^\x00-\x1f\x7f]+$"),
+]
+_Count = Annotated[int, Field(ge=0, lt=2**53, strict=True)]
+# A capture stamp in nanoseconds needs more digits than a number of JavaScript has, so it is sent as text.
+_Stamp = Annotated[str, StringConstraints(pattern=r"^(0|[1-9][0-9]{0,18})$")]
+
+
+class _Said(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Seen(_Said):
+    """A picture was drawn on the screen, or could not be decoded."""
+
+    t: Literal["seen"]
+    c: Annotated[int, Field(ge=0, le=2, strict=True)]
+    s: _Stamp
+
+
+class Wants(_Said):
+    """The pictures that the page shows."""
+
+    t: Literal["wants"]
+    c: Annotated[list[Annotated[int, Field(ge=0, le=2, strict=True)]], Field(max_length=3)]
+
+
+class _Act(_Said):
+    """An act carries the key of its connection, a number that grows, and the newest picture that its operator saw."""
+
+    key: Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{32}$")]
+    n: _Count
+    frame: _Stamp
+
+
+class Hold(_Act):
+    """The answer to a beat while the button is held."""
+
+    t: Literal["hold"]
+    beat: _Count
+    press: Annotated[int, Field(ge=1, lt=2**53, strict=True)]
+
+
+class Release(_Act):
+    """The button was released."""
+
+    t: Literal["release"]
+    press: Annotated[int, Field(ge=1, lt=2**53, strict=True)]
+
+
+class Take(_Act):
+    """Ask for the desk."""
+
+    t: Literal["take"]
+    name: _Name
+
+
+class Plain(_Act):
+    """An act without arguments."""
+
+    t: Literal[
+        "leave", "estop", "reset_estop", "disarm", "trial", "trial_end", "attack_off", "record", "record_stop"
+    ]
+
+
+class ChooseAttack(_Act):
+    """Show an attack of the catalogue."""
+
+    t: Literal["attack"]
+    id: Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{12}$")]
+
+
+class Label(_Act):
+    """Label an event in the bag."""
+
+    t: Literal["label"]
+    text: _Text
+
+
+Act = Hold | Release | Take | Plain | ChooseAttack | Label
+Said = Seen | Wants | Act
+_ADAPTER: TypeAdapter[Said] = TypeAdapter(Annotated[Said, Field(discriminator="t")])
+
+
+def read_said(data: str | bytes) -> Said:
+    """Read one message.
+
+    Raises:
+        MessageError: The message is too long, is not JSON, or has a wrong field.
+    """
+    if isinstance(data, bytes) or len(data) > LONGEST_BYTES:
+        raise MessageError(f"expected text of at most {LONGEST_BYTES} characters, got {len(data)}")
+    try:
+        return _ADAPTER.validate_json(data)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        where = ".".join(map(str, first["loc"])) or "the message"
+        raise MessageError(f"expected a message of the page: {where}: {first['msg']}") from None

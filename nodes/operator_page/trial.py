@@ -1,0 +1,92 @@
+"""A trial on the page: one drive from the start pose over a fixed time, and how far it left the path. Pure.
+
+The trial runs from the moment the car is armed. Its metrics are those of ``advnerf trial`` and ``advnerf evaluate``.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from advnerf_core.driving.metrics import Horizon, drive_metrics
+from advnerf_core.driving.path import Path as DrivingPath
+from nodes.runtime.clock import NS_PER_S
+
+IDLE, WAITING, RUNNING, DONE = "idle", "waiting", "running", "done"
+
+
+class Trial:
+    """The current or last trial.
+
+    Args:
+        path: Reference path; None leaves out the metrics.
+        off_track_m: Cross-track error beyond which the car is off the track [m].
+        ticks: Length in control ticks.
+        dt_s: Time between two ticks [s].
+    """
+
+    def __init__(
+        self, path: DrivingPath | None, off_track_m: float, ticks: int = 60, dt_s: float = 0.1
+    ) -> None:
+        self._path = path
+        self._horizon = Horizon(ticks=ticks, dt_s=dt_s, off_track_m=off_track_m)
+        self.phase, self.number, self.attack_id = IDLE, 0, ""
+        self._began_ns = 0
+        self._states: list[tuple[float, float]] = []
+        self._result: dict[str, Any] = {}
+
+    def start(self) -> None:
+        """Begin a new trial, which waits for the car to be armed."""
+        self.phase, self.number = WAITING, self.number + 1
+        self._states, self._result, self.attack_id = [], {}, ""
+
+    def step(self, armed: bool, position_m: tuple[float, float] | None, attack_id: str, mono_ns: int) -> bool:
+        """Continue the trial. Returns whether it has just ended.
+
+        Args:
+            armed: Whether the car is armed.
+            position_m: Position of the rear axle [m]; None while unknown.
+            attack_id: The attack that is drawn now; empty for none.
+            mono_ns: Current time [ns].
+        """
+        if self.phase == WAITING and armed and position_m is not None:
+            self.phase, self._began_ns = RUNNING, mono_ns
+            self._states = [position_m]
+        if self.phase != RUNNING:
+            return False
+        self.attack_id = self.attack_id or attack_id
+        tick = (mono_ns - self._began_ns) // round(self._horizon.dt_s * NS_PER_S)
+        if position_m is not None and armed:
+            while len(self._states) <= min(tick, self._horizon.ticks):
+                self._states.append(position_m)
+        if armed and tick < self._horizon.ticks:
+            return False
+        self.end()
+        return True
+
+    def end(self) -> bool:
+        """End the trial. Returns whether there was one."""
+        if self.phase not in (WAITING, RUNNING):
+            return False
+        ran, self.phase = self.phase == RUNNING, DONE
+        if ran and self._path is not None and len(self._states) > 1:
+            found = drive_metrics(self._path, np.array(self._states), self._horizon)
+            self._result = {
+                "total_cte_m": found.total_cte_m,
+                "mean_cte_m": found.mean_cte_m,
+                "max_cte_m": found.max_cte_m,
+                "off_track": found.off_track,
+            }
+        return True
+
+    def state(self) -> dict[str, Any]:
+        """Describe the trial for the page."""
+        return {
+            "phase": self.phase,
+            "number": self.number,
+            "attack_id": self.attack_id,
+            "ticks": max(0, len(self._states) - 1),
+            "of_ticks": self._horizon.ticks,
+            **self._result,
+        }

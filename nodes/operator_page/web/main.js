@@ -1,0 +1,164 @@
+// Puts the page together.
+
+import { HoldButton } from "./hold.js";
+import { Link } from "./link.js";
+import { showAttacks, showState, text } from "./panels.js";
+import { CHANNELS, Pictures } from "./pictures.js";
+import { PlaceMap, SteeringPlot } from "./plots.js";
+
+const element = (id) => document.getElementById(id);
+const DRAW_MS = 100;
+
+let welcome = null;
+let state = null;
+let heldPress = 0; // the press that the node has confirmed
+const pictures = new Pictures((channel, stamp) => link.tell({ t: "seen", c: channel, s: stamp }));
+const map = new PlaceMap(element("map"));
+const plot = new SteeringPlot(element("steering"));
+const link = new Link({
+  frame: () => pictures.stamp,
+  onPicture: (data) => pictures.take(data),
+  onMessage: hear,
+  onOpen: opened,
+  onClose: closed,
+  onLocked: locked,
+});
+const hold = new HoldButton(element("hold"), link, showHold);
+
+function opened() {
+  pictures.reset();
+  element("enter").hidden = true;
+  element("main").hidden = false;
+  text("link", "");
+}
+
+function closed() {
+  hold.release();
+  state = null;
+  heldPress = 0;
+  element("hold").disabled = true;
+  text("armed", "no connection");
+  element("armed").classList.remove("armed");
+  text("reason", "");
+  text("link", "connecting again");
+}
+
+function locked() {
+  element("enter").hidden = false;
+  element("main").hidden = true;
+  text("armed", "locked");
+  text("link", "");
+  element("code").focus();
+}
+
+function hear(message) {
+  if (message.t === "beat") hold.beat(message.beat);
+  else if (message.t === "state") update(message);
+  else if (message.t === "answer") answer(message);
+  else if (message.t === "welcome") begin(message);
+  else if (message.t === "refused") text("answer", `Refused: ${message.text}`);
+}
+
+function begin(message) {
+  welcome = message;
+  map.set(message);
+  element("policy-figure").hidden = !message.policy_view;
+  document.body.classList.toggle("watch", !message.operates);
+  showAttacks(message.attacks, (id) => link.act("attack", { id }));
+  link.tell({ t: "wants", c: CHANNELS.filter((channel) => channel !== 2 || message.policy_view) });
+}
+
+function update(message) {
+  state = message;
+  pictures.clock(message.real_ms);
+  map.move(message.car);
+  plot.add(message.steering);
+  showState(message, me());
+  showHold();
+}
+
+function me() {
+  return { operates: welcome.operates, session: welcome.session, mine: Boolean(state.lease) && state.lease.client === welcome.client };
+}
+
+/** Say what the button does now, and stop holding when the node has ended the hold. */
+function showHold() {
+  const button = element("hold");
+  const held = hold.held;
+  button.classList.toggle("held", held);
+  if (!state) return;
+  if (held && heldPress === hold.press && state.press !== hold.press) {
+    hold.release();
+    text("hold-answer", `Released: ${state.ended}. Hold the button again.`);
+  }
+  heldPress = hold.held && state.press === hold.press ? hold.press : 0;
+  const armed = state.safety?.armed;
+  text("hold", !hold.held ? "Hold to drive" : armed ? "Driving: let go to stop" : state.held ? "Held, not armed" : "Asking");
+}
+
+function answer(message) {
+  const words = message.act.replaceAll("_", " ");
+  if (message.act === "hold") {
+    if (message.refused) hold.release();
+    text("hold-answer", message.refused ? `Not held: ${message.refused}.` : "");
+    return;
+  }
+  if (message.act === "release") return;
+  text("answer", message.refused ? `Not done: ${words}: ${message.refused}.` : `Done: ${words}.`);
+}
+
+function drawPlots() {
+  if (!document.hidden && welcome) {
+    map.draw();
+    plot.draw();
+  }
+}
+
+element("take-form").addEventListener("submit", (event) => {
+  event.preventDefault();
+  link.act("take", { name: element("name").value });
+  element("hold").focus();
+});
+element("label-form").addEventListener("submit", (event) => {
+  event.preventDefault();
+  if (link.act("label", { text: element("label").value }) !== null) element("label").value = "";
+});
+for (const id of ["leave", "disarm", "reset_estop", "trial", "trial_end", "attack_off", "record", "record_stop"]) {
+  element(id).addEventListener("click", () => link.act(id));
+}
+// The e-stop acts when the finger goes down, not when it goes up.
+element("estop").addEventListener("pointerdown", () => { hold.release(); link.act("estop"); });
+element("estop").addEventListener("keydown", (event) => {
+  if (event.key !== " " && event.key !== "Enter") return;
+  event.preventDefault(); // no click beside it
+  if (!event.repeat) { hold.release(); link.act("estop"); }
+});
+element("estop").addEventListener("click", (event) => {
+  // A screen reader clicks without a pointer and without a key.
+  if (event.detail === 0) { hold.release(); link.act("estop"); }
+});
+window.addEventListener("keydown", (event) => {
+  if (event.key === "Escape" && !event.repeat) { hold.release(); link.act("estop"); }
+});
+element("enter-form").addEventListener("submit", async (event) => {
+  event.preventDefault();
+  const code = element("code").value;
+  text("enter-answer", "");
+  try {
+    const response = await fetch("/enter", {
+      method: "POST", headers: { "content-type": "application/json" }, body: JSON.stringify({ code }),
+    });
+    if (response.ok) {
+      element("code").value = "";
+      link.connect();
+      return;
+    }
+  } catch {
+    text("enter-answer", "No answer from the robot.");
+    return;
+  }
+  text("enter-answer", "This code is wrong, was used, or has expired. Run advnerf page on the robot for a new one.");
+});
+
+setInterval(drawPlots, DRAW_MS);
+link.connect();

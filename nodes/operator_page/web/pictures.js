@@ -1,0 +1,78 @@
+// Pictures, newest only. Each is drawn in an animation frame and then acknowledged; the node sends no more than two ahead.
+
+export const CHANNELS = [0, 1, 2];
+const HEAD_BYTES = 9;
+const LIVE_MS = 60000;
+
+export class Pictures {
+  #waiting = new Map();
+  #frame = 0;
+  #stamp = 0n;
+  #clockMs = null;
+
+  /** @param {(channel: number, stamp: string) => void} onDrawn */
+  constructor(onDrawn) {
+    this.onDrawn = onDrawn;
+    this.canvases = CHANNELS.map((channel) => document.getElementById(`picture-${channel}`));
+    this.ages = CHANNELS.map((channel) => document.getElementById(`age-${channel}`));
+  }
+
+  /** Capture stamp of the newest picture on the screen, in nanoseconds, as text. */
+  get stamp() {
+    return String(this.#stamp);
+  }
+
+  /** Forget what was shown on an earlier connection. */
+  reset() {
+    this.#stamp = 0n;
+    this.#clockMs = null;
+  }
+
+  /** Note the node's clock, which tells how old a picture is. The message with the shortest way counts. */
+  clock(realMs) {
+    const offset = Date.now() - realMs;
+    this.#clockMs = this.#clockMs === null ? offset : Math.min(this.#clockMs + 0.01, offset);
+  }
+
+  /** Take a picture from the node. */
+  async take(data) {
+    const view = new DataView(data);
+    const channel = view.getUint8(0);
+    const stamp = view.getBigInt64(1);
+    let bitmap = null;
+    try {
+      bitmap = await createImageBitmap(new Blob([new Uint8Array(data, HEAD_BYTES)], { type: "image/jpeg" }));
+    } catch {
+      this.onDrawn(channel, String(stamp));
+      return;
+    }
+    const before = this.#waiting.get(channel);
+    if (before) {
+      before.bitmap.close();
+      this.onDrawn(channel, String(before.stamp));
+    }
+    this.#waiting.set(channel, { bitmap, stamp });
+    if (!this.#frame) this.#frame = requestAnimationFrame(() => this.#draw());
+  }
+
+  #draw() {
+    this.#frame = 0;
+    for (const [channel, { bitmap, stamp }] of this.#waiting) {
+      const canvas = this.canvases[channel];
+      if (canvas.width !== bitmap.width || canvas.height !== bitmap.height) {
+        canvas.width = bitmap.width;
+        canvas.height = bitmap.height;
+      }
+      canvas.getContext("2d").drawImage(bitmap, 0, 0);
+      bitmap.close();
+      canvas.dataset.stamp = String(stamp);
+      if (stamp > this.#stamp) this.#stamp = stamp;
+      if (this.#clockMs !== null) {
+        const age = Date.now() - this.#clockMs - Number(stamp / 1000000n);
+        this.ages[channel].textContent = age < LIVE_MS ? `${Math.max(0, Math.round(age))} ms` : "recorded";
+      }
+      this.onDrawn(channel, String(stamp));
+    }
+    this.#waiting.clear();
+  }
+}

@@ -1,0 +1,292 @@
+"""The page node: shows the running launch in a browser, and passes on what its operator asks for.
+
+One operator at a time has the desk; all others watch. The car may move only while the operator holds a button on the page: the
+node then reports the button like the teleop node (``safety.teleop: hold``), and the safety node decides. The page is served to this
+computer only, unless ``host`` says otherwise; then it needs TLS and a one-time code. The page is no safety-rated stop.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any, Literal
+
+import cv2
+from pydantic import BaseModel, ConfigDict, Field
+
+from advnerf_core.files import write_atomically
+from advnerf_core.policies.view import PolicyView
+from calibration.schema import RoomCalibration, load_calibration
+from nodes.operator_page import board as topics
+from nodes.operator_page.board import Board
+from nodes.operator_page.catalogue import read_catalogue
+from nodes.operator_page.client import Asked, Gone
+from nodes.operator_page.desk import Desk, DeskLimits
+from nodes.operator_page.diary import Diary
+from nodes.operator_page.launched import read_launched
+from nodes.operator_page.operation import ACT, FILE, RESET, SWITCH, TELEOP, Operation, Parts
+from nodes.operator_page.pictures import ATTACKED, CAMERA, POLICY, Picture, jpeg_of, view_of_policy
+from nodes.operator_page.recording import RECORDER, Recording
+from nodes.operator_page.server import PageServer, ServerSettings
+from nodes.operator_page.trial import Trial
+from nodes.runtime.arm_requests import ARM
+from nodes.runtime.clock import NS_PER_S
+from nodes.runtime.errors import MessageError
+from nodes.runtime.messages import stamp_ns
+from nodes.runtime.node import ACTIVE, READY, Inbox, MessageInfo, Node, NodeContext, Now, Out
+from nodes.runtime.pictures import rgb_image
+from nodes.runtime.process import run_node_main
+from nodes.runtime.topics import status_topic
+
+_TICK_HZ = 50.0
+_BEAT_NS, _STATE_NS, _DOOR_NS = NS_PER_S // 20, NS_PER_S // 10, NS_PER_S
+_COMPOSITOR = "/compositor/image"
+_INBOX = 4096
+_OFF_TRACK_M = 0.4
+FOLDER, DOOR, LOG = "page", "page/door.json", "page/acts.jsonl"
+
+
+class PageConfig(BaseModel):
+    """Configuration of the page node.
+
+    Attributes:
+        host: Address to listen on. Any address other than loopback is served with TLS, and asks for the one-time code that
+            ``advnerf page`` shows on this computer.
+        port: TCP port; 0 selects a free one.
+        names: Further names of this computer by which browsers may call it.
+        role: ``operate``, or ``watch`` for a page that only shows.
+        room: Room calibration file with path, fence and start; empty for none.
+        policy: The policy that drives, for the picture of what it sees. Only ``.safetensors`` files tell.
+        attacks: Attack files, and folders with attack files, to choose from.
+        camera_topic: Topic of the camera's images.
+        nodes: Nodes whose health is shown; none means all of the launch.
+        picture_width_px: Largest width of a picture on the page [px].
+        picture_quality: JPEG quality of the pictures, 1 to 100.
+        hold_age_limit_s: Time without an answer of the operator's browser after which the button counts as released [s].
+        picture_age_limit_s: Age of the picture on the operator's screen after which the button counts as released [s].
+        lease_s: Time without an act after which another person may operate [s].
+        code_s: Time for which a one-time code is valid [s].
+        trial_ticks: Length of a trial in control ticks of 0.1 s.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    host: str = "127.0.0.1"
+    port: int = Field(default=8090, ge=0, le=65535)
+    names: tuple[str, ...] = ()
+    role: Literal["operate", "watch"] = "operate"
+    room: Path | None = None
+    policy: str = ""
+    attacks: tuple[Path, ...] = ()
+    camera_topic: Literal["/camera/image_raw", "/camera/image_raw/compressed"] = "/camera/image_raw"
+    nodes: tuple[str, ...] | None = None
+    picture_width_px: int = Field(default=480, ge=64, le=1920)
+    picture_quality: int = Field(default=75, ge=10, le=95)
+    hold_age_limit_s: float = Field(default=0.25, ge=0.1, le=0.25)
+    picture_age_limit_s: float = Field(default=1.0, ge=0.3, le=5.0)
+    lease_s: float = Field(default=120.0, ge=5.0)
+    code_s: float = Field(default=300.0, ge=1.0)
+    trial_ticks: int = Field(default=60, ge=1)
+
+
+class PageNode(Node):
+    """Connects the bus, the desk and the web server.
+
+    Args:
+        config: Configuration.
+        run_dir: Folder of the run.
+    """
+
+    tick_rate_hz = _TICK_HZ
+
+    def __init__(self, config: PageConfig, run_dir: Path) -> None:
+        self._config, self._run_dir = config, run_dir
+        launched = read_launched(run_dir)
+        room = None if config.room is None else load_calibration(RoomCalibration, config.room)
+        nodes = launched.nodes if config.nodes is None else config.nodes
+        self._catalogue, self._left_out = read_catalogue(config.attacks)
+        self._board = Board(room, nodes)
+        self._view: PolicyView | None = view_of_policy(config.policy)
+        self._operates = config.role == "operate"
+        self._holds = launched.holds
+        limits = DeskLimits(config.hold_age_limit_s, config.picture_age_limit_s, config.lease_s)
+        self._desk = Desk(limits)
+        self._diary = Diary(run_dir / LOG)
+        self._recording = Recording(run_dir, nodes)
+        path = None if room is None else room.reference_path
+        off_track_m = _OFF_TRACK_M if room is None else room.off_track_m
+        parts = Parts(
+            self._desk,
+            self._board,
+            self._diary,
+            Trial(path, off_track_m, config.trial_ticks),
+            self._recording,
+            self._catalogue,
+            launched,
+            None if room is None else room.start_pose,
+            self._operates,
+        )
+        self.inbox: Inbox[Asked | Gone] = Inbox(_INBOX)
+        self._operation = Operation(parts, self._answer)
+        statuses = tuple(map(status_topic, (*nodes, *((RECORDER,) if self._operates else ()))))
+        self.subscriptions = (config.camera_topic, _COMPOSITOR, *topics.TOPICS, *statuses)
+        self.publications = self._publications(launched.twin)
+        self._beat_ns = self._state_ns = self._door_ns = 0
+        self._door_is_new = True
+        self._pictures = self._trouble_count = 0
+        settings = ServerSettings(config.host, config.port, config.names, config.code_s)
+        self._server = PageServer(settings, self.inbox, self._png_of, self._welcome)
+        self._server.start()
+
+    @classmethod
+    def build(cls, config: PageConfig, context: NodeContext) -> PageNode:
+        """Build the node and start the server."""
+        cv2.setNumThreads(1)
+        return cls(config, context.run_dir)
+
+    @property
+    def url(self) -> str:
+        """Address of the page."""
+        return self._server.url
+
+    def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
+        """Show a message."""
+        if topic in (self._config.camera_topic, _COMPOSITOR):
+            self._show(topic, message, info, now)
+            return []
+        self._board.hear(topic, message, info)
+        if topic == topics.SAFETY:
+            self._operation.heard_safety(message)
+        return []
+
+    def receive(self, item: Asked | Gone, now: Now) -> list[Out]:
+        """Decide an act of a browser, or note that it has gone."""
+        if isinstance(item, Gone):
+            return self._operation.gone(item.client, now)
+        return self._operation.obey(item, now)
+
+    def tick(self, now: Now) -> list[Out]:
+        """Check the button, send a beat to the operator and the state to all, and keep the one-time code fresh."""
+        outs = self._operation.tick(now)
+        if now.mono_ns - self._beat_ns >= _BEAT_NS and self._desk.lease is not None:
+            self._beat_ns = now.mono_ns
+            self._server.send_beat(self._desk.lease.client, self._desk.beat(now.mono_ns))
+        if now.mono_ns - self._state_ns >= _STATE_NS:
+            self._state_ns = now.mono_ns
+            if self._server.viewers:
+                self._server.send_state(json.dumps(self._state(now), separators=(",", ":")))
+        if now.mono_ns - self._door_ns >= _DOOR_NS:
+            self._door_ns = now.mono_ns
+            self._write_door(now)
+        return outs
+
+    def status(self) -> tuple[str, str]:
+        """Report active while somebody operates."""
+        lease = self._desk.lease
+        who = f"{lease.name} operates" if lease else "nobody operates"
+        words = [f"{self.url}, {self._server.viewers} open, {who}", self._hint(), *self._left_out[:1]]
+        return (ACTIVE if lease else READY), "; ".join(filter(None, words))
+
+    def counters(self) -> dict[str, float]:
+        """Report pictures, acts, and what was refused."""
+        counts = self._server.counts
+        return {
+            "pictures": self._pictures,
+            "bad_pictures": self._trouble_count,
+            "acts_done": self._operation.done,
+            "acts_refused": self._operation.refused,
+            "requests_refused": counts.refused,
+            "messages_malformed": counts.malformed,
+            "connections_closed": counts.closed,
+        }
+
+    def close(self) -> None:
+        """Stop the server and finish a recording."""
+        self._server.close()
+        self._recording.close()
+        self._diary.close()
+        (self._run_dir / DOOR).unlink(missing_ok=True)
+
+    def _publications(self, twin: bool) -> tuple[str, ...]:
+        if not self._operates:
+            return ()
+        attack = (SWITCH, *((FILE,) if self._catalogue else ()))
+        return (TELEOP, ARM, ACT, *attack, *((RESET,) if twin else ()))
+
+    def _show(self, topic: str, message: Any, info: MessageInfo, now: Now) -> None:
+        """Send an image to the browsers that show it. Without one, nothing is compressed."""
+        wanted = self._server.wanted()
+        attacked = topic == _COMPOSITOR
+        if not wanted & ({ATTACKED, POLICY} if attacked else {CAMERA}):
+            return
+        try:
+            rgb = rgb_image(message, topic)
+            pictures = {ATTACKED if attacked else CAMERA: rgb}
+            if attacked and self._view is not None:
+                pictures[POLICY] = self._view.image(rgb)
+        except (MessageError, ValueError):
+            self._trouble_count += 1
+            return
+        stamp = stamp_ns(message)
+        for channel in wanted & pictures.keys():
+            jpeg = jpeg_of(pictures[channel], self._config.picture_width_px, self._config.picture_quality)
+            self._server.send_picture(Picture(channel, stamp, info.receive_mono_ns, jpeg))
+            self._pictures += 1
+        self._board.shown(stamp, now.real_ns)
+
+    def _state(self, now: Now) -> dict[str, Any]:
+        return {
+            "t": "state",
+            "real_ms": now.real_ns // 1_000_000,
+            "viewers": self._server.viewers,
+            "hint": self._hint(),
+            **self._board.state(now),
+            **self._operation.state(now),
+        }
+
+    def _welcome(self) -> dict[str, Any]:
+        """What a new browser is told. Called by the server's thread, and reads only what that thread may."""
+        return {
+            "operates": self._operates,
+            "attacks": [entry.facts for entry in self._catalogue.values()],
+            "policy_view": self._view is not None,
+            **self._board.place(),
+        }
+
+    def _hint(self) -> str:
+        if self._operates and self._holds is False:
+            return "the safety node does not wait for a held button; launch with --set safety.teleop=hold to drive from the page"
+        return ""
+
+    def _answer(self, client: int, answer: dict[str, Any]) -> None:
+        self._server.answer(client, answer)
+
+    def _png_of(self, attack_id: str) -> bytes | None:
+        entry = self._catalogue.get(attack_id)
+        return None if entry is None else entry.png
+
+    def _write_door(self, now: Now) -> None:
+        """Write address and code to a file that only this user can read. Nothing secret goes on the bus, which is recorded.
+
+        A slow disk must not stop the car, so nothing is written while the button is held.
+        """
+        if self._desk.held or not (self._server.renew_code(now.mono_ns) or self._door_is_new):
+            return
+        self._door_is_new = False
+        tls = self._server.tls
+        door = {
+            "url": self.url,
+            "code": self._server.doors.code if tls else "",
+            "valid_until_s": round(now.real_s + self._config.code_s),
+            "fingerprint": tls.fingerprint if tls else "",
+        }
+        write_atomically(self._run_dir / DOOR, json.dumps(door) + "\n")
+
+
+def main() -> int:
+    """Run the node as a process."""
+    return run_node_main(PageConfig, PageNode.build)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

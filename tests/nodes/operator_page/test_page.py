@@ -1,0 +1,410 @@
+"""The page node with real processes and sockets: who may act, and what stops the car."""
+
+import json
+import signal
+import time
+
+import pytest
+
+pytest.importorskip("uvicorn")
+pytest.importorskip("starlette")
+pytest.importorskip("websockets")
+
+from benchmarks.page_client import Browser, cookie_of, request
+from tests.support.page import STOP_S, Run
+
+pytestmark = pytest.mark.live
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    run = Run(tmp_path_factory.mktemp("page"))
+    try:
+        yield run.start()
+    finally:
+        run.close()
+
+
+@pytest.fixture
+def browser(run):
+    made = []
+
+    def make(*arguments, **options):
+        made.append(Browser(run.port, *arguments, **options))
+        return made[-1]
+
+    yield make
+    for each in made:
+        each.close()
+
+
+def drive(run, ann):
+    """Hold until the car moves."""
+    ann.hold()
+    run.wait(lambda: run.car.armed, "the car to be armed")
+    since_ns = time.monotonic_ns()
+    run.wait(
+        lambda: any(t > since_ns and speed > 0.0 for t, speed in list(run.car.moves)), "a command to move"
+    )
+
+
+def test_the_car_drives_while_the_button_is_held(run, browser):
+    ann = browser()
+    assert ann.take() == ""
+    drive(run, ann)
+    time.sleep(0.5)
+    assert run.car.armed
+    since_ns = time.monotonic_ns()
+    assert ann.release() == ""
+    run.wait(lambda: not run.car.armed, "the car to be disarmed")
+    assert run.car.stop_after(since_ns) < STOP_S
+    assert run.car.reason == "the button is not held"
+    held = [act for act in run.car.acts if act.act == "hold"][-1]
+    assert (held.operator, held.granted, held.address) == ("Ann", True, "127.0.0.1")
+    seen_ns = held.seen.sec * 10**9 + held.seen.nanosec
+    assert seen_ns in {int(stamp) for _, stamp, _ in ann.pictures}
+    row = [row for row in run.log() if row["act"] == "hold"][-1]
+    assert (row["operator"], row["frame_ns"], row["refused"]) == ("Ann", seen_ns, "")
+
+
+def test_the_page_shows_what_happens(run, browser):
+    ann = browser()
+    ann.take()
+    ann.wait(lambda: len(ann.pictures) > 6, "pictures")
+    channel, _, jpeg = ann.pictures[-1]
+    assert channel in (0, 1)
+    assert jpeg.startswith(b"\xff\xd8")
+    assert ann.welcome["operates"]
+    assert len(ann.welcome["fence"]) >= 3
+    state = ann.state
+    assert state["car"]["cte_m"] is not None
+    assert {node["name"] for node in state["nodes"]} == {"page", "safety"}
+    assert state["recording"]["disk_left_gb"] > 0.0
+    assert state["hint"] == ""
+
+
+@pytest.mark.parametrize("how", ["closed", "killed", "silent", "blind"])
+def test_a_browser_that_goes_stops_the_car(run, browser, how):
+    ann = browser()
+    ann.take()
+    drive(run, ann)
+    since_ns = time.monotonic_ns()
+    if how == "closed":
+        ann.close()
+    elif how == "killed":
+        ann.socket.socket.shutdown(2)
+    elif how == "silent":
+        ann.responsive = False  # frozen: it neither answers beats nor draws
+    else:
+        run.car.pictures = False
+        run.wait(lambda: not run.car.armed, "the car to be disarmed")
+        run.car.pictures = True
+        assert 0.8 < run.car.stop_after(since_ns) < 1.0 + STOP_S
+        assert [act for act in run.car.acts if act.act == "let_go"][-1].detail.startswith(
+            "the picture on the page is 1."
+        )
+        return
+    run.wait(lambda: not run.car.armed, "the car to be disarmed")
+    time.sleep(0.1)
+    assert run.car.stop_after(since_ns) < STOP_S
+    if how == "silent":
+        ann.responsive = True
+        time.sleep(0.5)
+        assert not run.car.armed, "the earlier press must not continue"
+        drive(run, ann)  # a new one does
+
+
+def test_answers_to_old_beats_do_not_hold(run, browser):
+    ann = browser()
+    ann.take()
+    ann.wait(lambda: len(ann.beats) > 20, "beats")
+    ann.responsive = False
+    for beat in ann.beats[:12]:
+        ann.act("hold", beat=beat, press=1)
+    time.sleep(0.3)
+    assert not run.car.armed
+    assert ann.state["held"] is False
+    assert {a["refused"] for a in ann.answers if a["t"] == "answer" and a["act"] == "hold"} == {
+        "the answer of the page is too old"
+    }
+
+
+def test_a_page_node_that_hangs_stops_the_car(run, browser):
+    ann = browser()
+    ann.take()
+    drive(run, ann)
+    since_ns = time.monotonic_ns()
+    run.processes["page"].send_signal(signal.SIGSTOP)
+    try:
+        time.sleep(0.5)
+        assert run.car.stop_after(since_ns) < STOP_S
+    finally:
+        run.processes["page"].send_signal(signal.SIGCONT)
+    time.sleep(0.5)
+    assert not run.car.armed
+
+
+def test_one_operator_and_others_who_watch(run, browser):
+    ann, bob = browser(), browser()
+    assert ann.take() == ""
+    assert bob.take("Bob") == "Ann operates; one operator at a time"
+    bob.hold()
+    bob.wait(lambda: bob.state["lease"] is not None, "the lease")
+    assert bob.state["lease"]["name"] == "Ann"
+    for act in ("trial", "record", "attack_off", "reset_estop", "leave"):
+        assert bob.do(act) == "Ann operates; one operator at a time"
+    assert bob.do("label", text="mine") == "Ann operates; one operator at a time"
+    time.sleep(0.2)
+    assert not run.car.armed
+    assert ann.do("leave") == ""
+    assert bob.take("Bob") == ""
+    bob.hold()
+    run.wait(lambda: run.car.armed, "Bob to drive")
+    assert ann.do("disarm") == "", "anyone who watches may stop the car"
+    run.wait(lambda: not run.car.armed, "the car to be disarmed")
+
+
+def test_the_e_stop_of_a_watcher_latches_until_the_operator_resets_it(run, browser):
+    ann, bob = browser(), browser()
+    ann.take()
+    drive(run, ann)
+    since_ns = time.monotonic_ns()
+    assert bob.do("estop") == ""
+    run.wait(lambda: not run.car.armed, "the car to be disarmed")
+    assert run.car.stop_after(since_ns) < STOP_S
+    ann.held = False
+    ann.hold()
+    time.sleep(0.3)
+    assert not run.car.armed
+    assert ann.state["estop"]
+    run.wait(lambda: "e-stop" in run.car.reason, "the safety node's own latch")
+    assert ann.do("reset_estop") == ""
+    time.sleep(0.4)
+    assert not run.car.armed, "a reset arms nothing"
+    ann.release()
+    drive(run, ann)
+    ann.release()
+
+
+def test_a_label_is_in_the_bag_with_the_picture_that_its_author_saw(run, browser):
+    from nodes.bags.reader import read_messages
+    from nodes.runtime.messages import decode
+
+    ann = browser()
+    ann.take()
+    assert ann.do("record") == ""
+    assert ann.do("record").startswith("already recording")
+    ann.wait(lambda: (run.folder / "bus" / "status.page_recorder").exists(), "the recorder")
+    ann.wait(lambda: ann.state["recording"]["on"], "the page to say so")
+    time.sleep(1.0)
+    assert ann.do("label", text="a person crossed") == ""
+    time.sleep(0.3)
+    assert ann.do("record_stop") == ""
+    ann.wait(lambda: not ann.state["recording"]["on"], "the recorder to end", 15.0)
+    assert ann.state["recording"]["trouble"] == ""
+    bag = run.folder / ann.state["recording"]["folder"]
+    acts = [decode("advnerf_msgs/msg/OperatorAct", m.cdr) for m in read_messages(bag, ["/operator/act"])]
+    label = next(act for act in acts if act.act == "label")
+    assert (label.operator, label.detail, label.granted) == ("Ann", "a person crossed", True)
+    assert label.seen.sec > 0
+
+
+def test_a_trial_runs_from_arming_and_is_measured(tmp_path):
+    run = Run(tmp_path, trial_ticks=5)
+    try:
+        run.start()
+        ann = Browser(run.port)
+        ann.take()
+        assert ann.do("trial") == ""
+        drive(run, ann)
+        assert ann.do("trial") == "the car is armed; release the button first"
+        ann.wait(lambda: ann.state["trial"]["phase"] == "done", "the trial to end")
+        run.wait(lambda: not run.car.armed, "the end of the trial to let go")
+        trial = ann.state["trial"]
+        assert (trial["ticks"], trial["number"]) == (5, 1)
+        # The car stands at the origin, so its error is the same at all five ticks.
+        assert trial["total_cte_m"] == pytest.approx(5 * abs(ann.state["car"]["cte_m"]), abs=0.01)
+        ann.close()
+    finally:
+        run.close()
+
+
+def test_without_a_held_button_the_page_says_so_and_arms_nothing(tmp_path):
+    run = Run(tmp_path, teleop="none")
+    try:
+        run.start()
+        ann = Browser(run.port)
+        assert "launch with --set safety.teleop=hold" in ann.state["hint"]
+        ann.take()
+        ann.hold()
+        time.sleep(0.5)
+        assert not run.car.armed
+        assert ann.do("estop") == ""
+        assert ann.do("reset_estop") == ""
+        time.sleep(0.5)
+        assert not run.car.armed, "a reset is no request to arm"
+        ann.close()
+    finally:
+        run.close()
+
+
+def test_strangers_do_nothing_and_the_page_stays_up(run, browser):
+    from websockets.exceptions import InvalidStatus
+
+    ann = browser()
+    ann.take()
+    time.sleep(0.3)
+    before = len(run.car.acts)
+    good = cookie_of(run.port)
+    origins = ["http://evil.example", f"https://127.0.0.1:{run.port}", "null", f"http://localhost:{run.port}"]
+    for origin in origins:
+        with pytest.raises(InvalidStatus, match="403"):
+            Browser(run.port, good, origin)
+    for cookie in ("", "advnerf_page=1", good[:-1] + ("0" if good[-1] != "0" else "1")):
+        with pytest.raises(InvalidStatus, match="403"):
+            Browser(run.port, cookie)
+    assert request(run.port, headers={"Host": "evil.example"})[0] == 421
+    assert request(run.port, "/session", {"Host": f"evil.example:{run.port}"})[0] == 421
+    assert request(run.port, "/web/../desk.py")[0] == 404
+    assert request(run.port, "/web/%2e%2e%2fdesk.py")[0] == 404
+    assert request(run.port, "/attack/000000000000")[0] == 404
+    time.sleep(0.3)
+    assert len(run.car.acts) == before
+    assert ann.do("label", text="still here") == ""
+
+
+def test_a_replayed_or_malformed_message_is_no_act(run, browser):
+    ann, eve = browser(), browser()
+    ann.take()
+    number = ann.act("label", text="once")
+    ann.wait(lambda: any(a.get("n") == number for a in ann.answers), "the answer")
+    time.sleep(0.3)
+    message = {"t": "label", "key": ann.welcome["key"], "n": number, "frame": ann.frame, "text": "once"}
+    before = len(run.car.acts)
+    ann.tell(message)  # the same bytes again
+    eve.tell({**message, "n": number + 1})  # in another connection
+    eve.tell({**message, "n": number + 1, "frame": "1"})
+    for text in ("{}", "nonsense", json.dumps({"t": "arm"})):
+        eve.socket.send(text)
+    eve.wait(lambda: len([a for a in eve.answers if a["t"] == "refused"]) == 5, "five refusals")
+    for _ in range(20):
+        eve.tell({"t": "arm"})
+    eve.wait(lambda: eve.closed, "the connection to be closed")
+    assert len(run.car.acts) == before
+    assert ann.do("label", text="still here") == ""
+
+
+def test_the_headers_keep_foreign_code_out(run):
+    status, headers, body = request(run.port)
+    assert status == 200
+    policy = headers["content-security-policy"]
+    assert "default-src 'none'" in policy
+    assert "script-src 'self'" in policy
+    assert "unsafe" not in policy
+    assert headers["x-content-type-options"] == "nosniff"
+    assert headers["set-cookie"] is None
+    cookie = request(run.port, "/session")[1]["set-cookie"]
+    assert "HttpOnly" in cookie
+    assert "samesite=strict" in cookie.lower()
+    assert b"//" not in body.replace(b"//www.w3.org", b""), "nothing from elsewhere"
+    assert request(run.port, "/docs")[0] == 404
+
+
+def test_off_the_machine_there_is_tls_and_a_code(tmp_path):
+    from websockets.exceptions import InvalidStatus
+
+    run = Run(tmp_path, host="0.0.0.0", code_s=3.0)
+    try:
+        run.start(environment={"XDG_CONFIG_HOME": str(tmp_path / "config")})
+        port, door = run.port, run.door
+        assert door["url"].startswith("https://")
+        assert len(door["fingerprint"].split(":")) == 32
+        status, headers, _ = request(port, "/session", tls=True)
+        assert (status, headers["set-cookie"]) == (200, None)
+        origin = {"Origin": f"https://127.0.0.1:{port}"}
+
+        def enter(code, headers=origin, **options):
+            body = json.dumps({"code": code})
+            return request(port, "/enter", headers, "POST", body, tls=True, **options)
+
+        assert enter(run.door["code"], {"Origin": "https://evil.example"})[0] == 403
+        assert enter("AAAAAAAA")[0] == 403
+        old = run.door["code"]
+        run.wait(lambda: run.door["code"] != old, "a new code")
+        assert enter(old)[0] == 403, "it has expired"
+        code = run.door["code"]
+        status, headers, _ = enter(code)
+        assert status == 200
+        cookie = headers["set-cookie"]
+        assert "Secure" in cookie
+        assert enter(code)[0] == 403, "it was used"
+        token = cookie.partition(";")[0]
+        with pytest.raises(InvalidStatus, match="403"):
+            Browser(port, "", tls=True)
+        ann = Browser(port, token, tls=True)
+        assert ann.take() == ""
+        ann.hold()
+        run.wait(lambda: run.car.armed, "the car to be armed")
+        ann.close()
+        # The same cookie from another address is a stolen one.
+        session = request(port, "/session", {"Cookie": token}, tls=True, source=("127.0.0.2", 0))
+        assert json.loads(session[2])["open"] is False
+        assert json.loads(request(port, "/session", {"Cookie": token}, tls=True)[2])["open"] is True
+    finally:
+        run.close()
+
+
+def test_an_attack_is_chosen_and_switched_off(tmp_path):
+    import numpy as np
+
+    from advnerf_core.attack.artifact import AttackFile, attack_from_bytes, save_attack
+    from advnerf_core.geometry import Pinhole
+    from nodes.runtime.transfer import Assembler
+
+    theta = np.random.default_rng(0).normal(size=(8, 8, 3)).astype(np.float32)
+    attack = AttackFile.of_face(
+        method="gradient",
+        theta=theta,
+        size_m=(0.6, 0.6),
+        subject="board",
+        corners_in_subject=np.zeros((4, 3)),
+        T_world_from_object=np.eye(4),
+        camera=Pinhole(200, 66, 103.6, 103.4, 100, 32),
+        scene_sha256="",
+        policy_sha256="",
+        config_sha256="",
+        seed=3,
+        predicted_total_cte_m=12.5,
+        software_version="0",
+    )
+    save_attack(tmp_path / "strong.attack.safetensors", attack)
+    run = Run(tmp_path, attacks=[str(tmp_path / "strong.attack.safetensors")])
+    try:
+        run.start()
+        ann = Browser(run.port)
+        facts = ann.welcome["attacks"][0]
+        assert (facts["id"], facts["name"], facts["predicted_m"]) == (attack.attack_id, "strong", 12.5)
+        status, headers, png = request(
+            run.port, f"/attack/{attack.attack_id}", {"Cookie": cookie_of(run.port)}
+        )
+        assert (status, headers["content-type"], png[:4]) == (200, "image/png", b"\x89PNG")
+        assert request(run.port, f"/attack/{attack.attack_id}")[0] == 404, "only with a session"
+        assert ann.do("attack", id=attack.attack_id) == "nobody operates; take control first"
+        ann.take()
+        assert ann.do("attack", id="0" * 12) == "no attack 000000000000 among the 1 of this page"
+        assert ann.do("attack", id=attack.attack_id) == ""
+        run.wait(lambda: "/attack/switch" in run.car.heard, "the switch")
+        run.wait(
+            lambda: any(m.index + 1 == m.count for _, m in run.car.heard.get("/attack/file", ())), "the file"
+        )
+        assembler = Assembler()
+        whole = [assembler.add(message, 1) for _, message in run.car.heard["/attack/file"]]
+        received = next(file for file, _ in whole if file is not None)
+        assert attack_from_bytes(received.content, "test").attack_id == attack.attack_id
+        assert run.car.newest["/attack/switch"].show
+        assert ann.do("attack_off") == ""
+        run.wait(lambda: not run.car.newest["/attack/switch"].show, "the attack to be switched off")
+        assert run.car.newest["/attack/switch"].source == "Ann"
+        ann.close()
+    finally:
+        run.close()

@@ -1,0 +1,54 @@
+"""The metrics of a trial on the page are those of every other trial."""
+
+import numpy as np
+import pytest
+
+from advnerf_core.driving.metrics import Horizon, drive_metrics
+from advnerf_core.driving.path import Path
+from nodes.operator_page.trial import DONE, RUNNING, WAITING, Trial
+
+MS = 1_000_000
+
+
+def test_it_samples_the_control_ticks_from_arming_on():
+    path = Path.rounded_square(4.0, 1.0)
+    trial = Trial(path, 0.4, ticks=20, dt_s=0.1)
+    trial.start()
+    assert not trial.step(False, (0.0, 0.0), "", 0)
+    assert trial.phase == WAITING
+    track = [tuple(np.add(path.pose_at(0.08 * k)[:2], [0.0, 0.01 * k])) for k in range(21)]
+    ended = []
+    for ms in range(5000, 8000, 20):
+        position = track[(ms - 5000) // 100]
+        ended.append(trial.step(True, position, "abc" if ms > 5500 else "", ms * MS))
+        if ended[-1]:
+            break
+        assert trial.phase == RUNNING
+    assert trial.phase == DONE
+    assert ms == 7000
+    expected = drive_metrics(path, np.array(track), Horizon(ticks=20))
+    assert trial.state()["total_cte_m"] == pytest.approx(expected.total_cte_m, abs=1e-6)
+    assert trial.state()["ticks"] == 20
+    assert trial.state()["attack_id"] == "abc"
+
+
+def test_a_car_that_stops_is_charged_for_the_rest():
+    path = Path.rounded_square(4.0, 1.0)
+    trial = Trial(path, 0.4, ticks=10)
+    trial.start()
+    beside = tuple(np.add(path.pose_at(0.0)[:2], [0.0, 0.3]))
+    for ms in range(0, 500, 20):
+        assert not trial.step(True, beside, "", ms * MS)
+    assert trial.step(False, beside, "", 500 * MS)
+    assert trial.state()["total_cte_m"] == pytest.approx(
+        10 * abs(float(path.project(np.array(beside)).cte_m)), rel=1e-6
+    )
+
+
+def test_without_a_path_it_only_counts():
+    trial = Trial(None, 0.4, ticks=3)
+    trial.start()
+    for ms in range(0, 400, 20):
+        trial.step(True, (0.0, 0.0), "", ms * MS)
+    assert "total_cte_m" not in trial.state()
+    assert trial.state()["phase"] == DONE

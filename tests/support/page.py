@@ -1,0 +1,163 @@
+"""Helper of the page's tests: a run with a real page, a real safety process, and a car as far as both can tell."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from nodes.runtime.bus import Bus
+from nodes.runtime.messages import drive_message, image_message, pose_message
+
+REPOSITORY = Path(__file__).parents[2]
+TWIN = REPOSITORY / "calibration" / "twin"
+STOP_S = 0.35
+
+
+class Car(threading.Thread):
+    """A car that is measured, seen and commanded, as far as page and safety node can tell; and the test's eyes on the bus."""
+
+    def __init__(self, folder):
+        super().__init__(daemon=True)
+        self.folder, self.stopping = folder, False
+        self.newest, self.acts, self.moves, self.heard = {}, [], [], {}
+        self.pictures = True
+
+    def run(self):
+        heard = (
+            "/safety/state",
+            "/safety/drive",
+            "/operator/act",
+            "/attack/file",
+            "/attack/switch",
+            "/status/page",
+        )
+        with Bus(self.folder) as bus:
+            for topic in heard:
+                bus.subscribe(topic, queue=1000)
+            next_s, tick = time.monotonic(), 0
+            while not self.stopping:
+                bus.wait(max(0.0, next_s - time.monotonic()))
+                for received in bus.receive():
+                    self._hear(received)
+                if time.monotonic() < next_s:
+                    continue
+                next_s, tick = next_s + 0.02, tick + 1
+                self._say(bus, tick)
+
+    def _hear(self, received):
+        message = received.message()
+        self.newest[received.topic] = message
+        self.heard.setdefault(received.topic, []).append((received.info.publish_mono_ns, message))
+        if received.topic == "/operator/act":
+            self.acts.append(message)
+        elif received.topic == "/safety/drive":
+            self.moves.append((received.info.publish_mono_ns, float(message.drive.speed)))
+
+    def _say(self, bus, tick):
+        now_ns = time.time_ns()
+        bus.publish("/vicon/car", pose_message(np.eye(4), now_ns))
+        bus.publish("/policy/drive", drive_message(0.5, 0.0, now_ns))
+        if tick % 5 == 0 and self.pictures:
+            rgb = np.full((188, 336, 3), tick % 255, np.uint8)
+            for topic in ("/camera/image_raw", "/compositor/image"):
+                bus.publish(topic, image_message(rgb, now_ns, "camera"))
+
+    @property
+    def armed(self):
+        return bool(getattr(self.newest.get("/safety/state"), "armed", False))
+
+    @property
+    def reason(self):
+        return getattr(self.newest.get("/safety/state"), "reason", "")
+
+    def stop_after(self, since_ns):
+        """Seconds from an instant to the first stop after the last command to move."""
+        moving = [t for t, speed in list(self.moves) if speed > 0.0]
+        stops = [t for t, speed in list(self.moves) if speed == 0.0 and t > (moving[-1] if moving else 0)]
+        assert stops, "the car was not stopped"
+        return (stops[0] - since_ns) / 1e9
+
+
+class Run:
+    """A run folder with page, safety node and car."""
+
+    def __init__(self, folder, teleop="hold", **config):
+        self.folder, self.processes = folder, {}
+        self.car = Car(folder)
+        safety = {
+            "room": str(TWIN / "room.yaml"),
+            "vehicle": str(TWIN / "vehicle.yaml"),
+            "nodes": [],
+            "teleop": teleop,
+        }
+        page = {"port": 0, "room": str(TWIN / "room.yaml"), **config}
+        self.configs = {"safety": safety, "page": page}
+        nodes = {name: {"module": f"nodes.{name}", "config": config} for name, config in self.configs.items()}
+        (folder / "launch.resolved.yaml").write_text(yaml.safe_dump({"name": "test", "nodes": nodes}))
+
+    def start(self, *names, environment=None):
+        for name in names or self.configs:
+            file = self.folder / f"{name}.yaml"
+            file.write_text(yaml.safe_dump(self.configs[name]))
+            command = [sys.executable, "-m", f"nodes.{name}", "--config", str(file)]
+            log = open(self.folder / f"{name}.log", "ab")  # noqa: SIM115 - belongs to the child
+            self.processes[name] = subprocess.Popen(
+                [*command, "--run-dir", str(self.folder), "--name", name],
+                stdout=log,
+                stderr=log,
+                cwd=REPOSITORY,
+                env={**os.environ, **(environment or {})},
+            )
+        if not self.car.is_alive():
+            self.car.start()
+        self.wait(lambda: (self.folder / "page" / "door.json").exists(), "the page")
+        if "safety" in self.processes:
+            self.wait(lambda: "/safety/state" in self.car.newest, "the safety node")
+        return self
+
+    @property
+    def door(self):
+        return json.loads((self.folder / "page" / "door.json").read_text())
+
+    @property
+    def port(self):
+        return int(self.door["url"].rstrip("/").rpartition(":")[2])
+
+    def log(self):
+        """What the page wrote about acts."""
+        return [json.loads(line) for line in (self.folder / "page" / "acts.jsonl").read_text().splitlines()]
+
+    def counter(self, name):
+        status = self.car.newest["/status/page"]
+        return dict(zip(status.counter_names, status.counter_values, strict=True))[name]
+
+    def wait(self, condition, what, timeout_s=20.0):
+        deadline = time.monotonic() + timeout_s
+        while not condition():
+            for name, process in self.processes.items():
+                assert process.poll() is None, (
+                    f"{name} ended: {(self.folder / f'{name}.log').read_text()[-2000:]}"
+                )
+            assert time.monotonic() < deadline, f"gave up waiting for {what}; the car is {self.car.reason!r}"
+            time.sleep(0.01)
+
+    def close(self):
+        self.car.stopping = True
+        for process in self.processes.values():
+            with contextlib.suppress(ProcessLookupError):
+                process.send_signal(signal.SIGCONT)
+                process.terminate()
+        for process in self.processes.values():
+            process.wait(15.0)
+        if self.car.is_alive():
+            self.car.join()
