@@ -51,7 +51,7 @@ class Ros2Config(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     domain_id: int = Field(default=0, ge=0, le=232)
-    interface: str = Field(default="lo", pattern=r"[A-Za-z0-9_.\-]{1,15}")
+    interface: str = Field(default="lo", pattern=r"^[A-Za-z0-9_.\-]{1,15}$")
     open_to_network: bool = False
     vehicle: Path | None = None
     send: tuple[SendRoute, ...] = ()

@@ -46,10 +46,11 @@ _CONFIG = """<CycloneDDS><Domain Id="any">
 <Internal><MaxSampleSize>{most_bytes}B</MaxSampleSize></Internal>
 <Compatibility><IgnoreTypeInformation>1.15,1.16</IgnoreTypeInformation></Compatibility>
 </Domain></CycloneDDS>"""
-# Loopback has no multicast on most computers: participants are looked for one by one. Large datagrams save the fragments.
+# Loopback has no multicast on most computers: participants are looked for one by one, again and again, because ROS programs that start
+# later may announce themselves by multicast only. Large datagrams save the fragments.
 _LOCAL_GENERAL = "<AllowMulticast>false</AllowMulticast><MaxMessageSize>65500B</MaxMessageSize><FragmentSize>65000B</FragmentSize>"
 _LOCAL_DISCOVERY = (
-    "<ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>"
+    "<SPDPInterval>500ms</SPDPInterval><ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>"
     '<Peers><Peer Address="localhost"/></Peers>'
 )
 

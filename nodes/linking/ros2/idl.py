@@ -87,5 +87,5 @@ def _field(kind: Any) -> Any:
         return _nested(detail)
     inner, length = _field(detail[0]), detail[1]
     if nodetype == Nodetype.ARRAY:
-        return idl.array[inner, length]
-    return idl.sequence[inner, length] if length else idl.sequence[inner]
+        return idl.array.__class_getitem__((inner, length))
+    return idl.sequence.__class_getitem__((inner, length) if length else inner)

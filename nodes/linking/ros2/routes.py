@@ -9,6 +9,7 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from nodes.linking.ros2.conversions import ACKERMANN, COMPRESSED, IMAGE, POSE, convertible
+from nodes.runtime.errors import TopicError
 from nodes.runtime.topics import topic as topic_row
 
 Reliability = Literal["best_effort", "reliable"]
@@ -76,6 +77,10 @@ class _Route(BaseModel):
 
     @model_validator(mode="after")
     def _names_and_types_exist(self) -> _Route:
+        try:
+            topic_row(self.topic)
+        except TopicError as error:
+            raise ValueError(str(error)) from None
         if not _ROS_NAME.fullmatch(self.ros_name) or len(self.ros_name) > _LONGEST_NAME:
             raise ValueError(
                 f"expected an absolute ROS name such as /car/image_raw for {self.topic}, got {self.ros_name!r}; correct 'ros'"
