@@ -10,6 +10,7 @@ stamp. Without the stamp the command does not count, because nobody could say ho
 from __future__ import annotations
 
 import argparse
+import contextlib
 
 import cv2
 import numpy as np
@@ -59,10 +60,8 @@ def main() -> None:
     parser.add_argument("--wheelbase", type=float, default=0.25, help="distance of the axles [m]")
     options = parser.parse_args()
     rclpy.init()
-    try:
+    with contextlib.suppress(KeyboardInterrupt, ExternalShutdownException):
         rclpy.spin(Policy(options))
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
 
 
 if __name__ == "__main__":

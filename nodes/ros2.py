@@ -84,6 +84,10 @@ class Side(Protocol):
         """Why publishers of a taken topic are not heard; empty if there are none of these."""
         ...
 
+    def rivals(self, number: int) -> tuple[str, ...]:
+        """Identities of the other publishers of a sent topic that commands answer."""
+        ...
+
     def readers_of(self, number: int) -> int:
         """Number of subscribers of a sent topic."""
         ...
@@ -99,6 +103,7 @@ class _Taken:
     def __init__(self, route: TakeRoute, setting: Setting) -> None:
         self.route, self._setting = route, setting
         self.writer = OneWriter()
+        self.rivals: tuple[str, ...] = ()
         self.answers = Answers(route.max_age_s) if route.answers else None
         self.sequence = 0
         self.passed_ns: int | None = None
@@ -110,10 +115,17 @@ class _Taken:
             conversion(route.table_type, route.ros_type, outward=False) if route.converts else None
         )
 
+    @property
+    def problem(self) -> str:
+        """Why nothing of the topic may pass; empty if it may."""
+        if self.rivals:
+            return f"somebody else publishes what it answers ({self.route.answers}): {', '.join(self.rivals[:4])}; stop that program, then arm again"
+        return self.writer.problem
+
     def cdr(self, heard: Heard) -> bytes:
         """CDR bytes of the topic's own type. A message that must not pass is a `MessageError`."""
         self.writer.present = heard.present
-        if refusal := self.writer.refusal(heard.writer):
+        if refusal := self.problem or self.writer.refusal(heard.writer):
             raise MessageError(refusal)
         if heard.stated_hash not in ("", self._hash):
             raise MessageError(
@@ -183,7 +195,7 @@ class Ros2Node(Node):
         wheelbase_m: float = 0.0,
         on_this_host: bool = True,
     ) -> None:
-        self.inbox, self._side, self._on_this_host = inbox, side, on_this_host
+        self._config, self.inbox, self._side, self._on_this_host = config, inbox, side, on_this_host
         self.subscriptions = tuple(dict.fromkeys(route.topic for route in config.send))
         self.publications = tuple(route.topic for route in config.take)
         self._sent: dict[str, list[tuple[int, _Sent, _Rate]]] = defaultdict(list)
@@ -221,6 +233,7 @@ class Ros2Node(Node):
             [route.endpoint for route in config.send],
             [route.endpoint for route in config.take],
             inbox,
+            sorted({number for route in config.take for number in answered(config, route)}),
         )
         return cls(config, side, inbox, wheelbase_m, local)
 
@@ -265,6 +278,12 @@ class Ros2Node(Node):
         for number, (taken, _) in enumerate(self._taken):
             taken.writer.present = self._side.present(number)
             taken.mismatch = self._side.mismatch(number)
+            if taken.route.answers is not None:
+                taken.rivals = tuple(
+                    rival
+                    for watched in answered(self._config, taken.route)
+                    for rival in self._side.rivals(watched)
+                )
         if self._driven_ns is not None and now.mono_ns - self._driven_ns > _LATE_S * NS_PER_S:
             self._driven_ns, self._stops_left = None, _STOPS
         if self._stops_left > 0:
@@ -275,8 +294,8 @@ class Ros2Node(Node):
     def status(self) -> tuple[str, str]:
         """Report a fault if a topic has two publishers."""
         for taken, _ in self._taken:
-            if taken.writer.problem:
-                return FAULT, f"{taken.route.ros_name} has {taken.writer.problem}"
+            if taken.problem:
+                return FAULT, f"{taken.route.ros_name}: {taken.problem}"
         for taken, _ in self._taken:
             if taken.mismatch:
                 return READY, taken.mismatch
@@ -336,6 +355,11 @@ class Ros2Node(Node):
 
     def _recent(self, mono_ns: int | None) -> bool:
         return mono_ns is not None and self._now_ns - mono_ns < _ACTIVE_S * NS_PER_S
+
+
+def answered(config: Ros2Config, route: TakeRoute) -> list[int]:
+    """Numbers of the routes that send what a command answers."""
+    return [number for number, send in enumerate(config.send) if send.topic == route.answers]
 
 
 def require_local(config: Ros2Config, local: bool) -> None:

@@ -11,6 +11,7 @@ import re
 import socket
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -76,6 +77,7 @@ class Participant:
         sends: What it writes.
         takes: What it reads.
         inbox: Receives batches of samples.
+        watched: Numbers of the writers beside which no other publisher may exist.
     """
 
     def __init__(
@@ -85,6 +87,7 @@ class Participant:
         sends: Sequence[Endpoint],
         takes: Sequence[Endpoint],
         inbox: Inbox[list[Heard]],
+        watched: Sequence[int] = (),
     ) -> None:
         local = is_loopback_interface(interface)
         before = _udp_sockets()
@@ -95,6 +98,9 @@ class Participant:
                 _bind_to_device(_udp_sockets() - before, interface)
             self._writers = [_writer(self._participant, each) for each in sends]
             self._readers = [_Reader(number, self._participant, each) for number, each in enumerate(takes)]
+            self._rivals = {
+                number: _Reader(number, self._participant, _any_qos(sends[number])) for number in watched
+            }
         except DDSException as error:
             raise BusError(
                 f"cannot open DDS domain {domain_id} on {interface}: {error.msg}; see the lines above"
@@ -124,6 +130,10 @@ class Participant:
         """Why publishers of a reader's topic are not heard; empty if there are none of these."""
         return self._readers[number].mismatch()
 
+    def rivals(self, number: int) -> tuple[str, ...]:
+        """Identities of the other publishers of a watched writer's topic."""
+        return self._rivals[number].present()
+
     def readers_of(self, number: int) -> int:
         """Number of subscribers of a writer's topic."""
         return len(self._writers[number].get_matched_subscriptions())
@@ -132,7 +142,7 @@ class Participant:
         """Leave the domain."""
         self._thread.stop()
         # An entity leaves the domain with its last reference.
-        del self._waitset, self._readers, self._writers, self._participant, self._domain
+        del self._waitset, self._readers, self._rivals, self._writers, self._participant, self._domain
 
     def _read(self) -> list[Heard] | None:
         self._waitset.wait(duration(milliseconds=_WAIT_MS))
@@ -203,6 +213,11 @@ class _Reader:
         return self._known[handle]
 
 
+def _any_qos(endpoint: Endpoint) -> Endpoint:
+    """A reader that every publisher of the topic matches."""
+    return replace(endpoint, reliable=False, depth=1)
+
+
 def _topic(participant: Any, endpoint: Endpoint) -> Any:
     return Topic(participant, dds_topic(endpoint.ros), bytes_type(endpoint.typename))
 
@@ -218,6 +233,7 @@ def _qos(endpoint: Endpoint) -> Any:
         reliability,
         Policy.Durability.Volatile,
         Policy.History.KeepLast(endpoint.depth),
+        Policy.IgnoreLocal.Participant,
         Policy.DataRepresentation(use_cdrv0_representation=True),
         Policy.Userdata(f"typehash={type_hash(endpoint.typename)};".encode()),
     )

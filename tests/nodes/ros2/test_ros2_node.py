@@ -49,6 +49,7 @@ class Recorded:
 
     def __init__(self):
         self.written, self.publishers, self.full, self.closed, self.wrong = [], {}, False, False, ""
+        self.others = {}
 
     def write(self, number, cdr):
         self.written.append((number, bytes(cdr)))
@@ -59,6 +60,10 @@ class Recorded:
 
     def mismatch(self, number):
         return self.wrong
+
+    def rivals(self, number):
+        assert number in (0, 1, 2)  # the topics that commands answer
+        return self.others.get(number, ())
 
     def readers_of(self, number):
         return 1
@@ -216,7 +221,19 @@ def test_two_publishers_are_a_fault_even_if_one_is_silent(node, side):
     node.tick(now(2 * S))
     state, text = node.status()
     assert state == "fault"
-    assert "/cmd has 2 publishers (one, two)" in text
+    assert "/cmd: 2 publishers (one, two)" in text
+
+
+def test_another_publisher_of_what_is_answered_is_a_fault(node, side):
+    send(node, "/compositor/image", image(REAL), S)
+    side.others[0] = ("liar",)
+    node.tick(now(S))
+    assert node.status()[0] == "fault"
+    assert "somebody else publishes what it answers (/compositor/image): liar" in node.status()[1]
+    assert node.receive([heard(twist(REAL), S + MS)], now(S + MS)) == []
+    side.others.clear()
+    node.tick(now(S + 2 * MS))
+    assert node.receive([heard(twist(REAL), S + 3 * MS)], now(S + 3 * MS))
 
 
 def test_silence_is_explained(node, side):
