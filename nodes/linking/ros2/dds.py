@@ -92,7 +92,7 @@ class Participant:
         local = is_loopback_interface(interface)
         before = _udp_sockets()
         try:
-            self._domain = Domain(domain_id, _config(interface, local))
+            self._domain = Domain(domain_id, domain_config(interface, local))
             self._participant = DomainParticipant(domain_id, qos=Qos(Policy.Userdata(b"enclave=/;")))
             if local:
                 _bind_to_device(_udp_sockets() - before, interface)
@@ -239,7 +239,8 @@ def _qos(endpoint: Endpoint) -> Any:
     )
 
 
-def _config(interface: str, local: bool) -> str:
+def domain_config(interface: str, local: bool) -> str:
+    """Configuration (XML) of Cyclone DDS on an interface."""
     return _CONFIG.format(
         interface=interface,
         most_bytes=MOST_BYTES,
