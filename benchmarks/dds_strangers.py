@@ -10,6 +10,7 @@ import argparse
 import json
 import math
 import random
+import signal
 import sys
 import time
 from collections.abc import Callable
@@ -313,6 +314,7 @@ def main() -> None:
     options = parser.parse_args()
     domain = Domain(options.domain, domain_config("lo", local=True))
     if options.honest:
+        signal.signal(signal.SIGTERM, lambda *_: sys.exit())  # the interpreter's end leaves the domain
         print("ready", flush=True)
         command = lambda stamp: twist(stamp, HONEST_SPEED_MPS, HONEST_STEERING_RAD)  # noqa: E731 - one line
         answer(Dds(options.domain), math.inf, command)

@@ -1,8 +1,8 @@
 """Can a stranger on the DDS domain make the car do what its operator did not allow? ``python -m benchmarks.ros2_strangers`` (20 minutes).
 
 The shipped ROS 2 launch drives the simulated lab; an honest policy, a DDS program of its own, answers each image with one fixed command.
-Beside it strangers act, one at a time (`benchmarks.dds_strangers`): half the time the car drives, the other half it is disarmed and
-must stay where it is. What may reach the motor is known: the honest command while the operator's arming lasts, and stops. Anything
+Strangers act, one at a time (`benchmarks.dds_strangers`): half of the time beside the honest policy while the car drives, the other
+half alone while it is disarmed and must stay where it is. What may reach the motor is known: the honest command while the operator's arming lasts, and stops. Anything
 else that moves, and any arming that the operator did not ask for, is a failure. To stop is always allowed.
 """
 
@@ -70,8 +70,15 @@ class Programs:
         self._stranger = self._start()
 
     def start_honest(self) -> None:
-        """Start the operator's own policy."""
-        self._honest = self._start("--honest")
+        """Start the operator's own policy, if it does not run."""
+        self._honest = self._honest or self._start("--honest")
+
+    def stop_honest(self) -> None:
+        """End the operator's own policy; it leaves the domain as a program that is ended."""
+        if self._honest is not None:
+            self._honest.terminate()
+            self._honest.wait()
+            self._honest = None
 
     def act(self, kind: str, seed: int) -> None:
         """Let a stranger begin; `acting` says when it is done."""
@@ -181,9 +188,10 @@ def put_back(watcher: Watcher) -> None:
     watcher.watch(0.3)
 
 
-def prepare(watcher: Watcher, driving: bool) -> None:
+def prepare(watcher: Watcher, programs: Programs, driving: bool) -> None:
     """Bring the car into the state in which a stranger meets it."""
     if not driving:
+        programs.stop_honest()
         watcher.say_arm(False)
         watcher.wait_until(lambda: not watcher.armed, 10.0, "to be disarmed")
         watcher.watch(0.3)  # what was on its way
@@ -203,7 +211,7 @@ def run_case(
     watcher: Watcher, programs: Programs, kind: str, seed: int, driving: bool
 ) -> tuple[list[str], bool]:
     """Let one stranger act. Returns what was not allowed, and whether the car was stopped."""
-    prepare(watcher, driving)
+    prepare(watcher, programs, driving)
     watcher.failures.clear()
     programs.act(kind, seed)
     stopped = False
@@ -230,7 +238,6 @@ def run(count: int, domain: int) -> tuple[list[str], Counter[str], Counter[str]]
         watcher = Watcher(programs)
         try:
             watcher.wait_ready(90.0)
-            programs.start_honest()
             for number in range(count):
                 kind, driving = kinds[number // 2 % len(kinds)], number % 2 == 0
                 failures, stopped = run_case(watcher, programs, kind, rng.getrandbits(32), driving)

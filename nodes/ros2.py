@@ -30,6 +30,7 @@ from nodes.runtime.wire import Meta, Relayed
 _SMALL_BYTES = 64 * 2**10
 _LARGE = (IMAGE, COMPRESSED)
 _INBOX = 64
+_QUEUE = 4
 _ACTIVE_S = 1.0
 _LATE_S = 0.25
 _TICK_HZ = 20.0
@@ -198,6 +199,10 @@ class Ros2Node(Node):
         self._config, self.inbox, self._side, self._on_this_host = config, inbox, side, on_this_host
         self.subscriptions = tuple(dict.fromkeys(route.topic for route in config.send))
         self.publications = tuple(route.topic for route in config.take)
+        # Every image is carried, also if two arrive at once. Of a command only the newest counts.
+        self.queues = {
+            name: _QUEUE for name in self.subscriptions if name != SAFETY_DRIVE and topic_row(name).latest
+        }
         self._sent: dict[str, list[tuple[int, _Sent, _Rate]]] = defaultdict(list)
         for number, send in enumerate(config.send):
             setting = Setting(wheelbase_m, send.child_frame, send.frame)
