@@ -215,6 +215,7 @@ class Ros2Node(Node):
         self._now_ns = self._now_real_ns = 0
         self._driven_ns: int | None = None  # the newest command to move that a driver in ROS got
         self._stops_left = 0
+        self._closed = False
 
     @classmethod
     def build(cls, config: Ros2Config, context: NodeContext) -> Ros2Node:
@@ -316,6 +317,8 @@ class Ros2Node(Node):
 
     def counters(self) -> dict[str, float]:
         """Report carried, skipped and refused messages, and the subscribers in ROS of each sent topic."""
+        if self._closed:
+            return {name: float(count) for name, count in self._counts.items()}
         readers = {
             f"readers {sent.route.ros_name}": float(self._side.readers_of(number))
             for entries in self._sent.values()
@@ -325,9 +328,12 @@ class Ros2Node(Node):
 
     def close(self) -> None:
         """Stop a car in ROS, and leave the domain."""
-        if self._driven_ns is not None:
-            self._stop(self._now_real_ns)
-        self._side.close()
+        self._closed = True
+        try:
+            if self._driven_ns is not None:
+                self._stop(self._now_real_ns)
+        finally:
+            self._side.close()
 
     def _send(self, number: int, sent: _Sent, info: MessageInfo) -> None:
         topic = sent.route.topic

@@ -59,9 +59,13 @@ def bytes_type(typename: str) -> Any:
     def from_bytes(cls: Any, data: bytes, *_: Any, **__: Any) -> Any:
         return cls(data)
 
+    def no_key(cls: Any, *_: Any, **__: Any) -> Any:
+        return cls(b"")  # the sample that reports that a publisher has left
+
     found.__init__ = take_bytes
     found.serialize = give_bytes
     found.deserialize = classmethod(from_bytes)
+    found.deserialize_key = classmethod(no_key)
     return found
 
 

@@ -101,6 +101,27 @@ def test_bytes_come_back_as_they_were_sent(participant_of, program, inbox):
     assert all(0 <= heard.real_ns - heard.source_real_ns < 10**9 for heard in got)
 
 
+def test_a_publisher_that_leaves_is_followed_by_another(participant_of, program, inbox):
+    participant = participant_of(
+        [Endpoint("/image_raw", IMAGE, False, 5)], [Endpoint("/cmd_vel", TWIST, True, 10)]
+    )
+    cdr, writers = encode(image_message(PIXELS, time.time_ns(), "camera")), set()
+    for _ in range(2):
+        policy = program("benchmarks.dds_strangers", "--honest")
+
+        def answered():
+            participant.write(0, cdr)
+            time.sleep(0.05)
+            found = {heard.writer for batch in inbox.take() for heard in batch} - writers
+            writers.update(found)
+            return found
+
+        wait_until(answered)
+        policy.terminate()
+        wait_until(lambda: participant.present(0) == ())
+    assert len(writers) == 2
+
+
 def test_other_computers_cannot_reach_the_sockets(participant_of):
     before = dds._udp_sockets()
     participant_of([Endpoint("/image_raw", IMAGE, False, 5)])
