@@ -1,6 +1,7 @@
 """A plain rclpy program: prints each image that it gets, and may answer it. Run by the Python of an rclpy environment.
 
-One line of JSON for each image: its stamp, the digest of its pixels, and monotonic times of its arrival and of the answer [ns].
+One line of JSON for each image: its stamp, the digest of its pixels, and monotonic times of its arrival and of the answer [ns]; and one
+for each pose: its stamp.
 """
 
 import argparse
@@ -10,7 +11,7 @@ import json
 import time
 
 import rclpy
-from geometry_msgs.msg import TwistStamped
+from geometry_msgs.msg import PoseStamped, TwistStamped
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
@@ -18,23 +19,31 @@ from sensor_msgs.msg import Image
 
 
 class Answering(Node):
-    def __init__(self, images, commands, speed_mps, digest, reliable):
+    def __init__(self, options):
         super().__init__("answering")
-        self._speed_mps, self._digest = speed_mps, digest
-        self._commands = self.create_publisher(TwistStamped, commands, 1) if commands else None
-        self.create_subscription(Image, images, self._see, 10 if reliable else qos_profile_sensor_data)
+        self._options = options
+        self._commands = (
+            self.create_publisher(TwistStamped, options.commands, 1) if options.commands else None
+        )
+        quality = 10 if options.reliable else qos_profile_sensor_data
+        self.create_subscription(Image, options.images, self._see, quality)
+        if options.poses:
+            self.create_subscription(PoseStamped, options.poses, self._note, 1000)
+
+    def _note(self, pose):
+        print(json.dumps({"pose_ns": pose.header.stamp.sec * 10**9 + pose.header.stamp.nanosec}), flush=True)
 
     def _see(self, image):
         line = {"arrived_ns": time.monotonic_ns()}
         if self._commands is not None:
             command = TwistStamped()
             command.header.stamp = image.header.stamp
-            command.twist.linear.x = self._speed_mps
+            command.twist.linear.x = self._options.speed
             line["answered_ns"] = time.monotonic_ns()
             self._commands.publish(command)
         stamp = image.header.stamp
         line["stamp_ns"] = stamp.sec * 10**9 + stamp.nanosec
-        if self._digest:
+        if self._options.digest:
             line["sha256"] = hashlib.sha256(bytes(image.data)).hexdigest()
             line["shape"] = [image.height, image.width, image.encoding, image.step]
         print(json.dumps(line), flush=True)
@@ -49,12 +58,11 @@ def main():
     parser.add_argument(
         "--reliable", action="store_true", help="rclpy's default QoS instead of that of sensor data"
     )
+    parser.add_argument("--poses", default="", help="note each pose there")
     options = parser.parse_args()
     rclpy.init()
     with contextlib.suppress(KeyboardInterrupt, ExternalShutdownException):
-        rclpy.spin(
-            Answering(options.images, options.commands, options.speed, options.digest, options.reliable)
-        )
+        rclpy.spin(Answering(options))
 
 
 if __name__ == "__main__":
