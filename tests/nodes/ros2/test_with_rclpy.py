@@ -231,21 +231,77 @@ def test_rclpy_reads_poses_odometry_diagnostics_and_commands(bridge_of, peer_of)
     assert set(stops[1:]) == {0.0}
 
 
+def launch_of(file, run_dir, *settings):
+    """A launch as a process; its log lies beside the run folder."""
+    options = [word for setting in settings for word in ("--set", setting)]
+    with open(run_dir.with_suffix(".log"), "wb") as log:
+        command = [
+            sys.executable,
+            "-m",
+            "nodes.cli.main",
+            "launch",
+            file,
+            "--run-dir",
+            str(run_dir),
+            *options,
+        ]
+        environment = {**os.environ, "MUJOCO_GL": "egl"}
+        return subprocess.Popen(command, cwd=ROOT, env=environment, stdout=log, stderr=log)
+
+
+def test_a_car_in_ros_obeys_the_safety_node_only(tmp_path, peer_of):
+    run_dir, domain = tmp_path / "run", DOMAIN + 2
+    launch = launch_of(
+        "launch/ros2_car.launch.yaml",
+        run_dir,
+        f"params.domain_id={domain}",
+        "policy.module=benchmarks.straight_policy",
+        "policy.config.speed_mps=0.5",
+        "ros2.send=[{topic: /safety/drive, ros: /safe_cmd, type: geometry_msgs/msg/TwistStamped}]",
+        "record=false",
+    )
+    operator = LiveOperator(run_dir, ("compositor", "policy", "ros2", "safety"))
+    car = peer_of(PEERS / "car.py", "/safe_cmd", "-2.0", "-2.0", domain=domain)
+
+    def moved_after(mono_ns):
+        return [line for line in car.lines if line["mono_ns"] > mono_ns and line["speed_mps"] != 0.0]
+
+    try:
+        operator.wait_until(lambda: operator.state_of("ros2") == "active", 60.0, "for the car")
+        operator.watch(1.0)
+        assert not moved_after(0)
+        operator.say_arm(source="trial")
+        operator.watch(0.5)
+        assert not operator.armed  # a program may arm only the simulated car
+        operator.wait_until(
+            lambda: (operator.say_arm(source="operator"), operator.watch(0.3), operator.armed)[2],
+            20.0,
+            "to arm",
+        )
+        operator.watch(1.0)
+        assert operator.armed, operator.describe()
+        assert {line["speed_mps"] for line in moved_after(0)} == {0.5}
+        # The safety node hangs: nothing arrives from it any more, and the ROS 2 node tells the car to stop.
+        os.kill(operator.pid_of("safety"), signal.SIGSTOP)
+        hung_ns = time.monotonic_ns()
+        operator.watch(1.0)
+        stop = next(line for line in car.lines if line["mono_ns"] > hung_ns and line["speed_mps"] == 0.0)
+        assert (stop["mono_ns"] - hung_ns) / 1e6 <= 350.0
+        assert not moved_after(stop["mono_ns"])
+    finally:
+        operator.bus.close()
+        os.kill(operator.pid_of("safety"), signal.SIGCONT)
+        launch.send_signal(signal.SIGINT)
+        launch.wait(30.0)
+
+
 def test_a_policy_in_ros_drives_the_lab_and_the_drive_is_recorded(tmp_path, peer_of):
     onnx = tmp_path / "policy.onnx"
     advnerf = [sys.executable, "-m", "nodes.cli.main"]
     subprocess.run([*advnerf, "policy", "export", str(REFERENCE), "--onnx", str(onnx)], cwd=ROOT, check=True)
     run_dir, domain = tmp_path / "run", DOMAIN + 1
     settings = (f"params.domain_id={domain}", f"params.vicon_port={free_port()}")
-    options = [word for setting in settings for word in ("--set", setting)]
-    log = open(tmp_path / "launch.log", "wb")  # noqa: SIM115 - belongs to the child
-    launch = subprocess.Popen(
-        [*advnerf, "launch", "launch/ros2.launch.yaml", "--run-dir", str(run_dir), *options],
-        cwd=ROOT,
-        env={**os.environ, "MUJOCO_GL": "egl"},
-        stdout=log,
-        stderr=log,
-    )
+    launch = launch_of("launch/ros2.launch.yaml", run_dir, *settings)
     nodes = ("twin", "camera", "vicon", "compositor", "ros2", "safety", "motor")
     operator = LiveOperator(run_dir, nodes)
     try:
@@ -270,7 +326,6 @@ def test_a_policy_in_ros_drives_the_lab_and_the_drive_is_recorded(tmp_path, peer
         operator.bus.close()
         launch.send_signal(signal.SIGINT)
         assert launch.wait(30.0) == 0
-        log.close()
     bag = run_dir / "bag"
     counts = {topic.name: topic.count for topic in read_info(bag).topics}
     assert counts["/policy/drive"] >= 40
