@@ -53,7 +53,7 @@ test-hardware: setup  ## The tests that need a real device; each says which, and
 # rclpy cannot share our environment: it has packages of ROS in the versions of one distribution.
 ROS2_VENV ?= .venv-ros2
 setup-ros2: $(ROS2_VENV)/.installed  ## Install rclpy from PyPI into .venv-ros2 (x86-64 Linux, Python 3.10 to 3.12)
-$(ROS2_VENV)/.installed: tests/support/rclpy_peers/requirements.txt
+$(ROS2_VENV)/.installed: benchmarks/rclpy_peers/requirements.txt
 	@test -x $(ROS2_VENV)/bin/python || $(PYTHON) -m venv $(ROS2_VENV)
 	@$(ROS2_VENV)/bin/pip install -q --disable-pip-version-check -r $<
 	@touch $@
@@ -92,4 +92,4 @@ fmt: setup  ## Format and fix what can be fixed
 	@$(BIN)/ruff format .
 
 clean:  ## Remove the environment and every run
-	rm -rf $(VENV) runs
+	rm -rf $(VENV) $(ROS2_VENV) runs

@@ -24,10 +24,10 @@ import numpy as np
 import yaml
 
 from advnerf_core.geometry import planar_pose
+from benchmarks.rclpy_peer import PEERS, RclpyPeer, rclpy_python
 from benchmarks.results import REPOSITORY, record_row
 from nodes.runtime.bus import Bus
 from nodes.runtime.messages import image_message, pose_message, stamp_ns
-from tests.support.rclpy_peer import PEERS, RclpyPeer, rclpy_python
 
 COMMAND = "python -m benchmarks.ros2_latency"
 IMAGE_HZ, POSE_HZ, LIMIT_MS = 10.0, 100.0, 10.0

@@ -15,20 +15,19 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from calibration.schema import VehicleCalibration, load_calibration
 from nodes.linking.link import on_our_clock
-from nodes.linking.ros2.answers import Answers, OneWriter, stamp_of_cdr
-from nodes.linking.ros2.conversions import COMPRESSED, IMAGE, Setting, conversion
+from nodes.linking.ros2.answers import stamp_of_cdr
+from nodes.linking.ros2.carried import Rate, Sent, Taken
+from nodes.linking.ros2.conversions import Setting
 from nodes.linking.ros2.routes import SAFETY_DRIVE, SendRoute, TakeRoute, check_routes, needs_wheelbase
 from nodes.linking.ros2.samples import Heard
 from nodes.runtime.clock import NS_PER_S
 from nodes.runtime.errors import ConfigError, MessageError, SecurityError
-from nodes.runtime.messages import decode, drive_message, encode, type_hash, type_hash_prefix
+from nodes.runtime.messages import decode, drive_message, encode
 from nodes.runtime.node import ACTIVE, FAULT, READY, Inbox, MessageInfo, Node, NodeContext, Now, Out
 from nodes.runtime.process import run_node_main
 from nodes.runtime.topics import topic as topic_row
 from nodes.runtime.wire import Meta, Relayed
 
-_SMALL_BYTES = 64 * 2**10
-_LARGE = (IMAGE, COMPRESSED)
 _INBOX = 64
 _QUEUE = 4
 _ACTIVE_S = 1.0
@@ -98,82 +97,6 @@ class Side(Protocol):
         ...
 
 
-class _Taken:
-    """State of one taken topic."""
-
-    def __init__(self, route: TakeRoute, setting: Setting) -> None:
-        self.route, self._setting = route, setting
-        self.writer = OneWriter()
-        self.rivals: tuple[str, ...] = ()
-        self.answers = Answers(route.max_age_s) if route.answers else None
-        self.sequence = 0
-        self.passed_ns: int | None = None
-        self.mismatch = ""
-        self._hash = type_hash(route.ros_type)
-        self.prefix = type_hash_prefix(route.table_type)
-        self._most_bytes = 16 * 2**20 if route.ros_type in _LARGE else _SMALL_BYTES
-        self._convert = (
-            conversion(route.table_type, route.ros_type, outward=False) if route.converts else None
-        )
-
-    @property
-    def problem(self) -> str:
-        """Why nothing of the topic may pass; empty if it may."""
-        if self.rivals:
-            return f"somebody else publishes what it answers ({self.route.answers}): {', '.join(self.rivals[:4])}; stop that program, then arm again"
-        return self.writer.problem
-
-    def cdr(self, heard: Heard) -> bytes:
-        """CDR bytes of the topic's own type. A message that must not pass is a `MessageError`."""
-        self.writer.present = heard.present
-        if refusal := self.problem or self.writer.refusal(heard.writer):
-            raise MessageError(refusal)
-        if heard.stated_hash not in ("", self._hash):
-            raise MessageError(
-                f"its publisher has another definition of {self.route.ros_type}; use the same version of the message package"
-            )
-        if len(heard.cdr) > self._most_bytes:
-            raise MessageError(f"expected at most {self._most_bytes} bytes, got {len(heard.cdr)}")
-        message = decode(self.route.ros_type, heard.cdr)
-        converted = heard.cdr if self._convert is None else encode(self._convert(message, self._setting))
-        if self.answers is not None and (
-            refusal := self.answers.refusal(stamp_of_cdr(heard.cdr), heard.mono_ns)
-        ):
-            raise MessageError(refusal)
-        return converted
-
-
-class _Sent:
-    """State of one sent topic."""
-
-    def __init__(self, route: SendRoute, setting: Setting) -> None:
-        self.route, self._setting = route, setting
-        self.max_age_s = topic_row(route.topic).max_age_s
-        self._convert = conversion(route.table_type, route.ros_type, outward=True) if route.converts else None
-
-    def cdr(self, raw: bytes) -> bytes:
-        """CDR bytes of the type in ROS."""
-        if self._convert is None:
-            return raw
-        return encode(self._convert(decode(self.route.table_type, raw), self._setting))
-
-
-class _Rate:
-    """Skips messages that come faster than a rate."""
-
-    def __init__(self, rate_hz: float | None) -> None:
-        # A tenth of a period early counts as on time, because messages arrive on another grid.
-        self._least_ns = 0 if rate_hz is None else round(0.9 / rate_hz * NS_PER_S)
-        self._passed_ns: int | None = None
-
-    def due(self, mono_ns: int) -> bool:
-        """Whether a message may pass now."""
-        if self._passed_ns is not None and mono_ns - self._passed_ns < self._least_ns:
-            return False
-        self._passed_ns = mono_ns
-        return True
-
-
 class Ros2Node(Node):
     """Carries messages between the bus of this host and DDS.
 
@@ -203,12 +126,12 @@ class Ros2Node(Node):
         self.queues = {
             name: _QUEUE for name in self.subscriptions if name != SAFETY_DRIVE and topic_row(name).latest
         }
-        self._sent: dict[str, list[tuple[int, _Sent, _Rate]]] = defaultdict(list)
+        self._sent: dict[str, list[tuple[int, Sent, Rate]]] = defaultdict(list)
         for number, send in enumerate(config.send):
             setting = Setting(wheelbase_m, send.child_frame, send.frame)
-            self._sent[send.topic].append((number, _Sent(send, setting), _Rate(send.rate_hz)))
+            self._sent[send.topic].append((number, Sent(send, setting), Rate(send.rate_hz)))
         setting = Setting(wheelbase_m)
-        self._taken = [(_Taken(route, setting), _Rate(route.rate_hz)) for route in config.take]
+        self._taken = [(Taken(route, setting), Rate(route.rate_hz)) for route in config.take]
         self._counts: Counter[str] = Counter()
         self._last_refusal = ""
         self._active_ns: int | None = None
@@ -335,7 +258,7 @@ class Ros2Node(Node):
         finally:
             self._side.close()
 
-    def _send(self, number: int, sent: _Sent, info: MessageInfo) -> None:
+    def _send(self, number: int, sent: Sent, info: MessageInfo) -> None:
         topic = sent.route.topic
         for taken, _ in self._taken:
             if taken.answers is not None and taken.route.answers == topic:
@@ -356,9 +279,10 @@ class Ros2Node(Node):
             self._side.write(number, sent.cdr(raw))
             self._counts["stops"] += 1
 
-    def _meta(self, taken: _Taken, heard: Heard) -> Meta:
-        # Another publisher counts as a restart: whoever armed the car meant the earlier one.
-        instance_id = int.from_bytes(hashlib.sha256(heard.writer.encode()).digest()[:8], "big")
+    def _meta(self, taken: Taken, heard: Heard) -> Meta:
+        # Another publisher counts as a restart: whoever armed the car meant the earlier one. Many together count as one.
+        writer = "" if taken.writer.shared else heard.writer
+        instance_id = int.from_bytes(hashlib.sha256(writer.encode()).digest()[:8], "big")
         # The publisher's clock says how long the message was on its way only if it is our own clock.
         real_ns = heard.source_real_ns if self._on_this_host else heard.real_ns
         meta = Meta(0, min(max(real_ns, 0), heard.real_ns), taken.sequence, taken.prefix, instance_id)

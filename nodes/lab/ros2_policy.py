@@ -99,7 +99,7 @@ class Ros2Network(nn.Module):
         )
 
     def _answer(self, heard: Heard) -> float | None:
-        if problem := OneWriter(heard.present).problem:
+        if problem := OneWriter(present=heard.present).problem:
             raise BusError(f"{self._names[1]}: {problem}")
         if stamp_of_cdr(heard.cdr) != self._stamp_ns:
             return None
@@ -116,6 +116,7 @@ def ros2_policy(
     images: str = "/image_raw",
     commands: str = "/cmd_vel",
     command_type: str = TWIST,
+    view: PolicyView | None = None,
 ) -> AdaptedPolicy:
     """A running ROS 2 program as a policy: a black box that sees the whole camera image.
 
@@ -126,11 +127,13 @@ def ros2_policy(
         images: ROS name of the images.
         commands: ROS name of its commands.
         command_type: Type of its commands.
+        view: What the program is sent; none sends whole camera images. A program that takes its network's own input size is asked faster,
+            because the scene is rendered at that size.
     """
     found = load_calibration(CameraCalibration, Path(camera)).pinhole
-    view = PolicyView(
+    whole = PolicyView(
         found, crop_top_px=0, crop_height_px=found.height, width=found.width, height=found.height
     )
     wheelbase_m = load_calibration(VehicleCalibration, Path(vehicle)).wheelbase_m
     network = Ros2Network(domain_id, images, commands, command_type, wheelbase_m)
-    return adapt(network, PolicyContract(view, differentiable=False))
+    return adapt(network, PolicyContract(view or whole, differentiable=False))

@@ -75,15 +75,17 @@ class OneWriter:
     """Accepts the only publisher of a topic. With two of them, none counts: nobody can say which one the operator means.
 
     Attributes:
+        shared: Accept any number of publishers instead.
         present: Publishers that exist, by their DDS identity.
     """
 
+    shared: bool = False
     present: tuple[str, ...] = field(default=())
 
     @property
     def problem(self) -> str:
         """Why no message counts; empty if messages of the only publisher do."""
-        if len(self.present) < 2:
+        if self.shared or len(self.present) < 2:
             return ""
         return f"{len(self.present)} publishers ({', '.join(self.present[:4])}); keep only the one that may drive, then arm again"
 

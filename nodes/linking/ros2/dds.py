@@ -29,11 +29,11 @@ from cyclonedds.util import duration
 from nodes.linking.ros2.idl import bytes_type, dds_topic
 from nodes.linking.ros2.routes import Endpoint
 from nodes.linking.ros2.samples import Heard
+from nodes.linking.sockets import MOST_BYTES
 from nodes.runtime.errors import BusError, SecurityError
 from nodes.runtime.inbox import Inbox, ReaderThread
 from nodes.runtime.messages import type_hash
 
-MOST_BYTES = 16 * 2**20
 _WAIT_MS = 100
 # A flood may not keep the interpreter busy: after a full batch the reader rests, and the middleware keeps the newest samples.
 _REST_S = 0.002
@@ -94,7 +94,7 @@ class Participant:
         try:
             self._domain = Domain(domain_id, domain_config(interface, local))
             self._participant = DomainParticipant(domain_id, qos=Qos(Policy.Userdata(b"enclave=/;")))
-            if local:
+            if local:  # before there is a reader that a packet from elsewhere could reach
                 _bind_to_device(_udp_sockets() - before, interface)
             self._writers = [_writer(self._participant, each) for each in sends]
             self._readers = [_Reader(number, self._participant, each) for number, each in enumerate(takes)]

@@ -29,6 +29,8 @@ SENSORS = (
     "/diagnostics",
 )
 """Topics with measurements that ROS 2 may supply. No other topic comes in: none that arms, none that stands for a person's hand."""
+SHARED = ("/diagnostics",)
+"""Topics that many ROS programs publish at the same time. No decision depends on them."""
 
 _SENSOR_DATA = (IMAGE, COMPRESSED, "sensor_msgs/msg/CameraInfo")
 _ROS_NAME = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")

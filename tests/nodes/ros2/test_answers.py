@@ -60,6 +60,11 @@ def test_of_two_publishers_none_counts():
     assert one.refusal("b") == one.problem
 
 
+def test_a_shared_topic_has_any_number_of_publishers():
+    many = OneWriter(shared=True, present=("a", "b"))
+    assert many.problem == many.refusal("a") == many.refusal("b") == ""
+
+
 def test_the_stamp_is_read_without_decoding():
     cdr = encode(drive_message(0.5, 0.1, 1_795_000_000_123_456_789))
     assert stamp_of_cdr(cdr) == 1_795_000_000_123_456_789

@@ -10,13 +10,13 @@ import time
 import numpy as np
 import pytest
 
+from benchmarks.rclpy_peer import ROOT
 from nodes.linking.ros2.routes import Endpoint
 from nodes.ros2 import Ros2Config, Ros2Node
 from nodes.runtime.errors import BusError, ConfigError
 from nodes.runtime.inbox import Inbox
 from nodes.runtime.messages import decode, encode, image_message, stamp_ns, type_hash
 from nodes.runtime.node import NodeContext
-from tests.support.rclpy_peer import ROOT
 
 pytest.importorskip("cyclonedds")
 from nodes.linking.ros2 import dds

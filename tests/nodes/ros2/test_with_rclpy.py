@@ -16,12 +16,12 @@ import yaml
 
 from advnerf_core.geometry import planar_pose
 from benchmarks.operator import LiveOperator
+from benchmarks.rclpy_peer import PEERS, ROOT, RclpyPeer, rclpy_python
 from benchmarks.ros2_strangers import free_port
 from nodes.bags import read_info, read_messages
 from nodes.runtime.bus import Bus
 from nodes.runtime.messages import decode, drive_message, image_message, pose_message, stamp_ns, types
 from nodes.runtime.messages import header as make_header
-from tests.support.rclpy_peer import PEERS, ROOT, RclpyPeer, rclpy_python
 
 pytestmark = [
     pytest.mark.ros2,

@@ -8,7 +8,7 @@ import subprocess
 import threading
 from pathlib import Path
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[1]
 PEERS = Path(__file__).parent / "rclpy_peers"
 
 
