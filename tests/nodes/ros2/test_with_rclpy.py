@@ -295,6 +295,36 @@ def test_a_car_in_ros_obeys_the_safety_node_only(tmp_path, peer_of):
         launch.wait(30.0)
 
 
+def test_a_policy_in_ros_answers_as_a_black_box(tmp_path, peer_of):
+    torch = pytest.importorskip("torch")
+    from advnerf_core.policies.load import load_driver
+    from advnerf_core.policies.view import PolicyView
+    from nodes.lab.ros2_policy import ros2_policy
+
+    onnx = tmp_path / "policy.onnx"
+    command = [
+        sys.executable,
+        "-m",
+        "nodes.cli.main",
+        "policy",
+        "export",
+        str(REFERENCE),
+        "--onnx",
+        str(onnx),
+    ]
+    subprocess.run(command, cwd=ROOT, check=True)
+    peer_of(ROOT / "examples" / "ros2_policy.py", str(onnx), domain=DOMAIN + 3)
+    policy = ros2_policy(VEHICLE.parent / "camera.yaml", VEHICLE, domain_id=DOMAIN + 3)
+    itself = load_driver(onnx)
+    images = np.random.default_rng(1).integers(0, 256, (5, 188, 336, 3), dtype=np.uint8)
+    asked = policy(torch.from_numpy(np.moveaxis(images, -1, 1) / np.float32(255.0)))
+    assert not policy.differentiable
+    assert isinstance(policy.contract.view, PolicyView)
+    expected = [itself.steer(itself.view.image(image), ()) for image in images]
+    assert asked.tolist() == pytest.approx(expected, abs=1e-4)
+    assert np.ptp(expected) > 1e-3
+
+
 def test_a_policy_in_ros_drives_the_lab_and_the_drive_is_recorded(tmp_path, peer_of):
     onnx = tmp_path / "policy.onnx"
     advnerf = [sys.executable, "-m", "nodes.cli.main"]
