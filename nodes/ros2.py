@@ -7,6 +7,7 @@ publisher is the only one; then the safety node decides. No message from DDS can
 from __future__ import annotations
 
 import hashlib
+import secrets
 from collections import Counter, defaultdict
 from pathlib import Path
 from typing import Any, Protocol
@@ -106,6 +107,7 @@ class Ros2Node(Node):
         inbox: Queue of batches from the DDS end.
         wheelbase_m: Distance of the axles [m].
         on_this_host: Whether every publisher runs on this computer, so that its clock is ours.
+        instance: Random text of this process. A restart of this node counts as a restart of the publishers.
     """
 
     raw = True
@@ -118,7 +120,9 @@ class Ros2Node(Node):
         inbox: Inbox[list[Heard]],
         wheelbase_m: float = 0.0,
         on_this_host: bool = True,
+        instance: str = "",
     ) -> None:
+        self._instance = instance
         self._config, self.inbox, self._side, self._on_this_host = config, inbox, side, on_this_host
         self.subscriptions = tuple(dict.fromkeys(route.topic for route in config.send))
         self.publications = tuple(route.topic for route in config.take)
@@ -164,7 +168,7 @@ class Ros2Node(Node):
             inbox,
             sorted({number for route in config.take for number in answered(config, route)}),
         )
-        return cls(config, side, inbox, wheelbase_m, local)
+        return cls(config, side, inbox, wheelbase_m, local, secrets.token_hex(8))
 
     def handle(self, topic: str, message: Any, info: MessageInfo, now: Now) -> list[Out]:
         """Send a message to ROS 2, unless it is too old."""
@@ -282,7 +286,9 @@ class Ros2Node(Node):
     def _meta(self, taken: Taken, heard: Heard) -> Meta:
         # Another publisher counts as a restart: whoever armed the car meant the earlier one. Many together count as one.
         writer = "" if taken.writer.shared else heard.writer
-        instance_id = int.from_bytes(hashlib.sha256(writer.encode()).digest()[:8], "big")
+        instance_id = int.from_bytes(
+            hashlib.sha256(f"{self._instance} {writer}".encode()).digest()[:8], "big"
+        )
         # The publisher's clock says how long the message was on its way only if it is our own clock.
         real_ns = heard.source_real_ns if self._on_this_host else heard.real_ns
         meta = Meta(0, min(max(real_ns, 0), heard.real_ns), taken.sequence, taken.prefix, instance_id)

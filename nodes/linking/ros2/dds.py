@@ -1,4 +1,4 @@
-"""The DDS end of the ROS 2 node: one participant with its readers and writers. The only module that imports ``cyclonedds``.
+"""The DDS end of the ROS 2 node: one participant with its readers and writers. With `idl` the only module that imports ``cyclonedds``.
 
 On the loopback interface the participant hears this computer alone. Cyclone DDS sends on the chosen interface, but its sockets
 receive from every one, so they are bound to the loopback device as well.
@@ -35,6 +35,7 @@ from nodes.runtime.inbox import Inbox, ReaderThread
 from nodes.runtime.messages import type_hash
 
 _WAIT_MS = 100
+_ATTEMPTS = 10
 # A flood may not keep the interpreter busy: after a full batch the reader rests, and the middleware keeps the newest samples.
 _REST_S = 0.002
 _LOOPBACK_FLAG = 0x8
@@ -188,7 +189,9 @@ class _Reader:
 
     def present(self) -> tuple[str, ...]:
         """Identities of the publishers, in a fixed order."""
-        return tuple(sorted(self._identity(handle)[0] for handle in self._handles()))
+        found = {handle: self._identity(handle) for handle in self._handles()}
+        self._known = found  # publishers that left are forgotten
+        return tuple(sorted(identity for identity, _ in found.values()))
 
     def mismatch(self) -> str:
         """Why publishers are not heard; empty if there are none of these."""
@@ -199,18 +202,26 @@ class _Reader:
         return ""
 
     def _handles(self) -> list[int]:
-        return [handle & 0xFFFFFFFFFFFFFFFF for handle in self._reader.get_matched_publications()]
+        for _ in range(_ATTEMPTS):
+            try:
+                found = self._reader.get_matched_publications()
+            except IndexError:  # another publisher came while the binding counted them
+                continue
+            return [handle & 0xFFFFFFFFFFFFFFFF for handle in found]
+        raise BusError(
+            f"cannot count the publishers of {self._endpoint.ros}: they change too fast; look for the program that restarts"
+        )
 
     def _identity(self, handle: int) -> tuple[str, str]:
         """Identity of a publisher, and the ROS hash of its type if it states one."""
-        if handle not in self._known:
-            data = self._reader.get_matched_publication_data(handle)
-            if data is None:
-                return f"handle {handle:x}", ""
-            stated = data.qos[Policy.Userdata].data if Policy.Userdata in data.qos else b""
-            found = _TYPE_HASH.search(bytes(stated).decode("ascii", "replace"))
-            self._known[handle] = (data.key.hex, found[1] if found else "")
-        return self._known[handle]
+        if (known := self._known.get(handle)) is not None:
+            return known
+        data = self._reader.get_matched_publication_data(handle)
+        if data is None:
+            return f"handle {handle:x}", ""
+        stated = data.qos[Policy.Userdata].data if Policy.Userdata in data.qos else b""
+        found = _TYPE_HASH.search(bytes(stated).decode("ascii", "replace"))
+        return data.key.hex, found[1] if found else ""
 
 
 def _any_qos(endpoint: Endpoint) -> Endpoint:

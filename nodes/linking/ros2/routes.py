@@ -87,7 +87,7 @@ class _Route(BaseModel):
             raise ValueError(
                 f"expected an absolute ROS name such as /car/image_raw for {self.topic}, got {self.ros_name!r}; correct 'ros'"
             )
-        ours, theirs = self._direction()
+        ours, theirs = self.table_type, self.ros_type
         if ours != theirs and theirs not in convertible(ours, self._outward()):
             known = ", ".join((self.table_type, *convertible(ours, self._outward())))
             raise ValueError(
@@ -97,9 +97,6 @@ class _Route(BaseModel):
 
     def _outward(self) -> bool:
         raise NotImplementedError
-
-    def _direction(self) -> tuple[str, str]:
-        return self.table_type, self.ros_type
 
     @property
     def ros_name(self) -> str:
