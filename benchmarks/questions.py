@@ -36,6 +36,7 @@ QUESTIONS = (
             "closed_loop_cosine",
             "mesh_render",
             "black_box",
+            "ros2_black_box",
         ),
     ),
     Question(
