@@ -10,7 +10,7 @@ DEFAULT_TESTS := not slow and not gpu and not hardware and not data and not ros2
 .PHONY: help setup demo experiment evidence test test-slow test-gpu test-hardware setup-ros2 test-ros2 check bench bench-quick campaign rooms api docs fmt clean
 
 help:  ## Show this list
-	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
+	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
 
 # The stamp depends on what is installed, so that a changed dependency is installed by the next command.
 setup: $(VENV)/.installed  ## Install everything into .venv (and the EGL packages when root on Debian or Ubuntu)
