@@ -1,5 +1,6 @@
 """A DDS program: sends every image back as the bytes that it got. ``python -m tests.support.dds_echo DOMAIN``."""
 
+import select
 import sys
 
 from nodes.linking.ros2.dds import Participant
@@ -10,26 +11,16 @@ IMAGE = "sensor_msgs/msg/Image"
 
 
 def main():
-    inbox = Inbox(100)
+    inbox, domain = Inbox(100), int(sys.argv[1])
     participant = Participant(
-        int(sys.argv[1]),
-        "lo",
-        [Endpoint("/echo", IMAGE, True, 10)],
-        [Endpoint("/image_raw", IMAGE, True, 10)],
-        inbox,
+        domain, "lo", [Endpoint("/echo", IMAGE, True, 10)], [Endpoint("/image_raw", IMAGE, True, 10)], inbox
     )
     print("ready", flush=True)
-    while sys.stdin not in select([sys.stdin], 0.002):
+    while not select.select([sys.stdin], [], [], 0.002)[0]:
         for batch in inbox.take():
             for heard in batch:
                 participant.write(0, heard.cdr)
     participant.close()
-
-
-def select(files, timeout_s):
-    import select
-
-    return select.select(files, [], [], timeout_s)[0]
 
 
 if __name__ == "__main__":
