@@ -5,12 +5,12 @@ BIN := $(VENV)/bin
 export MUJOCO_GL ?= egl
 # Kept byte code, whatever the shell asks for: the second run of pytest need not rewrite the assertions of 365 files again.
 export PYTHONDONTWRITEBYTECODE :=
-DEFAULT_TESTS := not slow and not gpu and not hardware and not data and not browser
+DEFAULT_TESTS := not slow and not gpu and not hardware and not data and not browser and not ros2
 
-.PHONY: help setup demo experiment evidence test test-slow test-gpu test-hardware test-browser check bench bench-quick campaign rooms api docs fmt clean
+.PHONY: help setup demo experiment evidence test test-slow test-gpu test-hardware test-browser setup-ros2 test-ros2 check bench bench-quick campaign rooms api docs fmt clean
 
 help:  ## Show this list
-	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
+	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
 
 # The stamp depends on what is installed, so that a changed dependency is installed by the next command.
 setup: $(VENV)/.installed  ## Install everything into .venv (and the EGL packages when root on Debian or Ubuntu)
@@ -53,6 +53,17 @@ test-hardware: setup  ## The tests that need a real device; each says which, and
 test-browser: setup  ## The tests that drive the operator page in Chromium (apt-get install chromium)
 	@$(BIN)/pytest -q -m 'browser' --timeout 300
 
+# rclpy cannot share our environment: it has packages of ROS in the versions of one distribution.
+ROS2_VENV ?= .venv-ros2
+setup-ros2: $(ROS2_VENV)/.installed  ## Install rclpy from PyPI into .venv-ros2 (x86-64 Linux, Python 3.10 to 3.12)
+$(ROS2_VENV)/.installed: benchmarks/rclpy_peers/requirements.txt
+	@test -x $(ROS2_VENV)/bin/python || $(PYTHON) -m venv $(ROS2_VENV)
+	@$(ROS2_VENV)/bin/pip install -q --disable-pip-version-check -r $<
+	@touch $@
+
+test-ros2: setup setup-ros2  ## The tests with real rclpy programs as peers (two minutes)
+	@ADVNERF_RCLPY_PYTHON=$(ROS2_VENV)/bin/python $(BIN)/pytest -q -m 'ros2' --timeout 300
+
 check: setup  ## Lint, types (also of the Python in the pages), import contracts
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check .
@@ -84,4 +95,4 @@ fmt: setup  ## Format and fix what can be fixed
 	@$(BIN)/ruff format .
 
 clean:  ## Remove the environment and every run
-	rm -rf $(VENV) runs
+	rm -rf $(VENV) $(ROS2_VENV) runs

@@ -36,6 +36,7 @@ QUESTIONS = (
             "closed_loop_cosine",
             "mesh_render",
             "black_box",
+            "ros2_black_box",
         ),
     ),
     Question(
@@ -102,6 +103,7 @@ QUESTIONS = (
             "pose_jumps",
             "requests",
             "strangers",
+            "ros2_strangers",
             "thirty_minutes",
             "page_faults",
             "page_strangers",
@@ -117,6 +119,7 @@ QUESTIONS = (
             "launch_times",
             "car_nodes",
             "two_hosts",
+            "ros2_latency",
             "lockstep_replay",
             "calibrations",
             "policy_from_bags",

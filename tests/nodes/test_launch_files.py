@@ -39,6 +39,12 @@ LAUNCH = Path(__file__).parents[2] / "launch"
             },
         ),
         ("robot", None, {"camera", "vicon", "safety", "motor", "recorder"}),
+        (
+            "ros2",
+            None,
+            {"twin", "camera", "vicon", "compositor", "ros2", "safety", "motor", "recorder"},
+        ),
+        ("ros2_car", None, {"compositor", "policy", "ros2", "safety", "recorder"}),
         ("workstation", None, {"compositor", "policy", "player", "recorder"}),
         ("two_hosts", "robot", {"camera", "vicon", "safety", "motor", "gateway"}),
         ("two_hosts", "workstation", {"compositor", "policy", "gateway", "recorder"}),
@@ -73,10 +79,27 @@ def test_the_page_holds_the_button_that_the_safety_node_waits_for():
     assert plan.documents["page"].data["host"] == "127.0.0.1"
 
 
+@pytest.mark.parametrize("file", ["ros2", "ros2_car"])
+def test_the_safety_node_watches_the_one_that_speaks_to_ros(file):
+    plan = load_launch(LAUNCH / f"{file}.launch.yaml")
+    watched = set(plan.documents["safety"].data["nodes"])
+    assert "ros2" in watched
+    assert watched <= set(plan.nodes)
+    assert plan.documents["ros2"].data.get("interface", "lo") == "lo"
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("file", "host"),
-    [("monitor", None), ("page", None), ("robot", None), ("workstation", None), ("two_hosts", "all")],
+    [
+        ("monitor", None),
+        ("page", None),
+        ("robot", None),
+        ("workstation", None),
+        ("two_hosts", "all"),
+        ("ros2", None),
+        ("ros2_car", None),
+    ],
 )
 def test_every_node_accepts_its_configuration(file, host):
     assert check_nodes(load_launch(LAUNCH / f"{file}.launch.yaml", host=host)) == {}

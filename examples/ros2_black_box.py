@@ -1,0 +1,30 @@
+"""A policy that runs in ROS 2 as a black box: the factory to name wherever advnerf asks for a policy.
+
+    .venv/bin/python examples/ros2_black_box.py
+    .venv-ros2/bin/python examples/ros2_policy.py policy.onnx
+
+Start the second line in another terminal; the first one asks it for its steering. Then attack it, with images of a learned scene:
+
+    .venv/bin/advnerf attack run launch/corner.attack.yaml -o runs/black_ros2 \\
+        --set policy=examples.ros2_black_box:factory --set search.method=cem --set search.evaluations=50
+"""
+
+from __future__ import annotations
+
+import torch
+
+from advnerf_core.policies.adapter import AdaptedPolicy
+from nodes.lab.ros2_policy import ros2_policy
+
+
+def factory() -> AdaptedPolicy:
+    """The program on domain 0 that drives the simulated lab's car."""
+    return ros2_policy("calibration/twin/camera.yaml", "calibration/twin/vehicle.yaml", domain_id=0)
+
+
+if __name__ == "__main__":
+    policy = factory()
+    camera = policy.contract.view.camera
+    for name, value in (("black", 0.0), ("grey", 0.5), ("white", 1.0)):
+        image = torch.full((1, 3, camera.height, camera.width), value)
+        print(f"{name:5s} image: {float(policy(image)):+.4f} rad")
