@@ -35,22 +35,6 @@ COMMAND = "python -m benchmarks.ros2_black_box"
 SPEED_MPS, SIGMA = 0.8, 0.1
 
 
-class Goalless(torch.nn.Module):
-    """A policy without goals for drives that hand each policy its goals, also none."""
-
-    stateless, goal_size = True, 0
-
-    def __init__(self, policy: AdaptedPolicy) -> None:
-        super().__init__()
-        self._policy = policy
-
-    def forward(self, images: torch.Tensor, goals: torch.Tensor | None = None) -> torch.Tensor:
-        """Steering ``[B]`` [rad]."""
-        del goals
-        found: torch.Tensor = self._policy(images)
-        return found
-
-
 def drive_starts(
     folder: Path, attack: AttackFile, policy: AdaptedPolicy, count: int, ticks: int
 ) -> list[tuple[float, float]]:
@@ -62,7 +46,7 @@ def drive_starts(
     face = cube_face_object(size_m, carrier.theta.shape[0], plain_rgb, carrier.T_world_from_object)
     x_m, y_m, yaw_rad = room.start_pose
     starts = draw_start_states((x_m, y_m, yaw_rad), count, SIGMA, 1).numpy()
-    driver = Goalless(policy)
+    driver = policy
     found, horizon = [], Horizon(ticks, off_track_m=room.off_track_m)
     with LabWorld() as world:
         dressed = DressedScene(world, policy.contract.view, [face])

@@ -201,8 +201,9 @@ def attack_problem(
     )
 
 
-def _goals(experiment: Experiment, scenario: str, count: int) -> torch.Tensor:
-    return torch.tensor([experiment.goal(scenario)], dtype=torch.float32).expand(count, -1)
+def _goals(experiment: Experiment, scenario: str, count: int) -> torch.Tensor | None:
+    goal = experiment.goal(scenario)
+    return torch.tensor([goal], dtype=torch.float32).expand(count, -1) if goal else None
 
 
 def from_measured_starts(experiment: Experiment, scenario: str, problem: AttackProblem) -> AttackProblem:

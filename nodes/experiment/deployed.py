@@ -229,7 +229,7 @@ def drive_deployed(
     Args:
         dressed: The scene with its objects.
         policy: The victim.
-        goal: What it is told.
+        goal: What it is told; empty if it is told nothing.
         start: Pose ``[3]``.
         path: What it should follow.
         limits: Ticks and limits.
@@ -239,7 +239,7 @@ def drive_deployed(
     """
     car = SelfDriving(dressed.scene, speed_mps, limits.dt_s)
     car.start(np.asarray(start))
-    goals = torch.tensor([tuple(goal)], dtype=torch.float32)
+    goals = torch.tensor([tuple(goal)], dtype=torch.float32) if goal else None
     first = torch.from_numpy(np.array(start, dtype=np.float64))[None]
     seen = (
         partial(dressed.seen_now, theta) if camera is None else _through(camera, dressed, theta, limits.dt_s)

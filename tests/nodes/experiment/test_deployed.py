@@ -89,6 +89,18 @@ def test_drive_is_that_of_the_scenes_own_car(wall: Any) -> None:
     assert policy.brightness[-1] > policy.brightness[0]  # the bright wall comes nearer
 
 
+def test_a_policy_without_goals_is_given_none(wall: Any) -> None:
+    class Goalless(Steady):
+        def __call__(self, images: torch.Tensor, goals: torch.Tensor | None = None) -> torch.Tensor:
+            assert goals is None
+            return super().__call__(images, torch.full((1, 1), 0.4))
+
+    limits = Horizon(ticks=3, dt_s=0.1, off_track_m=1.75, held_cap_m=6.0)
+    alone = drive_deployed(dressed(wall), Goalless(), (), np.zeros(3), STRAIGHT, limits, 6.0, None)
+    told = drive_deployed(dressed(wall), Steady(), (0.4,), np.zeros(3), STRAIGHT, limits, 6.0, None)
+    assert np.array_equal(alone.states, told.states)
+
+
 def test_a_blocked_car_is_charged_what_it_had(make_wall: Any) -> None:
     limits = Horizon(ticks=6, dt_s=0.1, off_track_m=1.75, held_cap_m=6.0)
     done = drive_deployed(
