@@ -20,7 +20,7 @@ from nodes.runtime.errors import MessageError
 
 _CREDIT = 2
 _STAMPS_KEPT = 256
-_MALFORMED_LIMIT = 20
+_MALFORMED_LIMIT = 100
 # A page sends about 20 answers to beats and 30 acknowledged pictures a second, and a person no ten acts.
 _RATE_HZ, _BURST = 120.0, 240.0
 _ACT_RATE_HZ, _ACT_BURST = 10.0, 40.0
