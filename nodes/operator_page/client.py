@@ -16,7 +16,7 @@ from typing import Any, Protocol
 
 from nodes.operator_page.pictures import Picture
 from nodes.operator_page.said import Act, Hold, Seen, Wants, read_said
-from nodes.runtime.errors import MessageError
+from nodes.runtime.errors import MessageError, SecurityError
 
 _CREDIT = 2
 _STAMPS_KEPT = 256
@@ -68,7 +68,7 @@ class Gone:
     client: int
 
 
-class Misuse(Exception):
+class Misuse(SecurityError):
     """A browser sent too much, or too many messages that a page does not send. Its connection is closed."""
 
 
