@@ -16,11 +16,11 @@ from typing import Any, Protocol
 
 from nodes.operator_page.pictures import Picture
 from nodes.operator_page.said import Act, Hold, Seen, Wants, read_said
-from nodes.runtime.errors import MessageError
+from nodes.runtime.errors import MessageError, SecurityError
 
 _CREDIT = 2
 _STAMPS_KEPT = 256
-_MALFORMED_LIMIT = 20
+_MALFORMED_LIMIT = 100
 # A page sends about 20 answers to beats and 30 acknowledged pictures a second, and a person no ten acts.
 _RATE_HZ, _BURST = 120.0, 240.0
 _ACT_RATE_HZ, _ACT_BURST = 10.0, 40.0
@@ -68,7 +68,7 @@ class Gone:
     client: int
 
 
-class Misuse(Exception):
+class Misuse(SecurityError):
     """A browser sent too much, or too many messages that a page does not send. Its connection is closed."""
 
 

@@ -287,7 +287,7 @@ def test_a_replayed_or_malformed_message_is_no_act(run, browser):
     for text in ("{}", "nonsense", json.dumps({"t": "arm"})):
         eve.socket.send(text)
     eve.wait(lambda: len([a for a in eve.answers if a["t"] == "refused"]) == 5, "five refusals")
-    for _ in range(20):
+    for _ in range(100):
         eve.tell({"t": "arm"})
     eve.wait(lambda: eve.closed, "the connection to be closed")
     assert len(run.car.acts) == before
