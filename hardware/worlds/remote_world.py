@@ -241,6 +241,11 @@ class RemoteWorld(ABC):
                     "expected the same map as when it was opened before; got another one"
                 )
         self._description = said
+        # The first picture of a camera may take as long as opening, as shaders are compiled for it.
+        place = planar_pose(*next(iter(said.paths.values())).start_pose) @ self._mount
+        for camera in cameras:
+            asked = {"camera": camera, "depth": False}
+            self._call("render", asked, {"T_world_from_camera": place}, self._deadlines.open_s)
 
     def _described(self, answer: Answer) -> WorldDescription:
         try:
