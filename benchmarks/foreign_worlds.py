@@ -25,7 +25,7 @@ VARIANTS: dict[str, dict[str, tuple[str, ...]]] = {
         "without its sky": ("sky=false",),
         "without its grass": ("terrain=false",),
         "one sample per pixel": ("supersampling=1",),
-        "anisotropic filtering": ("anisotropic=true",),
+        "one sample per pixel, anisotropic filtering": ("supersampling=1", "anisotropic=true"),
     },
     "duckietown": {"as it is": (), "one sample per pixel": ("supersampling=1",)},
 }

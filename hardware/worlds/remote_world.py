@@ -29,7 +29,7 @@ from hardware.worlds.remote_answers import (
     state_in,
 )
 from hardware.worlds.remote_errors import RemoteWorldError, ServerLost, ServerProtocolError
-from hardware.worlds.world import Depth, NotOpenError, Panel, Rgb, WorldDescription
+from hardware.worlds.world import Depth, NotOpenError, Panel, Rgb, WorldDescription, WorldError
 
 _World = TypeVar("_World", bound="RemoteWorld")
 _Arrays = Mapping[str, NDArray[Any]]
@@ -241,10 +241,17 @@ class RemoteWorld(ABC):
                     "expected the same map as when it was opened before; got another one"
                 )
         self._description = said
+        # The first picture of a camera may take as long as opening, as shaders are compiled for it.
+        place = planar_pose(*next(iter(said.paths.values())).start_pose) @ self._mount
+        for camera in cameras:
+            asked = {"camera": camera, "depth": False}
+            self._call("render", asked, {"T_world_from_camera": place}, self._deadlines.open_s)
 
     def _described(self, answer: Answer) -> WorldDescription:
         try:
             return self.description_of(answer.result, answer.arrays)
+        except WorldError:
+            raise  # a map that is none for this configuration
         except (KeyError, TypeError, ValueError, IndexError) as error:
             raise ServerProtocolError(
                 f"expected a map that can be driven; got {type(error).__name__}: {error}"
@@ -270,8 +277,10 @@ class RemoteWorld(ABC):
         """An answer that is refused ends the process; the error says of which world it is."""
         try:
             yield
-        except RemoteWorldError as error:
+        except WorldError as error:
             self._lose()
+            if not isinstance(error, RemoteWorldError):
+                raise
             raise type(error)(
                 f"world {self._name}: {error}; its process was ended and the drive does not count; run `advnerf world check {self._name}`"
             ) from None

@@ -60,12 +60,11 @@ class MetaDrive(RemotePanelWorld):
         """The driven stretch of the route, the lanes near it, and the box about it.
 
         Raises:
-            WorldError: The route is shorter than where the stretch begins.
+            WorldError: The route is shorter than where the stretch begins, or the lane ends on the way.
         """
         road, car = self.config.road, self.config.car
         stretch = self._stretch(arrays["route"])
-        x, y, yaw = map(float, stretch[0])
-        path = ReferencePath((x, y, yaw), fit_lines_and_arcs(stretch))
+        path = self._path(stretch)
         lanes = [path_through(line) for line in _near(arrays["middles"], facts["middles"], stretch)]
         low, high = stretch[:, :2].min(axis=0) - _BESIDE_M, stretch[:, :2].max(axis=0) + _BESIDE_M
         return WorldDescription(
@@ -95,6 +94,17 @@ class MetaDrive(RemotePanelWorld):
         return road_photo_poses(
             list(description.paths.values()), 2.0 * description.off_track_m, self.config.camera, count, rng
         )
+
+    def _path(self, stretch: Array) -> ReferencePath:
+        """The driven stretch as lines and arcs."""
+        x, y, yaw = map(float, stretch[0])
+        try:
+            return ReferencePath((x, y, yaw), fit_lines_and_arcs(stretch))
+        except ValueError as error:
+            raise WorldError(
+                f"expected a lane that goes on along the whole stretch; lane {self.config.road.lane} of the road {self.config.road.blocks!r} does not "
+                f"({error}): name another one in road.lane, or end before with road.length_m"
+            ) from error
 
     def _stretch(self, route: Array) -> Array:
         """Poses ``[N, 3]`` of the part of the route that is driven."""

@@ -1,7 +1,6 @@
 """MetaDrive 0.3.0.1 for ``serve.py``: a road by block string and seed, a camera of its own, and a Bullet vehicle under a controller.
 
-Runs in MetaDrive's environment, and imports nothing of advnerf. Coordinates are Panda3D's: x, y and heading are right-handed with z up;
-MetaDrive's own y and heading have the other sign.
+It imports nothing of advnerf. Its axes are Panda3D's, z up; MetaDrive's own y and heading have the other sign.
 """
 
 from __future__ import annotations
@@ -22,8 +21,7 @@ from metadrive.envs.metadrive_env import MetaDriveEnv  # noqa: E402
 from panda3d.core import LQuaternionf, Vec3  # noqa: E402
 from panda_camera import View, panel_card  # noqa: E402
 
-# MetaDrive asks for 8 samples per pixel in its window and for 16 in the pass before its tone curve, which software rendering does not have. Our
-# cameras are not that window: they average several pixels into one, and apply the same curve to the mean.
+# Software rendering has no 16 samples per pixel for the pass before the tone curve; our cameras average pixels and apply that curve to the mean.
 loadPrcFileData("", "framebuffer-multisample 0\nmultisamples 0\nload-display p3headlessgl")
 OurPipeline._setup_tonemapping = lambda self: None
 
@@ -32,11 +30,6 @@ _SETTLING_S, _SPACING_M, _CLEAR_M = 4.0, 1.0, 15.0
 # Force per wheel [N] and brake for an error of speed of 1 m/s; the vehicle's own limits hold.
 _FORCE_PER_MPS, _BRAKE_PER_MPS = 1600.0, 40.0
 Reply = tuple[dict[str, Any], dict[str, np.ndarray]]
-
-
-def open_simulator(config: dict[str, Any], cameras: dict[str, Any]) -> Simulator:
-    """The simulator of one road."""
-    return Simulator(config, cameras)
 
 
 class Simulator:
@@ -55,6 +48,7 @@ class Simulator:
                 "vehicle_config": {"image_source": "main_camera", "vehicle_model": config["car"]["model"], "show_navi_mark": False},
             }
         )  # fmt: skip
+        np.random.seed(road["seed"])  # noqa: NPY002 - MetaDrive draws heights of its lanes and pavements from it
         self._env.reset()
         self._engine = self._env.engine
         fine, mask = config["supersampling"], CamMask.RgbCam
@@ -70,26 +64,32 @@ class Simulator:
 
     def describe(self) -> Reply:
         """Wheelbase [m], the route's lane as poses ``[N, 3]``, and the middles and edges of all lanes, one after the other ``[N, 2]``."""
-        network, route = self._engine.current_map.road_network, []
+        network = self._engine.current_map.road_network
+        route: list[tuple[float, float, float]] = []
         for start, end in pairwise(self._vehicle.navigation.checkpoints):
             lanes = network.graph[start][end]
-            lane = lanes[min(self._config["road"]["lane"], len(lanes) - 1)]
+            wanted = lanes[min(self._config["road"]["lane"], len(lanes) - 1)]
+            lane = _nearest(lanes, route[-1]) if route else wanted
             route += [_pose(lane, s) for s in np.arange(0.0, lane.length - 0.5 * _SPACING_M, _SPACING_M)]
         middles, edges = [], []
         for lanes in (lanes for ends in network.graph.values() for lanes in ends.values()):
             middles += [_line(lane, 0.0) for lane in lanes]
-            edges += [
-                _line(lanes[0], -0.5 * lanes[0].width_at(0.0)),
-                _line(lanes[-1], 0.5 * lanes[-1].width_at(0.0)),
-            ]
-        counts = {"middles": [*map(len, middles)], "edges": [*map(len, edges)]}
-        facts = {"simulator": "MetaDrive 0.3.0.1", "wheelbase_m": self._wheelbase_m, **counts}
+            sides = ((lanes[0], -0.5), (lanes[-1], 0.5))
+            edges += [_line(lane, share * lane.width_at(0.0)) for lane, share in sides]
+        facts = {
+            "middles": [*map(len, middles)],
+            "edges": [*map(len, edges)],
+            "simulator": "MetaDrive 0.3.0.1",
+        }
         lines = {"middles": np.concatenate(middles), "edges": np.concatenate(edges)}
-        return facts, {"route": np.array(route), **lines}
+        return {"wheelbase_m": self._wheelbase_m, **facts}, {"route": np.array(route), **lines}
 
     def render(self, camera: str, depth: bool, T_world_from_camera: np.ndarray) -> Reply:
         """A picture, and its depth where it is wanted; photographs show no traffic."""
-        view, hidden = self._views[camera], self._others() if camera == "photo" else []
+        view, hidden = (
+            self._views[camera],
+            self._engine.traffic_manager.traffic_vehicles if camera == "photo" else [],
+        )
         taken = view.aim(T_world_from_camera)
         view.buffer.setActive(True)
         for other in hidden:
@@ -163,8 +163,7 @@ class Simulator:
         for index in range(4):
             vehicle.system.applyEngineForce(force, index)
             vehicle.system.setBrake(brake, index)
-        for index in (0, 1):
-            vehicle.system.setSteeringValue(math.degrees(wheel_rad), index)
+            vehicle.system.setSteeringValue(math.degrees(wheel_rad) if index < 2 else 0.0, index)
 
     def _follow(self, wheel_rad: float, speed_mps: float) -> None:
         """The ideal car: a kinematic bicycle, exact over each physics step; the Bullet body goes with it, for traffic to see."""
@@ -199,8 +198,7 @@ class Simulator:
 
     def _settled(self) -> float:
         """Height of the vehicle's origin when it stands on its springs [m]."""
-        at = self._vehicle.origin.getPos()
-        forward = self._vehicle.system.getForwardVector()
+        at, forward = self._vehicle.origin.getPos(), self._vehicle.system.getForwardVector()
         self._pose, self._speed_mps = (at[0], at[1], math.atan2(forward[1], forward[0])), 0.0
         self._put(at[2], 0.0)
         for _ in range(round(_SETTLING_S / PHYSICS_S)):
@@ -215,19 +213,13 @@ class Simulator:
         for texture in [] if self._config["anisotropic"] else self._engine.render.findAllTextures():
             texture.setAnisotropicDegree(1)
 
-    def _others(self) -> list[Any]:
-        """The vehicles of the traffic."""
-        return list(self._engine.traffic_manager.traffic_vehicles)
-
     def _restart_traffic(self) -> None:
         """MetaDrive's traffic as it was in the beginning, without vehicles where the car is put down."""
         self._env.reset(force_seed=self._config["road"]["seed"])
         self._prepare()
         manager, x, y = self._engine.traffic_manager, *self._pose[:2]
-        near = [
-            each for each in self._others() if math.dist(tuple(each.origin.getPos())[:2], (x, y)) < _CLEAR_M
-        ]
-        manager._traffic_vehicles = [each for each in self._others() if each not in near]
+        near = [each for each in manager.traffic_vehicles if math.dist(each.position, (x, -y)) < _CLEAR_M]
+        manager._traffic_vehicles = [each for each in manager.traffic_vehicles if each not in near]
         manager.clear_objects([each.id for each in near])
 
     def _move_traffic(self) -> None:
@@ -236,6 +228,11 @@ class Simulator:
             if self._time_steps:
                 self._engine.traffic_manager.after_step()
             self._engine.traffic_manager.before_step()
+
+
+def _nearest(lanes: list[Any], pose: tuple[float, float, float]) -> Any:
+    """Of lanes the one that begins nearest to a pose."""
+    return min(lanes, key=lambda lane: math.dist(_pose(lane, 0.0)[:2], pose[:2]))
 
 
 def _pose(lane: Any, along_m: float) -> tuple[float, float, float]:
@@ -248,3 +245,6 @@ def _line(lane: Any, aside_m: float) -> np.ndarray:
     count = max(round(lane.length / _SPACING_M), 2)
     points = [lane.position(s, aside_m) for s in np.linspace(0.0, lane.length, count + 1)]
     return np.array([(float(x), -float(y)) for x, y in points])
+
+
+open_simulator = Simulator

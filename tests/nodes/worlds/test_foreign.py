@@ -11,7 +11,8 @@ from hardware.worlds.duckietown.world import Duckietown
 from hardware.worlds.environments import ENVIRONMENTS
 from hardware.worlds.metadrive.config import CarConfig, MetaDriveConfig, RoadConfig
 from hardware.worlds.metadrive.world import MetaDrive
-from hardware.worlds.world import NotOpenError
+from hardware.worlds.remote_errors import RemoteWorldError
+from hardware.worlds.world import NotOpenError, WorldError
 from nodes.lab.worlds.check import check_world
 from nodes.lab.worlds.named import read_world
 from nodes.runtime.config import Document, apply_overrides
@@ -80,15 +81,25 @@ def test_a_road_is_the_same_in_every_process_and_another_seed_is_another_road() 
 @installed["metadrive"]
 def test_a_road_that_ends_too_early_is_refused() -> None:
     world = MetaDrive(MetaDriveConfig(road=RoadConfig(blocks="S", from_m=500.0)))
-    with pytest.raises(ValueError, match=r"add blocks, or begin earlier"), world:
+    with pytest.raises(WorldError, match="add blocks, or begin earlier") as refused, world:
         raise AssertionError("it was opened")
+    assert not isinstance(refused.value, RemoteWorldError)
     assert world.server is None
     with pytest.raises(NotOpenError):
         world.describe()
 
 
 @pytest.mark.slow
+@installed["metadrive"]
+def test_a_lane_that_ends_is_refused_and_the_one_beside_it_is_driven() -> None:
+    with pytest.raises(WorldError, match=r"name another one in road\.lane"):
+        MetaDrive(MetaDriveConfig(road=RoadConfig(blocks="y", seed=5))).__enter__()
+    with MetaDrive(MetaDriveConfig(road=RoadConfig(blocks="y", seed=5, lane=0))) as world:
+        assert world.describe().paths["route"].length_m > 40.0
+
+
+@pytest.mark.slow
 @installed["duckietown"]
 def test_a_map_without_a_way_round_is_refused() -> None:
-    with pytest.raises(ValueError, match="name another one, such as small_loop"):
+    with pytest.raises(WorldError, match="name another one, such as small_loop"):
         Duckietown(DuckietownConfig(map_name="straight_road")).__enter__()
