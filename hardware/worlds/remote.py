@@ -26,7 +26,6 @@ import zmq
 from numpy.typing import NDArray
 
 from hardware.worlds.remote_errors import (
-    RemoteWorldError,
     ServerLost,
     ServerProtocolError,
     ServerTimeout,
@@ -273,6 +272,3 @@ def _kill_all(process: subprocess.Popen[bytes]) -> None:
 
 def _how(code: int) -> str:
     return f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
-
-
-__all__ = ["PROTOCOL", "SERVERS", "Answer", "RemoteServer", "RemoteWorldError"]
