@@ -241,7 +241,7 @@ def table_command(
     _show(campaign, cells, None, source)
 
 
-def page(
+def report(
     file: File,
     setting: Setting = "demo",
     folder: Folder = None,
@@ -336,7 +336,7 @@ def _write_and_print(
 def _say_where(full: TransferTable, cells: Sequence[Cell], page: Path | None) -> None:
     print(
         f"{len(full.cells)} of {len(cells)} cells; "
-        + (f"page: {page}" if page else "advnerf page writes a page of them")
+        + (f"page: {page}" if page else "advnerf report writes a page of them")
     )
 
 
@@ -422,6 +422,6 @@ def publish(
 
 def add_to(app: typer.Typer) -> None:
     """Add the commands."""
-    for command in (experiment, status, page, predict, maps, publish):
+    for command in (experiment, status, report, predict, maps, publish):
         app.command()(command)
     app.command(name="table")(table_command)

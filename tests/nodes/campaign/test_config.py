@@ -144,16 +144,16 @@ def test_a_page_of_some_cells_does_not_take_the_place_of_the_page_of_all(bench, 
         assert done.exit_code == 0, done.output
         return done.output
 
-    assert "of 4 cells; page: " in call("page")
+    assert "of 4 cells; page: " in call("report")
     whole = (bench.cells.parent / "table" / "table.json").read_text()
     assert {row["method"] for row in json.loads(whole)["rows"]} == {"none", "gradient"}
     said = call("table", "--only", "method=gradient")
     assert said.count(" missing ") == 2  # in either domain
-    assert "0 of 2 cells; advnerf page writes a page of them" in said
+    assert "0 of 2 cells; advnerf report writes a page of them" in said
     assert (bench.cells.parent / "table" / "table.json").read_text() == whole
     with pytest.raises(ConfigError, match="expected --output with --only"):
-        CliRunner().invoke(app, ["page", str(bench.file), "--only", "seed=0"], catch_exceptions=False)
-    call("page", "--only", "method=gradient", "-o", str(tmp_path / "some"))
+        CliRunner().invoke(app, ["report", str(bench.file), "--only", "seed=0"], catch_exceptions=False)
+    call("report", "--only", "method=gradient", "-o", str(tmp_path / "some"))
     assert {row["method"] for row in json.loads((tmp_path / "some" / "table.json").read_text())["rows"]} == {
         "gradient"
     }

@@ -125,7 +125,7 @@ def test_a_published_cell_whose_key_matches_is_done_on_any_machine(here, tmp_pat
     shutil.rmtree(here.cells)
     assert "2 of 2 cells" in command("table", here.file, *only)
     assert "2 of 2 cells" in command("table", here.file, "--from", kept, *only)
-    said = command("page", here.file, "-o", tmp_path / "page")
+    said = command("report", here.file, "-o", tmp_path / "page")
     assert f"2 of 4 cells; page: {tmp_path / 'page' / 'index.html'}" in said.replace("\n", "")
     rows = list(csv.DictReader((tmp_path / "page" / "table.csv").open()))
     (attacked,) = [row for row in rows if (row["method"], row["domain"]) == ("gradient", "deployed")]

@@ -71,13 +71,22 @@ def test_every_shipped_experiment_names_its_world(tmp_path: Path) -> None:
         for file in LAUNCH.parent.glob("*.experiment.yaml")
         for setting in ("full",)
     }
-    assert kinds == {"room": "lab", "monitor": "lab", "junction": "junction", "carla": "carla"}
+    assert kinds == {
+        "room": "lab",
+        "monitor": "lab",
+        "junction": "junction",
+        "carla": "carla",
+        "metadrive": "metadrive",
+    }
 
 
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"world": {"kind": "moon"}}, "expected a world of lab, junction, carla; got 'moon'"),
+        (
+            {"world": {"kind": "moon"}},
+            "expected a world of lab, junction, carla, metadrive, duckietown; got 'moon'",
+        ),
         ({"world": {"road": {}}}, "expected kind: NAME"),
         (
             {"scenarios": ["backwards"]},
