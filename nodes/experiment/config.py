@@ -11,12 +11,13 @@ from advnerf_core.attack.methods import method_name
 from advnerf_core.scene.gate_limits import GateLimits
 from nodes.experiment.deploy_config import DeployConfig
 from nodes.experiment.method_names import MethodReference
-from nodes.experiment.placed import PlacedObject
+from nodes.experiment.placed import PANEL, PlacedObject
 from nodes.experiment.robustness_config import RobustnessConfig
 from nodes.experiment.space_config import (
     ColoursConfig,
     FaceConfig,
     MeshShapeConfig,
+    MeshTextureConfig,
     PlacesConfig,
     SpaceConfig,
 )
@@ -24,6 +25,7 @@ from nodes.experiment.space_config import (
 Count = Annotated[int, Field(ge=0)]
 Positive = Annotated[int, Field(ge=1)]
 PositiveNumber = Annotated[float, Field(gt=0)]
+Unit = Annotated[float, Field(ge=0, le=1)]
 
 
 class _Section(BaseModel):
@@ -150,6 +152,15 @@ class ObjectConfig(_Section):
         default=48, description="The same of a hydrant."
     )
     fit_steps: Count = Field(default=300, description="Steps that refine the voxels on pictures of the mesh.")
+    # Left out where they are these, so that results without panels do not depend on them.
+    panel_resolution: Annotated[int, Field(ge=2, le=128)] = Field(
+        default=64, exclude_if=lambda cells: cells == 64, description="Colours along each edge of a panel."
+    )
+    panel_rgb: tuple[Unit, Unit, Unit] = Field(
+        default=(0.5, 0.5, 0.5),
+        exclude_if=lambda rgb: rgb == (0.5, 0.5, 0.5),
+        description="Colour of a panel without an attack.",
+    )
 
 
 class MeasureConfig(_Section):
@@ -285,6 +296,17 @@ class ExperimentConfig(_Section):
             raise ValueError(
                 f"expected space.kind face, which the live nodes can show, with deploy.through nodes, got {self.space.kind}"
             )
+        return self
+
+    @model_validator(mode="after")
+    def _panels_are_panels(self) -> ExperimentConfig:
+        others = [each.name for each in self.objects if each.kind != PANEL]
+        if self.deploy.panels == "native" and (others or not self.objects):
+            raise ValueError(
+                f"expected objects of kind panel alone with deploy.panels native, got {', '.join(others) or 'none'}"
+            )
+        if isinstance(self.space, (MeshTextureConfig, MeshShapeConfig)) and len(others) < len(self.objects):
+            raise ValueError(f"expected objects with a mesh with space.kind {self.space.kind}, got a panel")
         return self
 
     @model_validator(mode="after")

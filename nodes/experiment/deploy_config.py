@@ -13,7 +13,7 @@ Positive = Annotated[int, Field(ge=1)]
 
 
 class DeployConfig(BaseModel):
-    """What drives past a found attack, and how often. All but ``through``, ``starts`` and ``camera`` concerns live nodes only."""
+    """What drives past a found attack, and how often. All but ``through``, ``starts``, ``camera`` and ``panels`` concerns live nodes only."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -30,6 +30,11 @@ class DeployConfig(BaseModel):
         default=PRESETS["ideal"],
         exclude_if=lambda effects: effects.ideal,
         description="What the driving camera adds to an ideal picture: ideal, webcam, zed, or the effects themselves.",
+    )
+    panels: Literal["composed", "native"] = Field(
+        default="composed",
+        exclude_if=lambda way: way == "composed",
+        description="Panels are drawn into the pictures by depth, or put into the world's own scene, which lights and hides them.",
     )
     launch_file: str = Field(
         default="green_screen.launch.yaml", description="Node graph, beside the experiment file."

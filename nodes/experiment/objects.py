@@ -1,4 +1,4 @@
-"""Stage object: cars and hydrants as voxels; and all objects as they stand in the world."""
+"""Stage object: cars and hydrants as voxels; and all objects, panels too, as they stand in the world."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from advnerf_core.fields.voxel_grid import VoxelGridObject
+from advnerf_core.fields.voxel_grid import VoxelGridObject, cube_face_object
 from advnerf_core.geometry import Array, Pinhole
 from advnerf_core.objects.voxel.build import build_from_mesh
 from advnerf_core.objects.voxel.generators import GENERATORS
@@ -18,7 +18,7 @@ from advnerf_core.objects.voxel.model import ObjectModel, load_object, save_obje
 from advnerf_core.scene.surrogate import BackgroundRenderer, Surrogate
 from nodes.experiment.context import Experiment
 from nodes.experiment.learned_scene import load_background
-from nodes.experiment.placed import ObjectKind
+from nodes.experiment.placed import PANEL, ObjectKind
 from nodes.runtime.progress import Report
 
 GENERATOR_OF: dict[ObjectKind, str] = {"small_car": "car", "hydrant": "hydrant"}
@@ -26,7 +26,7 @@ GENERATOR_OF: dict[ObjectKind, str] = {"small_car": "car", "hydrant": "hydrant"}
 
 def run(experiment: Experiment, folder: Path, report: Report) -> None:
     """Write one object file for each kind; where they stand is not part of it."""
-    kinds = sorted({thing.kind for thing in experiment.config.objects})
+    kinds = sorted({thing.kind for thing in experiment.config.objects} - {PANEL})
     for index, kind in enumerate(kinds):
 
         def progress(fraction: float, text: str, index: int = index, kind: str = kind) -> None:
@@ -51,8 +51,22 @@ def object_file(experiment: Experiment, kind: str) -> Path:
 
 def placed_objects(experiment: Experiment) -> list[VoxelGridObject]:
     """The objects in the order of the experiment file, in their plain colours."""
-    models = {thing.kind: load_object(object_file(experiment, thing.kind)) for thing in experiment.objects}
-    return [models[thing.kind].placed(thing.T_world_from_object, thing.scale) for thing in experiment.objects]
+    kinds = {thing.kind for thing in experiment.objects} - {PANEL}
+    models = {kind: load_object(object_file(experiment, kind)) for kind in kinds}
+    return [
+        panel_object(experiment, thing.side_m, thing.T_world_from_face)
+        if thing.kind == PANEL
+        else models[thing.kind].placed(thing.T_world_from_object, thing.scale)
+        for thing in experiment.objects
+    ]
+
+
+def panel_object(
+    experiment: Experiment, side_m: float, T_world_from_face: Array | None = None
+) -> VoxelGridObject:
+    """A panel in its plain colour: opaque, seen from its front."""
+    wanted = experiment.config.object
+    return cube_face_object(side_m, wanted.panel_resolution, wanted.panel_rgb, T_world_from_face)
 
 
 def describe(experiment: Experiment) -> list[dict[str, Any]]:

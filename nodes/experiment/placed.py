@@ -12,9 +12,14 @@ from pydantic import BaseModel, ConfigDict, Field
 from advnerf_core.geometry import Array, make_transform, rotation_z
 from hardware.worlds.world import WorldDescription
 
-ObjectKind = Literal["small_car", "hydrant"]
-# Length and width [m] at scale 1 of the objects that ``advnerf object build --generate`` makes.
-OBJECT_SIZES_M: dict[ObjectKind, tuple[float, float]] = {"small_car": (3.64, 1.7), "hydrant": (0.48, 0.48)}
+ObjectKind = Literal["small_car", "hydrant", "panel"]
+PANEL: ObjectKind = "panel"
+# Length and width [m] at scale 1: of the objects that ``advnerf object build --generate`` makes, and of a square panel that stands upright.
+OBJECT_SIZES_M: dict[ObjectKind, tuple[float, float]] = {
+    "small_car": (3.64, 1.7),
+    "hydrant": (0.48, 0.48),
+    "panel": (0.1, 2.0),
+}
 _SPACING_M = 0.05  # of the points that stand for a lane's middle
 
 
@@ -27,7 +32,7 @@ class PlacedObject(BaseModel):
         x_m: Middle of its foot [m].
         y_m: Middle of its foot [m].
         z_m: Height it stands on [m]: the kerb's on a pavement.
-        yaw_rad: Heading of its front [rad].
+        yaw_rad: Heading of its front [rad]; a panel shows its texture there.
         scale: Size relative to the object as it was built.
     """
 
@@ -40,6 +45,17 @@ class PlacedObject(BaseModel):
     z_m: float = 0.0
     yaw_rad: float = 0.0
     scale: float = Field(default=1.0, gt=0.0, le=2.0)
+
+    @property
+    def side_m(self) -> float:
+        """Width [m]; of a panel also its height."""
+        return self.scale * OBJECT_SIZES_M[self.kind][1]
+
+    @property
+    def T_world_from_face(self) -> Array:
+        """Pose ``[4, 4]`` of a panel's face: its middle, x out of it, z up."""
+        middle = [self.x_m, self.y_m, self.z_m + 0.5 * self.side_m]
+        return make_transform(rotation_z(self.yaw_rad), middle)
 
     @property
     def T_world_from_object(self) -> Array:

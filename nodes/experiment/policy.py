@@ -25,10 +25,11 @@ from advnerf_core.policies.pilotnet import images_to_tensor, load_policy
 from hardware.worlds.world import World
 from nodes.experiment import capture
 from nodes.experiment.context import Experiment
-from nodes.experiment.deployed import Dressed, DressedScene
+from nodes.experiment.deployed import Dressed
 from nodes.experiment.faces import PaintedScene, face_object, face_space, has_face
 from nodes.experiment.images import as_uint8
 from nodes.experiment.learned_scene import load_background
+from nodes.experiment.native import stand_in
 from nodes.experiment.objects import describe, last_result_kept, placed_objects, random_theta, surrogate_of
 from nodes.runtime.errors import ConfigError
 from nodes.runtime.progress import Report
@@ -179,7 +180,7 @@ def _object_domains(
         frames = surrogate.prepare(surrogate.camera_poses(torch.from_numpy(np.asarray(states))))
         return lambda theta: frames.render(surrogate.plain_theta() if theta is None else theta).images
 
-    return _Domains(DressedScene(scene, experiment.view, objects), seen, surrogate.theta_shape)
+    return _Domains(stand_in(experiment, scene, objects), seen, surrogate.theta_shape)
 
 
 def surrogate_plan(experiment: Experiment) -> SourcePlan:

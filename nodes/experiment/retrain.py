@@ -34,8 +34,9 @@ from nodes.experiment import retrain_plot
 from nodes.experiment.attack import attack_problem, freeze, load_shown, surrogate_part
 from nodes.experiment.cell import Cell
 from nodes.experiment.context import Experiment
-from nodes.experiment.deployed import DressedScene
+from nodes.experiment.deployed import Dressed
 from nodes.experiment.drives import deployed_drives
+from nodes.experiment.native import stand_in
 from nodes.experiment.objects import placed_objects
 from nodes.experiment.policy import HARDENED, plans, victim_file
 from nodes.experiment.spaces import colour_space, random_placements
@@ -68,7 +69,7 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
     victim = load_policy(file)
     thetas: list[torch.Tensor] = []
     with experiment.open_world() as scene:
-        dressed = DressedScene(scene, experiment.view, placed_objects(experiment))
+        dressed = stand_in(experiment, scene, placed_objects(experiment))
         told = _part(report, 0.0, 1.0 / (wanted.rounds + 1), "round 0")
         first = _first_attacks(experiment, space, dressed, victim, folder / "round0", told)
         old_attacks: dict[str, Any] = {}
@@ -136,7 +137,7 @@ def _old_frames(experiment: Experiment) -> list[Frames]:
 def _first_attacks(
     experiment: Experiment,
     space: ColourSpace,
-    dressed: DressedScene,
+    dressed: Dressed,
     victim: LoadedPolicy,
     folder: Path,
     report: Callable[[float, str], None],
@@ -160,7 +161,7 @@ def _first_attacks(
 def _attack_again(
     experiment: Experiment,
     space: ColourSpace,
-    dressed: DressedScene,
+    dressed: Dressed,
     victim: LoadedPolicy,
     folder: Path,
     report: Callable[[float, str], None],
@@ -195,7 +196,7 @@ def _attack_again(
 def _judged(
     experiment: Experiment,
     space: ColourSpace,
-    dressed: DressedScene,
+    dressed: Dressed,
     policy: LoadedPolicy,
     thetas: dict[str, torch.Tensor],
     folder: Path,
@@ -223,7 +224,7 @@ def _judged(
 
 def _total_cte_m(
     experiment: Experiment,
-    dressed: DressedScene,
+    dressed: Dressed,
     policy: LoadedPolicy,
     scenario: str,
     starts: torch.Tensor,
@@ -298,7 +299,7 @@ def _frames(
 
 
 def _under_old_attacks(
-    experiment: Experiment, dressed: DressedScene, folder: Path, first: Found
+    experiment: Experiment, dressed: Dressed, folder: Path, first: Found
 ) -> dict[str, Any]:
     """The retrained policy past the attacks that it was trained on, from a start that nothing has seen, beside the original undisturbed."""
     original, file = load_policy(victim_file(experiment, HARDENED)), folder / "policy.safetensors"

@@ -26,11 +26,19 @@ from advnerf_core.scene.remembered import frame_bytes
 from advnerf_core.scene.surrogate import Surrogate
 from hardware.worlds.world import World
 from nodes.experiment.context import Experiment
-from nodes.experiment.deployed import Dressed, DressedScene
+from nodes.experiment.deployed import Dressed
 from nodes.experiment.faces import PaintedScene, face_space, has_face
-from nodes.experiment.objects import GENERATOR_OF, object_file, placed_objects, surrogate_of
-from nodes.experiment.placed import PlacedObject
+from nodes.experiment.native import stand_in
+from nodes.experiment.objects import (
+    GENERATOR_OF,
+    object_file,
+    panel_object,
+    placed_objects,
+    surrogate_of,
+)
+from nodes.experiment.placed import OBJECT_SIZES_M, PANEL, PlacedObject
 from nodes.experiment.request.frames import DeployedFrames
+from nodes.experiment.request.objects import object_sha256
 from nodes.experiment.space_config import (
     ColoursConfig,
     FaceConfig,
@@ -79,7 +87,7 @@ def dress(experiment: Experiment, scene: World, shown: Shown) -> Dressed:
     """An open deployment scene that shows what a search found; see `shown_there` for its colours."""
     if has_face(experiment):
         return PaintedScene(experiment, scene)
-    return DressedScene(scene, experiment.view, shown.objects)
+    return stand_in(experiment, scene, shown.objects)
 
 
 def shown_there(shown: Shown, attack: AttackFile | None) -> Tensor | None:
@@ -143,7 +151,9 @@ def random_placements(experiment: Experiment, count: int, seed: int) -> list[tup
 
 
 def geometry_sha256(experiment: Experiment, kind: str) -> str:
-    """Hash of the object file of a kind."""
+    """Hash of the object file of a kind; of a panel, that of the panel at scale 1."""
+    if kind == PANEL:
+        return object_sha256(panel_object(experiment, OBJECT_SIZES_M[PANEL][1]))
     path = object_file(experiment, kind)
     return _file_sha256(path, path.stat().st_mtime_ns)
 

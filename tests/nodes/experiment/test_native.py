@@ -1,0 +1,121 @@
+"""Panels in a world's own scene, against the same panels composed by depth."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from advnerf_core.fields.voxel_grid import cube_face_object
+from advnerf_core.geometry import make_transform, rotation_z
+from advnerf_core.policies.view import PolicyView
+from nodes.experiment.deployed import DressedScene
+from nodes.experiment.native import NativeScene
+from nodes.experiment.objects import placed_objects
+from nodes.experiment.placed import PlacedObject
+from nodes.experiment.run import load_experiment
+from nodes.runtime.errors import ConfigError
+from tests.support.remote.flat_world import FlatConfig, FlatWorld
+
+LAUNCH = Path(__file__).parents[3] / "launch"
+STATE = np.array([0.0, 0.0, 0.3])
+
+
+@pytest.fixture(scope="module")
+def world():
+    with FlatWorld(FlatConfig()) as world:
+        world.reset(*map(float, STATE))
+        yield world
+
+
+def face(side_m: float = 1.5, x_m: float = 4.0):
+    """A panel ahead of the car, which looks back at it."""
+    yaw = 0.3 + np.pi - 0.2
+    return cube_face_object(
+        side_m, 8, (0.5, 0.5, 0.5), make_transform(rotation_z(yaw), [x_m, 1.2, 0.5 * side_m + 0.05])
+    )
+
+
+def quarters() -> torch.Tensor:
+    """Red, green, blue and white in the corners of a texture: a mirrored or turned one is another picture."""
+    theta = torch.full((8, 8, 3), -9.0)
+    theta[:4, :4, 0] = theta[:4, 4:, 1] = theta[4:, :4, 2] = 9.0
+    theta[4:, 4:] = 9.0
+    return theta
+
+
+def test_the_world_shows_what_composition_draws(world: Any) -> None:
+    view = PolicyView(world.camera_pinhole)
+    native, composed = NativeScene(world, view, [face()]), DressedScene(world, view, [face()])
+    NativeScene(world, view, []).camera_image(STATE, None)  # composed over a bare scene
+    bare = world.observe_at(*map(float, STATE), depth=False)[0]
+    drawn = composed.camera_image(STATE, quarters())
+    shown = native.camera_image(STATE, quarters())
+    inside = np.abs(drawn.astype(int) - bare).max(axis=2) > 40
+    assert 1500 < inside.sum() < 20000
+    difference = np.abs(drawn.astype(int) - shown).mean(axis=2)
+    assert np.median(difference[inside]) <= 3.0
+    assert (difference[inside] > 30.0).mean() < 0.12  # edges of panel and quarters
+    assert (difference[~inside] > 30.0).mean() < 0.01
+    # What the policy sees, now and from a state, is cut out of the same picture.
+    assert np.array_equal(native.seen_now(quarters()), view.image(shown))
+    assert np.array_equal(native.policy_images(native.prepare(STATE[None]), quarters())[0], view.image(shown))
+
+
+def test_scenes_that_share_a_world_do_not_see_each_others_panels(world: Any) -> None:
+    view = PolicyView(world.camera_pinhole)
+    one, two, none = (
+        NativeScene(world, view, panels) for panels in ([face()], [face(0.8), face(0.8, 5.0)], [])
+    )
+    bare = none.camera_image(STATE, None)
+    first = one.camera_image(STATE, quarters())
+    second = two.camera_image(STATE, torch.zeros(2 * 64, 3))
+    assert np.array_equal(one.camera_image(STATE, quarters()), first)
+    assert np.array_equal(two.camera_image(STATE, torch.zeros(2 * 64, 3)), second)
+    assert np.array_equal(none.camera_image(STATE, None), bare)
+    assert len({picture.tobytes() for picture in (bare, first, second)}) == 3
+    # Without an attack a panel has its plain colour.
+    grey = one.camera_image(STATE, None)
+    changed = (grey != bare).any(axis=2)
+    assert np.median(grey[changed]) == pytest.approx(128, abs=2)
+
+
+def test_what_cannot_be_shown_is_refused(world: Any, make_wall: Any) -> None:
+    view = PolicyView(world.camera_pinhole)
+    with pytest.raises(ConfigError, match="a world that takes panels"):
+        NativeScene(make_wall(20.0), view, [face()])
+    solid = cube_face_object(1.0, 4)
+    flat = dataclasses.replace(solid, theta_shape=(16, 3))
+    with pytest.raises(ConfigError, match="expected panels"):
+        NativeScene(world, view, [flat])
+
+
+def test_a_panel_is_an_object_of_an_experiment(tmp_path: Path) -> None:
+    board = {
+        "name": "board",
+        "kind": "panel",
+        "x_m": 12.0,
+        "y_m": 5.0,
+        "z_m": 0.12,
+        "yaw_rad": -2.0,
+        "scale": 1.5,
+    }
+    changes = [f"objects=[{board}]".replace("'", ""), "object.panel_resolution=16"]
+    experiment = load_experiment(LAUNCH / "junction.experiment.yaml", "demo", changes, tmp_path)
+    (field,) = placed_objects(experiment)
+    assert field.theta_shape == (16, 16, 3)
+    assert (field.box_max - field.box_min)[1:].tolist() == [3.0, 3.0]
+    assert field.T_world_from_object[:3, 3].tolist() == [12.0, 5.0, 0.12 + 1.5]
+    assert field.T_world_from_object[:3, 0] == pytest.approx([np.cos(-2.0), np.sin(-2.0), 0.0])
+    assert PlacedObject(**board).side_m == 3.0
+    plain = load_experiment(LAUNCH / "junction.experiment.yaml", "demo", [], tmp_path / "other")
+    dumped = plain.config.model_dump(mode="json")
+    assert not {"panel_resolution", "panel_rgb"} & set(dumped["object"])
+    assert "panels" not in dumped["deploy"]
+    with pytest.raises(ConfigError, match="objects of kind panel alone"):
+        load_experiment(LAUNCH / "junction.experiment.yaml", "demo", ["deploy.panels=native"], tmp_path)
+    mesh = [*changes, "space={kind: mesh_texture}"]
+    with pytest.raises(ConfigError, match="objects with a mesh"):
+        load_experiment(LAUNCH / "junction.experiment.yaml", "demo", mesh, tmp_path)
