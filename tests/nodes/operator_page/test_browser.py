@@ -149,7 +149,8 @@ def test_a_trial_is_driven_to_its_end_and_measured(lab, phones):
     for _ in range(10):
         ann.page.click("#trial")
         says(ann.page, "#trial-text", "hold the button to begin")
-        ann.page.wait_for_timeout(500)  # the car was just put to the start, which the safety node must have seen
+        # The car was just put to the start, which the safety node must have seen.
+        ann.page.wait_for_timeout(500)
         drive(ann.page, ann.hold, ann.let_go)
         says(ann.page, "#trial-text", "total cross-track error")
         says(ann.page, "#armed", "disarmed")

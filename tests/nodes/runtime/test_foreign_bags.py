@@ -55,7 +55,7 @@ from tests.support.foreign_samples import (
 
 pytestmark = pytest.mark.live
 
-LOGS = Path("/work/shared/data/logs/rosbag2")
+LOGS = Path(__file__).parents[4] / "shared/data/logs/rosbag2"
 POSES = [
     f"geometry_msgs/msg/{name}" for name in ("PoseStamped", "TransformStamped", "PoseWithCovarianceStamped")
 ]
