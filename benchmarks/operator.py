@@ -48,10 +48,14 @@ class LiveOperator:
             self.bus.wait(max(0.0, min(0.02, deadline - time.monotonic())))
             for received in self.bus.receive():
                 self.seen[received.topic] = message = received.message()
-                if received.topic == "/motor/sent":
-                    self.sent.append(message)
+                self.heard(received.topic, message)
             if time.monotonic() >= deadline:
                 return
+
+    def heard(self, topic: str, message: Any) -> None:
+        """Note a message; a subclass may look at more."""
+        if topic == "/motor/sent":
+            self.sent.append(message)
 
     def wait_until(self, condition: Callable[[], bool], timeout_s: float, what: str) -> None:
         """Look until something is so; a `TimeoutError` says what is not."""

@@ -1,4 +1,4 @@
-"""Does an attack on a ROS 2 policy as a black box work on the simulated lab? ``python -m benchmarks.ros2_black_box RUN_FOLDER ATTACK_FILE``.
+"""Does an attack on a ROS 2 policy as a black box work on the simulated lab? ``python -m benchmarks.ros2_black_box RUN_FOLDER ATTACK_FILE ONNX_FILE``.
 
 The policy is `examples/ros2_policy.py`, plain rclpy, in an environment of its own (`make setup-ros2`). The attack was searched by asking it:
 
@@ -31,7 +31,7 @@ from hardware.worlds.lab.lab_world import LabWorld
 from nodes.experiment.deployed import DressedScene, drive_deployed
 from nodes.lab.ros2_policy import ros2_policy
 
-COMMAND = "python -m benchmarks.ros2_black_box"
+COMMAND = "python -m benchmarks.ros2_black_box RUN_FOLDER ATTACK_FILE ONNX_FILE"
 SPEED_MPS, SIGMA = 0.8, 0.1
 
 
@@ -46,7 +46,6 @@ def drive_starts(
     face = cube_face_object(size_m, carrier.theta.shape[0], plain_rgb, carrier.T_world_from_object)
     x_m, y_m, yaw_rad = room.start_pose
     starts = draw_start_states((x_m, y_m, yaw_rad), count, SIGMA, 1).numpy()
-    driver = policy
     found, horizon = [], Horizon(ticks, off_track_m=room.off_track_m)
     with LabWorld() as world:
         dressed = DressedScene(world, policy.contract.view, [face])
@@ -57,7 +56,7 @@ def drive_starts(
         for start in starts:
             none_m, attacked_m = (
                 drive_deployed(
-                    dressed, driver, (), start, room.reference_path, horizon, SPEED_MPS, theta
+                    dressed, policy, (), start, room.reference_path, horizon, SPEED_MPS, theta
                 ).metrics.total_cte_m
                 for theta in shown
             )

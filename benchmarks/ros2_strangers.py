@@ -151,19 +151,13 @@ class Watcher(LiveOperator):
         """Raise if the launch has ended."""
         self._programs.check()
 
-    def watch(self, duration_s: float = 0.0) -> None:
-        """Look for a while; note what the operator did not allow."""
-        deadline = time.monotonic() + duration_s
-        while True:
-            self.bus.wait(max(0.0, min(0.02, deadline - time.monotonic())))
-            for received in self.bus.receive():
-                self.seen[received.topic] = message = received.message()
-                if received.topic == "/safety/drive":
-                    self._judge(message.drive)
-                elif received.topic == "/safety/state" and message.armed and not self.allowed:
-                    self.failures.append(f"armed by {message.source} without being asked")
-            if time.monotonic() >= deadline:
-                return
+    def heard(self, topic: str, message: Any) -> None:
+        """Note what the operator did not allow."""
+        super().heard(topic, message)
+        if topic == "/safety/drive":
+            self._judge(message.drive)
+        elif topic == "/safety/state" and message.armed and not self.allowed:
+            self.failures.append(f"armed by {message.source} without being asked")
 
     def say_arm(self, arm: bool = True, source: str = "trial") -> None:
         """Ask, and remember that the operator allows or forbids motion."""

@@ -7,6 +7,7 @@ from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from advnerf_core.attack.artifact import TEXTURE_PX, face_texture
@@ -60,6 +61,7 @@ class NativeScene:
         self._fields = tuple(panels)
         self._panels = [_panel_of(field) for field in panels]
         self._plain = DressedScene(scene, view, panels).plain_theta()
+        self._shown: tuple[Tensor, _Shown] | None = None
 
     def plain_theta(self) -> Tensor:
         """The panels' own colours."""
@@ -91,19 +93,23 @@ class NativeScene:
 
     def _show(self, theta: Tensor | None) -> None:
         """Have the world show the panels in these colours, in plain ones for None, unless it does already."""
-        parts = split_theta(self._fields, self._plain if theta is None else theta)
-        textures = [face_texture(part.detach().numpy(), TEXTURE_PX) for part in parts]
+        colours = self._plain if theta is None else theta.detach()
+        standing = _STANDING.get(self.scene, ())
+        # Every tick of a drive asks for the same colours; their textures are painted once.
+        if self._shown is not None and self._shown[1] is standing and torch.equal(self._shown[0], colours):
+            return
+        textures = [face_texture(part.numpy(), TEXTURE_PX) for part in split_theta(self._fields, colours)]
         wanted: _Shown = tuple(
             (f"panel{number}", panel.T_world_from_face.tobytes(), texture.tobytes())
             for number, (panel, texture) in enumerate(zip(self._panels, textures, strict=True))
         )
-        standing = _STANDING.get(self.scene, ())
         for name, *_ in standing[len(wanted) :]:
             self._native.add_panel(name, Panel(np.eye(4), 1.0, 1.0), None)
         for entry, panel, texture in zip(wanted, self._panels, textures, strict=True):
             if entry not in standing:
                 self._native.add_panel(entry[0], panel, texture)
         _STANDING[self.scene] = wanted
+        self._shown = colours.clone(), wanted
 
 
 def _panel_of(field: ColouredObject) -> Panel:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -10,10 +9,9 @@ from numpy.typing import NDArray
 
 from advnerf_core.geometry import Array
 from hardware.worlds.duckietown.config import DuckietownConfig
-from hardware.worlds.environments import ENVIRONMENTS
 from hardware.worlds.fitting import path_through
+from hardware.worlds.installed_world import InstalledWorld
 from hardware.worlds.paths import ReferencePath
-from hardware.worlds.remote_world import RemotePanelWorld
 from hardware.worlds.road_photos import road_photo_poses
 from hardware.worlds.world import Box, CarDescription, Traits, WorldDescription, WorldError
 
@@ -24,7 +22,7 @@ _FIT_M = 0.004  # half a lane is 0.12 m
 _LOWEST_M, _LOW_M, _HIGH_M, _BESIDE_M = -0.1, -0.05, 0.6, 0.3
 
 
-class Duckietown(RemotePanelWorld):
+class Duckietown(InstalledWorld):
     """A map of Duckietown with its own renderer and its differential drive.
 
     Its paths are the closed ways along the lanes' middles, named by the way round: ``left`` (seen from above counter-clockwise) and ``right``. The
@@ -39,21 +37,7 @@ class Duckietown(RemotePanelWorld):
 
     def __init__(self, config: DuckietownConfig | None = None) -> None:
         self.config = DuckietownConfig() if config is None else config
-        camera = self.config.camera
-        super().__init__(
-            "duckietown",
-            ENVIRONMENTS["duckietown"].simulator,
-            self.config.model_dump(mode="json", exclude={"camera", "photo", "robot", "server"}),
-            (camera.pinhole, self.config.photo.pinhole),
-            camera.T_car_from_camera,
-            RANGE_M,
-            _LOWEST_M,
-            self.config.server,
-        )
-
-    def python(self) -> Path:
-        """The interpreter of Duckietown's environment."""
-        return ENVIRONMENTS["duckietown"].python()
+        super().__init__("duckietown", self.config, RANGE_M, _LOWEST_M, frozenset({"robot"}))
 
     def description_of(self, facts: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> WorldDescription:
         """The ways round the map.

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from advnerf_core.geometry import Array
-from hardware.worlds.environments import ENVIRONMENTS
 from hardware.worlds.fitting import fit_lines_and_arcs, path_through
+from hardware.worlds.installed_world import InstalledWorld
 from hardware.worlds.metadrive.config import MetaDriveConfig
 from hardware.worlds.paths import ReferencePath
-from hardware.worlds.remote_world import RemotePanelWorld
 from hardware.worlds.road_photos import road_photo_poses
 from hardware.worlds.world import Box, CarDescription, Traits, WorldDescription, WorldError
 
@@ -25,7 +23,7 @@ _SPACING_M = 1.0  # of the route's poses
 _BESIDE_M, _HIGH_M, _LOW_M = 25.0, 12.0, -0.5
 
 
-class MetaDrive(RemotePanelWorld):
+class MetaDrive(InstalledWorld):
     """A road by block string and seed, with MetaDrive's renderer and its own car.
 
     The world's axes are those of MetaDrive's renderer: x along the first straight, z up, the middle of the road at y = 0. The body of the car is
@@ -40,21 +38,7 @@ class MetaDrive(RemotePanelWorld):
 
     def __init__(self, config: MetaDriveConfig | None = None) -> None:
         self.config = MetaDriveConfig() if config is None else config
-        camera = self.config.camera
-        super().__init__(
-            "metadrive",
-            ENVIRONMENTS["metadrive"].simulator,
-            self.config.model_dump(mode="json", exclude={"camera", "photo", "server"}),
-            (camera.pinhole, self.config.photo.pinhole),
-            camera.T_car_from_camera,
-            RANGE_M,
-            _LOWEST_M,
-            self.config.server,
-        )
-
-    def python(self) -> Path:
-        """The interpreter of MetaDrive's environment."""
-        return ENVIRONMENTS["metadrive"].python()
+        super().__init__("metadrive", self.config, RANGE_M, _LOWEST_M)
 
     def description_of(self, facts: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> WorldDescription:
         """The driven stretch of the route, the lanes near it, and the box about it.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
@@ -69,6 +69,7 @@ class _Route(BaseModel):
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
+    outward: ClassVar[bool]  # whether messages go to ROS
 
     topic: str
     ros: str | None = None
@@ -88,15 +89,12 @@ class _Route(BaseModel):
                 f"expected an absolute ROS name such as /car/image_raw for {self.topic}, got {self.ros_name!r}; correct 'ros'"
             )
         ours, theirs = self.table_type, self.ros_type
-        if ours != theirs and theirs not in convertible(ours, self._outward()):
-            known = ", ".join((self.table_type, *convertible(ours, self._outward())))
+        if ours != theirs and theirs not in convertible(ours, self.outward):
+            known = ", ".join((self.table_type, *convertible(ours, self.outward)))
             raise ValueError(
                 f"expected a type of {known} for {self.topic}, got {self.ros_type}; correct 'type'"
             )
         return self
-
-    def _outward(self) -> bool:
-        raise NotImplementedError
 
     @property
     def ros_name(self) -> str:
@@ -136,6 +134,8 @@ class SendRoute(_Route):
         frame: Frame to name instead of the message's own, for example ``map``; only with a converted type.
     """
 
+    outward: ClassVar[bool] = True
+
     child_frame: str = "base_link"
     frame: str | None = None
 
@@ -155,9 +155,6 @@ class SendRoute(_Route):
             )
         return self
 
-    def _outward(self) -> bool:
-        return True
-
 
 class TakeRoute(_Route):
     """A topic that ROS 2 supplies.
@@ -167,6 +164,8 @@ class TakeRoute(_Route):
             among the topics that the node sends.
         max_age_s: For a command: largest age of the answered message when the answer arrives [s].
     """
+
+    outward: ClassVar[bool] = False
 
     answers: str | None = None
     max_age_s: float = Field(default=0.15, gt=0.0, le=0.25)
@@ -182,9 +181,6 @@ class TakeRoute(_Route):
             wanted = "'answers', for example /compositor/image" if self.commands else "no 'answers'"
             raise ValueError(f"expected {wanted} for {self.topic}, got {self.answers!r}; correct the route")
         return self
-
-    def _outward(self) -> bool:
-        return False
 
     @property
     def commands(self) -> bool:

@@ -1,23 +1,14 @@
 """An experiment in a world of another process: a cell whose process dies fails by name and has no result; the other cells go on."""
 
 import json
-import sys
 from pathlib import Path
 
 import pytest
 import yaml
 
-from nodes.cli.main import main
+from tests.support.commands import advnerf
 from tests.support.remote.flat_world import HERE, plan_fault
 from tests.support.warehouse import EXAMPLES
-
-
-def advnerf(monkeypatch: pytest.MonkeyPatch, *words: str) -> object:
-    """The exit code of a command."""
-    monkeypatch.setattr(sys, "argv", ["advnerf", *words])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    return ended.value.code
 
 
 @pytest.mark.slow

@@ -1,7 +1,6 @@
 """The junction's experiment in the example's warehouse: all of it, through the command line, in its smallest size."""
 
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -10,17 +9,9 @@ import pytest
 from advnerf_core.driving.path import Path as DrivingPath
 from advnerf_core.report.clips import read_clip
 from hardware.worlds.world import WorldDescription
-from nodes.cli.main import main
 from nodes.lab.worlds.expert_drive import as_path
+from tests.support.commands import advnerf
 from tests.support.warehouse import EXAMPLES
-
-
-def advnerf(monkeypatch: pytest.MonkeyPatch, *words: str) -> object:
-    """The exit code of a command."""
-    monkeypatch.setattr(sys, "argv", ["advnerf", *words])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    return ended.value.code
 
 
 @pytest.mark.slow

@@ -1,0 +1,45 @@
+"""What the foreign worlds that ``advnerf world install`` brings have in common."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from hardware.worlds.environments import ENVIRONMENTS
+from hardware.worlds.remote_world import RemotePanelWorld
+
+
+class InstalledWorld(RemotePanelWorld):
+    """A remote world whose simulator runs in an environment of `ENVIRONMENTS`.
+
+    Args:
+        name: Name of the environment, and what messages call the world.
+        config: Its configuration, with ``camera``, ``photo`` and ``server``.
+        range_m: See `RemoteWorld`.
+        lowest_m: See `RemoteWorld`.
+        unsent: Keys of the configuration that the simulator does not know, beside those three.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        config: Any,
+        range_m: tuple[float, float],
+        lowest_m: float,
+        unsent: frozenset[str] = frozenset(),
+    ) -> None:
+        self._environment = ENVIRONMENTS[name]
+        super().__init__(
+            name,
+            self._environment.simulator,
+            config.model_dump(mode="json", exclude={"camera", "photo", "server", *unsent}),
+            (config.camera.pinhole, config.photo.pinhole),
+            config.camera.T_car_from_camera,
+            range_m,
+            lowest_m,
+            config.server,
+        )
+
+    def python(self) -> Path:
+        """The interpreter of the world's environment; see `RemoteWorld.python`."""
+        return self._environment.python()
