@@ -186,7 +186,7 @@ class IdealDriving:
     """
 
     def __init__(self, dynamics: Dynamics, fence_m: float | None) -> None:
-        self.state_size = dynamics.state_size
+        self.state_size, self.dt_s = dynamics.state_size, dynamics.dt_s
         self.blocked_tick: int | None = None
         self._dynamics, self._fence_m, self._tick = dynamics, fence_m, 0
 
