@@ -180,7 +180,11 @@ def _object_domains(
         frames = surrogate.prepare(surrogate.camera_poses(torch.from_numpy(np.asarray(states))))
         return lambda theta: frames.render(surrogate.plain_theta() if theta is None else theta).images
 
-    return _Domains(stand_in(experiment, scene, objects), seen, surrogate.theta_shape)
+    return _Domains(
+        stand_in(experiment.view, scene, objects, experiment.config.policy.panels),
+        seen,
+        surrogate.theta_shape,
+    )
 
 
 def surrogate_plan(experiment: Experiment) -> SourcePlan:

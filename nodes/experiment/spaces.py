@@ -87,7 +87,7 @@ def dress(experiment: Experiment, scene: World, shown: Shown) -> Dressed:
     """An open deployment scene that shows what a search found; see `shown_there` for its colours."""
     if has_face(experiment):
         return PaintedScene(experiment, scene)
-    return stand_in(experiment, scene, shown.objects)
+    return stand_in(experiment.view, scene, shown.objects, experiment.config.deploy.panels)
 
 
 def shown_there(shown: Shown, attack: AttackFile | None) -> Tensor | None:
