@@ -95,6 +95,12 @@ class Experiment(RunFolder[ExperimentConfig]):
             return False
         return True
 
+    def ask_world(self) -> None:
+        """Have a world that must be asked for its description say it, and keep that: nothing is photographed for it."""
+        if not self.is_described:
+            with self.named_world.make() as world:
+                self.keep_world(world)
+
     @contextmanager
     def open_world(self) -> Iterator[World]:
         """The world, open; closed at the end.
