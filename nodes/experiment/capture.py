@@ -18,6 +18,7 @@ from hardware.worlds.world import World
 from nodes.experiment.context import CALIBRATION, PLACED, Experiment
 from nodes.experiment.faces import DISPLAY, on_screen, panel_of, plain_screen, wanted_face
 from nodes.experiment.learned_scene import HELD_OUT
+from nodes.experiment.light import LIGHT, measure_light
 from nodes.experiment.placing import as_text, place_by_rule
 from nodes.experiment.screen import measure_display, screens_of
 from nodes.runtime.progress import Report, counted
@@ -36,6 +37,9 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
         if experiment.has_rules:
             report(0.0, "placing objects")
             write_atomically(folder / PLACED, as_text(place_by_rule(experiment, scene)))
+        if experiment.config.object.panel_light == "measured":
+            report(0.0, "measuring the light on the panel")
+            save_calibration(measure_light(experiment, scene).calibration(), folder / CALIBRATION / LIGHT)
         _calibrate(experiment, scene, folder / CALIBRATION, report)
         poses = scene.photo_poses(config.photos, rng)
         write_posed_images(

@@ -167,6 +167,11 @@ class ObjectConfig(_Section):
         exclude_if=lambda rgb: rgb == (0.5, 0.5, 0.5),
         description="Colour of a panel without an attack.",
     )
+    panel_light: Literal["ideal", "measured"] = Field(
+        default="ideal",
+        exclude_if=lambda light: light == "ideal",
+        description="How the learned scene shows a panel: in its own colours, or as the driving camera saw plain colours on it while the world was photographed.",
+    )
 
 
 class MeasureConfig(_Section):
@@ -314,6 +319,17 @@ class ExperimentConfig(_Section):
                 )
         if isinstance(self.space, (MeshTextureConfig, MeshShapeConfig)) and len(others) < len(self.objects):
             raise ValueError(f"expected objects with a mesh with space.kind {self.space.kind}, got a panel")
+        return self
+
+    @model_validator(mode="after")
+    def _light_falls_on_panels(self) -> ExperimentConfig:
+        if self.object.panel_light == "ideal":
+            return self
+        if len(self.objects) != 1 or self.policy.panels != "native" or self.retrain is not None:
+            raise ValueError(
+                "expected one panel, policy.panels native and no retrain with object.panel_light measured, got "
+                f"{len(self.objects)} objects, policy.panels {self.policy.panels}{'' if self.retrain is None else ' and retrain'}"
+            )
         return self
 
     @model_validator(mode="after")

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from advnerf_core.geometry import Array, invert_transform, planar_pose
+from hardware.worlds.paths import Pose
 from hardware.worlds.world import Depth, World
 from nodes.experiment.context import Experiment
 from nodes.experiment.placed import PlacedObject, RuledObject, in_a_lane
@@ -76,7 +77,7 @@ def as_text(objects: Sequence[PlacedObject]) -> str:
     return json.dumps([each.model_dump(mode="json") for each in objects], indent=1) + "\n"
 
 
-def _drive(experiment: Experiment, name: str) -> Array:
+def clean_poses(experiment: Experiment, name: str) -> Array:
     """Poses ``[T + 1, 3]`` of a drive without an error."""
     path, config = experiment.paths[name], experiment.config
     start = np.array(experiment.references[name].drive_start[:2])
@@ -86,7 +87,7 @@ def _drive(experiment: Experiment, name: str) -> Array:
 
 
 def _views(experiment: Experiment, world: World, name: str) -> Iterator[_View]:
-    for x_m, y_m, yaw_rad in _drive(experiment, name).tolist():
+    for x_m, y_m, yaw_rad in clean_poses(experiment, name).tolist():
         T_world_from_camera = planar_pose(x_m, y_m, yaw_rad) @ experiment.mount
         yield _View(invert_transform(T_world_from_camera), world.observe_at(x_m, y_m, yaw_rad)[1])
 
@@ -94,7 +95,7 @@ def _views(experiment: Experiment, world: World, name: str) -> Iterator[_View]:
 def _spots(experiment: Experiment, wanted: RuledObject, name: str) -> Iterator[PlacedObject]:
     """Spots in the order in which they are tried: along the drive, right before left, near before far."""
     path, half_lane_m = experiment.paths[name], experiment.world.off_track_m
-    drive = _drive(experiment, name)
+    drive = clean_poses(experiment, name)
     ahead_m = wanted.stands.seen_s * experiment.car.speed_mps
     begin_m = float(path.project(drive[:1, :2]).s_m[0])
     length_m = float(np.hypot(*np.diff(drive[:, :2], axis=0).T).sum())
@@ -102,11 +103,11 @@ def _spots(experiment: Experiment, wanted: RuledObject, name: str) -> Iterator[P
     for passed_m in np.arange(ahead_m, length_m, _ALONG * half_lane_m):
         x, y, yaw = np.asarray(path.pose_at(begin_m + passed_m)).tolist()
         # It looks at where the car is when it must begin to be seen.
-        seen_from = np.asarray(path.pose_at(begin_m + passed_m - ahead_m))[:2]
+        car = np.asarray(path.pose_at(begin_m + passed_m - ahead_m))[:2]
         for side in sides:
             for away_m in half_lane_m * np.arange(1.0, _FARTHEST, _AWAY):
                 at = np.array([x - side * away_m * math.sin(yaw), y + side * away_m * math.cos(yaw)])
-                towards = seen_from - at
+                towards = car - at
                 yield wanted.at(float(at[0]), float(at[1]), math.atan2(towards[1], towards[0]))
 
 
@@ -125,6 +126,16 @@ def _fits(
             return False
     ticks = sum(_is_seen(experiment, spot, view, wanted.stands.least_px) for view in views)
     return ticks * experiment.config.dt_s >= wanted.stands.seen_s - 1e-9
+
+
+def seen_from(experiment: Experiment, world: World, panel: PlacedObject, least_px: float) -> list[Pose]:
+    """Poses of the drive without an error along the first path from which nearly all of a panel is seen."""
+    name = experiment.config.scenarios[0]
+    poses = [(float(x), float(y), float(yaw)) for x, y, yaw in clean_poses(experiment, name)]
+    views = _views(experiment, world, name)
+    return [
+        pose for pose, view in zip(poses, views, strict=True) if _is_seen(experiment, panel, view, least_px)
+    ]
 
 
 def _is_seen(experiment: Experiment, spot: PlacedObject, view: _View, least_px: float) -> bool:

@@ -211,6 +211,8 @@ def stages_of(experiment: Experiment) -> list[Stage]:
     driven = {"world": world, "objects": placed, "view": view, **measured}
     # A rule looks at the world while it is photographed.
     ruled = {"objects": placed, "view": view} if experiment.has_rules else {}
+    if config.object.panel_light == "measured":
+        ruled = {"objects": placed, "view": view, "panel_light": "measured"}
     stages = [
         stage(
             "capture",
