@@ -254,4 +254,4 @@ class ExperimentCells(CellKind):
 
     def loop(self, experiment: Experiment, cell: Cell, folder: Path) -> Loop:
         """See `fidelity.loop`."""
-        return fidelity.loop(experiment, cell, folder)
+        return fidelity.loop(experiment, cell, folder, clean_folder(experiment, cell, folder))
