@@ -207,7 +207,7 @@ def _along_the_drive(
     space = make_space(experiment, None)
     policy, _ = policy_of(experiment, cell)
     shown, there = attack or (space.plain, shown_there(experiment, space.plain, None))
-    with experiment.open_world() as scene:
+    with experiment.open_deployed_world() as scene:
         dressed = dress(experiment, scene, space.plain)
         start = experiment.measured_starts(cell.scenario)[:1]
         plain = shown_there(experiment, space.plain, None)
