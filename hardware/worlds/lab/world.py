@@ -33,6 +33,11 @@ def build_model(config: LabConfig) -> Any:
     Returns:
         A ``mujoco.MjModel``.
     """
+    return compose_room(config).compile()
+
+
+def compose_room(config: LabConfig) -> Any:
+    """The room of `build_model` as a ``mujoco.MjSpec`` that is not compiled yet."""
     mujoco = load_mujoco()
     spec = mujoco.MjSpec()
     spec.visual.headlight.active = 0
@@ -54,7 +59,7 @@ def build_model(config: LabConfig) -> Any:
         mujoco, spec, "monitor", config.monitor, MONITOR_PIXELS, textures.screen_image(*MONITOR_PIXELS)
     )
     _add_car(mujoco, spec, config)
-    return spec.compile()
+    return spec
 
 
 def _add_lights(mujoco: Any, spec: Any) -> None:
