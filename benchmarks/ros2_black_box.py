@@ -28,7 +28,7 @@ from benchmarks.rclpy_peer import RclpyPeer
 from benchmarks.results import REPOSITORY, record_row
 from calibration.schema import RoomCalibration, load_calibration
 from hardware.worlds.lab.lab_world import LabWorld
-from nodes.experiment.deployed import DressedScene, drive_deployed
+from nodes.experiment.deployed import DressedScene, SelfDriving, drive_deployed
 from nodes.lab.ros2_policy import ros2_policy
 
 COMMAND = "python -m benchmarks.ros2_black_box RUN_FOLDER ATTACK_FILE ONNX_FILE"
@@ -53,10 +53,11 @@ def drive_starts(
             dressed.plain_theta(),
             torch.from_numpy(np.asarray(carrier.theta)).reshape(dressed.theta_shape),
         )
+        car = SelfDriving(world, SPEED_MPS, horizon.dt_s)
         for start in starts:
             none_m, attacked_m = (
                 drive_deployed(
-                    dressed, policy, (), start, room.reference_path, horizon, SPEED_MPS, theta
+                    dressed, policy, (), start, room.reference_path, horizon, car, theta
                 ).metrics.total_cte_m
                 for theta in shown
             )

@@ -28,7 +28,13 @@ from nodes.experiment.faces import has_face, panel_of
 from nodes.experiment.learned_scene import baked_file, load_field, scene_sha256
 from nodes.experiment.policy import HARDENED, victim_file, victims
 from nodes.experiment.request.telling import telling
-from nodes.experiment.space_config import FaceConfig, MeshShapeConfig, MeshTextureConfig, PlacesConfig
+from nodes.experiment.space_config import (
+    ColoursConfig,
+    FaceConfig,
+    MeshShapeConfig,
+    MeshTextureConfig,
+    PlacesConfig,
+)
 from nodes.experiment.spaces import geometry_sha256, over_the_world
 from nodes.experiment.stage_record import hash_of
 from nodes.runtime.errors import RuntimeFault
@@ -242,8 +248,7 @@ def load_found(folder: Path, cell: Cell) -> AttackFile | None:
 def search_settings(experiment: Experiment, method: Method) -> SearchSettings:
     """What a search may spend."""
     attack, space = experiment.config.attack, experiment.config.space
-    # Objects that are no face have no coarse texture: every colour is searched.
-    cells = space.cells if isinstance(space, FaceConfig) else 0
+    cells = space.cells if isinstance(space, (ColoursConfig, FaceConfig)) else 0
     return SearchSettings(
         evaluations=planned_evaluations(experiment),
         learning_rate=space.learning_rate

@@ -8,15 +8,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from advnerf_core.data.posed_images import write_posed_images
+from advnerf_core.files import write_atomically
 from advnerf_core.geometry import Array, planar_pose
 from advnerf_core.learning.imitation import recovery_states
 from calibration.by_construction import write_twin_calibrations
 from calibration.schema import save_calibration
 from hardware.worlds.lab.lab_world import LabWorld
 from hardware.worlds.world import World
-from nodes.experiment.context import CALIBRATION, Experiment
+from nodes.experiment.context import CALIBRATION, PLACED, Experiment
 from nodes.experiment.faces import DISPLAY, on_screen, panel_of, plain_screen, wanted_face
 from nodes.experiment.learned_scene import HELD_OUT
+from nodes.experiment.light import LIGHT, measure_light
+from nodes.experiment.placing import as_text, place_by_rule
 from nodes.experiment.screen import measure_display, screens_of
 from nodes.runtime.progress import Report, counted
 
@@ -26,11 +29,17 @@ _LATERAL_M, _HEADING_RAD = 1.0, 0.2
 
 
 def run(experiment: Experiment, folder: Path, report: Report) -> None:
-    """Write ``world.json`` and posed image sets: ``photos`` (learned from), ``held_out`` and ``colour_pairs`` (driving camera, without objects)."""
+    """Write ``world.json``, the places of objects with a rule, and posed image sets: ``photos`` (learned from), ``held_out`` and ``colour_pairs`` (driving camera, without objects)."""
     config = experiment.config.capture
     rng = np.random.default_rng(config.seed)
     with experiment.open_world() as scene:
         experiment.keep_world(scene)
+        if experiment.has_rules:
+            report(0.0, "placing objects")
+            write_atomically(folder / PLACED, as_text(place_by_rule(experiment, scene)))
+        if experiment.config.object.panel_light == "measured":
+            report(0.0, "measuring the light on the panel")
+            save_calibration(measure_light(experiment, scene).calibration(), folder / CALIBRATION / LIGHT)
         _calibrate(experiment, scene, folder / CALIBRATION, report)
         poses = scene.photo_poses(config.photos, rng)
         write_posed_images(

@@ -29,6 +29,7 @@ from nodes.experiment.keys import (
 )
 from nodes.experiment.reference import ReferenceBuild
 from nodes.experiment.run import load_experiment, prepare_victims, stages_of
+from nodes.experiment.shared_search import take_search
 from nodes.experiment.space_config import PlacesConfig
 from nodes.experiment.spaces import make_space, over_the_world
 from nodes.experiment.stages import keep_stages
@@ -132,9 +133,11 @@ def search_cell(
     clean = clean_folder(experiment, cell, folder)
     freeze(experiment, cell, folder)
     with Bench(experiment) if bench is None else nullcontext(bench) as shared:
+        take_search(experiment, cell.clean, clean)
         surrogate_part(experiment, shared.space, cell.clean, clean, report)
         if cell.method == NONE:
             return clean
+        take_search(experiment, cell, folder)
         surrogate_part(experiment, shared.space, cell, folder, report)
     return clean
 

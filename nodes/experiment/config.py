@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
@@ -11,7 +11,7 @@ from advnerf_core.attack.methods import method_name
 from advnerf_core.scene.gate_limits import GateLimits
 from nodes.experiment.deploy_config import DeployConfig
 from nodes.experiment.method_names import MethodReference
-from nodes.experiment.placed import PANEL, PlacedObject
+from nodes.experiment.placed import PANEL, WantedObject
 from nodes.experiment.robustness_config import RobustnessConfig
 from nodes.experiment.space_config import (
     ColoursConfig,
@@ -120,6 +120,12 @@ class PolicyConfig(_Section):
         default=False,
         description="Drives in the deployment scene are those of its own car, with its lag, one after another; else the surrogate's.",
     )
+    # Left out where it is this, so that results without panels do not depend on it.
+    panels: Literal["composed", "native"] = Field(
+        default="composed",
+        exclude_if=lambda way: way == "composed",
+        description="How frames of the deployment scene show panels, as deploy.panels; all deployments share the victim.",
+    )
     deployed_stills: Count = Field(default=320, description="Poses about each path in the deployment scene.")
     surrogate_stills: Count = Field(default=240, description="The same in the surrogate.")
     deployed_drives: Count = Field(
@@ -160,6 +166,11 @@ class ObjectConfig(_Section):
         default=(0.5, 0.5, 0.5),
         exclude_if=lambda rgb: rgb == (0.5, 0.5, 0.5),
         description="Colour of a panel without an attack.",
+    )
+    panel_light: Literal["ideal", "measured"] = Field(
+        default="ideal",
+        exclude_if=lambda light: light == "ideal",
+        description="How the learned scene shows a panel: in its own colours, or as the driving camera saw plain colours on it while the world was photographed.",
     )
 
 
@@ -301,12 +312,24 @@ class ExperimentConfig(_Section):
     @model_validator(mode="after")
     def _panels_are_panels(self) -> ExperimentConfig:
         others = [each.name for each in self.objects if each.kind != PANEL]
-        if self.deploy.panels == "native" and (others or not self.objects):
-            raise ValueError(
-                f"expected objects of kind panel alone with deploy.panels native, got {', '.join(others) or 'none'}"
-            )
+        for section in ("deploy", "policy"):
+            if getattr(self, section).panels == "native" and (others or not self.objects):
+                raise ValueError(
+                    f"expected objects of kind panel alone with {section}.panels native, got {', '.join(others) or 'none'}"
+                )
         if isinstance(self.space, (MeshTextureConfig, MeshShapeConfig)) and len(others) < len(self.objects):
             raise ValueError(f"expected objects with a mesh with space.kind {self.space.kind}, got a panel")
+        return self
+
+    @model_validator(mode="after")
+    def _light_falls_on_panels(self) -> ExperimentConfig:
+        if self.object.panel_light == "ideal":
+            return self
+        if len(self.objects) != 1 or self.policy.panels != "native" or self.retrain is not None:
+            raise ValueError(
+                "expected one panel, policy.panels native and no retrain with object.panel_light measured, got "
+                f"{len(self.objects)} objects, policy.panels {self.policy.panels}{'' if self.retrain is None else ' and retrain'}"
+            )
         return self
 
     @model_validator(mode="after")
@@ -356,9 +379,9 @@ class ExperimentConfig(_Section):
         description="kind: junction, carla, an installed package's, or file.py:Class relative to this file; and changes of that world's Config."
     )
     scenarios: tuple[str, ...] = Field(min_length=1, description="Which of the world's paths are driven.")
-    objects: tuple[PlacedObject, ...] = Field(
+    objects: tuple[WantedObject, ...] = Field(
         default=(),
-        description="Where the objects of the attack stand; composed by depth, not part of the world.",
+        description="Where the objects of the attack stand, or by which rule (stands); not part of the world.",
     )
     horizon: Positive = Field(default=60, description="Control ticks of every drive (T).")
     dt_s: PositiveNumber = Field(

@@ -33,7 +33,7 @@ from nodes.lab.worlds.named import NamedWorld, read_world, without
 from nodes.runtime.config import Document, load_config
 from nodes.runtime.errors import ConfigError
 
-WORLD, CALIBRATION, CELLS = "world.json", "calibration", "cells"
+WORLD, PLACED, CALIBRATION, CELLS = "world.json", "objects.json", "calibration", "cells"
 # Distances that stages use were chosen for half a lane of this width [m] and for this speed [m/s]: those of the simulated junction.
 _HALF_LANE_M, _SPEED_MPS = 1.75, 6.0
 
@@ -94,6 +94,12 @@ class Experiment(RunFolder[ExperimentConfig]):
         except ConfigError:
             return False
         return True
+
+    def ask_world(self) -> None:
+        """Have a world that must be asked for its description say it, and keep that: nothing is photographed for it."""
+        if not self.is_described:
+            with self.named_world.make() as world:
+                self.keep_world(world)
 
     @contextmanager
     def open_world(self) -> Iterator[World]:
@@ -164,14 +170,33 @@ class Experiment(RunFolder[ExperimentConfig]):
 
     @cached_property
     def objects(self) -> tuple[PlacedObject, ...]:
-        """The objects of the attack, beside the lanes.
+        """The objects of the attack, beside the lanes. Those with a rule stand where the capture stage has put them.
 
         Raises:
-            ConfigError: One stands in a lane.
+            ConfigError: One stands in a lane, or nothing is captured yet and one has a rule.
         """
-        if (found := in_a_lane(self.config.objects, self.world)) is not None:
+        objects = self._objects_by_rule() if self.has_rules else self.placed_by_hand
+        if (found := in_a_lane(objects, self.world)) is not None:
             raise ConfigError(f"{self.file}: objects.{found[0]}: {found[1]}")
-        return self.config.objects
+        return objects
+
+    @property
+    def placed_by_hand(self) -> tuple[PlacedObject, ...]:
+        """The objects whose places the file names."""
+        return tuple(each for each in self.config.objects if isinstance(each, PlacedObject))
+
+    @property
+    def has_rules(self) -> bool:
+        """Whether a rule places an object."""
+        return len(self.placed_by_hand) < len(self.config.objects)
+
+    def _objects_by_rule(self) -> tuple[PlacedObject, ...]:
+        file = self.stage_folder("capture") / PLACED
+        if not file.exists():
+            raise ConfigError(
+                f"expected {file}, where the capture stage writes the places of objects with a rule; run that stage first"
+            )
+        return tuple(map(PlacedObject.model_validate, json.loads(file.read_text(encoding="utf-8"))))
 
     def goal(self, scenario: str) -> tuple[float, ...]:
         """What the policy is told on a path; empty where it is told nothing."""

@@ -66,7 +66,10 @@ class ThroughWorld:
         policy = load_policy(victim_file(experiment, cell.victim)).policy
         shown = load_shown(space, folder, cell)
         there = dress(experiment, self.scene, shown)
-        starts, colours = deployed_starts(experiment, cell), shown_there(shown, load_found(folder, cell))
+        starts, colours = (
+            deployed_starts(experiment, cell),
+            shown_there(experiment, shown, load_found(folder, cell)),
+        )
         return Deployed(deployed_drives(experiment, there, policy, cell.scenario, starts, colours))
 
 

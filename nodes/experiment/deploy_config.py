@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from hardware.cameras.effects import PRESETS, Effects
 
@@ -13,7 +13,7 @@ Positive = Annotated[int, Field(ge=1)]
 
 
 class DeployConfig(BaseModel):
-    """What drives past a found attack, and how often. All but ``through``, ``starts``, ``camera`` and ``panels`` concerns live nodes only."""
+    """What drives past a found attack, and how often. All but ``through``, ``starts``, ``car``, ``camera`` and ``panels`` concerns live nodes only."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -24,6 +24,11 @@ class DeployConfig(BaseModel):
     starts: Positive | None = Field(
         default=None,
         description="So many of the measured starts are deployed; none: all. A live drive takes half a minute.",
+    )
+    car: Literal["own", "ideal"] = Field(
+        default="own",
+        exclude_if=lambda car: car == "own",
+        description="What drives through the world: its own car; or the surrogate's, which does what it is told and meets no obstacle.",
     )
     # Left out where it changes nothing, so that results of ideal cameras do not depend on it.
     camera: Effects = Field(
@@ -48,6 +53,12 @@ class DeployConfig(BaseModel):
     ready_timeout_s: Annotated[float, Field(gt=0)] = Field(
         default=60.0, description="Time for the graph to become ready [s]."
     )
+
+    @model_validator(mode="after")
+    def _live_cars_are_their_own(self) -> DeployConfig:
+        if self.car == "ideal" and self.through != "world":
+            raise ValueError(f"expected deploy.through world with deploy.car ideal, got {self.through}")
+        return self
 
     @property
     def live(self) -> bool:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, Protocol
 
 import cv2
@@ -17,6 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from advnerf_core.driving.dynamics import Dynamics
 from advnerf_core.driving.metrics import DriveMetrics, Horizon, drive_metrics
 from advnerf_core.driving.path import Path
 from advnerf_core.driving.rollout import drive
@@ -177,6 +177,37 @@ class SelfDriving:
         )
 
 
+class IdealDriving:
+    """The surrogate's car in a scene that is only looked at: it does what it is told, and nothing but the fence stops it.
+
+    Args:
+        dynamics: The surrogate's car.
+        fence_m: Where abs(x) or abs(y) exceeds this the car counts as blocked [m]; None without a fence.
+    """
+
+    def __init__(self, dynamics: Dynamics, fence_m: float | None) -> None:
+        self.state_size, self.dt_s = dynamics.state_size, dynamics.dt_s
+        self.blocked_tick: int | None = None
+        self._dynamics, self._fence_m, self._tick = dynamics, fence_m, 0
+
+    def start(self, pose: Array) -> None:
+        """Begin a drive."""
+        self.blocked_tick, self._tick = None, 0
+
+    def step(self, states: Tensor, controls: Tensor) -> Tensor:
+        """Drive on for one tick from states ``[1, n]``."""
+        moved = self._dynamics.step(states, controls)
+        self._tick += 1
+        outside = self._fence_m is not None and bool((moved[0, :2].abs() > self._fence_m).any())
+        if outside and self.blocked_tick is None:
+            self.blocked_tick = self._tick
+        return moved
+
+    def jacobians(self, states: Tensor, controls: Tensor) -> tuple[Tensor, Tensor]:
+        """Those of the surrogate's car."""
+        return self._dynamics.jacobians(states, controls)
+
+
 @dataclass(frozen=True, eq=False)
 class DeployedDrive:
     """One drive in the deployment scene.
@@ -196,16 +227,23 @@ class DeployedDrive:
     collided_with: str | None = None
 
 
-def _through(
-    camera: ImperfectCamera, dressed: Dressed, theta: Tensor | None, dt_s: float
-) -> Callable[[], NDArray[np.uint8]]:
+Seen = Callable[[Array], NDArray[np.uint8]]
+"""Policy image ``[66, 200, 3]`` from the state ``[3]`` of the car that drives."""
+
+
+def _ideally(dressed: Dressed, theta: Tensor | None, car: SelfDriving | IdealDriving) -> Seen:
+    """What the policy sees of an ideal camera; the world is asked where its own car is, not where that should be."""
+    if isinstance(car, SelfDriving):
+        return lambda state: dressed.seen_now(theta)
+    return lambda state: dressed.policy_images(dressed.prepare(state[None]), theta)[0]
+
+
+def _through(camera: ImperfectCamera, dressed: Dressed, theta: Tensor | None, dt_s: float) -> Seen:
     """What the policy sees through a camera, tick by tick; of a lost frame the one before."""
     last: list[NDArray[np.uint8]] = []
 
-    def seen() -> NDArray[np.uint8]:
-        state = dressed.scene.state
-        now = np.array([state.x_m, state.y_m, state.yaw_rad])
-        picture = camera.see(lambda pose: dressed.camera_image(pose, theta), now, dt_s)
+    def seen(state: Array) -> NDArray[np.uint8]:
+        picture = camera.see(lambda pose: dressed.camera_image(pose, theta), state, dt_s)
         if picture is not None:
             last[:] = [dressed.view.image(picture)]
         return last[0]
@@ -220,7 +258,7 @@ def drive_deployed(
     start: Array,
     path: Path,
     limits: Horizon,
-    speed_mps: float,
+    car: SelfDriving | IdealDriving,
     theta: Tensor | None,
     camera: ImperfectCamera | None = None,
 ) -> DeployedDrive:
@@ -233,18 +271,17 @@ def drive_deployed(
         start: Pose ``[3]``.
         path: What it should follow.
         limits: Ticks and limits.
-        speed_mps: Commanded speed.
+        car: What drives.
         theta: The objects' colours; None for no objects.
         camera: What takes the pictures; None for an ideal camera.
     """
-    car = SelfDriving(dressed.scene, speed_mps, limits.dt_s)
     car.start(np.asarray(start))
     goals = torch.tensor([tuple(goal)], dtype=torch.float32) if goal else None
     first = torch.from_numpy(np.array(start, dtype=np.float64))[None]
-    seen = (
-        partial(dressed.seen_now, theta) if camera is None else _through(camera, dressed, theta, limits.dt_s)
+    seen = _ideally(dressed, theta, car) if camera is None else _through(camera, dressed, theta, limits.dt_s)
+    rollout = drive(
+        policy, lambda states: images_to_tensor(seen(states[0].numpy())), car, first, limits.ticks, goals
     )
-    rollout = drive(policy, lambda _: images_to_tensor(seen()), car, first, limits.ticks, goals)
     states = rollout.states[:, 0].numpy().copy()
     states[:, 2] = np.unwrap(states[:, 2])
     metrics = drive_metrics(path, states, limits, car.blocked_tick)

@@ -14,7 +14,7 @@ from advnerf_core.geometry import Array
 from advnerf_core.policies.pilotnet import Policy
 from hardware.cameras.effects import ImperfectCamera
 from nodes.experiment.context import Experiment
-from nodes.experiment.deployed import DeployedDrive, Dressed, drive_deployed
+from nodes.experiment.deployed import DeployedDrive, Dressed, IdealDriving, SelfDriving, drive_deployed
 
 
 def learned_drives(
@@ -46,8 +46,8 @@ def deployed_drives(
     starts: Tensor,
     theta: Tensor | None,
 ) -> list[DeployedDrive]:
-    """Drives of the deployment scene's own car from starts ``[B, 3]``."""
-    effects = experiment.config.deploy.camera
+    """Drives through the deployment scene from starts ``[B, 3]``, of its own car or of an ideal one."""
+    effects, car = experiment.config.deploy.camera, _car(experiment, dressed)
     return [
         drive_deployed(
             dressed,
@@ -56,12 +56,18 @@ def deployed_drives(
             np.asarray(start),
             experiment.paths[scenario],
             experiment.limits,
-            experiment.car.speed_mps,
+            car,
             theta,
             None if effects.ideal else ImperfectCamera(effects, experiment.camera, number),
         )
         for number, start in enumerate(starts.numpy())
     ]
+
+
+def _car(experiment: Experiment, dressed: Dressed) -> SelfDriving | IdealDriving:
+    if experiment.config.deploy.car == "ideal":
+        return IdealDriving(experiment.dynamics, experiment.world.fence_m)
+    return SelfDriving(dressed.scene, experiment.car.speed_mps, experiment.limits.dt_s)
 
 
 def totals(scores: Sequence[DriveMetrics]) -> dict[str, Any]:

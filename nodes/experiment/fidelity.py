@@ -107,7 +107,7 @@ def attacked(experiment: Experiment, cell: Cell, folder: Path, clean: Path) -> P
     space, attack = _found(experiment, cell, folder)
     shown = space.restored(attack)
     if not experiment.config.deploy.live:
-        there = shown_there(shown, attack)
+        there = shown_there(experiment, shown, attack)
         return _along_the_drive(experiment, cell, (shown, there), "the same drive, attacked")
     frames, states = posed_frames(clean_bag(cell, clean))
     cars, overlay, panel = planar_poses(states), _overlay(experiment, attack), panel_of(experiment)
@@ -186,11 +186,11 @@ def _along_the_drive(
     """Pictures of the deployed drive without attack, again with an attack if one is given: as it is seen in the surrogate, and as it is shown."""
     space = make_space(experiment, None)
     policy, _ = policy_of(experiment, cell)
-    shown, there = attack or (space.plain, shown_there(space.plain, None))
+    shown, there = attack or (space.plain, shown_there(experiment, space.plain, None))
     with experiment.open_world() as scene:
         dressed = dress(experiment, scene, space.plain)
         start = experiment.measured_starts(cell.scenario)[:1]
-        plain = shown_there(space.plain, None)
+        plain = shown_there(experiment, space.plain, None)
         (drive,) = deployed_drives(experiment, dressed, policy, cell.scenario, start, plain)
         states = drive.states[:-1]
         real = dressed.policy_images(dressed.prepare(states), there)

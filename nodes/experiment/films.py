@@ -91,7 +91,10 @@ def _deployed_track(
         note = live["outcome"]["stopped_early"] or "ended"
         return _track(experiment, cell, title, views, states, "".join(live["attack_ids"]), note)
     shown = load_shown(space, folder, cell)
-    dressed, colours = dress(experiment, scene, shown), shown_there(shown, load_found(folder, cell))
+    dressed, colours = (
+        dress(experiment, scene, shown),
+        shown_there(experiment, shown, load_found(folder, cell)),
+    )
     return _track(experiment, cell, title, [dressed.camera_image(state, colours) for state in states], states)
 
 

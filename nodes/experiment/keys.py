@@ -9,11 +9,12 @@ from typing import Any
 from advnerf_core.attack.methods import require_method
 from advnerf_core.plugins import PluginError
 from advnerf_core.policies.pilotnet import load_policy
-from advnerf_core.report.conditions import NONE
+from advnerf_core.report.conditions import EMPTY, NONE
 from nodes.experiment import bake
 from nodes.experiment.cell import Cell
 from nodes.experiment.context import Experiment
 from nodes.experiment.policy import RETRAINED, attackable, victim_file
+from nodes.experiment.space_config import FaceConfig
 from nodes.experiment.stage_record import hash_of, stage_digests
 from nodes.runtime.errors import RuntimeFault
 
@@ -85,6 +86,10 @@ def require_known(experiment: Experiment, cell: Cell) -> None:
     for what, value, choices in known:
         if value not in choices:
             raise CellError(f"expected a {what} of {', '.join(choices)}, got {value!r}")
+    if cell.method == EMPTY and isinstance(experiment.config.space, FaceConfig):
+        raise CellError(
+            "expected the control empty only where objects are attacked; a panel of the room was photographed with its scene"
+        )
     if cell.searched:
         try:
             require_method(cell.code)

@@ -10,7 +10,7 @@ from pydantic_core import PydanticCustomError
 
 from advnerf_core.attack.methods import require_method
 from advnerf_core.plugins import PluginError, absolute_reference
-from advnerf_core.report.conditions import NONE
+from advnerf_core.report.conditions import CONTROLS
 from nodes.runtime.config import COMPLETE
 
 
@@ -24,11 +24,11 @@ def _checked(name: str, info: ValidationInfo) -> str:
 
 
 def _checked_condition(name: str, info: ValidationInfo) -> str:
-    return name if name == NONE else _checked(name, info)
+    return name if name in CONTROLS else _checked(name, info)
 
 
 MethodReference = Annotated[str, AfterValidator(_checked)]
 """A method as `advnerf_core.attack.methods.load_method` takes it; ``file.py:Name`` becomes absolute. Nothing is loaded."""
 
 ConditionReference = Annotated[str, AfterValidator(_checked_condition)]
-"""The same, or ``none``."""
+"""The same, or a control: ``none``, ``empty``."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -17,7 +17,6 @@ from advnerf_core.geometry import Array
 from advnerf_core.policies.view import PolicyView
 from advnerf_core.scene.surrogate import split_theta
 from hardware.worlds.world import NativePanels, Panel, Rgb, World
-from nodes.experiment.context import Experiment
 from nodes.experiment.deployed import Dressed, DressedScene
 from nodes.runtime.errors import ConfigError
 
@@ -27,15 +26,15 @@ _Shown = tuple[tuple[str, bytes, bytes], ...]
 _STANDING: WeakKeyDictionary[Any, _Shown] = WeakKeyDictionary()
 
 
-def stand_in(experiment: Experiment, scene: World, objects: Sequence[ColouredObject]) -> Dressed:
+def stand_in(
+    view: PolicyView, scene: World, objects: Sequence[ColouredObject], panels: Literal["composed", "native"]
+) -> Dressed:
     """An open deployment scene with objects in it: composed by depth, or as panels of the world's own scene.
 
     Raises:
         ConfigError: The world takes no panels.
     """
-    if experiment.config.deploy.panels == "composed":
-        return DressedScene(scene, experiment.view, objects)
-    return NativeScene(scene, experiment.view, objects)
+    return DressedScene(scene, view, objects) if panels == "composed" else NativeScene(scene, view, objects)
 
 
 class NativeScene:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Literal
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag
 
 from advnerf_core.geometry import Array, make_transform, rotation_z
 from hardware.worlds.world import WorldDescription
@@ -69,6 +69,66 @@ class PlacedObject(BaseModel):
         signs = ((1, 1), (-1, 1), (-1, -1), (1, -1))
         ends = [(a * length, b * width) for a, b in signs]
         return [(self.x_m + c * u - s * v, self.y_m + s * u + c * v) for u, v in ends]
+
+
+class FirstSeen(BaseModel):
+    """A rule for where an object stands: the first spot beside a path where it fits and is seen; see `nodes.experiment.placing`.
+
+    Attributes:
+        scenario: The path; None for the experiment's first.
+        side: On which side of it.
+        seen_s: For so long a drive along the path sees nearly all of it, unhidden and from the front [s].
+        least_px: So high it is then in the policy's picture [px].
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    scenario: str | None = None
+    side: Literal["right", "left", "either"] = "either"
+    seen_s: float = Field(default=2.0, gt=0.0)
+    least_px: float = Field(default=8.0, gt=0.0)
+
+
+class RuledObject(BaseModel):
+    """An object that stands where a rule puts it while the world is photographed.
+
+    Attributes:
+        name: Unique name.
+        kind: What it is: a panel.
+        z_m: Height it stands on [m].
+        scale: Size relative to the object as it was built.
+        stands: The rule.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    name: str = Field(min_length=1)
+    kind: Literal["panel"]
+    z_m: float = 0.0
+    scale: float = Field(default=1.0, gt=0.0, le=2.0)
+    stands: FirstSeen
+
+    def at(self, x_m: float, y_m: float, yaw_rad: float) -> PlacedObject:
+        """The object in one place; to the millimetre, so that no machine's last bit moves it."""
+        return PlacedObject(
+            name=self.name,
+            kind=self.kind,
+            x_m=round(x_m, 3),
+            y_m=round(y_m, 3),
+            z_m=self.z_m,
+            yaw_rad=round(yaw_rad, 3),
+            scale=self.scale,
+        )
+
+
+def _by_rule(value: Any) -> str:
+    found = isinstance(value, RuledObject) or (isinstance(value, Mapping) and "stands" in value)
+    return "by rule" if found else "by hand"
+
+
+WantedObject = Annotated[
+    Annotated[PlacedObject, Tag("by hand")] | Annotated[RuledObject, Tag("by rule")], Discriminator(_by_rule)
+]
 
 
 def in_a_lane(objects: Sequence[PlacedObject], world: WorldDescription) -> tuple[int, str] | None:

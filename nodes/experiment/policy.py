@@ -29,6 +29,7 @@ from nodes.experiment.deployed import Dressed
 from nodes.experiment.faces import PaintedScene, face_object, face_space, has_face
 from nodes.experiment.images import as_uint8
 from nodes.experiment.learned_scene import load_background
+from nodes.experiment.light import light_on_panels
 from nodes.experiment.native import stand_in
 from nodes.experiment.objects import describe, last_result_kept, placed_objects, random_theta, surrogate_of
 from nodes.runtime.errors import ConfigError
@@ -175,12 +176,23 @@ def _object_domains(
     """Objects stand in both scenes, plain or coloured."""
     objects = placed_objects(experiment) if objects is None else objects
     surrogate = surrogate_of(experiment, objects, load_background(experiment))
+    light = light_on_panels(experiment)
+    lit = None if light is None else DisplayedSensor(surrogate, light)
 
     def seen(states: Array) -> Show:
         frames = surrogate.prepare(surrogate.camera_poses(torch.from_numpy(np.asarray(states))))
-        return lambda theta: frames.render(surrogate.plain_theta() if theta is None else theta).images
 
-    return _Domains(stand_in(experiment, scene, objects), seen, surrogate.theta_shape)
+        def show(theta: torch.Tensor | None) -> torch.Tensor:
+            painted = surrogate.plain_theta() if theta is None else theta
+            return frames.render(painted if lit is None else lit.seen_theta(painted)).images
+
+        return show
+
+    return _Domains(
+        stand_in(experiment.view, scene, objects, experiment.config.policy.panels),
+        seen,
+        surrogate.theta_shape,
+    )
 
 
 def surrogate_plan(experiment: Experiment) -> SourcePlan:

@@ -95,6 +95,9 @@ def textures_seen(
         cell = Cell(scenario, HARDENED, method, seed)
         folder = driven_folder(experiment, cell)
         shown = load_shown(space, folder, cell)
-        dressed, colours = dress(experiment, scene, shown), shown_there(shown, load_found(folder, cell))
+        dressed, colours = (
+            dress(experiment, scene, shown),
+            shown_there(experiment, shown, load_found(folder, cell)),
+        )
         seen[method] = np.concatenate([dressed.camera_image(state, colours) for state in states], axis=1)
     return seen

@@ -69,7 +69,9 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
     victim = load_policy(file)
     thetas: list[torch.Tensor] = []
     with experiment.open_world() as scene:
-        dressed = stand_in(experiment, scene, placed_objects(experiment))
+        dressed = stand_in(
+            experiment.view, scene, placed_objects(experiment), experiment.config.policy.panels
+        )
         told = _part(report, 0.0, 1.0 / (wanted.rounds + 1), "round 0")
         first = _first_attacks(experiment, space, dressed, victim, folder / "round0", told)
         old_attacks: dict[str, Any] = {}

@@ -115,7 +115,10 @@ def _check_places(experiment: Experiment, document: Document) -> None:
         if name not in experiment.world.paths:
             message = unknown(name, "scenario", experiment.world.paths)
             raise ConfigError(f"{document.place(('scenarios', index))}: scenarios: {message}")
-    if (found := in_a_lane(experiment.config.objects, experiment.world)) is not None:
+    if (
+        not experiment.has_rules
+        and (found := in_a_lane(experiment.placed_by_hand, experiment.world)) is not None
+    ):
         raise ConfigError(f"{document.place(('objects', found[0]))}: {found[1]}")
     if (
         isinstance(space := experiment.config.space, FaceConfig)
@@ -206,11 +209,15 @@ def stages_of(experiment: Experiment) -> list[Stage]:
     shown = ("panel", "resolution", "plain_rgb")
     face = {"face": {name: space[name] for name in shown}} if isinstance(config.space, FaceConfig) else {}
     driven = {"world": world, "objects": placed, "view": view, **measured}
+    # A rule looks at the world while it is photographed.
+    ruled = {"objects": placed, "view": view} if experiment.has_rules else {}
+    if config.object.panel_light == "measured":
+        ruled = {"objects": placed, "view": view, "panel_light": "measured"}
     stages = [
         stage(
             "capture",
             capture,
-            {"world": experiment.seen_settings, "capture": part("capture"), **face, **measured},
+            {"world": experiment.seen_settings, "capture": part("capture"), **face, **ruled, **measured},
             (),
             bulk=(capture.PHOTOS, capture.COLOUR_PAIRS),
         ),

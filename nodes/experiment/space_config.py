@@ -21,6 +21,12 @@ class ColoursConfig(_Section):
 
     kind: Literal["colours"] = "colours"
     searched: ClassVar[str] = "The colours of {} are searched together in the learned scene"
+    # Left out where it changes nothing, so that results without it do not depend on it.
+    cells: Annotated[int, Field(ge=0)] = Field(
+        default=0,
+        exclude_if=lambda cells: cells == 0,
+        description="Cells along each edge of coarse random textures; 0: as many as the objects have colours.",
+    )
 
 
 class PlacesConfig(_Section):

@@ -28,6 +28,7 @@ from hardware.worlds.world import World
 from nodes.experiment.context import Experiment
 from nodes.experiment.deployed import Dressed
 from nodes.experiment.faces import PaintedScene, face_space, has_face
+from nodes.experiment.light import light_on_panels
 from nodes.experiment.native import stand_in
 from nodes.experiment.objects import (
     GENERATOR_OF,
@@ -51,9 +52,8 @@ from nodes.lab.worlds.expert_drive import as_path
 
 def colour_space(experiment: Experiment, surrogate: Surrogate | None = None) -> ColourSpace:
     """The colours of the voxel objects, in the learned scene; ``surrogate`` if it is made already."""
-    return ColourSpace(
-        surrogate or surrogate_of(experiment, placed_objects(experiment)), _named_voxels(experiment)
-    )
+    behind = surrogate or surrogate_of(experiment, placed_objects(experiment))
+    return ColourSpace(behind, _named_voxels(experiment), light_on_panels(experiment))
 
 
 def make_space(experiment: Experiment, scene: World | None) -> Space:
@@ -87,15 +87,17 @@ def dress(experiment: Experiment, scene: World, shown: Shown) -> Dressed:
     """An open deployment scene that shows what a search found; see `shown_there` for its colours."""
     if has_face(experiment):
         return PaintedScene(experiment, scene)
-    return stand_in(experiment, scene, shown.objects)
+    return stand_in(experiment.view, scene, shown.objects, experiment.config.deploy.panels)
 
 
-def shown_there(shown: Shown, attack: AttackFile | None) -> Tensor | None:
-    """What a dressed scene is asked to show: colours of objects; of a face those that are displayed, which a screen changes, or None."""
-    if attack is None:
-        return shown.colours if shown.objects else None
-    if attack.face is None:
-        return shown.colours
+def shown_there(experiment: Experiment, shown: Shown, attack: AttackFile | None) -> Tensor | None:
+    """What a dressed scene is asked to show: colours of objects; of a face those that are displayed, which a screen changes, or None.
+
+    A composed object has the colours that are seen; what the world's own light falls on has those that are painted.
+    """
+    if attack is None or attack.face is None:
+        native = experiment.config.deploy.panels == "native" and shown.painted is not None
+        return (shown.painted if native else shown.colours) if shown.objects else None
     return torch.from_numpy(np.array(attack.face_object.theta))
 
 

@@ -26,6 +26,8 @@ from advnerf_core.attack.artifact import (
 from advnerf_core.attack.methods import SearchRun, SearchSettings, load_method
 from advnerf_core.attack.problem import AttackProblem, Sensor
 from advnerf_core.attack.search.search import SearchResult
+from advnerf_core.attack.spaces.displayed import DisplayedSensor
+from advnerf_core.display import DisplayModel
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.fields.coloured import ColouredObject
 from advnerf_core.objects.mesh.field import MeshField
@@ -45,10 +47,12 @@ class Shown:
     Attributes:
         objects: Geometry and pose of each.
         colours: Their colours before squashing, of the ``theta_shape`` of a `Surrogate` with these objects.
+        painted: What is painted on them, where the place's light changes how that is seen; None where the colours are painted.
     """
 
     objects: Sequence[ColouredObject]
     colours: Tensor
+    painted: Tensor | None = None
 
     def seen_by(self, surrogate: Surrogate) -> Surrogate:
         """The surrogate with these objects in the place of its own."""
@@ -136,23 +140,27 @@ class ColourSpace:
     Args:
         surrogate: The scene with the objects.
         named: What attack files say of them, in their order.
+        light: What the camera sees of a painted colour, as measured; None where it is seen as it is painted.
     """
 
-    def __init__(self, surrogate: Surrogate, named: Sequence[NamedObject]) -> None:
+    def __init__(
+        self, surrogate: Surrogate, named: Sequence[NamedObject], light: DisplayModel | None = None
+    ) -> None:
         self.surrogate, self._named = surrogate, tuple(named)
+        self._lit = None if light is None else DisplayedSensor(surrogate, light)
         self.name = (
             MESH_TEXTURE if all(isinstance(each, MeshField) for each in surrogate.objects) else COLOURS
         )
 
     @property
-    def sensor(self) -> Surrogate:
-        """The surrogate: its theta are the colours."""
-        return self.surrogate
+    def sensor(self) -> Surrogate | DisplayedSensor:
+        """The surrogate, in the light if that is measured: its theta are the colours that are painted."""
+        return self._lit or self.surrogate
 
     @property
     def plain(self) -> Shown:
         """The objects in their own colours."""
-        return Shown(self.surrogate.objects, self.surrogate.plain_theta())
+        return self._in_light(self.surrogate.plain_theta())
 
     def search(
         self, method: str, problem: AttackProblem, settings: SearchSettings, run: SearchRun
@@ -173,7 +181,12 @@ class ColourSpace:
     def restored(self, attack: AttackFile) -> Shown:
         """The objects where they are, in the colours of the file; see `Space.restored`."""
         require_same(attack, self._named)
-        return Shown(self.surrogate.objects, colours_of(attack, self.surrogate.dtype))
+        return self._in_light(colours_of(attack, self.surrogate.dtype))
+
+    def _in_light(self, painted: Tensor) -> Shown:
+        if self._lit is None:
+            return Shown(self.surrogate.objects, painted)
+        return Shown(self.surrogate.objects, self._lit.seen_theta(painted).detach(), painted)
 
 
 class ShapeSpace:

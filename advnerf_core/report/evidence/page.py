@@ -16,6 +16,14 @@ drive without it from the same start. All of it was registered before it was run
 `advnerf verify` computes it again from the drives that are kept. What is registered, kept and
 tested is explained in [evidence.md](../evidence.md).
 """
+_MOST_SENTENCES = 4
+_TESTS_SAY = """Primary tests: the deployed excess of the attack minus that of the baseline that is strongest in the
+surrogate, under each condition; exact permutation tests over searches, adjusted by Holm over this
+table.
+"""
+_CONTRASTS_SAY = """The same attacks, driven under two conditions that differ in one thing: excess after minus before,
+paired by search and start.
+"""
 _COLUMNS = (
     "victim",
     "object shows",
@@ -51,13 +59,71 @@ def _section(name: str, data: Mapping[str, Any]) -> str:
         ),
         f"![Excess of every drive, by method and domain]({picture_of(name)})\n",
         _where(data["deployed_through"]) + "\n",
-        *(_sentences(test, data["rows"]) + "\n" for test in data["primary"]),
+        *_tests(data),
         _table(registered),
     ]
+    if data.get("contrasts"):
+        parts += ["### What each difference costs\n", _CONTRASTS_SAY, _contrasts(data["contrasts"])]
     if explored:
         parts += ["### Exploration\n", "Run, and not registered before.\n", _table(explored)]
     parts += ["### How to run it\n", _commands(name, data["registered"])]
     return "\n".join(parts)
+
+
+def _tests(data: Mapping[str, Any]) -> list[str]:
+    """Sentences about the primary tests; a table where there are many."""
+    if len(data["primary"]) <= _MOST_SENTENCES:
+        return [_sentences(test, data["rows"]) + "\n" for test in data["primary"]]
+    columns = ("condition", "victim", "method", "against", "difference [m per tick]", "95 %", "p after Holm")
+    rows = tuple(
+        (
+            _place(test["test"]),
+            test["test"]["victim"],
+            style_of(test["test"]["method"]).title,
+            style_of(test["baseline"]).title,
+            f"{test['difference_m']:.3f}",
+            _ends(test),
+            test["reason"] if test["p"] is None else _p(test["p_holm"]),
+        )
+        for test in data["primary"]
+    )
+    return [_TESTS_SAY, Table("", columns, rows, (False,) * len(columns)).markdown()]
+
+
+def _contrasts(found: Sequence[Mapping[str, Any]]) -> str:
+    columns = (
+        "what differs",
+        "victim",
+        "attack",
+        "searches x starts",
+        "before [m per tick]",
+        "after",
+        "difference",
+        "95 %",
+    )
+    rows = tuple(
+        (
+            row["name"] + ("" if row["registered"] else " (exploration)"),
+            row["victim"],
+            style_of(row["method"]).title,
+            f"{row['searches']} x {row['drives'] // row['searches']}",
+            f"{row['before_m']:.3f}",
+            f"{row['after_m']:.3f}",
+            f"{row['difference_m']:+.3f}",
+            _ends(row),
+        )
+        for row in found
+    )
+    return Table("", columns, rows, (False,) * len(columns)).markdown()
+
+
+def _ends(row: Mapping[str, Any]) -> str:
+    return "" if row["low_m"] is None else f"{row['low_m']:.3f} to {row['high_m']:.3f}"
+
+
+def _place(row: Mapping[str, Any]) -> str:
+    """A condition as readers see it."""
+    return f"{row['scenario']} {row['placement']}".strip().replace("_", " ")
 
 
 def picture_of(name: str) -> str:
@@ -88,7 +154,7 @@ def _sentences(test: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> st
         for each in rows
         if each["domain"] == "deployed" and all(each[name] == value for name, value in key.items())
     )
-    place = f"{which['scenario']} {which['placement']}".strip()
+    place = _place(which)
     first = (
         f"**{place}, {which['victim']} victim.** Where it is deployed, the {style_of(which['method']).title} attack moves the car "
         f"{row['excess_m']:.3f} m per tick further from its path{_between(row)}, and {row['off_track']} of {row['drives']} drives leave the "
@@ -97,8 +163,9 @@ def _sentences(test: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> st
     baseline = f"{style_of(test['baseline']).title}, the strongest baseline in the surrogate"
     if test["p"] is None:
         return f"{first} The difference to {baseline}, is {test['difference_m']:.3f} m. {test['reason']}."
+    between = "" if test["low_m"] is None else f", 95 % interval {_ends(test)} m"
     return (
-        f"{first} The difference to {baseline}, is {test['difference_m']:.3f} m per tick (exact permutation test over searches, "
+        f"{first} The difference to {baseline}, is {test['difference_m']:.3f} m per tick{between} (exact permutation test over searches, "
         f"p = {_p(test['p_holm'])} after Holm's adjustment)."
     )
 
@@ -112,20 +179,21 @@ def _p(value: float) -> str:
 
 
 def _table(rows: Sequence[Mapping[str, Any]]) -> str:
-    left = (False,) * len(_COLUMNS)
-    return Table("", _COLUMNS, tuple(tuple(_cells(row)) for row in rows), left).markdown()
+    several = len({_place(row) for row in rows}) > 1
+    columns = ("condition", *_COLUMNS) if several else _COLUMNS
+    cells = tuple(((_place(row),) if several else ()) + tuple(_cells(row)) for row in rows)
+    return Table("", columns, cells, (False,) * len(columns)).markdown()
 
 
 def _cells(row: Mapping[str, Any]) -> list[str]:
     excess = f"{row['excess_m']:.3f}" if row["method"] != NONE else f"(mean abs. CTE {row['excess_m']:.3f})"
-    interval = "" if row["low_m"] is None else f"{row['low_m']:.3f} to {row['high_m']:.3f}"
     return [
         row["victim"],
         style_of(row["method"]).title,
         row["domain"],
         f"{row['searches']} x {row['drives'] // row['searches']}",
         excess,
-        interval,
+        _ends(row),
         f"{row['off_track']} of {row['drives']}",
         _collisions(row["collided"]),
         f"{100 * row['off_lane_share']:.0f} %",

@@ -1,4 +1,4 @@
-"""The picture of a set: the excess of every drive, by method and domain."""
+"""The picture of a set: the excess of every drive, by condition, method and domain."""
 
 from __future__ import annotations
 
@@ -6,14 +6,21 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from advnerf_core.report.conditions import NONE, style_of
-from advnerf_core.report.evidence.results import Evidence, rows
+from advnerf_core.report.evidence.results import Evidence, Row, rows
 from advnerf_core.report.palette import LIGHT
 from advnerf_core.report.plots import new_axes
 
+_MOST_COLUMNS = 12
+
 
 def excess_plot(evidence: Evidence) -> Figure:
-    """Excess |CTE| per tick of each drive, one column per search, with the interval of the mean beside them."""
+    """Excess |CTE| per tick of each drive, one column per search; of sets with many conditions the means, one line per condition."""
     shown = [row for row in rows(evidence) if row.method != NONE]
+    return _drives(evidence, shown) if len(shown) <= _MOST_COLUMNS else _means(shown)
+
+
+def _drives(evidence: Evidence, shown: list[Row]) -> Figure:
+    """Every drive, with the interval of the mean beside them."""
     with new_axes(max(5.0, 1.1 * len(shown) + 1.5), 3.4) as ax:
         ax.axhline(0.0, color=LIGHT["tape"], lw=1.0, zorder=1)
         for place, row in enumerate(shown):
@@ -34,5 +41,34 @@ def excess_plot(evidence: Evidence) -> Figure:
         ax.set_xticks(range(len(shown)), names, size=7.5)
         ax.set(ylabel="excess |CTE| per tick [m]", xlim=(-0.6, len(shown) - 0.4))
         ax.grid(axis="x", visible=False)
+    figure: Figure = ax.figure
+    return figure
+
+
+def _means(shown: list[Row]) -> Figure:
+    """Means with their intervals: deployed ones filled, those in the learned scene hollow."""
+    places = list(dict.fromkeys((row.scenario, row.placement, row.victim) for row in shown))
+    methods = list(dict.fromkeys(row.method for row in shown))
+    with new_axes(7.2, 0.9 + 0.42 * len(places)) as ax:
+        ax.axvline(0.0, color=LIGHT["tape"], lw=1.0, zorder=1)
+        for row in shown:
+            style, filled = style_of(row.method), row.domain == "deployed"
+            down = float(places.index((row.scenario, row.placement, row.victim)))
+            down += 0.22 * (methods.index(row.method) - 0.5 * (len(methods) - 1)) + (
+                0.06 if filled else -0.06
+            )
+            if row.low_m is not None and row.high_m is not None:
+                ax.plot([row.low_m, row.high_m], [down, down], color=style.light, lw=1.2, zorder=2)
+            label = f"{style.title}, {row.domain}"
+            face = style.light if filled else LIGHT["paper"]
+            ax.plot(
+                row.excess_m, down, style.marker, color=style.light, mfc=face, ms=5, label=label, zorder=3
+            )
+        entries = dict(zip(*reversed(ax.get_legend_handles_labels()), strict=True))
+        ax.figure.legend(entries.values(), entries.keys(), loc="outside upper left", ncols=3)
+        names = [f"{' '.join(filter(None, place[:2]))}, {place[2]}" for place in places]
+        ax.set_yticks(range(len(places)), [name.replace("_", " ") for name in names])
+        ax.set(xlabel="excess |CTE| per tick [m]", ylim=(len(places) - 0.5, -0.5))
+        ax.grid(axis="y", visible=False)
     figure: Figure = ax.figure
     return figure

@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from advnerf_core.driving.metrics import Horizon
 from advnerf_core.driving.path import Path
 from advnerf_core.errors import AdvnerfError
+from advnerf_core.report.reference import Domain
 
 FORMAT: Literal["advnerf-registration-1"] = "advnerf-registration-1"
 FILE = "set/registration.json"  # in the folder of the published cells
@@ -104,6 +105,24 @@ class PrimaryTest(_Part):
     against: tuple[str, ...] = Field(min_length=1)
 
 
+class Contrast(_Part):
+    """Two conditions that the same attacks are driven under, and what differs between them.
+
+    Attributes:
+        name: What differs, for readers.
+        before: A scenario.
+        after: Another scenario of the same attacks, or the same one.
+        before_in: Which of its drives.
+        after_in: Which of its drives.
+    """
+
+    name: str = Field(min_length=1)
+    before: str
+    after: str
+    before_in: Domain = "deployed"
+    after_in: Domain = "deployed"
+
+
 class Registration(_Part):
     """What will be run.
 
@@ -118,6 +137,7 @@ class Registration(_Part):
         scenarios: By name, ``NAME`` or ``NAME.PLACEMENT``.
         cells: All cells.
         primary: The tests that are claimed; Holm's adjustment is over these.
+        contrasts: What is told apart by the same attacks under other conditions.
         level: Coverage of all intervals.
         alpha: Level of the tests.
     """
@@ -132,6 +152,7 @@ class Registration(_Part):
     scenarios: dict[str, RegisteredScenario]
     cells: tuple[RegisteredCell, ...]
     primary: tuple[PrimaryTest, ...] = ()
+    contrasts: tuple[Contrast, ...] = Field(default=(), exclude_if=lambda contrasts: not contrasts)
     level: Share = 0.95
     alpha: Share = 0.05
 

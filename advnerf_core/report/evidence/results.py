@@ -14,7 +14,7 @@ from advnerf_core.driving.metrics import DriveMetrics
 from advnerf_core.report.cells import CellResult, cell_name
 from advnerf_core.report.conditions import NONE
 from advnerf_core.report.evidence.exact import McNemar, holm, mcnemar_per_search, permutation_test
-from advnerf_core.report.evidence.intervals import clustered_interval
+from advnerf_core.report.evidence.intervals import ClusteredInterval, clustered_interval
 from advnerf_core.report.evidence.outcome import Outcome, drive_outcome
 from advnerf_core.report.evidence.registration import (
     PrimaryTest,
@@ -78,6 +78,8 @@ class TestResult:
         test: Which, as it was registered.
         baseline: The baseline that is strongest in the surrogate.
         difference_m: Mean excess of the method minus that of the baseline, deployed [m].
+        low_m: Lower end of its interval [m]; None where the two have other numbers of searches or too few drives.
+        high_m: Upper end [m].
         p: Exact p of the permutation test; None where none is claimed.
         p_holm: Adjusted for all primary tests.
         reason: Why there is no p.
@@ -87,6 +89,8 @@ class TestResult:
     test: PrimaryTest
     baseline: str
     difference_m: float
+    low_m: float | None
+    high_m: float | None
     p: float | None
     p_holm: float | None
     reason: str
@@ -253,17 +257,35 @@ def _test(evidence: Evidence, test: PrimaryTest) -> TestResult | None:
 
     baseline = max(test.against, key=lambda method: float(means(method, "surrogate").mean()))
     found = permutation_test(means(test.method, "deployed"), means(baseline, "deployed"))
+    interval = _difference(evidence, by_method[test.method], by_method[baseline])
     off = [_off_track(evidence, by_method[name]) for name in (test.method, baseline)]
     same = len(off[0]) == len(off[1])
     return TestResult(
         test,
         baseline,
         found.difference,
+        interval.low if interval else None,
+        interval.high if interval else None,
         found.p,
         None,
         found.reason,
         mcnemar_per_search(off[0], off[1]) if same else (),
     )
+
+
+def _difference(
+    evidence: Evidence, method: Sequence[CellResult], baseline: Sequence[CellResult]
+) -> ClusteredInterval | None:
+    """Interval of the difference in deployed excess, search by search from the same starts."""
+    if len(method) != len(baseline):
+        return None
+    one, other = (
+        [[outcome.excess_cte_m_per_tick for outcome in evidence.outcomes(cell, "deployed")] for cell in cells]
+        for cells in (method, baseline)
+    )
+    if len({len(each) for each in (*one, *other)}) != 1:
+        return None
+    return clustered_interval(list(np.array(one) - np.array(other)), evidence.registration.level)
 
 
 def _mean_excess_m(evidence: Evidence, cell: CellResult, domain: Domain) -> float:

@@ -17,6 +17,7 @@ import numpy as np
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.files import sha256_of, write_atomically
 from advnerf_core.report.cells import CellError, CellResult, cell_name, read_cell
+from advnerf_core.report.evidence.contrasts import contrast_data
 from advnerf_core.report.evidence.kept import KeptDrive
 from advnerf_core.report.evidence.page import film_of, picture_of, results_page
 from advnerf_core.report.evidence.registration import (
@@ -78,7 +79,7 @@ def write_set(folder: Path) -> Path:
         "name": registration.name,
         "registration": registration.digest,
         "files": digests_of(folder),
-        **as_data(evidence),
+        **_published(evidence),
     }
     write_atomically(folder / SET, json.dumps(data, indent=1) + "\n")
     from advnerf_core.report.evidence.plot import (
@@ -116,11 +117,16 @@ def verify_set(folder: Path) -> Verified:
     if not problems:  # numbers of damaged drives say nothing more
         numbers, wrong = _numbers(folder, evidence)
         problems += wrong
-        page = folder.parent / PAGE
-        if not page.exists() or page.read_text(encoding="utf-8") != _page(folder.parent):
-            problems.append(f"{page}: is not the page of the published sets")
+        if not wrong:  # it is made of these numbers
+            problems += _page_problems(folder.parent)
     drives = sum(len(kept) for cell in cells for kept in cell.kept.values())
     return Verified(folder.name, numbers, drives, tuple(problems))
+
+
+def _page_problems(published: Path) -> list[str]:
+    page = published / PAGE
+    same = page.exists() and page.read_text(encoding="utf-8") == _page(published)
+    return [] if same else [f"{page}: is not the page of the published sets"]
 
 
 def _page(published: Path) -> str:
@@ -266,19 +272,25 @@ def _one_build(evidence: Evidence) -> Iterator[str]:
             yield f"{scenario} {placement}: two victims are one policy"
 
 
+def _published(evidence: Evidence) -> dict[str, Any]:
+    """All numbers of a set as JSON data."""
+    return {**as_data(evidence), **contrast_data(evidence)}
+
+
 def _numbers(folder: Path, evidence: Evidence) -> tuple[int, list[str]]:
     """How many published numbers there are, and those that are not what the drives give."""
     published = json.loads((folder / SET).read_text(encoding="utf-8"))
-    found = json.loads(json.dumps(as_data(evidence)))
+    found = json.loads(json.dumps(_published(evidence)))
     count, wrong = 0, []
     if published["deployed_through"] != found["deployed_through"]:
         wrong.append(
             f"{SET}: expected drives deployed through {found['deployed_through']}, got {published['deployed_through']}"
         )
-    for part in ("rows", "primary"):
-        if len(published[part]) != len(found[part]):
-            wrong.append(f"{SET}, {part}: expected {len(found[part])}, got {len(published[part])}")
-        for said, again in zip(published[part], found[part], strict=False):
+    for part in ("rows", "primary", *(["contrasts"] if "contrasts" in found else [])):
+        there = published.get(part, [])
+        if len(there) != len(found[part]):
+            wrong.append(f"{SET}, {part}: expected {len(found[part])}, got {len(there)}")
+        for said, again in zip(there, found[part], strict=False):
             for name, value in again.items():
                 count += 1
                 if not _equal(said.get(name), value):

@@ -6,7 +6,6 @@ from types import TracebackType
 from typing import Literal, overload
 
 import numpy as np
-from numpy.typing import NDArray
 
 from advnerf_core.geometry import Array, Pinhole, VehicleState, look_at, planar_pose
 from hardware.worlds.lab import textures
@@ -16,9 +15,7 @@ from hardware.worlds.lab.monitor import ScreenOptics
 from hardware.worlds.lab.phone import apply_colours
 from hardware.worlds.lab.renderer import Renderer
 from hardware.worlds.lab.world import CAR_GROUP, CEILING_GROUP, MONITOR_PIXELS, build_model
-
-Rgb = NDArray[np.uint8]
-Depth = NDArray[np.float32]
+from hardware.worlds.world import Depth, Panel, Rgb
 
 
 class Lab:
@@ -41,9 +38,9 @@ class Lab:
         self.photo_pinhole: Pinhole = self.phone_pinhole
         self.T_car_from_camera: Array = self.config.camera.T_car_from_camera
         self._car = DrivenCar(self.config)
-        self._renderer = Renderer(
-            build_model(self.config), self.config.supersampling, hidden_groups=(CAR_GROUP,)
-        )
+        self._stood: dict[str, tuple[Panel, Rgb]] = {}
+        self._shown: dict[str, Rgb] = {}  # textures that are no longer those of the model
+        self._renderer = self._new_renderer()
         # None where colours are seen as they are shown: nothing to compute from frame to frame.
         self._optics: ScreenOptics | None = None
         if self.config.monitor_optics != MonitorOpticsConfig():
@@ -51,6 +48,10 @@ class Lab:
         self._screen_seen_from: Array | None = None
         if self._optics is not None:
             self.set_monitor_image(None)
+
+    def _new_renderer(self) -> Renderer:
+        model = build_model(self.config, self._stood)
+        return Renderer(model, self.config.supersampling, hidden_groups=(CAR_GROUP,))
 
     def reset(self, x_m: float, y_m: float, yaw_rad: float, speed_mps: float = 0.0) -> VehicleState:
         """Put the car down, forget commands under way and start lab time at 0; a speed, if given, is held."""
@@ -150,16 +151,44 @@ class Lab:
     def set_board_image(self, rgb: Rgb | None) -> None:
         """Show a picture ``[h, w, 3]`` on the board's face (row 0 on top); None makes it plain again."""
         plain = np.full((2, 2, 3), self.config.board.rgb, dtype=np.float32)
-        self._renderer.set_texture("board", textures.to_uint8(plain) if rgb is None else rgb)
+        self._set_texture("board", textures.to_uint8(plain) if rgb is None else rgb)
 
     def set_monitor_image(self, rgb: Rgb | None) -> None:
         """Show a picture ``[h, w, 3]`` on the whole monitor (row 0 on top); None shows the idle screen again."""
         shown = textures.to_uint8(textures.screen_image(256, 144)) if rgb is None else rgb
         if self._optics is None:
-            self._renderer.set_texture("monitor", shown)
+            self._set_texture("monitor", shown)
             return
         self._optics.show(shown)
         self._screen_seen_from = None
+
+    def add_panel(self, name: str, panel: Panel, rgb: Rgb | None) -> None:
+        """Stand a panel in the room, lit as the furniture is, or take it out; see `hardware.worlds.world.NativePanels`.
+
+        A new picture on a panel that stands there takes no time; anything else makes the room anew. Nobody runs into it.
+        """
+        texture, before = f"panel {name}", self._stood.get(f"panel {name}")
+        if rgb is None:
+            if before is not None:
+                del self._stood[texture]
+                self._rebuild()
+            return
+        self._stood[texture] = panel, np.array(rgb, dtype=np.uint8)
+        if before is not None and _same_place(before[0], panel) and before[1].shape == rgb.shape:
+            self._renderer.set_texture(texture, rgb)
+        else:
+            self._rebuild()
+
+    def _rebuild(self) -> None:
+        """Another model; what board and monitor show stays."""
+        self._renderer.close()
+        self._renderer = self._new_renderer()
+        for name, rgb in self._shown.items():
+            self._renderer.set_texture(name, rgb)
+
+    def _set_texture(self, name: str, rgb: Rgb) -> None:
+        self._shown[name] = np.array(rgb)
+        self._renderer.set_texture(name, rgb)
 
     def close(self) -> None:
         """Free the OpenGL context; safe to call twice."""
@@ -191,5 +220,10 @@ class Lab:
         before = self._screen_seen_from
         if before is not None and (not self._optics.depends_on_place or np.array_equal(before, place)):
             return
-        self._renderer.set_texture("monitor", self._optics.seen_from(place))
+        self._set_texture("monitor", self._optics.seen_from(place))
         self._screen_seen_from = np.array(place)
+
+
+def _same_place(one: Panel, other: Panel) -> bool:
+    same_size = (one.width_m, one.height_m) == (other.width_m, other.height_m)
+    return same_size and np.array_equal(one.T_world_from_face, other.T_world_from_face)

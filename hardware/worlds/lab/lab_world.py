@@ -157,6 +157,10 @@ class LabWorld:
             raise WorldError(f"expected a screen of the lab: monitor; got {panel!r}")
         self._open().set_monitor_image(rgb)
 
+    def add_panel(self, name: str, panel: Panel, rgb: Rgb | None) -> None:
+        """Stand a panel in the room; see `Lab.add_panel`."""
+        self._open().add_panel(name, panel, rgb)
+
     @property
     def lab(self) -> Lab:
         """The open lab behind this contract, for what only a lab has: a car that is held, tilted too."""

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -14,6 +16,7 @@ from hardware.worlds.lab.furniture import Solid, furnish
 from hardware.worlds.lab.gl import load_mujoco
 from hardware.worlds.lab.surfaces import UP, Surface, paint_room
 from hardware.worlds.lab.textures import Image
+from hardware.worlds.world import Panel, Rgb
 
 BOARD_PIXELS = (512, 512)  # width, height of the board face's texture
 MONITOR_PIXELS = (1024, 576)
@@ -24,16 +27,26 @@ AMBIENT = 0.62
 LIGHTS = (((0.30, 0.18, -0.94), 0.44), ((-0.82, 0.45, -0.35), 0.16), ((0.55, -0.80, -0.25), 0.12))
 
 
-def build_model(config: LabConfig) -> Any:
+def build_model(config: LabConfig, stood: Mapping[str, tuple[Panel, Rgb]] = MappingProxyType({})) -> Any:
     """Compile the room.
 
-    The body "car" is a mocap body whose frame is the car's. The materials' textures "board" and "monitor" can be replaced
-    while it runs (``Renderer.set_texture``).
+    The body "car" is a mocap body whose frame is the car's. The materials' textures "board" and "monitor", and those of panels that
+    stand in the room, can be replaced while it runs (``Renderer.set_texture``).
+
+    Args:
+        config: All numbers of the lab.
+        stood: Panels that stand in the room besides, each with its texture ``[h, w, 3]``, by the texture's name. The lights that shade
+            the furniture shade them.
 
     Returns:
         A ``mujoco.MjModel``.
     """
-    return compose_room(config).compile()
+    mujoco, spec = load_mujoco(), compose_room(config)
+    for name, (panel, rgb) in stood.items():
+        add_texture(mujoco, spec, name, rgb)
+        add_material(mujoco, spec, name)
+        _add_rectangle(mujoco, spec, name, panel.T_world_from_face, panel.width_m, panel.height_m)
+    return spec.compile()
 
 
 def compose_room(config: LabConfig) -> Any:
@@ -146,12 +159,17 @@ def _add_panel(
     add_texture(mujoco, spec, name, full)
     material = add_material(mujoco, spec, name)
     material.emission = max(1.0 - shading(T[:3, 0]), 0.0)
-    geom = add_geom(
-        spec.worldbody, mujoco.mjtGeom.mjGEOM_PLANE, (0.5 * panel.width_m, 0.5 * panel.height_m, 0.1)
-    )
-    geom.pos = T[:3, 3]
+    _add_rectangle(mujoco, spec, name, T, panel.width_m, panel.height_m)
+
+
+def _add_rectangle(
+    mujoco: Any, spec: Any, name: str, T_world_from_face: Array, width_m: float, height_m: float
+) -> None:
+    """Add a one-sided rectangle that wears the material of a name."""
+    geom = add_geom(spec.worldbody, mujoco.mjtGeom.mjGEOM_PLANE, (0.5 * width_m, 0.5 * height_m, 0.1))
+    geom.pos = T_world_from_face[:3, 3]
     # A MuJoCo plane faces its z; its x is to the viewer's right, which is the panel's +y.
-    geom.quat = wxyz(T[:3, [1, 2, 0]])
+    geom.quat = wxyz(T_world_from_face[:3, [1, 2, 0]])
     geom.material = name
 
 

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, model_validator
 
 from advnerf_core.attack.methods import method_name
-from advnerf_core.report.conditions import NONE, order_of
+from advnerf_core.report.conditions import CONTROLS, NONE, order_of
+from advnerf_core.report.evidence.registration import Contrast
 from advnerf_core.report.reference import Reference
 from advnerf_core.scene.gate_limits import GateLimits
 from nodes.experiment.cell import Cell
@@ -90,6 +91,16 @@ class ScenarioConfig(_NothingTwice):
 class CampaignConfig(_NothingTwice):
     """A campaign file."""
 
+    @model_validator(mode="after")
+    def _contrasts_scenarios(self) -> CampaignConfig:
+        for contrast in self.contrasts:
+            for name in (contrast.before, contrast.after):
+                if name not in self.scenarios:
+                    raise ValueError(
+                        f"contrast {contrast.name!r}: expected one of the scenarios {', '.join(self.scenarios)}, got {name!r}"
+                    )
+        return self
+
     name: Name
     folder: Path | None = Field(default=None, description="Where cells go; default runs/campaigns/NAME.")
     seeds: tuple[int, ...] = Field(default=(0, 1, 2), min_length=1)
@@ -97,10 +108,14 @@ class CampaignConfig(_NothingTwice):
     methods: tuple[ConditionReference, ...] = Field(
         default=METHODS,
         min_length=1,
-        description="none, and methods of attack; also file.py:Name, relative to the campaign file.",
+        description="none, empty, and methods of attack; also file.py:Name, relative to the campaign file.",
     )
     scenarios: dict[Name, ScenarioConfig] = Field(min_length=1)
     gate: GateLimits = GateLimits()
+    contrasts: tuple[Contrast, ...] = Field(
+        default=(),
+        description="What the same attacks under two conditions tell apart; they must be searched alike.",
+    )
     reference: Path | None = Field(
         default=None,
         description="File of totals and limits that the table is held against; relative to the campaign file.",
@@ -119,6 +134,7 @@ class Campaign:
         cells: All cells, in the order in which they are run.
         gate: What a learned scene must reach; None judges none.
         reference: What the table is held against.
+        contrasts: Conditions that are told apart.
     """
 
     name: str
@@ -128,6 +144,7 @@ class Campaign:
     cells: tuple[Cell, ...]
     gate: GateLimits | None = None
     reference: Reference = field(default_factory=Reference)
+    contrasts: tuple[Contrast, ...] = ()
 
     def scenario(self, cell: Cell) -> ScenarioConfig:
         """The scenario of a cell."""
@@ -172,7 +189,14 @@ def load_campaign(file: Path, folder: Path | None = None, overrides: tuple[str, 
     where = (folder or config.folder or Path("runs/campaigns") / config.name).resolve()
     against = load_config(Reference, file.parent / config.reference) if config.reference else Reference()
     campaign = Campaign(
-        config.name, file.resolve(), where, config.scenarios, tuple(_cells(config)), config.gate, against
+        config.name,
+        file.resolve(),
+        where,
+        config.scenarios,
+        tuple(_cells(config)),
+        config.gate,
+        against,
+        config.contrasts,
     )
     for cell in campaign.cells:
         if not campaign.experiment_file(cell).is_file():
@@ -223,11 +247,11 @@ def _cells(config: CampaignConfig) -> Iterator[Cell]:
                     for method in sorted(scenario.methods or config.methods, key=_order):
                         cell = Cell.of(name, victim, method, seed, placement)
                         # All seeds of an experiment are measured from the same starts; cells of another kind may not be.
-                        shared = method == NONE and scenario.kind == "experiment"
+                        shared = method in CONTROLS and scenario.kind == "experiment"
                         if not shared:
                             yield cell
                         elif number == 0:
-                            yield cell.clean
+                            yield replace(cell, seed=0)
 
 
 def _order(method: str) -> tuple[int, str]:

@@ -57,6 +57,7 @@ def register(campaign: Campaign, setting: str, overrides: Sequence[str], publish
         scenarios=_scenarios(campaign),
         cells=tuple(registered_cell(cell) for cell in campaign.cells),
         primary=tuple(_primary(campaign.cells)),
+        contrasts=campaign.contrasts,
     )
     folder = published / campaign.name
     before = read_registration(folder)
@@ -88,6 +89,7 @@ def _experiment(campaign: Campaign, cell: Cell) -> Experiment:
         raise RegistrationError(
             f"{cell.name}: expected a cell of an experiment file, got one of {type(kind).__name__}, which cannot be registered"
         )
+    experiment.ask_world()
     return experiment
 
 

@@ -1,14 +1,18 @@
 """The synchronous lab: determinism, actuator delay, nominal gains, and driving a lap."""
 
 import math
+from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
-from advnerf_core.geometry import planar_pose
+from advnerf_core.geometry import invert_transform, make_transform, planar_pose, rotation_z
 from hardware.worlds.lab.config import CameraConfig, CarConfig, LabConfig
 from hardware.worlds.lab.lab import Lab
 from hardware.worlds.lab.phone import track_length, track_pose
+from hardware.worlds.lab.world import shading
+from hardware.worlds.world import Panel
 
 
 @pytest.fixture(scope="module")
@@ -157,3 +161,35 @@ def test_a_closed_lab_says_so():
     lab.close()
     with pytest.raises(RuntimeError, match="closed"):
         lab.observe()
+
+
+def test_a_panel_in_the_room_is_lit_as_the_furniture_is_and_leaves_no_trace(lab: Lab) -> None:
+    pose = (0.0, -1.5, 0.0)
+    lab.set_board_image(np.full((4, 4, 3), (200, 20, 20), np.uint8))
+    before = lab.observe_at(*pose, depth=False)[0]
+    panel = Panel(make_transform(rotation_z(math.pi - 0.3), [1.2, -1.5, 0.2]), 0.3, 0.3)
+    grey, other = (np.full((8, 8, 3), value, np.uint8) for value in (120, 40))
+    lab.add_panel("p", panel, grey)
+    rgb, depth = lab.observe_at(*pose)
+    on_it = np.abs(rgb.astype(int) - before).max(axis=2) > 8
+    T_camera_from_world = invert_transform(planar_pose(*pose) @ lab.T_car_from_camera)
+    middle = (T_camera_from_world @ [1.2, -1.5, 0.2, 1.0])[:3]
+    column, row = np.rint(lab.camera_pinhole.project(middle)).astype(int)
+    # The closed form of the lights that are on: ambient, and three directions.
+    normal = np.array([math.cos(math.pi - 0.3), math.sin(math.pi - 0.3), 0.0])
+    assert rgb[row, column] == pytest.approx([120 * min(shading(normal), 1.0)] * 3, abs=2)
+    assert shading(normal) < 0.95
+    assert depth[row, column] == pytest.approx(middle[2], abs=0.01)
+    side_px = 0.3 * lab.camera_pinhole.fx / middle[2]
+    assert on_it.sum() == pytest.approx(side_px**2, rel=0.1)
+    lab.add_panel("p", panel, other)
+    darker = lab.observe_at(*pose, depth=False)[0]
+    assert darker[row, column] == pytest.approx(rgb[row, column] / 3.0, abs=2)
+    beside = cv2.dilate(on_it.astype(np.uint8), np.ones((5, 5))) == 0
+    assert np.array_equal(darker[beside], rgb[beside])
+    # What the board shows outlives the panels, and nothing of these stays.
+    lab.add_panel("q", replace(panel, width_m=0.2), grey)
+    for name in ("p", "q", "q"):
+        lab.add_panel(name, panel, None)
+    assert np.array_equal(lab.observe_at(*pose, depth=False)[0], before)
+    lab.set_board_image(None)

@@ -10,7 +10,7 @@ from advnerf_core.geometry import make_transform
 from advnerf_core.policies.view import PolicyView
 from advnerf_core.scene.surrogate import Surrogate
 from hardware.worlds.carla import CarlaConfig, CarlaScene
-from nodes.experiment.deployed import DressedScene, drive_deployed
+from nodes.experiment.deployed import DressedScene, SelfDriving, drive_deployed
 from nodes.lab.worlds.expert_drive import as_path, drive_expert, lane_expert
 
 
@@ -114,7 +114,7 @@ def test_the_intersections_own_loop_drives_in_carla(library, settings):
             np.array(reference.start_pose),
             as_path(reference),
             limits,
-            6.0,
+            SelfDriving(scene, 6.0, limits.dt_s),
         )
         drive = drive_deployed(*arguments, torch.full(dressed.theta_shape, 9.0))
     assert drive.states.shape == (5, 3)

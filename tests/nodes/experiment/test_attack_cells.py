@@ -24,7 +24,7 @@ from nodes.experiment import attack, page, report, run
 from nodes.experiment.attack import cells, load_shown, surrogate_part
 from nodes.experiment.cell import Cell
 from nodes.experiment.cell_kind import settings_hash
-from nodes.experiment.cells import run_cell
+from nodes.experiment.cells import run_cell, search_cell
 from nodes.experiment.context import Experiment
 from nodes.experiment.deploy import DRIVES, ThroughWorld, cell_data
 from nodes.experiment.films import film_cell
@@ -33,6 +33,7 @@ from nodes.experiment.kinds import load_kind
 from nodes.experiment.learned_scene import load_field
 from nodes.experiment.policy import NAIVE, victim_file
 from nodes.experiment.robustness_config import RobustnessConfig
+from nodes.experiment.shared_search import search_key, take_search
 from nodes.experiment.spaces import colour_space
 from nodes.runtime.errors import ConfigError
 from tests.support.strangers import spiral_code, spiral_theta, write_spiral
@@ -236,6 +237,29 @@ def test_a_search_bears_what_it_is_asked_to_and_is_measured_undisturbed(fresh: E
     wrong = ["attack.robustness.smoothness=1", "space={kind: places}"]
     with pytest.raises(ConfigError, match="smoothness only where colours are searched"):
         run.load_experiment(junction, "demo", wrong, fresh.folder / "x")
+
+
+def test_cells_that_differ_in_their_deployment_alone_share_one_search(fresh: Experiment) -> None:
+    folder = fresh.folder / "campaign"
+    first = search_cell(fresh, GRADIENT, folder / "ideal", silent)
+    noisy = changed(fresh, "deploy", camera=CameraEffects(read_noise=0.01))
+    drawn = []
+    clean = search_cell(noisy, GRADIENT, folder / "noisy", lambda fraction, text="": drawn.append(text))
+    assert not any("total CTE" in text for text in drawn)
+    assert clean != first
+    for name in (attack.ATTACK, attack.SEARCHED):
+        assert (folder / "noisy" / name).read_bytes() == (folder / "ideal" / name).read_bytes()
+    assert (clean / attack.SEARCHED).read_bytes() == (first / attack.SEARCHED).read_bytes()
+    # What is searched otherwise is searched anew, and what has begun its own search goes on with it.
+    other = changed(fresh, "attack", learning_rate=0.2)
+    assert search_key(other, GRADIENT) != search_key(fresh, GRADIENT) == search_key(noisy, GRADIENT)
+    assert search_key(noisy, replace(GRADIENT, seed=1)) != search_key(noisy, GRADIENT)
+    assert take_search(other, GRADIENT, folder / "other") is None
+    assert take_search(noisy, GRADIENT, folder / "noisy") is None
+    # A search that is not finished is not taken.
+    (folder / "ideal" / attack.SEARCHED).unlink()
+    (folder / "noisy" / attack.SEARCHED).unlink()
+    assert take_search(noisy, GRADIENT, folder / "third") is None
 
 
 def test_the_driving_camera_may_be_a_real_one(fresh: Experiment, wall: Any) -> None:

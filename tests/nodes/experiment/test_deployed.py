@@ -13,9 +13,10 @@ from advnerf_core.driving.path import Line, Path
 from advnerf_core.fields.voxel_grid import VoxelGridObject
 from advnerf_core.geometry import make_transform
 from advnerf_core.objects.voxel.model import load_object
+from advnerf_core.policies.pilotnet import images_to_tensor
 from advnerf_core.policies.view import PolicyView
 from nodes.experiment.context import Experiment
-from nodes.experiment.deployed import DressedScene, drive_deployed
+from nodes.experiment.deployed import DressedScene, IdealDriving, SelfDriving, drive_deployed
 from nodes.experiment.objects import object_file
 
 STRAIGHT = Path.from_segments((0.0, 0.0, 0.0), [Line(60.0)], closed=False)
@@ -77,9 +78,13 @@ def test_policy_sees_the_resized_window_of_the_camera_image(car: VoxelGridObject
     assert not np.array_equal(expected, view.image(cv2.convertScaleAbs(scene.observe()[0])))
 
 
+def own_car(scene: Any) -> SelfDriving:
+    return SelfDriving(scene, 6.0, 0.1)
+
+
 def test_drive_is_that_of_the_scenes_own_car(wall: Any) -> None:
     policy, limits = Steady(), Horizon(ticks=5, dt_s=0.1, off_track_m=1.75, held_cap_m=6.0)
-    done = drive_deployed(dressed(wall), policy, (0.4,), np.zeros(3), STRAIGHT, limits, 6.0, None)
+    done = drive_deployed(dressed(wall), policy, (0.4,), np.zeros(3), STRAIGHT, limits, own_car(wall), None)
     states, ideal = torch.zeros(1, 3, dtype=torch.float64), Dubins(6.0, 0.1)
     for tick in range(5):
         np.testing.assert_allclose(done.states[tick], states[0].numpy(), atol=1e-9)
@@ -96,17 +101,47 @@ def test_a_policy_without_goals_is_given_none(wall: Any) -> None:
             return super().__call__(images, torch.full((1, 1), 0.4))
 
     limits = Horizon(ticks=3, dt_s=0.1, off_track_m=1.75, held_cap_m=6.0)
-    alone = drive_deployed(dressed(wall), Goalless(), (), np.zeros(3), STRAIGHT, limits, 6.0, None)
-    told = drive_deployed(dressed(wall), Steady(), (0.4,), np.zeros(3), STRAIGHT, limits, 6.0, None)
+    alone = drive_deployed(dressed(wall), Goalless(), (), np.zeros(3), STRAIGHT, limits, own_car(wall), None)
+    told = drive_deployed(dressed(wall), Steady(), (0.4,), np.zeros(3), STRAIGHT, limits, own_car(wall), None)
     assert np.array_equal(alone.states, told.states)
+
+
+def test_an_ideal_car_does_what_it_is_told_in_any_world(make_wall: Any, car: VoxelGridObject) -> None:
+    limits = Horizon(ticks=6, dt_s=0.1, off_track_m=1.75, held_cap_m=6.0)
+    # Its own car would be stopped; and what the policy sees is where the ideal one is.
+    scene, policy = make_wall(blocked_beyond_m=2.0), Steady()
+    ideal = IdealDriving(Dubins(6.0, 0.1), fence_m=3.0)
+    done = drive_deployed(dressed(scene), policy, (0.4,), np.zeros(3), STRAIGHT, limits, ideal, None)
+    yaw = 0.04 * np.arange(7)
+    chord = 2.0 * 15.0 * np.sin(0.02)  # of the circle of 6 m/s and 0.4 rad/s
+    steps = chord * np.stack([np.cos(yaw[:-1] + 0.02), np.sin(yaw[:-1] + 0.02)], axis=1)
+    expected = np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
+    np.testing.assert_allclose(done.states, np.c_[expected, yaw], atol=1e-9)
+    assert (done.blocked_tick, done.collided_with) == (6, "obstacle")  # the fence: 3.6 m after six ticks
+    assert policy.brightness[-1] > policy.brightness[0]
+    assert scene.state.x_m == 0.0
+    # Attacked: every picture is the composed one.
+    there, seen = dressed(make_wall(), car), []
+
+    def watching(images: torch.Tensor, goals: torch.Tensor | None) -> torch.Tensor:
+        seen.append(images)
+        return torch.full((1,), 0.4)
+
+    colours = torch.full(there.theta_shape, 9.0)
+    ideal = IdealDriving(Dubins(6.0, 0.1), fence_m=None)
+    again = drive_deployed(there, watching, (0.4,), np.zeros(3), STRAIGHT, limits, ideal, colours)
+    assert again.blocked_tick is None
+    for state, image in zip(again.states, seen, strict=False):
+        wanted = there.view.image(there.camera_image(state, colours))
+        assert torch.equal(image, images_to_tensor(wanted))
 
 
 def test_a_blocked_car_is_charged_what_it_had(make_wall: Any) -> None:
     limits = Horizon(ticks=6, dt_s=0.1, off_track_m=1.75, held_cap_m=6.0)
-    done = drive_deployed(
-        dressed(make_wall(blocked_beyond_m=2.0)), Steady(), (1.0,), np.zeros(3), STRAIGHT, limits, 6.0, None
+    done, free = (
+        drive_deployed(dressed(scene), Steady(), (1.0,), np.zeros(3), STRAIGHT, limits, own_car(scene), None)
+        for scene in (make_wall(blocked_beyond_m=2.0), make_wall())
     )
-    free = drive_deployed(dressed(make_wall()), Steady(), (1.0,), np.zeros(3), STRAIGHT, limits, 6.0, None)
     assert free.blocked_tick is None
     assert done.blocked_tick == 4
     assert done.metrics.held_ticks == 2

@@ -1,0 +1,107 @@
+"""Registered contrasts: the same attacks under two conditions, drive by drive, so that one thing that differs can be told from the others."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from advnerf_core.report.cells import CellResult
+from advnerf_core.report.conditions import CONTROLS
+from advnerf_core.report.evidence.intervals import clustered_interval
+from advnerf_core.report.evidence.registration import Contrast
+from advnerf_core.report.evidence.results import Evidence
+from advnerf_core.report.reference import Domain
+
+
+@dataclass(frozen=True)
+class ContrastRow:
+    """One contrast of one method against one victim.
+
+    Attributes:
+        name: Of the contrast.
+        victim: Which policy.
+        method: Which search.
+        before_m: Mean excess |CTE| per tick under the first condition [m].
+        after_m: The same under the second, over the same searches and starts [m].
+        difference_m: After minus before, paired by search and start [m].
+        low_m: Lower end of its interval [m]; None where there are too few drives.
+        high_m: Upper end [m].
+        searches: Searches that both conditions have.
+        drives: Pairs of drives.
+        registered: Whether all cells were registered; else it is exploration.
+    """
+
+    name: str
+    victim: str
+    method: str
+    before_m: float
+    after_m: float
+    difference_m: float
+    low_m: float | None
+    high_m: float | None
+    searches: int
+    drives: int
+    registered: bool
+
+
+def contrast_rows(evidence: Evidence) -> list[ContrastRow]:
+    """All registered contrasts, for each victim and method that both conditions have searched."""
+    found = []
+    for contrast in evidence.registration.contrasts:
+        keys = dict.fromkeys(
+            (cell.victim, cell.method)
+            for cell in evidence.registration.cells
+            if cell.scenario == contrast.after and cell.method not in CONTROLS
+        )
+        found += [
+            row for victim, method in keys if (row := _row(evidence, contrast, victim, method)) is not None
+        ]
+    return found
+
+
+def contrast_data(evidence: Evidence) -> dict[str, Any]:
+    """The contrasts as JSON data; empty where none is registered."""
+    if not evidence.registration.contrasts:
+        return {}
+    return {"contrasts": [vars(row) for row in contrast_rows(evidence)]}
+
+
+def _row(evidence: Evidence, contrast: Contrast, victim: str, method: str) -> ContrastRow | None:
+    before, after = (
+        {cell.seed: cell for cell in evidence.searches((scenario, "", victim, method))}
+        for scenario in (contrast.before, contrast.after)
+    )
+    pairs = [(before[seed], after[seed]) for seed in sorted(before.keys() & after.keys())]
+    # Another attack under the second condition would be a difference of its own.
+    if not pairs or any(one.attack_id != other.attack_id for one, other in pairs):
+        return None
+    values = [
+        [_excess_m(evidence, one, contrast.before_in), _excess_m(evidence, other, contrast.after_in)]
+        for one, other in pairs
+    ]
+    drives = min(len(each) for pair in values for each in pair)
+    if not drives:
+        return None
+    first, second = np.array([[each[:drives] for each in pair] for pair in values]).transpose(1, 0, 2)
+    interval = clustered_interval(list(second - first), evidence.registration.level)
+    return ContrastRow(
+        contrast.name,
+        victim,
+        method,
+        before_m=float(first.mean()),
+        after_m=float(second.mean()),
+        difference_m=float((second - first).mean()),
+        low_m=interval.low if interval else None,
+        high_m=interval.high if interval else None,
+        searches=len(pairs),
+        drives=second.size,
+        registered=all(evidence.is_registered(cell) for pair in pairs for cell in pair),
+    )
+
+
+def _excess_m(evidence: Evidence, cell: CellResult, domain: Domain) -> Sequence[float]:
+    """Excess of each drive [m per tick], in the order of the measured starts."""
+    return [outcome.excess_cte_m_per_tick for outcome in evidence.outcomes(cell, domain)]

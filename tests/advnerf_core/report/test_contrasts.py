@@ -1,0 +1,110 @@
+"""The same attacks under two conditions, against sums by hand."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from advnerf_core.report.cells import CellResult, read_cells
+from advnerf_core.report.evidence.contrasts import contrast_data, contrast_rows
+from advnerf_core.report.evidence.intervals import clustered_interval
+from advnerf_core.report.evidence.page import results_page
+from advnerf_core.report.evidence.plot import excess_plot
+from advnerf_core.report.evidence.registration import Contrast, RegisteredCell, read_registration
+from advnerf_core.report.evidence.results import Evidence, as_data
+from benchmarks.planted_changes import write_simulated_set
+
+
+def replace(cell: CellResult, **values: Any) -> CellResult:
+    return cell.model_copy(update=values)
+
+
+LEARNED = Contrast(name="learned scene to world", before="track", before_in="surrogate", after="track")
+RENDERER = Contrast(name="another renderer", before="track", after="native")
+
+
+@pytest.fixture(scope="module")
+def evidence(tmp_path_factory: pytest.TempPathFactory) -> Evidence:
+    """A set of which the second condition has the drives of the first, but those of its gradient are in the other domain."""
+    folder = tmp_path_factory.mktemp("published") / "simulated"
+    write_simulated_set(folder)
+    registration, cells = read_registration(folder), read_cells(folder)
+    assert registration is not None
+    copies = [
+        replace(
+            cell,
+            scenario="native",
+            kept={"deployed": cell.kept["surrogate" if cell.method == "gradient" else "deployed"]},
+        )
+        for cell in cells
+    ]
+    both = registration.model_copy(
+        update={
+            "scenarios": {**registration.scenarios, "native": registration.scenarios["track"]},
+            "cells": (
+                *registration.cells,
+                *(
+                    RegisteredCell(**{**cell.model_dump(), "scenario": "native"})
+                    for cell in registration.cells
+                ),
+            ),
+            "contrasts": (LEARNED, RENDERER),
+        }
+    )
+    digest = both.digest
+    return Evidence(both, [replace(cell, registration=digest) for cell in (*cells, *copies)])
+
+
+def excess(evidence: Evidence, method: str, domain: str) -> np.ndarray:
+    cells = evidence.searches(("track", "", "hardened", method))
+    return np.array([[o.excess_cte_m_per_tick for o in evidence.outcomes(cell, domain)] for cell in cells])
+
+
+def test_a_contrast_is_the_paired_difference_of_excess(evidence: Evidence) -> None:
+    found = {(row.name, row.method): row for row in contrast_rows(evidence)}
+    assert set(found) == {(each.name, m) for each in (LEARNED, RENDERER) for m in ("gradient", "random")}
+    row = found[LEARNED.name, "gradient"]
+    before, after = excess(evidence, "gradient", "surrogate"), excess(evidence, "gradient", "deployed")
+    assert row.before_m == pytest.approx(before.mean())
+    assert row.after_m == pytest.approx(after.mean())
+    assert row.difference_m == pytest.approx(after.mean() - before.mean())
+    interval = clustered_interval(list(after - before))
+    assert interval is not None
+    assert (row.low_m, row.high_m) == pytest.approx((interval.low, interval.high))
+    assert (row.searches, row.drives, row.registered) == (6, 30, True)
+    # Under the second condition nothing but the gradient's drives is another.
+    assert found[RENDERER.name, "random"].difference_m == 0.0
+    assert found[RENDERER.name, "gradient"].after_m == pytest.approx(
+        found[RENDERER.name, "gradient"].before_m - row.difference_m, abs=0.02
+    )
+
+
+def test_another_attack_is_no_contrast(evidence: Evidence) -> None:
+    cells = [
+        replace(cell, attack_id="another") if (cell.scenario, cell.method) == ("native", "gradient") else cell
+        for cell in evidence.cells.values()
+    ]
+    found = contrast_rows(Evidence(evidence.registration, cells))
+    assert {(row.name, row.method) for row in found if row.name == RENDERER.name} == {
+        (RENDERER.name, "random")
+    }
+    none = evidence.registration.model_copy(update={"contrasts": ()})
+    assert contrast_data(Evidence(none, cells)) == {}
+    # Without contrasts a registration is the one that it was before there were any.
+    assert "contrasts" not in none.model_dump(mode="json")
+
+
+def test_the_page_and_the_picture_name_the_conditions(evidence: Evidence) -> None:
+    data = {
+        **as_data(evidence),
+        **contrast_data(evidence),
+        "registered": evidence.registration.model_dump(mode="json")
+        | {"digest": evidence.registration.digest},
+        "filmed": False,
+    }
+    text = results_page({"simulated": data})
+    assert "### What each difference costs" in text
+    assert "| learned scene to world | hardened | gradient | 6 x 5 |" in text
+    assert "| native | hardened | gradient | deployed |" in text
+    names = [label.get_text() for label in excess_plot(evidence).axes[0].get_xticklabels()]
+    assert any("native" in name for name in names)

@@ -1,0 +1,114 @@
+"""The light on a panel: measured with plain colours, against the closed form of the room's lights and against the room's own pictures."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from advnerf_core.attack.artifact import AttackFile
+from advnerf_core.attack.spaces.displayed import DisplayedSensor
+from advnerf_core.attack.spaces.space import ColourSpace, NamedObject
+from advnerf_core.geometry import planar_pose
+from advnerf_core.scene.surrogate import Surrogate
+from hardware.worlds.lab.lab_world import LabWorld
+from hardware.worlds.lab.world import shading
+from nodes.experiment.deployed import DressedScene
+from nodes.experiment.light import measure_light
+from nodes.experiment.native import NativeScene
+from nodes.experiment.objects import placed_objects
+from nodes.experiment.run import load_experiment, stages_of
+from nodes.runtime.errors import ConfigError
+
+LAUNCH = Path(__file__).parents[3] / "launch"
+BOARD = "{name: board, kind: panel, x_m: 2.0, y_m: -2.8, yaw_rad: 2.8, scale: 0.3}"
+CHANGES = [
+    "space={kind: colours}",
+    "deploy.through=world",
+    "object.panel_resolution=8",
+    "object.panel_light=measured",
+    "policy.panels=native",
+]
+
+
+@pytest.fixture(scope="module")
+def measured(tmp_path_factory: pytest.TempPathFactory):
+    folder = tmp_path_factory.mktemp("run")
+    experiment = load_experiment(
+        LAUNCH / "room.experiment.yaml", "demo", [*CHANGES, f"objects=[{BOARD}]"], folder
+    )
+    with LabWorld() as world:
+        yield experiment, world, measure_light(experiment, world)
+
+
+def test_the_light_is_that_of_the_rooms_lamps(measured) -> None:
+    experiment, _, fit = measured
+    factor = shading(experiment.objects[0].T_world_from_face[:3, 0])
+    assert 0.7 < factor < 0.95
+    for painted in ([1.0, 1.0, 1.0], [0.5, 0.5, 0.5], [0.8, 0.3, 0.6]):
+        assert fit.model.forward(np.array(painted)) == pytest.approx(factor * np.array(painted), abs=0.01)
+    assert fit.rmse(True) < 0.01
+
+
+def test_what_is_seen_of_a_texture_is_what_the_room_draws(measured) -> None:
+    experiment, world, fit = measured
+    (panel,) = placed_objects(experiment)
+    surrogate = Surrogate(lambda poses, pinhole: None, experiment.view.pinhole, experiment.mount, [panel])
+    space = ColourSpace(surrogate, [NamedObject("board", "")], fit.model)
+    assert isinstance(space.sensor, DisplayedSensor)
+    theta = 2.0 * torch.randn(8, 8, 3, generator=torch.Generator().manual_seed(0))
+    attack = AttackFile(
+        method="gradient", space=space.name, objects=space.attacked(theta), face=None, camera=experiment.view.pinhole,
+        scene_sha256="", policy_sha256="", config_sha256="", seed=0, predicted_total_cte_m=None, software_version="",
+    )  # fmt: skip
+    found = space.restored(attack)
+    assert found.painted is not None
+    assert torch.equal(found.painted, theta)
+    state = np.array([0.9, -2.0, 0.0])
+    native, composed = (kind(world, experiment.view, [panel]) for kind in (NativeScene, DressedScene))
+    real = native.camera_image(state, found.painted).astype(int)
+    NativeScene(world, experiment.view, []).camera_image(state, None)
+    inside = (
+        np.abs(composed.camera_image(state, torch.full_like(theta, 9.0)).astype(int) - real).max(axis=2) > 60
+    )
+    assert inside.sum() > 300
+    lit, unlit = (
+        float(np.median(np.abs(composed.camera_image(state, colours).astype(int) - real)[inside]))
+        for colours in (found.colours, found.painted)
+    )
+    assert lit < 4.0
+    assert unlit > 3.0 * lit
+    # Without an attack the panel is grey in the same light.
+    plain = space.plain
+    assert torch.sigmoid(plain.colours).mean() < torch.sigmoid(plain.painted).mean() - 0.03
+
+
+def test_light_needs_a_panel_and_a_world_that_takes_it(tmp_path: Path) -> None:
+    def load(name: str, *changes: str):
+        return load_experiment(LAUNCH / f"{name}.experiment.yaml", "demo", list(changes), tmp_path / name)
+
+    with pytest.raises(ConfigError, match=r"one panel, policy\.panels native"):
+        load("room", *CHANGES[:-1], f"objects=[{BOARD}]")
+    junction = load(
+        "junction", *CHANGES[2:], "objects=[{name: board, kind: panel, x_m: 12.0, y_m: 5.0, yaw_rad: -2.0}]"
+    )
+    with junction.open_world() as world, pytest.raises(ConfigError, match="a world that takes panels"):
+        measure_light(junction, world)
+    with LabWorld() as world, pytest.raises(ConfigError, match="hidden, turned away or too small"):
+        measure_light(load("room", *CHANGES, f"objects=[{BOARD.replace('2.8, scale', '0.3, scale')}]"), world)
+    plain = load("room", *CHANGES[:3], "policy.panels=native", f"objects=[{BOARD}]")
+    measured = load("room", *CHANGES, f"objects=[{BOARD}]")
+    assert "panel_light" not in plain.config.model_dump(mode="json")["object"]
+    assert stages_of(plain)[0].settings != stages_of(measured)[0].settings
+
+
+def test_the_region_is_where_the_camera_sees_the_panel(measured) -> None:
+    from nodes.experiment.light import _region
+
+    experiment, _, _ = measured
+    thing, pose = experiment.objects[0], (0.0, -2.0, 0.0)
+    region = _region(experiment, thing, pose)
+    T_camera_from_face = np.linalg.inv(planar_pose(*pose) @ experiment.mount) @ thing.T_world_from_face
+    middle = experiment.camera.project(T_camera_from_face[:3, 3])
+    rows, columns = np.nonzero(region)
+    assert (columns.mean() + 0.5, rows.mean() + 0.5) == pytest.approx(tuple(middle), abs=1.0)
