@@ -101,7 +101,7 @@ class Room:
         solid = self._context.create_renderable(mjrf.RenderableParams())
         solid.set_geom_mesh(kind, quality.numstacks, quality.numslices, quality.numquads)
         solid.set_size(np.array(half_m, np.float32))
-        solid.set_pose(np.float32(place), np.float32(axes).ravel())
+        solid.set_pose(place.astype(np.float32), axes.astype(np.float32).ravel())
         return solid
 
     def _texture(self, rgb: np.ndarray) -> Any:
@@ -135,7 +135,7 @@ class View:
 
     def aimed(self, T_world_from_camera: np.ndarray) -> Any:
         """A camera at a pose, with the lens as its frustum at the near plane."""
-        lens, T = self._lens, np.float32(T_world_from_camera)
+        lens, T = self._lens, T_world_from_camera.astype(np.float32)
         across, down = NEAR_M / lens["fx"], NEAR_M / lens["fy"]
         return mjrf.Camera(
             pos=T[:3, 3],
