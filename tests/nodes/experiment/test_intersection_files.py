@@ -77,6 +77,7 @@ def test_every_shipped_experiment_names_its_world(tmp_path: Path) -> None:
         "junction": "junction",
         "carla": "carla",
         "metadrive": "metadrive",
+        "duckietown": "duckietown",
     }
 
 
