@@ -8,7 +8,8 @@ the steering on views without the attack. Then the loop is driven in the surroga
 
 where ``d`` and ``e`` are drawn from what was measured, in blocks of neighbouring views, as errors along a path are alike from tick to tick
 (block bootstrap, Kunsch 1989). Several draws give a distribution of the total CTE. The baseline without attack is predicted alike, so that
-a ratio is predicted too. What the model does not know: delay, slew and gain of the deployed car, and states far from the held-out views.
+a ratio and an excess are predicted too. The car is that of the problem: give it one with the deployed car's measured response
+(`advnerf_core.driving.measured_car`). What the model does not know: obstacles but the fence, and states far from the held-out views.
 """
 
 from __future__ import annotations
@@ -45,11 +46,13 @@ class TransferPrediction:
         attacked_m: Of each draw, with the attack [m].
         none_m: Of each draw, without [m].
         retained: Share of the effect on the steering that survives in real pictures.
+        ticks: Ticks of a drive.
     """
 
     attacked_m: tuple[float, ...]
     none_m: tuple[float, ...]
     retained: float
+    ticks: int
 
     @property
     def ratio(self) -> float:
@@ -62,10 +65,21 @@ class TransferPrediction:
         low, high = np.quantile(self.attacked_m, (0.1, 0.9)) / np.mean(self.none_m)
         return float(low), float(high)
 
+    @property
+    def excess_m_per_tick(self) -> tuple[float, float, float]:
+        """Excess |CTE| per tick of one drive [m]: its 10 % quantile, mean and 90 % quantile over the draws, each against its own without attack."""
+        excess = (np.array(self.attacked_m) - np.array(self.none_m)) / self.ticks
+        low, high = np.quantile(excess, (0.1, 0.9))
+        return float(low), float(excess.mean()), float(high)
+
     def record(self) -> dict[str, Any]:
         """JSON-ready values."""
         low, high = self.ratio_band
+        excess_low_m, excess_m, excess_high_m = self.excess_m_per_tick
         return {
+            "excess_low_m": excess_low_m,
+            "excess_m": excess_m,
+            "excess_high_m": excess_high_m,
             "ratio": self.ratio,
             "ratio_low": low,
             "ratio_high": high,
@@ -118,7 +132,7 @@ def predict_transfer(
         policy = _AsDeployed(problem.policy, images, share, noise, attacked)
         rollout = drive(policy, lambda states: states, problem.dynamics, starts, horizon.ticks, goals)
         totals[attacked] = _totals(problem, rollout.states, horizon)
-    return TransferPrediction(totals[True], totals[False], effect.retained)
+    return TransferPrediction(totals[True], totals[False], effect.retained, horizon.ticks)
 
 
 def _blocks(values: Floats, ticks: int, draws: int, rng: np.random.Generator) -> Floats:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from advnerf_core.attack.artifact import PLACES, load_attack
 from advnerf_core.attack.spaces.space import Space
 from advnerf_core.report.conditions import NONE
-from hardware.worlds.world import World
+from hardware.worlds.world import World, traits_of
 from nodes.experiment import fidelity, pose_maps
 from nodes.experiment.attack import ATTACK, check_frozen, freeze, surrogate_part
 from nodes.experiment.cell import Cell
@@ -63,8 +63,10 @@ class Bench:
     def scene(self) -> World | None:
         """The open world; None where neither a search nor a drive looks at it."""
         experiment = self.experiment
-        if experiment.config.deploy.through == "world" or over_the_world(experiment):
+        if over_the_world(experiment):
             return self._stack.enter_context(experiment.open_world())
+        if experiment.config.deploy.through == "world":
+            return self._stack.enter_context(experiment.open_deployed_world())
         return None
 
     @cached_property
@@ -207,7 +209,8 @@ class ExperimentCells(CellKind):
 
     def runs_alone(self, experiment: Experiment) -> bool:
         """Where a server steps one world at a time, or live nodes measure time."""
-        return experiment.traits.exclusive or experiment.config.deploy.live
+        deployed = traits_of(experiment.deployed_world.make())
+        return deployed.exclusive or experiment.traits.exclusive or experiment.config.deploy.live
 
     def needed_settings(self, experiment: Experiment) -> dict[str, Any]:
         """Settings of capture, scene, object and policy."""
@@ -254,4 +257,4 @@ class ExperimentCells(CellKind):
 
     def loop(self, experiment: Experiment, cell: Cell, folder: Path) -> Loop:
         """See `fidelity.loop`."""
-        return fidelity.loop(experiment, cell, folder)
+        return fidelity.loop(experiment, cell, folder, clean_folder(experiment, cell, folder))

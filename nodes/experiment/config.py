@@ -322,6 +322,16 @@ class ExperimentConfig(_Section):
         return self
 
     @model_validator(mode="after")
+    def _searches_where_it_deploys(self) -> ExperimentConfig:
+        if self.deploy.world is not None and isinstance(
+            self.space, (FaceConfig, MeshTextureConfig, MeshShapeConfig)
+        ):
+            raise ValueError(
+                f"expected space.kind colours or places with deploy.world, got {self.space.kind}, which is bound to the world that was captured"
+            )
+        return self
+
+    @model_validator(mode="after")
     def _light_falls_on_panels(self) -> ExperimentConfig:
         if self.object.panel_light == "ideal":
             return self

@@ -34,6 +34,8 @@ from nodes.runtime.config import Document, load_config
 from nodes.runtime.errors import ConfigError
 
 WORLD, PLACED, CALIBRATION, CELLS = "world.json", "objects.json", "calibration", "cells"
+# What two worlds have in common in which the same attack can be deployed.
+_SHARED = ("paths", "off_track_m", "car", "camera", "T_car_from_camera", "fence_m")
 # Distances that stages use were chosen for half a lane of this width [m] and for this speed [m/s]: those of the simulated junction.
 _HALF_LANE_M, _SPEED_MPS = 1.75, 6.0
 
@@ -115,6 +117,36 @@ class Experiment(RunFolder[ExperimentConfig]):
                 raise ConfigError(
                     f"expected the world of {self._kept_world}, got one with other {', '.join(differ)}: open the world that was captured, or name "
                     "another run folder"
+                )
+            yield world
+
+    @cached_property
+    def deployed_world(self) -> NamedWorld:
+        """The world where attacks are deployed."""
+        wanted = self.config.deploy.world
+        return (
+            self.named_world
+            if wanted is None
+            else read_world(Document(wanted, str(self.file)), self.file.parent)
+        )
+
+    @contextmanager
+    def open_deployed_world(self) -> Iterator[World]:
+        """The world where attacks are deployed, open; closed at the end.
+
+        Raises:
+            ConfigError: It has other paths, another camera or another car than the world that was captured.
+        """
+        if self.config.deploy.world is None:
+            with self.open_world() as world:
+                yield world
+            return
+        with self.deployed_world.make() as world:
+            captured, found = as_json(self.world), as_json(world.describe())
+            if differ := [name for name in _SHARED if captured[name] != found[name]]:
+                raise ConfigError(
+                    f"{self.file}: deploy.world: expected a world with the {', '.join(_SHARED)} of {self.named_world.kind}, got "
+                    f"{self.deployed_world.kind} with other {', '.join(differ)}"
                 )
             yield world
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
@@ -13,7 +13,7 @@ Positive = Annotated[int, Field(ge=1)]
 
 
 class DeployConfig(BaseModel):
-    """What drives past a found attack, and how often. All but ``through``, ``starts``, ``car``, ``camera`` and ``panels`` concerns live nodes only."""
+    """What drives past a found attack, and how often. All but ``through``, ``starts``, ``car``, ``world``, ``camera`` and ``panels`` concerns live nodes only."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -29,6 +29,11 @@ class DeployConfig(BaseModel):
         default="own",
         exclude_if=lambda car: car == "own",
         description="What drives through the world: its own car; or the surrogate's, which does what it is told and meets no obstacle.",
+    )
+    world: dict[str, Any] | None = Field(
+        default=None,
+        exclude_if=lambda world: world is None,
+        description="Another world of the same paths, camera and car, where attacks are deployed: another renderer, or another car behind it. none: the experiment's own.",
     )
     # Left out where it changes nothing, so that results of ideal cameras do not depend on it.
     camera: Effects = Field(
@@ -56,8 +61,10 @@ class DeployConfig(BaseModel):
 
     @model_validator(mode="after")
     def _live_cars_are_their_own(self) -> DeployConfig:
-        if self.car == "ideal" and self.through != "world":
-            raise ValueError(f"expected deploy.through world with deploy.car ideal, got {self.through}")
+        wanted = {"deploy.car ideal": self.car == "ideal", "deploy.world": self.world is not None}
+        for what, is_wanted in wanted.items():
+            if is_wanted and self.through != "world":
+                raise ValueError(f"expected deploy.through world with {what}, got {self.through}")
         return self
 
     @property

@@ -7,6 +7,7 @@ calibration says the camera sees. No drive with the attack is looked at.
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from advnerf_core.attack.spaces.displayed import DisplayedSensor
 from advnerf_core.attack.spaces.space import Shown, Space
 from advnerf_core.attack.transfer import Scene
 from advnerf_core.data.dataset import load_transforms
+from advnerf_core.driving.measured_car import CarResponse, RespondingCar, fit_response
 from advnerf_core.driving.metrics import Horizon
 from advnerf_core.geometry import Array, invert_transform, planar_poses, yaw_of
 from advnerf_core.policies.pilotnet import load_policy
@@ -30,10 +32,10 @@ from advnerf_core.scene.surrogate import Surrogate
 from nodes.bags.reader import read_messages
 from nodes.control.pose_buffer import PoseBuffer
 from nodes.experiment import capture
-from nodes.experiment.attack import ATTACK, attack_problem, load_found
+from nodes.experiment.attack import ATTACK, attack_problem, from_measured_starts, load_found
 from nodes.experiment.cell import Cell
 from nodes.experiment.context import Experiment
-from nodes.experiment.deploy import live_name
+from nodes.experiment.deploy import DRIVES, live_name
 from nodes.experiment.drives import deployed_drives
 from nodes.experiment.faces import face_space, has_face, on_screen, panel_of
 from nodes.experiment.images import as_uint8
@@ -121,23 +123,41 @@ def attacked(experiment: Experiment, cell: Cell, folder: Path, clean: Path) -> P
 
 
 def loop(
-    experiment: Experiment, cell: Cell, folder: Path
+    experiment: Experiment, cell: Cell, folder: Path, clean: Path
 ) -> tuple[AttackProblem, Scene, torch.Tensor, Horizon]:
-    """What a prediction drives: the problem, pictures with or without the attack, the deployed starts ``[S, n]`` and the horizon."""
+    """What a prediction drives: the problem, pictures with or without the attack, the deployed starts ``[S, n]`` and the horizon.
+
+    Its car is the deployed one as the drives without attack in the folder ``clean`` have shown it.
+    """
     space, attack = _found(experiment, cell, folder)
     found, plain = space.restored(attack), space.plain
     with_it, without = (each.seen_by(space.surrogate) for each in (found, plain))
     problem = attack_problem(
         experiment, space, load_policy(victim_file(experiment, cell.victim)), cell.scenario, cell.seed
     )
-    problem = replace(problem, steps=experiment.config.horizon)
+    car, problem = _measured_car(experiment, clean), from_measured_starts(experiment, cell.scenario, problem)
+    problem = replace(problem, dynamics=car, start_states=car.start(problem.start_states))
 
     def images(states: torch.Tensor, attacked: bool) -> torch.Tensor:
         sensor, colours = (with_it, found.colours) if attacked else (without, plain.colours)
-        return sensor.sense(states, colours).images
+        return sensor.sense(states[:, :3], colours).images
 
     starts = problem.start_states[: experiment.config.deploy.starts]
     return problem, images, starts, experiment.limits
+
+
+def _measured_car(experiment: Experiment, clean: Path) -> RespondingCar:
+    """The deployed car as its drives without attack have shown it; an ideal one until there are any."""
+    ideal = experiment.dynamics
+    if not (clean / DRIVES).exists():
+        return RespondingCar(ideal, CarResponse(ideal.speed_mps))
+    kept = json.loads((clean / DRIVES).read_text(encoding="utf-8"))
+    ends = [
+        tick or len(commands) for tick, commands in zip(kept["blocked_tick"], kept["commands"], strict=True)
+    ]
+    poses = [np.array(each)[: end + 1] for each, end in zip(kept["states"], ends, strict=True)]
+    controls = [np.array(each)[:end] for each, end in zip(kept["commands"], ends, strict=True)]
+    return RespondingCar(ideal, fit_response(poses, controls, ideal))
 
 
 def _found(experiment: Experiment, cell: Cell, folder: Path) -> tuple[Space, AttackFile]:
@@ -187,7 +207,7 @@ def _along_the_drive(
     space = make_space(experiment, None)
     policy, _ = policy_of(experiment, cell)
     shown, there = attack or (space.plain, shown_there(experiment, space.plain, None))
-    with experiment.open_world() as scene:
+    with experiment.open_deployed_world() as scene:
         dressed = dress(experiment, scene, space.plain)
         start = experiment.measured_starts(cell.scenario)[:1]
         plain = shown_there(experiment, space.plain, None)

@@ -70,6 +70,11 @@ def registered_settings(experiment: Experiment) -> dict[str, Any]:
         "bake": bake.VERSION,
         "config": experiment.config.model_dump(mode="json", exclude=_FREE),
         "world": experiment.world_settings,
+        **(
+            {}
+            if experiment.config.deploy.world is None
+            else {"deployed_world": experiment.deployed_world.settings}
+        ),
     }
 
 

@@ -40,7 +40,7 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
         _write(experiment, folder, parts.sections, parts.lead, parts.targets)
         return
     films_of: list[Path] = []
-    with experiment.open_world() as scene:
+    with experiment.open_deployed_world() as scene:
         space = make_space(experiment, scene)
         overview = from_above(experiment, scene)
         for index, name in enumerate(experiment.config.scenarios):

@@ -16,7 +16,7 @@ from nodes.experiment import bake, capture, live, objects, policy, retrain, scen
 from nodes.experiment.config import ExperimentConfig
 from nodes.experiment.context import Experiment
 from nodes.experiment.live import lab_of
-from nodes.experiment.placed import in_a_lane
+from nodes.experiment.placed import PlacedObject, in_a_lane
 from nodes.experiment.reference import REFERENCE
 from nodes.experiment.run_folder import run_to_end
 from nodes.experiment.space_config import FaceConfig
@@ -115,11 +115,11 @@ def _check_places(experiment: Experiment, document: Document) -> None:
         if name not in experiment.world.paths:
             message = unknown(name, "scenario", experiment.world.paths)
             raise ConfigError(f"{document.place(('scenarios', index))}: scenarios: {message}")
-    if (
-        not experiment.has_rules
-        and (found := in_a_lane(experiment.placed_by_hand, experiment.world)) is not None
-    ):
-        raise ConfigError(f"{document.place(('objects', found[0]))}: {found[1]}")
+    by_hand = [
+        index for index, each in enumerate(experiment.config.objects) if isinstance(each, PlacedObject)
+    ]
+    if (found := in_a_lane(experiment.placed_by_hand, experiment.world)) is not None:
+        raise ConfigError(f"{document.place(('objects', by_hand[found[0]]))}: {found[1]}")
     if (
         isinstance(space := experiment.config.space, FaceConfig)
         and space.panel not in experiment.world.panels

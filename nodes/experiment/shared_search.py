@@ -23,6 +23,7 @@ def search_key(experiment: Experiment, cell: Cell) -> str:
     """
     inputs = cell_inputs(experiment, cell)
     inputs["config"].pop("deploy")
+    inputs.pop("deployed_world", None)
     inputs["world"] = experiment.seen_settings
     which = [cell.scenario, cell.victim, cell.method, cell.seed]
     return hash_of({"cell": which, "code": method_digest(cell.code), "inputs": inputs})

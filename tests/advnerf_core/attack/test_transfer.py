@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from advnerf_core.attack.problem import AttackProblem
-from advnerf_core.attack.transfer import predict_transfer
+from advnerf_core.attack.transfer import TransferPrediction, predict_transfer
 from advnerf_core.driving.dynamics import Dubins
 from advnerf_core.driving.metrics import Horizon, drive_metrics
 from advnerf_core.driving.path import Line, Path
@@ -98,3 +98,11 @@ def test_the_fence_stops_a_car_as_the_protocol_does():
     fenced = AttackProblem(Reads(), Nothing(), Dubins(1.0, 0.1), PATH, START, 20, fence_m=1.0, held_cap_m=0.1)
     found = predict_transfer(fenced, images, clean, effect, START, HORIZON, draws=2)
     assert found.attacked_m[0] < driven(TURN)
+
+
+def test_the_excess_per_tick_is_that_of_each_draw_over_its_own_without_attack():
+    found = TransferPrediction((4.0, 6.0, 8.0), (2.0, 2.0, 3.0), 1.0, 20)
+    low, mean, high = found.excess_m_per_tick
+    assert mean == pytest.approx((0.1 + 0.2 + 0.25) / 3)
+    assert (low, high) == pytest.approx(tuple(np.quantile([0.1, 0.2, 0.25], (0.1, 0.9))))
+    assert found.record()["excess_m"] == mean

@@ -262,6 +262,26 @@ def test_cells_that_differ_in_their_deployment_alone_share_one_search(fresh: Exp
     assert take_search(noisy, GRADIENT, folder / "third") is None
 
 
+def test_an_attack_may_be_deployed_in_another_world_of_the_same_paths(fresh: Experiment) -> None:
+    slow = {**fresh.config.world, "car": {**fresh.config.world.get("car", {}), "turn_rate_lag_s": 0.5}}
+    there, folder = changed(fresh, "deploy", world=slow), fresh.folder / "campaign"
+    here = run_cell(fresh, GRADIENT, folder / "here", silent)
+    found = run_cell(there, GRADIENT, folder / "there", silent)
+    assert found["attack_id"] == here["attack_id"]
+    assert found["surrogate"] == here["surrogate"]
+    assert found["deployed"] != here["deployed"]
+    # It counts as what the cell depends on, and the search does not.
+    assert settings_hash(load_kind("experiment"), there, GRADIENT) != settings_hash(
+        load_kind("experiment"), fresh, GRADIENT
+    )
+    assert search_key(there, GRADIENT) == search_key(fresh, GRADIENT)
+    other = changed(fresh, "deploy", world={**fresh.config.world, "camera": {"horizontal_fov_deg": 60.0}})
+    with pytest.raises(
+        ConfigError, match=r"deploy\.world: expected a world with the paths.* with other camera"
+    ):
+        run_cell(other, GRADIENT, folder / "other", silent)
+
+
 def test_the_driving_camera_may_be_a_real_one(fresh: Experiment, wall: Any) -> None:
     def commands(**effects: Any) -> Any:
         experiment = changed(fresh, "deploy", camera=CameraEffects(**effects))

@@ -1,0 +1,77 @@
+"""Were the predictions of a registered set any good? ``python -m benchmarks.predictions SET [--past SET]...``.
+
+Reads published cells and the predictions beside them (``advnerf predict``-ed before any deployed drive with the attack was looked at), and
+scores every deployed drive: how many lie in the predicted 80 % bands, and the mean interval score against that of "as in the surrogate,
+with the spread between surrogate and deployment that earlier sets had".
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+
+import numpy as np
+
+from advnerf_core.report.cells import read_cells
+from advnerf_core.report.evidence.prediction_score import ScoredCell, score_cells
+from advnerf_core.report.evidence.registration import read_registration
+from advnerf_core.report.evidence.results import Evidence
+from benchmarks.results import REPOSITORY, record_row
+
+PUBLISHED = REPOSITORY / "docs" / "results"
+_HOLD = (0.65, 0.95)
+
+
+def main() -> None:
+    """Score and record."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("set", help="name of a published set")
+    parser.add_argument("--past", nargs="*", default=["room"], help="published sets that were known before")
+    options = parser.parse_args()
+    found = score_cells(
+        evidence_of(options.set), predictions_of(options.set), [evidence_of(name) for name in options.past]
+    )
+    if not found:
+        raise SystemExit(f"no predictions of deployed cells in {PUBLISHED / options.set / 'predictions'}")
+    for each in found:
+        print(
+            f"{each.name}: said {each.band[0]:.3f} to {each.band[1]:.3f}, was {np.mean(each.measured):.3f} half lanes per tick, "
+            f"{each.held} of {len(each.measured)} drives held; score {each.score:.3f}, trivial {each.trivial_score:.3f}"
+        )
+    record(
+        options.set, found, f"python -m benchmarks.predictions {options.set} --past {' '.join(options.past)}"
+    )
+
+
+def evidence_of(name: str) -> Evidence:
+    """A published set."""
+    registration = read_registration(PUBLISHED / name)
+    if registration is None:
+        raise SystemExit(f"expected a registered set in {PUBLISHED / name}, got none")
+    return Evidence(registration, read_cells(PUBLISHED / name))
+
+
+def predictions_of(name: str) -> dict[str, dict[str, float]]:
+    """Predictions by cell."""
+    return {
+        file.stem: json.loads(file.read_text()) for file in (PUBLISHED / name / "predictions").glob("*.json")
+    }
+
+
+def record(name: str, found: list[ScoredCell], command: str) -> None:
+    """Print and record the two rows."""
+    drives = sum(len(each.measured) for each in found)
+    share = sum(each.held for each in found) / drives
+    ours, trivial = (
+        float(np.mean([getattr(each, which) for each in found])) for which in ("score", "trivial_score")
+    )
+    note = f"{len(found)} attacks, {drives} deployed drives of the set {name}"
+    print(
+        f"{100 * share:.0f} % of {drives} drives in their 80 % bands; mean interval score {ours:.3f}, trivial {trivial:.3f}"
+    )
+    record_row(f"deployed drives within their predicted 80 % bands, {name}", round(100 * share), "%", "65 to 95 %", _HOLD[0] <= share <= _HOLD[1], command, note)  # fmt: skip
+    record_row(f"interval score of predicted excess against the surrogate's with the past's spread, {name}", ours / trivial, "x", "< 1", ours < trivial, command, f"{note}; {ours:.3f} against {trivial:.3f} half lanes per tick")  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()
