@@ -1,4 +1,4 @@
-"""How fast are worlds of other people? ``python -m benchmarks.foreign_worlds [metadrive|duckietown]``; they must be installed.
+"""How fast are worlds of other people? ``python -m benchmarks.foreign_worlds [metadrive|duckietown|filament]``; they must be installed.
 
 A step of a tenth of a second, and the driving camera's picture of 336 x 188 pixels with depth, through the other process; in MetaDrive also without
 what could be switched off. The processor's time of the server is told beside the wall time, as the machine may have other work.
@@ -28,6 +28,11 @@ VARIANTS: dict[str, dict[str, tuple[str, ...]]] = {
         "one sample per pixel, anisotropic filtering": ("supersampling=1", "anisotropic=true"),
     },
     "duckietown": {"as it is": (), "one sample per pixel": ("supersampling=1",)},
+    "filament": {
+        "as it is": (),
+        "one sample per pixel": ("lab.supersampling=1",),
+        "with ambient occlusion": ("ambient_occlusion=true",),
+    },
 }
 
 

@@ -79,11 +79,18 @@ def _duckietown() -> WorldClass:
     return Duckietown
 
 
+def _filament() -> WorldClass:
+    from hardware.worlds.filament.world import Filament
+
+    return Filament
+
+
 WORLDS: Mapping[str, Callable[[], WorldClass]] = {
     "lab": _lab,
     "junction": _junction,
     "carla": _carla,
     "metadrive": _metadrive,
     "duckietown": _duckietown,
+    "filament": _filament,
 }
 """Loaders of the worlds' classes by name; a simulator is imported when its world is opened."""

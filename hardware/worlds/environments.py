@@ -104,6 +104,14 @@ ENVIRONMENTS = {
             870,
             ("libegl1", "libgl1", "libgl1-mesa-dri", "libglu1-mesa"),
         ),
+        Environment(
+            "filament",
+            "MuJoCo 4.0.0 with its renderer Filament, which draws the lab",
+            "MuJoCo and Filament are published under the Apache License 2.0 (https://github.com/google-deepmind/mujoco).",
+            ("3.11", "3.12", "3.13"),
+            200,
+            ("libvulkan1", "mesa-vulkan-drivers"),
+        ),
     )
 }
 """Foreign worlds by kind."""

@@ -106,6 +106,10 @@ class RemoteWorld(ABC):
     def description_of(self, facts: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> WorldDescription:
         """What the simulator said when it was opened, as a description."""
 
+    def opened_with(self) -> _Arrays:
+        """Arrays by name that the simulator is opened with beside its settings, such as files; none unless a subclass says so."""
+        return {}
+
     @abstractmethod
     def photo_poses(self, count: int, rng: np.random.Generator, /) -> list[Array]:
         """From where it is photographed for learning; see `World.photo_poses`."""
@@ -231,9 +235,8 @@ class RemoteWorld(ABC):
         """Start the process and open its simulator."""
         self.server = RemoteServer(self._name, self.python(), self._simulator, self._server_file)
         cameras = {"driving": asdict(self.camera_pinhole), "photo": asdict(self.photo_pinhole)}
-        answer = self._call(
-            "open", {"config": self._settings, "cameras": cameras}, {}, self._deadlines.open_s
-        )
+        opened = {"config": self._settings, "cameras": cameras}
+        answer = self._call("open", opened, self.opened_with(), self._deadlines.open_s)
         with self._or_lost():
             said = self._described(answer)
             if self._description is not None and said.to_dict() != self._description.to_dict():

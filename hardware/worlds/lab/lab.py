@@ -10,7 +10,7 @@ import numpy as np
 from advnerf_core.geometry import Array, Pinhole, VehicleState, look_at, planar_pose
 from hardware.worlds.lab import textures
 from hardware.worlds.lab.config import LabConfig, MonitorOpticsConfig
-from hardware.worlds.lab.furniture import vehicle_in_room
+from hardware.worlds.lab.driven import DrivenCar
 from hardware.worlds.lab.monitor import ScreenOptics
 from hardware.worlds.lab.phone import apply_colours
 from hardware.worlds.lab.renderer import Renderer
@@ -37,9 +37,7 @@ class Lab:
         self.phone_pinhole: Pinhole = self.config.phone.pinhole
         self.photo_pinhole: Pinhole = self.phone_pinhole
         self.T_car_from_camera: Array = self.config.camera.T_car_from_camera
-        self._vehicle = vehicle_in_room(self.config)
-        self._pending: list[tuple[float, float, float]] = []  # due time [s], servo, erpm
-        self._time_s = 0.0
+        self._car = DrivenCar(self.config)
         self._stood: dict[str, tuple[Panel, Rgb]] = {}
         self._shown: dict[str, Rgb] = {}  # textures that are no longer those of the model
         self._renderer = self._new_renderer()
@@ -57,12 +55,7 @@ class Lab:
 
     def reset(self, x_m: float, y_m: float, yaw_rad: float, speed_mps: float = 0.0) -> VehicleState:
         """Put the car down, forget commands under way and start lab time at 0; a speed, if given, is held."""
-        self._vehicle.reset(x_m, y_m, yaw_rad, speed_mps)
-        if speed_mps != 0.0:
-            self._vehicle.command(erpm=self._vehicle.erpm)
-        self._pending.clear()
-        self._time_s = 0.0
-        return self.state
+        return self._car.reset(x_m, y_m, yaw_rad, speed_mps)
 
     def step(self, steering_rad: float, speed_mps: float, duration_s: float) -> VehicleState:
         """Send one command and let time pass.
@@ -75,43 +68,22 @@ class Lab:
             speed_mps: Commanded speed [m/s].
             duration_s: Time to the next observation [s].
         """
-        if not np.isfinite([steering_rad, speed_mps, duration_s]).all() or duration_s < 0.0:
-            raise ValueError(
-                f"expected a finite command and duration >= 0, got {steering_rad}, {speed_mps}, {duration_s}"
-            )
-        car = self.config.car
-        due = self._time_s + car.command_delay_s
-        self._pending.append((due, car.servo_from_steering(steering_rad), car.erpm_from_speed(speed_mps)))
-        end = self._time_s + duration_s
-        while self._pending and self._pending[0][0] <= end:
-            due, servo, erpm = self._pending.pop(0)
-            self._vehicle.advance(max(due - self._time_s, 0.0))
-            self._time_s = due
-            self._actuate(servo, erpm)
-        self._vehicle.advance(max(end - self._time_s, 0.0))
-        self._time_s = end
-        return self.state
-
-    def _actuate(self, servo: float, erpm: float) -> None:
-        if abs(erpm) < self.config.car.min_erpm:
-            self._vehicle.command(servo=servo, duty=0.0)
-        else:
-            self._vehicle.command(servo=servo, erpm=erpm)
+        return self._car.step(steering_rad, speed_mps, duration_s)
 
     @property
     def state(self) -> VehicleState:
         """True state of the car."""
-        return self._vehicle.state
+        return self._car.state
 
     @property
     def time_s(self) -> float:
         """Lab time since the last reset [s]."""
-        return self._time_s
+        return self._car.time_s
 
     @property
     def blocked(self) -> bool:
         """Whether the car stands against a wall or an obstacle."""
-        return self._vehicle.blocked
+        return self._car.blocked
 
     @overload
     def observe(self, depth: Literal[True] = True) -> tuple[Rgb, Depth]: ...
@@ -231,7 +203,7 @@ class Lab:
         self.close()
 
     def _pose(self) -> tuple[float, float, float]:
-        state = self._vehicle.state
+        state = self._car.state
         return state.x_m, state.y_m, state.yaw_rad
 
     def _see(self, T_world_from_car: Array, depth: bool) -> tuple[Rgb, Depth | None]:

@@ -41,6 +41,16 @@ def build_model(config: LabConfig, stood: Mapping[str, tuple[Panel, Rgb]] = Mapp
     Returns:
         A ``mujoco.MjModel``.
     """
+    mujoco, spec = load_mujoco(), compose_room(config)
+    for name, (panel, rgb) in stood.items():
+        add_texture(mujoco, spec, name, rgb)
+        add_material(mujoco, spec, name)
+        _add_rectangle(mujoco, spec, name, panel.T_world_from_face, panel.width_m, panel.height_m)
+    return spec.compile()
+
+
+def compose_room(config: LabConfig) -> Any:
+    """The room of `build_model` as a ``mujoco.MjSpec`` that is not compiled yet."""
     mujoco = load_mujoco()
     spec = mujoco.MjSpec()
     spec.visual.headlight.active = 0
@@ -61,12 +71,8 @@ def build_model(config: LabConfig, stood: Mapping[str, tuple[Panel, Rgb]] = Mapp
     _add_panel(
         mujoco, spec, "monitor", config.monitor, MONITOR_PIXELS, textures.screen_image(*MONITOR_PIXELS)
     )
-    for name, (panel, rgb) in stood.items():
-        add_texture(mujoco, spec, name, rgb)
-        add_material(mujoco, spec, name)
-        _add_rectangle(mujoco, spec, name, panel.T_world_from_face, panel.width_m, panel.height_m)
     _add_car(mujoco, spec, config)
-    return spec.compile()
+    return spec
 
 
 def _add_lights(mujoco: Any, spec: Any) -> None:

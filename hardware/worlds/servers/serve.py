@@ -1,7 +1,8 @@
 """Serves one simulator to advnerf: ``python -I serve.py SIMULATOR.py ENDPOINT``.
 
 This file runs in the simulator's own environment. It needs Python 3.10, pyzmq and numpy, and nothing of advnerf, so that the two
-environments never meet. ``SIMULATOR.py`` defines ``open_simulator(config, cameras)``; docs/foreign_worlds.md says what that returns.
+environments never meet. ``SIMULATOR.py`` defines ``open_simulator(config, cameras)``, which also takes arrays where its world sends some;
+docs/foreign_worlds.md says what it returns.
 
 A message is a header of JSON and one frame of raw bytes for each array, C-contiguous, little-endian, in the header's order:
 
@@ -36,7 +37,7 @@ class Server:
     """Answers calls with the methods of a simulator, which the call ``open`` makes.
 
     Args:
-        open_simulator: Called with the configuration and the cameras of ``open``.
+        open_simulator: Called with the configuration, the cameras and the arrays of ``open``.
         socket: A connected PAIR socket.
     """
 
@@ -74,7 +75,7 @@ class Server:
         if name == "hello":
             return {"python": sys.version.split()[0], "numpy": np.__version__}, {}
         if name == "open":
-            self._simulator = self._open_simulator(**arguments)
+            self._simulator = self._open_simulator(**arguments, **arrays)
             return self._simulator.describe()
         if name not in ("render", "reset", "step", "add_panel"):
             raise ValueError(f"expected a call of the protocol, got {name!r}")

@@ -46,6 +46,22 @@ def test_the_server_imports_nothing_of_ours_and_does_not_see_our_path(tmp_path: 
         server.close()
 
 
+def test_a_simulator_is_opened_with_arrays_where_the_world_sends_some(tmp_path: Path) -> None:
+    simulator = tmp_path / "simulator.py"
+    simulator.write_text(
+        "def open_simulator(config, cameras, **files):\n    return Told(files)\nclass Told:\n    def __init__(self, files):\n"
+        "        self.files = files\n    def describe(self):\n        return {'names': sorted(self.files)}, self.files\n"
+    )
+    server = RemoteServer("told", Path(sys.executable), simulator)
+    sent = {"room.xml": np.frombuffer(b"<mujoco/>", np.uint8), "floor.png": np.arange(5, dtype=np.uint8)}
+    try:
+        answer = server.call("open", {"config": {}, "cameras": {}}, sent, 10.0)
+    finally:
+        server.close()
+    assert answer.result == {"names": sorted(sent)}
+    assert all(np.array_equal(answer.arrays[name], data) for name, data in sent.items())
+
+
 @pytest.mark.parametrize("kind", FAULTS)
 def test_a_fault_ends_as_its_named_error_and_the_next_drive_goes_on(kind: str, tmp_path: Path) -> None:
     calls, expected = FAULTS[kind]

@@ -77,6 +77,7 @@ def test_every_shipped_experiment_names_its_world(tmp_path: Path) -> None:
         "junction": "junction",
         "carla": "carla",
         "metadrive": "metadrive",
+        "duckietown": "duckietown",
     }
 
 
@@ -85,7 +86,7 @@ def test_every_shipped_experiment_names_its_world(tmp_path: Path) -> None:
     [
         (
             {"world": {"kind": "moon"}},
-            "expected a world of lab, junction, carla, metadrive, duckietown; got 'moon'",
+            "expected a world of lab, junction, carla, metadrive, duckietown, filament; got 'moon'",
         ),
         ({"world": {"road": {}}}, "expected kind: NAME"),
         (

@@ -9,10 +9,13 @@ import pytest
 from hardware.worlds.duckietown.config import DuckietownConfig
 from hardware.worlds.duckietown.world import Duckietown
 from hardware.worlds.environments import ENVIRONMENTS
+from hardware.worlds.filament.config import FilamentConfig
+from hardware.worlds.filament.world import Filament
+from hardware.worlds.lab.lab_world import LabWorld
 from hardware.worlds.metadrive.config import CarConfig, MetaDriveConfig, RoadConfig
 from hardware.worlds.metadrive.world import MetaDrive
 from hardware.worlds.remote_errors import RemoteWorldError
-from hardware.worlds.world import NotOpenError, WorldError
+from hardware.worlds.world import NotOpenError, Panel, WorldError
 from nodes.lab.worlds.check import check_world
 from nodes.lab.worlds.named import read_world
 from nodes.runtime.config import Document, apply_overrides
@@ -33,6 +36,7 @@ installed = {
         pytest.param("metadrive", ("traffic_density=0.3",), marks=installed["metadrive"]),
         pytest.param("duckietown", (), marks=installed["duckietown"]),
         pytest.param("duckietown", ("map_name=loop_obstacles",), marks=installed["duckietown"]),
+        pytest.param("filament", (), marks=installed["filament"]),
     ],
 )
 def test_a_foreign_world_keeps_the_contract(kind: str, changes: tuple[str, ...]) -> None:
@@ -103,3 +107,68 @@ def test_a_lane_that_ends_is_refused_and_the_one_beside_it_is_driven() -> None:
 def test_a_map_without_a_way_round_is_refused() -> None:
     with pytest.raises(WorldError, match="name another one, such as small_loop"):
         Duckietown(DuckietownConfig(map_name="straight_road")).__enter__()
+
+
+@pytest.mark.slow
+@installed["filament"]
+def test_another_renderer_changes_the_colours_and_neither_depth_nor_dynamics() -> None:
+    with Filament() as drawn, LabWorld() as lab:
+        told, expected = drawn.describe().to_dict(), lab.describe().to_dict()
+        assert told.pop("facts") == {"simulator": "Filament of MuJoCo 4.0.0"}
+        assert told == {key: value for key, value in expected.items() if key != "facts"}
+        for world in (drawn, lab):
+            world.reset(-1.1, -2.0, 0.0)
+        for steering in (0.2, -0.1, 0.3):
+            assert drawn.step(steering, 0.8, 0.1) == lab.step(steering, 0.8, 0.1)
+        (rgb, depth), (lab_rgb, lab_depth) = drawn.observe(), lab.observe()
+        apart = np.abs(depth / lab_depth - 1.0)
+        assert np.quantile(apart, 0.99) < 1e-3
+        greys = [each.mean(axis=-1).ravel() for each in (rgb, lab_rgb)]
+        assert np.corrcoef(*greys)[0, 1] > 0.8
+        assert 2.0 < np.abs(rgb.astype(float) - lab_rgb).mean() < 40.0
+
+
+@pytest.mark.slow
+@installed["filament"]
+def test_the_monitor_shows_a_picture_and_a_drive_whose_renderer_died_ends() -> None:
+    with Filament() as world:
+        place = (0.9, 2.0, 0.9)
+        idle = world.observe_at(*place, depth=False)[0]
+        world.show("monitor", np.full((4, 4, 3), (250, 20, 20), np.uint8))
+        red = world.observe_at(*place, depth=False)[0]
+        changed = (red != idle).any(axis=-1)
+        assert changed.sum() > 500
+        assert red[changed].mean(axis=0)[0] > 3.0 * red[changed].mean(axis=0)[1]
+        world.reset(-1.1, -2.0, 0.0)
+        assert world.server is not None
+        world.server.kill()
+        with pytest.raises(RemoteWorldError):
+            world.observe()
+        with pytest.raises(RemoteWorldError, match="call reset first"):
+            world.step(0.0, 0.8, 0.1)
+        world.reset(-1.1, -2.0, 0.0)
+        assert np.array_equal(world.observe_at(*place, depth=False)[0], red)
+        world.show("monitor", None)
+        assert np.array_equal(world.observe_at(*place, depth=False)[0], idle)
+        with pytest.raises(WorldError, match="a screen of the lab"):
+            world.show("board", None)
+
+
+@pytest.mark.slow
+@installed["filament"]
+def test_the_back_of_a_panel_is_plain() -> None:
+    face = np.eye(4)
+    face[:3, 3] = 0.3, -2.0, 0.3
+    with Filament() as world:
+        world.add_panel("red", Panel(face, 0.6, 0.4), np.full((8, 8, 3), (255, 0, 0), np.uint8))
+        back = world.observe_at(-1.1, -2.0, 0.0, depth=False)[0][60:70, 160:176]
+        assert np.ptp(back.astype(int), axis=-1).max() < 40
+        face[:2, :2] = -np.eye(2)
+        world.add_panel("red", Panel(face, 0.6, 0.4), np.full((8, 8, 3), (255, 0, 0), np.uint8))
+        front = world.observe_at(-1.1, -2.0, 0.0, depth=False)[0][60:70, 160:176]
+        assert (front[..., 0] > 2 * front[..., 1]).all()
+
+
+def test_optics_that_the_twin_computes_are_refused() -> None:
+    with pytest.raises(ValueError, match="no monitor_optics"):
+        FilamentConfig.model_validate({"lab": {"monitor_optics": {"response": 2.2}}})

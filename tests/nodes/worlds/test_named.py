@@ -113,7 +113,7 @@ def test_a_package_brings_a_world(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     }
     listed = CliRunner().invoke(app, ["world", "list"])
     names = [line.split()[0] for line in listed.output.splitlines()]
-    assert names == ["lab", "junction", "carla", "metadrive", "duckietown", "yard"]
+    assert names == ["lab", "junction", "carla", "metadrive", "duckietown", "filament", "yard"]
 
 
 @pytest.mark.parametrize(
@@ -121,7 +121,7 @@ def test_a_package_brings_a_world(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     [
         (
             "kind: moon",
-            r"yard\.experiment\.yaml:1: expected a world of lab, junction, carla, metadrive, duckietown; got 'moon'",
+            r"yard\.experiment\.yaml:1: expected a world of lab, junction, carla, metadrive, duckietown, filament; got 'moon'",
         ),
         ("kind: junctoin", r"did you mean junction\?"),
         ("{}", r"expected kind: NAME"),

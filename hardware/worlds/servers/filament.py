@@ -1,0 +1,222 @@
+"""MuJoCo 4.0.0's renderer Filament on software Vulkan for ``serve.py``: a MuJoCo scene that is sent as files, drawn physically based.
+
+Runs in an environment of its own, and imports nothing of advnerf. Nothing moves here: the car drives in the other process.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mujoco
+import mujoco.studio
+import numpy as np
+from mujoco import mjrf
+
+SCENE = "room.xml"
+NEAR_M, FAR_M = 0.02, 30.0
+BACK_M, BACK_RGB = 0.005, (0.2, 0.2, 0.2)
+# What MuJoCo 4 lights a scene with whose lights have no intensities of their own [lux]: its environment, and all lights together.
+_ENVIRONMENT_LX, _LIGHTS_LX = 5000.0, 80000.0
+_COLOURS, _NUMBERS = mjrf.PixelFormat.PIXEL_FORMAT_RGB8, mjrf.PixelFormat.PIXEL_FORMAT_R32F
+_GEOM = mujoco.mjtObj.mjOBJ_GEOM
+Reply = tuple[dict[str, Any], dict[str, np.ndarray]]
+
+
+def open_simulator(config: dict[str, Any], cameras: dict[str, Any], **files: np.ndarray) -> Room:
+    """The scene ``room.xml`` with the pictures that it names, as bytes."""
+    return Room(config, cameras, {name: data.tobytes() for name, data in files.items()})
+
+
+class Room:
+    """One static scene; see docs/foreign_worlds.md for the calls."""
+
+    def __init__(self, config: dict[str, Any], cameras: dict[str, Any], files: dict[str, bytes]) -> None:
+        asked = mjrf.ContextConfig()
+        asked.graphics_api, asked.software_rendering = mjrf.GraphicsApi.GRAPHICS_API_VULKAN, True
+        self._context = mjrf.Context(asked)
+        self._context.set_clear_color(np.zeros(3, np.float32))
+        self._scene = self._context.create_scene(mjrf.SceneParams())
+        self._fill(_model(config, files))
+        fine = config["lab"]["supersampling"]
+        self._views = {name: View(self._context, self._scene, lens, fine) for name, lens in cameras.items()}
+        self._panels: dict[str, list[Any]] = {}
+
+    def _fill(self, model: Any) -> None:
+        """Put the model into the scene; what it consists of must be kept while it is drawn."""
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        resources = mjrf.ModelResources(self._context, model)
+        self._scene.configure_from_model(model)
+        lights = mjrf.ModelLights(self._scene, resources)
+        solids = mjrf.ModelRenderables(self._scene, resources)
+        lights.update(data)
+        solids.update(data)
+        self._kept = (model, data, resources, lights, solids)
+
+    def describe(self) -> Reply:
+        """Which renderer it is."""
+        return {"simulator": f"Filament of MuJoCo {mujoco.mj_versionString()}"}, {}
+
+    def render(self, camera: str, depth: bool, T_world_from_camera: np.ndarray) -> Reply:
+        """A picture, and its depth where it is wanted."""
+        view = self._views[camera]
+        eye = view.aimed(T_world_from_camera)
+        found = {"rgb": view.rgb(eye), "T_world_from_camera": _pose_of(eye)}
+        if depth:
+            found["depth"] = view.depth(eye)
+        return {}, found
+
+    def add_panel(self, name: str, size_m: list[float] | None, **arrays: np.ndarray) -> Reply:
+        """Put a panel with ``T_world_from_face`` and texture ``rgb`` into the scene; without a size, take it out."""
+        for solid in self._panels.pop(name, [])[:2]:
+            self._scene.remove_renderable(solid)
+        if size_m is not None:
+            self._panels[name] = self._panel(size_m, **arrays)
+            for solid in self._panels[name][:2]:
+                self._scene.add_renderable(solid)
+        return {}, {}
+
+    def _panel(self, size_m: list[float], T_world_from_face: np.ndarray, rgb: np.ndarray) -> list[Any]:
+        """A face that is lit as every other matte surface, a plain thin box behind it, and the face's texture, which must be kept."""
+        half_m = 0.5 * size_m[0], 0.5 * size_m[1]
+        # A plane faces its z; its x is to the viewer's right, which is the face's y.
+        axes, place = T_world_from_face[:3, [1, 2, 0]], T_world_from_face[:3, 3]
+        face = self._solid(mujoco.mjtGeom.mjGEOM_PLANE, (*half_m, 1.0), place, axes)
+        back = self._solid(
+            mujoco.mjtGeom.mjGEOM_BOX, (*half_m, 0.5 * BACK_M), place - 0.6 * BACK_M * axes[:, 2], axes
+        )
+        texture = self._texture(rgb)
+        for solid in (face, back):
+            matte = mjrf.Material()
+            matte.specular = matte.glossiness = matte.reflectance = matte.emissive = 0.0
+            if solid is face:
+                matte.color_texture = texture
+            else:
+                matte.color = np.array([*BACK_RGB, 1.0], np.float32)
+            solid.set_material(matte)
+        return [face, back, texture]
+
+    def _solid(self, kind: Any, half_m: tuple[float, ...], place: np.ndarray, axes: np.ndarray) -> Any:
+        quality = self._kept[0].vis.quality
+        solid = self._context.create_renderable(mjrf.RenderableParams())
+        solid.set_geom_mesh(kind, quality.numstacks, quality.numslices, quality.numquads)
+        solid.set_size(np.array(half_m, np.float32))
+        solid.set_pose(place.astype(np.float32), axes.astype(np.float32).ravel())
+        return solid
+
+    def _texture(self, rgb: np.ndarray) -> Any:
+        """A picture ``[h, w, 3]`` of display values."""
+        form = mjrf.TextureConfig(
+            width=rgb.shape[1],
+            height=rgb.shape[0],
+            format=_COLOURS,
+            color_space=mjrf.ColorSpace.COLORSPACE_SRGB,
+            sampler_type=mjrf.SamplerType.TEXTURE_2D,
+        )
+        texture, data = self._context.create_texture(form), mjrf.TextureData()
+        data.set_image(rgb.tobytes())
+        texture.upload(data)
+        return texture
+
+
+class View:
+    """A lens, with a target for colours, each the mean of ``supersampling`` squared ones, and one for depth at pixel centres."""
+
+    def __init__(self, context: Any, scene: Any, lens: dict[str, Any], supersampling: int) -> None:
+        self._context, self._scene, self._lens, self._fine = context, scene, lens, supersampling
+        height, width = lens["height"], lens["width"]
+        self._colours = Target(
+            context, np.zeros((supersampling * height, supersampling * width, 3), np.uint8)
+        )
+        self._nearness = Target(context, np.zeros((height, width), np.float32))
+        share = np.arange(255 * supersampling**2 + 1) / (255.0 * supersampling**2)
+        curve = np.where(share <= 0.0031308, 12.92 * share, 1.055 * share ** (1.0 / 2.4) - 0.055)
+        self._display = np.rint(255.0 * curve).astype(np.uint8)
+
+    def aimed(self, T_world_from_camera: np.ndarray) -> Any:
+        """A camera at a pose, with the lens as its frustum at the near plane."""
+        lens, T = self._lens, T_world_from_camera.astype(np.float32)
+        across, down = NEAR_M / lens["fx"], NEAR_M / lens["fy"]
+        return mjrf.Camera(
+            pos=T[:3, 3],
+            forward=T[:3, 2],
+            up=-T[:3, 1],
+            frustum_center=(0.5 * lens["width"] - lens["cx"]) * across,
+            frustum_width=0.5 * lens["width"] * across,
+            frustum_top=lens["cy"] * down,
+            frustum_bottom=(lens["cy"] - lens["height"]) * down,
+            frustum_near=NEAR_M,
+            frustum_far=FAR_M,
+        )
+
+    def rgb(self, eye: Any) -> np.ndarray:
+        """Colours ``[H, W, 3]``: the light of all samples of a pixel, then the curve of a display."""
+        self._draw(eye, self._colours, mjrf.DrawMode.DRAW_MODE_DEFAULT)
+        n, (height, width) = self._fine, self._nearness.buffer.shape
+        light = self._colours.buffer.reshape(height, n, width, n, 3).sum(axis=(1, 3), dtype=np.int32)
+        return self._display[light]
+
+    def depth(self, eye: Any) -> np.ndarray:
+        """Planar depth ``[H, W]`` [m]; infinite where nothing is."""
+        self._draw(eye, self._nearness, mjrf.DrawMode.DRAW_MODE_DEPTH)
+        # The target has 1 at the nearest and 0 at the farthest depth; between them the inverse of depth is linear.
+        share = self._nearness.buffer.astype(np.float64)
+        depth_m = 1.0 / (share * (1.0 / NEAR_M - 1.0 / FAR_M) + 1.0 / FAR_M)
+        return np.where(share > 0.0, depth_m, np.inf).astype(np.float32)
+
+    def _draw(self, eye: Any, target: Target, mode: Any) -> None:
+        height, width = target.buffer.shape[:2]
+        request = mjrf.RenderRequest(
+            scene=self._scene,
+            camera=eye,
+            target=target.target,
+            viewport=mjrf.Rect(0, 0, width, height),
+            draw_mode=mode,
+            post_processing=False,  # its dithering differs from frame to frame, so that no picture could be repeated
+            reflections=False,
+            shadows=False,
+            skybox=False,
+            haze=False,
+            headlight=False,
+        )
+        self._context.wait_for_frame(self._context.render([request], [target.reading]))
+
+
+class Target:
+    """Where a frame is drawn, and the array that it is read into."""
+
+    def __init__(self, context: Any, buffer: np.ndarray) -> None:
+        self.buffer = buffer
+        height, width = buffer.shape[:2]
+        form = _COLOURS if buffer.dtype == np.uint8 else _NUMBERS
+        self.target = context.create_render_target(
+            mjrf.RenderTargetConfig(width=width, height=height, color_format=form)
+        )
+        self.target.resize(width, height)
+        self.reading = mjrf.ReadRequest(target=self.target)
+        self.reading.set_buffer(buffer)
+
+
+def _model(config: dict[str, Any], files: dict[str, bytes]) -> Any:
+    """The scene with what Filament is to make of it."""
+    spec = mujoco.MjSpec.from_string(files[SCENE].decode(), assets=files)
+    for texture in spec.textures:
+        # Pictures of the scene are display values; Filament computes with light.
+        texture.colorspace = mujoco.mjtColorSpace.mjCOLORSPACE_SRGB
+    for name, value in {
+        "ao.enabled": float(config["ambient_occlusion"]),
+        "fallback.environment_light_intensity": _ENVIRONMENT_LX * config["brightness"],
+        "fallback.scene_light_intensity": _LIGHTS_LX * config["brightness"],
+        # The scene's emission corrects the lighting of another renderer; here it would be white light.
+        "phong.emissive_multiplier": 0.0,
+    }.items():
+        spec.add_numeric(name=f"filament.{name}", data=[value])
+    return spec.compile()
+
+
+def _pose_of(eye: Any) -> np.ndarray:
+    """``T_world_from_camera`` of a camera, with axes x right, y down, z forward."""
+    T, forward, up = np.eye(4), np.asarray(eye.forward, np.float64), np.asarray(eye.up, np.float64)
+    T[:3, :3] = np.stack([np.cross(forward, up), -up, forward], axis=1)
+    T[:3, 3] = eye.pos
+    return T
