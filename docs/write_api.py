@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from textwrap import dedent
+from textwrap import dedent, fill
 
 from advnerf_core.files import write_atomically
 
@@ -32,6 +32,7 @@ control ticks, H and W rows and columns of an image, n entries of a car's state 
 """
 _SECTION = re.compile(r"^(Args|Attributes|Returns|Raises):$")
 _ITEM = re.compile(r"^(\*{0,2}\w+): ?(.*)$")
+_CODE, _NO_BREAK = re.compile(r"`[^`]*`"), "\x00"
 _ROLE = re.compile(r":\w+:`~?([^`]+)`")
 _CODE_LINE = 110
 _LONGEST_DEFAULT = 80
@@ -307,7 +308,7 @@ def _members(node: ast.ClassDef) -> Iterator[str]:
     for member in methods:
         doc = parsed(ast.get_docstring(member) or "")
         signature = " ".join(_signature(member, node.name).split()).replace("( ", "(").replace(", )", ")")
-        yield f"- **`{signature}`**: {_plain(' '.join(doc.text.split()))}"
+        yield _wrapped(f"- **`{signature}`**: {_plain(' '.join(doc.text.split()))}", "  ")
         yield from _bullets(doc, "  ", {})
 
 
@@ -321,7 +322,7 @@ def _bullets(doc: Doc, indent: str, types: dict[str, str]) -> Iterator[str]:
                 label = f"`{name}: {types[name]}`" if name in types else f"`{name}`"
             else:
                 label = f"*{section}*" + (f" `{name}`" if name else "")
-            yield f"{indent}- {label}: {_plain(text)}"
+            yield _wrapped(f"{indent}- {label}: {_plain(text)}", indent + "  ")
 
 
 def _paragraphs(text: str) -> str:
@@ -331,8 +332,16 @@ def _paragraphs(text: str) -> str:
         if paragraph.startswith(" "):
             parts.append(f"```\n{dedent(paragraph)}\n```")
         else:
-            parts.append(_plain(paragraph))
+            parts.append(_wrapped(_plain(paragraph)))
     return "\n\n".join(parts)
+
+
+def _wrapped(text: str, indent: str = "") -> str:
+    """Lines of 100 columns; what stands between backticks is not broken."""
+    whole = _CODE.sub(lambda found: found.group().replace(" ", _NO_BREAK), text)
+    whole = re.sub(r"^( *-) ", rf"\1{_NO_BREAK}", whole)
+    lines = fill(whole, 100, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
+    return lines.replace(_NO_BREAK, " ")
 
 
 def _plain(text: str) -> str:

@@ -165,7 +165,12 @@ class Lab:
     def add_panel(self, name: str, panel: Panel, rgb: Rgb | None) -> None:
         """Stand a panel in the room, lit as the furniture is, or take it out; see `hardware.worlds.world.NativePanels`.
 
-        A new picture on a panel that stands there takes no time; anything else makes the room anew. Nobody runs into it.
+        A new picture on a panel that stands there takes no time; anything else builds the room again. Nothing collides with it.
+
+        Args:
+            name: Of the panel.
+            panel: Pose and size.
+            rgb: Texture ``[h, w, 3]`` uint8, row 0 on top; None takes the panel out.
         """
         texture, before = f"panel {name}", self._stood.get(f"panel {name}")
         if rgb is None:
