@@ -41,7 +41,7 @@ def main() -> None:
             phone.take()
             page.evaluate("document.querySelector('#attacks button').click()")
             drive(operator, phone)
-            save(name, page.screenshot())
+            save("operator_page", name, page.screenshot())
             phone.let_go()
             page.evaluate("document.getElementById('leave').click()")
             phone.close()
@@ -67,14 +67,20 @@ def drive(operator: LiveOperator, phone: Phone) -> None:
     raise TimeoutError(f"the car did not drive with the attack: {operator.describe()}")
 
 
-def save(name: str, png: bytes) -> None:
-    """Write a small WebP picture into the documentation."""
+def save(page: str, name: str, png: bytes) -> None:
+    """Write a small WebP picture into the documentation.
+
+    Args:
+        page: What it shows: the first part of the file's name.
+        name: ``desk`` or ``phone``.
+        png: The screenshot.
+    """
     image = Image.open(BytesIO(png)).convert("RGB")
     width = _WIDTH_PX[name]
     image = image.resize((width, round(image.height * width / image.width)), Image.Resampling.LANCZOS)
     out = BytesIO()
     image.save(out, "WEBP", quality=_QUALITY, method=6)
-    file = REPOSITORY / "docs" / f"operator_page_{name}.webp"
+    file = REPOSITORY / "docs" / f"{page}_{name}.webp"
     write_atomically(file, out.getvalue())
     print(f"{file.relative_to(REPOSITORY)}: {len(out.getvalue()) / 1e3:.0f} kB")
 

@@ -56,7 +56,7 @@ class PageConfig(BaseModel):
         names: Further names of this computer by which browsers may call it.
         role: ``operate``, or ``watch`` for a page that only shows.
         room: Room calibration file with path, fence and start; empty for none.
-        policy: The policy that drives, for the picture of what it sees. Only ``.safetensors`` files tell.
+        policy: The policy that drives, for the picture of what it sees. ``.safetensors`` and ``.onnx`` files tell.
         attacks: Attack files, and folders with attack files, to choose from.
         camera_topic: Topic of the camera's images.
         nodes: Nodes whose health is shown; none means all of the launch.

@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path as FilePath
-from typing import Any
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -28,10 +28,36 @@ from advnerf_core.learning.sources import KeepDriving, Seen, steer_with
 from advnerf_core.policies.pilotnet import PilotNet, save_policy
 from advnerf_core.policies.view import PolicyView
 
-__all__ = ["ImitationConfig", "Progress", "SourcePlan", "TrainedPolicy", "recovery_states", "train_policy"]
+__all__ = [
+    "ImitationConfig",
+    "Learned",
+    "Progress",
+    "SourcePlan",
+    "TrainedPolicy",
+    "recovery_states",
+    "train_policy",
+]
 
-Progress = Callable[[float, str], None]
-"""Told the finished fraction (0..1) and what is being done."""
+
+class Learned(NamedTuple):
+    """How well a network in training fits its frames.
+
+    Attributes:
+        naive: Whether it is the policy of plain frames only.
+        step: Optimiser steps of this policy so far, over all rounds.
+        error_rad: Running root mean square error of the control on training frames [rad, or rad/s where it is a turn rate].
+    """
+
+    naive: bool
+    step: int
+    error_rad: float
+
+
+class Progress(Protocol):
+    """Progress callback of a training."""
+
+    def __call__(self, fraction: float, text: str, learned: Learned | None = None) -> None:
+        """Report the finished fraction (0..1), the current step, and in training the error so far."""
 
 
 def train_policy(
@@ -82,6 +108,7 @@ class _Recipe:
         steps = config.first_steps + config.dagger_rounds * config.round_steps + config.naive_steps
         self._total_work = 0.02 * looks + 0.0022 * config.batch_size * steps
         self._done_work = 0.0
+        self._steps = 0  # of the policy in training, in the rounds before
 
     def run(self) -> TrainedPolicy:
         self._claim_folder()
@@ -116,6 +143,7 @@ class _Recipe:
     def _naive(self) -> tuple[FilePath, str, float]:
         """A policy from the plain frames only, drives included."""
         torch.manual_seed(self.config.seed)
+        self._steps = 0
         policy = PilotNet(self._goal_size, self.config.max_steering_rad, self.config.hidden)
         self._train(policy, "naive", self.config.naive_steps, self.config.learning_rate, textured=False)
         mae = mean_absolute_error(policy, self._frames(textured=False))
@@ -213,13 +241,15 @@ class _Recipe:
 
         def report(step: int, loss: float) -> None:
             self._done_work = before + work * step
-            self._advance(0.0, f"training {stage}: step {step}/{steps}, error {loss**0.5:.3f} rad")
+            learned = Learned(not textured, self._steps + step, loss**0.5)
+            self._advance(0.0, f"training {stage}: step {step}/{steps}, error {loss**0.5:.3f} rad", learned)
 
         # Later shards must not change what an earlier stage saw, so a resumed stage reads the shards it began with.
         shard_names = self._claim_shards(stage)
         frames = FrameSet([self.store.load(name) for name in shard_names], textured, config.holdout_every)
         fit(policy, frames, settings, self.out_dir / f"{stage}.checkpoint.safetensors", report)
         self._done_work = before + work * steps
+        self._steps += steps
         self.seconds["train"] += time.perf_counter() - start
 
     def _claim_shards(self, stage: str) -> list[str]:
@@ -256,7 +286,7 @@ class _Recipe:
             )
         write_atomically(record, text)
 
-    def _advance(self, work: float, text: str) -> None:
+    def _advance(self, work: float, text: str, learned: Learned | None = None) -> None:
         self._done_work += work
         if self._progress is not None:
-            self._progress(min(self._done_work / self._total_work, 1.0), text)
+            self._progress(min(self._done_work / self._total_work, 1.0), text, learned)

@@ -37,6 +37,10 @@ _RGB_IN_YUV = (
 )
 
 
+# Where an ONNX file carries its declaration.
+ONNX_METADATA_KEY = "advnerf_policy"
+
+
 class PolicyContractError(AdvnerfError, ValueError):
     """A policy is not what its declaration says, or the declaration itself is wrong."""
 

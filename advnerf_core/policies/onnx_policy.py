@@ -12,9 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from advnerf_core.files import write_atomically
-from advnerf_core.policies.contract import PolicyContract, PolicyContractError, declaration_beside
+from advnerf_core.policies.contract import (
+    ONNX_METADATA_KEY,
+    PolicyContract,
+    PolicyContractError,
+    declaration_beside,
+)
 
-METADATA_KEY = "advnerf_policy"
 _TYPES = {"tensor(float)": np.float32, "tensor(double)": np.float64, "tensor(float16)": np.float16}
 _OPSET = 17
 
@@ -48,7 +52,7 @@ class OnnxNetwork:
                 f"expected an ONNX model in {path}, got {reason:.200}; export it again"
             ) from error
         declared = declaration_beside(
-            path, self._session.get_modelmeta().custom_metadata_map.get(METADATA_KEY)
+            path, self._session.get_modelmeta().custom_metadata_map.get(ONNX_METADATA_KEY)
         )
         self.contract = _black_box(declared, path)
         self.sha256 = hashlib.sha256(content + self.contract.to_json().encode()).hexdigest()
@@ -147,7 +151,7 @@ def export_onnx(network: Any, contract: PolicyContract, path: Path) -> None:
                 "or replace the layer"
             ) from error
     model = onnx.load_from_string(buffer.getvalue())
-    model.metadata_props.add(key=METADATA_KEY, value=_black_box(contract, path).to_json())
+    model.metadata_props.add(key=ONNX_METADATA_KEY, value=_black_box(contract, path).to_json())
     onnx.checker.check_model(model)
     write_atomically(path, model.SerializeToString())
 

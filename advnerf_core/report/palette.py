@@ -6,6 +6,7 @@ The keys are also the names of the page's CSS variables: a figure drawn in the l
 from __future__ import annotations
 
 from collections.abc import Mapping
+from importlib.resources import files
 from types import MappingProxyType
 
 from advnerf_core.report.conditions import CONDITIONS, SPARE
@@ -34,12 +35,43 @@ DARK: Mapping[str, str] = MappingProxyType(
     }
 )
 
+# What is not drawn in plots: boxes, marks of good and bad, what has the focus or can be pressed.
+SURFACE_LIGHT: Mapping[str, str] = MappingProxyType(
+    {
+        "panel": "#f7f8f9",
+        "good": "#1c7245",
+        "bad": "#b0123c",
+        "on-bad": "#ffffff",
+        "warn": "#8a5a00",
+        "accent": "#00695c",
+        "on-accent": "#ffffff",
+    }
+)
+SURFACE_DARK: Mapping[str, str] = MappingProxyType(
+    {
+        "panel": "#1b2026",
+        "good": "#5ccb8f",
+        "bad": "#ff8296",
+        "on-bad": "#2b0400",
+        "warn": "#ffc46b",
+        "accent": "#4db6a4",
+        "on-accent": "#04211c",
+    }
+)
+
 LINE_STYLES: Mapping[str, str] = MappingProxyType({"surrogate": "--", "deployed": "-"})
 
 
 def css_variables(palette: Mapping[str, str]) -> str:
     """The palette as CSS custom properties."""
     return " ".join(f"--{name}: {colour};" for name, colour in palette.items())
+
+
+def look_css() -> str:
+    """The style sheet that all pages share: the palette in both themes, and ``look.css``."""
+    light, dark = css_variables({**LIGHT, **SURFACE_LIGHT}), css_variables({**DARK, **SURFACE_DARK})
+    shared = files("advnerf_core.report").joinpath("look.css").read_text(encoding="utf-8")
+    return f":root {{ {light} }}\n@media (prefers-color-scheme: dark) {{ :root {{ {dark} }} }}\n{shared}"
 
 
 def themed_svg(svg: str) -> str:

@@ -19,7 +19,7 @@ from markupsafe import Markup
 
 from advnerf_core.report.cells import CellResult
 from advnerf_core.report.conditions import NONE, style_of
-from advnerf_core.report.palette import DARK, LIGHT, css_variables
+from advnerf_core.report.palette import look_css
 from advnerf_core.report.statistics import Interval
 from advnerf_core.report.tables import Table, number, spread
 from advnerf_core.report.transfer import TableRow, TransferTable
@@ -282,8 +282,7 @@ def render_transfer_page(
         name=table.name or "Transfer table",
         legend=LEGEND,
         style=Markup(resources.joinpath("page.css").read_text(encoding="utf-8")),
-        light=Markup(css_variables(LIGHT)),
-        dark=Markup(css_variables(DARK)),
+        look=Markup(look_css()),
         table=text_table(table).html(),
         targets=targets or _targets_html(table),
         lead=lead or (_LEAD,),

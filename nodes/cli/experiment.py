@@ -19,7 +19,9 @@ if TYPE_CHECKING:
     from advnerf_core.report.transfer import TransferTable
     from nodes.experiment.campaign.config import Campaign
     from nodes.experiment.campaign.run import Options
+    from nodes.experiment.campaign.worker import Ended
     from nodes.experiment.cell import Cell
+    from nodes.experiment.progress_record import ProgressRecord
 
 File = Annotated[
     Path,
@@ -133,6 +135,15 @@ def experiment(
             "--anew", help="Make every stage here, also those that are kept in docs/results/reference."
         ),
     ] = False,
+    page: Annotated[
+        bool,
+        typer.Option(
+            "--page", help="Serve the running experiment to browsers on this computer, then its report."
+        ),
+    ] = False,
+    page_port: Annotated[
+        int, typer.Option("--page-port", min=0, max=65535, help="Port of the page; 0 selects a free one.")
+    ] = 8091,
     overrides: Overrides = None,
 ) -> None:
     """Run an experiment, from the photographs to the report: every stage and every cell that is not there yet. It may be stopped at any time."""
@@ -149,10 +160,12 @@ def experiment(
         jobs or 0, threads or 0, backend, address, retry, gate, search_only, here, ready=not many
     )
     if not many:
-        _run_one(file, setting, folder or Path("runs") / setting, until, only, options, overrides or [], anew)
+        port = page_port if page else None
+        run_folder = folder or Path("runs") / setting
+        _run_one(file, setting, run_folder, until, only, options, overrides or [], anew, port)
         return
-    if until is not None or anew:
-        what = "--until" if until is not None else "--anew"
+    if until is not None or anew or page:
+        what = "--until" if until is not None else "--anew" if anew else "--page"
         raise ConfigError(f"expected {what} with an experiment file, got it with the campaign {file}")
     _run_many(file, folder, only, options, overrides)
 
@@ -166,13 +179,23 @@ def _run_one(
     options: Options,
     overrides: Sequence[str],
     anew: bool,
+    port: int | None,
 ) -> None:
     from nodes.experiment.run import load_experiment
     from nodes.experiment.whole import run_experiment
 
     with ends_in_order():
         loaded = load_experiment(file, setting, overrides, folder)
-        ended = run_experiment(loaded, until, options, only, overrides, anew=anew)
+
+        def run(record: ProgressRecord | None) -> list[Ended]:
+            return run_experiment(loaded, until, options, only, overrides, anew=anew, record=record)
+
+        if port is None:
+            ended = run(None)
+        else:
+            from nodes.experiment_page.page import run_with_page
+
+            ended = run_with_page(loaded, port, run, lambda text: print(text, flush=True))
     _say_wrong(ended)
 
 

@@ -19,7 +19,7 @@ from advnerf_core.driving.path import Array
 from advnerf_core.fields.voxel_grid import VoxelGridObject
 from advnerf_core.files import write_atomically
 from advnerf_core.geometry import planar_pose
-from advnerf_core.learning.imitation import ImitationConfig, SourcePlan, train_policy
+from advnerf_core.learning.imitation import ImitationConfig, Learned, Progress, SourcePlan, train_policy
 from advnerf_core.learning.sources import FrameSource, RenderedSource, SceneSource, Show
 from advnerf_core.policies.pilotnet import images_to_tensor, load_policy
 from hardware.worlds.world import World
@@ -33,7 +33,7 @@ from nodes.experiment.light import light_on_panels
 from nodes.experiment.native import stand_in
 from nodes.experiment.objects import describe, last_result_kept, placed_objects, random_theta, surrogate_of
 from nodes.runtime.errors import ConfigError
-from nodes.runtime.progress import Report
+from nodes.runtime.progress import MeasuringReport, Point
 
 HARDENED, NAIVE, RETRAINED = "hardened", "naive", "retrained"
 VICTIMS = (HARDENED, NAIVE)
@@ -46,7 +46,7 @@ _TRAINING_TEXTURE_PX = 128
 Sample = Callable[[np.random.Generator], torch.Tensor]
 
 
-def run(experiment: Experiment, folder: Path, report: Report) -> None:
+def run(experiment: Experiment, folder: Path, report: MeasuringReport) -> None:
     """Train the victims, then compare their controls on held-out views and on the surrogate's image of them."""
     config = experiment.config.policy
     settings = ImitationConfig(
@@ -71,7 +71,7 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
             experiment.expert(experiment.config.scenarios[0]),
             experiment.view,
             folder,
-            lambda part, text: report(0.98 * part, text),
+            _telling(experiment, report),
         )
     report(0.98, "comparing controls on true and learned views")
     summary = {
@@ -84,6 +84,20 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
         "on_held_out_views": agreement(experiment),
     }
     write_atomically(folder / "policy.json", json.dumps(summary, indent=1) + "\n")
+
+
+def _telling(experiment: Experiment, report: MeasuringReport) -> Progress:
+    """Progress of the training as that of the stage, with the error as a curve for each victim."""
+    unit = experiment.car.control_unit
+
+    def told(fraction: float, text: str, learned: Learned | None = None) -> None:
+        point = None
+        if learned is not None:
+            victim = NAIVE if learned.naive else HARDENED
+            point = Point(f"Error of the {victim} policy [{unit}]", learned.step, learned.error_rad)
+        report(0.98 * fraction, text, point)
+
+    return told
 
 
 def victims(experiment: Experiment) -> tuple[str, ...]:

@@ -26,7 +26,7 @@ from nodes.lab.worlds.named import read_world
 from nodes.launching.launch_file import load_launch
 from nodes.runtime.config import Document, Key, apply_overrides, read_yaml, validate
 from nodes.runtime.errors import ConfigError
-from nodes.runtime.progress import Report
+from nodes.runtime.progress import Display, MeasuringReport
 
 _LIBRARIES = (
     "torch",
@@ -135,11 +135,15 @@ def _check_places(experiment: Experiment, document: Document) -> None:
 
 
 def make_ready(
-    experiment: Experiment, until: str | None = None, console: Console | None = None, anew: bool = False
+    experiment: Experiment,
+    until: str | None = None,
+    console: Console | None = None,
+    anew: bool = False,
+    watcher: Display | None = None,
 ) -> dict[str, StageRecord]:
     """Run the stages that are not there yet: what cells need. Those that are kept with the code are there, unless all is to be made ``anew``."""
     reference = None if anew else REFERENCE
-    return run_to_end(experiment, stages_of(experiment), _LIBRARIES, until, console, reference)
+    return run_to_end(experiment, stages_of(experiment), _LIBRARIES, until, console, reference, watcher)
 
 
 def prepare_victims(experiment: Experiment) -> None:
@@ -191,7 +195,7 @@ def stages_of(experiment: Experiment) -> list[Stage]:
         bulk: Sequence[str] = (),
         reads_bulk_of: Sequence[str] = (),
     ) -> Stage:
-        def work(folder: Path, told: Report) -> None:
+        def work(folder: Path, told: MeasuringReport) -> None:
             module.run(experiment, folder, told)
 
         settings, *smaller = json.loads(json.dumps([settings, *parts]))

@@ -18,7 +18,7 @@ from nodes.experiment.reference import ReferenceBuild
 from nodes.experiment.stage_record import Stage, StageRecord
 from nodes.experiment.stages import check_until, run_stages
 from nodes.runtime.errors import ConfigError
-from nodes.runtime.progress import ProgressDisplay
+from nodes.runtime.progress import Display, ProgressDisplay
 
 Config = TypeVar("Config")
 _MANIFEST = "manifest.json"
@@ -52,6 +52,7 @@ def run_to_end(
     until: str | None = None,
     console: Console | None = None,
     reference: ReferenceBuild | None = None,
+    watcher: Display | None = None,
 ) -> dict[str, StageRecord]:
     """Run the stages that are not there yet.
 
@@ -62,21 +63,26 @@ def run_to_end(
         until: Last stage to run; None for all.
         console: Where to print.
         reference: Where results of stages may be besides.
+        watcher: Receives the progress too.
 
     Raises:
         ConfigError: The folder has the stages of another experiment, which would be replaced.
     """
     console = console or Console()
     check_until(stages, until)
-    _refuse_the_folder_of_another(experiment)
+    require_own_folder(experiment)
     experiment.folder.mkdir(parents=True, exist_ok=True)
     _write_manifest(experiment, libraries)
-    with ProgressDisplay(console) as display:
+    with ProgressDisplay(console, watcher) as display:
         return run_stages(stages, experiment.folder, display, until, reference)
 
 
-def _refuse_the_folder_of_another(experiment: RunFolder[Any]) -> None:
-    """Stages with the same names and other keys would empty each other's folders: hours of work."""
+def require_own_folder(experiment: RunFolder[Any]) -> None:
+    """Refuse a run folder of another experiment: stages with the same names and other keys would empty each other's folders.
+
+    Raises:
+        ConfigError: It is one of another experiment.
+    """
     manifest = experiment.folder / _MANIFEST
     try:
         there = json.loads(manifest.read_text(encoding="utf-8"))["experiment"]

@@ -19,12 +19,12 @@ from advnerf_core.scene.train import Progress, TrainConfig, TrainedScene, train_
 from nodes.experiment import capture
 from nodes.experiment.context import Experiment
 from nodes.experiment.learned_scene import compare_views, scene_file
-from nodes.runtime.progress import Report
+from nodes.runtime.progress import MeasuringReport, Point
 
 _TRAINING_SHARE = 0.97
 
 
-def run(experiment: Experiment, folder: Path, report: Report) -> None:
+def run(experiment: Experiment, folder: Path, report: MeasuringReport) -> None:
     """Write ``scene.safetensors``, and ``fidelity.json`` with pictures of true and learned views."""
     config = experiment.config.scene
     photographs = load_transforms(
@@ -32,7 +32,8 @@ def run(experiment: Experiment, folder: Path, report: Report) -> None:
     ).load()
 
     def progress(at: Progress) -> None:
-        report(_TRAINING_SHARE * at.fraction, f"step {at.step}, {at.psnr_db:.1f} dB on training rays")
+        text = f"step {at.step}, {at.psnr_db:.1f} dB on training rays"
+        report(_TRAINING_SHARE * at.fraction, text, Point("PSNR on training rays [dB]", at.step, at.psnr_db))
 
     field = field_config(experiment)
     march = pixel_intervals(

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from advnerf_core.files import write_atomically
-from nodes.runtime.progress import Report
+from nodes.runtime.progress import MeasuringReport
 
 RECORD = "stage.json"
 
@@ -31,7 +31,7 @@ class Stage:
     """
 
     name: str
-    run: Callable[[Path, Report], None]
+    run: Callable[[Path, MeasuringReport], None]
     settings: Mapping[str, Any]
     after: Sequence[str] = ()
     version: int = 1

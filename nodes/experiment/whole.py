@@ -16,7 +16,9 @@ from nodes.experiment.campaign.run import Options, run_campaign
 from nodes.experiment.campaign.worker import Ended
 from nodes.experiment.cell import Cell, select
 from nodes.experiment.context import Experiment
+from nodes.experiment.progress_record import ProgressRecord
 from nodes.experiment.run import make_ready, stages_of
+from nodes.experiment.run_folder import require_own_folder
 from nodes.experiment.stage_record import Stage
 from nodes.experiment.stages import check_until, run_stages
 from nodes.runtime.progress import ProgressDisplay
@@ -32,6 +34,7 @@ def run_experiment(
     overrides: Sequence[str] = (),
     console: Console | None = None,
     anew: bool = False,
+    record: ProgressRecord | None = None,
 ) -> list[Ended]:
     """Run the stages and the cells that are not there yet; where all cells are there, also the report.
 
@@ -43,6 +46,7 @@ def run_experiment(
         overrides: ``key=value`` texts with which the experiment was read, for other processes.
         console: Where to print.
         anew: Whether stages are made here that are kept with the code.
+        record: Keeps the progress for the experiment page.
 
     Returns:
         How every cell that was run ended.
@@ -56,12 +60,18 @@ def run_experiment(
     check_until(stages, until)
     plan = cells(experiment)
     chosen = select(plan, only)
-    make_ready(experiment, None if until == REPORT else until, console, anew)
+    if record is not None:
+        require_own_folder(experiment)
+        names = [stage.name for stage in stages]
+        until_there = names if until is None else names[: names.index(until) + 1]
+        record.plan(until_there, chosen if REPORT in until_there else [])
+    make_ready(experiment, None if until == REPORT else until, console, anew, record)
     ended: list[Ended] = []
     if until in (None, REPORT):
         campaign = campaign_of(experiment, overrides, plan)
-        ended = _run_cells(experiment, campaign, chosen, options, console)
-        _write_report(experiment, campaign, console)
+        options = options or Options(here=True, ready=True)
+        ended = _run_cells(experiment, campaign, chosen, options, console, record)
+        _write_report(experiment, campaign, console, record)
     console.print(
         f"{experiment.config.name} ({experiment.setting}): {time.monotonic() - began:.0f} s", highlight=False
     )
@@ -72,18 +82,36 @@ def _run_cells(
     experiment: Experiment,
     campaign: Campaign,
     chosen: Sequence[Cell],
-    options: Options | None,
+    options: Options,
     console: Console,
+    record: ProgressRecord | None,
 ) -> list[Ended]:
     known = {(name, ""): experiment for name in campaign.scenarios}
+    if record is not None:
+        _record_cells_there(campaign, chosen, options, record)
 
     def say(text: str) -> None:
         console.print(text, highlight=False, soft_wrap=True)
+        if record is not None:
+            record.say(text)
 
-    return run_campaign(campaign, chosen, options or Options(here=True, ready=True), say, known, console)
+    return run_campaign(campaign, chosen, options, say, known, console, record)
 
 
-def _write_report(experiment: Experiment, campaign: Campaign, console: Console) -> None:
+def _record_cells_there(
+    campaign: Campaign, chosen: Sequence[Cell], options: Options, record: ProgressRecord
+) -> None:
+    """Cells that will not be run again: done, or failed before."""
+    for each in statuses(campaign, chosen):
+        if each.state == "done":
+            record.finish(each.cell.name, 0.0, cached=True)
+        elif each.state == "failed" and not options.retry:
+            record.fail(each.cell.name, each.text)
+
+
+def _write_report(
+    experiment: Experiment, campaign: Campaign, console: Console, record: ProgressRecord | None
+) -> None:
     """The report, once every cell of these settings is here and deployed; what it was made of is part of its key."""
     files = {cell.name: experiment.cell_result(cell) for cell in campaign.cells}
     found = statuses(campaign, campaign.cells)
@@ -91,10 +119,13 @@ def _write_report(experiment: Experiment, campaign: Campaign, console: Console) 
     if experiment.config.deploy.through == "nothing":
         return
     if missing:
-        console.print(f"no report yet: {len(missing)} of {len(found)} cells are missing", highlight=False)
+        text = f"no report yet: {len(missing)} of {len(found)} cells are missing"
+        console.print(text, highlight=False)
+        if record is not None:
+            record.say(text)
         return
     digests = {name: hashlib.sha256(file.read_bytes()).hexdigest() for name, file in files.items()}
-    with ProgressDisplay(console) as display:
+    with ProgressDisplay(console, record) as display:
         run_stages([_report_stage(experiment, digests)], experiment.folder, display)
     report.print_summary(experiment, console)
 

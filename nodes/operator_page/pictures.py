@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 
+from advnerf_core.policies.contract import ONNX_METADATA_KEY, PolicyContractError, declaration_beside
 from advnerf_core.policies.view import PolicyView
 
 CAMERA, ATTACKED, POLICY = 0, 1, 2
@@ -52,12 +53,28 @@ def jpeg_of(rgb: NDArray[np.uint8], width_px: int, quality: int) -> bytes:
 
 
 def view_of_policy(policy: str) -> PolicyView | None:
-    """Read the view of a policy from the header of its ``.safetensors`` file, without torch; None for any other policy."""
+    """Read the view of a policy from its ``.safetensors`` or ``.onnx`` file, without torch; None for any other policy."""
     path = Path(policy)
-    if path.suffix != ".safetensors" or not path.is_file():
+    if not path.is_file():
         return None
     try:
-        with safe_open(path, framework="numpy") as file:
-            return PolicyView.from_dict(json.loads((file.metadata() or {})["view"]))
-    except (SafetensorError, OSError, KeyError, ValueError):
+        if path.suffix == ".onnx":
+            return _view_of_onnx(path)
+        if path.suffix == ".safetensors":
+            with safe_open(path, framework="numpy") as file:
+                return PolicyView.from_dict(json.loads((file.metadata() or {})["view"]))
+    except (SafetensorError, PolicyContractError, OSError, KeyError, ValueError):
+        pass
+    return None
+
+
+def _view_of_onnx(path: Path) -> PolicyView | None:
+    """The view in the declaration of an ONNX file; None where ONNX Runtime is missing or cannot read the file."""
+    try:
+        import onnxruntime
+
+        session = onnxruntime.InferenceSession(path.read_bytes(), providers=["CPUExecutionProvider"])
+    except Exception:  # its exceptions share no base of their own
         return None
+    embedded = session.get_modelmeta().custom_metadata_map.get(ONNX_METADATA_KEY)
+    return declaration_beside(path, embedded).view

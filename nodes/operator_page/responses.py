@@ -7,6 +7,7 @@ from collections.abc import Callable
 from importlib.resources import files
 from typing import Any
 
+from advnerf_core.report.palette import look_css
 from nodes.operator_page.doors import host_is_ours
 
 _TYPES = {
@@ -16,7 +17,7 @@ _TYPES = {
     ".svg": "image/svg+xml",
 }
 _POLICY = (
-    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; connect-src 'self'; "
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; media-src 'self'; connect-src 'self'; "
     "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
 _HEADERS = {
@@ -31,7 +32,7 @@ _HEADERS = {
 
 
 class Guard:
-    """Refuses requests for another host, and adds the security headers to every response.
+    """Refuses requests for another host, and adds to every response the security headers that it does not set itself.
 
     Args:
         application: The application behind it.
@@ -55,8 +56,10 @@ class Guard:
 
         async def send_with_headers(event: Any) -> None:
             if event["type"] == "http.response.start":
+                given = list(event.get("headers", []))
+                own = {name for name, _ in given}
                 ours = [(name.encode(), value.encode()) for name, value in _HEADERS.items()]
-                event = {**event, "headers": [*event.get("headers", []), *ours]}
+                event = {**event, "headers": [*given, *(each for each in ours if each[0] not in own)]}
             await send(event)
 
         await self._application(scope, receive, send_with_headers)
@@ -84,11 +87,13 @@ async def code_in(request: Any) -> str:
     return code if isinstance(code, str) and code.isascii() and len(code) <= 64 else ""
 
 
-def web_file(name: str) -> Any:
-    """Response with a file of ``web/``; status 404 for any other name."""
+def web_file(name: str, package: str = "nodes.operator_page") -> Any:
+    """Response with a file of the package's ``web/``, or with the shared style sheet; status 404 for any other name."""
     from starlette.responses import Response
 
-    folder = files("nodes.operator_page") / "web"
+    if name == "look.css":
+        return Response(look_css(), headers={"content-type": _TYPES[".css"]})
+    folder = files(package) / "web"
     found = {file.name: file for file in folder.iterdir()}.get(name)
     suffix = f".{name.rpartition('.')[2]}"
     if found is None or suffix not in _TYPES:

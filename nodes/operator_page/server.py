@@ -14,17 +14,17 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from importlib.util import find_spec
 from typing import Any
 
 from nodes.linking.keys import is_loopback
 from nodes.operator_page.certificate import Certificate, certificate
 from nodes.operator_page.client import Client, Gone, Misuse
 from nodes.operator_page.doors import COOKIE, Doors, origin_is_ours, peer_is_same_user
+from nodes.operator_page.listening import bound_socket, require_packages
 from nodes.operator_page.pictures import Picture
 from nodes.operator_page.responses import Guard, code_in, web_file
 from nodes.operator_page.said import LONGEST_BYTES
-from nodes.runtime.errors import BusError, ConfigError
+from nodes.runtime.errors import BusError
 from nodes.runtime.inbox import Inbox
 
 _PACKAGES = ("starlette", "uvicorn", "websockets", "cryptography")
@@ -85,11 +85,11 @@ class PageServer:
     counts: Counts = field(default_factory=Counts)
 
     def __post_init__(self) -> None:
-        require_packages()
+        require_packages(_PACKAGES)
         self.tls: Certificate | None = None if is_loopback(self.settings.host) else certificate()
         self.doors = Doors(self.settings.code_s)
         self._door_lock = threading.Lock()
-        self._socket = _bound(self.settings)
+        self._socket = bound_socket(self.settings.host, self.settings.port)
         self.port = int(self._socket.getsockname()[1])
         self._cookie = f"{COOKIE}_{self.port}"
         self._clients: dict[int, Client] = {}
@@ -336,23 +336,3 @@ class PageServer:
         response.set_cookie(
             self._cookie, token, httponly=True, samesite="strict", secure=self.tls is not None
         )
-
-
-def require_packages() -> None:
-    """Refuse to serve without the packages of the extra ``page``."""
-    if missing := [name for name in _PACKAGES if find_spec(name) is None]:
-        raise ConfigError(f"the page needs {', '.join(missing)}, not installed: pip install 'advnerf[page]'")
-
-
-def _bound(settings: ServerSettings) -> socket.socket:
-    family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
-    made = socket.socket(family, socket.SOCK_STREAM)
-    made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    try:
-        made.bind((settings.host, settings.port))
-    except OSError as error:
-        made.close()
-        raise BusError(
-            f"cannot serve the page on {settings.host}:{settings.port}: {error.strerror}; choose another port"
-        ) from error
-    return made

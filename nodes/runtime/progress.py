@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from types import TracebackType
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -13,11 +13,32 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedCo
 LOG_PERIOD_S = 15.0
 
 
+class Point(NamedTuple):
+    """One value that a running stage measured, as a point of a curve.
+
+    Attributes:
+        curve: Name of the curve with its unit, e.g. ``PSNR on training rays [dB]``.
+        step: Number of the step at which it was measured.
+        value: The value, in the unit of the curve.
+    """
+
+    curve: str
+    step: float
+    value: float
+
+
 class Report(Protocol):
     """Progress callback of one stage."""
 
     def __call__(self, fraction: float, text: str = "") -> None:
         """Report the finished fraction (0..1) and the current step."""
+
+
+class MeasuringReport(Report, Protocol):
+    """Progress callback of a stage that also measures something on its way."""
+
+    def __call__(self, fraction: float, text: str = "", point: Point | None = None) -> None:
+        """Report the finished fraction (0..1), the current step, and a value that was measured in it."""
 
 
 def counted(report: Report, what: str, count: int, before: int, total: int) -> Callable[[int], None]:
@@ -36,7 +57,7 @@ def counted(report: Report, what: str, count: int, before: int, total: int) -> C
 class Display(Protocol):
     """Shows the progress of stages to the user."""
 
-    def start(self, stage: str) -> Report:
+    def start(self, stage: str) -> MeasuringReport:
         """Start a stage and return its progress callback."""
 
     def finish(self, stage: str, seconds: float, cached: bool) -> None:
@@ -48,10 +69,11 @@ class ProgressDisplay:
 
     Args:
         console: Where to write. A log file or pipe gets lines instead of bars.
+        watcher: A second display that receives the same reports, such as the record of the experiment page.
     """
 
-    def __init__(self, console: Console | None = None) -> None:
-        self._console = console or Console()
+    def __init__(self, console: Console | None = None, watcher: Display | None = None) -> None:
+        self._console, self._watcher = console or Console(), watcher
         columns = (
             TextColumn("{task.fields[stage]:<8}"),
             BarColumn(bar_width=24),
@@ -74,8 +96,12 @@ class ProgressDisplay:
         if self._progress is not None:
             self._progress.stop()
 
-    def start(self, stage: str) -> Report:
+    def start(self, stage: str) -> MeasuringReport:
         """Start a stage and return its progress callback."""
+        shown = self._shown(stage)
+        return shown if self._watcher is None else _BothReports(shown, self._watcher.start(stage))
+
+    def _shown(self, stage: str) -> MeasuringReport:
         if self._progress is None:
             self._console.print(f"{stage}: started", highlight=False, soft_wrap=True)
             return _LogReport(self._console, stage)
@@ -85,13 +111,24 @@ class ProgressDisplay:
         """Finish a stage, or report that its earlier result is reused."""
         text = "unchanged, reused" if cached else f"done in {seconds:.1f} s"
         self._console.print(f"{stage}: {text}", highlight=False, soft_wrap=True)
+        if self._watcher is not None:
+            self._watcher.finish(stage, seconds, cached)
+
+
+class _BothReports:
+    def __init__(self, first: MeasuringReport, second: MeasuringReport) -> None:
+        self._reports = (first, second)
+
+    def __call__(self, fraction: float, text: str = "", point: Point | None = None) -> None:
+        for report in self._reports:
+            report(fraction, text, point)
 
 
 class _BarReport:
     def __init__(self, progress: Progress, task: TaskID) -> None:
         self._progress, self._task = progress, task
 
-    def __call__(self, fraction: float, text: str = "") -> None:
+    def __call__(self, fraction: float, text: str = "", point: Point | None = None) -> None:
         self._progress.update(self._task, completed=min(max(fraction, 0.0), 1.0), text=text)
 
 
@@ -100,7 +137,7 @@ class _LogReport:
         self._console, self._stage = console, stage
         self._begin_s = self._printed_s = time.monotonic()
 
-    def __call__(self, fraction: float, text: str = "") -> None:
+    def __call__(self, fraction: float, text: str = "", point: Point | None = None) -> None:
         now_s = time.monotonic()
         if now_s - self._printed_s < LOG_PERIOD_S:
             return

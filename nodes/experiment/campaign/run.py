@@ -20,7 +20,7 @@ from nodes.experiment.campaign.worker import Ended, Job, run_here, run_in_proces
 from nodes.experiment.cell import Cell
 from nodes.experiment.kinds import load_kind
 from nodes.runtime.errors import ConfigError
-from nodes.runtime.progress import ProgressDisplay, Report
+from nodes.runtime.progress import Display, ProgressDisplay, Report
 
 Backend = Literal["local", "ray"]
 Say = Callable[[str], None]
@@ -62,6 +62,7 @@ def run_campaign(
     say: Say,
     experiments: dict[tuple[str, str], Any] | None = None,
     console: Console | None = None,
+    watcher: Display | None = None,
 ) -> list[Ended]:
     """Run the cells that are not there yet.
 
@@ -72,6 +73,7 @@ def run_campaign(
         say: Told of every start and end.
         experiments: As of `plan_cells`.
         console: Where the progress of cells in this process is shown.
+        watcher: Receives the progress of cells in this process too.
 
     Returns:
         How every cell that was run ended, in the order of their ends.
@@ -101,7 +103,7 @@ def run_campaign(
         return []
     _require_positive(options)
     if options.here:
-        return _run_here(store, wanted, experiments, options, say, console)
+        return _run_here(store, wanted, experiments, options, say, ProgressDisplay(console, watcher))
     jobs, threads = _shares(options)
     if options.search_only:
         return _search(wanted, jobs, threads, options, say)
@@ -129,10 +131,10 @@ def _run_here(
     experiments: Mapping[tuple[str, str], Any],
     options: Options,
     say: Say,
-    console: Console | None,
+    display: ProgressDisplay,
 ) -> list[Ended]:
     """One cell after another in this process; those of one experiment share what it opens."""
-    ended, display = [], ProgressDisplay(console)
+    ended = []
     kinds = {each.job.kind: load_kind(each.job.kind) for each in wanted}
     for (kind_name, key), group in groupby(
         wanted, lambda each: (each.job.kind, (each.cell.scenario, each.cell.placement))

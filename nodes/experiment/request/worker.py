@@ -23,7 +23,7 @@ from advnerf_core.errors import AdvnerfError
 from advnerf_core.scene.surrogate import split_theta
 from nodes.experiment.request.prepare import Prepared
 from nodes.experiment.request.search import TOGETHER_STATE, kept_request, planned_evaluations, run_attack
-from nodes.runtime.progress import Report
+from nodes.runtime.progress import MeasuringReport
 
 TEXTURE, PREVIEW = "texture", "preview"
 _PREVIEW_SCALE = 2
@@ -42,10 +42,10 @@ class Speaker:
         self._stream.write(json.dumps({"kind": kind, "bytes": len(pixels), **data}).encode() + b"\n" + pixels)
         self._stream.flush()
 
-    def start(self, stage: str) -> Report:
+    def start(self, stage: str) -> MeasuringReport:
         """A seed begins; its progress is told with its evaluations."""
         del stage
-        return lambda fraction, text="": None
+        return lambda fraction, text="", point=None: None
 
     def finish(self, stage: str, seconds: float, cached: bool) -> None:
         """A seed has ended; told with its file."""

@@ -20,6 +20,7 @@ from advnerf_core.learning.imitation import ImitationConfig, Progress, SourcePla
 from advnerf_core.policies.pilotnet import PilotNet, save_policy
 from advnerf_core.policies.view import PolicyView
 from nodes.lab.policy_data.frames import Recording
+from nodes.runtime.progress import Report
 
 POLICY = "policy.safetensors"
 
@@ -77,7 +78,7 @@ def train_from_recordings(
     config: ImitationConfig,
     out: Path,
     surrogate: SourcePlan | None = None,
-    progress: Progress | None = None,
+    progress: Report | None = None,
 ) -> Training:
     """Train on recordings, and on the surrogate if given, and write ``policy.safetensors`` to ``out``.
 
@@ -94,13 +95,14 @@ def train_from_recordings(
         else [surrogate.source.name, surrogate.stills, surrogate.drives],
     }
     work = out / "work" / _digest(claim)
-    report = progress or (lambda share, text: None)
+    report: Report = progress or (lambda share, text="": None)
     store = FrameStore(work / "frames")
     left_out = {part.name: _cut(part, store, work, report) for part in parts}
     if surrogate is None:
         sha256, mae = _clone(store, view, expert, config, work, {"recordings": claim["parts"]}, report)
     else:
-        trained = train_policy(config, [surrogate], expert, view, work, report)
+        bare: Progress = lambda share, text, learned=None: report(share, text)  # noqa: E731 - typed
+        trained = train_policy(config, [surrogate], expert, view, work, bare)
         sha256, mae = trained.sha256, trained.validation_mae_rad
     write_atomically(out / POLICY, (work / POLICY).read_bytes())
     frames = {name: len(store.load(name)) for name in store.names()}
@@ -115,7 +117,7 @@ def train_from_recordings(
     return result
 
 
-def _cut(part: Part, store: FrameStore, work: Path, report: Progress) -> dict[str, int]:
+def _cut(part: Part, store: FrameStore, work: Path, report: Report) -> dict[str, int]:
     """Extract the frames of a recording to a shard, once. Returns the numbers of skipped images."""
     record = work / f"{_shard(part)}.json"
     if _shard(part) not in store.names() or not record.is_file():
@@ -134,7 +136,7 @@ def _clone(
     config: ImitationConfig,
     work: Path,
     metadata: dict[str, Any],
-    report: Progress,
+    report: Report,
 ) -> tuple[str, float]:
     torch.manual_seed(config.seed)
     policy = PilotNet(0, config.max_steering_rad, config.hidden)

@@ -69,14 +69,14 @@ export class PlaceMap {
     };
     context.lineJoin = "round";
     context.lineWidth = 2;
-    context.strokeStyle = colour("line");
+    context.strokeStyle = colour("grid");
     line(context, this.place.fence.map(at), true);
     context.setLineDash([6, 5]);
-    context.strokeStyle = colour("path");
+    context.strokeStyle = colour("tape");
     line(context, this.place.path.map(at));
     context.setLineDash([]);
     context.lineWidth = 3;
-    context.strokeStyle = colour("trail");
+    context.strokeStyle = colour("accent");
     jump(this.place.trail);
     if (this.car) this.#drawCar(context, at, colour);
   }
@@ -98,7 +98,7 @@ export class PlaceMap {
     context.save();
     context.translate(x, y);
     context.rotate(-this.car.yaw_rad);
-    context.fillStyle = colour("attacked");
+    context.fillStyle = colour("gradient");
     context.beginPath();
     context.moveTo(14, 0);
     context.lineTo(-8, 7);
@@ -129,15 +129,15 @@ export class SteeringPlot {
     const largest = Math.max(0.1, ...this.#points.flatMap(([, a, b]) => [Math.abs(a ?? 0), Math.abs(b ?? 0)]));
     const at = (time, value) => [width - ((now - time) / SPAN_MS) * width, height / 2 - (value / largest) * (height / 2 - 14)];
     context.lineWidth = 1;
-    context.strokeStyle = colour("line");
+    context.strokeStyle = colour("grid");
     line(context, [[0, height / 2], [width, height / 2]]);
-    context.fillStyle = colour("quiet");
+    context.fillStyle = colour("muted");
     context.font = "12px system-ui, sans-serif";
     const degrees = (largest * 180 / Math.PI).toFixed(0);
     context.fillText(`left ${degrees}°`, 2, 11);
     context.fillText(`right ${degrees}°`, 2, height - 2);
     context.lineWidth = 2;
-    ["clean", "attacked"].forEach((name, index) => {
+    ["none", "gradient"].forEach((name, index) => {
       context.strokeStyle = colour(name);
       const points = this.#points.filter((point) => point[index + 1] !== null);
       line(context, points.map((point) => at(point[0], point[index + 1])));

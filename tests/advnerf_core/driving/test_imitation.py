@@ -145,7 +145,7 @@ def test_drives_follow_the_policy_and_stop_when_told() -> None:
 def test_recipe_writes_both_policies_and_repeats_itself(tmp_path: Path) -> None:
     heard: list[float] = []
     result = train_policy(
-        TINY, _plans(), EXPERT, VIEW, tmp_path / "a", lambda share, text: heard.append(share)
+        TINY, _plans(), EXPERT, VIEW, tmp_path / "a", lambda share, text, learned=None: heard.append(share)
     )
     again = train_policy(TINY, _plans(), EXPERT, VIEW, tmp_path / "b")
     assert result.sha256 == again.sha256

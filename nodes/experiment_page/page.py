@@ -1,0 +1,125 @@
+"""Runs an experiment with its page: the page is served from before the first stage until the user ends it."""
+
+from __future__ import annotations
+
+import contextlib
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+from typing import TypeVar
+
+from nodes.experiment.attack import planned_evaluations
+from nodes.experiment.context import Experiment
+from nodes.experiment.progress_record import ProgressRecord
+from nodes.experiment_page.server import HOST, PACKAGES
+from nodes.operator_page.listening import bound_socket, require_packages
+
+_LOG = "page.log"
+_END_S = 3.0
+
+Result = TypeVar("Result")
+Say = Callable[[str], None]
+
+
+class ExperimentPage:
+    """The server's process. Whatever happens to it, the experiment goes on.
+
+    Args:
+        folder: The run folder.
+        port: TCP port; 0 selects a free one.
+
+    Raises:
+        BusError: The port is taken.
+        ConfigError: A package of the extra ``page`` is not installed.
+    """
+
+    def __init__(self, folder: Path, port: int) -> None:
+        require_packages(PACKAGES)
+        with bound_socket(HOST, port) as listening:
+            listening.listen()  # from here on no other process can take the port
+            self.url = f"http://{HOST}:{listening.getsockname()[1]}/"
+            folder.mkdir(parents=True, exist_ok=True)
+            number = listening.fileno()
+            with (folder / _LOG).open("wb") as log:
+                self._process = subprocess.Popen(
+                    [sys.executable, "-m", "nodes.experiment_page.server", str(folder), str(number)],
+                    stdin=subprocess.PIPE,
+                    stdout=subprocess.DEVNULL,
+                    stderr=log,
+                    pass_fds=[number],
+                    start_new_session=True,  # Ctrl-C is for the experiment
+                )
+
+    def __enter__(self) -> ExperimentPage:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    @property
+    def is_served(self) -> bool:
+        """Whether the server is still there."""
+        return self._process.poll() is None
+
+    def wait(self) -> None:
+        """Serve until Ctrl-C, or until the server has ended."""
+        with contextlib.suppress(KeyboardInterrupt):
+            self._process.wait()
+
+    def close(self) -> None:
+        """End the server."""
+        assert self._process.stdin is not None
+        with contextlib.suppress(OSError):
+            self._process.stdin.close()
+        try:
+            self._process.wait(_END_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+
+def run_with_page(
+    experiment: Experiment, port: int, run: Callable[[ProgressRecord], Result], say: Say
+) -> Result:
+    """Run an experiment while its page is served, then serve it until Ctrl-C.
+
+    Args:
+        experiment: The experiment.
+        port: TCP port; 0 selects a free one.
+        run: Runs it, with what keeps its progress.
+        say: Told the address, and what to do at the end.
+
+    Raises:
+        BusError: The port is taken; nothing was run.
+    """
+    about = {
+        "name": experiment.config.name,
+        "setting": experiment.setting,
+        "planned": planned_evaluations(experiment),
+        "space": experiment.config.space.kind,
+    }
+    with ExperimentPage(experiment.folder, port) as page:
+        say(f"page: {page.url}")
+        record = ProgressRecord(experiment.folder, about)
+        try:
+            result = run(record)
+        except Exception as error:
+            reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
+            record.end(reason)
+            _serve_on(page, f"failed: {reason}", say)
+            raise
+        record.end()
+        _serve_on(page, "finished", say)
+        return result
+
+
+def _serve_on(page: ExperimentPage, how: str, say: Say) -> None:
+    if not page.is_served:
+        say(f"{how}; the page ended before, see {_LOG} in the run folder")
+        return
+    say(f"{how}; page: {page.url} (how it ran: {page.url}run); Ctrl-C ends it")
+    page.wait()

@@ -1,0 +1,127 @@
+"""What the searches of a run folder have found so far, read from the files that they keep anyway."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from safetensors import SafetensorError, safe_open
+
+from advnerf_core.attack.artifact import COLOURS, MESH_TEXTURE, AttackFileError, face_texture, load_attack
+
+ATTACK, SEARCHED, STATE = "attack.safetensors", "surrogate.json", "state.safetensors"
+# Spaces whose theta are colours. Of the others, places and shapes, there is no texture to show.
+_COLOURED = ("face", COLOURS, MESH_TEXTURE)
+_PICTURE_PX, _MOST_OBJECTS = 192, 6
+
+Pixels = NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class Search:
+    """A search so far.
+
+    Attributes:
+        totals_m: Total CTE of each evaluation [m].
+        version: Changes with every change of what was found.
+        finished: Whether it has ended.
+    """
+
+    totals_m: tuple[float, ...]
+    version: str
+    finished: bool
+
+    @property
+    def best(self) -> int:
+        """Index of the best evaluation, the first of equals."""
+        return max(range(len(self.totals_m)), key=lambda index: (self.totals_m[index], -index))
+
+
+def read_search(folder: Path, state: str = STATE) -> Search | None:
+    """The search of a cell's folder; None if there is none yet.
+
+    Args:
+        folder: Of the cell.
+        state: Name of the state file that a running search keeps.
+    """
+    for name, read in ((SEARCHED, _finished), (state, _running)):
+        try:
+            changed_ns = (folder / name).stat().st_mtime_ns
+            found = read(folder / name, changed_ns)
+        except (OSError, ValueError, KeyError, TypeError, SafetensorError):
+            continue  # not there, or replaced while it was read
+        if found:
+            return Search(found, f"{changed_ns:x}", name == SEARCHED)
+    return None
+
+
+@lru_cache(maxsize=512)
+def _finished(file: Path, changed_ns: int) -> tuple[float, ...]:
+    del changed_ns  # a changed file is another entry of the cache
+    return tuple(round(float(each), 3) for each in json.loads(file.read_text())["curve_total_cte_m"])
+
+
+@lru_cache(maxsize=64)
+def _running(file: Path, changed_ns: int) -> tuple[float, ...]:
+    del changed_ns
+    with safe_open(file, framework="numpy") as handle:
+        history = json.loads((handle.metadata() or {})["history"])
+    return tuple(round(sum(row["protocol_cte_m"]) / len(row["protocol_cte_m"]), 3) for row in history)
+
+
+def has_texture(space: str) -> bool:
+    """Whether a search of this space, as an experiment file names it, finds colours."""
+    return space in _COLOURED
+
+
+def texture_png(folder: Path) -> bytes | None:
+    """Texture of the best evaluation so far of a cell, as a PNG file; None if there is none.
+
+    Args:
+        folder: Of the cell.
+    """
+    try:
+        pictures = (
+            _attack_pictures(folder / ATTACK)
+            if (folder / ATTACK).exists()
+            else _state_pictures(folder / STATE)
+        )
+    except (OSError, ValueError, KeyError, SafetensorError, AttackFileError):
+        return None
+    small = [_square(each) for each in pictures[:_MOST_OBJECTS]]
+    if not small:
+        return None
+    _, png = cv2.imencode(".png", cv2.cvtColor(np.concatenate(small, axis=1), cv2.COLOR_RGB2BGR))
+    return png.tobytes()
+
+
+def _attack_pictures(file: Path) -> list[Pixels]:
+    attack = load_attack(file)
+    if attack.face is not None:
+        return [np.asarray(attack.face.texture, np.uint8)]
+    return [_picture(each.theta) for each in attack.objects]
+
+
+def _state_pictures(file: Path) -> list[Pixels]:
+    with safe_open(file, framework="numpy") as handle:
+        return [_picture(handle.get_tensor("best_theta"))]
+
+
+def _picture(theta: NDArray[np.float32]) -> Pixels:
+    """Colours before squashing as a picture: a grid as it is, free voxels or texels ``[K, 3]`` in rows of a square."""
+    if theta.ndim != 3:
+        flat = theta.reshape(-1, 3)
+        side = int(np.ceil(np.sqrt(len(flat))))
+        grid = np.zeros((side * side, 3), np.float32)
+        grid[: len(flat)] = flat
+        theta = grid.reshape(side, side, 3)
+    return face_texture(theta)
+
+
+def _square(picture: Pixels) -> Pixels:
+    return np.asarray(cv2.resize(picture, (_PICTURE_PX, _PICTURE_PX), interpolation=cv2.INTER_AREA), np.uint8)

@@ -1,0 +1,297 @@
+"""The experiment page over HTTP, from its own process: what it shows, what it refuses, and that the experiment does not notice it."""
+
+import json
+import os
+import shutil
+import signal
+import socket
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from advnerf_core.attack.artifact import load_attack
+from benchmarks.page_client import request
+from nodes.experiment import whole
+from nodes.experiment.cell import Cell
+from nodes.experiment.progress_record import read_progress
+from nodes.experiment_page.page import ExperimentPage, run_with_page
+from nodes.experiment_page.time_left import all_left_s
+from nodes.runtime.errors import BusError
+from tests.support.experiment_page import CELLS, record_of, search_so_far, state_of
+from tests.support.stage_versions import tiny_experiment
+
+pytestmark = pytest.mark.live
+OTHER_PATHS = [
+    "/../secret.png",
+    "/report/../../secret.png",
+    "/%2e%2e/secret.png",
+    "/report/%2e%2e/%2e%2e/secret.png",
+    "//etc/passwd",
+    "/etc/passwd",
+    "/policy/link.png",
+    "/policy/policy.safetensors",
+    "/progress.json",
+    "/manifest.json",
+    "/cells/../../secret.png",
+    "/cells/track_hardened_random_0/attack.safetensors",
+    "/texture/..%2f..%2fsecret.png",
+    "/texture/nobody.png",
+    "/web/../server.py",
+    "/web/%2e%2e%2fserver.py",
+    "/policy/a.png%00.png",
+    "/policy",
+    "/policy/",
+]
+CLEAN, RANDOM, GRADIENT = (cell.name for cell in CELLS)
+
+
+def port_of(page):
+    return int(page.url.rstrip("/").rpartition(":")[2])
+
+
+@pytest.fixture
+def served(tmp_path):
+    """A run folder, its record, and the port of its page."""
+    folder = tmp_path / "run"
+    record = record_of(folder)
+    with ExperimentPage(folder, 0) as page:
+        yield folder, record, port_of(page)
+
+
+def test_the_state_follows_the_experiment(served):
+    folder, record, port = served
+    record.finish("capture", 3.0, cached=False)
+    record.start("scene")(0.4, "step 40")
+    state = state_of(port)
+    assert [part["name"] for part in state["parts"]] == [
+        "capture",
+        "scene",
+        CLEAN,
+        RANDOM,
+        GRADIENT,
+        "report",
+    ]
+    assert [part["state"] for part in state["parts"]] == ["done", "running", *["waiting"] * 4]
+    assert (state["phase"], state["left_known"], state["report"]) == ("running", False, False)
+    record.finish("scene", 9.0, cached=False)
+    record.start(RANDOM)
+    search_so_far(folder / "cells" / RANDOM, [1.0, 3.0, 2.0])
+    (search,) = state_of(port)["searches"]
+    assert (search["totals_m"], search["best"], search["planned"]) == ([1.0, 3.0, 2.0], 1, 5)
+    status, headers, png = request(port, f"/texture/{RANDOM}.png")
+    assert (status, headers["content-type"]) == (200, "image/png")
+    finished = {"curve_total_cte_m": [4.0, 5.0]}
+    (folder / "cells" / GRADIENT).mkdir()
+    record.finish(GRADIENT, 0.0, cached=True)
+    (folder / "cells" / GRADIENT / "surrogate.json").write_text(json.dumps(finished))
+    running, ended = state_of(port)["searches"]
+    assert (running["name"], ended["name"], ended["planned"]) == (RANDOM, GRADIENT, 2)
+    picture = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
+    assert picture.std() > 10.0
+    record.end("ValueError: no more")
+    state = state_of(port)
+    assert (state["phase"], state["failure"]) == ("failed", "ValueError: no more")
+    assert [part["state"] for part in state["parts"]][3] == "failed"
+    assert request(port, "/")[1]["location"] == "/run"
+
+
+def test_cells_that_other_processes_run_are_seen_by_their_files(served):
+    folder, record, port = served
+    record.finish(CLEAN, 0.0, cached=True)
+    for name, percent in ((RANDOM, 40), (GRADIENT, 80)):
+        (folder / "cells" / name).mkdir(parents=True)
+        (folder / "cells" / name / "key").write_text("a hash\n")
+        (folder / "cells" / name / "log.txt").write_text(f"{percent} % 4/5, total CTE 2.0 m\n")
+    parts = {part["name"]: part for part in state_of(port)["parts"]}
+    assert parts[CLEAN]["state"] == "reused"
+    assert (parts[RANDOM]["state"], parts[RANDOM]["fraction"]) == ("running", 0.4)
+    assert parts[RANDOM]["text"] == "4/5, total CTE 2.0 m"
+    (folder / "cells" / RANDOM / "error.json").write_text(json.dumps({"error": "ValueError: NaN"}))
+    result = {"seconds": 12.5, "surrogate": {"total_cte_m": [4.0, 6.0], "none_total_cte_m": [1.0, 1.0]}}
+    (folder / "cells" / f"{GRADIENT}.json").write_text(json.dumps(result))
+    parts = {part["name"]: part for part in state_of(port)["parts"]}
+    assert (parts[RANDOM]["state"], parts[RANDOM]["text"]) == ("failed", "ValueError: NaN")
+    assert (parts[GRADIENT]["state"], parts[GRADIENT]["seconds"]) == ("done", 12.5)
+    assert parts[GRADIENT]["measured"] == {"surrogate": [5.0, 1.0]}
+
+
+def test_an_unchanged_state_is_not_sent_again(served):
+    _, _, port = served
+    _, headers, body = request(port, "/state.json")
+    assert body
+    status, again, body = request(port, "/state.json", headers={"if-none-match": headers["etag"]})
+    assert (status, again["etag"], body) == (304, headers["etag"], b"")
+
+
+def test_the_report_takes_over_once_it_is_made(served):
+    folder, record, port = served
+    (folder / "report" / "videos").mkdir(parents=True)
+    (folder / "report" / "report.html").write_text("<html>the report</html>")
+    (folder / "report" / "videos" / "a.mp4").write_bytes(bytes(range(256)))
+    record.finish("report", 1.0, cached=False)
+    assert request(port, "/")[1]["location"] == "/run"
+    record.end()
+    status, headers, _ = request(port, "/")
+    assert (status, headers["location"]) == (307, "/report/report.html")
+    status, headers, body = request(port, "/report/report.html")
+    assert b"the report" in body
+    assert "script-src" not in headers["content-security-policy"]
+    assert "style-src 'unsafe-inline'" in headers["content-security-policy"]
+    status, _, part = request(port, "/report/videos/a.mp4", headers={"range": "bytes=10-19"})
+    assert (status, part) == (206, bytes(range(10, 20)))
+    assert request(port, "/run")[0] == 200
+
+
+@pytest.mark.parametrize("path", OTHER_PATHS)
+def test_only_the_files_of_the_page_are_served(served, path):
+    folder, _, port = served
+    (folder.parent / "secret.png").write_bytes(b"secret")
+    (folder / "policy").mkdir()
+    (folder / "policy" / "a.png").write_bytes(b"a picture")
+    (folder / "policy" / "policy.safetensors").write_bytes(b"secret")
+    (folder / "policy" / "link.png").symlink_to(folder.parent / "secret.png")
+    assert request(port, "/policy/a.png")[2] == b"a picture"
+    status, _, body = request(port, path)
+    assert status == 404
+    assert b"secret" not in body
+
+
+@pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "PATCH", "OPTIONS"])
+@pytest.mark.parametrize("path", ["/", "/state.json", "/web/main.js", "/policy/a.png"])
+def test_it_only_reads(served, method, path):
+    assert request(served[2], path, method=method)[0] == 405
+
+
+def test_a_stranger_with_a_name_for_this_computer_gets_nothing(served):
+    status, _, body = request(served[2], "/state.json", headers={"host": "evil.example:80"})
+    assert (status, b"room" in body) == (421, False)
+
+
+def test_all_answers_forbid_what_is_not_ours(served):
+    for path in ("/run", "/web/main.js", "/web/look.css", "/favicon.ico", "/state.json"):
+        status, headers, _ = request(served[2], path)
+        assert status == 200
+        assert "default-src 'none'" in headers["content-security-policy"]
+        assert headers["x-content-type-options"] == "nosniff"
+
+
+def test_a_taken_port_is_one_error_before_anything_is_run(tmp_path):
+    experiment = tiny_experiment(tmp_path / "run")
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        port = other.getsockname()[1]
+        with pytest.raises(BusError, match=f"127.0.0.1:{port}.*choose another port"):
+            run_with_page(experiment, port, lambda record: pytest.fail("it was run"), print)
+    assert not (tmp_path / "run").exists()
+
+
+def test_clients_that_never_read_do_not_reach_the_experiment(served):
+    folder, record, port = served
+    film = folder / "cells" / RANDOM / "clip.mp4"
+    film.parent.mkdir(parents=True)
+    film.write_bytes(bytes(8 << 20))
+    silent = []
+    for _ in range(100):
+        client = socket.create_connection(("127.0.0.1", port))
+        client.sendall(f"GET /cells/{RANDOM}/clip.mp4 HTTP/1.1\r\nHost: localhost\r\n\r\n".encode())
+        silent.append(client)
+    report, began_s = record.start("scene"), time.monotonic()
+    for step in range(1000):
+        report(step / 1000, f"step {step}")
+    record.finish("scene", 1.0, cached=False)
+    assert time.monotonic() - began_s < 5.0
+    for client in silent:
+        client.close()
+    while request(port, "/state.json")[0] == 503:
+        time.sleep(0.1)
+    assert state_of(port)["parts"][1]["state"] == "done"
+
+
+def test_an_experiment_outlives_its_page(tmp_path):
+    said = []
+
+    def run(record):
+        (server,) = Path(f"/proc/{os.getpid()}/task/{os.getpid()}/children").read_text().split()
+        os.kill(int(server), signal.SIGKILL)
+        time.sleep(0.5)
+        record.start("scene")(0.5, "goes on")
+        return "done"
+
+    assert run_with_page(tiny_experiment(tmp_path / "run"), 0, run, said.append) == "done"
+    assert "the page ended before" in said[-1]
+
+
+def test_the_time_left_is_that_of_running_parts_and_of_cells_like_those_that_are_done():
+    def part(name, state, searched=True, **changes):
+        return {
+            "name": name,
+            "state": state,
+            "searched": searched,
+            "fraction": 0.0,
+            "first_fraction": 0.0,
+            "began_s": 0.0,
+            "seconds": 0.0,
+            **changes,
+        }
+
+    stages = [
+        part("scene", "running", began_s=50.0, fraction=0.6, first_fraction=0.1),
+        part("report", "waiting"),
+    ]
+    cells = [part("a", "done", seconds=30.0), part("b", "waiting"), part("c", "waiting")]
+    # Half of it took 50 s, 0.4 are left.
+    assert all_left_s(stages, cells, 100.0) == (40.0 + 60.0, True)
+    assert all_left_s(stages, [*cells, part("d", "waiting", searched=False)], 100.0) == (100.0, False)
+    assert all_left_s([part("policy", "waiting")], cells, 100.0) == (60.0, False)
+    # Two cells at a time.
+    cells = [
+        part("a", "done", seconds=30.0),
+        part("b", "running", began_s=90.0),
+        part("c", "running", began_s=80.0),
+    ]
+    assert all_left_s([], cells, 100.0) == ((20.0 + 10.0) / 2, True)
+
+
+def test_a_page_changes_no_key_and_no_attack(tiny_room, tmp_path, monkeypatch):
+    """The same tiny experiment without and with its page, from the same stages."""
+    monkeypatch.setattr(ExperimentPage, "wait", lambda page: None)
+    found = []
+    for name in ("alone", "watched"):
+        shutil.copytree(tiny_room[0], tmp_path / name, ignore=shutil.ignore_patterns("cells"))
+        experiment = tiny_experiment(tmp_path / name)
+
+        def run(record, experiment=experiment):
+            only = "victim=hardened,method=none+random"
+            return whole.run_experiment(experiment, only=only, record=record)
+
+        ended = run(None) if name == "alone" else run_with_page(experiment, 0, run, lambda text: None)
+        assert [end.how for end in ended] == ["done", "done"]
+        found.append(made_by(experiment))
+    assert found[0] == found[1]
+    record = read_progress(tmp_path / "watched")
+    assert {name: part["state"] for name, part in record["parts"].items()} == {
+        **dict.fromkeys(("capture", "scene", "bake", "object", "policy"), "reused"),
+        **dict.fromkeys((CLEAN, RANDOM), "done"),
+        "report": "waiting",
+    }
+    assert "no report yet: 1 of 3 cells are missing" in [line for _, line in record["log"]]
+    assert not (tmp_path / "alone" / "progress.json").exists()
+
+
+def made_by(experiment):
+    """Keys and results: of the stages, and of a cell."""
+    cell = Cell("track", "hardened", "random", 0)
+    result = json.loads(experiment.cell_result(cell).read_text())
+    stages = [
+        (experiment.stage_folder(name) / "stage.json").read_text() for name in ("capture", "scene", "policy")
+    ]
+    attack = load_attack(experiment.cell_folder(cell) / "attack.safetensors")
+    return (
+        attack.attack_id,
+        stages,
+        [result[key] for key in ("settings_hash", "attack_id", "surrogate", "deployed")],
+    )

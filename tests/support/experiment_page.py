@@ -1,0 +1,42 @@
+"""A run folder as an experiment leaves it, made quickly: the record, a finished search, a running one, films and a report."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from advnerf_core.attack.adjoint import Totals
+from advnerf_core.attack.search.search import SearchState
+from benchmarks.page_client import request
+from nodes.experiment.cell import Cell
+from nodes.experiment.progress_record import ProgressRecord
+
+CELLS = [Cell("track", "hardened", method, 0) for method in ("none", "random", "gradient")]
+ABOUT = {"name": "room", "setting": "demo", "planned": 5, "space": "face"}
+
+
+def record_of(folder: Path) -> ProgressRecord:
+    """The record of an experiment that has just begun."""
+    record = ProgressRecord(folder, ABOUT)
+    record.plan(["capture", "scene", "report"], CELLS)
+    return record
+
+
+def search_so_far(folder: Path, totals_m: list[float], seed: int = 0) -> None:
+    """The state file of a running search, as `advnerf_core.attack.search` writes it."""
+    state = SearchState({})
+    for total_m in totals_m:
+        theta = torch.from_numpy(np.random.default_rng(seed).normal(size=(8, 8, 3)).astype(np.float32))
+        state.record(theta, -total_m, Totals(*(torch.tensor([total_m]) for _ in range(2))), 0.1)
+    folder.mkdir(parents=True, exist_ok=True)
+    state.save(folder / "state.safetensors", "a fingerprint")
+
+
+def state_of(port: int) -> dict[str, object]:
+    """The state, not older than this call."""
+    time.sleep(0.6)
+    return dict(json.loads(request(port, "/state.json")[2]))
