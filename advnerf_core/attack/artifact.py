@@ -48,6 +48,7 @@ class AttackedObject:
         scale: World metres per object unit.
         sha256: Hash of its geometry and fixed colours.
         glb: Of a mesh, the found mesh as a binary glTF file, in the object's frame; empty for other objects.
+        size_m: Width and height of a panel's texture [m]; None for solid objects, for a face (see `Face`), and in older files.
     """
 
     name: str
@@ -56,6 +57,7 @@ class AttackedObject:
     scale: float
     sha256: str
     glb: bytes = b""
+    size_m: tuple[float, float] | None = None
 
     @property
     def placement(self) -> tuple[float, float, float, float]:
@@ -262,7 +264,13 @@ class AttackFile:
 
 def _object_metadata(each: AttackedObject) -> dict[str, Any]:
     pose = np.asarray(each.T_world_from_object, dtype=np.float64).tolist()
-    return {"name": each.name, "T_world_from_object": pose, "scale": float(each.scale), "sha256": each.sha256}
+    return {
+        "name": each.name,
+        "T_world_from_object": pose,
+        "scale": float(each.scale),
+        "sha256": each.sha256,
+        **({} if each.size_m is None else {"size_m": [float(v) for v in each.size_m]}),
+    }
 
 
 def _face_metadata(face: Face) -> dict[str, Any]:
@@ -354,6 +362,7 @@ def _from_parts(metadata: dict[str, Any], tensors: dict[str, NDArray[Any]]) -> A
             each["scale"],
             each["sha256"],
             tensors[f"objects.{k}.glb"].tobytes() if f"objects.{k}.glb" in tensors else b"",
+            tuple(each["size_m"]) if "size_m" in each else None,
         )
         for k, each in enumerate(values["objects"])
     )

@@ -109,6 +109,14 @@ class VoxelGridObject:
         return self.free_count + len(self.fixed_colours)
 
     @property
+    def face_size_m(self) -> tuple[float, float] | None:
+        """Width and height of its flat texture in the world [m]; None for a solid object."""
+        if len(self.theta_shape) != 3:
+            return None
+        width_m, height_m = self.scale * (np.asarray(self.box_max) - self.box_min)[1:]
+        return float(width_m), float(height_m)
+
+    @property
     def plain_theta(self) -> Array:
         """Free parameters without an attack, ``[parameter_count, 3]``; grey if nothing says otherwise."""
         if self.plain_colours is not None:

@@ -112,9 +112,8 @@ class NativeScene:
 
 
 def _panel_of(field: ColouredObject) -> Panel:
-    if not isinstance(field, VoxelGridObject) or len(field.theta_shape) != 3:
+    if not isinstance(field, VoxelGridObject) or field.face_size_m is None:
         raise ConfigError(
             "expected panels with deploy.panels native, got a solid object; set deploy.panels=composed"
         )
-    width_m, height_m = field.scale * (field.box_max - field.box_min)[1:]
-    return Panel(np.array(field.T_world_from_object), float(width_m), float(height_m))
+    return Panel(np.array(field.T_world_from_object), *field.face_size_m)

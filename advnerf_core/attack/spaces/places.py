@@ -96,6 +96,7 @@ class PlaceSpace:
                 field.T_world_from_object,
                 field.scale,
                 named.sha256,
+                size_m=field.face_size_m,
             )
             for named, field, part in rows
         )

@@ -30,6 +30,7 @@ from advnerf_core.attack.spaces.displayed import DisplayedSensor
 from advnerf_core.display import DisplayModel
 from advnerf_core.errors import AdvnerfError
 from advnerf_core.fields.coloured import ColouredObject
+from advnerf_core.fields.voxel_grid import VoxelGridObject
 from advnerf_core.objects.mesh.field import MeshField
 from advnerf_core.objects.mesh.glb import glb_bytes
 from advnerf_core.objects.mesh.shape import ShapeLimits, ShapeSensor
@@ -241,7 +242,10 @@ class ShapeSpace:
 
 def _attacked(named: NamedObject, field: ColouredObject, part: Tensor, glb: bytes) -> AttackedObject:
     theta = part.detach().numpy().astype(np.float32)
-    return AttackedObject(named.name, theta, field.T_world_from_object, field.scale, named.sha256, glb)
+    size_m = field.face_size_m if isinstance(field, VoxelGridObject) else None
+    return AttackedObject(
+        named.name, theta, field.T_world_from_object, field.scale, named.sha256, glb, size_m
+    )
 
 
 def _textured_glb(field: ColouredObject, colours: Tensor) -> bytes:

@@ -6,6 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from advnerf_core.attack.artifact import AttackFile, load_attack
+from advnerf_core.attack.printing.pages import pdf_bytes
+from advnerf_core.attack.printing.poster import Poster, PrintError, png_bytes
+from advnerf_core.attack.printing.tiles import Paper, layout_of
 from advnerf_core.files import write_atomically
 
 
@@ -29,6 +32,33 @@ def export_attack(attack: AttackFile, folder: Path, stem: str) -> list[Path]:
             written.append(folder / f"{stem}.{number}_{each.name}.glb")
             write_atomically(written[-1], each.glb)
     return written
+
+
+def write_poster(
+    poster: Poster, target: Path, paper: Paper, dpi: float, margin_mm: float, overlap_mm: float
+) -> str:
+    """Write a poster as PDF or PNG, as the file's name says.
+
+    Returns:
+        What was written, in words.
+
+    Raises:
+        PrintError: Another kind of file, or measures that do not go together.
+    """
+    size = f"{poster.size_m[0]:.3f} x {poster.size_m[1]:.3f} m"
+    if target.suffix.lower() == ".png":
+        write_atomically(target, png_bytes(poster, dpi))
+        return f"written: {target}, {size}; print at 100 %"
+    if target.suffix.lower() != ".pdf":
+        raise PrintError(f"expected a .pdf or .png file to write, got {target}; correct --output")
+    layout = layout_of(poster.size_mm, paper, margin_mm, overlap_mm)
+    write_atomically(target, pdf_bytes(poster, layout, paper, dpi))
+    pages = (
+        "1 page of this size"
+        if paper == "none"
+        else f"{layout.rows * layout.columns} pages of {paper.title()}"
+    )
+    return f"written: {target}, {size}, {pages} and an overview; print at 100 %, no fit to page"
 
 
 def print_attacks(files: Sequence[Path]) -> None:

@@ -127,6 +127,17 @@ def test_garbage_gives_one_clear_error(tmp_path, content):
         load_attack(path)
 
 
+def test_the_size_of_a_panel_is_kept_and_files_without_one_keep_their_id(tmp_path):
+    first, panel = of_two().objects
+    sized = dataclasses.replace(of_two(), objects=(first, dataclasses.replace(panel, size_m=(2.8, 1.4))))
+    assert save_attack(tmp_path / "attack.safetensors", sized) == sized.attack_id != of_two().attack_id
+    assert [each.size_m for each in load_attack(tmp_path / "attack.safetensors").objects] == [
+        None,
+        (2.8, 1.4),
+    ]
+    assert of_two().attack_id == "e5a1f1c18a70"
+
+
 def test_missing_truncated_and_foreign_files(tmp_path):
     with pytest.raises(AttackFileError, match="found none"):
         load_attack(tmp_path / "none.safetensors")

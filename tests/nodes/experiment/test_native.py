@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 import torch
 
+from advnerf_core.attack.spaces.space import ColourSpace, NamedObject
 from advnerf_core.fields.voxel_grid import cube_face_object
 from advnerf_core.geometry import make_transform, rotation_z
 from advnerf_core.policies.view import PolicyView
+from advnerf_core.scene.surrogate import Surrogate
 from nodes.experiment.deployed import DressedScene
 from nodes.experiment.native import NativeScene
 from nodes.experiment.objects import placed_objects
@@ -110,6 +112,10 @@ def test_a_panel_is_an_object_of_an_experiment(tmp_path: Path) -> None:
     assert field.T_world_from_object[:3, 3].tolist() == [12.0, 5.0, 0.12 + 1.5]
     assert field.T_world_from_object[:3, 0] == pytest.approx([np.cos(-2.0), np.sin(-2.0), 0.0])
     assert PlacedObject(**board).side_m == 3.0
+    # Its size goes into the attack file, whose scale says nothing of it.
+    surrogate = Surrogate(lambda poses, pinhole: None, experiment.view.pinhole, np.eye(4), [field])
+    (attacked,) = ColourSpace(surrogate, [NamedObject("board", "")]).attacked(torch.zeros(16, 16, 3))
+    assert (attacked.size_m, attacked.scale) == ((3.0, 3.0), 1.0)
     plain = load_experiment(LAUNCH / "junction.experiment.yaml", "demo", [], tmp_path / "other")
     dumped = plain.config.model_dump(mode="json")
     assert not {"panel_resolution", "panel_rgb"} & set(dumped["object"])

@@ -1,0 +1,81 @@
+"""`advnerf attack print` as people call it."""
+
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from advnerf_core.attack.artifact import AttackFile, save_attack
+from advnerf_core.fields.voxel_grid import face_corners_in_object
+from advnerf_core.geometry import Pinhole
+from nodes.cli import main as cli
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    path = tmp_path / "seed_0.attack.safetensors"
+    attack = AttackFile.of_face(
+        method="gradient",
+        theta=np.random.default_rng(0).normal(size=(8, 8, 3)).astype(np.float32),
+        size_m=(0.4, 0.4),
+        subject="board",
+        corners_in_subject=face_corners_in_object(0.4),
+        T_world_from_object=np.eye(4),
+        camera=Pinhole(200, 66, 103.6, 103.4, 100, 32),
+        scene_sha256="",
+        policy_sha256="",
+        config_sha256="",
+        seed=0,
+        predicted_total_cte_m=None,
+        software_version="0",
+    )
+    save_attack(path, attack)
+    return path
+
+
+@pytest.fixture
+def printed(monkeypatch, capsys, file):
+    """Call the command: exit code, and what it says in one line."""
+
+    def call(*arguments: object) -> tuple[int, str]:
+        monkeypatch.setattr(sys, "argv", ["advnerf", "attack", "print", str(file), *map(str, arguments)])
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+        said = capsys.readouterr()
+        return int(ended.value.code or 0), " ".join((said.out + said.err).split())
+
+    return call
+
+
+def test_the_pdf_lies_beside_the_file(printed, file):
+    code, said = printed("--dpi", 40)
+    assert (code, said.split(", ", 1)[1]) == (
+        0,
+        "0.400 x 0.400 m, 6 pages of A4 and an overview; print at 100 %, no fit to page",
+    )
+    assert (file.parent / "seed_0.poster.pdf").read_bytes().count(b"/MediaBox") == 7
+
+
+def test_a_png_and_a_page_of_the_posters_size(printed, tmp_path):
+    assert printed("-o", tmp_path / "poster.png", "--dpi", 127)[0] == 0
+    assert cv2.imread(str(tmp_path / "poster.png")).shape == (2000, 2000, 3)
+    assert printed("-o", tmp_path / "shop.pdf", "--paper", "none", "--dpi", 40)[0] == 0
+    assert b"/MediaBox [0 0 1133.858268 1133.858268]" in (tmp_path / "shop.pdf").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["-o", "poster.jpg"], "expected a .pdf or .png file to write, got poster.jpg; correct --output"),
+        (["--margin-mm", 1], "expected a margin of 4 to 40 mm"),
+        (["--object", "car"], "expected an object of face; got 'car'"),
+        (["--size-m", 1], "whose attack file says 0.4 x 0.4 m"),
+        (["--paper", "a7"], "'a7' is not one of"),
+    ],
+)
+def test_mistakes_are_told_in_one_line(printed, arguments, message):
+    code, said = printed(*arguments)
+    assert code == 2
+    assert message in said
