@@ -98,10 +98,10 @@ class Experiment(RunFolder[ExperimentConfig]):
         return True
 
     def ask_world(self) -> None:
-        """Have a world that must be asked for its description say it, and keep that: nothing is photographed for it."""
+        """Have a world that must be asked for its description say it, before the capture stage keeps it: nothing is photographed for it."""
         if not self.is_described:
             with self.named_world.make() as world:
-                self.keep_world(world)
+                vars(self)["world"] = world.describe()  # where the cached property keeps it
 
     @contextmanager
     def open_world(self) -> Iterator[World]:
